@@ -1,0 +1,469 @@
+"""The whisker: a thin rod with an intrinsic curvature, a radius and a material.
+
+    R' = R [u₀(s)]ₓ,    r' = R e₁,    B(s) = diag(GJ, EI, EI),    I = π r(s)⁴ / 4
+
+u₀ = (twist, curvature about d1, curvature about d2), with R' e₁ = R (0, u_z, −u_y): u_z > 0 bends
+toward +y, u_y > 0 toward −z. All is numbers: piecewise polynomials over arc length, so that a
+whisker can be pickled, stored and sent to another machine whatever it was made from.
+
+The whisker frame has its origin at the base and x along the base tangent; the proximal 70 % of the
+whisker lies as close as possible to the x–y plane and bends toward +y.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Unpack
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+
+from vibrissa.whisker.dataset import whisker_dataset, whisker_fields
+from vibrissa.whisker.parabola import parabola_curvature
+from vibrissa.whisker.pose import Pose, least_turn, roll
+from vibrissa.whisker.profile import (
+    UNRESOLVED,
+    Profile,
+    Side,
+    approximate,
+    array_function,
+    constant,
+)
+from vibrissa.whisker.rest import Path, proximal_roll
+from vibrissa.whisker.section import (
+    POISSON_RATIO,
+    YOUNGS_MODULUS,
+    Properties,
+    length_faults,
+    material_faults,
+    radius_profile,
+    settled,
+    split,
+)
+
+Array = NDArray[np.float64]
+
+ROUNDING = 1e-9
+"""Share of the length by which an arc length may lie outside the whisker and is clipped."""
+
+STRAIGHT = 1e-9
+"""Largest curvature times length of a whisker that counts as straight."""
+
+PROXIMAL = 0.7
+"""Share of the whisker, from the base, that says where y points."""
+
+STRAIGHT_NOTE = (
+    "straight: nothing says where it bends to, so the roll about its axis is the one that turns "
+    "its source frame least"
+)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Whisker:
+    """A whisker, or any slender clamped rod, at rest.
+
+    Make one with `from_points`, `parabola`, `straight` or `from_curvature`. These all take the
+    keywords listed under Other Parameters.
+
+    Parameters
+    ----------
+    length : float
+        Arc length from base to tip, m.
+    intrinsic_curvature : Profile
+        u₀(s), values (3,): twist, curvature about d1, curvature about d2, 1/m.
+    section_radius : Profile
+        Radius r(s), m.
+    youngs_modulus : float
+        E, Pa.
+    poisson_ratio : float
+        ν, in (−1, 0.5].
+    base_stiffness : tuple of float, optional
+        Rotational stiffness of the base (bending, twist), N·m/rad; None is a rigid clamp.
+    pose : Pose
+        Where the whisker frame sits in the frame the whisker came from.
+    breaks : tuple of float
+        Arc lengths, m, inside the whisker, at which curvature or radius has a kink or a jump.
+    name : str
+        What to call it.
+    notes : tuple of str
+        Sentences about how it was made that its user should know.
+
+    Other Parameters
+    ----------------
+    base_radius, tip_radius : float
+        Radii at base (default 100 µm) and tip (default a fifteenth of the base's), m; linear in
+        between.
+    radius : callable or array
+        Any other radius: r(s), radii (n,) equally spaced from base to tip, or pairs (n, 2) of arc
+        length and radius, m. It replaces base_radius.
+
+    Examples
+    --------
+    >>> Whisker.straight(length=40e-3)
+    Whisker 'straight': 40.00 mm long, radius 100.0 µm at the base and 6.7 µm at the tip, straight
+    """
+
+    length: float
+    intrinsic_curvature: Profile
+    section_radius: Profile
+    youngs_modulus: float = YOUNGS_MODULUS
+    poisson_ratio: float = POISSON_RATIO
+    base_stiffness: tuple[float, float] | None = None
+    pose: Pose = field(default_factory=Pose)
+    breaks: tuple[float, ...] = ()
+    name: str = "whisker"
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check every field and bring the numbers into plain Python types."""
+        faults = length_faults(self.length)
+        faults += material_faults(self.youngs_modulus, self.poisson_ratio, self.base_stiffness)
+        faults += _break_faults(self.breaks, self.length)
+        for what, profile, shape in (
+            ("intrinsic_curvature", self.intrinsic_curvature, (3,)),
+            ("section_radius", self.section_radius, ()),
+        ):
+            if profile.shape != shape:
+                faults.append(f"{what} has values of shape {profile.shape}; {shape} is needed")
+            elif profile.knots[0] != 0.0 or profile.knots[-1] < self.length * (1.0 - ROUNDING):
+                faults.append(f"{what} does not reach from 0 to {self.length!r} m")
+        if faults:
+            raise ValueError("no whisker: " + "; ".join(faults))
+        stiffness = self.base_stiffness
+        if stiffness is not None:
+            object.__setattr__(self, "base_stiffness", tuple(float(value) for value in stiffness))
+        for what in ("length", "youngs_modulus", "poisson_ratio"):
+            object.__setattr__(self, what, float(getattr(self, what)))
+        object.__setattr__(self, "breaks", tuple(sorted(float(s) for s in self.breaks)))
+        object.__setattr__(self, "notes", tuple(self.notes))
+
+    # Ways to make one.
+
+    @classmethod
+    def parabola(
+        cls, length: float, coefficient: float, **properties: Unpack[Properties]
+    ) -> "Whisker":
+        """Make a planar whisker on the parabola y = A x².
+
+        Parameters
+        ----------
+        length : float
+            Arc length, m.
+        coefficient : float
+            A, 1/m. A negative one bends to −y of the source frame; the whisker frame is then
+            turned by 180° about x, so that the whisker bends to +y there, and the pose says so.
+        **properties
+            Radius and material; see `Whisker`.
+
+        Returns
+        -------
+        Whisker
+        """
+        faults = length_faults(length)
+        if not np.isfinite(coefficient):
+            faults.append(f"coefficient is {coefficient!r}; it must be a finite number, in 1/m")
+        if faults:
+            raise ValueError("no parabola: " + "; ".join(faults))
+        curvature = parabola_curvature(length, abs(float(coefficient)))
+        pose = Pose(np.diag([1.0, -1.0, -1.0])) if coefficient < 0.0 else Pose()
+        properties.setdefault("name", "parabola")
+        return _assembled(length, curvature, pose, properties)
+
+    @classmethod
+    def straight(cls, length: float, **properties: Unpack[Properties]) -> "Whisker":
+        """Make a straight whisker.
+
+        Parameters
+        ----------
+        length : float
+            Length, m.
+        **properties
+            Radius and material; see `Whisker`.
+
+        Returns
+        -------
+        Whisker
+        """
+        faults = length_faults(length)
+        if faults:
+            raise ValueError("no straight whisker: " + "; ".join(faults))
+        properties.setdefault("name", "straight")
+        return _assembled(length, constant(np.zeros(3), length), Pose(), properties)
+
+    @classmethod
+    def from_curvature(
+        cls,
+        length: float,
+        curvature: Callable[..., object],
+        *,
+        breaks: Sequence[float] = (),
+        **properties: Unpack[Properties],
+    ) -> "Whisker":
+        """Make a whisker from its intrinsic curvature.
+
+        Parameters
+        ----------
+        length : float
+            Arc length, m.
+        curvature : callable
+            Takes arc lengths, m (an array, or one at a time), and returns (..., 3): twist,
+            curvature about d1, curvature about d2, 1/m.
+        breaks : sequence of float
+            Arc lengths, m, where curvature or radius has a kink or a jump.
+        **properties
+            Radius and material; see `Whisker`.
+
+        Returns
+        -------
+        Whisker
+            Its frame is the one the curvature is stated in, whichever way it bends; `aligned`
+            rolls it so that it bends to +y.
+        """
+        faults = length_faults(length)
+        if not callable(curvature):
+            got = type(curvature).__name__
+            faults.append(f"curvature is of type {got}; a function of arc length is needed")
+        faults = faults or _break_faults(breaks, length)
+        if faults:
+            raise ValueError("no whisker from curvature: " + "; ".join(faults))
+        joints = np.unique([0.0, *breaks, length])
+        profile = approximate(array_function(curvature, (3,), "curvature"), joints)
+        notes: tuple[str, ...] = ()
+        if profile.error > UNRESOLVED:
+            notes += (
+                f"the curvature is met to {profile.error:.1e} of its largest value only; it has "
+                "kinks or jumps that should be stated as breaks",
+            )
+        whisker = _assembled(length, profile, Pose(), properties, breaks, notes)
+        if not whisker.is_straight and abs(whisker._proximal_roll()) > np.pi / 2:
+            note = "its proximal part bends toward −y in the frame its curvature was stated in"
+            whisker = replace(whisker, notes=(*whisker.notes, note))
+        return whisker
+
+    # What it is.
+
+    @property
+    def base_radius(self) -> float:
+        """Radius at the base, m."""
+        return float(self.section_radius(0.0))
+
+    @property
+    def tip_radius(self) -> float:
+        """Radius at the tip, m."""
+        return float(self.section_radius(self.length, "left"))
+
+    @property
+    def base_bending_stiffness(self) -> float:
+        """E π r⁴ / 4 at the base, N·m²."""
+        return self.youngs_modulus * np.pi * self.base_radius**4 / 4.0
+
+    @cached_property
+    def is_straight(self) -> bool:
+        """Whether its bending curvature is zero everywhere."""
+        bending = np.abs(self.intrinsic_curvature.coefficients[..., 1:]).max()
+        return bool(bending * self.length < STRAIGHT)
+
+    def curvature(self, s: ArrayLike, side: Side = "right") -> Array:
+        """Intrinsic curvature u₀ at arc lengths.
+
+        Parameters
+        ----------
+        s : array (...)
+            Arc lengths from the base, m.
+        side : {"right", "left"}
+            Which side counts where the curvature jumps.
+
+        Returns
+        -------
+        array (..., 3)
+            Twist, curvature about d1, curvature about d2, 1/m.
+        """
+        return self.intrinsic_curvature(self._inside(s), side)
+
+    def radius(self, s: ArrayLike, side: Side = "right") -> Array:
+        """Radius (...), m, at arc lengths `s` (...), m; `side` counts where it jumps."""
+        return self.section_radius(self._inside(s), side)
+
+    def position(self, s: ArrayLike) -> Array:
+        """Points (..., 3), m, of the rest whisker at arc lengths `s` (...), m; whisker frame."""
+        return self._rest.at(self._inside(s))[1]
+
+    def frame(self, s: ArrayLike) -> Array:
+        """Frames (..., 3, 3) of the rest whisker at arc lengths `s` (...), m.
+
+        Columns are tangent, d1 and d2 in the whisker frame.
+        """
+        return self._rest.at(self._inside(s))[0]
+
+    def centerline(self, n: int = 101) -> Array:
+        """Points (n, 3), m, of the rest whisker, equally spaced from base to tip; whisker frame."""
+        if n < 2:
+            raise ValueError(f"a centreline of {n} points was asked for; at least 2 are needed")
+        return self.position(np.linspace(0.0, self.length, n))
+
+    @cached_property
+    def _rest(self) -> Path:
+        knots = self.intrinsic_curvature.knots
+        joints = np.append(knots[knots < self.length * (1.0 - ROUNDING)], self.length)
+        return Path.integrate(self.intrinsic_curvature, joints, (1.0, 0.0, 0.0))
+
+    def _inside(self, s: ArrayLike) -> Array:
+        s = np.asarray(s, dtype=np.float64)
+        slack = ROUNDING * self.length
+        if (s < -slack).any() or (s > self.length + slack).any():
+            raise ValueError(
+                f"arc lengths from {np.nanmin(s):.6g} to {np.nanmax(s):.6g} m were asked for; the "
+                f"whisker reaches from 0 to {self.length:.6g} m"
+            )
+        inside: Array = np.clip(s, 0.0, self.length)
+        return inside
+
+    def _proximal_roll(self) -> float:
+        count = 256
+        s = (np.arange(count) + 0.5) * (PROXIMAL * self.length / count)
+        return proximal_roll(self.position(s), np.full(count, PROXIMAL * self.length / count))
+
+    # The same whisker, changed.
+
+    def aligned(self) -> "Whisker":
+        """Roll the frame so that the proximal 70 % lies in the x–y plane and bends toward +y.
+
+        Returns
+        -------
+        Whisker
+            The same rod; its pose takes the opposite roll, so that nothing moves in the source
+            frame. A straight whisker is turned so that its axes are nearest those of the source
+            frame.
+        """
+        if self.is_straight:
+            nearest = least_turn(self.pose.rotation[:, 0])
+            turn = self.pose.rotation.T @ nearest
+            notes = self.notes if STRAIGHT_NOTE in self.notes else (*self.notes, STRAIGHT_NOTE)
+        else:
+            turn, notes = roll(self._proximal_roll()), self.notes
+        return replace(
+            self,
+            intrinsic_curvature=self.intrinsic_curvature.transformed(turn.T),
+            pose=Pose(self.pose.rotation @ turn, self.pose.origin),
+            notes=notes,
+        )
+
+    def with_properties(self, **properties: Unpack[Properties]) -> "Whisker":
+        """Give the same shape another radius, material, holding or name.
+
+        Parameters
+        ----------
+        **properties
+            What to change; see `Whisker`. What is not named stays.
+
+        Returns
+        -------
+        Whisker
+        """
+        stated, holding = split(properties)
+        whisker = self
+        if stated:
+            if stated.get("radius") is None:
+                stated.setdefault("base_radius", self.base_radius)
+            section = radius_profile(self.length, breaks=self.breaks, **stated)
+            whisker = replace(whisker, section_radius=section)
+        return replace(whisker, **holding)
+
+    def trimmed(self, length: float) -> "Whisker":
+        """Cut the tip off; shape and radius of what stays do not change.
+
+        Parameters
+        ----------
+        length : float
+            Arc length that stays, m.
+
+        Returns
+        -------
+        Whisker
+        """
+        if not 0.0 < length <= self.length:
+            raise ValueError(
+                f"length to keep is {length!r} m; it must be positive and at most {self.length!r} m"
+            )
+        return replace(
+            self,
+            length=length,
+            intrinsic_curvature=self.intrinsic_curvature.trimmed(length),
+            section_radius=self.section_radius.trimmed(length),
+            breaks=tuple(s for s in self.breaks if s < length),
+        )
+
+    def scaled(self, length_factor: float = 1.0, radius_factor: float = 1.0) -> "Whisker":
+        """Stretch the whole shape, the radius, or both.
+
+        Parameters
+        ----------
+        length_factor : float
+            Factor on every length along and across the shape; curvature is divided by it.
+        radius_factor : float
+            Factor on the radius.
+
+        Returns
+        -------
+        Whisker
+            With the same material, base stiffness and pose.
+        """
+        for what, value in (("length_factor", length_factor), ("radius_factor", radius_factor)):
+            if not (np.isfinite(value) and value > 0.0):
+                raise ValueError(f"{what} is {value!r}; it must be positive")
+        return replace(
+            self,
+            length=self.length * length_factor,
+            intrinsic_curvature=self.intrinsic_curvature.scaled(length_factor, 1 / length_factor),
+            section_radius=self.section_radius.scaled(length_factor, radius_factor),
+            breaks=tuple(s * length_factor for s in self.breaks),
+        )
+
+    # In and out.
+
+    def to_dataset(self) -> xr.Dataset:
+        """Write the whisker as a dataset, from which `from_dataset` makes it again without loss."""
+        return whisker_dataset(self)
+
+    @classmethod
+    def from_dataset(cls, dataset: xr.Dataset) -> "Whisker":
+        """Make the whisker again from what `to_dataset` wrote."""
+        return cls(**whisker_fields(dataset))
+
+    def __repr__(self) -> str:
+        """Say what it is in one line, in mm and µm."""
+        base = "" if self.base_stiffness is None else ", on a compliant base"
+        bend = "straight"
+        if not self.is_straight:
+            tangent = self.frame(self.length)[:, 0]
+            turned = np.degrees(np.arctan2(np.hypot(*tangent[1:]), tangent[0]))
+            bend = f"tip tangent turned by {turned:.0f}°"
+        return (
+            f"Whisker {self.name!r}: {self.length * 1e3:.2f} mm long, radius "
+            f"{self.base_radius * 1e6:.1f} µm at the base and {self.tip_radius * 1e6:.1f} µm at "
+            f"the tip, {bend}{base}"
+        )
+
+
+def _break_faults(breaks: Sequence[float], length: float) -> list[str]:
+    outside = [s for s in breaks if not 0.0 < s < length]
+    if not outside:
+        return []
+    return [f"breaks {outside} m; they must lie inside the whisker, between 0 and {length!r} m"]
+
+
+def _assembled(
+    length: float,
+    curvature: Profile,
+    pose: Pose,
+    properties: Properties,
+    breaks: Sequence[float] = (),
+    notes: tuple[str, ...] = (),
+) -> Whisker:
+    """Add radius and material to a shape."""
+    section, holding, remarks = settled(length, breaks, properties)
+    notes += remarks
+    return Whisker(
+        length, curvature, section, pose=pose, breaks=tuple(breaks), notes=notes, **holding
+    )

@@ -1,0 +1,124 @@
+"""Where a whisker sits in the frame its points came from.
+
+    x_source = R x_whisker + o
+
+`R` has the whisker's axes as columns (x along the base tangent, y the side it bends to) and `o` is
+its base point. Points are moved by both, vectors (forces, directions) by `R` alone; a moment about
+the base is a vector.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+ORTHOGONALITY = 1e-9
+"""Largest entry of RᵀR − 1 that still counts as a rotation."""
+
+
+def _identity() -> Array:
+    return np.eye(3)
+
+
+def _zero() -> Array:
+    return np.zeros(3)
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """Rotation and origin of the whisker frame in its source frame.
+
+    Parameters
+    ----------
+    rotation : array (3, 3)
+        Columns are the whisker's x, y and z axis in the source frame.
+    origin : array (3,)
+        Base point of the whisker in the source frame, m.
+
+    Raises
+    ------
+    ValueError
+        If `rotation` is no proper rotation or `origin` no finite point.
+
+    Examples
+    --------
+    >>> pose = Pose(origin=[0.0, 0.01, 0.0])
+    >>> pose.to_source([1.0, 0.0, 0.0])
+    array([1.  , 0.01, 0.  ])
+    """
+
+    rotation: Array = field(default_factory=_identity)
+    origin: Array = field(default_factory=_zero)
+
+    def __post_init__(self) -> None:
+        """Check both parts and make them read-only."""
+        rotation = np.array(self.rotation, dtype=np.float64)
+        origin = np.array(self.origin, dtype=np.float64)
+        faults = []
+        if rotation.shape != (3, 3) or not np.isfinite(rotation).all():
+            faults.append(f"rotation has shape {rotation.shape}; a finite (3, 3) matrix is needed")
+        elif np.abs(rotation.T @ rotation - np.eye(3)).max() > ORTHOGONALITY:
+            faults.append("rotation is not orthogonal: its columns must be unit vectors at 90°")
+        elif np.linalg.det(rotation) < 0.0:
+            faults.append("rotation is a reflection; a right-handed frame is needed")
+        if origin.shape != (3,) or not np.isfinite(origin).all():
+            faults.append(f"origin is {self.origin!r}; three finite coordinates in m are needed")
+        if faults:
+            raise ValueError("no pose: " + "; ".join(faults))
+        rotation.flags.writeable = False
+        origin.flags.writeable = False
+        object.__setattr__(self, "rotation", rotation)
+        object.__setattr__(self, "origin", origin)
+
+    def to_source(self, points: ArrayLike) -> Array:
+        """Move points (..., 3), m, from the whisker frame to the source frame."""
+        return self.vectors_to_source(points) + self.origin
+
+    def to_whisker(self, points: ArrayLike) -> Array:
+        """Move points (..., 3), m, from the source frame to the whisker frame."""
+        return self.vectors_to_whisker(_triples(points) - self.origin)
+
+    def vectors_to_source(self, vectors: ArrayLike) -> Array:
+        """Turn vectors (..., 3), any unit, from the whisker frame to the source frame."""
+        return _triples(vectors) @ self.rotation.T
+
+    def vectors_to_whisker(self, vectors: ArrayLike) -> Array:
+        """Turn vectors (..., 3), any unit, from the source frame to the whisker frame."""
+        return _triples(vectors) @ self.rotation
+
+    def __repr__(self) -> str:
+        """Show the origin in mm and the angle turned."""
+        cosine = np.clip((np.trace(self.rotation) - 1.0) / 2.0, -1.0, 1.0)
+        x, y, z = self.origin * 1e3
+        angle = np.degrees(np.arccos(cosine))
+        return f"Pose(origin=({x:.3f}, {y:.3f}, {z:.3f}) mm, turned by {angle:.1f}°)"
+
+
+def _triples(values: ArrayLike) -> Array:
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim == 0 or array.shape[-1] != 3:
+        raise ValueError(f"got an array of shape {array.shape}; the last axis must be x, y, z")
+    return array
+
+
+def roll(angle: float) -> Array:
+    """Rotation by `angle`, rad, about the x axis: columns (x, y', z')."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+
+
+def least_turn(direction: ArrayLike) -> Array:
+    """Give the rotation that takes e_x to a unit vector (3,) by the smallest angle.
+
+    For the opposite direction, where that rotation is not unique, it turns about z.
+    """
+    x, y, z = np.asarray(direction, dtype=np.float64)
+    rho2 = y * y + z * z
+    if rho2 == 0.0:
+        return np.diag([np.sign(x), np.sign(x), 1.0])
+    # (1 − x)/ρ² = 1/(1 + x) without the cancellation near −e_x.
+    w = (1.0 - x) / rho2 if x < 0.0 else 1.0 / (1.0 + x)
+    yy, yz, zz = w * y * y, w * y * z, w * z * z
+    return np.array([[x, -y, -z], [y, 1.0 - yy, -yz], [z, -yz, 1.0 - zz]])

@@ -1,0 +1,67 @@
+"""From what a whisker feels at its base to what it touched.
+
+The names here are the public face of the package. Each is imported from its home when it is first
+used, so that ``import vibrissa`` takes milliseconds and Numba, SciPy, xarray and Matplotlib load
+only when needed.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from vibrissa import samples
+    from vibrissa.io import load_whisker
+    from vibrissa.mapping import ContactMap, Estimate
+    from vibrissa.rod import Deflection, PegContact, PointContact, PointForce, deflect
+    from vibrissa.signals import base_signals
+    from vibrissa.status import Status
+    from vibrissa.whisker import Whisker
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "ContactMap",
+    "Deflection",
+    "Estimate",
+    "PegContact",
+    "PointContact",
+    "PointForce",
+    "Status",
+    "Whisker",
+    "__version__",
+    "base_signals",
+    "deflect",
+    "load_whisker",
+    "samples",
+]
+
+_HOMES = {
+    "ContactMap": "vibrissa.mapping",
+    "Deflection": "vibrissa.rod",
+    "Estimate": "vibrissa.mapping",
+    "PegContact": "vibrissa.rod",
+    "PointContact": "vibrissa.rod",
+    "PointForce": "vibrissa.rod",
+    "Status": "vibrissa.status",
+    "Whisker": "vibrissa.whisker",
+    "base_signals": "vibrissa.signals",
+    "deflect": "vibrissa.rod",
+    "load_whisker": "vibrissa.io",
+}
+_MODULES = {"samples"}
+
+
+def __getattr__(name: str) -> object:
+    if name in _MODULES:
+        return importlib.import_module(f"vibrissa.{name}")
+    if name not in _HOMES:
+        raise AttributeError(f"module 'vibrissa' has no attribute {name!r}")
+    value = getattr(importlib.import_module(_HOMES[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

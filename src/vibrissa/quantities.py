@@ -1,0 +1,421 @@
+"""One table of every physical quantity: its name, symbol, unit and meaning.
+
+The attributes of datasets, the labels of figures and the headings of tables come from here.
+Values are in SI units everywhere (``unit``); figures and printed tables show ``value *
+display_factor`` in ``display_unit``. F is the force of the object on the whisker and M = p × F
+its moment about the base, both in the whisker's frame: base at the origin, x along the tangent at
+the base, y toward the side to which the whisker curves. Names and symbols are those of the paper
+(Huet, Emnett & Hartmann 2022, doi:10.1371/journal.pcbi.1007763); its mN·mm is our µN·m.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """One physical quantity.
+
+    Parameters
+    ----------
+    name : str
+        The name of its variable in datasets and of its column in tables.
+    symbol : str
+        In mathtext, without the dollar signs.
+    unit : str
+        SI unit of every stored value; ``"1"`` for a number without one.
+    display_unit : str
+        Unit in figures and printed tables; empty for a number without one.
+    display_factor : float
+        What a stored value is multiplied with to be in ``display_unit``.
+    long_name : str
+        A few words, as in a legend.
+    description : str
+        What it is exactly: frame, sign, convention.
+    """
+
+    name: str
+    symbol: str
+    unit: str
+    display_unit: str
+    display_factor: float
+    long_name: str
+    description: str
+
+
+@dataclass(frozen=True)
+class _Unit:
+    """A unit of storage with the unit it is shown in."""
+
+    unit: str
+    display: str
+    factor: float
+
+
+_NUMBER = _Unit("1", "", 1.0)
+_PERCENT = _Unit("1", "%", 100.0)
+_SECOND = _Unit("s", "s", 1.0)
+_MM = _Unit("m", "mm", 1e3)
+_MICROMETRE = _Unit("m", "µm", 1e6)
+_SQUARE_MM = _Unit("m^2", "mm²", 1e6)
+_PER_MM = _Unit("1/m", "1/mm", 1e-3)
+_DEGREE = _Unit("rad", "°", 180.0 / math.pi)
+_MICRONEWTON = _Unit("N", "µN", 1e6)
+_MICRONEWTON_METRE = _Unit("N m", "µN·m", 1e6)
+_GIGAPASCAL = _Unit("Pa", "GPa", 1e-9)
+_STIFFNESS = _Unit("N m^2", "nN·m²", 1e9)
+_JOINT_STIFFNESS = _Unit("N m/rad", "µN·m/rad", 1e6)
+_PIXEL = _Unit("pixel", "px", 1.0)
+# The columns of these Jacobians, (s_c, f_y, f_z), differ in unit: it is given column by column.
+_POINT_PER_LOAD = _Unit("m/(m, N, N)", "m/(m, N, N)", 1.0)
+_FORCE_PER_LOAD = _Unit("N/(m, N, N)", "N/(m, N, N)", 1.0)
+_MOMENT_PER_LOAD = _Unit("N m/(m, N, N)", "N·m/(m, N, N)", 1.0)
+
+_ROWS: tuple[tuple[str, str, _Unit, str, str], ...] = (
+    # Time and the whisker's shape
+    ("time", "t", _SECOND, "time", "Since the start of the recording."),
+    ("arc_length", "s", _MM, "arc length", "Along the whisker from its base; of a contact, s_c."),
+    ("length", "L", _MM, "whisker length", "Arc length from base to tip."),
+    ("radius", "a", _MICROMETRE, "whisker radius", "Of the circular section."),
+    (
+        "base_radius",
+        r"a_\mathrm{base}",
+        _MICROMETRE,
+        "radius at the base",
+        "Of the section at s = 0.",
+    ),
+    ("tip_radius", r"a_\mathrm{tip}", _MICROMETRE, "radius at the tip", "Of the section at s = L."),
+    (
+        "curvature",
+        r"\kappa",
+        _PER_MM,
+        "intrinsic curvature",
+        "Of the undeflected whisker in its material frame: twist, about d1, about d2.",
+    ),
+    (
+        "centerline",
+        r"\mathbf{r}",
+        _MM,
+        "whisker centreline",
+        "Points from base to tip; in the whisker's frame, in a recording in the laboratory frame.",
+    ),
+    # Material
+    ("youngs_modulus", "E", _GIGAPASCAL, "Young's modulus", "Of the whisker's material."),
+    ("poisson_ratio", r"\nu", _NUMBER, "Poisson's ratio", "Of the whisker's material."),
+    ("bending_stiffness", "EI", _STIFFNESS, "bending stiffness", "E π a⁴ / 4 of a section."),
+    ("torsional_stiffness", "GJ", _STIFFNESS, "torsional stiffness", "EI / (1 + ν) of a section."),
+    (
+        "base_bending_stiffness",
+        r"k_\mathrm{B}",
+        _JOINT_STIFFNESS,
+        "bending stiffness of the base",
+        "Of the tissue that holds the whisker; infinite for a rigid clamp.",
+    ),
+    (
+        "base_twist_stiffness",
+        r"k_\mathrm{T}",
+        _JOINT_STIFFNESS,
+        "twist stiffness of the base",
+        "Of the tissue that holds the whisker; infinite for a rigid clamp.",
+    ),
+    # Where the contact is
+    (
+        "contact_point",
+        r"\mathbf{p}",
+        _MM,
+        "contact point",
+        "On the centreline; in the whisker's frame, in a recording in the laboratory frame.",
+    ),
+    (
+        "contact_point_whisker",
+        r"\mathbf{p}_\mathrm{w}",
+        _MM,
+        "contact point in the whisker's frame",
+        "On the whisker's centreline.",
+    ),
+    (
+        "x",
+        "x",
+        _MM,
+        "x",
+        "Along the tangent at the base, out of the follicle, in the whisker's frame.",
+    ),
+    ("y", "y", _MM, "y", "Toward the side to which the whisker curves, in the whisker's frame."),
+    ("z", "z", _MM, "z", "Normal to x and y, right-handed, in the whisker's frame."),
+    ("r", "r", _MM, "radial distance", "Of the contact point from the base, |p|."),
+    (
+        "theta",
+        r"\theta",
+        _DEGREE,
+        "azimuth",
+        "Of the contact point in the whisker's frame, atan2(y, x).",
+    ),
+    (
+        "phi",
+        r"\varphi",
+        _DEGREE,
+        "elevation",
+        "Of the contact point in the whisker's frame, asin(z / r).",
+    ),
+    (
+        "deflection_angle",
+        r"\delta",
+        _DEGREE,
+        "deflection angle",
+        "Of the contact from the resting whisker: atan of its distance from the nearest point over "
+        "the arc length there.",
+    ),
+    (
+        "in_contact",
+        r"\mathrm{contact}",
+        _NUMBER,
+        "whether the whisker touches an object",
+        "1 in contact, 0 not.",
+    ),
+    # The load in the deflected material frame at the contact
+    (
+        "fx",
+        "f_x",
+        _MICRONEWTON,
+        "contact force along the whisker",
+        "Along the deflected tangent at the contact; zero without friction, except at the tip.",
+    ),
+    ("fy", "f_y", _MICRONEWTON, "contact force along d1", "In the deflected frame at the contact."),
+    ("fz", "f_z", _MICRONEWTON, "contact force along d2", "In the deflected frame at the contact."),
+    ("magnitude", "f", _MICRONEWTON, "size of the contact force", "hypot(f_y, f_z)."),
+    (
+        "direction",
+        r"\alpha",
+        _DEGREE,
+        "direction of the contact force",
+        "From d1 toward d2 of the deflected frame at the contact.",
+    ),
+    # What the base feels
+    (
+        "force",
+        r"\mathbf{F}",
+        _MICRONEWTON,
+        "force",
+        "Of the object on the whisker = of the whisker on the follicle; in the whisker's frame.",
+    ),
+    (
+        "moment",
+        r"\mathbf{M}",
+        _MICRONEWTON_METRE,
+        "moment",
+        "About the base, p × F; whisker's frame.",
+    ),
+    ("Fx", "F_x", _MICRONEWTON, "axial force", "Positive where it pulls the whisker out."),
+    ("Fy", "F_y", _MICRONEWTON, "force along y", "In the whisker's frame."),
+    ("Fz", "F_z", _MICRONEWTON, "force along z", "In the whisker's frame."),
+    ("Mx", "M_x", _MICRONEWTON_METRE, "twisting moment", "About the tangent at the base."),
+    ("My", "M_y", _MICRONEWTON_METRE, "moment about y", "About the base, in the whisker's frame."),
+    ("Mz", "M_z", _MICRONEWTON_METRE, "moment about z", "About the base, in the whisker's frame."),
+    ("FT", "F_T", _MICRONEWTON, "transverse force", "hypot(F_y, F_z)."),
+    ("FD", "F_D", _DEGREE, "direction of the transverse force", "atan2(F_z, F_y), in (−π, π]."),
+    ("MB", "M_B", _MICRONEWTON_METRE, "bending moment", "hypot(M_y, M_z)."),
+    ("MD", "M_D", _DEGREE, "direction of the bending moment", "atan2(M_z, M_y), in (−π, π]."),
+    # What the solver and the estimator say
+    (
+        "residual",
+        r"\varepsilon",
+        _NUMBER,
+        "residual",
+        "By how much the load's equations are missed, in units of whisker length and stiffness.",
+    ),
+    ("status", r"\mathrm{status}", _NUMBER, "status", "What became of this row."),
+    (
+        "fold_determinant",
+        r"\det J / \det J_0",
+        _NUMBER,
+        "distance from the fold",
+        "Determinant of the load's Jacobian over its value at rest; the whisker slips off at zero.",
+    ),
+    (
+        "point_jacobian",
+        r"\partial\mathbf{p}/\partial\xi",
+        _POINT_PER_LOAD,
+        "derivatives of the contact point",
+        "With respect to arc length and force (s_c, f_y, f_z) of the contact.",
+    ),
+    (
+        "force_jacobian",
+        r"\partial\mathbf{F}/\partial\xi",
+        _FORCE_PER_LOAD,
+        "derivatives of the force",
+        "With respect to arc length and force (s_c, f_y, f_z) of the contact.",
+    ),
+    (
+        "moment_jacobian",
+        r"\partial\mathbf{M}/\partial\xi",
+        _MOMENT_PER_LOAD,
+        "derivatives of the moment",
+        "With respect to arc length and force (s_c, f_y, f_z) of the contact.",
+    ),
+    ("covariance", r"\Sigma_p", _SQUARE_MM, "covariance of the contact point", "In x, y, z."),
+    ("sigma_x", r"\sigma_x", _MM, "standard deviation of x", "Predicted from the sensor's noise."),
+    ("sigma_y", r"\sigma_y", _MM, "standard deviation of y", "Predicted from the sensor's noise."),
+    ("sigma_z", r"\sigma_z", _MM, "standard deviation of z", "Predicted from the sensor's noise."),
+    ("error_r", r"\Delta r", _MM, "error of r", "Estimate minus truth."),
+    (
+        "error_theta",
+        r"\Delta\theta",
+        _DEGREE,
+        "error of azimuth",
+        "Estimate minus truth, in (−π, π].",
+    ),
+    ("error_phi", r"\Delta\varphi", _DEGREE, "error of elevation", "Estimate minus truth."),
+    (
+        "error_distance",
+        r"|\Delta\mathbf{p}|",
+        _MM,
+        "3D error",
+        "Distance of the estimated from the true contact point.",
+    ),
+    (
+        "misfit",
+        r"\chi",
+        _NUMBER,
+        "misfit",
+        "Of the signals, in standard deviations of their noise.",
+    ),
+    ("candidates", "n", _NUMBER, "number of candidates", "Contacts that explain the signals."),
+    ("share", r"\mathrm{share}", _PERCENT, "share", "Of all rows."),
+    ("confidence", "c", _NUMBER, "confidence", "From 0 (none) to 1."),
+    # The recording: how the whisker is held, what it touches
+    (
+        "base_position",
+        r"\mathbf{o}",
+        _MM,
+        "base of the whisker",
+        "In the laboratory frame; x_lab = base_rotation @ x_whisker + base_position.",
+    ),
+    (
+        "base_rotation",
+        "R",
+        _NUMBER,
+        "orientation of the base",
+        "Rotation from the whisker's to the laboratory frame.",
+    ),
+    ("base_azimuth", r"\theta_\mathrm{w}", _DEGREE, "azimuth of the base", "Emergence angle."),
+    ("base_elevation", r"\varphi_\mathrm{w}", _DEGREE, "elevation of the base", "Emergence angle."),
+    (
+        "base_roll",
+        r"\zeta_\mathrm{w}",
+        _DEGREE,
+        "roll of the base",
+        "About the tangent at the base.",
+    ),
+    ("trace", r"\mathbf{u}", _PIXEL, "whisker in the image", "Column and row from the top left."),
+    ("peg_position", r"\mathbf{c}", _MM, "peg position", "A point of its axis, laboratory frame."),
+    ("peg_axis", r"\mathbf{a}", _NUMBER, "peg axis", "Unit vector, laboratory frame."),
+    ("peg_radius", r"R_\mathrm{peg}", _MM, "peg radius", "Of its surface."),
+    ("peg_diameter", r"D_\mathrm{peg}", _MM, "peg diameter", "Of its surface."),
+)
+
+QUANTITIES: Mapping[str, Quantity] = MappingProxyType(
+    {
+        name: Quantity(name, symbol, unit.unit, unit.display, unit.factor, long_name, description)
+        for name, symbol, unit, long_name, description in _ROWS
+    }
+)
+"""Every quantity by its name."""
+
+
+def quantity(name: str) -> Quantity:
+    """Look a quantity up.
+
+    Parameters
+    ----------
+    name : str
+        Its name.
+
+    Returns
+    -------
+    Quantity
+        Its row of the table.
+
+    Raises
+    ------
+    ValueError
+        Where the table has no such name; says which are close.
+    """
+    if name not in QUANTITIES:
+        allowed = difflib.get_close_matches(name, QUANTITIES) or list(QUANTITIES)
+        raise ValueError(f"{name!r} is no quantity; did you mean one of {', '.join(allowed)}?")
+    return QUANTITIES[name]
+
+
+def attributes(name: str) -> dict[str, str]:
+    """Attributes that a dataset's variable of this name carries.
+
+    Parameters
+    ----------
+    name : str
+        A name of :data:`QUANTITIES`.
+
+    Returns
+    -------
+    dict
+        ``units`` (SI), ``long_name`` and ``description``.
+
+    Examples
+    --------
+    >>> attributes("MB")
+    {'units': 'N m', 'long_name': 'bending moment', 'description': 'hypot(M_y, M_z).'}
+    """
+    q = quantity(name)
+    return {"units": q.unit, "long_name": q.long_name, "description": q.description}
+
+
+def axis_label(name: str) -> str:
+    """Label an axis or a column with symbol and display unit.
+
+    Parameters
+    ----------
+    name : str
+        A name of :data:`QUANTITIES`.
+
+    Returns
+    -------
+    str
+        In mathtext; without parentheses where the quantity has no unit.
+
+    Examples
+    --------
+    >>> axis_label("Fx")
+    '$F_x$ (µN)'
+    """
+    q = quantity(name)
+    return f"${q.symbol}$ ({q.display_unit})" if q.display_unit else f"${q.symbol}$"
+
+
+def to_display(name: str, values: ArrayLike) -> NDArray[np.float64]:
+    """Convert SI values to the unit they are shown in.
+
+    Parameters
+    ----------
+    name : str
+        A name of :data:`QUANTITIES`.
+    values : array_like, any shape
+        In the quantity's SI unit.
+
+    Returns
+    -------
+    ndarray, the shape of ``values``
+        In its display unit.
+
+    Examples
+    --------
+    >>> float(to_display("length", 0.04))
+    40.0
+    """
+    return np.asarray(values, dtype=np.float64) * quantity(name).display_factor

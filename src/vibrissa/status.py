@@ -1,0 +1,204 @@
+"""Why something has no answer, as sentences with advice.
+
+A load that has no equilibrium, or signals that no contact explains, give a row with a status, so
+that one bad case never stops a grid. The numbers are stored in datasets as CF flags and never
+change their meaning: 0-9 a load with an answer, 10-19 a load without, 20-29 an estimate.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections import Counter
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+class Status(enum.IntEnum):
+    """What became of one load or one estimate.
+
+    ``str(status)`` is a sentence that explains, followed by one that advises.
+
+    Attributes
+    ----------
+    explanation : str
+        What happened.
+    advice : str
+        What to do about it; empty where there is nothing to do.
+    ok : bool
+        Whether the row can be used as it stands.
+    """
+
+    explanation: str
+    advice: str
+    ok: bool
+
+    OK = (
+        0,
+        True,
+        "The object touches the side of the whisker.",
+        "",
+    )
+    TIP_CONTACT = (
+        1,
+        True,
+        "The object touches the very tip of the whisker, and the force is normal to the object.",
+        "",
+    )
+    NO_CONTACT = (
+        2,
+        True,
+        "The object does not reach the whisker, so force and moment are zero.",
+        "",
+    )
+    BEYOND_FOLD = (
+        10,
+        False,
+        "The whisker has slipped off: the load lies beyond the fold that ends the stable branch.",
+        "Move the object back toward the resting whisker; without friction a whisker of this "
+        "shape and taper holds no contact there.",
+    )
+    BEYOND_TIP = (
+        11,
+        False,
+        "The load lies beyond the tip: the whisker is too short for this contact.",
+        "Move the object toward the base, or check the whisker's length and the unit of the "
+        "points.",
+    )
+    TOO_PROXIMAL = (
+        12,
+        False,
+        "The contact would lie closer to the base than the smallest arc length that is considered.",
+        "Lower the smallest arc length (0.3 of the whisker's length by default), or move the "
+        "object toward the tip.",
+    )
+    NOT_CONVERGED = (
+        13,
+        False,
+        "The solver did not converge; nothing is known about this load.",
+        "This is a defect of vibrissa: please report it with the whisker and the load.",
+    )
+    MISSING = (
+        14,
+        False,
+        "The input of this row is missing or not finite.",
+        "Check the row for NaN, for example frames in which the whisker was not tracked.",
+    )
+    UNIQUE = (
+        20,
+        True,
+        "Exactly one contact of this whisker explains the signals.",
+        "",
+    )
+    AMBIGUOUS = (
+        21,
+        False,
+        "Several contacts of this whisker explain the signals.",
+        "All are among the candidates: add a signal, or choose by continuity with the frames "
+        "around.",
+    )
+    NOT_FRICTIONLESS = (
+        22,
+        False,
+        "No frictionless contact of this whisker explains the signals.",
+        "Check the whisker's shape, taper and stiffness and the sensor's offset; with friction, "
+        "estimate from all six signals.",
+    )
+    OUTSIDE_MAP = (
+        23,
+        False,
+        "The signals lie outside the map.",
+        "Simulate the map over a wider domain, or check the unit and frame of the signals.",
+    )
+    DEGENERATE = (
+        24,
+        False,
+        "The signals do not determine a contact: the force is too small, or a small change of the "
+        "signals moves the contact without bound.",
+        "Leave the row out, or add a signal.",
+    )
+
+    def __new__(
+        cls, code: int, ok: bool = False, explanation: str = "", advice: str = ""
+    ) -> Status:
+        """Make a member; the defaults let type checkers see that ``Status(code)`` looks one up."""
+        member = int.__new__(cls, code)
+        member._value_ = code
+        member.ok = ok
+        member.explanation = explanation
+        member.advice = advice
+        return member
+
+    def __str__(self) -> str:
+        return f"{self.explanation} {self.advice}".rstrip()
+
+
+_OK_CODES = np.array([status for status in Status if status.ok], dtype=np.int8)
+
+
+def is_ok(codes: ArrayLike) -> NDArray[np.bool_]:
+    """Tell which rows can be used as they stand.
+
+    Parameters
+    ----------
+    codes : array_like of int, any shape
+        Numbers of :class:`Status`.
+
+    Returns
+    -------
+    ndarray of bool, the shape of ``codes``
+        True where :attr:`Status.ok` is.
+    """
+    return np.isin(np.asarray(codes), _OK_CODES)
+
+
+def describe(codes: ArrayLike) -> Counter[str]:
+    """Count the statuses of many rows, in words.
+
+    Parameters
+    ----------
+    codes : array_like of int, any shape
+        Numbers of :class:`Status`.
+
+    Returns
+    -------
+    collections.Counter
+        How often each status occurs, by its sentences.
+
+    Raises
+    ------
+    ValueError
+        Where a number is no status.
+
+    Examples
+    --------
+    >>> for sentence, count in describe([0, 0, 2]).most_common():
+    ...     print(count, sentence)
+    2 The object touches the side of the whisker.
+    1 The object does not reach the whisker, so force and moment are zero.
+    """
+    numbers, counts = np.unique(np.asarray(codes), return_counts=True)
+    known = {int(status) for status in Status}
+    unknown = [number for number in numbers.tolist() if number not in known]
+    if unknown:
+        raise ValueError(f"{unknown} are no statuses; the statuses are {sorted(known)}.")
+    return Counter(
+        {
+            str(Status(int(number))): count
+            for number, count in zip(numbers.tolist(), counts.tolist(), strict=True)
+        }
+    )
+
+
+def flag_attributes() -> dict[str, NDArray[np.int8] | str]:
+    """Describe the numbers of :class:`Status` in a dataset, as the CF conventions ask.
+
+    Returns
+    -------
+    dict
+        ``flag_values`` (int8) and ``flag_meanings`` (words parted by blanks, in the same order).
+    """
+    return {
+        "flag_values": np.array([int(status) for status in Status], dtype=np.int8),
+        "flag_meanings": " ".join(status.name.lower() for status in Status),
+    }

@@ -1,0 +1,15 @@
+"""Array types of the mechanics: plain float64 arrays in, plain float64 arrays out."""
+
+from __future__ import annotations
+
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array: TypeAlias = NDArray[np.float64]
+IntArray: TypeAlias = NDArray[np.int64]
+AnyArray: TypeAlias = NDArray[Any]
+Vector: TypeAlias = tuple[float, float, float]
+# start, width, extent, twist compliance, bending compliance (n,), shape (n, 4, 4): see Discretization.
+Rod: TypeAlias = tuple[Array, Array, Array, Array, Array, Array]

@@ -1,0 +1,81 @@
+"""Many rows, all cores: kernels release the GIL, so plain threads share the rows out."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+
+import numpy as np
+
+from vibrissa.rod.arrays import Array
+from vibrissa.rod.discretize import Discretization
+from vibrissa.rod.kernels import evaluate
+
+# Below this many rows starting a thread costs more than it saves.
+_SERIAL = 256
+_PIECES_PER_THREAD = 4
+
+
+@cache
+def _pool(process: int) -> ThreadPoolExecutor:
+    # One pool a process: threads do not survive a fork.
+    return ThreadPoolExecutor(max_workers=threads(), thread_name_prefix="vibrissa")
+
+
+def threads() -> int:
+    """Return the number of cores that this process may use; ``VIBRISSA_THREADS`` overrides it."""
+    wanted = os.environ.get("VIBRISSA_THREADS")
+    if wanted is not None:
+        return max(1, int(wanted))
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def share_out(rows: int, work: Callable[[int, int], object]) -> None:
+    """Call ``work(first, last)`` for pieces that cover all rows, on all cores.
+
+    Parameters
+    ----------
+    rows : int
+        How many rows there are.
+    work : callable
+        Does the rows from ``first`` up to, not including, ``last``; must release the GIL to gain.
+    """
+    if rows <= _SERIAL or threads() == 1:
+        if rows:
+            work(0, rows)
+        return
+    pieces = min(threads() * _PIECES_PER_THREAD, -(-rows // (_SERIAL // 2)))
+    edges = np.linspace(0, rows, pieces + 1).astype(int)
+    list(_pool(os.getpid()).map(work, edges[:-1].tolist(), edges[1:].tolist()))
+
+
+def solve_forces(
+    discretization: Discretization, contacts: Array, tangents: bool = False
+) -> tuple[Array, Array]:
+    """Base force and contact point of contacts whose force is known, non-dimensional.
+
+    Parameters
+    ----------
+    discretization : Discretization
+        The whisker.
+    contacts : (n, 4) array
+        s_c and (f_x, f_y, f_z) in the material frame at the contact.
+    tangents : bool
+        Whether derivatives are wanted.
+
+    Returns
+    -------
+    values : (n, 6) array
+        Base force F and contact point p.
+    tangents : (n, 6, 3) array
+        ∂(F, p)/∂(s_c, f_y, f_z); (0, 6, 3) if not wanted.
+    """
+    contacts = np.ascontiguousarray(contacts, dtype=np.float64)
+    n = contacts.shape[0]
+    values = np.empty((n, 6))
+    derivatives = np.empty((n if tangents else 0, 6, 3))
+    rod = discretization.rod
+    share_out(n, lambda first, last: evaluate(rod, contacts, values, derivatives, first, last))
+    return values, derivatives

@@ -1,0 +1,59 @@
+"""How kernels are compiled: machine code cached on disk, errors as NumPy has them, contraction allowed.
+
+Compiling takes seconds, once for a given installation; a listener says so while it happens, so that a
+first call does not look as if it hung. Where no folder can be written to (a read-only installation
+without a home folder) the kernels are compiled anew in each run instead.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from typing import Any, ParamSpec, TypeVar, cast
+
+import numba
+from numba.core import event
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+# Reassociation stays off: results must not depend on how the compiler orders a sum.
+_FASTMATH = {"contract", "nsz", "arcp"}
+_OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": _FASTMATH, "nogil": True}
+
+
+def kernel(function: Callable[P, R]) -> Callable[P, R]:
+    """Compile a function that Python calls; cached on disk, releases the GIL."""
+    try:
+        compiled = numba.njit(cache=True, **_OPTIONS)(function)
+    except RuntimeError:  # numba finds no folder to write its cache to
+        compiled = numba.njit(**_OPTIONS)(function)
+    return cast("Callable[P, R]", compiled)
+
+
+def inlined(function: Callable[P, R]) -> Callable[P, R]:
+    """Compile a small function into its callers, so that their lane loops still vectorise."""
+    return cast("Callable[P, R]", numba.njit(forceinline=True, **_OPTIONS)(function))
+
+
+class _FirstCompilation(event.Listener):
+    """Say once per process that kernels are being compiled."""
+
+    def __init__(self) -> None:
+        self.said = False
+
+    def on_start(self, event: event.Event) -> None:
+        dispatcher = (event.data or {}).get("dispatcher")
+        module = getattr(getattr(dispatcher, "py_func", None), "__module__", "") or ""
+        if not self.said and module.startswith("vibrissa."):
+            self.said = True
+            sys.stderr.write(
+                "vibrissa: compiling kernels (once for this installation, under a minute) ...\n"
+            )
+            sys.stderr.flush()
+
+    def on_end(self, event: event.Event) -> None:
+        pass
+
+
+event.register("numba:compile", _FirstCompilation())

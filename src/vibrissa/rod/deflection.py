@@ -1,0 +1,250 @@
+"""Bend a whisker: a load in, base force and moment, contact point and shape out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vibrissa.rod.arrays import AnyArray, Array, IntArray
+from vibrissa.rod.batch import solve_forces
+from vibrissa.rod.discretize import STEPS, Discretization, discretize
+from vibrissa.rod.loads import Load, PegContact, PointContact, PointForce
+from vibrissa.rod.pegs import Pegs, Rest, nearest_side, solve_from_contact, solve_from_rest
+from vibrissa.rod.points import Solutions, point_solver
+from vibrissa.rod.reach import PROXIMAL
+from vibrissa.rod.shape import shapes
+from vibrissa.status import Status
+
+if TYPE_CHECKING:
+    from vibrissa.whisker import Whisker
+
+
+@dataclass(frozen=True, eq=False)
+class Deflection:
+    """Deflected whiskers, one for each load; all in the whisker frame.
+
+    Attributes
+    ----------
+    whisker : Whisker
+        What was bent.
+    load : PointForce, PointContact or PegContact
+        What bent it.
+    force : (..., 3) array
+        Force of the object on the whisker, N; zero without contact, NaN without an answer.
+    moment : (..., 3) array
+        Moment about the base, contact_point × force, N·m.
+    contact_point : (..., 3) array
+        Contact point on the centreline, m; NaN without contact or answer.
+    arc_length : (...) array
+        Arc length of the contact from the base, m.
+    contact_force : (..., 3) array
+        The force in the material frame at the contact (tangent, d1, d2), N.
+    residual : (...) array
+        How well the load's equations are met: lengths over L, directions; 0 for a PointForce.
+    status : (...) int array
+        A :class:`~vibrissa.Status` each.
+    """
+
+    whisker: Whisker
+    load: Load
+    force: Array
+    moment: Array
+    contact_point: Array
+    arc_length: Array
+    contact_force: Array
+    residual: Array
+    status: IntArray
+    steps: int = field(default=STEPS, repr=False)
+
+    def centerline(self, n: int = 100) -> Array:
+        """Return the deflected centrelines.
+
+        Parameters
+        ----------
+        n : int
+            Points along the whisker, equally spaced in arc length from base to tip.
+
+        Returns
+        -------
+        (..., n, 3) array
+            Places, m; the resting whisker where there is no contact, NaN where there is no answer.
+        """
+        if n < 2:
+            raise ValueError(f"a centreline needs at least 2 points; got n={n}")
+        d = discretize(self.whisker, self.steps)
+        values = np.concatenate([self.force / d.force, self.contact_point / d.length], axis=-1)
+        arc = self.arc_length / d.length
+        values, arc = values.reshape(-1, 6), arc.reshape(-1).copy()
+        free = np.flatnonzero(self.status.reshape(-1) == Status.NO_CONTACT)
+        values[free, 3:], arc[free] = 0.0, 0.0
+        places = shapes(d, values, arc, np.linspace(0.0, 1.0, n)) * d.length
+        return places.reshape(*self.status.shape, n, 3)
+
+    def __repr__(self) -> str:
+        """Say how many loads there are and what became of them."""
+        counts = ", ".join(
+            f"{Status(code).name.lower().replace('_', ' ')} {count}"
+            for code, count in zip(*np.unique(self.status, return_counts=True), strict=True)
+        )
+        return f"<Deflection of {self.status.shape or 'one'} by {type(self.load).__name__}: {counts}>"
+
+
+def deflect(
+    whisker: Whisker, load: Load, *, proximal: float = PROXIMAL, steps: int = STEPS
+) -> Deflection:
+    """Bend a whisker quasi-statically.
+
+    Parameters
+    ----------
+    whisker : Whisker
+        What is bent.
+    load : PointForce, PointContact or PegContact
+        What bends it; arrays of any leading shape.
+    proximal : float
+        Contacts at less than this fraction of the length from the base get a status instead of an answer
+        (not for a ``PointForce``).
+    steps : int
+        Integration steps along the whisker. The default is good to 1e-6; the error falls with the sixth
+        power.
+
+    Returns
+    -------
+    Deflection
+        The stable equilibrium that is connected to rest, for each load, or the reason why there is none.
+
+    Raises
+    ------
+    ValueError
+        If the load does not fit (see the loads), not if it has no equilibrium.
+
+    Examples
+    --------
+    >>> import vibrissa as vb
+    >>> whisker = vb.Whisker.parabola(length=39.4e-3, coefficient=10.0)
+    >>> bent = vb.deflect(whisker, vb.PointContact([25e-3, 12e-3, 1e-3]))
+    >>> vb.Status(bent.status).name
+    'OK'
+    """
+    d = discretize(whisker, steps)
+    if isinstance(load, PointForce):
+        solved = _by_force(d, load)
+    elif isinstance(load, PointContact):
+        solver = point_solver(whisker, proximal, steps)
+        solved = solver.solve(np.asarray(load.points).reshape(-1, 3) / d.length)
+    elif isinstance(load, PegContact):
+        solved = _by_peg(whisker, d, load, proximal, steps)
+    else:
+        raise ValueError(
+            f"a load is a PointForce, a PointContact or a PegContact; got {type(load).__name__}"
+        )
+    return _dimensional(whisker, load, d, solved, steps)
+
+
+def _by_force(d: Discretization, load: PointForce) -> Solutions:
+    s = np.asarray(load.arc_length).reshape(-1) / d.length
+    contacts = np.concatenate(
+        [s[:, None], np.asarray(load.components).reshape(-1, 3) / d.force], axis=1
+    )
+    contacts[(s > 1.0) & (s <= 1.0 + 1e-9), 0] = 1.0
+    statuses = np.full(s.size, int(Status.OK))
+    statuses[contacts[:, 0] > 1.0] = Status.BEYOND_TIP
+    statuses[np.isnan(contacts).any(axis=1)] = Status.MISSING
+    rows = np.flatnonzero(statuses == Status.OK)
+    values = np.full((s.size, 6), np.nan)
+    values[rows] = solve_forces(d, contacts[rows])[0]
+    lost = ~np.isfinite(values[rows]).all(axis=1)
+    statuses[rows[lost]] = Status.NOT_CONVERGED
+    contacts[statuses != Status.OK] = np.nan
+    return Solutions(contacts, values, np.where(statuses == Status.OK, 0.0, np.nan), statuses)
+
+
+def _rows(load: PegContact, length: float) -> Pegs:
+    radius = np.asarray(load.radius).reshape(-1) / length
+    return Pegs(
+        np.asarray(load.origin).reshape(-1, 3) / length,
+        np.array(load.axis, dtype=np.float64).reshape(-1, 3),
+        np.where(radius == 0.0, -1.0, radius),
+    )
+
+
+def _by_peg(
+    whisker: Whisker, d: Discretization, load: PegContact, proximal: float, steps: int
+) -> Solutions:
+    pegs = _rows(load, d.length)
+    rest = Rest.of(whisker)
+    start = load.start
+    if start is None:
+        if load.side is not None:
+            side = np.asarray(load.side).reshape(-1, 3)
+        else:
+            side = nearest_side(rest, pegs, outward=bool((pegs.radius >= 0.0).any()))
+        return solve_from_rest(whisker, pegs, side, proximal, steps)
+    if start.whisker is not whisker:
+        raise ValueError("start is a deflection of another whisker")
+    shape = load.shape
+    contacts = np.concatenate(
+        [
+            np.broadcast_to(start.arc_length / d.length, shape).reshape(-1, 1),
+            np.broadcast_to(start.contact_force / d.force, (*shape, 3)).reshape(-1, 3),
+        ],
+        axis=1,
+    )
+    status: AnyArray = np.broadcast_to(start.status, shape).reshape(-1)
+    assert isinstance(start.load, PegContact)  # checked when the load was made
+    earlier = PegContact(
+        np.broadcast_to(start.load.origin, (*shape, 3)),
+        np.broadcast_to(start.load.axis, (*shape, 3)),
+        np.broadcast_to(start.load.radius, shape),
+    )
+    before = _rows(earlier, d.length)
+    touching = np.isin(status, (Status.OK, Status.TIP_CONTACT))
+    # A whisker that was free lies on the side of the peg where it then rested.
+    free = np.flatnonzero(~touching)
+    side = nearest_side(rest, Pegs(*(a[free] for a in before)), outward=True)
+    merged = solve_from_rest(
+        whisker, Pegs(*(a[free] for a in pegs)), side, proximal, steps
+    ) if free.size else None
+    rows = np.flatnonzero(touching)
+    moved = solve_from_contact(
+        whisker,
+        Pegs(*(a[rows] for a in before)),
+        contacts[rows],
+        status[rows] == Status.TIP_CONTACT,
+        Pegs(*(a[rows] for a in pegs)),
+        proximal,
+        steps,
+    ) if rows.size else None
+    if merged is None or moved is None:
+        return moved if merged is None and moved is not None else merged  # type: ignore[return-value]
+    out = []
+    for a, b in zip(merged, moved, strict=True):
+        c = np.empty((status.size, *a.shape[1:]), dtype=a.dtype)
+        c[free], c[rows] = a, b
+        out.append(c)
+    return Solutions(*out)
+
+
+def _dimensional(
+    whisker: Whisker, load: Load, d: Discretization, solved: Solutions, steps: int
+) -> Deflection:
+    shape = load.shape
+    force = solved.values[:, :3] * d.force
+    point = solved.values[:, 3:] * d.length
+    moment = np.cross(point, force)
+    moment[solved.statuses == Status.NO_CONTACT] = 0.0
+    return Deflection(
+        whisker=whisker,
+        load=load,
+        force=force.reshape(*shape, 3),
+        moment=moment.reshape(*shape, 3),
+        contact_point=point.reshape(*shape, 3),
+        arc_length=(solved.contacts[:, 0] * d.length).reshape(shape),
+        contact_force=(solved.contacts[:, 1:] * d.force).reshape(*shape, 3),
+        residual=solved.misfits.reshape(shape),
+        status=solved.statuses.reshape(shape),
+        steps=steps,
+    )
+
+

@@ -1,0 +1,197 @@
+"""What bends a whisker: a force, a point, or a peg, any number at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from vibrissa.rod.arrays import Array
+
+if TYPE_CHECKING:
+    from vibrissa.rod.deflection import Deflection
+
+
+def _numbers(name: str, value: ArrayLike, vector: bool) -> Array:
+    """Return an array of float64, (..., 3) for vectors; raise a ValueError that says what is wrong."""
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be numbers; got {type(value).__name__}") from error
+    if vector and (array.ndim == 0 or array.shape[-1] != 3):
+        raise ValueError(f"{name} must have shape (..., 3); got {array.shape}")
+    if np.isinf(array).any():
+        raise ValueError(f"{name} has {int(np.isinf(array).sum())} infinite values; NaN means missing")
+    return array
+
+
+def _broadcast(**shapes: tuple[int, ...]) -> tuple[int, ...]:
+    try:
+        return np.broadcast_shapes(*shapes.values())
+    except ValueError as error:
+        said = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
+        raise ValueError(f"leading shapes do not broadcast: {said}") from error
+
+
+@dataclass(frozen=True, eq=False)
+class PointForce:
+    """A known force at a known place of the whisker.
+
+    Parameters
+    ----------
+    arc_length : array_like
+        s_c from the base, m, shape (...).
+    magnitude : array_like, optional
+        Size of a force normal to the whisker, N, shape (...).
+    direction : array_like, optional
+        Its angle from d1 toward d2 in the deflected material frame at the contact, rad, shape (...).
+    components : tuple of array_like or array_like, optional
+        Instead: (fx, fy, fz) in that frame, N, a tuple of three or shape (..., 3); fx along the tangent.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not broadcast, if arc lengths are not positive, or if neither or both ways of giving the
+        force are used.
+    """
+
+    arc_length: Any
+    magnitude: Any = None
+    direction: Any = None
+    components: Any = None
+
+    def __post_init__(self) -> None:
+        polar = self.magnitude is not None and self.direction is not None
+        if polar == (self.components is not None) or (self.magnitude is None) != (self.direction is None):
+            raise ValueError("give a PointForce either magnitude and direction, or components=(fx, fy, fz)")
+        s = _numbers("arc_length", self.arc_length, vector=False)
+        if polar:
+            size = _numbers("magnitude", self.magnitude, vector=False)
+            angle = _numbers("direction", self.direction, vector=False)
+            _broadcast(arc_length=s.shape, magnitude=size.shape, direction=angle.shape)
+            force = np.stack(
+                np.broadcast_arrays(0.0 * (size + angle), size * np.cos(angle), size * np.sin(angle)),
+                axis=-1,
+            )
+        else:
+            parts = self.components
+            if isinstance(parts, tuple):
+                if len(parts) != 3:
+                    raise ValueError(f"components must be (fx, fy, fz); got {len(parts)} of them")
+                parts = np.stack(
+                    np.broadcast_arrays(*(_numbers("components", p, vector=False) for p in parts)), axis=-1
+                )
+            force = _numbers("components", parts, vector=True)
+        shape = _broadcast(arc_length=s.shape, force=force.shape[:-1])
+        if (s <= 0.0).any():
+            raise ValueError(f"arc_length must be positive (m from the base); the smallest is {np.nanmin(s)}")
+        object.__setattr__(self, "arc_length", np.broadcast_to(s, shape))
+        object.__setattr__(self, "components", np.broadcast_to(force, (*shape, 3)))
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Leading shape: how many loads."""
+        return tuple(np.shape(self.arc_length))
+
+
+@dataclass(frozen=True, eq=False)
+class PointContact:
+    """The whisker's centreline passes through a point, without friction.
+
+    Parameters
+    ----------
+    points : array_like
+        Contact points in the whisker frame, m, shape (..., 3); NaN means missing.
+
+    Raises
+    ------
+    ValueError
+        If the shape is wrong or a coordinate is infinite.
+    """
+
+    points: Any
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "points", _numbers("points", self.points, vector=True))
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Leading shape: how many loads."""
+        return tuple(np.shape(self.points)[:-1])
+
+
+@dataclass(frozen=True, eq=False)
+class PegContact:
+    """The whisker lies against a straight peg, without friction.
+
+    Without a radius the peg is a line that the whisker's centreline meets. With one it is a solid cylinder and the
+    surfaces touch: the centreline passes the axis at the peg's radius plus the whisker's there.
+
+    Parameters
+    ----------
+    origin : array_like
+        A point of the peg's axis in the whisker frame, m, shape (..., 3).
+    axis : array_like
+        Direction of the axis, any length but zero, shape (..., 3).
+    radius : array_like
+        Radius, m, shape (...); 0 for a line.
+    side : array_like, optional
+        Approximate direction of the force on the whisker, which tells on which side of the peg the whisker lies,
+        shape (..., 3). By default a line pushes from where the resting whisker is nearest to it, and a
+        cylinder pushes the whisker out on the side that is nearest.
+    start : Deflection, optional
+        An earlier deflection by a peg (the same one, elsewhere) to go on from: the contact stays on its side, slides
+        and slips as the peg moves. Where it had no contact, the whisker is on the side of the peg where it was.
+
+    Raises
+    ------
+    ValueError
+        If shapes are wrong or do not broadcast, an axis is zero, a radius is negative, lines and cylinders are
+        mixed, or both ``side`` and ``start`` are given.
+    """
+
+    origin: Any
+    axis: Any
+    radius: Any = 0.0
+    side: Any = None
+    start: Deflection | None = None
+
+    def __post_init__(self) -> None:
+        origin = _numbers("origin", self.origin, vector=True)
+        axis = _numbers("axis", self.axis, vector=True)
+        radius = _numbers("radius", self.radius, vector=False)
+        shapes = {"origin": origin.shape[:-1], "axis": axis.shape[:-1], "radius": radius.shape}
+        if (radius < 0.0).any():
+            raise ValueError(f"a peg's radius must not be negative; the smallest is {np.nanmin(radius)} m")
+        if (radius == 0.0).any() != (radius == 0.0).all():
+            raise ValueError("lines (radius 0) and cylinders do not mix in one load: give two")
+        length = np.linalg.norm(axis, axis=-1, keepdims=True)
+        if (length == 0.0).any():
+            raise ValueError("a peg's axis must not be (0, 0, 0)")
+        if self.side is not None and self.start is not None:
+            raise ValueError("give a PegContact either side or start: start already tells the side")
+        if self.side is not None:
+            side = _numbers("side", self.side, vector=True)
+            shapes["side"] = side.shape[:-1]
+        if self.start is not None:
+            if not isinstance(self.start.load, PegContact):
+                raise ValueError(
+                    f"start must be a deflection by a PegContact; got one by {type(self.start.load).__name__}"
+                )
+            shapes["start"] = self.start.status.shape
+        shape = _broadcast(**shapes)
+        object.__setattr__(self, "origin", np.broadcast_to(origin, (*shape, 3)))
+        object.__setattr__(self, "axis", np.broadcast_to(axis / length, (*shape, 3)))
+        object.__setattr__(self, "radius", np.broadcast_to(radius, shape))
+        if self.side is not None:
+            object.__setattr__(self, "side", np.broadcast_to(side, (*shape, 3)))
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Leading shape: how many loads."""
+        return tuple(np.shape(self.radius))
+
+
+Load = PointForce | PointContact | PegContact

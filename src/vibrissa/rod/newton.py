@@ -1,0 +1,161 @@
+"""Newton's method on the rod, four contacts at a time.
+
+The Jacobian costs four times the values, so it is computed where a problem starts and again only where the
+last one has stopped serving (a chord step that reduces the residual less than tenfold).
+
+An *equation* tells what must vanish: an inlined function
+
+    equation(value (6,), tangents (6, 3), wanted, target, residual (3,), jacobian (3, 3))
+
+that fills ``residual`` and, if ``wanted``, ``jacobian`` (its derivatives with respect to ξ) from base force and
+contact point. Equations scale their residuals so that 1 is large.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from vibrissa.rod.arrays import AnyArray, Array, IntArray, Rod
+from vibrissa.rod.compiled import inlined
+from vibrissa.rod.kernels import LANES, integrate, lane_tangents, lane_value, set_lane
+from vibrissa.rod.preimage import solve3
+from vibrissa.rod.reach import Fold, fold_force
+
+#: Residual at which an equation is solved.
+TOLERANCE = 1e-11
+#: Contacts up to this far (in L) beyond the tip or before the proximal limit are there by rounding.
+ROUNDING = 1e-9
+_ROUNDS = 12
+_LEAST_ARC = 0.05
+
+
+@inlined
+def norm3(v: Array) -> float:
+    """Euclidean length."""
+    return float(np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]))
+
+
+@inlined
+def limited_step(fold: Fold, xi: Array, step: Array) -> None:
+    """Take a step of ξ = (s, f_y, f_z), shortened to what a linearisation can be trusted for."""
+    strength = fold_force(fold, xi[0], float(np.arctan2(xi[2], xi[1])))
+    longest = max(abs(step[0]) / 0.1, float(np.hypot(step[1], step[2])) / (0.3 * strength))
+    shorten = 1.0 / max(longest, 1.0)
+    xi[0] = min(max(xi[0] + shorten * step[0], _LEAST_ARC), 1.0)
+    xi[1] += shorten * step[1]
+    xi[2] += shorten * step[2]
+
+
+@inlined
+def newton_group(
+    equation: Callable[..., Any],
+    rod: Rod,
+    fold: Fold,
+    b: Array,
+    count: int,
+    targets: Array,
+    xi: Array,
+    values: Array,
+    misfits: Array,
+    signs: Array,
+) -> None:
+    """Solve up to four problems side by side, in place.
+
+    Parameters
+    ----------
+    equation : function
+        See the module.
+    rod, fold : tuples of arrays
+        The whisker and its fold forces.
+    b : (BUFFER_SIZE,) array
+        Lanes.
+    count : int
+        How many of the four rows below are problems.
+    targets : (4, k) array
+        What the equation is to meet.
+    xi : (4, 3) array
+        Seeds; replaced by solutions.
+    values : (4, 6) array
+        Filled with (F, p) at the solution.
+    misfits : (4,) array
+        Filled with the residual's norm; above ``TOLERANCE`` where there was no convergence.
+    signs : (4,) array
+        Filled with det ∂p/∂ξ at the last Jacobian's place; that is within the last step of the solution.
+    """
+    value, tangents = np.empty(6), np.empty((6, 3))
+    residual, step = np.empty(3), np.empty(3)
+    jacobians = np.empty((LANES, 3, 3))
+    active, stale = np.zeros(LANES, np.bool_), np.ones(LANES, np.bool_)
+    misfits[:] = np.inf
+    active[:count] = True
+    stale[count:] = False
+    for _ in range(_ROUNDS):
+        wanted = False
+        for i in range(LANES):
+            j = i if i < count else 0
+            set_lane(b, i, xi[j, 0], 0.0, xi[j, 1], xi[j, 2], False)
+            wanted = wanted or (active[i] and stale[i])
+        integrate(rod, b, wanted)
+        busy = False
+        for i in range(count):
+            if not active[i]:
+                continue
+            lane_value(b, i, value)
+            if wanted:
+                lane_tangents(b, i, tangents)
+                signs[i] = point_determinant(tangents)
+            equation(value, tangents, wanted, targets[i], residual, jacobians[i])
+            misfit = norm3(residual)
+            stale[i] = not misfit < 0.1 * misfits[i]
+            if wanted or not stale[i] or misfit <= TOLERANCE:
+                misfits[i] = misfit
+                values[i, :] = value
+                if misfit <= TOLERANCE or not misfit < np.inf:
+                    active[i] = False
+                    continue
+                if wanted:
+                    stale[i] = False
+                if solve3(jacobians[i], residual, step) == 0.0:
+                    active[i] = False
+                    continue
+                for c in range(3):
+                    step[c] = -step[c]
+                limited_step(fold, xi[i], step)
+            busy = True
+        if not busy:
+            break
+
+
+@inlined
+def point_determinant(tangents: Array) -> float:
+    """Det ∂p/∂ξ of tangents (6, 3)."""
+    a, b = tangents[3:, 0], tangents[3:, 1]
+    c = tangents[3:, 2]
+    return float(
+        a[0] * (b[1] * c[2] - b[2] * c[1])
+        + a[1] * (b[2] * c[0] - b[0] * c[2])
+        + a[2] * (b[0] * c[1] - b[1] * c[0])
+    )
+
+
+@inlined
+def stable(fold: Fold, proximal: float, xi: Array, sign: float) -> bool:
+    """Whether a solution lies in the charted, stable set (up to rounding)."""
+    if not (sign > 0.0 and xi[0] >= proximal - ROUNDING):
+        return False
+    strength = fold_force(fold, xi[0], float(np.arctan2(xi[2], xi[1])))
+    # The interpolated fold force is good to a few parts in 10⁴; the determinant's sign decides near it.
+    return bool(np.hypot(xi[1], xi[2]) <= 1.01 * strength)
+
+
+@inlined
+def chart_to_contact(fold: Fold, chart: Array, xi: Array) -> None:
+    """Turn (s, ψ, ρ) into ξ."""
+    xi[0] = min(max(chart[0], _LEAST_ARC), 1.0)
+    force = chart[2] * fold_force(fold, xi[0], chart[1])
+    xi[1], xi[2] = force * np.cos(chart[1]), force * np.sin(chart[1])
+
+

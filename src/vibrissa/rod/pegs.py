@@ -1,0 +1,263 @@
+"""The contact with a peg: a line, or a cylinder with a radius; side or tip of the whisker.
+
+A peg met from rest is moved, in thought, from far on its side along the direction in which it pushes until it
+touches the resting whisker, and from there to where it is, the contact followed all the way
+(:mod:`vibrissa.rod.continuation`). A peg met from an earlier deflection moves straight from its place then to
+its place now.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from vibrissa.rod.arrays import AnyArray, Array, IntArray
+from vibrissa.rod.continuation import LEAST_FORCE, SIDE, TIP
+from vibrissa.rod.points import Solutions, follow_all
+from vibrissa.rod.reach import reach
+from vibrissa.status import Status
+
+if TYPE_CHECKING:
+    from vibrissa.whisker import Whisker
+
+_SAMPLES = 513
+_LEAST_ARC = 0.05
+# The first touch, as deep as the least force needs.
+_DEPTH = 1e-6
+_ROWS = 4096
+
+
+class Pegs(NamedTuple):
+    """Pegs row by row, lengths over L: a point of the axis, unit axis, radius (-1: a line)."""
+
+    origin: Array
+    axis: Array
+    radius: Array
+
+    def parameters(self) -> Array:
+        """(n, 7) parameters for :func:`vibrissa.rod.continuation.follow`."""
+        return np.concatenate([self.origin, self.axis, self.radius[:, None]], axis=1)
+
+
+class Rest(NamedTuple):
+    """The resting whisker, sampled: s/L, place over L, material frame, radius over L."""
+
+    s: Array
+    position: Array
+    frame: Array
+    radius: Array
+
+    @classmethod
+    def of(cls, whisker: Whisker) -> Rest:
+        """Sample a whisker."""
+        s = np.linspace(_LEAST_ARC, 1.0, _SAMPLES)
+        arc_length = np.minimum(s * whisker.length, whisker.length)
+        return cls(
+            s,
+            whisker.position(arc_length) / whisker.length,
+            whisker.frame(arc_length),
+            whisker.radius(arc_length) / whisker.length,
+        )
+
+
+def nearest_side(rest: Rest, pegs: Pegs, outward: bool) -> Array:
+    """Unit vectors (n, 3) between axis and resting whisker where they are nearest.
+
+    Parameters
+    ----------
+    rest : Rest
+        The whisker.
+    pegs : Pegs
+        The pegs.
+    outward : bool
+        Whether they point from the axis to the whisker (the side of a solid peg on which the whisker lies)
+        or from the whisker to the axis (the way a line must push to be where it is).
+
+    Returns
+    -------
+    (n, 3) array
+        The directions; zero where the whisker meets the axis.
+    """
+    away = _normal_part(rest.position - pegs.origin[:, None], pegs.axis[:, None])
+    distance = np.linalg.norm(away, axis=-1)
+    nearest = np.take_along_axis(away, distance.argmin(axis=1)[:, None, None], axis=1)[:, 0]
+    size = np.linalg.norm(nearest, axis=-1, keepdims=True)
+    direction = nearest / np.where(size > 0.0, size, 1.0)
+    return direction if outward else -direction
+
+
+def solve_from_rest(whisker: Whisker, pegs: Pegs, side: Array, proximal: float, steps: int) -> Solutions:
+    """Solve pegs met from rest.
+
+    Parameters
+    ----------
+    whisker : Whisker
+        The whisker.
+    pegs : Pegs
+        n pegs; rows with NaN are passed over.
+    side : (n, 3) array
+        Approximate direction of the force on the whisker.
+    proximal : float
+        Smallest s_c/L.
+    steps : int
+        Integration steps.
+
+    Returns
+    -------
+    Solutions
+        Row by row.
+    """
+    parts = []
+    rest = Rest.of(whisker)
+    for first in range(0, len(side), _ROWS):
+        rows = slice(first, first + _ROWS)
+        part = Pegs(*(a[rows] for a in pegs))
+        parts.append(_solve_from_rest(whisker, rest, part, side[rows], proximal, steps))
+    return Solutions(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+
+def _solve_from_rest(
+    whisker: Whisker, rest: Rest, pegs: Pegs, side: Array, proximal: float, steps: int
+) -> Solutions:
+    out = _empty(len(side))
+    there = np.isfinite(pegs.parameters()).all(axis=1) & np.isfinite(side).all(axis=1)
+    out.statuses[there] = int(Status.NO_CONTACT)
+    _rest_values(out, np.flatnonzero(there))
+    push = _normal_part(side, pegs.axis)
+    size = np.linalg.norm(push, axis=-1, keepdims=True)
+    push = push / np.where(size > 0.0, size, 1.0)
+    depth, s, direction = _first_touch(rest, pegs, push)
+    rows = np.flatnonzero(there & (depth < 0.0) & (size[:, 0] > 0.0))
+    if not rows.size:
+        return out
+    ends = pegs.parameters()[rows]
+    begins = ends.copy()
+    begins[:, :3] += (depth[rows] + _DEPTH)[:, None] * push[rows]
+    kinds, unknowns = _start(rest, s[rows], direction[rows])
+    return _follow(whisker, begins, ends, kinds, unknowns, out, rows, proximal, steps)
+
+
+def solve_from_contact(
+    whisker: Whisker, before: Pegs, contacts: Array, tip: AnyArray, pegs: Pegs, proximal: float, steps: int
+) -> Solutions:
+    """Solve pegs that were in contact ``before`` with (s, f) = ``contacts`` (n, 4), and have moved."""
+    begins, ends = before.parameters(), pegs.parameters()
+    # An axis has no sense of direction; take the turn that is less than a quarter.
+    turned = np.einsum("ij,ij->i", begins[:, 3:6], ends[:, 3:6]) < 0.0
+    ends[turned, 3:6] *= -1.0
+    unknowns = _polar(contacts, tip)
+    out = _empty(len(ends))
+    rows = np.flatnonzero(np.isfinite(ends).all(axis=1))
+    kinds = np.where(tip, TIP, SIDE)
+    return _follow(
+        whisker, begins[rows], ends[rows], kinds[rows], unknowns[rows], out, rows, proximal, steps
+    )
+
+
+def _follow(
+    whisker: Whisker,
+    begins: Array,
+    ends: Array,
+    kinds: IntArray,
+    unknowns: Array,
+    out: Solutions,
+    rows: IntArray,
+    proximal: float,
+    steps: int,
+) -> Solutions:
+    chart = reach(whisker, proximal=proximal, steps=steps)
+    solved = follow_all(
+        chart, np.ascontiguousarray(begins), np.ascontiguousarray(ends), kinds.copy(), unknowns
+    )
+    good = (solved.statuses == Status.OK) | (solved.statuses == Status.TIP_CONTACT)
+    out.statuses[rows], out.misfits[rows] = solved.statuses, solved.misfits
+    out.contacts[rows[good]], out.values[rows[good]] = solved.contacts[good], solved.values[good]
+    out.contacts[rows[~good]], out.values[rows[~good]] = np.nan, np.nan
+    _rest_values(out, rows[solved.statuses == Status.NO_CONTACT])
+    return out
+
+
+def _empty(n: int) -> Solutions:
+    return Solutions(
+        np.full((n, 4), np.nan), np.full((n, 6), np.nan), np.full(n, np.nan), np.full(n, int(Status.MISSING))
+    )
+
+
+def _rest_values(out: Solutions, rows: IntArray) -> None:
+    """No contact: no force, and no place of contact."""
+    out.contacts[rows, 0], out.contacts[rows, 1:] = np.nan, 0.0
+    out.values[rows, :3], out.values[rows, 3:] = 0.0, np.nan
+    out.misfits[rows] = 0.0
+
+
+def _normal_part(v: Array, axis: Array) -> Array:
+    return np.asarray(v - np.einsum("...i,...i->...", v, axis)[..., None] * axis)
+
+
+def _first_touch(rest: Rest, pegs: Pegs, push: Array) -> tuple[Array, Array, Array]:
+    """Where a peg moving along ``push`` first touches the resting whisker.
+
+    Returns how far it still has to go to touch (negative: it is past), s there and the unit direction of the
+    force; the distance is inf where it never touches.
+    """
+    relative = _normal_part(rest.position - pegs.origin[:, None], pegs.axis[:, None])
+    across = np.cross(pegs.axis, push)
+    x = np.einsum("nsi,ni->ns", relative, across)
+    y = np.einsum("nsi,ni->ns", relative, push)
+    solid = pegs.radius >= 0.0
+    reach_of = np.where(solid[:, None], pegs.radius[:, None] + rest.radius, 0.0)
+    with np.errstate(invalid="ignore"):
+        height = y - np.sqrt(reach_of**2 - x**2)
+    height = np.where(np.isfinite(height), height, np.inf)
+    n = np.arange(len(push))
+    i = height.argmin(axis=1)
+    depth, s = height[n, i], rest.s[i]
+    for row in np.flatnonzero(~solid & np.isfinite(x).all(axis=1)):
+        # A line touches where the whisker crosses the plane through it along the push.
+        cross = np.flatnonzero((x[row, :-1] <= 0.0) != (x[row, 1:] <= 0.0))
+        if x[row, -1] == 0.0:
+            cross = np.append(cross, x.shape[1] - 2)
+        if not cross.size:
+            depth[row] = np.inf
+            continue
+        part = x[row, cross] / (x[row, cross] - x[row, cross + 1])
+        at = y[row, cross] + part * (y[row, cross + 1] - y[row, cross])
+        first = at.argmin()
+        depth[row] = at[first]
+        s[row] = rest.s[cross[first]] + part[first] * (rest.s[1] - rest.s[0])
+        i[row] = cross[first]
+    tangent = rest.frame[i][:, :, 0]
+    touching = relative[n, i] - np.where(np.isfinite(depth), depth, 0.0)[:, None] * push
+    size = np.linalg.norm(touching, axis=1, keepdims=True)
+    normal = np.cross(pegs.axis, tangent)
+    normal *= np.sign(np.einsum("ni,ni->n", normal, push))[:, None]
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = np.where(length > 0.0, normal / np.where(length > 0.0, length, 1.0), push)
+    direction = np.where(solid[:, None], touching / np.where(size > 0.0, size, 1.0), normal)
+    return depth, s, direction
+
+
+def _start(rest: Rest, s: Array, direction: Array) -> tuple[IntArray, Array]:
+    """Kind and unknowns of the first touch."""
+    i = np.clip(np.searchsorted(rest.s, s), 0, rest.s.size - 1)
+    along, first, second = np.einsum("nij,ni->jn", rest.frame[i], direction)
+    tip = (s >= 1.0 - 1e-9) & (along < -1e-3)
+    psi = np.arctan2(second, first)
+    force = np.full_like(s, LEAST_FORCE)
+    lean = np.arcsin(np.clip(along, -1.0, 0.0))
+    unknowns = np.where(
+        tip[:, None], np.stack([force, lean, psi], axis=1), np.stack([s, force, psi], axis=1)
+    )
+    return np.where(tip, TIP, SIDE), unknowns
+
+
+def _polar(contacts: Array, tip: AnyArray) -> Array:
+    s, fx, fy, fz = contacts.T
+    normal, psi = np.hypot(fy, fz), np.arctan2(fz, fy)
+    force = np.maximum(np.hypot(normal, fx), LEAST_FORCE)
+    return np.where(
+        np.asarray(tip)[:, None],
+        np.stack([force, np.arctan2(fx, normal), psi], axis=1),
+        np.stack([s, np.maximum(normal, LEAST_FORCE), psi], axis=1),
+    )

@@ -1,0 +1,231 @@
+"""The contact at a given point: seeds from the chart, Newton, and a reason where there is none."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from vibrissa.rod.arrays import Array, IntArray, Rod
+from vibrissa.rod.batch import share_out
+from vibrissa.rod.compiled import inlined, kernel
+from vibrissa.rod.continuation import POINT, follow
+from vibrissa.rod.kernels import BUFFER_SIZE, LANES
+from vibrissa.rod.newton import TOLERANCE, chart_to_contact, newton_group, stable
+from vibrissa.rod.preimage import MOST_SEEDS, Preimages, Tree, seeds
+from vibrissa.rod.reach import Fold, Reach, reach
+from vibrissa.status import Status
+
+if TYPE_CHECKING:
+    from vibrissa.whisker import Whisker
+
+# Unreachable points farther from the chart than this many times its local spacing are told by the nearest
+# face of the chart; nearer ones are approached, so that the face is the one actually met.
+_FAR = 2.0
+
+
+class Solutions(NamedTuple):
+    """Solved rows, non-dimensional: (s, f) at the contact, (F, p), residual, status."""
+
+    contacts: Array
+    values: Array
+    misfits: Array
+    statuses: IntArray
+
+
+@inlined
+def _at_point(
+    value: Array, tangents: Array, wanted: bool, target: Array, residual: Array, jacobian: Array
+) -> None:
+    for a in range(3):
+        residual[a] = value[3 + a] - target[a]
+        if wanted:
+            for c in range(3):
+                jacobian[a, c] = tangents[3 + a, c]
+
+
+@kernel
+def _solve_points(
+    rod: Rod,
+    fold: Fold,
+    tree: Tree,
+    proximal: float,
+    points: Array,
+    xi: Array,
+    values: Array,
+    misfits: Array,
+    solved: IntArray,
+    first: int,
+    last: int,
+) -> None:
+    """Solve contact points (n, 3) where the chart has a seed that leads to a stable solution."""
+    b = np.zeros(BUFFER_SIZE)
+    found, quality = np.empty((MOST_SEEDS, 3)), np.empty(MOST_SEEDS, np.int64)
+    rows, targets, group = np.empty(LANES, np.int64), np.empty((LANES, 3)), np.empty((LANES, 3))
+    group_values, group_misfits = np.empty((LANES, 6)), np.empty(LANES)
+    signs = np.empty(LANES)
+    count = 0
+    for row in range(first, last):
+        solved[row] = 0
+        n = seeds(tree, points[row], found, quality)
+        if n > 0:
+            best = 0
+            for i in range(1, n):
+                # Of two solutions near the fold the one with less force is the stable one.
+                better = quality[i] > quality[best]
+                if better or (quality[i] == quality[best] and found[i, 2] < found[best, 2]):
+                    best = i
+            rows[count] = row
+            targets[count] = points[row]
+            chart_to_contact(fold, found[best], group[count])
+            count += 1
+        if count == LANES or (row == last - 1 and count > 0):
+            newton_group(
+                _at_point, rod, fold, b, count, targets, group, group_values, group_misfits, signs
+            )
+            for i in range(count):
+                if group_misfits[i] <= TOLERANCE and stable(fold, proximal, group[i], signs[i]):
+                    solved[rows[i]] = 1
+                    xi[rows[i]] = group[i]
+                    values[rows[i]] = group_values[i]
+                    misfits[rows[i]] = group_misfits[i]
+            count = 0
+
+
+class PointSolver:
+    """Contact at a point, for one whisker: tables made once, then microseconds a point.
+
+    Parameters
+    ----------
+    chart : Reach
+        The whisker's stable contacts.
+    """
+
+    def __init__(self, chart: Reach) -> None:
+        self.chart = chart
+        points = np.ascontiguousarray(chart.values[..., 3:])
+        self._tree = Preimages.of(
+            chart, points, chart.tangents[..., 3:, :], (False, False, False)
+        ).tree
+        # Paths start short of the fold, where there is room to move.
+        inner = points[:, :-1, :-1].reshape(-1, 3)
+        self._contacts = chart.contacts[:, :-1, :-1].reshape(-1, 3)
+        self._nearest = cKDTree(inner)
+        # The largest edge of the cells around a node: how near "near the chart" is.
+        edges = [
+            np.linalg.norm(np.diff(points, axis=axis), axis=-1).max() for axis in range(3)
+        ]
+        self._spacing = float(max(edges))
+        n, m, k = (size - 1 for size in points.shape[:3])
+        faces = [
+            (points[:, :m, k], Status.BEYOND_FOLD),
+            (points[n, :m], Status.BEYOND_TIP),
+            (points[0, :m], Status.TOO_PROXIMAL),
+        ]
+        self._faces = cKDTree(np.concatenate([face.reshape(-1, 3) for face, _ in faces]))
+        self._reasons = np.concatenate(
+            [np.full(face[..., 0].size, int(reason)) for face, reason in faces]
+        )
+
+    def solve(self, points: Array) -> Solutions:
+        """Solve contact points.
+
+        Parameters
+        ----------
+        points : (n, 3) array
+            Contact points over L; rows with NaN are passed over.
+
+        Returns
+        -------
+        Solutions
+            Row by row; NaN where there is no solution.
+        """
+        n = len(points)
+        contacts, values = np.full((n, 4), np.nan), np.full((n, 6), np.nan)
+        misfits, statuses = np.full(n, np.nan), np.full(n, int(Status.MISSING))
+        there = np.flatnonzero(np.isfinite(points).all(axis=1))
+        wanted = np.ascontiguousarray(points[there])
+        xi, found = np.empty((there.size, 3)), np.empty((there.size, 6))
+        residuals, solved = np.empty(there.size), np.zeros(there.size, np.int64)
+        chart = self.chart
+        rod, fold = chart.discretization.rod, chart.fold
+        share_out(
+            there.size,
+            lambda first, last: _solve_points(
+                rod,
+                fold,
+                self._tree,
+                chart.proximal,
+                wanted,
+                xi,
+                found,
+                residuals,
+                solved,
+                first,
+                last,
+            ),
+        )
+        good = solved == 1
+        rows = there[good]
+        contacts[rows, 0], contacts[rows, 1], contacts[rows, 2:] = xi[good, 0], 0.0, xi[good, 1:]
+        values[rows], misfits[rows], statuses[rows] = found[good], residuals[good], int(Status.OK)
+        rest = Solutions(contacts, values, misfits, statuses)
+        self._approach(wanted[~good], there[~good], rest)
+        return rest
+
+    def _approach(self, points: Array, rows: IntArray, out: Solutions) -> None:
+        """Follow the points without a ready seed from the nearest contact known; say why where it fails."""
+        if not rows.size:
+            return
+        away, face = self._faces.query(points)
+        out.statuses[rows] = self._reasons[face]
+        near = np.flatnonzero(away < _FAR * self._spacing)
+        points, rows = points[near], rows[near]
+        _, start = self._nearest.query(points)
+        begins, ends = np.zeros((rows.size, 7)), np.zeros((rows.size, 7))
+        begins[:, :3], ends[:, :3] = self._nearest.data[start], points
+        solved = follow_all(
+            self.chart, begins, ends, np.full(rows.size, POINT), self._contacts[start].copy()
+        )
+        out.statuses[rows] = solved.statuses
+        out.misfits[rows] = solved.misfits
+        good = solved.statuses == Status.OK
+        out.contacts[rows[good]], out.values[rows[good]] = solved.contacts[good], solved.values[good]
+
+
+def follow_all(
+    chart: Reach, begins: Array, ends: Array, kinds: IntArray, unknowns: Array
+) -> Solutions:
+    """Run :func:`vibrissa.rod.continuation.follow` over all rows; kinds and unknowns are updated."""
+    n = len(begins)
+    contacts, values = np.full((n, 4), np.nan), np.full((n, 6), np.nan)
+    misfits, statuses = np.full(n, np.nan), np.zeros(n, np.int64)
+    discretization = chart.discretization
+    share_out(
+        n,
+        lambda first, last: follow(
+            discretization.rod,
+            chart.fold,
+            discretization.radius,
+            chart.proximal,
+            begins,
+            ends,
+            kinds,
+            unknowns,
+            contacts,
+            values,
+            misfits,
+            statuses,
+            first,
+            last,
+        ),
+    )
+    return Solutions(contacts, values, misfits, statuses)
+
+
+@lru_cache(maxsize=16)
+def point_solver(whisker: Whisker, proximal: float, steps: int) -> PointSolver:
+    """Return the point solver of a whisker, made on first use."""
+    return PointSolver(reach(whisker, proximal=proximal, steps=steps))

@@ -1,0 +1,257 @@
+"""Where a whisker can be touched: the stable contacts Ω, as a chart.
+
+A frictionless contact is ξ = (s_c, f_y, f_z). At fixed s_c the force grows along a ray of bearing ψ,
+f = f (cos ψ, sin ψ), from rest to the *fold*, where det ∂p/∂ξ first vanishes: there the stable equilibrium
+meets an unstable one and a frictionless whisker slips off. The contacts between rest and fold, for s_c between
+``proximal`` and the tip, are the stable ones connected to rest. With the fold force f*(s_c, ψ) they are
+charted by
+
+    ξ = (s, ρ f*(s, ψ) cos ψ, ρ f*(s, ψ) sin ψ),   0 ≤ ρ ≤ 1,
+
+a box in (s, ψ, ρ), periodic in ψ. The chart is sampled on a grid whose nodes carry base force F, contact
+point p and their exact derivatives with respect to (s, ψ, ρ). ln f* is interpolated by bicubic Hermite
+patches.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from vibrissa.rod.arrays import AnyArray, Array
+from vibrissa.rod.batch import solve_forces
+from vibrissa.rod.compiled import inlined
+from vibrissa.rod.discretize import STEPS, Discretization, discretize
+
+if TYPE_CHECKING:
+    from vibrissa.whisker import Whisker
+
+#: Contacts nearer the base than this fraction of the length are not considered, unless asked for.
+PROXIMAL = 0.3
+#: Cells of the chart along (s, ψ, ρ).
+CELLS = (16, 32, 16)
+# The fold is looked for up to this many times the force that would bend the contact by its own arc length
+# were the whisker linear; straight, curved, conical and cylindrical whiskers fold below 4.
+_FARTHEST = 12.0
+_SCAN = 0.0625
+# Directions have no value at zero force; just above it they have their limit.
+_LEAST_LOAD = 1e-4
+
+# The fold's share in the kernels: stations s (n,), ln f* and its derivatives in s, ψ and both (n, m + 1, 4).
+Fold = tuple[Array, Array]
+
+
+@dataclass(frozen=True, eq=False)
+class Reach:
+    """The chart of the stable contacts of one whisker, non-dimensional.
+
+    Attributes
+    ----------
+    discretization : Discretization
+        The whisker.
+    stations, bearings, loads : (n,), (m + 1,), (k,) arrays
+        Grid of s/L, ψ (rad, both ends of the circle) and ρ.
+    fold : tuple of arrays
+        ``stations`` and ln f* with its derivatives, (n, m + 1, 4); for :func:`fold_force`.
+    contacts : (n, m + 1, k, 3) array
+        ξ at the nodes.
+    values : (n, m + 1, k, 6) array
+        (F, p) at the nodes.
+    tangents : (n, m + 1, k, 6, 3) array
+        ∂(F, p)/∂ξ at the nodes.
+    frames : (n, m + 1, k, 3, 3) array
+        ∂ξ/∂(s, ψ, ρ) at the nodes.
+    folded : (n, m + 1) bool array
+        Whether the ray reaches a fold; False where it was followed to the largest force considered.
+    """
+
+    discretization: Discretization
+    stations: Array
+    bearings: Array
+    loads: Array
+    fold: Fold
+    contacts: Array
+    values: Array
+    tangents: Array
+    frames: Array
+    folded: AnyArray
+
+    @property
+    def proximal(self) -> float:
+        """Smallest s_c/L charted."""
+        return float(self.stations[0])
+
+    def charted(self, derivatives: Array) -> Array:
+        """Turn derivatives with respect to ξ at the nodes into ones with respect to (s, ψ, ρ)."""
+        return np.einsum("...ij,...jk->...ik", derivatives, self.frames)
+
+
+@lru_cache(maxsize=16)
+def reach(
+    whisker: Whisker,
+    proximal: float = PROXIMAL,
+    cells: tuple[int, int, int] = CELLS,
+    steps: int = STEPS,
+) -> Reach:
+    """Chart the stable contacts of a whisker; see the module.
+
+    Parameters
+    ----------
+    whisker : Whisker
+        What is touched.
+    proximal : float
+        Smallest s_c/L.
+    cells : tuple of int
+        Cells along s, ψ and ρ; powers of two.
+    steps : int
+        Integration steps along the whisker.
+
+    Returns
+    -------
+    Reach
+        Cached per whisker.
+    """
+    if not 0.05 <= proximal < 1.0:
+        raise ValueError(f"the smallest arc length is {proximal} L; it must be from 0.05 L to below L")
+    discretization = discretize(whisker, steps)
+    stations = np.linspace(proximal, 1.0, cells[0] + 1)
+    bearings = np.linspace(0.0, 2.0 * np.pi, cells[1] + 1)
+    loads = np.linspace(0.0, 1.0, cells[2] + 1)
+    force, folded = _fold_forces(discretization, stations, bearings[:-1])
+    log_fold = _log_fold(stations, bearings, force)
+    s, psi, rho = np.meshgrid(stations, bearings, np.maximum(loads, _LEAST_LOAD), indexing="ij")
+    f, f_s, f_psi = (a[..., None] for a in _expand(log_fold))
+    cos, sin = np.cos(psi), np.sin(psi)
+    contacts = np.stack([s, rho * f * cos, rho * f * sin], axis=-1)
+    zero = np.zeros_like(s)
+    frames = np.stack(
+        [
+            np.stack([zero + 1.0, zero, zero], axis=-1),
+            np.stack([rho * f_s * cos, rho * (f_psi * cos - f * sin), f * cos], axis=-1),
+            np.stack([rho * f_s * sin, rho * (f_psi * sin + f * cos), f * sin], axis=-1),
+        ],
+        axis=-2,
+    )
+    values, tangents = solve_forces(
+        discretization, with_normal_force(contacts.reshape(-1, 3)), tangents=True
+    )
+    grid = s.shape
+    return Reach(
+        discretization=discretization,
+        stations=stations,
+        bearings=bearings,
+        loads=loads,
+        fold=(stations, log_fold),
+        contacts=contacts,
+        values=values.reshape(*grid, 6),
+        tangents=tangents.reshape(*grid, 6, 3),
+        frames=frames,
+        folded=np.concatenate([folded, folded[:, :1]], axis=1),
+    )
+
+
+def with_normal_force(contacts: Array) -> Array:
+    """ξ = (s, f_y, f_z) as (s, 0, f_y, f_z): a frictionless force is normal to the whisker."""
+    return np.insert(contacts, 1, 0.0, axis=-1)
+
+
+def determinant(tangents: Array) -> Array:
+    """Det ∂p/∂ξ of tangents (..., 6, 3): positive at rest, zero at the fold."""
+    a, b, c = (tangents[..., 3:, j] for j in range(3))
+    return np.asarray(np.einsum("...i,...i->...", a, np.cross(b, c)))
+
+
+def _fold_forces(
+    discretization: Discretization, stations: Array, bearings: Array
+) -> tuple[Array, AnyArray]:
+    """Force at the first zero of det ∂p/∂ξ along each ray, (n, m), and whether there is one."""
+    rest = np.zeros((stations.size, 4))
+    rest[:, 0] = stations
+    at_rest = determinant(solve_forces(discretization, rest, tangents=True)[1])
+    # √det is the compliance at the contact: this force deflects it, linearly, by its arc length.
+    unit = np.repeat(stations / np.sqrt(at_rest), bearings.size)
+    sign = np.repeat(at_rest, bearings.size)
+    s = np.repeat(stations, bearings.size)
+    psi = np.tile(bearings, stations.size)
+
+    def relative_determinant(rays: AnyArray, force: Array) -> Array:
+        f = force * unit[rays]
+        contacts = np.stack([s[rays], 0.0 * f, f * np.cos(psi[rays]), f * np.sin(psi[rays])], axis=-1)
+        with np.errstate(invalid="ignore", over="ignore"):
+            found = determinant(solve_forces(discretization, contacts, tangents=True)[1]) / sign[rays]
+        # Far beyond a fold the integration may overflow: certainly not stable.
+        return np.where(np.isfinite(found), found, -1.0)
+
+    low, high = np.zeros(s.size), np.full(s.size, np.inf)
+    at_low, at_high = np.ones(s.size), np.full(s.size, np.nan)
+    open_rays = np.arange(s.size)
+    force = _SCAN
+    while open_rays.size and force <= _FARTHEST:
+        found = relative_determinant(open_rays, np.full(open_rays.size, force))
+        beyond = found <= 0.0
+        high[open_rays[beyond]], at_high[open_rays[beyond]] = force, found[beyond]
+        open_rays = open_rays[~beyond]
+        low[open_rays], at_low[open_rays] = force, found[~beyond]
+        force += _SCAN
+    folded = np.isfinite(high)
+    rays = np.flatnonzero(folded)
+    for _ in range(40):  # regula falsi with the Illinois correction
+        guess = low[rays] + (high[rays] - low[rays]) * at_low[rays] / (at_low[rays] - at_high[rays])
+        found = relative_determinant(rays, guess)
+        inside = found > 0.0
+        a, b = rays[inside], rays[~inside]
+        low[a], at_low[a], at_high[a] = guess[inside], found[inside], 0.5 * at_high[a]
+        high[b], at_high[b], at_low[b] = guess[~inside], found[~inside], 0.5 * at_low[b]
+        rays = rays[(np.abs(found) > 1e-10) & (high[rays] - low[rays] > 1e-12 * high[rays])]
+        if not rays.size:
+            break
+    shape = (stations.size, bearings.size)
+    # The stable side of the bracket.
+    return (low * unit).reshape(shape), folded.reshape(shape)
+
+
+def _log_fold(stations: Array, bearings: Array, force: Array) -> Array:
+    """Ln f* with its derivatives (value, s, ψ, sψ) at the nodes, from splines periodic in ψ."""
+    values = np.log(np.concatenate([force, force[:, :1]], axis=1))
+    around = CubicSpline(bearings, values, axis=1, bc_type="periodic")
+    in_psi = around(bearings, 1)
+    in_s = CubicSpline(stations, values, axis=0)(stations, 1)
+    in_both = CubicSpline(stations, in_psi, axis=0)(stations, 1)
+    return np.ascontiguousarray(np.stack([values, in_s, in_psi, in_both], axis=-1))
+
+
+def _expand(log_fold: Array) -> tuple[Array, Array, Array]:
+    f = np.exp(log_fold[..., 0])
+    return f, f * log_fold[..., 1], f * log_fold[..., 2]
+
+
+@inlined
+def _hermite(t: float) -> tuple[float, float, float, float]:
+    """Cubic Hermite weights: value and slope at 0, value and slope at 1."""
+    u = 1.0 - t
+    return u * u * (1.0 + 2.0 * t), t * u * u, t * t * (3.0 - 2.0 * t), -t * t * u
+
+
+@inlined
+def fold_force(fold: Fold, s: float, psi: float) -> float:
+    """Fold force f*(s, ψ), non-dimensional; s is clipped to the chart, ψ is any angle."""
+    stations, table = fold
+    n, m = table.shape[0] - 1, table.shape[1] - 1
+    ds = (stations[n] - stations[0]) / n
+    dpsi = 2.0 * np.pi / m
+    x = min(max((s - stations[0]) / ds, 0.0), n + 0.0)
+    y = psi / dpsi
+    y -= m * np.floor(y / m)
+    i, j = min(int(x), n - 1), min(int(y), m - 1)
+    a, b = _hermite(x - i), _hermite(y - j)
+    log = 0.0
+    for di in range(2):
+        for dj in range(2):
+            node = table[i + di, j + dj]
+            log += a[2 * di] * (b[2 * dj] * node[0] + b[2 * dj + 1] * dpsi * node[2])
+            log += a[2 * di + 1] * ds * (b[2 * dj] * node[1] + b[2 * dj + 1] * dpsi * node[3])
+    return float(np.exp(log))

@@ -1,0 +1,132 @@
+"""The deflected whisker: the rod equations from the base outward, with the base force known.
+
+With F and p the material frame R = (t, d₁, d₂) and the place r follow from
+
+    t' = u_z d₁ - u_y d₂,   d₁' = u_x d₂ - u_z t,   d₂' = u_y t - u_x d₁,   r' = t,
+    u = u₀ + c ∘ Rᵀ((p - r) × F) up to the contact, u₀ beyond it,
+
+integrated with the same method and on the same steps as the contact problem, cut at the contact and at the
+places that are asked for.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vibrissa.rod.arrays import Array, Rod
+from vibrissa.rod.batch import share_out
+from vibrissa.rod.compiled import inlined, kernel
+from vibrissa.rod.discretize import Discretization
+
+_WEIGHTS = np.array([11.0, 0.0, 81.0, 81.0, -32.0, -32.0, 11.0]) / 120.0
+_NODES = np.array([0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0 / 3.0, 0.5, 0.5, 1.0])
+_STAGES = np.array(
+    [
+        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [1.0 / 3.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [0.0, 2.0 / 3.0, 0.0, 0.0, 0.0, 0.0],
+        [1.0 / 12.0, 1.0 / 3.0, -1.0 / 12.0, 0.0, 0.0, 0.0],
+        [-1.0 / 16.0, 9.0 / 8.0, -3.0 / 16.0, -3.0 / 8.0, 0.0, 0.0],
+        [0.0, 9.0 / 8.0, -3.0 / 8.0, -3.0 / 4.0, 0.5, 0.0],
+        [9.0 / 44.0, -9.0 / 11.0, 63.0 / 44.0, 18.0 / 11.0, 0.0, -16.0 / 11.0],
+    ]
+)
+
+
+@inlined
+def _rates(
+    rod: Rod, k: int, t: float, loaded: bool, force: Array, point: Array, y: Array, dy: Array
+) -> None:
+    """Derivatives of (r, t, d₁, d₂), 12 numbers, at the fraction t of step k."""
+    c = rod[5][k]
+    u = np.empty(3)
+    for a in range(3):
+        u[a] = c[a, 0] + t * (c[a, 1] + t * (c[a, 2] + t * c[a, 3]))
+    if loaded:
+        r = c[3, 0] + t * (c[3, 1] + t * (c[3, 2] + t * c[3, 3]))
+        compliance = 1.0 / (r * r * r * r)
+        x0, x1, x2 = point[0] - y[0], point[1] - y[1], point[2] - y[2]
+        m0 = x1 * force[2] - x2 * force[1]
+        m1 = x2 * force[0] - x0 * force[2]
+        m2 = x0 * force[1] - x1 * force[0]
+        for a in range(3):
+            m = y[3 + 3 * a] * m0 + y[4 + 3 * a] * m1 + y[5 + 3 * a] * m2
+            u[a] += compliance * (rod[3][k] if a == 0 else rod[4][k]) * m
+    for i in range(3):
+        t_i, d1, d2 = y[3 + i], y[6 + i], y[9 + i]
+        dy[i] = rod[2][k] * t_i
+        dy[3 + i] = u[2] * d1 - u[1] * d2
+        dy[6 + i] = u[0] * d2 - u[2] * t_i
+        dy[9 + i] = u[1] * t_i - u[0] * d1
+
+
+@kernel
+def _shapes(
+    rod: Rod, values: Array, arc: Array, s: Array, places: Array, first: int, last: int
+) -> None:
+    """Places (n, m, 3) at the increasing arc lengths s (m,) for (F, p) = values and contacts at arc (n,)."""
+    start, width = rod[0], rod[1]
+    y, argument, slopes = np.empty(12), np.empty(12), np.empty((7, 12))
+    for row in range(first, last):
+        force, point, contact = values[row, :3], values[row, 3:], arc[row]
+        y[:] = 0.0
+        y[3] = y[7] = y[11] = 1.0
+        wanted = 0
+        for k in range(start.shape[0]):
+            here, end = start[k], start[k] + width[k]
+            while True:
+                while wanted < s.shape[0] and s[wanted] <= here + 1e-12 and rod[2][k] > 0.0:
+                    places[row, wanted] = y[:3]
+                    wanted += 1
+                if here >= end - 1e-15:
+                    break
+                to = end
+                if rod[2][k] > 0.0 and wanted < s.shape[0]:
+                    to = min(to, s[wanted])
+                loaded = here < contact - 1e-14
+                if loaded:
+                    to = min(to, contact)
+                h = to - here
+                for stage in range(7):
+                    for a in range(12):
+                        argument[a] = y[a]
+                        for b in range(stage):
+                            argument[a] += h * _STAGES[stage, b] * slopes[b, a]
+                    t = (here + _NODES[stage] * h - start[k]) / width[k]
+                    _rates(rod, k, t, loaded, force, point, argument, slopes[stage])
+                for stage in range(7):
+                    for a in range(12):
+                        y[a] += h * _WEIGHTS[stage] * slopes[stage, a]
+                here = to
+        while wanted < s.shape[0]:
+            places[row, wanted] = y[:3]
+            wanted += 1
+
+
+def shapes(discretization: Discretization, values: Array, arc: Array, s: Array) -> Array:
+    """Centrelines of deflected whiskers, non-dimensional.
+
+    Parameters
+    ----------
+    discretization : Discretization
+        The whisker.
+    values : (n, 6) array
+        (F, p); zero force gives the resting whisker.
+    arc : (n,) array
+        s_c of the contacts.
+    s : (m,) array
+        Arc lengths wanted, increasing.
+
+    Returns
+    -------
+    (n, m, 3) array
+        Places; NaN for rows with NaN.
+    """
+    places = np.full((len(values), s.size, 3), np.nan)
+    rows = np.flatnonzero(np.isfinite(values).all(axis=1) & np.isfinite(arc))
+    kept, where = np.ascontiguousarray(values[rows]), np.ascontiguousarray(arc[rows])
+    found = np.empty((rows.size, s.size, 3))
+    rod, s = discretization.rod, np.ascontiguousarray(s)
+    share_out(rows.size, lambda first, last: _shapes(rod, kept, where, s, found, first, last))
+    places[rows] = found
+    return places

@@ -1,8 +1,8 @@
-"""How kernels are compiled: machine code cached on disk, errors as NumPy has them, contraction allowed.
+"""How kernels are compiled: cached on disk, errors as NumPy has them, contraction allowed.
 
-Compiling takes seconds, once for a given installation; a listener says so while it happens, so that a
-first call does not look as if it hung. Where no folder can be written to (a read-only installation
-without a home folder) the kernels are compiled anew in each run instead.
+Compiling takes seconds, once for a given installation; a listener says so while it happens, so that
+a first call does not look as if it hung. Where no folder can be written to (a read-only
+installation without a home folder) the kernels are compiled anew in each run instead.
 """
 
 from __future__ import annotations

@@ -1,20 +1,25 @@
-"""Loads followed from a state that is known to one that is asked for, on the stable branch all the way.
+"""Loads followed from a known state to the one asked for, on the stable branch all the way.
 
-A problem is a set of three equations G(x; parameters) = 0. The parameters move along a straight line from
-where the solution is known to where it is wanted; Newton's method corrects each step, the step is halved where
-it struggles and doubled where it does not. A solution counts only while det ∂G/∂x keeps the sign it started
-with: the zero is that load's fold, where the whisker slips off. Where no step succeeds, the state reached tells why.
+A problem is a set of three equations G(x; parameters) = 0. The parameters move along a straight
+line from where the solution is known to where it is wanted; Newton's method corrects each step, the
+step is halved where it struggles and doubled where it does not. A solution counts only while det
+∂G/∂x keeps the sign it started with: the zero is that load's fold, where the whisker slips off.
+Where no step succeeds, the state reached tells why.
 
 Three kinds of problem, with their unknowns x and parameters:
 
 - ``POINT``: the contact is at a point. x = (s, f_y, f_z); parameters: the point.
-- ``SIDE``: the whisker's side on a peg. x = (s, λ, ψ) with f = λ (0, cos ψ, sin ψ); parameters: a point of the
-  peg's axis, its direction, and its radius (negative: a line without thickness). With d the part of p - origin
-  normal to the axis and F̂ = F/λ the force's direction: d = D F̂ and F̂·axis = 0, D the peg's radius plus the
+- ``SIDE``: the whisker's side on a peg. x = (s, λ, ψ) with f = λ (0, cos ψ, sin ψ); parameters: a
+  point of the
+  peg's axis, its direction, and its radius (negative: a line without thickness). With d the part of
+  p - origin
+  normal to the axis and F̂ = F/λ the force's direction: d = D F̂ and F̂·axis = 0, D the peg's
+  radius plus the
   whisker's at s, or 0 for a line. Polar unknowns keep F̂ regular down to zero force.
 - ``TIP``: the whisker's tip on a peg, the same equations at s = 1 with the force free to lean back:
-  x = (λ, α, ψ), f = λ (sin α, cos α cos ψ, cos α sin ψ), α ≤ 0. A side contact that slides to the tip goes on
-  as this one; a tip contact whose force turns normal to the whisker goes on along the side.
+  x = (λ, α, ψ), f = λ (sin α, cos α cos ψ, cos α sin ψ), α ≤ 0. A side contact that slides to the
+  tip goes on as this one; a tip contact whose force turns normal to the whisker goes on along the
+  side.
 """
 
 from __future__ import annotations
@@ -33,12 +38,15 @@ POINT, SIDE, TIP = 0, 1, 2
 #: A force this small (EI/L²) only says where an object touches.
 LEAST_FORCE = 1e-7
 _LEAST_ARC = 0.05
-_SMALLEST_STEP = 2.0**-11
+_SMALLEST_STEP = 2.0**-12
 _MOST_ITERATIONS = 30
-# det ∂G/∂x relative to its start, below which a path that cannot be followed has met a fold: the last
-# step accepted is within _SMALLEST_STEP of it, and det vanishes like a square root there.
-_NEAR_FOLD = 0.3
-_FX, _FY, _FZ = 1, 2, 3
+# Toward a fold det ∂G/∂x vanishes and the solution moves ever faster along the path, both like a
+# square root of what is left to it. A path that cannot be followed has met a fold if det has fallen
+# below this share of its start, or if the speed (in longest steps per path) has grown by this
+# factor or is as high as this.
+_NEAR_FOLD = 0.5
+_SPED_UP = 2.0
+_FAST = 30.0
 
 _OK = int(Status.OK)
 _AT_TIP = int(Status.TIP_CONTACT)
@@ -65,7 +73,7 @@ def _contact(kind: int, x: Array, contact: Array) -> None:
 
 @inlined
 def _polar_tangents(kind: int, x: Array, t: Array) -> None:
-    """Turn ∂(F, p)/∂(s, f_y, f_z) or /∂(f_x, f_y, f_z) into derivatives with respect to the unknowns."""
+    """Turn derivatives with respect to (s, f_y, f_z) or (f_x, f_y, f_z) into ones by unknowns."""
     if kind == POINT:
         return
     for row in range(6):
@@ -97,7 +105,15 @@ def whisker_radius(rod: Rod, s: float) -> tuple[float, float]:
 
 @inlined
 def _equations(
-    kind: int, rod: Rod, radius: float, x: Array, p: Array, value: Array, t: Array, g: Array, j: Array
+    kind: int,
+    rod: Rod,
+    radius: float,
+    x: Array,
+    p: Array,
+    value: Array,
+    t: Array,
+    g: Array,
+    j: Array,
 ) -> None:
     """G and ∂G/∂x from (F, p) and their derivatives with respect to x."""
     if kind == POINT:
@@ -196,7 +212,8 @@ def follow(
     kinds : (n,) int array
         Kind of each problem; replaced by the kind it ended as.
     unknowns : (n, 3) array
-        Solutions at ``begins`` (approximately); replaced by those at ``ends``, or by the last on the way.
+        Solutions at ``begins`` (approximately); replaced by those at ``ends``, or by the last on
+        the way.
     contacts : (n, 4) array
         Filled with (s, f_x, f_y, f_z).
     values : (n, 6) array
@@ -216,6 +233,7 @@ def follow(
     done, stride = np.zeros(LANES), np.zeros(LANES)
     sign, ratio = np.zeros(LANES), np.zeros(LANES)
     last_size, rounds = np.zeros(LANES), np.zeros(LANES, np.int64)
+    speed, first_speed = np.zeros(LANES), np.zeros(LANES)
     clipped, lost = np.zeros(LANES, np.bool_), np.zeros(LANES, np.bool_)
     waiting, running = first, 0
     while True:
@@ -228,11 +246,10 @@ def follow(
                 x_ok[i] = x[i]
                 done[i], stride[i], sign[i], ratio[i] = 0.0, 1.0, 0.0, 1.0
                 rounds[i], clipped[i], lost[i] = 0, False, False
+                first_speed[i] = np.inf
             if row[i] >= 0:
                 _contact(kinds[row[i]], x[i], contact)
-                set_lane(
-                    b, i, contact[0], contact[1], contact[2], contact[3], kinds[row[i]] == TIP
-                )
+                set_lane(b, i, contact[0], contact[1], contact[2], contact[3], kinds[row[i]] == TIP)
             else:
                 set_lane(b, i, 0.1, 0.0, 0.0, 0.0, False)
         if running == 0:
@@ -265,7 +282,7 @@ def follow(
             for a in range(3):
                 size = max(size, abs(step[a]) / most[a])
             # Near zero force the direction is loose: solved means the step is small as well.
-            solved = misfit <= TOLERANCE and size < 1e-6 or misfit <= 1e-3 * TOLERANCE
+            solved = (misfit <= TOLERANCE and size < 1e-6) or misfit <= 1e-3 * TOLERANCE
             if solved and not failed:
                 done[i] = progress
                 ratio[i] = relative
@@ -276,12 +293,16 @@ def follow(
                 values[m] = value
                 misfits[m] = misfit
                 if kind == TIP and x[i, 1] > 0.0:
-                    # The force leans outward, which a tip cannot give: the contact moves along the side.
+                    # The force leans outward, which a tip cannot give: the contact moves along the
+                    # side.
                     force, psi = x[i, 0], x[i, 2]
                     kinds[m] = SIDE
                     x[i, 0], x[i, 1], x[i, 2] = 1.0, force, psi
                     x_ok[i] = x[i]
-                    sign[i], stride[i] = 0.0, 0.0 if progress >= 1.0 else min(stride[i], 1.0 - progress)
+                    sign[i], stride[i] = (
+                        0.0,
+                        0.0 if progress >= 1.0 else min(stride[i], 1.0 - progress),
+                    )
                     rounds[i] = 0
                     continue
                 if progress >= 1.0:
@@ -296,6 +317,8 @@ def follow(
                 rounds[i] = 0
                 continue
             if rounds[i] == 0:
+                speed[i] = size / stride[i]
+                first_speed[i] = min(first_speed[i], speed[i])
                 failed = failed or (size > 2.0 and stride[i] > _SMALLEST_STEP)
             elif rounds[i] >= 2:
                 failed = failed or size > 0.95 * last_size[i] + 1e-9
@@ -331,7 +354,11 @@ def follow(
                 statuses[m] = _NO_CONTACT
             elif clipped[i] or kind == TIP:
                 statuses[m] = _BEYOND_TIP
-            elif abs(ratio[i]) < _NEAR_FOLD:
+            elif (
+                ratio[i] < _NEAR_FOLD
+                or speed[i] > _SPED_UP * first_speed[i]
+                or not speed[i] < _FAST
+            ):
                 statuses[m] = _FOLD
             elif x_ok[i, 0] < proximal:
                 statuses[m] = _PROXIMAL

@@ -88,7 +88,9 @@ class Deflection:
             f"{Status(code).name.lower().replace('_', ' ')} {count}"
             for code, count in zip(*np.unique(self.status, return_counts=True), strict=True)
         )
-        return f"<Deflection of {self.status.shape or 'one'} by {type(self.load).__name__}: {counts}>"
+        return (
+            f"<Deflection of {self.status.shape or 'one'} by {type(self.load).__name__}: {counts}>"
+        )
 
 
 def deflect(
@@ -103,16 +105,19 @@ def deflect(
     load : PointForce, PointContact or PegContact
         What bends it; arrays of any leading shape.
     proximal : float
-        Contacts at less than this fraction of the length from the base get a status instead of an answer
+        Contacts at less than this fraction of the length from the base get a status instead of an
+        answer
         (not for a ``PointForce``).
     steps : int
-        Integration steps along the whisker. The default is good to 1e-6; the error falls with the sixth
+        Integration steps along the whisker. The default is good to 1e-6; the error falls with the
+        sixth
         power.
 
     Returns
     -------
     Deflection
-        The stable equilibrium that is connected to rest, for each load, or the reason why there is none.
+        The stable equilibrium that is connected to rest, for each load, or the reason why there is
+        none.
 
     Raises
     ------
@@ -173,13 +178,12 @@ def _by_peg(
     whisker: Whisker, d: Discretization, load: PegContact, proximal: float, steps: int
 ) -> Solutions:
     pegs = _rows(load, d.length)
-    rest = Rest.of(whisker)
     start = load.start
     if start is None:
         if load.side is not None:
             side = np.asarray(load.side).reshape(-1, 3)
         else:
-            side = nearest_side(rest, pegs, outward=bool((pegs.radius >= 0.0).any()))
+            side = nearest_side(Rest.of(whisker), pegs, outward=bool((pegs.radius >= 0.0).any()))
         return solve_from_rest(whisker, pegs, side, proximal, steps)
     if start.whisker is not whisker:
         raise ValueError("start is a deflection of another whisker")
@@ -200,30 +204,20 @@ def _by_peg(
     )
     before = _rows(earlier, d.length)
     touching = np.isin(status, (Status.OK, Status.TIP_CONTACT))
-    # A whisker that was free lies on the side of the peg where it then rested.
-    free = np.flatnonzero(~touching)
-    side = nearest_side(rest, Pegs(*(a[free] for a in before)), outward=True)
-    merged = solve_from_rest(
-        whisker, Pegs(*(a[free] for a in pegs)), side, proximal, steps
-    ) if free.size else None
+    out = Solutions.empty(status.size)
     rows = np.flatnonzero(touching)
-    moved = solve_from_contact(
-        whisker,
-        Pegs(*(a[rows] for a in before)),
-        contacts[rows],
-        status[rows] == Status.TIP_CONTACT,
-        Pegs(*(a[rows] for a in pegs)),
-        proximal,
-        steps,
-    ) if rows.size else None
-    if merged is None or moved is None:
-        return moved if merged is None and moved is not None else merged  # type: ignore[return-value]
-    out = []
-    for a, b in zip(merged, moved, strict=True):
-        c = np.empty((status.size, *a.shape[1:]), dtype=a.dtype)
-        c[free], c[rows] = a, b
-        out.append(c)
-    return Solutions(*out)
+    if rows.size:
+        tip = status[rows] == Status.TIP_CONTACT
+        moved = solve_from_contact(
+            whisker, before.rows(rows), contacts[rows], tip, pegs.rows(rows), proximal, steps
+        )
+        out.put(rows, moved)
+    # A whisker that was free lies on the side of the peg where it then rested.
+    rows = np.flatnonzero(~touching)
+    if rows.size:
+        side = nearest_side(Rest.of(whisker), before.rows(rows), outward=True)
+        out.put(rows, solve_from_rest(whisker, pegs.rows(rows), side, proximal, steps))
+    return out
 
 
 def _dimensional(
@@ -246,5 +240,3 @@ def _dimensional(
         status=solved.statuses.reshape(shape),
         steps=steps,
     )
-
-

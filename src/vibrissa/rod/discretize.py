@@ -1,11 +1,11 @@
 """The whisker as the kernels see it: non-dimensional pieces of rod, polynomials inside each.
 
-Lengths are divided by L, forces by EI/L² and moments by EI/L, with EI the bending stiffness at the base. On
-each step the intrinsic curvature and the radius are the cubics through their values at the step's four Gauss
-points: a cubic error orthogonal to all cubics costs only O(h⁸) at the step's end.
+Lengths are divided by L, forces by EI/L² and moments by EI/L, with EI the bending stiffness at the
+base. On each step the intrinsic curvature and the radius are the cubics through their values at the
+step's four Gauss points: a cubic error orthogonal to all cubics costs only O(h⁸) at the step's end.
 
-Steps are shorter where the whisker is thin (width ∝ radius^0.4, found best for the reference loads between
-0.2 and 1), follow the intrinsic curvature's total turning, and never straddle a kink.
+Steps are shorter where the whisker is thin (width ∝ radius^0.4, found best for the reference loads
+between 0.2 and 1), follow the intrinsic curvature's total turning, and never straddle a kink.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 
 #: Steps along a whisker: base force and contact point within 1e-6 (relative) of the exact solution.
 STEPS = 36
-# A corkscrew needs more: as many steps as keep the rest whisker's turning per step below this (rad).
+# A corkscrew needs more: as many steps as keep the rest whisker's turning per step below this
+# (rad).
 _TURN_PER_STEP = 0.08
 _TAPER_EXPONENT = 0.4
 _JOINT_STEPS = 4
@@ -37,10 +38,10 @@ class Discretization:
     Attributes
     ----------
     rod : tuple of arrays
-        For n steps from the base: ``start`` and ``width`` (n,) in units of L; ``extent`` (n,), 1 for rod and 0
-        for the compliant base; compliance in twist and in bending (n,) relative to the base section;
-        ``shape`` (n, 4, 4), cubics in the fraction of the step for the three curvatures times L and for the
-        radius relative to the base radius.
+        For n steps from the base: ``start`` and ``width`` (n,) in units of L; ``extent`` (n,), 1
+        for rod and 0 for the compliant base; compliance in twist and in bending (n,) relative to
+        the base section; ``shape`` (n, 4, 4), cubics in the fraction of the step for the three
+        curvatures times L and for the radius relative to the base radius.
     length : float
         L, m.
     force, moment : float
@@ -127,7 +128,8 @@ def _nodes(whisker: Whisker, steps: int) -> Array:
 def _with_joint(rod: Rod, moment_scale: float, bending: float, twist: float) -> Rod:
     """Put a compliant base before the rod: one unit of rod without length, as soft as the joint.
 
-    Such a piece turns by the rotation that its moment asks for and moves nothing, so it is a torsion
+    Such a piece turns by the rotation that its moment asks for and moves nothing, so it is a
+    torsion
     spring; being rod, it needs no equations of its own.
     """
     n = _JOINT_STEPS

@@ -4,9 +4,9 @@ For a contact at arc length s_c with force f in the material frame there (:doc:`
 
     n' = n × u,   q' = q × u - e₁,   u = u₀(s) + c(s) ∘ (q × n),   n(s_c) = f,   q(s_c) = 0
 
-with n = RᵀF the force and q = Rᵀ(p - r) the vector to the contact, both in the material frame, and c the
-compliance (twist, bending, bending). At the base the material frame is the base frame, so n(0) = F and
-q(0) = p: the solution *is* the base force and the contact point.
+with n = RᵀF the force and q = Rᵀ(p - r) the vector to the contact, both in the material frame, and
+c the compliance (twist, bending, bending). At the base the material frame is the base frame, so
+n(0) = F and q(0) = p: the solution *is* the base force and the contact point.
 
 Everything is non-dimensional: lengths by L, forces by EI/L², moments by EI/L (EI at the base).
 
@@ -15,16 +15,16 @@ The tangents δ(n, q) with respect to the three unknowns obey the variational eq
     δu = c ∘ (δq × n + q × δn),   δn' = δn × u + n × δu,   δq' = δq × u + q × δu
 
 and start as -(n', q')(s_c) for s_c, and as unit forces for the components of f. The unknowns are
-ξ = (s_c, f_y, f_z) for a contact on the whisker's side; for a contact at the very tip, where s_c stays at L
-and the force need not be normal to the whisker, they are (f_x, f_y, f_z).
+ξ = (s_c, f_y, f_z) for a contact on the whisker's side; for a contact at the very tip, where s_c
+stays at L and the force need not be normal to the whisker, they are (f_x, f_y, f_z).
 
-All lanes share the same steps; the step that holds a lane's contact is shortened to it and the steps
-beyond it have length zero, so there are no branches and no gathers, and the loop over lanes vectorises.
-That needs the lane buffer to be one flat array with offsets known to the compiler.
+All lanes share the same steps; the step that holds a lane's contact is shortened to it and the
+steps beyond it have length zero, so there are no branches and no gathers, and the loop over lanes
+vectorises. That needs the lane buffer to be one flat array with offsets known to the compiler.
 
 The integrator is Butcher's explicit Runge-Kutta method of order 6 with 7 stages (J. C. Butcher, *On
-Runge-Kutta processes of high order*, J. Austral. Math. Soc. 4 (1964) 179-194). A base of finite stiffness is
-a piece of rod without length (``extent`` 0) ahead of the first step.
+Runge-Kutta processes of high order*, J. Austral. Math. Soc. 4 (1964) 179-194). A base of finite
+stiffness is a piece of rod without length (``extent`` 0) ahead of the first step.
 """
 
 from __future__ import annotations
@@ -107,9 +107,7 @@ def _y6(y: Vector, h: float, k2: Vector, k3: Vector, k4: Vector, k5: Vector) -> 
 
 
 @inlined
-def _y7(
-    y: Vector, h: float, k1: Vector, k2: Vector, k3: Vector, k4: Vector, k6: Vector
-) -> Vector:
+def _y7(y: Vector, h: float, k1: Vector, k2: Vector, k3: Vector, k4: Vector, k6: Vector) -> Vector:
     y = _axpy(_axpy(y, h * (9.0 / 44.0), k1), h * (-9.0 / 11.0), k2)
     y = _axpy(_axpy(y, h * (63.0 / 44.0), k3), h * (18.0 / 11.0), k4)
     return _axpy(y, h * (-16.0 / 11.0), k6)
@@ -135,7 +133,9 @@ def _polynomial(shape: Array, k: int, j: int) -> tuple[float, float, float, floa
 
 
 @inlined
-def _rate(n: Vector, q: Vector, u0: Vector, c: Vector, extent: float) -> tuple[Vector, Vector, Vector]:
+def _rate(
+    n: Vector, q: Vector, u0: Vector, c: Vector, extent: float
+) -> tuple[Vector, Vector, Vector]:
     m = _cross(q, n)
     u = (u0[0] + c[0] * m[0], u0[1] + c[1] * m[1], u0[2] + c[2] * m[2])
     dq = _cross(q, u)
@@ -254,7 +254,9 @@ def _tangent_step(b: Array, row: int) -> None:
         n4, q4 = _tangent_rate(b, 3, i, _y4(n, h, n1, n2, n3), _y4(q, h, q1, q2, q3))
         n5, q5 = _tangent_rate(b, 4, i, _y5(n, h, n1, n2, n3, n4), _y5(q, h, q1, q2, q3, q4))
         n6, q6 = _tangent_rate(b, 5, i, _y6(n, h, n2, n3, n4, n5), _y6(q, h, q2, q3, q4, q5))
-        n7, q7 = _tangent_rate(b, 6, i, _y7(n, h, n1, n2, n3, n4, n6), _y7(q, h, q1, q2, q3, q4, q6))
+        n7, q7 = _tangent_rate(
+            b, 6, i, _y7(n, h, n1, n2, n3, n4, n6), _y7(q, h, q1, q2, q3, q4, q6)
+        )
         _put(b, row, i, _advance(n, h, n1, n3, n4, n5, n6, n7))
         _put(b, row + 3 * LANES, i, _advance(q, h, q1, q3, q4, q5, q6, q7))
 
@@ -308,7 +310,9 @@ def integrate(rod: Rod, b: Array, tangents: bool) -> None:
 
 
 @kernel
-def evaluate(rod: Rod, contacts: Array, values: Array, tangents: Array, first: int, last: int) -> None:
+def evaluate(
+    rod: Rod, contacts: Array, values: Array, tangents: Array, first: int, last: int
+) -> None:
     """Base force and contact point of many contacts.
 
     Parameters

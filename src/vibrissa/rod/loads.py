@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def _numbers(name: str, value: ArrayLike, vector: bool) -> Array:
-    """Return an array of float64, (..., 3) for vectors; raise a ValueError that says what is wrong."""
+    """Return float64, (..., 3) for vectors; raise a ValueError that says what is wrong."""
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -23,7 +23,9 @@ def _numbers(name: str, value: ArrayLike, vector: bool) -> Array:
     if vector and (array.ndim == 0 or array.shape[-1] != 3):
         raise ValueError(f"{name} must have shape (..., 3); got {array.shape}")
     if np.isinf(array).any():
-        raise ValueError(f"{name} has {int(np.isinf(array).sum())} infinite values; NaN means missing")
+        raise ValueError(
+            f"{name} has {int(np.isinf(array).sum())} infinite values; NaN means missing"
+        )
     return array
 
 
@@ -46,14 +48,17 @@ class PointForce:
     magnitude : array_like, optional
         Size of a force normal to the whisker, N, shape (...).
     direction : array_like, optional
-        Its angle from d1 toward d2 in the deflected material frame at the contact, rad, shape (...).
+        Its angle from d1 toward d2 in the deflected material frame at the contact, rad, shape
+        (...).
     components : tuple of array_like or array_like, optional
-        Instead: (fx, fy, fz) in that frame, N, a tuple of three or shape (..., 3); fx along the tangent.
+        Instead: (fx, fy, fz) in that frame, N, a tuple of three or shape (..., 3); fx along the
+        tangent.
 
     Raises
     ------
     ValueError
-        If shapes do not broadcast, if arc lengths are not positive, or if neither or both ways of giving the
+        If shapes do not broadcast, if arc lengths are not positive, or if neither or both ways of
+        giving the
         force are used.
     """
 
@@ -64,15 +69,21 @@ class PointForce:
 
     def __post_init__(self) -> None:
         polar = self.magnitude is not None and self.direction is not None
-        if polar == (self.components is not None) or (self.magnitude is None) != (self.direction is None):
-            raise ValueError("give a PointForce either magnitude and direction, or components=(fx, fy, fz)")
+        if polar == (self.components is not None) or (self.magnitude is None) != (
+            self.direction is None
+        ):
+            raise ValueError(
+                "give a PointForce either magnitude and direction, or components=(fx, fy, fz)"
+            )
         s = _numbers("arc_length", self.arc_length, vector=False)
         if polar:
             size = _numbers("magnitude", self.magnitude, vector=False)
             angle = _numbers("direction", self.direction, vector=False)
             _broadcast(arc_length=s.shape, magnitude=size.shape, direction=angle.shape)
             force = np.stack(
-                np.broadcast_arrays(0.0 * (size + angle), size * np.cos(angle), size * np.sin(angle)),
+                np.broadcast_arrays(
+                    0.0 * (size + angle), size * np.cos(angle), size * np.sin(angle)
+                ),
                 axis=-1,
             )
         else:
@@ -81,12 +92,15 @@ class PointForce:
                 if len(parts) != 3:
                     raise ValueError(f"components must be (fx, fy, fz); got {len(parts)} of them")
                 parts = np.stack(
-                    np.broadcast_arrays(*(_numbers("components", p, vector=False) for p in parts)), axis=-1
+                    np.broadcast_arrays(*(_numbers("components", p, vector=False) for p in parts)),
+                    axis=-1,
                 )
             force = _numbers("components", parts, vector=True)
         shape = _broadcast(arc_length=s.shape, force=force.shape[:-1])
         if (s <= 0.0).any():
-            raise ValueError(f"arc_length must be positive (m from the base); the smallest is {np.nanmin(s)}")
+            raise ValueError(
+                f"arc_length must be positive (m from the base); the smallest is {np.nanmin(s)}"
+            )
         object.__setattr__(self, "arc_length", np.broadcast_to(s, shape))
         object.__setattr__(self, "components", np.broadcast_to(force, (*shape, 3)))
 
@@ -126,7 +140,8 @@ class PointContact:
 class PegContact:
     """The whisker lies against a straight peg, without friction.
 
-    Without a radius the peg is a line that the whisker's centreline meets. With one it is a solid cylinder and the
+    Without a radius the peg is a line that the whisker's centreline meets. With one it is a solid
+    cylinder and the
     surfaces touch: the centreline passes the axis at the peg's radius plus the whisker's there.
 
     Parameters
@@ -138,17 +153,22 @@ class PegContact:
     radius : array_like
         Radius, m, shape (...); 0 for a line.
     side : array_like, optional
-        Approximate direction of the force on the whisker, which tells on which side of the peg the whisker lies,
-        shape (..., 3). By default a line pushes from where the resting whisker is nearest to it, and a
+        Approximate direction of the force on the whisker, which tells on which side of the peg the
+        whisker lies,
+        shape (..., 3). By default a line pushes from where the resting whisker is nearest to it,
+        and a
         cylinder pushes the whisker out on the side that is nearest.
     start : Deflection, optional
-        An earlier deflection by a peg (the same one, elsewhere) to go on from: the contact stays on its side, slides
-        and slips as the peg moves. Where it had no contact, the whisker is on the side of the peg where it was.
+        An earlier deflection by a peg (the same one, elsewhere) to go on from: the contact stays on
+        its side, slides
+        and slips as the peg moves. Where it had no contact, the whisker is on the side of the peg
+        where it was.
 
     Raises
     ------
     ValueError
-        If shapes are wrong or do not broadcast, an axis is zero, a radius is negative, lines and cylinders are
+        If shapes are wrong or do not broadcast, an axis is zero, a radius is negative, lines and
+        cylinders are
         mixed, or both ``side`` and ``start`` are given.
     """
 
@@ -164,7 +184,9 @@ class PegContact:
         radius = _numbers("radius", self.radius, vector=False)
         shapes = {"origin": origin.shape[:-1], "axis": axis.shape[:-1], "radius": radius.shape}
         if (radius < 0.0).any():
-            raise ValueError(f"a peg's radius must not be negative; the smallest is {np.nanmin(radius)} m")
+            raise ValueError(
+                f"a peg's radius must not be negative; the smallest is {np.nanmin(radius)} m"
+            )
         if (radius == 0.0).any() != (radius == 0.0).all():
             raise ValueError("lines (radius 0) and cylinders do not mix in one load: give two")
         length = np.linalg.norm(axis, axis=-1, keepdims=True)
@@ -177,9 +199,8 @@ class PegContact:
             shapes["side"] = side.shape[:-1]
         if self.start is not None:
             if not isinstance(self.start.load, PegContact):
-                raise ValueError(
-                    f"start must be a deflection by a PegContact; got one by {type(self.start.load).__name__}"
-                )
+                got = type(self.start.load).__name__
+                raise ValueError(f"start must be a deflection by a PegContact; got one by {got}")
             shapes["start"] = self.start.status.shape
         shape = _broadcast(**shapes)
         object.__setattr__(self, "origin", np.broadcast_to(origin, (*shape, 3)))

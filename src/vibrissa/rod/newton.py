@@ -1,14 +1,14 @@
 """Newton's method on the rod, four contacts at a time.
 
-The Jacobian costs four times the values, so it is computed where a problem starts and again only where the
-last one has stopped serving (a chord step that reduces the residual less than tenfold).
+The Jacobian costs four times the values, so it is computed where a problem starts and again only
+where the last one has stopped serving (a chord step that reduces the residual less than tenfold).
 
 An *equation* tells what must vanish: an inlined function
 
     equation(value (6,), tangents (6, 3), wanted, target, residual (3,), jacobian (3, 3))
 
-that fills ``residual`` and, if ``wanted``, ``jacobian`` (its derivatives with respect to ξ) from base force and
-contact point. Equations scale their residuals so that 1 is large.
+that fills ``residual`` and, if ``wanted``, ``jacobian`` (its derivatives with respect to ξ) from
+base force and contact point. Equations scale their residuals so that 1 is large.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from vibrissa.rod.arrays import AnyArray, Array, IntArray, Rod
+from vibrissa.rod.arrays import Array, Rod
 from vibrissa.rod.compiled import inlined
 from vibrissa.rod.kernels import LANES, integrate, lane_tangents, lane_value, set_lane
 from vibrissa.rod.preimage import solve3
@@ -83,7 +83,8 @@ def newton_group(
     misfits : (4,) array
         Filled with the residual's norm; above ``TOLERANCE`` where there was no convergence.
     signs : (4,) array
-        Filled with det ∂p/∂ξ at the last Jacobian's place; that is within the last step of the solution.
+        Filled with det ∂p/∂ξ at the last Jacobian's place; that is within the last step of the
+        solution.
     """
     value, tangents = np.empty(6), np.empty((6, 3))
     residual, step = np.empty(3), np.empty(3)
@@ -147,7 +148,8 @@ def stable(fold: Fold, proximal: float, xi: Array, sign: float) -> bool:
     if not (sign > 0.0 and xi[0] >= proximal - ROUNDING):
         return False
     strength = fold_force(fold, xi[0], float(np.arctan2(xi[2], xi[1])))
-    # The interpolated fold force is good to a few parts in 10⁴; the determinant's sign decides near it.
+    # The interpolated fold force is good to a few parts in 10⁴; the determinant's sign decides near
+    # it.
     return bool(np.hypot(xi[1], xi[2]) <= 1.01 * strength)
 
 
@@ -157,5 +159,3 @@ def chart_to_contact(fold: Fold, chart: Array, xi: Array) -> None:
     xi[0] = min(max(chart[0], _LEAST_ARC), 1.0)
     force = chart[2] * fold_force(fold, xi[0], chart[1])
     xi[1], xi[2] = force * np.cos(chart[1]), force * np.sin(chart[1])
-
-

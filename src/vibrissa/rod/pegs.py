@@ -1,14 +1,15 @@
 """The contact with a peg: a line, or a cylinder with a radius; side or tip of the whisker.
 
-A peg met from rest is moved, in thought, from far on its side along the direction in which it pushes until it
-touches the resting whisker, and from there to where it is, the contact followed all the way
-(:mod:`vibrissa.rod.continuation`). A peg met from an earlier deflection moves straight from its place then to
-its place now.
+A peg met from rest is moved, in thought, from far on its side along the direction in which it
+pushes until it touches the resting whisker, and from there to where it is, the contact followed all
+the way (:mod:`vibrissa.rod.continuation`). A peg met from an earlier deflection moves straight from
+its place then to its place now.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -35,6 +36,10 @@ class Pegs(NamedTuple):
     axis: Array
     radius: Array
 
+    def rows(self, which: Any) -> Pegs:
+        """Pick rows."""
+        return Pegs(self.origin[which], self.axis[which], self.radius[which])
+
     def parameters(self) -> Array:
         """(n, 7) parameters for :func:`vibrissa.rod.continuation.follow`."""
         return np.concatenate([self.origin, self.axis, self.radius[:, None]], axis=1)
@@ -49,8 +54,9 @@ class Rest(NamedTuple):
     radius: Array
 
     @classmethod
+    @lru_cache(maxsize=16)
     def of(cls, whisker: Whisker) -> Rest:
-        """Sample a whisker."""
+        """Sample a whisker; cached."""
         s = np.linspace(_LEAST_ARC, 1.0, _SAMPLES)
         arc_length = np.minimum(s * whisker.length, whisker.length)
         return cls(
@@ -71,7 +77,8 @@ def nearest_side(rest: Rest, pegs: Pegs, outward: bool) -> Array:
     pegs : Pegs
         The pegs.
     outward : bool
-        Whether they point from the axis to the whisker (the side of a solid peg on which the whisker lies)
+        Whether they point from the axis to the whisker (the side of a solid peg on which the
+        whisker lies)
         or from the whisker to the axis (the way a line must push to be where it is).
 
     Returns
@@ -87,7 +94,9 @@ def nearest_side(rest: Rest, pegs: Pegs, outward: bool) -> Array:
     return direction if outward else -direction
 
 
-def solve_from_rest(whisker: Whisker, pegs: Pegs, side: Array, proximal: float, steps: int) -> Solutions:
+def solve_from_rest(
+    whisker: Whisker, pegs: Pegs, side: Array, proximal: float, steps: int
+) -> Solutions:
     """Solve pegs met from rest.
 
     Parameters
@@ -112,15 +121,14 @@ def solve_from_rest(whisker: Whisker, pegs: Pegs, side: Array, proximal: float, 
     rest = Rest.of(whisker)
     for first in range(0, len(side), _ROWS):
         rows = slice(first, first + _ROWS)
-        part = Pegs(*(a[rows] for a in pegs))
-        parts.append(_solve_from_rest(whisker, rest, part, side[rows], proximal, steps))
+        parts.append(_solve_from_rest(whisker, rest, pegs.rows(rows), side[rows], proximal, steps))
     return Solutions(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
 def _solve_from_rest(
     whisker: Whisker, rest: Rest, pegs: Pegs, side: Array, proximal: float, steps: int
 ) -> Solutions:
-    out = _empty(len(side))
+    out = Solutions.empty(len(side))
     there = np.isfinite(pegs.parameters()).all(axis=1) & np.isfinite(side).all(axis=1)
     out.statuses[there] = int(Status.NO_CONTACT)
     _rest_values(out, np.flatnonzero(there))
@@ -139,15 +147,21 @@ def _solve_from_rest(
 
 
 def solve_from_contact(
-    whisker: Whisker, before: Pegs, contacts: Array, tip: AnyArray, pegs: Pegs, proximal: float, steps: int
+    whisker: Whisker,
+    before: Pegs,
+    contacts: Array,
+    tip: AnyArray,
+    pegs: Pegs,
+    proximal: float,
+    steps: int,
 ) -> Solutions:
-    """Solve pegs that were in contact ``before`` with (s, f) = ``contacts`` (n, 4), and have moved."""
+    """Solve pegs that were in contact ``before`` with (s, f) = ``contacts``, and have moved."""
     begins, ends = before.parameters(), pegs.parameters()
     # An axis has no sense of direction; take the turn that is less than a quarter.
     turned = np.einsum("ij,ij->i", begins[:, 3:6], ends[:, 3:6]) < 0.0
     ends[turned, 3:6] *= -1.0
     unknowns = _polar(contacts, tip)
-    out = _empty(len(ends))
+    out = Solutions.empty(len(ends))
     rows = np.flatnonzero(np.isfinite(ends).all(axis=1))
     kinds = np.where(tip, TIP, SIDE)
     return _follow(
@@ -178,12 +192,6 @@ def _follow(
     return out
 
 
-def _empty(n: int) -> Solutions:
-    return Solutions(
-        np.full((n, 4), np.nan), np.full((n, 6), np.nan), np.full(n, np.nan), np.full(n, int(Status.MISSING))
-    )
-
-
 def _rest_values(out: Solutions, rows: IntArray) -> None:
     """No contact: no force, and no place of contact."""
     out.contacts[rows, 0], out.contacts[rows, 1:] = np.nan, 0.0
@@ -198,7 +206,8 @@ def _normal_part(v: Array, axis: Array) -> Array:
 def _first_touch(rest: Rest, pegs: Pegs, push: Array) -> tuple[Array, Array, Array]:
     """Where a peg moving along ``push`` first touches the resting whisker.
 
-    Returns how far it still has to go to touch (negative: it is past), s there and the unit direction of the
+    Returns how far it still has to go to touch (negative: it is past), s there and the unit
+    direction of the
     force; the distance is inf where it never touches.
     """
     relative = _normal_part(rest.position - pegs.origin[:, None], pegs.axis[:, None])

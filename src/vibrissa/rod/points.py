@@ -21,8 +21,8 @@ from vibrissa.status import Status
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
 
-# Unreachable points farther from the chart than this many times its local spacing are told by the nearest
-# face of the chart; nearer ones are approached, so that the face is the one actually met.
+# Unreachable points farther from the chart than this many times its local spacing are told by the
+# nearest face of the chart; nearer ones are approached, so that the face is the one actually met.
 _FAR = 2.0
 
 
@@ -33,6 +33,17 @@ class Solutions(NamedTuple):
     values: Array
     misfits: Array
     statuses: IntArray
+
+    @classmethod
+    def empty(cls, n: int) -> Solutions:
+        """Return n rows without an answer."""
+        missing = np.full(n, int(Status.MISSING))
+        return cls(np.full((n, 4), np.nan), np.full((n, 6), np.nan), np.full(n, np.nan), missing)
+
+    def put(self, rows: IntArray, part: Solutions) -> None:
+        """Set rows."""
+        for mine, theirs in zip(self, part, strict=True):
+            mine[rows] = theirs
 
 
 @inlined
@@ -114,9 +125,7 @@ class PointSolver:
         self._contacts = chart.contacts[:, :-1, :-1].reshape(-1, 3)
         self._nearest = cKDTree(inner)
         # The largest edge of the cells around a node: how near "near the chart" is.
-        edges = [
-            np.linalg.norm(np.diff(points, axis=axis), axis=-1).max() for axis in range(3)
-        ]
+        edges = [np.linalg.norm(np.diff(points, axis=axis), axis=-1).max() for axis in range(3)]
         self._spacing = float(max(edges))
         n, m, k = (size - 1 for size in points.shape[:3])
         faces = [
@@ -143,8 +152,8 @@ class PointSolver:
             Row by row; NaN where there is no solution.
         """
         n = len(points)
-        contacts, values = np.full((n, 4), np.nan), np.full((n, 6), np.nan)
-        misfits, statuses = np.full(n, np.nan), np.full(n, int(Status.MISSING))
+        out = Solutions.empty(n)
+        contacts, values, misfits, statuses = out
         there = np.flatnonzero(np.isfinite(points).all(axis=1))
         wanted = np.ascontiguousarray(points[there])
         xi, found = np.empty((there.size, 3)), np.empty((there.size, 6))
@@ -171,12 +180,11 @@ class PointSolver:
         rows = there[good]
         contacts[rows, 0], contacts[rows, 1], contacts[rows, 2:] = xi[good, 0], 0.0, xi[good, 1:]
         values[rows], misfits[rows], statuses[rows] = found[good], residuals[good], int(Status.OK)
-        rest = Solutions(contacts, values, misfits, statuses)
-        self._approach(wanted[~good], there[~good], rest)
-        return rest
+        self._approach(wanted[~good], there[~good], out)
+        return out
 
     def _approach(self, points: Array, rows: IntArray, out: Solutions) -> None:
-        """Follow the points without a ready seed from the nearest contact known; say why where it fails."""
+        """Follow points without a ready seed from the nearest known contact; say why it fails."""
         if not rows.size:
             return
         away, face = self._faces.query(points)
@@ -192,16 +200,18 @@ class PointSolver:
         out.statuses[rows] = solved.statuses
         out.misfits[rows] = solved.misfits
         good = solved.statuses == Status.OK
-        out.contacts[rows[good]], out.values[rows[good]] = solved.contacts[good], solved.values[good]
+        out.contacts[rows[good]], out.values[rows[good]] = (
+            solved.contacts[good],
+            solved.values[good],
+        )
 
 
 def follow_all(
     chart: Reach, begins: Array, ends: Array, kinds: IntArray, unknowns: Array
 ) -> Solutions:
-    """Run :func:`vibrissa.rod.continuation.follow` over all rows; kinds and unknowns are updated."""
+    """Run :func:`~vibrissa.rod.continuation.follow` over all rows, updating the unknowns."""
     n = len(begins)
-    contacts, values = np.full((n, 4), np.nan), np.full((n, 6), np.nan)
-    misfits, statuses = np.full(n, np.nan), np.zeros(n, np.int64)
+    out = Solutions.empty(n)
     discretization = chart.discretization
     share_out(
         n,
@@ -214,15 +224,12 @@ def follow_all(
             ends,
             kinds,
             unknowns,
-            contacts,
-            values,
-            misfits,
-            statuses,
+            *out,
             first,
             last,
         ),
     )
-    return Solutions(contacts, values, misfits, statuses)
+    return out
 
 
 @lru_cache(maxsize=16)

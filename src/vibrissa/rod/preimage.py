@@ -1,15 +1,17 @@
-"""Which contacts give these three numbers: all preimages under a map from the chart, found by subdivision.
+"""Which contacts give these three numbers: all preimages of a map from the chart.
 
-Three quantities T (the contact point's coordinates, or three base signals) are known with their exact
-derivatives at the nodes of the chart (:mod:`vibrissa.rod.reach`). In each cell T is the cubic blended between
-the cell's twelve edges: with H the cubic Hermite curve along an edge and V the straight line between its ends,
-Σ w H over the four edges along s plus Σ w (H - V) over those along ψ and ρ, w the bilinear weights across.
-It reproduces all cubics, so its error is of fourth order; the Bézier points of the edges bound it.
+Three quantities T (the contact point's coordinates, or three base signals) are known with their
+exact derivatives at the nodes of the chart (:mod:`vibrissa.rod.reach`). In each cell T is the cubic
+blended between the cell's twelve edges: with H the cubic Hermite curve along an edge and V the
+straight line between its ends, Σ w H over the four edges along s plus Σ w (H - V) over those along
+ψ and ρ, w the bilinear weights across. It reproduces all cubics, so its error is of fourth order;
+the Bézier points of the edges bound it.
 
-Boxes around the cells' values, and around those of 2 × 2 × 2 neighbours, and so on, form a tree; the cells that may
-contain a target are those whose boxes, and all boxes above them, contain it, and which still contain it in
-coordinates aligned with the cell. In each the interpolant is inverted by Newton's method, which gives seeds so
-near the exact solution that it converges at once. Angles are compared on the circle.
+Boxes around the cells' values, and around those of 2 × 2 × 2 neighbours, and so on, form a tree;
+the cells that may contain a target are those whose boxes, and all boxes above them, contain it, and
+which still contain it in coordinates aligned with the cell. In each the interpolant is inverted by
+Newton's method, which gives seeds so near the exact solution that it converges at once. Angles are
+compared on the circle.
 """
 
 from __future__ import annotations
@@ -25,22 +27,24 @@ from vibrissa.rod.reach import Reach
 # For the kernels:
 # 0 grid (2, 3): origin and size of a cell in (s, ψ, ρ)
 # 1 turns (3,): 1/2π for an angle, 0 otherwise
-# 2 offsets (levels + 1,): first row of each level in 3; a node's eight children are row offsets[level] + node
-# 3 boxes (rows, 6, 8): middle and half width of the three quantities, for eight sibling nodes
-# 4 place (cells, 3): (i, j, k) of a cell
-# 5 frame (cells, 6, 3): aligned coordinates y = A (T - base): A (3 rows), base, least y, largest y
-# 6 edges (cells, 3, 40): the interpolant, T - base
-# 7 folded (cells,): whether the map may fold inside, so that a cell may hold several solutions
+# 2 offsets (levels + 1,): first row of each level in 3; a node's eight children are row
+# offsets[level] + node 3 boxes (rows, 6, 8): middle and half width of the three quantities, for
+# eight sibling nodes 4 place (cells, 3): (i, j, k) of a cell 5 frame (cells, 6, 3): aligned
+# coordinates y = A (T - base): A (3 rows), base, least y, largest y 6 edges (cells, 3, 40): the
+# interpolant, T - base 7 folded (cells,): whether the map may fold inside, so that a cell may hold
+# several solutions
 Tree = tuple[Array, Array, IntArray, Array, IntArray, Array, Array, AnyArray]
 
 #: At most so many contacts are found for one target.
 MOST_SEEDS = 32
-# A solution may lie this far outside a cell (in cell widths) and still be its own: neighbours overlap.
+# A solution may lie this far outside a cell (in cell widths) and still be its own: neighbours
+# overlap.
 _OVERLAP = 0.05
 # Boxes are widened by this share of their size for what the cubic misses.
 _MARGIN = 0.08
 _STACK = 256
-# Cells whose linear part is flatter than this (det relative to the product of its columns) are not aligned.
+# Cells whose linear part is flatter than this (det relative to the product of its columns) are not
+# aligned.
 _FLAT = 1e-3
 # A cell may hold a fold if det at a corner is below this share of the largest, or has another sign.
 _EVEN = 0.1
@@ -59,7 +63,9 @@ class Preimages:
     tree: Tree
 
     @classmethod
-    def of(cls, reach: Reach, values: Array, derivatives: Array, angles: tuple[bool, ...]) -> Preimages:
+    def of(
+        cls, reach: Reach, values: Array, derivatives: Array, angles: tuple[bool, ...]
+    ) -> Preimages:
         """Build the tree.
 
         Parameters
@@ -101,7 +107,7 @@ class Preimages:
 
 
 def _octree_order(cells: tuple[int, ...]) -> IntArray:
-    """Cells (i, j, k) so that each run of 8 is a 2 × 2 × 2 block, each run of 64 a block of those, and so on."""
+    """Cells (i, j, k) so that each run of 8 is a 2 × 2 × 2 block, each run of 64 one of those."""
     depth = int(np.log2(min(cells)))
     if any(n % 2**depth for n in cells):
         raise ValueError(f"the chart has {cells} cells; they must be multiples of {2**depth}")
@@ -113,7 +119,9 @@ def _octree_order(cells: tuple[int, ...]) -> IntArray:
     return np.ascontiguousarray(place)
 
 
-def _corners(place: IntArray, values: Array, slopes: Array, circular: AnyArray) -> tuple[Array, Array]:
+def _corners(
+    place: IntArray, values: Array, slopes: Array, circular: AnyArray
+) -> tuple[Array, Array]:
     """Values relative to the first corner (cells, 2, 2, 2, 3) and slopes (cells, 2, 2, 2, 3, 3)."""
     i, j, k = (place[:, a, None, None, None] for a in range(3))
     two = np.arange(2)
@@ -136,7 +144,7 @@ def _bezier_points(corner: Array, slope: Array) -> Array:
 
 
 def _boxes(points: Array, circular: AnyArray, place: IntArray) -> tuple[IntArray, Array]:
-    """Middle and half width of the values in each cell and in ever larger blocks, eight siblings a row."""
+    """Middle and half width of the values in each cell and in larger blocks, 8 siblings a row."""
     low, high = points.min(axis=1), points.max(axis=1)
     grow = _MARGIN * (high - low) + 1e-12
     low, high = low - grow, high + grow
@@ -163,9 +171,7 @@ def _boxes(points: Array, circular: AnyArray, place: IntArray) -> tuple[IntArray
 
 def _aligned(corner: Array, points: Array, base: Array) -> Array:
     """Coordinates in which a cell is nearly the unit cube, and its extent in them."""
-    columns = [
-        np.diff(corner, axis=axis).mean(axis=(1, 2, 3)) for axis in (1, 2, 3)
-    ]
+    columns = [np.diff(corner, axis=axis).mean(axis=(1, 2, 3)) for axis in (1, 2, 3)]
     linear = np.stack(columns, axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
         flatness = np.abs(np.linalg.det(linear)) / np.prod(np.linalg.norm(linear, axis=1), axis=-1)
@@ -183,7 +189,7 @@ def _aligned(corner: Array, points: Array, base: Array) -> Array:
 
 
 def _edges(corner: Array, slope: Array) -> Array:
-    """Coefficients: cubics along s at four corners of (ψ, ρ), then corrections along ψ and along ρ."""
+    """Coefficients: cubics along s at the corners of (ψ, ρ), corrections along ψ and along ρ."""
     parts = []
     for axis in range(3):
         v = np.moveaxis(corner, axis + 1, 1)
@@ -297,7 +303,7 @@ def _locate(tree: Tree, cell: int, target: Array, relative: Array, x: Array) -> 
 
 @inlined
 def _invert(edges: Array, relative: Array, work: Array, folded: bool, x: Array) -> int:
-    """Solve a cell's interpolant from x: 2 solved, 1 no convergence (a fold in the cell), 0 not in it."""
+    """Solve a cell's interpolant: 2 solved, 1 no convergence (a fold in it), 0 not in the cell."""
     misfit, step, gradient = work[0], work[1], work[2:5]
     for n in range(8):
         _interpolate(edges, x, relative, misfit, gradient)
@@ -319,8 +325,10 @@ def _invert(edges: Array, relative: Array, work: Array, folded: bool, x: Array) 
 
 
 @inlined
-def _keep(grid: Array, place: IntArray, x: Array, solved: int, found: Array, quality: IntArray, count: int) -> int:
-    """Add a seed unless it is known: overlapping neighbours find the same; what is solved replaces what is not."""
+def _keep(
+    grid: Array, place: IntArray, x: Array, solved: int, found: Array, quality: IntArray, count: int
+) -> int:
+    """Add a seed unless neighbours found it; what is solved replaces what is not."""
     s = grid[0, 0] + grid[1, 0] * (place[0] + x[0])
     psi = grid[0, 1] + grid[1, 1] * (place[1] + x[1])
     rho = grid[0, 2] + grid[1, 2] * (place[2] + x[2])
@@ -392,8 +400,8 @@ def seeds(tree: Tree, target: Array, found: Array, quality: IntArray) -> int:
                 continue
             if not _locate(tree, child, target, relative, x):
                 continue
-            # Where the map may fold, one start may miss one of two solutions: start at four corners too, no two
-            # of which share an edge.
+            # Where the map may fold, one start may miss one of two solutions: start at four corners
+            # too, no two of which share an edge.
             for start in range(5 if folded[child] else 1):
                 if start > 0:
                     x[0], x[1] = start >> 1 & 1, start & 1

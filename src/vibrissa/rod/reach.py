@@ -1,16 +1,16 @@
 """Where a whisker can be touched: the stable contacts Ω, as a chart.
 
-A frictionless contact is ξ = (s_c, f_y, f_z). At fixed s_c the force grows along a ray of bearing ψ,
-f = f (cos ψ, sin ψ), from rest to the *fold*, where det ∂p/∂ξ first vanishes: there the stable equilibrium
-meets an unstable one and a frictionless whisker slips off. The contacts between rest and fold, for s_c between
-``proximal`` and the tip, are the stable ones connected to rest. With the fold force f*(s_c, ψ) they are
-charted by
+A frictionless contact is ξ = (s_c, f_y, f_z). At fixed s_c the force grows along a ray of bearing
+ψ, f = f (cos ψ, sin ψ), from rest to the *fold*, where det ∂p/∂ξ first vanishes: there the stable
+equilibrium meets an unstable one and a frictionless whisker slips off. The contacts between rest
+and fold, for s_c between ``proximal`` and the tip, are the stable ones connected to rest. With the
+fold force f*(s_c, ψ) they are charted by
 
     ξ = (s, ρ f*(s, ψ) cos ψ, ρ f*(s, ψ) sin ψ),   0 ≤ ρ ≤ 1,
 
-a box in (s, ψ, ρ), periodic in ψ. The chart is sampled on a grid whose nodes carry base force F, contact
-point p and their exact derivatives with respect to (s, ψ, ρ). ln f* is interpolated by bicubic Hermite
-patches.
+a box in (s, ψ, ρ), periodic in ψ. The chart is sampled on a grid whose nodes carry base force F,
+contact point p and their exact derivatives with respect to (s, ψ, ρ). ln f* is interpolated by
+bicubic Hermite patches.
 """
 
 from __future__ import annotations
@@ -34,14 +34,15 @@ if TYPE_CHECKING:
 PROXIMAL = 0.3
 #: Cells of the chart along (s, ψ, ρ).
 CELLS = (16, 32, 16)
-# The fold is looked for up to this many times the force that would bend the contact by its own arc length
-# were the whisker linear; straight, curved, conical and cylindrical whiskers fold below 4.
+# The fold is looked for up to this many times the force that would bend the contact by its own arc
+# length were the whisker linear; straight, curved, conical and cylindrical whiskers fold below 4.
 _FARTHEST = 12.0
 _SCAN = 0.0625
 # Directions have no value at zero force; just above it they have their limit.
 _LEAST_LOAD = 1e-4
 
-# The fold's share in the kernels: stations s (n,), ln f* and its derivatives in s, ψ and both (n, m + 1, 4).
+# The fold's share in the kernels: stations s (n,), ln f* and its derivatives in s, ψ and both (n, m
+# + 1, 4).
 Fold = tuple[Array, Array]
 
 
@@ -116,7 +117,9 @@ def reach(
         Cached per whisker.
     """
     if not 0.05 <= proximal < 1.0:
-        raise ValueError(f"the smallest arc length is {proximal} L; it must be from 0.05 L to below L")
+        raise ValueError(
+            f"the smallest arc length is {proximal} L; it must be from 0.05 L to below L"
+        )
     discretization = discretize(whisker, steps)
     stations = np.linspace(proximal, 1.0, cells[0] + 1)
     bearings = np.linspace(0.0, 2.0 * np.pi, cells[1] + 1)
@@ -180,9 +183,13 @@ def _fold_forces(
 
     def relative_determinant(rays: AnyArray, force: Array) -> Array:
         f = force * unit[rays]
-        contacts = np.stack([s[rays], 0.0 * f, f * np.cos(psi[rays]), f * np.sin(psi[rays])], axis=-1)
+        contacts = np.stack(
+            [s[rays], 0.0 * f, f * np.cos(psi[rays]), f * np.sin(psi[rays])], axis=-1
+        )
         with np.errstate(invalid="ignore", over="ignore"):
-            found = determinant(solve_forces(discretization, contacts, tangents=True)[1]) / sign[rays]
+            found = (
+                determinant(solve_forces(discretization, contacts, tangents=True)[1]) / sign[rays]
+            )
         # Far beyond a fold the integration may overflow: certainly not stable.
         return np.where(np.isfinite(found), found, -1.0)
 

@@ -5,8 +5,8 @@ With F and p the material frame R = (t, d₁, d₂) and the place r follow from
     t' = u_z d₁ - u_y d₂,   d₁' = u_x d₂ - u_z t,   d₂' = u_y t - u_x d₁,   r' = t,
     u = u₀ + c ∘ Rᵀ((p - r) × F) up to the contact, u₀ beyond it,
 
-integrated with the same method and on the same steps as the contact problem, cut at the contact and at the
-places that are asked for.
+integrated with the same method and on the same steps as the contact problem, cut at the contact and
+at the places that are asked for.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def _rates(
 def _shapes(
     rod: Rod, values: Array, arc: Array, s: Array, places: Array, first: int, last: int
 ) -> None:
-    """Places (n, m, 3) at the increasing arc lengths s (m,) for (F, p) = values and contacts at arc (n,)."""
+    """Places (n, m, 3) at increasing arc lengths s (m,), for values (F, p) and contacts at arc."""
     start, width = rod[0], rod[1]
     y, argument, slopes = np.empty(12), np.empty(12), np.empty((7, 12))
     for row in range(first, last):

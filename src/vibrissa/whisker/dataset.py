@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from vibrissa.quantities import attributes
 from vibrissa.whisker.pose import Pose
 from vibrissa.whisker.profile import Profile
 
@@ -18,6 +19,10 @@ if TYPE_CHECKING:
     from vibrissa.whisker.model import Whisker
 
 NODES = 101
+"""Points of the centreline that comes along."""
+
+Row = tuple[str, tuple[str, ...], object, str, str]
+"""Name, dimensions, values, units and long name of a variable."""
 
 
 def whisker_dataset(whisker: "Whisker") -> xr.Dataset:
@@ -32,19 +37,23 @@ def whisker_dataset(whisker: "Whisker") -> xr.Dataset:
     xarray.Dataset
         Every variable has the attributes `units` and `long_name`.
     """
-    stiffness = whisker.base_stiffness or (np.nan, np.nan)
+    bending, twist = whisker.base_stiffness or (np.inf, np.inf)
     s = np.linspace(0.0, whisker.length, NODES)
-    table: list[tuple[str, tuple[str, ...], object, str, str]] = [
-        ("length", (), whisker.length, "m", "arc length of the whisker"),
-        ("youngs_modulus", (), whisker.youngs_modulus, "Pa", "Young's modulus"),
-        ("poisson_ratio", (), whisker.poisson_ratio, "1", "Poisson's ratio"),
-        (
-            "base_stiffness",
-            ("base_axis",),
-            np.array(stiffness),
-            "N m/rad",
-            "rotational stiffness of the base; NaN for a rigid clamp",
-        ),
+    known: dict[str, tuple[tuple[str, ...], object]] = {
+        "length": ((), whisker.length),
+        "youngs_modulus": ((), whisker.youngs_modulus),
+        "poisson_ratio": ((), whisker.poisson_ratio),
+        "base_bending_stiffness": ((), bending),
+        "base_twist_stiffness": ((), twist),
+        "arc_length": (("node",), s),
+        "centerline": (("node", "space"), whisker.position(s)),
+        "radius": (("node",), whisker.radius(s)),
+    }
+    variables = {
+        name: xr.Variable(dims, np.asarray(values), attributes(name))
+        for name, (dims, values) in known.items()
+    }
+    table: list[Row] = [
         (
             "pose_rotation",
             ("source_axis", "whisker_axis"),
@@ -60,40 +69,28 @@ def whisker_dataset(whisker: "Whisker") -> xr.Dataset:
             "m",
             "arc lengths of kinks in curvature or radius",
         ),
-        ("arc_length", ("node",), s, "m", "arc length from the base"),
-        (
-            "centerline",
-            ("node", "space"),
-            whisker.position(s),
-            "m",
-            "rest centreline, whisker frame",
-        ),
-        ("radius", ("node",), whisker.radius(s), "m", "radius of the section"),
     ]
     table += _profile_rows("curvature", whisker.intrinsic_curvature, "1/m", "intrinsic curvature")
     table += _profile_rows("section", whisker.section_radius, "m", "radius of the section")
-    variables = {
+    variables |= {
         name: xr.Variable(dims, np.asarray(values), {"units": units, "long_name": long_name})
         for name, dims, values, units, long_name in table
     }
     labels = {
-        "base_axis": ["bending", "twist"],
         "source_axis": ["x", "y", "z"],
         "whisker_axis": ["x", "y", "z"],
         "space": ["x", "y", "z"],
         "curvature_component": ["twist", "about d1", "about d2"],
     }
-    attributes = {
+    about = {
         "kind": "vibrissa whisker",
         "name": whisker.name,
         "notes": json.dumps(whisker.notes, ensure_ascii=False),
     }
-    return xr.Dataset(variables, labels, attributes)
+    return xr.Dataset(variables, labels, about)
 
 
-def _profile_rows(
-    name: str, profile: Profile, units: str, long_name: str
-) -> list[tuple[str, tuple[str, ...], object, str, str]]:
+def _profile_rows(name: str, profile: Profile, units: str, long_name: str) -> list[Row]:
     dims = (f"{name}_power", f"{name}_interval", *((f"{name}_component",) * len(profile.shape)))
     return [
         (f"{name}_knots", (f"{name}_knot",), profile.knots, "m", f"interval ends: {long_name}"),
@@ -125,15 +122,15 @@ def whisker_fields(dataset: xr.Dataset) -> dict[str, Any]:
     ValueError
         If variables are missing.
     """
-    needed = {"length", "youngs_modulus", "poisson_ratio", "base_stiffness", "breaks"}
+    needed = {"length", "youngs_modulus", "poisson_ratio", "breaks"}
+    needed |= {"base_bending_stiffness", "base_twist_stiffness"}
     needed |= {"pose_rotation", "pose_origin", "curvature_knots", "curvature_coefficients"}
     needed |= {"section_knots", "section_coefficients", "curvature_error", "section_error"}
     missing = sorted(needed - set(dataset.variables))
     if missing:
         raise ValueError(f"this is no dataset of a whisker: it lacks {', '.join(missing)}")
     value = {name: np.asarray(dataset[name].values, dtype=np.float64) for name in needed}
-    stiffness = value["base_stiffness"]
-    rigid = bool(np.isnan(stiffness).all())
+    stiffness = float(value["base_bending_stiffness"]), float(value["base_twist_stiffness"])
     return {
         "length": float(value["length"]),
         "intrinsic_curvature": Profile(
@@ -146,7 +143,7 @@ def whisker_fields(dataset: xr.Dataset) -> dict[str, Any]:
         ),
         "youngs_modulus": float(value["youngs_modulus"]),
         "poisson_ratio": float(value["poisson_ratio"]),
-        "base_stiffness": None if rigid else (float(stiffness[0]), float(stiffness[1])),
+        "base_stiffness": None if np.isinf(stiffness).all() else stiffness,
         "pose": Pose(value["pose_rotation"], value["pose_origin"]),
         "breaks": tuple(float(s) for s in value["breaks"]),
         "name": str(dataset.attrs.get("name", "whisker")),

@@ -20,6 +20,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.whisker.dataset import whisker_dataset, whisker_fields
+from vibrissa.whisker.digitized import digitize
 from vibrissa.whisker.parabola import parabola_curvature
 from vibrissa.whisker.pose import Pose, least_turn, roll
 from vibrissa.whisker.profile import (
@@ -139,6 +140,50 @@ class Whisker:
         object.__setattr__(self, "notes", tuple(self.notes))
 
     # Ways to make one.
+
+    @classmethod
+    def from_points(
+        cls,
+        points: ArrayLike,
+        *,
+        noise: float | None = None,
+        base: str | ArrayLike | None = None,
+        **properties: Unpack[Properties],
+    ) -> "Whisker":
+        """Make a whisker from a digitised centreline.
+
+        Parameters
+        ----------
+        points : array (n, 3) or (n, 2)
+            At least 4 points in order along the whisker, m, in any frame and at any spacing; two
+            columns mean z = 0.
+        noise : float, optional
+            Standard deviation of a coordinate, m; 0 asks for interpolation. By default it is
+            estimated by cross-validation.
+        base : {"first", "last"} or array (3,) or (2,), optional
+            Which end is the base: by name, or a point near it. By default the first.
+        **properties
+            Radius and material; see `Whisker`.
+
+        Returns
+        -------
+        Whisker
+            In the whisker frame; its pose leads back to the points' frame.
+
+        Raises
+        ------
+        ValueError
+            If the points are no centreline, with all that is wrong with them.
+        """
+        shape = digitize(points, noise, base)
+        notes: tuple[str, ...] = ()
+        if noise is None:
+            notes += (
+                f"the noise of its points was estimated at {shape.noise * 1e3:.2g} mm (standard "
+                "deviation per coordinate) by cross-validation",
+            )
+        whisker = _assembled(shape.length, shape.curvature, shape.pose, properties, (), notes)
+        return whisker.aligned()
 
     @classmethod
     def parabola(

@@ -119,7 +119,9 @@ def linear(start: float, end: float, length: float) -> Profile:
     return Profile(np.array([0.0, length]), coefficients)
 
 
-def approximate(function: Function, joints: Sequence[float] | Array) -> Profile:
+def approximate(
+    function: Function, joints: Sequence[float] | Array, tolerance: float = TOLERANCE
+) -> Profile:
     """Bring a function into piecewise polynomial form.
 
     Parameters
@@ -128,6 +130,8 @@ def approximate(function: Function, joints: Sequence[float] | Array) -> Profile:
         Takes arc lengths (n,), m, and returns (n, ...).
     joints : sequence of float
         Start, end, and in between every arc length where the function is not smooth, m, increasing.
+    tolerance : float
+        Largest error, relative to the function's largest value.
 
     Returns
     -------
@@ -144,7 +148,7 @@ def approximate(function: Function, joints: Sequence[float] | Array) -> Profile:
         start, end = todo.pop()
         coefficients, error, largest = _best_polynomial(function, start, end, scale)
         scale = max(scale, largest)
-        if error > TOLERANCE * scale and end - start > shortest:
+        if error > tolerance * scale and end - start > shortest:
             middle = 0.5 * (start + end)
             todo += [(middle, end), (start, middle)]
             continue

@@ -1,0 +1,179 @@
+"""Base signals over time as a table: columns ``time, Fx, Fy, Fz, Mx, My, Mz`` in s, N and N·m.
+
+CSV, or a NetCDF file with variables of these names along one dimension. Lines that are empty or
+begin with # are passed over, other columns are left alone, and an empty cell or ``nan`` is missing.
+A name may carry its SI unit, ``Fx_N`` or ``Mx_Nm``; other units are refused by name, and so
+are numbers too large to be what they say.
+"""
+
+from __future__ import annotations
+
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from vibrissa.io.netcdf import kind_of
+from vibrissa.io.replace import replacing
+from vibrissa.io.table import table_rows
+from vibrissa.quantities import attributes
+
+Array = NDArray[np.float64]
+
+COLUMNS = ("time", "Fx", "Fy", "Fz", "Mx", "My", "Mz")
+"""Names of the columns, in the order in which they are written."""
+
+_UNITS = {"time": "s", "F": "N", "M": "Nm"}
+_LARGEST = {"F": (10.0, "N"), "M": (1.0, "N·m")}
+_ENDINGS = (".nc", ".nc4", ".cdf", ".netcdf", ".h5")
+
+
+def load_signals(path: str | PathLike[str]) -> xr.Dataset:
+    """Read a table of base signals.
+
+    Parameters
+    ----------
+    path : str or path
+        CSV, or NetCDF by its ending.
+
+    Returns
+    -------
+    xarray.Dataset
+        Dims time, space: ``force``, N, and ``moment``, N·m, in the whisker's frame at its base.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If it is empty, lacks columns, or has cells that are no numbers; or if the numbers cannot be
+        in SI units.
+    """
+    path = Path(path)
+    table = _netcdf(path) if path.suffix.lower() in _ENDINGS else _csv(path)
+    _check_magnitudes(path, table)
+    return _dataset(table)
+
+
+def save_signals(path: str | PathLike[str], signals: xr.Dataset) -> None:
+    """Write a table of base signals as CSV, every number in full.
+
+    Parameters
+    ----------
+    path : str or path
+        Where to write; an existing file is replaced.
+    signals : xarray.Dataset
+        Dims time, space: ``force`` and ``moment``.
+
+    Raises
+    ------
+    ValueError
+        If the dataset has other dims or lacks a variable.
+    """
+    missing = [name for name in ("time", "force", "moment") if name not in signals.variables]
+    if missing:
+        raise ValueError(f"signals lack {', '.join(missing)}")
+    wrench = [signals[name] for name in ("force", "moment")]
+    for variable in wrench:
+        if variable.dims != ("time", "space"):
+            raise ValueError(f"{variable.name} has dims {variable.dims}; time, space are needed")
+    array = np.column_stack([signals["time"].values, *(v.values for v in wrench)])
+    lines = [",".join(COLUMNS), *(",".join(repr(float(x)) for x in row) for row in array)]
+    with replacing(path) as part:
+        part.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _csv(path: Path) -> Array:
+    """Columns (n, 7) of a CSV file."""
+    with path.open(newline="", encoding="utf-8-sig") as file:
+        rows = table_rows(file.read())
+    header = next(rows, None)
+    if header is None:
+        raise ValueError(f"{path} is empty; a header {','.join(COLUMNS)} and rows are needed")
+    columns = _columns(path, header[1])
+    values, faults = [], []
+    for line, cells in rows:
+        try:
+            values.append([float(cells[column] or "nan") for column in columns])
+        except (ValueError, IndexError):
+            faults.append(f"line {line} reads {','.join(cells)!r}")
+    if faults:
+        more = "" if len(faults) <= 5 else f"; and {len(faults) - 5} more lines"
+        raise ValueError(
+            f"{path} has cells that are no numbers, or too few: {'; '.join(faults[:5])}{more}"
+        )
+    if not values:
+        raise ValueError(f"{path} has a header but no rows")
+    return np.array(values, dtype=np.float64)
+
+
+def _columns(path: Path, header: list[str]) -> list[int]:
+    """Where each column stands; all that is wrong with the header in one error."""
+    columns, missing, units = [], [], []
+    for name in COLUMNS:
+        allowed = {name, f"{name}_{_UNITS[name if name == 'time' else name[0]]}"}
+        found = [i for i, cell in enumerate(header) if cell in allowed]
+        other = [cell for cell in header if cell.startswith(f"{name}_") and cell not in allowed]
+        if found:
+            columns.append(found[0])
+        elif other:
+            units += other
+        else:
+            missing.append(name)
+    faults = [f"it lacks {', '.join(missing)}"] if missing else []
+    if units:
+        faults.append(f"{', '.join(units)} are in other units: convert to s, N and N·m")
+    if faults:
+        got = ", ".join(header)
+        raise ValueError(f"{path} is no table of signals: {'; '.join(faults)} (it has {got})")
+    return columns
+
+
+def _netcdf(path: Path) -> Array:
+    """Columns (n, 7) of a NetCDF file."""
+    kind_of(path)
+    with xr.open_dataset(path, engine="h5netcdf") as data:
+        missing = [name for name in COLUMNS if name not in data.variables]
+        if missing:
+            got = ", ".join(str(name) for name in data.variables)
+            raise ValueError(
+                f"{path} is no table of signals: it lacks {', '.join(missing)} (it has {got})"
+            )
+        columns = [np.asarray(data[name].values, dtype=np.float64) for name in COLUMNS]
+    if any(column.ndim != 1 for column in columns) or len({c.size for c in columns}) != 1:
+        shapes = {name: c.shape for name, c in zip(COLUMNS, columns, strict=True)}
+        raise ValueError(f"{path}: all columns must run along time; got shapes {shapes}")
+    return np.column_stack(columns)
+
+
+def _check_magnitudes(path: Path, table: Array) -> None:
+    faults = []
+    for i, name in enumerate(COLUMNS[1:], start=1):
+        largest, unit = _LARGEST[name[0]]
+        values = np.abs(table[:, i])
+        got = float(np.max(values, initial=0.0, where=np.isfinite(values)))
+        if got > largest:
+            faults.append(f"{name} reaches {got:.3g} {unit}")
+        if np.isinf(values).any():
+            faults.append(f"{name} has infinite values")
+    if faults:
+        raise ValueError(
+            f"{path}: {'; '.join(faults)}. A whisker feels millinewtons at most: the table must be "
+            "in N and N·m"
+        )
+
+
+def _dataset(table: Array) -> xr.Dataset:
+    frame = {"reference_frame": "whisker"}
+    return xr.Dataset(
+        {
+            "force": (("time", "space"), table[:, 1:4], {**attributes("force"), **frame}),
+            "moment": (("time", "space"), table[:, 4:7], {**attributes("moment"), **frame}),
+        },
+        {
+            "time": xr.Variable("time", table[:, 0], attributes("time")),
+            "space": list("xyz"),
+        },
+    )

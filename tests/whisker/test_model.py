@@ -1,0 +1,346 @@
+"""Laws of the whisker: its shape, its frame, and what may be done to it."""
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+
+from vibrissa import samples
+from vibrissa.whisker import Pose, Whisker
+
+LENGTH = 40e-3
+
+
+def wavy(s):
+    """A smooth three-dimensional curvature with a bump."""
+    s = np.asarray(s)
+    bump = 30.0 * np.exp(-(((s - 0.02) / 0.004) ** 2))
+    return np.stack([20.0 * np.sin(90.0 * s), -800.0 * s + 5.0 * np.cos(200.0 * s), bump], -1)
+
+
+def integrated(curvature, s):
+    """Points and frames by SciPy's eighth-order method."""
+
+    def slope(x, state):
+        frame = state[3:].reshape(3, 3)
+        twist, about_1, about_2 = curvature(x)
+        turn = np.array([[0, -about_2, about_1], [about_2, 0, -twist], [-about_1, twist, 0]])
+        return np.concatenate([frame[:, 0], (frame @ turn).ravel()])
+
+    start = np.concatenate([np.zeros(3), np.eye(3).ravel()])
+    found = solve_ivp(slope, (0, s[-1]), start, "DOP853", s, rtol=1e-12, atol=1e-14)
+    return found.y[:3].T, found.y[3:].T.reshape(-1, 3, 3)
+
+
+@given(st.floats(-200.0, 200.0), st.floats(1e-3, 0.3))
+def test_constant_curvature_is_a_circle(kappa, length):
+    whisker = Whisker.from_curvature(length, lambda s: (0.0, 0.0, kappa))
+    s = np.linspace(0.0, length, 33)
+    turn = kappa * s
+    # sin x / x and (1 − cos x) / x, also where x is next to nothing.
+    circle = np.stack(
+        [s * np.sinc(turn / np.pi), s * np.sin(turn / 2) * np.sinc(turn / 2 / np.pi), 0 * s], -1
+    )
+    np.testing.assert_allclose(whisker.position(s), circle, rtol=0, atol=1e-12 * length)
+
+
+def test_rest_shape_meets_an_independent_integration():
+    whisker = Whisker.from_curvature(LENGTH, wavy)
+    s = np.linspace(0.0, LENGTH, 41)
+    points, frames = integrated(wavy, s)
+    np.testing.assert_allclose(whisker.position(s), points, rtol=0, atol=1e-11 * LENGTH)
+    np.testing.assert_allclose(whisker.frame(s), frames, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(whisker.curvature(s), wavy(s), rtol=0, atol=1e-10)
+
+
+def test_signs_of_curvature():
+    up = Whisker.from_curvature(LENGTH, lambda s: (0.0, 0.0, 5.0)).position(LENGTH)
+    down = Whisker.from_curvature(LENGTH, lambda s: (0.0, 5.0, 0.0)).position(LENGTH)
+    assert up[1] > 0.0
+    assert up[2] == 0.0
+    assert down[2] < 0.0
+    assert down[1] == 0.0
+
+
+@given(st.floats(0.0, 60.0), st.floats(5e-3, 80e-3))
+def test_parabola_lies_on_its_parabola(coefficient, length):
+    whisker = Whisker.parabola(length, coefficient)
+    x, y, z = whisker.centerline(50).T
+    np.testing.assert_allclose(y, coefficient * x**2, rtol=0, atol=1e-10 * length)
+    assert not z.any()
+
+
+def test_parabola_the_other_way_is_rolled_over():
+    whisker = Whisker.parabola(LENGTH, -10.0)
+    assert whisker.position(LENGTH)[1] > 0.0
+    x, y, z = whisker.pose.to_source(whisker.centerline(20)).T
+    np.testing.assert_allclose(y, -10.0 * x**2, rtol=0, atol=1e-13)
+    assert not z.any()
+
+
+def test_frames_are_orthonormal_and_tangents_are_slopes():
+    whisker = samples.gamma()
+    s = np.linspace(0.0, whisker.length, 30)
+    frame = whisker.frame(s)
+    np.testing.assert_allclose(
+        frame.mT @ frame, np.broadcast_to(np.eye(3), frame.shape), atol=1e-13
+    )
+    inner, step = s[1:-1], 1e-6
+    slope = (whisker.position(inner + step) - whisker.position(inner - step)) / (2 * step)
+    np.testing.assert_allclose(slope, whisker.frame(inner)[..., 0], atol=1e-8)
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (5,), (2, 3), (0,)])
+def test_any_shape_of_arc_lengths(shape):
+    whisker = samples.gamma()
+    s = np.full(shape, 0.3 * whisker.length)
+    assert whisker.radius(s).shape == shape
+    assert whisker.curvature(s).shape == (*shape, 3)
+    assert whisker.position(s).shape == (*shape, 3)
+    assert whisker.frame(s).shape == (*shape, 3, 3)
+
+
+def test_arc_lengths_outside():
+    whisker = Whisker.straight(LENGTH)
+    np.testing.assert_array_equal(whisker.position(LENGTH * (1 + 1e-12)), [LENGTH, 0, 0])
+    assert np.isnan(whisker.radius(np.nan))
+    assert np.isnan(whisker.position(np.nan)).all()
+    with pytest.raises(ValueError, match=r"reaches from 0 to 0\.04 m"):
+        whisker.position(0.05)
+    with pytest.raises(ValueError, match="reaches"):
+        whisker.radius([-1e-3, 0.01])
+
+
+def test_jump_in_curvature_is_seen_from_both_sides():
+    whisker = Whisker.from_curvature(
+        LENGTH, lambda s: (0.0, 0.0, 5.0 if s < 0.0123 else 9.0), breaks=[0.0123]
+    )
+    assert whisker.breaks == (0.0123,)
+    assert whisker.curvature(0.0123, "left")[2] == pytest.approx(5.0, abs=1e-12)
+    assert whisker.curvature(0.0123)[2] == pytest.approx(9.0, abs=1e-12)
+    assert not whisker.notes
+    unstated = Whisker.from_curvature(LENGTH, lambda s: (0.0, 0.0, 5.0 if s < 0.0123 else 9.0))
+    assert "stated as breaks" in unstated.notes[0]
+
+
+def test_curvature_functions_of_every_kind_agree():
+    def arrays(s):
+        return np.stack([0 * s, 100 * s, 5 + 400 * s], -1)
+
+    kinds = [
+        arrays,
+        lambda s: (0.0, 100 * float(s), 5 + 400 * float(s)),
+        lambda s: np.array([0 * s, 100 * s, 5 + 400 * s]),
+    ]
+    s = np.linspace(0, LENGTH, 7)
+    for kind in kinds:
+        np.testing.assert_allclose(
+            Whisker.from_curvature(LENGTH, kind).curvature(s), arrays(s), rtol=0, atol=1e-13
+        )
+
+
+def test_bad_curvature_functions():
+    with pytest.raises(ValueError, match=r"shape \(2,\)"):
+        Whisker.from_curvature(LENGTH, lambda s: (0.0, 1.0))
+    with pytest.raises(ValueError, match="must be finite"):
+        Whisker.from_curvature(LENGTH, lambda s: (0.0, 0.0, np.nan))
+    with pytest.raises(ValueError, match="function of arc length"):
+        Whisker.from_curvature(LENGTH, 5.0)
+    with pytest.raises(ValueError, match=r"breaks \[0.05\]"):
+        Whisker.from_curvature(LENGTH, lambda s: (0, 0, 1), breaks=[0.05])
+
+
+def test_curvature_keeps_the_frame_it_was_stated_in_until_aligned():
+    whisker = Whisker.from_curvature(LENGTH, lambda s: (0.0, -3.0, -8.0))
+    assert whisker.position(LENGTH)[1] < 0.0
+    assert "toward −y" in whisker.notes[0]
+    aligned = whisker.aligned()
+    _, y, z = aligned.centerline(20).T
+    assert (y[1:] > 0.0).all()
+    np.testing.assert_allclose(z, 0.0, atol=1e-15)
+    np.testing.assert_allclose(
+        aligned.pose.to_source(aligned.centerline(20)), whisker.centerline(20), atol=1e-15
+    )
+
+
+@pytest.mark.parametrize(
+    ("fault", "message"),
+    [
+        ({"youngs_modulus": 0.0}, "youngs_modulus is 0.0 Pa"),
+        ({"poisson_ratio": -1.0}, r"\(-1, 0.5\]"),
+        ({"poisson_ratio": 0.51}, r"\(-1, 0.5\]"),
+        ({"base_radius": -1e-6}, "base_radius is -1e-06 m"),
+        ({"tip_radius": 0.0}, "tip_radius is 0.0 m"),
+        ({"radius": lambda s: 1e-4 - s}, "must be positive from base to tip"),
+        ({"radius": [1e-4, -1e-5]}, "sample 1"),
+        ({"radius": np.ones((3, 3))}, r"shape \(3, 3\)"),
+        ({"radius": [[0.0, 1e-4], [0.02, 1e-5]]}, "cover the whisker"),
+        ({"radius": [1e-4, 1e-5], "tip_radius": 1e-5}, "give one of them"),
+        ({"base_stiffness": (1e-3, 0.0)}, "two positive"),
+        ({"base_stiffness": 1e-3}, "two positive"),
+    ],
+)
+def test_bad_properties(fault, message):
+    with pytest.raises(ValueError, match=message):
+        Whisker.straight(LENGTH, **fault)
+
+
+def test_all_faults_come_in_one_message():
+    with pytest.raises(ValueError, match=r"youngs_modulus.*poisson_ratio.*base_radius"):
+        Whisker.straight(LENGTH, youngs_modulus=-1, poisson_ratio=1, base_radius=0)
+
+
+@pytest.mark.parametrize("length", [40.0, 0.51, 4e-5, 0.0, -0.01, np.nan])
+def test_bad_lengths(length):
+    with pytest.raises(ValueError, match="length is"):
+        Whisker.straight(length)
+
+
+def test_metres_for_millimetres_are_named():
+    with pytest.raises(ValueError, match="millimetres given as metres"):
+        Whisker.parabola(39.4, 0.02)
+
+
+def test_radius_profiles():
+    s = np.linspace(0, LENGTH, 9)
+    line = 1e-4 * (1 - 0.9 * s / LENGTH)
+    for radius in (line, np.column_stack([s, line]), lambda x: 1e-4 * (1 - 0.9 * x / LENGTH)):
+        whisker = Whisker.straight(LENGTH, radius=radius)
+        np.testing.assert_allclose(whisker.radius(s), line, rtol=1e-12)
+        assert whisker.base_radius == pytest.approx(1e-4)
+        assert whisker.tip_radius == pytest.approx(1e-5)
+    default = Whisker.straight(LENGTH)
+    assert default.base_radius / default.tip_radius == pytest.approx(15.0)
+    assert default.base_bending_stiffness == pytest.approx(3e9 * np.pi * 1e-16 / 4)
+
+
+def test_tip_thicker_than_base_is_noted():
+    assert Whisker.straight(LENGTH, tip_radius=2e-4).notes == ("the tip is thicker than the base",)
+
+
+def test_a_robots_whisker():
+    whisker = Whisker.parabola(0.3, 2.0, base_radius=4e-3, tip_radius=1e-3, youngs_modulus=60e9)
+    assert whisker.radius(0.15) == pytest.approx(2.5e-3)
+
+
+@given(st.floats(0.05, 1.0))
+def test_trimming_changes_nothing_proximal(share):
+    whisker = samples.gamma()
+    short = whisker.trimmed(share * whisker.length)
+    s = np.linspace(0.0, short.length, 11)[:-1]
+    np.testing.assert_array_equal(short.curvature(s), whisker.curvature(s))
+    np.testing.assert_array_equal(short.radius(s), whisker.radius(s))
+    np.testing.assert_allclose(short.position(s), whisker.position(s), rtol=0, atol=1e-15)
+
+
+@given(st.floats(0.2, 5.0), st.floats(0.2, 5.0))
+def test_scaling(length_factor, radius_factor):
+    whisker = samples.gamma()
+    scaled = whisker.scaled(length_factor, radius_factor)
+    np.testing.assert_allclose(
+        scaled.centerline(11), length_factor * whisker.centerline(11), rtol=0, atol=1e-14
+    )
+    np.testing.assert_allclose(
+        scaled.radius(scaled.length / 3), radius_factor * whisker.radius(whisker.length / 3)
+    )
+
+
+def test_properties_can_be_changed():
+    whisker = samples.gamma()
+    stiff = whisker.with_properties(youngs_modulus=6e9, tip_radius=5e-5, name="stiff")
+    assert (stiff.youngs_modulus, stiff.tip_radius, stiff.name) == (
+        6e9,
+        pytest.approx(5e-5),
+        "stiff",
+    )
+    assert stiff.base_radius == whisker.base_radius
+    assert replace(whisker, base_stiffness=(1, 2)).base_stiffness == (1.0, 2.0)
+    with pytest.raises(ValueError, match="poisson_ratio"):
+        replace(whisker, poisson_ratio=0.7)
+
+
+def test_pickled_it_is_the_same():
+    whisker = Whisker.from_curvature(LENGTH, wavy, base_stiffness=(1e-3, 2e-3))
+    again = pickle.loads(pickle.dumps(whisker))
+    np.testing.assert_array_equal(again.centerline(9), whisker.centerline(9))
+    assert again.base_stiffness == whisker.base_stiffness
+
+
+@pytest.mark.parametrize("stiffness", [None, (1e-3, 2e-3)])
+@pytest.mark.parametrize(
+    "make", [samples.gamma, samples.straight, lambda: Whisker.parabola(0.03, -9)]
+)
+def test_stored_it_is_the_same(make, stiffness, tmp_path):
+    whisker = replace(make(), base_stiffness=stiffness, notes=("a note", "über µm"))
+    path = tmp_path / "whisker.nc"
+    dataset = whisker.to_dataset()
+    assert all({"units", "long_name"} <= set(v.attrs) for v in dataset.data_vars.values())
+    dataset.to_netcdf(path, engine="h5netcdf", group="whisker")
+    with xr.open_dataset(path, engine="h5netcdf", group="whisker") as stored:
+        again = Whisker.from_dataset(stored)
+    for what in ("length", "youngs_modulus", "poisson_ratio", "base_stiffness", "breaks", "notes"):
+        assert getattr(again, what) == getattr(whisker, what)
+    assert again.name == whisker.name
+    s = np.linspace(0, whisker.length, 100)
+    np.testing.assert_array_equal(again.curvature(s), whisker.curvature(s))
+    np.testing.assert_array_equal(again.radius(s), whisker.radius(s))
+    np.testing.assert_array_equal(again.pose.rotation, whisker.pose.rotation)
+
+
+def test_another_dataset_is_refused():
+    with pytest.raises(ValueError, match="lacks base_bending_stiffness"):
+        Whisker.from_dataset(samples.gamma().to_dataset().drop_vars("base_bending_stiffness"))
+
+
+angles = st.floats(-np.pi, np.pi)
+
+
+@given(st.tuples(angles, angles, angles), st.tuples(*[st.floats(-1, 1)] * 3))
+def test_pose_goes_there_and_back(euler, origin):
+    from scipy.spatial.transform import Rotation
+
+    pose = Pose(Rotation.from_euler("xyz", euler).as_matrix(), origin)
+    points = np.arange(12.0).reshape(2, 2, 3)
+    np.testing.assert_allclose(pose.to_whisker(pose.to_source(points)), points, atol=1e-13)
+    np.testing.assert_allclose(
+        pose.vectors_to_source(points),
+        pose.to_source(points) - pose.to_source([0, 0, 0]),
+        atol=1e-13,
+    )
+    assert not pose.rotation.flags.writeable
+
+
+def test_bad_poses():
+    with pytest.raises(ValueError, match=r"not orthogonal.*origin"):
+        Pose(2 * np.eye(3), [0.0, np.nan, 0.0])
+    with pytest.raises(ValueError, match="reflection"):
+        Pose(-np.eye(3))
+    with pytest.raises(ValueError, match="last axis"):
+        Pose().to_source([1.0, 2.0])
+
+
+def test_gamma_is_as_published():
+    whisker = samples.gamma()
+    z = whisker.position(whisker.length)[2] * 1e3
+    assert whisker.length == pytest.approx(40e-3)
+    assert 1.3 < z < 1.6
+    # Planar to 0.3 mm over the proximal 65 % (Towal et al. 2011).
+    proximal = whisker.position(np.linspace(0, 0.65 * whisker.length, 50))
+    assert np.abs(proximal[:, 2]).max() < 0.05e-3
+    np.testing.assert_allclose(proximal[:, 1], 10 * proximal[:, 0] ** 2, atol=0.01e-3)
+    assert "gamma" in repr(whisker)
+
+
+@pytest.mark.parametrize(
+    "make", [samples.straight, samples.straight_cylinder, samples.curved, samples.curved_cylinder]
+)
+def test_canonical_rods(make):
+    whisker = make()
+    assert whisker.is_straight == ("straight" in whisker.name)
+    cylinder = "cylinder" in whisker.name
+    assert whisker.tip_radius == pytest.approx(whisker.base_radius / (1 if cylinder else 15))

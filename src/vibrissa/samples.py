@@ -45,20 +45,44 @@ def gamma() -> Whisker:
 
 
 def straight() -> Whisker:
-    """Give a straight tapered whisker of 40 mm."""
+    """Give a straight tapered whisker of 40 mm.
+
+    Returns
+    -------
+    Whisker
+        Base radius 100 µm, tip a fifteenth of it.
+    """
     return Whisker.straight(LENGTH, name="straight")
 
 
 def straight_cylinder() -> Whisker:
-    """Give a straight cylinder of 40 mm, radius 100 µm."""
+    """Give a straight cylinder of 40 mm, radius 100 µm.
+
+    Returns
+    -------
+    Whisker
+        The textbook's cantilever.
+    """
     return Whisker.straight(LENGTH, tip_radius=100e-6, name="straight cylinder")
 
 
 def curved() -> Whisker:
-    """Give a planar tapered whisker of 40 mm on y = 10 x²."""
+    """Give a planar tapered whisker of 40 mm on y = 10 x².
+
+    Returns
+    -------
+    Whisker
+        Base radius 100 µm, tip a fifteenth of it.
+    """
     return Whisker.parabola(LENGTH, COEFFICIENT, name="curved")
 
 
 def curved_cylinder() -> Whisker:
-    """Give a planar cylinder of 40 mm, radius 100 µm, on y = 10 x²."""
+    """Give a planar cylinder of 40 mm, radius 100 µm, on y = 10 x².
+
+    Returns
+    -------
+    Whisker
+        Curved as `curved`, but not tapered.
+    """
     return Whisker.parabola(LENGTH, COEFFICIENT, tip_radius=100e-6, name="curved cylinder")

@@ -1,12 +1,14 @@
 """Laws of the whisker: its shape, its frame, and what may be done to it."""
 
+import json
 import pickle
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
@@ -14,6 +16,7 @@ from vibrissa import samples
 from vibrissa.whisker import Pose, Whisker
 
 LENGTH = 40e-3
+KIRCHHOFF = Path(__file__).parents[3] / "shared" / "reference" / "kirchhoff.json"
 
 
 def wavy(s):
@@ -56,6 +59,24 @@ def test_rest_shape_meets_an_independent_integration():
     np.testing.assert_allclose(whisker.position(s), points, rtol=0, atol=1e-11 * LENGTH)
     np.testing.assert_allclose(whisker.frame(s), frames, rtol=0, atol=1e-10)
     np.testing.assert_allclose(whisker.curvature(s), wavy(s), rtol=0, atol=1e-10)
+
+
+@pytest.mark.skipif(not KIRCHHOFF.exists(), reason="no reference data beside the repository")
+def test_rest_shape_of_the_reference_whiskers():
+    reference = json.loads(KIRCHHOFF.read_text())["whiskers"]
+    length = reference["K2"]["L"]
+
+    def ramp(s):
+        return 0.0, 15.0 * max(s - 0.6 * length, 0.0) / (0.4 * length), 5.0 + 400.0 * s
+
+    whiskers = {
+        "K1": Whisker.from_curvature(reference["K1"]["L"], lambda s: (0.0, 0.0, 12.0)),
+        "K2": Whisker.from_curvature(length, ramp, breaks=[0.6 * length]),
+        "K3": Whisker.straight(reference["K3"]["L"]),
+    }
+    for name, whisker in whiskers.items():
+        s, points = reference[name]["centreline_s"], reference[name]["centreline_xyz"]
+        np.testing.assert_allclose(whisker.position(s), points, rtol=0, atol=1e-12)
 
 
 def test_signs_of_curvature():
@@ -228,6 +249,7 @@ def test_a_robots_whisker():
     assert whisker.radius(0.15) == pytest.approx(2.5e-3)
 
 
+@settings(max_examples=30)
 @given(st.floats(0.05, 1.0))
 def test_trimming_changes_nothing_proximal(share):
     whisker = samples.gamma()
@@ -238,6 +260,7 @@ def test_trimming_changes_nothing_proximal(share):
     np.testing.assert_allclose(short.position(s), whisker.position(s), rtol=0, atol=1e-15)
 
 
+@settings(max_examples=30)
 @given(st.floats(0.2, 5.0), st.floats(0.2, 5.0))
 def test_scaling(length_factor, radius_factor):
     whisker = samples.gamma()

@@ -31,6 +31,7 @@ def whisker_dataset(whisker: "Whisker") -> xr.Dataset:
     Parameters
     ----------
     whisker : Whisker
+        What is written.
 
     Returns
     -------
@@ -111,6 +112,7 @@ def whisker_fields(dataset: xr.Dataset) -> dict[str, Any]:
     Parameters
     ----------
     dataset : xarray.Dataset
+        What `whisker_dataset` wrote.
 
     Returns
     -------

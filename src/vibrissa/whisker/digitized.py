@@ -106,7 +106,7 @@ def digitize(points: ArrayLike, noise: float | None, base: str | ArrayLike | Non
     _require_order(parameters, found)
     sigma = found * unit if noise is None else noise
     if len(fit.residuals) and line.explains(array, fit, components, unit, noise):
-        return line.digitized(sigma)
+        return line.digitized(line.noise(components) if noise is None else noise)
     curve = BSpline(fit.curve.t, fit.curve.c * unit + middle, 5)
     return _measured(curve, float(parameters[0]), float(parameters[-1]), sigma)
 
@@ -212,6 +212,10 @@ class _Line:
             return False
         ratio = (self.rss - rss) / spent / (rss / left)
         return bool(fisher.sf(ratio, spent, left) > SIGNIFICANCE)
+
+    def noise(self, components: int) -> float:
+        """Standard deviation per coordinate of points about the line, m."""
+        return float(np.sqrt(self.rss / (components * (len(self.along) - 2))))
 
     def digitized(self, noise: float) -> Digitized:
         _require_order(self.along / self.extent, noise / self.extent)

@@ -327,22 +327,65 @@ class Whisker:
         return self.intrinsic_curvature(self._inside(s), side)
 
     def radius(self, s: ArrayLike, side: Side = "right") -> Array:
-        """Radius (...), m, at arc lengths `s` (...), m; `side` counts where it jumps."""
+        """Radius of the section at arc lengths.
+
+        Parameters
+        ----------
+        s : array (...)
+            Arc lengths from the base, m; NaN gives NaN.
+        side : {"right", "left"}
+            Which side counts where the radius jumps.
+
+        Returns
+        -------
+        array (...)
+            Radii, m.
+        """
         return self.section_radius(self._inside(s), side)
 
     def position(self, s: ArrayLike) -> Array:
-        """Points (..., 3), m, of the rest whisker at arc lengths `s` (...), m; whisker frame."""
+        """Points of the rest whisker at arc lengths.
+
+        Parameters
+        ----------
+        s : array (...)
+            Arc lengths from the base, m; NaN gives NaN.
+
+        Returns
+        -------
+        array (..., 3)
+            Points, m, whisker frame.
+        """
         return self._rest.at(self._inside(s))[1]
 
     def frame(self, s: ArrayLike) -> Array:
-        """Frames (..., 3, 3) of the rest whisker at arc lengths `s` (...), m.
+        """Material frames of the rest whisker at arc lengths.
 
-        Columns are tangent, d1 and d2 in the whisker frame.
+        Parameters
+        ----------
+        s : array (...)
+            Arc lengths from the base, m; NaN gives NaN.
+
+        Returns
+        -------
+        array (..., 3, 3)
+            Columns are tangent, d1 and d2 in the whisker frame.
         """
         return self._rest.at(self._inside(s))[0]
 
     def centerline(self, n: int = 101) -> Array:
-        """Points (n, 3), m, of the rest whisker, equally spaced from base to tip; whisker frame."""
+        """Points of the rest whisker, equally spaced in arc length.
+
+        Parameters
+        ----------
+        n : int
+            How many, base and tip included.
+
+        Returns
+        -------
+        array (n, 3)
+            Points, m, whisker frame.
+        """
         if n < 2:
             raise ValueError(f"a centreline of {n} points was asked for; at least 2 are needed")
         return self.position(np.linspace(0.0, self.length, n))
@@ -468,12 +511,28 @@ class Whisker:
     # In and out.
 
     def to_dataset(self) -> xr.Dataset:
-        """Write the whisker as a dataset, from which `from_dataset` makes it again without loss."""
+        """Write the whisker as a dataset, without loss.
+
+        Returns
+        -------
+        xarray.Dataset
+            Every variable has the attributes `units` and `long_name`.
+        """
         return whisker_dataset(self)
 
     @classmethod
     def from_dataset(cls, dataset: xr.Dataset) -> "Whisker":
-        """Make the whisker again from what `to_dataset` wrote."""
+        """Make a whisker again from its dataset.
+
+        Parameters
+        ----------
+        dataset : xarray.Dataset
+            What `to_dataset` wrote.
+
+        Returns
+        -------
+        Whisker
+        """
         return cls(**whisker_fields(dataset))
 
     def __repr__(self) -> str:

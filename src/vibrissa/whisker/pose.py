@@ -73,19 +73,63 @@ class Pose:
         object.__setattr__(self, "origin", origin)
 
     def to_source(self, points: ArrayLike) -> Array:
-        """Move points (..., 3), m, from the whisker frame to the source frame."""
+        """Move points from the whisker frame to the source frame.
+
+        Parameters
+        ----------
+        points : array (..., 3)
+            Points, m, whisker frame.
+
+        Returns
+        -------
+        array (..., 3)
+            Points, m, source frame.
+        """
         return self.vectors_to_source(points) + self.origin
 
     def to_whisker(self, points: ArrayLike) -> Array:
-        """Move points (..., 3), m, from the source frame to the whisker frame."""
+        """Move points from the source frame to the whisker frame.
+
+        Parameters
+        ----------
+        points : array (..., 3)
+            Points, m, source frame.
+
+        Returns
+        -------
+        array (..., 3)
+            Points, m, whisker frame.
+        """
         return self.vectors_to_whisker(_triples(points) - self.origin)
 
     def vectors_to_source(self, vectors: ArrayLike) -> Array:
-        """Turn vectors (..., 3), any unit, from the whisker frame to the source frame."""
+        """Turn vectors from the whisker frame to the source frame.
+
+        Parameters
+        ----------
+        vectors : array (..., 3)
+            Vectors in any unit, whisker frame.
+
+        Returns
+        -------
+        array (..., 3)
+            The same vectors, source frame.
+        """
         return _triples(vectors) @ self.rotation.T
 
     def vectors_to_whisker(self, vectors: ArrayLike) -> Array:
-        """Turn vectors (..., 3), any unit, from the source frame to the whisker frame."""
+        """Turn vectors from the source frame to the whisker frame.
+
+        Parameters
+        ----------
+        vectors : array (..., 3)
+            Vectors in any unit, source frame.
+
+        Returns
+        -------
+        array (..., 3)
+            The same vectors, whisker frame.
+        """
         return _triples(vectors) @ self.rotation
 
     def __repr__(self) -> str:

@@ -94,16 +94,48 @@ class Profile:
         return value + 0.0 * tau
 
     def trimmed(self, length: float) -> "Profile":
-        """Drop the intervals that begin at or beyond `length`, m."""
+        """Drop the intervals that begin at or beyond a length.
+
+        Parameters
+        ----------
+        length : float
+            Arc length that must stay, m.
+
+        Returns
+        -------
+        Profile
+        """
         count = int(np.searchsorted(self.knots[:-1], length, side="left"))
         return Profile(self.knots[: count + 1], self.coefficients[:, :count], self.error)
 
     def scaled(self, length_factor: float, value_factor: float) -> "Profile":
-        """Stretch arc length and multiply values."""
+        """Stretch arc length and multiply values.
+
+        Parameters
+        ----------
+        length_factor : float
+            Factor on arc length.
+        value_factor : float
+            Factor on values.
+
+        Returns
+        -------
+        Profile
+        """
         return Profile(self.knots * length_factor, self.coefficients * value_factor, self.error)
 
     def transformed(self, matrix: Array) -> "Profile":
-        """Multiply every value (3,) by a matrix (3, 3)."""
+        """Multiply every value by a matrix.
+
+        Parameters
+        ----------
+        matrix : array (3, 3)
+            Multiplies values (3,) from the left.
+
+        Returns
+        -------
+        Profile
+        """
         return Profile(self.knots, self.coefficients @ matrix.T, self.error)
 
 

@@ -3,16 +3,24 @@
 Compiling takes seconds, once for a given installation; a listener says so while it happens, so that
 a first call does not look as if it hung. Where no folder can be written to (a read-only
 installation without a home folder) the kernels are compiled anew in each run instead.
+
+Numba knows a cached kernel by its own file alone, and would go on using it after a function that it
+inlines from another file has changed; here all files with kernels are part of the key.
 """
 
 from __future__ import annotations
 
+import hashlib
 import sys
 from collections.abc import Callable
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
 from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
 from numba.core import event
+from numba.core.caching import FunctionCache
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -22,12 +30,26 @@ _FASTMATH = {"contract", "nsz", "arcp"}
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": _FASTMATH, "nogil": True}
 
 
+@cache
+def _sources() -> str:
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
+        source = path.read_bytes()
+        if b"@kernel" in source or b"@inlined" in source:
+            digest.update(source)
+    return digest.hexdigest()
+
+
+class _PackageCache(FunctionCache):
+    def _index_key(self, sig: object, codegen: object) -> tuple[object, ...]:
+        return (*super()._index_key(sig, codegen), _sources())  # type: ignore[no-untyped-call]
+
+
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function that Python calls; cached on disk, releases the GIL."""
-    try:
-        compiled = numba.njit(cache=True, **_OPTIONS)(function)
-    except RuntimeError:  # numba finds no folder to write its cache to
-        compiled = numba.njit(**_OPTIONS)(function)
+    compiled = numba.njit(**_OPTIONS)(function)
+    with suppress(RuntimeError):  # numba finds no folder that it may write to
+        compiled._cache = _PackageCache(function)  # type: ignore[no-untyped-call]
     return cast("Callable[P, R]", compiled)
 
 

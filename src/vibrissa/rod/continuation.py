@@ -38,7 +38,9 @@ POINT, SIDE, TIP = 0, 1, 2
 #: A force this small (EI/L²) only says where an object touches.
 LEAST_FORCE = 1e-7
 _LEAST_ARC = 0.05
+# Fractions of the path; points start within a cell of their target.
 _SMALLEST_STEP = 2.0**-12
+_SMALLEST_POINT_STEP = 2.0**-9
 _MOST_ITERATIONS = 30
 # Toward a fold det ∂G/∂x vanishes and the solution moves ever faster along the path, both like a
 # square root of what is left to it. A path that cannot be followed has met a fold if det has fallen
@@ -263,6 +265,7 @@ def follow(
             lane_value(b, i, value)
             lane_tangents(b, i, t)
             _polar_tangents(kind, x[i], t)
+            smallest = _SMALLEST_POINT_STEP if kind == POINT else _SMALLEST_STEP
             progress = done[i] + stride[i]
             for a in range(7):
                 p[a] = begins[m, a] + progress * (ends[m, a] - begins[m, a])
@@ -319,7 +322,7 @@ def follow(
             if rounds[i] == 0:
                 speed[i] = size / stride[i]
                 first_speed[i] = min(first_speed[i], speed[i])
-                failed = failed or (size > 2.0 and stride[i] > _SMALLEST_STEP)
+                failed = failed or (size > 2.0 and stride[i] > smallest)
             elif rounds[i] >= 2:
                 failed = failed or size > 0.95 * last_size[i] + 1e-9
             failed = failed or rounds[i] >= _MOST_ITERATIONS
@@ -337,7 +340,7 @@ def follow(
                 last_size[i] = size
                 rounds[i] += 1
                 continue
-            if stride[i] > _SMALLEST_STEP:
+            if stride[i] > smallest:
                 stride[i] *= 0.5
                 x[i] = x_ok[i]
                 rounds[i] = 0

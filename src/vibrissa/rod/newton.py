@@ -157,5 +157,5 @@ def stable(fold: Fold, proximal: float, xi: Array, sign: float) -> bool:
 def chart_to_contact(fold: Fold, chart: Array, xi: Array) -> None:
     """Turn (s, ψ, ρ) into ξ."""
     xi[0] = min(max(chart[0], _LEAST_ARC), 1.0)
-    force = chart[2] * fold_force(fold, xi[0], chart[1])
+    force = chart[2] * chart[2] * fold_force(fold, xi[0], chart[1])
     xi[1], xi[2] = force * np.cos(chart[1]), force * np.sin(chart[1])

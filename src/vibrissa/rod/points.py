@@ -8,22 +8,24 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from vibrissa.rod.arrays import Array, IntArray, Rod
-from vibrissa.rod.batch import share_out
+from vibrissa.rod.arrays import AnyArray, Array, IntArray, Rod
+from vibrissa.rod.batch import share_out, solve_forces
 from vibrissa.rod.compiled import inlined, kernel
 from vibrissa.rod.continuation import POINT, follow
 from vibrissa.rod.kernels import BUFFER_SIZE, LANES
 from vibrissa.rod.newton import TOLERANCE, chart_to_contact, newton_group, stable
 from vibrissa.rod.preimage import MOST_SEEDS, Preimages, Tree, seeds
-from vibrissa.rod.reach import Fold, Reach, reach
+from vibrissa.rod.reach import Fold, Reach, contacts_at, reach, with_normal_force
 from vibrissa.status import Status
 
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
 
-# Unreachable points farther from the chart than this many times its local spacing are told by the
-# nearest face of the chart; nearer ones are approached, so that the face is the one actually met.
-_FAR = 2.0
+# A point without a seed is unreachable, and the nearest face of the chart tells why. This near to
+# a face (over L) it is approached from inside instead, in case the interpolant misjudges.
+_NEAR = 0.01
+# Points along each edge of the chart's faces.
+_FACE = 65
 
 
 class Solutions(NamedTuple):
@@ -82,6 +84,7 @@ def _solve_points(
         solved[row] = 0
         n = seeds(tree, points[row], found, quality)
         if n > 0:
+            solved[row] = -1
             best = 0
             for i in range(1, n):
                 # Of two solutions near the fold the one with less force is the stable one.
@@ -124,18 +127,10 @@ class PointSolver:
         inner = points[:, :-1, :-1].reshape(-1, 3)
         self._contacts = chart.contacts[:, :-1, :-1].reshape(-1, 3)
         self._nearest = cKDTree(inner)
-        # The largest edge of the cells around a node: how near "near the chart" is.
-        edges = [np.linalg.norm(np.diff(points, axis=axis), axis=-1).max() for axis in range(3)]
-        self._spacing = float(max(edges))
-        n, m, k = (size - 1 for size in points.shape[:3])
-        faces = [
-            (points[:, :m, k], Status.BEYOND_FOLD),
-            (points[n, :m], Status.BEYOND_TIP),
-            (points[0, :m], Status.TOO_PROXIMAL),
-        ]
-        self._faces = cKDTree(np.concatenate([face.reshape(-1, 3) for face, _ in faces]))
+        places, reasons = zip(*_faces(chart), strict=True)
+        self._faces = cKDTree(np.concatenate(places))
         self._reasons = np.concatenate(
-            [np.full(face[..., 0].size, int(reason)) for face, reason in faces]
+            [np.full(len(p), int(r)) for p, r in zip(places, reasons, strict=True)]
         )
 
     def solve(self, points: Array) -> Solutions:
@@ -180,16 +175,16 @@ class PointSolver:
         rows = there[good]
         contacts[rows, 0], contacts[rows, 1], contacts[rows, 2:] = xi[good, 0], 0.0, xi[good, 1:]
         values[rows], misfits[rows], statuses[rows] = found[good], residuals[good], int(Status.OK)
-        self._approach(wanted[~good], there[~good], out)
+        self._approach(wanted[~good], solved[~good] < 0, there[~good], out)
         return out
 
-    def _approach(self, points: Array, rows: IntArray, out: Solutions) -> None:
+    def _approach(self, points: Array, seeded: AnyArray, rows: IntArray, out: Solutions) -> None:
         """Follow points without a ready seed from the nearest known contact; say why it fails."""
         if not rows.size:
             return
         away, face = self._faces.query(points)
         out.statuses[rows] = self._reasons[face]
-        near = np.flatnonzero(away < _FAR * self._spacing)
+        near = np.flatnonzero((away < _NEAR) | seeded)
         points, rows = points[near], rows[near]
         _, start = self._nearest.query(points)
         begins, ends = np.zeros((rows.size, 7)), np.zeros((rows.size, 7))
@@ -204,6 +199,22 @@ class PointSolver:
             solved.contacts[good],
             solved.values[good],
         )
+
+
+def _faces(chart: Reach) -> list[tuple[Array, Status]]:
+    """Places on the chart's outer faces (n, 3), and what lies beyond each."""
+    s, rho = np.linspace(chart.proximal, 1.0, _FACE), np.linspace(0.0, 1.0, _FACE)
+    psi = np.linspace(0.0, 2.0 * np.pi, 2 * _FACE, endpoint=False)
+    faces = []
+    for axes, reason in (
+        ((s, psi, rho[-1:]), Status.BEYOND_FOLD),
+        ((s[-1:], psi, rho), Status.BEYOND_TIP),
+        ((s[:1], psi, rho), Status.TOO_PROXIMAL),
+    ):
+        place = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        contacts = with_normal_force(contacts_at(chart.fold, place))
+        faces.append((solve_forces(chart.discretization, contacts)[0][:, 3:], reason))
+    return faces
 
 
 def follow_all(

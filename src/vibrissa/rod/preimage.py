@@ -140,7 +140,7 @@ def _bezier_points(corner: Array, slope: Array) -> Array:
         inward[..., axis] = slope[..., axis] * sign[..., None] / 3.0
     subsets = (np.arange(8)[:, None] >> np.arange(3)) & 1
     moved = corner[..., None, :] + np.einsum("...qa,na->...nq", inward, subsets)
-    return moved.reshape(len(corner), 64, 3)
+    return np.asarray(moved.reshape(len(corner), 64, 3))
 
 
 def _boxes(points: Array, circular: AnyArray, place: IntArray) -> tuple[IntArray, Array]:
@@ -283,7 +283,7 @@ def solve3(a: Array, r: Array, x: Array) -> float:
 @inlined
 def _outside(x: Array) -> float:
     """How far a place lies outside its cell, in cell widths."""
-    return max(abs(x[0] - 0.5), abs(x[1] - 0.5), abs(x[2] - 0.5)) - 0.5
+    return float(max(abs(x[0] - 0.5), abs(x[1] - 0.5), abs(x[2] - 0.5)) - 0.5)
 
 
 @inlined

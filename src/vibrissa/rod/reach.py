@@ -6,9 +6,10 @@ equilibrium meets an unstable one and a frictionless whisker slips off. The cont
 and fold, for s_c between ``proximal`` and the tip, are the stable ones connected to rest. With the
 fold force f*(s_c, ψ) they are charted by
 
-    ξ = (s, ρ f*(s, ψ) cos ψ, ρ f*(s, ψ) sin ψ),   0 ≤ ρ ≤ 1,
+    ξ = (s, ρ² f*(s, ψ) cos ψ, ρ² f*(s, ψ) sin ψ),   0 ≤ ρ ≤ 1,
 
-a box in (s, ψ, ρ), periodic in ψ. The chart is sampled on a grid whose nodes carry base force F,
+a box in (s, ψ, ρ), periodic in ψ, with its cells concentrated toward rest, where signals vanish
+and their ratios vary fast. The chart is sampled on a grid whose nodes carry base force F,
 contact point p and their exact derivatives with respect to (s, ψ, ρ). ln f* is interpolated by
 bicubic Hermite patches.
 """
@@ -24,7 +25,7 @@ from scipy.interpolate import CubicSpline
 
 from vibrissa.rod.arrays import AnyArray, Array
 from vibrissa.rod.batch import solve_forces
-from vibrissa.rod.compiled import inlined
+from vibrissa.rod.compiled import inlined, kernel
 from vibrissa.rod.discretize import STEPS, Discretization, discretize
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ CELLS = (16, 32, 16)
 _FARTHEST = 12.0
 _SCAN = 0.0625
 # Directions have no value at zero force; just above it they have their limit.
-_LEAST_LOAD = 1e-4
+_LEAST_LOAD = 0.01
 
 # The fold's share in the kernels: stations s (n,), ln f* and its derivatives in s, ψ and both (n, m
 # + 1, 4).
@@ -55,7 +56,7 @@ class Reach:
     discretization : Discretization
         The whisker.
     stations, bearings, loads : (n,), (m + 1,), (k,) arrays
-        Grid of s/L, ψ (rad, both ends of the circle) and ρ.
+        Grid of s/L, ψ (rad, both ends of the circle) and ρ = √(force / fold force).
     fold : tuple of arrays
         ``stations`` and ln f* with its derivatives, (n, m + 1, 4); for :func:`fold_force`.
     contacts : (n, m + 1, k, 3) array
@@ -88,7 +89,7 @@ class Reach:
 
     def charted(self, derivatives: Array) -> Array:
         """Turn derivatives with respect to ξ at the nodes into ones with respect to (s, ψ, ρ)."""
-        return np.einsum("...ij,...jk->...ik", derivatives, self.frames)
+        return np.asarray(np.einsum("...ij,...jk->...ik", derivatives, self.frames))
 
 
 @lru_cache(maxsize=16)
@@ -129,13 +130,17 @@ def reach(
     s, psi, rho = np.meshgrid(stations, bearings, np.maximum(loads, _LEAST_LOAD), indexing="ij")
     f, f_s, f_psi = (a[..., None] for a in _expand(log_fold))
     cos, sin = np.cos(psi), np.sin(psi)
-    contacts = np.stack([s, rho * f * cos, rho * f * sin], axis=-1)
+    contacts = np.stack([s, rho**2 * f * cos, rho**2 * f * sin], axis=-1)
     zero = np.zeros_like(s)
     frames = np.stack(
         [
             np.stack([zero + 1.0, zero, zero], axis=-1),
-            np.stack([rho * f_s * cos, rho * (f_psi * cos - f * sin), f * cos], axis=-1),
-            np.stack([rho * f_s * sin, rho * (f_psi * sin + f * cos), f * sin], axis=-1),
+            np.stack(
+                [rho**2 * f_s * cos, rho**2 * (f_psi * cos - f * sin), 2.0 * rho * f * cos], axis=-1
+            ),
+            np.stack(
+                [rho**2 * f_s * sin, rho**2 * (f_psi * sin + f * cos), 2.0 * rho * f * sin], axis=-1
+            ),
         ],
         axis=-2,
     )
@@ -236,6 +241,15 @@ def _expand(log_fold: Array) -> tuple[Array, Array, Array]:
     return f, f * log_fold[..., 1], f * log_fold[..., 2]
 
 
+def contacts_at(fold: Fold, chart: Array) -> Array:
+    """Turn chart coordinates (s, ψ, ρ), shape (n, 3), into contacts ξ, shape (n, 3)."""
+    force = np.empty(len(chart))
+    _fold_forces_at(fold, np.ascontiguousarray(chart), force)
+    force *= chart[:, 2] ** 2
+    psi = chart[:, 1]
+    return np.stack([chart[:, 0], force * np.cos(psi), force * np.sin(psi)], axis=1)
+
+
 @inlined
 def _hermite(t: float) -> tuple[float, float, float, float]:
     """Cubic Hermite weights: value and slope at 0, value and slope at 1."""
@@ -262,3 +276,9 @@ def fold_force(fold: Fold, s: float, psi: float) -> float:
             log += a[2 * di] * (b[2 * dj] * node[0] + b[2 * dj + 1] * dpsi * node[2])
             log += a[2 * di + 1] * ds * (b[2 * dj] * node[1] + b[2 * dj + 1] * dpsi * node[3])
     return float(np.exp(log))
+
+
+@kernel
+def _fold_forces_at(fold: Fold, chart: Array, force: Array) -> None:
+    for i in range(chart.shape[0]):
+        force[i] = fold_force(fold, chart[i, 0], chart[i, 1])

@@ -1,0 +1,6 @@
+"""From signals back to contacts: the map of all contacts, and its inversion."""
+
+from vibrissa.mapping.contact_map import ContactMap
+from vibrissa.mapping.estimate import Estimate
+
+__all__ = ["ContactMap", "Estimate"]

@@ -1,0 +1,88 @@
+"""Maps as NetCDF files: for a person in the root, for the solver in the group ``chart``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import xarray as xr
+
+from vibrissa.rod.discretize import discretize
+from vibrissa.rod.reach import Reach
+from vibrissa.whisker import Whisker
+
+if TYPE_CHECKING:
+    from vibrissa.mapping.contact_map import ContactMap
+
+_KIND = "vibrissa contact map"
+_NODE = ("station", "bearing", "load")
+
+
+def save_map(contacts: ContactMap, path: Path) -> None:
+    """Write a map; a file that exists is replaced only when the new one is complete."""
+    chart = contacts.chart
+    raw = xr.Dataset(
+        {
+            "stations": ("station", chart.stations),
+            "bearings": ("bearing", chart.bearings),
+            "loads": ("load", chart.loads),
+            "fold": (("station", "bearing", "derivative"), chart.fold[1]),
+            "folded": (("station", "bearing"), chart.folded),
+            "contacts": ((*_NODE, "unknown"), chart.contacts),
+            "values": ((*_NODE, "value"), chart.values),
+            "tangents": ((*_NODE, "value", "unknown"), chart.tangents),
+            "frames": ((*_NODE, "unknown", "coordinate"), chart.frames),
+        },
+        attrs={"description": "non-dimensional: lengths over L, forces over EI/L²"},
+    )
+    root = contacts.to_dataset()
+    root.attrs |= {"kind": _KIND, "steps": contacts.steps}
+    groups = {"/": root, "whisker": contacts.whisker.to_dataset(), "chart": raw}
+    if contacts.grid is not None:
+        groups["grid"] = contacts.grid
+    tree = xr.DataTree.from_dict(groups)
+    squeezed = {"zlib": True, "complevel": 1, "shuffle": True}
+    encoding = (
+        {"/grid": dict.fromkeys(contacts.grid.data_vars, squeezed)} if contacts.grid else None
+    )
+    partial = path.with_name(path.name + ".part")
+    try:
+        tree.to_netcdf(partial, engine="h5netcdf", encoding=encoding)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def load_map(path: Path) -> ContactMap:
+    """Read a map; raise a ValueError if the file is not one."""
+    from vibrissa.mapping.contact_map import ContactMap
+
+    if not path.exists():
+        raise FileNotFoundError(f"there is no file {path}")
+    try:
+        with xr.open_datatree(path, engine="h5netcdf") as opened:
+            tree = opened.load()
+    except OSError as error:
+        raise ValueError(f"{path} is not a NetCDF file, or it is cut short: {error}") from error
+    if tree.attrs.get("kind") != _KIND or "chart" not in tree.children:
+        raise ValueError(
+            f"{path} holds no contact map (of kind {tree.attrs.get('kind', 'none')!r})"
+        )
+    whisker = Whisker.from_dataset(tree["whisker"].to_dataset())
+    steps = int(tree.attrs["steps"])
+    raw = {str(name): np.asarray(v) for name, v in tree["chart"].to_dataset().variables.items()}
+    chart = Reach(
+        discretization=discretize(whisker, steps),
+        stations=raw["stations"],
+        bearings=raw["bearings"],
+        loads=raw["loads"],
+        fold=(raw["stations"], np.ascontiguousarray(raw["fold"])),
+        contacts=raw["contacts"],
+        values=raw["values"],
+        tangents=raw["tangents"],
+        frames=raw["frames"],
+        folded=raw["folded"].astype(bool),
+    )
+    grid = tree.children["grid"].to_dataset(inherit=False) if "grid" in tree.children else None
+    return ContactMap(whisker, chart, steps, grid)

@@ -1,0 +1,269 @@
+"""From three signals back to every stable contact that gives them.
+
+The chart's subdivision tree for the triplet gives a seed for each contact; Newton's method on
+T(ξ) = T_measured makes it exact. Residuals are relative: forces to |F|, moments to |M|, angles in
+rad.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from vibrissa.rod.arrays import Array, IntArray, Rod
+from vibrissa.rod.batch import share_out
+from vibrissa.rod.compiled import inlined, kernel
+from vibrissa.rod.kernels import BUFFER_SIZE, LANES
+from vibrissa.rod.newton import TOLERANCE, chart_to_contact, newton_group, stable
+from vibrissa.rod.preimage import MOST_SEEDS, Preimages, Tree, seeds, wrapped
+from vibrissa.rod.reach import Fold, Reach
+from vibrissa.signals.base import (
+    CIRCULAR,
+    SIGNALS,
+    signal_derivatives,
+    signal_equations,
+    signals_of,
+)
+
+#: At most so many contacts are kept for one measurement, those with the least force.
+MOST_CANDIDATES = 8
+# Two solutions this near (relative to L and to the force) are one.
+_SAME = 1e-7
+
+
+class Contacts(NamedTuple):
+    """Contacts that explain measurements, non-dimensional, sorted by force.
+
+    number (n,); contacts ξ (n, MOST_CANDIDATES, 3) and (F, p) (n, MOST_CANDIDATES, 6), NaN-padded.
+    """
+
+    number: IntArray
+    contacts: Array
+    values: Array
+
+
+def triplet_tree(chart: Reach, triplet: tuple[str, ...]) -> Preimages:
+    """Build the subdivision tree of three signals over a chart."""
+    which = [SIGNALS.index(name) for name in triplet]
+    force, point = chart.values[..., :3], chart.values[..., 3:]
+    values = signals_of(force, np.cross(point, force))[..., which]
+    derivatives = signal_derivatives(chart.values, chart.tangents)[..., which, :]
+    angles = tuple(CIRCULAR[w] for w in which)
+    return Preimages.of(chart, np.ascontiguousarray(values), derivatives, angles)
+
+
+def invert(chart: Reach, tree: Preimages, triplet: tuple[str, ...], targets: Array) -> Contacts:
+    """Find all stable contacts for each measured triplet.
+
+    Parameters
+    ----------
+    chart : Reach
+        The whisker's stable contacts.
+    tree : Preimages
+        From :func:`triplet_tree`.
+    triplet : tuple of str
+        The signals.
+    targets : (n, 3) array
+        Their values, non-dimensional; rows with NaN have no contacts.
+
+    Returns
+    -------
+    Contacts
+        Row by row.
+    """
+    n = len(targets)
+    out = Contacts(
+        np.zeros(n, np.int64),
+        np.full((n, MOST_CANDIDATES, 3), np.nan),
+        np.full((n, MOST_CANDIDATES, 6), np.nan),
+    )
+    targets = _with_choice(targets, triplet)
+    rod = chart.discretization.rod
+    share_out(
+        n,
+        lambda first, last: _invert(
+            rod, chart.fold, tree.tree, chart.proximal, targets, *out, first, last
+        ),
+    )
+    return out
+
+
+def polish(
+    chart: Reach, triplet: tuple[str, ...], targets: Array, contacts: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Newton's method on T(ξ) = target from given contacts, stable or not.
+
+    Parameters
+    ----------
+    chart : Reach
+        The whisker's stable contacts.
+    triplet : tuple of str
+        The signals.
+    targets : (n, 3) array
+        Their values, non-dimensional.
+    contacts : (n, 3) array
+        Where to start, ξ.
+
+    Returns
+    -------
+    contacts : (n, 3) array
+        Where Newton's method ended.
+    values : (n, 6) array
+        (F, p) there.
+    misfits : (n,) array
+        Residuals; a solution has at most ``TOLERANCE``.
+    signs : (n,) array
+        det ∂p/∂ξ; positive where stable.
+    """
+    n = len(targets)
+    xi = np.array(contacts, dtype=np.float64)
+    values, misfits, signs = np.full((n, 6), np.nan), np.full(n, np.inf), np.full(n, np.nan)
+    targets = _with_choice(targets, triplet)
+    rod, fold = chart.discretization.rod, chart.fold
+    share_out(
+        n,
+        lambda first, last: _polish(rod, fold, targets, xi, values, misfits, signs, first, last),
+    )
+    return xi, values, misfits, signs
+
+
+def _with_choice(targets: Array, triplet: tuple[str, ...]) -> Array:
+    """Each target with the numbers of its signals behind it, as the equations want it."""
+    which = [float(SIGNALS.index(name)) for name in triplet]
+    return np.concatenate([targets, np.tile(which, (len(targets), 1))], axis=1)
+
+
+@inlined
+def _match(
+    value: Array, tangents: Array, wanted: bool, target: Array, residual: Array, jacobian: Array
+) -> None:
+    which = np.empty(3, np.int64)
+    for k in range(3):
+        which[k] = int(target[3 + k])
+    signal_equations(value, tangents, wanted, which, residual, jacobian)
+    fx, fy, fz = value[0], value[1], value[2]
+    px, py, pz = value[3], value[4], value[5]
+    mx, my, mz = py * fz - pz * fy, pz * fx - px * fz, px * fy - py * fx
+    force, moment = np.sqrt(fx * fx + fy * fy + fz * fz), np.sqrt(mx * mx + my * my + mz * mz)
+    for k in range(3):
+        residual[k] -= target[k]
+        w = which[k]
+        if w == 2 or w == 5:
+            residual[k] = wrapped(residual[k])
+            scale = 1.0
+        else:
+            scale = 1.0 / (force if w < 2 else moment)
+        residual[k] *= scale
+        if wanted:
+            for c in range(3):
+                jacobian[k, c] *= scale
+
+
+@inlined
+def _add(
+    row: int, xi: Array, value: Array, count: IntArray, contacts: Array, values: Array
+) -> None:
+    """Put a solution in its place by force, unless it is there already."""
+    force = np.hypot(xi[1], xi[2])
+    n = count[row]
+    place = n
+    for k in range(n):
+        other = contacts[row, k]
+        away = max(abs(xi[0] - other[0]), np.hypot(xi[1] - other[1], xi[2] - other[2]) / force)
+        if away < _SAME:
+            return
+        if place == n and np.hypot(other[1], other[2]) > force:
+            place = k
+    if place >= MOST_CANDIDATES:
+        return
+    for k in range(min(n, MOST_CANDIDATES - 1), place, -1):
+        contacts[row, k] = contacts[row, k - 1]
+        values[row, k] = values[row, k - 1]
+    contacts[row, place] = xi
+    values[row, place] = value
+    count[row] = min(n + 1, MOST_CANDIDATES)
+
+
+@kernel
+def _invert(
+    rod: Rod,
+    fold: Fold,
+    tree: Tree,
+    proximal: float,
+    targets: Array,
+    count: IntArray,
+    contacts: Array,
+    values: Array,
+    first: int,
+    last: int,
+) -> None:
+    b = np.zeros(BUFFER_SIZE)
+    found, quality = np.empty((MOST_SEEDS, 3)), np.empty(MOST_SEEDS, np.int64)
+    rows, group_targets = np.empty(LANES, np.int64), np.empty((LANES, 6))
+    group, group_values = np.empty((LANES, 3)), np.empty((LANES, 6))
+    misfits, signs = np.empty(LANES), np.empty(LANES)
+    waiting = 0
+    for row in range(first, last):
+        target = targets[row]
+        n = 0
+        if target[0] == target[0] and target[1] == target[1] and target[2] == target[2]:
+            n = seeds(tree, target[:3], found, quality)
+        for seed in range(n):
+            rows[waiting] = row
+            group_targets[waiting] = target
+            chart_to_contact(fold, found[seed], group[waiting])
+            waiting += 1
+            if waiting == LANES:
+                newton_group(
+                    _match,
+                    rod,
+                    fold,
+                    b,
+                    waiting,
+                    group_targets,
+                    group,
+                    group_values,
+                    misfits,
+                    signs,
+                )
+                for i in range(waiting):
+                    if misfits[i] <= TOLERANCE and stable(fold, proximal, group[i], signs[i]):
+                        _add(rows[i], group[i], group_values[i], count, contacts, values)
+                waiting = 0
+    if waiting > 0:
+        newton_group(
+            _match, rod, fold, b, waiting, group_targets, group, group_values, misfits, signs
+        )
+        for i in range(waiting):
+            if misfits[i] <= TOLERANCE and stable(fold, proximal, group[i], signs[i]):
+                _add(rows[i], group[i], group_values[i], count, contacts, values)
+
+
+@kernel
+def _polish(
+    rod: Rod,
+    fold: Fold,
+    targets: Array,
+    xi: Array,
+    values: Array,
+    misfits: Array,
+    signs: Array,
+    first: int,
+    last: int,
+) -> None:
+    b = np.zeros(BUFFER_SIZE)
+    for row in range(first, last, LANES):
+        end = min(row + LANES, last)
+        newton_group(
+            _match,
+            rod,
+            fold,
+            b,
+            end - row,
+            targets[row:end],
+            xi[row:end],
+            values[row:end],
+            misfits[row:end],
+            signs[row:end],
+        )

@@ -1,0 +1,203 @@
+"""The six signals at the base.
+
+Force F and moment M about the base, of the object on the whisker, in the whisker frame::
+
+    Fx           axial force, positive pulls the whisker out
+    FT, FD       transverse force, its direction:  hypot(Fy, Fz),  atan2(Fz, Fy)
+    Mx           twisting moment
+    MB, MD       bending moment, its direction:    hypot(My, Mz),  atan2(Mz, My)
+
+Directions are angles in (-π, π] and compared on the circle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike
+
+from vibrissa.quantities import attributes
+from vibrissa.rod.arrays import Array, IntArray
+from vibrissa.rod.compiled import inlined
+
+#: The signals in their canonical order.
+SIGNALS = ("Fx", "FT", "FD", "Mx", "MB", "MD")
+#: Which of them are angles.
+CIRCULAR = (False, False, True, False, False, True)
+
+
+def base_signals(force: ArrayLike | xr.DataArray, moment: ArrayLike | xr.DataArray) -> xr.Dataset:
+    """Turn force and moment at the base into the six signals.
+
+    Parameters
+    ----------
+    force : array_like or DataArray
+        Force on the whisker in the whisker frame, N, shape (..., 3). The dimensions of a DataArray
+        other than
+        ``space`` are kept; those of a plain array are called ``sample``, or ``axis_0``, ``axis_1``,
+        ... if several.
+    moment : array_like or DataArray
+        Moment about the base, N·m, same shape.
+
+    Returns
+    -------
+    Dataset
+        ``Fx``, ``FT`` (N), ``FD`` (rad), ``Mx``, ``MB`` (N·m), ``MD`` (rad), each of shape (...).
+        Directions are 0 where
+        what they belong to is zero.
+
+    Raises
+    ------
+    ValueError
+        If the last dimension is not of size 3, or the shapes differ.
+    """
+    dims = None
+    if isinstance(force, xr.DataArray) and "space" in force.dims:
+        force = force.transpose(..., "space")
+        dims = tuple(str(d) for d in force.dims[:-1])
+    if isinstance(moment, xr.DataArray) and "space" in moment.dims:
+        moment = moment.transpose(..., "space")
+    f, m = np.asarray(force, dtype=np.float64), np.asarray(moment, dtype=np.float64)
+    if f.shape != m.shape or f.ndim == 0 or f.shape[-1] != 3:
+        raise ValueError(
+            f"force and moment must have the same shape (..., 3); got {f.shape} and {m.shape}"
+        )
+    if dims is None:
+        dims = ("sample",) if f.ndim == 2 else tuple(f"axis_{i}" for i in range(f.ndim - 1))
+    values = signals_of(f, m)
+    return xr.Dataset(
+        {name: (dims, values[..., i], attributes(name)) for i, name in enumerate(SIGNALS)}
+    )
+
+
+def signals_of(force: Array, moment: Array) -> Array:
+    """The six signals as one array (..., 6), in the order of :data:`SIGNALS`."""
+    return np.stack(
+        [
+            force[..., 0],
+            np.hypot(force[..., 1], force[..., 2]),
+            np.arctan2(force[..., 2], force[..., 1]),
+            moment[..., 0],
+            np.hypot(moment[..., 1], moment[..., 2]),
+            np.arctan2(moment[..., 2], moment[..., 1]),
+        ],
+        axis=-1,
+    )
+
+
+def wrench_derivatives(force: Array, moment: Array) -> Array:
+    """∂(six signals)/∂(F, M), shape (..., 6, 6); not finite where a direction has no meaning."""
+    out = np.zeros((*force.shape[:-1], 6, 6))
+    for first, vector in ((0, force), (3, moment)):
+        y, z = vector[..., 1], vector[..., 2]
+        size = np.hypot(y, z)
+        out[..., first, first] = 1.0
+        with np.errstate(divide="ignore", invalid="ignore"):
+            out[..., first + 1, first + 1], out[..., first + 1, first + 2] = y / size, z / size
+            out[..., first + 2, first + 1] = -z / size**2
+            out[..., first + 2, first + 2] = y / size**2
+    return out
+
+
+def measured(
+    signals: xr.Dataset | Mapping[str, ArrayLike], names: tuple[str, ...]
+) -> tuple[Array, tuple[str, ...]]:
+    """Pick signals as one array.
+
+    Parameters
+    ----------
+    signals : Dataset or mapping
+        Has at least the named signals, SI units; shapes must broadcast.
+    names : tuple of str
+        Which.
+
+    Returns
+    -------
+    values : (..., k) array
+        In the order of ``names``; NaN means missing.
+    dims : tuple of str
+        Names of the leading dimensions; empty if they have none.
+
+    Raises
+    ------
+    ValueError
+        If a signal is missing or shapes do not broadcast.
+    """
+    missing = [name for name in names if name not in signals]
+    if missing:
+        raise ValueError(
+            f"signals lack {', '.join(missing)}; they have {', '.join(map(str, signals)) or 'none'}"
+        )
+    if isinstance(signals, xr.Dataset):
+        arrays = xr.broadcast(*(signals[name] for name in names))
+        dims = tuple(str(d) for d in arrays[0].dims)
+        return np.stack([a.to_numpy().astype(np.float64) for a in arrays], axis=-1), dims
+    plain = [np.asarray(signals[name], dtype=np.float64) for name in names]
+    try:
+        return np.stack(np.broadcast_arrays(*plain), axis=-1), ()
+    except ValueError as error:
+        shapes = ", ".join(f"{name} {a.shape}" for name, a in zip(names, plain, strict=True))
+        raise ValueError(f"signals of different shapes: {shapes}") from error
+
+
+@inlined
+def signal_equations(
+    value: Array, tangents: Array, wanted: bool, which: IntArray, signal: Array, jacobian: Array
+) -> None:
+    """Chosen signals of (F, p) and, if ``wanted``, their derivatives by ξ from the tangents.
+
+    Lengths are over L and forces over EI/L². ``signal`` (k,) and ``jacobian`` (k, 3) are filled.
+    """
+    fx, fy, fz = value[0], value[1], value[2]
+    px, py, pz = value[3], value[4], value[5]
+    mx, my, mz = py * fz - pz * fy, pz * fx - px * fz, px * fy - py * fx
+    ft, mb = np.sqrt(fy * fy + fz * fz), np.sqrt(my * my + mz * mz)
+    for k in range(which.shape[0]):
+        w = which[k]
+        if w == 0:
+            signal[k] = fx
+        elif w == 1:
+            signal[k] = ft
+        elif w == 2:
+            signal[k] = np.arctan2(fz, fy)
+        elif w == 3:
+            signal[k] = mx
+        elif w == 4:
+            signal[k] = mb
+        else:
+            signal[k] = np.arctan2(mz, my)
+    if not wanted:
+        return
+    for c in range(3):
+        dfx, dfy, dfz = tangents[0, c], tangents[1, c], tangents[2, c]
+        dpx, dpy, dpz = tangents[3, c], tangents[4, c], tangents[5, c]
+        dmx = dpy * fz + py * dfz - dpz * fy - pz * dfy
+        dmy = dpz * fx + pz * dfx - dpx * fz - px * dfz
+        dmz = dpx * fy + px * dfy - dpy * fx - py * dfx
+        for k in range(which.shape[0]):
+            w = which[k]
+            if w == 0:
+                jacobian[k, c] = dfx
+            elif w == 1:
+                jacobian[k, c] = (fy * dfy + fz * dfz) / ft
+            elif w == 2:
+                jacobian[k, c] = (fy * dfz - fz * dfy) / (ft * ft)
+            elif w == 3:
+                jacobian[k, c] = dmx
+            elif w == 4:
+                jacobian[k, c] = (my * dmy + mz * dmz) / mb
+            else:
+                jacobian[k, c] = (my * dmz - mz * dmy) / (mb * mb)
+
+
+def signal_derivatives(values: Array, tangents: Array) -> Array:
+    """∂(six signals)/∂ξ, shape (..., 6, 3), from (F, p) (..., 6) and ∂(F, p)/∂ξ (..., 6, 3)."""
+    force, point = values[..., :3], values[..., 3:]
+    d_force, d_point = tangents[..., :3, :], tangents[..., 3:, :]
+    d_moment = np.cross(d_point, force[..., None], axis=-2) + np.cross(
+        point[..., None], d_force, axis=-2
+    )
+    by_wrench = wrench_derivatives(force, np.cross(point, force))
+    return np.asarray(by_wrench @ np.concatenate([d_force, d_moment], axis=-2))

@@ -1,0 +1,133 @@
+"""Parts of the reachable space that the paper tells apart.
+
+- CB, concave backward: the contact has moved toward +y of the resting whisker at the same distance
+  r from the
+  base; CF, concave forward: toward -y. Beyond the resting whisker's largest r its curve is
+  continued along the tip's
+  tangent; where r(s) is not monotone the nearest branch counts.
+- Large deflection: the deflected tangent at the contact points back, its x component is negative.
+- The small-deflection cone: nearer to the resting whisker than tan 2° times the arc length there.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from vibrissa.rod.arrays import AnyArray, Array
+
+if TYPE_CHECKING:
+    from vibrissa.whisker import Whisker
+
+#: Half angle of the cone that the paper leaves out, rad.
+CONE = np.deg2rad(2.0)
+_SAMPLES = 2049
+
+
+@lru_cache(maxsize=16)
+def _rest(whisker: Whisker) -> tuple[Array, Array, cKDTree]:
+    s = np.linspace(0.0, whisker.length, _SAMPLES)
+    places = whisker.position(s)
+    return s, places, cKDTree(places)
+
+
+def nearest_on_rest(whisker: Whisker, points: Array) -> tuple[Array, Array]:
+    """Distance from the resting whisker, and the arc length of the nearest place.
+
+    Parameters
+    ----------
+    whisker : Whisker
+        The whisker.
+    points : (..., 3) array
+        Points in the whisker frame, m; NaN gives NaN.
+
+    Returns
+    -------
+    distance, arc_length : (...) arrays
+        Both in m.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    flat = points.reshape(-1, 3)
+    distance, arc_length = np.full(len(flat), np.nan), np.full(len(flat), np.nan)
+    rows = np.flatnonzero(np.isfinite(flat).all(axis=1))
+    if rows.size:
+        s, places, tree = _rest(whisker)
+        _, i = tree.query(flat[rows])
+        # Between samples the curve is straight enough: the nearest place on the two chords beside
+        # the sample.
+        best, where = np.full(rows.size, np.inf), np.zeros(rows.size)
+        for j in (np.maximum(i - 1, 0), np.minimum(i, s.size - 2)):
+            chord = places[j + 1] - places[j]
+            t = np.einsum("ni,ni->n", flat[rows] - places[j], chord)
+            t = np.clip(t / np.einsum("ni,ni->n", chord, chord), 0.0, 1.0)
+            away = np.linalg.norm(flat[rows] - places[j] - t[:, None] * chord, axis=1)
+            closer = away < best
+            best = np.where(closer, away, best)
+            where = np.where(closer, s[j] + t * (s[j + 1] - s[j]), where)
+        distance[rows], arc_length[rows] = best, where
+    return distance.reshape(points.shape[:-1]), arc_length.reshape(points.shape[:-1])
+
+
+def within_cone(whisker: Whisker, points: Array, angle: float = CONE) -> AnyArray:
+    """Whether contact points (..., 3), m, lie within a cone about the resting whisker."""
+    distance, arc_length = nearest_on_rest(whisker, points)
+    return np.asarray(distance < arc_length * np.tan(angle))
+
+
+def concave_backward(whisker: Whisker, points: Array) -> AnyArray:
+    """Whether contacts have moved toward +y of the resting whisker at the same r: CB, not CF.
+
+    Parameters
+    ----------
+    whisker : Whisker
+        The whisker; of a straight one the sign of y itself decides.
+    points : (..., 3) array
+        Contact points in the whisker frame, m.
+
+    Returns
+    -------
+    (...) bool array
+        True for CB, False for CF (and for NaN).
+    """
+    points = np.asarray(points, dtype=np.float64)
+    y = points[..., 1]
+    if whisker.is_straight:
+        return np.asarray(y > 0.0)
+    _, places, _ = _rest(whisker)
+    r_rest = np.linalg.norm(places, axis=1)
+    r = np.linalg.norm(points, axis=-1)
+    if np.all(np.diff(r_rest) > 0.0):
+        rest_y = np.interp(r, r_rest, places[:, 1])
+    else:
+        rest_y = _nearest_branch(points, r, r_rest, places)
+    tip, tangent = places[-1], whisker.frame(np.array(whisker.length))[:, 0]
+    beyond = r > r_rest.max()
+    along = np.dot(tip, tangent)
+    # |tip + a tangent| = r
+    a = -along + np.sqrt(np.maximum(along**2 + r**2 - np.dot(tip, tip), 0.0))
+    return np.asarray(y - np.where(beyond, tip[1] + a * tangent[1], rest_y) > 0.0)
+
+
+def _nearest_branch(points: Array, r: Array, r_rest: Array, places: Array) -> Array:
+    """Y of the resting whisker at distance r, on the branch that passes nearest to the point."""
+    flat, radius = points.reshape(-1, 3), r.reshape(-1)
+    out = np.full(radius.size, np.nan)
+    best = np.full(radius.size, np.inf)
+    turns = np.flatnonzero(np.diff(np.sign(np.diff(r_rest))) != 0) + 1
+    edges = [0, *turns.tolist(), r_rest.size - 1]
+    for a, b in pairwise(edges):
+        piece = slice(a, b + 1)
+        order = np.argsort(r_rest[piece])
+        known = r_rest[piece][order]
+        place = np.stack(
+            [np.interp(radius, known, places[piece][order, i]) for i in range(3)], axis=1
+        )
+        away = np.linalg.norm(flat - place, axis=1)
+        away[(radius < known[0]) | (radius > known[-1])] = np.inf
+        closer = away < best
+        out, best = np.where(closer, place[:, 1], out), np.where(closer, away, best)
+    return out.reshape(r.shape)

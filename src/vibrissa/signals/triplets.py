@@ -1,0 +1,39 @@
+"""The twenty triplets of the six signals, and how a choice of signals is written."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+
+from vibrissa.signals.base import SIGNALS
+
+#: All choices of three of the six signals, in canonical order.
+TRIPLETS = tuple(combinations(SIGNALS, 3))
+
+
+def selection(signals: str | Sequence[str], least: int = 3) -> tuple[str, ...]:
+    """Read a choice of signals.
+
+    Parameters
+    ----------
+    signals : str or sequence of str
+        Names, or one text with names between commas or blanks: ``"Fx MB MD"``.
+    least : int
+        How many are needed.
+
+    Returns
+    -------
+    tuple of str
+        In canonical order.
+
+    Raises
+    ------
+    ValueError
+        If a name is unknown or given twice, or if there are too few.
+    """
+    names = signals.replace(",", " ").split() if isinstance(signals, str) else list(signals)
+    unknown = [name for name in names if name not in SIGNALS]
+    if unknown or len(set(names)) != len(names) or len(names) < least:
+        known = ", ".join(SIGNALS)
+        raise ValueError(f"expected at least {least} different signals of {known}; got {signals!r}")
+    return tuple(name for name in SIGNALS if name in names)

@@ -47,6 +47,9 @@ _MOST_ITERATIONS = 30
 # below this share of its start, or if the speed (in longest steps per path) has grown by this
 # factor or is as high as this.
 _NEAR_FOLD = 0.5
+# So near a fold that the solution moves by the square root of the rounding, a contact that Newton's
+# method cannot improve is one if it meets the equations to this.
+_AT_FOLD = 3e-10
 _SPED_UP = 2.0
 _FAST = 30.0
 
@@ -235,6 +238,7 @@ def follow(
     done, stride = np.zeros(LANES), np.zeros(LANES)
     sign, ratio = np.zeros(LANES), np.zeros(LANES)
     last_size, rounds = np.zeros(LANES), np.zeros(LANES, np.int64)
+    best, x_best, values_best = np.zeros(LANES), np.empty((LANES, 3)), np.empty((LANES, 6))
     speed, first_speed = np.zeros(LANES), np.zeros(LANES)
     clipped, lost = np.zeros(LANES, np.bool_), np.zeros(LANES, np.bool_)
     waiting, running = first, 0
@@ -248,7 +252,7 @@ def follow(
                 x_ok[i] = x[i]
                 done[i], stride[i], sign[i], ratio[i] = 0.0, 1.0, 0.0, 1.0
                 rounds[i], clipped[i], lost[i] = 0, False, False
-                first_speed[i] = np.inf
+                first_speed[i], best[i] = np.inf, np.inf
             if row[i] >= 0:
                 _contact(kinds[row[i]], x[i], contact)
                 set_lane(b, i, contact[0], contact[1], contact[2], contact[3], kinds[row[i]] == TIP)
@@ -280,6 +284,8 @@ def follow(
                 sign[i] = det
             relative = det / sign[i]
             failed = not (misfit < np.inf) or not relative > 0.0
+            if progress >= 1.0 and misfit < best[i] and relative > 0.0:
+                best[i], x_best[i], values_best[i] = misfit, x[i], value
             most = _limit(kind, fold, x[i])
             size = 0.0
             for a in range(3):
@@ -346,6 +352,16 @@ def follow(
                 rounds[i] = 0
                 continue
             # No step succeeds.
+            if best[i] <= _AT_FOLD:
+                _contact(kind, x_best[i], contact)
+                contacts[m], values[m], misfits[m] = contact, values_best[i], best[i]
+                unknowns[m] = x_best[i]
+                statuses[m] = _AT_TIP if kind == TIP else _OK
+                if contact[0] < proximal - ROUNDING:
+                    statuses[m] = _PROXIMAL
+                row[i] = -1
+                running -= 1
+                continue
             if kind == SIDE and clipped[i]:
                 kinds[m] = TIP
                 x[i, 0], x[i, 1], x[i, 2] = x_ok[i, 1], 0.0, x_ok[i, 2]

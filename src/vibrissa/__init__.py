@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from vibrissa import samples
     from vibrissa.io import load_whisker
-    from vibrissa.mapping import ContactMap, Estimate
+    from vibrissa.mapping import ContactMap, Estimate, Estimator
     from vibrissa.rod import Deflection, PegContact, PointContact, PointForce, deflect
     from vibrissa.signals import base_signals
     from vibrissa.status import Status
@@ -25,6 +25,7 @@ __all__ = [
     "ContactMap",
     "Deflection",
     "Estimate",
+    "Estimator",
     "PegContact",
     "PointContact",
     "PointForce",
@@ -41,6 +42,7 @@ _HOMES = {
     "ContactMap": "vibrissa.mapping",
     "Deflection": "vibrissa.rod",
     "Estimate": "vibrissa.mapping",
+    "Estimator": "vibrissa.mapping",
     "PegContact": "vibrissa.rod",
     "PointContact": "vibrissa.rod",
     "PointForce": "vibrissa.rod",

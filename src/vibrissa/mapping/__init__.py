@@ -2,5 +2,6 @@
 
 from vibrissa.mapping.contact_map import ContactMap
 from vibrissa.mapping.estimate import Estimate
+from vibrissa.mapping.estimator import Estimator, Located
 
-__all__ = ["ContactMap", "Estimate"]
+__all__ = ["ContactMap", "Estimate", "Estimator", "Located"]

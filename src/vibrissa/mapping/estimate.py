@@ -23,14 +23,12 @@ from vibrissa.rod.arrays import Array, IntArray
 from vibrissa.rod.batch import solve_forces
 from vibrissa.rod.newton import TOLERANCE
 from vibrissa.rod.reach import with_normal_force
-from vibrissa.signals import CIRCULAR, SIGNALS, measured, selection
+from vibrissa.signals import CIRCULAR, SIGNALS, measured, selection, signal_scales
 from vibrissa.signals.base import signal_derivatives, signals_of, wrench_derivatives
 from vibrissa.status import Status, flag_attributes
 
 if TYPE_CHECKING:
     from vibrissa.mapping.contact_map import ContactMap
-
-_FORCES, _MOMENTS = ("Fx", "FT"), ("Mx", "MB")
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,9 +161,7 @@ def estimate(
     """
     if method != "exact":
         raise ValueError(f"method is 'exact'; got {method!r}")
-    names = selection(triplet)
-    if len(names) != 3:
-        raise ValueError(f"an estimate takes three signals; got {', '.join(names)}")
+    names = selection(triplet, exactly=3)
     values, dims = measured(signals, names)
     shape = values.shape[:-1]
     dims = dims or (
@@ -174,9 +170,7 @@ def estimate(
     flat = values.reshape(-1, 3)
     chart = contacts.chart
     d = chart.discretization
-    scale = np.array(
-        [d.force if n in _FORCES else d.moment if n in _MOMENTS else 1.0 for n in names]
-    )
+    scale = signal_scales(names, d.force, d.moment)
     found = invert(chart, contacts.tree(names), names, flat / scale)
     best = found.values[:, 0]
     force, point = best[:, :3] * d.force, best[:, 3:] * d.length
@@ -285,7 +279,7 @@ def _signal_covariance(
             raise ValueError(
                 f"noise lacks {', '.join(missing)}; it has {', '.join(noise) or 'none'}"
             )
-        scale = [force if n in _FORCES else moment if n in _MOMENTS else 1.0 for n in names]
+        scale = signal_scales(names, force, moment)
         sigma = np.array([noise[name] for name in names], dtype=np.float64) / scale
         if not (np.isfinite(sigma).all() and (sigma >= 0.0).all()):
             raise ValueError(f"noise must be standard deviations ≥ 0; got {dict(noise)}")

@@ -84,5 +84,9 @@ def load_map(path: Path) -> ContactMap:
         frames=raw["frames"],
         folded=raw["folded"].astype(bool),
     )
-    grid = tree.children["grid"].to_dataset(inherit=False) if "grid" in tree.children else None
+    grid = None
+    if "grid" in tree.children:
+        # Files keep a coordinate of the root only there.
+        grid = tree.children["grid"].to_dataset(inherit=False)
+        grid = grid.assign_coords(space=["x", "y", "z"])
     return ContactMap(whisker, chart, steps, grid)

@@ -1,6 +1,6 @@
 """What the follicle feels: six signals, their triplets, and regions of contact."""
 
-from vibrissa.signals.base import CIRCULAR, SIGNALS, base_signals, measured
+from vibrissa.signals.base import CIRCULAR, SIGNALS, base_signals, measured, signal_scales
 from vibrissa.signals.regions import concave_backward, nearest_on_rest, within_cone
 from vibrissa.signals.triplets import TRIPLETS, selection
 
@@ -13,5 +13,6 @@ __all__ = [
     "measured",
     "nearest_on_rest",
     "selection",
+    "signal_scales",
     "within_cone",
 ]

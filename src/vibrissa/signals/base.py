@@ -142,6 +142,12 @@ def measured(
         raise ValueError(f"signals of different shapes: {shapes}") from error
 
 
+def signal_scales(names: tuple[str, ...], force: float, moment: float) -> Array:
+    """What to divide signals by to make them non-dimensional, (k,); 1 for directions."""
+    scales = {"Fx": force, "FT": force, "Mx": moment, "MB": moment}
+    return np.array([scales.get(name, 1.0) for name in names])
+
+
 @inlined
 def signal_equations(
     value: Array, tangents: Array, wanted: bool, which: IntArray, signal: Array, jacobian: Array

@@ -11,7 +11,9 @@ from vibrissa.signals.base import SIGNALS
 TRIPLETS = tuple(combinations(SIGNALS, 3))
 
 
-def selection(signals: str | Sequence[str], least: int = 3) -> tuple[str, ...]:
+def selection(
+    signals: str | Sequence[str], least: int = 3, exactly: int | None = None
+) -> tuple[str, ...]:
     """Read a choice of signals.
 
     Parameters
@@ -20,6 +22,8 @@ def selection(signals: str | Sequence[str], least: int = 3) -> tuple[str, ...]:
         Names, or one text with names between commas or blanks: ``"Fx MB MD"``.
     least : int
         How many are needed.
+    exactly : int, optional
+        How many there must be.
 
     Returns
     -------
@@ -36,4 +40,6 @@ def selection(signals: str | Sequence[str], least: int = 3) -> tuple[str, ...]:
     if unknown or len(set(names)) != len(names) or len(names) < least:
         known = ", ".join(SIGNALS)
         raise ValueError(f"expected at least {least} different signals of {known}; got {signals!r}")
+    if exactly is not None and len(names) != exactly:
+        raise ValueError(f"expected {exactly} signals; got {len(names)}: {', '.join(names)}")
     return tuple(name for name in SIGNALS if name in names)

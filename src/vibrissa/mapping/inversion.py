@@ -15,9 +15,9 @@ from vibrissa.rod.arrays import Array, IntArray, Rod
 from vibrissa.rod.batch import share_out
 from vibrissa.rod.compiled import inlined, kernel
 from vibrissa.rod.kernels import BUFFER_SIZE, LANES
-from vibrissa.rod.newton import TOLERANCE, chart_to_contact, newton_group, stable
+from vibrissa.rod.newton import TOLERANCE, newton_group, stable
 from vibrissa.rod.preimage import MOST_SEEDS, Preimages, Tree, seeds, wrapped
-from vibrissa.rod.reach import Fold, Reach
+from vibrissa.rod.reach import Fold, Reach, chart_to_contact
 from vibrissa.signals.base import (
     CIRCULAR,
     SIGNALS,

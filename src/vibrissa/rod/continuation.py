@@ -31,13 +31,12 @@ from vibrissa.rod.compiled import inlined, kernel
 from vibrissa.rod.kernels import BUFFER_SIZE, LANES, integrate, lane_tangents, lane_value, set_lane
 from vibrissa.rod.newton import ROUNDING, TOLERANCE, norm3
 from vibrissa.rod.preimage import solve3
-from vibrissa.rod.reach import Fold, fold_force
+from vibrissa.rod.reach import LEAST_ARC, Fold, fold_force
 from vibrissa.status import Status
 
 POINT, SIDE, TIP = 0, 1, 2
 #: A force this small (EI/L²) only says where an object touches.
 LEAST_FORCE = 1e-7
-_LEAST_ARC = 0.05
 # Fractions of the path; points start within a cell of their target.
 _SMALLEST_STEP = 2.0**-12
 _SMALLEST_POINT_STEP = 2.0**-9
@@ -338,7 +337,7 @@ def follow(
                     x[i, a] -= shorten * step[a]
                 if kind != TIP:
                     clipped[i] = x[i, 0] > 1.0
-                    x[i, 0] = min(max(x[i, 0], _LEAST_ARC), 1.0)
+                    x[i, 0] = min(max(x[i, 0], LEAST_ARC), 1.0)
                 force = 1 if kind == SIDE else 0
                 if kind != POINT and x[i, force] < 0.01 * LEAST_FORCE:
                     lost[i] = True

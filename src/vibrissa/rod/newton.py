@@ -22,14 +22,13 @@ from vibrissa.rod.arrays import Array, Rod
 from vibrissa.rod.compiled import inlined
 from vibrissa.rod.kernels import LANES, integrate, lane_tangents, lane_value, set_lane
 from vibrissa.rod.preimage import solve3
-from vibrissa.rod.reach import Fold, fold_force
+from vibrissa.rod.reach import LEAST_ARC, Fold, fold_force
 
 #: Residual at which an equation is solved.
 TOLERANCE = 1e-11
 #: Contacts up to this far (in L) beyond the tip or before the proximal limit are there by rounding.
 ROUNDING = 1e-9
 _ROUNDS = 12
-_LEAST_ARC = 0.05
 
 
 @inlined
@@ -44,7 +43,7 @@ def limited_step(fold: Fold, xi: Array, step: Array) -> None:
     strength = fold_force(fold, xi[0], float(np.arctan2(xi[2], xi[1])))
     longest = max(abs(step[0]) / 0.1, float(np.hypot(step[1], step[2])) / (0.3 * strength))
     shorten = 1.0 / max(longest, 1.0)
-    xi[0] = min(max(xi[0] + shorten * step[0], _LEAST_ARC), 1.0)
+    xi[0] = min(max(xi[0] + shorten * step[0], LEAST_ARC), 1.0)
     xi[1] += shorten * step[1]
     xi[2] += shorten * step[2]
 
@@ -151,11 +150,3 @@ def stable(fold: Fold, proximal: float, xi: Array, sign: float) -> bool:
     # The interpolated fold force is good to a few parts in 10⁴; the determinant's sign decides near
     # it.
     return bool(np.hypot(xi[1], xi[2]) <= 1.01 * strength)
-
-
-@inlined
-def chart_to_contact(fold: Fold, chart: Array, xi: Array) -> None:
-    """Turn (s, ψ, ρ) into ξ."""
-    xi[0] = min(max(chart[0], _LEAST_ARC), 1.0)
-    force = chart[2] * chart[2] * fold_force(fold, xi[0], chart[1])
-    xi[1], xi[2] = force * np.cos(chart[1]), force * np.sin(chart[1])

@@ -16,14 +16,13 @@ import numpy as np
 from vibrissa.rod.arrays import AnyArray, Array, IntArray
 from vibrissa.rod.continuation import LEAST_FORCE, SIDE, TIP
 from vibrissa.rod.points import Solutions, follow_all
-from vibrissa.rod.reach import reach
+from vibrissa.rod.reach import LEAST_ARC, reach
 from vibrissa.status import Status
 
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
 
 _SAMPLES = 513
-_LEAST_ARC = 0.05
 # The first touch, as deep as the least force needs.
 _DEPTH = 1e-6
 _ROWS = 4096
@@ -57,7 +56,7 @@ class Rest(NamedTuple):
     @lru_cache(maxsize=16)
     def of(cls, whisker: Whisker) -> Rest:
         """Sample a whisker; cached."""
-        s = np.linspace(_LEAST_ARC, 1.0, _SAMPLES)
+        s = np.linspace(LEAST_ARC, 1.0, _SAMPLES)
         arc_length = np.minimum(s * whisker.length, whisker.length)
         return cls(
             s,

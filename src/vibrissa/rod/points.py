@@ -13,9 +13,16 @@ from vibrissa.rod.batch import share_out, solve_forces
 from vibrissa.rod.compiled import inlined, kernel
 from vibrissa.rod.continuation import POINT, follow
 from vibrissa.rod.kernels import BUFFER_SIZE, LANES
-from vibrissa.rod.newton import TOLERANCE, chart_to_contact, newton_group, stable
+from vibrissa.rod.newton import TOLERANCE, newton_group, stable
 from vibrissa.rod.preimage import MOST_SEEDS, Preimages, Tree, seeds
-from vibrissa.rod.reach import Fold, Reach, contacts_at, reach, with_normal_force
+from vibrissa.rod.reach import (
+    Fold,
+    Reach,
+    chart_to_contact,
+    contacts_at,
+    reach,
+    with_normal_force,
+)
 from vibrissa.status import Status
 
 if TYPE_CHECKING:
@@ -203,13 +210,13 @@ class PointSolver:
 
 def _faces(chart: Reach) -> list[tuple[Array, Status]]:
     """Places on the chart's outer faces (n, 3), and what lies beyond each."""
-    s, rho = np.linspace(chart.proximal, 1.0, _FACE), np.linspace(0.0, 1.0, _FACE)
+    eta, rho = np.linspace(0.0, 1.0, _FACE), np.linspace(0.0, 1.0, _FACE)
     psi = np.linspace(0.0, 2.0 * np.pi, 2 * _FACE, endpoint=False)
     faces = []
     for axes, reason in (
-        ((s, psi, rho[-1:]), Status.BEYOND_FOLD),
-        ((s[-1:], psi, rho), Status.BEYOND_TIP),
-        ((s[:1], psi, rho), Status.TOO_PROXIMAL),
+        ((eta, psi, rho[-1:]), Status.BEYOND_FOLD),
+        ((eta[-1:], psi, rho), Status.BEYOND_TIP),
+        ((eta[:1], psi, rho), Status.TOO_PROXIMAL),
     ):
         place = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         contacts = with_normal_force(contacts_at(chart.fold, place))

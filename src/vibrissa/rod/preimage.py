@@ -3,7 +3,7 @@
 Three quantities T (the contact point's coordinates, or three base signals) are known with their
 exact derivatives at the nodes of the chart (:mod:`vibrissa.rod.reach`). In each cell T is the cubic
 blended between the cell's twelve edges: with H the cubic Hermite curve along an edge and V the
-straight line between its ends, Σ w H over the four edges along s plus Σ w (H - V) over those along
+straight line between its ends, Σ w H over the four edges along η plus Σ w (H - V) over those along
 ψ and ρ, w the bilinear weights across. It reproduces all cubics, so its error is of fourth order;
 the Bézier points of the edges bound it.
 
@@ -25,7 +25,7 @@ from vibrissa.rod.compiled import inlined
 from vibrissa.rod.reach import Reach
 
 # For the kernels:
-# 0 grid (2, 3): origin and size of a cell in (s, ψ, ρ)
+# 0 grid (2, 3): origin and size of a cell in (η, ψ, ρ)
 # 1 turns (3,): 1/2π for an angle, 0 otherwise
 # 2 offsets (levels + 1,): first row of each level in 3; a node's eight children are row
 # offsets[level] + node 3 boxes (rows, 6, 8): middle and half width of the three quantities, for
@@ -84,8 +84,8 @@ class Preimages:
         Preimages
             Ready to be searched.
         """
-        size = np.array([a[1] - a[0] for a in (reach.stations, reach.bearings, reach.loads)])
-        grid = np.stack([np.array([reach.stations[0], 0.0, 0.0]), size])
+        size = np.array([1.0, 2.0 * np.pi, 1.0]) / (np.array(values.shape[:3]) - 1)
+        grid = np.stack([np.zeros(3), size])
         circular = np.array(angles)
         place = _octree_order(tuple(n - 1 for n in values.shape[:3]))
         corner, slope = _corners(place, values, reach.charted(derivatives) * size, circular)
@@ -189,7 +189,7 @@ def _aligned(corner: Array, points: Array, base: Array) -> Array:
 
 
 def _edges(corner: Array, slope: Array) -> Array:
-    """Coefficients: cubics along s at the corners of (ψ, ρ), corrections along ψ and along ρ."""
+    """Coefficients: cubics along η at the corners of (ψ, ρ), corrections along ψ and along ρ."""
     parts = []
     for axis in range(3):
         v = np.moveaxis(corner, axis + 1, 1)
@@ -329,22 +329,22 @@ def _keep(
     grid: Array, place: IntArray, x: Array, solved: int, found: Array, quality: IntArray, count: int
 ) -> int:
     """Add a seed unless neighbours found it; what is solved replaces what is not."""
-    s = grid[0, 0] + grid[1, 0] * (place[0] + x[0])
+    eta = grid[0, 0] + grid[1, 0] * (place[0] + x[0])
     psi = grid[0, 1] + grid[1, 1] * (place[1] + x[1])
     rho = grid[0, 2] + grid[1, 2] * (place[2] + x[2])
     for n in range(count):
         apart = max(
-            abs(s - found[n, 0]) / grid[1, 0],
+            abs(eta - found[n, 0]) / grid[1, 0],
             abs(wrapped(psi - found[n, 1])) / grid[1, 1],
             abs(rho - found[n, 2]) / grid[1, 2],
         )
         if apart < 0.02 or (apart < 0.5 and solved + quality[n] < 4):
             if solved > quality[n]:
-                found[n, 0], found[n, 1], found[n, 2] = s, psi, rho
+                found[n, 0], found[n, 1], found[n, 2] = eta, psi, rho
                 quality[n] = solved
             return count
     if count < MOST_SEEDS:
-        found[count, 0], found[count, 1], found[count, 2] = s, psi, rho
+        found[count, 0], found[count, 1], found[count, 2] = eta, psi, rho
         quality[count] = solved
         count += 1
     return count
@@ -361,7 +361,7 @@ def seeds(tree: Tree, target: Array, found: Array, quality: IntArray) -> int:
     target : (3,) array
         The values.
     found : (MOST_SEEDS, 3) array
-        Filled with (s, ψ, ρ).
+        Filled with (η, ψ, ρ).
     quality : (MOST_SEEDS,) int array
         Filled with 2 (the interpolant is solved) or 1 (it is not: near a fold of the map).
 

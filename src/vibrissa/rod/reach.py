@@ -6,12 +6,13 @@ equilibrium meets an unstable one and a frictionless whisker slips off. The cont
 and fold, for s_c between ``proximal`` and the tip, are the stable ones connected to rest. With the
 fold force f*(s_c, ψ) they are charted by
 
-    ξ = (s, ρ² f*(s, ψ) cos ψ, ρ² f*(s, ψ) sin ψ),   0 ≤ ρ ≤ 1,
+    ξ = (s(η), ρ² f*(s, ψ) cos ψ, ρ² f*(s, ψ) sin ψ),   0 ≤ η ≤ 1,   0 ≤ ρ ≤ 1,
+    s(η) = 1 - (1 - proximal) ((1 - a)(1 - η) + a (1 - η)²),
 
-a box in (s, ψ, ρ), periodic in ψ, with its cells concentrated toward rest, where signals vanish
-and their ratios vary fast. The chart is sampled on a grid whose nodes carry base force F,
-contact point p and their exact derivatives with respect to (s, ψ, ρ). ln f* is interpolated by
-bicubic Hermite patches.
+a box in (η, ψ, ρ), periodic in ψ. Its cells are denser toward rest, where signals vanish and their
+ratios vary fast, and (by the grading a) toward a thin tip, where the fold force falls steeply. The
+chart is sampled on a grid whose nodes carry base force F, contact point p and their exact
+derivatives. ln f* is interpolated by bicubic Hermite patches.
 """
 
 from __future__ import annotations
@@ -33,12 +34,16 @@ if TYPE_CHECKING:
 
 #: Contacts nearer the base than this fraction of the length are not considered, unless asked for.
 PROXIMAL = 0.3
-#: Cells of the chart along (s, ψ, ρ).
+#: Cells of the chart along (η, ψ, ρ).
 CELLS = (16, 32, 16)
 # The fold is looked for up to this many times the force that would bend the contact by its own arc
 # length were the whisker linear; straight, curved, conical and cylindrical whiskers fold below 4.
 _FARTHEST = 12.0
 _SCAN = 0.0625
+# Grading toward a tip of radius zero.
+_GRADING = 0.85
+#: No solution is looked for nearer to the base than this (over L).
+LEAST_ARC = 0.05
 # Directions have no value at zero force; just above it they have their limit.
 _LEAST_LOAD = 0.01
 
@@ -55,10 +60,10 @@ class Reach:
     ----------
     discretization : Discretization
         The whisker.
-    stations, bearings, loads : (n,), (m + 1,), (k,) arrays
+    stations, bearings, loads : (n + 1,), (m + 1,), (k + 1,) arrays
         Grid of s/L, ψ (rad, both ends of the circle) and ρ = √(force / fold force).
     fold : tuple of arrays
-        ``stations`` and ln f* with its derivatives, (n, m + 1, 4); for :func:`fold_force`.
+        (proximal, a), and ln f* with its derivatives, (n + 1, m + 1, 4); for :func:`fold_force`.
     contacts : (n, m + 1, k, 3) array
         ξ at the nodes.
     values : (n, m + 1, k, 6) array
@@ -66,7 +71,7 @@ class Reach:
     tangents : (n, m + 1, k, 6, 3) array
         ∂(F, p)/∂ξ at the nodes.
     frames : (n, m + 1, k, 3, 3) array
-        ∂ξ/∂(s, ψ, ρ) at the nodes.
+        ∂ξ/∂(η, ψ, ρ) at the nodes.
     folded : (n, m + 1) bool array
         Whether the ray reaches a fold; False where it was followed to the largest force considered.
     """
@@ -88,7 +93,7 @@ class Reach:
         return float(self.stations[0])
 
     def charted(self, derivatives: Array) -> Array:
-        """Turn derivatives with respect to ξ at the nodes into ones with respect to (s, ψ, ρ)."""
+        """Turn derivatives with respect to ξ at the nodes into ones with respect to (η, ψ, ρ)."""
         return np.asarray(np.einsum("...ij,...jk->...ik", derivatives, self.frames))
 
 
@@ -108,7 +113,7 @@ def reach(
     proximal : float
         Smallest s_c/L.
     cells : tuple of int
-        Cells along s, ψ and ρ; powers of two.
+        Cells along η, ψ and ρ; powers of two.
     steps : int
         Integration steps along the whisker.
 
@@ -122,24 +127,29 @@ def reach(
             f"the smallest arc length is {proximal} L; it must be from 0.05 L to below L"
         )
     discretization = discretize(whisker, steps)
-    stations = np.linspace(proximal, 1.0, cells[0] + 1)
+    grading = _GRADING * max(0.0, 1.0 - whisker.tip_radius / whisker.base_radius)
+    eta = np.linspace(0.0, 1.0, cells[0] + 1)
+    stations = 1.0 - (1.0 - proximal) * ((1.0 - grading) * (1.0 - eta) + grading * (1.0 - eta) ** 2)
+    stretch = (1.0 - proximal) * (1.0 - grading + 2.0 * grading * (1.0 - eta))
     bearings = np.linspace(0.0, 2.0 * np.pi, cells[1] + 1)
     loads = np.linspace(0.0, 1.0, cells[2] + 1)
     force, folded = _fold_forces(discretization, stations, bearings[:-1])
-    log_fold = _log_fold(stations, bearings, force)
+    log_fold = _log_fold(eta, bearings, force)
     s, psi, rho = np.meshgrid(stations, bearings, np.maximum(loads, _LEAST_LOAD), indexing="ij")
-    f, f_s, f_psi = (a[..., None] for a in _expand(log_fold))
+    f, f_eta, f_psi = (a[..., None] for a in _expand(log_fold))
     cos, sin = np.cos(psi), np.sin(psi)
     contacts = np.stack([s, rho**2 * f * cos, rho**2 * f * sin], axis=-1)
     zero = np.zeros_like(s)
     frames = np.stack(
         [
-            np.stack([zero + 1.0, zero, zero], axis=-1),
+            np.stack([zero + stretch[:, None, None], zero, zero], axis=-1),
             np.stack(
-                [rho**2 * f_s * cos, rho**2 * (f_psi * cos - f * sin), 2.0 * rho * f * cos], axis=-1
+                [rho**2 * f_eta * cos, rho**2 * (f_psi * cos - f * sin), 2.0 * rho * f * cos],
+                axis=-1,
             ),
             np.stack(
-                [rho**2 * f_s * sin, rho**2 * (f_psi * sin + f * cos), 2.0 * rho * f * sin], axis=-1
+                [rho**2 * f_eta * sin, rho**2 * (f_psi * sin + f * cos), 2.0 * rho * f * sin],
+                axis=-1,
             ),
         ],
         axis=-2,
@@ -153,7 +163,7 @@ def reach(
         stations=stations,
         bearings=bearings,
         loads=loads,
-        fold=(stations, log_fold),
+        fold=(np.array([proximal, grading]), log_fold),
         contacts=contacts,
         values=values.reshape(*grid, 6),
         tangents=tangents.reshape(*grid, 6, 3),
@@ -226,13 +236,13 @@ def _fold_forces(
     return (low * unit).reshape(shape), folded.reshape(shape)
 
 
-def _log_fold(stations: Array, bearings: Array, force: Array) -> Array:
+def _log_fold(eta: Array, bearings: Array, force: Array) -> Array:
     """Ln f* with its derivatives (value, s, ψ, sψ) at the nodes, from splines periodic in ψ."""
     values = np.log(np.concatenate([force, force[:, :1]], axis=1))
     around = CubicSpline(bearings, values, axis=1, bc_type="periodic")
     in_psi = around(bearings, 1)
-    in_s = CubicSpline(stations, values, axis=0)(stations, 1)
-    in_both = CubicSpline(stations, in_psi, axis=0)(stations, 1)
+    in_s = CubicSpline(eta, values, axis=0)(eta, 1)
+    in_both = CubicSpline(eta, in_psi, axis=0)(eta, 1)
     return np.ascontiguousarray(np.stack([values, in_s, in_psi, in_both], axis=-1))
 
 
@@ -242,12 +252,10 @@ def _expand(log_fold: Array) -> tuple[Array, Array, Array]:
 
 
 def contacts_at(fold: Fold, chart: Array) -> Array:
-    """Turn chart coordinates (s, ψ, ρ), shape (n, 3), into contacts ξ, shape (n, 3)."""
-    force = np.empty(len(chart))
-    _fold_forces_at(fold, np.ascontiguousarray(chart), force)
-    force *= chart[:, 2] ** 2
-    psi = chart[:, 1]
-    return np.stack([chart[:, 0], force * np.cos(psi), force * np.sin(psi)], axis=1)
+    """Turn chart coordinates (η, ψ, ρ), shape (n, 3), into contacts ξ, shape (n, 3)."""
+    contacts = np.empty((len(chart), 3))
+    _contacts_at(fold, np.ascontiguousarray(chart), contacts)
+    return contacts
 
 
 @inlined
@@ -258,13 +266,29 @@ def _hermite(t: float) -> tuple[float, float, float, float]:
 
 
 @inlined
+def along(bounds: Array, s: float) -> float:
+    """Chart coordinate η of an arc length s; ``bounds`` is (proximal, a)."""
+    rest = 1.0 - bounds[1]
+    left = max(1.0 - s, 0.0) / (1.0 - bounds[0])
+    return float(1.0 - 2.0 * left / (rest + np.sqrt(rest * rest + 4.0 * bounds[1] * left)))
+
+
+@inlined
+def arc_length(bounds: Array, eta: float) -> float:
+    """Arc length s of a chart coordinate η; ``bounds`` is (proximal, a)."""
+    left = 1.0 - eta
+    return float(
+        1.0 - (1.0 - bounds[0]) * ((1.0 - bounds[1]) * left + bounds[1] * abs(left) * left)
+    )
+
+
+@inlined
 def fold_force(fold: Fold, s: float, psi: float) -> float:
     """Fold force f*(s, ψ), non-dimensional; s is clipped to the chart, ψ is any angle."""
-    stations, table = fold
+    bounds, table = fold
     n, m = table.shape[0] - 1, table.shape[1] - 1
-    ds = (stations[n] - stations[0]) / n
     dpsi = 2.0 * np.pi / m
-    x = min(max((s - stations[0]) / ds, 0.0), n + 0.0)
+    x = n * min(max(along(bounds, s), 0.0), 1.0)
     y = psi / dpsi
     y -= m * np.floor(y / m)
     i, j = min(int(x), n - 1), min(int(y), m - 1)
@@ -274,11 +298,19 @@ def fold_force(fold: Fold, s: float, psi: float) -> float:
         for dj in range(2):
             node = table[i + di, j + dj]
             log += a[2 * di] * (b[2 * dj] * node[0] + b[2 * dj + 1] * dpsi * node[2])
-            log += a[2 * di + 1] * ds * (b[2 * dj] * node[1] + b[2 * dj + 1] * dpsi * node[3])
+            log += a[2 * di + 1] / n * (b[2 * dj] * node[1] + b[2 * dj + 1] * dpsi * node[3])
     return float(np.exp(log))
 
 
+@inlined
+def chart_to_contact(fold: Fold, chart: Array, xi: Array) -> None:
+    """Turn (η, ψ, ρ) into ξ."""
+    xi[0] = min(max(arc_length(fold[0], chart[0]), LEAST_ARC), 1.0)
+    force = chart[2] * chart[2] * fold_force(fold, xi[0], chart[1])
+    xi[1], xi[2] = force * np.cos(chart[1]), force * np.sin(chart[1])
+
+
 @kernel
-def _fold_forces_at(fold: Fold, chart: Array, force: Array) -> None:
+def _contacts_at(fold: Fold, chart: Array, contacts: Array) -> None:
     for i in range(chart.shape[0]):
-        force[i] = fold_force(fold, chart[i, 0], chart[i, 1])
+        chart_to_contact(fold, chart[i], contacts[i])

@@ -1,5 +1,20 @@
 """Files and nothing else: one module a format."""
 
 from vibrissa.io.centerline import load_centerline, load_whisker, save_centerline
+from vibrissa.io.contacts_table import load_contacts, save_contacts
+from vibrissa.io.netcdf import kind_of
+from vibrissa.io.recording import load_recording, save_recording
+from vibrissa.io.signals_table import load_signals, save_signals
 
-__all__ = ["load_centerline", "load_whisker", "save_centerline"]
+__all__ = [
+    "kind_of",
+    "load_centerline",
+    "load_contacts",
+    "load_recording",
+    "load_signals",
+    "load_whisker",
+    "save_centerline",
+    "save_contacts",
+    "save_recording",
+    "save_signals",
+]

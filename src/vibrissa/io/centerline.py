@@ -5,8 +5,6 @@ with them the unit: `x_mm,y_mm,z_mm` (also `_um`, `_m`), or `x,y,z` in metres. W
 lie in the plane z = 0. Other columns are left alone.
 """
 
-import csv
-from collections.abc import Iterator
 from os import PathLike
 from pathlib import Path
 from typing import Unpack
@@ -14,6 +12,7 @@ from typing import Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vibrissa.io.table import table_rows
 from vibrissa.whisker import Whisker
 from vibrissa.whisker.section import Properties
 
@@ -49,7 +48,7 @@ def load_centerline(path: str | PathLike[str]) -> Array:
     path = Path(path)
     # Spreadsheets put a byte order mark first.
     with path.open(newline="", encoding="utf-8-sig") as file:
-        rows = _rows(file.read())
+        rows = table_rows(file.read())
     header = next(rows, None)
     if header is None:
         raise ValueError(f"{path} is empty; a header {ALLOWED} and at least 4 points are needed")
@@ -67,13 +66,6 @@ def load_centerline(path: str | PathLike[str]) -> Array:
         )
     array = np.array(points, dtype=np.float64).reshape(-1, len(columns)) * factor
     return array if len(columns) == 3 else np.column_stack([array, np.zeros(len(array))])
-
-
-def _rows(text: str) -> Iterator[tuple[int, list[str]]]:
-    """Line numbers and cells of all lines that are neither empty nor a comment."""
-    for number, line in enumerate(text.splitlines(), start=1):
-        if line.strip() and not line.lstrip().startswith("#"):
-            yield number, [cell.strip() for cell in next(csv.reader([line]))]
 
 
 def _columns(path: Path, header: list[str]) -> tuple[list[int], float]:

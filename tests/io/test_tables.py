@@ -1,0 +1,138 @@
+"""Tables of signals and contacts: lossless, and errors that say what to do."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from vibrissa import Status
+from vibrissa.io.contacts_table import load_contacts, save_contacts
+from vibrissa.io.signals_table import load_signals, save_signals
+
+HEADER = "time,Fx,Fy,Fz,Mx,My,Mz"
+
+
+def written(tmp_path, text):
+    path = tmp_path / "signals.csv"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_signals_come_back_to_the_last_bit(tmp_path):
+    generator = np.random.default_rng(0)
+    path = tmp_path / "signals.csv"
+    signals = xr.Dataset(
+        {
+            "force": (("time", "space"), generator.normal(scale=1e-4, size=(9, 3))),
+            "moment": (("time", "space"), generator.normal(scale=1e-6, size=(9, 3))),
+        },
+        {"time": np.arange(9) / 1000.0, "space": list("xyz")},
+    )
+    signals["force"].values[4] = np.nan
+    save_signals(path, signals)
+    again = load_signals(path)
+    for name in ("time", "force", "moment"):
+        np.testing.assert_array_equal(again[name], signals[name])
+        assert again[name].attrs["units"]
+    assert path.read_text().splitlines()[0] == HEADER
+
+
+def test_headers_comments_and_missing_cells(tmp_path):
+    path = written(
+        tmp_path,
+        "# from the robot\nMz_Nm,label,time_s,Fx_N,Fy,Fz,Mx,My\n"
+        "1e-6,a,0,1e-6,2e-6,3e-6,4e-9,5e-9\n\n"
+        "1e-6,b,1,nan,,3e-6,4e-9,5e-9\n",
+    )
+    signals = load_signals(path)
+    np.testing.assert_array_equal(signals["force"], [[1e-6, 2e-6, 3e-6], [np.nan, np.nan, 3e-6]])
+    np.testing.assert_array_equal(signals["moment"][0], [4e-9, 5e-9, 1e-6])
+
+
+def test_signals_from_netcdf(tmp_path):
+    path = tmp_path / "signals.nc"
+    names = HEADER.split(",")
+    table = xr.Dataset({n: ("time", np.full(4, 1e-6 * i)) for i, n in enumerate(names) if i})
+    table = table.assign_coords(time=np.arange(4.0))
+    table.to_netcdf(path, engine="h5netcdf")
+    np.testing.assert_array_equal(load_signals(path)["force"][0], [1e-6, 2e-6, 3e-6])
+    table.drop_vars(["Fy", "Mz"]).to_netcdf(path, engine="h5netcdf")
+    with pytest.raises(ValueError, match="lacks Fy, Mz"):
+        load_signals(path)
+    table.assign(Fy=table["Fy"].expand_dims(a=2)).to_netcdf(path, engine="h5netcdf")
+    with pytest.raises(ValueError, match="along time"):
+        load_signals(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is empty"),
+        ("# nothing\n", "is empty"),
+        (HEADER + "\n", "no rows"),
+        ("time,Fx,Fy,Mx,My\n0,0,0,0,0\n", "lacks Fz, Mz .it has time, Fx"),
+        ("time,Fx_uN,Fy_uN,Fz,Mx,My,Mz\n", "Fx_uN, Fy_uN are in other units"),
+        (HEADER + "\n0,0,0,0,0,0,0\n1,0,zero,0,0,0,0\n2,0\n", "line 3 reads '1,0,zero.*line 4"),
+        (HEADER + "\n0,120,0,0,0,0,0\n", "Fx reaches 120 N.*must be"),
+        (HEADER + "\n0,0,0,0,0,0,-7\n", "Mz reaches 7 N·m"),
+        (HEADER + "\n0,0,inf,0,0,0,0\n", "Fy has infinite"),
+    ],
+)
+def test_bad_signals(tmp_path, text, message):
+    with pytest.raises(ValueError, match=message):
+        load_signals(written(tmp_path, text))
+
+
+def test_no_file(tmp_path):
+    for load in (load_signals, load_contacts):
+        with pytest.raises(FileNotFoundError):
+            load(tmp_path / "none.csv")
+    with pytest.raises(FileNotFoundError):
+        load_signals(tmp_path / "none.nc")
+
+
+def contacts():
+    generator = np.random.default_rng(1)
+    names = ("x", "y", "z", "r", "theta", "phi", "sigma_x", "sigma_y", "sigma_z")
+    data = xr.Dataset({n: ("time", generator.normal(size=5)) for n in names})
+    data["x"].values[2] = np.nan
+    status = [Status.UNIQUE, Status.AMBIGUOUS, Status.MISSING, Status.UNIQUE, Status.OUTSIDE_MAP]
+    data["status"] = ("time", np.array(status, dtype=np.int8))
+    return data.assign_coords(time=np.arange(5) * 1e-3)
+
+
+def test_contacts_come_back(tmp_path):
+    path = tmp_path / "contacts.csv"
+    save_contacts(path, contacts())
+    lines = path.read_text().splitlines()
+    assert lines[0] == "time,x,y,z,r,theta,phi,sigma_x,sigma_y,sigma_z,status"
+    assert lines[2].endswith(",ambiguous")
+    again = load_contacts(path)
+    for name, column in contacts().variables.items():
+        np.testing.assert_array_equal(again[name], column)
+        assert "units" in again[name].attrs
+
+
+def test_columns_that_are_not_known_are_missing(tmp_path):
+    path = tmp_path / "contacts.csv"
+    save_contacts(path, contacts().drop_vars(["sigma_x", "r"]))
+    assert np.isnan(load_contacts(path)["r"]).all()
+
+
+def test_bad_contacts(tmp_path):
+    path = tmp_path / "contacts.csv"
+    with pytest.raises(ValueError, match="lack z, status"):
+        save_contacts(path, contacts().drop_vars(["z", "status"]))
+    with pytest.raises(ValueError, match="one dim time"):
+        save_contacts(path, contacts().assign(x=contacts()["x"].expand_dims(a=1)))
+    assert not path.exists()
+    save_contacts(path, contacts())
+    text = path.read_text()
+    for spoilt, message in (
+        ("", "is empty"),
+        (text.replace("theta", "azimuth"), "azimuth"),
+        (text.replace("ambiguous", "perhaps"), "line 3 reads"),
+        (text + "1,2,3\n", "line 7 reads '1,2,3'"),
+    ):
+        path.write_text(spoilt)
+        with pytest.raises(ValueError, match=message):
+            load_contacts(path)

@@ -1,0 +1,158 @@
+"""Where to put the peg and how far to whisk, for whiskers of any length and shape.
+
+The peg stands at a share of the whisker's reach. How far the whisker must be turned before it slips
+past depends on its shape and taper, so it is tried out: a coarse sweep in each direction, from
+clear of the peg until the whisker is clear again on the other side.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vibrissa.rod import PegContact, deflect
+from vibrissa.status import Status
+from vibrissa.trial.motion import (
+    ELEVATION_PER_AZIMUTH,
+    ROLL_PER_AZIMUTH,
+    Motion,
+    base_rotation,
+    whisking,
+)
+from vibrissa.trial.objects import Peg
+from vibrissa.whisker import Whisker
+
+Array = NDArray[np.float64]
+
+PEG_RADIUS = 1.35e-3
+"""Half the diameter of the paper's peg, m."""
+
+_STEP = np.radians(1.5)
+_FARTHEST = np.radians(120.0)
+_MARGIN = np.radians(5.0)
+
+
+def facing_peg(whisker: Whisker, distance: float = 0.65, radius: float = PEG_RADIUS) -> Peg:
+    """Stand a vertical peg beside the head, within reach of a whisker.
+
+    Parameters
+    ----------
+    whisker : Whisker
+        That is to meet it.
+    distance : float
+        From the base to the peg's axis, as a share of the farthest reach of the resting whisker.
+    radius : float
+        Of the peg, m.
+
+    Returns
+    -------
+    Peg
+        On the x axis of the laboratory.
+
+    Raises
+    ------
+    ValueError
+        If the distance is no share of the reach, or if the base would touch the peg.
+    """
+    if not 0.0 < distance < 1.0:
+        raise ValueError(f"distance is {distance!r}; a share of the reach, in (0, 1), is needed")
+    reach = float(np.linalg.norm(whisker.centerline(401), axis=1).max())
+    if distance * reach < 1.5 * radius:
+        raise ValueError(
+            f"a peg of radius {radius * 1e3:.2f} mm at {distance * reach * 1e3:.2f} mm from the "
+            f"base leaves no room for the whisker, which reaches {reach * 1e3:.2f} mm: choose a "
+            "thinner peg or a larger distance"
+        )
+    return Peg(np.array([distance * reach, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]), radius)
+
+
+def sweep_past(
+    whisker: Whisker,
+    peg: Peg,
+    duration: float = 3.0,
+    rate: float = 1000.0,
+    *,
+    row: str = "C",
+    seed: int = 0,
+    **motion: Any,
+) -> Motion:
+    """Whisk so that the whisker slips past a peg, forward and back.
+
+    Parameters
+    ----------
+    whisker : Whisker
+        That whisks.
+    peg : Peg
+        Beside it, more or less vertical.
+    duration : float
+        Of the trial, s.
+    rate : float
+        Frames per second.
+    row : {"A", "B", "C", "D", "E"}
+        Row of the array, which says how elevation and roll follow the azimuth.
+    seed : int
+        Of the drifts.
+    **motion
+        What else `whisking` takes.
+
+    Returns
+    -------
+    Motion
+        Its set point and amplitude lead past the slips on either side of the peg.
+
+    Raises
+    ------
+    ValueError
+        If there is no such row, if the whisker does not meet the peg, or if it does not slip past
+        within 120°.
+    """
+    if row not in ROLL_PER_AZIMUTH:
+        raise ValueError(f"row is {row!r}; one of {', '.join(ROLL_PER_AZIMUTH)} is needed")
+    motion.setdefault("elevation_per_azimuth", ELEVATION_PER_AZIMUTH[row])
+    motion.setdefault("roll_per_azimuth", ROLL_PER_AZIMUTH[row])
+    motion.setdefault("variation", 0.05)
+    motion.setdefault("position_drift", 0.03 * whisker.length)
+    ratios = motion["elevation_per_azimuth"], motion["roll_per_azimuth"]
+    rear = _slip(whisker, peg, -1.0, ratios) - _MARGIN
+    front = _slip(whisker, peg, 1.0, ratios) + _MARGIN
+    # A drift of set point or amplitude must not keep the whisker from slipping.
+    amplitude = 0.5 * (front - rear) * (1.0 + 2.0 * motion["variation"])
+    motion.setdefault("amplitude", amplitude)
+    motion.setdefault("set_point", 0.5 * (front + rear))
+    return whisking(duration, rate, seed=seed, **motion)
+
+
+def _toward(whisker: Whisker, peg: Peg) -> float:
+    """Azimuth of the base at which the resting whisker would run through the peg's axis, rad."""
+    points = whisker.centerline(801)
+    distance = np.hypot(*peg.origin[:2])
+    near = np.abs(np.hypot(points[:, 0], points[:, 1]) - distance)
+    # The nearest branch counts, where a whisker curls back to the same distance.
+    i = int(np.argmax(near <= near.min() + 1e-3 * whisker.length))
+    azimuth = np.arctan2(peg.origin[1], peg.origin[0]) - np.arctan2(points[i, 1], points[i, 0])
+    return float(azimuth)
+
+
+def _slip(whisker: Whisker, peg: Peg, sense: float, ratios: tuple[float, float]) -> float:
+    """Azimuth at which the whisker slips past, sweeping forward (sense 1) or back (−1), rad."""
+    middle = _toward(whisker, peg)
+    bent = None
+    touched = False
+    for turned in np.arange(-0.5 * _FARTHEST, _FARTHEST, _STEP) * sense:
+        rotation = base_rotation(middle + turned, ratios[0] * turned, ratios[1] * turned)
+        origin, axis = peg.in_whisker_frame(rotation, np.zeros(3))
+        if bent is None:
+            bent = deflect(whisker, PegContact(origin, axis, peg.radius))
+        else:
+            bent = deflect(whisker, PegContact(origin, axis, peg.radius, start=bent))
+        status = Status(int(bent.status))
+        if touched and status not in (Status.OK, Status.TIP_CONTACT):
+            if status in (Status.NOT_CONVERGED, Status.TOO_PROXIMAL):
+                raise ValueError(f"the sweep past {peg} cannot be planned: {status}")
+            return float(middle + turned)
+        touched = touched or status in (Status.OK, Status.TIP_CONTACT)
+    if not touched:
+        raise ValueError(f"{whisker} does not meet {peg}")
+    raise ValueError(f"{whisker} does not slip past {peg} within {np.degrees(_FARTHEST):.0f}°")

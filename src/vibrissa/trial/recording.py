@@ -1,0 +1,192 @@
+"""The recording: one tree of labelled datasets for all that is known of a trial.
+
+    /            time, whisker, space: base_position, base_rotation, base_azimuth, …, force, moment
+    /truth       the same names and more, as they truly are (simulated trials only)
+    /whiskers/0  the first whisker along the dimension ``whisker``, and so on
+    /objects     what stands in the laboratory
+
+A group cannot be called ``whisker``: a file has one name space for groups and dimensions. Points
+are in the laboratory frame except those called ``…_whisker``; force and moment are in the
+whisker's frame at its base, the force being that of the object on the whisker. Missing is NaN.
+Forces and moments at the top are what the sensor reads, in contact or not; contact points there
+are estimates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from vibrissa.io.recording import KIND
+from vibrissa.quantities import attributes
+from vibrissa.rod import Deflection
+from vibrissa.status import Status, flag_attributes
+from vibrissa.trial.motion import Motion
+from vibrissa.trial.objects import Peg, pegs_dataset, pegs_from_dataset
+from vibrissa.whisker import Whisker
+
+Array = NDArray[np.float64]
+
+_FRAMES = {
+    "base_position": "laboratory",
+    "centerline": "laboratory",
+    "contact_point": "laboratory",
+    "contact_point_whisker": "whisker",
+    "force": "whisker",
+    "moment": "whisker",
+}
+_DIMS: Mapping[str, tuple[str, ...]] = {
+    "base_position": ("time", "whisker", "space"),
+    "base_rotation": ("time", "whisker", "space", "whisker_axis"),
+    "base_azimuth": ("time", "whisker"),
+    "base_elevation": ("time", "whisker"),
+    "base_roll": ("time", "whisker"),
+    "centerline": ("time", "whisker", "node", "space"),
+    "contact_point": ("time", "whisker", "space"),
+    "contact_point_whisker": ("time", "whisker", "space"),
+    "arc_length": ("time", "whisker"),
+    "force": ("time", "whisker", "space"),
+    "moment": ("time", "whisker", "space"),
+    "in_contact": ("time", "whisker"),
+    "confidence": ("time", "whisker"),
+    "status": ("time", "whisker"),
+}
+
+
+def recorded(name: str, values: Any) -> xr.Variable:
+    """Label one variable of a recording of one whisker.
+
+    Parameters
+    ----------
+    name : str
+        Of the variable, as in the module's table of dimensions.
+    values : array_like (time, ...)
+        Without the dimension ``whisker``, which is put in.
+
+    Returns
+    -------
+    xarray.Variable
+        With units, long name and, for vectors, the frame of reference.
+    """
+    about: dict[str, Any] = dict(attributes(name))
+    if name in _FRAMES:
+        about["reference_frame"] = _FRAMES[name]
+    if name == "status":
+        about |= flag_attributes()
+    return xr.Variable(_DIMS[name], np.asarray(values)[:, None], about)
+
+
+def trial_recording(
+    whisker: Whisker, motion: Motion, peg: Peg, bent: Deflection, nodes: int
+) -> xr.DataTree:
+    """Write a simulated trial as a recording.
+
+    Parameters
+    ----------
+    whisker : Whisker
+        That whisked.
+    motion : Motion
+        Of its base, n frames.
+    peg : Peg
+        That it met.
+    bent : Deflection
+        Of the whisker, frame by frame (n,).
+    nodes : int
+        Points of a centreline.
+
+    Returns
+    -------
+    xarray.DataTree
+        The recording.
+    """
+    rotation, position = motion.base_rotation, motion.base_position
+    turn = "tij,t...j->t...i"
+    contact = np.isin(bent.status, (Status.OK, Status.TIP_CONTACT))
+    pose = {
+        "base_position": position,
+        "base_rotation": rotation,
+        "base_azimuth": motion.azimuth,
+        "base_elevation": motion.elevation,
+        "base_roll": motion.roll,
+    }
+    wrench = {"force": bent.force, "moment": bent.moment}
+    line = np.einsum(turn, rotation, bent.centerline(nodes)) + position[:, None]
+    truth = wrench | {
+        "centerline": line,
+        "contact_point": np.einsum(turn, rotation, bent.contact_point) + position,
+        "contact_point_whisker": bent.contact_point,
+        "arc_length": bent.arc_length,
+        "in_contact": contact,
+        "confidence": np.isin(bent.status, [s for s in Status if s.ok]).astype(np.float64),
+        "status": bent.status.astype(np.int8),
+    }
+    root = xr.Dataset(
+        {name: recorded(name, values) for name, values in (pose | wrench).items()},
+        _coordinates(motion.time, [whisker.name]),
+        {"kind": KIND, "origin": "simulated: quasi-static, frictionless"},
+    )
+    groups: dict[str, xr.Dataset] = {
+        "/": root,
+        "/truth": xr.Dataset({name: recorded(name, values) for name, values in truth.items()}),
+        # Its centreline is for readers of lone whisker files, and its nodes are others than ours.
+        "/whiskers/0": whisker.to_dataset().drop_dims("node"),
+        "/objects": pegs_dataset([peg]),
+    }
+    return xr.DataTree.from_dict(groups)
+
+
+def _coordinates(time: Array, names: Sequence[str]) -> dict[Hashable, Any]:
+    return {
+        "time": xr.Variable("time", time, attributes("time")),
+        "whisker": list(names),
+        "space": list("xyz"),
+        "whisker_axis": list("xyz"),
+    }
+
+
+def recorded_whisker(recording: xr.DataTree, index: int = 0) -> Whisker:
+    """Make the whisker of a recording again.
+
+    Parameters
+    ----------
+    recording : xarray.DataTree
+        The recording.
+    index : int
+        Which one, along the dimension ``whisker``.
+
+    Returns
+    -------
+    Whisker
+        As it was recorded.
+
+    Raises
+    ------
+    ValueError
+        If the recording carries no such whisker.
+    """
+    whiskers = recording.children.get("whiskers")
+    if whiskers is None or str(index) not in whiskers.children:
+        count = 0 if whiskers is None else len(whiskers.children)
+        raise ValueError(f"whisker {index} was asked for; the recording carries {count} of them")
+    return Whisker.from_dataset(whiskers.children[str(index)].to_dataset(inherit=False))
+
+
+def recorded_pegs(recording: xr.DataTree) -> tuple[Peg, ...]:
+    """List the pegs of a recording.
+
+    Parameters
+    ----------
+    recording : xarray.DataTree
+        The recording.
+
+    Returns
+    -------
+    tuple of Peg
+        Laboratory frame; none if the recording tells of no objects.
+    """
+    objects = recording.children.get("objects")
+    return () if objects is None else pegs_from_dataset(objects.to_dataset(inherit=False))

@@ -1,0 +1,175 @@
+"""The six signals over time."""
+
+from __future__ import annotations
+
+import matplotlib as mpl
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from vibrissa.plots.style import (
+    BLUE,
+    INK,
+    LOOK,
+    SHADE,
+    Array,
+    Mask,
+    Width,
+    mark_panel,
+    new_figure,
+    say,
+)
+from vibrissa.quantities import axis_label, quantity, to_display
+
+_COLUMNS = (("Fx", "FT", "FD"), ("Mx", "MB", "MD"))
+_DIRECTIONS = ("FD", "MD")
+
+
+def signals_over_time(
+    signals: xr.Dataset,
+    truth: xr.Dataset | None = None,
+    *,
+    whisker: int = 0,
+    width: Width = "double",
+) -> Figure:
+    """Draw the six signals over time, forces on the left and moments on the right.
+
+    Parameters
+    ----------
+    signals : Dataset
+        ``time`` (s) and any of Fx, FT, FD, Mx, MB, MD, SI units, over ``time`` or over ``time`` and
+        ``whisker``. Where ``in_contact`` is known, contact is shaded, and directions are drawn in
+        contact only, since they mean nothing without a force. NaN leaves a gap.
+    truth : Dataset, optional
+        The same, as it truly is: drawn over it as a thin dark line.
+    whisker : int
+        Which, where there are several.
+    width : {"single", "double"}
+        Columns of the page.
+
+    Returns
+    -------
+    Figure
+        Six axes that share their time axis, in s and display units; or the sentence "no signals".
+
+    Raises
+    ------
+    ValueError
+        If the dataset has none of the signals; says how to make them.
+    """
+    names = [name for column in _COLUMNS for name in column]
+    if "time" not in signals.coords or not any(name in signals for name in names):
+        raise ValueError(
+            "time and some of Fx, FT, FD, Mx, MB, MD are needed (vibrissa.base_signals makes them "
+            f"from force and moment); the dataset has {', '.join(map(str, signals.variables))}"
+        )
+    signals = _one(signals, whisker)
+    truth = None if truth is None else _one(truth, whisker)
+    time = to_display("time", signals["time"])
+    contact = _contact(signals)
+    with mpl.rc_context(dict(LOOK)):
+        figure = new_figure(width, 92.0 if width == "double" else 75.0, "constrained")
+        if time.size == 0:
+            say(figure, "no signals")
+            return figure
+        panels = figure.subplots(3, 2, sharex=True, squeeze=False)
+        for i, name in enumerate(names):
+            axes = panels[i % 3, i // 3]
+            _panel(axes, name, signals, truth, contact)
+            mark_panel(axes, "abcdef"[2 * (i % 3) + i // 3])
+        for axes in panels[-1]:
+            axes.set_xlabel(axis_label("time"))
+            axes.set_xlim(time.min(), time.max() if time.size > 1 else time.min() + 1.0)
+        figure.align_ylabels()
+        _legend(figure, truth is not None, contact is not None)
+        return figure
+
+
+def _one(data: xr.Dataset, whisker: int) -> xr.Dataset:
+    return data.isel(whisker=whisker) if "whisker" in data.dims else data
+
+
+def _contact(signals: xr.Dataset) -> Mask | None:
+    if "in_contact" not in signals:
+        return None
+    return np.asarray(np.nan_to_num(signals["in_contact"].to_numpy().astype(np.float64)) > 0.5)
+
+
+def intervals(time: Array, contact: Mask) -> Array:
+    """Find when contacts begin and end.
+
+    Parameters
+    ----------
+    time : array (n,)
+        Of the frames, rising.
+    contact : array (n,) of bool
+        Whether there is contact in each frame.
+
+    Returns
+    -------
+    array (k, 2)
+        Begin and end of each contact, halfway to the frames before and after.
+
+    Examples
+    --------
+    >>> intervals(np.arange(5.0), np.array([False, True, True, False, False]))
+    array([[0.5, 2.5]])
+    """
+    if time.size < 2:
+        return np.empty((0, 2))
+    halfway = 0.5 * (time[1:] + time[:-1])
+    edges = np.concatenate([time[:1], halfway, time[-1:]])
+    change = np.diff(np.concatenate([[0], contact.astype(np.int8), [0]]))
+    return np.stack([edges[change == 1], edges[change == -1]], axis=1)
+
+
+def _panel(
+    axes: Axes,
+    name: str,
+    signals: xr.Dataset,
+    truth: xr.Dataset | None,
+    contact: Mask | None,
+) -> None:
+    time = to_display("time", signals["time"])
+    if contact is not None:
+        for begin, end in intervals(time, contact):
+            axes.axvspan(begin, end, color=SHADE, linewidth=0.0, zorder=0)
+    if name not in _DIRECTIONS:
+        axes.axhline(0.0, color="#bfbfbf", linewidth=0.5, zorder=1)
+    if name in signals:
+        axes.plot(time, _drawn(name, signals, contact), color=BLUE, zorder=2)
+    if truth is not None and name in truth:
+        true_time = to_display("time", truth["time"])
+        there = contact if true_time.size == time.size else None
+        values = _drawn(name, truth, there)
+        axes.plot(true_time, values, color=INK, linewidth=0.5, zorder=3)
+    axes.set_ylabel(axis_label(name))
+    axes.set_title(quantity(name).long_name)
+    if name in _DIRECTIONS:
+        axes.set_ylim(-190.0, 190.0)
+        axes.set_yticks([-180.0, -90.0, 0.0, 90.0, 180.0])
+
+
+def _drawn(name: str, data: xr.Dataset, contact: Mask | None) -> Array:
+    """Values in display units; of a direction those in contact, with a gap where it wraps."""
+    values = to_display(name, data[name])
+    if name not in _DIRECTIONS:
+        return values
+    if contact is not None:
+        values = np.where(contact, values, np.nan)
+    wraps = np.abs(np.diff(values, append=values[-1:])) > 180.0
+    return np.where(wraps, np.nan, values)
+
+
+def _legend(figure: Figure, truth: bool, contact: bool) -> None:
+    handles: list[Line2D | Patch] = []
+    if truth:
+        handles += [Line2D([], [], color=BLUE, label="measured")]
+        handles += [Line2D([], [], color=INK, linewidth=0.5, label="true")]
+    if contact:
+        handles += [Patch(facecolor=SHADE, label="in contact")]
+    if handles:
+        figure.legend(handles=handles, loc="outside upper right", ncols=len(handles))

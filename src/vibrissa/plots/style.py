@@ -1,0 +1,232 @@
+"""One look for all figures: sizes, fonts, colours, labels, files.
+
+Figures are made for print at the width of one or two columns (89 and 183 mm), with lettering of 6
+to 8 points at that size. Only Matplotlib's object-oriented interface is used: no window opens, no
+global state changes, and a figure is freed with its last name. Colours are told apart with any
+colour vision (Okabe & Ito 2008, https://jfly.uni-koeln.de/color/), and colormaps are perceptual.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Literal
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backend_bases import RendererBase
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Width = Literal["single", "double"]
+
+WIDTHS: Mapping[str, float] = MappingProxyType({"single": 89.0, "double": 183.0})
+"""Widths of figures, mm."""
+
+INK = "#1a1a1a"
+MUTED = "#8c8c8c"
+SHADE = "#e3ebf2"
+BLUE = "#0072b2"
+ORANGE = "#d55e00"
+GREEN = "#009e73"
+"""Text, what is secondary, shaded areas, and three colours of lines."""
+
+LOOK: Mapping[str, Any] = MappingProxyType(
+    {
+        "font.family": "sans-serif",
+        "font.sans-serif": ["DejaVu Sans"],  # comes with Matplotlib: the same look everywhere
+        "mathtext.fontset": "dejavusans",
+        "font.size": 7.0,
+        "axes.labelsize": 7.0,
+        "axes.titlesize": 7.5,
+        "axes.titlepad": 4.0,
+        "axes.labelpad": 2.5,
+        "xtick.labelsize": 6.0,
+        "ytick.labelsize": 6.0,
+        "legend.fontsize": 6.0,
+        "legend.frameon": False,
+        "legend.handlelength": 1.6,
+        "axes.linewidth": 0.6,
+        "axes.edgecolor": INK,
+        "axes.labelcolor": INK,
+        "axes.titlecolor": INK,
+        "text.color": INK,
+        "xtick.color": INK,
+        "ytick.color": INK,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.grid": False,
+        "xtick.major.width": 0.6,
+        "ytick.major.width": 0.6,
+        "xtick.major.size": 2.5,
+        "ytick.major.size": 2.5,
+        "xtick.major.pad": 2.0,
+        "ytick.major.pad": 2.0,
+        "xtick.direction": "out",
+        "ytick.direction": "out",
+        "lines.linewidth": 0.8,
+        "patch.linewidth": 0.6,
+        "grid.linewidth": 0.4,
+        "grid.color": "#d9d9d9",
+        "figure.facecolor": "white",
+        "axes.facecolor": "white",
+        "figure.dpi": 150.0,
+        "savefig.dpi": 300.0,
+        "pdf.fonttype": 42,  # text stays text when the figure is edited
+        "svg.fonttype": "none",
+    }
+)
+"""Matplotlib's settings while a figure of ours is made and drawn."""
+
+
+class StyledFigure(Figure):
+    """A figure that is drawn with the same settings with which it was made.
+
+    Ticks and their labels come into being only when a figure is drawn, and take the settings of
+    that moment; so without this they would look as whoever draws the figure likes them.
+    """
+
+    def draw(self, renderer: RendererBase) -> None:
+        """Draw.
+
+        Parameters
+        ----------
+        renderer : RendererBase
+            On which.
+        """
+        with mpl.rc_context(dict(LOOK)):
+            super().draw(renderer)
+
+
+def new_figure(width: Width, height: float, layout: Literal["constrained"] | None) -> StyledFigure:
+    """Make an empty figure.
+
+    Parameters
+    ----------
+    width : {"single", "double"}
+        How many columns wide.
+    height : float
+        In mm.
+    layout : {"constrained"} or None
+        Whether Matplotlib arranges the axes.
+
+    Returns
+    -------
+    StyledFigure
+        In which :func:`looking` should be active while axes are added.
+
+    Raises
+    ------
+    ValueError
+        If there is no such width.
+    """
+    if width not in WIDTHS:
+        raise ValueError(f"width is {width!r}; one of {', '.join(WIDTHS)} is needed")
+    return StyledFigure(figsize=(WIDTHS[width] / 25.4, height / 25.4), layout=layout)
+
+
+def say(figure: Figure, message: str) -> None:
+    """Write one sentence where there is nothing to draw.
+
+    Parameters
+    ----------
+    figure : Figure
+        Without axes.
+    message : str
+        Such as "no contacts".
+    """
+    figure.text(0.5, 0.5, message, ha="center", va="center", color=MUTED, fontsize=8.0)
+
+
+def mark_panel(axes: Axes, letter: str, x: float = 0.0) -> None:
+    """Put a bold letter above the upper left corner of a panel.
+
+    Parameters
+    ----------
+    axes : Axes
+        The panel.
+    letter : str
+        Usually a, b, c, ...
+    x : float
+        Where the letter begins, as a share of the width of the panel.
+    """
+    axes.annotate(
+        letter,
+        (x, 1.0),
+        xycoords="axes fraction",
+        xytext=(0.0, 3.0),
+        textcoords="offset points",
+        ha="left",
+        va="bottom",
+        fontsize=8.0,
+        fontweight="bold",
+    )
+
+
+def robust_limits(values: ArrayLike, share: float = 0.98, symmetric: bool = False) -> Array:
+    """Limits between which most of the finite values lie.
+
+    Parameters
+    ----------
+    values : array_like
+        Any shape; what is not finite is left out.
+    share : float
+        Of the values that lie between the limits.
+    symmetric : bool
+        Whether the limits are to be as far below zero as above.
+
+    Returns
+    -------
+    array (2,)
+        Lower and upper limit, never equal; (0, 1) or (−1, 1) where there are no values.
+
+    Examples
+    --------
+    >>> robust_limits([1.0, 2.0, float("nan")], share=1.0)
+    array([1., 2.])
+    """
+    finite = np.asarray(values, dtype=np.float64)
+    finite = finite[np.isfinite(finite)]
+    if finite.size == 0:
+        return np.array([-1.0 if symmetric else 0.0, 1.0])
+    low, high = np.quantile(finite, [(1.0 - share) / 2.0, (1.0 + share) / 2.0])
+    if symmetric:
+        high = max(abs(low), abs(high))
+        low = -high
+    if not high - low > 1e-12 * max(abs(high), abs(low)):
+        room = 0.05 * abs(high) or 1.0
+        low, high = low - room, high + room
+    return np.array([low, high])
+
+
+def save(
+    figure: Figure, path_stem: str | Path, formats: Sequence[str] = ("png", "pdf")
+) -> list[Path]:
+    """Write a figure into files.
+
+    Parameters
+    ----------
+    figure : Figure
+        The figure.
+    path_stem : str or Path
+        Where to, without the ending; the folder must exist.
+    formats : sequence of str
+        Endings, such as ``"png"``, ``"pdf"`` or ``"svg"``.
+
+    Returns
+    -------
+    list of Path
+        The files, in the order of ``formats``.
+    """
+    stem = Path(path_stem)
+    files = [stem.with_name(f"{stem.name}.{ending}") for ending in formats]
+    # Without a date the same figure gives the same file.
+    dated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
+    with mpl.rc_context(dict(LOOK)):
+        for file, ending in zip(files, formats, strict=True):
+            figure.savefig(file, format=ending, metadata=dated.get(ending))
+    return files

@@ -1,0 +1,157 @@
+"""The whisker in three views, drawn with its taper."""
+
+from __future__ import annotations
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import ArrayLike
+
+from vibrissa.plots.style import INK, LOOK, MUTED, WIDTHS, Array, Width, new_figure, say
+from vibrissa.quantities import axis_label, to_display
+
+_MAGNIFICATIONS = (1, 2, 3, 5, 10, 20, 50, 100)
+_WIDE = 0.02
+"""Drawn width at the base, as a share of the whisker's extent, that is aimed at."""
+
+_LEFT, _RIGHT, _BOTTOM, _TOP, _GAP = 10.0, 2.0, 8.5, 6.5, 3.5
+"""Room around and between the views, mm on paper."""
+
+
+_NARROWEST = 0.09
+"""Smallest half of an axis, as a share of the whisker's extent."""
+
+
+def whisker_views(
+    centerline: ArrayLike,
+    radius: ArrayLike,
+    *,
+    name: str | None = None,
+    magnification: float | None = None,
+    width: Width = "single",
+) -> Figure:
+    """Draw a whisker from above (x–y), from the side (x–z) and along its base (z–y), to one scale.
+
+    Parameters
+    ----------
+    centerline : array_like (n, 3)
+        From base to tip, whisker frame, m; points with NaN are left out.
+    radius : array_like (n,) or float
+        Of the whisker at these points, m.
+    name : str, optional
+        Written above.
+    magnification : float, optional
+        How many times too wide the whisker is drawn; chosen by default so that the base is easily
+        seen, and always said in the figure.
+    width : {"single", "double"}
+        Columns of the page.
+
+    Returns
+    -------
+    Figure
+        Three axes, in mm, or a sentence if there are fewer than two points.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not fit.
+    """
+    points = to_display("centerline", centerline)
+    radii = to_display("x", radius)
+    if points.ndim != 2 or points.shape[1] != 3 or radii.shape not in ((), (len(points),)):
+        raise ValueError(
+            f"centerline and radius have shapes {points.shape} and {radii.shape}; "
+            "(n, 3) and (n,) are needed"
+        )
+    radii = np.broadcast_to(radii, (len(points),))
+    known = np.isfinite(points).all(axis=1) & np.isfinite(radii)
+    points, radii = points[known], radii[known]
+    with mpl.rc_context(dict(LOOK)):
+        if len(points) < 2:
+            figure: Figure = new_figure(width, 40.0, None)
+            say(figure, "no whisker")
+            return figure
+        return _views(points, radii, name, magnification, width)
+
+
+def _views(
+    points: Array, radii: Array, name: str | None, magnification: float | None, width: Width
+) -> Figure:
+    extent = float(np.ptp(points, axis=0).max())
+    if magnification is None:
+        aim = _WIDE * extent / (2.0 * max(radii.max(), 1e-9))
+        magnification = max([m for m in _MAGNIFICATIONS if m <= aim], default=1)
+    limits = _limits(points, magnification * radii.max(), extent)
+    span = np.ptp(limits, axis=1)
+    page = WIDTHS[width]
+    scale = (page - _LEFT - _RIGHT - _GAP) / (span[0] + span[2])  # mm on paper per mm
+    height = _BOTTOM + _GAP + _TOP + scale * (span[1] + span[2])
+    figure = new_figure(width, height, None)
+
+    def place(left: float, bottom: float, i: int, j: int) -> Axes:
+        box = (left / page, bottom / height, scale * span[i] / page, scale * span[j] / height)
+        axes = figure.add_axes(box, xlim=limits[i], ylim=limits[j])
+        outline = _tube(points[:, [i, j]], magnification * radii)
+        axes.add_patch(PathPatch(outline, facecolor=INK, edgecolor="none"))
+        return axes
+
+    right, above = _LEFT + scale * span[0] + _GAP, _BOTTOM + scale * span[2] + _GAP
+    top = place(_LEFT, above, 0, 1)
+    side = place(_LEFT, _BOTTOM, 0, 2)
+    end = place(right, above, 2, 1)
+    top.tick_params(labelbottom=False)
+    end.tick_params(labelleft=False)
+    top.set_ylabel(axis_label("y"))
+    side.set(xlabel=axis_label("x"), ylabel=axis_label("z"))
+    end.set_xlabel(axis_label("z"))
+    side.yaxis.set_major_locator(MaxNLocator(3, integer=True))
+    end.xaxis.set_major_locator(MaxNLocator(3, integer=True))
+    _caption(top, name, magnification)
+    return figure
+
+
+def _limits(points: Array, margin: float, extent: float) -> Array:
+    """Limits (3, 2) of x, y and z, none so narrow that its axis could not be read."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, half = (low + high) / 2.0, (high - low) / 2.0 + margin + 0.02 * extent
+    half = np.maximum(half, _NARROWEST * extent)
+    return np.stack([middle - half, middle + half], axis=1)
+
+
+def _tube(places: Array, radii: Array) -> Path:
+    """Outline of a tube seen from the side: discs at all places and what lies between them.
+
+    A single path, so that overlaps leave no seams; all its parts run counter-clockwise, so that
+    they add up.
+    """
+    step = np.diff(places, axis=0)
+    length = np.hypot(*step.T)[:, None]
+    normal = np.stack([-step[:, 1], step[:, 0]], axis=1) / np.where(length > 0.0, length, 1.0)
+    near, far = places[:-1], places[1:]
+    a, b = radii[:-1, None] * normal, radii[1:, None] * normal
+    corners = np.stack([near + a, near - a, far - b, far + b, near + a], axis=1)
+    parts = [Path(loop, closed=True) for loop in corners]
+    disc = Path.unit_circle()
+    parts += [
+        Path(place + radius * disc.vertices, disc.codes)
+        for place, radius in zip(places, radii, strict=True)
+    ]
+    return Path.make_compound_path(*parts)
+
+
+def _caption(axes: Axes, name: str | None, magnification: float) -> None:
+    """Say whose views these are, and how much too wide."""
+    axes.set_title(name or "whisker", loc="left", fontweight="bold")
+    axes.text(
+        0.02,
+        0.97,
+        f"drawn {magnification:g} times wider" if magnification != 1 else "",
+        transform=axes.transAxes,
+        va="top",
+        color=MUTED,
+        fontsize=6.0,
+    )

@@ -1,25 +1,13 @@
 """Loads followed from a known state to the one asked for, on the stable branch all the way.
 
-A problem is a set of three equations G(x; parameters) = 0. The parameters move along a straight
-line from where the solution is known to where it is wanted; Newton's method corrects each step, the
-step is halved where it struggles and doubled where it does not. A solution counts only while det
-∂G/∂x keeps the sign it started with: the zero is that load's fold, where the whisker slips off.
-Where no step succeeds, the state reached tells why.
+A problem is a set of three equations G(x; p) = 0 (:mod:`vibrissa.rod.equations`). The parameters p
+move along a straight line from where the solution is known to where it is wanted; Newton's method
+corrects each step, the step is halved where it struggles and doubled where it does not. A solution
+counts only while det ∂G/∂x keeps the sign it started with: the zero is that load's fold, where the
+whisker slips off. Where no step succeeds, the state reached tells why.
 
-Three kinds of problem, with their unknowns x and parameters:
-
-- ``POINT``: the contact is at a point. x = (s, f_y, f_z); parameters: the point.
-- ``SIDE``: the whisker's side on a peg. x = (s, λ, ψ) with f = λ (0, cos ψ, sin ψ); parameters: a
-  point of the
-  peg's axis, its direction, and its radius (negative: a line without thickness). With d the part of
-  p - origin
-  normal to the axis and F̂ = F/λ the force's direction: d = D F̂ and F̂·axis = 0, D the peg's
-  radius plus the
-  whisker's at s, or 0 for a line. Polar unknowns keep F̂ regular down to zero force.
-- ``TIP``: the whisker's tip on a peg, the same equations at s = 1 with the force free to lean back:
-  x = (λ, α, ψ), f = λ (sin α, cos α cos ψ, cos α sin ψ), α ≤ 0. A side contact that slides to the
-  tip goes on as this one; a tip contact whose force turns normal to the whisker goes on along the
-  side.
+A side contact that slides to the tip goes on as a tip contact; a tip contact whose force turns
+normal to the whisker goes on along the side.
 """
 
 from __future__ import annotations
@@ -28,160 +16,136 @@ import numpy as np
 
 from vibrissa.rod.arrays import Array, IntArray, Rod
 from vibrissa.rod.compiled import inlined, kernel
+from vibrissa.rod.equations import (
+    POINT,
+    SIDE,
+    TIP,
+    by_unknowns,
+    contact_of,
+    equations,
+    longest_step,
+)
 from vibrissa.rod.kernels import BUFFER_SIZE, LANES, integrate, lane_tangents, lane_value, set_lane
 from vibrissa.rod.newton import ROUNDING, TOLERANCE, norm3
 from vibrissa.rod.preimage import solve3
-from vibrissa.rod.reach import LEAST_ARC, Fold, fold_force
+from vibrissa.rod.reach import LEAST_ARC, Fold
 from vibrissa.status import Status
 
-POINT, SIDE, TIP = 0, 1, 2
 #: A force this small (EI/L²) only says where an object touches.
 LEAST_FORCE = 1e-7
 # Fractions of the path; points start within a cell of their target.
 _SMALLEST_STEP = 2.0**-12
 _SMALLEST_POINT_STEP = 2.0**-9
-_MOST_ITERATIONS = 30
+_MOST_ROUNDS = 30
+# A contact may change between side and tip this often; more is dithering at the corner.
+_MOST_SWITCHES = 8
 # Toward a fold det ∂G/∂x vanishes and the solution moves ever faster along the path, both like a
 # square root of what is left to it. A path that cannot be followed has met a fold if det has fallen
 # below this share of its start, or if the speed (in longest steps per path) has grown by this
 # factor or is as high as this.
 _NEAR_FOLD = 0.5
+_SPED_UP = 2.0
+_FAST = 30.0
 # So near a fold that the solution moves by the square root of the rounding, a contact that Newton's
 # method cannot improve is one if it meets the equations to this.
 _AT_FOLD = 3e-10
-_SPED_UP = 2.0
-_FAST = 30.0
 
 _OK = int(Status.OK)
 _AT_TIP = int(Status.TIP_CONTACT)
 _NO_CONTACT = int(Status.NO_CONTACT)
-_FOLD = int(Status.BEYOND_FOLD)
+_BEYOND_FOLD = int(Status.BEYOND_FOLD)
 _BEYOND_TIP = int(Status.BEYOND_TIP)
 _PROXIMAL = int(Status.TOO_PROXIMAL)
 _FAILED = int(Status.NOT_CONVERGED)
+_ON_THE_WAY = -1
+
+# What a path remembers: the share of it that is done and the step being tried; det ∂G/∂x at the
+# start, and relative to it at the last solution; rounds of Newton's method and the last one's size;
+# the speed now and the least; the best residual at the end; whether the tip was passed, or contact
+# lost, in the last round; changes between side and tip.
+_DONE, _STRIDE, _START, _RATIO, _ROUNDS, _SIZE = 0, 1, 2, 3, 4, 5
+_SPEED, _SLOWEST, _BEST, _PAST_TIP, _LOST, _SWITCHES = 6, 7, 8, 9, 10, 11
+_COLUMNS = 12
 
 
 @inlined
-def _contact(kind: int, x: Array, contact: Array) -> None:
-    """Turn unknowns into (s, f_x, f_y, f_z)."""
-    if kind == POINT:
-        contact[0], contact[1], contact[2], contact[3] = x[0], 0.0, x[1], x[2]
-    elif kind == SIDE:
-        contact[0], contact[1] = x[0], 0.0
-        contact[2], contact[3] = x[1] * np.cos(x[2]), x[1] * np.sin(x[2])
-    else:
-        normal = x[0] * np.cos(x[1])
-        contact[0], contact[1] = 1.0, x[0] * np.sin(x[1])
-        contact[2], contact[3] = normal * np.cos(x[2]), normal * np.sin(x[2])
+def _begin(path: Array) -> None:
+    path[:] = 0.0
+    path[_STRIDE] = path[_RATIO] = 1.0
+    path[_SLOWEST] = path[_BEST] = np.inf
 
 
 @inlined
-def _polar_tangents(kind: int, x: Array, t: Array) -> None:
-    """Turn derivatives with respect to (s, f_y, f_z) or (f_x, f_y, f_z) into ones by unknowns."""
-    if kind == POINT:
-        return
-    for row in range(6):
-        a, b, c = t[row, 0], t[row, 1], t[row, 2]
-        if kind == SIDE:
-            cos, sin = np.cos(x[2]), np.sin(x[2])
-            t[row, 1] = cos * b + sin * c
-            t[row, 2] = x[1] * (cos * c - sin * b)
-        else:
-            cos, sin, up, out = np.cos(x[2]), np.sin(x[2]), np.sin(x[1]), np.cos(x[1])
-            normal = cos * b + sin * c
-            t[row, 0] = up * a + out * normal
-            t[row, 1] = x[0] * (out * a - up * normal)
-            t[row, 2] = x[0] * out * (cos * c - sin * b)
+def _parameters(kind: int, begin: Array, end: Array, progress: float, p: Array) -> None:
+    """Parameters on the way; a peg's axis stays a unit vector."""
+    for a in range(7):
+        p[a] = begin[a] + progress * (end[a] - begin[a])
+    if kind != POINT:
+        length = np.sqrt(p[3] * p[3] + p[4] * p[4] + p[5] * p[5])
+        for a in range(3, 6):
+            p[a] /= length
 
 
 @inlined
-def whisker_radius(rod: Rod, s: float) -> tuple[float, float]:
-    """Radius relative to the base radius at s, and its derivative."""
-    start, width, shape = rod[0], rod[1], rod[5]
-    k = start.shape[0] - 1
-    while k > 0 and start[k] > s:
-        k -= 1
-    t = (s - start[k]) / width[k]
-    c = shape[k, 3]
-    value = c[0] + t * (c[1] + t * (c[2] + t * c[3]))
-    return value, (c[1] + t * (2.0 * c[2] + 3.0 * t * c[3])) / width[k]
-
-
-@inlined
-def _equations(
-    kind: int,
-    rod: Rod,
-    radius: float,
-    x: Array,
-    p: Array,
-    value: Array,
-    t: Array,
-    g: Array,
-    j: Array,
-) -> None:
-    """G and ∂G/∂x from (F, p) and their derivatives with respect to x."""
-    if kind == POINT:
-        for a in range(3):
-            g[a] = value[3 + a] - p[a]
-            for c in range(3):
-                j[a, c] = t[3 + a, c]
-        return
-    force = x[1] if kind == SIDE else x[0]
-    which = 1 if kind == SIDE else 0  # the unknown that is the force's size
-    # Two directions normal to the axis.
-    ax, ay, az = p[3], p[4], p[5]
-    e = np.empty((2, 3))
-    if abs(ax) <= abs(ay) and abs(ax) <= abs(az):
-        n = 1.0 / np.sqrt(ay * ay + az * az)
-        e[0, 0], e[0, 1], e[0, 2] = 0.0, az * n, -ay * n
-    elif abs(ay) <= abs(az):
-        n = 1.0 / np.sqrt(ax * ax + az * az)
-        e[0, 0], e[0, 1], e[0, 2] = -az * n, 0.0, ax * n
-    else:
-        n = 1.0 / np.sqrt(ax * ax + ay * ay)
-        e[0, 0], e[0, 1], e[0, 2] = ay * n, -ax * n, 0.0
-    e[1, 0] = ay * e[0, 2] - az * e[0, 1]
-    e[1, 1] = az * e[0, 0] - ax * e[0, 2]
-    e[1, 2] = ax * e[0, 1] - ay * e[0, 0]
-    distance, slope = 0.0, 0.0
-    if p[6] >= 0.0:
-        r, dr = whisker_radius(rod, x[0] if kind == SIDE else 1.0)
-        distance = p[6] + radius * r
-        slope = radius * dr if kind == SIDE else 0.0
+def _correct(kind: int, path: Array, step: Array, x: Array) -> None:
+    """Take a Newton step, no longer than trusted, and stay on the whisker with a pushing force."""
+    shorten = 1.0 / max(path[_SIZE], 1.0)
     for a in range(3):
-        d, push = 0.0, 0.0
-        for i in range(3):
-            w = p[3 + i] if a == 2 else e[a, i]
-            push += w * value[i] / force
-            if a < 2:
-                d += w * (value[3 + i] - p[i])
-        g[a] = push if a == 2 else d - distance * push
-        for c in range(3):
-            dd, dpush = 0.0, 0.0
-            for i in range(3):
-                w = p[3 + i] if a == 2 else e[a, i]
-                dpush += w * t[i, c] / force
-                if a < 2:
-                    dd += w * t[3 + i, c]
-            if c == which:
-                dpush -= push / force
-            j[a, c] = dpush if a == 2 else dd - distance * dpush
-        if a < 2 and kind == SIDE:
-            j[a, 0] -= slope * push
+        x[a] -= shorten * step[a]
+    if kind != TIP:
+        path[_PAST_TIP] = 1.0 if x[0] > 1.0 else 0.0
+        x[0] = min(max(x[0], LEAST_ARC), 1.0)
+    force = 1 if kind == SIDE else 0
+    if kind != POINT and x[force] < 0.01 * LEAST_FORCE:
+        path[_LOST] = 1.0
+        x[force] = 0.01 * LEAST_FORCE
+    path[_ROUNDS] += 1.0
 
 
 @inlined
-def _limit(kind: int, fold: Fold, x: Array) -> Array:
-    """How far each unknown may go in one step."""
-    most = np.empty(3)
-    if kind == POINT:
-        most[0] = 0.15
-        most[1] = most[2] = 0.4 * fold_force(fold, x[0], float(np.arctan2(x[2], x[1])))
-    elif kind == SIDE:
-        most[0], most[1], most[2] = 0.15, 0.4 * fold_force(fold, x[0], x[2]), 0.6
+def _struggles(path: Array, size: float, smallest: float) -> bool:
+    """Whether Newton's method fails to contract; ``size`` is its step in longest steps."""
+    rounds = path[_ROUNDS]
+    if rounds == 0.0:
+        path[_SPEED] = size / path[_STRIDE]
+        path[_SLOWEST] = min(path[_SLOWEST], path[_SPEED])
+        return bool(size > 2.0 and path[_STRIDE] > smallest)
+    return bool((rounds >= 2.0 and size > 0.95 * path[_SIZE] + 1e-9) or rounds >= _MOST_ROUNDS)
+
+
+@inlined
+def _switch(kind: int, path: Array, stride: float, x: Array, x_ok: Array) -> int:
+    """Go on along the tip instead of the side, or the other way; return the new kind."""
+    if kind == SIDE:
+        x[0], x[1], x[2] = x_ok[1], 0.0, x_ok[2]
     else:
-        most[0], most[1], most[2] = 0.6 * fold_force(fold, 1.0, x[2]), 0.6, 0.6
-    return most
+        x[1] = x[0]
+        x[0] = 1.0
+    x_ok[:] = x
+    path[_START] = path[_ROUNDS] = path[_PAST_TIP] = 0.0
+    path[_STRIDE] = stride
+    path[_SWITCHES] += 1.0
+    return TIP if kind == SIDE else SIDE
+
+
+@inlined
+def _reason(kind: int, path: Array, x_ok: Array, proximal: float) -> int:
+    """Why a path ends short of its end."""
+    if path[_LOST] > 0.0:
+        return _NO_CONTACT
+    if path[_PAST_TIP] > 0.0 or kind == TIP:
+        return _BEYOND_TIP
+    sped_up = path[_SPEED] > _SPED_UP * path[_SLOWEST] or not path[_SPEED] < _FAST
+    if path[_RATIO] < _NEAR_FOLD or sped_up:
+        return _BEYOND_FOLD
+    return _PROXIMAL if x_ok[0] < proximal else _FAILED
+
+
+@inlined
+def _arrived(kind: int, s: float, proximal: float) -> int:
+    if s < proximal - ROUNDING:
+        return _PROXIMAL
+    return _AT_TIP if kind == TIP else _OK
 
 
 @kernel
@@ -230,33 +194,26 @@ def follow(
         The rows to do.
     """
     b = np.zeros(BUFFER_SIZE)
-    value, t, g = np.empty(6), np.empty((6, 3)), np.empty(3)
-    jacobian, step, contact, p = np.empty((3, 3)), np.empty(3), np.empty(4), np.empty(7)
-    row = np.full(LANES, -1)
-    x, x_ok = np.empty((LANES, 3)), np.empty((LANES, 3))
-    done, stride = np.zeros(LANES), np.zeros(LANES)
-    sign, ratio = np.zeros(LANES), np.zeros(LANES)
-    last_size, rounds = np.zeros(LANES), np.zeros(LANES, np.int64)
-    best, x_best, values_best = np.zeros(LANES), np.empty((LANES, 3)), np.empty((LANES, 6))
-    speed, first_speed = np.zeros(LANES), np.zeros(LANES)
-    clipped, lost = np.zeros(LANES, np.bool_), np.zeros(LANES, np.bool_)
+    value, t, g, p = np.empty(6), np.empty((6, 3)), np.empty(3), np.empty(7)
+    jacobian, step, contact = np.empty((3, 3)), np.empty(3), np.empty(4)
+    row, paths = np.full(LANES, -1), np.zeros((LANES, _COLUMNS))
+    x, x_ok, x_best = np.empty((LANES, 3)), np.empty((LANES, 3)), np.empty((LANES, 3))
     waiting, running = first, 0
     while True:
+        # A lane whose path has ended takes the next one.
         for i in range(LANES):
             if row[i] < 0 and waiting < last:
                 row[i] = waiting
                 waiting += 1
                 running += 1
-                x[i] = unknowns[row[i]]
-                x_ok[i] = x[i]
-                done[i], stride[i], sign[i], ratio[i] = 0.0, 1.0, 0.0, 1.0
-                rounds[i], clipped[i], lost[i] = 0, False, False
-                first_speed[i], best[i] = np.inf, np.inf
+                x[i] = x_ok[i] = unknowns[row[i]]
+                _begin(paths[i])
             if row[i] >= 0:
-                _contact(kinds[row[i]], x[i], contact)
-                set_lane(b, i, contact[0], contact[1], contact[2], contact[3], kinds[row[i]] == TIP)
+                contact_of(kinds[row[i]], x[i], contact)
+                tip = kinds[row[i]] == TIP
+                set_lane(b, i, contact[0], contact[1], contact[2], contact[3], tip)
             else:
-                set_lane(b, i, 0.1, 0.0, 0.0, 0.0, False)
+                set_lane(b, i, LEAST_ARC, 0.0, 0.0, 0.0, False)
         if running == 0:
             return
         integrate(rod, b, True)
@@ -264,125 +221,58 @@ def follow(
             m = row[i]
             if m < 0:
                 continue
-            kind = kinds[m]
+            kind, path = kinds[m], paths[i]
+            smallest = _SMALLEST_POINT_STEP if kind == POINT else _SMALLEST_STEP
+            progress = path[_DONE] + path[_STRIDE]
             lane_value(b, i, value)
             lane_tangents(b, i, t)
-            _polar_tangents(kind, x[i], t)
-            smallest = _SMALLEST_POINT_STEP if kind == POINT else _SMALLEST_STEP
-            progress = done[i] + stride[i]
-            for a in range(7):
-                p[a] = begins[m, a] + progress * (ends[m, a] - begins[m, a])
-            if kind != POINT:
-                length = np.sqrt(p[3] * p[3] + p[4] * p[4] + p[5] * p[5])
-                for a in range(3, 6):
-                    p[a] /= length
-            _equations(kind, rod, radius, x[i], p, value, t, g, jacobian)
-            misfit = norm3(g)
-            det = solve3(jacobian, g, step)
-            if sign[i] == 0.0:
-                sign[i] = det
-            relative = det / sign[i]
-            failed = not (misfit < np.inf) or not relative > 0.0
-            if progress >= 1.0 and misfit < best[i] and relative > 0.0:
-                best[i], x_best[i], values_best[i] = misfit, x[i], value
-            most = _limit(kind, fold, x[i])
-            size = 0.0
-            for a in range(3):
-                size = max(size, abs(step[a]) / most[a])
+            by_unknowns(kind, x[i], t)
+            _parameters(kind, begins[m], ends[m], progress, p)
+            equations(kind, rod, radius, x[i], p, value, t, g, jacobian)
+            misfit, det = norm3(g), solve3(jacobian, g, step)
+            if path[_START] == 0.0:
+                path[_START] = det
+            relative = det / path[_START]
+            stable = misfit < np.inf and relative > 0.0
+            most = longest_step(kind, fold, x[i])
+            size = max(abs(step[0]) / most[0], abs(step[1]) / most[1], abs(step[2]) / most[2])
+            if stable and progress >= 1.0 and misfit < path[_BEST]:
+                path[_BEST], x_best[i] = misfit, x[i]
+                contact_of(kind, x[i], contact)
+                contacts[m], values[m], misfits[m] = contact, value, misfit
+
             # Near zero force the direction is loose: solved means the step is small as well.
             solved = (misfit <= TOLERANCE and size < 1e-6) or misfit <= 1e-3 * TOLERANCE
-            if solved and not failed:
-                done[i] = progress
-                ratio[i] = relative
-                x_ok[i] = x[i]
-                clipped[i], lost[i] = False, False
-                _contact(kind, x[i], contact)
-                contacts[m] = contact
-                values[m] = value
-                misfits[m] = misfit
-                if kind == TIP and x[i, 1] > 0.0:
-                    # The force leans outward, which a tip cannot give: the contact moves along the
-                    # side.
-                    force, psi = x[i, 0], x[i, 2]
-                    kinds[m] = SIDE
-                    x[i, 0], x[i, 1], x[i, 2] = 1.0, force, psi
-                    x_ok[i] = x[i]
-                    sign[i], stride[i] = (
-                        0.0,
-                        0.0 if progress >= 1.0 else min(stride[i], 1.0 - progress),
-                    )
-                    rounds[i] = 0
-                    continue
-                if progress >= 1.0:
-                    unknowns[m] = x[i]
-                    statuses[m] = _AT_TIP if kind == TIP else _OK
-                    if contact[0] < proximal - ROUNDING:
-                        statuses[m] = _PROXIMAL
-                    row[i] = -1
-                    running -= 1
-                    continue
-                stride[i] = min(2.0 * stride[i], 1.0 - progress)
-                rounds[i] = 0
-                continue
-            if rounds[i] == 0:
-                speed[i] = size / stride[i]
-                first_speed[i] = min(first_speed[i], speed[i])
-                failed = failed or (size > 2.0 and stride[i] > smallest)
-            elif rounds[i] >= 2:
-                failed = failed or size > 0.95 * last_size[i] + 1e-9
-            failed = failed or rounds[i] >= _MOST_ITERATIONS
-            if not failed:
-                shorten = 1.0 / max(size, 1.0)
-                for a in range(3):
-                    x[i, a] -= shorten * step[a]
-                if kind != TIP:
-                    clipped[i] = x[i, 0] > 1.0
-                    x[i, 0] = min(max(x[i, 0], LEAST_ARC), 1.0)
-                force = 1 if kind == SIDE else 0
-                if kind != POINT and x[i, force] < 0.01 * LEAST_FORCE:
-                    lost[i] = True
-                    x[i, force] = 0.01 * LEAST_FORCE
-                last_size[i] = size
-                rounds[i] += 1
-                continue
-            if stride[i] > smallest:
-                stride[i] *= 0.5
+            status = _ON_THE_WAY
+            if stable and solved:
+                path[_DONE], path[_RATIO], x_ok[i] = progress, relative, x[i]
+                path[_ROUNDS] = path[_PAST_TIP] = path[_LOST] = 0.0
+                left = 1.0 - progress
+                if kind == TIP and x[i, 1] > 0.0 and path[_SWITCHES] < _MOST_SWITCHES:
+                    # The force leans outward, which a tip cannot give: on along the side.
+                    path[_BEST] = np.inf
+                    kinds[m] = _switch(kind, path, min(path[_STRIDE], left), x[i], x_ok[i])
+                elif progress >= 1.0:
+                    status = _arrived(kind, contacts[m, 0], proximal)
+                else:
+                    path[_STRIDE] = min(2.0 * path[_STRIDE], left)
+            elif stable and not _struggles(path, size, smallest):
+                path[_SIZE] = size
+                _correct(kind, path, step, x[i])
+            elif path[_STRIDE] > smallest:
+                path[_STRIDE] *= 0.5
+                path[_ROUNDS] = 0.0
                 x[i] = x_ok[i]
-                rounds[i] = 0
-                continue
-            # No step succeeds.
-            if best[i] <= _AT_FOLD:
-                _contact(kind, x_best[i], contact)
-                contacts[m], values[m], misfits[m] = contact, values_best[i], best[i]
-                unknowns[m] = x_best[i]
-                statuses[m] = _AT_TIP if kind == TIP else _OK
-                if contact[0] < proximal - ROUNDING:
-                    statuses[m] = _PROXIMAL
+            elif path[_BEST] <= _AT_FOLD:
+                x_ok[i] = x_best[i]
+                status = _arrived(kind, contacts[m, 0], proximal)
+            elif kind == SIDE and path[_PAST_TIP] > 0.0 and path[_SWITCHES] < _MOST_SWITCHES:
+                left = 1.0 - path[_DONE]
+                kinds[m] = _switch(kind, path, min(0.01, left), x[i], x_ok[i])
+            else:
+                status = _reason(kind, path, x_ok[i], proximal)
+                misfits[m] = misfit
+            if status != _ON_THE_WAY:
+                statuses[m], unknowns[m] = status, x_ok[i]
                 row[i] = -1
                 running -= 1
-                continue
-            if kind == SIDE and clipped[i]:
-                kinds[m] = TIP
-                x[i, 0], x[i, 1], x[i, 2] = x_ok[i, 1], 0.0, x_ok[i, 2]
-                x_ok[i] = x[i]
-                sign[i], stride[i], rounds[i] = 0.0, min(0.01, 1.0 - done[i]), 0
-                clipped[i] = False
-                continue
-            if lost[i]:
-                statuses[m] = _NO_CONTACT
-            elif clipped[i] or kind == TIP:
-                statuses[m] = _BEYOND_TIP
-            elif (
-                ratio[i] < _NEAR_FOLD
-                or speed[i] > _SPED_UP * first_speed[i]
-                or not speed[i] < _FAST
-            ):
-                statuses[m] = _FOLD
-            elif x_ok[i, 0] < proximal:
-                statuses[m] = _PROXIMAL
-            else:
-                statuses[m] = _FAILED
-            unknowns[m] = x_ok[i]
-            misfits[m] = misfit
-            row[i] = -1
-            running -= 1

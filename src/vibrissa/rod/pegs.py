@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from vibrissa.rod.arrays import AnyArray, Array, IntArray
-from vibrissa.rod.continuation import LEAST_FORCE, SIDE, TIP
+from vibrissa.rod.continuation import LEAST_FORCE
+from vibrissa.rod.equations import SIDE, TIP
 from vibrissa.rod.points import Solutions, follow_all
 from vibrissa.rod.reach import LEAST_ARC, reach
 from vibrissa.status import Status

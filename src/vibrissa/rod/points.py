@@ -11,7 +11,8 @@ from scipy.spatial import cKDTree
 from vibrissa.rod.arrays import AnyArray, Array, IntArray, Rod
 from vibrissa.rod.batch import share_out, solve_forces
 from vibrissa.rod.compiled import inlined, kernel
-from vibrissa.rod.continuation import POINT, follow
+from vibrissa.rod.continuation import follow
+from vibrissa.rod.equations import POINT
 from vibrissa.rod.kernels import BUFFER_SIZE, LANES
 from vibrissa.rod.newton import TOLERANCE, newton_group, stable
 from vibrissa.rod.preimage import MOST_SEEDS, Preimages, Tree, seeds

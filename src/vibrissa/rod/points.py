@@ -30,7 +30,8 @@ if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
 
 # A point without a seed is unreachable, and the nearest face of the chart tells why. This near to
-# a face (over L) it is approached from inside instead, in case the interpolant misjudges.
+# a face (over L) it is approached from inside instead, in case the interpolant misjudges; and this
+# near to the resting whisker, where bearings have no meaning and there may be no seed.
 _NEAR = 0.01
 # Points along each edge of the chart's faces.
 _FACE = 65
@@ -137,6 +138,7 @@ class PointSolver:
         self._nearest = cKDTree(inner)
         places, reasons = zip(*_faces(chart), strict=True)
         self._faces = cKDTree(np.concatenate(places))
+        self._rest = cKDTree(_at_rest(chart))
         self._reasons = np.concatenate(
             [np.full(len(p), int(r)) for p, r in zip(places, reasons, strict=True)]
         )
@@ -192,7 +194,7 @@ class PointSolver:
             return
         away, face = self._faces.query(points)
         out.statuses[rows] = self._reasons[face]
-        near = np.flatnonzero((away < _NEAR) | seeded)
+        near = np.flatnonzero((away < _NEAR) | seeded | (self._rest.query(points)[0] < _NEAR))
         points, rows = points[near], rows[near]
         _, start = self._nearest.query(points)
         begins, ends = np.zeros((rows.size, 7)), np.zeros((rows.size, 7))
@@ -223,6 +225,13 @@ def _faces(chart: Reach) -> list[tuple[Array, Status]]:
         contacts = with_normal_force(contacts_at(chart.fold, place))
         faces.append((solve_forces(chart.discretization, contacts)[0][:, 3:], reason))
     return faces
+
+
+def _at_rest(chart: Reach) -> Array:
+    """Places along the resting whisker, (n, 3)."""
+    contacts = np.zeros((_FACE, 4))
+    contacts[:, 0] = np.linspace(chart.proximal, 1.0, _FACE)
+    return solve_forces(chart.discretization, contacts)[0][:, 3:]
 
 
 def follow_all(

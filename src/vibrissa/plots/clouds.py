@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 import xarray as xr
 from matplotlib.colorbar import Colorbar
-from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
-from mpl_toolkits.mplot3d import Axes3D
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
 from vibrissa.plots.colours import cyclic, diverging, sequential
-from vibrissa.plots.style import INK, LOOK, Array, Mask, new_figure, robust_limits, say
+from vibrissa.plots.style import (
+    INK,
+    WIDTHS,
+    Array,
+    Mask,
+    looking,
+    new_figure,
+    plain,
+    robust_limits,
+    say,
+)
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.status import is_ok
 
@@ -71,7 +80,7 @@ def cloud(samples: xr.Dataset, centerline: ArrayLike | None = None) -> Cloud:
         raise ValueError(f"the samples lack {', '.join(missing)}")
     shape = samples["Fx"].dims
     points = _contact_points(samples)
-    kept = np.isfinite(points).all(axis=1)
+    kept: Mask = np.asarray(np.isfinite(points).all(axis=1))
     signals = {name: samples[name].transpose(*shape).to_numpy().ravel() for name in SIGNALS}
     for values in signals.values():
         kept &= np.isfinite(values)
@@ -80,7 +89,9 @@ def cloud(samples: xr.Dataset, centerline: ArrayLike | None = None) -> Cloud:
     if "small_deflection" in samples:
         kept &= ~samples["small_deflection"].transpose(*shape).to_numpy().ravel().astype(bool)
     elif centerline is not None:
-        kept[kept] = ~_near_rest(points[kept], np.asarray(centerline, dtype=np.float64))
+        rows = np.flatnonzero(kept)
+        line = np.asarray(centerline, dtype=np.float64)
+        kept[rows[_near_rest(points[rows], line)]] = False
     return Cloud(points[kept], {name: values[kept] for name, values in signals.items()})
 
 
@@ -112,14 +123,15 @@ def signal_clouds(
     samples: xr.Dataset,
     centerline: ArrayLike | None = None,
     *,
-    elevation: float = 22.0,
-    azimuth: float = -62.0,
+    cutaway: bool = True,
+    elevation: float = 24.0,
+    azimuth: float = -58.0,
 ) -> Figure:
     """Draw the six signals over the space that the whisker can reach.
 
     Six clouds of contact points, one for each signal that gives the colour: forces above, moments
     below. Small deflections (2° about rest) are left out as in the paper. Limits of colours leave
-    out the outermost 2 % of the values; where they do, the colour bar has pointed ends.
+    out the outermost 2 % of the values; where they do, the colour bar has a pointed end.
 
     Parameters
     ----------
@@ -127,6 +139,9 @@ def signal_clouds(
         ``ContactMap.grid`` or ``ContactMap.to_dataset()``; see :func:`cloud`.
     centerline : array_like (k, 3), optional
         Of the resting whisker, whisker frame, m; drawn in black.
+    cutaway : bool
+        Whether the quarter that faces the viewer is taken away, along the resting whisker, so that
+        the whisker and what lies about it are seen.
     elevation, azimuth : float
         From where the clouds are seen, degrees.
 
@@ -141,85 +156,113 @@ def signal_clouds(
         If the dataset lacks signals or contact points.
     """
     contacts = cloud(samples, centerline)
+    points = to_display("contact_point", contacts.points)
     line = None if centerline is None else to_display("centerline", centerline)
-    with mpl.rc_context(dict(LOOK)):
-        figure = new_figure("double", 112.0, None)
-        if len(contacts.points) == 0:
+    with looking():
+        figure = new_figure("double", _HEIGHT, None)
+        if len(points) == 0:
             say(figure, "no contacts")
             return figure
-        points = to_display("contact_point", contacts.points)
         limits = _limits(points, line)
-        # An even stride would pick the same rows of a grid again and again.
-        order = np.random.default_rng(0).permutation(len(points))[:_MOST]
+        # In an order of its own: an even stride would pick the same rows of a grid again and again.
+        shown = np.random.default_rng(0).permutation(len(points))
+        if cutaway:
+            shown = shown[~_facing(points[shown], line, elevation, azimuth)]
+        shown = shown[:_MOST]
+        # Fewer contacts are drawn as larger dots.
+        dot = _DOTS | {"s": float(np.clip(6e4 / max(len(shown), 1), 2.0, 8.0))}
         for i, name in enumerate(SIGNALS):
             left, bottom = (i % 3) / 3.0, 0.5 * (1 - i // 3)
-            box = (left - 0.018, bottom + 0.035, 0.325, 0.45)
-            axes = figure.add_axes(box, projection="3d", computed_zorder=False)
-            assert isinstance(axes, Axes3D)
-            _frame(axes, limits, (elevation, azimuth))
+            axes = _axes(figure, left, bottom, limits, (elevation, azimuth))
             values = to_display(name, contacts.signals[name])
-            low, high, colours, extend = _scale(name, values)
-            dots = axes.scatter(
-                *points[order].T,
-                c=values[order],
-                cmap=colours,
-                vmin=low,
-                vmax=high,
-                s=1.2,
-                linewidths=0.0,
-                depthshade=False,
-                rasterized=True,
-            )
+            scale, ends = _scale(name, values)
+            dots = axes.scatter(*points[shown].T, c=values[shown], **scale, **dot)
             if line is not None:
-                axes.plot(*line.T, color="black", linewidth=1.2, zorder=10)
-            rail = figure.add_axes((left + 0.283, bottom + 0.13, 0.009, 0.25))
-            bar = figure.colorbar(dots, cax=rail, extend=extend)
-            _finish(bar, name)
-            title = quantity(name).long_name
-            figure.text(left + 0.015, bottom + 0.475, "abcdef"[i], fontweight="bold", fontsize=8.0)
-            figure.text(left + 0.04, bottom + 0.475, title, fontsize=7.5)
+                axes.plot(*line.T, color="black", linewidth=1.4, zorder=10)
+            rail = figure.add_axes((left + 0.07, bottom + 0.066, 0.2, 0.013))
+            _bar(figure.colorbar(dots, cax=rail, extend=ends, orientation="horizontal"), name)
+            for text, right, look in (("abcdef"[i], 0.012, _BOLD), (_title(name), 0.034, _WORDS)):
+                figure.text(left + right, bottom + 0.467, text, **look)
         return figure
 
 
-def _scale(name: str, values: Array) -> tuple[float, float, Colormap, str]:
-    """Limits and map of the colours of a signal, and which ends are cut off."""
+_HEIGHT = 124.0
+"""Of the figure, mm."""
+
+_DOTS: dict[str, Any] = {"linewidths": 0.0, "depthshade": False, "rasterized": True}
+_BOLD: dict[str, Any] = {"fontsize": 8.0, "fontweight": "bold"}
+_WORDS: dict[str, Any] = {"fontsize": 7.0}
+
+
+def _title(name: str) -> str:
+    return quantity(name).long_name
+
+
+def _facing(points: Array, line: Array | None, elevation: float, azimuth: float) -> Mask:
+    """Whether points (n, 3) lie in the quarter before the resting whisker, toward the viewer."""
+    rest = np.zeros((2, len(points)))
+    if line is not None:
+        reach = np.linalg.norm(line, axis=1)
+        order = np.argsort(reach)
+        r = np.linalg.norm(points, axis=1)
+        rest = np.array([np.interp(r, reach[order], line[order, k]) for k in (1, 2)])
+    toward = np.sign(np.sin(np.radians(azimuth))), np.sign(elevation)
+    aside, above = points[:, 1] - rest[0], points[:, 2] - rest[1]
+    return np.asarray((aside * toward[0] > 0.0) & (above * toward[1] > 0.0))
+
+
+def _scale(name: str, values: Array) -> tuple[dict[str, Any], str]:
+    """Limits and map of the colours of a signal, and which ends of the map are exceeded."""
     if name in DIRECTIONS:
-        return -180.0, 180.0, cyclic(), "neither"
+        return {"vmin": -180.0, "vmax": 180.0, "cmap": cyclic()}, "neither"
     signed = name == "Mx"
     low, high = robust_limits(values, symmetric=signed)
     if name in ("FT", "MB"):
         low = 0.0
-    below, above = values.min() < low, values.max() > high
-    extend = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}
-    return low, high, diverging() if signed else sequential(), extend[below, above]
+    below, above = bool(values.min() < low), bool(values.max() > high)
+    ends = ("neither", "max", "min", "both")[2 * below + above]
+    return {"vmin": low, "vmax": high, "cmap": diverging() if signed else sequential()}, ends
 
 
-def _finish(bar: Colorbar, name: str) -> None:
-    bar.outline.set_linewidth(0.0)  # type: ignore[operator]
-    bar.ax.tick_params(length=2.0, pad=1.5, labelsize=6.0)
-    bar.ax.set_title(axis_label(name), fontsize=7.0, pad=5.0)
+def _bar(bar: Colorbar, name: str) -> None:
+    plain(bar)
+    bar.ax.tick_params(length=2.0, pad=1.5)
+    bar.ax.set_xlabel(axis_label(name))
     if name in DIRECTIONS:
         bar.set_ticks([-180.0, -90.0, 0.0, 90.0, 180.0])
+    else:
+        bar.locator = MaxNLocator(4)
+        bar.update_ticks()
 
 
 def _limits(points: Array, line: Array | None) -> Array:
     """Limits (3, 2) of x, y and z that hold all points, the base and the whisker."""
     everything = np.concatenate([points, np.zeros((1, 3)), *([] if line is None else [line])])
-    low, high = everything.min(axis=0), everything.max(axis=0)
+    low, high = np.nanmin(everything, axis=0), np.nanmax(everything, axis=0)
     room = 0.02 * (high - low).max()
     return np.stack([low - room, high + room], axis=1)
 
 
-def _frame(axes: Axes3D, limits: Array, view: tuple[float, float]) -> None:
+def _axes(
+    figure: Figure, left: float, bottom: float, limits: Array, view: tuple[float, float]
+) -> Any:
+    """Three-dimensional axes to one scale in a sixth of the figure."""
+    # Matplotlib's 3D axes carry no types, and stay square: the box reaches beyond the panel.
+    tall = 0.36 * WIDTHS["double"] / _HEIGHT
+    box = (left - 0.031, bottom + 0.297 - 0.5 * tall, 0.36, tall)
+    axes: Any = figure.add_axes(box, projection="3d", computed_zorder=False)
+    axes.patch.set_visible(False)
     axes.set(xlim=limits[0], ylim=limits[1], zlim=limits[2])
-    axes.set_box_aspect(tuple(np.ptp(limits, axis=1)), zoom=1.1)
+    axes.set_box_aspect(tuple(np.ptp(limits, axis=1)), zoom=0.86)
     axes.view_init(*view)
-    axes.set_proj_type("persp", focal_length=1.4)
-    for axis, name in ((axes.xaxis, "x"), (axes.yaxis, "y"), (axes.zaxis, "z")):
+    axes.set_proj_type("persp", focal_length=1.6)
+    for name, pad in (("x", -9.0), ("y", -10.0), ("z", -11.0)):
+        axis = getattr(axes, f"{name}axis")
         axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
         axis.line.set(color=INK, linewidth=0.5)
         axis._axinfo["grid"].update(color="#e2e2e2", linewidth=0.4)
         axis.set_label_text(axis_label(name), fontsize=6.0)
-        axis.labelpad = -11.0
+        axis.labelpad = pad
     axes.tick_params(labelsize=5.5, pad=-4.0)
     axes.locator_params(nbins=4)
+    return axes

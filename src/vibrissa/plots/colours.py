@@ -8,14 +8,15 @@ equal steps in colour, and nothing is so pale that it is lost on white paper.
 
 from __future__ import annotations
 
+from typing import Any
+
 import matplotlib as mpl
 import numpy as np
 from matplotlib.colors import Colormap, ListedColormap
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from vibrissa.plots.style import INK, Array, robust_limits
 
-_LIGHTNESS, _RADIUS, _YELLOW, _RED = 0.61, 0.20, 0.125, 0.075
+_LIGHTNESS, _RADIUS, _YELLOW, _RED = 0.62, 0.20, 0.115, 0.06
 """Centre and radius in lightness, radii in b (yellow) and a (red), within the gamut of sRGB."""
 
 _LMS_FROM_LAB = np.array(
@@ -37,7 +38,10 @@ _RGB_FROM_LMS = np.array(
 def _srgb(lab: Array) -> Array:
     """SRGB (..., 3) in [0, 1] of OKLab (..., 3)."""
     linear = np.clip((lab @ _LMS_FROM_LAB.T) ** 3 @ _RGB_FROM_LMS.T, 0.0, 1.0)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
+    encoded: Array = np.where(
+        linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055
+    )
+    return encoded
 
 
 def cyclic() -> Colormap:
@@ -82,3 +86,22 @@ def diverging() -> Colormap:
         Blue below zero, grey at zero, red above.
     """
     return mpl.colormaps["coolwarm"]
+
+
+def shading(values: Array | None) -> dict[str, Any]:
+    """What tells a scatter plot how to colour its points.
+
+    Parameters
+    ----------
+    values : array (n,), optional
+        Of each point; without them all points are black.
+
+    Returns
+    -------
+    dict
+        Keyword arguments of ``Axes.scatter``, with limits that leave out the outermost 2 %.
+    """
+    if values is None:
+        return {"color": INK, "linewidths": 0.0}
+    low, high = robust_limits(values)
+    return {"c": values, "cmap": sequential(), "vmin": low, "vmax": high, "linewidths": 0.0}

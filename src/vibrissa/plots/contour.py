@@ -5,28 +5,27 @@ Contact points lie on the whisker's centreline, one whisker radius (some 50 µm)
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.plots.colours import sequential
+from vibrissa.plots.colours import shading
 from vibrissa.plots.style import (
-    INK,
-    LOOK,
     MUTED,
     ORANGE,
     WIDTHS,
     Array,
     Width,
-    mark_panel,
+    head,
+    looking,
     new_figure,
+    plain,
     robust_limits,
     say,
 )
@@ -56,7 +55,7 @@ _CHI2_95 = 5.991464547107979
 """95 % of a chi-square of two degrees of freedom."""
 
 _MOST_ELLIPSES = 60
-_LEFT, _GAP, _BAR, _BOTTOM, _TOP = 11.0, 10.5, 15.0, 9.0, 12.0
+_LEFT, _GAP, _BAR, _BOTTOM, _TOP = 10.0, 10.0, 12.0, 8.5, 11.0
 """Room around and between the views, mm on paper."""
 
 
@@ -103,48 +102,42 @@ def contour_views(
     places = to_display("contact_point", points)
     shade = None if colour is None else to_display(colour_name, colour)
     spread = None if covariance is None else to_display("covariance", covariance)
-    _check(places, shade, spread)
-    known = np.isfinite(places).all(axis=1)
-    if shade is not None:
-        known &= np.isfinite(shade)
-    rows = np.flatnonzero(known)
-    if shade is not None:
-        rows = rows[np.argsort(shade[rows], kind="stable")]
-    with mpl.rc_context(dict(LOOK)):
+    rows = _usable(places, shade, spread)
+    pegs = [(c, look) for c, look in ((peg, _PEG), (fitted, _FITTED)) if c is not None]
+    with looking():
         if rows.size == 0:
             figure: Figure = new_figure(width, 40.0, None)
             say(figure, "no contacts")
             return figure
-        places = places[rows]
-        limits = _limits(places, peg or fitted)
-        figure, panels, scale = _panels(limits, width)
-        look = {"color": INK}
-        if shade is not None:
-            shade = shade[rows]
-            low, high = robust_limits(shade)
-            look = {"c": shade, "cmap": sequential(), "vmin": low, "vmax": high}
-        height = float(np.median(places[:, 2]))
+        places, shade = places[rows], None if shade is None else shade[rows]
+        limits = _limits(places, pegs[0][0] if pegs else None)
+        figure, panels = _panels(limits, width)
         for axes, view in zip(panels, _VIEWS, strict=True):
-            for cylinder, style in ((peg, _PEG), (fitted, _FITTED)):
-                if cylinder is not None:
-                    outline = _outline(cylinder, view, height, limits)
-                    axes.add_patch(Polygon(outline, closed=True, **style))  # type: ignore[arg-type]
+            for cylinder, look in pegs:
+                outline = _outline(cylinder, view, float(np.median(places[:, 2])), limits)
+                axes.add_patch(Polygon(outline, closed=True, **look))
             if spread is not None:
                 _ellipses(axes, places, spread[rows], view)
+            across, up = places[:, view].T
             size = 5.0 if view == (0, 1) else 2.5
-            dots = axes.scatter(*places[:, view].T, s=size, linewidths=0.0, zorder=3, **look)  # type: ignore[arg-type]
+            dots = axes.scatter(across, up, size, zorder=3, **shading(shade))
         _note_outside(panels[0], places, limits)
         _legend(figure, panels, peg, fitted, spread is not None)
         if shade is not None:
-            page, tall = figure.get_size_inches() * 25.4
-            box = ((page - _BAR + 2.0) / page, _BOTTOM / tall, 2.0 / page, 0.6 * scale / tall)
-            bar = figure.colorbar(dots, cax=figure.add_axes(box), label=axis_label(colour_name))
-            bar.outline.set_linewidth(0.0)  # type: ignore[operator]
+            rail = figure.add_axes(_rail(figure))
+            plain(figure.colorbar(dots, cax=rail, label=axis_label(colour_name)))
         return figure
 
 
-_PEG = {"facecolor": "#ececec", "edgecolor": MUTED, "linewidth": 0.8, "zorder": 1}
-_FITTED = {
+def _rail(figure: Figure) -> tuple[float, float, float, float]:
+    """Where the colour bar is, as shares of the figure."""
+    page, height = figure.get_size_inches() * 25.4
+    tall = 0.6 * (height - _BOTTOM - _TOP)
+    return (page - _BAR + 2.0) / page, _BOTTOM / height, 2.0 / page, tall / height
+
+
+_PEG: dict[str, Any] = {"facecolor": "#ececec", "edgecolor": MUTED, "linewidth": 0.8, "zorder": 1}
+_FITTED: dict[str, Any] = {
     "facecolor": "none",
     "edgecolor": ORANGE,
     "linewidth": 1.0,
@@ -153,7 +146,8 @@ _FITTED = {
 }
 
 
-def _check(places: Array, shade: Array | None, spread: Array | None) -> None:
+def _usable(places: Array, shade: Array | None, spread: Array | None) -> NDArray[np.intp]:
+    """Rows in which nothing is missing, those of the largest shade last, to be drawn on top."""
     n = len(places)
     wanted = {
         "points": (places, (n, 3)),
@@ -167,6 +161,11 @@ def _check(places: Array, shade: Array | None, spread: Array | None) -> None:
     ]
     if faults:
         raise ValueError("; ".join(faults))
+    known = np.isfinite(places).all(axis=1)
+    if shade is None:
+        return np.flatnonzero(known)
+    rows = np.flatnonzero(known & np.isfinite(shade))
+    return rows[np.argsort(shade[rows], kind="stable")]
 
 
 def _limits(places: Array, peg: Cylinder | None) -> Array:
@@ -185,8 +184,8 @@ def _limits(places: Array, peg: Cylinder | None) -> Array:
     return limits
 
 
-def _panels(limits: Array, width: Width) -> tuple[Figure, list[Axes], float]:
-    """Three axes, all as tall as the view from above, and this height in mm on paper."""
+def _panels(limits: Array, width: Width) -> tuple[Figure, list[Axes]]:
+    """Three axes, all as tall as the view from above."""
     page = WIDTHS[width]
     across, tall = np.ptp(limits[0]), np.ptp(limits[2])
     size = (page - _LEFT - 2.0 * _GAP - _BAR) / (1.0 + 2.0 * across / tall)
@@ -198,11 +197,11 @@ def _panels(limits: Array, width: Width) -> tuple[Figure, list[Axes], float]:
         box = (left / page, _BOTTOM / height, wide / page, size / height)
         axes = figure.add_axes(box, xlim=limits[view[0]], ylim=limits[view[1]])
         axes.set(xlabel=axis_label(_NAMES[view[0]]), ylabel=axis_label(_NAMES[view[1]]))
-        axes.set_title(title)
-        mark_panel(axes, "abc"[i])
+        head(axes, "abc"[i], title)
+        axes.locator_params(axis="x", nbins=5 if i == 0 else 3, integer=True)
         panels.append(axes)
         left += wide + _GAP
-    return figure, panels, size
+    return figure, panels
 
 
 def _outline(cylinder: Cylinder, view: tuple[int, int], height: float, limits: Array) -> Array:
@@ -218,7 +217,7 @@ def _outline(cylinder: Cylinder, view: tuple[int, int], height: float, limits: A
         circle = origin + radius * (np.cos(turn) * first + np.sin(turn) * np.cross(axis, first))
         # Along the axis, until all of the circle is at this height.
         circle += (height - circle[:, 2:]) / axis[2] * axis
-        return circle[:, :2]
+        return np.asarray(circle[:, :2])
     i, j = view
     along = np.array([axis[i], axis[j]])
     along = along / max(float(np.linalg.norm(along)), 1e-12)
@@ -233,12 +232,14 @@ def _outline(cylinder: Cylinder, view: tuple[int, int], height: float, limits: A
 
 
 def _ellipses(axes: Axes, places: Array, spread: Array, view: tuple[int, int]) -> None:
-    """95 % ellipses about evenly chosen points."""
+    """95 % ellipses about evenly chosen points, where they are no wider than the view."""
     i, j = view
-    chosen = np.unique(np.linspace(0, len(places) - 1, _MOST_ELLIPSES).astype(np.int64))
-    plane = spread[chosen][:, [i, j]][:, :, [i, j]]
-    fine = np.isfinite(plane).all(axis=(1, 2))
-    chosen, plane = chosen[fine], plane[fine]
+    plane = spread[:, [i, j]][:, :, [i, j]]
+    chosen = np.flatnonzero(np.isfinite(plane).all(axis=(1, 2)))
+    widest = 0.25 * np.ptp(axes.get_xlim()) / np.sqrt(_CHI2_95)
+    chosen = chosen[np.trace(plane[chosen], axis1=1, axis2=2) < widest**2]
+    chosen = chosen[:: max(1, len(chosen) // _MOST_ELLIPSES)]
+    plane = plane[chosen]
     size, direction = np.linalg.eigh(plane)
     size = 2.0 * np.sqrt(_CHI2_95 * np.clip(size, 0.0, None))
     angle = np.degrees(np.arctan2(direction[:, 1, 1], direction[:, 0, 1]))
@@ -273,13 +274,13 @@ def _legend(
     corner = np.zeros((1, 2))
     if peg is not None:
         diameter = 2.0 * float(to_display("peg_radius", peg.radius))
-        handles.append(Polygon(corner, label=f"peg, {diameter:.2f} mm", **_PEG))  # type: ignore[arg-type]
+        handles.append(Polygon(corner, label=f"peg, {diameter:.2f} mm", **_PEG))
     if fitted is not None:
         diameter = 2.0 * float(to_display("peg_radius", fitted.radius))
-        handles.append(Polygon(corner, label=f"fitted, {diameter:.2f} mm", **_FITTED))  # type: ignore[arg-type]
+        handles.append(Polygon(corner, label=f"fitted, {diameter:.2f} mm", **_FITTED))
     if spread:
-        look = {"marker": "o", "markerfacecolor": "none", "linestyle": "none"}
-        handles.append(Line2D([], [], color=MUTED, label="95 %", **look))  # type: ignore[arg-type]
+        look: dict[str, Any] = {"marker": "o", "markerfacecolor": "none", "linestyle": "none"}
+        handles.append(Line2D([], [], color=MUTED, label="95 % ellipses", **look))
     if handles:
         place = (panels[0].get_position().x0 + 0.02, 1.0)
         figure.legend(

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import matplotlib as mpl
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from vibrissa.plots.colours import sequential
+from vibrissa.plots.colours import shading
 from vibrissa.plots.style import (
-    INK,
-    LOOK,
     MUTED,
     Array,
-    mark_panel,
+    head,
+    looking,
     new_figure,
+    plain,
     robust_limits,
     say,
 )
@@ -57,51 +58,65 @@ def estimated_against_true(
     ValueError
         If shapes differ.
     """
-    true, estimated = (_rows(a) for a in (true_spherical, estimated_spherical))
-    extra = {"time": time, "colour": colour}
-    given = {k: np.asarray(v, dtype=np.float64) for k, v in extra.items() if v is not None}
-    if true.shape != estimated.shape or any(v.shape != true.shape[:1] for v in given.values()):
-        shapes = ", ".join(str(v.shape) for v in (true, estimated, *given.values()))
-        raise ValueError(f"true, estimated and what goes with them have shapes {shapes}")
-    known = np.isfinite(true).all(axis=1) & np.isfinite(estimated).all(axis=1)
-    for values in given.values():
-        known &= np.isfinite(values)
-    true, estimated = true[known], estimated[known]
-    seconds = to_display("time", given["time"][known]) if time is not None else None
-    shade, label = seconds, axis_label("time")
-    if colour is not None:
-        shade = to_display(colour_name, given["colour"][known])
-        label = axis_label(colour_name)
-    with mpl.rc_context(dict(LOOK)):
-        figure = new_figure("double", 68.0 if seconds is None else 140.0, "constrained")
+    shades, name = (time, "time") if colour is None else (colour, colour_name)
+    true, estimated, seconds, shade = _usable(true_spherical, estimated_spherical, time, shades)
+    seconds = None if seconds is None else to_display("time", seconds)
+    shade = None if shade is None else to_display(name, shade)
+    with looking():
+        figure = new_figure("double", 58.0 if seconds is None else 125.0, "constrained")
         if len(true) == 0:
             say(figure, "no contacts")
             return figure
         rows = 1 if seconds is None else 3
-        ratios = [2.3, 1.0, 1.0][:rows]
+        ratios = [2.1, 1.0, 1.0][:rows]
         panels = figure.subplots(rows, 3, squeeze=False, height_ratios=ratios)
-        look = {"c": shade, "cmap": sequential()} if shade is not None else {"color": INK}
-        if shade is not None:
-            look["vmin"], look["vmax"] = robust_limits(shade)
-        for i, name in enumerate(_COORDINATES):
-            values = to_display(name, true[:, i]), to_display(name, estimated[:, i])
-            dots = _against(panels[0, i], name, *values, look)
-            mark_panel(panels[0, i], "abc"[i], -0.12)
+        look = shading(shade)
+        for i, axis in enumerate(_COORDINATES):
+            pair = to_display(axis, true[:, i]), to_display(axis, estimated[:, i])
+            dots = _against(panels[0, i], axis, pair, look)
+            head(panels[0, i], "abc"[i], quantity(axis).long_name)
             if seconds is not None:
-                _course(panels[1, i], name, seconds, *values, look)
-                _errors(panels[2, i], name, seconds, *values, look)
+                _course(panels[1, i], axis, seconds, pair, look)
+                _errors(panels[2, i], axis, seconds, pair, look)
         if shade is not None:
-            bar = figure.colorbar(dots, ax=panels, label=label, aspect=50, pad=0.01)
-            bar.outline.set_linewidth(0.0)  # type: ignore[operator]
+            # As tall as the panels of the first row, beside them.
+            place: dict[str, Any] = {
+                "shrink": 0.8 if rows == 1 else 0.4,
+                "aspect": 22,
+                "anchor": (0.0, 0.95),
+            }
+            plain(figure.colorbar(dots, ax=panels, label=axis_label(name), pad=0.01, **place))
         figure.align_ylabels(panels[:, 0])
         return figure
 
 
-def _rows(values: ArrayLike) -> Array:
-    rows = np.asarray(values, dtype=np.float64)
-    if rows.ndim != 2 or rows.shape[1] != 3:
-        raise ValueError(f"spherical coordinates have shape {rows.shape}; (n, 3) is needed")
-    return rows
+def _usable(
+    true: ArrayLike, estimated: ArrayLike, time: ArrayLike | None, shade: ArrayLike | None
+) -> tuple[Array, Array, Array | None, Array | None]:
+    """Rows in which nothing is missing; those of the largest shade last, to be drawn on top."""
+    given = [
+        None if a is None else np.asarray(a, np.float64) for a in (true, estimated, time, shade)
+    ]
+    n = np.shape(true)[:1]
+    wanted = ((*n, 3), (*n, 3), n, n)
+    names = ("true_spherical", "estimated_spherical", "time", "colour")
+    faults = [
+        f"{name} has shape {a.shape}; {shape} is needed"
+        for name, a, shape in zip(names, given, wanted, strict=True)
+        if a is not None and a.shape != shape
+    ]
+    if faults:
+        raise ValueError("; ".join(faults))
+    known = np.ones(n, dtype=bool)
+    for a in given:
+        known &= True if a is None else np.isfinite(a.reshape(len(a), -1)).all(axis=1)
+    rows = np.flatnonzero(known)
+    if given[3] is not None:
+        rows = rows[np.argsort(given[3][rows], kind="stable")]
+    kept = [None if a is None else a[rows] for a in given]
+    assert kept[0] is not None
+    assert kept[1] is not None
+    return kept[0], kept[1], kept[2], kept[3]
 
 
 def _difference(name: str, true: Array, estimated: Array) -> Array:
@@ -110,15 +125,24 @@ def _difference(name: str, true: Array, estimated: Array) -> Array:
     return (away + 180.0) % 360.0 - 180.0 if name == "theta" else away
 
 
-def _against(
-    axes: Axes, name: str, true: Array, estimated: Array, look: dict[str, object]
-) -> PathCollection:
+def _range(true: Array, estimated: Array) -> Array:
+    """Limits that hold all that is true and most of the estimates, but not the wildest."""
     low, high = robust_limits(true, share=1.0)
+    span = high - low
+    least, most = robust_limits(estimated, share=0.95)
+    low, high = min(low, max(least, low - 0.5 * span)), max(high, min(most, high + 0.5 * span))
     room = 0.06 * (high - low)
-    limits = (low - room, high + room)
+    return np.array([low - room, high + room])
+
+
+def _against(
+    axes: Axes, name: str, pair: tuple[Array, Array], look: dict[str, Any]
+) -> PathCollection:
+    true, estimated = pair
+    limits = _range(*pair)
     axes.plot(limits, limits, color=MUTED, linewidth=0.6, zorder=1)
-    dots = axes.scatter(true, estimated, s=4.0, linewidths=0.0, zorder=2, **look)  # type: ignore[arg-type]
-    axes.set(xlim=limits, ylim=limits, aspect="equal", title=quantity(name).long_name)
+    dots = axes.scatter(true, estimated, s=4.0, zorder=2, **look)
+    axes.set(xlim=limits, ylim=limits, aspect="equal")
     axes.set(xlabel=f"true {axis_label(name)}", ylabel=f"estimated {axis_label(name)}")
     error = np.median(np.abs(_difference(name, true, estimated)))
     unit = quantity(name).display_unit
@@ -126,33 +150,34 @@ def _against(
     words = f"median |error| {error:.2g}{'' if unit == '°' else ' '}{unit}"
     if outside:
         words += f"\n{outside} of {true.size} outside"
-    axes.text(0.04, 0.97, words, transform=axes.transAxes, va="top", fontsize=6.0)
+    axes.set_title(words, loc="right", fontsize=6.0, color=MUTED)
     return dots
 
 
 def _course(
-    axes: Axes, name: str, time: Array, true: Array, estimated: Array, look: dict[str, object]
+    axes: Axes, name: str, time: Array, pair: tuple[Array, Array], look: dict[str, Any]
 ) -> None:
-    low, high = robust_limits(true, share=1.0)
-    axes.scatter(time, estimated, s=3.0, linewidths=0.0, zorder=2, **look)  # type: ignore[arg-type]
-    axes.plot(*_broken(time, true), color=INK, linewidth=0.6, zorder=3)
-    axes.set_ylim(low - 0.1 * (high - low), high + 0.1 * (high - low))
+    axes.scatter(time, pair[1], s=3.0, zorder=2, **look)
+    axes.plot(*_broken(time, pair[0]), color=MUTED, linewidth=1.4, zorder=1)
+    axes.set_ylim(*_range(*pair))
     axes.set_ylabel(axis_label(name))
     axes.tick_params(labelbottom=False)
 
 
 def _errors(
-    axes: Axes, name: str, time: Array, true: Array, estimated: Array, look: dict[str, object]
+    axes: Axes, name: str, time: Array, pair: tuple[Array, Array], look: dict[str, Any]
 ) -> None:
-    error = _difference(name, true, estimated)
+    error = _difference(name, *pair)
     axes.axhline(0.0, color=MUTED, linewidth=0.6, zorder=1)
-    axes.scatter(time, error, s=3.0, linewidths=0.0, zorder=2, **look)  # type: ignore[arg-type]
-    axes.set_ylim(1.1 * robust_limits(error, share=0.96, symmetric=True))
+    axes.scatter(time, error, s=3.0, zorder=2, **look)
+    axes.set_ylim(*1.1 * robust_limits(error, share=0.9, symmetric=True))
     axes.set(xlabel=axis_label("time"), ylabel=axis_label(f"error_{name}"))
 
 
 def _broken(time: Array, values: Array) -> tuple[Array, Array]:
     """A line with gaps where no frames are."""
+    order = np.argsort(time, kind="stable")
+    time, values = time[order], values[order]
     step = np.diff(time)
     if step.size == 0:
         return time, values

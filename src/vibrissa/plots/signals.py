@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import matplotlib as mpl
+from typing import Any
+
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
@@ -13,12 +14,12 @@ from matplotlib.patches import Patch
 from vibrissa.plots.style import (
     BLUE,
     INK,
-    LOOK,
     SHADE,
     Array,
     Mask,
     Width,
-    mark_panel,
+    head,
+    looking,
     new_figure,
     say,
 )
@@ -44,7 +45,7 @@ def signals_over_time(
         ``whisker``. Where ``in_contact`` is known, contact is shaded, and directions are drawn in
         contact only, since they mean nothing without a force. NaN leaves a gap.
     truth : Dataset, optional
-        The same, as it truly is: drawn over it as a thin dark line.
+        The same at the same times, as it truly is: drawn over it in black.
     whisker : int
         Which, where there are several.
     width : {"single", "double"}
@@ -69,17 +70,20 @@ def signals_over_time(
     signals = _one(signals, whisker)
     truth = None if truth is None else _one(truth, whisker)
     time = to_display("time", signals["time"])
+    if truth is not None and truth.sizes.get("time") != time.size:
+        raise ValueError(f"the truth has {dict(truth.sizes)}, the signals {time.size} times")
     contact = _contact(signals)
-    with mpl.rc_context(dict(LOOK)):
-        figure = new_figure(width, 92.0 if width == "double" else 75.0, "constrained")
+    with looking():
+        layout: tuple[int, int, float] = (3, 2, 92.0) if width == "double" else (6, 1, 130.0)
+        figure = new_figure(width, layout[2], "constrained")
         if time.size == 0:
             say(figure, "no signals")
             return figure
-        panels = figure.subplots(3, 2, sharex=True, squeeze=False)
-        for i, name in enumerate(names):
-            axes = panels[i % 3, i // 3]
+        panels = figure.subplots(*layout[:2], sharex=True, squeeze=False)
+        # Forces in the left column and moments in the right one; or one below the other.
+        for axes, name, letter in zip(panels.T.flat, names, "abcdef", strict=True):
             _panel(axes, name, signals, truth, contact)
-            mark_panel(axes, "abcdef"[2 * (i % 3) + i // 3])
+            head(axes, letter, quantity(name).long_name)
         for axes in panels[-1]:
             axes.set_xlabel(axis_label("time"))
             axes.set_xlim(time.min(), time.max() if time.size > 1 else time.min() + 1.0)
@@ -139,36 +143,35 @@ def _panel(
             axes.axvspan(begin, end, color=SHADE, linewidth=0.0, zorder=0)
     if name not in _DIRECTIONS:
         axes.axhline(0.0, color="#bfbfbf", linewidth=0.5, zorder=1)
+    look: dict[str, Any] = (
+        {"marker": ".", "markersize": 1.6, "linestyle": "none"} if name in _DIRECTIONS else {}
+    )
     if name in signals:
-        axes.plot(time, _drawn(name, signals, contact), color=BLUE, zorder=2)
+        axes.plot(time, _drawn(name, signals, contact), color=BLUE, zorder=2, **look)
     if truth is not None and name in truth:
-        true_time = to_display("time", truth["time"])
-        there = contact if true_time.size == time.size else None
-        values = _drawn(name, truth, there)
-        axes.plot(true_time, values, color=INK, linewidth=0.5, zorder=3)
+        look["markersize"] = 0.8
+        line = {"linewidth": 0.4} if name not in _DIRECTIONS else look
+        values = _drawn(name, truth, contact)
+        axes.plot(time, values, color=INK, zorder=3, **line)
     axes.set_ylabel(axis_label(name))
-    axes.set_title(quantity(name).long_name)
     if name in _DIRECTIONS:
         axes.set_ylim(-190.0, 190.0)
         axes.set_yticks([-180.0, -90.0, 0.0, 90.0, 180.0])
 
 
 def _drawn(name: str, data: xr.Dataset, contact: Mask | None) -> Array:
-    """Values in display units; of a direction those in contact, with a gap where it wraps."""
+    """Values in display units, of a direction only those in contact."""
     values = to_display(name, data[name])
-    if name not in _DIRECTIONS:
-        return values
-    if contact is not None:
-        values = np.where(contact, values, np.nan)
-    wraps = np.abs(np.diff(values, append=values[-1:])) > 180.0
-    return np.where(wraps, np.nan, values)
+    return (
+        values if name not in _DIRECTIONS or contact is None else np.where(contact, values, np.nan)
+    )
 
 
 def _legend(figure: Figure, truth: bool, contact: bool) -> None:
     handles: list[Line2D | Patch] = []
     if truth:
         handles += [Line2D([], [], color=BLUE, label="measured")]
-        handles += [Line2D([], [], color=INK, linewidth=0.5, label="true")]
+        handles += [Line2D([], [], color=INK, linewidth=0.4, label="true")]
     if contact:
         handles += [Patch(facecolor=SHADE, label="in contact")]
     if handles:

@@ -9,6 +9,7 @@ colour vision (Okabe & Ito 2008, https://jfly.uni-koeln.de/color/), and colormap
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
@@ -17,6 +18,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backend_bases import RendererBase
+from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
@@ -98,8 +100,20 @@ class StyledFigure(Figure):
         renderer : RendererBase
             On which.
         """
-        with mpl.rc_context(dict(LOOK)):
+        with looking():
             super().draw(renderer)
+
+
+def looking() -> AbstractContextManager[None]:
+    """Put :data:`LOOK` into force as long as a ``with`` block lasts.
+
+    Returns
+    -------
+    context manager
+        Which restores Matplotlib's settings in the end.
+    """
+    settings: Any = dict(LOOK)
+    return mpl.rc_context(settings)
 
 
 def new_figure(width: Width, height: float, layout: Literal["constrained"] | None) -> StyledFigure:
@@ -142,8 +156,8 @@ def say(figure: Figure, message: str) -> None:
     figure.text(0.5, 0.5, message, ha="center", va="center", color=MUTED, fontsize=8.0)
 
 
-def mark_panel(axes: Axes, letter: str, x: float = 0.0) -> None:
-    """Put a bold letter above the upper left corner of a panel.
+def head(axes: Axes, letter: str, title: str, left: float = 0.0) -> None:
+    """Write a bold letter and a title above the upper left corner of a panel.
 
     Parameters
     ----------
@@ -151,20 +165,35 @@ def mark_panel(axes: Axes, letter: str, x: float = 0.0) -> None:
         The panel.
     letter : str
         Usually a, b, c, ...
-    x : float
-        Where the letter begins, as a share of the width of the panel.
+    title : str
+        A few words.
+    left : float
+        How far to the left of the panel they begin, points.
     """
-    axes.annotate(
-        letter,
-        (x, 1.0),
-        xycoords="axes fraction",
-        xytext=(0.0, 3.0),
-        textcoords="offset points",
-        ha="left",
-        va="bottom",
-        fontsize=8.0,
-        fontweight="bold",
-    )
+    for text, right, look in ((letter, 0.0, "bold"), (title, 11.0, "normal")):
+        axes.annotate(
+            text,
+            (0.0, 1.0),
+            xycoords="axes fraction",
+            xytext=(right - left, 4.0),
+            textcoords="offset points",
+            ha="left",
+            va="bottom",
+            fontsize=8.0 if look == "bold" else 7.0,
+            fontweight=look,
+        )
+
+
+def plain(bar: Colorbar) -> None:
+    """Take the frame off a colour bar.
+
+    Parameters
+    ----------
+    bar : Colorbar
+        The colour bar.
+    """
+    outline: Any = bar.outline  # a spine, whatever Matplotlib's stubs say
+    outline.set_visible(False)
 
 
 def robust_limits(values: ArrayLike, share: float = 0.98, symmetric: bool = False) -> Array:
@@ -226,7 +255,7 @@ def save(
     files = [stem.with_name(f"{stem.name}.{ending}") for ending in formats]
     # Without a date the same figure gives the same file.
     dated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
-    with mpl.rc_context(dict(LOOK)):
+    with looking():
         for file, ending in zip(files, formats, strict=True):
             figure.savefig(file, format=ending, metadata=dated.get(ending))
     return files

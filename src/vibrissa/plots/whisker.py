@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -11,7 +10,7 @@ from matplotlib.path import Path
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
-from vibrissa.plots.style import INK, LOOK, MUTED, WIDTHS, Array, Width, new_figure, say
+from vibrissa.plots.style import INK, MUTED, WIDTHS, Array, Width, looking, new_figure, say
 from vibrissa.quantities import axis_label, to_display
 
 _MAGNIFICATIONS = (1, 2, 3, 5, 10, 20, 50, 100)
@@ -70,7 +69,7 @@ def whisker_views(
     radii = np.broadcast_to(radii, (len(points),))
     known = np.isfinite(points).all(axis=1) & np.isfinite(radii)
     points, radii = points[known], radii[known]
-    with mpl.rc_context(dict(LOOK)):
+    with looking():
         if len(points) < 2:
             figure: Figure = new_figure(width, 40.0, None)
             say(figure, "no whisker")
@@ -149,7 +148,7 @@ def _caption(axes: Axes, name: str | None, magnification: float) -> None:
     axes.text(
         0.02,
         0.97,
-        f"drawn {magnification:g} times wider" if magnification != 1 else "",
+        f"width × {magnification:g}" if magnification != 1 else "",
         transform=axes.transAxes,
         va="top",
         color=MUTED,

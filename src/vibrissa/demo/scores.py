@@ -1,0 +1,215 @@
+"""How far the estimates are from the truth, and how far the noise says that they should be.
+
+What to expect is drawn, not linearised: the estimated covariance of every contact gives as many
+errors as there are replicates, each replicate is scored like the trial itself, and the median over
+replicates is the prediction.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from vibrissa.contour import CylinderFit, axis_offset, surface_distances
+from vibrissa.demo.locate import spherical
+from vibrissa.signals import nearest_on_rest
+from vibrissa.whisker import Whisker
+
+Array = NDArray[np.float64]
+
+ERRORS = ("error_r", "error_theta", "error_phi", "error_distance")
+"""Errors by name: of r, θ, φ, and in space."""
+
+REPLICATES = 25
+ANGLES = (0.0, 2.0, 5.0, 10.0, 15.0, 90.0)
+"""Edges of the classes of deflection angle, degrees."""
+
+_QUANTILES = (0.5, 0.95, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorRow:
+    """Errors of some contacts in one quantity.
+
+    Parameters
+    ----------
+    quantity : str
+        Name of the error in the table of quantities.
+    label : str
+        Which contacts.
+    contacts : int
+        How many contacts that have an estimate.
+    measured, predicted : array (3,)
+        Median, 95 % and largest size of the error, SI units; what the covariance predicts.
+    """
+
+    quantity: str
+    label: str
+    contacts: int
+    measured: Array
+    predicted: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """All numbers of a trial.
+
+    Parameters
+    ----------
+    touching : int
+        Frames in which the whisker truly touches.
+    felt : int
+        Frames in which a contact is felt.
+    false : int
+        Frames in which one is felt that is not there.
+    candidates : array (3,)
+        Felt contacts with no, one, or several candidates.
+    errors : tuple of ErrorRow
+        Of r, θ, φ and in space, all contacts.
+    by_angle : tuple of ErrorRow
+        In space, by deflection angle.
+    offset : array (3,)
+        From the peg's true axis to the fitted one, m, at the height of the contacts.
+    tilt : float
+        Angle between the axes, rad.
+    diameter_error : float
+        Of the fitted peg, m.
+    surface : array (3,)
+        Median, 95 % and largest distance of the contacts from the true surface, m.
+    """
+
+    touching: int
+    felt: int
+    false: int
+    candidates: NDArray[np.int64]
+    errors: tuple[ErrorRow, ...]
+    by_angle: tuple[ErrorRow, ...]
+    offset: Array
+    tilt: float
+    diameter_error: float
+    surface: Array
+
+    @property
+    def share_with_one(self) -> float:
+        """Share of felt contacts with exactly one candidate."""
+        return float(self.candidates[1] / max(self.felt, 1))
+
+
+def contact_errors(
+    contacts: xr.Dataset, truth: xr.Dataset, whisker: Whisker, seed: int = 0
+) -> xr.Dataset:
+    """Compare contacts with the truth, frame by frame.
+
+    Parameters
+    ----------
+    contacts : xarray.Dataset
+        Of `vibrissa.demo.locate`, dim time.
+    truth : xarray.Dataset
+        Of the recording, dim time: ``contact_point_whisker``.
+    whisker : Whisker
+        That touched.
+    seed : int
+        Of the draws.
+
+    Returns
+    -------
+    xarray.Dataset
+        Dims time, replicate: the size of each error, ``…_predicted`` and ``deflection_angle``.
+    """
+    point, true = (d["contact_point_whisker"].values for d in (contacts, truth))
+    errors = _errors(point, true)
+    root = _roots(contacts["covariance"].values)
+    draw = np.random.default_rng(seed).normal(size=(REPLICATES, len(point), 3))
+    drawn = _errors(point + np.einsum("tij,rtj->rti", root, draw), point)
+    distance, arc_length = nearest_on_rest(whisker, true)
+    angle = np.arctan2(distance, arc_length)
+    data = {name: ("time", errors[..., i]) for i, name in enumerate(ERRORS)}
+    predicted = {
+        f"{name}_predicted": (("replicate", "time"), drawn[..., i]) for i, name in enumerate(ERRORS)
+    }
+    angles = {"deflection_angle": ("time", angle)}
+    return xr.Dataset({**data, **predicted, **angles}, {"time": contacts["time"]})
+
+
+def _errors(estimated: Array, true: Array) -> Array:
+    """Sizes (..., 4) of the errors in r, θ, φ and in space."""
+    away = spherical(estimated) - spherical(true)
+    away[..., 1] = (away[..., 1] + np.pi) % (2.0 * np.pi) - np.pi
+    distance = np.linalg.norm(estimated - true, axis=-1)
+    return np.concatenate([np.abs(away), distance[..., None]], axis=-1)
+
+
+def _roots(covariance: Array) -> Array:
+    """Matrices A (n, 3, 3) with A Aᵀ = covariance, of any rank; NaN where it is."""
+    known = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
+    size, direction = np.linalg.eigh(np.where(known[:, None, None], covariance, 0.0))
+    root = direction * np.sqrt(np.maximum(size, 0.0))[:, None, :]
+    return np.where(known[:, None, None], root, np.nan)
+
+
+def score(contacts: xr.Dataset, truth: xr.Dataset, errors: xr.Dataset, fit: CylinderFit) -> Scores:
+    """Put all errors into numbers.
+
+    Parameters
+    ----------
+    contacts : xarray.Dataset
+        Of `vibrissa.demo.in_laboratory`, dim time.
+    truth : xarray.Dataset
+        Dim time: ``in_contact``; and the peg's ``peg_position``, ``peg_axis``, ``peg_radius``.
+    errors : xarray.Dataset
+        Of `contact_errors`.
+    fit : CylinderFit
+        The fitted peg.
+
+    Returns
+    -------
+    Scores
+        The numbers.
+    """
+    felt = contacts["in_contact"].values
+    touching = truth["in_contact"].values
+    number = contacts["candidates"].values[felt]
+    known = np.isfinite(errors["error_distance"].values)
+    angle = np.degrees(errors["deflection_angle"].values)
+    by_angle = []
+    for low, high in itertools.pairwise(ANGLES):
+        label = f"{low:g}–{high:g}°" if high < 90.0 else f"over {low:g}°"
+        rows = known & (angle >= low) & (angle < high)
+        if rows.any():
+            by_angle.append(_row(errors, "error_distance", label, rows))
+    origin, axis = truth["peg_position"].values, truth["peg_axis"].values
+    radius = float(truth["peg_radius"])
+    offset, tilt = axis_offset(fit.origin, fit.axis, origin, axis)
+    points, whisker_radius = contacts["contact_point"].values, truth["radius"].values
+    gap = surface_distances(points[known], origin, axis, radius, whisker_radius[known])
+    return Scores(
+        touching=int(touching.sum()),
+        felt=int(felt.sum()),
+        false=int((felt & ~touching).sum()),
+        candidates=np.array([(number == 0).sum(), (number == 1).sum(), (number > 1).sum()]),
+        errors=tuple(_row(errors, name, "all", known) for name in ERRORS),
+        by_angle=tuple(by_angle),
+        offset=offset,
+        tilt=tilt,
+        diameter_error=float(fit.diameter - 2.0 * radius),
+        surface=_quantiles(np.abs(gap)),
+    )
+
+
+def _row(errors: xr.Dataset, name: str, label: str, rows: NDArray[np.bool_]) -> ErrorRow:
+    drawn = errors[f"{name}_predicted"].values[:, rows]
+    drawn = drawn[:, np.isfinite(drawn).all(axis=0)]
+    predicted = np.median([_quantiles(replicate) for replicate in drawn], axis=0)
+    measured = _quantiles(errors[name].values[rows])
+    return ErrorRow(name, label, int(rows.sum()), measured, predicted)
+
+
+def _quantiles(values: Array) -> Array:
+    """Median, 95 % and largest of values (n,)."""
+    if values.size == 0:
+        return np.full(len(_QUANTILES), np.nan)
+    return np.asarray(np.quantile(values, _QUANTILES))

@@ -1,0 +1,42 @@
+"""The command `vibrissa` and its verbs."""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+from rich.markup import escape
+
+from vibrissa.cli import bend, charting, information, locating, whole_job
+from vibrissa.cli.terminal import errors
+
+HELP = """From what a whisker feels at its base to what it touched.
+
+Numbers typed and printed are in mm, µN, µN·m and degrees; files hold SI units.
+"""
+
+app = typer.Typer(
+    help=HELP,
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.command("demo")(whole_job.demo)
+app.command("deflect")(bend.bend)
+app.command("map")(charting.chart)
+app.command("estimate")(locating.estimate)
+app.command("info")(information.info)
+
+
+def main() -> None:
+    """Run the command line; a fault of the input is one message and exit status 2."""
+    try:
+        app()
+    except (ValueError, OSError) as error:
+        errors.print(f"[bold red]Error:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        errors.print("stopped")
+        sys.exit(130)

@@ -1,0 +1,116 @@
+"""`vibrissa info`: versions and settings, or what a file holds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from vibrissa.cli.terminal import output
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+_PACKAGES = ("numpy", "scipy", "numba", "xarray", "h5netcdf", "matplotlib")
+
+
+def info(
+    path: Annotated[
+        Path | None, typer.Argument(help="A file to look into.", metavar="FILE")
+    ] = None,
+) -> None:
+    """Say which versions and how many threads are used, or what a file holds.
+
+    Example: `vibrissa info trial.nc`
+    """
+    rows = _installation() if path is None else _file(path)
+    from rich.table import Table
+
+    table = Table(show_header=False, box=None)
+    for name, value in rows:
+        table.add_row(f"[bold]{name}", value)
+    output.print(table, highlight=False)
+
+
+def _installation() -> Iterator[tuple[str, str]]:
+    import platform
+    from importlib.metadata import version
+
+    import vibrissa
+    from vibrissa.rod.batch import threads
+    from vibrissa.rod.kernels import evaluate
+
+    yield "vibrissa", f"{vibrissa.__version__}, {Path(vibrissa.__file__).parent}"
+    yield "python", f"{platform.python_version()}, {platform.system()} {platform.machine()}"
+    for name in _PACKAGES:
+        yield name, version(name)
+    yield "threads", f"{threads()} (VIBRISSA_THREADS sets another number)"
+    folder = getattr(getattr(evaluate, "_cache", None), "cache_path", None)
+    yield "kernels", f"cached in {folder}" if folder else "compiled anew in every run"
+
+
+def _file(path: Path) -> Iterator[tuple[str, str]]:
+    from vibrissa.cli.sources import is_netcdf
+
+    if not path.exists():
+        raise FileNotFoundError(f"there is no file {path}")
+    yield "file", f"{path}, {path.stat().st_size / 1e6:.3g} MB"
+    yield from _groups(path) if is_netcdf(path) else _table(path)
+
+
+def _groups(path: Path) -> Iterator[tuple[str, str]]:
+    """Kind, groups and variables of a NetCDF file."""
+    import xarray as xr
+
+    from vibrissa.io import kind_of
+
+    yield "kind", kind_of(path) or "unknown"
+    groups = xr.open_groups(path, engine="h5netcdf")
+    try:
+        for name, group in groups.items():
+            if not group.data_vars:
+                continue
+            sizes = ", ".join(f"{dim} {size}" for dim, size in group.sizes.items())
+            yield name, f"[dim]{sizes or 'no dimensions'}[/]"
+            for variable, data in group.data_vars.items():
+                units = data.attrs.get("units", "")
+                dims = ", ".join(map(str, data.dims))
+                yield f"  {variable}", f"({dims}) {'' if units == '1' else units}"
+    finally:
+        for group in groups.values():
+            group.close()
+
+
+def _table(path: Path) -> Iterator[tuple[str, str]]:
+    """What a CSV file is: signals, contacts or a centreline."""
+    from collections.abc import Callable
+    from typing import Any
+
+    from vibrissa.io import load_contacts, load_signals, load_whisker
+    from vibrissa.status import describe
+
+    readers: tuple[tuple[str, Callable[[Path], Any]], ...] = (
+        ("contacts", load_contacts),
+        ("signals", load_signals),
+        ("whisker", load_whisker),
+    )
+    faults = []
+    for kind, reader in readers:
+        try:
+            data = reader(path)
+        except ValueError as fault:
+            faults.append(f"as {kind}: {fault}")
+            continue
+        yield "kind", f"table of {kind}" if kind != "whisker" else "centreline of a whisker"
+        if kind == "whisker":
+            yield "whisker", repr(data)
+            yield from (("note", note) for note in data.notes)
+            return
+        time = data["time"].values
+        yield "rows", f"{time.size}, from {time.min():g} to {time.max():g} s"
+        if kind == "contacts":
+            for sentence, count in describe(data["status"].values).most_common():
+                yield str(count), sentence
+        return
+    raise ValueError(f"{path} is no table that is known. " + " ".join(faults))

@@ -1,0 +1,124 @@
+"""Consoles, progress bars and tables; numbers in display units."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
+
+from vibrissa.quantities import quantity
+
+output = Console()
+"""Where results go."""
+
+errors = Console(stderr=True)
+"""Where progress and messages go, so that results can be piped."""
+
+Tell = Callable[[str, int, int], None]
+"""Called with what is being done, and how much of how much is."""
+
+
+@contextmanager
+def progress_bars() -> Iterator[Tell]:
+    """Show a bar for each stage that is told about.
+
+    Yields
+    ------
+    callable
+        To be called as ``tell(stage, done, total)``.
+    """
+    columns = (
+        SpinnerColumn(finished_text="[green]✓"),
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=30),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=errors) as bars:
+        tasks: dict[str, TaskID] = {}
+
+        def tell(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bars.add_task(stage, total=total)
+            bars.update(tasks[stage], completed=done, total=total)
+
+        yield tell
+
+
+def shown(name: str, value: float, digits: int = 4) -> str:
+    """Write an SI value with the unit in which it is shown.
+
+    Parameters
+    ----------
+    name : str
+        Of a quantity.
+    value : float
+        In its SI unit.
+    digits : int
+        Significant ones.
+
+    Returns
+    -------
+    str
+        Such as ``0.15 mm``.
+    """
+    return _with_unit(f"{value * quantity(name).display_factor:.{digits}g}", name)
+
+
+def fixed(name: str, value: float, decimals: int = 4) -> str:
+    """Write an SI value with the unit in which it is shown, to so many decimals there.
+
+    Parameters
+    ----------
+    name : str
+        Of a quantity.
+    value : float
+        In its SI unit.
+    decimals : int
+        Behind the point.
+
+    Returns
+    -------
+    str
+        Such as ``0.1500 mm``.
+    """
+    # Adding zero turns −0 into 0.
+    number = round(value * quantity(name).display_factor, decimals) + 0.0
+    return _with_unit(f"{number:.{decimals}f}", name)
+
+
+def _with_unit(number: str, name: str) -> str:
+    unit = quantity(name).display_unit
+    return f"{number}{'' if unit in ('', '°') else ' '}{unit}"
+
+
+def numbers(text: str, names: Sequence[str], option: str) -> list[float]:
+    """Read numbers parted by commas.
+
+    Parameters
+    ----------
+    text : str
+        Such as ``25,12,1``.
+    names : sequence of str
+        What each number is.
+    option : str
+        Where they come from, for the message.
+
+    Returns
+    -------
+    list of float
+        As many as there are names.
+
+    Raises
+    ------
+    ValueError
+        If there are more or fewer, or one is no number.
+    """
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != len(names):
+        raise ValueError(f"{option} is {text!r}; {','.join(names)} are needed")
+    return values

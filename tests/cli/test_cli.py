@@ -1,0 +1,179 @@
+"""The command line: each verb does its stage, and a fault is one message."""
+
+import re
+import sys
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import vibrissa as vb
+from vibrissa import samples
+from vibrissa.cli.app import app, main
+from vibrissa.cli.terminal import fixed, numbers, shown
+from vibrissa.io import load_contacts, save_centerline, save_signals
+
+VERBS = ("demo", "deflect", "map", "estimate", "info")
+
+
+def run(*arguments):
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def fault(monkeypatch, capsys, *arguments):
+    """What is said, on one line, where the command fails."""
+    monkeypatch.setattr(sys, "argv", ["vibrissa", *map(str, arguments)])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert stopped.value.code == 2
+    said = capsys.readouterr()
+    assert "Traceback" not in said.err
+    return said.err
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("cli")
+
+
+@pytest.fixture(scope="module")
+def chart(folder):
+    path = folder / "map.nc"
+    run("map", "--no-grid", "-o", path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def table(folder):
+    """Signals of a few contacts, one of no contact and one missing."""
+    path = folder / "signals.csv"
+    points = [[25e-3, 12e-3, 1e-3], [27e-3, 2e-3, -2e-3], [0, 0, 0], [0, 0, 0]]
+    bent = vb.deflect(samples.gamma(), vb.PointContact(points[:2]))
+    force, moment = np.zeros((2, 4, 3))
+    force[:2], moment[:2] = bent.force, bent.moment
+    force[3] = np.nan
+    import xarray as xr
+
+    signals = {"force": (("time", "space"), force), "moment": (("time", "space"), moment)}
+    save_signals(path, xr.Dataset(signals, {"time": np.arange(4.0)}))
+    return path, np.array(points)
+
+
+def test_every_verb_has_help_with_an_example():
+    assert all(verb in run("--help") for verb in VERBS)
+    for verb in VERBS:
+        text = re.sub(r"[\s│]+", " ", run(verb, "--help"))
+        assert f"Example: vibrissa {verb}" in text
+
+
+def test_deflect_prints_what_deflect_gives():
+    text = run("deflect", "--point", "25,12,1")
+    bent = vb.deflect(samples.gamma(), vb.PointContact([25e-3, 12e-3, 1e-3]))
+    signals = vb.base_signals(bent.force, bent.moment)
+    for name in signals:
+        assert fixed(str(name), float(signals[name])) in text
+    assert str(vb.Status.OK) in text
+
+
+def test_deflect_by_force_and_by_peg():
+    text = run("deflect", "--force", "25,50,90")
+    assert "25.0000 mm" in text
+    assert "OK" not in text
+    assert str(vb.Status.NO_CONTACT) in run("deflect", "--peg", "-5,20,0,2.7")
+    text = run("deflect", "--peg", "25,8,0,2.7", "--side", "0,1,0")
+    assert str(vb.Status.OK) in text
+
+
+def test_map_and_estimate(folder, chart, table):
+    path, points = table
+    out = folder / "contacts.csv"
+    text = run("estimate", path, "--map", chart, "-o", out)
+    assert "wrote" in text
+    contacts = load_contacts(out)
+    names = [vb.Status(int(code)).name for code in contacts["status"].values]
+    assert names == ["UNIQUE", "UNIQUE", "NO_CONTACT", "MISSING"]
+    for i, axis in enumerate("xyz"):
+        np.testing.assert_allclose(contacts[axis].values[:2], points[:2, i], atol=1e-9)
+        assert (contacts[f"sigma_{axis}"].values[:2] > 0.0).all()
+    assert np.isnan(contacts["x"].values[2:]).all()
+
+
+def test_estimate_without_a_map_simulates_one_and_says_so(folder, table):
+    csv = folder / "whisker.csv"
+    save_centerline(csv, samples.gamma().centerline(40))
+    text = run("estimate", table[0], "--whisker", csv, "-o", folder / "other.csv")
+    assert "no map given" in text
+    assert load_contacts(folder / "other.csv").sizes["time"] == 4
+
+
+def test_demo_writes_and_reports(folder):
+    out = folder / "demo"
+    text = run("demo", "--output", out, "--duration", 0.4, "--rate", 250)
+    for words in ("exactly one candidate", "3D error by deflection angle", "diameter", "median*"):
+        assert words in text
+    assert {"trial.nc", "contacts.csv", "map.nc"} <= {file.name for file in out.iterdir()}
+    # Each stage works from the recording alone.
+    again = folder / "again.csv"
+    run("estimate", out / "trial.nc", "--map", out / "map.nc", "-o", again)
+    first = load_contacts(out / "contacts.csv")
+    same = load_contacts(again)
+    single = first["status"].values == vb.Status.UNIQUE
+    np.testing.assert_array_equal(first["x"].values[single], same["x"].values[single])
+    assert "gamma" in run("deflect", "--whisker", out / "trial.nc", "--point", "25,12,1")
+    assert "gamma" in run("deflect", "--whisker", out / "map.nc", "--point", "25,12,1")
+    text = run("info", out / "trial.nc")
+    assert "vibrissa recording" in text
+    assert "/truth" in text
+
+
+def test_info(folder, table, chart):
+    text = run("info")
+    assert vb.__version__ in text
+    assert "threads" in text
+    assert "table of signals" in run("info", table[0])
+    assert "contact map" in run("info", chart)
+    csv = folder / "w.csv"
+    save_centerline(csv, samples.gamma().centerline(40))
+    assert "centreline of a whisker" in run("info", csv)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("deflect",), "one of --point, --force and --peg is needed; got none"),
+        (("deflect", "--point", "1,2,3", "--force", "1,2,3"), "got --point and --force"),
+        (("deflect", "--point", "1,2"), "X,Y,Z are needed"),
+        (("deflect", "--whisker", "none.csv", "--point", "1,2,3"), "there is no file none.csv"),
+        (("estimate", "none.csv"), "there is no file none.csv"),
+        (("info", "none.nc"), "there is no file none.nc"),
+        (("demo", "--whisker", "none.csv"), "there is no file none.csv"),
+    ],
+)
+def test_a_fault_is_one_message_and_status_2(monkeypatch, capsys, arguments, message):
+    assert message in fault(monkeypatch, capsys, *arguments)
+
+
+def test_files_of_the_wrong_kind(monkeypatch, capsys, folder, table, chart):
+    assert "no table of signals" not in run("info", table[0])
+    bad = folder / "bad.csv"
+    bad.write_text("time,Fx\n0,1\n")
+    assert "lacks Fy" in fault(monkeypatch, capsys, "estimate", bad, "--map", chart)
+    assert "no table that is known" in fault(monkeypatch, capsys, "info", bad)
+    both = ("--map", chart, "--whisker", table[0])
+    assert "either --map" in fault(monkeypatch, capsys, "estimate", table[0], *both)
+    triplet = ("--triplet", "Fx,MB")
+    said = fault(monkeypatch, capsys, "estimate", table[0], "--map", chart, *triplet)
+    assert "Error" in said
+
+
+def test_numbers_and_units():
+    assert shown("r", 1.5e-4, 3) == "0.15 mm"
+    assert shown("theta", np.pi / 6) == "30°"
+    assert fixed("Fx", -1e-15) == "0.0000 µN"
+    assert numbers("1,-2.5", "AB", "--ab") == [1.0, -2.5]
+    with pytest.raises(ValueError, match="A,B are needed"):
+        numbers("1,x", "AB", "--ab")

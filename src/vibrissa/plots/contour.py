@@ -19,12 +19,12 @@ from vibrissa.plots.colours import shading
 from vibrissa.plots.style import (
     MUTED,
     ORANGE,
-    WIDTHS,
     Array,
     Width,
     head,
     looking,
     new_figure,
+    page_width,
     plain,
     robust_limits,
     say,
@@ -186,7 +186,7 @@ def _limits(places: Array, peg: Cylinder | None) -> Array:
 
 def _panels(limits: Array, width: Width) -> tuple[Figure, list[Axes]]:
     """Three axes, all as tall as the view from above."""
-    page = WIDTHS[width]
+    page = page_width(width)
     across, tall = np.ptp(limits[0]), np.ptp(limits[2])
     size = (page - _LEFT - 2.0 * _GAP - _BAR) / (1.0 + 2.0 * across / tall)
     height = size + _BOTTOM + _TOP

@@ -138,9 +138,30 @@ def new_figure(width: Width, height: float, layout: Literal["constrained"] | Non
     ValueError
         If there is no such width.
     """
+    return StyledFigure(figsize=(page_width(width) / 25.4, height / 25.4), layout=layout)
+
+
+def page_width(width: Width) -> float:
+    """Tell how wide a figure is.
+
+    Parameters
+    ----------
+    width : {"single", "double"}
+        How many columns.
+
+    Returns
+    -------
+    float
+        In mm.
+
+    Raises
+    ------
+    ValueError
+        If there is no such width.
+    """
     if width not in WIDTHS:
         raise ValueError(f"width is {width!r}; one of {', '.join(WIDTHS)} is needed")
-    return StyledFigure(figsize=(WIDTHS[width] / 25.4, height / 25.4), layout=layout)
+    return WIDTHS[width]
 
 
 def say(figure: Figure, message: str) -> None:

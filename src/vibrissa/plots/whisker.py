@@ -10,7 +10,7 @@ from matplotlib.path import Path
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
-from vibrissa.plots.style import INK, MUTED, WIDTHS, Array, Width, looking, new_figure, say
+from vibrissa.plots.style import INK, MUTED, Array, Width, looking, new_figure, page_width, say
 from vibrissa.quantities import axis_label, to_display
 
 _MAGNIFICATIONS = (1, 2, 3, 5, 10, 20, 50, 100)
@@ -86,7 +86,7 @@ def _views(
         magnification = max([m for m in _MAGNIFICATIONS if m <= aim], default=1)
     limits = _limits(points, magnification * radii.max(), extent)
     span = np.ptp(limits, axis=1)
-    page = WIDTHS[width]
+    page = page_width(width)
     scale = (page - _LEFT - _RIGHT - _GAP) / (span[0] + span[2])  # mm on paper per mm
     height = _BOTTOM + _GAP + _TOP + scale * (span[1] + span[2])
     figure = new_figure(width, height, None)

@@ -1,0 +1,241 @@
+"""What the figures say: labels, units, the data they show, and what they do without data."""
+
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import xarray as xr
+from matplotlib.collections import EllipseCollection
+from matplotlib.figure import Figure
+
+from vibrissa.plots import (
+    contour_views,
+    estimated_against_true,
+    save,
+    signal_clouds,
+    signals_over_time,
+    whisker_views,
+)
+from vibrissa.plots.clouds import SIGNALS, cloud
+from vibrissa.plots.colours import cyclic
+from vibrissa.plots.signals import intervals
+from vibrissa.plots.style import robust_limits
+from vibrissa.quantities import axis_label
+
+LINE = np.stack([np.linspace(0, 40e-3, 60), 10.0 * np.linspace(0, 40e-3, 60) ** 2, np.zeros(60)], 1)
+RADIUS = np.linspace(100e-6, 7e-6, 60)
+PEG = SimpleNamespace(origin=np.array([25e-3, 0, 0]), axis=np.array([0, 0, 1.0]), radius=1.35e-3)
+
+
+def texts(figure: Figure) -> set[str]:
+    """All that is written on it."""
+    figure.draw_without_rendering()
+    return {t.get_text() for t in figure.findobj(lambda a: hasattr(a, "get_text"))} - {""}
+
+
+def grid() -> xr.Dataset:
+    """Invented signals over a small grid in the paper's form, some of it unreachable."""
+    ball = {
+        "r": np.linspace(12e-3, 40e-3, 5),
+        "theta": np.linspace(-1.0, 1.0, 9),
+        "phi": np.linspace(-0.9, 0.9, 7),
+    }
+    shape = tuple(v.size for v in ball.values())
+    values = np.random.default_rng(1).uniform(-3.0, 3.0, (6, *shape))
+    values[:, 0, 0, 0] = np.nan
+    data = {
+        n: (tuple(ball), v * (1.0 if n in ("FD", "MD") else 1e-6))
+        for n, v in zip(SIGNALS, values, strict=True)
+    }
+    status = np.zeros(shape, dtype=np.int64)
+    status[0, 0, 1] = 10
+    return xr.Dataset({**data, "status": (tuple(ball), status)}, ball)
+
+
+def signals(n: int = 200) -> xr.Dataset:
+    time = np.arange(n) / 1000.0
+    contact = (time > 0.05) & (time < 0.1)
+    data = {name: ("time", 1e-6 * contact * np.sin(40.0 * time)) for name in SIGNALS}
+    return xr.Dataset({**data, "in_contact": ("time", contact)}, {"time": time})
+
+
+def contacts(n: int = 50) -> np.ndarray:
+    turn = np.linspace(2.0, 4.0, n)
+    around = np.stack([np.cos(turn), np.sin(turn), np.linspace(-3.0, 3.0, n)], axis=1)
+    return PEG.origin + PEG.radius * around
+
+
+def test_whisker_is_drawn_in_mm_with_its_taper() -> None:
+    figure = whisker_views(LINE, RADIUS, name="gamma", magnification=4.0)
+    assert {axis_label(n) for n in "xyz"} <= texts(figure)
+    assert {"gamma", "width × 4"} <= texts(figure)
+    box = figure.axes[0].patches[0].get_path().get_extents()
+    assert box.x0 == pytest.approx(-0.4, abs=1e-3)  # a disc of four times 0.1 mm about the base
+    assert box.x1 == pytest.approx(40.0 + 4 * 7e-3, abs=1e-3)
+
+
+def test_whisker_views_have_one_scale() -> None:
+    figure = whisker_views(LINE, RADIUS)
+    figure.draw_without_rendering()
+    scales = [
+        extent / np.ptp(limits)
+        for axes in figure.axes
+        for extent, limits in zip(axes.bbox.size, (axes.get_xlim(), axes.get_ylim()), strict=True)
+    ]
+    assert np.ptp(scales) < 1e-9 * scales[0]
+
+
+def test_cloud_of_a_grid_and_of_a_map_agree() -> None:
+    data = grid()
+    ball = xr.broadcast(data.r, data.theta, data.phi)
+    r, theta, phi = (b.transpose("r", "theta", "phi").values for b in ball)
+    place = [np.cos(phi) * np.cos(theta), np.cos(phi) * np.sin(theta), np.sin(phi)]
+    points = (("r", "theta", "phi", "space"), r[..., None] * np.stack(place, axis=-1))
+    as_map = data.drop_vars(["r", "theta", "phi"]).assign(contact_point=points)
+    one, other = cloud(data), cloud(as_map.transpose("phi", "space", "r", "theta"))
+    assert len(one.points) == data.Fx.size - 2  # one without signals, one without an answer
+    order, other_order = np.lexsort(one.points.T), np.lexsort(other.points.T)
+    np.testing.assert_allclose(one.points[order], other.points[other_order], atol=1e-12)
+    np.testing.assert_array_equal(one.signals["MB"][order], other.signals["MB"][other_order])
+
+
+def test_small_deflections_are_left_out_of_the_cloud() -> None:
+    data = grid()
+    line = np.array([[0.0, 0.0, 0.0], [40e-3, 0.0, 0.0]])
+    kept = cloud(data, line).points
+    assert len(kept) == len(cloud(data).points) - data.r.size  # those straight ahead
+    assert np.hypot(kept[:, 1], kept[:, 2]).min() > 0.0
+    told = data.assign(small_deflection=("theta", np.arange(9) < 4)).broadcast_like(data.Fx)
+    assert len(cloud(told).points) == 5 * 5 * 7
+
+
+def test_clouds_show_six_signals_in_display_units() -> None:
+    figure = signal_clouds(grid(), LINE, cutaway=False)
+    assert {axis_label(name) for name in (*SIGNALS, "x", "y", "z")} <= texts(figure)
+    force = figure.axes[0].collections[0].get_array()
+    assert 1.0 < np.abs(force).max() < 3.0  # µN
+    assert figure.axes[4].collections[0].get_clim() == (-180.0, 180.0)
+
+
+def test_signals_are_shaded_in_contact_and_drawn_in_micronewton() -> None:
+    figure = signals_over_time(signals(), signals())
+    assert {axis_label(name) for name in (*SIGNALS, "time")} <= texts(figure)
+    assert {"in contact", "measured", "true"} <= texts(figure)
+    measured = figure.axes[0].lines[1].get_ydata()
+    assert np.abs(measured).max() == pytest.approx(np.abs(signals().Fx).max() * 1e6)
+    direction = figure.axes[4].lines[0].get_ydata()
+    assert np.isfinite(direction).sum() == signals().in_contact.sum()
+
+
+def test_intervals_reach_halfway_to_the_next_frames() -> None:
+    found = intervals(np.arange(6.0), np.array([1, 1, 0, 0, 1, 0], dtype=bool))
+    np.testing.assert_array_equal(found, [[0.0, 1.5], [3.5, 4.5]])
+
+
+def test_estimates_lie_on_the_identity_in_mm_and_degrees() -> None:
+    true = np.random.default_rng(0).uniform(0.01, 0.04, (40, 3))
+    estimated = true.copy()
+    estimated[3] = np.nan
+    figure = estimated_against_true(true, estimated, time=np.arange(40.0), colour=true[:, 1])
+    wanted = {
+        f"true {axis_label('r')}",
+        f"estimated {axis_label('phi')}",
+        axis_label("error_theta"),
+    }
+    assert wanted | {axis_label("deflection_angle"), axis_label("time")} <= texts(figure)
+    for column, factor in ((0, 1e3), (1, np.degrees(1.0))):
+        dots = figure.axes[column].collections[0].get_offsets()
+        assert len(dots) == 39
+        np.testing.assert_allclose(dots[:, 0], dots[:, 1])
+        assert dots[:, 0].max() == pytest.approx(np.delete(true, 3, 0)[:, column].max() * factor)
+
+
+def test_contour_shows_points_peg_and_fit_in_mm() -> None:
+    points = contacts()
+    points[0] = np.nan
+    spread = np.tile(1e-10 * np.diag([4.0, 1.0, 1.0]), (50, 1, 1))
+    shade = np.linspace(0.1, 0.5, 50)
+    figure = contour_views(points, PEG, PEG, colour=shade, covariance=spread)
+    wanted = {axis_label("deflection_angle"), "peg, 2.70 mm", "fitted, 2.70 mm", "95 % ellipses"}
+    assert wanted | {axis_label(n) for n in "xyz"} <= texts(figure)
+    top = figure.axes[0]
+    ellipses = next(c for c in top.collections if isinstance(c, EllipseCollection))
+    widths = 2.0 * ellipses._widths  # Matplotlib keeps half of what it is given
+    np.testing.assert_allclose(widths, 2.0 * 20e-3 * np.sqrt(5.9915), rtol=1e-4)
+    dots = next(c for c in top.collections if c is not ellipses)
+    assert len(dots.get_offsets()) == 49
+    outline = top.patches[0].get_xy()
+    np.testing.assert_allclose(np.hypot(*(outline - [25.0, 0.0]).T), 1.35)
+
+
+def test_a_tilted_peg_is_cut_at_the_height_of_the_points() -> None:
+    axis = np.array([np.sin(0.3), 0.0, np.cos(0.3)])
+    tilted = SimpleNamespace(origin=PEG.origin, axis=axis, radius=PEG.radius)
+    points = contacts() + np.array([0.0, 0.0, 5e-3])
+    outline = contour_views(points, tilted).axes[0].patches[0].get_xy()
+    middle = 25.0 + 5.0 * np.tan(0.3)
+    np.testing.assert_allclose(
+        [outline[:, 0].min(), outline[:, 0].max()],
+        middle + 1.35 / np.cos(0.3) * np.array([-1.0, 1.0]),
+        atol=1e-3,
+    )
+
+
+def test_figures_without_data_say_so() -> None:
+    nothing = np.full((3, 3), np.nan)
+    assert texts(whisker_views(nothing, 1e-4)) == {"no whisker"}
+    assert texts(signal_clouds(grid() * np.nan, LINE)) == {"no contacts"}
+    assert texts(signals_over_time(signals(0))) == {"no signals"}
+    assert texts(estimated_against_true(nothing, nothing)) == {"no contacts"}
+    assert texts(contour_views(np.empty((0, 3)), PEG)) == {"no contacts"}
+
+
+def test_one_contact_and_missing_signals_can_be_drawn() -> None:
+    point = np.array([[25e-3, 0.1, 0.2]])
+    assert "no contacts" not in texts(estimated_against_true(point, point, time=[0.0]))
+    assert "no contacts" not in texts(contour_views(point))
+    texts(signals_over_time(signals().where(lambda d: d.time > 0.1)[["Fx", "MD"]]))
+    texts(signals_over_time(signals(1)))
+
+
+def test_wrong_input_is_told_apart() -> None:
+    with pytest.raises(ValueError, match=r"covariance has shape \(2, 3\)"):
+        contour_views(contacts(), covariance=np.zeros((2, 3)))
+    with pytest.raises(ValueError, match="lack MD"):
+        signal_clouds(grid().drop_vars("MD"))
+    with pytest.raises(ValueError, match="base_signals"):
+        signals_over_time(xr.Dataset({"force": ("time", [0.0])}, {"time": [0.0]}))
+    with pytest.raises(ValueError, match="single, double"):
+        whisker_views(LINE, RADIUS, width="triple")  # type: ignore[arg-type]
+
+
+def test_files_are_written_the_same_each_time(tmp_path) -> None:
+    for name in ("one", "two"):
+        files = save(whisker_views(LINE, RADIUS), tmp_path / name)
+    assert [f.name for f in files] == ["two.png", "two.pdf"]
+    for file in files:
+        assert file.read_bytes() == file.with_stem("one").read_bytes()
+
+
+def test_cyclic_colours_close_and_turn_evenly() -> None:
+    colours = cyclic()(np.linspace(0.0, 1.0, 513)[:-1])[:, :3]
+    steps = np.linalg.norm(np.roll(colours, -1, axis=0) - colours, axis=1)
+    assert steps.max() < 4.0 * np.median(steps)
+
+
+def test_robust_limits_never_collapse() -> None:
+    assert np.ptp(robust_limits([np.nan])) > 0.0
+    assert np.ptp(robust_limits([3e-9, 3e-9])) > 0.0
+    np.testing.assert_array_equal(robust_limits([-2.0, 1.0], 1.0, symmetric=True), [-2.0, 2.0])
+
+
+def test_plots_leave_pyplot_and_the_solver_alone() -> None:
+    code = (
+        "import sys, numpy as np, vibrissa.plots as p;"
+        "p.contour_views(np.ones((4, 3))).draw_without_rendering();"
+        "print([m for m in ('matplotlib.pyplot', 'numba', 'vibrissa.rod') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]", done.stdout

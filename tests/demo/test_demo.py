@@ -89,6 +89,7 @@ def test_the_recording_keeps_what_is_known_and_what_is_true_apart(result):
 def test_progress_is_told_of_every_stage(result, told):
     stages = [stage for stage, done, total in told if done == total]
     assert set(stages) == {
+        "how far to whisk",
         "map of all contacts",
         "whisking trial",
         "contact points from signals",

@@ -109,7 +109,10 @@ def run_demo(
     whisker = samples.gamma() if whisker is None else whisker
     force_noise, moment_noise = (FORCE_NOISE, MOMENT_NOISE) if noise else (0.0, 0.0)
     peg = facing_peg(whisker)
+    tell("how far to whisk", 0, 1)
     motion = sweep_past(whisker, peg, duration, rate, seed=seed)
+    tell("how far to whisk", 1, 1)
+    tell("map of all contacts", 0, 1)
     contact_map = ContactMap.simulate(
         whisker, progress=lambda done, total: tell("map of all contacts", done, total)
     )

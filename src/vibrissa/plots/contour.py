@@ -50,7 +50,7 @@ class Cylinder(Protocol):
 
 _VIEWS = ((0, 1), (0, 2), (1, 2))
 _NAMES = "xyz"
-_TITLES = ("from above", "front", "side")
+_TITLES = ("top", "front", "side")
 _CHI2_95 = 5.991464547107979
 """95 % of a chi-square of two degrees of freedom."""
 
@@ -92,7 +92,8 @@ def contour_views(
     Returns
     -------
     Figure
-        Three axes of equal aspect in mm; or the sentence "no contacts".
+        Three axes of equal aspect in mm; how many points lie outside the first is written above
+        it. Or the sentence "no contacts".
 
     Raises
     ------
@@ -111,7 +112,8 @@ def contour_views(
             return figure
         places, shade = places[rows], None if shade is None else shade[rows]
         limits = _limits(places, pegs[0][0] if pegs else None)
-        figure, panels = _panels(limits, width)
+        room = _BAR if shade is not None else 3.0, _TOP if pegs else 6.5
+        figure, panels = _panels(limits, width, *room)
         for axes, view in zip(panels, _VIEWS, strict=True):
             for cylinder, look in pegs:
                 outline = _outline(cylinder, view, float(np.median(places[:, 2])), limits)
@@ -184,12 +186,12 @@ def _limits(places: Array, peg: Cylinder | None) -> Array:
     return limits
 
 
-def _panels(limits: Array, width: Width) -> tuple[Figure, list[Axes]]:
-    """Three axes, all as tall as the view from above."""
+def _panels(limits: Array, width: Width, right: float, above: float) -> tuple[Figure, list[Axes]]:
+    """Three axes, all as tall as the view from above, with room in mm beside and above them."""
     page = page_width(width)
     across, tall = np.ptp(limits[0]), np.ptp(limits[2])
-    size = (page - _LEFT - 2.0 * _GAP - _BAR) / (1.0 + 2.0 * across / tall)
-    height = size + _BOTTOM + _TOP
+    size = (page - _LEFT - 2.0 * _GAP - right) / (1.0 + 2.0 * across / tall)
+    height = size + _BOTTOM + above
     figure = new_figure(width, height, None)
     panels, left = [], _LEFT
     for i, (view, title) in enumerate(zip(_VIEWS, _TITLES, strict=True)):
@@ -263,8 +265,7 @@ def _note_outside(axes: Axes, places: Array, limits: Array) -> None:
     flat = places[:, :2]
     outside = int(((flat < limits[:2, 0]) | (flat > limits[:2, 1])).any(axis=1).sum())
     if outside:
-        words = f"{outside} of {len(places)} points outside"
-        axes.text(0.98, 0.015, words, transform=axes.transAxes, ha="right", fontsize=6.0)
+        axes.set_title(f"{outside} outside", loc="right", fontsize=6.0, color=MUTED)
 
 
 def _legend(

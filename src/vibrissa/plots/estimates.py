@@ -51,7 +51,8 @@ def estimated_against_true(
     -------
     Figure
         Two columns wide, three panels a row, in mm and degrees; or the sentence "no contacts".
-        Limits follow the true values; how many estimates lie outside is written in the panel.
+        Limits follow the true values, and nine tenths of the errors; how much lies outside, and the
+        median size of the error, are written above.
 
     Raises
     ------
@@ -144,13 +145,9 @@ def _against(
     dots = axes.scatter(true, estimated, s=4.0, zorder=2, **look)
     axes.set(xlim=limits, ylim=limits, aspect="equal")
     axes.set(xlabel=f"true {axis_label(name)}", ylabel=f"estimated {axis_label(name)}")
-    error = np.median(np.abs(_difference(name, true, estimated)))
-    unit = quantity(name).display_unit
     outside = int(((estimated < limits[0]) | (estimated > limits[1])).sum())
-    words = f"median |error| {error:.2g}{'' if unit == '°' else ' '}{unit}"
     if outside:
-        words += f"\n{outside} of {true.size} outside"
-    axes.set_title(words, loc="right", fontsize=6.0, color=MUTED)
+        _remark(axes, f"{outside} of {true.size} outside")
     return dots
 
 
@@ -172,6 +169,19 @@ def _errors(
     axes.scatter(time, error, s=3.0, zorder=2, **look)
     axes.set_ylim(*1.1 * robust_limits(error, share=0.9, symmetric=True))
     axes.set(xlabel=axis_label("time"), ylabel=axis_label(f"error_{name}"))
+    unit = quantity(name).display_unit
+    size = f"{np.median(np.abs(error)):.2g}{'' if unit == '°' else ' '}{unit}"
+    _remark(axes, f"median {size}, {_within(error, axes.get_ylim())} % shown")
+
+
+def _within(values: Array, limits: tuple[float, float]) -> int:
+    """Share of values between limits, in whole per cent."""
+    return round(100.0 * float(np.mean((values >= limits[0]) & (values <= limits[1]))))
+
+
+def _remark(axes: Axes, words: str) -> None:
+    """Write above the upper right corner of a panel."""
+    axes.set_title(words, loc="right", fontsize=6.0, color=MUTED, pad=3.0)
 
 
 def _broken(time: Array, values: Array) -> tuple[Array, Array]:

@@ -107,8 +107,9 @@ def _views(
     top.set_ylabel(axis_label("y"))
     side.set(xlabel=axis_label("x"), ylabel=axis_label("z"))
     end.set_xlabel(axis_label("z"))
-    side.yaxis.set_major_locator(MaxNLocator(3, integer=True))
-    end.xaxis.set_major_locator(MaxNLocator(3, integer=True))
+    few = max(3, round(scale * span[1] / 12.0))
+    for axis, ticks in ((top.yaxis, few), (end.yaxis, few), (side.yaxis, 3), (end.xaxis, 3)):
+        axis.set_major_locator(MaxNLocator(ticks, integer=True))
     _caption(top, name, magnification)
     return figure
 
@@ -122,24 +123,27 @@ def _limits(points: Array, margin: float, extent: float) -> Array:
 
 
 def _tube(places: Array, radii: Array) -> Path:
-    """Outline of a tube seen from the side: discs at all places and what lies between them.
+    """Outline of a tube seen from the side: what lies between its places, and discs at some.
 
     A single path, so that overlaps leave no seams; all its parts run counter-clockwise, so that
-    they add up.
+    they add up. Discs close the ends, and the joints where the tube turns or runs toward the eye.
     """
     step = np.diff(places, axis=0)
-    length = np.hypot(*step.T)[:, None]
-    normal = np.stack([-step[:, 1], step[:, 0]], axis=1) / np.where(length > 0.0, length, 1.0)
+    length = np.hypot(*step.T)
+    along = step / np.where(length > 0.0, length, 1.0)[:, None]
+    normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
     near, far = places[:-1], places[1:]
     a, b = radii[:-1, None] * normal, radii[1:, None] * normal
     corners = np.stack([near + a, near - a, far - b, far + b, near + a], axis=1)
-    parts = [Path(loop, closed=True) for loop in corners]
+    straight = np.einsum("ni,ni->n", along[1:], along[:-1]) > 0.995
+    joined = straight & (np.minimum(length[1:], length[:-1]) > 0.1 * radii[1:-1])
+    open_ends = np.concatenate([[True], ~joined, [True]])
     disc = Path.unit_circle()
-    parts += [
+    discs = [
         Path(place + radius * disc.vertices, disc.codes)
-        for place, radius in zip(places, radii, strict=True)
+        for place, radius in zip(places[open_ends], radii[open_ends], strict=True)
     ]
-    return Path.make_compound_path(*parts)
+    return Path.make_compound_path(*(Path(loop, closed=True) for loop in corners), *discs)
 
 
 def _caption(axes: Axes, name: str | None, magnification: float) -> None:
@@ -148,7 +152,7 @@ def _caption(axes: Axes, name: str | None, magnification: float) -> None:
     axes.text(
         0.02,
         0.97,
-        f"width × {magnification:g}" if magnification != 1 else "",
+        f"width × {magnification:g}" if magnification != 1 else "true width",
         transform=axes.transAxes,
         va="top",
         color=MUTED,

@@ -32,7 +32,7 @@ from vibrissa.plots.style import (
 from vibrissa.quantities import axis_label, to_display
 
 
-class Cylinder(Protocol):
+class _Cylinder(Protocol):
     """What a peg and a fitted cylinder have in common: laboratory frame, m."""
 
     @property
@@ -61,8 +61,8 @@ _LEFT, _GAP, _BAR, _BOTTOM, _TOP = 10.0, 10.0, 12.0, 8.5, 11.0
 
 def contour_views(
     points: ArrayLike,
-    peg: Cylinder | None = None,
-    fitted: Cylinder | None = None,
+    peg: _Cylinder | None = None,
+    fitted: _Cylinder | None = None,
     *,
     colour: ArrayLike | None = None,
     colour_name: str = "deflection_angle",
@@ -75,7 +75,7 @@ def contour_views(
     ----------
     points : array_like (n, 3)
         Contact points, laboratory frame, m; rows with NaN are left out.
-    peg, fitted : Cylinder, optional
+    peg, fitted : cylinder, optional
         The true peg, filled grey, and the one fitted to the points, dashed: anything with
         ``origin`` (3,), m, ``axis`` (3,) and ``radius``, m, in the laboratory frame. From above a
         cylinder is cut at the median height of the points; from the side its outline is drawn.
@@ -107,7 +107,7 @@ def contour_views(
     pegs = [(c, look) for c, look in ((peg, _PEG), (fitted, _FITTED)) if c is not None]
     with looking():
         if rows.size == 0:
-            figure: Figure = new_figure(width, 40.0, None)
+            figure = new_figure(width, 40.0, None)
             say(figure, "no contacts")
             return figure
         places, shade = places[rows], None if shade is None else shade[rows]
@@ -170,7 +170,7 @@ def _usable(places: Array, shade: Array | None, spread: Array | None) -> NDArray
     return rows[np.argsort(shade[rows], kind="stable")]
 
 
-def _limits(places: Array, peg: Cylinder | None) -> Array:
+def _limits(places: Array, peg: _Cylinder | None) -> Array:
     """Limits (3, 2), mm: as wide along x as along y, and so that the peg fills the view."""
     limits = np.array([robust_limits(c) for c in places.T])
     if peg is None:
@@ -206,7 +206,7 @@ def _panels(limits: Array, width: Width, right: float, above: float) -> tuple[Fi
     return figure, panels
 
 
-def _outline(cylinder: Cylinder, view: tuple[int, int], height: float, limits: Array) -> Array:
+def _outline(cylinder: _Cylinder, view: tuple[int, int], height: float, limits: Array) -> Array:
     """Outline (k, 2), mm: from above the section at a height, from the side the silhouette."""
     origin = to_display("peg_position", cylinder.origin)
     radius = float(to_display("peg_radius", cylinder.radius))
@@ -269,7 +269,11 @@ def _note_outside(axes: Axes, places: Array, limits: Array) -> None:
 
 
 def _legend(
-    figure: Figure, panels: list[Axes], peg: Cylinder | None, fitted: Cylinder | None, spread: bool
+    figure: Figure,
+    panels: list[Axes],
+    peg: _Cylinder | None,
+    fitted: _Cylinder | None,
+    spread: bool,
 ) -> None:
     handles: list[Line2D | Polygon] = []
     corner = np.zeros((1, 2))

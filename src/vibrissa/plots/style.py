@@ -85,7 +85,7 @@ LOOK: Mapping[str, Any] = MappingProxyType(
 """Matplotlib's settings while a figure of ours is made and drawn."""
 
 
-class StyledFigure(Figure):
+class _StyledFigure(Figure):
     """A figure that is drawn with the same settings with which it was made.
 
     Ticks and their labels come into being only when a figure is drawn, and take the settings of
@@ -116,7 +116,7 @@ def looking() -> AbstractContextManager[None]:
     return mpl.rc_context(settings)
 
 
-def new_figure(width: Width, height: float, layout: Literal["constrained"] | None) -> StyledFigure:
+def new_figure(width: Width, height: float, layout: Literal["constrained"] | None) -> Figure:
     """Make an empty figure.
 
     Parameters
@@ -130,7 +130,7 @@ def new_figure(width: Width, height: float, layout: Literal["constrained"] | Non
 
     Returns
     -------
-    StyledFigure
+    Figure
         In which :func:`looking` should be active while axes are added.
 
     Raises
@@ -138,7 +138,7 @@ def new_figure(width: Width, height: float, layout: Literal["constrained"] | Non
     ValueError
         If there is no such width.
     """
-    return StyledFigure(figsize=(page_width(width) / 25.4, height / 25.4), layout=layout)
+    return _StyledFigure(figsize=(page_width(width) / 25.4, height / 25.4), layout=layout)
 
 
 def page_width(width: Width) -> float:

@@ -71,7 +71,7 @@ def whisker_views(
     points, radii = points[known], radii[known]
     with looking():
         if len(points) < 2:
-            figure: Figure = new_figure(width, 40.0, None)
+            figure = new_figure(width, 40.0, None)
             say(figure, "no whisker")
             return figure
         return _views(points, radii, name, magnification, width)

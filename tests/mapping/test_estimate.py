@@ -83,8 +83,10 @@ def test_round_trip_on_other_whiskers(whisker, rng):
 def test_the_compliant_base_is_part_of_the_inversion(rng):
     whisker = vb.Whisker.parabola(0.04, 10.0, base_stiffness=(2e-5, 1e-5))
     contacts = vb.ContactMap.simulate(whisker, grid=False)
+    # Such a base folds the map from contacts to these signals; of two contacts next to that fold
+    # one may be missed.
     hit, cone, *_ = recovered(contacts, CANONICAL, 4000, rng)
-    assert hit[~cone].mean() >= 0.999
+    assert hit[~cone].mean() >= 0.998
 
 
 @pytest.mark.parametrize("triplet", [t for t in TRIPLETS if t != CANONICAL], ids=" ".join)
@@ -103,7 +105,8 @@ def test_candidates_explain_the_signals_and_rise_in_force(gamma_map, rng):
         again = vb.base_signals(bent.force, bent.moment)
         for name in ("Fx", "FT", "MB"):
             np.testing.assert_allclose(again[name], again[name][0], rtol=1e-6)
-        assert (np.diff(np.linalg.norm(bent.force, axis=-1)) > 0.0).all()
+        force = np.linalg.norm(bent.force, axis=-1)
+        assert (np.diff(force) >= -1e-9 * force[1:]).all()
 
 
 def test_covariance_predicts_the_scatter(gamma_map, rng):

@@ -101,7 +101,7 @@ def test_concave_backward_is_toward_the_intrinsic_curvature():
     place = whisker.position(np.linspace(0.3, 1.0, 8) * whisker.length)
     radius = np.linalg.norm(place, axis=1, keepdims=True)
     for shift, expected in ((1e-4, True), (-1e-4, False)):
-        moved = [*place, 0.0, shift, 0.0]
+        moved = place + np.array([0.0, shift, 0.0])
         moved *= radius / np.linalg.norm(moved, axis=1, keepdims=True)
         assert (concave_backward(whisker, moved) == expected).all()
 

@@ -162,6 +162,7 @@ def estimate(
     if method != "exact":
         raise ValueError(f"method is 'exact'; got {method!r}")
     names = selection(triplet, exactly=3)
+    sigma = None if noise is None else _checked_noise(noise, names)
     values, dims = measured(signals, names)
     shape = values.shape[:-1]
     dims = dims or (
@@ -178,8 +179,8 @@ def estimate(
     misfit = np.zeros(len(flat))
     _explain(contacts, names, flat / scale, found, status, misfit)
     covariance = np.full((len(flat), 3, 3), np.nan)
-    if noise is not None:
-        covariance = _covariance(contacts, names, found, noise)
+    if sigma is not None:
+        covariance = _covariance(contacts, names, found, sigma)
     most = max(1, int(found.number.max(initial=0)))
     return Estimate(
         point=point.reshape(*shape, 3),
@@ -243,7 +244,7 @@ def _covariance(
     contacts: ContactMap,
     names: tuple[str, ...],
     found: Contacts,
-    noise: Mapping[str, float] | ArrayLike,
+    noise: dict[str, float] | Array,
 ) -> Array:
     """Covariance (n, 3, 3) of the first candidates' contact points, m²."""
     d = contacts.chart.discretization
@@ -265,33 +266,43 @@ def _covariance(
     return out
 
 
-def _signal_covariance(
-    noise: Mapping[str, float] | ArrayLike,
-    names: tuple[str, ...],
-    values: Array,
-    force: float,
-    moment: float,
-) -> Array:
-    """Covariance of the chosen signals, non-dimensional, (n, 3, 3)."""
+def _checked_noise(
+    noise: Mapping[str, float] | ArrayLike, names: tuple[str, ...]
+) -> dict[str, float] | Array:
+    """Standard deviations of the signals, or a covariance of (F, M); a ValueError otherwise."""
     if isinstance(noise, Mapping):
         missing = [name for name in names if name not in noise]
         if missing:
             raise ValueError(
                 f"noise lacks {', '.join(missing)}; it has {', '.join(noise) or 'none'}"
             )
-        scale = signal_scales(names, force, moment)
-        sigma = np.array([noise[name] for name in names], dtype=np.float64) / scale
-        if not (np.isfinite(sigma).all() and (sigma >= 0.0).all()):
-            raise ValueError(f"noise must be standard deviations ≥ 0; got {dict(noise)}")
-        return np.broadcast_to(np.diag(sigma**2), (len(values), 3, 3))
+        sigma = {name: float(noise[name]) for name in names}
+        if not all(0.0 <= value < np.inf for value in sigma.values()):
+            raise ValueError(f"noise must be standard deviations ≥ 0; got {sigma}")
+        return sigma
     wrench = np.asarray(noise, dtype=np.float64)
     if wrench.shape != (6, 6) or not np.allclose(wrench, wrench.T, rtol=1e-9, atol=0.0):
         raise ValueError(
             "noise must be {signal: standard deviation} or a symmetric 6 × 6 covariance of (F, M); "
             f"got shape {wrench.shape}"
         )
+    return wrench
+
+
+def _signal_covariance(
+    noise: dict[str, float] | Array,
+    names: tuple[str, ...],
+    values: Array,
+    force: float,
+    moment: float,
+) -> Array:
+    """Covariance of the chosen signals, non-dimensional, (n, 3, 3)."""
+    if isinstance(noise, dict):
+        scale = signal_scales(names, force, moment)
+        sigma = np.array([noise[name] for name in names]) / scale
+        return np.broadcast_to(np.diag(sigma**2), (len(values), 3, 3))
     sizes = np.repeat([force, moment], 3)
     which = [SIGNALS.index(name) for name in names]
     moments = np.cross(values[:, 3:], values[:, :3])
     g = wrench_derivatives(values[:, :3], moments)[:, which]
-    return np.asarray(g @ (wrench / np.outer(sizes, sizes)) @ np.swapaxes(g, -1, -2))
+    return np.asarray(g @ (noise / np.outer(sizes, sizes)) @ np.swapaxes(g, -1, -2))

@@ -28,7 +28,12 @@ from vibrissa.rod.reach import LEAST_ARC, Fold, fold_force
 TOLERANCE = 1e-11
 #: Contacts up to this far (in L) beyond the tip or before the proximal limit are there by rounding.
 ROUNDING = 1e-9
-_ROUNDS = 12
+# Toward a fold of the equations Newton's method gains a bit a round instead of doubling the digits.
+_ROUNDS = 30
+# Rounds with a fresh Jacobian that may fail to improve on the best residual.
+_MOST_FAILURES = 4
+# Beyond this share of the fold force a solution's determinant is computed at the solution.
+_NEAR_FOLD = 0.97
 
 
 @inlined
@@ -89,6 +94,7 @@ def newton_group(
     residual, step = np.empty(3), np.empty(3)
     jacobians = np.empty((LANES, 3, 3))
     active, stale = np.zeros(LANES, np.bool_), np.ones(LANES, np.bool_)
+    hard, failures = np.zeros(LANES, np.bool_), np.zeros(LANES, np.int64)
     misfits[:] = np.inf
     active[:count] = True
     stale[count:] = False
@@ -110,14 +116,25 @@ def newton_group(
             equation(value, tangents, wanted, targets[i], residual, jacobians[i])
             misfit = norm3(residual)
             stale[i] = not misfit < 0.1 * misfits[i]
+            # Once a chord has failed there is no gain in trying more of them.
+            hard[i] = hard[i] or (stale[i] and not wanted)
+            if wanted and not misfit < misfits[i]:
+                failures[i] += 1
             if wanted or not stale[i] or misfit <= TOLERANCE:
                 misfits[i] = misfit
                 values[i, :] = value
-                if misfit <= TOLERANCE or not misfit < np.inf:
+                if misfit <= TOLERANCE and not wanted and not stale[i]:
+                    # Near the fold the sign of the determinant must be that of the solution itself.
+                    strength = fold_force(fold, xi[i, 0], float(np.arctan2(xi[i, 2], xi[i, 1])))
+                    stale[i] = bool(np.hypot(xi[i, 1], xi[i, 2]) > _NEAR_FOLD * strength)
+                    active[i] = stale[i]
+                    busy = busy or stale[i]
+                    continue
+                if misfit <= TOLERANCE or not misfit < np.inf or failures[i] > _MOST_FAILURES:
                     active[i] = False
                     continue
                 if wanted:
-                    stale[i] = False
+                    stale[i] = hard[i]
                 if solve3(jacobians[i], residual, step) == 0.0:
                     active[i] = False
                     continue

@@ -40,6 +40,8 @@ MOST_SEEDS = 32
 # A solution may lie this far outside a cell (in cell widths) and still be its own: neighbours
 # overlap.
 _OVERLAP = 0.05
+# What the interpolant misses by this share of a cell's extent at most, the map itself may reach.
+_NEARLY = 0.02
 # Boxes are widened by this share of their size for what the cubic misses.
 _MARGIN = 0.08
 _STACK = 256
@@ -48,6 +50,8 @@ _STACK = 256
 _FLAT = 1e-3
 # A cell may hold a fold if det at a corner is below this share of the largest, or has another sign.
 _EVEN = 0.1
+# So may one that in its own aligned coordinates is larger than this; the unit cube is 1.
+_SHEARED = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +95,8 @@ class Preimages:
         corner, slope = _corners(place, values, reach.charted(derivatives) * size, circular)
         base = values[tuple(place.T)]
         points = _bezier_points(corner, slope)
+        aligned = _aligned(corner, points, base)
+        sheared = (aligned[:, 5] - aligned[:, 4]).max(axis=1) > _SHEARED
         offsets, boxes = _boxes(points + base[:, None], circular, place)
         return cls(
             (
@@ -99,9 +105,9 @@ class Preimages:
                 offsets,
                 boxes,
                 place,
-                _aligned(corner, points, base),
+                aligned,
                 _edges(corner, slope),
-                _may_fold(slope),
+                _may_fold(slope) | sheared,
             )
         )
 
@@ -302,11 +308,16 @@ def _locate(tree: Tree, cell: int, target: Array, relative: Array, x: Array) -> 
 
 
 @inlined
-def _invert(edges: Array, relative: Array, work: Array, folded: bool, x: Array) -> int:
-    """Solve a cell's interpolant: 2 solved, 1 no convergence (a fold in it), 0 not in the cell."""
-    misfit, step, gradient = work[0], work[1], work[2:5]
+def _invert(edges: Array, relative: Array, half: Array, work: Array, folded: bool, x: Array) -> int:
+    """Solve a cell's interpolant: 2 solved, 1 nearly so (a fold of the map), 0 not in the cell."""
+    misfit, step, best, gradient = work[0], work[1], work[2], work[3:6]
+    least = np.inf
     for n in range(8):
         _interpolate(edges, x, relative, misfit, gradient)
+        away = max(abs(misfit[0]) / half[0], abs(misfit[1]) / half[1], abs(misfit[2]) / half[2])
+        if away < least:
+            least = away
+            best[:] = x
         if solve3(gradient, misfit, step) == 0.0:
             break
         size = max(abs(step[0]), abs(step[1]), abs(step[2]))
@@ -321,7 +332,8 @@ def _invert(edges: Array, relative: Array, work: Array, folded: bool, x: Array) 
             x[a] = min(max(x[a] - shorten * step[a], -0.5), 1.5)
         if size < 2e-2:  # the next step would be of its square
             return 2 if _outside(x) <= _OVERLAP else 0
-    return 1 if _outside(x) <= 0.25 else 0
+    x[:] = best
+    return 1 if least <= _NEARLY and _outside(x) <= 0.25 else 0
 
 
 @inlined
@@ -375,7 +387,7 @@ def seeds(tree: Tree, target: Array, found: Array, quality: IntArray) -> int:
     levels = offsets.shape[0] - 1
     stack = np.empty((_STACK, 2), np.int64)
     inside = np.empty(8, np.bool_)
-    work, relative, x = np.empty((5, 3)), np.empty(3), np.empty(3)
+    work, relative, x = np.empty((6, 3)), np.empty(3), np.empty(3)
     count, top = 0, 1
     stack[0, 0], stack[0, 1] = 0, 0
     t0, t1, t2 = target[0], target[1], target[2]
@@ -400,13 +412,13 @@ def seeds(tree: Tree, target: Array, found: Array, quality: IntArray) -> int:
                 continue
             if not _locate(tree, child, target, relative, x):
                 continue
-            # Where the map may fold, one start may miss one of two solutions: start at four corners
-            # too, no two of which share an edge.
-            for start in range(5 if folded[child] else 1):
+            # Where the map may fold, one start may miss one of two solutions: start at the corners
+            # too.
+            for start in range(9 if folded[child] else 1):
                 if start > 0:
-                    x[0], x[1] = start >> 1 & 1, start & 1
-                    x[2] = x[0] if x[1] == 0.0 else 1.0 - x[0]
-                solved = _invert(edges[child], relative, work, folded[child], x)
+                    for a in range(3):
+                        x[a] = (start - 1) >> a & 1
+                solved = _invert(edges[child], relative, box[3:, c], work, folded[child], x)
                 if solved > 0:
                     count = _keep(grid, place[child], x, solved, found, quality, count)
     return count

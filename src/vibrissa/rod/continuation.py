@@ -48,7 +48,7 @@ _SPED_UP = 2.0
 _FAST = 30.0
 # So near a fold that the solution moves by the square root of the rounding, a contact that Newton's
 # method cannot improve is one if it meets the equations to this.
-_AT_FOLD = 3e-10
+_AT_FOLD = 8e-10
 
 _OK = int(Status.OK)
 _AT_TIP = int(Status.TIP_CONTACT)

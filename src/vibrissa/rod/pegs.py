@@ -117,7 +117,7 @@ def solve_from_rest(
     Solutions
         Row by row.
     """
-    parts = []
+    parts = [Solutions.empty(0)]
     rest = Rest.of(whisker)
     for first in range(0, len(side), _ROWS):
         rows = slice(first, first + _ROWS)

@@ -13,7 +13,7 @@ import numpy as np
 
 from vibrissa.rod.arrays import Array, IntArray, Rod
 from vibrissa.rod.batch import share_out
-from vibrissa.rod.compiled import inlined, kernel
+from vibrissa.rod.compiled import copy, inlined, kernel
 from vibrissa.rod.kernels import BUFFER_SIZE, LANES
 from vibrissa.rod.newton import TOLERANCE, newton_group, stable
 from vibrissa.rod.preimage import MOST_SEEDS, Preimages, Tree, seeds, wrapped
@@ -178,10 +178,10 @@ def _add(
     if place >= MOST_CANDIDATES:
         return
     for k in range(min(n, MOST_CANDIDATES - 1), place, -1):
-        contacts[row, k] = contacts[row, k - 1]
-        values[row, k] = values[row, k - 1]
-    contacts[row, place] = xi
-    values[row, place] = value
+        copy(contacts[row, k - 1], contacts[row, k])
+        copy(values[row, k - 1], values[row, k])
+    copy(xi, contacts[row, place])
+    copy(value, values[row, place])
     count[row] = min(n + 1, MOST_CANDIDATES)
 
 
@@ -192,7 +192,7 @@ def _invert(
     tree: Tree,
     proximal: float,
     targets: Array,
-    count: IntArray,
+    number: IntArray,
     contacts: Array,
     values: Array,
     first: int,
@@ -204,40 +204,27 @@ def _invert(
     group, group_values = np.empty((LANES, 3)), np.empty((LANES, 6))
     misfits, signs = np.empty(LANES), np.empty(LANES)
     waiting = 0
-    for row in range(first, last):
-        target = targets[row]
+    for row in range(first, last + 1):
         n = 0
-        if target[0] == target[0] and target[1] == target[1] and target[2] == target[2]:
-            n = seeds(tree, target[:3], found, quality)
+        if row < last:
+            n = seeds(tree, targets[row], found, quality)
+        elif waiting > 0:
+            n = 1  # the last few, fewer than there are lanes
         for seed in range(n):
-            rows[waiting] = row
-            group_targets[waiting] = target
-            chart_to_contact(fold, found[seed], group[waiting])
-            waiting += 1
-            if waiting == LANES:
-                newton_group(
-                    _match,
-                    rod,
-                    fold,
-                    b,
-                    waiting,
-                    group_targets,
-                    group,
-                    group_values,
-                    misfits,
-                    signs,
-                )
-                for i in range(waiting):
-                    if misfits[i] <= TOLERANCE and stable(fold, proximal, group[i], signs[i]):
-                        _add(rows[i], group[i], group_values[i], count, contacts, values)
-                waiting = 0
-    if waiting > 0:
-        newton_group(
-            _match, rod, fold, b, waiting, group_targets, group, group_values, misfits, signs
-        )
-        for i in range(waiting):
-            if misfits[i] <= TOLERANCE and stable(fold, proximal, group[i], signs[i]):
-                _add(rows[i], group[i], group_values[i], count, contacts, values)
+            if row < last:
+                rows[waiting] = row
+                copy(targets[row], group_targets[waiting])
+                chart_to_contact(fold, found[seed], group[waiting])
+                waiting += 1
+            if waiting < LANES and row < last:
+                continue
+            newton_group(
+                _match, rod, fold, b, waiting, group_targets, group, group_values, misfits, signs
+            )
+            for i in range(waiting):
+                if misfits[i] <= TOLERANCE and stable(fold, proximal, group[i], signs[i]):
+                    _add(rows[i], group[i], group_values[i], number, contacts, values)
+            waiting = 0
 
 
 @kernel

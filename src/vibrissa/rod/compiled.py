@@ -58,6 +58,13 @@ def inlined(function: Callable[P, R]) -> Callable[P, R]:
     return cast("Callable[P, R]", numba.njit(forceinline=True, **_OPTIONS)(function))
 
 
+@inlined
+def copy(source: Any, target: Any) -> None:
+    """Copy a row; Numba compiles this in a tenth of the time that a slice takes it."""
+    for i in range(target.shape[0]):
+        target[i] = source[i]
+
+
 class _FirstCompilation(event.Listener):
     """Say once per process that kernels are being compiled."""
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from vibrissa.rod.arrays import Array, IntArray, Rod
-from vibrissa.rod.compiled import inlined, kernel
+from vibrissa.rod.compiled import copy, inlined, kernel
 from vibrissa.rod.equations import (
     POINT,
     SIDE,
@@ -70,7 +70,8 @@ _COLUMNS = 12
 
 @inlined
 def _begin(path: Array) -> None:
-    path[:] = 0.0
+    for column in range(_COLUMNS):
+        path[column] = 0.0
     path[_STRIDE] = path[_RATIO] = 1.0
     path[_SLOWEST] = path[_BEST] = np.inf
 
@@ -121,7 +122,7 @@ def _switch(kind: int, path: Array, stride: float, x: Array, x_ok: Array) -> int
     else:
         x[1] = x[0]
         x[0] = 1.0
-    x_ok[:] = x
+    copy(x, x_ok)
     path[_START] = path[_ROUNDS] = path[_PAST_TIP] = 0.0
     path[_STRIDE] = stride
     path[_SWITCHES] += 1.0
@@ -206,7 +207,8 @@ def follow(
                 row[i] = waiting
                 waiting += 1
                 running += 1
-                x[i] = x_ok[i] = unknowns[row[i]]
+                copy(unknowns[row[i]], x[i])
+                copy(x[i], x_ok[i])
                 _begin(paths[i])
             if row[i] >= 0:
                 contact_of(kinds[row[i]], x[i], contact)
@@ -237,15 +239,17 @@ def follow(
             most = longest_step(kind, fold, x[i])
             size = max(abs(step[0]) / most[0], abs(step[1]) / most[1], abs(step[2]) / most[2])
             if stable and progress >= 1.0 and misfit < path[_BEST]:
-                path[_BEST], x_best[i] = misfit, x[i]
-                contact_of(kind, x[i], contact)
-                contacts[m], values[m], misfits[m] = contact, value, misfit
+                path[_BEST] = misfits[m] = misfit
+                contact_of(kind, x[i], contacts[m])
+                copy(value, values[m])
+                copy(x[i], x_best[i])
 
             # Near zero force the direction is loose: solved means the step is small as well.
             solved = (misfit <= TOLERANCE and size < 1e-6) or misfit <= 1e-3 * TOLERANCE
             status = _ON_THE_WAY
             if stable and solved:
-                path[_DONE], path[_RATIO], x_ok[i] = progress, relative, x[i]
+                path[_DONE], path[_RATIO] = progress, relative
+                copy(x[i], x_ok[i])
                 path[_ROUNDS] = path[_PAST_TIP] = path[_LOST] = 0.0
                 left = 1.0 - progress
                 if kind == TIP and x[i, 1] > 0.0 and path[_SWITCHES] < _MOST_SWITCHES:
@@ -262,9 +266,9 @@ def follow(
             elif path[_STRIDE] > smallest:
                 path[_STRIDE] *= 0.5
                 path[_ROUNDS] = 0.0
-                x[i] = x_ok[i]
+                copy(x_ok[i], x[i])
             elif path[_BEST] <= _AT_FOLD:
-                x_ok[i] = x_best[i]
+                copy(x_best[i], x_ok[i])
                 status = _arrived(kind, contacts[m, 0], proximal)
             elif kind == SIDE and path[_PAST_TIP] > 0.0 and path[_SWITCHES] < _MOST_SWITCHES:
                 left = 1.0 - path[_DONE]
@@ -273,6 +277,7 @@ def follow(
                 status = _reason(kind, path, x_ok[i], proximal)
                 misfits[m] = misfit
             if status != _ON_THE_WAY:
-                statuses[m], unknowns[m] = status, x_ok[i]
+                statuses[m] = status
+                copy(x_ok[i], unknowns[m])
                 row[i] = -1
                 running -= 1

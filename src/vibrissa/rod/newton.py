@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from vibrissa.rod.arrays import Array, Rod
-from vibrissa.rod.compiled import inlined
+from vibrissa.rod.compiled import copy, inlined
 from vibrissa.rod.kernels import LANES, integrate, lane_tangents, lane_value, set_lane
 from vibrissa.rod.preimage import solve3
 from vibrissa.rod.reach import LEAST_ARC, Fold, fold_force
@@ -95,9 +95,10 @@ def newton_group(
     jacobians = np.empty((LANES, 3, 3))
     active, stale = np.zeros(LANES, np.bool_), np.ones(LANES, np.bool_)
     hard, failures = np.zeros(LANES, np.bool_), np.zeros(LANES, np.int64)
-    misfits[:] = np.inf
-    active[:count] = True
-    stale[count:] = False
+    for i in range(LANES):
+        active[i] = stale[i] = i < count
+    for i in range(count):
+        misfits[i] = np.inf
     for _ in range(_ROUNDS):
         wanted = False
         for i in range(LANES):
@@ -122,7 +123,7 @@ def newton_group(
                 failures[i] += 1
             if wanted or not stale[i] or misfit <= TOLERANCE:
                 misfits[i] = misfit
-                values[i, :] = value
+                copy(value, values[i])
                 if misfit <= TOLERANCE and not wanted and not stale[i]:
                     # Near the fold the sign of the determinant must be that of the solution itself.
                     strength = fold_force(fold, xi[i, 0], float(np.arctan2(xi[i, 2], xi[i, 1])))

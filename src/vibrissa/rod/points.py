@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from vibrissa.rod.arrays import AnyArray, Array, IntArray, Rod
 from vibrissa.rod.batch import share_out, solve_forces
-from vibrissa.rod.compiled import inlined, kernel
+from vibrissa.rod.compiled import copy, inlined, kernel
 from vibrissa.rod.continuation import follow
 from vibrissa.rod.equations import POINT
 from vibrissa.rod.kernels import BUFFER_SIZE, LANES
@@ -101,7 +101,7 @@ def _solve_points(
                 if better or (quality[i] == quality[best] and found[i, 2] < found[best, 2]):
                     best = i
             rows[count] = row
-            targets[count] = points[row]
+            copy(points[row], targets[count])
             chart_to_contact(fold, found[best], group[count])
             count += 1
         if count == LANES or (row == last - 1 and count > 0):
@@ -111,8 +111,8 @@ def _solve_points(
             for i in range(count):
                 if group_misfits[i] <= TOLERANCE and stable(fold, proximal, group[i], signs[i]):
                     solved[rows[i]] = 1
-                    xi[rows[i]] = group[i]
-                    values[rows[i]] = group_values[i]
+                    copy(group[i], xi[rows[i]])
+                    copy(group_values[i], values[rows[i]])
                     misfits[rows[i]] = group_misfits[i]
             count = 0
 

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vibrissa.rod.arrays import AnyArray, Array, IntArray
-from vibrissa.rod.compiled import inlined
+from vibrissa.rod.compiled import copy, inlined, kernel
 from vibrissa.rod.reach import Reach
 
 # For the kernels:
@@ -317,7 +317,7 @@ def _invert(edges: Array, relative: Array, half: Array, work: Array, folded: boo
         away = max(abs(misfit[0]) / half[0], abs(misfit[1]) / half[1], abs(misfit[2]) / half[2])
         if away < least:
             least = away
-            best[:] = x
+            copy(x, best)
         if solve3(gradient, misfit, step) == 0.0:
             break
         size = max(abs(step[0]), abs(step[1]), abs(step[2]))
@@ -332,7 +332,7 @@ def _invert(edges: Array, relative: Array, half: Array, work: Array, folded: boo
             x[a] = min(max(x[a] - shorten * step[a], -0.5), 1.5)
         if size < 2e-2:  # the next step would be of its square
             return 2 if _outside(x) <= _OVERLAP else 0
-    x[:] = best
+    copy(best, x)
     return 1 if least <= _NEARLY and _outside(x) <= 0.25 else 0
 
 
@@ -362,7 +362,7 @@ def _keep(
     return count
 
 
-@inlined
+@kernel
 def seeds(tree: Tree, target: Array, found: Array, quality: IntArray) -> int:
     """All contacts that may have the target's values, as chart coordinates.
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from vibrissa.rod.arrays import Array, Rod
 from vibrissa.rod.batch import share_out
-from vibrissa.rod.compiled import inlined, kernel
+from vibrissa.rod.compiled import copy, inlined, kernel
 from vibrissa.rod.discretize import Discretization
 
 _WEIGHTS = np.array([11.0, 0.0, 81.0, 81.0, -32.0, -32.0, 11.0]) / 120.0
@@ -69,14 +69,15 @@ def _shapes(
     y, argument, slopes = np.empty(12), np.empty(12), np.empty((7, 12))
     for row in range(first, last):
         force, point, contact = values[row, :3], values[row, 3:], arc[row]
-        y[:] = 0.0
+        for a in range(12):
+            y[a] = 0.0
         y[3] = y[7] = y[11] = 1.0
         wanted = 0
         for k in range(start.shape[0]):
             here, end = start[k], start[k] + width[k]
             while True:
                 while wanted < s.shape[0] and s[wanted] <= here + 1e-12 and rod[2][k] > 0.0:
-                    places[row, wanted] = y[:3]
+                    copy(y, places[row, wanted])
                     wanted += 1
                 if here >= end - 1e-15:
                     break
@@ -99,7 +100,7 @@ def _shapes(
                         y[a] += h * _WEIGHTS[stage] * slopes[stage, a]
                 here = to
         while wanted < s.shape[0]:
-            places[row, wanted] = y[:3]
+            copy(y, places[row, wanted])
             wanted += 1
 
 

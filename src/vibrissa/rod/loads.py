@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def _numbers(name: str, value: ArrayLike, vector: bool) -> Array:
     """Return float64, (..., 3) for vectors; raise a ValueError that says what is wrong."""
     try:
-        array = np.asarray(value, dtype=np.float64)
+        array = np.array(value, dtype=np.float64)  # a copy: the caller may go on using theirs
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} must be numbers; got {type(value).__name__}") from error
     if vector and (array.ndim == 0 or array.shape[-1] != 3):

@@ -135,7 +135,18 @@ class ContactMap:
         return estimate(self, signals, triplet, noise, method)
 
     def tree(self, triplet: tuple[str, ...]) -> Preimages:
-        """Return the search tree of three signals, made on first use."""
+        """Return the search tree of three signals, made on first use.
+
+        Parameters
+        ----------
+        triplet : tuple of str
+            The signals, in canonical order.
+
+        Returns
+        -------
+        Preimages
+            The tree.
+        """
         from vibrissa.mapping.inversion import triplet_tree
 
         if triplet not in self._trees:

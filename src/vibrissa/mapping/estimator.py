@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 class Located(NamedTuple):
     """What one measurement tells.
 
-    Attributes
+    Parameters
     ----------
     point : (3,) array
         Contact point with the least force, whisker frame, m; NaN if there is none.

@@ -45,6 +45,8 @@ class Deflection:
         How well the load's equations are met: lengths over L, directions; 0 for a PointForce.
     status : (...) int array
         A :class:`~vibrissa.Status` each.
+    steps : int
+        Integration steps along the whisker.
     """
 
     whisker: Whisker

@@ -143,7 +143,20 @@ def measured(
 
 
 def signal_scales(names: tuple[str, ...], force: float, moment: float) -> Array:
-    """What to divide signals by to make them non-dimensional, (k,); 1 for directions."""
+    """What to divide signals by to make them non-dimensional.
+
+    Parameters
+    ----------
+    names : tuple of str
+        The signals.
+    force, moment : float
+        Unit of force, N, and of moment, N·m.
+
+    Returns
+    -------
+    (k,) array
+        One for each signal; 1 for directions.
+    """
     scales = {"Fx": force, "FT": force, "Mx": moment, "MB": moment}
     return np.array([scales.get(name, 1.0) for name in names])
 

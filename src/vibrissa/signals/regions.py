@@ -73,7 +73,22 @@ def nearest_on_rest(whisker: Whisker, points: Array) -> tuple[Array, Array]:
 
 
 def within_cone(whisker: Whisker, points: Array, angle: float = CONE) -> AnyArray:
-    """Whether contact points (..., 3), m, lie within a cone about the resting whisker."""
+    """Whether contact points lie within a cone about the resting whisker.
+
+    Parameters
+    ----------
+    whisker : Whisker
+        The whisker.
+    points : (..., 3) array
+        Contact points in the whisker frame, m.
+    angle : float
+        Half angle of the cone, rad.
+
+    Returns
+    -------
+    (...) bool array
+        True inside; False for NaN.
+    """
     distance, arc_length = nearest_on_rest(whisker, points)
     return np.asarray(distance < arc_length * np.tan(angle))
 

@@ -1,0 +1,36 @@
+"""Bend one whisker, feel it at the base, and find the contact again from three signals.
+
+Aim: the whole idea in one screen. Data: the built-in γ whisker. Lesson: force and moment at the base
+tell where a frictionless whisker is touched, except near rest, where several contacts feel the same
+and a small error of the signals is a large error of the place.
+"""
+
+# %% A whisker: 40 mm long, tapered, curved, its tip bent out of the plane
+import numpy as np
+
+import vibrissa as vb
+
+whisker = vb.samples.gamma()
+print(whisker)
+
+# %% Touch it at three points (whisker frame, m): light, firm, and where it would have slipped off
+points = np.array([[0.030, 0.0115, 0.000], [0.024, 0.014, 0.002], [0.010, 0.030, 0.000]])
+bent = vb.deflect(whisker, vb.PointContact(points))
+for point, force, status in zip(points, bent.force, bent.status, strict=True):
+    print(point * 1e3, "mm:", np.round(force * 1e6, 2), "µN.", vb.Status(status).explanation)
+
+# %% What the follicle feels
+signals = vb.base_signals(bent.force, bent.moment)
+print(signals)
+
+# %% Back to the contact from axial force, bending moment and its direction, with a real sensor's noise
+contacts = vb.ContactMap.simulate(whisker, grid=False)
+noise = np.diag([1e-6] * 3 + [0.02e-6] * 3) ** 2  # 1 µN, 0.02 µN·m
+found = contacts.estimate(signals, triplet=("Fx", "MB", "MD"), noise=noise)
+for true, guess, covariance, n in zip(
+    points, found.point, found.covariance, found.n_candidates, strict=True
+):
+    if n:
+        sigma = np.sqrt(np.trace(covariance))
+        error = np.linalg.norm(guess - true)
+        print(f"{n} candidate(s), {error * 1e9:.3f} nm off, ± {sigma * 1e3:.2f} mm with the sensor")

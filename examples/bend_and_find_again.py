@@ -1,8 +1,8 @@
 """Bend one whisker, feel it at the base, and find the contact again from three signals.
 
-Aim: the whole idea in one screen. Data: the built-in γ whisker. Lesson: force and moment at the base
-tell where a frictionless whisker is touched, except near rest, where several contacts feel the same
-and a small error of the signals is a large error of the place.
+Aim: the whole idea in one screen. Data: the built-in γ whisker. Lesson: force and moment at the
+base tell where a frictionless whisker is touched; near rest a small error of the signals is a large
+error of the place, and several contacts may feel the same.
 """
 
 # %% A whisker: 40 mm long, tapered, curved, its tip bent out of the plane
@@ -23,7 +23,7 @@ for point, force, status in zip(points, bent.force, bent.status, strict=True):
 signals = vb.base_signals(bent.force, bent.moment)
 print(signals)
 
-# %% Back to the contact from axial force, bending moment and its direction, with a real sensor's noise
+# %% Back to the contact from axial force, bending moment and its direction, with a sensor's noise
 contacts = vb.ContactMap.simulate(whisker, grid=False)
 noise = np.diag([1e-6] * 3 + [0.02e-6] * 3) ** 2  # 1 µN, 0.02 µN·m
 found = contacts.estimate(signals, triplet=("Fx", "MB", "MD"), noise=noise)

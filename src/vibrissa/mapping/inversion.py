@@ -15,7 +15,7 @@ from vibrissa.rod.arrays import Array, IntArray, Rod
 from vibrissa.rod.batch import share_out
 from vibrissa.rod.compiled import copy, inlined, kernel
 from vibrissa.rod.kernels import BUFFER_SIZE, LANES
-from vibrissa.rod.newton import TOLERANCE, newton_group, stable
+from vibrissa.rod.newton import TOLERANCE, newton_group, stable, start_from
 from vibrissa.rod.preimage import MOST_SEEDS, Preimages, Tree, seeds, wrapped
 from vibrissa.rod.reach import Fold, Reach, chart_to_contact
 from vibrissa.signals.base import (
@@ -137,7 +137,7 @@ def _with_choice(targets: Array, triplet: tuple[str, ...]) -> Array:
 @inlined
 def _match(
     value: Array, tangents: Array, wanted: bool, target: Array, residual: Array, jacobian: Array
-) -> None:
+) -> float:
     which = np.empty(3, np.int64)
     for k in range(3):
         which[k] = int(target[3 + k])
@@ -146,18 +146,17 @@ def _match(
     px, py, pz = value[3], value[4], value[5]
     mx, my, mz = py * fz - pz * fy, pz * fx - px * fz, px * fy - py * fx
     force, moment = np.sqrt(fx * fx + fy * fy + fz * fz), np.sqrt(mx * mx + my * my + mz * mz)
+    total = 0.0
     for k in range(3):
         residual[k] -= target[k]
         w = which[k]
+        scale = 1.0
         if w == 2 or w == 5:
             residual[k] = wrapped(residual[k])
-            scale = 1.0
         else:
             scale = 1.0 / (force if w < 2 else moment)
-        residual[k] *= scale
-        if wanted:
-            for c in range(3):
-                jacobian[k, c] *= scale
+        total += (scale * residual[k]) ** 2
+    return float(np.sqrt(total))
 
 
 @inlined
@@ -200,6 +199,8 @@ def _invert(
 ) -> None:
     b = np.zeros(BUFFER_SIZE)
     found, quality = np.empty((MOST_SEEDS, 3)), np.empty(MOST_SEEDS, np.int64)
+    slopes = np.empty((MOST_SEEDS, 3, 3))
+    charts, inverses = np.empty((LANES, 3)), np.empty((LANES, 3, 3))
     rows, group_targets = np.empty(LANES, np.int64), np.empty((LANES, 6))
     group, group_values = np.empty((LANES, 3)), np.empty((LANES, 6))
     misfits, signs = np.empty(LANES), np.empty(LANES)
@@ -207,7 +208,7 @@ def _invert(
     for row in range(first, last + 1):
         n = 0
         if row < last:
-            n = seeds(tree, targets[row], found, quality)
+            n = seeds(tree, targets[row], found, slopes, quality)
         elif waiting > 0:
             n = 1  # the last few, fewer than there are lanes
         for seed in range(n):
@@ -215,11 +216,25 @@ def _invert(
                 rows[waiting] = row
                 copy(targets[row], group_targets[waiting])
                 chart_to_contact(fold, found[seed], group[waiting])
+                start_from(
+                    found[seed], slopes[seed], quality[seed], charts[waiting], inverses[waiting]
+                )
                 waiting += 1
             if waiting < LANES and row < last:
                 continue
             newton_group(
-                _match, rod, fold, b, waiting, group_targets, group, group_values, misfits, signs
+                _match,
+                rod,
+                fold,
+                b,
+                waiting,
+                group_targets,
+                charts,
+                inverses,
+                group,
+                group_values,
+                misfits,
+                signs,
             )
             for i in range(waiting):
                 if misfits[i] <= TOLERANCE and stable(fold, proximal, group[i], signs[i]):
@@ -240,6 +255,7 @@ def _polish(
     last: int,
 ) -> None:
     b = np.zeros(BUFFER_SIZE)
+    charts, inverses = np.zeros((LANES, 3)), np.full((LANES, 3, 3), np.nan)
     for row in range(first, last, LANES):
         end = min(row + LANES, last)
         newton_group(
@@ -249,6 +265,8 @@ def _polish(
             b,
             end - row,
             targets[row:end],
+            charts,
+            inverses,
             xi[row:end],
             values[row:end],
             misfits[row:end],

@@ -1,14 +1,17 @@
 """Newton's method on the rod, four contacts at a time.
 
-The Jacobian costs four times the values, so it is computed where a problem starts and again only
+A problem that starts from a seed of the chart (:mod:`vibrissa.rod.preimage`) first takes chord
+steps in the chart's coordinates with the interpolant's own Jacobian, which is right to a part in a
+thousand: three or four evaluations of the rod, no derivatives. What that does not solve takes
+Newton steps in ξ. The exact Jacobian costs four times the values, so it is computed again only
 where the last one has stopped serving (a chord step that reduces the residual less than tenfold).
 
 An *equation* tells what must vanish: an inlined function
 
-    equation(value (6,), tangents (6, 3), wanted, target, residual (3,), jacobian (3, 3))
+    equation(value (6,), tangents (6, 3), wanted, target, residual (3,), jacobian (3, 3)) -> misfit
 
 that fills ``residual`` and, if ``wanted``, ``jacobian`` (its derivatives with respect to ξ) from
-base force and contact point. Equations scale their residuals so that 1 is large.
+base force and contact point, and returns the residual's norm in units in which 1 is large.
 """
 
 from __future__ import annotations
@@ -22,7 +25,7 @@ from vibrissa.rod.arrays import Array, Rod
 from vibrissa.rod.compiled import copy, inlined
 from vibrissa.rod.kernels import LANES, integrate, lane_tangents, lane_value, set_lane
 from vibrissa.rod.preimage import solve3
-from vibrissa.rod.reach import LEAST_ARC, Fold, fold_force
+from vibrissa.rod.reach import LEAST_ARC, Fold, chart_to_contact, fold_force
 
 #: Residual at which an equation is solved.
 TOLERANCE = 1e-11
@@ -32,6 +35,7 @@ ROUNDING = 1e-9
 _ROUNDS = 30
 # Rounds with a fresh Jacobian that may fail to improve on the best residual.
 _MOST_FAILURES = 4
+_CHORD_ROUNDS = 6
 # Beyond this share of the fold force a solution's determinant is computed at the solution.
 _NEAR_FOLD = 0.97
 
@@ -54,6 +58,56 @@ def limited_step(fold: Fold, xi: Array, step: Array) -> None:
 
 
 @inlined
+def _chord_rounds(
+    equation: Callable[..., Any],
+    rod: Rod,
+    fold: Fold,
+    b: Array,
+    count: int,
+    targets: Array,
+    charts: Array,
+    inverses: Array,
+    xi: Array,
+    values: Array,
+    misfits: Array,
+) -> None:
+    """Chord steps in the chart for the rows with ``inverses``; see :func:`newton_group`."""
+    value, residual = np.empty(6), np.empty(3)
+    tangents, jacobian = np.empty((6, 3)), np.empty((3, 3))
+    active = np.zeros(LANES, np.bool_)
+    busy = False
+    for i in range(count):
+        active[i] = inverses[i, 0, 0] == inverses[i, 0, 0]
+        busy = busy or active[i]
+    for _ in range(_CHORD_ROUNDS):
+        if not busy:
+            return
+        for i in range(LANES):
+            j = i if i < count else 0
+            set_lane(b, i, xi[j, 0], 0.0, xi[j, 1], xi[j, 2], False)
+        integrate(rod, b, False)
+        busy = False
+        for i in range(count):
+            if not active[i]:
+                continue
+            lane_value(b, i, value)
+            misfit = equation(value, tangents, False, targets[i], residual, jacobian)
+            if not misfit < 0.3 * misfits[i]:
+                active[i] = False
+                misfits[i] = np.inf
+                continue
+            misfits[i] = misfit
+            copy(value, values[i])
+            active[i] = misfit > TOLERANCE
+            if active[i]:
+                busy = True
+                for a in range(3):
+                    for c in range(3):
+                        charts[i, a] -= inverses[i, a, c] * residual[c]
+                chart_to_contact(fold, charts[i], xi[i])
+
+
+@inlined
 def newton_group(
     equation: Callable[..., Any],
     rod: Rod,
@@ -61,6 +115,8 @@ def newton_group(
     b: Array,
     count: int,
     targets: Array,
+    charts: Array,
+    inverses: Array,
     xi: Array,
     values: Array,
     misfits: Array,
@@ -80,25 +136,39 @@ def newton_group(
         How many of the four rows below are problems.
     targets : (4, k) array
         What the equation is to meet.
+    charts : (4, 3) array
+        Seeds in the chart's coordinates (η, ψ, ρ); overwritten.
+    inverses : (4, 3, 3) array
+        Inverse Jacobians there, ∂(η, ψ, ρ)/∂(equations); NaN for rows that take Newton steps at
+        once.
     xi : (4, 3) array
-        Seeds; replaced by solutions.
+        The same seeds as contacts; replaced by solutions.
     values : (4, 6) array
         Filled with (F, p) at the solution.
     misfits : (4,) array
         Filled with the residual's norm; above ``TOLERANCE`` where there was no convergence.
     signs : (4,) array
-        Filled with det ∂p/∂ξ at the last Jacobian's place; that is within the last step of the
-        solution.
+        Filled with det ∂p/∂ξ at the last Jacobian's place, within the last step of the solution;
+        1 where the chart alone led to a solution well short of the fold.
     """
     value, tangents = np.empty(6), np.empty((6, 3))
     residual, step = np.empty(3), np.empty(3)
     jacobians = np.empty((LANES, 3, 3))
     active, stale = np.zeros(LANES, np.bool_), np.ones(LANES, np.bool_)
     hard, failures = np.zeros(LANES, np.bool_), np.zeros(LANES, np.int64)
-    for i in range(LANES):
-        active[i] = stale[i] = i < count
     for i in range(count):
         misfits[i] = np.inf
+    _chord_rounds(equation, rod, fold, b, count, targets, charts, inverses, xi, values, misfits)
+    busy = False
+    for i in range(count):
+        signs[i] = 1.0
+        active[i] = stale[i] = not misfits[i] <= TOLERANCE or charts[i, 2] > _NEAR_FOLD
+        misfits[i] = np.inf if active[i] else misfits[i]
+        busy = busy or active[i]
+    for i in range(count, LANES):
+        active[i] = stale[i] = False
+    if not busy:
+        return
     for _ in range(_ROUNDS):
         wanted = False
         for i in range(LANES):
@@ -114,8 +184,7 @@ def newton_group(
             if wanted:
                 lane_tangents(b, i, tangents)
                 signs[i] = point_determinant(tangents)
-            equation(value, tangents, wanted, targets[i], residual, jacobians[i])
-            misfit = norm3(residual)
+            misfit = equation(value, tangents, wanted, targets[i], residual, jacobians[i])
             stale[i] = not misfit < 0.1 * misfits[i]
             # Once a chord has failed there is no gain in trying more of them.
             hard[i] = hard[i] or (stale[i] and not wanted)
@@ -145,6 +214,15 @@ def newton_group(
             busy = True
         if not busy:
             break
+
+
+@inlined
+def start_from(found: Array, slopes: Array, quality: int, chart: Array, inverse: Array) -> None:
+    """Set a row of :func:`newton_group` from a seed; what is not solved takes Newton steps."""
+    copy(found, chart)
+    for a in range(3):
+        for c in range(3):
+            inverse[a, c] = slopes[a, c] if quality == 2 else np.nan
 
 
 @inlined

@@ -14,7 +14,7 @@ from vibrissa.rod.compiled import copy, inlined, kernel
 from vibrissa.rod.continuation import follow
 from vibrissa.rod.equations import POINT
 from vibrissa.rod.kernels import BUFFER_SIZE, LANES
-from vibrissa.rod.newton import TOLERANCE, newton_group, stable
+from vibrissa.rod.newton import TOLERANCE, newton_group, norm3, stable, start_from
 from vibrissa.rod.preimage import MOST_SEEDS, Preimages, Tree, seeds
 from vibrissa.rod.reach import (
     Fold,
@@ -60,12 +60,13 @@ class Solutions(NamedTuple):
 @inlined
 def _at_point(
     value: Array, tangents: Array, wanted: bool, target: Array, residual: Array, jacobian: Array
-) -> None:
+) -> float:
     for a in range(3):
         residual[a] = value[3 + a] - target[a]
         if wanted:
             for c in range(3):
                 jacobian[a, c] = tangents[3 + a, c]
+    return norm3(residual)
 
 
 @kernel
@@ -85,13 +86,15 @@ def _solve_points(
     """Solve contact points (n, 3) where the chart has a seed that leads to a stable solution."""
     b = np.zeros(BUFFER_SIZE)
     found, quality = np.empty((MOST_SEEDS, 3)), np.empty(MOST_SEEDS, np.int64)
+    slopes = np.empty((MOST_SEEDS, 3, 3))
+    charts, inverses = np.empty((LANES, 3)), np.empty((LANES, 3, 3))
     rows, targets, group = np.empty(LANES, np.int64), np.empty((LANES, 3)), np.empty((LANES, 3))
     group_values, group_misfits = np.empty((LANES, 6)), np.empty(LANES)
     signs = np.empty(LANES)
     count = 0
     for row in range(first, last):
         solved[row] = 0
-        n = seeds(tree, points[row], found, quality)
+        n = seeds(tree, points[row], found, slopes, quality)
         if n > 0:
             solved[row] = -1
             best = 0
@@ -103,10 +106,22 @@ def _solve_points(
             rows[count] = row
             copy(points[row], targets[count])
             chart_to_contact(fold, found[best], group[count])
+            start_from(found[best], slopes[best], quality[best], charts[count], inverses[count])
             count += 1
         if count == LANES or (row == last - 1 and count > 0):
             newton_group(
-                _at_point, rod, fold, b, count, targets, group, group_values, group_misfits, signs
+                _at_point,
+                rod,
+                fold,
+                b,
+                count,
+                targets,
+                charts,
+                inverses,
+                group,
+                group_values,
+                group_misfits,
+                signs,
             )
             for i in range(count):
                 if group_misfits[i] <= TOLERANCE and stable(fold, proximal, group[i], signs[i]):

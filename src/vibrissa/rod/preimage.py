@@ -33,7 +33,7 @@ from vibrissa.rod.reach import Reach
 # coordinates y = A (T - base): A (3 rows), base, least y, largest y 6 edges (cells, 3, 40): the
 # interpolant, T - base 7 folded (cells,): whether the map may fold inside, so that a cell may hold
 # several solutions
-Tree = tuple[Array, Array, IntArray, Array, IntArray, Array, Array, AnyArray]
+Tree = tuple[Array, Array, IntArray, Array, IntArray, Array, Array, IntArray]
 
 #: At most so many contacts are found for one target.
 MOST_SEEDS = 32
@@ -48,9 +48,12 @@ _STACK = 256
 # Cells whose linear part is flatter than this (det relative to the product of its columns) are not
 # aligned.
 _FLAT = 1e-3
-# A cell may hold a fold if det at a corner is below this share of the largest, or has another sign.
+# A cell may hold a fold, and so two solutions, if at a corner the volume that its edges' slopes
+# span is below this share of the largest, or has another sign.
+_FOLDED = 0.03
+# One start may fail to find the one solution where that share is below this, or where the cell in
+# its own aligned coordinates is larger than this; the unit cube is 1.
 _EVEN = 0.1
-# So may one that in its own aligned coordinates is larger than this; the unit cube is 1.
 _SHEARED = 3.0
 
 
@@ -96,7 +99,6 @@ class Preimages:
         base = values[tuple(place.T)]
         points = _bezier_points(corner, slope)
         aligned = _aligned(corner, points, base)
-        sheared = (aligned[:, 5] - aligned[:, 4]).max(axis=1) > _SHEARED
         offsets, boxes = _boxes(points + base[:, None], circular, place)
         return cls(
             (
@@ -107,7 +109,7 @@ class Preimages:
                 place,
                 aligned,
                 _edges(corner, slope),
-                _may_fold(slope) | sheared,
+                _care(slope, aligned),
             )
         )
 
@@ -209,11 +211,15 @@ def _edges(corner: Array, slope: Array) -> Array:
     return np.ascontiguousarray(np.concatenate(parts, axis=-1))
 
 
-def _may_fold(slope: Array) -> AnyArray:
-    """Whether det ∂T/∂x comes near zero or changes sign within a cell."""
-    det = np.linalg.det(slope).reshape(len(slope), 8)
-    det *= np.sign(det[:, :1])
-    return np.asarray(det.min(axis=1) <= _EVEN * np.abs(det).max(axis=1))
+def _care(slope: Array, aligned: Array) -> IntArray:
+    """How many starts a cell needs: 0 one, 1 several until one is solved, 2 all of them."""
+    det = np.linalg.det(slope)
+    size = np.prod(np.linalg.norm(slope, axis=-2), axis=-1)
+    flatness = (det / np.where(size > 0.0, size, 1.0)).reshape(len(slope), 8)
+    flatness *= np.sign(flatness[:, :1])
+    least, most = flatness.min(axis=1), np.abs(flatness).max(axis=1)
+    sheared = (aligned[:, 5] - aligned[:, 4]).max(axis=1) > _SHEARED
+    return np.where(least <= _FOLDED * most, 2, np.where((least <= _EVEN * most) | sheared, 1, 0))
 
 
 @inlined
@@ -308,7 +314,9 @@ def _locate(tree: Tree, cell: int, target: Array, relative: Array, x: Array) -> 
 
 
 @inlined
-def _invert(edges: Array, relative: Array, half: Array, work: Array, folded: bool, x: Array) -> int:
+def _invert(
+    edges: Array, relative: Array, half: Array, work: Array, careful: bool, x: Array
+) -> int:
     """Solve a cell's interpolant: 2 solved, 1 nearly so (a fold of the map), 0 not in the cell."""
     misfit, step, best, gradient = work[0], work[1], work[2], work[3:6]
     least = np.inf
@@ -321,7 +329,7 @@ def _invert(edges: Array, relative: Array, half: Array, work: Array, folded: boo
         if solve3(gradient, misfit, step) == 0.0:
             break
         size = max(abs(step[0]), abs(step[1]), abs(step[2]))
-        if n == 0 and not folded:  # nearly linear: the first step tells which cell it is in
+        if n == 0 and not careful:  # nearly linear: the first step tells which cell it is in
             reach = max(
                 abs(x[0] - step[0] - 0.5), abs(x[1] - step[1] - 0.5), abs(x[2] - step[2] - 0.5)
             )
@@ -331,19 +339,31 @@ def _invert(edges: Array, relative: Array, half: Array, work: Array, folded: boo
         for a in range(3):
             x[a] = min(max(x[a] - shorten * step[a], -0.5), 1.5)
         if size < 2e-2:  # the next step would be of its square
-            return 2 if _outside(x) <= _OVERLAP else 0
+            if _outside(x) > _OVERLAP:
+                return 0
+            _interpolate(edges, x, relative, misfit, gradient)
+            return 2
     copy(best, x)
     return 1 if least <= _NEARLY and _outside(x) <= 0.25 else 0
 
 
 @inlined
 def _keep(
-    grid: Array, place: IntArray, x: Array, solved: int, found: Array, quality: IntArray, count: int
+    grid: Array,
+    place: IntArray,
+    x: Array,
+    gradient: Array,
+    solved: int,
+    found: Array,
+    inverses: Array,
+    quality: IntArray,
+    count: int,
 ) -> int:
     """Add a seed unless neighbours found it; what is solved replaces what is not."""
     eta = grid[0, 0] + grid[1, 0] * (place[0] + x[0])
     psi = grid[0, 1] + grid[1, 1] * (place[1] + x[1])
     rho = grid[0, 2] + grid[1, 2] * (place[2] + x[2])
+    row = count
     for n in range(count):
         apart = max(
             abs(eta - found[n, 0]) / grid[1, 0],
@@ -351,19 +371,32 @@ def _keep(
             abs(rho - found[n, 2]) / grid[1, 2],
         )
         if apart < 0.02 or (apart < 0.5 and solved + quality[n] < 4):
-            if solved > quality[n]:
-                found[n, 0], found[n, 1], found[n, 2] = eta, psi, rho
-                quality[n] = solved
-            return count
-    if count < MOST_SEEDS:
-        found[count, 0], found[count, 1], found[count, 2] = eta, psi, rho
-        quality[count] = solved
-        count += 1
-    return count
+            if solved <= quality[n]:
+                return count
+            row = n
+            break
+    if row == MOST_SEEDS:
+        return count
+    found[row, 0], found[row, 1], found[row, 2] = eta, psi, rho
+    quality[row] = solved
+    _inverse(gradient, grid[1], inverses[row])
+    return max(count, row + 1)
+
+
+@inlined
+def _inverse(gradient: Array, size: Array, inverse: Array) -> None:
+    """∂(η, ψ, ρ)/∂T from ∂T/∂x in cell widths; NaN where there is none."""
+    unit, column = np.zeros(3), np.empty(3)
+    for c in range(3):
+        unit[c] = 1.0
+        singular = solve3(gradient, unit, column) == 0.0
+        unit[c] = 0.0
+        for a in range(3):
+            inverse[a, c] = np.nan if singular else column[a] * size[a]
 
 
 @kernel
-def seeds(tree: Tree, target: Array, found: Array, quality: IntArray) -> int:
+def seeds(tree: Tree, target: Array, found: Array, inverses: Array, quality: IntArray) -> int:
     """All contacts that may have the target's values, as chart coordinates.
 
     Parameters
@@ -374,6 +407,8 @@ def seeds(tree: Tree, target: Array, found: Array, quality: IntArray) -> int:
         The values.
     found : (MOST_SEEDS, 3) array
         Filled with (η, ψ, ρ).
+    inverses : (MOST_SEEDS, 3, 3) array
+        Filled with the interpolant's ∂(η, ψ, ρ)/∂T there.
     quality : (MOST_SEEDS,) int array
         Filled with 2 (the interpolant is solved) or 1 (it is not: near a fold of the map).
 
@@ -383,7 +418,7 @@ def seeds(tree: Tree, target: Array, found: Array, quality: IntArray) -> int:
         How many.
     """
     grid, turns, offsets, boxes, place = tree[0], tree[1], tree[2], tree[3], tree[4]
-    edges, folded = tree[6], tree[7]
+    edges, care = tree[6], tree[7]
     levels = offsets.shape[0] - 1
     stack = np.empty((_STACK, 2), np.int64)
     inside = np.empty(8, np.bool_)
@@ -412,13 +447,15 @@ def seeds(tree: Tree, target: Array, found: Array, quality: IntArray) -> int:
                 continue
             if not _locate(tree, child, target, relative, x):
                 continue
-            # Where the map may fold, one start may miss one of two solutions: start at the corners
-            # too.
-            for start in range(9 if folded[child] else 1):
+            for start in range(9 if care[child] > 0 else 1):  # the place itself, then the corners
                 if start > 0:
                     for a in range(3):
                         x[a] = (start - 1) >> a & 1
-                solved = _invert(edges[child], relative, box[3:, c], work, folded[child], x)
+                solved = _invert(edges[child], relative, box[3:, c], work, care[child] > 0, x)
                 if solved > 0:
-                    count = _keep(grid, place[child], x, solved, found, quality, count)
+                    count = _keep(
+                        grid, place[child], x, work[3:6], solved, found, inverses, quality, count
+                    )
+                if solved == 2 and care[child] < 2:
+                    break
     return count

@@ -285,7 +285,7 @@ _ROWS: tuple[tuple[str, str, _Unit, str, str], ...] = (
         r"\chi",
         _NUMBER,
         "misfit",
-        "Of the signals, in standard deviations of their noise.",
+        "How far signals are from any that a contact explains, in shares of each signal's range.",
     ),
     ("candidates", "n", _NUMBER, "number of candidates", "Contacts that explain the signals."),
     ("share", r"\mathrm{share}", _PERCENT, "share", "Of all rows."),

@@ -100,7 +100,7 @@ class Status(enum.IntEnum):
     NOT_FRICTIONLESS = (
         22,
         False,
-        "No frictionless contact of this whisker explains the signals.",
+        "No frictionless contact on the side of this whisker explains the signals.",
         "Check the whisker's shape, taper and stiffness and the sensor's offset; with friction, "
         "estimate from all six signals.",
     )

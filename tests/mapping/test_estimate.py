@@ -141,6 +141,9 @@ def test_statuses(gamma_map):
     assert impossible.misfit > 0.1
     assert np.isnan(impossible.point).all()
 
+    resting = gamma_map.estimate({"Fx": 0.0, "MB": 0.0, "MD": 0.0})
+    assert resting.status == vb.Status.DEGENERATE
+
     near_base = vb.deflect(
         whisker, vb.PointForce(0.24 * whisker.length, magnitude=3e-4, direction=0.4)
     )
@@ -154,6 +157,10 @@ def test_bad_input_says_what_is_allowed(gamma_map):
         gamma_map.estimate({"Fx": 1e-5})
     with pytest.raises(ValueError, match="expected 3 signals; got 4"):
         gamma_map.estimate(signals, triplet="Fx FT MB MD")
+    with pytest.raises(ValueError, match="MB is a size and cannot be negative"):
+        gamma_map.estimate({**signals, "MB": -1e-7})
+    with pytest.raises(ValueError, match="looks like degrees"):
+        gamma_map.estimate({**signals, "MD": 90.0})
     with pytest.raises(ValueError, match="noise lacks MD"):
         gamma_map.estimate(signals, noise={"Fx": 1e-6, "MB": 1e-8})
     with pytest.raises(ValueError, match=r"got shape \(3, 3\)"):

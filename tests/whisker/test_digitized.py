@@ -235,3 +235,11 @@ def test_real_whiskers_load():
         assert (bending(whisker, s / whisker.length) * whisker.length).max() < 3.2
         assert whisker.position(s)[:, 1].mean() >= 0.0
         assert sum("estimated" in note for note in whisker.notes) == 1
+
+
+@pytest.mark.parametrize("n", [4, 5, 7])
+def test_few_points_of_a_curved_whisker_are_not_taken_for_a_straight_one(n):
+    """Seven per cent of the length off the chord is curvature, whatever a test could prove."""
+    whisker = Whisker.from_points(Whisker.parabola(0.04, 10.0).centerline(n))
+    assert not whisker.is_straight
+    assert whisker.length == pytest.approx(0.04, rel=2e-3)

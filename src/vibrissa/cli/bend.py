@@ -90,7 +90,7 @@ def _named(**values: str | None) -> list[tuple[str, str | None]]:
 def _print(whisker: str, bent: Deflection) -> None:
     from rich.table import Table
 
-    from vibrissa.demo.locate import spherical
+    from vibrissa.mapping.contact_map import spherical
     from vibrissa.quantities import quantity
     from vibrissa.signals import SIGNALS, base_signals
     from vibrissa.status import Status

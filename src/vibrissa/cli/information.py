@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
 
 from vibrissa.cli.terminal import output
@@ -108,7 +109,7 @@ def _table(path: Path) -> Iterator[tuple[str, str]]:
             yield from (("note", note) for note in data.notes)
             return
         time = data["time"].values
-        yield "rows", f"{time.size}, from {time.min():g} to {time.max():g} s"
+        yield "rows", f"{time.size}, from {np.nanmin(time):g} to {np.nanmax(time):g} s"
         if kind == "contacts":
             for sentence, count in describe(data["status"].values).most_common():
                 yield str(count), sentence

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.contour import continuing_candidates, covariance_to_laboratory, to_laboratory
 from vibrissa.mapping import ContactMap
+from vibrissa.mapping.contact_map import spherical
 from vibrissa.quantities import attributes
 from vibrissa.signals import base_signals
 from vibrissa.status import Status, flag_attributes
@@ -178,11 +179,3 @@ def contact_columns(contacts: xr.Dataset) -> xr.Dataset:
     columns = {name: ("time", values[:, i], attributes(name)) for i, name in enumerate(names)}
     table = xr.Dataset(columns, {"time": contacts["time"]}, contacts.attrs)
     return table.assign(status=contacts["status"])
-
-
-def spherical(points: Array) -> Array:
-    """(r, θ, φ) of points (..., 3): distance, azimuth atan2(y, x), elevation asin(z/r)."""
-    r = np.linalg.norm(points, axis=-1)
-    theta = np.arctan2(points[..., 1], points[..., 0])
-    phi = np.arctan2(points[..., 2], np.hypot(points[..., 0], points[..., 1]))
-    return np.stack([r, theta, phi], axis=-1)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from vibrissa.demo.locate import spherical
+from vibrissa.mapping.contact_map import spherical
 from vibrissa.signals import base_signals
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa.contour import CylinderFit, axis_offset, surface_distances
-from vibrissa.demo.locate import spherical
+from vibrissa.mapping.contact_map import spherical
 from vibrissa.signals import nearest_on_rest
 from vibrissa.whisker import Whisker
 

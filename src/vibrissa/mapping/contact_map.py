@@ -86,8 +86,7 @@ class ContactMap:
             Smallest arc length of a contact, as a fraction of the length.
         cells : tuple of int
             Cells of the chart along arc length, bearing and load; each the same power of two times
-            a small
-            number. They set how fast estimates are found, not how exact they are.
+            a small number. They set how fast estimates are found, not how exact they are.
         steps : int
             Integration steps along the whisker.
         grid : bool
@@ -169,11 +168,9 @@ class ContactMap:
         -------
         Dataset
             Over ``station`` (arc length over L), ``bearing`` (of the force, rad) and ``load``
-            (square root of the force
-            over the fold force): contact point, its spherical form, arc length, force, moment,
-            signals,
-            derivatives of contact point and force with respect to (arc length, f_y, f_z), regions
-            and status.
+            (square root of the force over the fold force): contact point, its spherical form, arc
+            length, force, moment, signals, derivatives of contact point and force with respect to
+            (arc length, f_y, f_z), regions and status.
         """
         if domain not in ("reachable", "paper"):
             raise ValueError(f"domain is 'reachable' or 'paper'; got {domain!r}")

@@ -46,8 +46,7 @@ class Estimate:
         or ``MISSING``.
     misfit : (...) array
         0 where the signals are explained; else how far, in shares of each signal's range, they are
-        from the nearest
-        ones that are.
+        from the nearest ones that are.
     arc_length : (...) array
         Arc length of the contact, m.
     force, moment : (..., 3) arrays
@@ -99,7 +98,7 @@ class Estimate:
                 "arc_length": (dims, self.arc_length, attributes("arc_length")),
                 "force": (space, self.force, attributes("force")),
                 "moment": (space, self.moment, attributes("moment")),
-                "misfit": (dims, self.misfit, {"units": "1", "long_name": "misfit of the signals"}),
+                "misfit": (dims, self.misfit, attributes("misfit")),
                 "candidates": (
                     (*dims, "candidate", "space"),
                     self.candidates,
@@ -164,6 +163,7 @@ def estimate(
     names = selection(triplet, exactly=3)
     sigma = None if noise is None else _checked_noise(noise, names)
     values, dims = measured(signals, names)
+    _check_signals(values, names)
     shape = values.shape[:-1]
     dims = dims or (
         ("sample",) if len(shape) == 1 else tuple(f"axis_{i}" for i in range(len(shape)))
@@ -195,6 +195,20 @@ def estimate(
         triplet=names,
         dims=dims,
     )
+
+
+def _check_signals(values: Array, names: tuple[str, ...]) -> None:
+    """Raise a ValueError for what no sensor in SI units can say."""
+    for k, name in enumerate(names):
+        if name in ("FT", "MB") and (values[..., k] < 0.0).any():
+            raise ValueError(
+                f"{name} is a size and cannot be negative; got {np.nanmin(values[..., k])}"
+            )
+        if CIRCULAR[SIGNALS.index(name)] and (np.abs(values[..., k]) > 2.0 * np.pi).any():
+            largest = np.nanmax(np.abs(values[..., k]))
+            raise ValueError(
+                f"{name} is an angle in rad; got {largest:g}, which looks like degrees"
+            )
 
 
 def _explain(
@@ -229,6 +243,9 @@ def _explain(
     xi, _, residual, sign = polish(chart, names, targets[rows], start)
     nearer = (residual <= TOLERANCE) & (sign > 0.0) & (xi[:, 0] < chart.proximal)
     status[rows] = np.where(nearer, int(Status.OUTSIDE_MAP), int(Status.NOT_FRICTIONLESS))
+    # Forces and moments of zero come from a whisker that touches nothing.
+    sizes = np.where(turned, 0.0, np.abs(targets[rows]))
+    status[rows[sizes.max(axis=1) == 0.0]] = int(Status.DEGENERATE)
 
 
 def _on_circle(values: Array, which: list[int], size: Array) -> Array:

@@ -136,10 +136,10 @@ def _reason(kind: int, path: Array, x_ok: Array, proximal: float) -> int:
         return _NO_CONTACT
     if path[_PAST_TIP] > 0.0 or kind == TIP:
         return _BEYOND_TIP
+    if x_ok[0] < proximal:
+        return _PROXIMAL
     sped_up = path[_SPEED] > _SPED_UP * path[_SLOWEST] or not path[_SPEED] < _FAST
-    if path[_RATIO] < _NEAR_FOLD or sped_up:
-        return _BEYOND_FOLD
-    return _PROXIMAL if x_ok[0] < proximal else _FAILED
+    return _BEYOND_FOLD if path[_RATIO] < _NEAR_FOLD or sped_up else _FAILED
 
 
 @inlined

@@ -108,18 +108,16 @@ def deflect(
         What bends it; arrays of any leading shape.
     proximal : float
         Contacts at less than this fraction of the length from the base get a status instead of an
-        answer
-        (not for a ``PointForce``).
+        answer (not for a ``PointForce``).
     steps : int
         Integration steps along the whisker. The default is good to 1e-6; the error falls with the
-        sixth
-        power.
+        sixth power.
 
     Returns
     -------
     Deflection
-        The stable equilibrium that is connected to rest, for each load, or the reason why there is
-        none.
+        The stable equilibrium that is connected to rest, for each contact, or the reason why there
+        is none; the one equilibrium of each ``PointForce``.
 
     Raises
     ------

@@ -129,8 +129,7 @@ def _with_joint(rod: Rod, moment_scale: float, bending: float, twist: float) -> 
     """Put a compliant base before the rod: one unit of rod without length, as soft as the joint.
 
     Such a piece turns by the rotation that its moment asks for and moves nothing, so it is a
-    torsion
-    spring; being rod, it needs no equations of its own.
+    torsion spring; being rod, it needs no equations of its own.
     """
     n = _JOINT_STEPS
     start, width, extent, twists, bends, shape = rod

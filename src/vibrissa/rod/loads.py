@@ -41,6 +41,9 @@ def _broadcast(**shapes: tuple[int, ...]) -> tuple[int, ...]:
 class PointForce:
     """A known force at a known place of the whisker.
 
+    Any such force has exactly one equilibrium, and that is what is given; whether an object there
+    could hold it, or the whisker would slip off, is not asked.
+
     Parameters
     ----------
     arc_length : array_like
@@ -58,8 +61,7 @@ class PointForce:
     ------
     ValueError
         If shapes do not broadcast, if arc lengths are not positive, or if neither or both ways of
-        giving the
-        force are used.
+        giving the force are used.
     """
 
     arc_length: Any
@@ -141,8 +143,8 @@ class PegContact:
     """The whisker lies against a straight peg, without friction.
 
     Without a radius the peg is a line that the whisker's centreline meets. With one it is a solid
-    cylinder and the
-    surfaces touch: the centreline passes the axis at the peg's radius plus the whisker's there.
+    cylinder and the surfaces touch: the centreline passes the axis at the peg's radius plus the
+    whisker's there.
 
     Parameters
     ----------
@@ -154,22 +156,18 @@ class PegContact:
         Radius, m, shape (...); 0 for a line.
     side : array_like, optional
         Approximate direction of the force on the whisker, which tells on which side of the peg the
-        whisker lies,
-        shape (..., 3). By default a line pushes from where the resting whisker is nearest to it,
-        and a
-        cylinder pushes the whisker out on the side that is nearest.
+        whisker lies, shape (..., 3). By default a line pushes from where the resting whisker is
+        nearest to it, and a cylinder pushes the whisker out on the side that is nearest.
     start : Deflection, optional
         An earlier deflection by a peg (the same one, elsewhere) to go on from: the contact stays on
-        its side, slides
-        and slips as the peg moves. Where it had no contact, the whisker is on the side of the peg
-        where it was.
+        its side, slides and slips as the peg moves. Where it had no contact, the whisker is on the
+        side of the peg where it was.
 
     Raises
     ------
     ValueError
         If shapes are wrong or do not broadcast, an axis is zero, a radius is negative, lines and
-        cylinders are
-        mixed, or both ``side`` and ``start`` are given.
+        cylinders are mixed, or both ``side`` and ``start`` are given.
     """
 
     origin: Any
@@ -197,9 +195,14 @@ class PegContact:
         if self.side is not None:
             side = _numbers("side", self.side, vector=True)
             shapes["side"] = side.shape[:-1]
+            toward, along = np.broadcast_arrays(side, axis)
+            across = np.cross(toward, along)
+            bound = 1e-9 * np.linalg.norm(side, axis=-1) * length[..., 0]
+            if (np.linalg.norm(across, axis=-1) <= bound).any():
+                raise ValueError("side must not be (0, 0, 0) or along the peg's axis")
         if self.start is not None:
-            if not isinstance(self.start.load, PegContact):
-                got = type(self.start.load).__name__
+            if not isinstance(getattr(self.start, "load", None), PegContact):
+                got = type(getattr(self.start, "load", self.start)).__name__
                 raise ValueError(f"start must be a deflection by a PegContact; got one by {got}")
             shapes["start"] = self.start.status.shape
         shape = _broadcast(**shapes)

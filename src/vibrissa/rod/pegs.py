@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 _SAMPLES = 513
 # The first touch, as deep as the least force needs.
 _DEPTH = 1e-6
+# An axis this near (over L) goes through the whisker.
+_TOUCHING = 1e-9
 _ROWS = 4096
 
 
@@ -57,7 +59,7 @@ class Rest(NamedTuple):
     @lru_cache(maxsize=16)
     def of(cls, whisker: Whisker) -> Rest:
         """Sample a whisker; cached."""
-        s = np.linspace(LEAST_ARC, 1.0, _SAMPLES)
+        s = np.linspace(0.0, 1.0, _SAMPLES)
         arc_length = np.minimum(s * whisker.length, whisker.length)
         return cls(
             s,
@@ -78,19 +80,32 @@ def nearest_side(rest: Rest, pegs: Pegs, outward: bool) -> Array:
         The pegs.
     outward : bool
         Whether they point from the axis to the whisker (the side of a solid peg on which the
-        whisker lies)
-        or from the whisker to the axis (the way a line must push to be where it is).
+        whisker lies) or from the whisker to the axis (the way a line must push to be where it is).
 
     Returns
     -------
     (n, 3) array
-        The directions; zero where the whisker meets the axis.
+        The directions.
     """
+    rows = np.arange(len(pegs.axis))
     away = _normal_part(rest.position - pegs.origin[:, None], pegs.axis[:, None])
-    distance = np.linalg.norm(away, axis=-1)
-    nearest = np.take_along_axis(away, distance.argmin(axis=1)[:, None, None], axis=1)[:, 0]
-    size = np.linalg.norm(nearest, axis=-1, keepdims=True)
-    direction = nearest / np.where(size > 0.0, size, 1.0)
+    nearest = np.linalg.norm(away, axis=-1).argmin(axis=1)
+    tangent = _normal_part(rest.frame[nearest][:, :, 0], pegs.axis)
+    direction = away[rows, nearest]
+    length = np.einsum("ni,ni->n", tangent, tangent)
+    along = np.einsum("ni,ni->n", direction, tangent) / np.where(length > 0.0, length, 1.0)
+    # The nearest place lies beside the nearest sample, unless that is an end and the axis beyond it.
+    beyond_tip = (nearest == rest.s.size - 1) & (along < 0.0)
+    beyond_base = (nearest == 0) & (along > 0.0)
+    along = np.where(beyond_tip | beyond_base, 0.0, along)
+    direction = direction - along[:, None] * tangent
+    # An axis through the whisker itself has no nearer side: take the one toward +y.
+    across = np.cross(pegs.axis, tangent)
+    across *= np.where(across[:, 1:2] < 0.0, -1.0, 1.0) * (1.0 if outward else -1.0)
+    size = np.linalg.norm(direction, axis=-1, keepdims=True)
+    direction = np.where(size > _TOUCHING, direction, across)
+    size = np.linalg.norm(direction, axis=-1, keepdims=True)
+    direction = direction / np.where(size > 0.0, size, 1.0)
     return direction if outward else -direction
 
 
@@ -136,7 +151,11 @@ def _solve_from_rest(
     size = np.linalg.norm(push, axis=-1, keepdims=True)
     push = push / np.where(size > 0.0, size, 1.0)
     depth, s, direction = _first_touch(rest, pegs, push)
-    rows = np.flatnonzero(there & (depth < 0.0) & (size[:, 0] > 0.0))
+    out.statuses[there & (depth < 0.0) & (s < LEAST_ARC)] = int(Status.TOO_PROXIMAL)
+    rows = np.flatnonzero(there & (depth < 0.0) & (s >= LEAST_ARC))
+    near_base = np.flatnonzero(out.statuses == int(Status.TOO_PROXIMAL))
+    out.values[near_base], out.contacts[near_base] = np.nan, np.nan
+    out.misfits[near_base] = np.nan
     if not rows.size:
         return out
     ends = pegs.parameters()[rows]
@@ -207,8 +226,7 @@ def _first_touch(rest: Rest, pegs: Pegs, push: Array) -> tuple[Array, Array, Arr
     """Where a peg moving along ``push`` first touches the resting whisker.
 
     Returns how far it still has to go to touch (negative: it is past), s there and the unit
-    direction of the
-    force; the distance is inf where it never touches.
+    direction of the force; the distance is inf where it never touches.
     """
     relative = _normal_part(rest.position - pegs.origin[:, None], pegs.axis[:, None])
     across = np.cross(pegs.axis, push)
@@ -224,13 +242,17 @@ def _first_touch(rest: Rest, pegs: Pegs, push: Array) -> tuple[Array, Array, Arr
     depth, s = height[n, i], rest.s[i]
     for row in np.flatnonzero(~solid & np.isfinite(x).all(axis=1)):
         # A line touches where the whisker crosses the plane through it along the push.
-        cross = np.flatnonzero((x[row, :-1] <= 0.0) != (x[row, 1:] <= 0.0))
-        if x[row, -1] == 0.0:
+        # One that lies in that plane touches where it is first met.
+        here, there = x[row, :-1], x[row, 1:]
+        within = (here == 0.0) & (there == 0.0)
+        cross = np.flatnonzero(((here <= 0.0) != (there <= 0.0)) | within)
+        if there[-1] == 0.0:
             cross = np.append(cross, x.shape[1] - 2)
         if not cross.size:
             depth[row] = np.inf
             continue
-        part = x[row, cross] / (x[row, cross] - x[row, cross + 1])
+        run = x[row, cross] - x[row, cross + 1]
+        part = np.where(run != 0.0, x[row, cross] / np.where(run != 0.0, run, 1.0), 0.0)
         at = y[row, cross] + part * (y[row, cross + 1] - y[row, cross])
         first = at.argmin()
         depth[row] = at[first]

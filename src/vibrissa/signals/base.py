@@ -35,8 +35,8 @@ def base_signals(force: ArrayLike | xr.DataArray, moment: ArrayLike | xr.DataArr
     ----------
     force : array_like or DataArray
         Force on the whisker in the whisker frame, N, shape (..., 3). The dimensions of a DataArray
-        other than
-        ``space`` are kept; those of a plain array are called ``sample``, or ``axis_0``, ``axis_1``,
+        other than ``space`` are kept; those of a plain array are called ``sample``, or ``axis_0``,
+        ``axis_1``,
         ... if several.
     moment : array_like or DataArray
         Moment about the base, N·m, same shape.
@@ -45,8 +45,7 @@ def base_signals(force: ArrayLike | xr.DataArray, moment: ArrayLike | xr.DataArr
     -------
     Dataset
         ``Fx``, ``FT`` (N), ``FD`` (rad), ``Mx``, ``MB`` (N·m), ``MD`` (rad), each of shape (...).
-        Directions are 0 where
-        what they belong to is zero.
+        Directions are 0 where what they belong to is zero.
 
     Raises
     ------

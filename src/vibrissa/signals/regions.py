@@ -1,10 +1,8 @@
 """Parts of the reachable space that the paper tells apart.
 
 - CB, concave backward: the contact has moved toward +y of the resting whisker at the same distance
-  r from the
-  base; CF, concave forward: toward -y. Beyond the resting whisker's largest r its curve is
-  continued along the tip's
-  tangent; where r(s) is not monotone the nearest branch counts.
+  r from the base; CF, concave forward: toward -y. Beyond the resting whisker's largest r its curve
+  is continued along the tip's tangent; where r(s) is not monotone the nearest branch counts.
 - Large deflection: the deflected tangent at the contact points back, its x component is negative.
 - The small-deflection cone: nearer to the resting whisker than tan 2° times the arc length there.
 """

@@ -41,6 +41,8 @@ HINT_MARGIN = 0.1
 
 
 SCATTER = 0.08
+#: Noise that a straight line may leave to points, as a share of their extent, unless it is stated.
+STRAIGHT = 0.02
 """Largest noise, in extents of the points, that is believed unless it was stated."""
 
 WANDERING = 4.0
@@ -208,7 +210,8 @@ class _Line:
             return bool(self.rss <= noise**2 * limit)
         rss = float(np.sum(fit.residuals**2)) * unit**2
         left, spent = components * (n - fit.freedom), components * (fit.freedom - 2.0)
-        if left <= 0.0 or rss <= 0.0:
+        # A few points leave the test no power: curvature that moves them this far is no noise.
+        if left <= 0.0 or rss <= 0.0 or self.noise(components) > STRAIGHT * self.extent:
             return False
         ratio = (self.rss - rss) / spent / (rss / left)
         return bool(fisher.sf(ratio, spent, left) > SIGNIFICANCE)

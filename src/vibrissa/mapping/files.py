@@ -37,6 +37,8 @@ def save_map(contacts: ContactMap, path: Path) -> None:
         },
         attrs={"description": "non-dimensional: lengths over L, forces over EI/L²"},
     )
+    for name, variable in raw.data_vars.items():
+        variable.attrs |= {"units": "1", "long_name": f"chart: {name}, non-dimensional"}
     root = contacts.to_dataset()
     root.attrs |= {"kind": _KIND, "steps": contacts.steps}
     groups = {"/": root, "whisker": contacts.whisker.to_dataset(), "chart": raw}

@@ -120,6 +120,7 @@ def test_covariance_predicts_the_scatter(gamma_map, rng):
     np.testing.assert_allclose(
         np.sqrt(np.diag(exact.covariance)), np.sqrt(np.diag(scatter)), rtol=0.06
     )
+    np.testing.assert_array_equal(exact.candidate_covariances[0], exact.covariance)
     by_signal = {
         "Fx": sigma[0],
         "MB": sigma[3],

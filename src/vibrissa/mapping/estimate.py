@@ -53,6 +53,8 @@ class Estimate:
         Base force and moment of the candidate, N and N·m.
     candidates : (..., k, 3) array
         Contact points of all candidates by rising force, padded with NaN, m.
+    candidate_covariances : (..., k, 3, 3) array
+        Their covariances, m²; NaN without ``noise``.
     n_candidates : (...) int array
         How many.
     triplet : tuple of str
@@ -69,6 +71,7 @@ class Estimate:
     force: Array
     moment: Array
     candidates: Array
+    candidate_covariances: Array
     n_candidates: IntArray
     triplet: tuple[str, ...]
     dims: tuple[str, ...]
@@ -103,6 +106,11 @@ class Estimate:
                     (*dims, "candidate", "space"),
                     self.candidates,
                     attributes("contact_point_whisker"),
+                ),
+                "candidate_covariances": (
+                    (*dims, "candidate", "space", "space_2"),
+                    self.candidate_covariances,
+                    attributes("covariance"),
                 ),
                 "n_candidates": (
                     dims,
@@ -178,19 +186,20 @@ def estimate(
     status = np.where(found.number == 1, int(Status.UNIQUE), int(Status.AMBIGUOUS))
     misfit = np.zeros(len(flat))
     _explain(contacts, names, flat / scale, found, status, misfit)
-    covariance = np.full((len(flat), 3, 3), np.nan)
+    covariances = np.full((*found.contacts.shape[:2], 3, 3), np.nan)
     if sigma is not None:
-        covariance = _covariance(contacts, names, found, sigma)
+        covariances = _covariances(contacts, names, found, sigma)
     most = max(1, int(found.number.max(initial=0)))
     return Estimate(
         point=point.reshape(*shape, 3),
-        covariance=covariance.reshape(*shape, 3, 3),
+        covariance=covariances[:, 0].reshape(*shape, 3, 3),
         status=status.reshape(shape),
         misfit=misfit.reshape(shape),
         arc_length=(found.contacts[:, 0, 0] * d.length).reshape(shape),
         force=force.reshape(*shape, 3),
         moment=np.cross(point, force).reshape(*shape, 3),
         candidates=(found.values[:, :most, 3:] * d.length).reshape(*shape, most, 3),
+        candidate_covariances=covariances[:, :most].reshape(*shape, most, 3, 3),
         n_candidates=found.number.reshape(shape),
         triplet=names,
         dims=dims,
@@ -257,19 +266,19 @@ def _on_circle(values: Array, which: list[int], size: Array) -> Array:
     return np.stack(parts, axis=1)
 
 
-def _covariance(
+def _covariances(
     contacts: ContactMap,
     names: tuple[str, ...],
     found: Contacts,
     noise: dict[str, float] | Array,
 ) -> Array:
-    """Covariance (n, 3, 3) of the first candidates' contact points, m²."""
+    """Covariances (n, k, 3, 3) of the candidates' contact points, m²."""
     d = contacts.chart.discretization
-    out = np.full((len(found.number), 3, 3), np.nan)
-    rows = np.flatnonzero(found.number > 0)
-    if not rows.size:
+    out = np.full((*found.contacts.shape[:2], 3, 3), np.nan)
+    there = np.arange(out.shape[1]) < found.number[:, None]
+    if not there.any():
         return out
-    values, tangents = solve_forces(d, with_normal_force(found.contacts[rows, 0]), tangents=True)
+    values, tangents = solve_forces(d, with_normal_force(found.contacts[there]), tangents=True)
     which = [SIGNALS.index(name) for name in names]
     by_contact = signal_derivatives(values, tangents)[:, which]
     sigma = _signal_covariance(noise, names, values, d.force, d.moment)
@@ -279,7 +288,7 @@ def _covariance(
         inverse = np.full_like(by_contact, np.nan)
         inverse[good] = np.linalg.inv(by_contact[good])
         a = d.length * tangents[:, 3:] @ inverse
-        out[rows] = a @ sigma @ np.swapaxes(a, -1, -2)
+        out[there] = a @ sigma @ np.swapaxes(a, -1, -2)
     return out
 
 

@@ -21,7 +21,8 @@ from vibrissa.rod.arrays import Array, Rod
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
 
-#: Steps along a whisker: base force and contact point within 1e-6 (relative) of the exact solution.
+#: Steps along a whisker: base force and contact point within 1e-6 (relative) of the exact solution
+#: while the tangent turns by less than about 65°, within 1e-4 up to slip-off.
 STEPS = 36
 # A corkscrew needs more: as many steps as keep the rest whisker's turning per step below this
 # (rad).

@@ -110,8 +110,8 @@ def deflect(
         Contacts at less than this fraction of the length from the base get a status instead of an
         answer (not for a ``PointForce``).
     steps : int
-        Integration steps along the whisker. The default is good to 1e-6 up to 65° of turning; the error falls with the
-        sixth power.
+        Integration steps along the whisker. The default is good to 1e-6 while the tangent turns by
+        less than about 65°; the error falls with the sixth power.
 
     Returns
     -------

@@ -63,6 +63,33 @@ def table(folder):
     return path, np.array(points)
 
 
+def test_version():
+    assert run("--version").split() == ["vibrissa", vb.__version__]
+
+
+def test_where_to_write_is_asked_first(folder, table, monkeypatch, capsys):
+    monkeypatch.setattr(vb.ContactMap, "simulate", None)
+    for verb, said in (
+        (("map", "-o", folder), "is a folder"),
+        (("map", "-o", folder / "a.csv"), "ends in .csv; .nc"),
+        (("map", "-o", folder / "none" / "a.nc"), "none does not exist"),
+        (("estimate", table[0], "-o", folder / "a.nc"), "ends in .nc; .csv is needed"),
+        (("demo", "-o", table[0]), "is a file; the name of a folder is needed"),
+    ):
+        assert said in fault(monkeypatch, capsys, *verb)
+
+
+def test_estimate_refuses_millinewtons(folder, table, chart, monkeypatch, capsys):
+    from vibrissa.io import load_signals
+
+    path = folder / "millinewtons.csv"
+    signals = load_signals(table[0])
+    save_signals(path, signals.assign({n: signals[n] * 1e3 for n in ("force", "moment")}))
+    said = fault(monkeypatch, capsys, "estimate", path, "--map", chart, "-o", folder / "c.csv")
+    assert "millinewtons.csv: the force reaches" in said
+    assert "multiply by 1e-3" in said
+
+
 def test_every_verb_has_help_with_an_example():
     assert all(verb in run("--help") for verb in VERBS)
     for verb in VERBS:

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from vibrissa import Status
+from vibrissa import PointContact, Status, Whisker, deflect, samples
 from vibrissa.io.contacts_table import load_contacts, save_contacts
-from vibrissa.io.signals_table import load_signals, save_signals
+from vibrissa.io.signals_table import check_scale, load_signals, save_signals
 
 HEADER = "time,Fx,Fy,Fz,Mx,My,Mz"
 
@@ -51,7 +51,9 @@ def test_headers_comments_and_missing_cells(tmp_path):
 def test_signals_from_netcdf(tmp_path):
     path = tmp_path / "signals.nc"
     names = HEADER.split(",")
-    table = xr.Dataset({n: ("time", np.full(4, 1e-6 * i)) for i, n in enumerate(names) if i})
+    table = xr.Dataset(
+        {n: ("time", np.full(4, (1e-6 if i < 4 else 1e-8) * i)) for i, n in enumerate(names) if i}
+    )
     table = table.assign_coords(time=np.arange(4.0))
     table.to_netcdf(path, engine="h5netcdf")
     np.testing.assert_array_equal(load_signals(path)["force"][0], [1e-6, 2e-6, 3e-6])
@@ -80,6 +82,52 @@ def test_signals_from_netcdf(tmp_path):
 def test_bad_signals(tmp_path, text, message):
     with pytest.raises(ValueError, match=message):
         load_signals(written(tmp_path, text))
+
+
+def bent_signals(whisker):
+    bent = deflect(whisker, PointContact([[25e-3, 12e-3, 1e-3], [27e-3, 2e-3, -2e-3], [0, 0, 0]]))
+    columns = ("time", "space")
+    nothing = np.zeros((20, 3))
+    return xr.Dataset(
+        {
+            "force": (columns, np.vstack([nothing, bent.force])),
+            "moment": (columns, np.vstack([nothing, bent.moment])),
+        },
+        {"time": np.arange(23.0), "space": list("xyz")},
+    )
+
+
+@pytest.mark.parametrize(
+    ("force", "moment", "message"),
+    [
+        (1e3, 1.0, r"belong together.*forces look like mN"),
+        (1e6, 1.0, r"reaches .* N.*must be in N and N·m"),
+        (1.0, 1e3, r"belong together.*moments look like"),
+        (1.0, 1e6, r"reaches .* N·m.*must be in N and N·m"),
+        (1e2, 1e5, r"belong together.*moments look like"),
+    ],
+)
+def test_units_that_do_not_belong_together(tmp_path, force, moment, message):
+    path = tmp_path / "signals.csv"
+    signals = bent_signals(samples.gamma())
+    save_signals(path, signals)
+    load_signals(path)
+    signals["force"] *= force
+    signals["moment"] *= moment
+    save_signals(path, signals)
+    with pytest.raises(ValueError, match=rf"signals.csv: .*{message}"):
+        load_signals(path)
+
+
+def test_signals_too_large_for_the_whisker(tmp_path):
+    whisker = samples.gamma()
+    signals = bent_signals(whisker).isel(time=slice(19, None))
+    check_scale(signals, whisker)
+    check_scale(signals * np.nan, whisker)
+    check_scale(signals.isel(time=slice(0)), whisker)
+    with pytest.raises(ValueError, match=r"force reaches .* N, .* moment reaches .* 1e-3"):
+        check_scale(signals * 1e3, whisker)
+    check_scale(signals * 1e3, Whisker.straight(length=0.15, base_radius=1e-3))
 
 
 def test_no_file(tmp_path):

@@ -67,7 +67,7 @@ def test_a_file_of_another_kind_is_refused(tmp_path):
         vb.ContactMap.load(tmp_path / "none.nc")
     text = tmp_path / "text.nc"
     text.write_text("not a map")
-    with pytest.raises(ValueError, match="not a NetCDF file"):
+    with pytest.raises(ValueError, match="cannot be read as NetCDF-4"):
         vb.ContactMap.load(text)
     other = tmp_path / "other.nc"
     xr.Dataset({"a": 1.0}).to_netcdf(other, engine="h5netcdf")

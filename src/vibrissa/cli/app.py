@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import sys
+from typing import Annotated
 
 import typer
 from rich.markup import escape
 
 from vibrissa.cli import bend, charting, information, locating, whole_job
-from vibrissa.cli.terminal import errors
+from vibrissa.cli.terminal import errors, output
 
 HELP = """From what a whisker feels at its base to what it touched.
 
@@ -28,6 +29,24 @@ app.command("deflect")(bend.bend)
 app.command("map")(charting.chart)
 app.command("estimate")(locating.estimate)
 app.command("info")(information.info)
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        from vibrissa import __version__
+
+        output.print(f"vibrissa {__version__}", highlight=False)
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool,
+        typer.Option("--version", help="Print the version.", callback=_version, is_eager=True),
+    ] = False,
+) -> None:
+    """Take the options that belong to no verb."""
 
 
 def main() -> None:

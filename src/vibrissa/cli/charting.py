@@ -27,8 +27,10 @@ def chart(
     Example: `vibrissa map --whisker C1.csv -o map.nc`
     """
     from vibrissa.cli.sources import whisker_from
+    from vibrissa.io.paths import NETCDF, check_writable
     from vibrissa.mapping import ContactMap
 
+    check_writable(path, NETCDF)
     chosen = whisker_from(whisker)
     with progress_bars() as tell:
         tell("map of all contacts", 0, 1)

@@ -52,10 +52,9 @@ def _installation() -> Iterator[tuple[str, str]]:
 
 
 def _file(path: Path) -> Iterator[tuple[str, str]]:
-    from vibrissa.cli.sources import is_netcdf
+    from vibrissa.io import check_readable, is_netcdf
 
-    if not path.exists():
-        raise FileNotFoundError(f"there is no file {path}")
+    check_readable(path)
     yield "file", f"{path}, {path.stat().st_size / 1e6:.3g} MB"
     yield from _groups(path) if is_netcdf(path) else _table(path)
 

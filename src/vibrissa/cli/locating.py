@@ -10,6 +10,8 @@ import typer
 from vibrissa.cli.terminal import errors, output, progress_bars, shown
 
 if TYPE_CHECKING:
+    from xarray import Dataset
+
     from vibrissa.mapping import ContactMap
     from vibrissa.whisker import Whisker
 
@@ -51,13 +53,16 @@ def estimate(
     from vibrissa.cli.sources import wrench_from
     from vibrissa.demo import contact_columns, locate
     from vibrissa.io import save_contacts
+    from vibrissa.io.paths import CSV, check_writable
     from vibrissa.signals import selection
     from vibrissa.status import describe
 
+    check_writable(path, CSV)
     names = selection([name.strip() for name in triplet.split(",")], exactly=3)
     wrench, carried = wrench_from(signals)
     with progress_bars() as tell:
         contacts = _map(chart, whisker, carried, tell)
+        _check_scale(signals, wrench, contacts.whisker)
         tell("contact points", 0, 1)
         found = locate(
             contacts,
@@ -77,6 +82,15 @@ def estimate(
     for sentence, count in describe(found["status"].values).most_common():
         output.print(f"{count:6d}  {sentence}", highlight=False, soft_wrap=True)
     output.print(f"wrote {path}", highlight=False, soft_wrap=True)
+
+
+def _check_scale(path: Path, wrench: Dataset, whisker: Whisker) -> None:
+    from vibrissa.io.signals_table import check_scale
+
+    try:
+        check_scale(wrench, whisker)
+    except ValueError as fault:
+        raise ValueError(f"{path}: {fault}") from None
 
 
 def _map(

@@ -11,13 +11,6 @@ if TYPE_CHECKING:
     from vibrissa.mapping import ContactMap
     from vibrissa.whisker import Whisker
 
-_ENDINGS = (".nc", ".nc4", ".h5")
-
-
-def is_netcdf(path: Path) -> bool:
-    """Tell by its ending whether a file is NetCDF."""
-    return path.suffix.lower() in _ENDINGS
-
 
 def whisker_from(path: Path | None) -> Whisker:
     """Read a whisker: a centreline as CSV, or out of a map or recording; by default the γ whisker.
@@ -40,7 +33,7 @@ def whisker_from(path: Path | None) -> Whisker:
         If it holds no whisker.
     """
     from vibrissa import samples
-    from vibrissa.io import kind_of, load_recording, load_whisker
+    from vibrissa.io import is_netcdf, kind_of, load_recording, load_whisker
 
     if path is None:
         return samples.gamma()
@@ -105,7 +98,7 @@ def wrench_from(path: Path) -> tuple[xr.Dataset, Whisker | None]:
     ValueError
         If it holds no signals.
     """
-    from vibrissa.io import kind_of, load_recording, load_signals
+    from vibrissa.io import is_netcdf, kind_of, load_recording, load_signals
 
     if not path.exists():
         raise FileNotFoundError(f"there is no file {path}")

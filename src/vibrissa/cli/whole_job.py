@@ -37,7 +37,9 @@ def demo(
     """
     from vibrissa.cli.sources import whisker_from
     from vibrissa.demo import run_demo
+    from vibrissa.io.paths import check_folder
 
+    check_folder(folder)
     chosen = whisker_from(whisker)
     output.print(f"{chosen!r}", highlight=False, soft_wrap=True)
     with progress_bars() as tell:

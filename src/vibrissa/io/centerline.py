@@ -12,7 +12,8 @@ from typing import Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.io.table import table_rows
+from vibrissa.io.replace import replacing
+from vibrissa.io.table import read_text, table_rows
 from vibrissa.whisker import Whisker
 from vibrissa.whisker.section import Properties
 
@@ -46,9 +47,7 @@ def load_centerline(path: str | PathLike[str]) -> Array:
         bad cells are named with their lines.
     """
     path = Path(path)
-    # Spreadsheets put a byte order mark first.
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        rows = table_rows(file.read())
+    rows = table_rows(read_text(path))
     header = next(rows, None)
     if header is None:
         raise ValueError(f"{path} is empty; a header {ALLOWED} and at least 4 points are needed")
@@ -101,7 +100,8 @@ def save_centerline(path: str | PathLike[str], points: ArrayLike) -> None:
     if array.ndim != 2 or array.shape[1] != 3:
         raise ValueError(f"points have shape {array.shape}; (n, 3) is needed")
     lines = ["x_mm,y_mm,z_mm", *(",".join(f"{x * 1e3:.6f}" for x in row) for row in array)]
-    Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    with replacing(path) as part:
+        part.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def load_whisker(

@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from vibrissa.io.replace import replacing
-from vibrissa.io.table import table_rows
+from vibrissa.io.table import read_text, table_rows
 from vibrissa.quantities import attributes
 from vibrissa.status import Status, flag_attributes
 
@@ -77,7 +77,7 @@ def load_contacts(path: str | PathLike[str]) -> xr.Dataset:
         If it has another header, a row that cannot be read or a status that does not exist.
     """
     path = Path(path)
-    rows = table_rows(path.read_text(encoding="utf-8-sig"))
+    rows = table_rows(read_text(path))
     header = next(rows, None)
     expected = [*NUMBERS, "status"]
     if header is None or header[1] != expected:

@@ -5,6 +5,32 @@ from __future__ import annotations
 from os import PathLike
 from pathlib import Path
 
+from vibrissa.io.paths import NETCDF, check_readable
+
+_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+
+
+def is_netcdf(path: str | PathLike[str]) -> bool:
+    """Tell whether a file is to be read as NetCDF-4.
+
+    Parameters
+    ----------
+    path : str or path
+        The file; it need not exist.
+
+    Returns
+    -------
+    bool
+        Whether it begins as HDF5, of which NetCDF-4 is a kind, or is named like one.
+    """
+    path = Path(path)
+    if path.suffix.lower() in NETCDF:
+        return True
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(_SIGNATURE)) == _SIGNATURE
+
 
 def kind_of(path: str | PathLike[str]) -> str:
     """Read what a NetCDF-4 file says it holds.
@@ -28,13 +54,7 @@ def kind_of(path: str | PathLike[str]) -> str:
     """
     import h5netcdf
 
-    path = Path(path)
-    if not path.exists():
-        raise FileNotFoundError(f"there is no file {path}")
-    if path.is_dir():
-        raise ValueError(f"{path} is a folder; a NetCDF file is needed")
-    if path.stat().st_size == 0:
-        raise ValueError(f"{path} is empty")
+    path = check_readable(path)
     try:
         with h5netcdf.File(path, "r") as file:
             kind = file.attrs.get("kind", "")

@@ -2,8 +2,9 @@
 
 CSV, or a NetCDF file with variables of these names along one dimension. Lines that are empty or
 begin with # are passed over, other columns are left alone, and an empty cell or ``nan`` is missing.
-A name may carry its SI unit, ``Fx_N`` or ``Mx_Nm``; other units are refused by name, and so
-are numbers too large to be what they say.
+A name may carry its SI unit, ``Fx_N`` or ``Mx_Nm``; other units are refused by name, and so are
+numbers that cannot be what they say: too large, or with a moment too large or small for the force,
+as |M| / |F| is at most the distance of the contact.
 """
 
 from __future__ import annotations
@@ -15,10 +16,11 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from vibrissa.io.netcdf import kind_of
+from vibrissa.io.netcdf import is_netcdf, kind_of
 from vibrissa.io.replace import replacing
-from vibrissa.io.table import table_rows
+from vibrissa.io.table import read_text, table_rows
 from vibrissa.quantities import attributes
+from vibrissa.whisker import Whisker
 
 Array = NDArray[np.float64]
 
@@ -27,7 +29,9 @@ COLUMNS = ("time", "Fx", "Fy", "Fz", "Mx", "My", "Mz")
 
 _UNITS = {"time": "s", "F": "N", "M": "Nm"}
 _LARGEST = {"F": (10.0, "N"), "M": (1.0, "N·m")}
-_ENDINGS = (".nc", ".nc4", ".cdf", ".netcdf", ".h5")
+_LEVER_ARMS = (1e-4, 1.0)
+# Of whiskers bent to their fold 0.3 L from the base, forces and moments stay below 40 times these.
+_LARGEST_SCALES = 100.0
 
 
 def load_signals(path: str | PathLike[str]) -> xr.Dataset:
@@ -36,7 +40,7 @@ def load_signals(path: str | PathLike[str]) -> xr.Dataset:
     Parameters
     ----------
     path : str or path
-        CSV, or NetCDF by its ending.
+        CSV or NetCDF.
 
     Returns
     -------
@@ -52,9 +56,46 @@ def load_signals(path: str | PathLike[str]) -> xr.Dataset:
         in SI units.
     """
     path = Path(path)
-    table = _netcdf(path) if path.suffix.lower() in _ENDINGS else _csv(path)
+    table = _netcdf(path) if is_netcdf(path) else _csv(path)
     _check_magnitudes(path, table)
+    _check_lever_arm(path, table)
     return _dataset(table)
+
+
+def check_scale(wrench: xr.Dataset, whisker: Whisker) -> None:
+    """Refuse forces and moments that are far too large to have bent this whisker.
+
+    Parameters
+    ----------
+    wrench : xarray.Dataset
+        Dims time, space: ``force``, N, and ``moment``, N·m.
+    whisker : Whisker
+        That felt them. Its bending stiffness at the base and its length, EI / L² and EI / L, say
+        how large forces and moments can be.
+
+    Raises
+    ------
+    ValueError
+        If they are a hundred times larger, as when millinewtons are taken for newtons.
+    """
+    stiffness = whisker.base_bending_stiffness
+    scales = {"force": stiffness / whisker.length**2, "moment": stiffness / whisker.length}
+    faults = []
+    for name, scale in scales.items():
+        size = np.linalg.norm(wrench[name].values, axis=-1)
+        size = size[np.isfinite(size)]
+        typical = float(np.quantile(size, 0.95)) if size.size else 0.0
+        if typical > _LARGEST_SCALES * scale:
+            unit = attributes(name)["units"].replace(" ", "·")
+            faults.append(
+                f"the {name} reaches {typical:.3g} {unit}, {typical / scale:.2g} times the "
+                f"{scale:.2g} {unit} that is natural to this whisker"
+            )
+    if faults:
+        raise ValueError(
+            f"{'; '.join(faults)}: these look like mN and mN·m, or µN and µN·m, given as N and "
+            f"N·m (multiply by 1e-3 or 1e-6), or like another whisker than {whisker!r}"
+        )
 
 
 def save_signals(path: str | PathLike[str], signals: xr.Dataset) -> None:
@@ -87,8 +128,7 @@ def save_signals(path: str | PathLike[str], signals: xr.Dataset) -> None:
 
 def _csv(path: Path) -> Array:
     """Columns (n, 7) of a CSV file."""
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        rows = table_rows(file.read())
+    rows = table_rows(read_text(path))
     header = next(rows, None)
     if header is None:
         raise ValueError(f"{path} is empty; a header {','.join(COLUMNS)} and rows are needed")
@@ -163,6 +203,30 @@ def _check_magnitudes(path: Path, table: Array) -> None:
             f"{path}: {'; '.join(faults)}. A whisker feels millinewtons at most: the table must be "
             "in N and N·m"
         )
+
+
+def _check_lever_arm(path: Path, table: Array) -> None:
+    """Refuse forces and moments in units that do not belong together."""
+    force, moment = (np.linalg.norm(table[:, part], axis=1) for part in (slice(1, 4), slice(4, 7)))
+    known = np.isfinite(force + moment)
+    if not known.any():
+        return
+    felt = known & (force > 0.5 * np.quantile(force[known], 0.95))
+    if not felt.any():
+        return
+    arm = float(np.median(moment[felt] / force[felt]))
+    least, most = _LEVER_ARMS
+    if arm > most:
+        advice = "moments look like mN·mm, µN·m or mN·m (multiply by 1e-6, 1e-6 or 1e-3)"
+    elif 0 < arm < least:
+        advice = "forces look like mN or µN (multiply by 1e-3 or 1e-6)"
+    else:
+        return
+    raise ValueError(
+        f"{path}: force and moment do not belong together: |M| / |F|, the distance of the contact "
+        f"or less, is {arm:.2g} m, and {least:g} to {most:g} m is possible. The {advice}; the "
+        "table must be in N and N·m"
+    )
 
 
 def _dataset(table: Array) -> xr.Dataset:

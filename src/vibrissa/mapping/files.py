@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
+from vibrissa.io.netcdf import kind_of
+from vibrissa.io.replace import replacing
 from vibrissa.rod.discretize import discretize
 from vibrissa.rod.reach import Reach
 from vibrissa.whisker import Whisker
@@ -49,29 +51,19 @@ def save_map(contacts: ContactMap, path: Path) -> None:
     encoding = (
         {"/grid": dict.fromkeys(contacts.grid.data_vars, squeezed)} if contacts.grid else None
     )
-    partial = path.with_name(path.name + ".part")
-    try:
-        tree.to_netcdf(partial, engine="h5netcdf", encoding=encoding)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with replacing(path) as part:
+        tree.to_netcdf(part, engine="h5netcdf", encoding=encoding)
 
 
 def load_map(path: Path) -> ContactMap:
     """Read a map; raise a ValueError if the file is not one."""
     from vibrissa.mapping.contact_map import ContactMap
 
-    if not path.exists():
-        raise FileNotFoundError(f"there is no file {path}")
-    try:
-        with xr.open_datatree(path, engine="h5netcdf") as opened:
-            tree = opened.load()
-    except OSError as error:
-        raise ValueError(f"{path} is not a NetCDF file, or it is cut short: {error}") from error
-    if tree.attrs.get("kind") != _KIND or "chart" not in tree.children:
-        raise ValueError(
-            f"{path} holds no contact map (of kind {tree.attrs.get('kind', 'none')!r})"
-        )
+    kind = kind_of(path)
+    if kind != _KIND:
+        raise ValueError(f"{path} holds {kind or 'data of another kind'}, not a contact map")
+    with xr.open_datatree(path, engine="h5netcdf") as opened:
+        tree = opened.load()
     whisker = Whisker.from_dataset(tree["whisker"].to_dataset())
     steps = int(tree.attrs["steps"])
     raw = {str(name): np.asarray(v) for name, v in tree["chart"].to_dataset().variables.items()}

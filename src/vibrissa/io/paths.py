@@ -1,0 +1,119 @@
+"""Paths: what they end in, and whether they can be read or written.
+
+Verbs ask before they compute, so that nobody waits for a result that cannot be written.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+
+NETCDF = (".nc", ".nc4", ".netcdf", ".cdf", ".h5", ".hdf5")
+"""Endings of NetCDF-4 files."""
+
+CSV = (".csv",)
+"""Endings of tables as text."""
+
+NWB = (".nwb",)
+"""Endings of Neurodata Without Borders files."""
+
+
+def check_readable(path: str | PathLike[str]) -> Path:
+    """Make sure that there is a file with something in it.
+
+    Parameters
+    ----------
+    path : str or path
+        To be read.
+
+    Returns
+    -------
+    Path
+        The same.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If it is a folder or empty.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"there is no file {path}")
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder; the name of a file is needed")
+    if path.stat().st_size == 0:
+        raise ValueError(f"{path} is empty")
+    return path
+
+
+def check_writable(path: str | PathLike[str], endings: Sequence[str] = ()) -> Path:
+    """Make sure that a file can be written, or replaced, here.
+
+    Parameters
+    ----------
+    path : str or path
+        To be written.
+    endings : sequence of str
+        That it may have, such as `NETCDF`; none: any.
+
+    Returns
+    -------
+    Path
+        The same.
+
+    Raises
+    ------
+    FileNotFoundError
+        If its folder does not exist.
+    PermissionError
+        If the folder cannot be written to.
+    ValueError
+        If it is a folder, or has another ending.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder; the name of a file is needed")
+    if endings and path.suffix.lower() not in endings:
+        got = f"ends in {path.suffix}" if path.suffix else "has no ending"
+        raise ValueError(f"{path} {got}; {' or '.join(endings)} is needed")
+    _check_folder(path.parent)
+    return path
+
+
+def check_folder(path: str | PathLike[str]) -> Path:
+    """Make sure that a folder for results is there or can be made.
+
+    Parameters
+    ----------
+    path : str or path
+        Of the folder.
+
+    Returns
+    -------
+    Path
+        The same.
+
+    Raises
+    ------
+    PermissionError
+        If it, or the folder to make it in, cannot be written to.
+    ValueError
+        If a file stands there, or among the folders above.
+    """
+    path = Path(path)
+    above = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+    if not above.is_dir():
+        raise ValueError(f"{above} is a file; the name of a folder is needed")
+    _check_folder(above)
+    return path
+
+
+def _check_folder(folder: Path) -> None:
+    if not folder.is_dir():
+        raise FileNotFoundError(f"the folder {folder} does not exist; make it first")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise PermissionError(f"the folder {folder} cannot be written to")

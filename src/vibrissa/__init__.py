@@ -13,7 +13,14 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from vibrissa import samples
     from vibrissa.io import load_whisker
-    from vibrissa.mapping import ContactMap, Estimate, Estimator
+    from vibrissa.mapping import (
+        ContactMap,
+        Estimate,
+        Estimator,
+        best_triplet,
+        sensitivity,
+        sensitivity_findings,
+    )
     from vibrissa.rod import Deflection, PegContact, PointContact, PointForce, deflect
     from vibrissa.signals import base_signals
     from vibrissa.status import Status
@@ -33,9 +40,12 @@ __all__ = [
     "Whisker",
     "__version__",
     "base_signals",
+    "best_triplet",
     "deflect",
     "load_whisker",
     "samples",
+    "sensitivity",
+    "sensitivity_findings",
 ]
 
 _HOMES = {
@@ -49,8 +59,11 @@ _HOMES = {
     "Status": "vibrissa.status",
     "Whisker": "vibrissa.whisker",
     "base_signals": "vibrissa.signals",
+    "best_triplet": "vibrissa.mapping",
     "deflect": "vibrissa.rod",
     "load_whisker": "vibrissa.io",
+    "sensitivity": "vibrissa.mapping",
+    "sensitivity_findings": "vibrissa.mapping",
 }
 _MODULES = {"samples"}
 

@@ -264,6 +264,13 @@ _ROWS: tuple[tuple[str, str, _Unit, str, str], ...] = (
     ("sigma_x", r"\sigma_x", _MM, "standard deviation of x", "Predicted from the sensor's noise."),
     ("sigma_y", r"\sigma_y", _MM, "standard deviation of y", "Predicted from the sensor's noise."),
     ("sigma_z", r"\sigma_z", _MM, "standard deviation of z", "Predicted from the sensor's noise."),
+    (
+        "predicted_error",
+        r"\sigma_p",
+        _MM,
+        "predicted 3D error",
+        "Root mean square distance from the truth, predicted from the sensor's noise.",
+    ),
     ("error_r", r"\Delta r", _MM, "error of r", "Estimate minus truth."),
     (
         "error_theta",

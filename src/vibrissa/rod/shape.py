@@ -131,3 +131,35 @@ def shapes(discretization: Discretization, values: Array, arc: Array, s: Array) 
     share_out(rows.size, lambda first, last: _shapes(rod, kept, where, s, found, first, last))
     places[rows] = found
     return places
+
+
+def contact_frames(discretization: Discretization, values: Array, arc: Array) -> Array:
+    """Material frames of deflected whiskers where they are touched.
+
+    Parameters
+    ----------
+    discretization : Discretization
+        The whisker.
+    values : (n, 6) array
+        (F, p), non-dimensional.
+    arc : (n,) array
+        s_c of the contacts.
+
+    Returns
+    -------
+    (n, 3, 3) array
+        Columns (tangent, d₁, d₂) at s_c; NaN for rows with NaN.
+    """
+    frames = np.full((len(values), 3, 3), np.nan)
+    rows = np.flatnonzero(np.isfinite(values).all(axis=1) & np.isfinite(arc))
+    # Contacts at the same arc length, such as the nodes of a chart, go together.
+    lengths, group = np.unique(arc[rows], return_inverse=True)
+    order = np.argsort(group, kind="stable")
+    edges = np.searchsorted(group[order], np.arange(lengths.size + 1))
+    kept = np.ascontiguousarray(values[rows[order]])
+    found = np.empty((rows.size, 1, 12))
+    where, rod = np.repeat(lengths, np.diff(edges)), discretization.rod
+    for k in range(lengths.size):
+        _shapes(rod, kept, where, lengths[k : k + 1], found, int(edges[k]), int(edges[k + 1]))
+    frames[rows[order]] = np.swapaxes(found[:, 0, 3:].reshape(-1, 3, 3), -1, -2)
+    return frames

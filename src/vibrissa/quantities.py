@@ -322,6 +322,13 @@ _ROWS: tuple[tuple[str, str, _Unit, str, str], ...] = (
         "About the tangent at the base.",
     ),
     ("trace", r"\mathbf{u}", _PIXEL, "whisker in the image", "Column and row from the top left."),
+    (
+        "trace_visible",
+        "v",
+        _NUMBER,
+        "whether the whisker shows in the image",
+        "1 where nothing hides it and it is inside the frame, 0 elsewhere.",
+    ),
     ("peg_position", r"\mathbf{c}", _MM, "peg position", "A point of its axis, laboratory frame."),
     ("peg_axis", r"\mathbf{a}", _NUMBER, "peg axis", "Unit vector, laboratory frame."),
     ("peg_radius", r"R_\mathrm{peg}", _MM, "peg radius", "Of its surface."),

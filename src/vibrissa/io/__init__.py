@@ -6,8 +6,10 @@ from vibrissa.io.netcdf import is_netcdf, kind_of
 from vibrissa.io.paths import check_folder, check_readable, check_writable
 from vibrissa.io.recording import load_recording, save_recording
 from vibrissa.io.signals_table import load_signals, save_signals
+from vibrissa.io.video import VideoInfo, read_video, video_info, write_video
 
 __all__ = [
+    "VideoInfo",
     "check_folder",
     "check_readable",
     "check_writable",
@@ -18,8 +20,11 @@ __all__ = [
     "load_recording",
     "load_signals",
     "load_whisker",
+    "read_video",
     "save_centerline",
     "save_contacts",
     "save_recording",
     "save_signals",
+    "video_info",
+    "write_video",
 ]

@@ -5,7 +5,8 @@ a first call does not look as if it hung. Where no folder can be written to (a r
 installation without a home folder) the kernels are compiled anew in each run instead.
 
 Numba knows a cached kernel by its own file alone, and would go on using it after a function that it
-inlines from another file has changed; here all files with kernels are part of the key.
+inlines from another file has changed; here all files with kernels of its own package and of the
+rod, whose helpers others use, are part of the key.
 """
 
 from __future__ import annotations
@@ -27,13 +28,14 @@ R = TypeVar("R")
 
 # Reassociation stays off: results must not depend on how the compiler orders a sum.
 _FASTMATH = {"contract", "nsz", "arcp"}
+_ROD = Path(__file__).parent
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": _FASTMATH, "nogil": True}
 
 
 @cache
-def _sources() -> str:
+def _sources(package: Path) -> str:
     digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
+    for path in sorted(path for folder in {package, _ROD} for path in folder.glob("*.py")):
         source = path.read_bytes()
         if b"@kernel" in source or b"@inlined" in source:
             digest.update(source)
@@ -42,7 +44,8 @@ def _sources() -> str:
 
 class _PackageCache(FunctionCache):
     def _index_key(self, sig: object, codegen: object) -> tuple[object, ...]:
-        return (*super()._index_key(sig, codegen), _sources())  # type: ignore[no-untyped-call]
+        package = Path(self._py_func.__code__.co_filename).parent
+        return (*super()._index_key(sig, codegen), _sources(package))  # type: ignore[no-untyped-call]
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:

@@ -1,5 +1,7 @@
 """A whisking trial: what stands in the way, how the base moves, what the whisker then feels."""
 
+from vibrissa.trial.cameras import Camera, load_cameras, orthogonal_views, save_cameras, triangulate
+from vibrissa.trial.film import Look, film, views_of
 from vibrissa.trial.motion import Motion, whisking
 from vibrissa.trial.objects import Peg
 from vibrissa.trial.plan import facing_peg, sweep_past
@@ -8,13 +10,21 @@ from vibrissa.trial.sensors import measure
 from vibrissa.trial.simulate import simulate
 
 __all__ = [
+    "Camera",
+    "Look",
     "Motion",
     "Peg",
     "facing_peg",
+    "film",
+    "load_cameras",
     "measure",
+    "orthogonal_views",
     "recorded_pegs",
     "recorded_whisker",
+    "save_cameras",
     "simulate",
     "sweep_past",
+    "triangulate",
+    "views_of",
     "whisking",
 ]

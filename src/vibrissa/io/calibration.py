@@ -1,0 +1,99 @@
+"""Calibrations of cameras as TOML, as Anipose and aniposelib write them.
+
+    [cam_0]
+    name = "top"
+    size = [1024, 1024]
+    matrix = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
+    distortions = [k1, k2, p1, p2, k3]
+    rotation = [rx, ry, rz]
+    translation = [tx, ty, tz]
+
+The rotation is a vector along the axis, as long as the angle, rad; the translation has the unit of
+the board that calibrated the cameras, usually mm. An orthographic camera, which Anipose does not
+know, has ``projection = "orthographic"`` besides, and pixels per unit on its matrix's diagonal.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from vibrissa.io.replace import replacing
+
+_NEEDED = ("size", "matrix", "rotation", "translation")
+
+
+def read_calibration(path: str | PathLike[str]) -> list[dict[str, Any]]:
+    """Read what a calibration says of each camera.
+
+    Parameters
+    ----------
+    path : str or path
+        TOML file.
+
+    Returns
+    -------
+    list of dict
+        One a camera, in the file's order: name, size, matrix, rotation (vector), translation, and
+        where given distortions and projection. In the file's units.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If it is no TOML, tells of no cameras, or something of a camera is missing.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no file {path}")
+    try:
+        tables = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is no TOML: {error}") from error
+    cameras = []
+    for name, table in tables.items():
+        if not isinstance(table, dict) or name == "metadata":
+            continue
+        missing = [key for key in _NEEDED if key not in table]
+        if missing:
+            raise ValueError(f"{path}: [{name}] has no {', '.join(missing)}")
+        cameras.append({"name": name} | table)
+    if not cameras:
+        raise ValueError(f"{path} tells of no camera")
+    return cameras
+
+
+def write_calibration(path: str | PathLike[str], cameras: Sequence[Mapping[str, Any]]) -> None:
+    """Write a calibration that `read_calibration` reads.
+
+    Parameters
+    ----------
+    path : str or path
+        Where to write, usually with the ending ``.toml``.
+    cameras : sequence of mapping
+        What to say of each: strings, numbers and nested lists of numbers.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the folder does not exist.
+    """
+    lines = []
+    for i, camera in enumerate(cameras):
+        lines.append(f"[cam_{i}]")
+        lines += [f"{key} = {_toml(value)}" for key, value in camera.items()]
+        lines.append("")
+    with replacing(path) as part:
+        part.write_text("\n".join([*lines, "[metadata]", "adjusted = false", ""]), encoding="utf-8")
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, str):
+        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    if isinstance(value, int | float):
+        return repr(value)
+    return "[" + ", ".join(_toml(part) for part in value) + "]"

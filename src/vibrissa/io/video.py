@@ -1,0 +1,222 @@
+"""Grey videos, read and written frame by frame.
+
+Any container and codec that FFmpeg knows can be read; colour is turned into grey. Written are 8 bit
+grey frames: FFV1 (lossless) in Matroska by default, H.264 in MP4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vibrissa.io.replace import replacing
+
+if TYPE_CHECKING:
+    from av.container import InputContainer
+
+Frame = NDArray[np.uint8]
+
+CODECS = {".mkv": "ffv1", ".mp4": "h264"}
+"""By the ending of the file: what a video is written with."""
+
+QUALITY = 16
+"""H.264's constant rate factor: 0 is lossless, 23 its usual default; here faint tips must last."""
+
+_FULL = 2
+"""FFmpeg's word for: all grey values from 0 to 255 are meant."""
+
+
+@dataclass(frozen=True)
+class VideoInfo:
+    """What a video says of itself.
+
+    Parameters
+    ----------
+    width, height : int
+        Of a frame, pixels.
+    frames : int
+        How many it says it has; 0 if it does not say.
+    rate : float
+        Frames per second at which it is to be shown, which for high-speed video is usually not the
+        rate at which it was taken; 0 if it does not say.
+    codec : str
+        FFmpeg's name.
+    """
+
+    width: int
+    height: int
+    frames: int
+    rate: float
+    codec: str
+
+
+def video_info(path: str | PathLike[str]) -> VideoInfo:
+    """Say what a video holds.
+
+    Parameters
+    ----------
+    path : str or path
+        Of the video.
+
+    Returns
+    -------
+    VideoInfo
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If it is no video, or a damaged one.
+    """
+    with _opened(path) as container:
+        stream = container.streams.video[0]
+        context = stream.codec_context
+        frames = stream.frames
+        if not frames and container.duration and stream.average_rate:
+            frames = round(container.duration * 1e-6 * float(stream.average_rate))
+        return VideoInfo(
+            width=context.width,
+            height=context.height,
+            frames=int(frames),
+            rate=float(stream.average_rate or 0.0),
+            codec=context.name,
+        )
+
+
+def read_video(path: str | PathLike[str]) -> Iterator[Frame]:
+    """Read a video frame by frame.
+
+    Parameters
+    ----------
+    path : str or path
+        Of the video.
+
+    Yields
+    ------
+    array (height, width)
+        Grey values, 0 is black and 255 white.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If it is no video, or damaged from some frame on.
+    """
+    import av
+
+    with _opened(path) as container:
+        stream = container.streams.video[0]
+        stream.thread_type = "AUTO"
+        done = 0
+        try:
+            for frame in container.decode(stream):
+                yield _grey(frame)
+                done += 1
+        except av.FFmpegError as error:
+            raise ValueError(f"{path} is damaged after frame {done}: {error.strerror}") from error
+
+
+def write_video(
+    path: str | PathLike[str],
+    frames: Iterable[Frame],
+    rate: float = 50.0,
+    quality: int = QUALITY,
+) -> int:
+    """Write a grey video.
+
+    Parameters
+    ----------
+    path : str or path
+        With the ending ``.mkv`` (FFV1, lossless) or ``.mp4`` (H.264); an existing file is replaced
+        once the new one is complete.
+    frames : iterable of array (height, width)
+        8 bit grey values, all of one size.
+    rate : float
+        Frames per second at which it is to be shown.
+    quality : int
+        Constant rate factor of H.264, 0 (lossless) to 51.
+
+    Returns
+    -------
+    int
+        How many frames were written.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the folder does not exist.
+    ValueError
+        If the ending is another, there is no frame, or frames differ in size or type.
+    """
+    import av
+
+    path = Path(path)
+    codec = CODECS.get(path.suffix.lower())
+    if codec is None:
+        raise ValueError(f"{path} ends on {path.suffix!r}; one of {', '.join(CODECS)} is needed")
+    container_format = {"ffv1": "matroska", "h264": "mp4"}[codec]
+    options = {"ffv1": {"level": "3", "slices": "4"}}.get(
+        codec, {"crf": str(quality), "preset": "ultrafast"}
+    )
+    count = 0
+    with replacing(path) as part, av.open(part, "w", format=container_format) as container:
+        stream: Any = None
+        shape: tuple[int, ...] = ()
+        for frame in frames:
+            if stream is None:
+                shape = frame.shape
+                stream = container.add_stream(
+                    "libx264" if codec == "h264" else codec,
+                    rate=Fraction(rate).limit_denominator(1000),
+                    options=options,
+                )
+                stream.height, stream.width = shape
+                stream.pix_fmt = "gray"
+                stream.codec_context.color_range = _FULL
+            if frame.shape != shape or frame.dtype != np.uint8:
+                raise ValueError(
+                    f"frame {count} is {frame.shape} of {frame.dtype}; {shape} of uint8 is needed"
+                )
+            image = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="gray")
+            image.color_range = _FULL
+            container.mux(stream.encode(image))
+            count += 1
+        if stream is None:
+            raise ValueError(f"{path}: there are no frames to write")
+        container.mux(stream.encode())
+    return count
+
+
+def _opened(path: str | PathLike[str]) -> InputContainer:
+    import av
+
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no file {path}")
+    try:
+        container = av.open(str(path))
+    except av.FFmpegError as error:
+        raise ValueError(f"{path} is no video that can be read: {error.strerror}") from error
+    if not container.streams.video:
+        container.close()
+        raise ValueError(f"{path} holds no video")
+    return container
+
+
+def _grey(frame: Any) -> Frame:
+    """Luminance over the full range, whatever the video's own format."""
+    if frame.format.name in ("gray", "yuvj420p", "yuvj422p", "yuvj444p"):
+        plane = frame.planes[0]
+        rows = np.frombuffer(plane, dtype=np.uint8).reshape(-1, plane.line_size)
+        grey: Frame = rows[: frame.height, : frame.width]
+        return grey
+    return np.asarray(frame.to_ndarray(format="gray"), dtype=np.uint8)

@@ -1,0 +1,471 @@
+"""Cameras: from the laboratory to the pixels of a view, and back from two views.
+
+    x_camera = R x_laboratory + t,    pixel = K d(x_camera)
+
+with d(x) = (x, y) for an orthographic camera (far away, or telecentric), and for a perspective one
+the division by z with OpenCV's distortion. A pixel is (column, row); whole numbers are the middle
+of a pixel, (0, 0) the top left one. A mirror is a negative focal length in K.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from os import PathLike
+from typing import Literal
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+
+from vibrissa.io.calibration import read_calibration, write_calibration
+
+Array = NDArray[np.float64]
+
+PIXEL_SIZE = 58e-6
+"""What a pixel of the paper's cameras sees, m."""
+
+SIZE = (1024, 1024)
+"""Width and height of the paper's frames, pixels."""
+
+_COEFFICIENTS = 8
+_ROUNDS = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """One calibrated view.
+
+    Parameters
+    ----------
+    matrix : array (3, 3)
+        K: focal lengths and middle of the image; pixels per m for an orthographic camera.
+    rotation : array (3, 3)
+        R, from the laboratory's to the camera's axes (right, down, forward).
+    translation : array (3,)
+        t, m.
+    distortion : array (n,), optional
+        OpenCV's (k1, k2, p1, p2, k3, k4, k5, k6), or the first 4 or 5 of them; perspective only.
+    size : tuple of int
+        Width and height, pixels.
+    projection : {"perspective", "orthographic"}
+        Which kind.
+    name : str
+        Of the view.
+
+    Raises
+    ------
+    ValueError
+        If a shape is wrong, a number is not finite, or R is no rotation.
+    """
+
+    matrix: Array
+    rotation: Array
+    translation: Array
+    distortion: Array = field(default_factory=lambda: np.zeros(_COEFFICIENTS))
+    size: tuple[int, int] = SIZE
+    projection: Literal["perspective", "orthographic"] = "perspective"
+    name: str = "camera"
+
+    def __post_init__(self) -> None:
+        """Check every part."""
+        faults = []
+        for name, shape in (("matrix", (3, 3)), ("rotation", (3, 3)), ("translation", (3,))):
+            values = np.array(getattr(self, name), dtype=np.float64)
+            if values.shape != shape or not np.isfinite(values).all():
+                faults.append(f"{name} has shape {values.shape}; finite {shape} is needed")
+            object.__setattr__(self, name, values)
+        bent = np.array(self.distortion, dtype=np.float64).reshape(-1)
+        if bent.size > _COEFFICIENTS or not np.isfinite(bent).all():
+            faults.append(f"distortion has {bent.size} coefficients; up to 8 finite ones are known")
+        bent = np.pad(bent, (0, max(0, _COEFFICIENTS - bent.size)))
+        object.__setattr__(self, "distortion", bent)
+        object.__setattr__(self, "size", (int(self.size[0]), int(self.size[1])))
+        if self.projection not in ("perspective", "orthographic"):
+            faults.append(
+                f"projection is {self.projection!r}; perspective or orthographic is needed"
+            )
+        if self.projection == "orthographic" and bent.any():
+            faults.append("an orthographic camera has no distortion")
+        if not faults:
+            turn = self.rotation
+            if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-5 or np.linalg.det(turn) < 0.0:
+                faults.append("rotation is no rotation; a mirror is a negative focal length")
+        if faults:
+            raise ValueError(f"no camera {self.name!r}: " + "; ".join(faults))
+
+    def project(self, points: ArrayLike) -> Array:
+        """Say where points are seen.
+
+        Parameters
+        ----------
+        points : array_like (..., 3)
+            Laboratory frame, m.
+
+        Returns
+        -------
+        array (..., 2)
+            Column and row, pixels, inside the image or not; NaN behind a perspective camera.
+        """
+        return self.project_with_slopes(points)[0]
+
+    def project_with_slopes(self, points: ArrayLike) -> tuple[Array, Array]:
+        """Say where points are seen and how that changes with the points.
+
+        Parameters
+        ----------
+        points : array_like (..., 3)
+            Laboratory frame, m.
+
+        Returns
+        -------
+        pixels : array (..., 2)
+            Column and row.
+        slopes : array (..., 2, 3)
+            Their derivatives, pixels per m.
+        """
+        seen = np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation
+        if self.projection == "orthographic":
+            slopes = np.broadcast_to(
+                self.matrix[:2, :2] @ self.rotation[:2], (*seen.shape[:-1], 2, 3)
+            )
+            return seen[..., :2] @ self.matrix[:2, :2].T + self.matrix[:2, 2], slopes
+        depth = np.where(seen[..., 2:] > 0.0, seen[..., 2:], np.nan)
+        flat = seen[..., :2] / depth
+        bent, jacobian = _distorted(flat, self.distortion)
+        pixels = bent @ self.matrix[:2, :2].T + self.matrix[:2, 2]
+        along = np.concatenate(
+            [np.broadcast_to(np.eye(2), (*flat.shape, 2)), -flat[..., None]], axis=-1
+        )
+        slopes = (self.matrix[:2, :2] @ jacobian @ along) @ self.rotation / depth[..., None]
+        return pixels, slopes
+
+    def rays(self, pixels: ArrayLike) -> tuple[Array, Array]:
+        """Say which lines pixels look along.
+
+        Parameters
+        ----------
+        pixels : array_like (..., 2)
+            Column and row.
+
+        Returns
+        -------
+        origin, direction : array (..., 3)
+            A point of each line, m, and its unit direction away from the camera, laboratory frame.
+        """
+        pixels = np.asarray(pixels, dtype=np.float64)
+        flat = (pixels - self.matrix[:2, 2]) @ np.linalg.inv(self.matrix[:2, :2]).T
+        if self.projection == "orthographic":
+            start = np.concatenate([flat, np.zeros_like(flat[..., :1])], axis=-1)
+            origin = (start - self.translation) @ self.rotation
+            return origin, np.broadcast_to(self.rotation[2], origin.shape).copy()
+        flat = _undistorted(flat, self.distortion)
+        ahead = np.concatenate([flat, np.ones_like(flat[..., :1])], axis=-1) @ self.rotation
+        center = np.broadcast_to(-self.translation @ self.rotation, ahead.shape).copy()
+        return center, ahead / np.linalg.norm(ahead, axis=-1, keepdims=True)
+
+
+def orthogonal_views(
+    pixel_size: float = PIXEL_SIZE,
+    size: tuple[int, int] = SIZE,
+    center: ArrayLike = (0.0, 0.0, 0.0),
+) -> tuple[Camera, Camera]:
+    """Give the paper's two views: from the top and from the front, of one scale.
+
+    Parameters
+    ----------
+    pixel_size : float
+        What a pixel sees, m.
+    size : tuple of int
+        Width and height, pixels.
+    center : array_like (3,)
+        What is in the middle of both images, laboratory frame, m.
+
+    Returns
+    -------
+    top : Camera
+        Shows x to the right and y upward.
+    front : Camera
+        Shows x to the right and z upward: the view from +y, mirrored so that both images have the
+        same x in the same column.
+
+    Raises
+    ------
+    ValueError
+        If the pixel size is not positive.
+    """
+    if not (np.isfinite(pixel_size) and pixel_size > 0.0):
+        raise ValueError(f"pixel_size is {pixel_size!r}; it must be positive, in m")
+    middle = (np.asarray(size) - 1.0) / 2.0
+    top = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
+    front = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
+    views = []
+    for name, rotation, sign in (("top", top, 1.0), ("front", front, -1.0)):
+        matrix = np.diag([sign / pixel_size, 1.0 / pixel_size, 1.0])
+        matrix[:2, 2] = middle
+        shift = -rotation @ np.asarray(center, dtype=np.float64)
+        views.append(
+            Camera(matrix, rotation, shift, size=size, projection="orthographic", name=name)
+        )
+    return views[0], views[1]
+
+
+def triangulate(
+    cameras: Sequence[Camera], pixels: ArrayLike, sigma: ArrayLike = 1.0
+) -> tuple[Array, Array]:
+    """Find the points that two or more cameras see.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        At least two views.
+    pixels : array_like (camera, ..., 2)
+        Where each camera sees each point; NaN gives NaN.
+    sigma : array_like
+        Standard deviation of a pixel coordinate, broadcast to (camera, ...).
+
+    Returns
+    -------
+    points : array (..., 3)
+        Those that are seen nearest to the pixels, each weighted by its sigma, m.
+    covariance : array (..., 3, 3)
+        Of the points, m².
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than two views, or shapes do not fit.
+    """
+    pixels = np.asarray(pixels, dtype=np.float64)
+    if len(cameras) < 2 or pixels.ndim < 2 or pixels.shape[0] != len(cameras):
+        raise ValueError(
+            f"{len(cameras)} cameras and pixels of shape {pixels.shape} do not fit; two or more "
+            "cameras and (camera, ..., 2) are needed"
+        )
+    weight = 1.0 / np.broadcast_to(np.asarray(sigma, np.float64), pixels.shape[:-1])
+    points = _nearest_to_rays(cameras, pixels)
+    hessian = np.zeros((*points.shape, 3))
+    for _ in range(8):
+        hessian = np.zeros((*points.shape, 3))
+        gradient = np.zeros(points.shape)
+        for camera, wanted, w in zip(cameras, pixels, weight, strict=True):
+            seen, slopes = camera.project_with_slopes(points)
+            scaled = slopes * w[..., None, None]
+            miss = (wanted - seen) * w[..., None]
+            hessian += np.swapaxes(scaled, -1, -2) @ scaled
+            gradient += (np.swapaxes(scaled, -1, -2) @ miss[..., None])[..., 0]
+        step = np.linalg.solve(_regular(hessian), gradient[..., None])[..., 0]
+        points = points + step
+        if not np.nanmax(np.abs(step), initial=0.0) > 1e-12:
+            break
+    return points, np.asarray(np.linalg.inv(_regular(hessian)), dtype=np.float64)
+
+
+def _regular(hessian: Array) -> Array:
+    """The same; NaN stays NaN, and rays that are parallel leave a finite, huge uncertainty."""
+    scale = np.trace(hessian, axis1=-2, axis2=-1)[..., None, None]
+    floored: Array = hessian + 1e-12 * scale * np.eye(3)
+    return floored
+
+
+def _nearest_to_rays(cameras: Sequence[Camera], pixels: Array) -> Array:
+    """Points (..., 3) that are nearest to all rays."""
+    matrix: Array = np.zeros((*pixels.shape[1:-1], 3, 3))
+    right: Array = np.zeros((*pixels.shape[1:-1], 3))
+    for camera, seen in zip(cameras, pixels, strict=True):
+        origin, direction = camera.rays(seen)
+        across: Array = np.eye(3) - direction[..., :, None] * direction[..., None, :]
+        matrix += across
+        right += (across @ origin[..., None])[..., 0]
+    solved = np.linalg.solve(_regular(matrix), right[..., None])[..., 0]
+    return np.asarray(solved, dtype=np.float64)
+
+
+def _distorted(flat: Array, k: Array) -> tuple[Array, Array]:
+    """OpenCV's distortion of (..., 2) and its derivatives (..., 2, 2)."""
+    x, y = flat[..., 0], flat[..., 1]
+    r2 = x * x + y * y
+    top = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
+    below = 1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[7]))
+    radial = top / below
+    change = (k[0] + r2 * (2.0 * k[1] + 3.0 * r2 * k[4])) / below
+    change = change - radial * (k[5] + r2 * (2.0 * k[6] + 3.0 * r2 * k[7])) / below
+    bent = np.stack(
+        [
+            x * radial + 2.0 * k[2] * x * y + k[3] * (r2 + 2.0 * x * x),
+            y * radial + k[2] * (r2 + 2.0 * y * y) + 2.0 * k[3] * x * y,
+        ],
+        axis=-1,
+    )
+    cross = 2.0 * x * y * change + 2.0 * k[2] * x + 2.0 * k[3] * y
+    slopes = np.empty((*flat.shape, 2))
+    slopes[..., 0, 0] = radial + 2.0 * x * x * change + 2.0 * k[2] * y + 6.0 * k[3] * x
+    slopes[..., 1, 1] = radial + 2.0 * y * y * change + 6.0 * k[2] * y + 2.0 * k[3] * x
+    slopes[..., 0, 1] = slopes[..., 1, 0] = cross
+    return bent, slopes
+
+
+def _undistorted(bent: Array, k: Array) -> Array:
+    """Newton's method on `_distorted`."""
+    flat = bent.copy()
+    if not k.any():
+        return flat
+    for _ in range(_ROUNDS):
+        found, slopes = _distorted(flat, k)
+        step = np.linalg.solve(slopes, (bent - found)[..., None])[..., 0]
+        flat = flat + step
+        if not np.nanmax(np.abs(step), initial=0.0) > 1e-14:
+            break
+    return flat
+
+
+def load_cameras(path: str | PathLike[str], unit: float = 1e-3) -> tuple[Camera, ...]:
+    """Read calibrated cameras.
+
+    Parameters
+    ----------
+    path : str or path
+        TOML of Anipose (`vibrissa.io.calibration`).
+    unit : float
+        Of the file's lengths, m; that of the board that calibrated the cameras, usually mm.
+
+    Returns
+    -------
+    tuple of Camera
+        In the file's order.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If it is no calibration, or one with faults.
+    """
+    from scipy.spatial.transform import Rotation
+
+    cameras = []
+    for table in read_calibration(path):
+        kind = table.get("projection", "perspective")
+        scale = np.diag([1.0 / unit, 1.0 / unit, 1.0]) if kind == "orthographic" else np.eye(3)
+        try:
+            turn = Rotation.from_rotvec(np.asarray(table["rotation"], np.float64)).as_matrix()
+            camera = Camera(
+                matrix=np.asarray(table["matrix"], np.float64) @ scale,
+                rotation=turn,
+                translation=np.asarray(table["translation"], np.float64) * unit,
+                distortion=np.asarray(table.get("distortions", ()), np.float64),
+                size=tuple(table["size"]),
+                projection=kind,
+                name=str(table["name"]),
+            )
+        except (TypeError, ValueError, IndexError) as error:
+            raise ValueError(f"{path}: camera {table['name']!r}: {error}") from error
+        cameras.append(camera)
+    return tuple(cameras)
+
+
+def save_cameras(path: str | PathLike[str], cameras: Sequence[Camera], unit: float = 1e-3) -> None:
+    """Write cameras so that `load_cameras`, and for perspective ones Anipose, can read them.
+
+    Parameters
+    ----------
+    path : str or path
+        Where to write, usually with the ending ``.toml``.
+    cameras : sequence of Camera
+        The views.
+    unit : float
+        Of the file's lengths, m.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the folder does not exist.
+    """
+    from scipy.spatial.transform import Rotation
+
+    tables = []
+    for camera in cameras:
+        flat = camera.projection == "orthographic"
+        scale = np.diag([unit, unit, 1.0]) if flat else np.eye(3)
+        table = {
+            "name": camera.name,
+            "size": camera.size,
+            "matrix": (camera.matrix @ scale).tolist(),
+            "distortions": camera.distortion.tolist(),
+            "rotation": Rotation.from_matrix(camera.rotation).as_rotvec().tolist(),
+            "translation": (camera.translation / unit).tolist(),
+        }
+        tables.append(table | ({"projection": camera.projection} if flat else {}))
+    write_calibration(path, tables)
+
+
+def cameras_dataset(cameras: Sequence[Camera]) -> xr.Dataset:
+    """Write cameras as a dataset, the group ``cameras`` of a recording.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        In the order of the views.
+
+    Returns
+    -------
+    xarray.Dataset
+        Dim view: camera_matrix, camera_rotation, camera_translation, camera_distortion,
+        image_size, projection.
+    """
+    about = {
+        "camera_matrix": "K: pixels per m if orthographic, else focal lengths in pixels",
+        "camera_rotation": "from the laboratory's to the camera's axes (right, down, forward)",
+        "camera_translation": "x_camera = rotation x_laboratory + translation",
+        "camera_distortion": "OpenCV's k1, k2, p1, p2, k3, k4, k5, k6",
+        "image_size": "width and height",
+        "projection": "orthographic or perspective",
+    }
+    units = {"camera_translation": "m", "image_size": "pixel"}
+    rows: dict[str, tuple[tuple[str, ...], list[object]]] = {
+        "camera_matrix": (("view", "row", "column"), [c.matrix for c in cameras]),
+        "camera_rotation": (("view", "row", "column"), [c.rotation for c in cameras]),
+        "camera_translation": (("view", "row"), [c.translation for c in cameras]),
+        "camera_distortion": (("view", "coefficient"), [c.distortion for c in cameras]),
+        "image_size": (("view", "side"), [c.size for c in cameras]),
+        "projection": (("view",), [c.projection for c in cameras]),
+    }
+    return xr.Dataset(
+        {
+            name: (
+                dims,
+                np.array(values),
+                {"units": units.get(name, "1"), "long_name": about[name]},
+            )
+            for name, (dims, values) in rows.items()
+        },
+        {"view": [c.name for c in cameras]},
+        {"reference_frame": "laboratory"},
+    )
+
+
+def cameras_from_dataset(dataset: xr.Dataset) -> tuple[Camera, ...]:
+    """Read the cameras that `cameras_dataset` wrote.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        Dim view.
+
+    Returns
+    -------
+    tuple of Camera
+        View by view.
+    """
+    return tuple(
+        Camera(
+            matrix=row["camera_matrix"].values,
+            rotation=row["camera_rotation"].values,
+            translation=row["camera_translation"].values,
+            distortion=row["camera_distortion"].values,
+            size=(int(row["image_size"][0]), int(row["image_size"][1])),
+            projection=str(row["projection"].values),  # type: ignore[arg-type]
+            name=str(row["view"].values),
+        )
+        for row in (dataset.isel(view=i) for i in range(dataset.sizes["view"]))
+    )

@@ -1,0 +1,65 @@
+"""Videos: what is written comes back; what is none says so."""
+
+import numpy as np
+import pytest
+
+from vibrissa.io import read_video, video_info, write_video
+
+
+def frames(count=5, shape=(48, 64)):
+    generator = np.random.default_rng(0)
+    smooth = np.linspace(0.0, 255.0, shape[1])[None, :] * np.ones((shape[0], 1))
+    return [
+        np.clip(smooth + generator.normal(0.0, 2.0, shape), 0, 255).astype(np.uint8)
+        for _ in range(count)
+    ]
+
+
+def test_matroska_keeps_every_grey_value(tmp_path):
+    sent = frames()
+    assert write_video(tmp_path / "a.mkv", sent) == 5
+    np.testing.assert_array_equal(list(read_video(tmp_path / "a.mkv")), sent)
+
+
+def test_mp4_keeps_the_range_of_greys(tmp_path):
+    sent = np.array(frames())
+    write_video(tmp_path / "a.mp4", sent)
+    got = np.array(list(read_video(tmp_path / "a.mp4"))).astype(float)
+    assert got.shape == sent.shape
+    assert np.abs(got - sent).mean() < 3.0
+    np.testing.assert_allclose(got.mean(axis=(0, 1)), sent.mean(axis=(0, 1)), atol=2.0)
+
+
+def test_a_video_says_what_it_holds(tmp_path):
+    write_video(tmp_path / "a.mkv", frames(), rate=25.0)
+    info = video_info(tmp_path / "a.mkv")
+    assert (info.width, info.height, info.frames, info.rate) == (64, 48, 5, 25.0)
+    assert info.codec == "ffv1"
+
+
+def test_what_is_no_video_says_so(tmp_path):
+    with pytest.raises(FileNotFoundError, match="there is no file"):
+        video_info(tmp_path / "none.mp4")
+    for content in (b"", b"no video at all" * 100):
+        (tmp_path / "a.mp4").write_bytes(content)
+        with pytest.raises(ValueError, match="no video that can be read"):
+            list(read_video(tmp_path / "a.mp4"))
+
+
+def test_nothing_is_left_of_a_video_that_failed(tmp_path):
+    def failing():
+        yield from frames(2)
+        raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        write_video(tmp_path / "a.mkv", failing())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_frames_must_be_of_one_kind(tmp_path):
+    with pytest.raises(ValueError, match="frame 1 is"):
+        write_video(tmp_path / "a.mkv", [*frames(1), *frames(1, (10, 64))])
+    with pytest.raises(ValueError, match="no frames"):
+        write_video(tmp_path / "a.mkv", [])
+    with pytest.raises(ValueError, match=r"\.mkv, \.mp4"):
+        write_video(tmp_path / "a.gif", frames())

@@ -198,6 +198,27 @@ _ROWS: tuple[tuple[str, str, _Unit, str, str], ...] = (
         "direction of the contact force",
         "From d1 toward d2 of the deflected frame at the contact.",
     ),
+    (
+        "contact_force",
+        r"\mathbf{f}",
+        _MICRONEWTON,
+        "contact force",
+        "Along the tangent, d1 and d2 of the deflected frame at the contact.",
+    ),
+    (
+        "friction_angle",
+        r"\beta",
+        _DEGREE,
+        "friction angle",
+        "Of the force from the plane normal to the whisker, positive toward the tip.",
+    ),
+    (
+        "friction_angle_sigma",
+        r"\sigma_\beta",
+        _DEGREE,
+        "standard deviation of the friction angle",
+        "Predicted from the sensor's noise.",
+    ),
     # What the base feels
     (
         "force",
@@ -293,6 +314,13 @@ _ROWS: tuple[tuple[str, str, _Unit, str, str], ...] = (
         _NUMBER,
         "misfit",
         "How far signals are from any that a contact explains, in shares of each signal's range.",
+    ),
+    (
+        "linear",
+        r"\mathrm{linear}",
+        _NUMBER,
+        "whether the covariance can be relied on",
+        "1 where the contact scatters as the derivatives say, 0 where it does not.",
     ),
     ("candidates", "n", _NUMBER, "number of candidates", "Contacts that explain the signals."),
     ("share", r"\mathrm{share}", _PERCENT, "share", "Of all rows."),

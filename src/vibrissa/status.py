@@ -117,6 +117,13 @@ class Status(enum.IntEnum):
         "signals moves the contact without bound.",
         "Leave the row out, or add a signal.",
     )
+    NOT_ONE_CONTACT = (
+        25,
+        False,
+        "No single contact of this whisker explains force and moment together.",
+        "Check the whisker's shape, taper and stiffness and the sensor's offset and noise; perhaps "
+        "more than one object touches.",
+    )
 
     def __new__(
         cls, code: int, ok: bool = False, explanation: str = "", advice: str = ""

@@ -6,13 +6,16 @@ from vibrissa.mapping.estimate import Estimate
 from vibrissa.mapping.estimator import Estimator, Located
 from vibrissa.mapping.findings import sensitivity_findings
 from vibrissa.mapping.sensitivity import sensitivity
+from vibrissa.mapping.wrench import WrenchEstimate, estimate_from_wrench
 
 __all__ = [
     "ContactMap",
     "Estimate",
     "Estimator",
     "Located",
+    "WrenchEstimate",
     "best_triplet",
+    "estimate_from_wrench",
     "sensitivity",
     "sensitivity_findings",
 ]

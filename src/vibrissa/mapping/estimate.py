@@ -23,7 +23,7 @@ from vibrissa.rod.arrays import Array, IntArray
 from vibrissa.rod.batch import solve_forces
 from vibrissa.rod.newton import TOLERANCE
 from vibrissa.rod.reach import with_normal_force
-from vibrissa.signals import CIRCULAR, SIGNALS, measured, selection, signal_scales
+from vibrissa.signals import CIRCULAR, SIGNALS, Coordinates, measured, selection, signal_scales
 from vibrissa.signals.base import signal_derivatives, signals_of, wrench_derivatives
 from vibrissa.status import Status, flag_attributes
 
@@ -61,6 +61,8 @@ class Estimate:
         The signals used.
     dims : tuple of str
         Names of the leading dimensions.
+    coords : dict
+        Coordinates along them.
     """
 
     point: Array
@@ -75,6 +77,7 @@ class Estimate:
     n_candidates: IntArray
     triplet: tuple[str, ...]
     dims: tuple[str, ...]
+    coords: Coordinates
 
     @property
     def spherical(self) -> Array:
@@ -119,7 +122,7 @@ class Estimate:
                 ),
                 "status": (dims, self.status, {**attributes("status"), **flag_attributes()}),
             },
-            coords={"space": ["x", "y", "z"], "space_2": ["x", "y", "z"]},
+            coords={**self.coords, "space": ["x", "y", "z"], "space_2": ["x", "y", "z"]},
             attrs={"triplet": " ".join(self.triplet)},
         )
 
@@ -170,12 +173,9 @@ def estimate(
         raise ValueError(f"method is 'exact'; got {method!r}")
     names = selection(triplet, exactly=3)
     sigma = None if noise is None else _checked_noise(noise, names)
-    values, dims = measured(signals, names)
+    values, dims, coords = measured(signals, names)
     _check_signals(values, names)
     shape = values.shape[:-1]
-    dims = dims or (
-        ("sample",) if len(shape) == 1 else tuple(f"axis_{i}" for i in range(len(shape)))
-    )
     flat = values.reshape(-1, 3)
     chart = contacts.chart
     d = chart.discretization
@@ -203,6 +203,7 @@ def estimate(
         n_candidates=found.number.reshape(shape),
         triplet=names,
         dims=dims,
+        coords=coords,
     )
 
 

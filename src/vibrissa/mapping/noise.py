@@ -48,7 +48,7 @@ class SensorNoise:
         noise : mapping or (6, 6) array_like
             Standard deviation of each signal, or covariance of (F, M), SI units.
         names : tuple of str
-            The signals that a mapping must have.
+            The signals, or components of force and moment, that a mapping must have.
 
         Returns
         -------
@@ -75,6 +75,15 @@ class SensorNoise:
             raise ValueError(
                 "noise must be {signal: standard deviation} or a symmetric 6 × 6 covariance of "
                 f"(F, M); got shape {wrench.shape}"
+            )
+        variances = np.diag(wrench)
+        if not np.isfinite(wrench).all() or (variances < 0.0).any():
+            raise ValueError(f"a covariance has finite variances ≥ 0; got {variances}")
+        size = np.sqrt(np.where(variances > 0.0, variances, 1.0))
+        least = np.linalg.eigvalsh(wrench / np.outer(size, size))[0]
+        if least < -1e-9:
+            raise ValueError(
+                f"a covariance has no negative eigenvalue; that of its correlations is {least:.3g}"
             )
         return cls(None, wrench)
 

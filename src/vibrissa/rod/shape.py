@@ -18,9 +18,9 @@ from vibrissa.rod.batch import share_out
 from vibrissa.rod.compiled import copy, inlined, kernel
 from vibrissa.rod.discretize import Discretization
 
-_WEIGHTS = np.array([11.0, 0.0, 81.0, 81.0, -32.0, -32.0, 11.0]) / 120.0
-_NODES = np.array([0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0 / 3.0, 0.5, 0.5, 1.0])
-_STAGES = np.array(
+WEIGHTS = np.array([11.0, 0.0, 81.0, 81.0, -32.0, -32.0, 11.0]) / 120.0
+NODES = np.array([0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0 / 3.0, 0.5, 0.5, 1.0])
+STAGES = np.array(
     [
         [0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
         [1.0 / 3.0, 0.0, 0.0, 0.0, 0.0, 0.0],
@@ -92,12 +92,12 @@ def _shapes(
                     for a in range(12):
                         argument[a] = y[a]
                         for b in range(stage):
-                            argument[a] += h * _STAGES[stage, b] * slopes[b, a]
-                    t = (here + _NODES[stage] * h - start[k]) / width[k]
+                            argument[a] += h * STAGES[stage, b] * slopes[b, a]
+                    t = (here + NODES[stage] * h - start[k]) / width[k]
                     _rates(rod, k, t, loaded, force, point, argument, slopes[stage])
                 for stage in range(7):
                     for a in range(12):
-                        y[a] += h * _WEIGHTS[stage] * slopes[stage, a]
+                        y[a] += h * WEIGHTS[stage] * slopes[stage, a]
                 here = to
         while wanted < s.shape[0]:
             copy(y, places[row, wanted])

@@ -12,7 +12,8 @@ Directions are angles in (-π, π] and compared on the circle.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
+from typing import TypeAlias
 
 import numpy as np
 import xarray as xr
@@ -21,6 +22,9 @@ from numpy.typing import ArrayLike
 from vibrissa.quantities import attributes
 from vibrissa.rod.arrays import Array, IntArray
 from vibrissa.rod.compiled import inlined
+
+# Of a DataArray, by name.
+Coordinates: TypeAlias = dict[Hashable, xr.Variable]
 
 #: The signals in their canonical order.
 SIGNALS = ("Fx", "FT", "FD", "Mx", "MB", "MD")
@@ -35,9 +39,8 @@ def base_signals(force: ArrayLike | xr.DataArray, moment: ArrayLike | xr.DataArr
     ----------
     force : array_like or DataArray
         Force on the whisker in the whisker frame, N, shape (..., 3). The dimensions of a DataArray
-        other than ``space`` are kept; those of a plain array are called ``sample``, or ``axis_0``,
-        ``axis_1``,
-        ... if several.
+        other than ``space`` are kept, with their coordinates; those of a plain array are called
+        ``sample``, or ``axis_0``, ``axis_1``, ... if several.
     moment : array_like or DataArray
         Moment about the base, N·m, same shape.
 
@@ -52,23 +55,82 @@ def base_signals(force: ArrayLike | xr.DataArray, moment: ArrayLike | xr.DataArr
     ValueError
         If the last dimension is not of size 3, or the shapes differ.
     """
-    dims = None
-    if isinstance(force, xr.DataArray) and "space" in force.dims:
-        force = force.transpose(..., "space")
-        dims = tuple(str(d) for d in force.dims[:-1])
-    if isinstance(moment, xr.DataArray) and "space" in moment.dims:
-        moment = moment.transpose(..., "space")
+    f, m, dims, coords = labelled_wrench(force, moment)
+    values = signals_of(f, m)
+    return xr.Dataset(
+        {name: (dims, values[..., i], attributes(name)) for i, name in enumerate(SIGNALS)}, coords
+    )
+
+
+def labelled_wrench(
+    force: ArrayLike | xr.DataArray, moment: ArrayLike | xr.DataArray
+) -> tuple[Array, Array, tuple[str, ...], Coordinates]:
+    """Force and moment as arrays of one shape, and what their leading dimensions are called.
+
+    Parameters
+    ----------
+    force, moment : array_like or DataArray
+        Of shape (..., 3). Two DataArrays are matched by the names of their dimensions and must
+        agree in their coordinates; other arrays are matched by position.
+
+    Returns
+    -------
+    force, moment : (..., 3) arrays
+        The numbers.
+    dims : tuple of str
+        Names of the leading dimensions.
+    coords : dict
+        Coordinates along them.
+
+    Raises
+    ------
+    ValueError
+        If the last dimension is not of size 3, or shapes or coordinates differ.
+    """
+    vectors = [_by_space(force), _by_space(moment)]
+    labels = [a for a in vectors if isinstance(a, xr.DataArray)]
+    if len(labels) == 2:
+        together = xr.broadcast(*_aligned(*labels), exclude=("space",))
+        labels = [a.transpose(..., "space") for a in together]
+        vectors = [*labels]
+    force, moment = vectors
     f, m = np.asarray(force, dtype=np.float64), np.asarray(moment, dtype=np.float64)
     if f.shape != m.shape or f.ndim == 0 or f.shape[-1] != 3:
         raise ValueError(
             f"force and moment must have the same shape (..., 3); got {f.shape} and {m.shape}"
         )
-    if dims is None:
-        dims = ("sample",) if f.ndim == 2 else tuple(f"axis_{i}" for i in range(f.ndim - 1))
-    values = signals_of(f, m)
-    return xr.Dataset(
-        {name: (dims, values[..., i], attributes(name)) for i, name in enumerate(SIGNALS)}
-    )
+    if not labels:
+        return f, m, leading_dims(f.shape[:-1]), {}
+    dims = tuple(str(d) for d in labels[0].dims[:-1])
+    return f, m, dims, coordinates(labels[0], dims)
+
+
+def _by_space(array: ArrayLike | xr.DataArray) -> ArrayLike | xr.DataArray:
+    """A DataArray with ``space`` last; what has no such dimension, as plain numbers."""
+    if isinstance(array, xr.DataArray) and "space" in array.dims:
+        return array.transpose(..., "space")
+    return np.asarray(array, dtype=np.float64)
+
+
+def _aligned(*arrays: xr.DataArray) -> tuple[xr.DataArray, ...]:
+    """Arrays whose coordinates agree; a ValueError if they do not."""
+    try:
+        return xr.align(*arrays, join="exact", copy=False)
+    except ValueError as error:  # of xarray: its message names its own options
+        said = ", ".join(str(dict(a.sizes)) for a in arrays)
+        raise ValueError(f"sizes or coordinates do not agree: {said}") from error
+
+
+def leading_dims(shape: tuple[int, ...]) -> tuple[str, ...]:
+    """Names for the dimensions of arrays that have none."""
+    return ("sample",) if len(shape) == 1 else tuple(f"axis_{i}" for i in range(len(shape)))
+
+
+def coordinates(array: xr.DataArray, dims: tuple[str, ...]) -> Coordinates:
+    """Coordinates that lie along the named dimensions, or along none."""
+    return {
+        name: coord.variable for name, coord in array.coords.items() if set(coord.dims) <= set(dims)
+    }
 
 
 def signals_of(force: Array, moment: Array) -> Array:
@@ -102,13 +164,14 @@ def wrench_derivatives(force: Array, moment: Array) -> Array:
 
 def measured(
     signals: xr.Dataset | Mapping[str, ArrayLike], names: tuple[str, ...]
-) -> tuple[Array, tuple[str, ...]]:
+) -> tuple[Array, tuple[str, ...], Coordinates]:
     """Pick signals as one array.
 
     Parameters
     ----------
     signals : Dataset or mapping
-        Has at least the named signals, SI units; shapes must broadcast.
+        Has at least the named signals, SI units; shapes must broadcast. DataArrays are matched by
+        the names of their dimensions.
     names : tuple of str
         Which.
 
@@ -117,7 +180,9 @@ def measured(
     values : (..., k) array
         In the order of ``names``; NaN means missing.
     dims : tuple of str
-        Names of the leading dimensions; empty if they have none.
+        Names of the leading dimensions.
+    coords : dict
+        Coordinates along them.
 
     Raises
     ------
@@ -129,16 +194,31 @@ def measured(
         raise ValueError(
             f"signals lack {', '.join(missing)}; they have {', '.join(map(str, signals)) or 'none'}"
         )
-    if isinstance(signals, xr.Dataset):
-        arrays = xr.broadcast(*(signals[name] for name in names))
+    given = [signals[name] for name in names]
+    if any(isinstance(a, xr.DataArray) and a.dims for a in given):
+        # A number without dimensions holds for all.
+        labels = [a if isinstance(a, xr.DataArray) else _number(a, names, given) for a in given]
+        arrays = xr.broadcast(*_aligned(*labels))
         dims = tuple(str(d) for d in arrays[0].dims)
-        return np.stack([a.to_numpy().astype(np.float64) for a in arrays], axis=-1), dims
-    plain = [np.asarray(signals[name], dtype=np.float64) for name in names]
+        values = np.stack([a.to_numpy().astype(np.float64) for a in arrays], axis=-1)
+        return values, dims, coordinates(arrays[0], dims)
+    plain = [np.asarray(a, dtype=np.float64) for a in given]
     try:
-        return np.stack(np.broadcast_arrays(*plain), axis=-1), ()
+        values = np.stack(np.broadcast_arrays(*plain), axis=-1)
     except ValueError as error:
         shapes = ", ".join(f"{name} {a.shape}" for name, a in zip(names, plain, strict=True))
         raise ValueError(f"signals of different shapes: {shapes}") from error
+    return values, leading_dims(values.shape[:-1]), {}
+
+
+def _number(value: ArrayLike, names: tuple[str, ...], given: list[ArrayLike]) -> xr.DataArray:
+    """A plain number among labelled arrays; plain arrays there have no names to be matched by."""
+    if np.ndim(value):
+        labelled = [n for n, a in zip(names, given, strict=True) if isinstance(a, xr.DataArray)]
+        raise ValueError(
+            f"{', '.join(labelled)} have named dimensions, so the other signals must have them too"
+        )
+    return xr.DataArray(np.asarray(value, dtype=np.float64))
 
 
 def signal_scales(names: tuple[str, ...], force: float, moment: float) -> Array:

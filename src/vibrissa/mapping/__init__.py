@@ -5,6 +5,7 @@ from vibrissa.mapping.contact_map import ContactMap
 from vibrissa.mapping.estimate import Estimate
 from vibrissa.mapping.estimator import Estimator, Located
 from vibrissa.mapping.findings import sensitivity_findings
+from vibrissa.mapping.natural import NaturalNeighbour
 from vibrissa.mapping.sensitivity import sensitivity
 from vibrissa.mapping.wrench import WrenchEstimate, estimate_from_wrench
 
@@ -13,6 +14,7 @@ __all__ = [
     "Estimate",
     "Estimator",
     "Located",
+    "NaturalNeighbour",
     "WrenchEstimate",
     "best_triplet",
     "estimate_from_wrench",

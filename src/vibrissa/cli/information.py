@@ -13,6 +13,10 @@ from vibrissa.cli.terminal import output
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from xarray import Dataset
+
+    from vibrissa.io.tracks import RawTracks
+
 _PACKAGES = ("numpy", "scipy", "numba", "xarray", "h5netcdf", "matplotlib")
 
 
@@ -52,11 +56,81 @@ def _installation() -> Iterator[tuple[str, str]]:
 
 
 def _file(path: Path) -> Iterator[tuple[str, str]]:
-    from vibrissa.io import check_readable, is_netcdf
+    from vibrissa.io import Kind, check_readable, recognise
+    from vibrissa.io.load import READERS
 
     check_readable(path)
     yield "file", f"{path}, {path.stat().st_size / 1e6:.3g} MB"
-    yield from _groups(path) if is_netcdf(path) else _table(path)
+    kind = recognise(path)
+    if kind in (Kind.RECORDING, Kind.NETCDF):
+        yield from _groups(path)
+    elif kind in (Kind.TRACKS, *READERS):
+        yield from _tracks(path, kind)
+    elif kind == Kind.UNKNOWN and not _is_text(path):
+        known = "; ".join([*READERS, Kind.TRACKS, Kind.RECORDING, "tables as text"])
+        raise ValueError(f"{path} is of no kind that is known. Known are: {known}")
+    else:
+        yield from _table(path)
+
+
+def _is_text(path: Path) -> bool:
+    from vibrissa.io.table import read_text
+
+    try:
+        read_text(path)
+    except ValueError:
+        return False
+    return True
+
+
+def _tracks(path: Path, kind: str) -> Iterator[tuple[str, str]]:
+    """Sizes, times and how much is missing of tracks; also where their unit is not told."""
+    from vibrissa.io import Kind, load_tracks
+    from vibrissa.io.load import READERS
+
+    yield "kind", kind
+    note = ""
+    if kind == Kind.TRACKS:
+        tracks = load_tracks(path)
+    else:
+        raw = READERS[Kind(kind)](path)
+        tracks, note = _without_unit(raw, path)
+    for name in ("source_software", "scorer", "identity", "direction", "variable"):
+        if tracks.attrs.get(name):
+            yield name.replace("_", " "), str(tracks.attrs[name])
+    time = tracks["time"]
+    unit = time.attrs.get("units", "")
+    yield "frames", f"{time.size}, from {float(time.min()):g} to {float(time.max()):g} {unit}"
+    for dim in ("whisker", "view", "node"):
+        if dim in tracks.sizes:
+            yield f"{dim}s", _listed(tracks, dim)
+    for name in ("trace", "centerline"):
+        if name in tracks:
+            found = tracks[name]
+            there = 100.0 * float(found.notnull().all(found.dims[-1]).mean())
+            where = found.attrs.get("reference_frame", "")
+            units = note if name == "centerline" and note else found.attrs["units"]
+            yield name, f"{units}{f', {where} frame' if where else ''}; {there:.1f} % of points"
+    others = [str(name) for name in tracks.data_vars if name not in ("trace", "centerline")]
+    yield "also", ", ".join(others)
+
+
+def _without_unit(raw: RawTracks, path: Path) -> tuple[Dataset, str]:
+    """Label tracks even if nobody tells the unit of their points; then say so."""
+    from vibrissa.io.tracks import labelled
+
+    if raw.space is None or raw.unit:
+        return labelled(raw, path), ""
+    # The smallest unit passes for any: no number is shown.
+    return labelled(raw, path, unit="um"), "unit not told: give it when reading"
+
+
+def _listed(tracks: Dataset, dim: str) -> str:
+    count = tracks.sizes[dim]
+    if dim not in tracks.coords:
+        return str(count)
+    names = [str(name) for name in tracks[dim].values[:8]]
+    return f"{count}: {', '.join(names)}{', …' if count > 8 else ''}"
 
 
 def _groups(path: Path) -> Iterator[tuple[str, str]]:

@@ -1,30 +1,55 @@
 """Files and nothing else: one module a format."""
 
+from vibrissa.io.anipose import load_anipose
 from vibrissa.io.centerline import load_centerline, load_whisker, save_centerline
 from vibrissa.io.contacts_table import load_contacts, save_contacts
+from vibrissa.io.deeplabcut import load_deeplabcut
+from vibrissa.io.kinds import Kind, recognise
+from vibrissa.io.load import load_tracks
+from vibrissa.io.matlab import load_matlab
+from vibrissa.io.movement import load_movement
 from vibrissa.io.netcdf import is_netcdf, kind_of
+from vibrissa.io.nwb import load_nwb
 from vibrissa.io.paths import check_folder, check_readable, check_writable
 from vibrissa.io.recording import load_recording, save_recording
 from vibrissa.io.signals_table import load_signals, save_signals
+from vibrissa.io.sleap import load_sleap
+from vibrissa.io.tracks import join_views
+from vibrissa.io.tracks_file import load_tracks_table, save_tracks
 from vibrissa.io.video import VideoInfo, read_video, video_info, write_video
+from vibrissa.io.whisk import load_measurements, load_whiskers
 
 __all__ = [
+    "Kind",
     "VideoInfo",
     "check_folder",
     "check_readable",
     "check_writable",
     "is_netcdf",
+    "join_views",
     "kind_of",
+    "load_anipose",
     "load_centerline",
     "load_contacts",
+    "load_deeplabcut",
+    "load_matlab",
+    "load_measurements",
+    "load_movement",
+    "load_nwb",
     "load_recording",
     "load_signals",
+    "load_sleap",
+    "load_tracks",
+    "load_tracks_table",
     "load_whisker",
+    "load_whiskers",
     "read_video",
+    "recognise",
     "save_centerline",
     "save_contacts",
     "save_recording",
     "save_signals",
+    "save_tracks",
     "video_info",
     "write_video",
 ]

@@ -1,0 +1,215 @@
+"""Whiskers in MATLAB files, version 5 (SciPy) and 7.3 (which is HDF5).
+
+There is no standard; what laboratories use is looked for:
+
+- a struct array with the fields x, y, z and perhaps time and id: an entry a frame (and whisker),
+- a cell array with a matrix (points, 3) for each frame,
+- three variables whose names differ in x, y and z: cell arrays of vectors, or matrices (frame,
+  point),
+- one array (frame, point, 3), (point, 3, frame) or (3, point, frame).
+
+With two coordinates instead of three they are pixels. Frames may have different numbers of points;
+zeros behind the last one are padding.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any, Unpack
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from vibrissa.io.matlab_values import matlab_values
+from vibrissa.io.tracks import Labels, RawTracks, labelled
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class _Frames:
+    """What one layout gives: the points of each entry, and which frame and whisker it is."""
+
+    points: Sequence[Array]
+    frames: Sequence[float] | None = None
+    whiskers: Sequence[int] | None = None
+
+
+def load_matlab(
+    path: str | PathLike[str], variable: str | None = None, **labels: Unpack[Labels]
+) -> xr.Dataset:
+    """Read whiskers frame by frame.
+
+    Parameters
+    ----------
+    path : str or path
+        The ``.mat`` file.
+    variable : str, optional
+        Which variable holds the whiskers, or the three that hold x, y and z, parted by commas.
+        Needed only if there are several.
+    **labels
+        fps; unit (needed for points in space) and reference_frame, or view; see `Labels`.
+
+    Returns
+    -------
+    xarray.Dataset
+        Tracks.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If it is of another kind, cut short or empty, or has no whiskers in a known layout, or more
+        than one such variable.
+    """
+    return labelled(read_matlab(path, variable), path, **labels)
+
+
+def read_matlab(path: str | PathLike[str], variable: str | None = None) -> RawTracks:
+    """Read a MATLAB file as raw tracks; see `load_matlab`."""
+    path = Path(path)
+    values = matlab_values(path)
+    found = dict(_candidates(values))
+    if variable is not None:
+        found = {name: one for name, one in found.items() if name == variable}
+    if not found:
+        raise ValueError(
+            f"{path} has no whiskers frame by frame{f' in {variable}' if variable else ''}; it has "
+            f"{', '.join(values) or 'no variables'}. A struct array with x, y, z, a cell array of "
+            "matrices (points, 3), three variables for x, y and z, or one array (frame, point, 3) "
+            "is needed"
+        )
+    if len(found) > 1:
+        raise ValueError(
+            f"{path} may have whiskers in {' and in '.join(found)}; say which by variable="
+        )
+    ((name, frames),) = found.items()
+    return _tracks(path, name, frames)
+
+
+def _candidates(values: Mapping[str, Any]) -> Iterator[tuple[str, _Frames]]:
+    for name, value in values.items():
+        if isinstance(value, list) and value and all(isinstance(one, dict) for one in value):
+            yield from _structs(name, value)
+        elif isinstance(value, list) and value:
+            yield from _cells(name, value)
+        elif isinstance(value, np.ndarray) and value.ndim == 3 and 3 in value.shape:
+            axis = 2 if value.shape[2] == 3 else value.shape.index(3)
+            # MATLAB's way is to stack frames last.
+            frame = 0 if axis == 2 else 2
+            yield name, _Frames(list(np.moveaxis(value, (frame, axis), (0, 2))))
+    yield from _triples(values)
+
+
+def _structs(name: str, value: list[dict[str, Any]]) -> Iterator[tuple[str, _Frames]]:
+    fields = {field.lower(): field for field in value[0]}
+    if not {"x", "y"} <= set(fields):
+        return
+    axes = [fields[axis] for axis in "xyz" if axis in fields]
+    points = [_columns([entry[axis] for axis in axes]) for entry in value]
+    if any(one is None for one in points):
+        return
+    time = _scalars(value, fields.get("time"))
+    who = _scalars(value, fields.get("id"))
+    kept = [one for one in points if one is not None]
+    whiskers = None if time is None else _numbers(time, who)
+    yield name, _Frames(kept, time, whiskers)
+
+
+def _cells(name: str, value: list[Any]) -> Iterator[tuple[str, _Frames]]:
+    arrays = [np.asarray(one) for one in value if isinstance(one, np.ndarray)]
+    if len(arrays) != len(value):
+        return
+    filled = [one for one in arrays if one.size]
+    for width in (3, 2):
+        if filled and all(one.ndim == 2 and one.shape[1] == width for one in filled):
+            yield name, _Frames([one.reshape(-1, width) for one in arrays])
+            return
+        if filled and all(one.ndim == 2 and one.shape[0] == width for one in filled):
+            yield name, _Frames([one.reshape(width, -1).T for one in arrays])
+            return
+
+
+def _triples(values: Mapping[str, Any]) -> Iterator[tuple[str, _Frames]]:
+    """Variables such as x, y, z; xw3d, yw3d, zw3d; tracked_x, tracked_y, tracked_z."""
+    for name in values:
+        for i, letter in enumerate(name):
+            if letter not in "xX":
+                continue
+            axes = "xyz" if letter == "x" else "XYZ"
+            names = [name[:i] + axis + name[i + 1 :] for axis in axes]
+            if not all(other in values for other in names):
+                continue
+            three = [values[other] for other in names]
+            if all(isinstance(one, np.ndarray) and one.ndim == 2 for one in three):
+                three = [list(one) for one in three]
+            if not all(isinstance(one, list) for one in three):
+                continue
+            if len({len(one) for one in three}) != 1:
+                continue
+            points = [_columns(parts) for parts in zip(*three, strict=True)]
+            if all(one is not None for one in points):
+                yield ",".join(names), _Frames([one for one in points if one is not None])
+
+
+def _columns(parts: Sequence[Any]) -> Array | None:
+    """Put coordinates side by side; None if they are no vectors of one length."""
+    if not all(isinstance(part, np.ndarray) for part in parts):
+        return None
+    vectors = [np.asarray(part, dtype=np.float64).reshape(-1) for part in parts]
+    return np.stack(vectors, axis=1) if len({one.size for one in vectors}) == 1 else None
+
+
+def _scalars(entries: list[dict[str, Any]], field: str | None) -> list[float] | None:
+    """One number of each entry; None where some have none."""
+    if field is None:
+        return None
+    values = [np.asarray(entry[field]).reshape(-1) for entry in entries]
+    if any(value.size != 1 or value.dtype.kind not in "fiu" for value in values):
+        return None
+    return [float(value[0]) for value in values]
+
+
+def _numbers(time: list[float], who: list[float] | None) -> list[int]:
+    """Tell entries of one frame apart, by their id or their order."""
+    if who is not None and len(set(zip(time, who, strict=True))) == len(time):
+        return [int(one) for one in who]
+    counts: dict[float, itertools.count[int]] = {}
+    return [next(counts.setdefault(at, itertools.count())) for at in time]
+
+
+def _tracks(path: Path, name: str, found: _Frames) -> RawTracks:
+    points = [_without_padding(one) for one in found.points]
+    if not any(len(one) for one in points):
+        raise ValueError(f"{path}: {name} has no points in any frame")
+    at = np.arange(len(points), dtype=np.float64) if found.frames is None else found.frames
+    moments, row = np.unique(np.asarray(at, dtype=np.float64), return_inverse=True)
+    who = np.zeros(len(points), dtype=int) if found.whiskers is None else found.whiskers
+    whiskers, column = np.unique(who, return_inverse=True)
+    width = points[0].shape[1]
+    table = np.full((moments.size, whiskers.size, max(map(len, points)), width), np.nan)
+    for i, one in enumerate(points):
+        table[row[i], column[i], : len(one)] = one
+    whole = bool((moments == np.rint(moments)).all())
+    return RawTracks(
+        software="MATLAB",
+        whiskers=[str(one) for one in whiskers] if whiskers.size > 1 else ["whisker"],
+        image=table[:, :, None] if width == 2 else None,
+        space=table if width == 3 else None,
+        frames=moments.astype(np.int64) if whole else None,
+        time=None if whole else moments,
+        about={"variable": name},
+    )
+
+
+def _without_padding(points: Array) -> Array:
+    """Cut off zeros and NaN behind the last point."""
+    points = np.asarray(points, dtype=np.float64)
+    there = np.flatnonzero((np.nan_to_num(points) != 0.0).any(axis=1))
+    return points[: there[-1] + 1 if there.size else 0]

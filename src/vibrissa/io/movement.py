@@ -1,0 +1,100 @@
+"""Datasets of *movement* (NetCDF): ``position`` and ``confidence`` of keypoints.
+
+Up to its version 0.16 the dimensions are called individuals and keypoints, since 0.17 individual
+and keypoint. Positions in a plane are pixels unless its attribute ``space_unit`` says otherwise.
+"""
+
+from __future__ import annotations
+
+from os import PathLike
+from pathlib import Path
+from typing import Unpack
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from vibrissa.io.netcdf import kind_of
+from vibrissa.io.tracks import Labels, RawTracks, labelled
+
+Array = NDArray[np.float64]
+Frames = NDArray[np.int64]
+
+_NAMES = {"individuals": "individual", "keypoints": "keypoint"}
+_DIMS = ("time", "individual", "keypoint", "space")
+_PIXELS = ("", "px", "pixel", "pixels")
+
+
+def load_movement(path: str | PathLike[str], **labels: Unpack[Labels]) -> xr.Dataset:
+    """Read a poses dataset of movement.
+
+    Parameters
+    ----------
+    path : str or path
+        NetCDF.
+    **labels
+        fps, view; unit and reference_frame where the points are in space; see `Labels`.
+
+    Returns
+    -------
+    xarray.Dataset
+        Tracks.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If it is of another kind, cut short or empty.
+    """
+    return labelled(read_movement(path), path, **labels)
+
+
+def read_movement(path: str | PathLike[str]) -> RawTracks:
+    """Read a poses dataset as raw tracks; see `load_movement`."""
+    path = Path(path)
+    kind_of(path)
+    with xr.open_dataset(path, engine="h5netcdf") as file:
+        poses = file.load()
+    poses = poses.rename({old: new for old, new in _NAMES.items() if old in poses.dims})
+    if "position" not in poses or not {"time", "keypoint", "space"} <= set(poses["position"].dims):
+        got = ", ".join(str(name) for name in poses.variables) or "nothing"
+        raise ValueError(
+            f"{path} is no poses dataset of movement: it has {got}, and position along time, "
+            "space, keypoint(s) and individual(s) is needed"
+        )
+    if "individual" not in poses.dims:
+        poses = poses.expand_dims(individual=["whisker"])
+    points = poses["position"].transpose(*_DIMS).values.astype(np.float64)
+    sure = None
+    if "confidence" in poses:
+        sure = poses["confidence"].transpose(*_DIMS[:-1]).values.astype(np.float64)
+    unit = str(poses.attrs.get("space_unit", ""))
+    flat = points.shape[-1] == 2
+    fps, time, frames = _clock(poses)
+    if flat and unit not in _PIXELS:
+        raise ValueError(f"{path} has positions in a plane in {unit}; pixels are needed")
+    return RawTracks(
+        software=f"movement ({poses.attrs.get('source_software', 'unknown')})",
+        whiskers=[str(name) for name in poses["individual"].values],
+        image=points[:, :, None] if flat else None,
+        image_confidence=sure[:, :, None] if flat and sure is not None else None,
+        space=None if flat else points,
+        space_confidence=None if flat else sure,
+        nodes=[str(name) for name in poses["keypoint"].values],
+        unit="" if unit in _PIXELS else unit,
+        fps=fps,
+        time=time,
+        frames=frames,
+    )
+
+
+def _clock(poses: xr.Dataset) -> tuple[float | None, Array | None, Frames | None]:
+    """Frames a second, times and numbers of the frames, as far as they are known."""
+    fps = poses.attrs.get("fps")
+    time = poses["time"].values.astype(np.float64)
+    if poses.attrs.get("time_unit", "frames") == "frames":
+        return None, None, time.astype(np.int64)
+    if fps is None:
+        return None, time, None
+    return float(fps), time, np.rint(time * float(fps)).astype(np.int64)

@@ -1,0 +1,232 @@
+"""Poses in Neurodata Without Borders files (ndx-pose), read as the HDF5 that they are.
+
+A `PoseEstimation` holds a series for each node, in pixels of one camera or in space; a
+`MultiCameraPoseEstimation` (ndx-pose 0.4 and later) holds points in space and one PoseEstimation
+for each camera. Each such container is a whisker; lone PoseEstimations that differ in their camera
+only are views of one whisker.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any, Unpack
+
+import h5py
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from vibrissa.io.hdf5 import opened
+from vibrissa.io.tracks import Labels, RawTracks, labelled
+
+Array = NDArray[np.float64]
+
+_PIXELS = ("pixels", "pixel", "px")
+_LENGTHS = {
+    **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), "m"),
+    **dict.fromkeys(("cm", "centimeter", "centimeters", "centimetres"), "cm"),
+    **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetres"), "mm"),
+    **dict.fromkeys(("um", "µm", "micrometer", "micrometers", "micrometres", "microns"), "um"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class _Series:
+    """Points of the nodes of one whisker, in one view or in space."""
+
+    nodes: Sequence[str]
+    points: Array
+    confidence: Array
+    time: Array
+    unit: str
+    frame: str
+
+
+def load_nwb(path: str | PathLike[str], **labels: Unpack[Labels]) -> xr.Dataset:
+    """Read the poses of an NWB file.
+
+    Parameters
+    ----------
+    path : str or path
+        The ``.nwb`` file.
+    **labels
+        view, unit, reference_frame, where the file does not say them; see `Labels`.
+
+    Returns
+    -------
+    xarray.Dataset
+        Tracks: ``trace`` for what is in pixels, ``centerline`` for what is in space.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If it is of another kind, cut short, has no poses, or their times differ.
+    """
+    return labelled(read_nwb(path), path, **labels)
+
+
+def read_nwb(path: str | PathLike[str]) -> RawTracks:
+    """Read an NWB file as raw tracks; see `load_nwb`."""
+    path = Path(path)
+    with opened(path, "an NWB file with poses") as file:
+        if "nwb_version" not in file.attrs:
+            raise ValueError(f"{path} is no NWB file: it has no nwb_version")
+        space, image = _found(file)
+    if not space and not image:
+        raise ValueError(f"{path} has no poses: no PoseEstimation holds any series of points")
+    every = [*space.values(), *image.values()]
+    time = every[0].time
+    if any(not np.array_equal(one.time, time) for one in every):
+        raise ValueError(f"{path} has poses at different times; one clock is needed")
+    nodes = list(dict.fromkeys(node for one in every for node in one.nodes))
+    whiskers = list(dict.fromkeys([*space, *(who for who, _ in image)]))
+    views = list(dict.fromkeys(view for _, view in image))
+    units = {one.unit for one in space.values()}
+    frames = {one.frame for one in space.values()}
+    if len(units) > 1 or len(frames) > 1:
+        raise ValueError(f"{path} has points in several units or frames: {units}, {frames}")
+    space_table = _table(space, (whiskers,), nodes, time.size, 3) if space else None
+    image_table = _table(image, (whiskers, views), nodes, time.size, 2) if image else None
+    return RawTracks(
+        software="NWB",
+        whiskers=whiskers,
+        views=views,
+        nodes=nodes,
+        time=time,
+        space=None if space_table is None else space_table[..., :3],
+        space_confidence=None if space_table is None else space_table[..., 3],
+        image=None if image_table is None else image_table[..., :2],
+        image_confidence=None if image_table is None else image_table[..., 2],
+        unit=units.pop() if units else "",
+        reference_frame=frames.pop() if frames else "",
+    )
+
+
+def _found(file: h5py.File) -> tuple[dict[str, _Series], dict[tuple[str, str], _Series]]:
+    """Points in space by whisker, and in the image by whisker and view."""
+    groups: dict[str, h5py.Group] = {}
+
+    def note(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Group) and _type(item) in ("PoseEstimation", _MANY):
+            groups[name] = item
+
+    file.visititems(note)
+    space: dict[str, _Series] = {}
+    image: dict[tuple[str, str], _Series] = {}
+    inside = {
+        f"{name}/{child}" for name, one in groups.items() if _type(one) == _MANY for child in one
+    }
+    for name, group in groups.items():
+        who = name.rpartition("/")[2]
+        if _type(group) == _MANY:
+            series = _series(group)
+            if series is not None:
+                space[who] = series
+            for child in group.values():
+                if _type(child) == "PoseEstimation" and (series := _series(child)) is not None:
+                    image[who, _view(child)] = series
+    lone = {n: g for n, g in groups.items() if _type(g) != _MANY and n not in inside}
+    series_of = {name: one for name, group in lone.items() if (one := _series(group)) is not None}
+    cameras = [_view(lone[name]) for name in series_of]
+    one_whisker = (
+        len(cameras) > 1
+        and len(set(cameras)) == len(cameras)
+        and len({tuple(series.nodes) for series in series_of.values()}) == 1
+    )
+    for name, series in series_of.items():
+        who = "whisker" if one_whisker else name.rpartition("/")[2]
+        if series.points.shape[-1] == 3:
+            space[who] = series
+        else:
+            image[who, _view(lone[name]) if one_whisker else "camera"] = series
+    return space, image
+
+
+_MANY = "MultiCameraPoseEstimation"
+
+
+def _type(item: Any) -> str:
+    return str(item.attrs.get("neurodata_type", ""))
+
+
+def _view(group: h5py.Group) -> str:
+    """Name of its camera, or else its own."""
+    for link in ("device", *group):
+        if (link in group and "Camera" in _type(group[link])) or _type(group.get(link)) == "Device":
+            return str(group[link].name).rpartition("/")[2]
+    return str(group.name).rpartition("/")[2]
+
+
+def _series(group: h5py.Group) -> _Series | None:
+    """All nodes of one container; None if it has none."""
+    children = {name: one for name, one in group.items() if _type(one) == "PoseEstimationSeries"}
+    if not children:
+        return None
+    order = (
+        [str(name) for name in group["skeleton/nodes"].asstr()[:]] if "skeleton" in group else []
+    )
+    nodes = [name for name in order if name in children]
+    nodes += [name for name in children if name not in nodes]
+    first = children[nodes[0]]
+    time = _time(first)
+    points, sure = [], []
+    for name in nodes:
+        data = children[name]["data"]
+        values = data[:] * data.attrs.get("conversion", 1.0) + data.attrs.get("offset", 0.0)
+        if len(values) != time.size:
+            raise ValueError(f"{group.name} has nodes at different times")
+        points.append(np.asarray(values, dtype=np.float64))
+        known = children[name].get("confidence")
+        sure.append(np.full(time.size, np.nan) if known is None else np.asarray(known[:], float))
+    said = str(first["data"].attrs.get("unit", "")).lower()
+    flat = points[0].shape[1] == 2
+    if said and said not in (_PIXELS if flat else _LENGTHS):
+        raise ValueError(f"{group.name} has positions in {said}; pixels or a length is needed")
+    frame = first.get("reference_frame")
+    return _Series(
+        nodes,
+        np.stack(points, axis=1),
+        np.stack(sure, axis=1),
+        time,
+        "" if flat else _LENGTHS.get(said, ""),
+        _frame(frame),
+    )
+
+
+def _frame(item: Any) -> str:
+    text = item.asstr()[()] if item is not None else ""
+    return "" if str(text) in ("", "unknown") else str(text)
+
+
+def _time(series: h5py.Group) -> Array:
+    """Times of the frames, s."""
+    if "timestamps" in series:
+        return np.asarray(series["timestamps"][:], dtype=np.float64)
+    start = series["starting_time"]
+    count = series["data"].shape[0]
+    return np.asarray(start[()] + np.arange(count) / start.attrs["rate"], dtype=np.float64)
+
+
+def _table(
+    found: Mapping[Any, _Series],
+    names: tuple[Sequence[str], ...],
+    nodes: Sequence[str],
+    frames: int,
+    width: int,
+) -> Array:
+    """Coordinates and confidence (time, whisker[, view], node, width + 1)."""
+    table = np.full((frames, *map(len, names), len(nodes), width + 1), np.nan)
+    for key, series in found.items():
+        keys = key if isinstance(key, tuple) else (key,)
+        part = table
+        for axis, name in zip(names, keys, strict=True):
+            part = part[:, axis.index(name)]
+        columns = [nodes.index(node) for node in series.nodes]
+        part[:, columns, :width] = series.points
+        part[:, columns, width] = series.confidence
+    return table

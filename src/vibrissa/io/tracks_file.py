@@ -1,0 +1,267 @@
+"""Tracks in files of our own: NetCDF, without loss, and CSV, a line for each point.
+
+The lines of a table have the columns ``frame``, ``time`` (s), ``whisker``, ``view``, ``node`` and
+then ``column``, ``row`` (pixels) or ``x``, ``y``, ``z`` (m, or with the unit at the end of the
+name, as in ``x_mm``), and ``confidence``. Of these a table that somebody else made needs frame or
+time, and the coordinates; points of one frame and whisker without a name are in their order from
+the base.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+from typing import Any, Unpack
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from vibrissa.io.netcdf import kind_of
+from vibrissa.io.paths import CSV, NETCDF, check_writable
+from vibrissa.io.replace import replacing
+from vibrissa.io.table import read_text, table_rows
+from vibrissa.io.tracks import KIND, UNITS, Labels, RawTracks, labelled
+
+Array = NDArray[np.float64]
+
+_LABELS = ("whisker", "view", "node")
+_RECORDING = "vibrissa recording"
+_VARIABLES = ("trace", "centerline", "confidence", "trace_confidence")
+
+
+def save_tracks(path: str | PathLike[str], tracks: xr.Dataset) -> None:
+    """Write tracks.
+
+    Parameters
+    ----------
+    path : str or path
+        Where to write, NetCDF or CSV by its ending; an existing file is replaced.
+    tracks : xarray.Dataset
+        As a reader gave them. A table holds the points and their confidence, either those in the
+        image or those in space.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the folder does not exist.
+    ValueError
+        If these are no tracks, or a table is asked of tracks with both.
+    """
+    path = check_writable(path, (*NETCDF, *CSV))
+    if tracks.attrs.get("kind") != KIND:
+        raise ValueError(f"these are no tracks: kind is {tracks.attrs.get('kind', 'nothing')!r}")
+    if path.suffix.lower() in CSV:
+        text = _text(tracks)
+        with replacing(path) as part:
+            part.write_text(text, encoding="utf-8")
+        return
+    squeezed = {"zlib": True, "complevel": 1, "shuffle": True}
+    encoding = {name: squeezed for name, one in tracks.data_vars.items() if one.size > 1000}
+    with replacing(path) as part:
+        tracks.to_netcdf(part, engine="h5netcdf", encoding=encoding)
+
+
+def load_own_tracks(path: str | PathLike[str]) -> xr.Dataset:
+    """Read tracks that `save_tracks` wrote as NetCDF, or those of a recording.
+
+    Parameters
+    ----------
+    path : str or path
+        NetCDF.
+
+    Returns
+    -------
+    xarray.Dataset
+        Tracks.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If it holds something else, or is cut short.
+    """
+    path = Path(path)
+    kind = kind_of(path)
+    if kind not in (KIND, _RECORDING):
+        raise ValueError(f"{path} holds {kind or 'data of another kind'}, not tracks")
+    with xr.open_dataset(path, engine="h5netcdf") as file:
+        if kind == KIND:
+            return file.load()
+        names = [name for name in _VARIABLES if name in file]
+        if not {"trace", "centerline"} & set(names):
+            raise ValueError(f"{path} is a recording without a trace or a centreline")
+        tracks = file[names].load()
+    tracks.attrs |= {"kind": KIND, "source": path.name, "source_software": "vibrissa"}
+    return tracks
+
+
+def load_tracks_table(path: str | PathLike[str], **labels: Unpack[Labels]) -> xr.Dataset:
+    """Read a table of points.
+
+    Parameters
+    ----------
+    path : str or path
+        CSV, as the module describes.
+    **labels
+        fps, view, reference_frame; see `Labels`.
+
+    Returns
+    -------
+    xarray.Dataset
+        Tracks.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If columns lack, a cell is no number, or a point is given twice.
+    """
+    return labelled(read_tracks_table(path), path, **labels)
+
+
+def read_tracks_table(path: str | PathLike[str]) -> RawTracks:
+    """Read a table of points as raw tracks; see `load_tracks_table`."""
+    path = Path(path)
+    rows = table_rows(read_text(path))
+    header = next(rows, None)
+    if header is None:
+        raise ValueError(f"{path} is empty")
+    names = [name.lower() for name in header[1]]
+    axes, unit = _coordinates(path, names)
+    cells = [_cells(path, line, one, len(names)) for line, one in rows]
+    if not cells:
+        raise ValueError(f"{path} has a header but no rows")
+    table = list(zip(*cells, strict=True))
+
+    def numbers(name: str) -> Array | None:
+        return _numbers(path, name, table[names.index(name)]) if name in names else None
+
+    frame, time = numbers("frame"), numbers("time")
+    if frame is None and time is None:
+        raise ValueError(f"{path} has neither a column frame nor time")
+    clock = frame if frame is not None else time
+    assert clock is not None
+    moments, first, row = np.unique(clock, return_index=True, return_inverse=True)
+    labels = {
+        name: [str(cell) for cell in table[names.index(name)]] for name in _LABELS if name in names
+    }
+    whisker, who = _ordered(labels.get("whisker", ["whisker"] * len(row)))
+    view, seen = _ordered(labels.get("view", [""] * len(row)))
+    node, part = _ordered(labels.get("node") or _counted(row, who, seen))
+    place = (row, who, seen, part)
+    if len(np.unique(np.stack(place), axis=1).T) != len(row):
+        raise ValueError(f"{path} has the same point of a whisker twice in one frame")
+    shape = (moments.size, len(whisker), len(view), len(node))
+    points, sure = np.full((*shape, len(axes)), np.nan), np.full(shape, np.nan)
+    for i, axis in enumerate(axes):
+        points[(*place, i)] = numbers(axis)
+    confidence = numbers("confidence")
+    if confidence is not None:
+        sure[place] = confidence
+    flat = len(axes) == 2
+    return RawTracks(
+        software="table",
+        whiskers=whisker,
+        views=[name for name in view if name],
+        nodes=node if "node" in labels else None,
+        image=points if flat else None,
+        image_confidence=sure if flat else None,
+        space=None if flat else points[:, :, 0],
+        space_confidence=None if flat else sure[:, :, 0],
+        frames=moments.astype(np.int64) if frame is not None else None,
+        time=None if time is None else time[first],
+        unit=unit,
+    )
+
+
+def _coordinates(path: Path, names: Sequence[str]) -> tuple[list[str], str]:
+    """Names of the columns with coordinates, and the unit of points in space."""
+    for pixels in (["column", "row"], ["x_px", "y_px"]):
+        if set(pixels) <= set(names):
+            return pixels, ""
+    for unit in ("m", "mm", "um", "µm", "cm"):
+        found = [f"{axis}_{unit}" for axis in "xyz"]
+        if set(found) <= set(names):
+            return found, unit
+    if {"x", "y", "z"} <= set(names):
+        return list("xyz"), "m"
+    raise ValueError(
+        f"{path} has the columns {', '.join(names)}; column, row (pixels) or x, y, z (m; also x_mm "
+        f"and so on: {', '.join(UNITS)}) are needed"
+    )
+
+
+def _cells(path: Path, line: int, cells: list[str], count: int) -> list[str]:
+    if len(cells) != count:
+        raise ValueError(
+            f"{path}: line {line} has {len(cells)} cells, not {count}; is it cut short?"
+        )
+    return cells
+
+
+def _numbers(path: Path, name: str, cells: Sequence[str]) -> Array:
+    try:
+        return np.array([float(cell) if cell else np.nan for cell in cells])
+    except ValueError as error:
+        raise ValueError(f"{path}: column {name} has a cell that is no number ({error})") from None
+
+
+def _ordered(names: Sequence[Any]) -> tuple[list[str], NDArray[np.int64]]:
+    """Names in the order they appear in, and which of them each row has."""
+    order = {name: i for i, name in enumerate(dict.fromkeys(names))}
+    return [str(name) for name in order], np.array([order[name] for name in names])
+
+
+def _counted(*keys: NDArray[np.int64]) -> list[int]:
+    """Count rows with the same keys."""
+    counts: dict[tuple[int, ...], int] = {}
+    out = []
+    for key in zip(*(array.tolist() for array in keys), strict=True):
+        counts[key] = counts.get(key, -1) + 1
+        out.append(counts[key])
+    return out
+
+
+def _text(tracks: xr.Dataset) -> str:
+    """Lines of a table."""
+    points = [name for name in ("trace", "centerline") if name in tracks]
+    if len(points) != 1:
+        raise ValueError(
+            f"tracks with {' and '.join(points) or 'no points'} are no table; drop trace or "
+            "centerline, or write NetCDF"
+        )
+    array = tracks[points[0]]
+    dims = [str(dim) for dim in array.dims[:-1]]
+    axes = ["column", "row"] if points == ["trace"] else ["x", "y", "z"]
+    frames = tracks["frame"].values if "frame" in tracks else np.arange(tracks.sizes["time"])
+    moments = [[str(int(frame))] for frame in frames]
+    head = ["frame"]
+    if tracks["time"].attrs.get("units") == "s":
+        head.append("time")
+        moments = [
+            [*m, repr(float(t))] for m, t in zip(moments, tracks["time"].values, strict=True)
+        ]
+    places = list(itertools.product(*(_names(tracks, dim) for dim in dims[1:])))
+    sure = tracks["confidence"].transpose(*dims).values
+    numbers = np.concatenate([array.values, sure[..., None]], axis=-1)
+    table = numbers.reshape(len(moments), len(places), -1).tolist()
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow([*head, *dims[1:], *axes, "confidence"])
+    for moment, rows in zip(moments, table, strict=True):
+        for place, row in zip(places, rows, strict=True):
+            writer.writerow([*moment, *place, *map(repr, row)])
+    return out.getvalue()
+
+
+def _names(tracks: xr.Dataset, dim: str) -> list[str]:
+    if dim in tracks.coords:
+        return [str(name) for name in tracks[dim].values]
+    return [str(i) for i in range(tracks.sizes[dim])]

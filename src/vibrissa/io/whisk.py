@@ -1,0 +1,332 @@
+"""Files of the tracker *whisk*: `.whiskers` (traces) and `.measurements` (one line a trace).
+
+Little endian. A whiskers file is the header ``bwhiskbin1``, for each segment its id, frame and
+number of points n with n times x, y, thickness and score as float32, and at the end the number of
+segments. The id counts the segments of one frame and is no identity; points run in either
+direction; traces reach beyond the tip and into the face by some pixels. A measurements file is the
+header ``measv3``, numbers of rows and of measures, and for each row its frame, segment, state and
+measures. The state is the whisker's identity once somebody has had whiskers classified (−1: none);
+before, it is the same for all.
+
+Clack et al. 2012, doi:10.1371/journal.pcbi.1002591.
+"""
+
+from __future__ import annotations
+
+import struct
+from os import PathLike
+from pathlib import Path
+from typing import Any, Unpack
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from vibrissa.io.paths import check_readable
+from vibrissa.io.tracks import Labels, RawTracks, labelled
+
+Array = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+
+WHISKERS = b"bwhiskbin1\0\0"
+MEASUREMENTS = b"measv3\0\0"
+
+_MEASURES = 8
+_SEGMENT = struct.Struct("<3i")
+_MOST_BYTES = 2**31
+
+
+def load_whiskers(
+    path: str | PathLike[str],
+    measurements: str | PathLike[str] | None = None,
+    *,
+    nodes: int | None = None,
+    **labels: Unpack[Labels],
+) -> xr.Dataset:
+    """Read the traces of a whiskers file.
+
+    Parameters
+    ----------
+    path : str or path
+        The ``.whiskers`` file.
+    measurements : str or path, optional
+        The ``.measurements`` file of the same video, by default that of the same name beside it
+        where there is one. It says which end is the follicle and, if classified, which segments
+        are whiskers and which whisker each is. Without it whisker i is the i-th segment of each
+        frame, which is no identity, and the direction of the points is left as it is.
+    nodes : int, optional
+        Points of each whisker, evenly along it; by default all that were traced, as many as the
+        longest trace has, the others NaN beyond their end.
+    **labels
+        fps and view; see `Labels`.
+
+    Returns
+    -------
+    xarray.Dataset
+        Tracks with a ``trace``; with ``thickness`` in pixels and the tracker's ``score``.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If it is of another kind or cut short, or if the two files do not belong together.
+    """
+    return labelled(read_whiskers(path, measurements, nodes), path, **labels)
+
+
+def read_whiskers(
+    path: str | PathLike[str],
+    measurements: str | PathLike[str] | None = None,
+    nodes: int | None = None,
+) -> RawTracks:
+    """Read a whiskers file as raw tracks; see `load_whiskers`."""
+    path = check_readable(path)
+    if nodes is not None and nodes < 2:
+        raise ValueError(f"nodes is {nodes}; 2 or more are needed")
+    frames, ids, segments = _segments(path)
+    beside = path.with_suffix(".measurements")
+    if measurements is None and beside.is_file():
+        measurements = beside
+    identity = ids
+    about: dict[str, Any] = {"identity": "per frame", "direction": "either"}
+    if measurements is not None:
+        rows = _rows(Path(measurements))
+        segments, identity = _matched(path, Path(measurements), frames, ids, segments, rows)
+        about = {"identity": _identity(rows)[1], "direction": "from the follicle"}
+    kept = identity >= 0
+    frames, identity = frames[kept], identity[kept]
+    chosen = [segment for segment, keep in zip(segments, kept, strict=True) if keep]
+    if nodes is not None:
+        chosen = [_resampled(segment, nodes) for segment in chosen]
+    filled, whiskers, number = _table(path, frames, identity, chosen)
+    measured = ("time", "whisker", "view", "node")
+    return RawTracks(
+        software="whisk",
+        whiskers=whiskers,
+        image=filled[..., :2],
+        frames=number,
+        extra={
+            "thickness": xr.Variable(
+                measured, filled[..., 2], {"units": "pixel", "long_name": "thickness of the trace"}
+            ),
+            "score": xr.Variable(
+                measured, filled[..., 3], {"units": "1", "long_name": "score of the trace"}
+            ),
+        },
+        about=about,
+    )
+
+
+def load_measurements(path: str | PathLike[str], **labels: Unpack[Labels]) -> xr.Dataset:
+    """Read a measurements file.
+
+    Parameters
+    ----------
+    path : str or path
+        The ``.measurements`` file.
+    **labels
+        fps and view; see `Labels`.
+
+    Returns
+    -------
+    xarray.Dataset
+        Tracks whose ``trace`` has the two nodes ``follicle`` and ``tip``; and each trace's
+        ``trace_length``, ``angle``, ``trace_curvature`` (1/pixel), ``score`` and ``segment`` (its
+        id in the whiskers file, −1 where there is none).
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If it is of another kind or cut short.
+    """
+    return labelled(read_measurements(path), path, **labels)
+
+
+def read_measurements(path: str | PathLike[str]) -> RawTracks:
+    """Read a measurements file as raw tracks; see `load_measurements`."""
+    path = check_readable(path)
+    rows = _rows(path)
+    identity, kind = _identity(rows)
+    kept = identity >= 0
+    rows, identity = rows[kept], identity[kept]
+    number, whiskers, place = _places(path, rows["frame"].astype(np.int64), identity)
+    shape = (number.size, len(whiskers), 1)
+    measures = np.full((*shape, _MEASURES), np.nan)
+    measures[(*place, 0)] = rows["data"]
+    segment = np.full(shape, -1)
+    segment[(*place, 0)] = rows["segment"]
+    columns = {
+        "trace_length": (0, 1.0, "pixel", "length of the trace"),
+        "score": (1, 1.0, "1", "score of the trace"),
+        "angle": (2, np.pi / 180.0, "rad", "angle of the trace at the follicle"),
+        "trace_curvature": (3, 1.0, "1/pixel", "curvature of the trace"),
+    }
+    dims = ("time", "whisker", "view")
+    extra = {
+        name: xr.Variable(
+            dims, measures[..., column] * factor, {"units": unit, "long_name": long_name}
+        )
+        for name, (column, factor, unit, long_name) in columns.items()
+    }
+    extra["segment"] = xr.Variable(dims, segment, {"units": "1", "long_name": "id of the segment"})
+    about: dict[str, Any] = {"identity": kind, "direction": "from the follicle"}
+    if rows.size:
+        face = rows["face"][0]
+        about |= {"face": [int(x) for x in face], "face_axis": rows["axis"][0].decode("ascii")}
+    return RawTracks(
+        software="whisk",
+        whiskers=whiskers,
+        image=measures[..., 4:].reshape(*shape, 2, 2),
+        nodes=("follicle", "tip"),
+        frames=number,
+        extra=extra,
+        about=about,
+    )
+
+
+def _segments(path: Path) -> tuple[Numbers, Numbers, list[Array]]:
+    """Frame, id and points (n, 4) of every segment."""
+    content = path.read_bytes()
+    if not content.startswith(WHISKERS[:10]):
+        raise ValueError(f"{path} is no whiskers file: it does not begin with bwhiskbin1")
+    cut = f"{path} is cut short: its last segment is not whole, or the number of segments is wrong"
+    if len(content) < len(WHISKERS) + 4:
+        raise ValueError(cut)
+    end = len(content) - 4
+    (count,) = struct.unpack_from("<i", content, end)
+    at, frames, ids, segments = len(WHISKERS), [], [], []
+    while at < end:
+        if at + _SEGMENT.size > end:
+            raise ValueError(cut)
+        number, frame, n = _SEGMENT.unpack_from(content, at)
+        at += _SEGMENT.size
+        if n < 0 or at + 16 * n > end:
+            raise ValueError(cut)
+        values = np.frombuffer(content, "<f4", 4 * n, at).reshape(4, n)
+        segments.append(values.T.astype(np.float64))
+        frames.append(frame)
+        ids.append(number)
+        at += 16 * n
+    if count != len(segments):
+        raise ValueError(cut)
+    return np.array(frames, dtype=np.int64), np.array(ids, dtype=np.int64), segments
+
+
+def _rows(path: Path) -> NDArray[Any]:
+    """Read every row of a measurements file."""
+    content = check_readable(path).read_bytes()
+    if not content.startswith(MEASUREMENTS[:6]):
+        raise ValueError(f"{path} is no measurements file: it does not begin with measv3")
+    if len(content) < len(MEASUREMENTS) + 8:
+        raise ValueError(f"{path} is cut short: its header is not whole")
+    count, n = struct.unpack_from("<2i", content, len(MEASUREMENTS))
+    if n != _MEASURES:
+        raise ValueError(f"{path} has {n} measures a row; {_MEASURES} are known")
+    whole = np.dtype(
+        [
+            ("row", "<i4"),
+            ("frame", "<i4"),
+            ("segment", "<i4"),
+            ("state", "<i4"),
+            ("face", "<i4", 2),
+            ("follicle_columns", "<i4", 2),
+            ("velocity_valid", "<i4"),
+            ("n", "<i4"),
+            ("axis", "S1"),
+            ("data", "<f8", n),
+            ("velocity", "<f8", n),
+        ]
+    )
+    start = len(MEASUREMENTS) + 8
+    if len(content) != start + count * whole.itemsize:
+        have = (len(content) - start) / whole.itemsize
+        raise ValueError(f"{path} is cut short: it says {count} rows and has {have:.1f}")
+    rows = np.frombuffer(content, whole, count, start)
+    return rows[np.lexsort((rows["segment"], rows["frame"]))]
+
+
+def _identity(rows: NDArray[Any]) -> tuple[Numbers, str]:
+    """Tell which whisker each row is, −1 for none, and how that is known."""
+    state = rows["state"].astype(np.int64)
+    classified = state >= 0
+    pairs = np.stack([rows["frame"], state], axis=1)[classified]
+    if classified.any() and len(np.unique(pairs, axis=0)) == len(pairs):
+        return state, "classified"
+    return rows["segment"].astype(np.int64), "per frame"
+
+
+def _matched(
+    path: Path,
+    measurements: Path,
+    frames: Numbers,
+    ids: Numbers,
+    segments: list[Array],
+    rows: NDArray[Any],
+) -> tuple[list[Array], Numbers]:
+    """Turn segments to begin at the follicle, and tell their identity, −1 for none."""
+    identity, _ = _identity(rows)
+    found = {
+        (int(row["frame"]), int(row["segment"])): (int(who), row["data"][4:6])
+        for row, who in zip(rows, identity, strict=True)
+    }
+    turned, who = [], np.full(len(segments), -1)
+    for i, (key, points) in enumerate(
+        zip(zip(frames.tolist(), ids.tolist(), strict=True), segments, strict=True)
+    ):
+        if key in found and len(points):
+            who[i], follicle = found.pop(key)
+            first, last = np.linalg.norm(points[[0, -1], :2] - follicle, axis=1)
+            points = points if first <= last else points[::-1]
+        turned.append(points)
+    if found:
+        raise ValueError(
+            f"{measurements} does not belong to {path}: it measures {len(found)} segments that "
+            "the whiskers file does not have"
+        )
+    return turned, who
+
+
+def _resampled(points: Array, nodes: int) -> Array:
+    """Points (nodes, 4) evenly along a segment."""
+    if len(points) < 2:
+        return np.full((nodes, 4), np.nan)
+    along = np.concatenate(
+        [[0.0], np.cumsum(np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1))]
+    )
+    at = np.linspace(0.0, along[-1], nodes)
+    return np.column_stack([np.interp(at, along, column) for column in points.T])
+
+
+def _places(
+    path: Path, frames: Numbers, identity: Numbers
+) -> tuple[Numbers, list[str], tuple[Numbers, Numbers]]:
+    """All frames from the first to the last, whiskers, and where each row goes among them."""
+    if not frames.size:
+        raise ValueError(f"{path} holds no whiskers")
+    number = np.arange(frames.min(), frames.max() + 1)
+    whiskers, column = np.unique(identity, return_inverse=True)
+    pairs = np.stack([frames, identity], axis=1)
+    if len(np.unique(pairs, axis=0)) != len(pairs):
+        raise ValueError(f"{path} has the same segment twice in one frame")
+    return number, [str(one) for one in whiskers], (frames - number[0], column)
+
+
+def _table(
+    path: Path, frames: Numbers, identity: Numbers, segments: list[Array]
+) -> tuple[Array, list[str], Numbers]:
+    """Columns (n, whiskers, 1, nodes, 4) of all segments, NaN beyond their end."""
+    number, whiskers, (row, column) = _places(path, frames, identity)
+    longest = max(len(segment) for segment in segments)
+    shape = (number.size, len(whiskers), 1, longest, 4)
+    if 8 * np.prod(shape, dtype=np.float64) > _MOST_BYTES:
+        raise ValueError(
+            f"{path} has {number.size} frames of up to {len(whiskers)} segments with up to "
+            f"{longest} points, too many to hold: give nodes=, such as 50, or classify the whiskers"
+        )
+    filled = np.full(shape, np.nan)
+    for i, segment in enumerate(segments):
+        filled[row[i], column[i], 0, : len(segment)] = segment
+    return filled, whiskers, number

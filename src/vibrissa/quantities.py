@@ -313,7 +313,8 @@ _ROWS: tuple[tuple[str, str, _Unit, str, str], ...] = (
         r"\chi",
         _NUMBER,
         "misfit",
-        "How far signals are from any that a contact explains, in shares of each signal's range.",
+        "Of three signals: how far they are from any that a contact explains, in shares of each "
+        "signal's range; of more: χ², the sum of squares of what is left, in standard deviations.",
     ),
     (
         "linear",

@@ -156,8 +156,8 @@ def test_bad_input_says_what_is_allowed(gamma_map):
     signals = {"Fx": 1e-5, "MB": 1e-7, "MD": 0.1}
     with pytest.raises(ValueError, match="signals lack MB, MD"):
         gamma_map.estimate({"Fx": 1e-5})
-    with pytest.raises(ValueError, match="expected 3 signals; got 4"):
-        gamma_map.estimate(signals, triplet="Fx FT MB MD")
+    with pytest.raises(ValueError, match="expected at least 3 different signals"):
+        gamma_map.estimate(signals, triplet="MB MD")
     with pytest.raises(ValueError, match="MB is a size and cannot be negative"):
         gamma_map.estimate({**signals, "MB": -1e-7})
     with pytest.raises(ValueError, match="looks like degrees"):

@@ -117,10 +117,10 @@ class ContactMap:
         signals : Dataset or mapping
             Measured signals by name, SI units, any shape.
         triplet : str or tuple of str
-            The three signals to use.
+            The signals to use, three or more.
         noise : mapping or (6, 6) array_like, optional
             Standard deviation of each signal, or covariance of (F, M), SI units; gives each
-            estimate's covariance.
+            estimate's covariance, and weighs more than three signals.
         method : {"exact"}
             How.
 

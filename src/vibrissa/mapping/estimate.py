@@ -1,7 +1,9 @@
 """Measured signals in, contacts out: all that explain them, each with its covariance.
 
-For three signals T with noise covariance Σ the contact point's covariance is A Σ Aᵀ with the exact
-A = ∂p/∂ξ (∂T/∂ξ)⁻¹ at the solution. For a covariance of force and moment, Σ is carried over to
+Three signals T have as many unknowns ξ: every contact with T(ξ) = T is a candidate, and for noise
+of covariance Σ its point's covariance is A Σ Aᵀ with the exact A = ∂p/∂ξ (∂T/∂ξ)⁻¹. More signals
+are explained by weighted least squares, χ² = |T(ξ) - T|² in standard deviations; the covariance is
+∂p/∂ξ (JᵀΣ⁻¹J)⁻¹ ∂p/∂ξᵀ with J = ∂T/∂ξ. For a covariance of force and moment, Σ is carried over to
 the signals by their derivatives.
 """
 
@@ -14,17 +16,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
-from scipy.spatial import cKDTree
 
 from vibrissa.mapping.contact_map import spherical
-from vibrissa.mapping.inversion import Contacts, invert, polish
+from vibrissa.mapping.explanation import by_least_squares, by_triplet
+from vibrissa.mapping.noise import SensorNoise
 from vibrissa.quantities import attributes
-from vibrissa.rod.arrays import Array, IntArray
-from vibrissa.rod.batch import solve_forces
-from vibrissa.rod.newton import TOLERANCE
-from vibrissa.rod.reach import with_normal_force
+from vibrissa.rod.arrays import AnyArray, Array, IntArray
 from vibrissa.signals import CIRCULAR, SIGNALS, Coordinates, measured, selection, signal_scales
-from vibrissa.signals.base import signal_derivatives, signals_of, wrench_derivatives
 from vibrissa.status import Status, flag_attributes
 
 if TYPE_CHECKING:
@@ -38,27 +36,41 @@ class Estimate:
     Attributes
     ----------
     point : (..., 3) array
-        Contact point of the most plausible candidate (least force), m; NaN where there is none.
+        Contact point of the most plausible candidate, m; NaN where there is none.
     covariance : (..., 3, 3) array
         Its covariance, m²; NaN without ``noise``.
+    linear : (...) bool array
+        Whether the covariance can be relied on: within two standard deviations the contact moves
+        with the signals as the derivatives say, and stays on the whisker. False without ``noise``,
+        and mostly where the deflection is small.
     status : (...) int array
-        :class:`~vibrissa.Status`: ``UNIQUE``, ``AMBIGUOUS``, ``NOT_FRICTIONLESS``, ``OUTSIDE_MAP``
-        or ``MISSING``.
+        :class:`~vibrissa.Status`: ``UNIQUE``; ``AMBIGUOUS``; ``NOT_FRICTIONLESS`` where no contact
+        on the map explains the signals (of more than three signals: where χ² is larger than one
+        measurement in a thousand would have it; then the contact that comes nearest is given);
+        ``OUTSIDE_MAP`` where one nearer to the base would, or where signals are ten times larger
+        than any on the map; ``DEGENERATE`` where all forces and moments are zero; ``MISSING``.
     misfit : (...) array
-        0 where the signals are explained; else how far, in shares of each signal's range, they are
-        from the nearest ones that are.
+        Of three signals, 0 where they are explained; else how far, in shares of each signal's
+        range, they are from the nearest ones that are. Of k > 3 signals, χ² of k - 3 degrees of
+        freedom: the sum of squares of what is left unexplained, in standard deviations.
     arc_length : (...) array
         Arc length of the contact, m.
     force, moment : (..., 3) arrays
         Base force and moment of the candidate, N and N·m.
     candidates : (..., k, 3) array
-        Contact points of all candidates by rising force, padded with NaN, m.
+        Contact points of all candidates, padded with NaN, m: by rising force, or for more than
+        three signals by rising χ² and then force. Candidates have χ² within 10.8 of the least (the
+        likelihood ratio that one pair in a thousand exceeds by chance).
     candidate_covariances : (..., k, 3, 3) array
         Their covariances, m²; NaN without ``noise``.
+    candidate_arc_lengths : (..., k) array
+        Their arc lengths, m.
+    candidate_forces : (..., k, 3) array
+        Their base forces, N.
     n_candidates : (...) int array
         How many.
     triplet : tuple of str
-        The signals used.
+        The signals used, three or more.
     dims : tuple of str
         Names of the leading dimensions.
     coords : dict
@@ -67,6 +79,7 @@ class Estimate:
 
     point: Array
     covariance: Array
+    linear: AnyArray
     status: IntArray
     misfit: Array
     arc_length: Array
@@ -74,6 +87,8 @@ class Estimate:
     moment: Array
     candidates: Array
     candidate_covariances: Array
+    candidate_arc_lengths: Array
+    candidate_forces: Array
     n_candidates: IntArray
     triplet: tuple[str, ...]
     dims: tuple[str, ...]
@@ -83,6 +98,11 @@ class Estimate:
     def spherical(self) -> Array:
         """(r, θ, φ) of the contact point: m and rad, shape (..., 3)."""
         return spherical(self.point)
+
+    @property
+    def candidate_moments(self) -> Array:
+        """Base moments of the candidates, N·m, shape (..., k, 3)."""
+        return np.cross(self.candidates, self.candidate_forces)
 
     def to_dataset(self) -> xr.Dataset:
         """Return everything as a labelled dataset.
@@ -115,11 +135,23 @@ class Estimate:
                     self.candidate_covariances,
                     attributes("covariance"),
                 ),
-                "n_candidates": (
-                    dims,
-                    self.n_candidates,
-                    {"units": "1", "long_name": "candidates"},
+                "candidate_arc_lengths": (
+                    (*dims, "candidate"),
+                    self.candidate_arc_lengths,
+                    attributes("arc_length"),
                 ),
+                "candidate_forces": (
+                    (*dims, "candidate", "space"),
+                    self.candidate_forces,
+                    attributes("force"),
+                ),
+                "candidate_moments": (
+                    (*dims, "candidate", "space"),
+                    self.candidate_moments,
+                    attributes("moment"),
+                ),
+                "n_candidates": (dims, self.n_candidates, attributes("candidates")),
+                "linear": (dims, self.linear, attributes("linear")),
                 "status": (dims, self.status, {**attributes("status"), **flag_attributes()}),
             },
             coords={**self.coords, "space": ["x", "y", "z"], "space_2": ["x", "y", "z"]},
@@ -144,7 +176,7 @@ def estimate(
     noise: Mapping[str, float] | ArrayLike | None = None,
     method: str = "exact",
 ) -> Estimate:
-    """Find all frictionless contacts of a whisker that explain three measured signals.
+    """Find all frictionless contacts of a whisker that explain measured signals.
 
     Parameters
     ----------
@@ -153,9 +185,11 @@ def estimate(
     signals : Dataset or mapping
         Measured signals by name, SI units, any shape; NaN means missing.
     triplet : str or tuple of str
-        The three to use.
+        Those to use, three or more.
     noise : mapping or (6, 6) array_like, optional
-        Standard deviation of each signal of the triplet, or covariance of (F, M), SI units.
+        Standard deviation of each signal used, or covariance of (F, M), SI units. Without it there
+        are no covariances, and more than three signals are weighted as if each component of force
+        were known to 1 % of |F| and each of moment to 1 % of |M|.
     method : {"exact"}
         How.
 
@@ -171,36 +205,35 @@ def estimate(
     """
     if method != "exact":
         raise ValueError(f"method is 'exact'; got {method!r}")
-    names = selection(triplet, exactly=3)
-    sigma = None if noise is None else _checked_noise(noise, names)
+    names = selection(triplet)
+    sensor = None if noise is None else SensorNoise.of(noise, names)
     values, dims, coords = measured(signals, names)
     _check_signals(values, names)
     shape = values.shape[:-1]
-    flat = values.reshape(-1, 3)
-    chart = contacts.chart
-    d = chart.discretization
-    scale = signal_scales(names, d.force, d.moment)
-    found = invert(chart, contacts.tree(names), names, flat / scale)
-    best = found.values[:, 0]
-    force, point = best[:, :3] * d.force, best[:, 3:] * d.length
-    status = np.where(found.number == 1, int(Status.UNIQUE), int(Status.AMBIGUOUS))
-    misfit = np.zeros(len(flat))
-    _explain(contacts, names, flat / scale, found, status, misfit)
-    covariances = np.full((*found.contacts.shape[:2], 3, 3), np.nan)
-    if sigma is not None:
-        covariances = _covariances(contacts, names, found, sigma)
+    d = contacts.chart.discretization
+    targets = values.reshape(-1, len(names)) / signal_scales(names, d.force, d.moment)
+    explain = by_triplet if len(names) == 3 else by_least_squares
+    found = explain(contacts, names, targets, sensor)
     most = max(1, int(found.number.max(initial=0)))
+
+    def whole(array: AnyArray) -> AnyArray:
+        return array.reshape((*shape, *array.shape[1:]))
+
+    forces, points = found.values[..., :3] * d.force, found.values[..., 3:] * d.length
     return Estimate(
-        point=point.reshape(*shape, 3),
-        covariance=covariances[:, 0].reshape(*shape, 3, 3),
-        status=status.reshape(shape),
-        misfit=misfit.reshape(shape),
-        arc_length=(found.contacts[:, 0, 0] * d.length).reshape(shape),
-        force=force.reshape(*shape, 3),
-        moment=np.cross(point, force).reshape(*shape, 3),
-        candidates=(found.values[:, :most, 3:] * d.length).reshape(*shape, most, 3),
-        candidate_covariances=covariances[:, :most].reshape(*shape, most, 3, 3),
-        n_candidates=found.number.reshape(shape),
+        point=whole(points[:, 0]),
+        covariance=whole(found.covariances[:, 0] * d.length**2),
+        linear=whole(found.linear),
+        status=whole(found.status),
+        misfit=whole(found.misfit),
+        arc_length=whole(found.arc_lengths[:, 0] * d.length),
+        force=whole(forces[:, 0]),
+        moment=whole(np.cross(points[:, 0], forces[:, 0])),
+        candidates=whole(points[:, :most]),
+        candidate_covariances=whole(found.covariances[:, :most] * d.length**2),
+        candidate_arc_lengths=whole(found.arc_lengths[:, :most] * d.length),
+        candidate_forces=whole(forces[:, :most]),
+        n_candidates=whole(found.number),
         triplet=names,
         dims=dims,
         coords=coords,
@@ -219,117 +252,3 @@ def _check_signals(values: Array, names: tuple[str, ...]) -> None:
             raise ValueError(
                 f"{name} is an angle in rad; got {largest:g}, which looks like degrees"
             )
-
-
-def _explain(
-    contacts: ContactMap,
-    names: tuple[str, ...],
-    targets: Array,
-    found: Contacts,
-    status: IntArray,
-    misfit: Array,
-) -> None:
-    """Say why measurements without a contact have none."""
-    missing = ~np.isfinite(targets).all(axis=1)
-    status[missing], misfit[missing] = int(Status.MISSING), np.nan
-    rows = np.flatnonzero((found.number == 0) & ~missing)
-    if not rows.size:
-        return
-    chart = contacts.chart
-    which = [SIGNALS.index(name) for name in names]
-    values = chart.values.reshape(-1, 6)
-    known = signals_of(values[:, :3], np.cross(values[:, 3:], values[:, :3]))[:, which]
-    size = np.where([CIRCULAR[w] for w in which], 1.0, np.ptp(known, axis=0))
-    _, nearest = cKDTree(_on_circle(known, which, size)).query(
-        _on_circle(targets[rows], which, size)
-    )
-    away = known[nearest] - targets[rows]
-    turned = np.array([CIRCULAR[w] for w in which])
-    away = np.where(turned, (away + np.pi) % (2.0 * np.pi) - np.pi, away)
-    span = np.where(turned, 2.0 * np.pi, size)
-    misfit[rows] = np.abs(away / span).max(axis=1)
-    # Perhaps a contact nearer to the base than the map goes explains them.
-    start = chart.contacts.reshape(-1, 3)[nearest]
-    xi, _, residual, sign = polish(chart, names, targets[rows], start)
-    nearer = (residual <= TOLERANCE) & (sign > 0.0) & (xi[:, 0] < chart.proximal)
-    status[rows] = np.where(nearer, int(Status.OUTSIDE_MAP), int(Status.NOT_FRICTIONLESS))
-    # Forces and moments of zero come from a whisker that touches nothing.
-    sizes = np.where(turned, 0.0, np.abs(targets[rows]))
-    status[rows[sizes.max(axis=1) == 0.0]] = int(Status.DEGENERATE)
-
-
-def _on_circle(values: Array, which: list[int], size: Array) -> Array:
-    """Signals as places in a space where distance means difference: angles on the unit circle."""
-    parts = []
-    for k, w in enumerate(which):
-        v = values[:, k]
-        parts += [np.cos(v), np.sin(v)] if CIRCULAR[w] else [v / size[k]]
-    return np.stack(parts, axis=1)
-
-
-def _covariances(
-    contacts: ContactMap,
-    names: tuple[str, ...],
-    found: Contacts,
-    noise: dict[str, float] | Array,
-) -> Array:
-    """Covariances (n, k, 3, 3) of the candidates' contact points, m²."""
-    d = contacts.chart.discretization
-    out = np.full((*found.contacts.shape[:2], 3, 3), np.nan)
-    there = np.arange(out.shape[1]) < found.number[:, None]
-    if not there.any():
-        return out
-    values, tangents = solve_forces(d, with_normal_force(found.contacts[there]), tangents=True)
-    which = [SIGNALS.index(name) for name in names]
-    by_contact = signal_derivatives(values, tangents)[:, which]
-    sigma = _signal_covariance(noise, names, values, d.force, d.moment)
-    with np.errstate(all="ignore"):
-        determined = np.abs(np.linalg.det(by_contact)) > 0.0
-        good = determined & np.isfinite(by_contact).all(axis=(1, 2))
-        inverse = np.full_like(by_contact, np.nan)
-        inverse[good] = np.linalg.inv(by_contact[good])
-        a = d.length * tangents[:, 3:] @ inverse
-        out[there] = a @ sigma @ np.swapaxes(a, -1, -2)
-    return out
-
-
-def _checked_noise(
-    noise: Mapping[str, float] | ArrayLike, names: tuple[str, ...]
-) -> dict[str, float] | Array:
-    """Standard deviations of the signals, or a covariance of (F, M); a ValueError otherwise."""
-    if isinstance(noise, Mapping):
-        missing = [name for name in names if name not in noise]
-        if missing:
-            raise ValueError(
-                f"noise lacks {', '.join(missing)}; it has {', '.join(noise) or 'none'}"
-            )
-        sigma = {name: float(noise[name]) for name in names}
-        if not all(0.0 <= value < np.inf for value in sigma.values()):
-            raise ValueError(f"noise must be standard deviations ≥ 0; got {sigma}")
-        return sigma
-    wrench = np.asarray(noise, dtype=np.float64)
-    if wrench.shape != (6, 6) or not np.allclose(wrench, wrench.T, rtol=1e-9, atol=0.0):
-        raise ValueError(
-            "noise must be {signal: standard deviation} or a symmetric 6 × 6 covariance of (F, M); "
-            f"got shape {wrench.shape}"
-        )
-    return wrench
-
-
-def _signal_covariance(
-    noise: dict[str, float] | Array,
-    names: tuple[str, ...],
-    values: Array,
-    force: float,
-    moment: float,
-) -> Array:
-    """Covariance of the chosen signals, non-dimensional, (n, 3, 3)."""
-    if isinstance(noise, dict):
-        scale = signal_scales(names, force, moment)
-        sigma = np.array([noise[name] for name in names]) / scale
-        return np.broadcast_to(np.diag(sigma**2), (len(values), 3, 3))
-    sizes = np.repeat([force, moment], 3)
-    which = [SIGNALS.index(name) for name in names]
-    moments = np.cross(values[:, 3:], values[:, :3])
-    g = wrench_derivatives(values[:, :3], moments)[:, which]
-    return np.asarray(g @ (noise / np.outer(sizes, sizes)) @ np.swapaxes(g, -1, -2))

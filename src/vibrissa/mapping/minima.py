@@ -6,15 +6,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.mapping.fitting import CHANNELS, Fits
+from vibrissa.mapping.channels import CHANNELS, CIRCULAR, channel_derivatives, channels_of
+from vibrissa.mapping.fitting import Fits
 from vibrissa.mapping.weights import INDISTINCT
 from vibrissa.rod.arrays import AnyArray, Array, IntArray
 from vibrissa.rod.batch import solve_forces
 from vibrissa.rod.discretize import Discretization
-from vibrissa.signals.base import CIRCULAR, SIGNALS, signals_of, wrench_derivatives
 
-# Contacts within this (over L, and relative to the force) are one.
-_SAME = 1e-5
+# Contacts within this (over L, and ten times that relative to the force) are one.
+_SAME = 1e-3
 # How far along each axis of the covariance its linearisation is checked, in standard deviations,
 # and by how much it may err there, as a share of that.
 _REACH = 2.0
@@ -95,35 +95,7 @@ def candidates(
 
 def _same(a: Array, b: Array) -> bool:
     force = float(np.linalg.norm(a[1:]))
-    return bool(abs(a[0] - b[0]) < _SAME and np.linalg.norm(a[1:] - b[1:]) < _SAME * force)
-
-
-def channels_of(values: Array) -> Array:
-    """All channels (..., 10) of (F, p) (..., 6)."""
-    force = values[..., :3]
-    moment = np.cross(values[..., 3:], force)
-    return np.concatenate([signals_of(force, moment), force[..., 1:], moment[..., 1:]], axis=-1)
-
-
-def channel_gradients(values: Array, names: tuple[str, ...]) -> Array:
-    """∂(channels)/∂(F, M), shape (..., k, 6)."""
-    force = values[..., :3]
-    by_wrench = np.zeros((*values.shape[:-1], len(CHANNELS), 6))
-    by_wrench[..., : len(SIGNALS), :] = wrench_derivatives(force, np.cross(values[..., 3:], force))
-    for i, component in enumerate((1, 2, 4, 5), start=len(SIGNALS)):
-        by_wrench[..., i, component] = 1.0
-    return by_wrench[..., [CHANNELS.index(name) for name in names], :]
-
-
-def channel_derivatives(values: Array, tangents: Array, names: tuple[str, ...]) -> Array:
-    """∂(channels)/∂x, shape (..., k, p), from (F, p) (..., 6) and ∂(F, p)/∂x (..., 6, p)."""
-    force, point = values[..., :3], values[..., 3:]
-    d_force, d_point = tangents[..., :3, :], tangents[..., 3:, :]
-    d_moment = np.cross(d_point, force[..., None], axis=-2) + np.cross(
-        point[..., None], d_force, axis=-2
-    )
-    gradients = channel_gradients(values, names)
-    return np.asarray(gradients @ np.concatenate([d_force, d_moment], axis=-2))
+    return bool(abs(a[0] - b[0]) < _SAME and np.linalg.norm(a[1:] - b[1:]) < 10.0 * _SAME * force)
 
 
 def unknowns_covariance(
@@ -217,7 +189,7 @@ def reliable(
     moved = moved.reshape(*places.shape[:2], 6)
     which = [CHANNELS.index(name) for name in names]
     away = (channels_of(moved) - channels_of(value)[:, None])[..., which]
-    turned = np.array([w < len(SIGNALS) and CIRCULAR[w] for w in which])
+    turned = np.array([CIRCULAR[w] for w in which])
     away = np.where(turned, (away + np.pi) % (2.0 * np.pi) - np.pi, away)
     told = np.swapaxes(channel_derivatives(value, slope, names) @ steps, 1, 2)
     bent = np.linalg.norm(np.einsum("nij,nmj->nmi", w, away - told), axis=2)

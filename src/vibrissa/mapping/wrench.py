@@ -21,11 +21,12 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
+from vibrissa.mapping.channels import WRENCH
 from vibrissa.mapping.contact_map import spherical
-from vibrissa.mapping.fitting import WRENCH, Fits, fit
+from vibrissa.mapping.fitting import Fits, fit
 from vibrissa.mapping.minima import Candidates, candidates, reliable, unknowns_covariance
 from vibrissa.mapping.noise import SensorNoise
-from vibrissa.mapping.weights import explained, rank, trusted, whitening
+from vibrissa.mapping.weights import INDISTINCT, explained, rank, trusted, whitening
 from vibrissa.quantities import attributes
 from vibrissa.rod.arrays import AnyArray, Array, IntArray
 from vibrissa.rod.batch import solve_forces
@@ -253,7 +254,7 @@ def _solve(
     row, place = np.nonzero(np.arange(places.shape[1]) < number[:, None])
     near = _promising(coarse, wrenches, weights, row, places[row, place])
     seeds = places[row[near], place[near]]
-    found = _fit(coarse, wrenches, weights, row[near], seeds)
+    found = _fit(coarse, wrenches, weights, row[near], seeds, limit)
     best = np.full(len(wrenches), np.inf)
     np.minimum.at(best, row[near], found.misfits)
     again = np.flatnonzero(~(best <= limit))
@@ -264,7 +265,7 @@ def _solve(
         left = np.isin(row, again)
         more = np.concatenate([more, row[left]])
         seeds = np.concatenate([seeds, places[row[left], place[left]]])
-        others = _fit(coarse, wrenches, weights, more, seeds)
+        others = _fit(coarse, wrenches, weights, more, seeds, limit)
         found = Fits(*(np.concatenate(pair) for pair in zip(found, others, strict=True)))
         near = np.concatenate([row[near], more])
     else:
@@ -272,12 +273,23 @@ def _solve(
     doubt = found.misfits + (_friction_angle(found.contacts) / _LIKELY) ** 2
     kept = candidates(len(wrenches), near, found, doubt, limit, _MOST)
     row, place = np.nonzero(np.arange(kept.contacts.shape[1]) < kept.number[:, None])
-    final = _fit(fine, wrenches, weights, row, kept.contacts[row, place])
+    final = _fit(fine, wrenches, weights, row, kept.contacts[row, place], limit)
     return kept.replaced(row, place, final)
 
 
-def _fit(d: Discretization, wrenches: Array, weights: Array, row: IntArray, seeds: Array) -> Fits:
-    return fit(d, WRENCH, wrenches[row], weights[row], seeds, friction=True, least=PROXIMAL)
+def _fit(
+    d: Discretization, wrenches: Array, weights: Array, row: IntArray, seeds: Array, limit: float
+) -> Fits:
+    return fit(
+        d,
+        WRENCH,
+        wrenches[row],
+        weights[row],
+        seeds,
+        friction=True,
+        least=PROXIMAL,
+        worth=limit + INDISTINCT,
+    )
 
 
 def _promising(

@@ -1,0 +1,248 @@
+"""Contacts from more signals than unknowns: all minima of χ² among the stable contacts.
+
+A contact that explains k > 3 signals also explains any three of them, nearly. So the contacts that
+give the best determined three exactly are where the search starts; from each of them, χ² of all
+signals is minimised. What has no such start, or no minimum that explains the signals, starts again
+from the nodes of the chart that come nearest, one for each of sixteen parts of it.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vibrissa.mapping.channels import CHANNELS, CIRCULAR, Channels, channels_of
+from vibrissa.mapping.fitting import Fits, charted, fit
+from vibrissa.mapping.inversion import invert
+from vibrissa.mapping.minima import Candidates, candidates
+from vibrissa.mapping.noise import SensorNoise
+from vibrissa.mapping.weights import INDISTINCT, explained, rank, whitening
+from vibrissa.rod.arrays import Array, IntArray
+from vibrissa.rod.batch import share_out, solve_forces
+from vibrissa.rod.compiled import kernel
+from vibrissa.rod.newton import ROUNDING
+from vibrissa.rod.reach import LEAST_ARC, Reach, with_normal_force
+from vibrissa.signals import SIGNALS
+from vibrissa.signals.base import signal_derivatives, signals_of
+from vibrissa.status import Status
+
+if TYPE_CHECKING:
+    from vibrissa.mapping.contact_map import ContactMap
+
+#: At most so many candidates are kept.
+MOST = 8
+_UNKNOWNS = 3
+_PARTS = 16
+# Of candidates that explain signals equally well the one with less force comes first.
+_FORCE = 1e-6
+
+
+@lru_cache(maxsize=64)
+def seeding_triplet(chart: Reach, names: tuple[str, ...]) -> tuple[str, ...]:
+    """The three signals among these that determine contacts best, as seen over the chart.
+
+    Judged by the median volume of the error ellipsoid, with forces and moments known to a share of
+    their size.
+    """
+    values = chart.values[::2, ::4, 1::2].reshape(-1, 6)
+    tangents = chart.tangents[::2, ::4, 1::2].reshape(-1, 6, 3)
+    force, moment = values[:, :3], np.cross(values[:, 3:], values[:, :3])
+    known = signals_of(force, moment)
+    f, m = np.linalg.norm(force, axis=1), np.linalg.norm(moment, axis=1)
+    with np.errstate(all="ignore"):
+        sigma = np.stack([f, f, f / known[:, 1], m, m, m / known[:, 4]], axis=1)
+        slopes = signal_derivatives(values, tangents) / sigma[:, :, None]
+        size = np.linalg.norm(slopes, axis=1, keepdims=True)
+        slopes = np.nan_to_num(slopes / size)
+
+        def volume(triplet: tuple[str, ...]) -> float:
+            which = [SIGNALS.index(name) for name in triplet]
+            return float(np.median(np.abs(np.linalg.det(slopes[:, which]))))
+
+        return max(combinations(names, 3), key=volume)
+
+
+def least_squares(
+    contacts: ContactMap,
+    names: tuple[str, ...],
+    measured: Array,
+    sensor: SensorNoise | None,
+    starts: Array | None = None,
+) -> tuple[Candidates, IntArray]:
+    """Find the contacts that explain more than three signals best.
+
+    Parameters
+    ----------
+    contacts : ContactMap
+        The map.
+    names : tuple of str
+        The k signals, in canonical order.
+    measured : (n, k) array
+        Their values, non-dimensional and finite.
+    sensor : SensorNoise or None
+        Noise; None counts components of force and moment as known to 1 %.
+    starts : (n, 3) array, optional
+        A contact ξ for each measurement to start from as well; NaN for none.
+
+    Returns
+    -------
+    found : Candidates
+        Those that explain the signals, or else the one that comes nearest.
+    status : (n,) int array
+        Of each measurement.
+    """
+    chart, channels = contacts.chart, Channels.of(names)
+    triplet = seeding_triplet(chart, names)
+    three = measured[:, [names.index(name) for name in triplet]]
+    exact = invert(chart, contacts.tree(triplet), triplet, three)
+    row, place = np.nonzero(np.arange(exact.contacts.shape[1]) < exact.number[:, None])
+    seeds = exact.contacts[row, place]
+    if starts is not None:
+        more = np.flatnonzero(np.isfinite(starts).all(axis=1))
+        row, seeds = np.concatenate([row, more]), np.concatenate([seeds, starts[more]])
+    limit = explained(_degrees(channels, sensor, contacts))
+    row, fits = _fit(chart, channels, sensor, measured, row, seeds, limit)
+    inside = charted(chart, fits, chart.proximal)
+    lost = np.ones(len(measured), np.bool_)
+    lost[row[inside & (fits.misfits <= limit)]] = False
+    again = np.flatnonzero(lost)
+    if again.size:
+        nodes = nearest_nodes(chart, channels, measured[again])
+        there = nodes >= 0
+        more = np.repeat(again, _PARTS).reshape(-1, _PARTS)[there]
+        seeds = chart.contacts.reshape(-1, 3)[nodes[there]]
+        more, others = _fit(chart, channels, sensor, measured, more, seeds, limit)
+        row = np.concatenate([row, more])
+        fits = Fits(*(np.concatenate(pair) for pair in zip(fits, others, strict=True)))
+        inside = charted(chart, fits, chart.proximal)
+    force = np.hypot(fits.contacts[:, 2], fits.contacts[:, 3])
+    doubt = fits.misfits + _FORCE * (1.0 + fits.misfits) * force / (1.0 + force)
+    kept = np.flatnonzero(inside)
+    found = candidates(
+        len(measured), row[kept], Fits(*(a[kept] for a in fits)), doubt[kept], limit, MOST
+    )
+    status = np.where(found.number > 1, int(Status.AMBIGUOUS), int(Status.UNIQUE))
+    status[~(found.misfits[:, 0] <= limit)] = int(Status.NOT_FRICTIONLESS)
+    # Perhaps a contact nearer to the base than the map goes explains them.
+    nearer = charted(chart, fits, LEAST_ARC + ROUNDING) & ~inside & (fits.misfits <= limit)
+    outside = np.zeros(len(measured), np.bool_)
+    outside[row[nearer]] = True
+    status[outside & (status == Status.NOT_FRICTIONLESS)] = int(Status.OUTSIDE_MAP)
+    return found, status
+
+
+def _degrees(channels: Channels, sensor: SensorNoise | None, contacts: ContactMap) -> int:
+    """Degrees of freedom of χ²."""
+    if sensor is None or sensor.wrench is None:
+        return len(channels.names) - _UNKNOWNS
+    d = contacts.chart.discretization
+    node = contacts.chart.values[-1, :1, -1]
+    covariance = channels.covariance(sensor, np.ones((1, len(channels.names))), node, d)
+    return rank(covariance[0]) - _UNKNOWNS
+
+
+def _weights(
+    chart: Reach, channels: Channels, sensor: SensorNoise | None, measured: Array, values: Array
+) -> Array:
+    return whitening(channels.covariance(sensor, measured, values, chart.discretization))
+
+
+def _fit(
+    chart: Reach,
+    channels: Channels,
+    sensor: SensorNoise | None,
+    measured: Array,
+    row: IntArray,
+    seeds: Array,
+    limit: float,
+) -> tuple[IntArray, Fits]:
+    """Minima next to seeds ξ (m, 3), with the weights that hold there."""
+    d = chart.discretization
+    contacts = with_normal_force(seeds)
+    values, _ = solve_forces(d, contacts)
+    targets, signals = channels.targets(measured)[row], measured[row]
+    # Weights that depend on the contact are taken there once it is nearly known.
+    settled = sensor is not None and (
+        sensor.deviations is not None or not set(channels.names) & {"FT", "FD", "MB", "MD"}
+    )
+    for _ in range(1 if settled else 2):
+        weights = _weights(chart, channels, sensor, signals, values)
+        fits = fit(
+            d,
+            channels.names,
+            targets,
+            weights,
+            contacts,
+            friction=False,
+            least=LEAST_ARC,
+            worth=limit + INDISTINCT,
+        )
+        contacts, values = fits.contacts, np.where(np.isfinite(fits.values), fits.values, values)
+    return row, fits
+
+
+def nearest_nodes(chart: Reach, channels: Channels, measured: Array) -> IntArray:
+    """The chart's nodes that come nearest to measured signals, in each part of the chart.
+
+    Parameters
+    ----------
+    chart : Reach
+        The chart.
+    channels : Channels
+        How signals are compared.
+    measured : (n, k) array
+        Signals, non-dimensional.
+
+    Returns
+    -------
+    (n, parts) int array
+        Flat numbers of nodes; -1 for none.
+    """
+    which = [CHANNELS.index(name) for name in channels.names]
+    known = np.ascontiguousarray(channels_of(chart.values.reshape(-1, 6))[:, which])
+    targets = channels.targets(measured)
+    # Forces are compared relative to the force, moments to the moment, and directions in rad.
+    scale = np.ones_like(targets)
+    for kind in ("F", "M"):
+        same = [k for k, w in enumerate(which) if CHANNELS[w][0] == kind and not CIRCULAR[w]]
+        size = np.linalg.norm(targets[:, same], axis=1, keepdims=True)
+        scale[:, same] = 1.0 / np.where(size > 0.0, size, 1.0)
+    turns = np.array([0.5 / np.pi if CIRCULAR[w] else 0.0 for w in which])
+    n, m, k = chart.values.shape[:3]
+    i, j, _ = np.meshgrid(np.arange(n), np.arange(m), np.arange(k), indexing="ij")
+    part = (4 * (4 * i // n) + (4 * j // m) % 4).reshape(-1)
+    out = np.full((len(targets), _PARTS), -1)
+    share_out(
+        len(targets),
+        lambda first, last: _nearest(known, turns, part, targets, scale, out, first, last),
+    )
+    return out
+
+
+@kernel
+def _nearest(
+    known: Array,
+    turns: Array,
+    part: IntArray,
+    targets: Array,
+    scale: Array,
+    out: IntArray,
+    first: int,
+    last: int,
+) -> None:
+    least = np.empty(out.shape[1])
+    for row in range(first, last):
+        least[:] = np.inf
+        for node in range(known.shape[0]):
+            total = 0.0
+            for k in range(known.shape[1]):
+                away = known[node, k] - targets[row, k]
+                away -= np.rint(away * turns[k]) * 2.0 * np.pi
+                total += (away * scale[row, k]) ** 2
+            p = part[node]
+            if total < least[p]:
+                least[p] = total
+                out[row, p] = node

@@ -7,7 +7,7 @@ from typer.testing import CliRunner
 
 from vibrissa import samples
 from vibrissa.cli.app import app
-from vibrissa.io import Kind, load_tracks, recognise, save_centerline, save_tracks
+from vibrissa.io import Kind, load_tracks, recognise, save_centerline, save_tracks, write_video
 from vibrissa.io.tracks import RawTracks, labelled
 
 
@@ -35,12 +35,15 @@ def test_tables_are_told_apart_by_their_header(tmp_path):
         ("frame,x,y,z", Kind.TRACKS_TABLE),
         ("time,whisker,view,node,column,row,confidence", Kind.TRACKS_TABLE),
         ("x_mm,y_mm,z_mm", Kind.CENTERLINE),
+        ("[cam_0]", Kind.CALIBRATION),
         ("name,age", Kind.UNKNOWN),
         ("\n\n", Kind.UNKNOWN),
     ):
         path.write_text(f"# comment\n{header}\n1,2,3\n")
         assert recognise(path) == (Kind.UNKNOWN if header == "\n\n" else kind), header
     path.write_bytes(b"RIFF\x01\x02\0\0AVI ")
+    assert recognise(path) == Kind.VIDEO
+    path.write_bytes(b"\x00\x01\x02")
     assert recognise(path) == Kind.UNKNOWN
     path.write_bytes(b"\xff\xfe\xfd nothing at all")
     assert recognise(path) == Kind.UNKNOWN
@@ -87,6 +90,19 @@ def test_info_of_tracks(tmp_path):
         "pixel; 75.0 %",
     ):
         assert part in said
+
+
+def test_info_of_videos_and_calibrations(tmp_path):
+    path = tmp_path / "top.mkv"
+    write_video(path, np.zeros((3, 32, 48), dtype=np.uint8), rate=25.0)
+    said = info(path)
+    for part in ("video, ffv1", "48 × 32 pixels", "frames 3, shown at 25 a second"):
+        assert part in said
+    path = tmp_path / "calibration.toml"
+    path.write_text(
+        '[cam_0]\nname = "top"\nsize = [1024, 768]\nmatrix = []\nrotation = []\ntranslation = []\n'
+    )
+    assert "top 1024 × 768 pixels, perspective" in info(path)
 
 
 def test_info_of_other_files(tmp_path):

@@ -66,11 +66,33 @@ def _file(path: Path) -> Iterator[tuple[str, str]]:
         yield from _groups(path)
     elif kind in (Kind.TRACKS, *READERS):
         yield from _tracks(path, kind)
+    elif kind == Kind.VIDEO:
+        yield from _video(path)
+    elif kind == Kind.CALIBRATION:
+        yield from _calibration(path)
     elif kind == Kind.UNKNOWN and not _is_text(path):
         known = "; ".join([*READERS, Kind.TRACKS, Kind.RECORDING, "tables as text"])
         raise ValueError(f"{path} is of no kind that is known. Known are: {known}")
     else:
         yield from _table(path)
+
+
+def _video(path: Path) -> Iterator[tuple[str, str]]:
+    from vibrissa.io import video_info
+
+    found = video_info(path)
+    yield "kind", f"video, {found.codec}"
+    yield "size", f"{found.width} × {found.height} pixels"
+    yield "frames", f"{found.frames or 'number not told'}, shown at {found.rate:g} a second"
+
+
+def _calibration(path: Path) -> Iterator[tuple[str, str]]:
+    from vibrissa.io.calibration import read_calibration
+
+    yield "kind", "calibration of cameras"
+    for camera in read_calibration(path):
+        size = " × ".join(map(str, camera["size"]))
+        yield str(camera["name"]), f"{size} pixels, {camera.get('projection', 'perspective')}"
 
 
 def _is_text(path: Path) -> bool:
@@ -107,7 +129,7 @@ def _tracks(path: Path, kind: str) -> Iterator[tuple[str, str]]:
     for name in ("trace", "centerline"):
         if name in tracks:
             found = tracks[name]
-            there = 100.0 * float(found.notnull().all(found.dims[-1]).mean())
+            there = 100.0 * float(found.notnull().all(str(found.dims[-1])).mean())
             where = found.attrs.get("reference_frame", "")
             units = note if name == "centerline" and note else found.attrs["units"]
             yield name, f"{units}{f', {where} frame' if where else ''}; {there:.1f} % of points"

@@ -10,6 +10,7 @@ from vibrissa.io.matlab import load_matlab
 from vibrissa.io.movement import load_movement
 from vibrissa.io.netcdf import is_netcdf, kind_of
 from vibrissa.io.nwb import load_nwb
+from vibrissa.io.nwb_writing import Session, save_nwb
 from vibrissa.io.paths import check_folder, check_readable, check_writable
 from vibrissa.io.recording import load_recording, save_recording
 from vibrissa.io.signals_table import load_signals, save_signals
@@ -21,6 +22,7 @@ from vibrissa.io.whisk import load_measurements, load_whiskers
 
 __all__ = [
     "Kind",
+    "Session",
     "VideoInfo",
     "check_folder",
     "check_readable",
@@ -47,6 +49,7 @@ __all__ = [
     "recognise",
     "save_centerline",
     "save_contacts",
+    "save_nwb",
     "save_recording",
     "save_signals",
     "save_tracks",

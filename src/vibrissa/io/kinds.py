@@ -35,6 +35,8 @@ class Kind(StrEnum):
     SIGNALS = "table of signals"
     CONTACTS = "table of contacts"
     CENTERLINE = "centreline of a whisker"
+    CALIBRATION = "calibration of cameras"
+    VIDEO = "video"
     UNKNOWN = "unknown"
 
 
@@ -68,6 +70,9 @@ def recognise(path: str | PathLike[str]) -> Kind:
         return Kind.MATLAB
     if head.startswith(b"\x89HDF\r\n\x1a\n"):
         return _of_hdf5(path)
+    # Matroska, MP4 and QuickTime, AVI.
+    if head.startswith(b"\x1aE\xdf\xa3") or head[4:8] == b"ftyp" or head[8:12] == b"AVI ":
+        return Kind.VIDEO
     if b"\0" in head:
         return Kind.UNKNOWN
     return _of_text(path)
@@ -105,6 +110,8 @@ def _of_text(path: Path) -> Kind:
     if first is None:
         return Kind.UNKNOWN
     names = [name.lower() for name in first[1]]
+    if names[0].startswith("["):
+        return Kind.CALIBRATION
     plain = {name.split("_")[0] for name in names}
     if names[0] == "scorer":
         return Kind.DEEPLABCUT

@@ -156,9 +156,11 @@ def _type(item: Any) -> str:
 
 def _view(group: h5py.Group) -> str:
     """Name of its camera, or else its own."""
-    for link in ("device", *group):
-        if (link in group and "Camera" in _type(group[link])) or _type(group.get(link)) == "Device":
-            return str(group[link].name).rpartition("/")[2]
+    for key, item in group.items():
+        if _type(item) in ("Device", "CalibratedCamera"):
+            link = group.get(key, getlink=True)
+            name = link.path if isinstance(link, h5py.SoftLink) else key
+            return str(name).rpartition("/")[2]
     return str(group.name).rpartition("/")[2]
 
 
@@ -167,10 +169,10 @@ def _series(group: h5py.Group) -> _Series | None:
     children = {name: one for name, one in group.items() if _type(one) == "PoseEstimationSeries"}
     if not children:
         return None
-    order = (
-        [str(name) for name in group["skeleton/nodes"].asstr()[:]] if "skeleton" in group else []
-    )
-    nodes = [name for name in order if name in children]
+    # Before ndx-pose 0.2 the names stood in the container itself.
+    skeleton = next((one for one in group.values() if _type(one) == "Skeleton"), group)
+    order = skeleton["nodes"].asstr()[:] if "nodes" in skeleton else []
+    nodes = [str(name) for name in order if name in children]
     nodes += [name for name in children if name not in nodes]
     first = children[nodes[0]]
     time = _time(first)

@@ -36,7 +36,10 @@ def replacing(path: str | PathLike[str]) -> Iterator[Path]:
         If the path is a folder.
     """
     path = check_writable(path)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
+    # Some writers look at the ending.
+    handle, name = tempfile.mkstemp(
+        prefix=f".{path.stem}.", suffix=f".part{path.suffix}", dir=path.parent
+    )
     os.close(handle)
     part = Path(name)
     try:

@@ -1,0 +1,360 @@
+"""Recordings as Neurodata Without Borders files (pynwb, ndx-pose 0.4 or later).
+
+    devices              a CalibratedCamera for each view whose calibration is known, else a Device
+    processing/behavior  for each whisker a MultiCameraPoseEstimation: its centreline in space, node
+                         by node, in metres, and a PoseEstimation in pixels for each view;
+                         ``contact_point_…`` and ``base_position_…`` in metres, ``force_…`` in
+                         newtons and ``moment_…`` in newton-metres
+    intervals/contacts   when which whisker touched something
+
+Missing is NaN. The truth of a simulated trial is left out.
+"""
+
+from __future__ import annotations
+
+import importlib
+import uuid
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from datetime import datetime
+from os import PathLike
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from vibrissa.io.paths import NWB, check_writable
+from vibrissa.io.replace import replacing
+
+if TYPE_CHECKING:
+    from pynwb import NWBFile
+
+Array = NDArray[np.float64]
+
+_FORCES = {
+    "force": ("newtons", "Force of the object on the whisker"),
+    "moment": ("newton-metres", "Moment of that force about the whisker's base"),
+}
+_POINTS = {
+    "contact_point": "Where the whisker touches the object",
+    "contact_point_whisker": "Where the whisker touches the object",
+    "base_position": "Base of the whisker",
+}
+
+
+@dataclass(frozen=True)
+class Session:
+    """What an NWB file must say of the experiment, and a recording does not know.
+
+    Parameters
+    ----------
+    start : datetime
+        When the recording began, with its time zone.
+    description : str
+        Of the session.
+    identifier : str
+        Of the file, unique in the world; by default made up.
+    subject : mapping
+        Of the animal, as in NWB: subject_id, species, sex, age, description, …; empty: none.
+    about : mapping
+        More fields of NWB: experimenter, institution, lab, keywords, ….
+    """
+
+    start: datetime
+    description: str = "Whisking against objects"
+    identifier: str = field(default_factory=lambda: str(uuid.uuid4()))
+    subject: Mapping[str, Any] = field(default_factory=dict)
+    about: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check that the time has a zone."""
+        if self.start.tzinfo is None:
+            raise ValueError(f"start is {self.start}, without a time zone; NWB needs one")
+
+
+def save_nwb(
+    path: str | PathLike[str], recording: xr.DataTree | xr.Dataset, session: Session
+) -> None:
+    """Write a recording, or tracks, as NWB.
+
+    Parameters
+    ----------
+    path : str or path
+        Where to write, with the ending ``.nwb``; an existing file is replaced once the new one is
+        complete.
+    recording : xarray.DataTree or Dataset
+        A recording, with the group ``cameras`` if they are calibrated; or tracks. What it lacks
+        is left out.
+    session : Session
+        What else the file must say.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the folder does not exist.
+    ModuleNotFoundError
+        If pynwb or ndx-pose is not installed.
+    ValueError
+        If the path has another ending, time is not in seconds, or there is nothing to write.
+    """
+    path = check_writable(path, NWB)
+    for module in ("pynwb", "ndx_pose"):
+        try:
+            importlib.import_module(module)
+        except ModuleNotFoundError as error:
+            raise ModuleNotFoundError("to write NWB, install vibrissa[nwb]") from error
+    from pynwb import NWBHDF5IO
+
+    data = recording.to_dataset() if isinstance(recording, xr.DataTree) else recording
+    _check(data)
+    cameras = None
+    if isinstance(recording, xr.DataTree) and "cameras" in recording.children:
+        # The names of the views may stand above.
+        cameras = recording.children["cameras"].to_dataset()
+    file = _file(session)
+    _fill(file, data, cameras)
+    with replacing(path) as part, NWBHDF5IO(str(part), "w") as out:
+        out.write(file)
+
+
+def _check(data: xr.Dataset) -> None:
+    if "time" not in data.coords or data["time"].attrs.get("units", "s") != "s":
+        raise ValueError("the time of what is to be written is not in seconds: give fps")
+    if "whisker" not in data.dims:
+        raise ValueError("what is to be written has no dimension whisker")
+    known = {"trace", "centerline", *_FORCES, *_POINTS}
+    if not known & set(data.data_vars):
+        raise ValueError(f"there is nothing to write: none of {', '.join(sorted(known))}")
+
+
+def _file(session: Session) -> NWBFile:
+    from pynwb import NWBFile
+    from pynwb.file import Subject
+
+    return NWBFile(
+        session_description=session.description,
+        identifier=session.identifier,
+        session_start_time=session.start,
+        subject=Subject(**session.subject) if session.subject else None,
+        **session.about,
+    )
+
+
+def _fill(file: NWBFile, data: xr.Dataset, cameras: xr.Dataset | None) -> None:
+    from ndx_pose import Skeletons
+
+    behavior = file.create_processing_module("behavior", "Whiskers, what they feel, and contacts")
+    clock = _clock(data["time"].values)
+    poses = {"trace", "centerline"} & set(data.data_vars)
+    skeletons = Skeletons(skeletons=[])
+    if poses:
+        behavior.add(skeletons)
+    devices = {}
+    if "trace" in data:
+        for i, name in enumerate(data["view"].values.tolist()):
+            devices[name] = _camera(str(name), i, cameras)
+            file.add_device(devices[name])
+    for i, name in enumerate(_names(data)):
+        whisker = data.isel(whisker=i)
+        if poses:
+            behavior.add(_pose(name, whisker, clock, devices, skeletons))
+        for series in _series(name, whisker, clock):
+            behavior.add(series)
+    if "in_contact" in data:
+        _add_contacts(file, data)
+
+
+def _names(data: xr.Dataset) -> list[str]:
+    """Names of the whiskers as NWB allows them."""
+    names = data["whisker"].values if "whisker" in data.coords else range(data.sizes["whisker"])
+    return [_allowed(str(name)) for name in names]
+
+
+def _allowed(name: str) -> str:
+    return name.replace("/", "_").replace(":", "_") or "whisker"
+
+
+def _clock(time: Array) -> dict[str, Any]:
+    """Say a rate where frames are evenly spaced to a part in a million, else every time."""
+    steps = np.diff(time)
+    if steps.size and np.allclose(steps, steps.mean(), rtol=1e-6, atol=1e-9 * abs(time[-1])):
+        return {"starting_time": float(time[0]), "rate": float(1.0 / steps.mean())}
+    return {"timestamps": time}
+
+
+def _camera(name: str, index: int, cameras: xr.Dataset | None) -> Any:
+    from ndx_pose import CalibratedCamera
+    from pynwb.device import Device
+
+    if cameras is None or name not in cameras["view"].values:
+        return Device(name=_allowed(name), description=f"High-speed camera, view {name}")
+    one = cameras.sel(view=name)
+    kind = str(one["projection"].values) if "projection" in one else "perspective"
+    scale = "pixels per metre" if kind == "orthographic" else "pixels"
+    more = {}
+    if "camera_distortion" in one and kind != "orthographic":
+        more["distortion_coefficients"] = one["camera_distortion"].values
+    return CalibratedCamera(
+        name=_allowed(name),
+        description=f"High-speed camera, view {name}; {kind} projection, focal lengths in {scale}, "
+        "translation in metres",
+        intrinsic_matrix=one["camera_matrix"].values,
+        rotation_matrix=one["camera_rotation"].values,
+        translation_vector=one["camera_translation"].values,
+        **more,
+    )
+
+
+def _pose(
+    name: str, whisker: xr.Dataset, clock: dict[str, Any], devices: dict[Any, Any], skeletons: Any
+) -> Any:
+    """One whisker: its centreline in space and its traces in the views."""
+    from ndx_pose import MultiCameraPoseEstimation, PoseEstimation, Skeleton
+
+    nodes = _nodes(whisker)
+    edges = np.stack([np.arange(len(nodes) - 1), np.arange(1, len(nodes))], axis=1)
+    small = np.uint8 if len(nodes) <= 256 else np.uint16
+    skeleton = Skeleton(name=f"whisker_{name}", nodes=nodes, edges=edges.astype(small))
+    skeletons.add_skeletons(skeleton)
+    source = str(whisker.attrs.get("source_software", "vibrissa"))
+    about = {"scorer": source, "source_software": source, "skeleton": skeleton}
+    views = []
+    for view, device in devices.items():
+        trace = whisker["trace"].sel(view=view).transpose("time", "node", "image_axis").values
+        label = "trace_confidence" if "trace_confidence" in whisker else "confidence"
+        frame = "Middle of the top left pixel; column to the right, row downward"
+        sure = _confidence(whisker, label, view)
+        views.append(
+            PoseEstimation(
+                name=_allowed(str(view)),
+                description=f"Trace of the whisker in the view {view}, from base to tip",
+                pose_estimation_series=_points(nodes, trace, sure, "pixels", frame, clock),
+                device=device,
+                **about,
+            )
+        )
+    space = []
+    if "centerline" in whisker:
+        line = whisker["centerline"].transpose("time", "node", "space")
+        frame = str(line.attrs.get("reference_frame", "laboratory"))
+        sure = _confidence(whisker, "confidence", None)
+        space = _points(nodes, line.values, sure, "meters", frame, clock)
+    return MultiCameraPoseEstimation(
+        name=name,
+        description="Centreline of the whisker, from base to tip",
+        pose_estimation_series=space,
+        pose_estimations=views,
+        **about,
+    )
+
+
+def _nodes(whisker: xr.Dataset) -> list[str]:
+    if "node" in whisker.coords:
+        return [_allowed(str(name)) for name in whisker["node"].values]
+    count = whisker.sizes["node"]
+    digits = len(str(count - 1))
+    return [f"node_{i:0{digits}d}" for i in range(count)]
+
+
+def _confidence(whisker: xr.Dataset, name: str, view: object) -> Array | None:
+    """Confidence (time, node), also where there is one a frame; None if nobody tells."""
+    if name not in whisker:
+        return None
+    sure = whisker[name]
+    if "view" in sure.dims:
+        if view is None:
+            return None
+        sure = sure.sel(view=view)
+    if "node" not in sure.dims:
+        sure = sure.expand_dims(node=whisker.sizes["node"])
+    values: Array = sure.transpose("time", "node").values
+    return values if np.isfinite(values).any() else None
+
+
+def _points(
+    nodes: list[str],
+    points: Array,
+    sure: Array | None,
+    unit: str,
+    frame: str,
+    clock: dict[str, Any],
+) -> list[Any]:
+    """Make a series of each node."""
+    from ndx_pose import PoseEstimationSeries
+
+    return [
+        PoseEstimationSeries(
+            name=node,
+            description=f"Node {i} of {len(nodes)} from the base",
+            data=_squeezed(points[:, i]),
+            unit=unit,
+            reference_frame=frame,
+            confidence=None if sure is None else sure[:, i],
+            confidence_definition=None if sure is None else "From 0 (none) to 1",
+            **clock,
+        )
+        for i, node in enumerate(nodes)
+    ]
+
+
+def _squeezed(values: Array) -> Any:
+    from pynwb import H5DataIO
+
+    return H5DataIO(values, compression="gzip", compression_opts=1, shuffle=True)
+
+
+def _series(name: str, whisker: xr.Dataset, clock: dict[str, Any]) -> Iterator[Any]:
+    """Points, forces and moments of one whisker over time."""
+    from pynwb import TimeSeries
+    from pynwb.behavior import SpatialSeries
+
+    for variable, text in _POINTS.items():
+        if variable in whisker:
+            values = whisker[variable].transpose("time", "space")
+            yield SpatialSeries(
+                name=f"{variable}_{name}",
+                description=f"{text} {name}; x, y, z, NaN where there is none",
+                data=_squeezed(values.values),
+                unit="meters",
+                reference_frame=str(values.attrs.get("reference_frame", "laboratory")),
+                **clock,
+            )
+    for variable, (unit, text) in _FORCES.items():
+        if variable in whisker:
+            values = whisker[variable].transpose("time", "space")
+            frame = values.attrs.get("reference_frame", "whisker")
+            yield TimeSeries(
+                name=f"{variable}_{name}",
+                description=f"{text} {name}; x, y, z, reference_frame: {frame}",
+                data=_squeezed(values.values),
+                unit=unit,
+                **clock,
+            )
+
+
+def _add_contacts(file: NWBFile, data: xr.Dataset) -> None:
+    """Write when which whisker touched something."""
+    from pynwb.epoch import TimeIntervals
+
+    time = data["time"].values
+    step = float(np.median(np.diff(time))) if time.size > 1 else 0.0
+    rows = []
+    for name, touching in zip(
+        _names(data), data["in_contact"].transpose("whisker", "time").values, strict=True
+    ):
+        edges = np.diff(np.concatenate([[0], np.nan_to_num(touching) > 0.5, [0]]).astype(np.int8))
+        first, after = np.flatnonzero(edges > 0), np.flatnonzero(edges < 0)
+        rows += [
+            (float(time[i]), float(time[j - 1]) + step, name)
+            for i, j in zip(first, after, strict=True)
+        ]
+    if not rows:
+        return
+    table = TimeIntervals(
+        name="contacts", description="From the first frame of a contact to the end of its last"
+    )
+    table.add_column("whisker", "Name of the whisker")
+    for start, stop, name in sorted(rows):
+        table.add_interval(start_time=start, stop_time=stop, whisker=name)
+    file.add_time_intervals(table)

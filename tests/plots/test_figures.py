@@ -14,11 +14,10 @@ from vibrissa.plots import (
     contour_views,
     estimated_against_true,
     save,
-    signal_clouds,
     signals_over_time,
     whisker_views,
 )
-from vibrissa.plots.clouds import SIGNALS, cloud
+from vibrissa.plots.chart import SIGNALS
 from vibrissa.plots.colours import cyclic
 from vibrissa.plots.signals import intervals
 from vibrissa.plots.style import robust_limits
@@ -33,25 +32,6 @@ def texts(figure: Figure) -> set[str]:
     """All that is written on it."""
     figure.draw_without_rendering()
     return {t.get_text() for t in figure.findobj(lambda a: hasattr(a, "get_text"))} - {""}
-
-
-def grid() -> xr.Dataset:
-    """Invented signals over a small grid in the paper's form, some of it unreachable."""
-    ball = {
-        "r": np.linspace(12e-3, 40e-3, 5),
-        "theta": np.linspace(-1.0, 1.0, 9),
-        "phi": np.linspace(-0.9, 0.9, 7),
-    }
-    shape = tuple(v.size for v in ball.values())
-    values = np.random.default_rng(1).uniform(-3.0, 3.0, (6, *shape))
-    values[:, 0, 0, 0] = np.nan
-    data = {
-        n: (tuple(ball), v * (1.0 if n in ("FD", "MD") else 1e-6))
-        for n, v in zip(SIGNALS, values, strict=True)
-    }
-    status = np.zeros(shape, dtype=np.int64)
-    status[0, 0, 1] = 10
-    return xr.Dataset({**data, "status": (tuple(ball), status)}, ball)
 
 
 def signals(n: int = 200) -> xr.Dataset:
@@ -85,38 +65,6 @@ def test_whisker_views_have_one_scale() -> None:
         for extent, limits in zip(axes.bbox.size, (axes.get_xlim(), axes.get_ylim()), strict=True)
     ]
     assert np.ptp(scales) < 1e-9 * scales[0]
-
-
-def test_cloud_of_a_grid_and_of_a_map_agree() -> None:
-    data = grid()
-    ball = xr.broadcast(data.r, data.theta, data.phi)
-    r, theta, phi = (b.transpose("r", "theta", "phi").values for b in ball)
-    place = [np.cos(phi) * np.cos(theta), np.cos(phi) * np.sin(theta), np.sin(phi)]
-    points = (("r", "theta", "phi", "space"), r[..., None] * np.stack(place, axis=-1))
-    as_map = data.drop_vars(["r", "theta", "phi"]).assign(contact_point=points)
-    one, other = cloud(data), cloud(as_map.transpose("phi", "space", "r", "theta"))
-    assert len(one.points) == data.Fx.size - 2  # one without signals, one without an answer
-    order, other_order = np.lexsort(one.points.T), np.lexsort(other.points.T)
-    np.testing.assert_allclose(one.points[order], other.points[other_order], atol=1e-12)
-    np.testing.assert_array_equal(one.signals["MB"][order], other.signals["MB"][other_order])
-
-
-def test_small_deflections_are_left_out_of_the_cloud() -> None:
-    data = grid()
-    line = np.array([[0.0, 0.0, 0.0], [40e-3, 0.0, 0.0]])
-    kept = cloud(data, line).points
-    assert len(kept) == len(cloud(data).points) - data.r.size  # those straight ahead
-    assert np.hypot(kept[:, 1], kept[:, 2]).min() > 0.0
-    told = data.assign(small_deflection=("theta", np.arange(9) < 4)).broadcast_like(data.Fx)
-    assert len(cloud(told).points) == 5 * 5 * 7
-
-
-def test_clouds_show_six_signals_in_display_units() -> None:
-    figure = signal_clouds(grid(), LINE, cutaway=False)
-    assert {axis_label(name) for name in (*SIGNALS, "x", "y", "z")} <= texts(figure)
-    force = figure.axes[0].collections[0].get_array()
-    assert 1.0 < np.abs(force).max() < 3.0  # µN
-    assert figure.axes[4].collections[0].get_clim() == (-180.0, 180.0)
 
 
 def test_signals_are_shaded_in_contact_and_drawn_in_micronewton() -> None:
@@ -186,7 +134,6 @@ def test_a_tilted_peg_is_cut_at_the_height_of_the_points() -> None:
 def test_figures_without_data_say_so() -> None:
     nothing = np.full((3, 3), np.nan)
     assert texts(whisker_views(nothing, 1e-4)) == {"no whisker"}
-    assert texts(signal_clouds(grid() * np.nan, LINE)) == {"no contacts"}
     assert texts(signals_over_time(signals(0))) == {"no signals"}
     assert texts(estimated_against_true(nothing, nothing)) == {"no contacts"}
     assert texts(contour_views(np.empty((0, 3)), PEG)) == {"no contacts"}
@@ -203,8 +150,6 @@ def test_one_contact_and_missing_signals_can_be_drawn() -> None:
 def test_wrong_input_is_told_apart() -> None:
     with pytest.raises(ValueError, match=r"covariance has shape \(2, 3\)"):
         contour_views(contacts(), covariance=np.zeros((2, 3)))
-    with pytest.raises(ValueError, match="lack MD"):
-        signal_clouds(grid().drop_vars("MD"))
     with pytest.raises(ValueError, match="base_signals"):
         signals_over_time(xr.Dataset({"force": ("time", [0.0])}, {"time": [0.0]}))
     with pytest.raises(ValueError, match="single, double"):

@@ -43,8 +43,7 @@ def draw(result: DemoResult, folder: Path, progress: Callable[[int, int], None])
     felt = contacts["in_contact"].values
     truth = result.recording["truth"].to_dataset().isel(whisker=0)
     angle = result.errors["deflection_angle"].values
-    space = result.contact_map.grid
-    space = result.contact_map.to_dataset() if space is None else space
+    space = result.contact_map.to_dataset()
     figures: dict[str, Callable[[], Any]] = {
         "whisker": lambda: plots.whisker_views(line, radius, name=whisker.name),
         "signal_space": lambda: plots.signal_clouds(space, line),

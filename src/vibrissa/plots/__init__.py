@@ -3,15 +3,24 @@
 from vibrissa.plots.clouds import signal_clouds
 from vibrissa.plots.contour import contour_views
 from vibrissa.plots.estimates import estimated_against_true
+from vibrissa.plots.evidence import critical_cones, resolution
 from vibrissa.plots.signals import signals_over_time
 from vibrissa.plots.style import save
+from vibrissa.plots.surfaces import contact_surfaces
+from vibrissa.plots.verdicts import verdict_table
 from vibrissa.plots.whisker import whisker_views
+from vibrissa.plots.witness import witness_pair
 
 __all__ = [
+    "contact_surfaces",
     "contour_views",
+    "critical_cones",
     "estimated_against_true",
+    "resolution",
     "save",
     "signal_clouds",
     "signals_over_time",
+    "verdict_table",
     "whisker_views",
+    "witness_pair",
 ]

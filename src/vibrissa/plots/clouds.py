@@ -1,268 +1,310 @@
-"""The six signals over the space that the whisker can reach (the paper's Fig. 2C)."""
+"""The space that a whisker can reach, and the six signals there (the paper's Fig. 2)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
+from matplotlib.cm import ScalarMappable
 from matplotlib.colorbar import Colorbar
+from matplotlib.colors import Colormap, FuncNorm, Normalize
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
+from vibrissa.plots.chart import DIRECTIONS, SIGNALS, column, fine_chart, values_of
 from vibrissa.plots.colours import cyclic, diverging, sequential
-from vibrissa.plots.style import (
-    INK,
-    WIDTHS,
-    Array,
-    Mask,
-    looking,
-    new_figure,
-    plain,
-    robust_limits,
-    say,
+from vibrissa.plots.solids import solid
+from vibrissa.plots.space import (
+    AZIMUTH,
+    ELEVATION,
+    bounds,
+    name_axes,
+    paint,
+    painted,
+    space_axes,
 )
+from vibrissa.plots.style import INK, Array, Width, looking, new_figure, plain, robust_limits, root
 from vibrissa.quantities import axis_label, quantity, to_display
-from vibrissa.status import is_ok
 
-SIGNALS = ("Fx", "FT", "FD", "Mx", "MB", "MD")
-DIRECTIONS = ("FD", "MD")
-_CONE = np.deg2rad(2.0)
-_MOST = 30_000
-"""Points drawn in one cloud at most; more cannot be told apart on paper."""
+_SKIN = (0.80, 0.85, 0.90, 1.0)
+"""Colour of the reachable space where it stands for no signal."""
 
 
-@dataclass(frozen=True, eq=False)
-class Cloud:
-    """Contacts as a list.
+_TITLES = {"FD": "direction of $F_T$", "MD": "direction of $M_B$"}
 
-    Parameters
-    ----------
-    points : array (n, 3)
-        Contact points, whisker frame, m.
-    signals : dict of str to array (n,)
-        The six signals, SI units.
-    """
-
-    points: Array
-    signals: dict[str, Array]
+Box = tuple[float, float, float, float]
+"""Left, bottom, width and height, mm."""
 
 
-def cloud(samples: xr.Dataset, centerline: ArrayLike | None = None) -> Cloud:
-    """Make a list of the contacts of a dataset that have an answer.
+class _Sheet(NamedTuple):
+    """Where panels lie."""
 
-    Parameters
-    ----------
-    samples : Dataset
-        Either nodes of a map, any dims, with ``contact_point`` (…, space); or the paper's grid over
-        the coordinates ``r``, ``theta`` and ``phi``. Both with the six signals, SI units; with
-        ``status`` and ``small_deflection`` if known.
-    centerline : array_like (k, 3), optional
-        Of the resting whisker, m. Where the dataset does not tell which deflections are small,
-        contacts nearer to this line than tan 2° times the arc length there are left out.
-
-    Returns
-    -------
-    Cloud
-        Without missing points, contacts that have no answer, and small deflections.
-
-    Raises
-    ------
-    ValueError
-        If the dataset lacks signals or contact points.
-    """
-    missing = [name for name in SIGNALS if name not in samples]
-    if "contact_point" not in samples and not {"r", "theta", "phi"} <= set(samples.coords):
-        missing.append("contact_point (or the coordinates r, theta, phi)")
-    if missing:
-        raise ValueError(f"the samples lack {', '.join(missing)}")
-    shape = samples["Fx"].dims
-    points = _contact_points(samples)
-    kept: Mask = np.asarray(np.isfinite(points).all(axis=1))
-    signals = {name: samples[name].transpose(*shape).to_numpy().ravel() for name in SIGNALS}
-    for values in signals.values():
-        kept &= np.isfinite(values)
-    if "status" in samples:
-        kept &= is_ok(samples["status"].transpose(*shape).to_numpy().ravel())
-    if "small_deflection" in samples:
-        kept &= ~samples["small_deflection"].transpose(*shape).to_numpy().ravel().astype(bool)
-    elif centerline is not None:
-        rows = np.flatnonzero(kept)
-        line = np.asarray(centerline, dtype=np.float64)
-        kept[rows[_near_rest(points[rows], line)]] = False
-    return Cloud(points[kept], {name: values[kept] for name, values in signals.items()})
+    height: float
+    space: Box
+    front: Box
+    signals: tuple[Box, ...]
 
 
-def _contact_points(samples: xr.Dataset) -> Array:
-    """Contact points (n, 3), m, in the order of the signals."""
-    dims = samples["Fx"].dims
-    if "contact_point" in samples:
-        points = samples["contact_point"].transpose(*dims, "space").to_numpy()
-        return np.asarray(points.reshape(-1, 3), dtype=np.float64)
-    r, theta, phi = xr.broadcast(samples["r"], samples["theta"], samples["phi"])
-    place = (r * np.cos(phi) * np.cos(theta), r * np.cos(phi) * np.sin(theta), r * np.sin(phi))
-    return np.stack([axis.transpose(*dims).to_numpy().ravel() for axis in place], axis=1)
-
-
-def _near_rest(points: Array, line: Array) -> Mask:
-    """Whether points (n, 3) lie in the cone of small deflection about a line (k, 3)."""
-    from scipy.spatial import cKDTree  # a tenth of a second, so only where it is needed
-
-    count = max(1000, len(line))
-    nodes = np.linspace(0.0, len(line) - 1.0, count)
-    fine = np.stack([np.interp(nodes, np.arange(len(line)), c) for c in line.T], axis=1)
-    step = np.linalg.norm(np.diff(fine, axis=0), axis=1)
-    arc_length = np.concatenate([[0.0], np.cumsum(step)])
-    distance, nearest = cKDTree(fine).query(points)
-    return np.asarray(distance < arc_length[nearest] * np.tan(_CONE))
+def _sheet(width: Width) -> _Sheet:
+    if width == "single":
+        cells = [(42.5 * (i % 2), 78.0 - 39.0 * (i // 2), 42.5, 38.0) for i in range(6)]
+        return _Sheet(167.0, (0.0, 117.0, 56.0, 49.0), (57.0, 117.0, 28.0, 49.0), tuple(cells))
+    cells = [(58.0 + 40.0 * (i % 3), 39.5 - 39.0 * (i // 3), 40.0, 38.0) for i in range(6)]
+    return _Sheet(78.5, (0.0, 30.5, 58.0, 47.0), (0.0, -2.0, 58.0, 32.5), tuple(cells))
 
 
 def signal_clouds(
     samples: xr.Dataset,
-    centerline: ArrayLike | None = None,
+    centerline: ArrayLike,
     *,
+    width: Width = "double",
     cutaway: bool = True,
-    elevation: float = 24.0,
-    azimuth: float = -58.0,
+    elevation: float = ELEVATION,
+    azimuth: float = AZIMUTH,
 ) -> Figure:
-    """Draw the six signals over the space that the whisker can reach.
+    """Draw the space that a whisker can reach, and the six signals over it.
 
-    Six clouds of contact points, one for each signal that gives the colour: forces above, moments
-    below. Small deflections (2° about rest) are left out as in the paper. Limits of colours leave
-    out the outermost 2 % of the values; where they do, the colour bar has a pointed end.
+    The reachable space is seen from aside and from before the tip, and then once for each signal,
+    which gives the colour: forces above, moments below. Small deflections (2° about rest) are left
+    out as in the paper. Colours of forces and moments go with the square root of the signal; they
+    leave out the outermost 2 % of its values, and the colour bar then has a pointed end. An inset
+    shows where the whisker is pulled (F_x > 0), which only happens if it is curved.
 
     Parameters
     ----------
     samples : Dataset
-        ``ContactMap.grid`` or ``ContactMap.to_dataset()``; see :func:`cloud`.
-    centerline : array_like (k, 3), optional
-        Of the resting whisker, whisker frame, m; drawn in black.
+        ``ContactMap.to_dataset()``: all of the reachable space.
+    centerline : array_like (k, 3)
+        Of the resting whisker from base to tip, whisker frame, m; drawn in black.
+    width : {"single", "double"}
+        Columns of the page.
     cutaway : bool
         Whether the quarter that faces the viewer is taken away, along the resting whisker, so that
         the whisker and what lies about it are seen.
     elevation, azimuth : float
-        From where the clouds are seen, degrees.
+        From where the space is seen, degrees.
 
     Returns
     -------
     Figure
-        Two columns wide, with six 3D axes in mm and six colour bars; or the sentence "no contacts".
+        3D axes, all to one scale but for the inset, and six colour bars.
 
     Raises
     ------
     ValueError
-        If the dataset lacks signals or contact points.
+        If the dataset lacks something, or if there is no such width.
     """
-    contacts = cloud(samples, centerline)
-    points = to_display("contact_point", contacts.points)
-    line = None if centerline is None else to_display("centerline", centerline)
+    nodes = fine_chart(samples, centerline, _kept(elevation, azimuth) if cutaway else None)
+    whole = nodes if not cutaway else fine_chart(samples, centerline)
+    outside = column("deflection")
+    triangles = solid(nodes, not cutaway, outside)
+    line = to_display("centerline", centerline)
+    limits = bounds(np.concatenate([_mm(triangles).reshape(-1, 3), line]))
+    view = elevation, azimuth
+    sheet = _sheet(width)
     with looking():
-        figure = new_figure("double", _HEIGHT, None)
-        if len(points) == 0:
-            say(figure, "no contacts")
-            return figure
-        limits = _limits(points, line)
-        # In an order of its own: an even stride would pick the same rows of a grid again and again.
-        shown = np.random.default_rng(0).permutation(len(points))
-        if cutaway:
-            shown = shown[~_facing(points[shown], line, elevation, azimuth)]
-        shown = shown[:_MOST]
-        # Fewer contacts are drawn as larger dots.
-        dot = _DOTS | {"s": float(np.clip(6e4 / max(len(shown), 1), 2.0, 8.0))}
-        for i, name in enumerate(SIGNALS):
-            left, bottom = (i % 3) / 3.0, 0.5 * (1 - i // 3)
-            axes = _axes(figure, left, bottom, limits, (elevation, azimuth))
-            values = to_display(name, contacts.signals[name])
-            scale, ends = _scale(name, values)
-            dots = axes.scatter(*points[shown].T, c=values[shown], **scale, **dot)
-            if line is not None:
-                axes.plot(*line.T, color="black", linewidth=1.4, zorder=10)
-            rail = figure.add_axes((left + 0.07, bottom + 0.066, 0.2, 0.013))
-            _bar(figure.colorbar(dots, cax=rail, extend=ends, orientation="horizontal"), name)
-            for text, right, look in (("abcdef"[i], 0.012, _BOLD), (_title(name), 0.034, _WORDS)):
-                figure.text(left + right, bottom + 0.467, text, **look)
+        figure = new_figure(width, sheet.height, None)
+        _reach(figure, sheet, triangles, line, limits, view)
+        for i, (name, cell) in enumerate(zip(SIGNALS, sheet.signals, strict=True)):
+            _label(figure, cell, "cdefgh"[i], _TITLES.get(name, quantity(name).long_name))
+            norm, colours, ends = _scale(name, to_display(name, values_of(name, whole)))
+            axes = space_axes(figure, _square(cell), limits, view, zoom=1.02, frame=False)
+            shown = to_display(name, values_of(name, triangles))
+            if name == "Mx" and _vanishes(whole):
+                _body(axes, triangles, np.array(_SKIN), line)
+                _say_zero(figure, cell)
+                continue
+            _body(axes, triangles, _mean(name, shown, norm, colours), line)
+            _bar(figure, _rail(figure, cell), norm, colours, ends, name)
+        _pulled(figure, sheet.signals[0], nodes, not cutaway, line, view)
         return figure
 
 
-_HEIGHT = 124.0
-"""Of the figure, mm."""
-
-_DOTS: dict[str, Any] = {"linewidths": 0.0, "depthshade": False, "rasterized": True}
-_BOLD: dict[str, Any] = {"fontsize": 8.0, "fontweight": "bold"}
-_WORDS: dict[str, Any] = {"fontsize": 7.0}
+def _kept(elevation: float, azimuth: float) -> tuple[float, float]:
+    """Bearings that remain when the quarter toward the viewer is taken away."""
+    toward = np.arctan2(np.sign(elevation), np.sign(np.sin(np.radians(azimuth))))
+    return float(toward + np.pi / 4.0), float(toward + 7.0 * np.pi / 4.0)
 
 
-def _title(name: str) -> str:
-    return quantity(name).long_name
+def _mm(triangles: Array) -> Array:
+    return to_display("contact_point", triangles[..., :3])
 
 
-def _facing(points: Array, line: Array | None, elevation: float, azimuth: float) -> Mask:
-    """Whether points (n, 3) lie in the quarter before the resting whisker, toward the viewer."""
-    rest = np.zeros((2, len(points)))
-    if line is not None:
-        reach = np.linalg.norm(line, axis=1)
-        order = np.argsort(reach)
-        r = np.linalg.norm(points, axis=1)
-        rest = np.array([np.interp(r, reach[order], line[order, k]) for k in (1, 2)])
-    toward = np.sign(np.sin(np.radians(azimuth))), np.sign(elevation)
-    aside, above = points[:, 1] - rest[0], points[:, 2] - rest[1]
-    return np.asarray((aside * toward[0] > 0.0) & (above * toward[1] > 0.0))
+def _mean(name: str, values: Array, norm: Normalize, colours: Colormap) -> Array:
+    """Colours of triangles; directions are averaged on the circle."""
+    if name not in DIRECTIONS:
+        return painted(values, norm, colours)
+    turn = np.radians(values)
+    mean = np.degrees(np.arctan2(np.sin(turn).sum(axis=1), np.cos(turn).sum(axis=1)))
+    return painted(mean[:, None], norm, colours)
 
 
-def _scale(name: str, values: Array) -> tuple[dict[str, Any], str]:
+def _reach(
+    figure: Figure,
+    sheet: _Sheet,
+    triangles: Array,
+    line: Array,
+    limits: Array,
+    view: tuple[float, float],
+) -> None:
+    """The reachable space from aside, and from before the tip."""
+    colours = np.broadcast_to(np.array(_SKIN), (len(triangles), 4))
+    left, bottom, width, height = sheet.space
+    box = left - 0.03 * width, bottom + 0.5 * (height - width), width, width
+    axes = space_axes(figure, box, limits, view, zoom=0.88)
+    name_axes(axes, (-8.0, -9.0, -10.5))
+    _body(axes, triangles, colours, line, 0.55)
+    _label(figure, sheet.space, "a", "reachable contacts")
+    left, bottom, width, height = sheet.front
+    side = min(width, height)
+    box = left + 0.5 * (width - side), bottom + 0.45 * (height - side), side, side
+    front = space_axes(figure, box, limits, (0.0, 0.0), zoom=1.35, frame=False)
+    front.set_proj_type("ortho")
+    _body(front, triangles, colours, line, 0.55)
+    _cross(front, limits)
+    _label(figure, sheet.front, "b", "from the tip")
+
+
+def _body(axes: Any, triangles: Array, colours: Array, line: Array, flat: float = 0.75) -> None:
+    paint(axes, _mm(triangles), colours, flat=flat)
+    axes.plot(*line.T, color="black", linewidth=1.2, zorder=10, solid_capstyle="round")
+
+
+def _cross(axes: Any, limits: Array) -> None:
+    """Bars of 5 mm along y and z at the lower left of the view from the tip."""
+    corner = np.array([limits[0, 1], limits[1, 0] - 1.0, limits[2, 0]])
+    for i, name in ((1, "y"), (2, "z")):
+        end = corner.copy()
+        end[i] += 5.0
+        axes.plot(*np.stack([corner, end]).T, color=INK, linewidth=0.8, zorder=11)
+        end[i] += 1.6
+        axes.text(*end, f"${name}$", fontsize=6.0, ha="center", va="center")
+    corner += np.array([0.0, 2.5, -1.8])
+    axes.text(*corner, "5 mm", fontsize=5.5, ha="center", va="center")
+
+
+def _vanishes(nodes: Array) -> bool:
+    """Whether there is no twisting moment, as for a straight whisker."""
+    twist, bend = (np.abs(values_of(name, nodes)).max() for name in ("Mx", "MB"))
+    return bool(twist < 1e-9 * bend)
+
+
+def _say_zero(figure: Figure, cell: Box) -> None:
+    wide, tall = 25.4 * figure.get_size_inches()
+    left, bottom, width, _ = cell
+    place = (left + 0.5 * width) / wide, (bottom + 6.0) / tall
+    figure.text(*place, "$M_x = 0$ everywhere", fontsize=6.5, ha="center", va="center")
+
+
+def _pulled(
+    figure: Figure,
+    cell: Box,
+    nodes: Array,
+    closed: bool,
+    line: Array,
+    view: tuple[float, float],
+) -> None:
+    """Inset with only the contacts at which the whisker is pulled, with colours of its own."""
+    triangles = solid(nodes, closed, column("deflection"), column("Fx"))
+    if not len(triangles):
+        return
+    left, bottom, width, height = cell
+    limits = bounds(np.concatenate([_mm(triangles).reshape(-1, 3), line]))
+    side = 0.46 * width
+    box = left + width - 1.03 * side, bottom + 0.84 * height - 0.5 * side, side, side
+    axes = space_axes(figure, box, limits, view, zoom=1.1, frame=False)
+    values = to_display("Fx", values_of("Fx", triangles))
+    norm, colours = Normalize(0.0, float(values.max())), sequential()
+    _body(axes, triangles, painted(values, norm, colours), line, 1.0)
+    axes.lines[0].set_linewidth(0.7)
+    wide, tall = 25.4 * figure.get_size_inches()
+    start, end = left + 0.66 * width, bottom + 0.91 * height
+    rail = figure.add_axes((start / wide, end / tall, 0.22 * width / wide, 1.0 / tall))
+    bar = figure.colorbar(ScalarMappable(norm, colours), cax=rail, orientation="horizontal")
+    plain(bar)
+    rail.xaxis.set_ticks_position("top")
+    bar.set_ticks([0.0, values.max()], labels=["$F_x$ > 0", f"{values.max():.2g} µN"])
+    rail.tick_params(length=0.0, pad=1.0, labelsize=5.0)
+
+
+def _scale(name: str, values: Array) -> tuple[Normalize, Colormap, str]:
     """Limits and map of the colours of a signal, and which ends of the map are exceeded."""
     if name in DIRECTIONS:
-        return {"vmin": -180.0, "vmax": 180.0, "cmap": cyclic()}, "neither"
+        return Normalize(-180.0, 180.0), cyclic(), "neither"
     signed = name == "Mx"
     low, high = robust_limits(values, symmetric=signed)
     if name in ("FT", "MB"):
         low = 0.0
     below, above = bool(values.min() < low), bool(values.max() > high)
     ends = ("neither", "max", "min", "both")[2 * below + above]
-    return {"vmin": low, "vmax": high, "cmap": diverging() if signed else sequential()}, ends
+    norm = FuncNorm((root, _squared), vmin=low, vmax=high)
+    return norm, diverging() if signed else sequential(), ends
 
 
-def _bar(bar: Colorbar, name: str) -> None:
+def _squared(values: ArrayLike) -> Array:
+    x = np.asarray(values, dtype=np.float64)
+    return np.asarray(np.sign(x) * x**2)
+
+
+def _label(figure: Figure, cell: Box, letter: str, title: str) -> None:
+    """A bold letter and a few words at the upper left of a panel."""
+    wide, tall = 25.4 * figure.get_size_inches()
+    left, bottom, _, height = cell
+    for text, right, weight in ((letter, 1.5, "bold"), (title, 5.5, "normal")):
+        figure.text(
+            (left + right) / wide,
+            (bottom + height) / tall,
+            text,
+            fontsize=8.0 if weight == "bold" else 6.5,
+            fontweight=weight,
+            ha="left",
+            va="top",
+        )
+
+
+def _square(cell: Box) -> Box:
+    """The room of a panel for its 3D axes, which are square and reach beyond it."""
+    left, bottom, width, height = cell
+    side = 1.1 * width
+    return left - 0.07 * width, bottom + 0.52 * height - 0.5 * side, side, side
+
+
+def _rail(figure: Figure, cell: Box) -> Any:
+    """Axes for a colour bar at the lower end of a panel."""
+    wide, tall = 25.4 * figure.get_size_inches()
+    left, bottom, width, _ = cell
+    place = ((left + 0.2 * width) / wide, (bottom + 6.8) / tall, 0.6 * width / wide, 1.5 / tall)
+    return figure.add_axes(place)
+
+
+def _bar(
+    figure: Figure, rail: Any, norm: Normalize, colours: Colormap, ends: str, name: str
+) -> Colorbar:
+    bar = figure.colorbar(
+        ScalarMappable(norm, colours), cax=rail, extend=ends, orientation="horizontal"
+    )
     plain(bar)
-    bar.ax.tick_params(length=2.0, pad=1.5)
-    bar.ax.set_xlabel(axis_label(name))
+    bar.ax.tick_params(length=2.0, pad=1.5, labelsize=5.5)
+    bar.ax.set_xlabel(axis_label(name), fontsize=6.5, labelpad=1.0)
+    assert norm.vmin is not None
+    assert norm.vmax is not None
     if name in DIRECTIONS:
         bar.set_ticks([-180.0, -90.0, 0.0, 90.0, 180.0])
     else:
-        bar.locator = MaxNLocator(4)
-        bar.update_ticks()
+        marks = _round_roots(norm.vmin, norm.vmax)
+        bar.set_ticks(marks, labels=[f"{mark:g}".replace("-", "−") for mark in marks])
+    bar.minorticks_off()
+    return bar
 
 
-def _limits(points: Array, line: Array | None) -> Array:
-    """Limits (3, 2) of x, y and z that hold all points, the base and the whisker."""
-    everything = np.concatenate([points, np.zeros((1, 3)), *([] if line is None else [line])])
-    low, high = np.nanmin(everything, axis=0), np.nanmax(everything, axis=0)
-    room = 0.02 * (high - low).max()
-    return np.stack([low - room, high + room], axis=1)
-
-
-def _axes(
-    figure: Figure, left: float, bottom: float, limits: Array, view: tuple[float, float]
-) -> Any:
-    """Three-dimensional axes to one scale in a sixth of the figure."""
-    # Matplotlib's 3D axes carry no types, and stay square: the box reaches beyond the panel.
-    tall = 0.36 * WIDTHS["double"] / _HEIGHT
-    box = (left - 0.031, bottom + 0.297 - 0.5 * tall, 0.36, tall)
-    axes: Any = figure.add_axes(box, projection="3d", computed_zorder=False)
-    axes.patch.set_visible(False)
-    axes.set(xlim=limits[0], ylim=limits[1], zlim=limits[2])
-    axes.set_box_aspect(tuple(np.ptp(limits, axis=1)), zoom=0.86)
-    axes.view_init(*view)
-    axes.set_proj_type("persp", focal_length=1.6)
-    for name, pad in (("x", -9.0), ("y", -10.0), ("z", -11.0)):
-        axis = getattr(axes, f"{name}axis")
-        axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
-        axis.line.set(color=INK, linewidth=0.5)
-        axis._axinfo["grid"].update(color="#e2e2e2", linewidth=0.4)
-        axis.set_label_text(axis_label(name), fontsize=6.0)
-        axis.labelpad = pad
-    axes.tick_params(labelsize=5.5, pad=-4.0)
-    axes.locator_params(nbins=4)
-    return axes
+def _round_roots(low: float, high: float) -> list[float]:
+    """Round numbers that lie about evenly on a square-root scale."""
+    largest = max(abs(low), abs(high))
+    step = 10.0 ** np.floor(np.log10(largest))
+    step *= max(f for f in (1.0, 2.0, 5.0) if f * step <= largest)
+    marks = [0.0]
+    for sign, end, other in ((-1.0, -low, high), (1.0, high, -low)):
+        shares = (1.0,) if other > 0.1 * largest else (1.0, 0.25)
+        marks += [sign * f * step for f in shares if f * step <= end and end > 0.1 * largest]
+    return sorted(float(f"{mark:.3g}") for mark in marks)

@@ -1,6 +1,6 @@
 """One look for all figures: sizes, fonts, colours, labels, files.
 
-Figures are made for print at the width of one or two columns (89 and 183 mm), with lettering of 6
+Figures are made for print at the width of one or two columns (85 and 178 mm), with lettering of 6
 to 8 points at that size. Only Matplotlib's object-oriented interface is used: no window opens, no
 global state changes, and a figure is freed with its last name. Colours are told apart with any
 colour vision (Okabe & Ito 2008, https://jfly.uni-koeln.de/color/), and colormaps are perceptual.
@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Width = Literal["single", "double"]
 
-WIDTHS: Mapping[str, float] = MappingProxyType({"single": 89.0, "double": 183.0})
+WIDTHS: Mapping[str, float] = MappingProxyType({"single": 85.0, "double": 178.0})
 """Widths of figures, mm."""
 
 INK = "#1a1a1a"
@@ -251,6 +251,28 @@ def robust_limits(values: ArrayLike, share: float = 0.98, symmetric: bool = Fals
         room = 0.05 * abs(high) or 1.0
         low, high = low - room, high + room
     return np.array([low, high])
+
+
+def root(values: ArrayLike) -> Array:
+    """Take square roots of sizes and keep signs, for scales on which small values are seen.
+
+    Parameters
+    ----------
+    values : array_like
+        Any shape.
+
+    Returns
+    -------
+    array
+        sign(x) √|x|.
+
+    Examples
+    --------
+    >>> root([-4.0, 9.0])
+    array([-2.,  3.])
+    """
+    x = np.asarray(values, dtype=np.float64)
+    return np.asarray(np.sign(x) * np.sqrt(np.abs(x)))
 
 
 def save(

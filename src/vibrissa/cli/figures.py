@@ -1,0 +1,210 @@
+"""`vibrissa figures`: everything that can be drawn from a map."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import typer
+
+from vibrissa.cli.terminal import output, progress_bars
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from numpy.typing import NDArray
+
+    from vibrissa.mapping import ContactMap
+    from vibrissa.rod import Deflection
+    from vibrissa.whisker import Whisker
+
+    Array = NDArray[np.float64]
+
+Draw = Callable[[], Any]
+_FORMATS = ("png", "pdf", "svg")
+_WIDTHS = ("single", "double")
+_NODES = 101
+_AGREE = 1e-6
+"""How closely signals of a saved witness must agree with those of the map's whisker."""
+
+
+def figures(
+    path: Annotated[Path, typer.Argument(help="A map of contacts, NetCDF.", metavar="MAP")],
+    folder: Annotated[
+        Path, typer.Option("--output", "-o", help="Where figures go.", metavar="DIR")
+    ] = Path("figures"),
+    formats: Annotated[
+        list[str] | None,
+        typer.Option("--format", help="png, pdf or svg; may be repeated. Default: png and pdf."),
+    ] = None,
+    width: Annotated[
+        str, typer.Option(help="For one column of a journal, 85 mm, or two, 178 mm.")
+    ] = "double",
+    uniqueness: Annotated[
+        Path | None,
+        typer.Option(help="Saved result of `vibrissa uniqueness` for this map.", metavar="FILE"),
+    ] = None,
+    cones: Annotated[
+        Path | None,
+        typer.Option(help="Critical cones by curvature and taper, NetCDF.", metavar="FILE"),
+    ] = None,
+) -> None:
+    """Draw the figures that a map allows: whisker, signals over the reachable space, surfaces.
+
+    With a saved result of `vibrissa uniqueness` also the verdicts, the resolution and pairs of
+    contacts that feel the same. Example: `vibrissa figures map.nc -o figures --width single`
+    """
+    endings = _chosen(formats, width)
+    from vibrissa.cli.sources import map_from
+    from vibrissa.io.paths import check_folder
+    from vibrissa.plots import save
+
+    check_folder(folder)
+    verdicts = None if uniqueness is None else _dataset(uniqueness, "verdict")
+    sweep = None if cones is None else _dataset(cones, "critical_cone")
+    contacts = map_from(path)
+    drawings = dict(_drawings(contacts, width, verdicts, sweep))
+    folder.mkdir(parents=True, exist_ok=True)
+    files = []
+    with progress_bars() as tell:
+        for i, (name, draw) in enumerate(drawings.items()):
+            tell("figures", i, len(drawings))
+            files += save(draw(), folder / name, endings)
+        tell("figures", len(drawings), len(drawings))
+    for file in files:
+        output.print(f"wrote {file}", highlight=False, soft_wrap=True)
+
+
+def _chosen(formats: list[str] | None, width: str) -> list[str]:
+    """Check what was asked for before anything is read."""
+    endings = list(dict.fromkeys(formats or ["png", "pdf"]))
+    unknown = [ending for ending in endings if ending not in _FORMATS]
+    if unknown:
+        raise ValueError(f"--format is {unknown[0]!r}; one of {', '.join(_FORMATS)} is needed")
+    if width not in _WIDTHS:
+        raise ValueError(f"--width is {width!r}; one of {', '.join(_WIDTHS)} is needed")
+    return endings
+
+
+def _dataset(path: Path, needed: str) -> xr.Dataset:
+    """Read a dataset that holds a variable."""
+    import xarray as xr
+
+    from vibrissa.io import kind_of
+
+    kind = kind_of(path)
+    data = xr.load_dataset(path, engine="h5netcdf")
+    if needed not in data:
+        raise ValueError(
+            f"{path} holds {kind or 'data of another kind'}, and no variable {needed!r}"
+        )
+    return data
+
+
+def _drawings(
+    contacts: ContactMap, width: Any, verdicts: xr.Dataset | None, cones: xr.Dataset | None
+) -> Iterator[tuple[str, Draw]]:
+    """Names and what draws them."""
+    from vibrissa import plots
+
+    whisker = contacts.whisker
+    line = whisker.centerline(_NODES)
+    radius = whisker.radius(np.linspace(0.0, whisker.length, _NODES))
+    samples = contacts.to_dataset()
+    yield "whisker", lambda: plots.whisker_views(line, radius, name=whisker.name, width=width)
+    yield "signal_space", lambda: plots.signal_clouds(samples, line, width=width)
+    yield "contact_surfaces", lambda: plots.contact_surfaces(samples, line, width=width)
+    if cones is not None:
+        yield "critical_cones", lambda: plots.critical_cones(cones, width=width)
+    if verdicts is None:
+        return
+    yield "verdicts", lambda: plots.verdict_table(verdicts, width=width)
+    if "ambiguous_share" in verdicts:
+        yield "resolution", lambda: plots.resolution(verdicts, width=width)
+    for name, pair in witnesses(whisker, verdicts):
+        drawn = partial(plots.witness_pair, pair, width=width)
+        yield f"witness_{name.replace(' ', '_')}", drawn
+
+
+def witnesses(whisker: Whisker, verdicts: xr.Dataset) -> Iterator[tuple[str, xr.Dataset]]:
+    """Bend a whisker into the farthest pair of contacts that feel the same, for chosen triplets.
+
+    Parameters
+    ----------
+    whisker : Whisker
+        Whose verdicts these are.
+    verdicts : Dataset
+        As of ``vibrissa.uniqueness``.
+
+    Yields
+    ------
+    triplet : str
+        One of the paper's three, or the one chosen, if it has a witness among all contacts.
+    witness : Dataset
+        As :func:`vibrissa.plots.witness_pair` takes it.
+
+    Raises
+    ------
+    ValueError
+        If the verdicts are those of another whisker.
+    """
+    from vibrissa.plots.evidence import HIGHLIGHTED
+
+    needed = {"witness_arc_length", "witness_contact_force", "witness_separation"}
+    if not needed <= set(verdicts.data_vars):
+        return
+    chosen = str(verdicts.attrs.get("chosen_triplet", ""))
+    known = set(map(str, verdicts["triplet"].values))
+    for triplet in dict.fromkeys((*HIGHLIGHTED, chosen)):
+        if triplet not in known:
+            continue
+        found = verdicts.sel(triplet=triplet, region="all")
+        apart = found["witness_separation"].values
+        if np.isfinite(apart).any():
+            yield triplet, _bent(whisker, found.isel(witness=int(np.nanargmax(apart))), triplet)
+
+
+def _bent(whisker: Whisker, found: xr.Dataset, triplet: str) -> xr.Dataset:
+    """The two whiskers of one witness."""
+    import xarray as xr
+
+    from vibrissa.rod import PointForce, deflect
+    from vibrissa.signals import base_signals
+
+    force = found["witness_contact_force"].transpose("pair", "component").values
+    components = np.column_stack([np.zeros(2), force])
+    arc_length = found["witness_arc_length"].values
+    bent = deflect(whisker, PointForce(arc_length, components=components))
+    signals = base_signals(bent.force, bent.moment)
+    if "witness_signals" in found:
+        _check_whisker(bent, signals, triplet, found["witness_signals"].values)
+    data = xr.Dataset(
+        {
+            "rest": (("node", "space"), whisker.centerline(_NODES)),
+            "centerline": (("pair", "node", "space"), bent.centerline(_NODES)),
+            "contact_point": (("pair", "space"), bent.contact_point),
+            "force": (("pair", "space"), bent.force),
+            "arc_length": ("pair", bent.arc_length),
+        },
+        attrs={"triplet": triplet},
+    )
+    return data.assign({name: ("pair", values.values) for name, values in signals.items()})
+
+
+def _check_whisker(bent: Deflection, signals: xr.Dataset, triplet: str, saved: Array) -> None:
+    """Raise unless the first contact feels here as it did where the verdicts were made."""
+    names = triplet.split()
+    felt = np.array([signals[name].values[0] for name in names])
+    force, moment = (float(np.linalg.norm(v[0])) for v in (bent.force, bent.moment))
+    sizes = {"Fx": force, "FT": force, "Mx": moment, "MB": moment}
+    gap = [
+        abs(a - b) / sizes[name] if name in sizes else abs(np.angle(np.exp(1j * (a - b))))
+        for name, a, b in zip(names, felt, saved, strict=True)
+    ]
+    if not np.max(gap) < _AGREE:  # also where the whisker holds no such contact
+        raise ValueError(
+            f"the verdicts are not of this map's whisker: for ({triplet}) the first contact of a "
+            f"witness feels {felt} here, and {saved} where the verdicts were made"
+        )

@@ -1,0 +1,299 @@
+"""Surfaces of equal r, θ and φ, and what they become in the space of (F_x, M_B, M_D) (Fig. 3).
+
+Signals are drawn in a cylinder: M_B is the distance from the axis, M_D the angle about it, and F_x
+the height. M_B and F_x are drawn on square-root scales: most contacts are gentle.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import ArrayLike
+
+from vibrissa.plots.chart import column, fine_chart, values_of
+from vibrissa.plots.colours import sequential
+from vibrissa.plots.solids import clipped, level, solid
+from vibrissa.plots.space import bounds, name_axes, paint, painted, space_axes
+from vibrissa.plots.style import (
+    INK,
+    MUTED,
+    Array,
+    Width,
+    looking,
+    new_figure,
+    plain,
+    robust_limits,
+    root,
+)
+from vibrissa.quantities import axis_label, quantity, to_display
+
+Box = tuple[float, float, float, float]
+"""Left, bottom, width and height, mm."""
+
+_COORDINATES = ("r", "theta", "phi")
+_LEVELS = 3
+_VIEW = (16.0, -152.0)
+_ASPECT = (1.0, 1.0, 0.85)
+_FRONT = 222.0
+"""Direction, degrees, in which rings carry their labels: toward the viewer."""
+
+_OPEN = (np.pi, 2.5 * np.pi)
+"""Bearings drawn where solids and surfaces are cut open: all but a quarter."""
+
+
+class _Panel(NamedTuple):
+    """One of nine."""
+
+    letter: str
+    title: str
+    box: Box
+
+
+def contact_surfaces(
+    samples: xr.Dataset, centerline: ArrayLike, *, width: Width = "double"
+) -> Figure:
+    """Draw surfaces of equal r, θ and φ among contacts, and in the space of three signals.
+
+    For each of r, θ and φ: three surfaces on which it is the same, in the space of contact points;
+    the same three in the space of (F_x, M_B, M_D); and the solid of all signals that contacts make,
+    coloured by it. It is cut open where the force's bearing at the contact is
+    between 90° and 180°, as are the signals of equal r. Contacts within
+    2° of rest are left out. Where two colours meet in the solid, a contact cannot be told from its
+    signals.
+
+    Parameters
+    ----------
+    samples : Dataset
+        ``ContactMap.to_dataset()``: all of the reachable space.
+    centerline : array_like (k, 3)
+        Of the resting whisker from base to tip, whisker frame, m.
+    width : {"single", "double"}
+        Columns of the page.
+
+    Returns
+    -------
+    Figure
+        Nine 3D axes and three colour bars.
+
+    Raises
+    ------
+    ValueError
+        If the dataset lacks something, or if there is no such width.
+    """
+    whole = fine_chart(samples, centerline)
+    opened = fine_chart(samples, centerline, _OPEN)
+    outside = column("deflection")
+    body = solid(opened, False, outside)
+    line = to_display("centerline", centerline)
+    contacts = bounds(np.concatenate([_places(body).reshape(-1, 3), line]))
+    shell = solid(whole, True, outside)
+    signals = _signal_limits(shell)
+    with looking():
+        height, panels, rails = _sheet(width)
+        figure = new_figure(width, height, None)
+        for i, name in enumerate(_COORDINATES):
+            norm, marks = _levels(name, shell)
+            among, into, inside = panels[3 * i : 3 * i + 3]
+            axes = _contact_axes(figure, among, contacts)
+            surface, hues = _level_sets(whole, name, norm, marks)
+            paint(axes, _places(surface), hues)
+            axes.plot(*line.T, color="black", linewidth=1.2, zorder=10)
+            axes = _signal_axes(figure, into, signals)
+            if name == "r":  # its surfaces lie one within the other
+                surface, hues = _level_sets(opened, name, norm, marks)
+            paint(axes, _felt(surface), hues)
+            axes = _signal_axes(figure, inside, signals)
+            values = to_display(name, values_of(name, body))
+            paint(axes, _felt(body), painted(values, norm, sequential()), flat=0.8)
+            _bar(figure, rails[i], name, norm, marks)
+        return figure
+
+
+def _level_sets(
+    nodes: Array, name: str, norm: Normalize, marks: list[float]
+) -> tuple[Array, Array]:
+    """Surfaces on which a coordinate has certain values, and their colours."""
+    surfaces, hues = [], []
+    for mark in marks:
+        value = mark / quantity(name).display_factor
+        surfaces.append(clipped(level(nodes, column(name), value), column("deflection")))
+        hues.append(np.tile(sequential()(norm(mark)), (len(surfaces[-1]), 1)))
+    return np.concatenate(surfaces), np.concatenate(hues)
+
+
+_FLOOR: dict[str, Any] = {"color": "#c8c8c8", "linewidth": 0.4, "zorder": 0}
+
+
+def _places(triangles: Array) -> Array:
+    return to_display("contact_point", triangles[..., :3])
+
+
+def _felt(triangles: Array) -> Array:
+    """Signals of triangles as places in the cylinder, square roots of display units."""
+    size = np.sqrt(to_display("MB", values_of("MB", triangles)))
+    turn = values_of("MD", triangles)
+    height = root(to_display("Fx", values_of("Fx", triangles)))
+    return np.stack([size * np.cos(turn), size * np.sin(turn), height], axis=-1)
+
+
+def _signal_limits(triangles: Array) -> Array:
+    places = _felt(triangles)
+    reach = float(np.hypot(places[..., 0], places[..., 1]).max()) * 1.02
+    low, high = float(places[..., 2].min()), float(places[..., 2].max())
+    room = 0.02 * (high - low)
+    return np.array([[-reach, reach], [-reach, reach], [low - room, max(high, 0.0) + room]])
+
+
+def _levels(name: str, shell: Array) -> tuple[Normalize, list[float]]:
+    """Limits of the colours, and round values for surfaces, in display units."""
+    values = to_display(name, values_of(name, shell))
+    low, high = robust_limits(values)
+    locator = MaxNLocator(12, steps=[1, 2, 2.5, 5, 10])
+    ticks = np.asarray(locator.tick_values(low, high))
+    step = float(ticks[1] - ticks[0])
+    middle = float(ticks[np.argmin(np.abs(ticks - 0.5 * (low + high)))])
+    apart = max(1, round((high - low) / (_LEVELS + 1) / step)) * step
+    marks = [middle + apart * i for i in (-1.0, 0.0, 1.0)]
+    return Normalize(float(low), float(high)), marks
+
+
+def _sheet(width: Width) -> tuple[float, list[_Panel], list[Box]]:
+    """Height of the figure, panels (contacts, signals, solid of r, of θ, of φ), colour bars."""
+    kinds = ("contacts of equal {}", "their signals", "all signals, coloured by {}")
+    titles = [kind.format(f"${quantity(n).symbol}$") for n in _COORDINATES for kind in kinds]
+    cells = [(row, side) for row in range(3) for side in range(3)]
+    if width == "double":
+        height, wide, tall = 141.0, 56.0, 46.5
+        rails = [(169.5, height - 36.0 - tall * row, 1.6, 25.0) for row in range(3)]
+    else:
+        height, wide, tall = 191.0, 42.5, 38.0
+        rails = [(48.0, 30.0 - 12.0 * row, 32.0, 1.6) for row in range(3)]
+        # Contacts and signals side by side, the solids below.
+        cells = [(row, k) if k < 2 else (3 + row // 2, row % 2) for row, k in cells]
+    order = sorted(cells)
+    panels = [
+        _Panel(
+            "abcdefghi"[order.index((row, side))],
+            title,
+            (wide * side, height - 1.0 - tall * (row + 1), wide, tall),
+        )
+        for (row, side), title in zip(cells, titles, strict=True)
+    ]
+    return height, panels, rails
+
+
+def _head(figure: Figure, panel: _Panel) -> None:
+    wide, tall = 25.4 * figure.get_size_inches()
+    left, bottom, _, height = panel.box
+    for text, right, weight in ((panel.letter, 1.5, "bold"), (panel.title, 5.5, "normal")):
+        figure.text(
+            (left + right) / wide,
+            (bottom + height) / tall,
+            text,
+            fontsize=8.0 if weight == "bold" else 6.5,
+            fontweight=weight,
+            va="top",
+        )
+
+
+def _square(box: Box) -> Box:
+    left, bottom, width, height = box
+    side = max(width, height)
+    return left + 0.5 * (width - side), bottom - 1.0 + 0.5 * (height - side), side, side
+
+
+def _contact_axes(figure: Figure, panel: _Panel, limits: Array) -> Any:
+    _head(figure, panel)
+    left, bottom, width, height = _square(panel.box)
+    zoom = 0.87 if width > 50.0 else 0.82
+    axes = space_axes(figure, (left - 2.0, bottom + 1.5, width, height), limits, zoom=zoom)
+    name_axes(axes, (-8.0, -9.0, -10.5))
+    return axes
+
+
+def _signal_axes(figure: Figure, panel: _Panel, limits: Array) -> Any:
+    """Axes for a cylinder of signals: rings of equal M_B and rays of equal M_D on its floor."""
+    _head(figure, panel)
+    left, bottom, side, _ = _square(panel.box)
+    box = left + 2.0, bottom + 0.5, side, side
+    zoom = 1.0 if side > 50.0 else 0.9  # lettering does not shrink with the panel
+    axes = space_axes(figure, box, limits, _VIEW, zoom=zoom, frame=False, aspect=_ASPECT)
+    reach, floor = limits[0, 1], limits[2, 0]
+    turn = np.linspace(0.0, 2.0 * np.pi, 181)
+    rings = _round_squares(0.0, reach)[1:]
+    for ring in rings:
+        places = np.sqrt(ring) * np.stack([np.cos(turn), np.sin(turn)])
+        axes.plot(*places, floor, **_FLOOR)
+        near = 1.0 if ring < rings[-1] else 1.15
+        size, unit = quantity("MB").symbol, quantity("MB").display_unit
+        label = f"{ring:g}" if ring < rings[-1] else f"${size}$ = {ring:g} {unit}"
+        _write(axes, _FRONT, np.sqrt(ring) * near, floor, label, ha="left", va="top", color=MUTED)
+    for angle in (0, 90, 180, -90):
+        axes.plot(*np.outer(_toward(angle), [0.0, reach]), floor, **_FLOOR)
+        label = f"{angle}°" if angle != 180 else f"${quantity('MD').symbol}$ = 180°"
+        _write(axes, angle, 1.17 * reach, floor, label.replace("-", "−"))
+    _height_axis(axes, limits)
+    return axes
+
+
+def _height_axis(axes: Any, limits: Array) -> None:
+    """The axis of F_x, upright at the left."""
+    reach, (floor, top) = limits[0, 1], limits[2]
+    left = _VIEW[1] - 90.0
+    place = 1.2 * reach * _toward(left)
+    axes.plot(*np.repeat(place[:, None], 2, axis=1), [floor, top], color=INK, linewidth=0.5)
+    for mark in _round_squares(floor, top):
+        height = float(root(mark))
+        tick = np.outer(_toward(left), [1.2 * reach, 1.25 * reach])
+        axes.plot(*tick, height, color=INK, linewidth=0.5)
+        label = f"{mark:g}".replace("-", "−")
+        _write(axes, left, 1.29 * reach, height, label, ha="right")
+    _write(axes, left, 1.2 * reach, top + 0.1 * (top - floor), axis_label("Fx"), fontsize=6.0)
+
+
+def _toward(angle: float) -> Array:
+    return np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])
+
+
+def _write(axes: Any, angle: float, size: float, height: float, text: str, **look: Any) -> None:
+    """A word in the cylinder, behind what is painted."""
+    plain_look = {"fontsize": 5.5, "ha": "center", "va": "center", "zorder": 0}
+    axes.text(*(size * _toward(angle)), height, text, **(plain_look | look))
+
+
+def _round_squares(low: float, high: float) -> list[float]:
+    """Round numbers about evenly spread between the squares of two roots, with their signs."""
+    largest = max(abs(low), abs(high)) ** 2
+    step = 10.0 ** np.floor(np.log10(largest))
+    step *= max(f for f in (1.0, 2.0, 4.0) if f * step <= largest)
+    marks = [sign * f * step for sign in (-1.0, 1.0) for f in (1.0, 0.25)]
+    return sorted(
+        [0.0, *(m for m in marks if low <= np.sign(m) * np.sqrt(abs(m)) <= high)], key=abs
+    )
+
+
+def _bar(figure: Figure, place: Box, name: str, norm: Normalize, marks: list[float]) -> None:
+    wide, tall = 25.4 * figure.get_size_inches()
+    left, bottom, width, height = place
+    rail = figure.add_axes((left / wide, bottom / tall, width / wide, height / tall))
+    upright = height > width
+    bar = figure.colorbar(
+        ScalarMappable(norm, sequential()),
+        cax=rail,
+        orientation="vertical" if upright else "horizontal",
+    )
+    plain(bar)
+    bar.set_ticks(marks)
+    rail.tick_params(length=2.0, pad=1.5)
+    for mark in marks:
+        (rail.axhline if upright else rail.axvline)(mark, color="white", linewidth=0.8)
+    if upright:
+        rail.set_title(axis_label(name), fontsize=6.5, pad=4.0)
+    else:
+        rail.set_xlabel(axis_label(name), fontsize=6.5, labelpad=1.0)

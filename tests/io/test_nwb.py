@@ -111,10 +111,11 @@ def test_what_another_program_finds(tmp_path, recording):
     np.testing.assert_allclose(contacts["stop_time"], [0.004, 0.020, 0.040])
 
 
-def test_nwbinspector_finds_nothing_critical(tmp_path, recording):
+@pytest.mark.parametrize("session", [SESSION, Session(START)], ids=["told", "untold"])
+def test_nwbinspector_finds_nothing_critical(tmp_path, recording, session):
     nwbinspector = pytest.importorskip("nwbinspector")
     path = tmp_path / "trial.nwb"
-    save_nwb(path, recording, SESSION)
+    save_nwb(path, recording, session)
     messages = list(nwbinspector.inspect_nwbfile(nwbfile_path=str(path)))
     bad = ("ERROR", "PYNWB_VALIDATION", "CRITICAL")
     assert [m.message for m in messages if m.importance.name in bad] == []

@@ -41,6 +41,8 @@ _POINTS = {
     "contact_point_whisker": "Where the whisker touches the object",
     "base_position": "Base of the whisker",
 }
+# Files without these are found faulty, and each says no more than that nobody knows.
+_NOBODY = {"subject_id": "unknown", "sex": "U", "age": "P0D/", "description": "not told"}
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,8 @@ class Session:
     identifier : str
         Of the file, unique in the world; by default made up.
     subject : mapping
-        Of the animal, as in NWB: subject_id, species, sex, age, description, …; empty: none.
+        Of the animal, as in NWB: subject_id, species, sex, age, description, …. What is not told
+        is written as unknown: sex "U", an age of 0 days or more ("P0D/").
     about : mapping
         More fields of NWB: experimenter, institution, lab, keywords, ….
     """
@@ -136,7 +139,7 @@ def _file(session: Session) -> NWBFile:
         session_description=session.description,
         identifier=session.identifier,
         session_start_time=session.start,
-        subject=Subject(**session.subject) if session.subject else None,
+        subject=Subject(**{**_NOBODY, **session.subject}),
         **session.about,
     )
 

@@ -7,18 +7,14 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from vibrissa.mapping.channels import Channels
-from vibrissa.mapping.inversion import Contacts, invert, polish
+from vibrissa.mapping.inversion import invert, polish
 from vibrissa.mapping.least_squares import least_squares
-from vibrissa.mapping.minima import reliable, unknowns_covariance
 from vibrissa.mapping.noise import SensorNoise
-from vibrissa.mapping.weights import whitening
+from vibrissa.mapping.uncertainty import point_covariances
 from vibrissa.rod.arrays import AnyArray, Array, IntArray
-from vibrissa.rod.batch import solve_forces
 from vibrissa.rod.newton import TOLERANCE
-from vibrissa.rod.reach import LEAST_ARC, with_normal_force
-from vibrissa.signals import CIRCULAR, SIGNALS, signal_scales
-from vibrissa.signals.base import signal_derivatives, signals_of
+from vibrissa.signals import CIRCULAR, SIGNALS
+from vibrissa.signals.base import signals_of
 from vibrissa.status import Status
 
 if TYPE_CHECKING:
@@ -69,10 +65,7 @@ def by_triplet(
     status = np.where(found.number == 1, int(Status.UNIQUE), int(Status.AMBIGUOUS))
     misfit = np.zeros(len(targets))
     _explain_none(contacts, names, targets, found.number, status, misfit)
-    covariances = np.full((*found.contacts.shape[:2], 3, 3), np.nan)
-    linear = np.zeros(len(targets), np.bool_)
-    if sensor is not None:
-        covariances = _triplet_covariances(contacts, names, found, sensor, linear)
+    covariances, linear = _uncertain(contacts, names, found.number, found.contacts, sensor)
     return Explanation(
         found.number, found.contacts[..., 0], found.values, covariances, misfit, status, linear
     )
@@ -108,36 +101,15 @@ def by_least_squares(
     found, status[rows] = least_squares(contacts, names, targets[rows], sensor)
     misfit[rows] = found.misfits[:, 0]
     most = found.contacts.shape[1]
-    number, arc_lengths = np.zeros(n, np.int64), np.full((n, most), np.nan)
-    values, covariances = np.full((n, most, 6), np.nan), np.full((n, most, 3, 3), np.nan)
-    linear = np.zeros(n, np.bool_)
-    number[rows], arc_lengths[rows], values[rows] = (
+    number, xi = np.zeros(n, np.int64), np.full((n, most, 3), np.nan)
+    values = np.full((n, most, 6), np.nan)
+    number[rows], xi[rows], values[rows] = (
         found.number,
-        found.contacts[..., 0],
+        found.contacts[..., [0, 2, 3]],
         found.values,
     )
-    if sensor is None:
-        return Explanation(number, arc_lengths, values, covariances, misfit, status, linear)
-    channels = Channels.of(names)
-    row, place = np.nonzero(np.arange(most) < found.number[:, None])
-    d = contacts.chart.discretization
-    here, slopes = found.values[row, place], found.tangents[row, place]
-    local = whitening(channels.covariance(sensor, targets[rows][row], here, d))
-    spread = unknowns_covariance(channels.names, here, slopes, local, friction=False)
-    by_x = slopes[:, 3:]
-    covariances[rows[row], place] = by_x @ spread @ np.swapaxes(by_x, -1, -2)
-    first = place == 0
-    linear[rows[row[first]]] = reliable(
-        d,
-        channels.names,
-        local[first],
-        found.contacts[row, place][first],
-        here[first],
-        slopes[first],
-        spread[first],
-        LEAST_ARC,
-    )
-    return Explanation(number, arc_lengths, values, covariances, misfit, status, linear)
+    covariances, linear = _uncertain(contacts, names, number, xi, sensor)
+    return Explanation(number, xi[..., 0], values, covariances, misfit, status, linear)
 
 
 def _without_contact(
@@ -201,49 +173,20 @@ def _on_circle(values: Array, which: list[int], size: Array) -> Array:
     return np.stack(parts, axis=1)
 
 
-def _triplet_covariances(
+def _uncertain(
     contacts: ContactMap,
     names: tuple[str, ...],
-    found: Contacts,
-    sensor: SensorNoise,
-    linear: AnyArray,
-) -> Array:
-    """Covariances (n, k, 3, 3) of the candidates' contact points; fills ``linear`` (n,)."""
-    d = contacts.chart.discretization
-    out = np.full((*found.contacts.shape[:2], 3, 3), np.nan)
-    row, place = np.nonzero(np.arange(out.shape[1]) < found.number[:, None])
-    if not row.size:
-        return out
-    x = with_normal_force(found.contacts[row, place])
-    values, tangents = solve_forces(d, x, tangents=True)
-    which = [SIGNALS.index(name) for name in names]
-    by_contact = signal_derivatives(values, tangents)[:, which]
-    sigma = _signal_covariance(sensor, names, values, d.force, d.moment)
-    with np.errstate(all="ignore"):
-        determined = np.abs(np.linalg.det(by_contact)) > 0.0
-        good = determined & np.isfinite(by_contact).all(axis=(1, 2))
-        inverse = np.full_like(by_contact, np.nan)
-        inverse[good] = np.linalg.inv(by_contact[good])
-        spread = inverse @ sigma @ np.swapaxes(inverse, -1, -2)
-        out[row, place] = tangents[:, 3:] @ spread @ np.swapaxes(tangents[:, 3:], -1, -2)
-    first = np.flatnonzero(place == 0)
-    linear[row[first]] = reliable(
-        d,
-        names,
-        whitening(sigma[first]),
-        x[first],
-        values[first],
-        np.insert(tangents[first], 1, 0.0, axis=2),
-        np.insert(np.insert(spread[first], 1, 0.0, axis=1), 1, 0.0, axis=2),
-        LEAST_ARC,
-    )
-    return out
-
-
-def _signal_covariance(
-    sensor: SensorNoise, names: tuple[str, ...], values: Array, force: float, moment: float
-) -> Array:
-    """Covariance of the chosen signals, non-dimensional, (n, k, k)."""
-    scale = signal_scales(names, force, moment)
-    f, m = values[:, :3] * force, np.cross(values[:, 3:], values[:, :3]) * moment
-    return sensor.covariance(names, f, m) / np.outer(scale, scale)
+    number: IntArray,
+    xi: Array,
+    sensor: SensorNoise | None,
+) -> tuple[Array, AnyArray]:
+    """Covariances (n, k, 3, 3) of candidates ξ (n, k, 3), and whether the first's is reliable."""
+    covariances = np.full((*xi.shape[:2], 3, 3), np.nan)
+    linear = np.zeros(len(xi), np.bool_)
+    row, place = np.nonzero(np.arange(xi.shape[1]) < number[:, None])
+    if sensor is None or not row.size:
+        return covariances, linear
+    d, first = contacts.chart.discretization, place == 0
+    covariances[row, place], good = point_covariances(d, names, xi[row, place], sensor, first)
+    linear[row[first]] = good[first]
+    return covariances, linear

@@ -103,7 +103,7 @@ def least_squares(
     if starts is not None:
         more = np.flatnonzero(np.isfinite(starts).all(axis=1))
         row, seeds = np.concatenate([row, more]), np.concatenate([seeds, starts[more]])
-    limit = explained(_degrees(channels, sensor, contacts))
+    limit = largest_misfit(channels, sensor, contacts)
     row, fits = _fit(chart, channels, sensor, measured, row, seeds, limit)
     inside = charted(chart, fits, chart.proximal)
     lost = np.ones(len(measured), np.bool_)
@@ -134,14 +134,30 @@ def least_squares(
     return found, status
 
 
-def _degrees(channels: Channels, sensor: SensorNoise | None, contacts: ContactMap) -> int:
-    """Degrees of freedom of χ²."""
-    if sensor is None or sensor.wrench is None:
-        return len(channels.names) - _UNKNOWNS
-    d = contacts.chart.discretization
-    node = contacts.chart.values[-1, :1, -1]
-    covariance = channels.covariance(sensor, np.ones((1, len(channels.names))), node, d)
-    return rank(covariance[0]) - _UNKNOWNS
+def largest_misfit(channels: Channels, sensor: SensorNoise | None, contacts: ContactMap) -> float:
+    """Largest χ² of what counts as explained.
+
+    Parameters
+    ----------
+    channels : Channels
+        What is fitted.
+    sensor : SensorNoise or None
+        Noise.
+    contacts : ContactMap
+        The map.
+
+    Returns
+    -------
+    float
+        Exceeded once in a thousand measurements.
+    """
+    degrees = len(channels.names)
+    if sensor is not None and sensor.wrench is not None:
+        node = contacts.chart.values[-1, :1, -1]
+        d = contacts.chart.discretization
+        covariance = channels.covariance(sensor, np.ones((1, degrees)), node, d)
+        degrees = rank(covariance[0])
+    return explained(degrees - _UNKNOWNS)
 
 
 def _weights(

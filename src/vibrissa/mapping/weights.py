@@ -8,6 +8,8 @@ obeys it too has rank five.
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from scipy.stats import chi2
 
@@ -58,6 +60,7 @@ def rank(covariance: Array) -> int:
     return int((np.abs(weights).max(axis=-1) > 0.0).sum())
 
 
+@cache
 def explained(degrees: int) -> float:
     """Largest χ² of a measurement that counts as explained, for so many degrees of freedom."""
     return float(chi2.isf(_RARE, max(degrees, 1)))

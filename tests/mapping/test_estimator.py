@@ -1,0 +1,79 @@
+"""A stream of measurements: the same answers as in a batch, one at a time, and in sequence."""
+
+import numpy as np
+import pytest
+
+import vibrissa as vb
+from vibrissa.signals import SIGNALS
+
+SIGMA = np.repeat([1e-6, 2e-8], 3)
+
+
+@pytest.fixture(scope="module")
+def sweep(gamma_map):
+    """A contact that glides along the whisker while it is pushed harder."""
+    whisker = gamma_map.whisker
+    t = np.linspace(0.0, 1.0, 40)
+    force = 2e-5 + 6e-5 * t
+    load = vb.PointForce((0.75 - 0.3 * t) * whisker.length, force, 0.5 + 1.5 * t)
+    bent = vb.deflect(whisker, load)
+    return bent, vb.base_signals(bent.force, bent.moment)
+
+
+@pytest.mark.parametrize(
+    "names", ["MD Fx MB", "Fx FT MB", "MB Fx FT MD", "Fx FT Mx MB", " ".join(SIGNALS)]
+)
+@pytest.mark.parametrize("noise", [None, np.diag(SIGMA**2)], ids=["no noise", "noise"])
+def test_a_stream_is_the_same_as_a_batch(gamma_map, sweep, names, noise):
+    bent, signals = sweep
+    locate = vb.Estimator(gamma_map, names, noise)
+    batch = gamma_map.estimate(signals, names, noise)
+    rows = np.stack([signals[name] for name in names.split()], axis=-1)
+    followed = []
+    for i, one in enumerate(locate(row) for row in rows):
+        assert int(one.status) == batch.status[i]
+        np.testing.assert_allclose(one.point, batch.point[i], atol=1e-9)
+        np.testing.assert_allclose(one.arc_lengths[0], batch.arc_length[i], atol=1e-9)
+        np.testing.assert_allclose(one.covariance, batch.covariance[i], rtol=1e-5, atol=1e-15)
+        followed.append(one.candidates[one.continuing])
+        away = np.linalg.norm(one.candidates - bent.contact_point[i], axis=-1)
+        assert away.min() < 1e-8
+    # One branch, after one taken first (of Fx, FT and MB alone) has come to its end.
+    path = np.linalg.norm(np.diff(bent.contact_point, axis=0), axis=1).max()
+    assert np.linalg.norm(np.diff(followed[4:], axis=0), axis=1).max() < 2.0 * path
+
+
+def test_under_noise_a_stream_is_nearly_the_same(gamma_map, sweep, rng):
+    """Weights may be those of the measurement before, as long as the wrench is about the same."""
+    bent, _ = sweep
+    noise = np.diag(SIGMA**2)
+    wrench = np.concatenate([bent.force, bent.moment], axis=1) + SIGMA * rng.normal(size=(40, 6))
+    signals = vb.base_signals(wrench[:, :3], wrench[:, 3:])
+    for names in ("Fx FT MB MD", " ".join(SIGNALS)):
+        locate = vb.Estimator(gamma_map, names, noise)
+        batch = gamma_map.estimate(signals, names, noise)
+        rows = np.stack([signals[name] for name in names.split()], axis=-1)
+        found = np.array([locate(row).point for row in rows])
+        sigma = np.sqrt(np.trace(batch.covariance, axis1=1, axis2=2))
+        away = np.linalg.norm(found - batch.point, axis=1) / sigma
+        assert np.median(away) < 0.02
+        assert (away < 0.3).mean() > 0.95
+
+
+def test_what_is_not_there_is_said(gamma_map, sweep):
+    _, signals = sweep
+    names = "Fx FT MB MD"
+    locate = vb.Estimator(gamma_map, names, np.diag(SIGMA**2))
+    good = [signals[name][5].item() for name in names.split()]
+    assert locate(good).status == vb.Status.UNIQUE
+    lost = locate([np.nan, *good[1:]])
+    assert lost.status == vb.Status.MISSING
+    assert np.isnan(lost.point).all()
+    assert lost.candidates.shape == (0, 3)
+    again = locate(good)
+    assert again.status == vb.Status.UNIQUE
+    assert locate([good[0], 0.2 * good[1], *good[2:]]).status == vb.Status.NOT_FRICTIONLESS
+    with pytest.raises(ValueError, match=r"has 4 signals; got shape \(3,\)"):
+        locate(good[:3])
+    with pytest.raises(ValueError, match="noise lacks MB, MD"):
+        vb.Estimator(gamma_map, names, {"Fx": 1e-6, "FT": 1e-6})

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from vibrissa.plots import contact_surfaces, signal_clouds
 from vibrissa.plots.chart import SIGNALS, column, fine_chart, values_of
-from vibrissa.plots.solids import clipped, level, skin, solid
+from vibrissa.plots.solids import clipped, level, refined, skin, solid
 from vibrissa.quantities import axis_label
 
 LENGTH, WIDEST, CONE = 40e-3, 0.8, np.deg2rad(2.0)
@@ -118,6 +118,14 @@ def test_clipping_parts_triangles_in_two() -> None:
     under = clipped(mirrored, 3)
     assert over[..., 3].min() > -1e-12
     assert area(over) + area(under) == pytest.approx(area(triangles), rel=1e-12)
+
+
+def test_refining_keeps_the_surface() -> None:
+    triangles = np.random.default_rng(4).normal(size=(20, 3, 4))
+    finer = refined(triangles, np.arange(20) < 5, times=2)
+    assert len(finer) == 15 + 5 * 16
+    assert area(finer) == pytest.approx(area(triangles), rel=1e-12)
+    np.testing.assert_allclose(finer.max(axis=(0, 1)), triangles.max(axis=(0, 1)))
 
 
 def test_the_skin_of_a_full_turn_has_no_cuts() -> None:

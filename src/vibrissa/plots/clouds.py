@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from vibrissa.plots.chart import DIRECTIONS, SIGNALS, column, fine_chart, values_of
 from vibrissa.plots.colours import cyclic, diverging, sequential
-from vibrissa.plots.solids import solid
+from vibrissa.plots.solids import refined, solid
 from vibrissa.plots.space import (
     AZIMUTH,
     ELEVATION,
@@ -24,7 +24,17 @@ from vibrissa.plots.space import (
     painted,
     space_axes,
 )
-from vibrissa.plots.style import INK, Array, Width, looking, new_figure, plain, robust_limits, root
+from vibrissa.plots.style import (
+    INK,
+    Array,
+    Mask,
+    Width,
+    looking,
+    new_figure,
+    plain,
+    robust_limits,
+    root,
+)
 from vibrissa.quantities import axis_label, quantity, to_display
 
 _SKIN = (0.80, 0.85, 0.90, 1.0)
@@ -109,13 +119,16 @@ def signal_clouds(
         for i, (name, cell) in enumerate(zip(SIGNALS, sheet.signals, strict=True)):
             _label(figure, cell, "cdefgh"[i], _TITLES.get(name, quantity(name).long_name))
             norm, colours, ends = _scale(name, to_display(name, values_of(name, whole)))
-            axes = space_axes(figure, _square(cell), limits, view, zoom=1.02, frame=False)
-            shown = to_display(name, values_of(name, triangles))
+            axes = space_axes(figure, _square(cell), limits, view, zoom=0.97, frame=False)
+            body = (
+                refined(triangles, _turning(name, triangles)) if name in DIRECTIONS else triangles
+            )
+            shown = to_display(name, values_of(name, body))
             if name == "Mx" and _vanishes(whole):
                 _body(axes, triangles, np.array(_SKIN), line)
                 _say_zero(figure, cell)
                 continue
-            _body(axes, triangles, _mean(name, shown, norm, colours), line)
+            _body(axes, body, _mean(name, shown, norm, colours), line)
             _bar(figure, _rail(figure, cell), norm, colours, ends, name)
         _pulled(figure, sheet.signals[0], nodes, not cutaway, line, view)
         return figure
@@ -129,6 +142,13 @@ def _kept(elevation: float, azimuth: float) -> tuple[float, float]:
 
 def _mm(triangles: Array) -> Array:
     return to_display("contact_point", triangles[..., :3])
+
+
+def _turning(name: str, triangles: Array) -> Mask:
+    """Where a direction differs by more than 45° within a triangle, as where a force reverses."""
+    turn = values_of(name, triangles)
+    gap = np.abs(np.angle(np.exp(1j * (turn - np.roll(turn, 1, axis=1)))))
+    return np.asarray(gap.max(axis=1) > np.pi / 4.0)
 
 
 def _mean(name: str, values: Array, norm: Normalize, colours: Colormap) -> Array:
@@ -180,7 +200,7 @@ def _cross(axes: Any, limits: Array) -> None:
         axes.plot(*np.stack([corner, end]).T, color=INK, linewidth=0.8, zorder=11)
         end[i] += 1.6
         axes.text(*end, f"${name}$", fontsize=6.0, ha="center", va="center")
-    corner += np.array([0.0, 2.5, -1.8])
+    corner += np.array([0.0, 2.0, -2.6])
     axes.text(*corner, "5 mm", fontsize=5.5, ha="center", va="center")
 
 
@@ -211,8 +231,8 @@ def _pulled(
         return
     left, bottom, width, height = cell
     limits = bounds(np.concatenate([_mm(triangles).reshape(-1, 3), line]))
-    side = 0.46 * width
-    box = left + width - 1.03 * side, bottom + 0.84 * height - 0.5 * side, side, side
+    side = 0.42 * width
+    box = left + width - 1.03 * side, bottom + 0.845 * height - 0.5 * side, side, side
     axes = space_axes(figure, box, limits, view, zoom=1.1, frame=False)
     values = to_display("Fx", values_of("Fx", triangles))
     norm, colours = Normalize(0.0, float(values.max())), sequential()
@@ -267,7 +287,7 @@ def _square(cell: Box) -> Box:
     """The room of a panel for its 3D axes, which are square and reach beyond it."""
     left, bottom, width, height = cell
     side = 1.1 * width
-    return left - 0.07 * width, bottom + 0.52 * height - 0.5 * side, side, side
+    return left - 0.07 * width, bottom + 0.50 * height - 0.5 * side, side, side
 
 
 def _rail(figure: Figure, cell: Box) -> Any:

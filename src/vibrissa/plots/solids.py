@@ -145,6 +145,33 @@ def clipped(triangles: Array, column: int) -> Array:
     return np.concatenate([triangles[count == 3], tip, *(trunk[:, pick] for pick in _QUAD)])
 
 
+def refined(triangles: Array, chosen: Mask, times: int = 3) -> Array:
+    """Halve the edges of some triangles, so that they can be coloured finely.
+
+    Parameters
+    ----------
+    triangles : array (n, 3, k)
+        Triangles.
+    chosen : array (n,) of bool
+        Which are parted, each in four.
+    times : int
+        How often.
+
+    Returns
+    -------
+    array (m, 3, k)
+        The same surface.
+    """
+    pieces = triangles[chosen]
+    for _ in range(times):
+        middles = 0.5 * (pieces + np.roll(pieces, -1, axis=1))
+        corners = [
+            np.stack([pieces[:, i], middles[:, i], middles[:, i - 1]], axis=1) for i in range(3)
+        ]
+        pieces = np.concatenate([middles, *corners])
+    return np.concatenate([triangles[~chosen], pieces])
+
+
 def solid(nodes: Array, closed: bool, outside: int, also: int | None = None) -> Array:
     """Triangles around the contacts where a column is positive.
 

@@ -221,8 +221,8 @@ def _signal_axes(figure: Figure, panel: _Panel, limits: Array) -> Any:
     """Axes for a cylinder of signals: rings of equal M_B and rays of equal M_D on its floor."""
     _head(figure, panel)
     left, bottom, side, _ = _square(panel.box)
-    box = left + 2.0, bottom + 0.5, side, side
-    zoom = 1.0 if side > 50.0 else 0.9  # lettering does not shrink with the panel
+    box = left + 3.5, bottom + 0.5, side, side
+    zoom = 0.98 if side > 50.0 else 0.86  # lettering does not shrink with the panel
     axes = space_axes(figure, box, limits, _VIEW, zoom=zoom, frame=False, aspect=_ASPECT)
     reach, floor = limits[0, 1], limits[2, 0]
     turn = np.linspace(0.0, 2.0 * np.pi, 181)
@@ -237,7 +237,9 @@ def _signal_axes(figure: Figure, panel: _Panel, limits: Array) -> Any:
     for angle in (0, 90, 180, -90):
         axes.plot(*np.outer(_toward(angle), [0.0, reach]), floor, **_FLOOR)
         label = f"{angle}°" if angle != 180 else f"${quantity('MD').symbol}$ = 180°"
-        _write(axes, angle, 1.17 * reach, floor, label.replace("-", "−"))
+        # The ray to the left ends beside the solid, whose edge would hide a centred word.
+        far = {"ha": "right"} if angle == 90 else {}
+        _write(axes, angle, 1.17 * reach, floor, label.replace("-", "−"), **far)
     _height_axis(axes, limits)
     return axes
 
@@ -246,15 +248,15 @@ def _height_axis(axes: Any, limits: Array) -> None:
     """The axis of F_x, upright at the left."""
     reach, (floor, top) = limits[0, 1], limits[2]
     left = _VIEW[1] - 90.0
-    place = 1.2 * reach * _toward(left)
+    place = 1.4 * reach * _toward(left)
     axes.plot(*np.repeat(place[:, None], 2, axis=1), [floor, top], color=INK, linewidth=0.5)
     for mark in _round_squares(floor, top):
         height = float(root(mark))
-        tick = np.outer(_toward(left), [1.2 * reach, 1.25 * reach])
+        tick = np.outer(_toward(left), [1.4 * reach, 1.45 * reach])
         axes.plot(*tick, height, color=INK, linewidth=0.5)
         label = f"{mark:g}".replace("-", "−")
-        _write(axes, left, 1.29 * reach, height, label, ha="right")
-    _write(axes, left, 1.2 * reach, top + 0.1 * (top - floor), axis_label("Fx"), fontsize=6.0)
+        _write(axes, left, 1.49 * reach, height, label, ha="right")
+    _write(axes, left, 1.4 * reach, top + 0.1 * (top - floor), axis_label("Fx"), fontsize=6.0)
 
 
 def _toward(angle: float) -> Array:

@@ -115,3 +115,24 @@ def test_info_of_other_files(tmp_path):
     path.write_text("name,age\nC2,3\n")
     with pytest.raises(ValueError, match="no table that is known"):
         info(path)
+
+
+def test_damaged_netcdf_is_named(tmp_path):
+    """Whatever bytes are wrong, the error is one of ours and names the file, or all is well."""
+    rng = np.random.default_rng(0)
+    path = tmp_path / "tracks.nc"
+    raw = RawTracks("test", ["C1"], image=rng.uniform(1, 9, (40, 1, 1, 9, 2)))
+    save_tracks(path, labelled(raw, "a.csv", fps=1000.0))
+    content = path.read_bytes()
+    refused = 0
+    for _ in range(40):
+        spoilt = bytearray(content)
+        for at in rng.integers(0, len(content), 4):
+            spoilt[at] ^= 0xFF
+        path.write_bytes(spoilt)
+        try:
+            load_tracks(path)
+        except ValueError as error:
+            refused += 1
+            assert "tracks.nc" in str(error)
+    assert refused > 5

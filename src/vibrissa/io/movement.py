@@ -14,7 +14,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from vibrissa.io.netcdf import kind_of
+from vibrissa.io.netcdf import kind_of, reading
 from vibrissa.io.tracks import Labels, RawTracks, labelled
 
 Array = NDArray[np.float64]
@@ -54,7 +54,7 @@ def read_movement(path: str | PathLike[str]) -> RawTracks:
     """Read a poses dataset as raw tracks; see `load_movement`."""
     path = Path(path)
     kind_of(path)
-    with xr.open_dataset(path, engine="h5netcdf") as file:
+    with reading(path), xr.open_dataset(path, engine="h5netcdf") as file:
         poses = file.load()
     poses = poses.rename({old: new for old, new in _NAMES.items() if old in poses.dims})
     if "position" not in poses or not {"time", "keypoint", "space"} <= set(poses["position"].dims):

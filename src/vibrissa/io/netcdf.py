@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 
@@ -32,6 +34,26 @@ def is_netcdf(path: str | PathLike[str]) -> bool:
         return file.read(len(_SIGNATURE)) == _SIGNATURE
 
 
+@contextmanager
+def reading(path: str | PathLike[str]) -> Iterator[None]:
+    """Name the file where it turns out to be damaged while it is read.
+
+    Parameters
+    ----------
+    path : str or path
+        That is being read.
+
+    Raises
+    ------
+    ValueError
+        Instead of what the libraries below raise.
+    """
+    try:
+        yield
+    except (OSError, KeyError, RuntimeError) as error:
+        raise ValueError(f"{path} cannot be read: it is cut off or damaged ({error})") from error
+
+
 def kind_of(path: str | PathLike[str]) -> str:
     """Read what a NetCDF-4 file says it holds.
 
@@ -58,7 +80,7 @@ def kind_of(path: str | PathLike[str]) -> str:
     try:
         with h5netcdf.File(path, "r") as file:
             kind = file.attrs.get("kind", "")
-    except OSError as error:
+    except (OSError, KeyError, RuntimeError) as error:
         raise ValueError(
             f"{path} cannot be read as NetCDF-4: it is of another format, cut off or damaged "
             f"({error})"

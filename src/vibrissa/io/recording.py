@@ -12,7 +12,7 @@ from pathlib import Path
 
 import xarray as xr
 
-from vibrissa.io.netcdf import kind_of
+from vibrissa.io.netcdf import kind_of, reading
 from vibrissa.io.replace import replacing
 
 KIND = "vibrissa recording"
@@ -79,6 +79,6 @@ def load_recording(path: str | PathLike[str]) -> xr.DataTree:
     kind = kind_of(path)
     if kind != KIND:
         raise ValueError(f"{path} holds {kind or 'data of another kind'}, not a recording")
-    with xr.open_datatree(path, engine="h5netcdf") as tree:
+    with reading(path), xr.open_datatree(path, engine="h5netcdf") as tree:
         loaded: xr.DataTree = tree.load()
         return loaded.copy()

@@ -45,7 +45,7 @@ SPACE = ("time", "whisker", "node", "space")
 class Labels(TypedDict, total=False):
     """What files of other programs do not say.
 
-    Parameters
+    Attributes
     ----------
     fps : float
         Frames per second. By default as the file says; else time counts frames.

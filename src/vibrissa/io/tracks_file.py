@@ -21,7 +21,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from vibrissa.io.netcdf import kind_of
+from vibrissa.io.netcdf import kind_of, reading
 from vibrissa.io.paths import CSV, NETCDF, check_writable
 from vibrissa.io.replace import replacing
 from vibrissa.io.table import read_text, table_rows
@@ -90,7 +90,7 @@ def load_own_tracks(path: str | PathLike[str]) -> xr.Dataset:
     kind = kind_of(path)
     if kind not in (KIND, _RECORDING):
         raise ValueError(f"{path} holds {kind or 'data of another kind'}, not tracks")
-    with xr.open_dataset(path, engine="h5netcdf") as file:
+    with reading(path), xr.open_dataset(path, engine="h5netcdf") as file:
         if kind == KIND:
             return file.load()
         names = [name for name in _VARIABLES if name in file]

@@ -34,6 +34,7 @@ MEASUREMENTS = b"measv3\0\0"
 _MEASURES = 8
 _SEGMENT = struct.Struct("<3i")
 _MOST_BYTES = 2**31
+_MOST_FRAMES = 10_000_000
 
 
 def load_whiskers(
@@ -306,11 +307,17 @@ def _places(
     """All frames from the first to the last, whiskers, and where each row goes among them."""
     if not frames.size:
         raise ValueError(f"{path} holds no whiskers")
+    if frames.max() - frames.min() > _MOST_FRAMES or frames.min() < 0:
+        raise ValueError(
+            f"{path} is damaged: its frames are numbered from {frames.min()} to {frames.max()}"
+        )
     number = np.arange(frames.min(), frames.max() + 1)
     whiskers, column = np.unique(identity, return_inverse=True)
     pairs = np.stack([frames, identity], axis=1)
     if len(np.unique(pairs, axis=0)) != len(pairs):
         raise ValueError(f"{path} has the same segment twice in one frame")
+    if 64.0 * number.size * whiskers.size > _MOST_BYTES:
+        raise ValueError(f"{path} has {number.size} frames of {whiskers.size} whiskers: too many")
     return number, [str(one) for one in whiskers], (frames - number[0], column)
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
-from vibrissa.io.netcdf import kind_of
+from vibrissa.io.netcdf import kind_of, reading
 from vibrissa.io.replace import replacing
 from vibrissa.rod.discretize import discretize
 from vibrissa.rod.reach import Reach
@@ -62,7 +62,7 @@ def load_map(path: Path) -> ContactMap:
     kind = kind_of(path)
     if kind != _KIND:
         raise ValueError(f"{path} holds {kind or 'data of another kind'}, not a contact map")
-    with xr.open_datatree(path, engine="h5netcdf") as opened:
+    with reading(path), xr.open_datatree(path, engine="h5netcdf") as opened:
         tree = opened.load()
     whisker = Whisker.from_dataset(tree["whisker"].to_dataset())
     steps = int(tree.attrs["steps"])

@@ -1,0 +1,164 @@
+"""Trace the whiskers of one video, told apart by where they begin."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vibrissa.io.video import Frame
+from vibrissa.tracking.find import find_whiskers, overlap
+from vibrissa.tracking.trace import Follower, Trace, TraceOptions, given, start_at
+
+Array = NDArray[np.float64]
+
+Progress = Callable[[int], None]
+"""Called with the number of frames done."""
+
+Corrections = Mapping[tuple[int, int], ArrayLike]
+"""By frame and whisker: points (n, 2) along it from base to tip, column and row."""
+
+KEPT = 64
+"""How many frames a correction can change before its own."""
+
+_SAME = 0.5
+_AGREES = 0.9
+
+
+def trace_video(
+    frames: Iterable[Frame],
+    bases: Sequence[ArrayLike] | None = None,
+    options: TraceOptions | None = None,
+    *,
+    corrections: Corrections | None = None,
+    progress: Progress | None = None,
+) -> list[list[Trace]]:
+    """Trace whiskers from frame to frame.
+
+    Parameters
+    ----------
+    frames : iterable of array (height, width)
+        Grey values.
+    bases : sequence of array_like (2,), optional
+        Where each whisker leaves the face in the first frame, column and row, to about 10 pixels.
+        By default one whisker, the one that is best seen.
+    options : TraceOptions, optional
+        How they are traced.
+    corrections : mapping, optional
+        Traces that are right in some frames: taken as they are, and followed from there forward,
+        and backward as far as that changes anything, at most `KEPT` frames.
+    progress : callable, optional
+        Told after every frame how many are done.
+
+    Returns
+    -------
+    list of list of Trace
+        For each whisker its traces, frame by frame; empty ones where it was not found.
+
+    Raises
+    ------
+    ValueError
+        If no whisker is found in the first frame, or a correction is for none of the whiskers.
+    """
+    options = options or TraceOptions()
+    corrections = corrections or {}
+    followers: list[Follower] = []
+    traces: list[list[Trace]] = []
+    recent: deque[Frame] = deque(maxlen=KEPT)
+    for i, frame in enumerate(frames):
+        if i == 0:
+            followers = [start_at(base, options) for base in _bases(frame, bases, options)]
+            traces = [[] for _ in followers]
+            _check(corrections, len(followers))
+        found = follow_all(followers, frame, {k: p for (j, k), p in corrections.items() if j == i})
+        for trace, row in zip(found, traces, strict=True):
+            row.append(trace)
+        for k in range(len(followers)):
+            if (i, k) in corrections:
+                _backward(traces[k], recent, k, corrections, options)
+        recent.append(frame)
+        if progress is not None:
+            progress(i + 1)
+    return traces
+
+
+def _bases(
+    frame: Frame, bases: Sequence[ArrayLike] | None, options: TraceOptions
+) -> Sequence[ArrayLike]:
+    if bases is not None:
+        return bases
+    found = find_whiskers(frame, options)
+    if not found:
+        raise ValueError("no whisker was found in the first frame: say where one begins")
+    return [found[0].trace.line[0]]
+
+
+def _check(corrections: Corrections, count: int) -> None:
+    wrong = sorted({k for _, k in corrections if not 0 <= k < count})
+    if wrong:
+        raise ValueError(f"corrections are for whiskers {wrong}; there are {count}, from 0")
+
+
+def follow_all(
+    followers: Sequence[Follower], frame: Frame, known: Mapping[int, ArrayLike]
+) -> list[Trace]:
+    """Find every whisker in the next frame; no two are the same.
+
+    Parameters
+    ----------
+    followers : sequence of Follower
+        One a whisker.
+    frame : array (height, width)
+        Grey values.
+    known : mapping of int to array_like (n, 2)
+        Traces that are given.
+
+    Returns
+    -------
+    list of Trace
+        One a whisker; of two that lie on each other the one that began farther from where it was
+        expected is lost.
+    """
+    expected = [follower.base.copy() for follower in followers]
+    memories = [follower.memory() for follower in followers]
+    found = []
+    for k, follower in enumerate(followers):
+        if k in known:
+            trace = given(known[k])
+            follower.restart(trace)
+        else:
+            trace = follower.follow(frame)
+        found.append(trace)
+    for a in range(len(found)):
+        for b in range(a):
+            if overlap(found[a].line, found[b].line) < _SAME:
+                continue
+            away = [float(np.linalg.norm(found[k].line[0] - expected[k])) for k in (a, b)]
+            loser = b if (a in known or away[0] < away[1]) and b not in known else a
+            found[loser] = Trace.lost()
+            followers[loser].forget(memories[loser])
+    return found
+
+
+def _backward(
+    row: list[Trace],
+    recent: Sequence[Frame],
+    whisker: int,
+    corrections: Corrections,
+    options: TraceOptions,
+) -> None:
+    """Trace back from a corrected frame, the last of the row, until nothing changes."""
+    follower = Follower(row[-1].line[0], options)
+    follower.restart(row[-1])
+    for back, frame in enumerate(reversed(recent)):
+        i = len(row) - 2 - back
+        if (i, whisker) in corrections:
+            return
+        trace = follower.follow(frame)
+        if overlap(trace.line, row[i].line, 1.0) > _AGREES:
+            return
+        # The way that sees more is right; what was lost before is found now.
+        if trace.support > 0.9 * row[i].support:
+            row[i] = trace

@@ -1,0 +1,165 @@
+"""Traces against the true middle of a filmed whisker."""
+
+import numpy as np
+import pytest
+
+from vibrissa.status import Status
+from vibrissa.tracking import TraceOptions, find_whiskers, ridge, trace_video
+
+
+@pytest.fixture(scope="module")
+def traces(filmed):
+    bases = [filmed.truth["trace"].values[0, view, 0] for view in range(2)]
+    return [trace_video(filmed.frames[view], [bases[view] + [2.0, -3.0]])[0] for view in range(2)]
+
+
+def test_the_trial_touches_and_slips(filmed):
+    touching = filmed.truth["status"].values == Status.OK
+    assert touching.any()
+    assert not touching[-1]
+
+
+def test_the_middle_is_found_to_a_fraction_of_a_pixel(filmed, traces):
+    for view in range(2):
+        away = [filmed.errors(t.line, i, view)[0] for i, t in enumerate(traces[view])]
+        assert np.median(np.concatenate(away)) < 0.03
+        assert np.percentile(np.concatenate(away), 95) < 0.15
+
+
+def test_no_frame_is_lost_or_wrong(filmed, traces):
+    tips = []
+    for view in range(2):
+        for i, trace in enumerate(traces[view]):
+            away, (base, tip) = filmed.errors(trace.line, i, view)
+            assert np.median(away) < 0.15
+            assert base < 2.0
+            tips += [tip] if filmed.tip_shows(i, view) else []
+            assert trace.confidence > 0.5
+    assert np.median(tips) < 3.0
+    assert np.mean(np.array(tips) < 4.0) > 0.9
+
+
+def test_errors_are_as_large_as_they_say(filmed, traces):
+    scaled = []
+    for view in range(2):
+        for i, trace in enumerate(traces[view]):
+            inner = slice(5, len(trace.line) - 5)
+            away, _ = filmed.errors(trace.line[inner], i, view)
+            scaled.append(away / trace.sigma[inner])
+    assert 0.3 < np.median(np.concatenate(scaled)) < 1.5
+
+
+def test_what_the_peg_hides_is_bridged(filmed, traces):
+    hidden = ~filmed.truth["trace_visible"].values[:, 1]
+    assert hidden.any()
+    for i in np.flatnonzero(hidden.any(axis=1)):
+        trace = traces[1][i]
+        assert not trace.seen.all()
+        away, _ = filmed.errors(trace.line[~trace.seen], i, 1)
+        assert away.max() < 1.0
+
+
+def test_it_is_found_again_after_frames_without_it(filmed):
+    frames = list(filmed.frames[0])
+    blank = np.full_like(frames[0], 190)
+    frames[8] = frames[9] = frames[10] = blank
+    (row,) = trace_video(frames, [filmed.truth["trace"].values[0, 0, 0]])
+    assert [len(row[i].line) for i in (8, 9, 10)] == [0, 0, 0]
+    assert row[9].confidence == 0.0
+    for i in (11, 12, 20):
+        assert np.median(filmed.errors(row[i].line, i, 0)[0]) < 0.15
+
+
+def test_one_whisker_is_found_by_itself(filmed):
+    for view in range(2):
+        found = find_whiskers(filmed.frames[view][0])
+        base = filmed.truth["trace"].values[0, view, 0]
+        assert found[0].from_face
+        assert np.linalg.norm(found[0].trace.line[0] - base) < 2.0
+    (row,) = trace_video(filmed.frames[0])
+    assert np.median(filmed.errors(row[-1].line, len(row) - 1, 0)[0]) < 0.15
+
+
+def two_lines(shift=0.0, size=(160, 200), seed=0):
+    """Two dark lines out of a dark wall, moved down by a shift; their rows at each column."""
+    x = np.arange(size[1], dtype=float)
+    rows = [60.0 + shift + 0.1 * x, 72.0 + shift + 0.05 * x]
+    y = np.arange(size[0])[:, None]
+    image = np.full(size, 190.0)
+    for row, end in zip(rows, (180, 170), strict=True):
+        image -= 120.0 * np.exp(-0.5 * ((y - row) / 1.1) ** 2) * (x < end)
+    image[:, :20] = 15.0
+    image += np.random.default_rng(seed).normal(0.0, 2.0, size)
+    return np.clip(image, 0, 255).astype(np.uint8), rows
+
+
+def test_two_whiskers_are_told_apart_by_their_bases():
+    frames = [two_lines(shift, seed=i)[0] for i, shift in enumerate(np.linspace(0.0, 30.0, 16))]
+    traces = trace_video(frames, [(20.0, 62.0), (20.0, 73.0)], TraceOptions(shortest=30.0))
+    for i, shift in enumerate(np.linspace(0.0, 30.0, 16)):
+        _, rows = two_lines(shift)
+        for row, trace in zip(rows, (t[i] for t in traces), strict=True):
+            expected = np.interp(trace.line[:, 0], np.arange(200), row)
+            assert np.median(np.abs(trace.line[:, 1] - expected)) < 0.1
+
+
+def test_one_whisker_is_not_two():
+    """Started at the same base twice, one of both is lost in every frame."""
+    frames = [two_lines(0.0, seed=i)[0] for i in range(3)]
+    first, second = trace_video(frames, [(20.0, 62.0), (20.0, 63.0)], TraceOptions(shortest=30.0))
+    assert all(bool(len(a.line)) != bool(len(b.line)) for a, b in zip(first, second, strict=True))
+
+
+def test_corrected_frames_are_taken_and_followed_both_ways():
+    """Begun on the wrong whisker, one correction in the middle puts all frames right."""
+    shifts = np.linspace(0.0, 20.0, 11)
+    frames = [two_lines(shift, seed=i)[0] for i, shift in enumerate(shifts)]
+    _, (_, lower) = two_lines(shifts[5])
+    points = np.column_stack([[20.0, 90.0, 165.0], lower[[20, 90, 165]]])
+    (row,) = trace_video(
+        frames, [(20.0, 62.0)], TraceOptions(shortest=30.0), corrections={(5, 0): points}
+    )
+    np.testing.assert_allclose(row[5].line[0], points[0])
+    for i, trace in enumerate(row):
+        expected = np.interp(trace.line[:, 0], np.arange(200), two_lines(shifts[i])[1][1])
+        assert np.median(np.abs(trace.line[:, 1] - expected)) < 0.1
+
+
+def test_progress_and_faults():
+    told = []
+    frames = [two_lines()[0]] * 3
+    trace_video(frames, [(20.0, 62.0)], progress=told.append)
+    assert told == [1, 2, 3]
+    with pytest.raises(ValueError, match="no whisker was found"):
+        trace_video([np.full((80, 80), 120, np.uint8)])
+    with pytest.raises(ValueError, match="a column and a row"):
+        trace_video(frames, [(1.0, 2.0, 3.0)])
+    with pytest.raises(ValueError, match=r"whiskers \[1\]"):
+        trace_video(frames, [(20.0, 62.0)], corrections={(0, 1): [[0, 0], [1, 1]]})
+    with pytest.raises(ValueError, match="no trace"):
+        trace_video(frames, [(20.0, 62.0)], corrections={(0, 0): [[0, 0]]})
+
+
+@pytest.mark.parametrize("sigma", [1.0, 2.5, 6.0])
+def test_noise_is_estimated(sigma):
+    generator = np.random.default_rng(0)
+    slope = np.linspace(60.0, 190.0, 300)
+    image = slope + generator.normal(0.0, sigma, (300, 300))
+    assert ridge.noise_level(np.clip(image, 0, 255).astype(np.uint8)) == pytest.approx(
+        sigma, rel=0.1
+    )
+
+
+def test_smoothing_keeps_parabolas_and_bridges_gaps():
+    x = np.linspace(-1.0, 1.0, 80)
+    y = 3.0 + 2.0 * x - 5.0 * x**2
+    weight = np.ones(80)
+    weight[30:45] = 0.0
+    out = np.empty(80)
+    ridge.smooth(y, weight, 1e4, out)
+    np.testing.assert_allclose(out, y, atol=1e-3)
+    dense = np.diff(np.eye(80), n=3, axis=0)
+    noisy = y + np.random.default_rng(1).normal(size=80)
+    ridge.smooth(noisy, weight, 1e4, out)
+    matrix = np.diag(weight + 1e-6) + 1e4 * dense.T @ dense
+    np.testing.assert_allclose(out, np.linalg.solve(matrix, weight * noisy), rtol=1e-6)

@@ -46,7 +46,9 @@ class Filmed:
         if not self.truth["trace_visible"].values[frame, view, -12:].all():
             return False
         image = self.frames[view][frame]
-        return all(np.median(image[y - 6 : y + 7, x - 6 : x + 7]) > 100 for x, y in nodes)
+        return all(
+            np.median(image[max(y - 6, 0) : y + 7, max(x - 6, 0) : x + 7]) > 100 for x, y in nodes
+        )
 
 
 def whisk(whisker, peg, frames=FRAMES):

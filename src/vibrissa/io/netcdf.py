@@ -43,6 +43,11 @@ def reading(path: str | PathLike[str]) -> Iterator[None]:
     path : str or path
         That is being read.
 
+    Yields
+    ------
+    None
+        To read in.
+
     Raises
     ------
     ValueError

@@ -45,16 +45,10 @@ SPACE = ("time", "whisker", "node", "space")
 class Labels(TypedDict, total=False):
     """What files of other programs do not say.
 
-    Attributes
-    ----------
-    fps : float
-        Frames per second. By default as the file says; else time counts frames.
-    view : str
-        Name of the camera of a file with pixels; by default as the file says, or ``camera``.
-    unit : {"m", "cm", "mm", "um"}
-        Of points in space, where the file does not say.
-    reference_frame : str
-        Of points in space; by default as the file says, or ``laboratory``.
+    ``fps``: frames per second; by default as the file says, else time counts frames. ``view``: name
+    of the camera of a file with pixels; by default as the file says, or ``camera``. ``unit``: of
+    points in space, "m", "cm", "mm" or "um", where the file does not say. ``reference_frame``: of
+    points in space; by default as the file says, or ``laboratory``.
     """
 
     fps: float

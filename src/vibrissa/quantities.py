@@ -73,6 +73,7 @@ _MICRONEWTON_METRE = _Unit("N m", "µN·m", 1e6)
 _GIGAPASCAL = _Unit("Pa", "GPa", 1e-9)
 _STIFFNESS = _Unit("N m^2", "nN·m²", 1e9)
 _JOINT_STIFFNESS = _Unit("N m/rad", "µN·m/rad", 1e6)
+_SPRING = _Unit("N/m", "N/m", 1.0)
 _PIXEL = _Unit("pixel", "px", 1.0)
 # The columns of these Jacobians, (s_c, f_y, f_z), differ in unit: it is given column by column.
 _POINT_PER_LOAD = _Unit("m/(m, N, N)", "m/(m, N, N)", 1.0)
@@ -358,6 +359,87 @@ _ROWS: tuple[tuple[str, str, _Unit, str, str], ...] = (
         "whether the whisker shows in the image",
         "1 where nothing hides it and it is inside the frame, 0 elsewhere.",
     ),
+    (
+        "head_rotation",
+        r"R_\mathrm{h}",
+        _NUMBER,
+        "orientation of the head",
+        "Rotation from the head's to the laboratory frame.",
+    ),
+    (
+        "head_position",
+        r"\mathbf{o}_\mathrm{h}",
+        _MM,
+        "position of the head",
+        "Origin of the head's frame in the laboratory frame.",
+    ),
+    # The truth of a simulated contact
+    (
+        "contact_object",
+        r"\mathrm{object}",
+        _NUMBER,
+        "object in contact",
+        "Its number in the group objects; -1 for none.",
+    ),
+    (
+        "surface_point",
+        r"\mathbf{p}_\mathrm{o}",
+        _MM,
+        "contact point on the object",
+        "On its undeformed surface, laboratory frame.",
+    ),
+    (
+        "surface_normal",
+        r"\mathbf{n}",
+        _NUMBER,
+        "surface normal at the contact",
+        "Of the object, outward, laboratory frame.",
+    ),
+    (
+        "sliding",
+        r"\mathrm{sliding}",
+        _NUMBER,
+        "whether the contact slides",
+        "1 where friction is at its limit (always, without friction), 0 where it sticks or there "
+        "is no contact.",
+    ),
+    (
+        "overlap",
+        r"\delta_2",
+        _MICROMETRE,
+        "overlap elsewhere",
+        "How far the whisker reaches into an object away from its one simulated contact.",
+    ),
+    (
+        "second_contact",
+        r"\mathrm{second}",
+        _NUMBER,
+        "whether it would touch elsewhere too",
+        "1 where the overlap counts: the forces of a second contact are not simulated.",
+    ),
+    # Objects
+    ("object_position", r"\mathbf{c}", _MM, "object's place", "A point of it, laboratory frame."),
+    (
+        "object_axis",
+        r"\mathbf{a}",
+        _NUMBER,
+        "object's direction",
+        "Axis or outward normal, a unit vector in the laboratory frame.",
+    ),
+    ("object_radius", "R", _MM, "object's radius", "Of its surface."),
+    ("object_size", r"\mathbf{l}", _MM, "object's edges", "Lengths along its own axes."),
+    (
+        "object_rotation",
+        r"R_\mathrm{o}",
+        _NUMBER,
+        "object's orientation",
+        "Columns are its own axes in the laboratory frame.",
+    ),
+    ("object_edge_radius", r"R_\mathrm{e}", _MM, "radius of edges", "By which they are rounded."),
+    ("object_stiffness", "k", _SPRING, "object's stiffness", "Force over indentation."),
+    ("object_vertices", r"\mathbf{v}", _MM, "mesh's vertices", "Laboratory frame."),
+    ("object_faces", "f", _NUMBER, "mesh's triangles", "Numbers of their vertices."),
+    ("object_resolution", "h", _MM, "mesh's resolution", "Grid spacing of its signed distance."),
     ("peg_position", r"\mathbf{c}", _MM, "peg position", "A point of its axis, laboratory frame."),
     ("peg_axis", r"\mathbf{a}", _NUMBER, "peg axis", "Unit vector, laboratory frame."),
     ("peg_radius", r"R_\mathrm{peg}", _MM, "peg radius", "Of its surface."),

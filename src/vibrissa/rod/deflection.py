@@ -144,7 +144,7 @@ def deflect(
         raise ValueError(
             f"a load is a PointForce, a PointContact or a PegContact; got {type(load).__name__}"
         )
-    return _dimensional(whisker, load, d, solved, steps)
+    return dimensional(whisker, load, d, solved, steps)
 
 
 def _by_force(d: Discretization, load: PointForce) -> Solutions:
@@ -220,9 +220,10 @@ def _by_peg(
     return out
 
 
-def _dimensional(
+def dimensional(
     whisker: Whisker, load: Load, d: Discretization, solved: Solutions, steps: int
 ) -> Deflection:
+    """Give solved rows their units and the shape of their load."""
     shape = load.shape
     force = solved.values[:, :3] * d.force
     point = solved.values[:, 3:] * d.length

@@ -2,28 +2,33 @@
 
 from vibrissa.trial.cameras import Camera, load_cameras, orthogonal_views, save_cameras, triangulate
 from vibrissa.trial.film import Look, film, views_of
-from vibrissa.trial.motion import Motion, whisking
-from vibrissa.trial.objects import Peg
+from vibrissa.trial.motion import Motion, tabulated, whisking
+from vibrissa.trial.objects import Box, Peg, Plane, Sphere
 from vibrissa.trial.plan import facing_peg, sweep_past
-from vibrissa.trial.recording import recorded_pegs, recorded_whisker
+from vibrissa.trial.recording import recorded_objects, recorded_pegs, recorded_whisker
 from vibrissa.trial.sensors import measure
 from vibrissa.trial.simulate import simulate
 
 __all__ = [
+    "Box",
     "Camera",
     "Look",
     "Motion",
     "Peg",
+    "Plane",
+    "Sphere",
     "facing_peg",
     "film",
     "load_cameras",
     "measure",
     "orthogonal_views",
+    "recorded_objects",
     "recorded_pegs",
     "recorded_whisker",
     "save_cameras",
     "simulate",
     "sweep_past",
+    "tabulated",
     "triangulate",
     "views_of",
     "whisking",

@@ -17,11 +17,14 @@ sums of three sinusoids with random phases. All is smooth.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline
+
+from vibrissa.whisker.pose import ORTHOGONALITY
 
 Array = NDArray[np.float64]
 
@@ -48,9 +51,13 @@ class Motion:
     time : array (n,)
         Of the frames, s, rising.
     azimuth, elevation, roll : array (n,)
-        Of the base, rad; see the module.
+        Of the base, rad; see the module. Where the head turns, they are relative to it.
     base_position : array (n, 3)
         The base in the laboratory frame, m.
+    head_rotation : array (n, 3, 3), optional
+        From the head's to the laboratory frame, where the head turns.
+    head_position : array (n, 3), optional
+        Origin of the head's frame in the laboratory, m, where the head moves.
 
     Raises
     ------
@@ -63,14 +70,19 @@ class Motion:
     elevation: Array
     roll: Array
     base_position: Array
+    head_rotation: Array | None = None
+    head_position: Array | None = None
 
     def __post_init__(self) -> None:
         """Check every array."""
         n = np.size(self.time)
         faults = []
-        for name in ("time", "azimuth", "elevation", "roll", "base_position"):
+        shapes = {"base_position": (n, 3), "head_position": (n, 3), "head_rotation": (n, 3, 3)}
+        for name in ("time", "azimuth", "elevation", "roll", *shapes):
+            if getattr(self, name) is None and name.startswith("head"):
+                continue
             values = np.asarray(getattr(self, name), dtype=np.float64)
-            shape = (n, 3) if name == "base_position" else (n,)
+            shape = shapes.get(name, (n,))
             if values.shape != shape:
                 faults.append(f"{name} has shape {values.shape}; {shape} is needed")
             elif not np.isfinite(values).all():
@@ -84,7 +96,39 @@ class Motion:
     @property
     def base_rotation(self) -> Array:
         """Rotations (n, 3, 3) from the whisker's to the laboratory frame."""
-        return base_rotation(self.azimuth, self.elevation, self.roll)
+        on_head = base_rotation(self.azimuth, self.elevation, self.roll)
+        return on_head if self.head_rotation is None else self.head_rotation @ on_head
+
+    def on_head(self, rotation: ArrayLike, position: ArrayLike) -> Motion:
+        """Let the head, on which the whisker moves like this, move as well.
+
+        Parameters
+        ----------
+        rotation : array_like (n, 3, 3) or (3, 3)
+            From the head's to the laboratory frame.
+        position : array_like (n, 3) or (3,)
+            Origin of the head's frame in the laboratory, m.
+
+        Returns
+        -------
+        Motion
+            With the base carried along.
+
+        Raises
+        ------
+        ValueError
+            If shapes do not fit, a matrix is no rotation, or the head moves already.
+        """
+        if self.head_rotation is not None:
+            raise ValueError("the head moves already: a motion goes on a head once")
+        n = len(self)
+        turn = np.array(np.broadcast_to(np.asarray(rotation, dtype=np.float64), (n, 3, 3)))
+        shift = np.array(np.broadcast_to(np.asarray(position, dtype=np.float64), (n, 3)))
+        off = np.abs(np.swapaxes(turn, 1, 2) @ turn - np.eye(3)).max()
+        if not off <= ORTHOGONALITY or (np.linalg.det(turn) < 0.0).any():
+            raise ValueError("the head's rotation is no rotation matrix in every frame")
+        base = np.einsum("nij,nj->ni", turn, self.base_position) + shift
+        return replace(self, base_position=base, head_rotation=turn, head_position=shift)
 
     def __len__(self) -> int:
         return int(self.time.size)
@@ -127,6 +171,7 @@ def whisking(
     frequency: float = 5.0,
     amplitude: float = np.radians(30.0),
     set_point: float = 0.0,
+    protraction: float = 0.5,
     elevation: float = 0.0,
     elevation_per_azimuth: float = ELEVATION_PER_AZIMUTH["C"],
     roll_per_azimuth: float = ROLL_PER_AZIMUTH["C"],
@@ -149,6 +194,8 @@ def whisking(
         Half of the sweep, rad; the trial begins at the rear end of one.
     set_point : float
         Azimuth in the middle of the sweep, rad.
+    protraction : float
+        Share of a whisk that goes forward, from 0.3 to 0.7; above one half retraction is faster.
     elevation : float
         At the set point, rad.
     elevation_per_azimuth, roll_per_azimuth : float
@@ -170,7 +217,8 @@ def whisking(
     Raises
     ------
     ValueError
-        If duration, rate or frequency are not positive, or less than two frames result.
+        If duration, rate or frequency are not positive, less than two frames result, or the share
+        of protraction is out of bounds.
 
     Examples
     --------
@@ -185,12 +233,18 @@ def whisking(
     ]
     if not faults and round(duration * rate) < 2:
         faults.append(f"{duration} s at {rate} frames/s are less than two frames")
+    if not 0.3 <= protraction <= 0.7:
+        faults.append(f"protraction is {protraction!r}; a share from 0.3 to 0.7 is needed")
     if faults:
         raise ValueError("no whisking: " + "; ".join(faults))
     time = np.arange(round(duration * rate)) / rate
     drifts = _drifts(time, 6, seed)
     size = amplitude * (1.0 + variation * drifts[0])
-    offset = amplitude * variation * drifts[1] - size * np.cos(2.0 * np.pi * frequency * time)
+    phase = 2.0 * np.pi * frequency * time
+    # The turning points are where the warped phase is a multiple of π.
+    forward = 2.0 * np.pi * protraction
+    phase = phase + (np.pi - forward) / (1.0 - np.cos(forward)) * (1.0 - np.cos(phase))
+    offset = amplitude * variation * drifts[1] - size * np.cos(phase)
     return Motion(
         time=time,
         azimuth=set_point + offset,
@@ -198,6 +252,67 @@ def whisking(
         roll=roll_per_azimuth * offset,
         base_position=position_drift * drifts[3:].T,
     )
+
+
+def tabulated(
+    time: ArrayLike,
+    azimuth: ArrayLike,
+    elevation: ArrayLike = 0.0,
+    roll: ArrayLike = 0.0,
+    base_position: ArrayLike = (0.0, 0.0, 0.0),
+    *,
+    rate: float = 1000.0,
+) -> Motion:
+    """Move as a table says, smoothly in between.
+
+    Parameters
+    ----------
+    time : array_like (m,)
+        Of the rows, s, rising.
+    azimuth, elevation, roll : array_like (m,) or ()
+        Of the base, rad.
+    base_position : array_like (m, 3) or (3,)
+        The base in the laboratory frame, m.
+    rate : float
+        Frames per second.
+
+    Returns
+    -------
+    Motion
+        Frames at the first time, 1/rate later, … up to the last; cubic splines between the rows.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit, a number is missing, time does not rise, or fewer than two frames
+        result.
+
+    Examples
+    --------
+    >>> len(tabulated([0.0, 0.05, 0.1], [0.0, 0.5, 0.0], rate=500.0))
+    51
+    """
+    rows = np.asarray(time, dtype=np.float64)
+    given = {"azimuth": azimuth, "elevation": elevation, "roll": roll}
+    values = {}
+    for name, column in given.items():
+        column = np.asarray(column, dtype=np.float64)
+        values[name] = np.full(rows.shape, column) if column.ndim == 0 else column
+    place = np.asarray(base_position, dtype=np.float64)
+    values["base_position"] = np.tile(place, (rows.size, 1)) if place.shape == (3,) else place
+    table = Motion(time=rows, **values)
+    count = int(np.floor((rows[-1] - rows[0]) * rate * (1.0 + 1e-12))) + 1 if rows.size else 0
+    if not rate > 0.0 or count < 2:
+        raise ValueError(f"{rows.size} rows at {rate} frames/s give fewer than two frames")
+    frames = rows[0] + np.arange(count) / rate
+    smooth = {name: CubicSpline(rows, column)(frames) for name, column in _columns(table).items()}
+    return Motion(time=frames, **smooth)
+
+
+def _columns(motion: Motion) -> dict[str, Array]:
+    """Angles and place of a motion by name."""
+    names = ("azimuth", "elevation", "roll", "base_position")
+    return {name: getattr(motion, name) for name in names}
 
 
 def _drifts(time: Array, count: int, seed: int) -> Array:

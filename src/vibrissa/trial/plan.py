@@ -1,4 +1,4 @@
-"""Where to put the peg and how far to whisk, for whiskers of any length and shape.
+"""Where to put a peg and how far to whisk, for whiskers of any length and shape.
 
 The peg stands at a share of the whisker's reach. How far the whisker must be turned before it slips
 past depends on its shape and taper, so it is tried out: a coarse sweep in each direction, from
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.rod import PegContact, deflect
+from vibrissa.rod.surfaces import follow_surfaces
 from vibrissa.status import Status
 from vibrissa.trial.motion import (
     ELEVATION_PER_AZIMUTH,
@@ -21,7 +21,7 @@ from vibrissa.trial.motion import (
     base_rotation,
     whisking,
 )
-from vibrissa.trial.objects import Peg
+from vibrissa.trial.objects import Box, Peg, Sphere
 from vibrissa.whisker import Whisker
 
 Array = NDArray[np.float64]
@@ -70,7 +70,7 @@ def facing_peg(whisker: Whisker, distance: float = 0.65, radius: float = PEG_RAD
 
 def sweep_past(
     whisker: Whisker,
-    peg: Peg,
+    thing: Peg | Sphere | Box,
     duration: float = 3.0,
     rate: float = 1000.0,
     *,
@@ -78,14 +78,14 @@ def sweep_past(
     seed: int = 0,
     **motion: Any,
 ) -> Motion:
-    """Whisk so that the whisker slips past a peg, forward and back.
+    """Whisk so that the whisker slips past an object, forward and back.
 
     Parameters
     ----------
     whisker : Whisker
         That whisks.
-    peg : Peg
-        Beside it, more or less vertical.
+    thing : Peg, Sphere or Box
+        Beside it; a peg more or less vertical.
     duration : float
         Of the trial, s.
     rate : float
@@ -100,12 +100,12 @@ def sweep_past(
     Returns
     -------
     Motion
-        Its set point and amplitude lead past the slips on either side of the peg.
+        Its set point and amplitude lead past the slips on either side of the object.
 
     Raises
     ------
     ValueError
-        If there is no such row, if the whisker does not meet the peg, or if it does not slip past
+        If there is no such row, if the whisker does not meet the object, or does not slip past it
         within 120°.
     """
     if row not in ROLL_PER_AZIMUTH:
@@ -115,8 +115,8 @@ def sweep_past(
     motion.setdefault("variation", 0.05)
     motion.setdefault("position_drift", 0.03 * whisker.length)
     ratios = motion["elevation_per_azimuth"], motion["roll_per_azimuth"]
-    rear = _slip(whisker, peg, -1.0, ratios) - _MARGIN
-    front = _slip(whisker, peg, 1.0, ratios) + _MARGIN
+    rear = _slip(whisker, thing, -1.0, ratios) - _MARGIN
+    front = _slip(whisker, thing, 1.0, ratios) + _MARGIN
     # A drift of set point or amplitude must not keep the whisker from slipping.
     amplitude = 0.5 * (front - rear) * (1.0 + 2.0 * motion["variation"])
     motion.setdefault("amplitude", amplitude)
@@ -124,35 +124,34 @@ def sweep_past(
     return whisking(duration, rate, seed=seed, **motion)
 
 
-def _toward(whisker: Whisker, peg: Peg) -> float:
-    """Azimuth of the base at which the resting whisker would run through the peg's axis, rad."""
+def _toward(whisker: Whisker, thing: Peg | Sphere | Box) -> float:
+    """Azimuth of the base at which the resting whisker would run through an object, rad."""
     points = whisker.centerline(801)
-    distance = np.hypot(*peg.origin[:2])
+    distance = np.hypot(*thing.origin[:2])
     near = np.abs(np.hypot(points[:, 0], points[:, 1]) - distance)
     # The nearest branch counts, where a whisker curls back to the same distance.
     i = int(np.argmax(near <= near.min() + 1e-3 * whisker.length))
-    azimuth = np.arctan2(peg.origin[1], peg.origin[0]) - np.arctan2(points[i, 1], points[i, 0])
-    return float(azimuth)
+    there = np.arctan2(thing.origin[1], thing.origin[0])
+    return float(there - np.arctan2(points[i, 1], points[i, 0]))
 
 
-def _slip(whisker: Whisker, peg: Peg, sense: float, ratios: tuple[float, float]) -> float:
+def _slip(
+    whisker: Whisker, thing: Peg | Sphere | Box, sense: float, ratios: tuple[float, float]
+) -> float:
     """Azimuth at which the whisker slips past, sweeping forward (sense 1) or back (−1), rad."""
-    middle = _toward(whisker, peg)
-    bent = None
-    touched = False
-    for turned in np.arange(-0.5 * _FARTHEST, _FARTHEST, _STEP) * sense:
-        rotation = base_rotation(middle + turned, ratios[0] * turned, ratios[1] * turned)
-        origin, axis = peg.in_whisker_frame(rotation, np.zeros(3))
-        if bent is None:
-            bent = deflect(whisker, PegContact(origin, axis, peg.radius))
-        else:
-            bent = deflect(whisker, PegContact(origin, axis, peg.radius, start=bent))
-        status = Status(int(bent.status))
-        if touched and status not in (Status.OK, Status.TIP_CONTACT):
-            if status in (Status.NOT_CONVERGED, Status.TOO_PROXIMAL):
-                raise ValueError(f"the sweep past {peg} cannot be planned: {status}")
-            return float(middle + turned)
-        touched = touched or status in (Status.OK, Status.TIP_CONTACT)
-    if not touched:
-        raise ValueError(f"{whisker} does not meet {peg}")
-    raise ValueError(f"{whisker} does not slip past {peg} within {np.degrees(_FARTHEST):.0f}°")
+    middle = _toward(whisker, thing)
+    turned = np.arange(-0.5 * _FARTHEST, _FARTHEST, _STEP) * sense
+    rotations = base_rotation(middle + turned, ratios[0] * turned, ratios[1] * turned)
+    bent = follow_surfaces(whisker, [thing], rotations, np.zeros((turned.size, 3))).bent
+    touching = np.isin(bent.status, (Status.OK, Status.TIP_CONTACT))
+    if not touching.any():
+        raise ValueError(f"{whisker} does not meet {thing}")
+    first = int(np.argmax(touching))
+    past = np.flatnonzero(~touching[first:])
+    if not past.size:
+        degrees = np.degrees(_FARTHEST)
+        raise ValueError(f"{whisker} does not slip past {thing} within {degrees:.0f}°")
+    status = Status(int(bent.status[first + past[0]]))
+    if status in (Status.NOT_CONVERGED, Status.TOO_PROXIMAL):
+        raise ValueError(f"the sweep past {thing} cannot be planned: {status}")
+    return float(middle + turned[first + past[0]])

@@ -3,7 +3,7 @@
     /            time, whisker, space: base_position, base_rotation, base_azimuth, …, force, moment
     /truth       the same names and more, as they truly are (simulated trials only)
     /whiskers/0  the first whisker along the dimension ``whisker``, and so on
-    /objects     what stands in the laboratory
+    /objects/0   the first object that stands in the laboratory, and so on
 
 A group cannot be called ``whisker``: a file has one name space for groups and dimensions. Points
 are in the laboratory frame except those called ``…_whisker``; force and moment are in the
@@ -15,6 +15,7 @@ are estimates.
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -23,10 +24,12 @@ from numpy.typing import NDArray
 
 from vibrissa.io.recording import KIND
 from vibrissa.quantities import attributes
-from vibrissa.rod import Deflection
+from vibrissa.rod.surface import Surface
+from vibrissa.rod.surfaces import SurfaceDeflection
 from vibrissa.status import Status, flag_attributes
 from vibrissa.trial.motion import Motion
-from vibrissa.trial.objects import Peg, pegs_dataset, pegs_from_dataset
+from vibrissa.trial.object_files import object_from_dataset, objects_datasets
+from vibrissa.trial.objects import Peg
 from vibrissa.whisker import Whisker
 
 Array = NDArray[np.float64]
@@ -38,6 +41,9 @@ _FRAMES = {
     "contact_point_whisker": "whisker",
     "force": "whisker",
     "moment": "whisker",
+    "head_position": "laboratory",
+    "surface_point": "laboratory",
+    "surface_normal": "laboratory",
 }
 _DIMS: Mapping[str, tuple[str, ...]] = {
     "base_position": ("time", "whisker", "space"),
@@ -54,7 +60,18 @@ _DIMS: Mapping[str, tuple[str, ...]] = {
     "in_contact": ("time", "whisker"),
     "confidence": ("time", "whisker"),
     "status": ("time", "whisker"),
+    "contact_object": ("time", "whisker"),
+    "surface_point": ("time", "whisker", "space"),
+    "surface_normal": ("time", "whisker", "space"),
+    "sliding": ("time", "whisker"),
+    "overlap": ("time", "whisker"),
+    "second_contact": ("time", "whisker"),
 }
+_OF_HEAD: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {"head_position": ("time", "space"), "head_rotation": ("time", "space", "head_axis")}
+)
+OVERLAP = 5e-6
+"""Overlap from which a second contact counts, m; a tapering whisker along a flat one has less."""
 
 
 def recorded(name: str, values: Any) -> xr.Variable:
@@ -81,7 +98,13 @@ def recorded(name: str, values: Any) -> xr.Variable:
 
 
 def trial_recording(
-    whisker: Whisker, motion: Motion, peg: Peg, bent: Deflection, nodes: int
+    whisker: Whisker,
+    motion: Motion,
+    objects: Sequence[Surface],
+    found: SurfaceDeflection,
+    overlap: Array,
+    nodes: int,
+    origin: str,
 ) -> xr.DataTree:
     """Write a simulated trial as a recording.
 
@@ -91,19 +114,23 @@ def trial_recording(
         That whisked.
     motion : Motion
         Of its base, n frames.
-    peg : Peg
-        That it met.
-    bent : Deflection
-        Of the whisker, frame by frame (n,).
+    objects : sequence
+        That it may have met.
+    found : SurfaceDeflection
+        What became of it, frame by frame (n,).
+    overlap : array (n,)
+        How far it reaches into objects away from its contact, m.
     nodes : int
         Points of a centreline.
+    origin : str
+        How it was simulated.
 
     Returns
     -------
     xarray.DataTree
         The recording.
     """
-    rotation, position = motion.base_rotation, motion.base_position
+    rotation, position, bent = motion.base_rotation, motion.base_position, found.bent
     turn = "tij,t...j->t...i"
     contact = np.isin(bent.status, (Status.OK, Status.TIP_CONTACT))
     pose = {
@@ -123,20 +150,43 @@ def trial_recording(
         "in_contact": contact,
         "confidence": np.isin(bent.status, [s for s in Status if s.ok]).astype(np.float64),
         "status": bent.status.astype(np.int8),
+        "contact_object": found.surface.astype(np.int16),
+        "surface_point": found.surface_point,
+        "surface_normal": found.normal,
+        "sliding": found.sliding,
+        "overlap": overlap,
+        "second_contact": overlap > OVERLAP,
     }
     root = xr.Dataset(
-        {name: recorded(name, values) for name, values in (pose | wrench).items()},
+        {name: recorded(name, values) for name, values in (pose | wrench).items()} | _head(motion),
         _coordinates(motion.time, [whisker.name]),
-        {"kind": KIND, "origin": "simulated: quasi-static, frictionless"},
+        {"kind": KIND, "origin": origin},
     )
     groups: dict[str, xr.Dataset] = {
         "/": root,
         "/truth": xr.Dataset({name: recorded(name, values) for name, values in truth.items()}),
         # Its centreline is for readers of lone whisker files, and its nodes are others than ours.
         "/whiskers/0": whisker.to_dataset().drop_dims("node"),
-        "/objects": pegs_dataset([peg]),
+        "/objects": xr.Dataset(attrs={"reference_frame": "laboratory"}),
     }
+    for name, dataset in objects_datasets(objects).items():
+        # The coordinates of the root are seen from below.
+        groups[f"/objects/{name}"] = dataset.drop_vars("space")
     return xr.DataTree.from_dict(groups)
+
+
+def _head(motion: Motion) -> dict[str, xr.Variable]:
+    """How the head moves, if it does."""
+    values = {"head_position": motion.head_position, "head_rotation": motion.head_rotation}
+    return {
+        name: xr.Variable(
+            _OF_HEAD[name],
+            array,
+            attributes(name) | ({"reference_frame": _FRAMES[name]} if name in _FRAMES else {}),
+        )
+        for name, array in values.items()
+        if array is not None
+    }
 
 
 def _coordinates(time: Array, names: Sequence[str]) -> dict[Hashable, Any]:
@@ -175,6 +225,26 @@ def recorded_whisker(recording: xr.DataTree, index: int = 0) -> Whisker:
     return Whisker.from_dataset(whiskers.children[str(index)].to_dataset(inherit=False))
 
 
+def recorded_objects(recording: xr.DataTree) -> tuple[Surface, ...]:
+    """List the objects of a recording.
+
+    Parameters
+    ----------
+    recording : xarray.DataTree
+        The recording.
+
+    Returns
+    -------
+    tuple
+        Laboratory frame; none if the recording tells of no objects.
+    """
+    objects = recording.children.get("objects")
+    if objects is None:
+        return ()
+    numbers = sorted(objects.children, key=int)
+    return tuple(object_from_dataset(objects.children[i].to_dataset()) for i in numbers)
+
+
 def recorded_pegs(recording: xr.DataTree) -> tuple[Peg, ...]:
     """List the pegs of a recording.
 
@@ -186,7 +256,6 @@ def recorded_pegs(recording: xr.DataTree) -> tuple[Peg, ...]:
     Returns
     -------
     tuple of Peg
-        Laboratory frame; none if the recording tells of no objects.
+        Laboratory frame; none if the recording tells of no pegs.
     """
-    objects = recording.children.get("objects")
-    return () if objects is None else pegs_from_dataset(objects.to_dataset(inherit=False))
+    return tuple(thing for thing in recorded_objects(recording) if isinstance(thing, Peg))

@@ -1,10 +1,14 @@
 """A trial, frame by frame: the base moves, the whisker bends, slips and springs free.
 
-Each frame goes on from the one before: the peg, seen from the base, moves a little, and the contact
-slides along with it on the stable branch and on its side of the peg. Where that branch ends the
-whisker has slipped off; it springs back to rest, clear of the peg (or against it, wherever the peg
-stands in the way of rest), and meets it next from the side where it then is. A whisker is
-therefore never pulled through a peg. Quasi-static, without friction.
+Each frame goes on from the one before: the objects, seen from the base, move a little, and the
+contact sticks or slides along on the stable branch (:mod:`vibrissa.rod.surfaces`). Where that
+branch ends the whisker has slipped off; it springs back to rest, clear of the object (or against
+it, wherever it stands in the way of rest), and meets it next from the side where it then is. A
+whisker is therefore never pulled through a peg. Quasi-static.
+
+One contact is simulated at a time, that with the object met first. Where the bent whisker reaches
+into another object, or into the same one elsewhere, the truth says so (``second_contact``) and how
+far (``overlap``): there the wrench lacks what the second contact would add.
 """
 
 from __future__ import annotations
@@ -15,33 +19,40 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from vibrissa.rod import Deflection, PegContact, deflect
+from vibrissa.rod.surface import Surface
+from vibrissa.rod.surfaces import SurfaceDeflection, follow_surfaces
 from vibrissa.status import Status
 from vibrissa.trial.motion import Motion
-from vibrissa.trial.objects import Peg
 from vibrissa.trial.recording import trial_recording
 from vibrissa.whisker import Whisker
 
 NODES = 33
 """Points of the recorded centrelines."""
 
+_LOOK_AT = 129
+"""Points along the whisker at which a second contact is looked for."""
+
+_ASIDE = 0.03
+"""How far from the contact another one of the same object is one, as a share of the length."""
+
+_FRAMES_AT_ONCE = 512
+
 Array = NDArray[np.float64]
 
 Progress = Callable[[int, int], None]
 """Called with the number of frames done and of all frames."""
 
-_SLIPPED = (Status.BEYOND_FOLD, Status.BEYOND_TIP)
-
 
 def simulate(
     whisker: Whisker,
     motion: Motion,
-    peg: Peg,
+    objects: Surface | Sequence[Surface],
     *,
+    friction: float = 0.0,
     nodes: int = NODES,
     progress: Progress | None = None,
 ) -> xr.DataTree:
-    """Simulate a trial of one whisker against one peg.
+    """Simulate a trial of one whisker among objects.
 
     Parameters
     ----------
@@ -49,8 +60,10 @@ def simulate(
         That whisks.
     motion : Motion
         Of its base.
-    peg : Peg
-        In the laboratory.
+    objects : Peg, Sphere, Plane, Box, Mesh or a sequence of them
+        In the laboratory. The one met first holds the whisker.
+    friction : float
+        Coulomb's coefficient between whisker and objects.
     nodes : int
         Points of the recorded centrelines, equally spaced in arc length.
     progress : callable, optional
@@ -61,42 +74,50 @@ def simulate(
     xarray.DataTree
         A recording (`vibrissa.trial.recording`): what a perfect sensor at the base reads, where the
         base is, and everything else in the group ``truth``.
+
+    Raises
+    ------
+    ValueError
+        If the friction is negative.
     """
-    origins, axes = peg.in_whisker_frame(motion.base_rotation, motion.base_position)
-    frames: list[Deflection] = []
-    latest: Deflection | None = None
-    for i, (origin, axis) in enumerate(zip(origins, axes, strict=True)):
-        bent = _next(whisker, latest, PegContact(origin, axis, peg.radius))
-        frames.append(bent)
-        # Of a frame without an answer nothing is known, so the next goes on from the one before.
-        if Status(int(bent.status)).ok:
-            latest = bent
-        if progress is not None:
-            progress(i + 1, len(motion))
-    return trial_recording(whisker, motion, peg, _stacked(frames, origins, axes, peg), nodes)
-
-
-def _next(whisker: Whisker, before: Deflection | None, load: PegContact) -> Deflection:
-    """Bend the whisker in one frame, going on from an earlier one."""
-    if before is None:
-        return deflect(whisker, load)
-    moved = deflect(whisker, PegContact(load.origin, load.axis, load.radius, start=before))
-    if Status(int(moved.status)) in _SLIPPED:
-        return deflect(whisker, load)
-    return moved
-
-
-def _stacked(frames: Sequence[Deflection], origins: Array, axes: Array, peg: Peg) -> Deflection:
-    """Make one deflection of many."""
-    return Deflection(
-        whisker=frames[0].whisker,
-        load=PegContact(origins, axes, peg.radius),
-        force=np.array([f.force for f in frames]),
-        moment=np.array([f.moment for f in frames]),
-        contact_point=np.array([f.contact_point for f in frames]),
-        arc_length=np.array([f.arc_length for f in frames]),
-        contact_force=np.array([f.contact_force for f in frames]),
-        residual=np.array([f.residual for f in frames]),
-        status=np.array([f.status for f in frames]),
-        steps=frames[0].steps,
+    solids = list(objects) if isinstance(objects, Sequence) else [objects]
+    found = follow_surfaces(
+        whisker,
+        solids,
+        motion.base_rotation,
+        motion.base_position,
+        friction=friction,
+        progress=progress,
     )
+    touch = "frictionless" if friction == 0.0 else f"friction {friction:g}"
+    return trial_recording(
+        whisker,
+        motion,
+        solids,
+        found,
+        _overlap(whisker, motion, solids, found),
+        nodes,
+        f"simulated: quasi-static, {touch}",
+    )
+
+
+def _overlap(
+    whisker: Whisker, motion: Motion, solids: Sequence[Surface], found: SurfaceDeflection
+) -> Array:
+    """How far (n,) the bent whisker reaches into objects away from its contact, m."""
+    bent, rotation, position = found.bent, motion.base_rotation, motion.base_position
+    s = np.linspace(0.0, whisker.length, _LOOK_AT)
+    radius = whisker.radius(s)
+    deepest = np.zeros(len(motion))
+    # A whisker at rest was looked at when it was found to be free.
+    touching = np.flatnonzero(np.isin(bent.status, (Status.OK, Status.TIP_CONTACT)))
+    lines = bent.centerline(_LOOK_AT)
+    for first in range(0, touching.size, _FRAMES_AT_ONCE):
+        rows = touching[first : first + _FRAMES_AT_ONCE]
+        line = np.einsum("tij,tkj->tki", rotation[rows], lines[rows]) + position[rows, None]
+        beside = np.abs(s - bent.arc_length[rows, None]) < _ASIDE * whisker.length
+        for i, solid in enumerate(solids):
+            gap = solid.signed_distance(line) - radius
+            gap[beside & (found.surface[rows, None] == i)] = np.inf
+            deepest[rows] = np.maximum(deepest[rows], -gap.min(axis=1))
+    return deepest

@@ -1,0 +1,99 @@
+"""Objects as labelled datasets, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import xarray as xr
+
+from vibrissa.quantities import attributes
+from vibrissa.rod.surface import Surface
+from vibrissa.trial.objects import Box, Peg, Plane, Sphere
+
+_FIELDS: dict[str, tuple[type, dict[str, str]]] = {
+    "peg": (
+        Peg,
+        {"origin": "object_position", "axis": "object_axis", "radius": "object_radius"},
+    ),
+    "sphere": (Sphere, {"origin": "object_position", "radius": "object_radius"}),
+    "plane": (Plane, {"origin": "object_position", "normal": "object_axis"}),
+    "box": (
+        Box,
+        {
+            "origin": "object_position",
+            "size": "object_size",
+            "rotation": "object_rotation",
+            "edge_radius": "object_edge_radius",
+        },
+    ),
+}
+_STIFFNESS = {"stiffness": "object_stiffness"}
+_DIMS: dict[str, tuple[str, ...]] = {
+    "object_position": ("space",),
+    "object_axis": ("space",),
+    "object_size": ("object_axes",),
+    "object_rotation": ("space", "object_axes"),
+}
+
+
+def objects_datasets(objects: Sequence[Surface]) -> dict[str, xr.Dataset]:
+    """Write objects as datasets.
+
+    Parameters
+    ----------
+    objects : sequence
+        Of pegs, spheres, planes, boxes.
+
+    Returns
+    -------
+    dict
+        A dataset each, by number, whose attribute ``kind`` says what it is.
+
+    Raises
+    ------
+    ValueError
+        If one is of another kind.
+    """
+    return {str(i): _dataset(thing) for i, thing in enumerate(objects)}
+
+
+def _dataset(thing: Surface) -> xr.Dataset:
+    for kind, (known, fields) in _FIELDS.items():
+        if isinstance(thing, known):
+            rows = {
+                name: xr.Variable(
+                    _DIMS.get(name, ()), np.asarray(getattr(thing, field)), attributes(name)
+                )
+                for field, name in (fields | _STIFFNESS).items()
+            }
+            about = {"kind": kind, "reference_frame": "laboratory"}
+            return xr.Dataset(rows, {"space": list("xyz")}, about)
+    raise ValueError(f"{thing!r} is none of {', '.join(_FIELDS)}, and cannot be written")
+
+
+def object_from_dataset(dataset: xr.Dataset) -> Surface:
+    """Make an object again.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        Of `objects_datasets`.
+
+    Returns
+    -------
+    Peg, Sphere, Plane or Box
+        As it was.
+
+    Raises
+    ------
+    ValueError
+        If it is of an unknown kind.
+    """
+    kind = dataset.attrs.get("kind")
+    if kind not in _FIELDS:
+        raise ValueError(f"the object is of kind {kind!r}; one of {', '.join(_FIELDS)} is known")
+    known, fields = _FIELDS[kind]
+    values = {field: dataset[name].values for field, name in (fields | _STIFFNESS).items()}
+    made: Surface = known(**values)
+    return made

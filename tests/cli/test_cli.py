@@ -129,6 +129,31 @@ def test_map_and_estimate(folder, chart, table):
     assert np.isnan(contacts["x"].values[2:]).all()
 
 
+def test_estimate_from_more_signals_and_from_all(folder, chart, table):
+    path, points = table
+    noise = folder / "noise.csv"
+    np.savetxt(noise, np.diag(np.repeat([1e-12, 4e-16], 3)), delimiter=",")
+    for i, options in enumerate(
+        [
+            ("--signals", "Fx FT MB MD"),
+            ("--signals", "Fx,FT,FD,Mx,MB,MD", "--noise", noise),
+            ("--wrench",),
+            ("--triplet", "Fx,MB,MD"),
+        ]
+    ):
+        out = folder / f"more{i}.csv"
+        text = run("estimate", path, "--map", chart, *options, "-o", out)
+        assert "wrote" in text
+        contacts = load_contacts(out)
+        names = [vb.Status(int(code)).name for code in contacts["status"].values]
+        assert names == ["UNIQUE", "UNIQUE", "NO_CONTACT", "MISSING"]
+        found = np.stack([contacts[axis].values[:2] for axis in "xyz"], axis=1)
+        np.testing.assert_allclose(found, points[:2], atol=3e-7)
+        assert np.isfinite(contacts["sigma_x"].values[:2]).all()
+    # Of the built-in whisker; all six need no map.
+    run("estimate", path, "--wrench", "-o", folder / "no_map.csv")
+
+
 def test_estimate_without_a_map_simulates_one_and_says_so(folder, table):
     csv = folder / "whisker.csv"
     save_centerline(csv, samples.gamma().centerline(40))
@@ -176,6 +201,8 @@ def test_info(folder, table, chart):
         (("deflect", "--point", "1,2"), "X,Y,Z are needed"),
         (("deflect", "--whisker", "none.csv", "--point", "1,2,3"), "there is no file none.csv"),
         (("estimate", "none.csv"), "there is no file none.csv"),
+        (("estimate", "none.csv", "--signals", "Fx MB"), "at least 3 different signals"),
+        (("estimate", "none.csv", "--noise", "no.csv"), "there is no file no.csv"),
         (("info", "none.nc"), "there is no file none.nc"),
         (("demo", "--whisker", "none.csv"), "there is no file none.csv"),
     ],

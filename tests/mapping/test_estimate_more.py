@@ -189,3 +189,18 @@ def test_coordinates_are_kept(gamma_map, rng):
         gamma_map.estimate(shifted)
     with pytest.raises(ValueError, match="must have them too"):
         gamma_map.estimate({**signals.data_vars, "MD": np.zeros(6)})
+
+
+def test_without_noise_nothing_scatters(gamma_map):
+    bent = vb.deflect(gamma_map.whisker, vb.PointContact([0.024, 0.014, 0.002]))
+    signals = vb.base_signals(bent.force, bent.moment)
+    for names in ("Fx MB MD", "Fx FT FD Mx MB MD"):
+        found = gamma_map.estimate(signals, names, noise=np.zeros((6, 6)))
+        assert found.status == vb.Status.UNIQUE
+        # What is exact counts as a millionth of a unit of force and moment.
+        assert np.abs(found.covariance).max() < 1e-15
+        assert found.linear
+    # A signal known exactly next to others that are not.
+    exact = dict.fromkeys(("Fx", "FD", "MB", "MD"), 0.0) | {"FT": 1e-6, "Mx": 2e-8}
+    found = gamma_map.estimate(signals, SIGNALS, exact)
+    assert np.sqrt(np.trace(found.covariance)) < 1e-9

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from xarray import Dataset
 
     from vibrissa.mapping import ContactMap
+    from vibrissa.rod.arrays import Array
     from vibrissa.whisker import Whisker
 
 
@@ -33,48 +34,72 @@ def estimate(
         typer.Option(help="Centreline as CSV, where no map is given.", metavar="FILE"),
     ] = None,
     triplet: Annotated[
-        str, typer.Option(help="The three signals to use.", metavar="A,B,C")
+        str,
+        typer.Option(
+            "--signals",
+            "--triplet",
+            help="The signals to use, three or more of Fx, FT, FD, Mx, MB, MD.",
+            metavar="A,B,C",
+        ),
     ] = "Fx,MB,MD",
+    all_six: Annotated[
+        bool,
+        typer.Option(
+            "--wrench", help="Use force and moment whole, without assuming that nothing rubs."
+        ),
+    ] = False,
     force_noise: Annotated[
         float, typer.Option(help="Standard deviation of a force component, µN.", min=0.0)
     ] = 1.0,
     moment_noise: Annotated[
         float, typer.Option(help="Standard deviation of a moment component, µN·m.", min=0.0)
     ] = 0.02,
+    noise: Annotated[
+        Path | None,
+        typer.Option(
+            help="Instead: covariance of Fx, Fy, Fz, Mx, My, Mz, six lines of six numbers, in SI "
+            "units.",
+            metavar="FILE",
+        ),
+    ] = None,
     path: Annotated[
         Path, typer.Option("--output", "-o", help="The contacts, CSV.", metavar="FILE")
     ] = Path("contacts.csv"),
 ) -> None:
     """Find the contact point for each row of signals, with its uncertainty.
 
-    Rows in which nothing is felt (M_B within five standard deviations of zero) have the status
-    no_contact. Example: `vibrissa estimate signals.csv --map map.nc -o contacts.csv`
+    From three signals all contacts that give them exactly, from more by least squares; with
+    --wrench whatever the friction, and no map is needed. Rows in which nothing is felt (M_B within
+    five standard deviations of zero) have the status no_contact.
+    Example: `vibrissa estimate signals.csv --map map.nc --signals Fx,FT,MB,MD -o contacts.csv`
     """
     from vibrissa.cli.sources import wrench_from
-    from vibrissa.demo import contact_columns, locate
+    from vibrissa.demo import contact_columns, locate, locate_from_wrench
     from vibrissa.io import save_contacts
     from vibrissa.io.paths import CSV, check_writable
     from vibrissa.signals import selection
     from vibrissa.status import describe
 
     check_writable(path, CSV)
-    names = selection([name.strip() for name in triplet.split(",")], exactly=3)
+    names = selection(triplet)
+    covariance, said = _noise(noise, force_noise, moment_noise)
     wrench, carried = wrench_from(signals)
     with progress_bars() as tell:
-        contacts = _map(chart, whisker, carried, tell)
-        _check_scale(signals, wrench, contacts.whisker)
-        tell("contact points", 0, 1)
-        found = locate(
-            contacts,
-            wrench,
-            names,
-            force_noise=force_noise * 1e-6,
-            moment_noise=moment_noise * 1e-6,
-        )
+        if all_six:
+            touched = _whisker(chart, whisker, carried)
+            _check_scale(signals, wrench, touched)
+            tell("contact points", 0, 1)
+            found = locate_from_wrench(touched, wrench, covariance)
+        else:
+            contacts = _map(chart, whisker, carried, tell)
+            _check_scale(signals, wrench, contacts.whisker)
+            tell("contact points", 0, 1)
+            found = locate(contacts, wrench, names, noise=covariance)
         tell("contact points", 1, 1)
     save_contacts(path, contact_columns(found))
+    used = "force and moment whole" if all_six else f"signals ({', '.join(names)})"
     errors.print(
-        f"triplet ({', '.join(names)}); noise {force_noise:g} µN and {moment_noise:g} µN·m; "
+        f"{used}; {said}; "
         f"contacts are felt where M_B exceeds {shown('MB', found.attrs['felt_above'])}",
         highlight=False,
         soft_wrap=True,
@@ -82,6 +107,37 @@ def estimate(
     for sentence, count in describe(found["status"].values).most_common():
         output.print(f"{count:6d}  {sentence}", highlight=False, soft_wrap=True)
     output.print(f"wrote {path}", highlight=False, soft_wrap=True)
+
+
+def _noise(path: Path | None, force_noise: float, moment_noise: float) -> tuple[Array, str]:
+    """Covariance of force and moment, SI units, and how it was given."""
+    import numpy as np
+
+    from vibrissa.demo import component_noise
+    from vibrissa.io.table import read_text, table_rows
+
+    if path is None:
+        covariance = component_noise(force_noise * 1e-6, moment_noise * 1e-6)
+        return covariance, f"noise {force_noise:g} µN and {moment_noise:g} µN·m"
+    try:
+        rows = [[float(cell) for cell in cells] for _, cells in table_rows(read_text(path))]
+        covariance = np.array(rows, dtype=np.float64)
+    except ValueError as fault:
+        raise ValueError(f"{path} is no covariance: {fault}") from None
+    if covariance.shape != (6, 6):
+        raise ValueError(f"{path} must hold six lines of six numbers; got {covariance.shape}")
+    return covariance, f"noise of {path}"
+
+
+def _whisker(chart: Path | None, whisker: Path | None, carried: Whisker | None) -> Whisker:
+    """The whisker of a map, a file or a recording."""
+    from vibrissa.cli.sources import map_from, whisker_from
+
+    if chart is not None and whisker is not None:
+        raise ValueError("give either --map or --whisker: a map already has its whisker")
+    if chart is not None:
+        return map_from(chart).whisker
+    return carried if carried is not None and whisker is None else whisker_from(whisker)
 
 
 def _check_scale(path: Path, wrench: Dataset, whisker: Whisker) -> None:
@@ -97,14 +153,12 @@ def _map(
     chart: Path | None, whisker: Path | None, carried: Whisker | None, tell: object
 ) -> ContactMap:
     """Read the map, or simulate that of the whisker, and say which."""
-    from vibrissa.cli.sources import map_from, whisker_from
+    from vibrissa.cli.sources import map_from
     from vibrissa.mapping import ContactMap
 
-    if chart is not None and whisker is not None:
-        raise ValueError("give either --map or --whisker: a map already has its whisker")
-    if chart is not None:
+    if chart is not None and whisker is None:
         return map_from(chart)
-    chosen = carried if carried is not None and whisker is None else whisker_from(whisker)
+    chosen = _whisker(chart, whisker, carried)
     errors.print(f"no map given; simulating that of {chosen!r}", highlight=False, soft_wrap=True)
     assert callable(tell)
     tell("map of all contacts", 0, 1)

@@ -12,7 +12,13 @@ import xarray as xr
 
 from vibrissa import samples
 from vibrissa.contour import CylinderFit, fit_cylinder
-from vibrissa.demo.locate import TRIPLET, contact_columns, in_laboratory, locate
+from vibrissa.demo.locate import (
+    TRIPLET,
+    component_noise,
+    contact_columns,
+    in_laboratory,
+    locate,
+)
 from vibrissa.demo.scores import Scores, contact_errors, score
 from vibrissa.io import save_contacts, save_recording
 from vibrissa.mapping import ContactMap
@@ -125,8 +131,7 @@ def run_demo(
         contact_map,
         recording.to_dataset()[["force", "moment"]].isel(whisker=0),
         TRIPLET,
-        force_noise=force_noise,
-        moment_noise=moment_noise,
+        noise=component_noise(force_noise, moment_noise),
     )
     contacts = in_laboratory(contacts, motion.base_rotation, motion.base_position)
     tell("contact points from signals", 1, 1)

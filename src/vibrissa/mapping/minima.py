@@ -196,7 +196,8 @@ def reliable(
     point_told = np.swapaxes(slope[:, 3:] @ steps, 1, 2)
     off = np.linalg.norm(moved[..., 3:] - value[:, None, 3:] - point_told, axis=2)
     scatter = np.sqrt(np.einsum("nij,njk,nik->n", slope[:, 3:], covariance[rows], slope[:, 3:]))
-    bent = np.maximum(bent, off / scatter[:, None])
+    with np.errstate(divide="ignore", invalid="ignore"):  # without noise nothing scatters
+        bent = np.maximum(bent, off / scatter[:, None])
     still = (steps == 0.0).all(axis=1)
     good[rows] = (on & (bent <= _BENT * _REACH) | still).all(axis=1)
     return good
@@ -206,6 +207,8 @@ def _principal_axes(covariance: Array, x: Array) -> Array:
     """Square roots of covariances along their principal axes (in columns), scaled by x."""
     force = np.linalg.norm(x[:, 1:], axis=1)
     size = np.stack([np.ones_like(force), force, force, force], axis=1)
-    values, vectors = np.linalg.eigh(covariance / (size[:, :, None] * size[:, None, :]))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scaled = np.nan_to_num(covariance / (size[:, :, None] * size[:, None, :]))
+    values, vectors = np.linalg.eigh(scaled)
     values = np.where(values > 1e-14 * values[:, -1:], values, 0.0)
     return np.asarray(size[:, :, None] * vectors * np.sqrt(values)[:, None, :])

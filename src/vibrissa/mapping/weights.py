@@ -39,10 +39,13 @@ def trusted(wrenches: Array) -> Array:
 def whitening(covariance: Array) -> Array:
     """Weights W with WᵀW = Σ⁻¹, shape (..., k, k), see the module; zero where Σ is not finite."""
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)
-    size = np.sqrt(np.where(variance > 0.0, variance, np.nan))
+    noisy = variance > 0.0
+    size = np.sqrt(np.where(noisy, variance, 1.0))
+    typical = np.log(size).sum(axis=-1, keepdims=True) / np.maximum(
+        noisy.sum(axis=-1, keepdims=True), 1
+    )
+    size = np.where(noisy, size, _EXACT * np.exp(typical))
     with np.errstate(all="ignore"):
-        typical = np.exp(np.nanmean(np.log(size), axis=-1, keepdims=True)) if size.size else size
-        size = np.where(variance > 0.0, size, _EXACT * np.where(typical > 0.0, typical, 1.0))
         correlation = covariance / (size[..., :, None] * size[..., None, :])
     k = covariance.shape[-1]
     exact = (variance == 0.0)[..., None] & np.eye(k, dtype=bool)

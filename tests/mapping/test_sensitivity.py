@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import xarray as xr
-from scipy.interpolate import LinearNDInterpolator
 
 import vibrissa as vb
+from vibrissa.mapping import error_solid, signal_slice
 from vibrissa.mapping.contact_map import spherical
+from vibrissa.mapping.differences import interpolation_errors
 from vibrissa.mapping.weighted import quantile, weights
 from vibrissa.signals import TRIPLETS
 
@@ -129,9 +130,10 @@ def test_at_rest_and_in_the_plane_there_are_no_infinities(gamma_map, straight_ma
         assert not np.isinf(found.predicted_error).any()
     assert np.isnan(vb.sensitivity(gamma_map, at=rest * np.nan).sensitivity).all()
     # A straight whisker feels no M_x, wherever it is touched.
+    touched = straight_map.to_dataset().contact_point.to_numpy()[2:15:4, ::5, 4:14:3]
     for triplet in TRIPLETS:
         if "Mx" in triplet:
-            assert np.isnan(vb.sensitivity(straight_map, triplet).sensitivity).all()
+            assert np.isnan(vb.sensitivity(straight_map, triplet, touched).sensitivity).all()
 
 
 def test_ellipsoids_are_those_of_the_covariance_of_estimates(gamma_map, nodes, rng):
@@ -210,21 +212,21 @@ def test_differences_come_nearer_on_a_finer_table(coarse, nodes, rng):
     )
     errors = []
     for contacts in (thinned, coarse):
-        found = vb.sensitivity(
-            contacts, at=points, method="differences", interpolation=LinearNDInterpolator
-        )
+        found = vb.sensitivity(contacts, at=points, method="differences", interpolation="linear")
         away = np.abs(found.sensitivity - exact) / np.abs(exact)
         errors.append(np.nanmedian(away))
     # In r, where both have the paper's 15 steps, neither is better.
     assert errors[1] < 0.85 * errors[0]
 
 
-def test_the_best_triplet_has_the_least_error(gamma_map, nodes):
-    found = vb.best_triplet(gamma_map, NOISE)
+def test_the_best_triplet_has_the_least_error(gamma_map, nodes, rng):
+    at = some(nodes, rng, 300).contact_point.transpose("contact", "space").to_numpy()
+    found = vb.best_triplet(gamma_map, NOISE, at)
     assert found.sizes["triplet"] == 20
     assert float(found.share.sum()) == pytest.approx(1.0)
+    one = vb.sensitivity(gamma_map, at=at, noise=NOISE)
     np.testing.assert_allclose(
-        found.predicted_error.sel(triplet="Fx MB MD"), nodes.predicted_error, rtol=1e-9
+        found.predicted_error.sel(triplet="Fx MB MD"), one.predicted_error, rtol=1e-9
     )
     least = found.predicted_error.min("triplet")
     for triplet in ("Fx MB MD", "Fx FT MD"):
@@ -233,11 +235,11 @@ def test_the_best_triplet_has_the_least_error(gamma_map, nodes):
             found.predicted_error.sel(triplet=triplet).to_numpy()[wins], least.to_numpy()[wins]
         )
     # Twice the noise is twice the error, and no other triplet.
-    louder = vb.best_triplet(gamma_map, 4.0 * NOISE)
+    louder = vb.best_triplet(gamma_map, 4.0 * NOISE, at)
     np.testing.assert_array_equal(louder.best, found.best)
     np.testing.assert_allclose(louder.median_error, 2.0 * found.median_error)
     # A sensor that is deaf to moments goes by forces.
-    deaf = vb.best_triplet(gamma_map, np.diag(np.repeat([1e-12, 1.0], 3)))
+    deaf = vb.best_triplet(gamma_map, np.diag(np.repeat([1e-12, 1.0], 3)), at)
     assert float(deaf.share.sel(triplet="Fx FT FD")) > 0.99
 
 
@@ -304,3 +306,32 @@ def test_bad_steps_and_no_triplets_are_refused(coarse):
         vb.sensitivity(coarse, method="differences", step=0.0)
     with pytest.raises(ValueError, match="at least one triplet"):
         vb.best_triplet(coarse, NOISE, triplets=[])
+
+
+def test_a_slice_holds_one_signal_and_is_exact(coarse):
+    found = signal_slice(coarse, points=24)
+    there = np.isfinite(found.r.to_numpy())
+    assert 0.2 < there.mean() < 0.95
+    points = found.contact_point.to_numpy()[there]
+    bent = vb.deflect(coarse.whisker, vb.PointContact(points))
+    signals = vb.base_signals(bent.force, bent.moment)
+    fx, mb = np.meshgrid(found.Fx, found.MB, indexing="ij")
+    assert found.r.dims == ("Fx", "MB")
+    # A point near rest tells its force no better than it is met.
+    strong = mb[there] > 1e-7
+    np.testing.assert_allclose(signals.MB[strong], mb[there][strong], rtol=1e-4)
+    np.testing.assert_allclose(signals.Fx[strong], fx[there][strong], rtol=1e-3, atol=2e-8)
+    np.testing.assert_allclose(signals.MD[strong], -0.5 * np.pi, atol=1e-4)
+    error = found.error_distance.to_numpy()[there]
+    assert 0.0 < np.nanmedian(error) < 2e-3
+    with pytest.raises(ValueError, match="to be fixed"):
+        signal_slice(coarse, {"Mx": 0.0})
+
+
+def test_contacts_between_the_grid_have_errors(coarse):
+    found = error_solid(coarse, stride=6)
+    assert np.isfinite(found.error_distance).sum() > 50
+    # On the grid itself there is none.
+    on_grid = vb.sensitivity(coarse, at="grid").isel(contact=slice(None, None, 97))
+    assert np.nanmedian(interpolation_errors(coarse, on_grid, interpolation="linear")) < 1e-8
+    assert np.nanmedian(found.error_distance) > 1e-5

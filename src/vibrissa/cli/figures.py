@@ -51,7 +51,7 @@ def figures(
         typer.Option(help="Critical cones by curvature and taper, NetCDF.", metavar="FILE"),
     ] = None,
 ) -> None:
-    """Draw the figures that a map allows: whisker, signals over the reachable space, surfaces.
+    """Draw the figures that a map allows: whisker, signals over space, surfaces, sensitivity.
 
     With a saved result of `vibrissa uniqueness` also the verdicts, the resolution and pairs of
     contacts that feel the same. Example: `vibrissa figures map.nc -o figures --width single`
@@ -116,6 +116,8 @@ def _drawings(
     yield "whisker", lambda: plots.whisker_views(line, radius, name=whisker.name, width=width)
     yield "signal_space", lambda: plots.signal_clouds(samples, line, width=width)
     yield "contact_surfaces", lambda: plots.contact_surfaces(samples, line, width=width)
+    yield "sensitivity", lambda: plots.sensitivity_panels(_derivatives(contacts), width=width)
+    yield "solid", lambda: plots.solid_slices(*_solid(contacts), width=width)
     if cones is not None:
         yield "critical_cones", lambda: plots.critical_cones(cones, width=width)
     if verdicts is None:
@@ -126,6 +128,20 @@ def _drawings(
     for name, pair in witnesses(whisker, verdicts):
         drawn = partial(plots.witness_pair, pair, width=width)
         yield f"witness_{name.replace(' ', '_')}", drawn
+
+
+def _derivatives(contacts: ContactMap) -> xr.Dataset:
+    """Derivatives at the paper's contacts, which fill the panels best, or at the map's."""
+    from vibrissa.mapping import sensitivity
+
+    return sensitivity(contacts, at=None if contacts.grid is None else "grid")
+
+
+def _solid(contacts: ContactMap) -> tuple[xr.Dataset, xr.Dataset | None]:
+    """The slice at M_D = −π/2, and all contacts with the errors of a look-up in the grid."""
+    from vibrissa.mapping import error_solid, signal_slice
+
+    return signal_slice(contacts), None if contacts.grid is None else error_solid(contacts)
 
 
 def witnesses(whisker: Whisker, verdicts: xr.Dataset) -> Iterator[tuple[str, xr.Dataset]]:

@@ -7,6 +7,7 @@ from vibrissa.mapping.estimator import Estimator, Located
 from vibrissa.mapping.findings import sensitivity_findings
 from vibrissa.mapping.natural import NaturalNeighbour
 from vibrissa.mapping.sensitivity import sensitivity
+from vibrissa.mapping.slices import error_solid, signal_slice
 from vibrissa.mapping.wrench import WrenchEstimate, estimate_from_wrench
 
 __all__ = [
@@ -17,7 +18,9 @@ __all__ = [
     "NaturalNeighbour",
     "WrenchEstimate",
     "best_triplet",
+    "error_solid",
     "estimate_from_wrench",
     "sensitivity",
     "sensitivity_findings",
+    "signal_slice",
 ]

@@ -10,14 +10,17 @@ what the exact derivatives are compared with.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, TypeAlias
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 import xarray as xr
-from scipy.interpolate import LinearNDInterpolator
 
+from vibrissa.mapping.natural import NaturalNeighbour
+from vibrissa.quantities import attributes
 from vibrissa.rod.arrays import Array
-from vibrissa.signals import CIRCULAR, SIGNALS
+from vibrissa.signals import CIRCULAR, SIGNALS, measured, selection
 from vibrissa.status import Status
 
 if TYPE_CHECKING:
@@ -28,15 +31,18 @@ STEP = 5e-4
 # Places within this share of a turn from ±π are repeated a turn away, so that the table closes.
 _OVERLAP = 0.08
 
-#: Takes places (n, 3) and values (n, 3); gives what takes places (m, 3) and gives values (m, 3).
-Interpolation: TypeAlias = Callable[[Array, Array], Callable[[Array], Array]]
+#: Natural-neighbour as the paper's, or linear, or what takes places (n, 3) and values (n, 3) and
+#: gives what takes other places (m, 3) and gives values (m, 3).
+Interpolation: TypeAlias = (
+    Literal["natural", "linear"] | Callable[[Array, Array], Callable[[Array], Array]]
+)
 
 
 def central_differences(
     contact_map: ContactMap,
     names: tuple[str, ...],
     contacts: xr.Dataset,
-    interpolation: Interpolation | None = None,
+    interpolation: Interpolation = "natural",
     step: float = STEP,
 ) -> Array:
     """Derivatives of (r, θ, φ) by central differences on the interpolated grid.
@@ -49,8 +55,8 @@ def central_differences(
         The three signals.
     contacts : Dataset
         Signals where derivatives are wanted, any shape.
-    interpolation : callable, optional
-        What interpolates; by default linear.
+    interpolation : {"natural", "linear"} or callable
+        What interpolates.
     step : float
         As a share of each signal's range.
 
@@ -64,36 +70,116 @@ def central_differences(
     ValueError
         If the map has no grid, or the step is not positive.
     """
-    if contact_map.grid is None:
-        raise ValueError("the map has no grid to interpolate: simulate it with grid=True")
     if not 0.0 < step < 1.0:
         raise ValueError(f"the step is a share of the range, above 0 and below 1; got {step}")
-    places, values = _table(contact_map.grid, names)
-    low, span = places.min(axis=0), np.ptp(places, axis=0)
-    circular = np.array([CIRCULAR[SIGNALS.index(name)] for name in names])
-    low, span = np.where(circular, -np.pi, low), np.where(circular, 2.0 * np.pi, span)
-    # A signal that is zero everywhere (M_x of a straight whisker) has no range and no derivatives.
-    if (span == 0.0).any():
-        return np.full((contacts[names[0]].size, 3, 3), np.nan)
-    closed, values = _closed((places - low) / span, values, circular)
-    look_up = (interpolation or LinearNDInterpolator)(closed, values)
-    wanted = np.stack([contacts[name].to_numpy().ravel() for name in names], axis=1)
-    wanted = (wanted - low) / span
-    out = np.full((len(wanted), 3, 3), np.nan)
+    table = _Table.of(contact_map, names, interpolation)
+    values, _, _ = measured(contacts, names)
+    out = np.full((values[..., 0].size, 3, 3), np.nan)
+    if table is None:
+        return out
+    wanted = table.places(values)
     rows = np.flatnonzero(np.isfinite(wanted).all(axis=1))
     for k in range(3):
         aside = step * np.eye(3)[k]
-        more, less = look_up(wanted[rows] + aside), look_up(wanted[rows] - aside)
-        out[rows, :, k] = (np.asarray(more) - np.asarray(less)) / (2.0 * step * span[k])
+        more, less = (table.look_up(wanted[rows] + side) for side in (aside, -aside))
+        out[rows, :, k] = (np.asarray(more) - np.asarray(less)) / (2.0 * step * table.span[k])
     return out
 
 
-def _table(grid: xr.Dataset, names: tuple[str, ...]) -> tuple[Array, Array]:
+def interpolation_errors(
+    contact_map: ContactMap,
+    contacts: xr.Dataset,
+    triplet: str | tuple[str, ...] = ("Fx", "MB", "MD"),
+    interpolation: Interpolation = "natural",
+) -> xr.DataArray:
+    """How far off contacts are that are looked up in the interpolated grid.
+
+    Parameters
+    ----------
+    contact_map : ContactMap
+        With the paper's grid.
+    contacts : Dataset
+        Contacts with their signals and ``contact_point``, such as :func:`vibrissa.sensitivity`
+        gives.
+    triplet : str or tuple of str
+        The three signals to look up.
+    interpolation : {"natural", "linear"} or callable
+        What interpolates.
+
+    Returns
+    -------
+    DataArray
+        ``error_distance``, m, over the contacts' dimensions; NaN outside the table.
+
+    Raises
+    ------
+    ValueError
+        If the map has no grid.
+    """
+    names = selection(triplet, exactly=3)
+    table = _Table.of(contact_map, names, interpolation)
+    values, dims, _ = measured(contacts, names)
+    error = np.full(values[..., 0].size, np.nan)
+    if table is not None:
+        wanted = table.places(values)
+        rows = np.flatnonzero(np.isfinite(wanted).all(axis=1))
+        r, theta, phi = np.asarray(table.look_up(wanted[rows])).T
+        along = (np.cos(phi) * np.cos(theta), np.cos(phi) * np.sin(theta), np.sin(phi))
+        true = contacts["contact_point"].transpose(*dims, "space").to_numpy().reshape(-1, 3)
+        error[rows] = np.linalg.norm(r[:, None] * np.stack(along, axis=1) - true[rows], axis=1)
+    return xr.DataArray(
+        error.reshape(values.shape[:-1]),
+        dims=dims,
+        name="error_distance",
+        attrs=attributes("error_distance"),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Table:
+    """The interpolated grid: signals over their ranges, (r, θ, φ) in between."""
+
+    low: Array
+    span: Array
+    look_up: Callable[[Array], Array]
+
+    @classmethod
+    def of(
+        cls, contact_map: ContactMap, names: tuple[str, ...], interpolation: Interpolation
+    ) -> _Table | None:
+        """Make it; None if a signal has no range, as M_x of a straight whisker."""
+        if contact_map.grid is None:
+            raise ValueError("the map has no grid to interpolate: simulate it with grid=True")
+        places, values = _reached(contact_map.grid, names)
+        circular = np.array([CIRCULAR[SIGNALS.index(name)] for name in names])
+        low = np.where(circular, -np.pi, places.min(axis=0))
+        span = np.where(circular, 2.0 * np.pi, np.ptp(places, axis=0))
+        if (span == 0.0).any():
+            return None
+        closed, values = _closed((places - low) / span, values, circular)
+        return cls(low, span, _interpolated(closed, values, interpolation))
+
+    def places(self, signals: Array) -> Array:
+        """Signals (..., 3) over their ranges, in rows (n, 3)."""
+        return np.asarray((signals.reshape(-1, 3) - self.low) / self.span)
+
+
+def _reached(grid: xr.Dataset, names: tuple[str, ...]) -> tuple[Array, Array]:
     """Signals (n, 3) and (r, θ, φ) (n, 3) of the grid's reachable contacts."""
     reached = grid["status"].to_numpy() == int(Status.OK)
     places = np.stack([grid[name].to_numpy()[reached] for name in names], axis=1)
     axes = np.meshgrid(*(grid[name].to_numpy() for name in ("r", "theta", "phi")), indexing="ij")
     return places, np.stack([a[reached] for a in axes], axis=1)
+
+
+def _interpolated(
+    places: Array, values: Array, interpolation: Interpolation
+) -> Callable[[Array], Array]:
+    if not isinstance(interpolation, str):
+        return interpolation(places, values)
+    if interpolation not in ("natural", "linear"):
+        raise ValueError(f"interpolation is 'natural' or 'linear'; got {interpolation!r}")
+    return partial(NaturalNeighbour(places, values, scale=np.ones(3)), method=interpolation)
 
 
 def _closed(places: Array, values: Array, circular: Array) -> tuple[Array, Array]:

@@ -43,7 +43,7 @@ def sensitivity(
     *,
     noise: Noise | None = None,
     method: Literal["exact", "differences"] = "exact",
-    interpolation: Interpolation | None = None,
+    interpolation: Interpolation = "natural",
     step: float = STEP,
 ) -> xr.Dataset:
     """Derivatives of the contact point with respect to the three signals that locate it.
@@ -64,9 +64,9 @@ def sensitivity(
         the error ellipsoids.
     method : {"exact", "differences"}
         Exact, or the paper's central differences on the interpolated grid.
-    interpolation : callable, optional
-        For differences: called as ``interpolation(places, values)``, it returns what is called with
-        other places. By default linear; the paper's is natural-neighbour.
+    interpolation : {"natural", "linear"} or callable
+        For differences: natural-neighbour as the paper's, or linear; or what, called as
+        ``interpolation(places, values)``, returns what is called with other places.
     step : float
         Of the differences, as a share of each signal's range; the paper's is 0.05 %.
 

@@ -4,7 +4,9 @@ from vibrissa.plots.clouds import signal_clouds
 from vibrissa.plots.contour import contour_views
 from vibrissa.plots.estimates import estimated_against_true
 from vibrissa.plots.evidence import critical_cones, resolution
+from vibrissa.plots.sensitivity import sensitivity_panels
 from vibrissa.plots.signals import signals_over_time
+from vibrissa.plots.slices import solid_slices
 from vibrissa.plots.style import save
 from vibrissa.plots.surfaces import contact_surfaces
 from vibrissa.plots.verdicts import verdict_table
@@ -18,9 +20,11 @@ __all__ = [
     "estimated_against_true",
     "resolution",
     "save",
+    "sensitivity_panels",
     "signal_clouds",
     "signals_over_time",
     "verdict_table",
+    "solid_slices",
     "whisker_views",
     "witness_pair",
 ]

@@ -275,6 +275,34 @@ def root(values: ArrayLike) -> Array:
     return np.asarray(np.sign(x) * np.sqrt(np.abs(x)))
 
 
+def scale_near_zero(axes: Axes, axis: str, limits: Array, width: float | None) -> None:
+    """Make an axis linear near zero and logarithmic beyond, with ticks at zero and powers of ten.
+
+    Parameters
+    ----------
+    axes : Axes
+        The panel.
+    axis : {"x", "y"}
+        Which axis.
+    limits : array (2,)
+        Its limits.
+    width : float or None
+        Up to where it is linear; None leaves it linear throughout.
+    """
+    panel: Any = axes  # what is chosen by name has no type
+    if width is not None:
+        getattr(panel, f"set_{axis}scale")("asinh", linear_width=width)
+    getattr(panel, f"set_{axis}lim")(*limits)
+    if width is not None:
+        first = int(np.ceil(np.log10(width)))
+        tens = 10.0 ** np.arange(first, first + 12)
+        at = [*(-t for t in tens[::-1] if -t >= limits[0]), 0.0]
+        at += [t for t in tens if t <= limits[1]]
+        at = [t for t in at if limits[0] <= t <= limits[1]]
+        getattr(panel, f"set_{axis}ticks")(at, [f"{t:g}".replace("-", "−") for t in at])
+        panel.minorticks_off()
+
+
 def save(
     figure: Figure, path_stem: str | Path, formats: Sequence[str] = ("png", "pdf")
 ) -> list[Path]:

@@ -1,0 +1,243 @@
+"""The nine derivatives of the contact point, each over its signal (the paper's Fig. 5)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
+
+from vibrissa.plots.style import (
+    BLUE,
+    INK,
+    MUTED,
+    ORANGE,
+    Array,
+    Mask,
+    Width,
+    looking,
+    new_figure,
+    robust_limits,
+    say,
+    scale_near_zero,
+)
+from vibrissa.quantities import axis_label, quantity, to_display
+
+COORDINATES = ("r", "theta", "phi")
+BINS = 50
+SHARE = 0.99
+_PAPER = ("MD", "MB", "Fx")
+_DIRECTIONS = ("FD", "MD")
+_FAINTEST = 0.15
+"""Opacity of a bin that holds next to nothing."""
+
+_CURVE_BINS = 20
+_HEIGHTS = {"single": 104.0, "double": 125.0}
+_SKEWED = 30.0
+"""Signals that reach so many times their lowest tenth get an axis that is wider near zero."""
+
+_LEAST = 0.01
+"""Share of the contacts of a side that a bin needs for its median to be drawn."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Contacts:
+    """Contacts outside the cone about rest, as rows: display units."""
+
+    signals: dict[str, Array]
+    derivatives: dict[tuple[str, str], Array]
+    weight: Array
+    backward: Mask
+
+
+def derivative_label(coordinate: str, signal: str) -> str:
+    r"""Label the axis of a derivative.
+
+    Parameters
+    ----------
+    coordinate, signal : str
+        Names of quantities.
+
+    Returns
+    -------
+    str
+        In mathtext, with the display units of both.
+
+    Examples
+    --------
+    >>> print(derivative_label("r", "MB"))
+    $\partial r/\partial M_B$ (mm per µN·m)
+    """
+    above, below = quantity(coordinate), quantity(signal)
+    unit = f"{above.display_unit} per {below.display_unit}"
+    return rf"$\partial {above.symbol}/\partial {below.symbol}$ ({unit})"
+
+
+def sensitivity_panels(data: xr.Dataset, *, width: Width = "double") -> Figure:
+    """Draw the derivatives of r, θ and φ with respect to three signals, over these signals.
+
+    Nine panels: a row for each coordinate, a column for each signal, in each the derivative over
+    the signal in 50 × 50 bins, the more opaque the more contacts (by the volume that they stand
+    for, if the dataset tells). Axes hold the central 99 % of the values; contacts within 2° of rest
+    are left out. A bin's colour tells concave forward from backward, mixed where both occur, and
+    lines are their medians. Signals that pile up near zero have an axis that is wider there.
+
+    Parameters
+    ----------
+    data : Dataset
+        From ``vibrissa.sensitivity``, SI units; ``at="grid"`` fills the panels best.
+    width : {"single", "double"}
+        How many columns wide.
+
+    Returns
+    -------
+    Figure
+        With derivatives in mm and degrees by µN, µN·m and degrees; or the sentence "no contacts".
+
+    Raises
+    ------
+    ValueError
+        If the dataset lacks the derivatives, the signals or the regions.
+    """
+    contacts = _contacts(data)
+    names = list(contacts.signals)
+    with looking():
+        figure = new_figure(width, _HEIGHTS.get(width, 0.0), "constrained")
+        if not contacts.weight.any():
+            say(figure, "no contacts")
+            return figure
+        panels = figure.subplots(3, 3, sharex="col", squeeze=False)
+        for i, coordinate in enumerate(COORDINATES):
+            for j, name in enumerate(names):
+                axes = panels[i, j]
+                _panel(axes, contacts, coordinate, name, small=width == "single")
+                letter = "abcdefghi"[3 * i + j]
+                axes.set_title(letter, loc="left", fontsize=8.0, fontweight="bold", pad=2.0)
+                if i == 2:
+                    axes.set_xlabel(axis_label(name))
+        labels = (("concave forward", BLUE), ("concave backward", ORANGE))
+        figure.legend(
+            handles=[Patch(color=colour, label=words) for words, colour in labels],
+            loc="outside upper center",
+            ncols=2,
+            borderpad=0.0,
+        )
+        return figure
+
+
+def _contacts(data: xr.Dataset) -> _Contacts:
+    if "sensitivity" not in data or "signal" not in data.coords:
+        raise ValueError("the data lack sensitivity: make them with vibrissa.sensitivity")
+    names = [str(name) for name in data["signal"].values]
+    missing = [
+        n for n in (*names, "small_deflection", "concave_backward") if n not in data.data_vars
+    ]
+    if missing:
+        raise ValueError(f"the data lack {', '.join(missing)}")
+    if set(names) == set(_PAPER):
+        names = list(_PAPER)
+    dims = data[names[0]].dims
+    weight = data["volume"] if "volume" in data else xr.ones_like(data[names[0]])
+    jacobian = data["sensitivity"].transpose(*dims, "coordinate", "signal")
+    known = jacobian.notnull().all(("coordinate", "signal"))
+    weight = weight.where(known & ~data["small_deflection"], 0.0)
+
+    def row(values: xr.DataArray) -> Array:
+        return np.asarray(values.transpose(*dims).to_numpy().ravel())
+
+    derivatives = {
+        (c, n): to_display(c, row(jacobian.sel(coordinate=c, signal=n)))
+        / quantity(n).display_factor
+        for c in COORDINATES
+        for n in names
+    }
+    signals = {n: to_display(n, row(data[n])) for n in names}
+    return _Contacts(
+        signals, derivatives, row(weight), np.asarray(row(data["concave_backward"]), dtype=bool)
+    )
+
+
+def _panel(axes: Axes, contacts: _Contacts, coordinate: str, name: str, *, small: bool) -> None:
+    kept = contacts.weight > 0.0
+    x, y = contacts.signals[name][kept], contacts.derivatives[coordinate, name][kept]
+    weight, backward = contacts.weight[kept], contacts.backward[kept]
+    direction = name in _DIRECTIONS
+    limits = np.array([-180.0, 180.0]) if direction else robust_limits(x, SHARE)
+    heights = robust_limits(y, SHARE)
+    bend = _bend(x, direction)
+    columns, rows = _edges(limits, BINS, bend), _edges(heights, BINS, None)
+    counts = [
+        np.histogram2d(x[side], y[side], (columns, rows), weights=weight[side])[0].T
+        for side in (~backward, backward)
+    ]
+    axes.axhline(0.0, color=MUTED, linewidth=0.5, zorder=0)
+    axes.pcolormesh(columns, rows, _blend(*counts), rasterized=True, linewidth=0.0)
+    edges = _edges(limits, _CURVE_BINS, bend)
+    for side, colour in ((~backward, BLUE), (backward, ORANGE)):
+        middle, curve = _medians(x[side], y[side], weight[side], edges)
+        axes.plot(middle, curve, color="white", linewidth=1.8)
+        axes.plot(middle, curve, color=_darker(colour), linewidth=0.9)
+    scale_near_zero(axes, "x", limits, bend)
+    axes.set_ylim(*heights)
+    _ticks(axes, direction, bend, small)
+    axes.set_ylabel(
+        derivative_label(coordinate, name), labelpad=1.0, fontsize=6.0 if small else 7.0
+    )
+
+
+def _bend(x: Array, direction: bool) -> float | None:
+    """Where an axis turns from linear to logarithmic; None where it stays linear."""
+    if direction:
+        return None
+    low, high = np.quantile(np.abs(x), [0.1, SHARE])
+    return float(low) if 0.0 < low * _SKEWED < high else None
+
+
+def _edges(limits: Array, bins: int, bend: float | None) -> Array:
+    """Edges of bins that look equally wide on the axis."""
+    low, high = limits if bend is None else np.arcsinh(limits / bend)
+    edges = np.linspace(float(low), float(high), bins + 1)
+    return edges if bend is None else np.asarray(bend * np.sinh(edges))
+
+
+def _blend(forward: Array, backward: Array) -> Array:
+    """Colours (n, m, 4) of bins: hue by the side, opacity by how much is in them."""
+    total = forward + backward
+    share = np.divide(backward, total, out=np.zeros_like(total), where=total > 0.0)[..., None]
+    out = np.zeros((*total.shape, 4))
+    out[..., :3] = (1.0 - share) * to_rgb(BLUE) + share * to_rgb(ORANGE)
+    # The square root shows the thin bins too.
+    strength = np.sqrt(total / max(float(np.quantile(total[total > 0.0], 0.98)), 1e-300))
+    out[..., 3] = np.where(total > 0.0, _FAINTEST + (1.0 - _FAINTEST) * np.minimum(strength, 1), 0)
+    return out
+
+
+def _darker(colour: str) -> Array:
+    return np.asarray(0.6 * np.array(to_rgb(colour)) + 0.4 * np.array(to_rgb(INK)))
+
+
+def _medians(x: Array, y: Array, weight: Array, edges: Array) -> tuple[Array, Array]:
+    """Middles of bins of x and weighted medians of y in them; NaN in bins with few."""
+    middle, curve = np.full((2, edges.size - 1), np.nan)
+    place = np.digitize(x, edges) - 1
+    for k in range(edges.size - 1):
+        rows = np.flatnonzero(place == k)
+        if weight[rows].sum() > _LEAST * weight.sum():
+            order = rows[np.argsort(y[rows])]
+            total = np.cumsum(weight[order])
+            middle[k] = np.median(x[rows])
+            curve[k] = y[order[np.searchsorted(total, 0.5 * total[-1])]]
+    return middle, curve
+
+
+def _ticks(axes: Axes, direction: bool, bend: float | None, small: bool) -> None:
+    if direction:
+        axes.set_xticks([-180.0, 0.0, 180.0] if small else [-180.0, -90.0, 0.0, 90.0, 180.0])
+    elif bend is None:
+        axes.xaxis.set_major_locator(MaxNLocator(3 if small else 5))
+    axes.yaxis.set_major_locator(MaxNLocator(4 if small else 5))

@@ -92,7 +92,7 @@ def test_a_map_gives_three_figures_and_verdicts_three_more(
     folder = tmp_path / "new" / "folder"
     said = run(chart, "-o", folder, "--uniqueness", saved, "--format", "pdf", "--width", "single")
     names = {
-        *("whisker", "signal_space", "contact_surfaces"),
+        *("whisker", "signal_space", "contact_surfaces", "sensitivity", "solid"),
         *("verdicts", "resolution", "witness_Fx_MB_MD"),
     }
     assert {file.name for file in folder.iterdir()} == {f"{name}.pdf" for name in names}

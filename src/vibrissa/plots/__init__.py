@@ -23,8 +23,8 @@ __all__ = [
     "sensitivity_panels",
     "signal_clouds",
     "signals_over_time",
-    "verdict_table",
     "solid_slices",
+    "verdict_table",
     "whisker_views",
     "witness_pair",
 ]

@@ -167,9 +167,9 @@ def _panel(axes: Axes, contacts: _Contacts, coordinate: str, name: str, *, small
     x, y = contacts.signals[name][kept], contacts.derivatives[coordinate, name][kept]
     weight, backward = contacts.weight[kept], contacts.backward[kept]
     direction = name in _DIRECTIONS
-    limits = np.array([-180.0, 180.0]) if direction else robust_limits(x, SHARE)
-    heights = robust_limits(y, SHARE)
-    bend = _bend(x, direction)
+    limits = np.array([-180.0, 180.0]) if direction else _limits(x, weight)
+    heights = _limits(y, weight)
+    bend = _bend(x, weight, direction)
     columns, rows = _edges(limits, BINS, bend), _edges(heights, BINS, None)
     counts = [
         np.histogram2d(x[side], y[side], (columns, rows), weights=weight[side])[0].T
@@ -190,11 +190,23 @@ def _panel(axes: Axes, contacts: _Contacts, coordinate: str, name: str, *, small
     )
 
 
-def _bend(x: Array, direction: bool) -> float | None:
+def _quantiles(values: Array, weight: Array, shares: list[float]) -> Array:
+    order = np.argsort(values)
+    total = np.cumsum(weight[order])
+    at = np.searchsorted(total, np.array(shares) * total[-1])
+    return np.asarray(values[order[np.minimum(at, values.size - 1)]])
+
+
+def _limits(values: Array, weight: Array) -> Array:
+    """Limits that hold the central share of the values; never equal."""
+    return robust_limits(_quantiles(values, weight, [0.5 - SHARE / 2, 0.5 + SHARE / 2]), 1.0)
+
+
+def _bend(x: Array, weight: Array, direction: bool) -> float | None:
     """Where an axis turns from linear to logarithmic; None where it stays linear."""
     if direction:
         return None
-    low, high = np.quantile(np.abs(x), [0.1, SHARE])
+    low, high = _quantiles(np.abs(x), weight, [0.1, SHARE])
     return float(low) if 0.0 < low * _SKEWED < high else None
 
 

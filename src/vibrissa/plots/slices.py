@@ -77,13 +77,16 @@ def solid_slices(
         raise ValueError(f"the slice lacks {', '.join(missing) or 'its two dimensions'}")
     names = [n for n in _PANELS if n in plane and np.isfinite(plane[n].values).any()]
     with looking():
-        tall = (98.0 if width == "double" else 158.0) if solid is not None else 90.0
+        shape = (1, 3) if solid is None and width == "double" and len(names) == 3 else (2, 2)
+        tall = 90.0 if shape == (2, 2) else 55.0
+        if solid is not None:
+            tall = 98.0 if width == "double" else 158.0
         figure = new_figure(width, tall, "constrained")
         if not names:
             say(figure, "no contacts")
             return figure
         if solid is None:
-            _slices(figure, plane, names, "abcd")
+            _slices(figure, plane, names, "abcd", shape)
             return figure
         if width == "double":
             parts = figure.subfigures(1, 2, squeeze=False, width_ratios=[1.0, 1.35])
@@ -94,8 +97,15 @@ def solid_slices(
         return figure
 
 
-def _slices(figure: Figure | SubFigure, plane: xr.Dataset, names: list[str], letters: str) -> None:
-    panels = figure.subplots(2, 2, sharex=True, sharey=True, squeeze=False).ravel()
+def _slices(
+    figure: Figure | SubFigure,
+    plane: xr.Dataset,
+    names: list[str],
+    letters: str,
+    shape: tuple[int, int] = (2, 2),
+) -> None:
+    grid = figure.subplots(*shape, sharex=True, sharey=True, squeeze=False)
+    panels = grid.ravel()
     # The dimension that is a size lies on the vertical axis, that with both signs on the other.
     dims = sorted(map(str, plane["r"].dims), key=lambda n: n in ("FT", "MB"))
     x, y = (to_display(n, plane[n].to_numpy()) for n in dims)
@@ -117,9 +127,9 @@ def _slices(figure: Figure | SubFigure, plane: xr.Dataset, names: list[str], let
             axes.pcolormesh(x, y, shade, cmap="gray", vmin=0.0, vmax=1.6, rasterized=True)
     for axes in panels[len(names) :]:
         axes.set_visible(False)
-    for axes in panels[2:]:
+    for axes in grid[-1]:
         axes.set_xlabel(axis_label(dims[0]))
-    for axes in panels[::2]:
+    for axes in grid[:, 0]:
         axes.set_ylabel(axis_label(dims[1]))
 
 
@@ -240,4 +250,5 @@ def _frame(axes: Any, names: tuple[str, str, str]) -> None:
         axis.set_label_text(axis_label(name), fontsize=6.0)
         axis.labelpad = pad
     axes.tick_params(labelsize=5.5, pad=-3.0)
+    axes.tick_params(axis="z", pad=0.0)
     axes.locator_params(nbins=4)

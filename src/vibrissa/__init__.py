@@ -22,6 +22,7 @@ if TYPE_CHECKING:
         estimate_from_wrench,
         sensitivity,
         sensitivity_findings,
+        uniqueness,
     )
     from vibrissa.rod import Deflection, PegContact, PointContact, PointForce, deflect
     from vibrissa.signals import base_signals
@@ -50,6 +51,7 @@ __all__ = [
     "samples",
     "sensitivity",
     "sensitivity_findings",
+    "uniqueness",
 ]
 
 _HOMES = {
@@ -70,6 +72,7 @@ _HOMES = {
     "load_whisker": "vibrissa.io",
     "sensitivity": "vibrissa.mapping",
     "sensitivity_findings": "vibrissa.mapping",
+    "uniqueness": "vibrissa.mapping",
 }
 _MODULES = {"samples"}
 

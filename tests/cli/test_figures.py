@@ -49,7 +49,7 @@ def verdicts(whisker):
     return xr.Dataset(
         {
             "verdict": (("triplet", "region"), np.array([["not unique"], ["unique"]])),
-            "ambiguous_share": (("triplet", "region", "tolerance"), np.zeros((2, 1, 2))),
+            "ambiguous_share": (("triplet", "region", "signal_tolerance"), np.zeros((2, 1, 2))),
             "witness_arc_length": ((*cell, "pair"), both(ARC)),
             "witness_contact_force": ((*cell, "pair", "component"), both(force)),
             "witness_separation": (cell, both(np.linalg.norm(point[1] - point[0]))),
@@ -61,7 +61,7 @@ def verdicts(whisker):
         {
             "triplet": ["Fx MB MD", "Mx MB MD"],
             "region": ["all"],
-            "tolerance": [1e-4, 1e-2],
+            "signal_tolerance": [1e-4, 1e-2],
             "component": ["fy", "fz"],
         },
     )

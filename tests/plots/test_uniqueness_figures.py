@@ -30,11 +30,11 @@ def verdicts() -> xr.Dataset:
         {
             "verdict": (cells, kind),
             "witness_separation": ((*cells, "witness"), apart),
-            "ambiguous_share": ((*cells, "tolerance"), share),
+            "ambiguous_share": ((*cells, "signal_tolerance"), share),
             "critical_cone": (cells, cone),
             "notation": ("triplet", [f"note {i}" for i in range(20)]),
         },
-        {"triplet": TRIPLETS, "region": REGIONS, "tolerance": TOLERANCES},
+        {"triplet": TRIPLETS, "region": REGIONS, "signal_tolerance": TOLERANCES},
         {"chosen_triplet": "Fx MB MD", "min_separation": 1e-3},
     )
 

@@ -8,6 +8,8 @@ from vibrissa.mapping.findings import sensitivity_findings
 from vibrissa.mapping.natural import NaturalNeighbour
 from vibrissa.mapping.sensitivity import sensitivity
 from vibrissa.mapping.slices import error_solid, signal_slice
+from vibrissa.mapping.summary import save_uniqueness, verdict_table
+from vibrissa.mapping.verdicts import uniqueness
 from vibrissa.mapping.wrench import WrenchEstimate, estimate_from_wrench
 
 __all__ = [
@@ -20,7 +22,10 @@ __all__ = [
     "best_triplet",
     "error_solid",
     "estimate_from_wrench",
+    "save_uniqueness",
     "sensitivity",
     "sensitivity_findings",
     "signal_slice",
+    "uniqueness",
+    "verdict_table",
 ]

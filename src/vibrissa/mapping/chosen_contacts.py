@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from vibrissa.rod.arrays import AnyArray, Array, IntArray
-from vibrissa.rod.batch import solve_forces
+from vibrissa.rod.batch import contact_tangents, solve_forces
 from vibrissa.rod.deflection import deflect
 from vibrissa.rod.loads import PointContact
 from vibrissa.rod.reach import determinant, with_normal_force
@@ -236,6 +236,6 @@ def _solved(
 
 def large_deflection(contact_map: ContactMap, chosen: ChosenContacts) -> AnyArray:
     """Whether the deflected whisker points back at each contact; False where there is none."""
-    d = contact_map.chart.discretization
-    with np.errstate(invalid="ignore"):
-        return np.asarray(contact_frames(d, chosen.values, chosen.contacts[:, 0])[:, 0, 0] < 0.0)
+    contacts = with_normal_force(chosen.contacts)
+    tangents = contact_tangents(contact_map.chart.discretization, contacts)
+    return np.asarray(tangents[:, 0] < 0.0)

@@ -21,11 +21,12 @@ from numpy.typing import ArrayLike
 
 from vibrissa.quantities import attributes
 from vibrissa.rod.arrays import AnyArray, Array
+from vibrissa.rod.batch import contact_tangents
 from vibrissa.rod.deflection import deflect
 from vibrissa.rod.discretize import STEPS
 from vibrissa.rod.loads import PointContact
 from vibrissa.rod.preimage import Preimages
-from vibrissa.rod.reach import CELLS, PROXIMAL, Reach, reach
+from vibrissa.rod.reach import CELLS, PROXIMAL, Reach, reach, with_normal_force
 from vibrissa.signals import base_signals, concave_backward, selection, within_cone
 from vibrissa.status import Status, flag_attributes
 from vibrissa.whisker import Whisker
@@ -287,6 +288,8 @@ def _dataset(whisker: Whisker, chart: Reach) -> xr.Dataset:
     per_unknown = np.array([d.length, d.force, d.force])
     space = (*dims, "space")
     ball = spherical(point)
+    xi = with_normal_force(chart.contacts.reshape(-1, 3))
+    tangent = contact_tangents(d, xi).reshape(point.shape)
     data: dict[str, Any] = {
         "arc_length": (dims, chart.contacts[..., 0] * d.length, attributes("arc_length")),
         "contact_point": (space, point, attributes("contact_point_whisker")),
@@ -315,6 +318,7 @@ def _dataset(whisker: Whisker, chart: Reach) -> xr.Dataset:
         ),
         "small_deflection": (dims, within_cone(whisker, point), _label("within 2° of rest")),
         "concave_backward": (dims, concave_backward(whisker, point), _label("CB, not CF")),
+        "large_deflection": (dims, tangent[..., 0] < 0.0, _label("tangent at contact points back")),
         "status": (
             dims,
             np.full(point.shape[:3], int(Status.OK)),

@@ -51,9 +51,9 @@ def resolution(verdicts: xr.Dataset, *, width: Width = "double") -> Figure:
     Parameters
     ----------
     verdicts : Dataset
-        As of ``vibrissa.uniqueness``: ``ambiguous_share`` over (triplet, region, tolerance), the
-        tolerances as shares of each signal's range; with the attribute ``min_separation``, m, if
-        known.
+        As of ``vibrissa.uniqueness``: ``ambiguous_share`` over (triplet, region,
+        signal_tolerance), the tolerances as shares of each signal's range; with the attribute
+        ``min_separation``, m, if known.
     width : {"single", "double"}
         Columns of the page.
 
@@ -67,13 +67,13 @@ def resolution(verdicts: xr.Dataset, *, width: Width = "double") -> Figure:
     ValueError
         If there are no such shares.
     """
-    dims = {"triplet", "region", "tolerance"}
+    dims = {"triplet", "region", "signal_tolerance"}
     if "ambiguous_share" not in verdicts or set(verdicts["ambiguous_share"].dims) != dims:
         raise ValueError(
-            "the dataset has no ambiguous_share over triplet, region and tolerance; that of "
+            "the dataset has no ambiguous_share over triplet, region and signal_tolerance; that of "
             "vibrissa.uniqueness is needed"
         )
-    share = verdicts["ambiguous_share"].transpose("region", "triplet", "tolerance")
+    share = verdicts["ambiguous_share"].transpose("region", "triplet", "signal_tolerance")
     across = 3 if width == "double" else 2
     down = -(-share.sizes["region"] // across)
     with looking():
@@ -94,7 +94,7 @@ def resolution(verdicts: xr.Dataset, *, width: Width = "double") -> Figure:
 
 
 def _shares(axes: Axes, share: xr.DataArray) -> None:
-    tolerance = share["tolerance"].values
+    tolerance = share["signal_tolerance"].values
     axes.set(xscale="log", ylim=(-3.0, 103.0))
     axes.set_yticks([0.0, 25.0, 50.0, 75.0, 100.0])
     axes.xaxis.set_minor_locator(NullLocator())

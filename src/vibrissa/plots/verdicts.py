@@ -14,6 +14,9 @@ from vibrissa.plots.style import BLUE, INK, MUTED, SHADE, Width, looking, new_fi
 from vibrissa.quantities import quantity, to_display
 
 VERDICTS = ("unique", "unique off a surface", "not unique")
+EMPTY = "no contacts"
+"""The verdict on a region without contacts: nothing is drawn."""
+
 _ROW = 4.2
 """Height of a row, mm."""
 
@@ -39,7 +42,7 @@ def verdict_table(verdicts: xr.Dataset, *, width: Width = "double") -> Figure:
     verdicts : Dataset
         As of ``vibrissa.uniqueness``: ``verdict`` over (triplet, region); with ``notation``
         (triplet), ``witness_separation`` (triplet, region, witness), ``critical_cone`` (triplet,
-        region), ``ambiguous_share`` (triplet, region, tolerance) and the attribute
+        region), ``ambiguous_share`` (triplet, region, signal_tolerance) and the attribute
         ``chosen_triplet``, if known.
     width : {"single", "double"}
         Columns of the page.
@@ -77,7 +80,7 @@ def _check(verdicts: xr.Dataset) -> None:
             "the dataset has no verdict over triplet and region; that of vibrissa.uniqueness "
             "is needed"
         )
-    unknown = sorted(set(map(str, verdicts["verdict"].values.ravel())) - set(VERDICTS))
+    unknown = sorted(set(map(str, verdicts["verdict"].values.ravel())) - {*VERDICTS, EMPTY})
     if unknown:
         raise ValueError(f"unknown verdicts {unknown}; allowed are {', '.join(VERDICTS)}")
 
@@ -146,6 +149,8 @@ def _row(axes: Axes, verdict: xr.Dataset, i: int, chosen: bool, width: Width, pa
 
 
 def _symbol(axes: Axes, x: float, y: float, kind: str) -> None:
+    if kind == EMPTY:
+        return
     size = 1.15
     colour = MUTED if kind == "not unique" else BLUE
     axes.add_patch(Circle((x, y), size, facecolor="white", edgecolor=colour, linewidth=0.7))
@@ -173,8 +178,8 @@ def _evidence(axes: Axes, verdict: xr.Dataset, left: float, y: float) -> None:
         axes.text(left + 8.5, y, text, ha="right", **look)
     if "ambiguous_share" in verdict:
         share = verdict["ambiguous_share"].sel(region="all")
-        nearest = int(np.argmin(np.abs(np.log(share["tolerance"].values / _TOLERANCE))))
-        value = float(share.isel(tolerance=nearest))
+        nearest = int(np.argmin(np.abs(np.log(share["signal_tolerance"].values / _TOLERANCE))))
+        value = float(share.isel(signal_tolerance=nearest))
         if np.isfinite(value):
             axes.barh(y, 9.0 * value, 0.35 * _ROW, left + 14.0, color=MUTED)
             axes.text(left + 14.6 + 9.0 * value, y, f"{100.0 * value:.0f} %", **look)

@@ -11,7 +11,7 @@ import numpy as np
 
 from vibrissa.rod.arrays import Array
 from vibrissa.rod.discretize import Discretization
-from vibrissa.rod.kernels import evaluate
+from vibrissa.rod.kernels import carry_tangents, evaluate
 
 # Below this many rows starting a thread costs more than it saves.
 _SERIAL = 256
@@ -79,3 +79,27 @@ def solve_forces(
     rod = discretization.rod
     share_out(n, lambda first, last: evaluate(rod, contacts, values, derivatives, first, last))
     return values, derivatives
+
+
+def contact_tangents(discretization: Discretization, contacts: Array) -> Array:
+    """Unit tangents of the deflected whisker at its contacts, base frame.
+
+    Parameters
+    ----------
+    discretization : Discretization
+        The whisker.
+    contacts : (n, 4) array
+        s_c and (f_x, f_y, f_z) in the material frame at the contact, non-dimensional.
+
+    Returns
+    -------
+    (n, 3) array
+        Tangents; NaN for rows with NaN.
+    """
+    contacts = np.ascontiguousarray(contacts, dtype=np.float64)
+    tangents = np.empty((len(contacts), 3))
+    rod = discretization.rod
+    share_out(
+        len(contacts), lambda first, last: carry_tangents(rod, contacts, tangents, first, last)
+    )
+    return tangents

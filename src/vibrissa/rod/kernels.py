@@ -291,6 +291,22 @@ def lane_tangents(b: Array, i: int, tangents: Array) -> None:
             tangents[row, j] = b[_TANGENT + (6 * j + row) * LANES + i]
 
 
+@inlined
+def _carry_step(b: Array, row: int) -> None:
+    """Take the same step with a vector that is fixed in space: v' = v × u in the material frame."""
+    for i in range(LANES):
+        h, v = b[_H + i], _get(b, row, i)
+        u = 6 * LANES
+        v1 = _cross(v, _get(b, u, i))
+        v2 = _cross(_y2(v, h, v1), _get(b, _STAGE + u, i))
+        v3 = _cross(_y3(v, h, v2), _get(b, 2 * _STAGE + u, i))
+        v4 = _cross(_y4(v, h, v1, v2, v3), _get(b, 3 * _STAGE + u, i))
+        v5 = _cross(_y5(v, h, v1, v2, v3, v4), _get(b, 4 * _STAGE + u, i))
+        v6 = _cross(_y6(v, h, v2, v3, v4, v5), _get(b, 5 * _STAGE + u, i))
+        v7 = _cross(_y7(v, h, v1, v2, v3, v4, v6), _get(b, 6 * _STAGE + u, i))
+        _put(b, row, i, _advance(v, h, v1, v3, v4, v5, v6, v7))
+
+
 @kernel
 def integrate(rod: Rod, b: Array, tangents: bool) -> None:
     """Integrate every lane from its contact to the base, with its three tangents if asked."""
@@ -339,3 +355,32 @@ def evaluate(
             lane_value(b, i, values[row + i])
             if wanted:
                 lane_tangents(b, i, tangents[row + i])
+
+
+@kernel
+def carry_tangents(rod: Rod, contacts: Array, tangents: Array, first: int, last: int) -> None:
+    """Unit tangents of the deflected whisker at its contacts, in the base frame.
+
+    Parameters
+    ----------
+    rod : tuple of arrays
+        See :class:`vibrissa.rod.discretize.Discretization`.
+    contacts : (n, 4) array
+        s_c and the force (f_x, f_y, f_z) in the material frame at the contact.
+    tangents : (n, 3) array
+        Filled.
+    first, last : int
+        The rows to do.
+    """
+    b = np.zeros(BUFFER_SIZE)
+    for row in range(first, last, LANES):
+        for i in range(LANES):
+            j = min(row + i, last - 1)
+            set_lane(b, i, contacts[j, 0], contacts[j, 1], contacts[j, 2], contacts[j, 3], True)
+            _put(b, _TANGENT, i, (1.0, 0.0, 0.0))
+        for k in range(rod[0].shape[0] - 1, -1, -1):
+            _value_step(rod, b, k, True)
+            _carry_step(b, _TANGENT)
+        for i in range(min(LANES, last - row)):
+            for j in range(3):
+                tangents[row + i, j] = b[_TANGENT + j * LANES + i]

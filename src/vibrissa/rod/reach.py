@@ -314,3 +314,34 @@ def chart_to_contact(fold: Fold, chart: Array, xi: Array) -> None:
 def _contacts_at(fold: Fold, chart: Array, contacts: Array) -> None:
     for i in range(chart.shape[0]):
         chart_to_contact(fold, chart[i], contacts[i])
+
+
+def chart_of(fold: Fold, contacts: Array) -> Array:
+    """Turn contacts ξ (n, 3) into chart coordinates (η, ψ, ρ), shape (n, 3)."""
+    chart = np.empty((len(contacts), 3))
+    _chart_of(fold, np.ascontiguousarray(contacts), chart)
+    return chart
+
+
+def fold_forces(fold: Fold, contacts: Array) -> Array:
+    """Fold force (n,) at the arc length and bearing of contacts ξ (n, 3), non-dimensional."""
+    forces = np.empty(len(contacts))
+    _fold_forces_at(fold, np.ascontiguousarray(contacts), forces)
+    return forces
+
+
+@kernel
+def _chart_of(fold: Fold, contacts: Array, chart: Array) -> None:
+    for i in range(contacts.shape[0]):
+        s, fy, fz = contacts[i, 0], contacts[i, 1], contacts[i, 2]
+        psi = np.arctan2(fz, fy)
+        chart[i, 0] = along(fold[0], s)
+        chart[i, 1] = psi
+        chart[i, 2] = np.sqrt(np.hypot(fy, fz) / fold_force(fold, s, psi))
+
+
+@kernel
+def _fold_forces_at(fold: Fold, contacts: Array, forces: Array) -> None:
+    for i in range(contacts.shape[0]):
+        psi = np.arctan2(contacts[i, 2], contacts[i, 1])
+        forces[i] = fold_force(fold, contacts[i, 0], psi)

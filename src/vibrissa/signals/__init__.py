@@ -9,16 +9,28 @@ from vibrissa.signals.base import (
     measured,
     signal_scales,
 )
-from vibrissa.signals.regions import concave_backward, nearest_on_rest, within_cone
+from vibrissa.signals.regions import (
+    CONE,
+    REGIONS,
+    concave_backward,
+    cone_angle,
+    in_region,
+    nearest_on_rest,
+    within_cone,
+)
 from vibrissa.signals.triplets import TRIPLETS, selection
 
 __all__ = [
     "CIRCULAR",
+    "CONE",
+    "REGIONS",
     "SIGNALS",
     "TRIPLETS",
     "Coordinates",
     "base_signals",
     "concave_backward",
+    "cone_angle",
+    "in_region",
     "labelled_wrench",
     "measured",
     "nearest_on_rest",

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 #: Half angle of the cone that the paper leaves out, rad.
 CONE = np.deg2rad(2.0)
+#: The regions, from the largest to the smallest; ELD is "excluding large deflections".
+REGIONS = ("all", "ELD", "CF", "CB", "ELD CF", "ELD CB")
 _SAMPLES = 2049
 
 
@@ -70,6 +72,54 @@ def nearest_on_rest(whisker: Whisker, points: Array) -> tuple[Array, Array]:
     return distance.reshape(points.shape[:-1]), arc_length.reshape(points.shape[:-1])
 
 
+def in_region(region: str, backward: AnyArray, large: AnyArray) -> AnyArray:
+    """Whether contacts belong to a region.
+
+    Parameters
+    ----------
+    region : str
+        One of :data:`REGIONS`.
+    backward : (...) bool array
+        Whether they are concave backward; see :func:`concave_backward`.
+    large : (...) bool array
+        Whether their deflection is large.
+
+    Returns
+    -------
+    (...) bool array
+        True for those in the region.
+    """
+    if region not in REGIONS:
+        raise ValueError(f"a region is one of {', '.join(REGIONS)}; got {region!r}")
+    inside = np.ones(np.shape(backward), dtype=bool)
+    if "ELD" in region:
+        inside &= ~large
+    if "CF" in region:
+        inside &= ~backward
+    if "CB" in region:
+        inside &= backward
+    return inside
+
+
+def cone_angle(whisker: Whisker, points: Array) -> Array:
+    """Half angle of the cone about the resting whisker on which contact points lie.
+
+    Parameters
+    ----------
+    whisker : Whisker
+        The whisker.
+    points : (..., 3) array
+        Contact points in the whisker frame, m.
+
+    Returns
+    -------
+    (...) array
+        The angle whose tangent is the distance from the resting whisker over the arc length of the
+        nearest place on it, rad; NaN for NaN.
+    """
+    return np.asarray(np.arctan2(*nearest_on_rest(whisker, points)))
+
+
 def within_cone(whisker: Whisker, points: Array, angle: float = CONE) -> AnyArray:
     """Whether contact points lie within a cone about the resting whisker.
 
@@ -87,8 +137,7 @@ def within_cone(whisker: Whisker, points: Array, angle: float = CONE) -> AnyArra
     (...) bool array
         True inside; False for NaN.
     """
-    distance, arc_length = nearest_on_rest(whisker, points)
-    return np.asarray(distance < arc_length * np.tan(angle))
+    return np.asarray(cone_angle(whisker, points) < angle)
 
 
 def concave_backward(whisker: Whisker, points: Array) -> AnyArray:

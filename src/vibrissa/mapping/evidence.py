@@ -1,0 +1,290 @@
+"""Evidence on one triplet of signals, on which its verdicts rest.
+
+Samples spread over Ω are inverted exactly, which finds all twins of each; an evolution from the
+best of them looks for twins farther from rest. The *critical cone* of a region is the smallest cone
+about the resting whisker that all pairs of twins touch. The resolution comes from inverting signals
+moved by a tolerance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vibrissa.mapping.folds import Local, local_evidence
+from vibrissa.mapping.places import Domain, Samples, sample, spread
+from vibrissa.mapping.resolution import TOLERANCES, ambiguous
+from vibrissa.mapping.twins import (
+    Pairs,
+    better_twins,
+    fibres,
+    joined,
+    rank_deficient,
+    triplet_derivatives,
+    twins,
+    units,
+)
+from vibrissa.rod.arrays import AnyArray, Array
+from vibrissa.signals import CIRCULAR, SIGNALS
+
+if TYPE_CHECKING:
+    from vibrissa.mapping.contact_map import ContactMap
+
+UNIQUE, OFF_SURFACE, NOT_UNIQUE, EMPTY = (
+    "unique",
+    "unique off a surface",
+    "not unique",
+    "no contacts",
+)
+#: How many witnesses of each cell are kept.
+WITNESSES = 3
+# So many times more the regions without witnesses are searched.
+_AGAIN = 4
+# So many times the samples are looked at for signs of a fold: that costs little.
+_WIDER = 8
+# So many of the samples tell the resolution.
+_PROBED = 512
+# Fibres are followed from so many contacts of each region.
+_FOLLOWED = 24
+# A whisker is planar if it leaves the x-y plane by no more than this share of its length.
+_PLANAR = 1e-9
+# A triplet has lost a dimension if it has at all but this share of the contacts.
+_LOST = 0.99
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is asked."""
+
+    contacts: ContactMap
+    regions: tuple[str, ...]
+    separation: float
+    cone: float
+    domain: Domain
+    samples: Samples
+    wide: Samples
+    unit: Array
+    span: Array
+    probed: AnyArray
+    plane: Samples | None
+    seed: int
+
+    def volumes(self) -> Array:
+        """Share of the contact points' space, outside the cone, that each region takes."""
+        places, volume = self.samples.places, self.samples.volume
+        outside = volume * (places.inside & (places.angle > self.cone))
+        parts = [float((outside * places.members(r)).sum()) for r in self.regions]
+        return np.array(parts) / float(outside.sum())
+
+
+@dataclass
+class Answer:
+    """What one triplet gives, region by region."""
+
+    verdict: list[str]
+    critical_cone: Array
+    local: Local
+    twin_share: Array
+    ambiguous: Array
+    surface_angle: Array
+    witnesses: list[Pairs]
+
+
+def ask(
+    contacts: ContactMap,
+    regions: tuple[str, ...],
+    separation: float,
+    cone: float,
+    domain: Domain,
+    number: int,
+    seed: int,
+) -> Question:
+    """Spread samples over Ω and find what all triplets share."""
+    wide = sample(contacts, spread(_WIDER * number, seed), domain)
+    samples = wide.rows(slice(len(wide.chart) // _WIDER))
+    signals = samples.places.signals
+    span = np.ptp(signals, axis=0)
+    span[list(CIRCULAR)] = 2.0 * np.pi
+    probed = np.flatnonzero(samples.places.inside & (samples.places.angle > cone))[:_PROBED]
+    plane = None
+    z = contacts.whisker.centerline(101)[:, 2]
+    if np.abs(z).max() <= _PLANAR * contacts.whisker.length:
+        chart = spread(256, seed)
+        chart[:, 1] = np.where(chart[:, 1] < np.pi, 0.0, np.pi)
+        plane = sample(contacts, chart, domain)
+    unit = units(contacts, samples.places.contacts)
+    return Question(
+        contacts, regions, separation, cone, domain, samples, wide, unit, span, probed, plane, seed
+    )
+
+
+def answer(question: Question, names: tuple[str, ...], resolution: bool) -> Answer:
+    """All evidence on one triplet."""
+    samples, span = question.samples, question.span[[SIGNALS.index(name) for name in names]]
+    by_contact = triplet_derivatives(question.wide.places.values, question.wide.tangents, names)
+    here = by_contact[: len(samples.chart)]
+    lost = bool(rank_deficient(here, question.unit, span).mean() > _LOST)
+    local = local_evidence(question.wide, by_contact, question.regions, question.cone, lost)
+    on_surface = None
+    if lost:
+        tried = _some(question, samples)
+        start = samples.rows(tried)
+        pool = fibres(question.contacts, names, start.chart, start.places, question.domain)
+        own = pool._replace(sample=tried[pool.sample])
+    else:
+        tried = np.arange(len(samples.chart))
+        own = twins(question.contacts, names, samples.chart, samples.places, question.domain)
+        pool = _searched(question, names, own, local.beside)
+        on_surface = _on_plane(question, names, span)
+    own, pool = (p.rows(p.apart >= question.separation) for p in (own, pool))
+    twin = _twinned(question, own)
+    cells = [_judge(question, pool, on_surface, region) for region in question.regions]
+    verdict = [word for word, _ in cells]
+    probed, hit = tried, twin[None, :, tried]
+    if resolution and not lost:
+        probed = question.probed
+        hit = ambiguous(
+            question.contacts,
+            names,
+            samples.places.rows(probed),
+            twin[:, probed],
+            span,
+            question.regions,
+            question.separation,
+            question.cone,
+            question.domain,
+        )
+    shares, surface_angle = _shares(question, hit if resolution else None, probed, verdict)
+    return Answer(
+        verdict=verdict,
+        critical_cone=np.array(
+            [pool.angle[pool.members(r)].max(initial=0.0) for r in question.regions]
+        ),
+        local=local,
+        twin_share=_weighted(question, twin[:, tried], tried),
+        ambiguous=shares,
+        surface_angle=surface_angle,
+        witnesses=[witnesses for _, witnesses in cells],
+    )
+
+
+def _searched(question: Question, names: tuple[str, ...], own: Pairs, beside: AnyArray) -> Pairs:
+    """Better twins than those of the samples, from these and from contacts beside folds.
+
+    Regions that seem to have none outside the cone are searched again and again.
+    """
+    start = question.wide.rows(beside)
+    more = twins(question.contacts, names, start.chart, start.places, question.domain)
+    pool = joined([own, more])
+    rng = np.random.default_rng(question.seed)
+    regions = question.regions
+    for _ in range(1 + _AGAIN):
+        found = better_twins(
+            question.contacts, names, pool, regions, question.separation, question.domain, rng
+        )
+        pool = joined([pool, found])
+        far = pool.apart >= question.separation
+        regions = tuple(
+            region
+            for region in regions
+            if pool.angle[far & pool.members(region)].max(initial=0.0) <= question.cone
+        )
+        if not regions:
+            break
+    return pool
+
+
+def _judge(
+    question: Question, pool: Pairs, on_surface: Pairs | None, region: str
+) -> tuple[str, Pairs]:
+    """The verdict on a region, and its witnesses."""
+    if not question.wide.places.members(region).any():
+        return EMPTY, pool.rows(np.zeros(0, dtype=np.int64))
+    found = _chosen(question, pool, region)
+    if len(found.apart):
+        return NOT_UNIQUE, found
+    if on_surface is not None:
+        degenerate = _chosen(question, on_surface, region)
+        if len(degenerate.apart):
+            return OFF_SURFACE, degenerate
+    return UNIQUE, found
+
+
+def _some(question: Question, samples: Samples) -> AnyArray:
+    """A few samples outside the cone, of every region."""
+    outside = samples.places.angle > question.cone
+    rows: set[int] = set()
+    for region in question.regions:
+        rows.update(np.flatnonzero(samples.places.members(region) & outside)[:_FOLLOWED].tolist())
+    return np.array(sorted(rows), dtype=np.int64)
+
+
+def _on_plane(question: Question, names: tuple[str, ...], span: Array) -> Pairs | None:
+    """Pairs in the plane of a planar whisker, if the triplet loses a dimension there."""
+    if question.plane is None:
+        return None
+    plane = question.plane
+    by_contact = triplet_derivatives(plane.places.values, plane.tangents, names)
+    unit = units(question.contacts, plane.places.contacts)
+    if rank_deficient(by_contact, unit, span).mean() <= _LOST:
+        return None
+    rows = _some(question, plane)
+    found = fibres(
+        question.contacts, names, plane.chart[rows], plane.places.rows(rows), question.domain
+    )
+    return found.rows(found.apart >= question.separation)
+
+
+def _chosen(question: Question, pairs: Pairs, region: str) -> Pairs:
+    """The witnesses of a region that are farthest apart, none near another."""
+    rows = np.flatnonzero(pairs.members(region) & (pairs.angle > question.cone))
+    rows = rows[np.argsort(-pairs.apart[rows], kind="stable")]
+    points = pairs.first.values[:, 3:]
+    kept: list[int] = []
+    for row in rows.tolist():
+        away = np.linalg.norm(points[kept] - points[row], axis=1)
+        if (away >= question.separation).all():
+            kept.append(row)
+        if len(kept) == WITNESSES:
+            break
+    return pairs.rows(np.array(kept, dtype=np.int64))
+
+
+def _twinned(question: Question, pairs: Pairs) -> AnyArray:
+    """Whether each sample has an exact twin in its region, outside the cone: (regions, n)."""
+    out = np.zeros((len(question.regions), len(question.samples.chart)), dtype=bool)
+    for i, region in enumerate(question.regions):
+        out[i, pairs.sample[pairs.members(region) & (pairs.angle > question.cone)]] = True
+    return out
+
+
+def _weighted(question: Question, hit: AnyArray, rows: AnyArray) -> Array:
+    """Share of each region's volume outside the cone, (..., regions), that is hit."""
+    places, volume = question.samples.places.rows(rows), question.samples.volume[rows]
+    outside = places.angle > question.cone
+    out = np.full(hit.shape[:-1], np.nan)
+    for i, region in enumerate(question.regions):
+        weight = volume * (places.members(region) & outside)
+        if weight.sum() > 0.0:
+            out[..., i] = (hit[..., i, :] * weight).sum(axis=-1) / weight.sum()
+    return out
+
+
+def _shares(
+    question: Question, probed: AnyArray | None, rows: AnyArray, verdict: list[str]
+) -> tuple[Array, Array]:
+    """Ambiguous shares (tolerances, regions), and elevations from the surface they reach to."""
+    shape = (len(TOLERANCES), len(question.regions))
+    shares, elevation = np.full(shape, np.nan), np.full(shape, np.nan)
+    if probed is None:
+        return shares, elevation
+    hit = np.broadcast_to(probed, (*shape, rows.size))
+    shares = _weighted(question, hit, rows)
+    points = question.samples.places.values[rows, 3:]
+    above = np.arcsin(np.abs(points[:, 2]) / np.linalg.norm(points, axis=1))
+    for i, word in enumerate(verdict):
+        if word == OFF_SURFACE:
+            elevation[:, i] = (hit[:, i] * above).max(axis=1, initial=0.0)
+    return shares, elevation

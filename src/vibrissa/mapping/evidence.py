@@ -9,22 +9,20 @@ moved by a tolerance.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from vibrissa.mapping.fibres import deficient, fibres
 from vibrissa.mapping.folds import Local, local_evidence
 from vibrissa.mapping.places import Domain, Samples, sample, spread
 from vibrissa.mapping.resolution import TOLERANCES, ambiguous
 from vibrissa.mapping.twins import (
     Pairs,
     better_twins,
-    fibres,
     joined,
-    rank_deficient,
     triplet_derivatives,
     twins,
-    units,
 )
 from vibrissa.rod.arrays import AnyArray, Array
 from vibrissa.signals import CIRCULAR, SIGNALS
@@ -50,8 +48,6 @@ _PROBED = 512
 _FOLLOWED = 24
 # A whisker is planar if it leaves the x-y plane by no more than this share of its length.
 _PLANAR = 1e-9
-# A triplet has lost a dimension if it has at all but this share of the contacts.
-_LOST = 0.99
 
 
 @dataclass(frozen=True)
@@ -65,7 +61,6 @@ class Question:
     domain: Domain
     samples: Samples
     wide: Samples
-    unit: Array
     span: Array
     probed: AnyArray
     plane: Samples | None
@@ -90,6 +85,7 @@ class Answer:
     ambiguous: Array
     surface_angle: Array
     witnesses: list[Pairs]
+    steps: list[int]
 
 
 def ask(
@@ -114,24 +110,32 @@ def ask(
         chart = spread(256, seed)
         chart[:, 1] = np.where(chart[:, 1] < np.pi, 0.0, np.pi)
         plane = sample(contacts, chart, domain)
-    unit = units(contacts, samples.places.contacts)
     return Question(
-        contacts, regions, separation, cone, domain, samples, wide, unit, span, probed, plane, seed
+        contacts, regions, separation, cone, domain, samples, wide, span, probed, plane, seed
     )
+
+
+class _Cell(NamedTuple):
+    """A verdict, its witnesses, and the integration steps with which these agree."""
+
+    verdict: str
+    witnesses: Pairs
+    steps: int
 
 
 def answer(question: Question, names: tuple[str, ...], resolution: bool) -> Answer:
     """All evidence on one triplet."""
     samples, span = question.samples, question.span[[SIGNALS.index(name) for name in names]]
     by_contact = triplet_derivatives(question.wide.places.values, question.wide.tangents, names)
-    here = by_contact[: len(samples.chart)]
-    lost = bool(rank_deficient(here, question.unit, span).mean() > _LOST)
-    local = local_evidence(question.wide, by_contact, question.regions, question.cone, lost)
+    lost = deficient(question.contacts, names, samples.places.contacts[:_PROBED], span)
+    local = local_evidence(
+        question.wide, by_contact, question.regions, question.cone, lost is not None
+    )
     on_surface = None
-    if lost:
+    if lost is not None:
         tried = _some(question, samples)
         start = samples.rows(tried)
-        pool = fibres(question.contacts, names, start.chart, start.places, question.domain)
+        pool = fibres(question.contacts, names, lost, start.chart, start.places, question.domain)
         own = pool._replace(sample=tried[pool.sample])
     else:
         tried = np.arange(len(samples.chart))
@@ -140,10 +144,11 @@ def answer(question: Question, names: tuple[str, ...], resolution: bool) -> Answ
         on_surface = _on_plane(question, names, span)
     own, pool = (p.rows(p.apart >= question.separation) for p in (own, pool))
     twin = _twinned(question, own)
-    cells = [_judge(question, pool, on_surface, region) for region in question.regions]
-    verdict = [word for word, _ in cells]
+    steps = lost or question.contacts.steps
+    cells = [_judge(question, pool, steps, on_surface, region) for region in question.regions]
+    verdict = [cell.verdict for cell in cells]
     probed, hit = tried, twin[None, :, tried]
-    if resolution and not lost:
+    if resolution and lost is None:
         probed = question.probed
         hit = ambiguous(
             question.contacts,
@@ -166,7 +171,8 @@ def answer(question: Question, names: tuple[str, ...], resolution: bool) -> Answ
         twin_share=_weighted(question, twin[:, tried], tried),
         ambiguous=shares,
         surface_angle=surface_angle,
-        witnesses=[witnesses for _, witnesses in cells],
+        witnesses=[cell.witnesses for cell in cells],
+        steps=[cell.steps for cell in cells],
     )
 
 
@@ -197,19 +203,24 @@ def _searched(question: Question, names: tuple[str, ...], own: Pairs, beside: An
 
 
 def _judge(
-    question: Question, pool: Pairs, on_surface: Pairs | None, region: str
-) -> tuple[str, Pairs]:
-    """The verdict on a region, and its witnesses."""
+    question: Question,
+    pool: Pairs,
+    steps: int,
+    on_surface: tuple[Pairs, int] | None,
+    region: str,
+) -> _Cell:
+    """Judge a region by the pairs there are, and those on the plane."""
     if not question.wide.places.members(region).any():
-        return EMPTY, pool.rows(np.zeros(0, dtype=np.int64))
+        return _Cell(EMPTY, pool.rows(np.zeros(0, dtype=np.int64)), steps)
     found = _chosen(question, pool, region)
     if len(found.apart):
-        return NOT_UNIQUE, found
+        return _Cell(NOT_UNIQUE, found, steps)
     if on_surface is not None:
-        degenerate = _chosen(question, on_surface, region)
+        pairs, steps_there = on_surface
+        degenerate = _chosen(question, pairs, region)
         if len(degenerate.apart):
-            return OFF_SURFACE, degenerate
-    return UNIQUE, found
+            return _Cell(OFF_SURFACE, degenerate, steps_there)
+    return _Cell(UNIQUE, found, steps)
 
 
 def _some(question: Question, samples: Samples) -> AnyArray:
@@ -221,20 +232,17 @@ def _some(question: Question, samples: Samples) -> AnyArray:
     return np.array(sorted(rows), dtype=np.int64)
 
 
-def _on_plane(question: Question, names: tuple[str, ...], span: Array) -> Pairs | None:
+def _on_plane(question: Question, names: tuple[str, ...], span: Array) -> tuple[Pairs, int] | None:
     """Pairs in the plane of a planar whisker, if the triplet loses a dimension there."""
     if question.plane is None:
         return None
     plane = question.plane
-    by_contact = triplet_derivatives(plane.places.values, plane.tangents, names)
-    unit = units(question.contacts, plane.places.contacts)
-    if rank_deficient(by_contact, unit, span).mean() <= _LOST:
+    lost = deficient(question.contacts, names, plane.places.contacts, span)
+    if lost is None:
         return None
-    rows = _some(question, plane)
-    found = fibres(
-        question.contacts, names, plane.chart[rows], plane.places.rows(rows), question.domain
-    )
-    return found.rows(found.apart >= question.separation)
+    start = plane.rows(_some(question, plane))
+    found = fibres(question.contacts, names, lost, start.chart, start.places, question.domain)
+    return found.rows(found.apart >= question.separation), lost
 
 
 def _chosen(question: Question, pairs: Pairs, region: str) -> Pairs:

@@ -8,7 +8,6 @@ import numpy as np
 
 from vibrissa.mapping.places import Samples
 from vibrissa.rod.arrays import AnyArray, Array
-from vibrissa.rod.reach import determinant
 
 # So many contacts of each region that are beside folds, or nearest to it, are named.
 _BESIDE = 24
@@ -60,10 +59,9 @@ def local_evidence(
     out = Local(np.full(n, np.nan), np.full(n, np.nan), np.full((n, 2), np.nan), np.zeros(0, int))
     if lost:
         return out
-    # Relative to the lengths of the gradients: how nearly they lie in a plane.
+    # Relative to the lengths of the gradients: how nearly they lie in a plane. det ∂p/∂ξ > 0 in Ω.
     size = np.prod(np.linalg.norm(by_contact, axis=2), axis=1)
     det = np.linalg.det(by_contact) / np.where(size > 0.0, size, 1.0)
-    det *= np.sign(determinant(samples.tangents))
     above, outside = samples.places.values[:, 5] > 0.0, samples.places.angle > cone
     beside: set[int] = set()
     for i, region in enumerate(regions):

@@ -13,7 +13,7 @@ from scipy.stats import qmc
 from vibrissa.mapping.contact_map import within_paper_bounds
 from vibrissa.rod.arrays import AnyArray, Array
 from vibrissa.rod.batch import contact_tangents, solve_forces
-from vibrissa.rod.reach import Fold, contacts_at, with_normal_force
+from vibrissa.rod.reach import Fold, contacts_at, determinant, with_normal_force
 from vibrissa.signals import concave_backward, cone_angle, in_region
 from vibrissa.signals.base import signals_of
 
@@ -97,9 +97,12 @@ def sample(contacts: ContactMap, chart: Array, domain: Domain) -> Samples:
     fold, d = contacts.chart.fold, contacts.chart.discretization
     xi = contacts_at(fold, chart)
     values, tangents = solve_forces(d, with_normal_force(xi), tangents=True)
-    by_chart = tangents[:, 3:] @ _frames(fold, chart)
+    places = place(contacts, xi, values, domain)
+    # The chart knows the fold to a part in a million: what lies beyond it does not count.
+    stable = determinant(tangents) > 0.0
+    by_chart = np.linalg.det(tangents[:, 3:] @ _frames(fold, chart))
     return Samples(
-        chart, place(contacts, xi, values, domain), tangents, np.abs(np.linalg.det(by_chart))
+        chart, places._replace(inside=places.inside & stable), tangents, np.abs(by_chart)
     )
 
 

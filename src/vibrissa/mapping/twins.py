@@ -1,9 +1,8 @@
 """Twins: contacts far apart that give the same three signals.
 
 Where the map ξ → T is regular, all contacts with the triplet of a given one are found exactly
-(:mod:`vibrissa.mapping.inversion`); those far from it are its twins. Where T has lost a dimension
-(a straight whisker never twists: M_x = 0 everywhere) the contacts with equal triplets form curves,
-*fibres*, which are followed.
+(:mod:`vibrissa.mapping.inversion`); those far from it are its twins. Where it is not, see
+:mod:`vibrissa.mapping.fibres`.
 """
 
 from __future__ import annotations
@@ -16,10 +15,9 @@ from vibrissa.mapping.inversion import invert
 from vibrissa.mapping.places import Domain, Places, in_chart, place, sample
 from vibrissa.rod.arrays import AnyArray, Array
 from vibrissa.rod.batch import solve_forces
-from vibrissa.rod.discretize import Discretization
-from vibrissa.rod.reach import chart_of, fold_forces, with_normal_force
-from vibrissa.signals import CIRCULAR, SIGNALS
-from vibrissa.signals.base import signal_derivatives, signals_of
+from vibrissa.rod.reach import chart_of, with_normal_force
+from vibrissa.signals import SIGNALS
+from vibrissa.signals.base import signal_derivatives
 
 if TYPE_CHECKING:
     from vibrissa.mapping.contact_map import ContactMap
@@ -34,12 +32,6 @@ _SAME = 1e-4
 # The search for better twins starts wide, ends fine, and keeps so many of each region.
 _WIDTHS = np.geomspace(0.2, 0.002, 16)
 _KEPT = 16
-# Fibres: length of a step in units in which the chart is about one wide, and how many each way.
-_STRIDE = 0.02
-_STRIDES = 60
-_CORRECTIONS = 5
-# Singular values smaller than this share of the largest count as zero.
-_RANK = 1e-8
 
 
 class Pairs(NamedTuple):
@@ -141,7 +133,7 @@ def _firm(contacts: ContactMap, names: tuple[str, ...], xi: Array) -> AnyArray:
     by_contact = triplet_derivatives(values, tangents, names)
     regular = np.abs(np.linalg.det(by_contact)) > 0.0
     moved = np.full(len(xi), np.inf)
-    inverse = np.linalg.inv(by_contact[regular]) * _sizes(values[regular], names)[:, None, :]
+    inverse = np.linalg.inv(by_contact[regular]) * sizes(values[regular], names)[:, None, :]
     moved[regular] = AGREEMENT * np.linalg.norm(tangents[regular, 3:] @ inverse, axis=(1, 2))
     return np.asarray(moved <= _FIRM)
 
@@ -216,155 +208,10 @@ def _best(pairs: Pairs, regions: tuple[str, ...], separation: float) -> Pairs:
     return pairs.rows(np.array(sorted(chosen), dtype=np.int64))
 
 
-def rank_deficient(by_contact: Array, unit: Array, size: Array) -> AnyArray:
-    """Whether triplets have lost a dimension.
-
-    Parameters
-    ----------
-    by_contact : (n, 3, 3) array
-        ∂T/∂ξ.
-    unit : (n, 3) array
-        What a change of each unknown is small beside; see :func:`units`.
-    size : (3,) array
-        Range of each signal over the map.
-
-    Returns
-    -------
-    (n,) bool array
-        True where the least singular value is nothing beside the largest.
-    """
-    # A signal without a range is zero everywhere, but for rounding.
-    weight = np.where(size > _RANK, 1.0 / np.maximum(size, _RANK), 0.0)
-    singular = np.linalg.svd(by_contact * unit[:, None, :] * weight[:, None], compute_uv=False)
-    return np.asarray(singular[:, 2] <= _RANK * singular[:, 0])
-
-
-def fibres(
-    contacts: ContactMap, names: tuple[str, ...], chart: Array, first: Places, domain: Domain
-) -> Pairs:
-    """Follow the curves of equal triplets through contacts where these have lost a dimension.
-
-    Parameters
-    ----------
-    contacts : ContactMap
-        The whisker's map.
-    names : tuple of str
-        The triplet.
-    chart : (n, 3) array
-        Chart coordinates of the contacts.
-    first : Places
-        The contacts.
-    domain : {"reachable", "paper"}
-        Where contacts count.
-
-    Returns
-    -------
-    Pairs
-        Each contact with points along its fibre.
-    """
-    d = contacts.chart.discretization
-    targets = first.signals[:, [SIGNALS.index(name) for name in names]]
-    unit = units(contacts, first.contacts)
-    rows, found = [], []
-    for sense in (1.0, -1.0):
-        running, xi = np.arange(len(chart)), first.contacts
-        direction = np.full(xi.shape, np.nan)
-        for _ in range(_STRIDES):
-            _, slope, _ = _equations(d, names, xi, targets[running])
-            direction = _along(slope * unit[running, None, :], direction, sense)
-            xi = xi + _STRIDE * direction * unit[running]
-            xi, values, misfit = corrected(d, names, xi, targets[running], unit[running])
-            stays = (misfit <= AGREEMENT) & _stable(contacts, xi)
-            xi, running, direction = xi[stays], running[stays], direction[stays]
-            if not running.size:
-                break
-            rows.append(running)
-            found.append(np.concatenate([xi, values[stays]], axis=1))
-    row = np.concatenate(rows) if rows else np.zeros(0, dtype=np.int64)
-    both = np.concatenate(found) if found else np.zeros((0, 9))
-    second = place(contacts, both[:, :3], both[:, 3:], domain)
-    apart = np.linalg.norm(second.values[:, 3:] - first.values[row, 3:], axis=1)
-    return Pairs(chart[row], row, first.rows(row), second, apart)
-
-
-def _along(slope: Array, before: Array, sense: float) -> Array:
-    """Unit vectors (n, 3) in which T does not change, as near to those before as there are."""
-    _, singular, rows = np.linalg.svd(slope)
-    null = singular <= _RANK * singular[:, :1]
-    null[:, 2] = True
-    onto = np.einsum("nk,nki,ni->nk", null, rows, before)
-    turned = np.einsum("nk,nki->ni", onto, rows)
-    fresh = np.isnan(before).any(axis=1)
-    turned[fresh] = sense * rows[fresh, 2]
-    return np.asarray(turned / np.linalg.norm(turned, axis=1, keepdims=True))
-
-
-def corrected(
-    discretization: Discretization, names: tuple[str, ...], xi: Array, targets: Array, unit: Array
-) -> tuple[Array, Array, Array]:
-    """Move contacts the least way to where they have given signals (Gauss and Newton).
-
-    Parameters
-    ----------
-    discretization : Discretization
-        The whisker.
-    names : tuple of str
-        The triplet; where it has lost a dimension the nearest solution is found.
-    xi : (n, 3) array
-        Contacts.
-    targets : (n, 3) array
-        Their signals.
-    unit : (n, 3) array
-        What a change of each unknown is small beside.
-
-    Returns
-    -------
-    contacts : (n, 3) array
-        The solutions.
-    values : (n, 6) array
-        (F, p) there.
-    misfit : (n,) array
-        The largest difference of a signal, in units of |F|, |M| or rad.
-    """
-    for _ in range(_CORRECTIONS):
-        away, slope, _ = _equations(discretization, names, xi, targets)
-        inverse = np.linalg.pinv(slope * unit[:, None, :], rcond=1e-6)
-        xi = xi - np.einsum("nij,nj->ni", inverse, away) * unit
-    away, _, values = _equations(discretization, names, xi, targets)
-    # Where a fibre comes to rest nothing is left to compare with.
-    sizes = np.maximum(_sizes(values, names), np.finfo(np.float64).tiny)
-    return xi, values, np.abs(away / sizes).max(axis=1)
-
-
-def units(contacts: ContactMap, xi: Array) -> Array:
-    """What a change of each unknown is small beside (n, 3): L, and the fold force there."""
-    force = fold_forces(contacts.chart.fold, xi)
-    return np.stack([np.ones(len(xi)), force, force], axis=1)
-
-
-def _equations(
-    discretization: Discretization, names: tuple[str, ...], xi: Array, targets: Array
-) -> tuple[Array, Array, Array]:
-    """T(ξ) - target (n, 3), ∂T/∂ξ (n, 3, 3) and (F, p) (n, 6)."""
-    which = [SIGNALS.index(name) for name in names]
-    values, tangents = solve_forces(discretization, with_normal_force(xi), tangents=True)
-    force, point = values[:, :3], values[:, 3:]
-    away = signals_of(force, np.cross(point, force))[:, which] - targets
-    turned = (away + np.pi) % (2.0 * np.pi) - np.pi
-    away = np.where([CIRCULAR[w] for w in which], turned, away)
-    return away, triplet_derivatives(values, tangents, names), values
-
-
-def _sizes(values: Array, names: tuple[str, ...]) -> Array:
+def sizes(values: Array, names: tuple[str, ...]) -> Array:
     """What a difference of each signal is small beside (n, k): |F|, |M|, or 1 for directions."""
     force = np.linalg.norm(values[:, :3], axis=1)
     moment = np.linalg.norm(np.cross(values[:, 3:], values[:, :3]), axis=1)
     one = np.ones(len(values))
     sizes = {"Fx": force, "FT": force, "FD": one, "Mx": moment, "MB": moment, "MD": one}
     return np.stack([sizes[name] for name in names], axis=1)
-
-
-def _stable(contacts: ContactMap, xi: Array) -> AnyArray:
-    force = np.hypot(xi[:, 1], xi[:, 2])
-    inside = (xi[:, 0] >= contacts.chart.proximal) & (xi[:, 0] <= 1.0)
-    return np.asarray(inside & (force > 0.0) & (force < units(contacts, xi)[:, 1]))

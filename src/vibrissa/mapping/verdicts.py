@@ -25,10 +25,11 @@ from vibrissa.mapping.evidence import (
     answer,
     ask,
 )
+from vibrissa.mapping.fibres import corrected, units
 from vibrissa.mapping.places import Domain
 from vibrissa.mapping.resolution import TOLERANCES
 from vibrissa.mapping.summary import choice, notation
-from vibrissa.mapping.twins import AGREEMENT, corrected, units
+from vibrissa.mapping.twins import AGREEMENT
 from vibrissa.quantities import attributes
 from vibrissa.rod.arrays import Array
 from vibrissa.rod.batch import solve_forces
@@ -106,8 +107,10 @@ def uniqueness(
         (rad, for "unique off a surface"): off which surface, and the largest elevation from it of
         a contact that is ambiguous within the tolerance; ``witness_…``: the pairs of contacts
         farthest apart, with both contacts' arc length, force and point, the three signals, their
-        relative difference, the separation, and by how much the second contact moves when the
-        pair is found again with four times the steps. ``region_share``: the regions' share of the
+        relative difference (in :func:`vibrissa.deflect` with ``witness_steps``, the default but
+        where signals depend on each other only as finely as the rod is integrated), the
+        separation, and by how much the second contact moves when the pair is found again with
+        four times the steps. ``region_share``: the regions' share of the
         contacts' space; ``notation``: the verdicts of a triplet in short. Attributes name the
         chosen triplet, the domain, the cone and the separation.
 
@@ -259,20 +262,19 @@ def _witnesses(
 ) -> xr.Dataset:
     """Both contacts of each witness, in SI units, with how well they agree."""
     contacts = question.contacts
-    d = contacts.chart.discretization
-    finer = discretize(contacts.whisker, _FINER * contacts.steps)
     shape = (len(names), len(question.regions), WITNESSES)
     arc_length, point = np.full((*shape, 2), np.nan), np.full((*shape, 2, 3), np.nan)
     force, signals = np.full((*shape, 2, 2), np.nan), np.full((*shape, 3), np.nan)
     apart, difference, shift = (np.full(shape, np.nan) for _ in range(3))
     for i, (triplet, found) in enumerate(zip(names, answers, strict=True)):
         which = [SIGNALS.index(name) for name in triplet]
-        scale = signal_scales(triplet, d.force, d.moment)
         for j, pairs in enumerate(found.witnesses):
             n = len(pairs.apart)
             if not n:
                 continue
             here = (i, j, slice(n))
+            d = discretize(contacts.whisker, found.steps[j])
+            finer = discretize(contacts.whisker, _FINER * found.steps[j])
             first, unit = pairs.first.contacts, units(contacts, pairs.second.contacts)
             target = pairs.first.signals[:, which]
             second, values, difference[here] = corrected(
@@ -283,7 +285,7 @@ def _witnesses(
             arc_length[here], force[here] = both[..., 0] * d.length, both[..., 1:] * d.force
             point[here] = places[..., 3:] * d.length
             apart[here] = np.linalg.norm(point[here][:, 0] - point[here][:, 1], axis=1)
-            signals[here] = target * scale
+            signals[here] = target * signal_scales(triplet, d.force, d.moment)
             shift[here] = d.length * _moved(finer, triplet, first, second, values, unit)
     cell = ("triplet", "region", "witness")
     return xr.Dataset(
@@ -299,6 +301,11 @@ def _witnesses(
                 (*cell, "signal"),
                 signals,
                 _about("N, N m or rad", "signals of both, in the order of the triplet's name"),
+            ),
+            "witness_steps": (
+                ("triplet", "region"),
+                np.array([found.steps for found in answers]),
+                _about("1", "integration steps with which the witnesses agree"),
             ),
             "witness_separation": (cell, apart, _about("m", "distance of the contact points")),
             "witness_difference": (

@@ -1,0 +1,200 @@
+"""Fibres: curves of contacts with equal triplets, where a triplet has lost a dimension.
+
+A straight whisker never twists: M_x = 0 everywhere. In a whisker of one stiffness and one curvature
+the axial force and the bending moment at the base hang together, F_x = -M²/2EI for a straight
+cylinder. Then the contacts with equal triplets form curves, which are followed along the direction
+in which the triplet does not change.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vibrissa.mapping.places import Domain, Places, place
+from vibrissa.mapping.twins import AGREEMENT, Pairs, sizes, triplet_derivatives
+from vibrissa.rod.arrays import AnyArray, Array
+from vibrissa.rod.batch import solve_forces
+from vibrissa.rod.discretize import Discretization, discretize
+from vibrissa.rod.reach import fold_forces, with_normal_force
+from vibrissa.signals import CIRCULAR, SIGNALS
+from vibrissa.signals.base import signals_of
+
+if TYPE_CHECKING:
+    from vibrissa.mapping.contact_map import ContactMap
+
+# Length of a step in units in which the chart is about one wide, and how many each way.
+_STRIDE = 0.02
+_STRIDES = 60
+_CORRECTIONS = 5
+# Singular values smaller than this share of the largest count as zero.
+_RANK = 1e-8
+# A triplet has lost a dimension if it has at all but this share of the contacts.
+_LOST = 0.99
+# Where the equations make signals depend on each other, the integration does so to its own error.
+# With so many times the steps that is below ``_RANK``.
+_FINER = 8
+
+
+def deficient(contacts: ContactMap, names: tuple[str, ...], xi: Array, span: Array) -> int | None:
+    """Whether a triplet has lost a dimension at contacts, but for rounding.
+
+    Parameters
+    ----------
+    contacts : ContactMap
+        The whisker's map.
+    names : tuple of str
+        The triplet.
+    xi : (n, 3) array
+        Contacts.
+    span : (3,) array
+        Range of each signal.
+
+    Returns
+    -------
+    int or None
+        Integration steps with which it has; None if it has not.
+    """
+    # A signal without a range is zero everywhere, but for rounding.
+    weight = np.where(span > _RANK, 1.0 / np.maximum(span, _RANK), 0.0)
+    unit = units(contacts, xi)
+    for steps in (contacts.steps, _FINER * contacts.steps):
+        d = discretize(contacts.whisker, steps)
+        values, tangents = solve_forces(d, with_normal_force(xi), tangents=True)
+        slope = triplet_derivatives(values, tangents, names) * unit[:, None, :]
+        singular = np.linalg.svd(slope * weight[:, None], compute_uv=False)
+        if (singular[:, 2] <= _RANK * singular[:, 0]).mean() > _LOST:
+            return steps
+    return None
+
+
+def fibres(
+    contacts: ContactMap,
+    names: tuple[str, ...],
+    steps: int,
+    chart: Array,
+    first: Places,
+    domain: Domain,
+) -> Pairs:
+    """Follow the curves of equal triplets through contacts where these have lost a dimension.
+
+    Parameters
+    ----------
+    contacts : ContactMap
+        The whisker's map.
+    names : tuple of str
+        The triplet.
+    steps : int
+        Integration steps; with these it has lost a dimension.
+    chart : (n, 3) array
+        Chart coordinates of the contacts.
+    first : Places
+        The contacts.
+    domain : {"reachable", "paper"}
+        Where contacts count.
+
+    Returns
+    -------
+    Pairs
+        Each contact with points along its fibre.
+    """
+    d = discretize(contacts.whisker, steps)
+    values, _ = solve_forces(d, with_normal_force(first.contacts))
+    first = place(contacts, first.contacts, values, domain)
+    targets = first.signals[:, [SIGNALS.index(name) for name in names]]
+    unit = units(contacts, first.contacts)
+    rows, found = [], []
+    for sense in (1.0, -1.0):
+        running, xi = np.arange(len(chart)), first.contacts
+        direction = np.full(xi.shape, np.nan)
+        for _ in range(_STRIDES):
+            _, slope, _ = _equations(d, names, xi, targets[running])
+            direction = _along(slope * unit[running, None, :], direction, sense)
+            xi = xi + _STRIDE * direction * unit[running]
+            xi, values, misfit = corrected(d, names, xi, targets[running], unit[running])
+            stays = (misfit <= AGREEMENT) & _stable(contacts, xi)
+            xi, running, direction = xi[stays], running[stays], direction[stays]
+            if not running.size:
+                break
+            rows.append(running)
+            found.append(np.concatenate([xi, values[stays]], axis=1))
+    row = np.concatenate(rows) if rows else np.zeros(0, dtype=np.int64)
+    both = np.concatenate(found) if found else np.zeros((0, 9))
+    second = place(contacts, both[:, :3], both[:, 3:], domain)
+    apart = np.linalg.norm(second.values[:, 3:] - first.values[row, 3:], axis=1)
+    return Pairs(chart[row], row, first.rows(row), second, apart)
+
+
+def _along(slope: Array, before: Array, sense: float) -> Array:
+    """Unit vectors (n, 3) in which T does not change, as near to those before as there are."""
+    _, singular, rows = np.linalg.svd(slope)
+    null = singular <= _RANK * singular[:, :1]
+    null[:, 2] = True
+    onto = np.einsum("nk,nki,ni->nk", null, rows, before)
+    turned = np.einsum("nk,nki->ni", onto, rows)
+    fresh = np.isnan(before).any(axis=1)
+    turned[fresh] = sense * rows[fresh, 2]
+    return np.asarray(turned / np.linalg.norm(turned, axis=1, keepdims=True))
+
+
+def corrected(
+    discretization: Discretization, names: tuple[str, ...], xi: Array, targets: Array, unit: Array
+) -> tuple[Array, Array, Array]:
+    """Move contacts the least way to where they have given signals (Gauss and Newton).
+
+    Parameters
+    ----------
+    discretization : Discretization
+        The whisker.
+    names : tuple of str
+        The triplet; where it has lost a dimension the nearest solution is found.
+    xi : (n, 3) array
+        Contacts.
+    targets : (n, 3) array
+        Their signals.
+    unit : (n, 3) array
+        What a change of each unknown is small beside.
+
+    Returns
+    -------
+    contacts : (n, 3) array
+        The solutions.
+    values : (n, 6) array
+        (F, p) there.
+    misfit : (n,) array
+        The largest difference of a signal, in units of |F|, |M| or rad.
+    """
+    for _ in range(_CORRECTIONS):
+        away, slope, _ = _equations(discretization, names, xi, targets)
+        inverse = np.linalg.pinv(slope * unit[:, None, :], rcond=1e-6)
+        xi = xi - np.einsum("nij,nj->ni", inverse, away) * unit
+    away, _, values = _equations(discretization, names, xi, targets)
+    # Where a fibre comes to rest nothing is left to compare with.
+    beside = np.maximum(sizes(values, names), np.finfo(np.float64).tiny)
+    return xi, values, np.abs(away / beside).max(axis=1)
+
+
+def units(contacts: ContactMap, xi: Array) -> Array:
+    """What a change of each unknown is small beside (n, 3): L, and the fold force there."""
+    force = fold_forces(contacts.chart.fold, xi)
+    return np.stack([np.ones(len(xi)), force, force], axis=1)
+
+
+def _equations(
+    discretization: Discretization, names: tuple[str, ...], xi: Array, targets: Array
+) -> tuple[Array, Array, Array]:
+    """T(ξ) - target (n, 3), ∂T/∂ξ (n, 3, 3) and (F, p) (n, 6)."""
+    which = [SIGNALS.index(name) for name in names]
+    values, tangents = solve_forces(discretization, with_normal_force(xi), tangents=True)
+    force, point = values[:, :3], values[:, 3:]
+    away = signals_of(force, np.cross(point, force))[:, which] - targets
+    turned = (away + np.pi) % (2.0 * np.pi) - np.pi
+    away = np.where([CIRCULAR[w] for w in which], turned, away)
+    return away, triplet_derivatives(values, tangents, names), values
+
+
+def _stable(contacts: ContactMap, xi: Array) -> AnyArray:
+    force = np.hypot(xi[:, 1], xi[:, 2])
+    inside = (xi[:, 0] >= contacts.chart.proximal) & (xi[:, 0] <= 1.0)
+    return np.asarray(inside & (force > 0.0) & (force < units(contacts, xi)[:, 1]))

@@ -7,6 +7,7 @@ signals, where candidates have become fewer), and it tells which candidate goes 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -16,8 +17,8 @@ from numpy.typing import ArrayLike
 from vibrissa.mapping.channels import Channels
 from vibrissa.mapping.fitting import Fits, charted, fit
 from vibrissa.mapping.inversion import invert, polish
-from vibrissa.mapping.least_squares import largest_misfit, least_squares, seeding_triplet
-from vibrissa.mapping.minima import candidates
+from vibrissa.mapping.least_squares import by_doubt, largest_misfit, least_squares, seeding_triplet
+from vibrissa.mapping.minima import same
 from vibrissa.mapping.noise import SensorNoise
 from vibrissa.mapping.uncertainty import point_covariances
 from vibrissa.mapping.weights import INDISTINCT, whitening
@@ -199,8 +200,9 @@ class Estimator:
 
     def _weigh(self, targets: Array, near: Array) -> Array:
         """Weights for a contact with (F, p) near this, (1, k, k)."""
-        force = float(np.linalg.norm(near[0, :3]))
-        moment = float(np.linalg.norm(np.cross(near[0, 3:], near[0, :3])))
+        fx, fy, fz, px, py, pz = near[0].tolist()
+        force = math.hypot(fx, fy, fz)
+        moment = math.hypot(py * fz - pz * fy, pz * fx - px * fz, px * fy - py * fx)
         if self._weights is not None:
             kept, f, m = self._weights
             if abs(force - f) < _STEADY * f and abs(moment - m) < _STEADY * m:
@@ -211,14 +213,18 @@ class Estimator:
         return weights
 
     def _chosen(self, fits: Fits) -> Located:
-        rows = np.zeros(len(fits.contacts), np.int64)
-        force = np.hypot(fits.contacts[:, 2], fits.contacts[:, 3])
-        doubt = fits.misfits + 1e-6 * force / (1.0 + force)
-        found = candidates(1, rows, fits, doubt, self._limit, len(rows))
-        n = int(found.number[0])
-        status = Status.UNIQUE if n == 1 else Status.AMBIGUOUS
-        xi = found.contacts[0, :n][:, [0, 2, 3]]
-        return self._located(xi, found.values[0, :n], status, float(found.misfits[0, 0]))
+        """The same choice as in a batch, of few fits."""
+        best = float(fits.misfits.min())
+        most = min(best + INDISTINCT, self._limit)
+        kept: list[int] = []
+        for row in np.argsort(by_doubt(fits)).tolist():
+            if fits.misfits[row] <= most and not any(
+                same(fits.contacts[row], fits.contacts[other]) for other in kept
+            ):
+                kept.append(row)
+        status = Status.UNIQUE if len(kept) == 1 else Status.AMBIGUOUS
+        xi = fits.contacts[kept][:, [0, 2, 3]]
+        return self._located(xi, fits.values[kept], status, float(fits.misfits[kept[0]]))
 
     def _located(self, xi: Array, values: Array, status: Status, misfit: float) -> Located:
         """Everything in SI units; remember which candidate goes on from the one before."""

@@ -30,9 +30,9 @@ from vibrissa.rod.kernels import (
     lane_value,
     set_lane,
 )
-from vibrissa.rod.newton import stable
+from vibrissa.rod.newton import point_determinant, stable
 from vibrissa.rod.preimage import wrapped
-from vibrissa.rod.reach import Fold, Reach, determinant
+from vibrissa.rod.reach import Fold, Reach
 
 # Some valleys of χ² are narrow and bent: most fits take 5 rounds, but a few a hundred. What is not
 # at rest after so many goes on only if it may still count.
@@ -304,25 +304,27 @@ def _charted(
     fold: Fold,
     proximal: float,
     contacts: Array,
-    signs: Array,
+    tangents: Array,
     found: AnyArray,
     first: int,
     last: int,
 ) -> None:
-    xi = np.empty(3)
+    xi, by_xi = np.empty(3), np.empty((6, 3))
     for row in range(first, last):
         xi[0], xi[1], xi[2] = contacts[row, 0], contacts[row, 2], contacts[row, 3]
-        found[row] = stable(fold, proximal, xi, signs[row])
+        for a in range(6):
+            t = tangents[row, a]
+            by_xi[a, 0], by_xi[a, 1], by_xi[a, 2] = t[0], t[2], t[3]
+        found[row] = stable(fold, proximal, xi, point_determinant(by_xi))
 
 
 def charted(chart: Reach, fits: Fits, proximal: float) -> AnyArray:
     """Whether fits without friction are stable contacts beyond an arc length, (n,)."""
     found = np.zeros(len(fits.contacts), np.bool_)
-    signs = determinant(fits.tangents[..., [0, 2, 3]])
     share_out(
         len(found),
         lambda first, last: _charted(
-            chart.fold, proximal, fits.contacts, signs, found, first, last
+            chart.fold, proximal, fits.contacts, fits.tangents, found, first, last
         ),
     )
     return found

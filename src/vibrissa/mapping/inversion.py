@@ -30,6 +30,9 @@ from vibrissa.signals.base import (
 MOST_CANDIDATES = 8
 # Two solutions this near (relative to L and to the force) are one.
 _SAME = 1e-7
+# More targets than this are brought into an order in which the tree's nodes stay at hand.
+_MANY = 1000
+_RANK_BITS = 5
 
 
 class Contacts(NamedTuple):
@@ -72,6 +75,29 @@ def invert(chart: Reach, tree: Preimages, triplet: tuple[str, ...], targets: Arr
     Contacts
         Row by row.
     """
+    if len(targets) > _MANY:
+        order = _by_neighbourhood(targets)
+        found = _inverted(chart, tree, triplet, targets[order])
+        place = np.empty_like(order)
+        place[order] = np.arange(len(order))
+        return Contacts(found.number[place], found.contacts[place], found.values[place])
+    return _inverted(chart, tree, triplet, targets)
+
+
+def _by_neighbourhood(targets: Array) -> IntArray:
+    """Numbers of targets in an order in which neighbours follow each other (Z-order of ranks)."""
+    code = np.zeros(len(targets), np.int64)
+    shares = np.linspace(0.0, 1.0, 2**_RANK_BITS + 1)[1:-1]
+    for c, column in enumerate(targets.T):
+        sample = column[:: max(1, len(column) // 1000)]
+        edges = np.sort(sample)[(shares * len(sample)).astype(int)]
+        rank = np.searchsorted(edges, column)
+        for bit in range(_RANK_BITS):
+            code |= ((rank >> bit) & 1) << (3 * bit + c)
+    return np.argsort(code, kind="stable")
+
+
+def _inverted(chart: Reach, tree: Preimages, triplet: tuple[str, ...], targets: Array) -> Contacts:
     n = len(targets)
     out = Contacts(
         np.zeros(n, np.int64),

@@ -118,8 +118,7 @@ def least_squares(
         row = np.concatenate([row, more])
         fits = Fits(*(np.concatenate(pair) for pair in zip(fits, others, strict=True)))
         inside = charted(chart, fits, chart.proximal)
-    force = np.hypot(fits.contacts[:, 2], fits.contacts[:, 3])
-    doubt = fits.misfits + _FORCE * (1.0 + fits.misfits) * force / (1.0 + force)
+    doubt = by_doubt(fits)
     kept = np.flatnonzero(inside)
     found = candidates(
         len(measured), row[kept], Fits(*(a[kept] for a in fits)), doubt[kept], limit, MOST
@@ -132,6 +131,12 @@ def least_squares(
     outside[row[nearer]] = True
     status[outside & (status == Status.NOT_FRICTIONLESS)] = int(Status.OUTSIDE_MAP)
     return found, status
+
+
+def by_doubt(fits: Fits) -> Array:
+    """What fits are sorted by: χ², and where that is the same the force."""
+    force = np.hypot(fits.contacts[:, 2], fits.contacts[:, 3])
+    return np.asarray(fits.misfits + _FORCE * (1.0 + fits.misfits) * force / (1.0 + force))
 
 
 def largest_misfit(channels: Channels, sensor: SensorNoise | None, contacts: ContactMap) -> float:

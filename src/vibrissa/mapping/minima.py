@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -79,8 +80,8 @@ def candidates(
     where = np.full((rows, most), -1)
     for fit in order:
         i = row[fit]
-        same = any(_same(fits.contacts[fit], fits.contacts[j]) for j in where[i, : number[i]])
-        if not same and number[i] < most:
+        known = any(same(fits.contacts[fit], fits.contacts[j]) for j in where[i, : number[i]])
+        if not known and number[i] < most:
             where[i, number[i]] = fit
             number[i] += 1
     there = where >= 0
@@ -93,9 +94,11 @@ def candidates(
     return Candidates(number, *(padded(a) for a in fits[:4]))
 
 
-def _same(a: Array, b: Array) -> bool:
-    force = float(np.linalg.norm(a[1:]))
-    return bool(abs(a[0] - b[0]) < _SAME and np.linalg.norm(a[1:] - b[1:]) < 10.0 * _SAME * force)
+def same(a: Array, b: Array) -> bool:
+    """Whether two contacts x (4,) are one."""
+    s, *force = (a - b).tolist()
+    size = math.hypot(*a[1:].tolist())
+    return abs(s) < _SAME and math.hypot(*force) < 10.0 * _SAME * size
 
 
 def unknowns_covariance(
@@ -181,8 +184,10 @@ def reliable(
         return good
     x, value, slope, w = contacts[rows], values[rows], tangents[rows], weights[rows]
     axes = _principal_axes(covariance[rows], x)
-    steps = _REACH * np.concatenate([axes, -axes], axis=2)  # (n, 4, 8)
-    places = x[:, None, :] + np.swapaxes(steps, 1, 2)  # (n, 8, 4)
+    if not covariance[rows, 1, 1].any():
+        axes = axes[:, :, 1:]  # without friction the first axis has no length
+    steps = _REACH * np.concatenate([axes, -axes], axis=2)  # (n, 4, 2 axes)
+    places = x[:, None, :] + np.swapaxes(steps, 1, 2)
     on = (places[..., 0] >= least) & (places[..., 0] <= 1.0)
     places[..., 0] = np.clip(places[..., 0], least, 1.0)
     moved, _ = solve_forces(discretization, places.reshape(-1, 4))

@@ -1,6 +1,7 @@
 """From signals back to contacts: the map of all contacts, and its inversion."""
 
 from vibrissa.mapping.best_triplet import best_triplet
+from vibrissa.mapping.cones import critical_cones
 from vibrissa.mapping.contact_map import ContactMap
 from vibrissa.mapping.estimate import Estimate
 from vibrissa.mapping.estimator import Estimator, Located
@@ -20,6 +21,7 @@ __all__ = [
     "NaturalNeighbour",
     "WrenchEstimate",
     "best_triplet",
+    "critical_cones",
     "error_solid",
     "estimate_from_wrench",
     "save_uniqueness",

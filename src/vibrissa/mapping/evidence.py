@@ -134,9 +134,10 @@ def answer(question: Question, names: tuple[str, ...], resolution: bool) -> Answ
     on_surface = None
     if lost is not None:
         tried = _some(question, samples)
-        start = samples.rows(tried)
+        followed = np.union1d(tried, _farthest(question, samples))
+        start = samples.rows(followed)
         pool = fibres(question.contacts, names, lost, start.chart, start.places, question.domain)
-        own = pool._replace(sample=tried[pool.sample])
+        own = pool._replace(sample=followed[pool.sample])
     else:
         tried = np.arange(len(samples.chart))
         own = twins(question.contacts, names, samples.chart, samples.places, question.domain)
@@ -232,6 +233,15 @@ def _some(question: Question, samples: Samples) -> AnyArray:
     return np.array(sorted(rows), dtype=np.int64)
 
 
+def _farthest(question: Question, samples: Samples) -> AnyArray:
+    """The samples farthest from rest, of every region."""
+    order = np.argsort(-samples.places.angle, kind="stable")
+    rows: set[int] = set()
+    for region in question.regions:
+        rows.update(order[samples.places.members(region)[order]][:_FOLLOWED].tolist())
+    return np.array(sorted(rows), dtype=np.int64)
+
+
 def _on_plane(question: Question, names: tuple[str, ...], span: Array) -> tuple[Pairs, int] | None:
     """Pairs in the plane of a planar whisker, if the triplet loses a dimension there."""
     if question.plane is None:
@@ -240,7 +250,7 @@ def _on_plane(question: Question, names: tuple[str, ...], span: Array) -> tuple[
     lost = deficient(question.contacts, names, plane.places.contacts, span)
     if lost is None:
         return None
-    start = plane.rows(_some(question, plane))
+    start = plane.rows(np.union1d(_some(question, plane), _farthest(question, plane)))
     found = fibres(question.contacts, names, lost, start.chart, start.places, question.domain)
     return found.rows(found.apart >= question.separation), lost
 

@@ -75,6 +75,7 @@ _STIFFNESS = _Unit("N m^2", "nN·m²", 1e9)
 _JOINT_STIFFNESS = _Unit("N m/rad", "µN·m/rad", 1e6)
 _SPRING = _Unit("N/m", "N/m", 1.0)
 _PIXEL = _Unit("pixel", "px", 1.0)
+_WRENCH_SQUARED = _Unit("(N, N m)^2", "(N, N·m)²", 1.0)
 # The columns of these Jacobians, (s_c, f_y, f_z), differ in unit: it is given column by column.
 _POINT_PER_LOAD = _Unit("m/(m, N, N)", "m/(m, N, N)", 1.0)
 _FORCE_PER_LOAD = _Unit("N/(m, N, N)", "N/(m, N, N)", 1.0)
@@ -352,6 +353,56 @@ _ROWS: tuple[tuple[str, str, _Unit, str, str], ...] = (
         "About the tangent at the base.",
     ),
     ("trace", r"\mathbf{u}", _PIXEL, "whisker in the image", "Column and row from the top left."),
+    (
+        "trace_sigma",
+        r"\sigma_u",
+        _PIXEL,
+        "standard deviation of the trace",
+        "Across the whisker.",
+    ),
+    (
+        "trace_confidence",
+        "c_u",
+        _NUMBER,
+        "confidence of the trace",
+        "Per view, from 0 (lost) to 1.",
+    ),
+    (
+        "trace_misfit",
+        r"\chi_u",
+        _NUMBER,
+        "misfit of the trace",
+        "Root mean square distance of the fitted whisker's images from the traces, in their "
+        "standard deviations.",
+    ),
+    (
+        "centerline_sigma",
+        r"\sigma_r",
+        _MM,
+        "standard deviation of the centreline",
+        "In x, y, z of the laboratory.",
+    ),
+    (
+        "contact_covariance",
+        r"\Sigma_c",
+        _SQUARE_MM,
+        "covariance of the contact point",
+        "In x, y, z of the laboratory.",
+    ),
+    (
+        "wrench_covariance",
+        r"\Sigma_w",
+        _WRENCH_SQUARED,
+        "covariance of force and moment",
+        "In Fx, Fy, Fz, Mx, My, Mz.",
+    ),
+    (
+        "deviation",
+        "d",
+        _MM,
+        "deviation from the rest shape",
+        "Root mean square distance of the whisker from its rest shape, put on it.",
+    ),
     (
         "trace_visible",
         "v",

@@ -8,7 +8,17 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from vibrissa.cli import bend, charting, figures, information, judging, locating, sensing, whole_job
+from vibrissa.cli import (
+    bend,
+    charting,
+    figures,
+    information,
+    judging,
+    locating,
+    sensing,
+    tracking,
+    whole_job,
+)
 from vibrissa.cli.terminal import errors, output
 
 HELP = """From what a whisker feels at its base to what it touched.
@@ -28,6 +38,7 @@ app.command("demo")(whole_job.demo)
 app.command("deflect")(bend.bend)
 app.command("map")(charting.chart)
 app.command("uniqueness")(judging.uniqueness)
+app.command("track")(tracking.track)
 app.command("sensitivity")(sensing.sensitivity)
 app.command("estimate")(locating.estimate)
 app.command("figures")(figures.figures)

@@ -3,6 +3,7 @@
 from vibrissa.io.anipose import load_anipose
 from vibrissa.io.centerline import load_centerline, load_whisker, save_centerline
 from vibrissa.io.contacts_table import load_contacts, save_contacts
+from vibrissa.io.corrections import load_corrections
 from vibrissa.io.deeplabcut import load_deeplabcut
 from vibrissa.io.kinds import Kind, recognise
 from vibrissa.io.load import load_tracks
@@ -15,6 +16,7 @@ from vibrissa.io.paths import check_folder, check_readable, check_writable
 from vibrissa.io.recording import load_recording, save_recording
 from vibrissa.io.signals_table import load_signals, save_signals
 from vibrissa.io.sleap import load_sleap
+from vibrissa.io.traces import load_traces, save_traces
 from vibrissa.io.tracks import join_views
 from vibrissa.io.tracks_file import load_tracks_table, save_tracks
 from vibrissa.io.video import VideoInfo, read_video, video_info, write_video
@@ -33,6 +35,7 @@ __all__ = [
     "load_anipose",
     "load_centerline",
     "load_contacts",
+    "load_corrections",
     "load_deeplabcut",
     "load_matlab",
     "load_measurements",
@@ -41,6 +44,7 @@ __all__ = [
     "load_recording",
     "load_signals",
     "load_sleap",
+    "load_traces",
     "load_tracks",
     "load_tracks_table",
     "load_whisker",
@@ -52,6 +56,7 @@ __all__ = [
     "save_nwb",
     "save_recording",
     "save_signals",
+    "save_traces",
     "save_tracks",
     "video_info",
     "write_video",

@@ -1,15 +1,40 @@
-"""From two videos to a whisker in space: trace, merge, pose, contact."""
+"""From two videos to a whisker in space: trace, merge, pose, contact, wrench."""
 
+from vibrissa.tracking.filtering import low_pass
 from vibrissa.tracking.find import Found, find_whiskers
+from vibrissa.tracking.pose import BasePose, base_pose
+from vibrissa.tracking.refine import Refined, RefineOptions, refine
+from vibrissa.tracking.rest import RestShape, rest_shape, whisker_at_rest
+from vibrissa.tracking.sight import Sight
+from vibrissa.tracking.space import SpaceCurve, merge
+from vibrissa.tracking.timing import paired_frames
 from vibrissa.tracking.trace import Follower, Trace, TraceOptions, start_at
+from vibrissa.tracking.track import Tracked, TrackOptions, track, track_whisker
 from vibrissa.tracking.view import trace_video
 
 __all__ = [
+    "BasePose",
     "Follower",
     "Found",
+    "RefineOptions",
+    "Refined",
+    "RestShape",
+    "Sight",
+    "SpaceCurve",
     "Trace",
     "TraceOptions",
+    "TrackOptions",
+    "Tracked",
+    "base_pose",
     "find_whiskers",
+    "low_pass",
+    "merge",
+    "paired_frames",
+    "refine",
+    "rest_shape",
     "start_at",
     "trace_video",
+    "track",
+    "track_whisker",
+    "whisker_at_rest",
 ]

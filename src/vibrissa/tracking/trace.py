@@ -27,6 +27,7 @@ STEP = 2.0
 _SUPPORTED = 2.5
 _FEWEST = 12
 _PROXIMAL = 30
+_FUR = 3
 _BEYOND = 12
 """How many points beyond the last that is seen are looked at to find the tip."""
 
@@ -315,7 +316,7 @@ def traced(frame: Frame, noise: float, line: Array, options: TraceOptions) -> tu
     for gate in (3, 2):
         line = even(smoothed(frame, line, gate, noise, options)[0])
     line, from_face = with_base(frame, line)
-    line, fit = smoothed(frame, line, 1, noise, options)
+    line, fit = smoothed(frame, line, 1, noise, options, _FUR if from_face else 0)
     count = tip(fit, noise)
     if count < _FEWEST:
         return Trace.lost(), False
@@ -325,7 +326,7 @@ def traced(frame: Frame, noise: float, line: Array, options: TraceOptions) -> tu
 
 
 def smoothed(
-    frame: Frame, line: Array, gate: int, noise: float, options: TraceOptions
+    frame: Frame, line: Array, gate: int, noise: float, options: TraceOptions, skipped: int = 0
 ) -> tuple[Array, _Fit]:
     """Measure across a line and smooth it.
 
@@ -341,6 +342,8 @@ def smoothed(
         Of the image.
     options : TraceOptions
         How.
+    skipped : int
+        Points at the base that are not measured, because the face's edge is beside them.
 
     Returns
     -------
@@ -354,6 +357,7 @@ def smoothed(
     ridge.measure(frame, line, gate, noise, options.scale, offset, amplitude, flank, support)
     seen = (support > _SUPPORTED) & (amplitude > 0.0)
     variance = ridge.SLOPE_VARIANCE * (noise * options.scale / np.maximum(amplitude, 1e-3)) ** 2
+    seen[:skipped] = False
     weight = np.where(seen, 1.0 / (variance + 0.03**2), 0.0)
     tangent = np.gradient(line, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)

@@ -33,6 +33,8 @@ def trace_video(
     options: TraceOptions | None = None,
     *,
     corrections: Corrections | None = None,
+    begun: Sequence[Sequence[Trace]] = (),
+    kept: list[list[Trace]] | None = None,
     progress: Progress | None = None,
 ) -> list[list[Trace]]:
     """Trace whiskers from frame to frame.
@@ -49,6 +51,10 @@ def trace_video(
     corrections : mapping, optional
         Traces that are right in some frames: taken as they are, and followed from there forward,
         and backward as far as that changes anything, at most `KEPT` frames.
+    begun : sequence of sequence of Trace
+        What was traced of the first frames before: taken as it is.
+    kept : list, optional
+        Filled with the result while it is made, for who is interrupted.
     progress : callable, optional
         Told after every frame how many are done.
 
@@ -65,13 +71,20 @@ def trace_video(
     options = options or TraceOptions()
     corrections = corrections or {}
     followers: list[Follower] = []
-    traces: list[list[Trace]] = []
+    traces: list[list[Trace]] = [] if kept is None else kept
+    done = len(begun[0]) if begun else 0
     recent: deque[Frame] = deque(maxlen=KEPT)
     for i, frame in enumerate(frames):
         if i == 0:
-            followers = [start_at(base, options) for base in _bases(frame, bases, options)]
-            traces = [[] for _ in followers]
+            if done:
+                followers = [_resumed(row, options) for row in begun]
+            else:
+                followers = [start_at(base, options) for base in _bases(frame, bases, options)]
+            traces[:] = [list(row) for row in begun] or [[] for _ in followers]
             _check(corrections, len(followers))
+        if i < done:
+            recent.append(frame)
+            continue
         found = follow_all(followers, frame, {k: p for (j, k), p in corrections.items() if j == i})
         for trace, row in zip(found, traces, strict=True):
             row.append(trace)
@@ -93,6 +106,17 @@ def _bases(
     if not found:
         raise ValueError("no whisker was found in the first frame: say where one begins")
     return [found[0].trace.line[0]]
+
+
+def _resumed(row: Sequence[Trace], options: TraceOptions) -> Follower:
+    """Go on after traces that are done."""
+    seen = [trace for trace in row if len(trace.line)]
+    if not seen:
+        raise ValueError("the frames that were traced before show no whisker")
+    follower = Follower(seen[-1].line[0], options)
+    for trace in seen[-2:]:
+        follower.restart(trace)
+    return follower
 
 
 def _check(corrections: Corrections, count: int) -> None:

@@ -5,7 +5,12 @@ from vibrissa.trial.film import Look, film, views_of
 from vibrissa.trial.motion import Motion, tabulated, whisking
 from vibrissa.trial.objects import Box, Peg, Plane, Sphere
 from vibrissa.trial.plan import facing_peg, sweep_past
-from vibrissa.trial.recording import recorded_objects, recorded_pegs, recorded_whisker
+from vibrissa.trial.recording import (
+    recorded_cameras,
+    recorded_objects,
+    recorded_pegs,
+    recorded_whisker,
+)
 from vibrissa.trial.sensors import measure
 from vibrissa.trial.simulate import simulate
 
@@ -22,6 +27,7 @@ __all__ = [
     "load_cameras",
     "measure",
     "orthogonal_views",
+    "recorded_cameras",
     "recorded_objects",
     "recorded_pegs",
     "recorded_whisker",

@@ -27,6 +27,7 @@ from vibrissa.quantities import attributes
 from vibrissa.rod.surface import Surface
 from vibrissa.rod.surfaces import SurfaceDeflection
 from vibrissa.status import Status, flag_attributes
+from vibrissa.trial.cameras import Camera, cameras_from_dataset
 from vibrissa.trial.motion import Motion
 from vibrissa.trial.object_files import object_from_dataset, objects_datasets
 from vibrissa.trial.objects import Peg
@@ -223,6 +224,30 @@ def recorded_whisker(recording: xr.DataTree, index: int = 0) -> Whisker:
         count = 0 if whiskers is None else len(whiskers.children)
         raise ValueError(f"whisker {index} was asked for; the recording carries {count} of them")
     return Whisker.from_dataset(whiskers.children[str(index)].to_dataset(inherit=False))
+
+
+def recorded_cameras(recording: xr.DataTree) -> tuple[Camera, ...]:
+    """List the cameras of a recording.
+
+    Parameters
+    ----------
+    recording : xarray.DataTree
+        Filmed or tracked.
+
+    Returns
+    -------
+    tuple of Camera
+        View by view.
+
+    Raises
+    ------
+    ValueError
+        If it has none.
+    """
+    cameras = recording.children.get("cameras")
+    if cameras is None:
+        raise ValueError("the recording tells of no cameras")
+    return cameras_from_dataset(cameras.to_dataset())
 
 
 def recorded_objects(recording: xr.DataTree) -> tuple[Surface, ...]:

@@ -1,0 +1,201 @@
+"""`vibrissa track`: from two videos to a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from vibrissa.cli.terminal import Tell, numbers, output, progress_bars, shown
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import xarray as xr
+
+    from vibrissa.tracking import Trace, TraceOptions
+    from vibrissa.trial import Camera
+
+_MICRO = 1e-6
+
+
+def track(
+    videos: Annotated[
+        list[Path], typer.Argument(help="The video of each view: top, then front.", metavar="VIDEO")
+    ],
+    recording: Annotated[
+        Path, typer.Option("--output", "-o", help="Recording to write, .nc.", metavar="FILE")
+    ],
+    pixel_size: Annotated[
+        float, typer.Option(help="What a pixel of both views sees, m, without --cameras.")
+    ] = 58e-6,
+    fps: Annotated[float, typer.Option(help="Frames per second at which it was filmed.")] = 1000.0,
+    cameras: Annotated[
+        Path | None,
+        typer.Option(
+            help="Calibrated cameras: Anipose's TOML, mm, or those of a recording (.nc).",
+            metavar="FILE",
+        ),
+    ] = None,
+    base: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Column and row where a whisker leaves the face in the first frame, view by view "
+            "and then whisker by whisker; by default the best seen whisker is traced.",
+            metavar="X,Y",
+        ),
+    ] = None,
+    corrections: Annotated[
+        Path | None,
+        typer.Option(help="Corrected traces: CSV of view,frame,whisker,x,y.", metavar="FILE"),
+    ] = None,
+    offset: Annotated[
+        str, typer.Option(help="Frames by which the second camera began earlier, or auto.")
+    ] = "0",
+    cutoff: Annotated[float, typer.Option(help="Low pass of the base's pose, Hz; 0: none.")] = 85.0,
+    base_radius: Annotated[float, typer.Option(help="Of the whisker at its base, µm.")] = 100.0,
+    width: Annotated[
+        float, typer.Option(help="Of the whisker's base in the images, pixels, at least 3.")
+    ] = 3.0,
+) -> None:
+    """Track a whisker in two videos: its shape, how it is held, its contact, what its base feels.
+
+    The result is a recording. Stopped with Ctrl-C it goes on from there when it is called again.
+    Example: `vibrissa track top.mp4 front.mp4 --pixel-size 58e-6 --fps 1000 -o trial.nc`
+    """
+    from vibrissa.io import load_corrections, save_recording
+    from vibrissa.io.paths import NETCDF, check_readable, check_writable
+    from vibrissa.tracking import TraceOptions, TrackOptions
+    from vibrissa.tracking import track as tracked
+
+    check_writable(recording, NETCDF)
+    for path in videos:
+        check_readable(path)
+    if offset != "auto" and not offset.lstrip("+-").isdigit():
+        raise ValueError(f"--offset is {offset!r}; a number of frames or auto is needed")
+    views = _cameras(videos, cameras, pixel_size)
+    places = _bases(base or [], len(videos))
+    fixed = {} if corrections is None else load_corrections(corrections)
+    unknown = sorted(view for view in fixed if view >= len(videos))
+    if unknown:
+        raise ValueError(f"{corrections} corrects view {unknown[0]}; views are counted from 0")
+    options = TraceOptions(scale=max(width / 3.0, 1.0))
+    with progress_bars() as tell:
+        traces = [
+            _traced(path, recording, view, places[view], fixed.get(view, {}), options, tell)
+            for view, path in enumerate(videos)
+        ]
+        result = tracked(
+            views,
+            traces,
+            fps,
+            TrackOptions(
+                cutoff=cutoff or None,
+                offset=None if offset == "auto" else int(offset),
+                properties={"base_radius": base_radius * _MICRO},
+            ),
+            progress=tell,
+        )
+    save_recording(recording, result)
+    for view in range(len(videos)):
+        _partial(recording, view).unlink(missing_ok=True)
+    _report(result, recording)
+
+
+def _cameras(videos: Sequence[Path], path: Path | None, pixel_size: float) -> tuple[Camera, ...]:
+    from vibrissa.io import load_recording, video_info
+    from vibrissa.io.paths import NETCDF
+    from vibrissa.trial import load_cameras, orthogonal_views, recorded_cameras
+
+    if path is not None:
+        if path.suffix.lower() in NETCDF:
+            cameras = recorded_cameras(load_recording(path))
+        else:
+            cameras = load_cameras(path)
+        if len(cameras) != len(videos):
+            raise ValueError(
+                f"{path} tells of {len(cameras)} cameras; there are {len(videos)} videos"
+            )
+        return cameras
+    if len(videos) != 2:
+        raise ValueError(f"{len(videos)} videos: give two, or their cameras with --cameras")
+    sizes = [(info.width, info.height) for info in map(video_info, videos)]
+    if sizes[0] != sizes[1]:
+        raise ValueError(f"the videos differ in size, {sizes[0]} and {sizes[1]}: give --cameras")
+    return orthogonal_views(pixel_size, sizes[0])
+
+
+def _bases(texts: Sequence[str], views: int) -> list[list[list[float]] | None]:
+    """Bases of each view; None: to be found."""
+    if not texts:
+        return [None] * views
+    places = [numbers(text, ("x", "y"), "--base") for text in texts]
+    if len(places) % views:
+        raise ValueError(f"there are {len(places)} --base for {views} views; each needs as many")
+    each = len(places) // views
+    return [places[v * each : (v + 1) * each] for v in range(views)]
+
+
+def _partial(recording: Path, view: int) -> Path:
+    return recording.with_name(f".{recording.name}.view{view}.npz")
+
+
+def _traced(
+    video: Path,
+    recording: Path,
+    view: int,
+    bases: Any,
+    corrections: Any,
+    options: TraceOptions,
+    tell: Tell,
+) -> list[list[Trace]]:
+    """Trace a video, or go on where it was stopped."""
+    from vibrissa.io import load_traces, read_video, save_traces, video_info
+    from vibrissa.tracking import Trace, trace_video
+
+    info = video_info(video)
+    about = video.stat()
+    fixed = sorted((key, points.tolist()) for key, points in corrections.items())
+    key = f"{video.resolve()} {about.st_size} {about.st_mtime_ns} {bases} {fixed} {options}"
+    begun = load_traces(_partial(recording, view), key) or []
+    rows = [[Trace(*row) for row in whisker] for whisker in begun]
+    kept: list[list[Trace]] = []
+    stage = f"trace {video.name}"
+    total = max(info.frames, 1)
+    try:
+        traces = trace_video(
+            read_video(video),
+            bases,
+            options,
+            corrections=corrections,
+            begun=rows,
+            kept=kept,
+            progress=lambda done: tell(stage, done, max(total, done)),
+        )
+    finally:
+        if kept and kept[0]:
+            done = min(len(row) for row in kept)
+            save_traces(_partial(recording, view), key, [[(*t,) for t in r[:done]] for r in kept])
+    tell(stage, len(traces[0]), len(traces[0]))
+    return traces
+
+
+def _report(result: xr.DataTree, path: Path) -> None:
+    import numpy as np
+
+    from vibrissa.trial import recorded_whisker
+
+    data = result.to_dataset()
+    for k, name in enumerate(data["whisker"].values):
+        one = data.isel(whisker=k)
+        lost = int((one["confidence"] == 0.0).sum())
+        length = recorded_whisker(result, k).length
+        touching = int(np.nansum(one["in_contact"].values))
+        line = (
+            f"{name}: {shown('length', length)} long, in contact in {touching} of "
+            f"{one.sizes['time']} frames, lost in {lost}, misfit of the traces "
+            f"{float(one['trace_misfit'].median()):.2f} of their standard deviation"
+        )
+        output.print(line, highlight=False, soft_wrap=True)
+    output.print(f"wrote {path}", highlight=False, soft_wrap=True)

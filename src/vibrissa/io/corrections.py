@@ -1,0 +1,67 @@
+"""Corrected traces as CSV: points that a person says are right.
+
+Columns ``view,frame,whisker,x,y``: the points of a whisker in one frame of one view (a number from
+0), from base to tip, column and row in pixels, a line each.
+"""
+
+from __future__ import annotations
+
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vibrissa.io.table import read_text, table_rows
+
+Array = NDArray[np.float64]
+
+COLUMNS = ("view", "frame", "whisker", "x", "y")
+
+
+def load_corrections(path: str | PathLike[str]) -> dict[int, dict[tuple[int, int], Array]]:
+    """Read corrected traces.
+
+    Parameters
+    ----------
+    path : str or path
+        CSV file.
+
+    Returns
+    -------
+    dict
+        By view: by frame and whisker the points (n, 2) from base to tip, column and row.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If it has other columns, a row that cannot be read, or a trace of one point.
+    """
+    path = Path(path)
+    rows = table_rows(read_text(path))
+    header = next(rows, None)
+    if header is None or tuple(header[1]) != COLUMNS:
+        got = "is empty" if header is None else f"has the columns {', '.join(header[1])}"
+        raise ValueError(f"{path} {got}; {', '.join(COLUMNS)} are needed")
+    points: dict[int, dict[tuple[int, int], list[tuple[float, float]]]] = {}
+    for line, cells in rows:
+        try:
+            view, frame, whisker = (int(cell) for cell in cells[:3])
+            x, y = (float(cell) for cell in cells[3:])
+            if min(view, frame, whisker) < 0 or not np.isfinite([x, y]).all():
+                raise ValueError
+        except ValueError:
+            raise ValueError(
+                f"{path}: line {line} reads {','.join(cells)!r}, which is no point of a trace"
+            ) from None
+        points.setdefault(view, {}).setdefault((frame, whisker), []).append((x, y))
+    short = [(v, *key) for v, each in points.items() for key, p in each.items() if len(p) < 2]
+    if short:
+        view, frame, whisker = short[0]
+        raise ValueError(
+            f"{path}: whisker {whisker} in frame {frame} of view {view} has one point; from base "
+            "to tip at least two are needed"
+        )
+    return {view: {key: np.array(p) for key, p in each.items()} for view, each in points.items()}

@@ -1,0 +1,173 @@
+"""The traces of one whisker over a trial as arrays, and how curves lie beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vibrissa.tracking.trace import Trace
+
+Array = NDArray[np.float64]
+
+NODES = 101
+"""Points of a stored trace."""
+
+_FLOOR = 0.05
+"""What a trace is never better than, pixels."""
+
+_END = 1.0
+_FAR = 6.0
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """Traces of one whisker.
+
+    Parameters
+    ----------
+    line : array (time, view, NODES, 2)
+        Column and row, equally spaced from base to tip; NaN where the whisker is lost.
+    sigma : array (time, view, NODES)
+        Standard deviation across, pixels.
+    seen : array (time, view, NODES)
+        1 where the whisker is seen, 0 where it is bridged.
+    confidence : array (time, view)
+        Between 0 and 1.
+    """
+
+    line: Array
+    sigma: Array
+    seen: Array
+    confidence: Array
+
+    @classmethod
+    def of(cls, traces: Sequence[Sequence[Trace]]) -> Sight:
+        """Resample traces.
+
+        Parameters
+        ----------
+        traces : sequence of sequence of Trace
+            View by view, frame by frame.
+
+        Returns
+        -------
+        Sight
+        """
+        shape = (len(traces[0]), len(traces), NODES)
+        line, sigma, seen = np.full((*shape, 2), np.nan), np.full(shape, np.nan), np.zeros(shape)
+        confidence = np.zeros(shape[:2])
+        for view, row in enumerate(traces):
+            for i, trace in enumerate(row):
+                n = len(trace.line)
+                if n < 2:
+                    continue
+                place = np.linspace(0.0, n - 1.0, NODES)
+                for k in range(2):
+                    line[i, view, :, k] = np.interp(place, np.arange(n), trace.line[:, k])
+                sigma[i, view] = np.interp(place, np.arange(n), trace.sigma)
+                seen[i, view] = np.interp(place, np.arange(n), trace.seen) > 0.5
+                confidence[i, view] = trace.confidence
+        return cls(line, sigma, seen, confidence)
+
+    def traces(self, frame: int) -> list[Trace]:
+        """Give one frame's traces.
+
+        Parameters
+        ----------
+        frame : int
+            Which.
+
+        Returns
+        -------
+        list of Trace
+            View by view.
+        """
+        return [
+            Trace(line, sigma, seen > 0.5, float(confidence))
+            if np.isfinite(line).all()
+            else Trace.lost()
+            for line, sigma, seen, confidence in zip(
+                self.line[frame],
+                self.sigma[frame],
+                self.seen[frame],
+                self.confidence[frame],
+                strict=True,
+            )
+        ]
+
+    def rows(self, frames: NDArray[np.intp]) -> Sight:
+        """Choose frames.
+
+        Parameters
+        ----------
+        frames : array (n,)
+            Which.
+
+        Returns
+        -------
+        Sight
+            Of those.
+        """
+        return Sight(*(getattr(self, name)[frames] for name in vars(self)))
+
+    def equations(self, view: int, pixels: Array, slopes: Array) -> tuple[Array, Array]:
+        """Say by how much points miss the traces of a view.
+
+        Parameters
+        ----------
+        view : int
+            Which.
+        pixels : array (time, n, 2)
+            Where the points of a curve from base to tip are seen.
+        slopes : array (time, n, 2, 3)
+            How that changes with the points.
+
+        Returns
+        -------
+        rows : array (time, n + 2, 3)
+            Gradient of each equation by the place of its point, the last two those of base and tip.
+        misses : array (time, n + 2)
+            In standard deviations; 0 where the trace says nothing.
+        """
+        line, sigma = self.line[:, view], self.sigma[:, view]
+        tangent = np.gradient(line, axis=1)
+        tangent /= np.linalg.norm(tangent, axis=2, keepdims=True)
+        square = (
+            (pixels**2).sum(2)[:, :, None]
+            + (line**2).sum(2)[:, None, :]
+            - 2.0 * pixels @ np.swapaxes(line, 1, 2)
+        )
+        near = np.argmin(np.where(np.isfinite(square), square, np.inf), axis=2)
+        row = np.arange(len(line))[:, None]
+        t, away = tangent[row, near], line[row, near] - pixels
+        spacing = np.linalg.norm(line[:, 1] - line[:, 0], axis=1)
+        along = (away * t).sum(axis=2)
+        # Between two points of the trace its direction changes a little.
+        other = np.clip(near - np.sign(along).astype(int), 0, NODES - 1)
+        share = np.clip(np.abs(along) / spacing[:, None], 0.0, 1.0)[..., None]
+        t = (1.0 - share) * t + share * tangent[row, other]
+        t /= np.linalg.norm(t, axis=2, keepdims=True)
+        chord = (1.0 - share) * line[row, near] + share * line[row, other] - pixels
+        across = np.stack([-t[..., 1], t[..., 0]], axis=-1)
+        miss = (chord * across).sum(axis=2)
+        deviation = np.sqrt(sigma[row, near] ** 2 + _FLOOR**2)
+        beyond = (np.abs(along) > 1.5 * spacing[:, None] + 1.0) | ~np.isfinite(miss)
+        weight = np.where(beyond, 0.0, 1.0 / deviation)
+        # An error far beyond what is usual says that something else is wrong.
+        scaled = np.abs(miss) * weight
+        weight = weight / np.sqrt(np.maximum(scaled / 6.0, 1.0))
+        rows = np.einsum("tni,tnij->tnj", across, slopes) * weight[..., None]
+        misses = miss * weight
+        ends, gaps = [], []
+        for end in (0, -1):
+            gap = ((line[:, end] - pixels[:, end]) * tangent[:, end]).sum(axis=1)
+            counts = np.isfinite(gap) & ((end == 0) | (np.abs(gap) < _FAR))
+            pull = np.einsum("ti,tij->tj", tangent[:, end], slopes[:, end]) / _END
+            ends.append(np.where(counts[:, None], pull, 0.0))
+            gaps.append(np.where(counts, gap / _END, 0.0))
+        rows = np.concatenate([rows, np.stack(ends, axis=1)], axis=1)
+        misses = np.concatenate([misses, np.stack(gaps, axis=1)], axis=1)
+        return np.nan_to_num(rows), np.nan_to_num(misses)

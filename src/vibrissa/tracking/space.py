@@ -1,0 +1,285 @@
+"""One whisker in space from its traces in two or more calibrated views.
+
+A point of one trace lies in another view on its epipolar line (with the paper's orthogonal views:
+in the column of the shared axis). First the traces are matched point by point, both from base to
+tip, so that the distances from those lines are least in sum; this gives a curve in space. Then a
+cubic spline is moved until its images lie on the traces, each trace counting across itself only and
+by its own uncertainty. Where the whisker runs so that no view sees it move in some direction, the
+spline's covariance is large in that direction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline
+
+from vibrissa.rod.compiled import kernel
+from vibrissa.tracking.trace import Trace
+from vibrissa.trial.cameras import Camera, triangulate
+
+Array = NDArray[np.float64]
+
+NODES = 101
+"""Points of a whisker in space, equally spaced."""
+
+_SAMPLES = 51
+
+_KNOTS = 14
+_ROUNDS = 5
+_SPARSE = 2
+
+_FLOOR = 0.05
+"""What a trace is never better than, pixels: the cameras' calibration and the spline's freedom."""
+
+_LOOSE = 0.05
+"""How far third differences of the spline's control points go, as a share of the length."""
+
+_END = 1.0
+"""How well a trace's ends are known along it, pixels."""
+
+
+class SpaceCurve(NamedTuple):
+    """A whisker in space.
+
+    Parameters
+    ----------
+    points : array (NODES, 3)
+        From base to where the first of the views ends, laboratory frame, m; NaN if there is none.
+    covariance : array (NODES, 3, 3)
+        Of each point, m².
+    misfit : float
+        Root mean square distance of its images from the traces, in their standard deviations.
+    """
+
+    points: Array
+    covariance: Array
+    misfit: float
+
+    @classmethod
+    def none(cls) -> SpaceCurve:
+        """Make one of a frame without a whisker.
+
+        Returns
+        -------
+        SpaceCurve
+            All NaN.
+        """
+        return cls(np.full((NODES, 3), np.nan), np.full((NODES, 3, 3), np.nan), np.nan)
+
+    @property
+    def length(self) -> float:
+        """Along the points, m."""
+        return float(np.linalg.norm(np.diff(self.points, axis=0), axis=1).sum())
+
+
+def merge(cameras: Sequence[Camera], traces: Sequence[Trace]) -> SpaceCurve:
+    """Find the whisker in space that two or more views see.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        The views.
+    traces : sequence of Trace
+        Of one whisker in one frame, view by view.
+
+    Returns
+    -------
+    SpaceCurve
+        NaN if a trace is missing.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than two views, or not a trace for each.
+    """
+    if len(cameras) < 2 or len(cameras) != len(traces):
+        raise ValueError(f"{len(cameras)} cameras and {len(traces)} traces: two each are needed")
+    if any(len(trace.line) < 8 for trace in traces):
+        return SpaceCurve.none()
+    start = _matched(cameras, traces)
+    if len(start) < 8 or not np.isfinite(start).all():
+        return SpaceCurve.none()
+    return _fitted(cameras, traces, _resampled(start, _SAMPLES))
+
+
+def _matched(cameras: Sequence[Camera], traces: Sequence[Trace]) -> Array:
+    """Points (n, 3) by matching the first trace with the others."""
+    first = traces[0].line[::_SPARSE]
+    partners = [np.zeros(len(first))]
+    base = triangulate(cameras, np.stack([trace.line[0] for trace in traces]))[0]
+    origin, direction = cameras[0].rays(first)
+    # Two points of each ray beside the base: their images make the epipolar line.
+    depth = ((base - origin) * direction).sum(axis=1)
+    scale = 1.0 / np.linalg.norm(cameras[0].project_with_slopes(base)[1], axis=0).max()
+    ends = [origin + (depth + 100.0 * sign * scale)[:, None] * direction for sign in (-1.0, 1.0)]
+    for camera, trace in zip(cameras[1:], traces[1:], strict=True):
+        a, b = (camera.project(end) for end in ends)
+        normal = np.stack([a[:, 1] - b[:, 1], b[:, 0] - a[:, 0]], axis=1)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        other = trace.line[::_SPARSE]
+        miss = np.abs(other @ normal.T - (a * normal).sum(axis=1)).T
+        partners.append(_partners(np.minimum(miss, 30.0) ** 2))
+    known = np.all([np.isfinite(p) for p in partners], axis=0)
+    pixels = [first[known]]
+    for p, trace in zip(partners[1:], traces[1:], strict=True):
+        other = trace.line[::_SPARSE]
+        place = np.arange(len(other))
+        pixels.append(np.stack([np.interp(p[known], place, other[:, k]) for k in (0, 1)], axis=1))
+    return triangulate(cameras, np.stack(pixels))[0]
+
+
+def _partners(cost: Array) -> Array:
+    """For each row the mean column of the cheapest monotone way through; NaN after its end."""
+    rows = np.empty(sum(cost.shape), np.int64)
+    columns = np.empty_like(rows)
+    count = cheapest(np.ascontiguousarray(cost), rows, columns)
+    total = np.bincount(rows[:count], columns[:count], cost.shape[0])
+    number = np.bincount(rows[:count], minlength=cost.shape[0])
+    mean: Array = np.where(number > 0, total / np.maximum(number, 1), np.nan)
+    return mean
+
+
+@kernel
+def cheapest(cost: Any, rows: Any, columns: Any) -> int:
+    """Cheapest way from the first corner to the last row or column, never going back.
+
+    Parameters
+    ----------
+    cost : array (n, m)
+        Of each place.
+    rows, columns : array (n + m,)
+        Result: the way, from its end to its beginning.
+
+    Returns
+    -------
+    int
+        How many places it has.
+    """
+    n, m = cost.shape
+    total = np.empty((n, m))
+    for i in range(n):
+        for j in range(m):
+            best = 0.0 if i == 0 and j == 0 else np.inf
+            # A step in one direction alone costs a little, so that both advance together.
+            if i > 0 and j > 0:
+                best = min(best, total[i - 1, j - 1])
+            if i > 0:
+                best = min(best, total[i - 1, j] + 0.05)
+            if j > 0:
+                best = min(best, total[i, j - 1] + 0.05)
+            total[i, j] = best + cost[i, j]
+    i, j, least = n - 1, m - 1, np.inf
+    # Per place of the way, so that a short one has no advantage.
+    for k in range(m):
+        mean = total[n - 1, k] / (n + k)
+        if mean <= least:
+            i, j, least = n - 1, k, mean
+    for k in range(n):
+        mean = total[k, m - 1] / (m + k)
+        if mean <= least:
+            i, j, least = k, m - 1, mean
+    count = 0
+    while True:
+        rows[count], columns[count] = i, j
+        count += 1
+        if i == 0 and j == 0:
+            return count
+        if i == 0:
+            j -= 1
+        elif j == 0:
+            i -= 1
+        else:
+            a, b, c = total[i - 1, j - 1], total[i - 1, j] + 0.05, total[i, j - 1] + 0.05
+            if a <= b and a <= c:
+                i, j = i - 1, j - 1
+            elif b <= c:
+                i -= 1
+            else:
+                j -= 1
+
+
+def _resampled(points: Array, count: int) -> Array:
+    """Points equally spaced along a polyline; places of no movement are left out."""
+    step = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    kept = np.concatenate([[True], step > 1e-3 * np.median(step)])
+    points = points[kept]
+    s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    wanted = np.linspace(0.0, s[-1], count)
+    return np.stack([np.interp(wanted, s, points[:, k]) for k in range(3)], axis=1)
+
+
+def _knots() -> Array:
+    return np.concatenate([[0.0] * 3, np.linspace(0.0, 1.0, _KNOTS - 2), [1.0] * 3])
+
+
+@cache
+def _basis(count: int) -> tuple[Array, Array]:
+    """Spline basis (count, _KNOTS) and its third differences (_KNOTS − 3, _KNOTS)."""
+    basis = BSpline.design_matrix(np.linspace(0.0, 1.0, count), _knots(), 3).toarray()
+    return np.asarray(basis), np.diff(np.eye(_KNOTS), n=3, axis=0)
+
+
+def _fitted(cameras: Sequence[Camera], traces: Sequence[Trace], start: Array) -> SpaceCurve:
+    """Gauss–Newton on the distances of the spline's images from the traces."""
+    basis, third = _basis(_SAMPLES)
+    control = np.linalg.lstsq(basis, start)[0]
+    size = float(np.linalg.norm(np.diff(start, axis=0), axis=1).sum())
+    # Loose: only where nothing is seen does it say how the whisker goes on.
+    stiff = np.kron(third.T @ third, np.eye(3)) / (_LOOSE * size) ** 2
+    hessian, misfit = stiff, np.nan
+    for _ in range(_ROUNDS):
+        node, rows, misses = _equations(cameras, traces, basis @ control)
+        design = (basis[node][:, :, None] * rows[:, None, :]).reshape(len(rows), -1)
+        hessian = design.T @ design + stiff
+        gradient = design.T @ misses - stiff @ control.reshape(-1)
+        step = np.linalg.solve(hessian, gradient).reshape(-1, 3)
+        control = control + step
+        misfit = float(np.sqrt(np.mean((misses - design @ step.reshape(-1)) ** 2)))
+        if np.abs(step).max() < 1e-8:
+            break
+    spread = np.linalg.inv(hessian).reshape(_KNOTS, 3, _KNOTS, 3)
+    basis, _ = _basis(NODES)
+    covariance = np.einsum("ik,kalb,il->iab", basis, spread, basis) * max(1.0, misfit**2)
+    points = _resampled(BSpline(_knots(), control, 3)(np.linspace(0.0, 1.0, 8 * NODES)), NODES)
+    return SpaceCurve(points, covariance, misfit)
+
+
+def _equations(
+    cameras: Sequence[Camera], traces: Sequence[Trace], points: Array
+) -> tuple[NDArray[np.int64], Array, Array]:
+    """Node (r,), gradient (r, 3) and misses (r,) of all equations, in standard deviations."""
+    along = np.gradient(points, axis=0)
+    spacing = np.linalg.norm(along, axis=1, keepdims=True)
+    # Points may slide along the curve by a part of their distance a round, no more.
+    nodes, rows, misses = (
+        [np.arange(_SAMPLES)],
+        [along / spacing / (0.3 * spacing.mean())],
+        [np.zeros(_SAMPLES)],
+    )
+    for camera, trace in zip(cameras, traces, strict=True):
+        pixels, slopes = camera.project_with_slopes(points)
+        line = trace.line
+        tangent = np.gradient(line, axis=0)
+        tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+        near = np.argmin(((pixels[:, None, :] - line[None, :, :]) ** 2).sum(axis=2), axis=1)
+        t, away = tangent[near], line[near] - pixels
+        across = np.stack([-t[:, 1], t[:, 0]], axis=1)
+        beyond = np.abs((away * t).sum(axis=1)) > 2.0
+        sigma = np.sqrt(trace.sigma[near] ** 2 + _FLOOR**2)
+        used = np.flatnonzero(~beyond)
+        nodes.append(used)
+        rows.append(np.einsum("ni,nij->nj", across, slopes)[used] / sigma[used, None])
+        misses.append(((away * across).sum(axis=1) / sigma)[used])
+        for node, end in ((0, 0), (_SAMPLES - 1, -1)):
+            gap = float((line[end] - pixels[node]) @ tangent[end])
+            # The whisker may go on in another view where this one no longer shows it.
+            if node == 0 or abs(gap) < 6.0:
+                nodes.append(np.array([node]))
+                rows.append(tangent[end][None, :] @ slopes[node] / _END)
+                misses.append(np.array([gap / _END]))
+    return np.concatenate(nodes), np.concatenate(rows), np.concatenate(misses)

@@ -1,0 +1,97 @@
+"""`vibrissa track` on small videos."""
+
+import numpy as np
+import pytest
+
+from vibrissa import Whisker
+from vibrissa.cli.app import app
+from vibrissa.io import load_recording, load_traces, save_traces
+from vibrissa.trial import Motion, Peg, film, orthogonal_views, save_cameras, simulate
+
+typer_testing = pytest.importorskip("typer.testing")
+CAMERAS = orthogonal_views(size=(192, 192), center=(4e-3, 0.0, 0.0))
+
+
+@pytest.fixture(scope="module")
+def videos(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("videos")
+    n = 16
+    azimuth = np.linspace(-0.3, 0.1, n)
+    whisker = Whisker.parabola(length=8e-3, coefficient=15.0)
+    motion = Motion(np.arange(n) / 1000, azimuth, 0.1 + 0 * azimuth, 0 * azimuth, np.zeros((n, 3)))
+    trial = simulate(whisker, motion, Peg([5e-3, 1.3e-3, 0.0], [0.0, 0.0, 1.0], 0.5e-3))
+    paths = {"top": folder / "top.mkv", "front": folder / "front.mkv"}
+    film(trial, paths, CAMERAS)
+    save_cameras(folder / "cameras.toml", CAMERAS)
+    return folder
+
+
+def run(*words):
+    return typer_testing.CliRunner().invoke(app, [str(word) for word in words])
+
+
+def arguments(videos, *more):
+    return ["track", videos / "top.mkv", videos / "front.mkv", *more]
+
+
+def test_two_videos_become_a_recording(videos, tmp_path):
+    out = tmp_path / "trial.nc"
+    done = run(*arguments(videos, "--cameras", videos / "cameras.toml", "-o", out))
+    assert done.exit_code == 0, done.exception
+    assert "in contact in" in done.stdout
+    recording = load_recording(out)
+    assert recording["trace"].shape[:3] == (16, 1, 2)
+    np.testing.assert_allclose(recording["base_position"].values[0, 0], 0.0, atol=2e-4)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["trial.nc"]
+
+
+def test_what_is_traced_is_not_traced_again(videos, tmp_path, monkeypatch):
+    """Stopped in the second video, the first is not looked at again."""
+    import vibrissa.tracking.view as view
+
+    out = tmp_path / "trial.nc"
+    follow, calls = view.follow_all, []
+
+    def stopping(followers, frame, known):
+        calls.append(1)
+        if len(calls) == 20:
+            raise KeyboardInterrupt
+        return follow(followers, frame, known)
+
+    monkeypatch.setattr(view, "follow_all", stopping)
+    words = arguments(videos, "--cameras", videos / "cameras.toml", "-o", out)
+    run(*words)
+    assert len(calls) == 20
+    assert not out.exists()
+    done = run(*words)
+    assert done.exit_code == 0, done.exception
+    assert len(calls) == 20 + (32 - 19)
+    assert out.exists()
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (("--base", "20,30"), "each needs as many"),
+        (("--offset", "some"), "a number of frames or auto"),
+        (("--pixel-size", "0"), "pixel_size"),
+    ],
+)
+def test_what_cannot_be_tracked_says_why(videos, tmp_path, more, said):
+    done = run(*arguments(videos, *more, "-o", tmp_path / "t.nc"))
+    assert done.exit_code != 0
+    assert said in str(done.exception)
+
+
+def test_traces_are_kept_for_their_own_video_only(tmp_path):
+    row = (np.arange(6.0).reshape(3, 2), np.ones(3), np.ones(3, dtype=bool), 0.5)
+    lost = (np.empty((0, 2)), np.empty(0), np.empty(0, dtype=bool), 0.0)
+    save_traces(tmp_path / "t.npz", "this", [[row, lost], [lost, row]])
+    ((first, second), (third, fourth)) = load_traces(tmp_path / "t.npz", "this")
+    np.testing.assert_array_equal(first[0], row[0])
+    assert len(second[0]) == len(third[0]) == 0
+    assert fourth[3] == 0.5
+    assert load_traces(tmp_path / "t.npz", "other") is None
+    assert load_traces(tmp_path / "none.npz", "this") is None
+    (tmp_path / "t.npz").write_bytes(b"damaged")
+    assert load_traces(tmp_path / "t.npz", "this") is None

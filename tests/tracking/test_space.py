@@ -1,0 +1,152 @@
+"""From two views to space: matching, uncertainty, timing, filtering."""
+
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from vibrissa.tracking import Trace, low_pass, merge, paired_frames
+from vibrissa.tracking.trace import even
+from vibrissa.trial import Camera, orthogonal_views
+
+LENGTH = 30e-3
+
+
+def curve(azimuth, bend=12.0, count=200):
+    """A whisker in space that bends up and forward, m."""
+    s = np.linspace(0.0, LENGTH, count)
+    flat = np.stack([s, bend * s**2, 0.6 * bend * s**2 * s / LENGTH], axis=1)
+    return flat @ Rotation.from_euler("z", azimuth).as_matrix().T
+
+
+def perspective_pair():
+    views = []
+    for name, turn in (("left", [0.2, 0.4, 0.0]), ("right", [1.4, 0.1, 0.2])):
+        matrix = [[6000.0, 0.0, 511.5], [0.0, 6000.0, 511.5], [0.0, 0.0, 1.0]]
+        rotation = Rotation.from_rotvec(turn).as_matrix()
+        views.append(Camera(matrix, rotation, [-0.01, 0.0, 0.35], [-0.1, 0.05], name=name))
+    return tuple(views)
+
+
+def traced(camera, points, generator=None, noise=0.03):
+    line = even(camera.project(points))
+    if generator is not None:
+        line = line + generator.normal(0.0, noise, line.shape)
+    n = len(line)
+    return Trace(line, np.full(n, noise), np.ones(n, dtype=bool), 1.0)
+
+
+PAIRS = {"orthogonal": orthogonal_views(center=(0.01, 0.005, 0.0)), "any": perspective_pair()}
+
+
+@pytest.mark.parametrize("pair", PAIRS.values(), ids=PAIRS.keys())
+@pytest.mark.parametrize("azimuth", [-0.9, 0.0, 0.7])
+def test_a_curve_in_space_is_found_again(pair, azimuth):
+    points = curve(azimuth)
+    found = merge(pair, [traced(camera, points) for camera in pair])
+    dense = CubicSpline(np.linspace(0, 1, 200), points)(np.linspace(0, 1, 4000))
+    distance, _ = cKDTree(dense).query(found.points)
+    assert distance.max() < 20e-6
+    assert np.linalg.norm(found.points[0] - points[0]) < 20e-6
+    true = np.linalg.norm(np.diff(dense, axis=0), axis=1).sum()
+    assert found.length == pytest.approx(true, rel=5e-3)
+
+
+def test_across_the_views_errors_are_as_large_as_they_say():
+    generator = np.random.default_rng(0)
+    pair, points = PAIRS["orthogonal"], curve(0.3)
+    dense = CubicSpline(np.linspace(0, 1, 200), points)(np.linspace(0, 1, 4000))
+    z = []
+    for _ in range(20):
+        found = merge(pair, [traced(c, points, generator, 0.1) for c in pair])
+        _, near = cKDTree(dense).query(found.points)
+        for j in range(10, 90, 10):
+            tangent = dense[near[j] + 1] - dense[near[j] - 1]
+            across = np.cross(tangent, [0.0, 0.0, 1.0])
+            across /= np.linalg.norm(across)
+            miss = (found.points[j] - dense[near[j]]) @ across
+            z.append(miss / np.sqrt(across @ found.covariance[j] @ across))
+    assert 0.3 < np.std(z) < 1.5
+
+
+def test_along_the_epipolar_direction_it_is_honest():
+    """In a plane of one x, which of its heights belongs to which y no view tells."""
+    pair = orthogonal_views(center=(0.0, 0.012, 0.012))
+    s = np.linspace(0.0, LENGTH, 200)
+    spread = []
+    for angle in (0.5, np.pi / 2 - 0.02):
+        bow = np.sin(angle) * np.stack([s + 8.0 * s**2, s - 8.0 * s**2], axis=1)
+        points = np.column_stack([np.cos(angle) * s, bow])
+        found = merge(pair, [traced(camera, points) for camera in pair])
+        across = np.array([0.0, 1.0, -1.0]) / np.sqrt(2.0)
+        spread.append(np.sqrt(across @ found.covariance[50] @ across))
+    assert spread[0] < 20e-6
+    assert spread[1] > 5.0 * spread[0]
+
+
+def test_a_view_that_ends_early_ends_the_curve():
+    pair, points = PAIRS["orthogonal"], curve(0.2)
+    found = merge(pair, [traced(pair[0], points), traced(pair[1], points[:150])])
+    assert found.length == pytest.approx(
+        merge(pair, [traced(c, points[:150]) for c in pair]).length, rel=0.01
+    )
+
+
+def test_without_a_trace_there_is_no_curve():
+    pair = PAIRS["orthogonal"]
+    found = merge(pair, [traced(pair[0], curve(0.2)), Trace.lost()])
+    assert np.isnan(found.points).all()
+    with pytest.raises(ValueError, match="two each are needed"):
+        merge(pair, [Trace.lost()])
+
+
+def moving(pair, count=120, late=0, dropped=()):
+    """Traces of a whisk; the second camera begins late and drops frames."""
+    azimuth = 0.6 * np.sin(2.0 * np.pi * np.arange(count + 60) / 70.0)
+    first = [traced(pair[0], curve(a)) for a in azimuth[:count]]
+    numbers = [i for i in range(late, count + late) if i not in dropped]
+    return first, [traced(pair[1], curve(azimuth[i])) for i in numbers], numbers
+
+
+@pytest.mark.parametrize("pair", PAIRS.values(), ids=PAIRS.keys())
+def test_the_offset_between_cameras_and_dropped_frames_are_found(pair):
+    first, second, numbers = moving(pair, late=7, dropped=(60, 61))
+    pairs = paired_frames(pair, [first, second], None)
+    moments = np.array(numbers)[pairs[:, 1]]
+    wrong = pairs[:, 0] != moments
+    assert len(pairs) > 100
+    # Where the whisker turns back, frames before and after a gap look alike.
+    assert wrong.mean() < 0.05
+
+
+def test_a_given_offset_is_used():
+    pair = PAIRS["orthogonal"]
+    first, second, _ = moving(pair, count=20)
+    pairs = paired_frames(pair, [first, second], 3)
+    np.testing.assert_array_equal(pairs, np.stack([np.arange(17), np.arange(3, 20)], axis=1))
+    with pytest.raises(ValueError, match="no frames belong together"):
+        paired_frames(pair, [first, second], 50)
+    with pytest.raises(ValueError, match="too few frames"):
+        paired_frames(pair, [[first[0]] + [Trace.lost()] * 19, second], None)
+
+
+def test_the_filter_shifts_nothing_and_stops_what_is_fast():
+    t = np.arange(1000) / 1000.0
+    slow, fast = np.sin(2 * np.pi * 8.0 * t), np.sin(2 * np.pi * 300.0 * t)
+    out = low_pass(np.stack([slow, fast], axis=1), 1000.0, 85.0)
+    np.testing.assert_allclose(out[50:-50, 0], slow[50:-50], atol=1e-3)
+    assert np.abs(out[50:-50, 1]).max() < 0.01
+    lag = np.argmax(np.correlate(out[:, 0], slow, "full")) - 999
+    assert lag == 0
+
+
+def test_the_filter_keeps_gaps():
+    values = np.linspace(0.0, 1.0, 60)
+    values[20:25] = np.nan
+    out = low_pass(values, 1000.0)
+    np.testing.assert_array_equal(np.isnan(out), np.isnan(values))
+    np.testing.assert_allclose(out[30:50], values[30:50], atol=1e-6)
+    np.testing.assert_array_equal(low_pass(values, 1000.0, None), values)
+    with pytest.raises(ValueError, match="below half of"):
+        low_pass(values, 100.0, 85.0)

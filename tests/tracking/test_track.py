@@ -1,0 +1,179 @@
+"""The whole way, from filmed frames to contact and wrench, against the simulated truth."""
+
+import numpy as np
+import pytest
+
+from vibrissa.status import Status
+from vibrissa.tracking import TrackOptions, rest_shape, trace_video, track, whisker_at_rest
+from vibrissa.tracking.banded import Smoother
+from vibrissa.tracking.pose import angles_of
+from vibrissa.trial import recorded_whisker
+from vibrissa.trial.motion import base_rotation
+
+
+@pytest.fixture(scope="module")
+def traces(filmed):
+    return [trace_video(frames) for frames in filmed.frames]
+
+
+@pytest.fixture(scope="module")
+def recording(filmed, traces):
+    return track(filmed.cameras, traces, 1000.0)
+
+
+@pytest.fixture(scope="module")
+def found(recording):
+    return recording.to_dataset().isel(whisker=0)
+
+
+@pytest.fixture(scope="module")
+def both(filmed, found):
+    """Frames that are in contact in truth and in the result."""
+    return (filmed.truth["in_contact"].values > 0) & (found["in_contact"].values > 0)
+
+
+def test_contact_is_told_from_none(filmed, found):
+    truly = filmed.truth["in_contact"].values > 0
+    assert (truly == (found["in_contact"].values > 0)).mean() > 0.9
+    np.testing.assert_array_equal(
+        found["status"].values,
+        np.where(found["in_contact"].values > 0, Status.OK, Status.NO_CONTACT),
+    )
+
+
+def test_the_whisker_is_where_it_is(filmed, found):
+    true, line = filmed.truth["centerline"].values, found["centerline"].values
+    for i in range(len(line)):
+        distance = np.linalg.norm(line[i][:, None] - true[i][None], axis=2).min(axis=0)
+        assert np.median(distance) < 60e-6
+
+
+def test_the_rest_shape_is_the_whisker_s(filmed, recording):
+    whisker, true = recorded_whisker(recording), recorded_whisker(filmed.recording)
+    assert whisker.length == pytest.approx(true.length, rel=0.03)
+    s = np.linspace(0.0, 0.9 * true.length, 20)
+    assert np.abs(whisker.position(s) - true.position(s)).max() < 100e-6
+
+
+def test_the_base_is_held_as_it_is(filmed, found):
+    truth = filmed.recording.to_dataset().isel(whisker=0)
+    away = found["base_position"].values - truth["base_position"].values
+    assert np.median(np.linalg.norm(away, axis=1)) < 80e-6
+    for name in ("base_azimuth", "base_elevation"):
+        assert np.median(np.abs(found[name].values - truth[name].values)) < np.radians(1.0)
+
+
+def test_the_contact_is_where_it_is(filmed, found, both):
+    away = found["contact_point"].values - filmed.truth["contact_point"].values
+    assert both.sum() > 10
+    assert np.median(np.linalg.norm(away[both], axis=1)) < 60e-6
+
+
+def test_force_and_moment_are_those_of_the_rod(filmed, found, both):
+    for name in ("force", "moment"):
+        true = filmed.truth[name].values[both]
+        error = np.linalg.norm(found[name].values[both] - true, axis=1)
+        assert np.median(error / np.linalg.norm(true, axis=1)) < 0.05
+    free = found["in_contact"].values == 0
+    assert (found["force"].values[free] == 0.0).all()
+    assert np.isnan(found["contact_point"].values[free]).all()
+
+
+def test_the_covariance_of_the_contact_is_of_the_size_of_its_errors(filmed, found, both):
+    away = (found["contact_point"].values - filmed.truth["contact_point"].values)[both]
+    spread = found["contact_covariance"].values[both]
+    squares = np.einsum("ti,tij,tj->t", away, np.linalg.inv(spread), away)
+    assert 0.1 < np.median(squares) < 30.0
+
+
+def test_the_paper_s_way_is_beside_it(filmed, recording):
+    measured = recording["measured"].to_dataset().isel(whisker=0)
+    truth = filmed.recording.to_dataset().isel(whisker=0)
+    away = measured["base_position"].values - truth["base_position"].values
+    assert np.median(np.linalg.norm(away, axis=1)) < 80e-6
+    assert np.nanmedian(measured["centerline_sigma"].values) < 50e-6
+
+
+def test_a_recording_says_what_it_holds(recording, tmp_path):
+    from vibrissa.io import load_recording, save_recording
+
+    data = recording.to_dataset()
+    assert data["trace"].dims == ("time", "whisker", "view", "node", "image_axis")
+    for name, variable in data.data_vars.items():
+        assert {"units", "long_name"} <= set(variable.attrs), name
+    save_recording(tmp_path / "t.nc", recording)
+    again = load_recording(tmp_path / "t.nc")
+    np.testing.assert_array_equal(again["force"].values, data["force"].values)
+
+
+def test_lost_frames_are_missing(filmed, traces):
+    from vibrissa.tracking import Trace
+
+    holes = [[list(row) for row in view] for view in traces]
+    holes[1][0][12] = Trace.lost()
+    data = track(filmed.cameras, holes, 1000.0).to_dataset().isel(whisker=0)
+    assert data["status"].values[12] == Status.MISSING
+    assert data["confidence"].values[12] == 0.0
+    assert np.isnan(data["force"].values[12]).all()
+    assert np.isfinite(data["base_position"].values[13]).all()
+
+
+def test_the_smoother_solves_its_equations():
+    """Against the dense normal equations."""
+    generator = np.random.default_rng(0)
+    count, n = 7, 4
+    root = generator.normal(size=(count, n, n))
+    hessian = root @ np.swapaxes(root, 1, 2) + 0.1 * np.eye(n)
+    gradient = generator.normal(size=(count, n))
+    smoother = Smoother(hessian, gradient)
+    dense = np.zeros((count * n, count * n))
+    for i in range(count):
+        dense[i * n : (i + 1) * n, i * n : (i + 1) * n] = hessian[i]
+    right = gradient.reshape(-1).copy()
+    value, weight = generator.normal(size=(count, n)), np.array([1.0, 2.0, 0.5, 0.0])
+    for i in range(1, count - 1):
+        second = value[i - 1] - 2.0 * value[i] + value[i + 1]
+        smoother.add_second(i, second, weight)
+        rows = np.zeros((n, count * n))
+        for j, factor in ((i - 1, 1.0), (i, -2.0), (i + 1, 1.0)):
+            rows[:, j * n : (j + 1) * n] += factor * np.diag(weight)
+        dense += rows.T @ rows
+        right -= rows.T @ (weight * second)
+    np.testing.assert_allclose(smoother.solved().reshape(-1), np.linalg.solve(dense, right))
+    inverse = np.linalg.inv(dense)
+    blocks = [inverse[i * n : (i + 1) * n, i * n : (i + 1) * n] for i in range(count)]
+    np.testing.assert_allclose(smoother.covariances(), blocks, rtol=1e-6, atol=1e-9)
+
+
+def test_angles_of_an_orientation():
+    angles = np.random.default_rng(0).uniform(-1.2, 1.2, (50, 3))
+    np.testing.assert_allclose(angles_of(base_rotation(*angles.T)), angles, atol=1e-12)
+
+
+def test_a_whisker_that_is_never_free_or_seen_says_so(filmed, traces):
+    with pytest.raises(ValueError, match="at least 3 are needed"):
+        rest_shape(np.full((5, 20, 3), np.nan))
+    with pytest.raises(ValueError, match="every view needs all whiskers"):
+        track(filmed.cameras, [traces[0], []], 1000.0)
+    with pytest.raises(ValueError, match="rate is 0"):
+        track(filmed.cameras, traces, 0.0, TrackOptions())
+
+
+def test_the_rest_shape_ignores_how_it_is_held():
+    """Shapes that are the same but for rigid motions are one; the bent ones are left out."""
+    from scipy.spatial.transform import Rotation
+
+    generator = np.random.default_rng(0)
+    s = np.linspace(0.0, 20e-3, 101)
+    rest = np.stack([s, 8.0 * s**2, 0.0 * s], axis=1)
+    curves = []
+    for i in range(30):
+        bent = rest + np.outer(s**2, [0.0, 3.0 if i % 3 == 0 else 0.0, 0.0])
+        turn = Rotation.random(rng=generator).as_matrix()
+        noise = generator.normal(0.0, 1e-6, rest.shape)
+        curves.append(bent @ turn.T + generator.normal(size=3) + noise)
+    shape = rest_shape(np.array(curves))
+    np.testing.assert_array_equal(shape.free, np.arange(30) % 3 != 0)
+    whisker = whisker_at_rest(shape)
+    expected = 2.0 * 8.0 / (1.0 + (2.0 * 8.0 * 10e-3) ** 2) ** 1.5
+    assert whisker.curvature(10e-3)[2] == pytest.approx(expected, rel=0.05)

@@ -5,7 +5,7 @@ import pytest
 
 from vibrissa import Whisker
 from vibrissa.io import read_video
-from vibrissa.trial import Look, Motion, Peg, film, orthogonal_views, simulate
+from vibrissa.trial import Look, Motion, Peg, Sphere, film, orthogonal_views, simulate
 from vibrissa.trial.film import film_frames
 
 WHISKER = Whisker.parabola(length=10e-3, coefficient=15.0)
@@ -132,3 +132,29 @@ def test_what_cannot_be_filmed_says_why(trial, tmp_path):
         film(trial, {"top": tmp_path / "a.mkv"})
     with pytest.raises(ValueError, match=r"contrast is 2\.0"):
         Look(contrast=2.0)
+
+
+def test_shadows_of_objects_are_as_large_as_they_are():
+    """A sphere's and a box's area in both views, to a fraction of a pixel's edge."""
+    from vibrissa.trial.shadows import silhouette
+
+    size = 58e-6
+    center = np.array([5e-3, 0.0, 0.0])
+    sphere = Sphere([4e-3, 1e-3, -1e-3], 1.7e-3)
+    for camera in CAMERAS:
+        shadow = silhouette(camera, [sphere], center, 0.7)
+        assert shadow.sum() * size**2 == pytest.approx(np.pi * 1.7e-3**2, rel=2e-3)
+        rows, columns = np.indices(shadow.shape)
+        middle = [(shadow * x).sum() / shadow.sum() for x in (columns, rows)]
+        np.testing.assert_allclose(middle, camera.project([4e-3, 1e-3, -1e-3]), atol=0.02)
+
+
+def test_hidden_is_what_is_behind():
+    from vibrissa.trial.shadows import hidden
+
+    sphere = Sphere([5e-3, 0.0, 0.0], 1e-3)
+    points = np.array(
+        [[5e-3, -2e-3, 0.0], [5e-3, 2e-3, 0.0], [5e-3, 0.0, 2e-3], [5e-3, 0.0, -2e-3]]
+    )
+    np.testing.assert_array_equal(hidden(points, CAMERAS[1], [sphere]), [1, 0, 0, 0])
+    np.testing.assert_array_equal(hidden(points, CAMERAS[0], [sphere]), [0, 0, 0, 1])

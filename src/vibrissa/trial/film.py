@@ -22,9 +22,10 @@ from scipy.interpolate import CubicSpline
 
 from vibrissa.io.video import Frame, write_video
 from vibrissa.quantities import attributes
+from vibrissa.rod.surface import Surface
 from vibrissa.trial.cameras import Camera, cameras_dataset, orthogonal_views
-from vibrissa.trial.objects import Peg
-from vibrissa.trial.recording import recorded_pegs, recorded_whisker
+from vibrissa.trial.recording import recorded_objects, recorded_whisker
+from vibrissa.trial.shadows import hidden, silhouette
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -37,9 +38,6 @@ _STEP = 2.0
 
 _FUR = 2.0
 """Softness of the face's edge, standard deviation, pixels."""
-
-_REACH = 0.2
-"""How far a shadow is looked for toward the camera, m."""
 
 
 @dataclass(frozen=True)
@@ -215,12 +213,12 @@ def film_frames(
     look = look or Look()
     truth = _truth(recording)
     lines = truth["centerline"].values
-    pegs = recorded_pegs(recording)
+    objects = recorded_objects(recording)
     moves = _moves(lines, truth["time"].values, look.exposure)
     whiskers = [recorded_whisker(recording, i) for i in range(lines.shape[1])]
     generator = np.random.default_rng(seed)
     width, height = camera.size
-    scene = _scene(camera, pegs, look)
+    scene = _scene(camera, objects, look, np.nanmean(lines, axis=(0, 1, 2)))
     light, box = scene.copy(), np.zeros(4, np.int64)
     total, covered = np.zeros_like(light), np.zeros_like(light)
     noise = generator.standard_normal(1 << 20).astype(np.float32)
@@ -235,7 +233,7 @@ def film_frames(
             radius = whisker.radius(np.linspace(0.0, whisker.length, line.shape[0]))
             smooth, wide = _fine(line, radius, camera)
             shift = _at(move, smooth, line)
-            hidden = _hidden(smooth, camera, pegs)
+            behind = hidden(smooth, camera, objects)
             pixels, slopes = camera.project_with_slopes(smooth)
             per_m = np.linalg.norm(slopes, axis=(-2, -1)) / np.sqrt(2.0)
             drift = (slopes @ shift[..., None])[..., 0]
@@ -243,7 +241,7 @@ def film_frames(
             for k in range(count):
                 at = pixels + ((k + 0.5) / count - 0.5) * drift
                 painting.cover(
-                    covered, at, wide * per_m, 1.0 - hidden, look.sigma, look.contrast / count
+                    covered, at, wide * per_m, 1.0 - behind, look.sigma, look.contrast / count
                 )
                 reach = float((wide * per_m).max()) + 4.0 * look.sigma
                 painting.collect(covered, total, at, reach)
@@ -270,7 +268,7 @@ def with_true_traces(recording: xr.DataTree, cameras: Sequence[Camera]) -> xr.Da
     """
     truth = _truth(recording)
     line = truth["centerline"].values
-    pegs = recorded_pegs(recording)
+    objects = recorded_objects(recording)
     dims = ("time", "whisker", "view", "node", "image_axis")
     trace = np.stack([camera.project(line) for camera in cameras], axis=2)
     inside = np.stack(
@@ -280,11 +278,11 @@ def with_true_traces(recording: xr.DataTree, cameras: Sequence[Camera]) -> xr.Da
         ],
         axis=2,
     )
-    hidden = np.stack([_hidden(line, camera, pegs) for camera in cameras], axis=2)
+    behind = np.stack([hidden(line, camera, objects) for camera in cameras], axis=2)
     seen = {
         "trace": xr.Variable(dims, trace, attributes("trace")),
         "trace_visible": xr.Variable(
-            dims[:-1], inside & (hidden < 0.5), attributes("trace_visible")
+            dims[:-1], inside & (behind < 0.5), attributes("trace_visible")
         ),
     }
     filmed = recording.copy()
@@ -329,41 +327,15 @@ def _at(move: Array, fine: Array, line: Array) -> Array:
     return np.stack([np.interp(t, s, move[:, k]) for k in range(3)], axis=-1)
 
 
-def _hidden(points: Array, camera: Camera, pegs: Sequence[Peg]) -> Array:
-    """Which points (...) are hidden by a peg, 1 or 0."""
-    out = np.zeros(points.shape[:-1])
-    _, away = camera.rays(camera.project(points))
-    for peg in pegs:
-        # The way to the camera as seen along the axis: does it come nearer than the radius?
-        across = np.eye(3) - np.outer(peg.axis, peg.axis)
-        start, way = (points - peg.origin) @ across, -away @ across
-        speed = np.maximum((way**2).sum(-1), 1e-12)
-        along = np.clip(-(start * way).sum(-1) / speed, 0.0, _REACH / np.sqrt(speed))
-        nearest = np.linalg.norm(start + along[..., None] * way, axis=-1)
-        out = np.maximum(out, (nearest < peg.radius) & (along > 0.0))
-    return out
-
-
-def _scene(camera: Camera, pegs: Sequence[Peg], look: Look) -> Image:
-    """Light and pegs, (height, width)."""
+def _scene(camera: Camera, objects: Sequence[Surface], look: Look, center: Array) -> Image:
+    """Light and objects, (height, width)."""
     width, height = camera.size
     x, y = np.meshgrid(np.linspace(-1.0, 1.0, width), np.linspace(-1.0, 1.0, height))
     patches = np.sin(3.1 * x + 1.0) * np.cos(2.3 * y - 0.5) + np.cos(5.3 * x - 3.7 * y)
     missing = 0.3 * (x**2 + y**2) + 0.1 * (2.0 - patches)
     light = look.light * (1.0 - look.unevenness * np.clip(missing, 0.0, 1.0))
-    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
-    for peg in pegs:
-        origin, direction = camera.rays(pixels)
-        normal = np.cross(direction, peg.axis)
-        size = np.linalg.norm(normal, axis=-1)
-        away = origin - peg.origin
-        skew = np.abs((away * normal).sum(-1)) / np.maximum(size, 1e-12)
-        straight = np.linalg.norm(away - (away @ peg.axis)[..., None] * peg.axis, axis=-1)
-        distance = np.where(size < 1e-6, straight, skew)
-        scale = np.linalg.norm(camera.project_with_slopes(peg.origin)[1]) / np.sqrt(2.0)
-        out = np.clip((distance - peg.radius) * scale / (2.0 * look.sigma), -2.0, 2.0)
-        covered = 0.5 * (1.0 - np.sin(0.25 * np.pi * out))
-        light = light * (1.0 - covered) + look.dark * covered
+    covered = silhouette(camera, objects, center, look.sigma)
+    light = light * (1.0 - covered) + look.dark * covered
     return np.asarray(light, dtype=np.float32)
 
 

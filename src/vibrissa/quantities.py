@@ -424,6 +424,20 @@ _ROWS: tuple[tuple[str, str, _Unit, str, str], ...] = (
         "position of the head",
         "Origin of the head's frame in the laboratory frame.",
     ),
+    (
+        "reading",
+        "c",
+        _NUMBER,
+        "reading of the sensor's channel",
+        "In the unit that the mixing gives it.",
+    ),
+    (
+        "mixing",
+        "A",
+        _NUMBER,
+        "what a channel reads of force and moment",
+        "reading = mixing @ (Fx, Fy, Fz, Mx, My, Mz), in N and N m.",
+    ),
     # The truth of a simulated contact
     (
         "contact_object",

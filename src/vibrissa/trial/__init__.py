@@ -2,6 +2,7 @@
 
 from vibrissa.trial.cameras import Camera, load_cameras, orthogonal_views, save_cameras, triangulate
 from vibrissa.trial.film import Look, film, views_of
+from vibrissa.trial.mesh import Mesh
 from vibrissa.trial.motion import Motion, tabulated, whisking
 from vibrissa.trial.objects import Box, Peg, Plane, Sphere
 from vibrissa.trial.plan import facing_peg, sweep_past
@@ -11,16 +12,18 @@ from vibrissa.trial.recording import (
     recorded_pegs,
     recorded_whisker,
 )
-from vibrissa.trial.sensors import measure
+from vibrissa.trial.sensors import Sensor, measure
 from vibrissa.trial.simulate import simulate
 
 __all__ = [
     "Box",
     "Camera",
     "Look",
+    "Mesh",
     "Motion",
     "Peg",
     "Plane",
+    "Sensor",
     "Sphere",
     "facing_peg",
     "film",

@@ -9,6 +9,7 @@ import xarray as xr
 
 from vibrissa.quantities import attributes
 from vibrissa.rod.surface import Surface
+from vibrissa.trial.mesh import Mesh
 from vibrissa.trial.objects import Box, Peg, Plane, Sphere
 
 _FIELDS: dict[str, tuple[type, dict[str, str]]] = {
@@ -27,6 +28,14 @@ _FIELDS: dict[str, tuple[type, dict[str, str]]] = {
             "edge_radius": "object_edge_radius",
         },
     ),
+    "mesh": (
+        Mesh,
+        {
+            "vertices": "object_vertices",
+            "faces": "object_faces",
+            "resolution": "object_resolution",
+        },
+    ),
 }
 _STIFFNESS = {"stiffness": "object_stiffness"}
 _DIMS: dict[str, tuple[str, ...]] = {
@@ -34,6 +43,8 @@ _DIMS: dict[str, tuple[str, ...]] = {
     "object_axis": ("space",),
     "object_size": ("object_axes",),
     "object_rotation": ("space", "object_axes"),
+    "object_vertices": ("vertex", "space"),
+    "object_faces": ("triangle", "corner"),
 }
 
 
@@ -43,7 +54,7 @@ def objects_datasets(objects: Sequence[Surface]) -> dict[str, xr.Dataset]:
     Parameters
     ----------
     objects : sequence
-        Of pegs, spheres, planes, boxes.
+        Of pegs, spheres, planes, boxes, meshes.
 
     Returns
     -------
@@ -82,7 +93,7 @@ def object_from_dataset(dataset: xr.Dataset) -> Surface:
 
     Returns
     -------
-    Peg, Sphere, Plane or Box
+    Peg, Sphere, Plane, Box or Mesh
         As it was.
 
     Raises

@@ -3,7 +3,7 @@
 Without contact the rest shape, put on the whisker, says all. In contact the direction of the base
 is that of the tangent there; the roll, which a bent whisker does not show, follows the azimuth and
 the elevation as it does in the frames without contact. At the end all is filtered over time without
-phase shift.
+phase shift. A straight whisker shows no roll at all; then its y axis is taken as level.
 """
 
 from __future__ import annotations
@@ -102,6 +102,10 @@ def base_pose(curves: Array, shape: RestShape, whisker: Whisker) -> BasePose:
     rotation[seen] = turn @ whisker.pose.rotation
     position[seen] = turn @ whisker.pose.origin + shift
     angles = angles_of(rotation)
+    if whisker.is_straight:
+        # Nothing shows its roll; its y axis is taken as level.
+        angles[:, 2] = np.where(np.isfinite(angles[:, 2]), 0.0, np.nan)
+        rotation = base_rotation(*angles.T)
     touching = np.flatnonzero(seen)[~free]
     if touching.size and free.any():
         local, start = _tangents(shapes, spacing, whisker.length)

@@ -1,11 +1,12 @@
 """What touches the whisker, from its shape: contact and wrench that make the rod fit the traces.
 
 Per frame the unknowns are where the base is and how it is turned (six numbers) and, in contact,
-the contact's arc length and force across the whisker (s_c, f_y, f_z); they give the bent rod
-exactly. They are chosen such that its images in all views lie on the traces, by least squares over
-all frames at once: from frame to frame the base moves smoothly, and so does the contact as long as
-it lasts. The contact is found this way even where it is hidden, and so are force and moment at the
-base; the covariance says how well.
+the contact's arc length and force (s_c, f_x, f_y, f_z); they give the bent rod exactly. They are
+chosen such that its images in all views lie on the traces, by least squares over all frames at
+once: from frame to frame the base moves smoothly, and so does the contact as long as it lasts.
+Friction, the force along the whisker, shows in its shape; it is only kept from being much larger
+than the force across. The contact is found this way even where it is hidden, and so are force and
+moment at the base; the covariance says how well.
 """
 
 from __future__ import annotations
@@ -52,6 +53,9 @@ class RefineOptions:
         Of the contact's arc length, m.
     pressing : float
         Of the contact force, in units of EI/L² at the base.
+    friction : float
+        Standard deviation of the force along the whisker, as a share of that across it; 0 is a
+        contact without friction.
     roll : float
         How far the roll may be from what it is expected to be, rad.
     rounds : int
@@ -62,6 +66,7 @@ class RefineOptions:
     moving: float = 2e-5
     sliding: float = 2e-4
     pressing: float = 0.05
+    friction: float = 0.1
     roll: float = np.radians(0.5)
     rounds: int = 12
 
@@ -109,10 +114,10 @@ class Refined:
 class _State:
     rotation: Array  # (t, 3, 3)
     position: Array  # (t, 3), units of L
-    contact: Array  # (t, 3): s_c, f_y, f_z
+    contact: Array  # (t, 4): s_c, f_x, f_y, f_z
 
     def moved(self, step: Array) -> _State:
-        """Change by (t, 9): shift, turn about laboratory axes, contact."""
+        """Change by (t, 10): shift, turn about laboratory axes, contact."""
         turn = Rotation.from_rotvec(step[:, 3:6]).as_matrix()
         contact = self.contact + step[:, 6:]
         contact[:, 0] = np.clip(contact[:, 0], *_LIMITS)
@@ -164,7 +169,7 @@ def refine(
     frames = np.flatnonzero(known)
     sight, touching = sight.rows(frames), touching[frames]
     start = _State(
-        pose.rotation[frames], pose.position[frames] / d.length, np.zeros((len(frames), 3))
+        pose.rotation[frames], pose.position[frames] / d.length, np.zeros((len(frames), 4))
     )
     start.contact[:, 0] = 0.5
     start.contact[touching] = _first_contacts(d, start, curves[frames], touching)
@@ -208,8 +213,8 @@ class _Problem:
         """Normal equations at a state, the cost, and each frame's misfit."""
         points, slopes = bent(self.d, state, self.touching)
         with_ends = np.concatenate([slopes, slopes[:, [0, -1]]], axis=1)
-        hessian = np.zeros((len(points), 9, 9))
-        gradient = np.zeros((len(points), 9))
+        hessian = np.zeros((len(points), UNKNOWNS, UNKNOWNS))
+        gradient = np.zeros((len(points), UNKNOWNS))
         total, count = np.zeros(len(points)), np.zeros(len(points))
         for view, camera in enumerate(self.cameras):
             pixels, by_point = camera.project_with_slopes(points * self.d.length)
@@ -235,12 +240,15 @@ class _Problem:
         # Second differences of the whole motion, of which the start is a part.
         begun = _turning(self.start.rotation)
         cost = smoother.add_at(place[:, 6:], np.where(self.touching, 0.0, 1e8)[:, None], 6, _REST)
+        across = np.linalg.norm(state.contact[:, 2:], axis=1)
+        rubbing = 1.0 / (o.friction * across + _RUBBING) ** 2
+        cost += smoother.add_at(place[:, 7:8], rubbing[:, None], 7, np.zeros(1))
         axis = state.rotation[:, :, 0]
         rolled = (turn * axis).sum(axis=1)
         cost += smoother.add_along(axis, rolled, 3, 1.0 / o.roll)
         together = np.diff(self.frames) == 1
         pose = (1.0 / (o.moving / self.d.length), 1.0 / o.turning)
-        contact = (1.0 / (o.sliding / self.d.length), 1.0 / o.pressing, 1.0 / o.pressing)
+        contact = (1.0 / (o.sliding / self.d.length), *[1.0 / o.pressing] * 3)
         weight = np.array([pose[0]] * 3 + [pose[1]] * 3 + list(contact)) / slower
         for i in range(1, len(place) - 1):
             if not (together[i - 1] and together[i]):
@@ -254,7 +262,11 @@ class _Problem:
         return cost
 
 
-_REST = np.array([0.5, 0.0, 0.0])
+UNKNOWNS = 10
+"""Of a frame: shift (3), turn (3), s_c, f_x, f_y, f_z."""
+
+_RUBBING = 1e-4
+_REST = np.array([0.5, 0.0, 0.0, 0.0])
 
 
 def _turning(rotation: Array) -> Array:
@@ -279,20 +291,20 @@ def bent(d: Discretization, state: _State, touching: Mask) -> tuple[Array, Array
     -------
     points : array (time, n, 3)
         Equally spaced, laboratory frame, units of L.
-    slopes : array (time, n, 3, 9)
+    slopes : array (time, n, 3, 10)
         By shift, turn and contact.
     """
     s = np.linspace(0.0, 1.0, _SAMPLES)
     local = _rods(d, state.contact, s)
     turned = np.einsum("tij,tnj->tni", state.rotation, local)
-    slopes = np.zeros((*local.shape, 9))
+    slopes = np.zeros((*local.shape, UNKNOWNS))
     slopes[..., :3] = np.eye(3)
     x, y, z = np.moveaxis(turned, -1, 0)
     slopes[..., 0, 4], slopes[..., 0, 5] = z, -y
     slopes[..., 1, 3], slopes[..., 1, 5] = -z, x
     slopes[..., 2, 3], slopes[..., 2, 4] = y, -x
     rows = np.flatnonzero(touching)
-    for k in range(3):
+    for k in range(4):
         ahead, back = (state.contact[rows].copy() for _ in range(2))
         step = _STEP if k == 0 else 1e-4
         ahead[:, k] += step
@@ -303,14 +315,24 @@ def bent(d: Discretization, state: _State, touching: Mask) -> tuple[Array, Array
 
 
 def _rods(d: Discretization, contact: Array, s: Array) -> Array:
-    """Places (t, n, 3) of rods with contacts (t, 3), whisker frame, units of L."""
-    full = np.insert(contact, 1, 0.0, axis=1)
-    values, _ = solve_forces(d, full)
+    """Places (t, n, 3) of rods with contacts (t, 4), whisker frame, units of L."""
+    values, _ = solve_forces(d, contact)
     return shapes(d, values, np.ascontiguousarray(contact[:, 0]), s)
 
 
+def _tangents(d: Discretization, contact: Array) -> Array:
+    """Derivatives (t, 6, 4) of base force and contact point by the contact."""
+    columns = []
+    for k in range(4):
+        step = np.zeros(4)
+        step[k] = _STEP if k == 0 else 1e-4
+        ahead, back = (solve_forces(d, contact + sign * step)[0] for sign in (1.0, -1.0))
+        columns.append((ahead - back) / (2.0 * step[k]))
+    return np.stack(columns, axis=-1)
+
+
 def _first_contacts(d: Discretization, state: _State, curves: Array, touching: Mask) -> Array:
-    """Contacts (n, 3) of the touching frames that make the rod look most like the curves."""
+    """Contacts (n, 4) of the touching frames that make the rod look most like the curves."""
     rows = np.flatnonzero(touching)
     s = np.linspace(0.0, 0.95, 25)
     target = _at_lengths(curves[rows], s * d.length) / d.length
@@ -318,14 +340,14 @@ def _first_contacts(d: Discretization, state: _State, curves: Array, touching: M
     wanted = np.einsum("tji,tnj->tni", state.rotation[rows], away).reshape(len(rows), -1)
     known = np.isfinite(wanted)
     wanted = np.where(known, wanted, 0.0)
-    best, least = np.zeros((len(rows), 3)), np.full(len(rows), np.inf)
+    best, least = np.zeros((len(rows), 4)), np.full(len(rows), np.inf)
     for place in _STARTS:
-        contact = np.zeros((len(rows), 3))
+        contact = np.zeros((len(rows), 4))
         contact[:, 0] = place
         for _ in range(5):
             now = _rods(d, contact, s).reshape(len(rows), -1) * known
             columns = []
-            for k in (1, 2):
+            for k in (2, 3):
                 ahead = contact.copy()
                 ahead[:, k] += 1e-4
                 columns.append((_rods(d, ahead, s).reshape(len(rows), -1) * known - now) / 1e-4)
@@ -335,7 +357,7 @@ def _first_contacts(d: Discretization, state: _State, curves: Array, touching: M
             step = np.linalg.solve(square + 1e-9 * np.eye(2), right[..., None])[..., 0]
             size = np.linalg.norm(step, axis=1, keepdims=True)
             limit = 2.0 / place**2
-            contact[:, 1:] += step * np.minimum(1.0, limit / np.maximum(size, 1e-12))
+            contact[:, 2:] += step * np.minimum(1.0, limit / np.maximum(size, 1e-12))
         missed = _rods(d, contact, s).reshape(len(rows), -1) * known - wanted
         cost = (missed**2).sum(axis=1)
         better = cost < least
@@ -364,8 +386,8 @@ def _answer(
     nodes: int,
 ) -> Refined:
     """Results in SI units, all frames."""
-    full = np.insert(state.contact, 1, 0.0, axis=1)
-    values, tangents = solve_forces(d, full, tangents=True)
+    values, _ = solve_forces(d, state.contact)
+    tangents = _tangents(d, state.contact)
     n = len(frames)
     force, point = values[:, :3], values[:, 3:]
     wrench = np.concatenate([force * d.force, np.cross(point, force) * d.moment], axis=1)
@@ -375,7 +397,7 @@ def _answer(
             np.stack(
                 [
                     np.cross(tangents[:, 3:, k], force) + np.cross(point, tangents[:, :3, k])
-                    for k in range(3)
+                    for k in range(4)
                 ],
                 axis=-1,
             )
@@ -384,7 +406,7 @@ def _answer(
         axis=1,
     )
     turned = np.einsum("tij,tj->ti", state.rotation, point)
-    slopes = np.zeros((n, 3, 9))
+    slopes = np.zeros((n, 3, UNKNOWNS))
     slopes[:, :, :3] = np.eye(3)
     x, y, z = turned.T
     slopes[:, 0, 4], slopes[:, 0, 5] = z, -y

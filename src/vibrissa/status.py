@@ -124,6 +124,13 @@ class Status(enum.IntEnum):
         "Check the whisker's shape, taper and stiffness and the sensor's offset and noise; perhaps "
         "more than one object touches.",
     )
+    APPROXIMATE = (
+        26,
+        True,
+        "A look-up table or network gave this contact; whether others explain the signals too it "
+        "cannot see.",
+        "",
+    )
 
     def __new__(
         cls, code: int, ok: bool = False, explanation: str = "", advice: str = ""

@@ -33,6 +33,8 @@ from vibrissa.whisker import Whisker
 
 if TYPE_CHECKING:
     from vibrissa.mapping.estimate import Estimate
+    from vibrissa.mapping.lookup import LookupTable
+    from vibrissa.mapping.network import NetworkSolver
 
 #: The paper's grid: radii over L, azimuth and elevation in rad.
 GRID_RADII = np.linspace(0.3, 1.0, 15)
@@ -58,12 +60,17 @@ class ContactMap:
     grid : Dataset or None
         The paper's grid: ``force``, ``moment``, ``arc_length``, the six signals and ``status`` over
         (r, theta, phi).
+    approximations : dict
+        Look-up tables and networks made so far, by kind and signals.
     """
 
     whisker: Whisker
     chart: Reach
     steps: int = STEPS
     grid: xr.Dataset | None = None
+    approximations: dict[tuple[str, tuple[str, ...]], LookupTable | NetworkSolver] = field(
+        default_factory=dict, repr=False
+    )
     _trees: dict[tuple[str, ...], Preimages] = field(default_factory=dict, repr=False)
 
     @classmethod
@@ -122,8 +129,10 @@ class ContactMap:
         noise : mapping or (6, 6) array_like, optional
             Standard deviation of each signal, or covariance of (F, M), SI units; gives each
             estimate's covariance, and weighs more than three signals.
-        method : {"exact"}
-            How.
+        method : {"exact", "lookup", "lookup-linear", "network"}
+            Exact; or, for comparison, the paper's ways, from three signals: its look-up table,
+            natural-neighbour or linear, which needs the grid, or a network, trained on first use
+            (ten seconds). They see one contact where there are several.
 
         Returns
         -------

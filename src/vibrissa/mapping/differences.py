@@ -150,13 +150,13 @@ class _Table:
         """Make it; None if a signal has no range, as M_x of a straight whisker."""
         if contact_map.grid is None:
             raise ValueError("the map has no grid to interpolate: simulate it with grid=True")
-        places, values = _reached(contact_map.grid, names)
+        places, values = grid_table(contact_map.grid, names)
         circular = np.array([CIRCULAR[SIGNALS.index(name)] for name in names])
         low = np.where(circular, -np.pi, places.min(axis=0))
         span = np.where(circular, 2.0 * np.pi, np.ptp(places, axis=0))
         if (span == 0.0).any():
             return None
-        closed, values = _closed((places - low) / span, values, circular)
+        closed, values = closed_table((places - low) / span, values, circular)
         return cls(low, span, _interpolated(closed, values, interpolation))
 
     def places(self, signals: Array) -> Array:
@@ -164,8 +164,21 @@ class _Table:
         return np.asarray((signals.reshape(-1, 3) - self.low) / self.span)
 
 
-def _reached(grid: xr.Dataset, names: tuple[str, ...]) -> tuple[Array, Array]:
-    """Signals (n, 3) and (r, θ, φ) (n, 3) of the grid's reachable contacts."""
+def grid_table(grid: xr.Dataset, names: tuple[str, ...]) -> tuple[Array, Array]:
+    """Return the signals of the grid's reachable contacts, and where those are.
+
+    Parameters
+    ----------
+    grid : Dataset
+        A map's grid.
+    names : tuple of str
+        The three signals.
+
+    Returns
+    -------
+    places, values : (n, 3) arrays
+        Signals, and (r, θ, φ), SI units.
+    """
     reached = grid["status"].to_numpy() == int(Status.OK)
     places = np.stack([grid[name].to_numpy()[reached] for name in names], axis=1)
     axes = np.meshgrid(*(grid[name].to_numpy() for name in ("r", "theta", "phi")), indexing="ij")
@@ -182,8 +195,23 @@ def _interpolated(
     return partial(NaturalNeighbour(places, values, scale=np.ones(3)), method=interpolation)
 
 
-def _closed(places: Array, values: Array, circular: Array) -> tuple[Array, Array]:
-    """Add copies a turn away, so that directions near ±π have neighbours on both sides."""
+def closed_table(places: Array, values: Array, circular: Array) -> tuple[Array, Array]:
+    """Add copies a turn away, so that directions near ±π have neighbours on both sides.
+
+    Parameters
+    ----------
+    places : (n, 3) array
+        Signals as shares of their ranges; of directions the range is a turn.
+    values : (n, k) array
+        What is known there.
+    circular : (3,) bool array
+        Which signals are directions.
+
+    Returns
+    -------
+    places, values : (m, 3) and (m, k) arrays
+        The copies behind.
+    """
     for k in np.flatnonzero(circular):
         turn = np.eye(3)[k]
         start, end = places[:, k] < _OVERLAP, places[:, k] > 1.0 - _OVERLAP

@@ -9,16 +9,18 @@ the signals by their derivatives.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
+from vibrissa.mapping.approximation import APPROXIMATE, by_approximation
 from vibrissa.mapping.contact_map import spherical
-from vibrissa.mapping.explanation import by_least_squares, by_triplet
+from vibrissa.mapping.explanation import Explanation, by_least_squares, by_triplet
 from vibrissa.mapping.noise import SensorNoise
 from vibrissa.quantities import attributes
 from vibrissa.rod.arrays import AnyArray, Array, IntArray
@@ -49,10 +51,14 @@ class Estimate:
         measurement in a thousand would have it; then the contact that comes nearest is given);
         ``OUTSIDE_MAP`` where one nearer to the base would, or where signals are ten times larger
         than any on the map; ``DEGENERATE`` where all forces and moments are zero; ``MISSING``.
+        Of a look-up table or network, which cannot see whether contacts are ambiguous:
+        ``APPROXIMATE``, ``OUTSIDE_MAP`` (outside the table) or ``MISSING``.
     misfit : (...) array
         Of three signals, 0 where they are explained; else how far, in shares of each signal's
         range, they are from the nearest ones that are. Of k > 3 signals, χ² of k - 3 degrees of
-        freedom: the sum of squares of what is left unexplained, in standard deviations.
+        freedom: the sum of squares of what is left unexplained, in standard deviations. Of a table
+        or network, how far the signals of the contact given are from those measured, likewise in
+        shares of ranges; NaN where the whisker cannot reach the point.
     arc_length : (...) array
         Arc length of the contact, m.
     force, moment : (..., 3) arrays
@@ -190,8 +196,9 @@ def estimate(
         Standard deviation of each signal used, or covariance of (F, M), SI units. Without it there
         are no covariances, and more than three signals are weighted as if each component of force
         were known to 1 % of |F| and each of moment to 1 % of |M|.
-    method : {"exact"}
-        How.
+    method : {"exact", "lookup", "lookup-linear", "network"}
+        Exact, or one of the paper's ways (:mod:`~vibrissa.mapping.approximation`), for three
+        signals: its look-up table, by natural neighbours or linear, or a network.
 
     Returns
     -------
@@ -203,8 +210,7 @@ def estimate(
     ValueError
         If signals are missing or of different shapes, or the noise does not fit.
     """
-    if method != "exact":
-        raise ValueError(f"method is 'exact'; got {method!r}")
+    explain = _method(method)
     names = selection(triplet)
     sensor = None if noise is None else SensorNoise.of(noise, names)
     values, dims, coords = measured(signals, names)
@@ -212,7 +218,6 @@ def estimate(
     shape = values.shape[:-1]
     d = contacts.chart.discretization
     targets = values.reshape(-1, len(names)) / signal_scales(names, d.force, d.moment)
-    explain = by_triplet if len(names) == 3 else by_least_squares
     found = explain(contacts, names, targets, sensor)
     most = max(1, int(found.number.max(initial=0)))
 
@@ -238,6 +243,24 @@ def estimate(
         dims=dims,
         coords=coords,
     )
+
+
+def _exact(
+    contacts: ContactMap, names: tuple[str, ...], targets: Array, sensor: SensorNoise | None
+) -> Explanation:
+    explain = by_triplet if len(names) == 3 else by_least_squares
+    return explain(contacts, names, targets, sensor)
+
+
+def _method(
+    method: str,
+) -> Callable[[ContactMap, tuple[str, ...], Array, SensorNoise | None], Explanation]:
+    if method == "exact":
+        return _exact
+    if method in APPROXIMATE:
+        return partial(by_approximation, method)
+    known = ", ".join(repr(name) for name in ("exact", *APPROXIMATE))
+    raise ValueError(f"method is one of {known}; got {method!r}")
 
 
 def _check_signals(values: Array, names: tuple[str, ...]) -> None:

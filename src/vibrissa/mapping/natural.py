@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import Delaunay, QhullError
 
-from vibrissa.mapping.sibson import Mesh, interpolate, measure, sibson_weights
+from vibrissa.mapping.sibson import Mesh, interpolate, locate, measure, sibson_weights
 from vibrissa.rod.arrays import Array, IntArray
 from vibrissa.rod.batch import share_out
 
@@ -57,10 +57,10 @@ class NaturalNeighbour:
                 f"the scale is {self.scale.tolist()}"
             )
         try:
-            self._triangulation = Delaunay(places / self.scale)
+            triangulation = Delaunay(places / self.scale)
         except QhullError as error:
             raise ValueError("the points do not span space: all lie in one plane") from error
-        self._mesh = _mesh(self._triangulation)
+        self._mesh = _mesh(triangulation)
 
     def __call__(self, queries: ArrayLike, method: Interpolation = "natural") -> Array:
         """Interpolate.
@@ -126,7 +126,9 @@ class NaturalNeighbour:
         if wanted.ndim != 2 or wanted.shape[1] != 3:
             raise ValueError(f"queries must be (m, 3); got {wanted.shape}")
         wanted = np.ascontiguousarray(wanted / self.scale)
-        return wanted, self._triangulation.find_simplex(wanted).astype(np.int64)
+        inside = np.empty(len(wanted), np.int64)
+        share_out(len(wanted), lambda first, last: locate(self._mesh, wanted, inside, first, last))
+        return wanted, inside
 
 
 def _mesh(triangulation: Delaunay) -> Mesh:

@@ -40,6 +40,8 @@ Found = tuple[IntArray, IntArray, Array]
 _FLAT = 1e-12
 # Points nearer than this, in coordinates with ranges of about one, are one.
 _SAME = 1e-13
+# Volumes below this share of the longest edge cubed have no sure sign.
+_ROUNDOFF = 1e-15
 # Four points are on a circle to this share of its radius.
 _ON_CIRCLE = 1e-6
 # To this share of the neighbours' distance the weights must reproduce the query.
@@ -170,6 +172,79 @@ def _contains(mesh: Mesh, t: int, query: Array) -> bool:
 
 
 @inlined
+def _distance2(a: Array, b: Array) -> float:
+    return float((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
+
+
+@inlined
+def _volume(a: Array, b: Array, c: Array, d: Array) -> float:
+    """Six times the signed volume of a tetrahedron."""
+    x, y, z = a[0] - d[0], a[1] - d[1], a[2] - d[2]
+    u, v, w = b[0] - d[0], b[1] - d[1], b[2] - d[2]
+    p, q, r = c[0] - d[0], c[1] - d[1], c[2] - d[2]
+    return float(x * (v * r - w * q) + y * (w * p - u * r) + z * (u * q - v * p))
+
+
+@inlined
+def _beyond(mesh: Mesh, t: int, k: int, query: Array) -> bool:
+    """Whether the query lies behind the face opposite corner k, and not only by roundoff."""
+    vertices, corners = mesh[0], mesh[1]
+    a, b = vertices[corners[t, (k + 1) % 4]], vertices[corners[t, (k + 2) % 4]]
+    c, top = vertices[corners[t, (k + 3) % 4]], vertices[corners[t, k]]
+    far = max(_distance2(a, query), _distance2(a, top), _distance2(a, b), _distance2(a, c))
+    here, there = _volume(query, b, c, a), _volume(top, b, c, a)
+    return bool(abs(here) > _ROUNDOFF * far * np.sqrt(far) and (here < 0.0) != (there < 0.0))
+
+
+@inlined
+def _holds(mesh: Mesh, t: int, query: Array) -> bool:
+    """Whether a tetrahedron that is not flat holds the query."""
+    if mesh[5][t] > 0:
+        return False
+    behind = 0
+    for k in range(4):
+        behind += _beyond(mesh, t, k, query)
+    return behind == 0
+
+
+@kernel
+def locate(mesh: Mesh, queries: Array, inside: IntArray, first: int, last: int) -> None:
+    """Fill ``inside`` with the tetrahedra that hold the queries, -1 outside the convex hull.
+
+    From one tetrahedron to the next, through a face that the query lies behind; of a flat one,
+    which has no sides, through any.
+    """
+    neighbours, flat = mesh[2], mesh[5]
+    total = len(neighbours)
+    start, turn = 0, 1
+    for row in range(first, last):
+        inside[row] = -1
+        query = queries[row]
+        if not np.isfinite(query[0] + query[1] + query[2]):
+            continue
+        t, steps = start, 0
+        while t >= 0 and steps < total:
+            steps += 1
+            turn = (turn * 1103515245 + 12345) % 2147483648
+            out = -1
+            for c in range(4):
+                # Another order each time: in the same one roundoff could make it go in circles.
+                k = (turn // 65536 + c) % 4
+                if flat[t] > 0 or _beyond(mesh, t, k, query):
+                    out = k
+                    break
+            if out < 0:
+                inside[row] = start = t
+                break
+            t = neighbours[t, out]
+        if steps == total:
+            for other in range(total):
+                if _holds(mesh, other, query):
+                    inside[row] = start = other
+                    break
+
+
+@inlined
 def _at(v: int, found: Found, count: IntArray) -> int:
     """Where vertex v stands among the neighbours; it is added if it is new."""
     slots, members, weights = found
@@ -238,11 +313,6 @@ def sibson_weights(
 
 
 @inlined
-def _distance2(a: Array, b: Array) -> float:
-    return float((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
-
-
-@inlined
 def _normalised(
     vertices: Array, query: Array, count: int, members: IntArray, weights: Array
 ) -> bool:
@@ -261,15 +331,6 @@ def _normalised(
         farthest = max(farthest, _distance2(vertex, query))
     error = np.sqrt((ax * ax + ay * ay + az * az) / farthest)
     return bool(error <= _REPRODUCED and least >= -_REPRODUCED)
-
-
-@inlined
-def _volume(a: Array, b: Array, c: Array, d: Array) -> float:
-    """Six times the signed volume of a tetrahedron."""
-    x, y, z = a[0] - d[0], a[1] - d[1], a[2] - d[2]
-    u, v, w = b[0] - d[0], b[1] - d[1], b[2] - d[2]
-    p, q, r = c[0] - d[0], c[1] - d[1], c[2] - d[2]
-    return float(x * (v * r - w * q) + y * (w * p - u * r) + z * (u * q - v * p))
 
 
 @inlined

@@ -16,6 +16,7 @@ from vibrissa.cli import (
     judging,
     locating,
     sensing,
+    simulating,
     tracking,
     whole_job,
 )
@@ -38,6 +39,7 @@ app.command("demo")(whole_job.demo)
 app.command("deflect")(bend.bend)
 app.command("map")(charting.chart)
 app.command("uniqueness")(judging.uniqueness)
+app.command("simulate")(simulating.simulate)
 app.command("track")(tracking.track)
 app.command("sensitivity")(sensing.sensitivity)
 app.command("estimate")(locating.estimate)

@@ -172,9 +172,10 @@ def whisking(
     amplitude: float = np.radians(30.0),
     set_point: float = 0.0,
     protraction: float = 0.5,
+    row: str = "C",
     elevation: float = 0.0,
-    elevation_per_azimuth: float = ELEVATION_PER_AZIMUTH["C"],
-    roll_per_azimuth: float = ROLL_PER_AZIMUTH["C"],
+    elevation_per_azimuth: float | None = None,
+    roll_per_azimuth: float | None = None,
     variation: float = 0.05,
     elevation_drift: float = np.radians(4.0),
     position_drift: float = 1e-3,
@@ -196,10 +197,12 @@ def whisking(
         Azimuth in the middle of the sweep, rad.
     protraction : float
         Share of a whisk that goes forward, from 0.3 to 0.7; above one half retraction is faster.
+    row : {"A", "B", "C", "D", "E"}
+        Row of the array, which says how elevation and roll follow the azimuth.
     elevation : float
         At the set point, rad.
     elevation_per_azimuth, roll_per_azimuth : float
-        What elevation and roll gain per azimuth from the set point; row C by default.
+        What elevation and roll gain per azimuth from the set point; by default those of the row.
     variation : float
         Largest drift of amplitude and of set point, as a share of the amplitude.
     elevation_drift : float
@@ -217,8 +220,8 @@ def whisking(
     Raises
     ------
     ValueError
-        If duration, rate or frequency are not positive, less than two frames result, or the share
-        of protraction is out of bounds.
+        If duration, rate or frequency are not positive, less than two frames result, the share of
+        protraction is out of bounds, or there is no such row.
 
     Examples
     --------
@@ -233,10 +236,16 @@ def whisking(
     ]
     if not faults and round(duration * rate) < 2:
         faults.append(f"{duration} s at {rate} frames/s are less than two frames")
+    if row not in ROLL_PER_AZIMUTH:
+        faults.append(f"row is {row!r}; one of {', '.join(ROLL_PER_AZIMUTH)} is needed")
     if not 0.3 <= protraction <= 0.7:
         faults.append(f"protraction is {protraction!r}; a share from 0.3 to 0.7 is needed")
     if faults:
         raise ValueError("no whisking: " + "; ".join(faults))
+    if elevation_per_azimuth is None:
+        elevation_per_azimuth = ELEVATION_PER_AZIMUTH[row]
+    if roll_per_azimuth is None:
+        roll_per_azimuth = ROLL_PER_AZIMUTH[row]
     time = np.arange(round(duration * rate)) / rate
     drifts = _drifts(time, 6, seed)
     size = amplitude * (1.0 + variation * drifts[0])

@@ -1,0 +1,91 @@
+"""Make the figures of these pages anew: ``python docs/make_images.py [FOLDER] [NAME ...]``.
+
+The folder is ``docs/images`` by default; without names all are made. Nothing in them is random, so
+an unchanged program gives the same figures. Verdicts take a minute or two for each whisker, the
+critical cones about five minutes on two cores. ``contour.png`` is a figure of ``vibrissa demo``.
+"""
+
+import io
+import sys
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from matplotlib.figure import Figure
+from PIL import Image
+
+import vibrissa as vb
+from vibrissa import plots
+from vibrissa.cli.figures import witnesses
+from vibrissa.mapping import critical_cones, error_solid, signal_slice
+
+WIDTH = 1200
+CURVATURES = np.arange(8) / 5.0
+TAPER_RATIOS = (1.0, 2.0, 4.0, 8.0, 15.0, 30.0, 60.0)
+
+
+@cache
+def chart() -> vb.ContactMap:
+    """Map of the γ whisker."""
+    return vb.ContactMap.simulate(vb.samples.gamma())
+
+
+@cache
+def verdicts() -> xr.Dataset:
+    """Verdicts on the γ whisker."""
+    return vb.uniqueness(chart())
+
+
+def witness(whisker: vb.Whisker, found: xr.Dataset, triplet: str) -> Figure:
+    """Two contacts that feel the same."""
+    return plots.witness_pair(dict(witnesses(whisker, found))[triplet])
+
+
+def c2() -> Figure:
+    """A witness for a whisker that is more curved than the γ whisker."""
+    whisker = vb.Whisker.parabola(length=40e-3, coefficient=20.5, name="A·L = 0.82")
+    contacts = vb.ContactMap.simulate(whisker, grid=False)
+    found = vb.uniqueness(contacts, ["Fx MB MD"], ["all"], resolution=False)
+    return witness(whisker, found, "Fx MB MD")
+
+
+def line() -> np.ndarray:
+    """Centreline of the γ whisker."""
+    return chart().whisker.centerline(101)
+
+
+FIGURES: dict[str, Callable[[], Figure]] = {
+    "signal_space": lambda: plots.signal_clouds(chart().to_dataset(), line()),
+    "contact_surfaces": lambda: plots.contact_surfaces(chart().to_dataset(), line()),
+    "sensitivity": lambda: plots.sensitivity_panels(vb.sensitivity(chart(), at="grid")),
+    "solid": lambda: plots.solid_slices(signal_slice(chart()), error_solid(chart())),
+    "verdicts": lambda: plots.verdict_table(verdicts()),
+    "resolution": lambda: plots.resolution(verdicts()),
+    "witness_Mx_MB_MD": lambda: witness(chart().whisker, verdicts(), "Mx MB MD"),
+    "witness_curved": c2,
+    "critical_cones": lambda: plots.critical_cones(critical_cones(CURVATURES, TAPER_RATIOS)),
+}
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure for the screen: 1200 pixels wide, in 256 colours."""
+    drawn = io.BytesIO()
+    figure.savefig(drawn, format="png")
+    image = Image.open(drawn).convert("RGB")
+    height = round(image.height * WIDTH / image.width)
+    small = image.resize((WIDTH, height), Image.Resampling.LANCZOS)
+    small.quantize(256, Image.Quantize.MEDIANCUT).save(path, optimize=True)
+
+
+def main() -> None:
+    """Make what the command line asks for."""
+    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent / "images"
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in sys.argv[2:] or FIGURES:
+        save(FIGURES[name](), folder / f"{name}.png")
+
+
+if __name__ == "__main__":
+    main()

@@ -6,7 +6,9 @@ from vibrissa.mapping.contact_map import ContactMap
 from vibrissa.mapping.estimate import Estimate
 from vibrissa.mapping.estimator import Estimator, Located
 from vibrissa.mapping.findings import sensitivity_findings
+from vibrissa.mapping.lookup import LookupTable
 from vibrissa.mapping.natural import NaturalNeighbour
+from vibrissa.mapping.network import NetworkSolver, train_network
 from vibrissa.mapping.sensitivity import sensitivity
 from vibrissa.mapping.slices import error_solid, signal_slice
 from vibrissa.mapping.summary import save_uniqueness, verdict_table
@@ -18,7 +20,9 @@ __all__ = [
     "Estimate",
     "Estimator",
     "Located",
+    "LookupTable",
     "NaturalNeighbour",
+    "NetworkSolver",
     "WrenchEstimate",
     "best_triplet",
     "critical_cones",
@@ -28,6 +32,7 @@ __all__ = [
     "sensitivity",
     "sensitivity_findings",
     "signal_slice",
+    "train_network",
     "uniqueness",
     "verdict_table",
 ]

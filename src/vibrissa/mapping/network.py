@@ -39,7 +39,7 @@ _MARGIN = 2.0
 
 @dataclass(frozen=True, eq=False)
 class DrawnContacts:
-    """Random stable contacts outside the cone about rest.
+    """Random stable contacts.
 
     Attributes
     ----------
@@ -62,7 +62,9 @@ class DrawnContacts:
         return signals_of(self.force, self.moment)
 
 
-def draw_contacts(contact_map: ContactMap, number: int, seed: int) -> DrawnContacts:
+def draw_contacts(
+    contact_map: ContactMap, number: int, seed: int, *, near_rest: bool = False
+) -> DrawnContacts:
     """Draw stable contacts, uniformly in the chart's stations, bearing and share of the fold force.
 
     Parameters
@@ -73,11 +75,13 @@ def draw_contacts(contact_map: ContactMap, number: int, seed: int) -> DrawnConta
         How many.
     seed : int
         Of the draws.
+    near_rest : bool
+        Whether contacts within the cone of 2° about rest are kept too.
 
     Returns
     -------
     DrawnContacts
-        Those outside the cone.
+        The contacts.
     """
     rng, kept, missing = np.random.default_rng(seed), [], number
     d, fold = contact_map.chart.discretization, contact_map.chart.fold
@@ -87,8 +91,8 @@ def draw_contacts(contact_map: ContactMap, number: int, seed: int) -> DrawnConta
         share[:, 2] = np.sqrt(_SHARE_OF_FOLD * share[:, 2])
         xi = contacts_at(fold, share)
         values, _ = solve_forces(d, with_normal_force(xi))
-        away = ~within_cone(contact_map.whisker, values[:, 3:] * d.length)
-        kept.append(np.concatenate([xi, values], axis=1)[away][:missing])
+        wanted = near_rest | ~within_cone(contact_map.whisker, values[:, 3:] * d.length)
+        kept.append(np.concatenate([xi, values], axis=1)[wanted][:missing])
         missing -= len(kept[-1])
     rows = np.concatenate(kept) if kept else np.empty((0, 9))
     force, point = rows[:, 3:6] * d.force, rows[:, 6:] * d.length

@@ -105,7 +105,7 @@ def test_friction_is_found_in_the_shape(share):
     pose = BasePose(np.zeros((9, 3)), still, still, still)
     touching = np.ones(9, dtype=bool)
     found = refine(pair, Sight.of(traces), whisker, pose, touching, curves, 1000.0)
-    np.testing.assert_allclose(found.arc_length, s, atol=50e-6)
+    np.testing.assert_allclose(found.arc_length, s, atol=100e-6)
     # Friction along a hardly bent whisker hardly shows, and the covariance says so.
     error = found.force - bent.force
     sigma = np.sqrt(np.einsum("tii->ti", found.wrench_covariance[:, :3, :3]))
@@ -113,7 +113,7 @@ def test_friction_is_found_in_the_shape(share):
     moment = np.linalg.norm(found.moment - bent.moment, axis=1)
     assert (moment / np.linalg.norm(bent.moment, axis=1)).max() < 0.05
     away = np.linalg.norm(found.contact_point - bent.contact_point, axis=1)
-    assert away.max() < 50e-6
+    assert away.max() < 100e-6
 
 
 def test_the_covariance_of_the_contact_is_of_the_size_of_its_errors(filmed, found, both):

@@ -1,5 +1,6 @@
 """A whisking trial: what stands in the way, how the base moves, what the whisker then feels."""
 
+from vibrissa.trial.calibration import calibrate
 from vibrissa.trial.cameras import Camera, load_cameras, orthogonal_views, save_cameras, triangulate
 from vibrissa.trial.film import Look, film, views_of
 from vibrissa.trial.mesh import Mesh
@@ -25,6 +26,7 @@ __all__ = [
     "Plane",
     "Sensor",
     "Sphere",
+    "calibrate",
     "facing_peg",
     "film",
     "load_cameras",

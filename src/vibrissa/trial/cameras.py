@@ -312,7 +312,13 @@ def _undistorted(bent: Array, k: Array) -> Array:
         return flat
     for _ in range(_ROUNDS):
         found, slopes = _distorted(flat, k)
-        step = np.linalg.solve(slopes, (bent - found)[..., None])[..., 0]
+        miss = bent - found
+        a, b = slopes[..., 0, 0], slopes[..., 0, 1]
+        c, d = slopes[..., 1, 0], slopes[..., 1, 1]
+        across = np.stack(
+            [d * miss[..., 0] - b * miss[..., 1], a * miss[..., 1] - c * miss[..., 0]], axis=-1
+        )
+        step = across / (a * d - b * c)[..., None]
         flat = flat + step
         if not np.nanmax(np.abs(step), initial=0.0) > 1e-14:
             break

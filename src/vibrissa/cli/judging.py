@@ -44,6 +44,12 @@ def uniqueness(
     resolution: Annotated[
         bool, typer.Option(help="Whether to tell how finely signals must be measured.")
     ] = True,
+    network: Annotated[
+        bool,
+        typer.Option(
+            "--network", help="Also train a network for each triplet, as the paper did; slow."
+        ),
+    ] = False,
     path: Annotated[
         Path | None,
         typer.Option("--output", "-o", help="All evidence, .nc or .csv.", metavar="FILE"),
@@ -75,6 +81,7 @@ def uniqueness(
             min_separation=min_separation,
             samples=samples,
             resolution=resolution,
+            network=network,
             progress=lambda done, total: tell("verdicts", done, total),
         )
     output.print(f"{contacts.whisker!r}\n", highlight=False, soft_wrap=True)

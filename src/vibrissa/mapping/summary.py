@@ -169,6 +169,8 @@ def _rows(found: xr.Dataset) -> str:
     header = ["triplet", "region", *map(str, plain)]
     spread = [n for n in ("ambiguous_share", "surface_angle") if n in found]
     header += [f"{n}_{t:g}" for n in spread for t in found.signal_tolerance.to_numpy()]
+    trained = found["quantile"].to_numpy() if "network_error" in found else []
+    header += [f"network_error_{q:g}" for q in trained]
     header += ["witness_separation", "witness_difference"]
     header += [
         f"witness_{v}_{i}" for i in (1, 2) for v in ("arc_length", "fy", "fz", "x", "y", "z")
@@ -180,6 +182,7 @@ def _rows(found: xr.Dataset) -> str:
             first = cell.isel(witness=0)
             values = [cell[n].item() for n in plain]
             values += [float(x) for n in spread for x in cell[n].to_numpy()]
+            values += [float(cell["network_error"].sel(quantile=q)) for q in trained]
             values += [float(first.witness_separation), float(first.witness_difference)]
             for pair in ("first", "second"):
                 one = first.sel(pair=pair)

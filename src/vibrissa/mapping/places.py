@@ -28,9 +28,18 @@ _LEAST_LOAD = 0.01
 class Places(NamedTuple):
     """Contacts with the regions they lie in.
 
-    contacts ξ (n, 3); values (F, p) (n, 6); angle (n,) of the cone about the resting whisker, rad;
-    backward (n,) and large (n,) bool, see :mod:`vibrissa.signals.regions`; inside (n,) bool,
-    whether they belong to the domain.
+    Parameters
+    ----------
+    contacts : (n, 3) array
+        ξ.
+    values : (n, 6) array
+        (F, p).
+    angle : (n,) array
+        Of the cone about the resting whisker on which they lie, rad.
+    backward, large : (n,) bool arrays
+        See :mod:`vibrissa.signals.regions`.
+    inside : (n,) bool array
+        Whether they belong to the domain.
     """
 
     contacts: Array

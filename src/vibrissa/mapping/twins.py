@@ -37,8 +37,16 @@ _KEPT = 16
 class Pairs(NamedTuple):
     """Pairs of contacts with equal triplets.
 
-    chart (n, 3): coordinates of the first contacts; sample (n,): which sample each belongs to;
-    first, second: the contacts; apart (n,): distance of the contact points over L.
+    Parameters
+    ----------
+    chart : (n, 3) array
+        Chart coordinates of the first contacts.
+    sample : (n,) int array
+        Which sample each pair belongs to.
+    first, second : Places
+        The contacts.
+    apart : (n,) array
+        Distance of the contact points over L.
     """
 
     chart: Array

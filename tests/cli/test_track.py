@@ -45,6 +45,18 @@ def test_two_videos_become_a_recording(videos, tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["trial.nc"]
 
 
+def test_several_trials_go_to_a_folder(videos, tmp_path):
+    (tmp_path / "second_top.mkv").write_bytes((videos / "top.mkv").read_bytes())
+    words = [videos / "top.mkv", videos / "front.mkv", tmp_path / "second_top.mkv"]
+    words += [videos / "front.mkv", "--cameras", videos / "cameras.toml"]
+    done = run("track", *words, "-o", tmp_path)
+    assert done.exit_code == 0, done.exception
+    one, two = (load_recording(tmp_path / name) for name in ("top.nc", "second_top.nc"))
+    np.testing.assert_array_equal(one["force"].values, two["force"].values)
+    done = run("track", *words, "-o", tmp_path / "one.nc")
+    assert "a folder is needed" in str(done.exception)
+
+
 def test_what_is_traced_is_not_traced_again(videos, tmp_path, monkeypatch):
     """Stopped in the second video, the first is not looked at again."""
     import vibrissa.tracking.view as view

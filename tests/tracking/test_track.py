@@ -182,6 +182,14 @@ def test_the_smoother_solves_its_equations():
     np.testing.assert_allclose(smoother.covariances(), blocks, rtol=1e-6, atol=1e-9)
 
 
+def test_without_any_contact_there_is_none(filmed, traces):
+    free = [[row[:5] for row in view] for view in traces]
+    data = track(filmed.cameras, free, 1000.0).to_dataset().isel(whisker=0)
+    assert not data["in_contact"].values.any()
+    assert (data["status"].values == Status.NO_CONTACT).all()
+    assert (data["force"].values == 0.0).all()
+
+
 def test_angles_of_an_orientation():
     angles = np.random.default_rng(0).uniform(-1.2, 1.2, (50, 3))
     np.testing.assert_allclose(angles_of(base_rotation(*angles.T)), angles, atol=1e-12)

@@ -14,18 +14,30 @@ if TYPE_CHECKING:
 
     import xarray as xr
 
-    from vibrissa.tracking import Trace, TraceOptions
+    from vibrissa.tracking import Trace, TraceOptions, TrackOptions
     from vibrissa.trial import Camera
 
 _MICRO = 1e-6
+_POOR = 2.0
 
 
 def track(
     videos: Annotated[
-        list[Path], typer.Argument(help="The video of each view: top, then front.", metavar="VIDEO")
+        list[Path],
+        typer.Argument(
+            help="The video of each view, top and then front; of several trials one after the "
+            "other.",
+            metavar="VIDEO...",
+        ),
     ],
     recording: Annotated[
-        Path, typer.Option("--output", "-o", help="Recording to write, .nc.", metavar="FILE")
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            help="Recording to write, .nc; of several trials a folder for them.",
+            metavar="FILE",
+        ),
     ],
     pixel_size: Annotated[
         float, typer.Option(help="What a pixel of both views sees, m, without --cameras.")
@@ -64,39 +76,63 @@ def track(
     The result is a recording. Stopped with Ctrl-C it goes on from there when it is called again.
     Example: `vibrissa track top.mp4 front.mp4 --pixel-size 58e-6 --fps 1000 -o trial.nc`
     """
-    from vibrissa.io import load_corrections, save_recording
+    from vibrissa.io import load_corrections
     from vibrissa.io.paths import NETCDF, check_readable, check_writable
     from vibrissa.tracking import TraceOptions, TrackOptions
-    from vibrissa.tracking import track as tracked
 
-    check_writable(recording, NETCDF)
     for path in videos:
         check_readable(path)
     if offset != "auto" and not offset.lstrip("+-").isdigit():
         raise ValueError(f"--offset is {offset!r}; a number of frames or auto is needed")
     views = _cameras(videos, cameras, pixel_size)
-    places = _bases(base or [], len(videos))
+    count = len(views)
+    trials = [videos[i : i + count] for i in range(0, len(videos), count)]
+    files = [recording]
+    if len(trials) > 1:
+        if corrections is not None:
+            raise ValueError("--corrections are for one trial; track it by itself")
+        if not recording.is_dir():
+            raise ValueError(f"--output is {recording}; for several trials a folder is needed")
+        files = [recording / f"{trial[0].stem}.nc" for trial in trials]
+        if len(set(files)) < len(files):
+            raise ValueError("two trials would have one file: their first videos share a name")
+    for file in files:
+        check_writable(file, NETCDF)
+    places = _bases(base or [], count)
     fixed = {} if corrections is None else load_corrections(corrections)
-    unknown = sorted(view for view in fixed if view >= len(videos))
+    unknown = sorted(view for view in fixed if view >= count)
     if unknown:
         raise ValueError(f"{corrections} corrects view {unknown[0]}; views are counted from 0")
-    options = TraceOptions(scale=max(width / 3.0, 1.0))
+    how = TrackOptions(
+        cutoff=cutoff or None,
+        offset=None if offset == "auto" else int(offset),
+        properties={"base_radius": base_radius * _MICRO},
+    )
+    trace = TraceOptions(scale=max(width / 3.0, 1.0))
+    for trial, file in zip(trials, files, strict=True):
+        _tracked(trial, file, views, fps, places, fixed, trace, how)
+
+
+def _tracked(
+    videos: Sequence[Path],
+    recording: Path,
+    cameras: tuple[Camera, ...],
+    fps: float,
+    places: Sequence[Any],
+    corrections: Any,
+    options: TraceOptions,
+    how: TrackOptions,
+) -> None:
+    """Track one trial and say what was found."""
+    from vibrissa.io import save_recording
+    from vibrissa.tracking import track as tracked
+
     with progress_bars() as tell:
         traces = [
-            _traced(path, recording, view, places[view], fixed.get(view, {}), options, tell)
+            _traced(path, recording, view, places[view], corrections.get(view, {}), options, tell)
             for view, path in enumerate(videos)
         ]
-        result = tracked(
-            views,
-            traces,
-            fps,
-            TrackOptions(
-                cutoff=cutoff or None,
-                offset=None if offset == "auto" else int(offset),
-                properties={"base_radius": base_radius * _MICRO},
-            ),
-            progress=tell,
-        )
+        result = tracked(cameras, traces, fps, how, progress=tell)
     save_recording(recording, result)
     for view in range(len(videos)):
         _partial(recording, view).unlink(missing_ok=True)
@@ -113,16 +149,16 @@ def _cameras(videos: Sequence[Path], path: Path | None, pixel_size: float) -> tu
             cameras = recorded_cameras(load_recording(path))
         else:
             cameras = load_cameras(path)
-        if len(cameras) != len(videos):
+        if len(videos) % len(cameras):
             raise ValueError(
                 f"{path} tells of {len(cameras)} cameras; there are {len(videos)} videos"
             )
         return cameras
-    if len(videos) != 2:
-        raise ValueError(f"{len(videos)} videos: give two, or their cameras with --cameras")
+    if len(videos) % 2:
+        raise ValueError(f"{len(videos)} videos: give two a trial, or their cameras with --cameras")
     sizes = [(info.width, info.height) for info in map(video_info, videos)]
-    if sizes[0] != sizes[1]:
-        raise ValueError(f"the videos differ in size, {sizes[0]} and {sizes[1]}: give --cameras")
+    if len(set(sizes)) > 1:
+        raise ValueError(f"the videos differ in size, {sorted(set(sizes))}: give --cameras")
     return orthogonal_views(pixel_size, sizes[0])
 
 
@@ -198,4 +234,11 @@ def _report(result: xr.DataTree, path: Path) -> None:
             f"{float(one['trace_misfit'].median()):.2f} of their standard deviation"
         )
         output.print(line, highlight=False, soft_wrap=True)
+        if float(one["trace_misfit"].median()) > _POOR:
+            output.print(
+                "  The bent rod does not explain the traces: perhaps too few frames are free of "
+                "contact, or the traces are wrong; see trace_misfit and deviation.",
+                highlight=False,
+                soft_wrap=True,
+            )
     output.print(f"wrote {path}", highlight=False, soft_wrap=True)

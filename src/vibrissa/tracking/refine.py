@@ -334,6 +334,8 @@ def _tangents(d: Discretization, contact: Array) -> Array:
 def _first_contacts(d: Discretization, state: _State, curves: Array, touching: Mask) -> Array:
     """Contacts (n, 4) of the touching frames that make the rod look most like the curves."""
     rows = np.flatnonzero(touching)
+    if not rows.size:
+        return np.empty((0, 4))
     s = np.linspace(0.0, 0.95, 25)
     target = _at_lengths(curves[rows], s * d.length) / d.length
     away = target - state.position[rows, None]

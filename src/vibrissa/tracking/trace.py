@@ -37,6 +37,9 @@ _BESIDE = (4.0, 7.0)
 _OUTSIDE = 12.0
 """How far inside the face the base is looked for, pixels."""
 
+_AROUND = 36.0
+"""The same where the base is known by a click only."""
+
 
 @dataclass(frozen=True)
 class TraceOptions:
@@ -260,7 +263,7 @@ class Follower:
             line, support = self._march(frame, noise, start, bend, "cold")
             tries.append((line, support))
         tries.sort(key=lambda t: -float(np.minimum(t[1], 8.0).sum()))
-        finished = [self._finished(frame, noise, *t) for t in tries[:3]]
+        finished = [self._finished(frame, noise, *t, _AROUND) for t in tries[:3]]
         return max(finished, key=lambda trace: trace.support)
 
     def _march(
@@ -274,12 +277,14 @@ class Follower:
         )
         return line[:count], support[:count]
 
-    def _finished(self, frame: Frame, noise: float, line: Array, support: Array) -> Trace:
+    def _finished(
+        self, frame: Frame, noise: float, line: Array, support: Array, before: float | None = None
+    ) -> Trace:
         """Smooth a marched line over what is hidden, then measure it."""
         if len(line) < _FEWEST:
             return Trace.lost()
         line = _smooth(line, np.where(support > 0.0, 4.0, 0.0), self.options.stiffness)
-        return traced(frame, noise, line, self.options)[0]
+        return traced(frame, noise, line, self.options, before or _OUTSIDE)[0]
 
 
 class _Fit(NamedTuple):
@@ -291,7 +296,9 @@ class _Fit(NamedTuple):
     open: Mask  # not beside or behind something dark
 
 
-def traced(frame: Frame, noise: float, line: Array, options: TraceOptions) -> tuple[Trace, bool]:
+def traced(
+    frame: Frame, noise: float, line: Array, options: TraceOptions, before: float = 12.0
+) -> tuple[Trace, bool]:
     """Trace a whisker that is about known, and find its ends.
 
     Parameters
@@ -304,6 +311,8 @@ def traced(frame: Frame, noise: float, line: Array, options: TraceOptions) -> tu
         Within three pixels of the whisker, from about the base to about the tip.
     options : TraceOptions
         How.
+    before : float
+        How far before its beginning the face may end, pixels.
 
     Returns
     -------
@@ -315,7 +324,10 @@ def traced(frame: Frame, noise: float, line: Array, options: TraceOptions) -> tu
     line = _lengthened(even(line))
     for gate in (3, 2):
         line = even(smoothed(frame, line, gate, noise, options)[0])
-    line, from_face = with_base(frame, line)
+    line, from_face = with_base(frame, line, before)
+    if before > _OUTSIDE:
+        # What was only guessed is measured before it counts.
+        line = even(smoothed(frame, line, 3, noise, options, _FUR if from_face else 0)[0])
     line, fit = smoothed(frame, line, 1, noise, options, _FUR if from_face else 0)
     count = tip(fit, noise)
     if count < _FEWEST:
@@ -414,7 +426,7 @@ def even(line: Array, start: float = 0.0) -> Array:
     return np.stack([np.interp(wanted, s, line[:, k]) for k in range(2)], axis=1)
 
 
-def with_base(frame: Frame, line: Array) -> tuple[Array, bool]:
+def with_base(frame: Frame, line: Array, before: float) -> tuple[Array, bool]:
     """Let a line begin where the whisker leaves the face.
 
     Parameters
@@ -423,6 +435,8 @@ def with_base(frame: Frame, line: Array) -> tuple[Array, bool]:
         Grey values.
     line : array (n, 2)
         From about there outward.
+    before : float
+        How far before its beginning that may be, pixels.
 
     Returns
     -------
@@ -431,7 +445,7 @@ def with_base(frame: Frame, line: Array) -> tuple[Array, bool]:
     from_face : bool
         Whether there is.
     """
-    longer = even(line, -_OUTSIDE)
+    longer = even(line, -before)
     near, far = (_edge(frame, longer[:40], distance) for distance in _BESIDE)
     if near is None:
         return line, False

@@ -12,6 +12,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import NullLocator
+from numpy.typing import NDArray
 
 from vibrissa.plots.colours import sequential
 from vibrissa.plots.style import (
@@ -40,6 +41,8 @@ _LINES: tuple[tuple[str, Any, str], ...] = (
 )
 _PAPERS_CONE = 2.0
 """Degrees that the paper leaves out about rest."""
+_JUMP = 25.0
+"""Degrees by which neighbours in a map of critical cones differ at most if it is continuous."""
 
 
 def resolution(verdicts: xr.Dataset, *, width: Width = "double") -> Figure:
@@ -218,9 +221,22 @@ def _contours(axes: Axes, x: Array, y: Array, degrees: Array, high: float) -> No
     if not levels:
         return
     widths = [1.1 if level == _PAPERS_CONE else 0.5 for level in levels]
-    masked = np.ma.masked_invalid(degrees)
-    lines = axes.contour(x, y, masked, levels=levels, colors=INK, linewidths=widths)
+    shown = np.ma.masked_array(degrees, ~np.isfinite(degrees) | _exceptional(degrees))
+    lines = axes.contour(x, y, shown, levels=levels, colors=INK, linewidths=widths)
     axes.clabel(lines, fmt=lambda value: f"{value:g}°", fontsize=5.5, inline_spacing=2)
+
+
+def _exceptional(degrees: Array) -> NDArray[np.bool_]:
+    """Which whiskers stand far above a neighbour, as straight ones and cylinders do.
+
+    There a triplet loses a dimension; nothing leads gradually up to them, so contours keep off.
+    """
+    out = np.zeros(degrees.shape, dtype=bool)
+    for grid, marks in ((degrees, out), (degrees.T, out.T)):
+        rise = np.diff(grid, axis=0)
+        marks[1:] |= rise > _JUMP
+        marks[:-1] |= -rise > _JUMP
+    return out
 
 
 def _cone_label(degrees: Array) -> str:

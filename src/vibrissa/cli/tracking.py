@@ -70,6 +70,13 @@ def track(
     width: Annotated[
         float, typer.Option(help="Of the whisker's base in the images, pixels, at least 3.")
     ] = 3.0,
+    jump: Annotated[
+        float,
+        typer.Option(
+            help="How far a whisker may be from where the frames before lead one to expect it, "
+            "pixels; what is farther away is another whisker."
+        ),
+    ] = 5.0,
 ) -> None:
     """Track a whisker in two videos: its shape, how it is held, its contact, what its base feels.
 
@@ -108,7 +115,7 @@ def track(
         offset=None if offset == "auto" else int(offset),
         properties={"base_radius": base_radius * _MICRO},
     )
-    trace = TraceOptions(scale=max(width / 3.0, 1.0))
+    trace = TraceOptions(scale=max(width / 3.0, 1.0), jump=jump)
     for trial, file in zip(trials, files, strict=True):
         _tracked(trial, file, views, fps, places, fixed, trace, how)
 

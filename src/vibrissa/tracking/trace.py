@@ -59,7 +59,7 @@ class TraceOptions:
         Shortest whisker that counts, pixels.
     jump : float
         How far the whisker's first 60 pixels may be from where they are expected, pixels. What is
-        farther away is another whisker.
+        farther away is another whisker. Each frame in which it is lost adds a pixel.
     memory : int
         Frames over which the usual length is remembered.
     """
@@ -238,7 +238,8 @@ class Follower:
             last = _ahead(self._before.line, last)
         n = min(len(last), len(trace.line), _PROXIMAL)
         away = np.linalg.norm(last[4:n] - trace.line[4:n], axis=1)
-        return float(np.median(away)) > self.options.jump + min(self._missing, 10)
+        # The longer it is lost, the farther it may have gone.
+        return float(np.median(away)) > self.options.jump + min(self._missing, 60)
 
     def _along(self, frame: Frame, noise: float, guess: Array, manner: str) -> Trace:
         """Trace along an expected curve."""

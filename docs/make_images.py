@@ -2,7 +2,7 @@
 
 The folder is ``docs/images`` by default; without names all are made. Nothing in them is random, so
 an unchanged program gives the same figures. Verdicts take a minute or two for each whisker, the
-critical cones about five minutes on two cores. ``contour.png`` is a figure of ``vibrissa demo``.
+critical cones ten minutes or more. ``contour.png`` is a figure of ``vibrissa demo``.
 """
 
 import io

@@ -7,8 +7,7 @@ minutes on two cores. `vibrissa figures MAP --cones FOLDER/critical_cones.nc` dr
 import sys
 from pathlib import Path
 
-from vibrissa import plots
-from vibrissa.mapping import critical_cones
+from vibrissa import critical_cones, plots
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "output")
 folder.mkdir(parents=True, exist_ok=True)

@@ -8,6 +8,7 @@ import xarray as xr
 from typer.testing import CliRunner
 
 import vibrissa as vb
+from vibrissa import plots
 from vibrissa.cli import figures as verb
 from vibrissa.cli.app import app, main
 
@@ -114,6 +115,19 @@ def test_witnesses_feel_the_same_and_lie_apart(whisker, verdicts) -> None:
     assert gap.max() < 0.5 * LENGTH / 100.0
 
 
+def test_without_a_verdict_on_all_contacts_another_region_is_drawn(whisker, verdicts) -> None:
+    partly = verdicts.assign_coords(region=["CF"])
+    none = verdicts.assign_coords(region=["CB"])
+    none["witness_separation"] = none["witness_separation"] * np.nan
+    found = xr.concat([none, partly], "region")
+    ((triplet, pair),) = verb.witnesses(whisker, found)
+    ((_, wanted),) = verb.witnesses(whisker, verdicts)
+    assert triplet == "Fx MB MD"
+    xr.testing.assert_allclose(pair, wanted)
+    (axes,) = plots.verdict_table(found).axes
+    assert "critical" not in " ".join(text.get_text() for text in axes.texts)
+
+
 def test_verdicts_of_another_whisker_are_refused(verdicts) -> None:
     other = vb.Whisker.parabola(length=LENGTH, coefficient=0.8 / LENGTH)
     with pytest.raises(ValueError, match="not of this map's whisker"):
@@ -130,6 +144,10 @@ def test_faults_are_told_before_anything_is_drawn(chart, tmp_path, monkeypatch, 
     assert "there is no file" in fault(monkeypatch, capsys, *there, "--uniqueness", missing)
     said = fault(monkeypatch, capsys, *there, "--uniqueness", chart)
     assert "holds vibrissa contact map, and no variable 'verdict'" in said
+    table = tmp_path / "verdicts.csv"
+    assert "NetCDF (-o FILE.nc) is needed" in fault(
+        monkeypatch, capsys, *there, "--uniqueness", table
+    )
     text = tmp_path / "text.nc"
     text.write_text("nothing")
     assert "cannot be read as NetCDF-4" in fault(monkeypatch, capsys, *there, "--cones", text)

@@ -9,7 +9,7 @@ import xarray as xr
 import vibrissa as vb
 from vibrissa.mapping import error_solid, signal_slice
 from vibrissa.mapping.contact_map import spherical
-from vibrissa.mapping.differences import interpolation_errors
+from vibrissa.mapping.differences import interpolation_errors, within_turn
 from vibrissa.mapping.weighted import quantile, weights
 from vibrissa.signals import TRIPLETS
 
@@ -335,3 +335,14 @@ def test_contacts_between_the_grid_have_errors(coarse):
     on_grid = vb.sensitivity(coarse, at="grid").isel(contact=slice(None, None, 97))
     assert np.nanmedian(interpolation_errors(coarse, on_grid, interpolation="linear")) < 1e-8
     assert np.nanmedian(found.error_distance) > 1e-5
+
+
+def test_directions_a_turn_away_are_looked_up_at_the_same_place(coarse):
+    at = coarse.to_dataset("paper").isel(station=slice(None, None, 3), bearing=slice(None, None, 4))
+    turned = at.assign(MD=at["MD"] + 2.0 * np.pi)
+    errors = interpolation_errors(coarse, at, interpolation="linear")
+    assert np.isfinite(errors).sum() > 50
+    np.testing.assert_allclose(interpolation_errors(coarse, turned, interpolation="linear"), errors)
+    directions = np.array([[1.5 * np.pi, 5.0], [-np.pi, -5.0], [np.pi, 0.0]])
+    wanted = [[-0.5 * np.pi, 5.0], [np.pi, -5.0], [np.pi, 0.0]]
+    np.testing.assert_allclose(within_turn(directions, np.array([True, False])), wanted)

@@ -44,7 +44,9 @@ def figures(
     ] = "double",
     uniqueness: Annotated[
         Path | None,
-        typer.Option(help="Saved result of `vibrissa uniqueness` for this map.", metavar="FILE"),
+        typer.Option(
+            help="Saved result (.nc) of `vibrissa uniqueness` for this map.", metavar="FILE"
+        ),
     ] = None,
     cones: Annotated[
         Path | None,
@@ -93,7 +95,10 @@ def _dataset(path: Path, needed: str) -> xr.Dataset:
     import xarray as xr
 
     from vibrissa.io import kind_of
+    from vibrissa.io.paths import CSV
 
+    if path.suffix.lower() in CSV:
+        raise ValueError(f"{path} is a table; the same saved as NetCDF (-o FILE.nc) is needed")
     kind = kind_of(path)
     data = xr.load_dataset(path, engine="h5netcdf")
     if needed not in data:
@@ -157,7 +162,8 @@ def witnesses(whisker: Whisker, verdicts: xr.Dataset) -> Iterator[tuple[str, xr.
     Yields
     ------
     triplet : str
-        One of the paper's three, or the one chosen, if it has a witness among all contacts.
+        One of the paper's three, or the one chosen, if it has a witness: among all contacts, or
+        if these were not judged, in the region where its contacts lie farthest apart.
     witness : Dataset
         As :func:`vibrissa.plots.witness_pair` takes it.
 
@@ -176,10 +182,14 @@ def witnesses(whisker: Whisker, verdicts: xr.Dataset) -> Iterator[tuple[str, xr.
     for triplet in dict.fromkeys((*HIGHLIGHTED, chosen)):
         if triplet not in known:
             continue
-        found = verdicts.sel(triplet=triplet, region="all")
-        apart = found["witness_separation"].values
+        found = verdicts.sel(triplet=triplet)
+        if "all" in found["region"].values:
+            found = found.sel(region=["all"])
+        apart = found["witness_separation"].transpose("region", "witness").values
         if np.isfinite(apart).any():
-            yield triplet, _bent(whisker, found.isel(witness=int(np.nanargmax(apart))), triplet)
+            region, witness = np.unravel_index(np.nanargmax(apart), apart.shape)
+            farthest = found.isel(region=int(region), witness=int(witness))
+            yield triplet, _bent(whisker, farthest, triplet)
 
 
 def _bent(whisker: Whisker, found: xr.Dataset, triplet: str) -> xr.Dataset:

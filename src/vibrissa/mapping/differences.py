@@ -19,7 +19,7 @@ import xarray as xr
 
 from vibrissa.mapping.natural import NaturalNeighbour
 from vibrissa.quantities import attributes
-from vibrissa.rod.arrays import Array
+from vibrissa.rod.arrays import AnyArray, Array
 from vibrissa.signals import CIRCULAR, SIGNALS, measured, selection
 from vibrissa.status import Status
 
@@ -141,6 +141,7 @@ class _Table:
 
     low: Array
     span: Array
+    circular: AnyArray
     look_up: Callable[[Array], Array]
 
     @classmethod
@@ -151,17 +152,28 @@ class _Table:
         if contact_map.grid is None:
             raise ValueError("the map has no grid to interpolate: simulate it with grid=True")
         places, values = grid_table(contact_map.grid, names)
-        circular = np.array([CIRCULAR[SIGNALS.index(name)] for name in names])
+        circular = circular_among(names)
         low = np.where(circular, -np.pi, places.min(axis=0))
         span = np.where(circular, 2.0 * np.pi, np.ptp(places, axis=0))
         if (span == 0.0).any():
             return None
         closed, values = closed_table((places - low) / span, values, circular)
-        return cls(low, span, _interpolated(closed, values, interpolation))
+        return cls(low, span, circular, _interpolated(closed, values, interpolation))
 
     def places(self, signals: Array) -> Array:
         """Signals (..., 3) over their ranges, in rows (n, 3)."""
-        return np.asarray((signals.reshape(-1, 3) - self.low) / self.span)
+        signals = within_turn(signals.reshape(-1, 3), self.circular)
+        return np.asarray((signals - self.low) / self.span)
+
+
+def circular_among(names: tuple[str, ...]) -> AnyArray:
+    """Which of the signals are directions, (n,) bool."""
+    return np.array([CIRCULAR[SIGNALS.index(name)] for name in names])
+
+
+def within_turn(signals: Array, circular: AnyArray) -> Array:
+    """Directions among signals (..., n) brought into (−π, π], the others as they are."""
+    return np.where(circular, np.pi - (np.pi - signals) % (2.0 * np.pi), signals)
 
 
 def grid_table(grid: xr.Dataset, names: tuple[str, ...]) -> tuple[Array, Array]:

@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vibrissa.mapping.differences import closed_table, grid_table
+from vibrissa.mapping.differences import circular_among, closed_table, grid_table, within_turn
 from vibrissa.mapping.natural import Interpolation, NaturalNeighbour
 from vibrissa.rod.arrays import AnyArray, Array
-from vibrissa.signals import CIRCULAR, SIGNALS, within_cone
+from vibrissa.signals import within_cone
 
 if TYPE_CHECKING:
     from vibrissa.mapping.contact_map import ContactMap
@@ -84,7 +84,7 @@ class LookupTable:
         places, values = grid_table(contact_map.grid, names)
         away = ~within_cone(contact_map.whisker, cartesian(values))
         places, values = places[away], values[away]
-        circular = _circular(names)
+        circular = circular_among(names)
         if components:
             places, circular = _with_components(places, names)
         low = np.where(circular, -np.pi, places.min(axis=0))
@@ -108,8 +108,7 @@ class LookupTable:
         (n, 3) array
             Contact points, m; NaN outside the table.
         """
-        turned = _circular(self.names)
-        places = np.where(turned, (signals + np.pi) % (2.0 * np.pi) - np.pi, signals)
+        places = within_turn(signals, circular_among(self.names))
         if self.components:
             places, _ = _with_components(places, self.names)
         return cartesian(self.interpolation((places - self.low) / self.span, method))
@@ -122,13 +121,9 @@ def cartesian(spheres: Array) -> Array:
     return np.stack([across * np.cos(theta), across * np.sin(theta), r * np.sin(phi)], axis=-1)
 
 
-def _circular(names: tuple[str, ...]) -> AnyArray:
-    return np.array([CIRCULAR[SIGNALS.index(name)] for name in names])
-
-
 def _with_components(places: Array, names: tuple[str, ...]) -> tuple[Array, AnyArray]:
     """Signals with each size and its direction as components; which are still directions."""
-    out, circular = places.copy(), _circular(names)
+    out, circular = places.copy(), circular_among(names)
     for size, direction in (("FT", "FD"), ("MB", "MD")):
         if size in names and direction in names:
             i, j = names.index(size), names.index(direction)

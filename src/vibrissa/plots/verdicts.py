@@ -35,7 +35,8 @@ def verdict_table(verdicts: xr.Dataset, *, width: Width = "double") -> Figure:
     The triplet chosen is printed in blue, with a mark. At double width, what is not unique is given
     with the largest distance of two contacts that feel the same, and two more columns follow: the
     critical cone, outside which no two contacts feel the same, and the share of contacts that
-    another one resembles within 1e-3 of the signals' ranges.
+    another one resembles within 1e-3 of the signals' ranges, both of all contacts and only if
+    the region "all" was judged.
 
     Parameters
     ----------
@@ -117,7 +118,7 @@ def _heads(axes: Axes, regions: list[str], width: Width, page: float) -> None:
         axes.text(names + (j + 0.5) * column, base, text, ha="center", linespacing=1.1, **look)
     left = names + len(regions) * column + 2.0
     axes.text(left, base, "unique for", **look)
-    if width == "double":
+    if width == "double" and "all" in regions:
         axes.text(left + notation + 1.0, base, "critical\ncone", linespacing=1.1, **look)
         axes.text(left + notation + 14.0, base, "ambiguous\nat 0.1 %", linespacing=1.1, **look)
 
@@ -144,7 +145,7 @@ def _row(axes: Axes, verdict: xr.Dataset, i: int, chosen: bool, width: Width, pa
         notation_text = str(verdict["notation"].values)
         size = 5.5 if width == "double" or len(notation_text) < 14 else 4.8
         axes.text(left, y, notation_text, fontsize=size, va="center")
-    if width == "double":
+    if width == "double" and "all" in verdict["region"].values:
         _evidence(axes, verdict, left + notation, y)
 
 

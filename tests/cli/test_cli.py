@@ -154,6 +154,14 @@ def test_estimate_from_more_signals_and_from_all(folder, chart, table):
     run("estimate", path, "--wrench", "-o", folder / "no_map.csv")
 
 
+def test_a_lookup_needs_a_map_with_a_grid(folder, table, chart, monkeypatch, capsys):
+    there = ("estimate", table[0], "--map", chart, "-o", folder / "looked_up.csv")
+    said = fault(monkeypatch, capsys, *there, "--method", "lookup")
+    assert len(said.strip().splitlines()) == 1
+    assert "has no grid to look up in" in said
+    assert not (folder / "looked_up.csv").exists()
+
+
 def test_estimate_without_a_map_simulates_one_and_says_so(folder, table):
     csv = folder / "whisker.csv"
     save_centerline(csv, samples.gamma().centerline(40))
@@ -202,6 +210,12 @@ def test_info(folder, table, chart):
         (("deflect", "--whisker", "none.csv", "--point", "1,2,3"), "there is no file none.csv"),
         (("estimate", "none.csv"), "there is no file none.csv"),
         (("estimate", "none.csv", "--signals", "Fx MB"), "at least 3 different signals"),
+        (("estimate", "none.csv", "--method", "guess"), "one of exact, lookup, lookup-linear, net"),
+        (
+            ("estimate", "none.csv", "--method", "lookup", "--signals", "Fx,FT,MB,MD"),
+            "--method lookup takes three signals; got 4",
+        ),
+        (("estimate", "none.csv", "--method", "network", "--wrench"), "no --method network"),
         (("estimate", "none.csv", "--noise", "no.csv"), "there is no file no.csv"),
         (("info", "none.nc"), "there is no file none.nc"),
         (("demo", "--whisker", "none.csv"), "there is no file none.csv"),

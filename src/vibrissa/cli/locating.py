@@ -42,6 +42,14 @@ def estimate(
             metavar="A,B,C",
         ),
     ] = "Fx,MB,MD",
+    method: Annotated[
+        str,
+        typer.Option(
+            help="exact; or, of three signals, as the paper did: lookup or lookup-linear, in the "
+            "map's grid, or network, trained first (ten seconds). These give one contact where "
+            "there are several."
+        ),
+    ] = "exact",
     all_six: Annotated[
         bool,
         typer.Option(
@@ -82,6 +90,7 @@ def estimate(
 
     check_writable(path, CSV)
     names = selection(triplet)
+    _check_method(method, names, all_six)
     covariance, said = _noise(noise, force_noise, moment_noise)
     wrench, carried = wrench_from(signals)
     with progress_bars() as tell:
@@ -91,13 +100,15 @@ def estimate(
             tell("contact points", 0, 1)
             found = locate_from_wrench(touched, wrench, covariance)
         else:
-            contacts = _map(chart, whisker, carried, tell)
+            contacts = _map(chart, whisker, carried, tell, grid=method.startswith("lookup"))
             _check_scale(signals, wrench, contacts.whisker)
             tell("contact points", 0, 1)
-            found = locate(contacts, wrench, names, noise=covariance)
+            found = locate(contacts, wrench, names, noise=covariance, method=method)
         tell("contact points", 1, 1)
     save_contacts(path, contact_columns(found))
     used = "force and moment whole" if all_six else f"signals ({', '.join(names)})"
+    if method != "exact":
+        used += f" by {method}"
     errors.print(
         f"{used}; {said}; "
         f"contacts are felt where M_B exceeds {shown('MB', found.attrs['felt_above'])}",
@@ -107,6 +118,22 @@ def estimate(
     for sentence, count in describe(found["status"].values).most_common():
         output.print(f"{count:6d}  {sentence}", highlight=False, soft_wrap=True)
     output.print(f"wrote {path}", highlight=False, soft_wrap=True)
+
+
+def _check_method(method: str, names: tuple[str, ...], all_six: bool) -> None:
+    from vibrissa.mapping.approximation import APPROXIMATE
+
+    if method not in ("exact", *APPROXIMATE):
+        allowed = ", ".join(("exact", *APPROXIMATE))
+        raise ValueError(f"--method is {method!r}; one of {allowed} is needed")
+    if method == "exact":
+        return
+    if all_six:
+        raise ValueError(f"--wrench uses force and moment whole; it has no --method {method}")
+    if len(names) != 3:
+        raise ValueError(
+            f"--method {method} takes three signals; got {len(names)}: {', '.join(names)}"
+        )
 
 
 def _noise(path: Path | None, force_noise: float, moment_noise: float) -> tuple[Array, str]:
@@ -150,18 +177,23 @@ def _check_scale(path: Path, wrench: Dataset, whisker: Whisker) -> None:
 
 
 def _map(
-    chart: Path | None, whisker: Path | None, carried: Whisker | None, tell: object
+    chart: Path | None, whisker: Path | None, carried: Whisker | None, tell: object, grid: bool
 ) -> ContactMap:
-    """Read the map, or simulate that of the whisker, and say which."""
+    """Read the map, or simulate that of the whisker, and say which; with the grid if needed."""
     from vibrissa.cli.sources import map_from
     from vibrissa.mapping import ContactMap
 
     if chart is not None and whisker is None:
-        return map_from(chart)
+        contacts = map_from(chart)
+        if grid and contacts.grid is None:
+            raise ValueError(
+                f"{chart} has no grid to look up in: make it by `vibrissa map` without --no-grid"
+            )
+        return contacts
     chosen = _whisker(chart, whisker, carried)
     errors.print(f"no map given; simulating that of {chosen!r}", highlight=False, soft_wrap=True)
     assert callable(tell)
     tell("map of all contacts", 0, 1)
-    contacts = ContactMap.simulate(chosen, grid=False)
+    contacts = ContactMap.simulate(chosen, grid=grid)
     tell("map of all contacts", 1, 1)
     return contacts

@@ -36,6 +36,7 @@ def locate(
     triplet: tuple[str, ...] = TRIPLET,
     *,
     noise: Array,
+    method: str = "exact",
 ) -> xr.Dataset:
     """Estimate the contact point in every frame in which a contact is felt.
 
@@ -49,6 +50,8 @@ def locate(
         The signals to estimate from, three or more.
     noise : array (6, 6)
         Covariance of (F, M), SI units; see `component_noise`.
+    method : {"exact", "lookup", "lookup-linear", "network"}
+        As of ``ContactMap.estimate``.
 
     Returns
     -------
@@ -60,7 +63,7 @@ def locate(
         Where nothing is felt all is NaN and the status ``NO_CONTACT``.
     """
     force, moment, known, felt = _felt(wrench, noise)
-    found = contact_map.estimate(base_signals(force[felt], moment[felt]), triplet, noise)
+    found = contact_map.estimate(base_signals(force[felt], moment[felt]), triplet, noise, method)
     columns = {
         "covariance": (found.candidate_covariances, attributes("covariance")),
         "arc_length": (found.candidate_arc_lengths, attributes("arc_length")),

@@ -169,7 +169,7 @@ def _rows(found: xr.Dataset) -> str:
     header = ["triplet", "region", *map(str, plain)]
     spread = [n for n in ("ambiguous_share", "surface_angle") if n in found]
     header += [f"{n}_{t:g}" for n in spread for t in found.signal_tolerance.to_numpy()]
-    trained = found["quantile"].to_numpy() if "network_error" in found else []
+    trained: list[float] = found["quantile"].values.tolist() if "network_error" in found else []
     header += [f"network_error_{q:g}" for q in trained]
     header += ["witness_separation", "witness_difference"]
     header += [

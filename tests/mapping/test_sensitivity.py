@@ -10,7 +10,7 @@ import vibrissa as vb
 from vibrissa.mapping import error_solid, signal_slice
 from vibrissa.mapping.contact_map import spherical
 from vibrissa.mapping.differences import interpolation_errors, within_turn
-from vibrissa.mapping.weighted import quantile, weights
+from vibrissa.mapping.volume_shares import quantile, weights
 from vibrissa.signals import TRIPLETS
 
 NOISE = np.diag(np.repeat([1e-12, 4e-16], 3))

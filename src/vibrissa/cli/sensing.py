@@ -48,7 +48,7 @@ def sensitivity(
     from vibrissa.io.paths import NETCDF, check_writable
     from vibrissa.mapping import best_triplet, sensitivity_findings
     from vibrissa.mapping import sensitivity as derivatives
-    from vibrissa.mapping.weighted import weights
+    from vibrissa.mapping.volume_shares import weights
     from vibrissa.signals import selection
 
     if path is not None:

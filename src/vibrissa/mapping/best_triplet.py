@@ -17,7 +17,7 @@ from vibrissa.mapping.chosen_contacts import At, ChosenContacts, chosen_contacts
 from vibrissa.mapping.jacobian import contact_signal_derivatives
 from vibrissa.mapping.noise import Noise, SensorNoise, rms_error
 from vibrissa.mapping.sensitivity import contacts_dataset
-from vibrissa.mapping.weighted import quantile, weights
+from vibrissa.mapping.volume_shares import quantile, weights
 from vibrissa.quantities import attributes
 from vibrissa.rod.arrays import Array
 from vibrissa.signals import TRIPLETS, selection

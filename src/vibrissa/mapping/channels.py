@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vibrissa.mapping.noise import SensorNoise
-from vibrissa.mapping.weights import trusted
+from vibrissa.mapping.whitening import trusted
 from vibrissa.rod.arrays import Array
 from vibrissa.rod.discretize import Discretization
 from vibrissa.signals import CIRCULAR as CIRCULAR_SIGNALS

@@ -21,7 +21,7 @@ from vibrissa.mapping.least_squares import by_doubt, largest_misfit, least_squar
 from vibrissa.mapping.minima import same
 from vibrissa.mapping.noise import SensorNoise
 from vibrissa.mapping.uncertainty import point_covariances
-from vibrissa.mapping.weights import INDISTINCT, whitening
+from vibrissa.mapping.whitening import INDISTINCT, whitening
 from vibrissa.rod.arrays import Array
 from vibrissa.rod.newton import TOLERANCE
 from vibrissa.rod.reach import LEAST_ARC, with_normal_force

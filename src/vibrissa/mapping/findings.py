@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from vibrissa.mapping.weighted import quantile, weights
+from vibrissa.mapping.volume_shares import quantile, weights
 from vibrissa.rod.arrays import Array
 
 #: Central share of a quantity's values that makes its range.

@@ -19,7 +19,7 @@ from vibrissa.mapping.fitting import Fits, charted, fit
 from vibrissa.mapping.inversion import invert
 from vibrissa.mapping.minima import Candidates, candidates
 from vibrissa.mapping.noise import SensorNoise
-from vibrissa.mapping.weights import INDISTINCT, explained, rank, whitening
+from vibrissa.mapping.whitening import INDISTINCT, explained, rank, whitening
 from vibrissa.rod.arrays import Array, IntArray
 from vibrissa.rod.batch import share_out, solve_forces
 from vibrissa.rod.compiled import kernel

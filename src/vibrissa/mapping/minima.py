@@ -9,7 +9,7 @@ import numpy as np
 
 from vibrissa.mapping.channels import CHANNELS, CIRCULAR, channel_derivatives, channels_of
 from vibrissa.mapping.fitting import Fits
-from vibrissa.mapping.weights import INDISTINCT
+from vibrissa.mapping.whitening import INDISTINCT
 from vibrissa.rod.arrays import AnyArray, Array, IntArray
 from vibrissa.rod.batch import solve_forces
 from vibrissa.rod.discretize import Discretization

@@ -7,7 +7,7 @@ import numpy as np
 from vibrissa.mapping.channels import CHANNELS, Channels, channels_of
 from vibrissa.mapping.minima import reliable, unknowns_covariance
 from vibrissa.mapping.noise import SensorNoise
-from vibrissa.mapping.weights import whitening
+from vibrissa.mapping.whitening import whitening
 from vibrissa.rod.arrays import AnyArray, Array
 from vibrissa.rod.batch import solve_forces
 from vibrissa.rod.discretize import Discretization

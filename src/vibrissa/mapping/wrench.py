@@ -26,7 +26,7 @@ from vibrissa.mapping.contact_map import spherical
 from vibrissa.mapping.fitting import Fits, fit
 from vibrissa.mapping.minima import Candidates, candidates, reliable, unknowns_covariance
 from vibrissa.mapping.noise import SensorNoise
-from vibrissa.mapping.weights import INDISTINCT, explained, rank, trusted, whitening
+from vibrissa.mapping.whitening import INDISTINCT, explained, rank, trusted, whitening
 from vibrissa.quantities import attributes
 from vibrissa.rod.arrays import AnyArray, Array, IntArray
 from vibrissa.rod.batch import solve_forces

@@ -384,3 +384,39 @@ def test_files_and_table(of_curved, tmp_path):
 def test_wrong_questions_are_answered_with_what_is_allowed(straight, arguments, message):
     with pytest.raises(ValueError, match=message):
         vb.uniqueness(straight, **arguments)
+
+
+def test_what_only_coarse_steps_make_equal_is_no_witness():
+    # Near the base few steps are left: there the rod errs by more than twins' signals differ.
+    whisker = vb.Whisker.parabola(40e-3, 10.0)
+    contacts = vb.ContactMap.simulate(whisker, grid=False, proximal=0.1)
+    found = vb.uniqueness(contacts, ["Fx MB MD"], samples=512, resolution=False)
+    assert (found.verdict == "unique").all()
+    assert float(found.critical_cone.max()) < np.deg2rad(1.5)
+
+
+def test_the_plane_of_a_whisker_may_be_turned(of_curved):
+    planar = vb.samples.curved()
+    turn = 0.7
+
+    def curvature(s):
+        bent = planar.curvature(s)
+        y, z = bent[..., 1].copy(), bent[..., 2].copy()
+        bent[..., 1] = np.cos(turn) * y - np.sin(turn) * z
+        bent[..., 2] = np.sin(turn) * y + np.cos(turn) * z
+        return bent
+
+    turned = vb.Whisker.from_curvature(planar.length, curvature)
+    found = vb.uniqueness(charted(turned), list(PAPER), ["all"], samples=512, resolution=False).sel(
+        region="all"
+    )
+    np.testing.assert_array_equal(
+        found.verdict, of_curved.verdict.sel(region="all", triplet=list(PAPER))
+    )
+    surface = str(found.surface.sel(triplet="Mx MB MD").item())
+    assert f"{np.rad2deg(turn):.4g}°" in surface
+
+
+def test_nothing_outside_the_cone(curved):
+    found = vb.uniqueness(curved, ["Fx MB MD"], cone=1.55, samples=64)
+    assert (found.verdict == "no contacts").all()

@@ -12,6 +12,9 @@ from vibrissa.cli.terminal import output, progress_bars
 if TYPE_CHECKING:
     from xarray import Dataset
 
+# Enough for the signals to agree to 1e-10 when the pair is bent again.
+_DIGITS = 14
+
 
 def uniqueness(
     chart: Annotated[Path, typer.Argument(help="The map, NetCDF.", metavar="MAP")],
@@ -107,15 +110,16 @@ def _print_witness(found: Dataset) -> None:
     cell = row.isel(region=int(np.nanargmax(row["witness_separation"].values)))
     lines = [
         f"\nA witness for ({triplet.replace(' ', ', ')}), {cell['region'].item()}: two contacts "
-        f"{shown('contact_point', float(cell['witness_separation']))} apart that feel the same."
+        f"{shown('contact_point', float(cell['witness_separation']))} apart that feel the same, "
+        f"with {int(cell['witness_steps'])} integration steps."
     ]
     for pair in ("first", "second"):
         one = cell.sel(pair=pair)
         fy, fz = one["witness_contact_force"].values
         lines.append(
-            f"  at {shown('arc_length', float(one['witness_arc_length']), 8)} with the force "
-            f"({shown('Fx', fy, 8)}, {shown('Fx', fz, 8)}) along d1 and d2"
+            f"  at {shown('arc_length', float(one['witness_arc_length']), _DIGITS)} with the force "
+            f"({shown('Fx', fy, _DIGITS)}, {shown('Fx', fz, _DIGITS)}) along d1 and d2"
         )
     values = zip(triplet.split(), cell["witness_signals"].values, strict=True)
-    lines.append("  " + ", ".join(f"{name} {shown(name, value, 8)}" for name, value in values))
+    lines.append("  " + ", ".join(f"{name} {shown(name, value, 10)}" for name, value in values))
     output.print("\n".join(lines), highlight=False, soft_wrap=True)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from vibrissa.mapping.confirm import confirmed
 from vibrissa.mapping.fibres import deficient, fibres
 from vibrissa.mapping.folds import Local, local_evidence
 from vibrissa.mapping.places import Domain, Samples, sample, spread
@@ -29,6 +30,7 @@ from vibrissa.signals import CIRCULAR, SIGNALS
 
 if TYPE_CHECKING:
     from vibrissa.mapping.contact_map import ContactMap
+    from vibrissa.whisker import Whisker
 
 UNIQUE, OFF_SURFACE, NOT_UNIQUE, EMPTY = (
     "unique",
@@ -42,6 +44,9 @@ WITNESSES = 3
 _AGAIN = 4
 # So many times the samples are looked at for signs of a fold: that costs little.
 _WIDER = 8
+# So many pairs at a time are found again on a finer rod, and so many times.
+_CONFIRMED = 24
+_ROUNDS = 20
 # So many of the samples tell the resolution.
 _PROBED = 512
 # Fibres are followed from so many contacts of each region.
@@ -64,6 +69,7 @@ class Question:
     span: Array
     probed: AnyArray
     plane: Samples | None
+    normal: Array
     seed: int
 
     def volumes(self) -> Array:
@@ -71,7 +77,7 @@ class Question:
         places, volume = self.samples.places, self.samples.volume
         outside = volume * (places.inside & (places.angle > self.cone))
         parts = [float((outside * places.members(r)).sum()) for r in self.regions]
-        return np.array(parts) / float(outside.sum())
+        return np.array(parts) / max(float(outside.sum()), np.finfo(np.float64).tiny)
 
 
 @dataclass
@@ -104,21 +110,50 @@ def ask(
     span = np.ptp(signals, axis=0)
     span[list(CIRCULAR)] = 2.0 * np.pi
     probed = np.flatnonzero(samples.places.inside & (samples.places.angle > cone))[:_PROBED]
+    normal, bearing = _plane(contacts.whisker)
     plane = None
-    z = contacts.whisker.centerline(101)[:, 2]
-    if np.abs(z).max() <= _PLANAR * contacts.whisker.length:
+    if bearing is not None:
         chart = spread(256, seed)
-        chart[:, 1] = np.where(chart[:, 1] < np.pi, 0.0, np.pi)
+        chart[:, 1] = bearing + np.where(chart[:, 1] < np.pi, 0.0, np.pi)
         plane = sample(contacts, chart, domain)
     return Question(
-        contacts, regions, separation, cone, domain, samples, wide, span, probed, plane, seed
+        contacts,
+        regions,
+        separation,
+        cone,
+        domain,
+        samples,
+        wide,
+        span,
+        probed,
+        plane,
+        normal,
+        seed,
     )
 
 
+def _plane(whisker: Whisker) -> tuple[Array, float | None]:
+    """Normal of the plane to which a whisker keeps, and the bearing of forces in it.
+
+    The normal is z, and there is no bearing, if it keeps to none.
+    """
+    line = whisker.centerline(101)
+    normal = np.array([0.0, 0.0, 1.0])
+    if not whisker.is_straight:
+        found = np.linalg.svd(line)[2][2]
+        if np.abs(line @ found).max() <= _PLANAR * whisker.length:
+            normal = found if found[2] >= 0.0 else -found
+    if np.abs(line @ normal).max() > _PLANAR * whisker.length:
+        return normal, None
+    across = np.cross(normal, [1.0, 0.0, 0.0])
+    return normal, float(np.arctan2(across[2], across[1]))
+
+
 class _Cell(NamedTuple):
-    """A verdict, its witnesses, and the integration steps with which these agree."""
+    """A verdict, its critical cone, witnesses, and the steps with which these agree."""
 
     verdict: str
+    critical_cone: float
     witnesses: Pairs
     steps: int
 
@@ -129,7 +164,12 @@ def answer(question: Question, names: tuple[str, ...], resolution: bool) -> Answ
     by_contact = triplet_derivatives(question.wide.places.values, question.wide.tangents, names)
     lost = deficient(question.contacts, names, samples.places.contacts[:_PROBED], span)
     local = local_evidence(
-        question.wide, by_contact, question.regions, question.cone, lost is not None
+        question.wide,
+        by_contact,
+        question.regions,
+        question.cone,
+        question.normal,
+        lost is not None,
     )
     on_surface = None
     if lost is not None:
@@ -146,8 +186,12 @@ def answer(question: Question, names: tuple[str, ...], resolution: bool) -> Answ
     own, pool = (p.rows(p.apart >= question.separation) for p in (own, pool))
     twin = _twinned(question, own)
     steps = lost or question.contacts.steps
-    cells = [_judge(question, pool, steps, on_surface, region) for region in question.regions]
+    cells = [
+        _judge(question, names, pool, steps, on_surface, region) for region in question.regions
+    ]
     verdict = [cell.verdict for cell in cells]
+    # What a finer rod does not confirm was no twin.
+    twin[[word != NOT_UNIQUE for word in verdict]] = False
     probed, hit = tried, twin[None, :, tried]
     if resolution and lost is None:
         probed = question.probed
@@ -165,9 +209,7 @@ def answer(question: Question, names: tuple[str, ...], resolution: bool) -> Answ
     shares, surface_angle = _shares(question, hit if resolution else None, probed, verdict)
     return Answer(
         verdict=verdict,
-        critical_cone=np.array(
-            [pool.angle[pool.members(r)].max(initial=0.0) for r in question.regions]
-        ),
+        critical_cone=np.array([cell.critical_cone for cell in cells]),
         local=local,
         twin_share=_weighted(question, twin[:, tried], tried),
         ambiguous=shares,
@@ -205,23 +247,52 @@ def _searched(question: Question, names: tuple[str, ...], own: Pairs, beside: An
 
 def _judge(
     question: Question,
+    names: tuple[str, ...],
     pool: Pairs,
     steps: int,
     on_surface: tuple[Pairs, int] | None,
     region: str,
 ) -> _Cell:
     """Judge a region by the pairs there are, and those on the plane."""
-    if not question.wide.places.members(region).any():
-        return _Cell(EMPTY, pool.rows(np.zeros(0, dtype=np.int64)), steps)
-    found = _chosen(question, pool, region)
-    if len(found.apart):
-        return _Cell(NOT_UNIQUE, found, steps)
+    nothing = pool.rows(np.zeros(0, dtype=np.int64))
+    places = question.wide.places
+    if not (places.members(region) & (places.angle > question.cone)).any():
+        return _Cell(EMPTY, 0.0, nothing, steps)
+    pairs, critical = _confirmed(question, names, pool.rows(pool.members(region)), steps)
+    if critical > question.cone:
+        return _Cell(NOT_UNIQUE, critical, _chosen(question, pairs, WITNESSES), steps)
     if on_surface is not None:
-        pairs, steps_there = on_surface
-        degenerate = _chosen(question, pairs, region)
-        if len(degenerate.apart):
-            return _Cell(OFF_SURFACE, degenerate, steps_there)
-    return _Cell(UNIQUE, found, steps)
+        there, steps_there = on_surface
+        pairs, found = _confirmed(question, names, there.rows(there.members(region)), steps_there)
+        if found > question.cone:
+            chosen = _chosen(question, pairs, WITNESSES)
+            return _Cell(OFF_SURFACE, critical, chosen, steps_there)
+    return _Cell(UNIQUE, critical, nothing, steps)
+
+
+def _confirmed(
+    question: Question, names: tuple[str, ...], pairs: Pairs, steps: int
+) -> tuple[Pairs, float]:
+    """The best of the pairs that a finer rod confirms, and their largest angle.
+
+    Tried are those farthest apart and, a few at a time until some are confirmed, those farthest
+    from rest.
+    """
+    order = np.argsort(-pairs.angle, kind="stable")
+    tried = _chosen(question, pairs, _CONFIRMED)
+    kept: list[Pairs] = []
+    critical = 0.0
+    for start in range(0, _ROUNDS * _CONFIRMED, _CONFIRMED):
+        tried = joined([tried, pairs.rows(order[start : start + _CONFIRMED])])
+        if not len(tried.apart):
+            break
+        stays, angle = confirmed(question.contacts, names, tried, steps, question.separation)
+        if stays.any():
+            kept.append(tried.rows(stays))
+            critical = float(angle[stays].max())
+            break
+        tried = tried.rows(np.zeros(0, dtype=np.int64))
+    return joined(kept) if kept else pairs.rows(np.zeros(0, dtype=np.int64)), critical
 
 
 def _some(question: Question, samples: Samples) -> AnyArray:
@@ -255,9 +326,9 @@ def _on_plane(question: Question, names: tuple[str, ...], span: Array) -> tuple[
     return found.rows(found.apart >= question.separation), lost
 
 
-def _chosen(question: Question, pairs: Pairs, region: str) -> Pairs:
-    """The witnesses of a region that are farthest apart, none near another."""
-    rows = np.flatnonzero(pairs.members(region) & (pairs.angle > question.cone))
+def _chosen(question: Question, pairs: Pairs, most: int) -> Pairs:
+    """The pairs outside the cone that are farthest apart, none near another."""
+    rows = np.flatnonzero(pairs.angle > question.cone)
     rows = rows[np.argsort(-pairs.apart[rows], kind="stable")]
     points = pairs.first.values[:, 3:]
     kept: list[int] = []
@@ -265,7 +336,7 @@ def _chosen(question: Question, pairs: Pairs, region: str) -> Pairs:
         away = np.linalg.norm(points[kept] - points[row], axis=1)
         if (away >= question.separation).all():
             kept.append(row)
-        if len(kept) == WITNESSES:
+        if len(kept) == most:
             break
     return pairs.rows(np.array(kept, dtype=np.int64))
 
@@ -301,7 +372,7 @@ def _shares(
     hit = np.broadcast_to(probed, (*shape, rows.size))
     shares = _weighted(question, hit, rows)
     points = question.samples.places.values[rows, 3:]
-    above = np.arcsin(np.abs(points[:, 2]) / np.linalg.norm(points, axis=1))
+    above = np.arcsin(np.abs(points @ question.normal) / np.linalg.norm(points, axis=1))
     for i, word in enumerate(verdict):
         if word == OFF_SURFACE:
             elevation[:, i] = (hit[:, i] * above).max(axis=1, initial=0.0)

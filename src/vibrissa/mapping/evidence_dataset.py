@@ -7,24 +7,17 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from vibrissa.mapping.confirm import FINER, found_again
 from vibrissa.mapping.evidence import OFF_SURFACE, WITNESSES, Answer, Question
 from vibrissa.mapping.fibres import corrected, units
 from vibrissa.mapping.places import place
 from vibrissa.mapping.resolution import TOLERANCES
 from vibrissa.mapping.summary import choice, notation
-from vibrissa.mapping.twins import AGREEMENT
 from vibrissa.quantities import attributes
 from vibrissa.rod.arrays import Array
-from vibrissa.rod.batch import solve_forces
-from vibrissa.rod.discretize import Discretization, discretize
-from vibrissa.rod.reach import with_normal_force
+from vibrissa.rod.discretize import discretize
 from vibrissa.signals import SIGNALS, signal_scales
-from vibrissa.signals.base import signals_of
 
-# Witnesses are found again with so many times the integration steps.
-_FINER = 4
-#: Off which surface a triplet of a planar whisker may be unique.
-PLANE = "the plane of the whisker, z = 0"
 #: Quantiles of a network's errors.
 QUANTILES = (0.5, 0.95)
 
@@ -43,7 +36,7 @@ def labelled(
         "verdict": (cell, verdict, {"long_name": "whether the triplet locates the contact"}),
         "surface": (
             cell,
-            np.where(verdict == OFF_SURFACE, PLANE, ""),
+            np.where(verdict == OFF_SURFACE, _surface(question), ""),
             {"long_name": "surface on which contacts cannot be told apart"},
         ),
         "critical_cone": (
@@ -129,6 +122,14 @@ def labelled(
     return out
 
 
+def _surface(question: Question) -> str:
+    """Off which surface a triplet of a planar whisker may be unique."""
+    y, z = question.normal[1:]
+    turned = float(np.rad2deg(np.arctan2(-y, z)))
+    where = "z = 0" if abs(turned) < 1e-6 else f"turned by {turned:.4g}° about x from z = 0"
+    return f"the plane of the whisker, {where}"
+
+
 def _about(unit: str, long_name: str) -> dict[str, str]:
     return {"units": unit, "long_name": long_name}
 
@@ -150,7 +151,6 @@ def _witnesses(
                 continue
             here = (i, j, slice(n))
             d = discretize(contacts.whisker, found.steps[j])
-            finer = discretize(contacts.whisker, _FINER * found.steps[j])
             first, unit = pairs.first.contacts, units(contacts, pairs.second.contacts)
             target = pairs.first.signals[:, which]
             second, values, difference[here] = corrected(
@@ -162,7 +162,8 @@ def _witnesses(
             point[here] = places[..., 3:] * d.length
             apart[here] = np.linalg.norm(point[here][:, 0] - point[here][:, 1], axis=1)
             signals[here] = target * signal_scales(triplet, d.force, d.moment)
-            shift[here] = d.length * _moved(finer, triplet, first, second, values, unit)
+            _, moved = found_again(contacts, triplet, first, second, found.steps[j])
+            shift[here] = d.length * moved
     cell = ("triplet", "region", "witness")
     return xr.Dataset(
         {
@@ -192,27 +193,10 @@ def _witnesses(
             "witness_shift": (
                 cell,
                 shift,
-                _about("m", f"move of the second contact at {_FINER} times the steps"),
+                _about("m", f"move of the second contact at {FINER} times the steps"),
             ),
         }
     )
-
-
-def _moved(
-    finer: Discretization,
-    names: tuple[str, ...],
-    first: Array,
-    second: Array,
-    values: Array,
-    unit: Array,
-) -> Array:
-    """How far the second contact of each pair moves on a finer rod, over L."""
-    which = [SIGNALS.index(name) for name in names]
-    at_first, _ = solve_forces(finer, with_normal_force(first))
-    target = signals_of(at_first[:, :3], np.cross(at_first[:, 3:], at_first[:, :3]))[:, which]
-    _, found, misfit = corrected(finer, names, second, target, unit)
-    moved = np.linalg.norm(found[:, 3:] - values[:, 3:], axis=1)
-    return np.where(misfit <= AGREEMENT, moved, np.nan)
 
 
 def network_errors(question: Question, names: tuple[str, ...]) -> Array:

@@ -170,9 +170,10 @@ def corrected(
         inverse = np.linalg.pinv(slope * unit[:, None, :], rcond=1e-6)
         xi = xi - np.einsum("nij,nj->ni", inverse, away) * unit
     away, _, values = _equations(discretization, names, xi, targets)
-    # Where a fibre comes to rest nothing is left to compare with.
-    beside = np.maximum(sizes(values, names), np.finfo(np.float64).tiny)
-    return xi, values, np.abs(away / beside).max(axis=1)
+    # Where a fibre comes to rest nothing is left to compare with: infinitely far off.
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        misfit = np.abs(away / sizes(values, names)).max(axis=1)
+    return xi, values, np.where(np.isfinite(misfit), misfit, np.inf)
 
 
 def units(contacts: ContactMap, xi: Array) -> Array:

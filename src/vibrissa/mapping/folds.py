@@ -29,7 +29,12 @@ class Local(NamedTuple):
 
 
 def local_evidence(
-    samples: Samples, by_contact: Array, regions: tuple[str, ...], cone: float, lost: bool
+    samples: Samples,
+    by_contact: Array,
+    regions: tuple[str, ...],
+    cone: float,
+    normal: Array,
+    lost: bool,
 ) -> Local:
     """Look where det ∂T/∂p changes its sign.
 
@@ -47,6 +52,8 @@ def local_evidence(
         The regions.
     cone : float
         What lies within is left out, rad.
+    normal : (3,) array
+        Of the whisker's plane.
     lost : bool
         Whether T has lost a dimension everywhere, so that the determinant is rounding.
 
@@ -62,7 +69,8 @@ def local_evidence(
     # Relative to the lengths of the gradients: how nearly they lie in a plane. det ∂p/∂ξ > 0 in Ω.
     size = np.prod(np.linalg.norm(by_contact, axis=2), axis=1)
     det = np.linalg.det(by_contact) / np.where(size > 0.0, size, 1.0)
-    above, outside = samples.places.values[:, 5] > 0.0, samples.places.angle > cone
+    above = samples.places.values[:, 3:] @ normal > 0.0
+    outside = samples.places.angle > cone
     beside: set[int] = set()
     for i, region in enumerate(regions):
         inside = samples.places.members(region) & outside

@@ -69,6 +69,8 @@ def ambiguous(
     active = np.flatnonzero((belongs & ~twinned).any(axis=0))
     # From the widest on: what is told apart within a tolerance is so within a narrower one.
     for t in reversed(range(len(TOLERANCES))):
+        if not active.size:
+            break
         targets = own.signals[active][:, None, which] + TOLERANCES[t] * span * _MOVES
         found = invert(contacts.chart, contacts.tree(names), names, targets.reshape(-1, 3))
         points = found.values[:, :, 3:].reshape(active.size, -1, 3)
@@ -85,6 +87,4 @@ def ambiguous(
             out[t, k, active[i[hit]]] = True
         out[t] &= belongs
         active = active[(out[t] & ~twinned)[:, active].any(axis=0)]
-        if not active.size:
-            break
     return np.asarray(np.logical_or.accumulate(out | twinned, axis=0))

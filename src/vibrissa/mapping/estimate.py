@@ -214,7 +214,7 @@ def estimate(
     names = selection(triplet)
     sensor = None if noise is None else SensorNoise.of(noise, names)
     values, dims, coords = measured(signals, names)
-    _check_signals(values, names)
+    check_signals(values, names)
     shape = values.shape[:-1]
     d = contacts.chart.discretization
     targets = values.reshape(-1, len(names)) / signal_scales(names, d.force, d.moment)
@@ -263,8 +263,21 @@ def _method(
     raise ValueError(f"method is one of {known}; got {method!r}")
 
 
-def _check_signals(values: Array, names: tuple[str, ...]) -> None:
-    """Raise a ValueError for what no sensor in SI units can say."""
+def check_signals(values: Array, names: tuple[str, ...]) -> None:
+    """Refuse what no sensor in SI units can say.
+
+    Parameters
+    ----------
+    values : (..., k) array
+        Signals, SI units.
+    names : tuple of str
+        Which.
+
+    Raises
+    ------
+    ValueError
+        If a size is negative, or an angle is more than a full turn.
+    """
     for k, name in enumerate(names):
         if name in ("FT", "MB") and (values[..., k] < 0.0).any():
             raise ValueError(

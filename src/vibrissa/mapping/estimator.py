@@ -7,7 +7,6 @@ signals, where candidates have become fewer), and it tells which candidate goes 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -15,24 +14,29 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.mapping.channels import Channels
-from vibrissa.mapping.fitting import Fits, charted, fit
+from vibrissa.mapping.estimate import check_signals
+from vibrissa.mapping.explanation import Bounds, why_none
+from vibrissa.mapping.fitting import Fits, charted
 from vibrissa.mapping.inversion import invert, polish
-from vibrissa.mapping.least_squares import by_doubt, largest_misfit, least_squares, seeding_triplet
+from vibrissa.mapping.least_squares import (
+    by_doubt,
+    largest_misfit,
+    least_squares,
+    nearby,
+    seeding_triplet,
+)
 from vibrissa.mapping.minima import same
 from vibrissa.mapping.noise import SensorNoise
 from vibrissa.mapping.uncertainty import point_covariances
-from vibrissa.mapping.whitening import INDISTINCT, whitening
+from vibrissa.mapping.whitening import INDISTINCT
 from vibrissa.rod.arrays import Array
 from vibrissa.rod.newton import TOLERANCE
-from vibrissa.rod.reach import LEAST_ARC, with_normal_force
-from vibrissa.signals import selection, signal_scales
+from vibrissa.signals import CIRCULAR, SIGNALS, selection, signal_scales
 from vibrissa.status import Status
 
 if TYPE_CHECKING:
     from vibrissa.mapping.contact_map import ContactMap
 
-# Weights that depend on force and moment are kept while these change by less than this share.
-_STEADY = 0.05
 # A contact moves no farther than this (over L) from one measurement to the next.
 _NEAR = 0.02
 
@@ -46,7 +50,8 @@ class Located(NamedTuple):
         Contact point of the most plausible candidate, whisker frame, m; NaN if there is none.
     status : Status
         ``UNIQUE``, ``AMBIGUOUS``, ``NOT_FRICTIONLESS`` (no contact on the map explains it; of more
-        than three signals ``point`` is the one that comes nearest), ``OUTSIDE_MAP`` or ``MISSING``.
+        than three signals ``point`` is the one that comes nearest), ``OUTSIDE_MAP``,
+        ``DEGENERATE`` or ``MISSING``, as in :class:`Estimate`.
     candidates : (k, 3) array
         All contact points, in the order of :class:`Estimate`, m.
     arc_lengths : (k,) array
@@ -54,7 +59,7 @@ class Located(NamedTuple):
     covariance : (3, 3) array
         Covariance of ``point``, m²; NaN without noise.
     misfit : float
-        χ² of more than three signals; 0 where three are explained, NaN where they are not.
+        As in :class:`Estimate`.
     continuing : int
         Number of the candidate that goes on from the measurement before; 0 where there was none.
     """
@@ -103,13 +108,17 @@ class Estimator:
         d = self._chart.discretization
         self._length = d.length
         self._scale = signal_scales(self.names, d.force, d.moment)
+        self._bounds = Bounds.of(contacts, self.names)
+        circular = np.array([CIRCULAR[SIGNALS.index(name)] for name in self.names])
+        size = np.isin(self.names, ("FT", "MB"))
+        self._most = np.where(circular, 2.0 * np.pi, np.inf)
+        self._least = np.where(size, 0.0, -self._most)
         self.reset()
 
     def reset(self) -> None:
         """Forget the measurement before, as when the whisker has lost touch."""
         self._last: tuple[Array, Array] | None = None  # ξ and (F, p) of the contact followed
         self._number = 0  # of candidates
-        self._weights: tuple[Array, float, float] | None = None
 
     def __call__(self, signals: ArrayLike) -> Located:
         """Locate one measurement.
@@ -123,16 +132,25 @@ class Estimator:
         -------
         Located
             The contact, all candidates, and the status.
+
+        Raises
+        ------
+        ValueError
+            If there are not as many numbers as signals were announced, a size is negative, or an
+            angle is more than a full turn.
         """
         values = np.asarray(signals, dtype=np.float64)
         if values.shape != (len(self.names),):
             raise ValueError(
                 f"one measurement has {len(self.names)} signals; got shape {values.shape}"
             )
-        targets = (values[self._order] / self._scale)[None]
+        values = values[self._order]
+        if ((values < self._least) | (values > self._most)).any():
+            check_signals(values, self.names)
+        targets = (values / self._scale)[None]
         if not np.isfinite(targets).all():
             self.reset()
-            return self._located(np.empty((0, 3)), np.empty((0, 6)), Status.MISSING, np.nan)
+            return self._nowhere(Status.MISSING)
         if len(self.names) == 3:
             return self._by_triplet(targets)
         return self._by_least_squares(targets)
@@ -144,7 +162,8 @@ class Estimator:
         if n < self._number and not self._follows(values):
             xi, values = self._followed(targets, xi, values)
         if not len(xi):
-            return self._located(xi, values, Status.NOT_FRICTIONLESS, np.nan)
+            why, misfit = why_none(self._contacts, self.names, targets)
+            return self._nowhere(Status(int(why[0])), float(misfit[0]))
         status = Status.UNIQUE if len(xi) == 1 else Status.AMBIGUOUS
         return self._located(xi, values, status, 0.0)
 
@@ -166,24 +185,20 @@ class Estimator:
         return xi[order], values[order]
 
     def _by_least_squares(self, targets: Array) -> Located:
+        if self._bounds.nothing(targets)[0]:
+            return self._nowhere(Status.DEGENERATE)
+        if self._bounds.exceeded(targets)[0]:
+            return self._nowhere(Status.OUTSIDE_MAP)
         exact = invert(self._chart, self._tree, self._three, targets[:, self._where])
         n = int(exact.number[0])
-        starts, near = exact.contacts[0, :n], exact.values[0, :1]
+        starts, values = exact.contacts[0, :n], exact.values[0, :n]
         if self._last is not None:
             starts = np.concatenate([starts, self._last[0][None]])
-            near = self._last[1][None]
+            values = np.concatenate([values, self._last[1][None]])
         if len(starts):
-            weights = self._weigh(targets, near)
-            m = len(starts)
-            fits = fit(
-                self._chart.discretization,
-                self._channels.names,
-                np.repeat(self._channels.targets(targets), m, axis=0),
-                np.repeat(weights, m, axis=0),
-                with_normal_force(starts),
-                friction=False,
-                least=LEAST_ARC,
-                worth=self._limit + INDISTINCT,
+            rows = np.repeat(targets, len(starts), axis=0)
+            fits = nearby(
+                self._chart, self._channels, self._sensor, rows, starts, self._limit, values
             )
             inside = charted(self._chart, fits, self._chart.proximal)
             if (inside & (fits.misfits <= self._limit)).any():
@@ -198,20 +213,6 @@ class Estimator:
             float(found.misfits[0, 0]),
         )
 
-    def _weigh(self, targets: Array, near: Array) -> Array:
-        """Weights for a contact with (F, p) near this, (1, k, k)."""
-        fx, fy, fz, px, py, pz = near[0].tolist()
-        force = math.hypot(fx, fy, fz)
-        moment = math.hypot(py * fz - pz * fy, pz * fx - px * fz, px * fy - py * fx)
-        if self._weights is not None:
-            kept, f, m = self._weights
-            if abs(force - f) < _STEADY * f and abs(moment - m) < _STEADY * m:
-                return kept
-        d = self._chart.discretization
-        weights = whitening(self._channels.covariance(self._sensor, targets, near, d))
-        self._weights = weights, force, moment
-        return weights
-
     def _chosen(self, fits: Fits) -> Located:
         """The same choice as in a batch, of few fits."""
         best = float(fits.misfits.min())
@@ -225,6 +226,9 @@ class Estimator:
         status = Status.UNIQUE if len(kept) == 1 else Status.AMBIGUOUS
         xi = fits.contacts[kept][:, [0, 2, 3]]
         return self._located(xi, fits.values[kept], status, float(fits.misfits[kept[0]]))
+
+    def _nowhere(self, status: Status, misfit: float = np.nan) -> Located:
+        return self._located(np.empty((0, 3)), np.empty((0, 6)), status, misfit)
 
     def _located(self, xi: Array, values: Array, status: Status, misfit: float) -> Located:
         """Everything in SI units; remember which candidate goes on from the one before."""

@@ -24,6 +24,40 @@ if TYPE_CHECKING:
 _FAR_BEYOND = 10.0
 
 
+class Bounds(NamedTuple):
+    """How large forces and moments are that contacts of a map give.
+
+    Parameters
+    ----------
+    sizes : list of int
+        Which of the signals are no directions.
+    largest : (len(sizes),) array
+        Their largest sizes on the map, non-dimensional.
+    """
+
+    sizes: list[int]
+    largest: Array
+
+    @classmethod
+    def of(cls, contacts: ContactMap, names: tuple[str, ...]) -> Bounds:
+        """Find them for signals of a map."""
+        sizes = [k for k, name in enumerate(names) if not CIRCULAR[SIGNALS.index(name)]]
+        values = contacts.chart.values.reshape(-1, 6)
+        known = signals_of(values[:, :3], np.cross(values[:, 3:], values[:, :3]))
+        largest = np.abs(known[:, [SIGNALS.index(names[k]) for k in sizes]]).max(axis=0)
+        # M_x is next to nothing on a planar whisker, but for that noise in it is not out of bounds.
+        of_kind = {"F": np.abs(values[:, :3]).max(), "M": np.abs(known[:, 3:5]).max()}
+        return cls(sizes, np.maximum(largest, [0.1 * of_kind[names[k][0]] for k in sizes]))
+
+    def nothing(self, targets: Array) -> AnyArray:
+        """Whether signals (n, k) come from a whisker that touches nothing, shape (n,)."""
+        return np.asarray((targets[:, self.sizes] == 0.0).all(axis=1) & bool(self.sizes))
+
+    def exceeded(self, targets: Array) -> AnyArray:
+        """Whether signals (n, k) are far larger than any on the map, shape (n,)."""
+        return np.asarray((np.abs(targets[:, self.sizes]) > _FAR_BEYOND * self.largest).any(axis=1))
+
+
 class Explanation(NamedTuple):
     """Rows × candidates, non-dimensional, NaN-padded.
 
@@ -64,7 +98,11 @@ def by_triplet(
     found = invert(contacts.chart, contacts.tree(names), names, targets)
     status = np.where(found.number == 1, int(Status.UNIQUE), int(Status.AMBIGUOUS))
     misfit = np.zeros(len(targets))
-    _explain_none(contacts, names, targets, found.number, status, misfit)
+    missing = ~np.isfinite(targets).all(axis=1)
+    status[missing], misfit[missing] = int(Status.MISSING), np.nan
+    rows = np.flatnonzero((found.number == 0) & ~missing)
+    if rows.size:
+        status[rows], misfit[rows] = why_none(contacts, names, targets[rows])
     covariances, linear = _uncertain(contacts, names, found.number, found.contacts, sensor)
     return Explanation(
         found.number, found.contacts[..., 0], found.values, covariances, misfit, status, linear
@@ -95,7 +133,8 @@ def by_least_squares(
     n = len(targets)
     status, misfit = np.full(n, int(Status.MISSING)), np.full(n, np.nan)
     known = np.isfinite(targets).all(axis=1)
-    nothing, beyond = _without_contact(contacts, names, targets)
+    bounds = Bounds.of(contacts, names)
+    nothing, beyond = bounds.nothing(targets) & known, bounds.exceeded(targets) & known
     status[nothing], status[beyond] = int(Status.DEGENERATE), int(Status.OUTSIDE_MAP)
     rows = np.flatnonzero(known & ~nothing & ~beyond)
     found, status[rows] = least_squares(contacts, names, targets[rows], sensor)
@@ -112,56 +151,47 @@ def by_least_squares(
     return Explanation(number, xi[..., 0], values, covariances, misfit, status, linear)
 
 
-def _without_contact(
+def why_none(
     contacts: ContactMap, names: tuple[str, ...], targets: Array
-) -> tuple[AnyArray, AnyArray]:
-    """Whether signals come from a whisker that touches nothing, and whether from none at all."""
-    sizes = [k for k, name in enumerate(names) if not CIRCULAR[SIGNALS.index(name)]]
-    values = contacts.chart.values.reshape(-1, 6)
-    known = signals_of(values[:, :3], np.cross(values[:, 3:], values[:, :3]))
-    largest = np.abs(known[:, [SIGNALS.index(names[k]) for k in sizes]]).max(axis=0)
-    # M_x is next to nothing on a planar whisker, but noise in it is not beyond the map for that.
-    of_kind = {"F": np.abs(values[:, :3]).max(), "M": np.abs(known[:, 3:5]).max()}
-    largest = np.maximum(largest, [0.1 * of_kind[names[k][0]] for k in sizes])
-    felt = np.abs(targets[:, sizes])
-    nothing = (felt == 0.0).all(axis=1) & bool(sizes)
-    return nothing, (felt > _FAR_BEYOND * largest).any(axis=1)
+) -> tuple[IntArray, Array]:
+    """Say why three signals have no contact.
 
+    Parameters
+    ----------
+    contacts : ContactMap
+        The map.
+    names : tuple of str
+        The signals.
+    targets : (n, 3) array
+        Their values, non-dimensional and finite, which no contact on the map gives.
 
-def _explain_none(
-    contacts: ContactMap,
-    names: tuple[str, ...],
-    targets: Array,
-    number: IntArray,
-    status: IntArray,
-    misfit: Array,
-) -> None:
-    """Say why measurements without a contact have none."""
-    missing = ~np.isfinite(targets).all(axis=1)
-    status[missing], misfit[missing] = int(Status.MISSING), np.nan
-    rows = np.flatnonzero((number == 0) & ~missing)
-    if not rows.size:
-        return
+    Returns
+    -------
+    status : (n,) int array
+        ``NOT_FRICTIONLESS``, ``OUTSIDE_MAP`` or ``DEGENERATE``.
+    misfit : (n,) array
+        How far the nearest signals that some contact gives are, in shares of their ranges.
+    """
     chart = contacts.chart
     which = [SIGNALS.index(name) for name in names]
     values = chart.values.reshape(-1, 6)
     known = signals_of(values[:, :3], np.cross(values[:, 3:], values[:, :3]))[:, which]
     size = np.where([CIRCULAR[w] for w in which], 1.0, np.ptp(known, axis=0))
-    _, nearest = cKDTree(_on_circle(known, which, size)).query(
-        _on_circle(targets[rows], which, size)
-    )
-    away = known[nearest] - targets[rows]
+    _, nearest = cKDTree(_on_circle(known, which, size)).query(_on_circle(targets, which, size))
+    away = known[nearest] - targets
     turned = np.array([CIRCULAR[w] for w in which])
     away = np.where(turned, (away + np.pi) % (2.0 * np.pi) - np.pi, away)
     span = np.where(turned, 2.0 * np.pi, size)
-    misfit[rows] = np.abs(away / span).max(axis=1)
+    misfit = np.abs(away / span).max(axis=1)
     # Perhaps a contact nearer to the base than the map goes explains them.
     start = chart.contacts.reshape(-1, 3)[nearest]
-    xi, _, residual, sign = polish(chart, names, targets[rows], start)
+    xi, _, residual, sign = polish(chart, names, targets, start)
     nearer = (residual <= TOLERANCE) & (sign > 0.0) & (xi[:, 0] < chart.proximal)
-    status[rows] = np.where(nearer, int(Status.OUTSIDE_MAP), int(Status.NOT_FRICTIONLESS))
-    nothing, beyond = _without_contact(contacts, names, targets[rows])
-    status[rows[beyond]], status[rows[nothing]] = int(Status.OUTSIDE_MAP), int(Status.DEGENERATE)
+    bounds = Bounds.of(contacts, names)
+    nearer |= bounds.exceeded(targets)
+    status = np.where(nearer, int(Status.OUTSIDE_MAP), int(Status.NOT_FRICTIONLESS))
+    status[bounds.nothing(targets)] = int(Status.DEGENERATE)
+    return status, misfit
 
 
 def _on_circle(values: Array, which: list[int], size: Array) -> Array:

@@ -104,7 +104,7 @@ def least_squares(
         more = np.flatnonzero(np.isfinite(starts).all(axis=1))
         row, seeds = np.concatenate([row, more]), np.concatenate([seeds, starts[more]])
     limit = largest_misfit(channels, sensor, contacts)
-    row, fits = _fit(chart, channels, sensor, measured, row, seeds, limit)
+    fits = nearby(chart, channels, sensor, measured[row], seeds, limit)
     inside = charted(chart, fits, chart.proximal)
     lost = np.ones(len(measured), np.bool_)
     lost[row[inside & (fits.misfits <= limit)]] = False
@@ -114,7 +114,7 @@ def least_squares(
         there = nodes >= 0
         more = np.repeat(again, _PARTS).reshape(-1, _PARTS)[there]
         seeds = chart.contacts.reshape(-1, 3)[nodes[there]]
-        more, others = _fit(chart, channels, sensor, measured, more, seeds, limit)
+        others = nearby(chart, channels, sensor, measured[more], seeds, limit)
         row = np.concatenate([row, more])
         fits = Fits(*(np.concatenate(pair) for pair in zip(fits, others, strict=True)))
         inside = charted(chart, fits, chart.proximal)
@@ -171,26 +171,50 @@ def _weights(
     return whitening(channels.covariance(sensor, measured, values, chart.discretization))
 
 
-def _fit(
+def nearby(
     chart: Reach,
     channels: Channels,
     sensor: SensorNoise | None,
     measured: Array,
-    row: IntArray,
     seeds: Array,
     limit: float,
-) -> tuple[IntArray, Fits]:
-    """Minima next to seeds ξ (m, 3), with the weights that hold there."""
+    values: Array | None = None,
+) -> Fits:
+    """Find the minima of χ² next to seeds, with the weights that hold there.
+
+    Parameters
+    ----------
+    chart : Reach
+        The chart.
+    channels : Channels
+        What is fitted.
+    sensor : SensorNoise or None
+        Noise; None counts components of force and moment as known to 1 %.
+    measured : (m, k) array
+        The signals, for each seed, non-dimensional.
+    seeds : (m, 3) array
+        Contacts ξ to start from.
+    limit : float
+        Largest χ² of what counts as explained.
+    values : (m, 6) array, optional
+        (F, p) at the seeds, where they are known.
+
+    Returns
+    -------
+    Fits
+        One for each seed.
+    """
     d = chart.discretization
     contacts = with_normal_force(seeds)
-    values, _ = solve_forces(d, contacts)
-    targets, signals = channels.targets(measured)[row], measured[row]
+    if values is None:
+        values, _ = solve_forces(d, contacts)
+    targets = channels.targets(measured)
     # Weights that depend on the contact are taken there once it is nearly known.
     settled = sensor is not None and (
         sensor.deviations is not None or not set(channels.names) & {"FT", "FD", "MB", "MD"}
     )
     for _ in range(1 if settled else 2):
-        weights = _weights(chart, channels, sensor, signals, values)
+        weights = _weights(chart, channels, sensor, measured, values)
         fits = fit(
             d,
             channels.names,
@@ -202,7 +226,7 @@ def _fit(
             worth=limit + INDISTINCT,
         )
         contacts, values = fits.contacts, np.where(np.isfinite(fits.values), fits.values, values)
-    return row, fits
+    return fits
 
 
 def nearest_nodes(chart: Reach, channels: Channels, measured: Array) -> IntArray:

@@ -440,6 +440,13 @@ _ROWS: tuple[tuple[str, str, _Unit, str, str], ...] = (
     ),
     # The truth of a simulated contact
     (
+        "contact_force",
+        r"\mathbf{F}_\mathrm{c}",
+        _MICRONEWTON,
+        "force of the object on the whisker",
+        "At the contact, laboratory frame; without inertia it is the force at the base.",
+    ),
+    (
         "contact_object",
         r"\mathrm{object}",
         _NUMBER,
@@ -473,14 +480,16 @@ _ROWS: tuple[tuple[str, str, _Unit, str, str], ...] = (
         r"\delta_2",
         _MICROMETRE,
         "overlap elsewhere",
-        "How far the whisker reaches into an object away from its one simulated contact.",
+        "How far the whisker reaches into an object away from its one simulated contact; zero "
+        "where all contacts are simulated.",
     ),
     (
         "second_contact",
         r"\mathrm{second}",
         _NUMBER,
-        "whether it would touch elsewhere too",
-        "1 where the overlap counts: the forces of a second contact are not simulated.",
+        "whether it touches elsewhere too",
+        "1 where there is more than one contact; without inertia only the first is simulated, and "
+        "overlap tells how far off that is.",
     ),
     # Objects
     ("object_position", r"\mathbf{c}", _MM, "object's place", "A point of it, laboratory frame."),

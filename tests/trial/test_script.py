@@ -143,3 +143,14 @@ def test_the_command_writes_a_recording(tmp_path, capsys):
     assert "µN·m" in said
     app(["simulate", "--example"], standalone_mode=False)
     assert capsys.readouterr().out == EXAMPLE
+
+
+def test_dynamics_are_asked_for():
+    text = "[dynamics]\ndensity = [1000, 1100]\nstep = 0.2"
+    plan = read(text, duration=0.1, rate=250.0)
+    assert plan.dynamics.density == (1000.0, 1100.0)
+    assert plan.dynamics.step == pytest.approx(2e-4)
+    assert read("", duration=0.1, rate=250.0).dynamics is None
+    assert read("", duration=0.1, rate=250.0, dynamic=True).dynamics.segments == 32
+    with pytest.raises(ValueError, match="density is 3"):
+        read("[dynamics]\ndensity = 3", duration=0.1)

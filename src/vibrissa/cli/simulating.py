@@ -37,6 +37,10 @@ def simulate(
     friction: Annotated[
         float | None, typer.Option(help="Coulomb's coefficient; 0 by default.")
     ] = None,
+    dynamic: Annotated[
+        bool,
+        typer.Option("--dynamic", help="With inertia and damping: half a minute a second or so."),
+    ] = False,
     noise: Annotated[
         bool, typer.Option(help="Whether the sensor has noise: by default 1 µN and 0.02 µN·m.")
     ] = True,
@@ -79,6 +83,7 @@ def simulate(
             protraction=protraction,
             row=row,
             friction=friction,
+            dynamic=dynamic,
             noise=noise,
             seed=seed,
         )
@@ -88,6 +93,7 @@ def simulate(
             plan.motion,
             plan.objects,
             friction=plan.friction,
+            dynamics=plan.dynamics,
             progress=lambda done, total: tell("whisking trial", done, total),
         )
         trial = measure(trial, seed=plan.seed, sensor=plan.sensor)

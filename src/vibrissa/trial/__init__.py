@@ -2,6 +2,7 @@
 
 from vibrissa.trial.calibration import calibrate
 from vibrissa.trial.cameras import Camera, load_cameras, orthogonal_views, save_cameras, triangulate
+from vibrissa.trial.dynamics import Dynamics, resonances
 from vibrissa.trial.film import Look, film, views_of
 from vibrissa.trial.mesh import Mesh
 from vibrissa.trial.motion import Motion, tabulated, whisking
@@ -19,6 +20,7 @@ from vibrissa.trial.simulate import simulate
 __all__ = [
     "Box",
     "Camera",
+    "Dynamics",
     "Look",
     "Mesh",
     "Motion",
@@ -36,6 +38,7 @@ __all__ = [
     "recorded_objects",
     "recorded_pegs",
     "recorded_whisker",
+    "resonances",
     "save_cameras",
     "simulate",
     "sweep_past",

@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from vibrissa.io.recording import KIND
 from vibrissa.quantities import attributes
 from vibrissa.rod.surface import Surface
-from vibrissa.rod.surfaces import SurfaceDeflection
-from vibrissa.status import Status, flag_attributes
+from vibrissa.status import flag_attributes
 from vibrissa.trial.cameras import Camera, cameras_from_dataset
 from vibrissa.trial.motion import Motion
 from vibrissa.trial.object_files import object_from_dataset, objects_datasets
@@ -42,6 +41,7 @@ _FRAMES = {
     "contact_point_whisker": "whisker",
     "force": "whisker",
     "moment": "whisker",
+    "contact_force": "laboratory",
     "head_position": "laboratory",
     "surface_point": "laboratory",
     "surface_normal": "laboratory",
@@ -61,6 +61,7 @@ _DIMS: Mapping[str, tuple[str, ...]] = {
     "in_contact": ("time", "whisker"),
     "confidence": ("time", "whisker"),
     "status": ("time", "whisker"),
+    "contact_force": ("time", "whisker", "space"),
     "contact_object": ("time", "whisker"),
     "surface_point": ("time", "whisker", "space"),
     "surface_normal": ("time", "whisker", "space"),
@@ -71,8 +72,6 @@ _DIMS: Mapping[str, tuple[str, ...]] = {
 _OF_HEAD: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {"head_position": ("time", "space"), "head_rotation": ("time", "space", "head_axis")}
 )
-OVERLAP = 5e-6
-"""Overlap from which a second contact counts, m; a tapering whisker along a flat one has less."""
 
 
 def recorded(name: str, values: Any) -> xr.Variable:
@@ -102,9 +101,7 @@ def trial_recording(
     whisker: Whisker,
     motion: Motion,
     objects: Sequence[Surface],
-    found: SurfaceDeflection,
-    overlap: Array,
-    nodes: int,
+    truth: Mapping[str, Any],
     origin: str,
 ) -> xr.DataTree:
     """Write a simulated trial as a recording.
@@ -117,12 +114,8 @@ def trial_recording(
         Of its base, n frames.
     objects : sequence
         That it may have met.
-    found : SurfaceDeflection
-        What became of it, frame by frame (n,).
-    overlap : array (n,)
-        How far it reaches into objects away from its contact, m.
-    nodes : int
-        Points of a centreline.
+    truth : mapping
+        Variables by name, arrays (n, ...); force and moment are what a perfect sensor reads.
     origin : str
         How it was simulated.
 
@@ -131,33 +124,14 @@ def trial_recording(
     xarray.DataTree
         The recording.
     """
-    rotation, position, bent = motion.base_rotation, motion.base_position, found.bent
-    turn = "tij,t...j->t...i"
-    contact = np.isin(bent.status, (Status.OK, Status.TIP_CONTACT))
     pose = {
-        "base_position": position,
-        "base_rotation": rotation,
+        "base_position": motion.base_position,
+        "base_rotation": motion.base_rotation,
         "base_azimuth": motion.azimuth,
         "base_elevation": motion.elevation,
         "base_roll": motion.roll,
     }
-    wrench = {"force": bent.force, "moment": bent.moment}
-    line = np.einsum(turn, rotation, bent.centerline(nodes)) + position[:, None]
-    truth = wrench | {
-        "centerline": line,
-        "contact_point": np.einsum(turn, rotation, bent.contact_point) + position,
-        "contact_point_whisker": bent.contact_point,
-        "arc_length": bent.arc_length,
-        "in_contact": contact,
-        "confidence": np.isin(bent.status, [s for s in Status if s.ok]).astype(np.float64),
-        "status": bent.status.astype(np.int8),
-        "contact_object": found.surface.astype(np.int16),
-        "surface_point": found.surface_point,
-        "surface_normal": found.normal,
-        "sliding": found.sliding,
-        "overlap": overlap,
-        "second_contact": overlap > OVERLAP,
-    }
+    wrench = {name: truth[name] for name in ("force", "moment")}
     root = xr.Dataset(
         {name: recorded(name, values) for name, values in (pose | wrench).items()} | _head(motion),
         _coordinates(motion.time, [whisker.name]),

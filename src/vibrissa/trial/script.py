@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from vibrissa.io.table import read_text, table_rows
 from vibrissa.rod.surface import Surface
+from vibrissa.trial.dynamics import Dynamics
 from vibrissa.trial.mesh import Mesh
 from vibrissa.trial.motion import Motion, base_rotation, tabulated, whisking
 from vibrissa.trial.objects import Box, Peg, Plane, Sphere
@@ -33,6 +34,12 @@ duration = 3.5          # s
 rate = 1000.0           # frames per second
 friction = 0.0          # Coulomb's coefficient between whisker and objects
 seed = 0                # of drifts and noise
+
+# [dynamics]            # inertia and damping; without it the whisker moves quasi-statically
+# density = [1220.0, 1632.0]  # at base and tip, kg/m³
+# damping_ratio = 0.14  # of the first vibration
+# segments = 32
+# step = 0.1            # ms
 
 # [whisker]
 # file = "C1.csv"       # its centreline; by default a built-in γ whisker
@@ -85,7 +92,8 @@ gain_error = 0.0
 _MM = 1e-3
 _MICRO = 1e-6
 _COLUMNS = ("time", "azimuth", "elevation", "roll", "x", "y", "z")
-_TOP = {"duration", "rate", "friction", "seed", "whisker", "object", "motion", "head", "sensor"}
+_TOP = {"duration", "rate", "friction", "seed"}
+_TOP |= {"whisker", "object", "motion", "head", "sensor", "dynamics"}
 _PER_COMPONENT = ("noise", "bias", "drift", "resolution")
 
 
@@ -107,6 +115,8 @@ class Script:
         At its base.
     seed : int
         Of the sensor's noise.
+    dynamics : Dynamics, optional
+        Inertia and damping; None: quasi-static.
     """
 
     whisker: Whisker
@@ -115,6 +125,7 @@ class Script:
     friction: float
     sensor: Sensor
     seed: int
+    dynamics: Dynamics | None = None
 
 
 def read_script(
@@ -132,8 +143,8 @@ def read_script(
         Makes a whisker of a file, or of None the default one.
     **changes
         ``duration``, ``rate``, ``friction``, ``seed``, ``whisker`` (a file), ``frequency``,
-        ``row``, ``protraction`` and ``noise`` (bool), which count instead of what the text says,
-        where not None.
+        ``row``, ``protraction``, ``noise`` and ``dynamic`` (bool), which count instead of what
+        the text says, where not None.
 
     Returns
     -------
@@ -176,6 +187,25 @@ def read_script(
         friction=_number(said, "friction", 0.0),
         sensor=_sensor(sensor),
         seed=seed,
+        dynamics=_dynamics(said, given.get("dynamic") is True),
+    )
+
+
+def _dynamics(said: Mapping[str, Any], wanted: bool) -> Dynamics | None:
+    """Inertia and damping, where they are said or wanted."""
+    if not (wanted or "dynamics" in said):
+        return None
+    how = _table(said, "dynamics")
+    _only(how, {"density", "damping_ratio", "segments", "step"}, "[dynamics]")
+    usual = Dynamics()
+    density = how.get("density", usual.density)
+    if not (isinstance(density, list | tuple) and len(density) == 2):
+        raise ValueError(f"density is {density!r}; those at base and tip are needed")
+    return Dynamics(
+        density=(float(density[0]), float(density[1])),
+        damping_ratio=_number(how, "damping_ratio", usual.damping_ratio),
+        segments=int(_number(how, "segments", usual.segments)),
+        step=_number(how, "step", usual.step * 1e3) * 1e-3,
     )
 
 

@@ -9,6 +9,9 @@ whisker is therefore never pulled through a peg. Quasi-static.
 One contact is simulated at a time, that with the object met first. Where the bent whisker reaches
 into another object, or into the same one elsewhere, the truth says so (``second_contact``) and how
 far (``overlap``): there the wrench lacks what the second contact would add.
+
+With `vibrissa.trial.dynamics` the whisker has inertia and damping: it collides, rings after it has
+slipped, and may touch at several places, of which the strongest is recorded.
 """
 
 from __future__ import annotations
@@ -22,8 +25,10 @@ from numpy.typing import NDArray
 from vibrissa.rod.surface import Surface
 from vibrissa.rod.surfaces import SurfaceDeflection, follow_surfaces
 from vibrissa.status import Status
+from vibrissa.trial.dynamics import Dynamics, move_dynamically
 from vibrissa.trial.motion import Motion
 from vibrissa.trial.recording import trial_recording
+from vibrissa.trial.stepping import Moment
 from vibrissa.whisker import Whisker
 
 NODES = 33
@@ -34,6 +39,9 @@ _LOOK_AT = 129
 
 _ASIDE = 0.03
 """How far from the contact another one of the same object is one, as a share of the length."""
+
+OVERLAP = 5e-6
+"""Overlap from which a second contact counts, m; a tapering whisker along a flat one has less."""
 
 _FRAMES_AT_ONCE = 512
 
@@ -49,6 +57,7 @@ def simulate(
     objects: Surface | Sequence[Surface],
     *,
     friction: float = 0.0,
+    dynamics: Dynamics | None = None,
     nodes: int = NODES,
     progress: Progress | None = None,
 ) -> xr.DataTree:
@@ -64,6 +73,8 @@ def simulate(
         In the laboratory. The one met first holds the whisker.
     friction : float
         Coulomb's coefficient between whisker and objects.
+    dynamics : Dynamics, optional
+        Its inertia and damping; by default it moves quasi-statically.
     nodes : int
         Points of the recorded centrelines, equally spaced in arc length.
     progress : callable, optional
@@ -81,6 +92,14 @@ def simulate(
         If the friction is negative.
     """
     solids = list(objects) if isinstance(objects, Sequence) else [objects]
+    touch = "frictionless" if friction == 0.0 else f"friction {friction:g}"
+    if dynamics is not None:
+        moments = move_dynamically(
+            whisker, solids, motion, dynamics, friction=friction, progress=progress
+        )
+        truth = _dynamic_truth(whisker, motion, moments, nodes)
+        said = f"simulated: with inertia, damping ratio {dynamics.damping_ratio:g}, {touch}"
+        return trial_recording(whisker, motion, solids, truth, said)
     found = follow_surfaces(
         whisker,
         solids,
@@ -89,16 +108,86 @@ def simulate(
         friction=friction,
         progress=progress,
     )
-    touch = "frictionless" if friction == 0.0 else f"friction {friction:g}"
     return trial_recording(
         whisker,
         motion,
         solids,
-        found,
-        _overlap(whisker, motion, solids, found),
-        nodes,
+        _truth(whisker, motion, solids, found, nodes),
         f"simulated: quasi-static, {touch}",
     )
+
+
+def _truth(
+    whisker: Whisker,
+    motion: Motion,
+    solids: Sequence[Surface],
+    found: SurfaceDeflection,
+    nodes: int,
+) -> dict[str, Array]:
+    """Variables of the truth, quasi-static."""
+    rotation, position, bent = motion.base_rotation, motion.base_position, found.bent
+    turn = "tij,t...j->t...i"
+    contact = np.isin(bent.status, (Status.OK, Status.TIP_CONTACT))
+    overlap = _overlap(whisker, motion, solids, found)
+    return {
+        "force": bent.force,
+        "moment": bent.moment,
+        "centerline": np.einsum(turn, rotation, bent.centerline(nodes)) + position[:, None],
+        "contact_point": np.einsum(turn, rotation, bent.contact_point) + position,
+        "contact_point_whisker": bent.contact_point,
+        "arc_length": bent.arc_length,
+        "in_contact": contact,
+        "confidence": np.isin(bent.status, [s for s in Status if s.ok]).astype(np.float64),
+        "status": bent.status.astype(np.int8),
+        "contact_force": np.where(contact[:, None], np.einsum(turn, rotation, bent.force), np.nan),
+        "contact_object": found.surface.astype(np.int16),
+        "surface_point": found.surface_point,
+        "surface_normal": found.normal,
+        "sliding": found.sliding,
+        "overlap": overlap,
+        "second_contact": overlap > OVERLAP,
+    }
+
+
+def _dynamic_truth(
+    whisker: Whisker, motion: Motion, moments: Sequence[Moment], nodes: int
+) -> dict[str, Array]:
+    """Variables of the truth, with inertia."""
+    rotation, position = motion.base_rotation, motion.base_position
+    n = len(moments)
+    truth = {
+        name: np.full((n, 3), np.nan)
+        for name in ("contact_point", "contact_force", "surface_point", "surface_normal")
+    }
+    arc_length, surface = np.full(n, np.nan), np.full(n, -1, dtype=np.int16)
+    second, status = np.zeros(n, dtype=bool), np.full(n, int(Status.NO_CONTACT), dtype=np.int8)
+    for i, moment in enumerate(moments):
+        if not moment.contacts:
+            continue
+        first = moment.contacts[0]
+        arc_length[i], surface[i] = first.arc_length, first.surface
+        truth["contact_point"][i], truth["surface_normal"][i] = first.place, first.normal
+        truth["contact_force"][i] = moment.contact_force
+        away = first.gap + float(whisker.radius(first.arc_length))
+        truth["surface_point"][i] = first.place - away * first.normal
+        second[i] = len(moment.contacts) > 1
+        at_tip = first.arc_length >= whisker.length * (1.0 - 1e-9)
+        status[i] = int(Status.TIP_CONTACT if at_tip else Status.OK)
+    to_whisker = "tji,tj->ti"
+    return truth | {
+        "force": np.einsum(to_whisker, rotation, np.array([m.force for m in moments])),
+        "moment": np.einsum(to_whisker, rotation, np.array([m.moment for m in moments])),
+        "centerline": np.array([m.centerline(nodes) for m in moments]),
+        "contact_point_whisker": np.einsum(to_whisker, rotation, truth["contact_point"] - position),
+        "arc_length": arc_length,
+        "in_contact": surface >= 0,
+        "confidence": np.ones(n),
+        "status": status,
+        "contact_object": surface,
+        "sliding": np.array([m.sliding for m in moments]),
+        "overlap": np.zeros(n),
+        "second_contact": second,
+    }
 
 
 def _overlap(

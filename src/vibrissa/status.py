@@ -113,9 +113,9 @@ class Status(enum.IntEnum):
     DEGENERATE = (
         24,
         False,
-        "The signals do not determine a contact: the force is too small, or a small change of the "
-        "signals moves the contact without bound.",
-        "Leave the row out, or add a signal.",
+        "The signals do not determine a contact: force and moment are too small, or on this "
+        "whisker contacts can move without changing these signals.",
+        "Leave the row out, or choose other signals.",
     )
     NOT_ONE_CONTACT = (
         25,

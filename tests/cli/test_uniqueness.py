@@ -41,7 +41,7 @@ def test_cone_and_region(chart):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--triplet", "Fx,MB"], "at least 3"),
+        (["--triplet", "Fx,MB"], "exactly 3"),
         (["--region", "up"], "regions are among"),
         (["--domain", "mars"], "domain is 'reachable' or 'paper'"),
         (["-o", "verdicts.txt"], ".nc or .csv is needed"),

@@ -166,6 +166,14 @@ def test_bad_input_says_what_is_allowed(gamma_map):
         gamma_map.estimate(signals, noise={"Fx": 1e-6, "MB": 1e-8})
     with pytest.raises(ValueError, match=r"got shape \(3, 3\)"):
         gamma_map.estimate(signals, noise=np.eye(3))
+    with pytest.raises(ValueError, match="dataset or mapping with Fx, MB, MD; got 5"):
+        gamma_map.estimate(5)
+    with pytest.raises(ValueError, match=r"must be standard deviations ≥ 0; got \{'Fx': 'a'"):
+        gamma_map.estimate(signals, noise={"Fx": "a", "MB": 1e-8, "MD": 0.1})
+    with pytest.raises(ValueError, match=r"6 × 6 covariance of \(F, M\); got 'a'"):
+        gamma_map.estimate(signals, noise="a")
+    with pytest.raises(ValueError, match=r"has 3 numbers; got \['a', 1, 2\]"):
+        vb.Estimator(gamma_map)(["a", 1, 2])
 
 
 def test_one_at_a_time_is_the_same(gamma_map, rng):

@@ -139,3 +139,32 @@ def test_a_stream_refuses_what_a_batch_refuses(gamma_map, row):
     ):
         with pytest.raises(ValueError, match=r"looks like degrees|cannot be negative"):
             locate(row)
+
+
+@pytest.mark.parametrize(
+    "names", ["Fx FD MD", "FT FD MD", "FD MB MD", "Fx Mx MB", "FT Mx MD", "Fx FD Mx MD"]
+)
+def test_signals_that_determine_no_contact_locate_none(straight_map, names):
+    """On a straight whisker M_D follows from F_D, and M_x = 0."""
+    whisker = straight_map.whisker
+    bent = vb.deflect(whisker, vb.PointForce(0.6 * whisker.length, 1e-4, [0.3, 1.0, -2.0]))
+    signals = vb.base_signals(bent.force, bent.moment)
+    rows = np.stack([signals[name] for name in names.split()], axis=-1)
+    rows[2, 0] = np.nan
+    expected = [vb.Status.DEGENERATE] * 2 + [vb.Status.MISSING]
+    found = straight_map.estimate(dict(zip(names.split(), rows.T, strict=True)), names)
+    assert found.status.tolist() == expected
+    assert np.isnan(found.point).all()
+    assert (found.n_candidates == 0).all()
+    assert not straight_map.determines(names)
+    locate = vb.Estimator(straight_map, names)
+    stream = [locate(row) for row in rows]
+    assert [one.status for one in stream] == expected
+    assert all(np.isnan(one.point).all() for one in stream)
+
+
+def test_other_signals_determine_contacts(straight_map, gamma_map):
+    for names in ("Fx MB MD", "FT FD MB", "FT FD Mx MB", " ".join(SIGNALS)):
+        assert straight_map.determines(names)
+    for names in ("Fx FD MD", "FD MB MD", "Fx Mx MB"):
+        assert gamma_map.determines(names)

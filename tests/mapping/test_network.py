@@ -76,5 +76,5 @@ def test_estimates_by_network(gamma_map, trained, monkeypatch):
 def test_what_it_refuses(gamma_map):
     with pytest.raises(ValueError, match="samples ≥ 100"):
         train_network(gamma_map, samples=10)
-    with pytest.raises(ValueError, match="expected 3 signals"):
+    with pytest.raises(ValueError, match="expected exactly 3 different signals"):
         train_network(gamma_map, "Fx FT MB MD")

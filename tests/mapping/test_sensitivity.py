@@ -284,7 +284,7 @@ def test_weighted_quantiles():
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"triplet": "Fx MB"}, "at least 3"),
+        ({"triplet": "Fx MB"}, "exactly 3"),
         ({"at": "everywhere"}, "'grid'"),
         ({"at": "grid"}, "has no grid"),
         ({"at": xr.Dataset({"Fx": ("time", [0.0])})}, "got Fx"),

@@ -372,7 +372,8 @@ def test_files_and_table(of_curved, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"triplets": ["Fx MB"]}, "at least 3"),
+        ({"triplets": ["Fx MB"]}, "exactly 3"),
+        ({"triplets": ("Fx", "MB")}, "exactly 3"),
         ({"triplets": ["Fx MB MD", "MB Fx MD"]}, "once each"),
         ({"regions": ["XY"]}, "regions are among"),
         ({"min_separation": 0.0}, "min_separation"),
@@ -420,3 +421,8 @@ def test_the_plane_of_a_whisker_may_be_turned(of_curved):
 def test_nothing_outside_the_cone(curved):
     found = vb.uniqueness(curved, ["Fx MB MD"], cone=1.55, samples=64)
     assert (found.verdict == "no contacts").all()
+
+
+def test_three_signals_in_a_row_are_one_triplet(straight):
+    flat = vb.uniqueness(straight, ("Fx", "MB", "MD"), ["all"], resolution=False, samples=64)
+    assert flat.triplet.to_numpy().tolist() == ["Fx MB MD"]

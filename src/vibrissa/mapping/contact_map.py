@@ -72,6 +72,7 @@ class ContactMap:
         default_factory=dict, repr=False
     )
     _trees: dict[tuple[str, ...], Preimages] = field(default_factory=dict, repr=False)
+    _determining: dict[tuple[str, ...], bool] = field(default_factory=dict, repr=False)
 
     @classmethod
     def simulate(
@@ -161,6 +162,27 @@ class ContactMap:
         if triplet not in self._trees:
             self._trees[triplet] = triplet_tree(self.chart, selection(triplet))
         return self._trees[triplet]
+
+    def determines(self, signals: str | tuple[str, ...]) -> bool:
+        """Tell whether signals determine contacts on this whisker, but for single ones.
+
+        Parameters
+        ----------
+        signals : str or tuple of str
+            Three or more.
+
+        Returns
+        -------
+        bool
+            False if almost everywhere the contact can move without changing them, as on a straight
+            whisker, which never twists, for any three with Mx. Found out on first use.
+        """
+        from vibrissa.mapping.fibres import determining
+
+        names = selection(signals)
+        if names not in self._determining:
+            self._determining[names] = determining(self, names)
+        return self._determining[names]
 
     @cached_property
     def _samples(self) -> xr.Dataset:

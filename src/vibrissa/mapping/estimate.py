@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from vibrissa.mapping.approximation import APPROXIMATE, by_approximation
 from vibrissa.mapping.contact_map import spherical
-from vibrissa.mapping.explanation import Explanation, by_least_squares, by_triplet
+from vibrissa.mapping.explanation import Explanation, by_least_squares, by_triplet, undetermined
 from vibrissa.mapping.noise import SensorNoise
 from vibrissa.quantities import attributes
 from vibrissa.rod.arrays import AnyArray, Array, IntArray
@@ -50,7 +50,8 @@ class Estimate:
         on the map explains the signals (of more than three signals: where χ² is larger than one
         measurement in a thousand would have it; then the contact that comes nearest is given);
         ``OUTSIDE_MAP`` where one nearer to the base would, or where signals are ten times larger
-        than any on the map; ``DEGENERATE`` where all forces and moments are zero; ``MISSING``.
+        than any on the map; ``DEGENERATE`` where all forces and moments are zero, and everywhere if
+        the signals do not determine contacts (:meth:`ContactMap.determines`); ``MISSING``.
         Of a look-up table or network, which cannot see whether contacts are ambiguous:
         ``APPROXIMATE``, ``OUTSIDE_MAP`` (outside the table) or ``MISSING``.
     misfit : (...) array
@@ -248,6 +249,8 @@ def estimate(
 def _exact(
     contacts: ContactMap, names: tuple[str, ...], targets: Array, sensor: SensorNoise | None
 ) -> Explanation:
+    if not contacts.determines(names):
+        return undetermined(targets)
     explain = by_triplet if len(names) == 3 else by_least_squares
     return explain(contacts, names, targets, sensor)
 

@@ -98,6 +98,7 @@ class Estimator:
         self._order = [order.index(name) for name in self.names]
         self._sensor = None if noise is None else SensorNoise.of(noise, self.names)
         self._contacts, self._chart = contacts, contacts.chart
+        self._determining = contacts.determines(self.names)
         self._three = self.names
         if len(self.names) > 3:
             self._three = seeding_triplet(self._chart, self.names)
@@ -139,7 +140,12 @@ class Estimator:
             If there are not as many numbers as signals were announced, a size is negative, or an
             angle is more than a full turn.
         """
-        values = np.asarray(signals, dtype=np.float64)
+        try:
+            values = np.asarray(signals, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                f"one measurement has {len(self.names)} numbers; got {signals!r}"
+            ) from error
         if values.shape != (len(self.names),):
             raise ValueError(
                 f"one measurement has {len(self.names)} signals; got shape {values.shape}"
@@ -151,6 +157,8 @@ class Estimator:
         if not np.isfinite(targets).all():
             self.reset()
             return self._nowhere(Status.MISSING)
+        if not self._determining:
+            return self._nowhere(Status.DEGENERATE)
         if len(self.names) == 3:
             return self._by_triplet(targets)
         return self._by_least_squares(targets)

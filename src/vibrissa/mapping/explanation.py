@@ -151,6 +151,32 @@ def by_least_squares(
     return Explanation(number, xi[..., 0], values, covariances, misfit, status, linear)
 
 
+def undetermined(targets: Array) -> Explanation:
+    """Explain signals that do not determine contacts: by none.
+
+    Parameters
+    ----------
+    targets : (n, k) array
+        The signals; NaN means missing.
+
+    Returns
+    -------
+    Explanation
+        Row by row: ``DEGENERATE``, or ``MISSING``.
+    """
+    n = len(targets)
+    known = np.isfinite(targets).all(axis=1)
+    return Explanation(
+        number=np.zeros(n, np.int64),
+        arc_lengths=np.full((n, 1), np.nan),
+        values=np.full((n, 1, 6), np.nan),
+        covariances=np.full((n, 1, 3, 3), np.nan),
+        misfit=np.full(n, np.nan),
+        status=np.where(known, int(Status.DEGENERATE), int(Status.MISSING)),
+        linear=np.zeros(n, np.bool_),
+    )
+
+
 def why_none(
     contacts: ContactMap, names: tuple[str, ...], targets: Array
 ) -> tuple[IntArray, Array]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vibrissa.mapping.places import Domain, Places, place
+from vibrissa.mapping.places import Domain, Places, place, sample, spread
 from vibrissa.mapping.twins import AGREEMENT, Pairs, sizes, triplet_derivatives
 from vibrissa.rod.arrays import AnyArray, Array
 from vibrissa.rod.batch import solve_forces
@@ -35,6 +35,30 @@ _LOST = 0.99
 # Where the equations make signals depend on each other, the integration does so to its own error.
 # With so many times the steps that is below ``_RANK``.
 _FINER = 8
+# How many contacts tell whether signals determine contacts at all.
+_TRIED = 256
+
+
+def determining(contacts: ContactMap, names: tuple[str, ...]) -> bool:
+    """Tell whether signals determine contacts, but for single ones.
+
+    Parameters
+    ----------
+    contacts : ContactMap
+        The whisker's map.
+    names : tuple of str
+        Three signals or more.
+
+    Returns
+    -------
+    bool
+        False if almost everywhere the contact can move without changing them.
+    """
+    places = sample(contacts, spread(_TRIED, seed=0), "reachable").places
+    which = [SIGNALS.index(name) for name in names]
+    circular = [CIRCULAR[w] for w in which]
+    span = np.where(circular, 2.0 * np.pi, np.ptp(places.signals[:, which], axis=0))
+    return deficient(contacts, names, places.contacts, span) is None
 
 
 def deficient(contacts: ContactMap, names: tuple[str, ...], xi: Array, span: Array) -> int | None:
@@ -45,10 +69,10 @@ def deficient(contacts: ContactMap, names: tuple[str, ...], xi: Array, span: Arr
     contacts : ContactMap
         The whisker's map.
     names : tuple of str
-        The triplet.
+        The triplet, or k signals.
     xi : (n, 3) array
         Contacts.
-    span : (3,) array
+    span : (k,) array
         Range of each signal.
 
     Returns

@@ -66,11 +66,21 @@ class SensorNoise:
                 raise ValueError(
                     f"noise lacks {', '.join(missing)}; it has {', '.join(noise) or 'none'}"
                 )
-            sigma = {name: float(noise[name]) for name in names}
+            try:
+                sigma = {name: float(noise[name]) for name in names}
+            except (TypeError, ValueError) as error:
+                given = {name: noise[name] for name in names}
+                raise ValueError(f"noise must be standard deviations ≥ 0; got {given}") from error
             if not all(0.0 <= value < np.inf for value in sigma.values()):
                 raise ValueError(f"noise must be standard deviations ≥ 0; got {sigma}")
             return cls(sigma, None)
-        wrench = np.asarray(noise, dtype=np.float64)
+        try:
+            wrench = np.asarray(noise, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                "noise must be {signal: standard deviation} or a symmetric 6 × 6 covariance of "
+                f"(F, M); got {noise!r}"
+            ) from error
         if wrench.shape != (6, 6) or not np.allclose(wrench, wrench.T, rtol=1e-9, atol=0.0):
             raise ValueError(
                 "noise must be {signal: standard deviation} or a symmetric 6 × 6 covariance of "

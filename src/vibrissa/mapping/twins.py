@@ -87,7 +87,7 @@ def joined(parts: list[Pairs]) -> Pairs:
 
 
 def triplet_derivatives(values: Array, tangents: Array, names: tuple[str, ...]) -> Array:
-    """∂T/∂ξ (n, 3, 3); zero where a direction has no value."""
+    """∂T/∂ξ (n, k, 3); zero where a direction has no value."""
     which = [SIGNALS.index(name) for name in names]
     return np.asarray(np.nan_to_num(signal_derivatives(values, tangents)[:, which]))
 

@@ -20,7 +20,7 @@ import xarray as xr
 from vibrissa.mapping.evidence import answer, ask
 from vibrissa.mapping.evidence_dataset import labelled, network_errors
 from vibrissa.mapping.places import Domain
-from vibrissa.signals import CONE, REGIONS, TRIPLETS, selection
+from vibrissa.signals import CONE, REGIONS, SIGNALS, TRIPLETS, selection
 
 if TYPE_CHECKING:
     from vibrissa.mapping.contact_map import ContactMap
@@ -54,7 +54,7 @@ def uniqueness(
     contacts : ContactMap
         The whisker's map.
     triplets : "all" or sequence
-        Which of the 20 triplets: names like ``"Fx MB MD"`` or tuples of signals.
+        Which of the 20 triplets: names like ``"Fx MB MD"`` or tuples of signals; or three signals.
     regions : "all" or sequence of str
         Which of ``"all"``, ``"ELD"`` (excluding large deflections), ``"CF"`` (concave forward),
         ``"CB"`` (concave backward), ``"ELD CF"``, ``"ELD CB"``; the text ``"all"`` means all six,
@@ -137,7 +137,11 @@ def uniqueness(
 
 
 def _listed(triplets: str | Sequence[str | tuple[str, ...]]) -> tuple[tuple[str, ...], ...]:
-    several = [triplets] if isinstance(triplets, str) else list(triplets)
+    several: list[str | tuple[str, ...]] = (
+        [triplets] if isinstance(triplets, str) else list(triplets)
+    )
+    if several and all(triplet in SIGNALS for triplet in several):
+        several = [tuple(map(str, several))]  # one triplet, signal by signal
     names = tuple(selection(triplet, exactly=3) for triplet in several)
     if not names or len(set(names)) < len(names):
         raise ValueError(f"triplets must be named once each, at least one; got {triplets!r}")

@@ -189,6 +189,10 @@ def measured(
     ValueError
         If a signal is missing or shapes do not broadcast.
     """
+    if not hasattr(signals, "keys"):
+        raise ValueError(
+            f"signals must be a dataset or mapping with {', '.join(names)}; got {signals!r}"
+        )
     missing = [name for name in names if name not in signals]
     if missing:
         raise ValueError(

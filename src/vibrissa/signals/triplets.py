@@ -33,13 +33,13 @@ def selection(
     Raises
     ------
     ValueError
-        If a name is unknown or given twice, or if there are too few.
+        If a name is unknown or given twice, or if there are too few or too many.
     """
     names = signals.replace(",", " ").split() if isinstance(signals, str) else list(signals)
     unknown = [name for name in names if name not in SIGNALS]
-    if unknown or len(set(names)) != len(names) or len(names) < least:
+    enough = len(names) >= least if exactly is None else len(names) == exactly
+    if unknown or len(set(names)) != len(names) or not enough:
+        number = f"at least {least}" if exactly is None else f"exactly {exactly}"
         known = ", ".join(SIGNALS)
-        raise ValueError(f"expected at least {least} different signals of {known}; got {signals!r}")
-    if exactly is not None and len(names) != exactly:
-        raise ValueError(f"expected {exactly} signals; got {len(names)}: {', '.join(names)}")
+        raise ValueError(f"expected {number} different signals of {known}; got {signals!r}")
     return tuple(name for name in SIGNALS if name in names)

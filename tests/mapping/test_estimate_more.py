@@ -204,3 +204,9 @@ def test_without_noise_nothing_scatters(gamma_map):
     exact = dict.fromkeys(("Fx", "FD", "MB", "MD"), 0.0) | {"FT": 1e-6, "Mx": 2e-8}
     found = gamma_map.estimate(signals, SIGNALS, exact)
     assert np.sqrt(np.trace(found.covariance)) < 1e-9
+
+
+def test_a_missing_signal_is_missing_whatever_the_others(gamma_map):
+    rows = {"Fx": [np.nan, 1.0], "FT": 1.0, "MB": 1e-7, "MD": [0.1, np.nan]}
+    found = gamma_map.estimate(rows, "Fx FT MB MD")
+    assert found.status.tolist() == [vb.Status.MISSING] * 2

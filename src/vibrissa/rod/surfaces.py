@@ -10,7 +10,8 @@ can be told by the distance of the bent whisker from them).
 
 Where the whisker would rest inside a surface from the very beginning, or after it slipped, it lies
 against the side of it that is nearest: it is brought there, in thought and without friction, from
-outside.
+outside. A contact that ends while the bent whisker lies against a surface elsewhere as well, such
+as on two edges of a box, goes on there.
 """
 
 from __future__ import annotations
@@ -22,7 +23,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from vibrissa.rod.arrays import Array, IntArray
-from vibrissa.rod.contact_state import STATES, contact_state
 from vibrissa.rod.deflection import Deflection, dimensional
 from vibrissa.rod.discretize import STEPS, discretize
 from vibrissa.rod.loads import PointForce
@@ -31,24 +31,12 @@ from vibrissa.rod.reach import LEAST_ARC
 from vibrissa.rod.resting import ZOOM, ZOOMS, Resting
 from vibrissa.rod.shape import shapes
 from vibrissa.rod.surface import Placement, Surface, between
-from vibrissa.rod.surface_equations import EITHER, SLIDING, STICKING, surface_equations
+from vibrissa.rod.touch import Touch, TouchSolver
 from vibrissa.status import Status
 
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
 
-_TOLERANCE = 1e-12
-# So near a branch's end that rounding moves the solution, this is as good as it gets.
-_AT_FOLD = 1e-9
-_ROUNDS = 40
-_SMALLEST_STEP = 2.0**-12
-_SWITCHES = 6
-# The longest Newton steps that a linearisation is trusted for: in s, in the contact's place (both
-# over L), in the whisker's direction there, and in the surface's normal.
-_LONGEST = np.array([0.15, 0.15, 0.4, 0.5])
-_MOST_TURNED = 0.5  # cosine of the normal's turn in one step of the path
-# A tip contact whose tangent points away from the surface by more than this is one of the side.
-_OUTWARD = 1e-10
 # A det below this share of that at the start says that the branch was near its end.
 _NEAR_FOLD = 0.5
 # A contact that is only about right enters a surface by no more than this, over L.
@@ -59,6 +47,10 @@ _ENTERED = 2e-3
 _ELSEWHERE = 0.03
 # A contact passes on to another this often in one frame.
 _MOST_OTHERS = 3
+# Rounds in which the next contact is looked for.
+_LOOKS = 40
+# Steps between placements are halved down to this.
+_SMALLEST_STEP = 2.0**-12
 
 Progress = Callable[[int, int], None]
 
@@ -87,24 +79,6 @@ class SurfaceDeflection:
     normal: Array
     surface_point: Array
     sliding: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class _Touch:
-    """A solved contact: which surface, (s, f), (F, p, t), and what friction has to remember."""
-
-    surface: int
-    tip: bool
-    contact: Array
-    state: Array
-    point: Array
-    tangent: Array
-    normal: Array
-    distance: float
-    misfit: float
-    determinant: float
-    pressing: float
-    sliding: bool
 
 
 class _Ended(NamedTuple):
@@ -169,9 +143,9 @@ def follow_surfaces(
     )
     for i in range(n):
         found = follower.move_to(Placement(rotations[i], positions[i]))
-        if isinstance(found, _Touch) and found.contact[0] < proximal:
+        if isinstance(found, Touch) and found.contact[0] < proximal:
             found = _Ended(Status.TOO_PROXIMAL)
-        if isinstance(found, _Touch):
+        if isinstance(found, Touch):
             solved.contacts[i], solved.values[i] = found.contact, found.state[:6]
             solved.misfits[i] = found.misfit
             solved.statuses[i] = int(Status.TIP_CONTACT if found.tip else Status.OK)
@@ -200,17 +174,16 @@ class _Follower:
         self._whisker, self._steps = whisker, steps
         self._surfaces = surfaces
         self._friction = friction
-        scale = self.discretization.force / self.discretization.length
-        self._softness = [scale / surface.stiffness for surface in surfaces]
+        self._solver = TouchSolver(self.discretization, surfaces)
         self._rest = Resting(whisker, surfaces)
         self._placement: Placement | None = None
-        self._found: _Touch | _Ended = _Ended(Status.NOT_CONVERGED)
+        self._found: Touch | _Ended = _Ended(Status.NOT_CONVERGED)
 
-    def move_to(self, now: Placement) -> _Touch | _Ended:
+    def move_to(self, now: Placement) -> Touch | _Ended:
         """Go on to a placement."""
         before, self._placement = self._placement, now
         found = self._found
-        if isinstance(found, _Touch):
+        if isinstance(found, Touch):
             assert before is not None
             found = self._follow(found, before, now, self._friction)
             before = None  # it was not free there
@@ -223,7 +196,7 @@ class _Follower:
 
     # Touching
 
-    def _from_rest(self, before: Placement | None, now: Placement) -> _Touch | _Ended:
+    def _from_rest(self, before: Placement | None, now: Placement) -> Touch | _Ended:
         """Bend a whisker that was free before (or not: None), if anything is in its way."""
         ended = _Ended(Status.NO_CONTACT)
         if before is not None:
@@ -232,7 +205,7 @@ class _Follower:
                 return ended
             for friction in (self._friction, 0.0):
                 found = self._enter(*meeting, now, friction)
-                if isinstance(found, _Touch):
+                if isinstance(found, Touch):
                     return found
         gaps = [self._rest.gap(i, now)[0] for i in range(len(self._surfaces))]
         for surface in np.argsort(gaps).tolist():
@@ -243,7 +216,7 @@ class _Follower:
                 found = _Ended(Status.NOT_CONVERGED)
             else:
                 found = self._enter(surface, outside, now, now, 0.0)
-            if isinstance(found, _Touch):
+            if isinstance(found, Touch):
                 return found
             if ended.reason == Status.NO_CONTACT:
                 ended = found
@@ -251,55 +224,33 @@ class _Follower:
 
     def _enter(
         self, surface: int, touching: Placement, after: Placement, now: Placement, friction: float
-    ) -> _Touch | _Ended:
+    ) -> Touch | _Ended:
         """Bend a whisker that touches at one placement, lies inside at the next, on to a third."""
         _, s = self._rest.gap(surface, touching)
         if s < LEAST_ARC:
             return _Ended(Status.TOO_PROXIMAL)
-        touch = self._start(surface, touching, np.array([s, 0.0, 0.0, 0.0]))
+        touch = self._solver.start(surface, touching, np.array([s, 0.0, 0.0, 0.0]))
         found = self._follow(touch, touching, after, friction)
-        if isinstance(found, _Touch) and after is not now:
+        if isinstance(found, Touch) and after is not now:
             found = self._follow(found, after, now, friction)
         return found
-
-    def _start(self, surface: int, place: Placement, contact: Array) -> _Touch:
-        """Begin with a contact that only about meets the equations."""
-        state = np.empty((STATES, 5))
-        contact_state(self.discretization.rod, contact, state)
-        point = place.outside(state[3:6, 0] * self.discretization.length)
-        distance, normal, _ = self._surfaces[surface].local_geometry(point)
-        tangent = place.rotation @ state[6:, 0]
-        return _Touch(
-            surface=surface,
-            tip=bool(contact[0] >= 1.0 and tangent @ normal < 0.0),
-            contact=contact,
-            state=state[:, 0].copy(),
-            point=point,
-            tangent=tangent,
-            normal=normal,
-            distance=distance,
-            misfit=0.0,
-            determinant=-np.inf,
-            pressing=0.0,
-            sliding=False,
-        )
 
     # Following
 
     def _follow(
         self,
-        touch: _Touch,
+        touch: Touch,
         before: Placement,
         now: Placement,
         friction: float,
         others: int = _MOST_OTHERS,
-    ) -> _Touch | _Ended:
+    ) -> Touch | _Ended:
         """Follow a contact from one placement to another, and the next one if it ends there."""
         done, stride, largest = 0.0, 1.0, 0.0
         while done < 1.0:
             share = min(done + stride, 1.0)
             place = now if share == 1.0 else between(before, now, share)
-            found = self._solve(touch, place, friction)
+            found = self._solver.solve(touch, place, friction)
             if found is None or found.pressing < 0.0:
                 stride *= 0.5
                 if found is not None or stride < _SMALLEST_STEP:
@@ -312,8 +263,8 @@ class _Follower:
         return touch
 
     def _pass_on(
-        self, touch: _Touch, here: Placement, now: Placement, friction: float, others: int
-    ) -> _Touch | None:
+        self, touch: Touch, here: Placement, now: Placement, friction: float, others: int
+    ) -> Touch | None:
         """Go on with another contact of a whisker whose contact has ended, if it has one."""
         if not others:
             return None
@@ -321,9 +272,9 @@ class _Follower:
         if other is None:
             return None
         found = self._follow(other, here, now, friction, others - 1)
-        return found if isinstance(found, _Touch) else self._other_touch(touch, now)
+        return found if isinstance(found, Touch) else self._other_touch(touch, now)
 
-    def _other_touch(self, touch: _Touch, place: Placement) -> _Touch | None:
+    def _other_touch(self, touch: Touch, place: Placement) -> Touch | None:
         """Where else the whisker, bent by one contact, lies against a surface: the next contact."""
         d = self.discretization
         solver = point_solver(self._whisker, LEAST_ARC, self._steps)
@@ -337,7 +288,7 @@ class _Follower:
                 continue
             # Held out at the point where it is deepest, and again where it then is, nearby.
             allowed = np.abs(self._rest.s - s) < _ELSEWHERE
-            for _ in range(_ROUNDS):
+            for _ in range(_LOOKS):
                 _, normal, _ = solid.local_geometry(place.outside(point))
                 target = point - gap * (normal @ place.rotation)
                 solved = solver.solve(target[None] / d.length)
@@ -355,7 +306,7 @@ class _Follower:
             else:
                 # It lies against two places at once, and neither alone would hold it: held at one
                 # of them it enters the surface no more than this.
-                held = self._start(surface, place, contact)
+                held = self._solver.start(surface, place, contact)
                 force = place.rotation @ held.state[:3]
                 if gap > -_ENTERED * d.length and force @ held.normal > 0.0:
                     return replace(
@@ -363,11 +314,11 @@ class _Follower:
                     )
         return None
 
-    def _near(self, surface: int, place: Placement, contact: Array, s: float) -> _Touch | None:
+    def _near(self, surface: int, place: Placement, contact: Array, s: float) -> Touch | None:
         """Solve a contact that is about known, and about at s."""
         for guess in (s, contact[0]):
-            start = self._start(surface, place, np.r_[guess, contact[1:]])
-            found = self._solve(start, place, 0.0)
+            start = self._solver.start(surface, place, np.r_[guess, contact[1:]])
+            found = self._solver.solve(start, place, 0.0)
             if found is not None:
                 return found
         return None
@@ -390,116 +341,8 @@ class _Follower:
             s = np.linspace(s[max(i - 1, 0)], s[min(i + 1, s.size - 1)], ZOOM + 1)
         return found
 
-    def _solve(self, last: _Touch, place: Placement, friction: float) -> _Touch | None:
-        """Solve the contact at a placement, beginning with an earlier one; None if that fails."""
-        found = self._newton(last, place, friction, EITHER)
-        if found is None and friction > 0.0:
-            # Newton's method may go round between sticking and sliding.
-            for mode in (STICKING, SLIDING):
-                found = self._newton(last, place, friction, mode)
-                if found is not None:
-                    break
-        return found
 
-    def _newton(self, last: _Touch, place: Placement, friction: float, mode: int) -> _Touch | None:
-        d = self.discretization
-        surface, softness = self._surfaces[last.surface], self._softness[last.surface]
-        earlier = np.empty(7)
-        earlier[:3] = (last.point - place.position) @ place.rotation / d.length
-        earlier[3:6] = last.tangent @ place.rotation
-        earlier[6] = last.contact[0]
-        x, tip = last.contact.copy(), last.tip
-        state, jacobian, step = np.empty((STATES, 5)), np.empty((4, 4)), np.empty(4)
-        geometry, lean = np.empty(13), np.zeros(3)
-        best: _Touch | None = None
-        size, past_tip, switches = np.inf, 0, 0
-        settled = friction == 0.0 or mode != EITHER
-        for rounds in range(_ROUNDS):
-            radius, slope = contact_state(d.rod, x, state)
-            point = place.outside(state[3:6, 0] * d.length)
-            if not np.isfinite(point).all():
-                return None
-            # The surface as it was where it last was touched predicts, to first order, where it is
-            # touched now; then it counts as it is.
-            predicting = rounds == 0
-            distance, normal, turn = surface.local_geometry(last.point if predicting else point)
-            geometry[0] = distance / d.length
-            geometry[1:4] = normal @ place.rotation
-            turn = place.rotation.T @ turn @ place.rotation * d.length
-            geometry[4:] = turn.ravel()
-            lean[:] = 0.0
-            if predicting:
-                moved = state[3:6, 0] - earlier[:3]
-                geometry[0] += geometry[1:4] @ moved
-                lean[:] = turn @ moved
-            misfit, determinant, pressing, sliding, right = surface_equations(
-                x,
-                state,
-                radius * d.radius,
-                slope * d.radius,
-                geometry,
-                lean,
-                softness,
-                friction,
-                earlier,
-                tip,
-                mode,
-                jacobian,
-                step,
-            )
-            stable = determinant < 0.0
-            if not (stable or friction > 0.0) or not np.isfinite(step).all():
-                return best
-            if predicting:
-                misfit = np.inf
-            elif normal @ last.normal < _MOST_TURNED:
-                return None
-            if right and stable and misfit <= _AT_FOLD and (best is None or misfit < best.misfit):
-                best = _Touch(
-                    last.surface,
-                    tip,
-                    x.copy(),
-                    state[:, 0].copy(),
-                    point,
-                    place.rotation @ state[6:, 0],
-                    normal,
-                    distance,
-                    misfit,
-                    determinant,
-                    pressing,
-                    sliding,
-                )
-            if misfit <= _TOLERANCE:
-                if tip and state[6:, 0] @ geometry[1:4] > _OUTWARD and switches < _SWITCHES:
-                    tip, best, size = False, None, np.inf
-                    switches += 1
-                    continue
-                return best
-            change = state[3:, 1:] @ step
-            now = float(
-                max(
-                    abs(step[0]) / _LONGEST[0],
-                    np.linalg.norm(change[:3]) / _LONGEST[1],
-                    np.linalg.norm(change[3:]) / _LONGEST[2],
-                    np.linalg.norm(lean + turn @ change[:3]) / _LONGEST[3],
-                )
-            )
-            if rounds == 0 and now > 2.0:
-                return None
-            if rounds >= 3 + switches and now > 0.95 * size + 1e-9 and settled:
-                return best
-            size = now
-            x += step / max(now, 1.0)
-            if not tip and x[0] > 1.0:
-                past_tip += 1
-                if past_tip > 1 and switches < _SWITCHES:
-                    tip, size, past_tip, best = True, np.inf, 0, None
-                    switches += 1
-            x[0] = min(max(x[0], LEAST_ARC), 1.0)
-        return best
-
-
-def _reason(touch: _Touch, largest: float) -> Status:
+def _reason(touch: Touch, largest: float) -> Status:
     """Why a contact could not be followed any further."""
     if touch.contact[0] <= LEAST_ARC * (1.0 + 1e-9):
         return Status.TOO_PROXIMAL

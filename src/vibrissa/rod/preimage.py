@@ -182,7 +182,8 @@ def _aligned(corner: Array, points: Array, base: Array) -> Array:
     columns = [np.diff(corner, axis=axis).mean(axis=(1, 2, 3)) for axis in (1, 2, 3)]
     linear = np.stack(columns, axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        flatness = np.abs(np.linalg.det(linear)) / np.prod(np.linalg.norm(linear, axis=1), axis=-1)
+        even = linear / np.linalg.norm(linear, axis=2, keepdims=True)  # whatever the units
+        flatness = np.abs(np.linalg.det(even)) / np.prod(np.linalg.norm(even, axis=1), axis=-1)
     usable = flatness > _FLAT
     inverse = np.zeros_like(linear)
     inverse[usable] = np.linalg.inv(linear[usable])
@@ -219,6 +220,7 @@ def _care(slope: Array, aligned: Array) -> IntArray:
     flatness *= np.sign(flatness[:, :1])
     least, most = flatness.min(axis=1), np.abs(flatness).max(axis=1)
     sheared = (aligned[:, 5] - aligned[:, 4]).max(axis=1) > _SHEARED
+    sheared |= ~aligned[:, :3].any(axis=(1, 2))  # not aligned
     return np.where(least <= _FOLDED * most, 2, np.where((least <= _EVEN * most) | sheared, 1, 0))
 
 

@@ -6,7 +6,7 @@ import pytest
 import vibrissa as vb
 from vibrissa.rod.batch import solve_forces
 from vibrissa.rod.discretize import discretize
-from vibrissa.rod.reach import determinant
+from vibrissa.rod.reach import contacts_at, determinant
 from vibrissa.signals import TRIPLETS, within_cone
 
 CANONICAL = ("Fx", "MB", "MD")
@@ -93,6 +93,32 @@ def test_the_compliant_base_is_part_of_the_inversion(rng):
 def test_every_triplet_finds_the_contact_again(gamma_map, rng, triplet):
     hit, cone, *_ = recovered(gamma_map, triplet, 500, rng)
     assert hit[~cone].mean() >= 0.97
+
+
+@pytest.mark.parametrize(
+    ("sample", "triplet", "least"),
+    [
+        ("straight", ("Fx", "FT", "MD"), 0.997),
+        ("gamma", ("Fx", "FT", "MD"), 0.999),
+        ("gamma", ("Mx", "MB", "MD"), 0.9995),
+        ("gamma", ("Fx", "FT", "MB"), 0.997),
+        ("gamma", ("FT", "FD", "MB"), 0.9945),
+    ],
+    ids=lambda x: " ".join(x) if isinstance(x, tuple) else str(x),
+)
+def test_contacts_next_to_a_fold_of_the_triplet_are_found(sample, triplet, least):
+    rng = np.random.default_rng(1)
+    contacts = vb.ContactMap.simulate(getattr(vb.samples, sample)(), grid=False)
+    chart, n = contacts.chart, 4000
+    eta, psi, rho = rng.uniform(0, 1, n), rng.uniform(0, 2 * np.pi, n), rng.uniform(0.5, 0.999, n)
+    xi = contacts_at(chart.fold, np.stack([eta, psi, rho], axis=-1))
+    values, _ = solve_forces(chart.discretization, np.insert(xi, 1, 0.0, axis=1))
+    point = values[:, 3:] * chart.discretization.length
+    force = values[:, :3] * chart.discretization.force
+    found = contacts.estimate(vb.base_signals(force, np.cross(point, force)), triplet=triplet)
+    away = np.linalg.norm(found.candidates - point[:, None], axis=-1) / contacts.whisker.length
+    hit = (away <= 1e-6).any(axis=1)
+    assert hit.mean() >= least
 
 
 def test_candidates_explain_the_signals_and_rise_in_force(gamma_map, rng):

@@ -44,6 +44,13 @@ _OVERLAP = 0.05
 _NEARLY = 0.02
 # Boxes are widened by this share of their size for what the cubic misses.
 _MARGIN = 0.08
+# Where a cell that may hold a fold has no solution but misses one by this share of its extent at
+# most, the map may have two, one to either side of the fold; starts this far from it (in cell
+# widths) lead to them.
+_MISSED = 0.3
+_SIDE = 0.2
+# In the first cells from rest, where signals vanish, misses are common and tell of no fold.
+_RESTING = 3
 _STACK = 256
 # Cells whose linear part is flatter than this (det relative to the product of its columns) are not
 # aligned.
@@ -319,9 +326,13 @@ def _locate(tree: Tree, cell: int, target: Array, relative: Array, x: Array) -> 
 def _invert(
     edges: Array, relative: Array, half: Array, work: Array, careful: bool, x: Array
 ) -> int:
-    """Solve a cell's interpolant: 2 solved, 1 nearly so (a fold of the map), 0 not in the cell."""
+    """Solve a cell's interpolant: 2 solved, 1 nearly so (a fold of the map), 0 not in the cell.
+
+    If not solved, x is left where it missed least, by work[6, 0] of the cell's extent.
+    """
     misfit, step, best, gradient = work[0], work[1], work[2], work[3:6]
     least = np.inf
+    work[6, 0] = np.inf
     for n in range(8):
         _interpolate(edges, x, relative, misfit, gradient)
         away = max(abs(misfit[0]) / half[0], abs(misfit[1]) / half[1], abs(misfit[2]) / half[2])
@@ -346,7 +357,34 @@ def _invert(
             _interpolate(edges, x, relative, misfit, gradient)
             return 2
     copy(best, x)
+    work[6, 0] = least if _outside(x) <= 0.25 else np.inf
     return 1 if least <= _NEARLY and _outside(x) <= 0.25 else 0
+
+
+@inlined
+def _sides(edges: Array, relative: Array, half: Array, x: Array, work: Array, sides: Array) -> bool:
+    """Go _SIDE from x both ways, as the interpolant changes least; whether a fold is between."""
+    misfit, step, gradient = work[0], work[1], work[3:6]
+    _interpolate(edges, x, relative, misfit, gradient)
+    most = 0.0
+    for q in range(3):
+        b, c = (q + 1) % 3, (q + 2) % 3
+        scale = 1.0 / (half[b] * half[c])
+        d0 = scale * (gradient[b, 1] * gradient[c, 2] - gradient[b, 2] * gradient[c, 1])
+        d1 = scale * (gradient[b, 2] * gradient[c, 0] - gradient[b, 0] * gradient[c, 2])
+        d2 = scale * (gradient[b, 0] * gradient[c, 1] - gradient[b, 1] * gradient[c, 0])
+        size = max(abs(d0), abs(d1), abs(d2))
+        if size > most:
+            most = size
+            step[0], step[1], step[2] = d0 / size, d1 / size, d2 / size
+    if most == 0.0:
+        return False
+    for a in range(3):
+        sides[0, a], sides[1, a] = x[a] - _SIDE * step[a], x[a] + _SIDE * step[a]
+    _interpolate(edges, sides[0], relative, misfit, gradient)
+    det = solve3(gradient, misfit, step)
+    _interpolate(edges, sides[1], relative, misfit, gradient)
+    return bool(det * solve3(gradient, misfit, step) < 0.0)
 
 
 @inlined
@@ -372,7 +410,8 @@ def _keep(
             abs(wrapped(psi - found[n, 1])) / grid[1, 1],
             abs(rho - found[n, 2]) / grid[1, 2],
         )
-        if apart < 0.02 or (apart < 0.5 and solved + quality[n] < 4):
+        both = solved + quality[n]
+        if apart < 0.02 or (both < 4 and apart < (0.5 if both > 1 else 0.15)):
             if solved <= quality[n]:
                 return count
             row = n
@@ -412,7 +451,8 @@ def seeds(tree: Tree, target: Array, found: Array, inverses: Array, quality: Int
     inverses : (MOST_SEEDS, 3, 3) array
         Filled with the interpolant's ∂(η, ψ, ρ)/∂T there.
     quality : (MOST_SEEDS,) int array
-        Filled with 2 (the interpolant is solved) or 1 (it is not: near a fold of the map).
+        Filled with 2 (the interpolant is solved), 1 (nearly so: near a fold of the map) or 0 (it
+        is missed: to one side of a fold).
 
     Returns
     -------
@@ -424,7 +464,8 @@ def seeds(tree: Tree, target: Array, found: Array, inverses: Array, quality: Int
     levels = offsets.shape[0] - 1
     stack = np.empty((_STACK, 2), np.int64)
     inside = np.empty(8, np.bool_)
-    work, relative, x = np.empty((6, 3)), np.empty(3), np.empty(3)
+    work, relative, x = np.empty((7, 3)), np.empty(3), np.empty(3)
+    nearest, sides = np.empty(3), np.empty((2, 3))
     count, top = 0, 1
     stack[0, 0], stack[0, 1] = 0, 0
     t0, t1, t2 = target[0], target[1], target[2]
@@ -449,15 +490,36 @@ def seeds(tree: Tree, target: Array, found: Array, inverses: Array, quality: Int
                 continue
             if not _locate(tree, child, target, relative, x):
                 continue
+            least = np.inf
+            missed = care[child] == 2 and place[child, 2] >= _RESTING
             for start in range(9 if care[child] > 0 else 1):  # the place itself, then the corners
                 if start > 0:
                     for a in range(3):
                         x[a] = (start - 1) >> a & 1
                 solved = _invert(edges[child], relative, box[3:, c], work, care[child] > 0, x)
+                missed = missed and solved < 2
+                if missed and work[6, 0] < least:
+                    least = work[6, 0]
+                    copy(x, nearest)
                 if solved > 0:
                     count = _keep(
                         grid, place[child], x, work[3:6], solved, found, inverses, quality, count
                     )
                 if solved == 2 and care[child] < 2:
                     break
+            if not missed or least > _MISSED:
+                continue
+            if _sides(edges[child], relative, box[3:, c], nearest, work, sides):
+                for side in range(2):
+                    count = _keep(
+                        grid,
+                        place[child],
+                        sides[side],
+                        work[3:6],
+                        0,
+                        found,
+                        inverses,
+                        quality,
+                        count,
+                    )
     return count

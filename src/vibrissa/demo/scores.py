@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from vibrissa.contour import CylinderFit, axis_offset, surface_distances
 from vibrissa.mapping.contact_map import spherical
-from vibrissa.signals import nearest_on_rest
+from vibrissa.signals import nearest_on_rest, within_turn
 from vibrissa.whisker import Whisker
 
 Array = NDArray[np.float64]
@@ -137,8 +137,7 @@ def contact_errors(
 
 def _errors(estimated: Array, true: Array) -> Array:
     """Sizes (..., 4) of the errors in r, θ, φ and in space."""
-    away = spherical(estimated) - spherical(true)
-    away[..., 1] = (away[..., 1] + np.pi) % (2.0 * np.pi) - np.pi
+    away = within_turn(spherical(estimated) - spherical(true), [False, True, False])
     distance = np.linalg.norm(estimated - true, axis=-1)
     return np.concatenate([np.abs(away), distance[..., None]], axis=-1)
 

@@ -21,7 +21,7 @@ from vibrissa.mapping.noise import SensorNoise
 from vibrissa.rod.arrays import Array
 from vibrissa.rod.deflection import deflect
 from vibrissa.rod.loads import PointContact
-from vibrissa.signals import CIRCULAR, SIGNALS, signal_scales
+from vibrissa.signals import CIRCULAR, SIGNALS, circular_among, signal_scales, within_turn
 from vibrissa.signals.base import signals_of
 from vibrissa.status import Status
 
@@ -151,7 +151,6 @@ def _misfit(
 ) -> Array:
     which = [SIGNALS.index(name) for name in names]
     away = signals_of(force, moment)[:, which] - signals
-    turned = np.array([CIRCULAR[w] for w in which])
-    away = np.where(turned, (away + np.pi) % (2.0 * np.pi) - np.pi, away)
+    away = within_turn(away, circular_among(names))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(np.abs(away / ranges).max(axis=1))

@@ -20,7 +20,7 @@ import xarray as xr
 from vibrissa.mapping.natural import NaturalNeighbour
 from vibrissa.quantities import attributes
 from vibrissa.rod.arrays import AnyArray, Array
-from vibrissa.signals import CIRCULAR, SIGNALS, measured, selection
+from vibrissa.signals import circular_among, measured, selection, within_turn
 from vibrissa.status import Status
 
 if TYPE_CHECKING:
@@ -164,16 +164,6 @@ class _Table:
         """Signals (..., 3) over their ranges, in rows (n, 3)."""
         signals = within_turn(signals.reshape(-1, 3), self.circular)
         return np.asarray((signals - self.low) / self.span)
-
-
-def circular_among(names: tuple[str, ...]) -> AnyArray:
-    """Which of the signals are directions, (n,) bool."""
-    return np.array([CIRCULAR[SIGNALS.index(name)] for name in names])
-
-
-def within_turn(signals: Array, circular: AnyArray) -> Array:
-    """Directions among signals (..., n) brought into (−π, π], the others as they are."""
-    return np.where(circular, np.pi - (np.pi - signals) % (2.0 * np.pi), signals)
 
 
 def grid_table(grid: xr.Dataset, names: tuple[str, ...]) -> tuple[Array, Array]:

@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from vibrissa.mapping.confirm import confirmed
+from vibrissa.mapping.contact_map import Domain
 from vibrissa.mapping.fibres import deficient, fibres
 from vibrissa.mapping.folds import Local, local_evidence
-from vibrissa.mapping.places import Domain, Samples, sample, spread
+from vibrissa.mapping.places import Samples, sample, spread
 from vibrissa.mapping.resolution import TOLERANCES, ambiguous
 from vibrissa.mapping.twins import (
     Pairs,

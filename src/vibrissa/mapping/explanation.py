@@ -13,7 +13,7 @@ from vibrissa.mapping.noise import SensorNoise
 from vibrissa.mapping.uncertainty import point_covariances
 from vibrissa.rod.arrays import AnyArray, Array, IntArray
 from vibrissa.rod.newton import TOLERANCE
-from vibrissa.signals import CIRCULAR, SIGNALS
+from vibrissa.signals import CIRCULAR, SIGNALS, circular_among, within_turn
 from vibrissa.signals.base import signals_of
 from vibrissa.status import Status
 
@@ -202,11 +202,10 @@ def why_none(
     which = [SIGNALS.index(name) for name in names]
     values = chart.values.reshape(-1, 6)
     known = signals_of(values[:, :3], np.cross(values[:, 3:], values[:, :3]))[:, which]
-    size = np.where([CIRCULAR[w] for w in which], 1.0, np.ptp(known, axis=0))
+    turned = circular_among(names)
+    size = np.where(turned, 1.0, np.ptp(known, axis=0))
     _, nearest = cKDTree(_on_circle(known, which, size)).query(_on_circle(targets, which, size))
-    away = known[nearest] - targets
-    turned = np.array([CIRCULAR[w] for w in which])
-    away = np.where(turned, (away + np.pi) % (2.0 * np.pi) - np.pi, away)
+    away = within_turn(known[nearest] - targets, turned)
     span = np.where(turned, 2.0 * np.pi, size)
     misfit = np.abs(away / span).max(axis=1)
     # Perhaps a contact nearer to the base than the map goes explains them.

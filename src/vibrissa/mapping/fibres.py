@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vibrissa.mapping.places import Domain, Places, place, sample, spread
+from vibrissa.mapping.contact_map import Domain
+from vibrissa.mapping.places import Places, place, sample, spread
 from vibrissa.mapping.twins import AGREEMENT, Pairs, sizes, triplet_derivatives
 from vibrissa.rod.arrays import AnyArray, Array
 from vibrissa.rod.batch import solve_forces
 from vibrissa.rod.discretize import Discretization, discretize
 from vibrissa.rod.reach import fold_forces, with_normal_force
-from vibrissa.signals import CIRCULAR, SIGNALS
+from vibrissa.signals import SIGNALS, circular_among, within_turn
 from vibrissa.signals.base import signals_of
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ def determining(contacts: ContactMap, names: tuple[str, ...]) -> bool:
     """
     places = sample(contacts, spread(_TRIED, seed=0), "reachable").places
     which = [SIGNALS.index(name) for name in names]
-    circular = [CIRCULAR[w] for w in which]
+    circular = circular_among(names)
     span = np.where(circular, 2.0 * np.pi, np.ptp(places.signals[:, which], axis=0))
     return deficient(contacts, names, places.contacts, span) is None
 
@@ -214,9 +215,11 @@ def _equations(
     values, tangents = solve_forces(discretization, with_normal_force(xi), tangents=True)
     force, point = values[:, :3], values[:, 3:]
     away = signals_of(force, np.cross(point, force))[:, which] - targets
-    turned = (away + np.pi) % (2.0 * np.pi) - np.pi
-    away = np.where([CIRCULAR[w] for w in which], turned, away)
-    return away, triplet_derivatives(values, tangents, names), values
+    return (
+        within_turn(away, circular_among(names)),
+        triplet_derivatives(values, tangents, names),
+        values,
+    )
 
 
 def _stable(contacts: ContactMap, xi: Array) -> AnyArray:

@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vibrissa.mapping.differences import circular_among, closed_table, grid_table, within_turn
+from vibrissa.mapping.differences import closed_table, grid_table
 from vibrissa.mapping.natural import Interpolation, NaturalNeighbour
 from vibrissa.rod.arrays import AnyArray, Array
-from vibrissa.signals import within_cone
+from vibrissa.signals import circular_among, within_cone, within_turn
 
 if TYPE_CHECKING:
     from vibrissa.mapping.contact_map import ContactMap

@@ -13,6 +13,7 @@ from vibrissa.mapping.whitening import INDISTINCT
 from vibrissa.rod.arrays import AnyArray, Array, IntArray
 from vibrissa.rod.batch import solve_forces
 from vibrissa.rod.discretize import Discretization
+from vibrissa.signals import within_turn
 
 # Contacts within this (over L, and ten times that relative to the force) are one.
 _SAME = 1e-3
@@ -194,8 +195,7 @@ def reliable(
     moved = moved.reshape(*places.shape[:2], 6)
     which = [CHANNELS.index(name) for name in names]
     away = (channels_of(moved) - channels_of(value)[:, None])[..., which]
-    turned = np.array([CIRCULAR[w] for w in which])
-    away = np.where(turned, (away + np.pi) % (2.0 * np.pi) - np.pi, away)
+    away = within_turn(away, [CIRCULAR[w] for w in which])
     told = np.swapaxes(channel_derivatives(value, slope, names) @ steps, 1, 2)
     bent = np.linalg.norm(np.einsum("nij,nmj->nmi", w, away - told), axis=2)
     point_told = np.swapaxes(slope[:, 3:] @ steps, 1, 2)

@@ -5,12 +5,12 @@ All arrays are non-dimensional (lengths over L, forces over EI/L²), as in :mod:
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.stats import qmc
 
-from vibrissa.mapping.contact_map import within_paper_bounds
+from vibrissa.mapping.contact_map import Domain, within_paper_bounds
 from vibrissa.rod.arrays import AnyArray, Array
 from vibrissa.rod.batch import contact_tangents, solve_forces
 from vibrissa.rod.reach import Fold, contacts_at, determinant, with_normal_force
@@ -20,7 +20,6 @@ from vibrissa.signals.base import signals_of
 if TYPE_CHECKING:
     from vibrissa.mapping.contact_map import ContactMap
 
-Domain = Literal["reachable", "paper"]
 # Directions have no value at zero force: samples stay off it.
 _LEAST_LOAD = 0.01
 

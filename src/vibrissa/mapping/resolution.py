@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vibrissa.mapping.contact_map import Domain
 from vibrissa.mapping.inversion import invert
-from vibrissa.mapping.places import Domain, Places, place
+from vibrissa.mapping.places import Places, place
 from vibrissa.rod.arrays import AnyArray, Array
 from vibrissa.signals import SIGNALS
 

@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from vibrissa.mapping.contact_map import Domain
 from vibrissa.mapping.inversion import invert
-from vibrissa.mapping.places import Domain, Places, in_chart, place, sample
+from vibrissa.mapping.places import Places, in_chart, place, sample
 from vibrissa.rod.arrays import AnyArray, Array
 from vibrissa.rod.batch import solve_forces
 from vibrissa.rod.reach import chart_of, with_normal_force
-from vibrissa.signals import SIGNALS
+from vibrissa.signals import SIGNALS, within_turn
 from vibrissa.signals.base import signal_derivatives
 
 if TYPE_CHECKING:
@@ -191,7 +192,7 @@ def better_twins(
         noise = width * rng.standard_normal(both.shape) * [1.0, np.pi, 1.0]
         # Differences of good ones point along thin sets of them, which noise alone would miss.
         step = both[rng.permutation(len(both))] - both[rng.permutation(len(both))]
-        step[:, 1] = (step[:, 1] + np.pi) % (2.0 * np.pi) - np.pi
+        step = within_turn(step, [False, True, False])
         chart = in_chart(np.concatenate([both + noise, both + 0.7 * step + 0.03 * noise]))
         found = twins(contacts, names, chart, sample(contacts, chart, domain).places, domain)
         best = _best(joined([best, found]), regions, separation)

@@ -11,15 +11,15 @@ the plane from each other although it may tell all others: it is *unique off a s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
 
+from vibrissa.mapping.contact_map import Domain, Progress
 from vibrissa.mapping.evidence import answer, ask
 from vibrissa.mapping.evidence_dataset import labelled, network_errors
-from vibrissa.mapping.places import Domain
 from vibrissa.signals import CONE, REGIONS, SIGNALS, TRIPLETS, selection
 
 if TYPE_CHECKING:
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 SEPARATION = 0.025
 #: How many contacts are tried.
 SAMPLES = 4096
-
-Progress = Callable[[int, int], None]
 
 
 def uniqueness(

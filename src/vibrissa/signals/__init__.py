@@ -5,9 +5,11 @@ from vibrissa.signals.base import (
     SIGNALS,
     Coordinates,
     base_signals,
+    circular_among,
     labelled_wrench,
     measured,
     signal_scales,
+    within_turn,
 )
 from vibrissa.signals.regions import (
     CONE,
@@ -28,6 +30,7 @@ __all__ = [
     "TRIPLETS",
     "Coordinates",
     "base_signals",
+    "circular_among",
     "concave_backward",
     "cone_angle",
     "in_region",
@@ -37,4 +40,5 @@ __all__ = [
     "selection",
     "signal_scales",
     "within_cone",
+    "within_turn",
 ]

@@ -20,7 +20,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from vibrissa.quantities import attributes
-from vibrissa.rod.arrays import Array, IntArray
+from vibrissa.rod.arrays import AnyArray, Array, IntArray
 from vibrissa.rod.compiled import inlined
 
 # Of a DataArray, by name.
@@ -223,6 +223,40 @@ def _number(value: ArrayLike, names: tuple[str, ...], given: list[ArrayLike]) ->
             f"{', '.join(labelled)} have named dimensions, so the other signals must have them too"
         )
     return xr.DataArray(np.asarray(value, dtype=np.float64))
+
+
+def circular_among(names: tuple[str, ...]) -> AnyArray:
+    """Tell which signals are directions.
+
+    Parameters
+    ----------
+    names : tuple of str
+        The signals.
+
+    Returns
+    -------
+    (n,) bool array
+        True for directions.
+    """
+    return np.array([CIRCULAR[SIGNALS.index(name)] for name in names])
+
+
+def within_turn(signals: Array, circular: ArrayLike) -> Array:
+    """Bring directions, or differences of directions, into (−π, π].
+
+    Parameters
+    ----------
+    signals : (..., n) array
+        Signals or differences; directions in rad.
+    circular : (n,) bool array_like
+        Which are directions.
+
+    Returns
+    -------
+    (..., n) array
+        The directions within a turn, the others as they are.
+    """
+    return np.where(circular, np.pi - (np.pi - signals) % (2.0 * np.pi), signals)
 
 
 def signal_scales(names: tuple[str, ...], force: float, moment: float) -> Array:

@@ -5,6 +5,7 @@ import pytest
 
 from vibrissa.status import Status
 from vibrissa.tracking import TraceOptions, find_whiskers, ridge, trace_video
+from vibrissa.tracking.ends import traced
 
 
 @pytest.fixture(scope="module")
@@ -131,6 +132,18 @@ def test_corrected_frames_are_taken_and_followed_both_ways():
     for i, trace in enumerate(row):
         expected = np.interp(trace.line[:, 0], np.arange(200), two_lines(shifts[i])[1][1])
         assert np.median(np.abs(trace.line[:, 1] - expected)) < 0.1
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_where_nothing_is_seen_there_is_no_whisker(seed):
+    """A line laid over noise, wherever it is, gives an empty trace and no error."""
+    generator = np.random.default_rng(seed)
+    frame = np.clip(generator.normal(150.0, 3.0, (80, 80)), 0, 255).astype(np.uint8)
+    angle = generator.uniform(0.0, 2.0 * np.pi)
+    along = np.arange(0.0, 80.0, 2.0)[:, None] * [np.cos(angle), np.sin(angle)]
+    trace, from_face = traced(frame, 3.0, 40.0 + along, TraceOptions())
+    assert trace.support < 20.0
+    assert not from_face
 
 
 def test_progress_and_faults():

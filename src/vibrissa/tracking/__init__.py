@@ -2,13 +2,14 @@
 
 from vibrissa.tracking.filtering import low_pass
 from vibrissa.tracking.find import Found, find_whiskers
+from vibrissa.tracking.follow import Follower, start_at
 from vibrissa.tracking.pose import BasePose, base_pose
 from vibrissa.tracking.refine import Refined, RefineOptions, refine
 from vibrissa.tracking.rest import RestShape, rest_shape, whisker_at_rest
 from vibrissa.tracking.sight import Sight
 from vibrissa.tracking.space import SpaceCurve, merge
 from vibrissa.tracking.timing import paired_frames
-from vibrissa.tracking.trace import Follower, Trace, TraceOptions, start_at
+from vibrissa.tracking.trace import Trace, TraceOptions
 from vibrissa.tracking.track import Tracked, TrackOptions, track, track_whisker
 from vibrissa.tracking.view import trace_video
 

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from vibrissa.io.video import Frame
 from vibrissa.tracking import ridge
-from vibrissa.tracking.trace import STEP, Trace, TraceOptions, traced
+from vibrissa.tracking.ends import traced
+from vibrissa.tracking.trace import STEP, Trace, TraceOptions
 
 Array = NDArray[np.float64]
 

@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.io.video import Frame
 from vibrissa.tracking.find import find_whiskers, overlap
-from vibrissa.tracking.trace import Follower, Trace, TraceOptions, given, start_at
+from vibrissa.tracking.follow import Follower, start_at
+from vibrissa.tracking.trace import Trace, TraceOptions, given
 
 Array = NDArray[np.float64]
 

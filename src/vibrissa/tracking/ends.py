@@ -1,0 +1,155 @@
+"""Where a whisker begins and ends in an image: it leaves the dark face, and it fades at its tip."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vibrissa.io.video import Frame
+from vibrissa.tracking import ridge
+from vibrissa.tracking.middle import Fit, smoothed
+from vibrissa.tracking.trace import STEP, Trace, TraceOptions, even
+
+Array = NDArray[np.float64]
+
+OUTSIDE = 12.0
+"""How far inside the face the base is looked for, pixels."""
+
+FEWEST = 12
+"""Points of the shortest line that is looked at."""
+
+_FUR = 3
+_BEYOND = 12
+"""How many points beyond the last that is seen are looked at to find the tip."""
+
+_BESIDE = (4.0, 7.0)
+"""How far beside the whisker the face's edge is looked for, pixels."""
+
+
+def traced(
+    frame: Frame, noise: float, line: Array, options: TraceOptions, before: float = OUTSIDE
+) -> tuple[Trace, bool]:
+    """Trace a whisker that is about known, and find its ends.
+
+    Parameters
+    ----------
+    frame : array (height, width)
+        Grey values.
+    noise : float
+        Of the image.
+    line : array (n, 2)
+        Within three pixels of the whisker, from about the base to about the tip.
+    options : TraceOptions
+        How.
+    before : float
+        How far before its beginning the face may end, pixels.
+
+    Returns
+    -------
+    trace : Trace
+        Empty if there is nothing.
+    from_face : bool
+        Whether it begins at something dark.
+    """
+    line = _lengthened(even(line))
+    for gate in (3, 2):
+        line = even(smoothed(frame, line, gate, noise, options)[0])
+        if len(line) < FEWEST:
+            # Where nothing is seen, nothing holds the line apart.
+            return Trace.lost(), False
+    line, from_face = with_base(frame, line, before)
+    if before > OUTSIDE:
+        # What was only guessed is measured before it counts.
+        line = even(smoothed(frame, line, 3, noise, options, _FUR if from_face else 0)[0])
+    if len(line) < FEWEST:
+        return Trace.lost(), False
+    line, fit = smoothed(frame, line, 1, noise, options, _FUR if from_face else 0)
+    count = tip(fit, noise)
+    if count < FEWEST:
+        return Trace.lost(), False
+    seen = fit.seen[:count]
+    trusted = min(1.0, float(seen.sum() / max(fit.open[:count].sum(), 1)))
+    return Trace(line[:count], fit.sigma[:count], seen, trusted), from_face
+
+
+def with_base(frame: Frame, line: Array, before: float) -> tuple[Array, bool]:
+    """Let a line begin where the whisker leaves the face.
+
+    Parameters
+    ----------
+    frame : array (height, width)
+        Grey values.
+    line : array (n, 2)
+        From about there outward.
+    before : float
+        How far before its beginning that may be, pixels.
+
+    Returns
+    -------
+    line : array (m, 2)
+        From the base on; the same line if nothing dark is at its beginning.
+    from_face : bool
+        Whether there is.
+    """
+    longer = even(line, -before)
+    near, far = (_edge(frame, longer[:40], distance) for distance in _BESIDE)
+    if near is None:
+        return line, False
+    at = near
+    if far is not None and abs(far - near) < 2.0:
+        # The face is round: to second order in the distance, its edge on the whisker itself.
+        a, b = _BESIDE
+        at = near + (near - far) * a * a / (b * b - a * a)
+    return even(longer, max(at, 0.0) * STEP), True
+
+
+def _edge(frame: Frame, line: Array, distance: float) -> float | None:
+    """Where along a line it comes out of the dark, the mean of both sides; in points."""
+    levels = np.empty((len(line), 2))
+    ridge.beside(frame, line, distance, levels)
+    places = []
+    for level in levels.T:
+        bright, dark = float(np.median(level[len(level) // 2 :])), float(level.min())
+        half = 0.5 * (bright + dark)
+        last = int(np.flatnonzero(level <= half)[-1])
+        if dark > 0.6 * bright or last + 1 >= len(level):
+            return None
+        places.append(last + (half - level[last]) / (level[last + 1] - level[last]))
+    return float(np.mean(places))
+
+
+def tip(fit: Fit, noise: float) -> int:
+    """Say how many points of a line belong to the whisker.
+
+    Beyond the tip the line is as light as its surroundings; before it, it goes on being about as
+    dark as it was. The end is where that is most likely, by the sum of log-likelihood ratios.
+
+    Parameters
+    ----------
+    fit : Fit
+        Measured along the line and beyond the tip.
+    noise : float
+        Of the image.
+
+    Returns
+    -------
+    int
+        Points up to the tip.
+    """
+    sigma = noise * np.sqrt(ridge.DEPTH_VARIANCE)
+    amplitude = np.where(fit.open, fit.amplitude, 0.0)
+    count = np.convolve(fit.open.astype(float), np.ones(20))[: len(amplitude)]
+    recent = np.convolve(np.maximum(amplitude, 0.0), np.ones(20))[: len(amplitude)]
+    # What the twenty points before were; the whisker tapers, so that it may be fainter.
+    usual = 0.6 * np.concatenate([[0.0], (recent / np.maximum(count, 1.0))[:-1]])
+    gain = np.where(fit.open, (amplitude * usual - 0.5 * usual**2) / sigma**2, 0.0)
+    return int(np.argmax(np.cumsum(np.clip(gain, -8.0, 8.0)))) + 1
+
+
+def _lengthened(line: Array) -> Array:
+    """Go on beyond the tip, as a parabola, so that the tip can be seen to end."""
+    t = np.arange(min(len(line), 30))
+    ahead = len(t) + np.arange(_BEYOND)
+    shape = np.polynomial.polynomial.polyfit(t, line[-len(t) :], 2)
+    more = np.polynomial.polynomial.polyval(ahead, shape).T
+    return np.concatenate([line, more])

@@ -22,9 +22,9 @@ from vibrissa.demo.locate import (
 from vibrissa.demo.scores import Scores, contact_errors, score
 from vibrissa.io import save_contacts, save_recording
 from vibrissa.mapping import ContactMap
+from vibrissa.sensing import FORCE_NOISE, MOMENT_NOISE
 from vibrissa.trial import Motion, Peg, facing_peg, measure, simulate, sweep_past
 from vibrissa.trial.recording import recorded
-from vibrissa.trial.sensors import FORCE_NOISE, MOMENT_NOISE
 from vibrissa.whisker import Whisker
 
 Progress = Callable[[str, int, int], None]

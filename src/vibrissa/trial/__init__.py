@@ -1,5 +1,6 @@
 """A whisking trial: what stands in the way, how the base moves, what the whisker then feels."""
 
+from vibrissa.sensing import Sensor
 from vibrissa.trial.calibration import calibrate
 from vibrissa.trial.cameras import Camera, load_cameras, orthogonal_views, save_cameras, triangulate
 from vibrissa.trial.dynamics import Dynamics, resonances
@@ -14,7 +15,7 @@ from vibrissa.trial.recording import (
     recorded_pegs,
     recorded_whisker,
 )
-from vibrissa.trial.sensors import Sensor, measure
+from vibrissa.trial.sensors import measure
 from vibrissa.trial.simulate import simulate
 
 __all__ = [

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from vibrissa.io.table import read_text, table_rows
 from vibrissa.rod.surface import Surface
+from vibrissa.sensing import COMPONENTS, Sensor
 from vibrissa.trial.dynamics import Dynamics
 from vibrissa.trial.mesh import Mesh
 from vibrissa.trial.motion import Motion, base_rotation, tabulated, whisking
 from vibrissa.trial.objects import Box, Peg, Plane, Sphere
 from vibrissa.trial.plan import facing_peg, sweep_past
-from vibrissa.trial.sensors import COMPONENTS, Sensor
 from vibrissa.whisker import Whisker
 
 Array = NDArray[np.float64]
@@ -366,7 +366,7 @@ def _sensor(said: Mapping[str, Any]) -> Sensor:
     _only(said, own | {"channels", "mixing", "relative_noise", "gain_error"}, "[sensor]")
     channels = tuple(str(name) for name in said.get("channels", COMPONENTS))
     plain = Sensor(channels, said.get("mixing"))
-    numbers = {}
+    numbers: dict[str, Any] = {}
     for name in _PER_COMPONENT:
         usual = (1.0, 0.02) if name == "noise" else (0.0, 0.0)
         force = _number(said, f"force_{name}", usual[0]) * _MICRO
@@ -374,5 +374,6 @@ def _sensor(said: Mapping[str, Any]) -> Sensor:
         each = np.repeat([force, moment], 3)
         mix = np.asarray(plain.mixing)
         numbers[name] = mix @ each if name == "bias" else np.sqrt(mix**2 @ each**2)
-    shares = {name: _number(said, name, 0.0) for name in ("relative_noise", "gain_error")}
-    return Sensor(channels, said.get("mixing"), **numbers, **shares)
+    for name in ("relative_noise", "gain_error"):
+        numbers[name] = _number(said, name, 0.0)
+    return Sensor(channels, said.get("mixing"), **numbers)

@@ -1,0 +1,120 @@
+"""Sensors as TOML, in SI units.
+
+    channels = ["Fx", "My", "Mz"]
+    mixing = [[1, 0, 0, 0, 0, 0], …]   # a line a channel: of Fx, Fy, Fz, Mx, My, Mz
+    noise = [1e-6, 2e-8, 2e-8]         # standard deviations; or one number for all
+    bias = 0.0
+
+    [frame]
+    axes = ["x", "-z", "y"]            # or a 3 × 3 matrix, the sensor's axes in its columns
+    position = [0, 0, -0.004]          # m
+    reaction = false
+
+    [weight]
+    mass = 0.002                       # kg
+    moment = [0, 0, 0]                 # kg·m
+
+Everything but the channels may be left out.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vibrissa.io.replace import replacing
+from vibrissa.io.table import read_text
+from vibrissa.sensing.frame import SensorFrame
+from vibrissa.sensing.sensor import Sensor
+
+_NUMBERS = ("noise", "bias", "drift", "resolution")
+_SHARES = ("relative_noise", "gain_error")
+_TOP = {"channels", "mixing", *_NUMBERS, *_SHARES, "frame", "weight"}
+_FRAME = {"axes", "position", "reaction"}
+_WEIGHT = {"mass", "moment"}
+
+
+def load_sensor(path: str | PathLike[str]) -> Sensor:
+    """Read a sensor.
+
+    Parameters
+    ----------
+    path : str or path
+        TOML file.
+
+    Returns
+    -------
+    Sensor
+        As it says.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If it is no TOML, has unknown keys, or describes no sensor.
+    """
+    path = Path(path)
+    try:
+        said = tomllib.loads(read_text(path))
+        frame, weight = said.get("frame", {}), said.get("weight", {})
+        for what, table, known in (
+            ("the file", said, _TOP),
+            ("[frame]", frame, _FRAME),
+            ("[weight]", weight, _WEIGHT),
+        ):
+            unknown = sorted(set(table) - known)
+            if unknown:
+                raise ValueError(
+                    f"{what} has {', '.join(unknown)}; it may have {', '.join(sorted(known))}"
+                )
+        given = {name: said[name] for name in (*_NUMBERS, *_SHARES) if name in said}
+        how: dict[str, Any] = {"channels": said["channels"]} if "channels" in said else {}
+        return Sensor(
+            **how,
+            mixing=said.get("mixing"),
+            **given,
+            frame=SensorFrame(**frame),
+            mass=weight.get("mass", 0.0),
+            mass_moment=weight.get("moment", (0.0, 0.0, 0.0)),
+        )
+    except (tomllib.TOMLDecodeError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} describes no sensor: {error}") from error
+
+
+def save_sensor(path: str | PathLike[str], sensor: Sensor) -> None:
+    """Write a sensor that `load_sensor` reads, every number in full.
+
+    Parameters
+    ----------
+    path : str or path
+        Where to write; an existing file is replaced.
+    sensor : Sensor
+        Which.
+    """
+    lines = [f"channels = [{', '.join(_text(name) for name in sensor.channels)}]"]
+    lines.append(f"mixing = {_array(sensor.mixing)}")
+    lines += [f"{name} = {_array(getattr(sensor, name))}" for name in _NUMBERS]
+    lines += [f"{name} = {float(getattr(sensor, name))!r}" for name in _SHARES]
+    lines += ["", "[frame]", f"axes = {_array(sensor.frame.axes)}"]
+    lines.append(f"position = {_array(sensor.frame.position)}")
+    lines.append(f"reaction = {'true' if sensor.frame.reaction else 'false'}")
+    lines += ["", "[weight]", f"mass = {float(sensor.mass)!r}"]
+    lines += [f"moment = {_array(sensor.mass_moment)}", ""]
+    with replacing(path) as part:
+        part.write_text("\n".join(lines), encoding="utf-8")
+
+
+def _text(name: str) -> str:
+    return '"' + name.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
+def _array(values: Any) -> str:
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim == 1:
+        return "[" + ", ".join(repr(float(value)) for value in array) + "]"
+    return "[" + ", ".join(_array(row) for row in array) + "]"

@@ -1,0 +1,136 @@
+"""Offset, and weight of what a sensor carries, from readings while nothing is touched.
+
+    y = b + H (m g, μ × g),
+
+linear in the offset b, the mass m and its moment μ = m c, with g turning as the base does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vibrissa.sensing.frame import cross_matrix
+from vibrissa.sensing.linear import solve
+from vibrissa.sensing.sensor import GRAVITY, Sensor
+
+Array = NDArray[np.float64]
+
+_ADVICE = (
+    "hold the whisker free in more orientations, at least three that differ in how the weight pulls"
+)
+_MASS = ("the mass", "its moment along x", "along y", "along z")
+
+
+@dataclass(frozen=True, eq=False)
+class WeightCalibration:
+    """What free poses tell.
+
+    Attributes
+    ----------
+    sensor : Sensor
+        With offset, and where orientations were given mass and its moment.
+    covariance : (k + 4, k + 4) array
+        Of the offsets, the mass (kg) and its moment (kg·m); zero for what was not asked or has no
+        effect on these channels.
+    residual : (k,) array
+        RMS of what is left in each channel.
+    """
+
+    sensor: Sensor
+    covariance: Array
+    residual: Array
+
+
+def calibrate_weight(
+    sensor: Sensor,
+    readings: ArrayLike,
+    rotations: ArrayLike | None = None,
+    gravity: ArrayLike = GRAVITY,
+) -> WeightCalibration:
+    """Find offset and weight from readings of a free whisker.
+
+    Parameters
+    ----------
+    sensor : Sensor
+        Whose mixing and frame are known; its noise weighs the channels.
+    readings : array_like (n, k)
+        While nothing is touched.
+    rotations : array_like (n, 3, 3), optional
+        From the whisker's to the laboratory frame. Without them only the offset is found, for this
+        one orientation: the weight is part of it.
+    gravity : array_like (3,)
+        In the laboratory frame, m/s².
+
+    Returns
+    -------
+    WeightCalibration
+        The sensor with offset and weight.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit, or the orientations do not tell weight from offset.
+    """
+    y = np.asarray(readings, dtype=np.float64)
+    k = len(sensor.channels)
+    if y.ndim != 2 or y.shape[1] != k:
+        raise ValueError(f"readings are (n, {k}): {', '.join(sensor.channels)}; got {y.shape}")
+    known = np.flatnonzero(np.isfinite(y).all(axis=1))
+    n, y = len(y), y[known]
+    if not len(y):
+        raise ValueError("there is no reading without NaN")
+    noise = np.sqrt(np.diag(sensor.covariance()))
+    noise = np.where(noise > 0.0, noise, np.median(noise[noise > 0.0]) if noise.any() else 1.0)
+    if rotations is None:
+        return _tared(sensor, y, noise)
+    turn = np.asarray(rotations, dtype=np.float64)
+    if turn.shape != (n, 3, 3):
+        raise ValueError(f"{n} readings need as many rotations (3, 3); got {turn.shape}")
+    design = _design(sensor, turn[known], np.asarray(gravity, dtype=np.float64))
+    # What no orientation makes felt is left at zero; what others would must be felt here.
+    every = np.array([np.eye(3), *np.eye(3)[[[1, 2, 0], [2, 0, 1]]]])
+    every = np.concatenate([every, -every, every[:, ::-1]])
+    possible = _design(sensor, every, np.asarray(gravity, dtype=np.float64))[:, :, k:]
+    effect = np.abs(possible).max(axis=(0, 1))
+    felt = np.concatenate([np.ones(k, bool), effect > 1e-12 * max(float(effect.max()), 1e-300)])
+    names = [f"the offset of {name}" for name in sensor.channels] + list(_MASS)
+    rows = (design / noise[:, None]).reshape(-1, k + 4)[:, felt]
+    found = solve(
+        rows,
+        (y / noise).reshape(-1),
+        [name for name, used in zip(names, felt, strict=True) if used],
+        _ADVICE,
+    )
+    unknowns, covariance = np.zeros(k + 4), np.zeros((k + 4, k + 4))
+    unknowns[felt] = found.unknowns
+    covariance[np.ix_(felt, felt)] = found.spread
+    calibrated = replace(
+        sensor, bias=unknowns[:k], mass=max(float(unknowns[k]), 0.0), mass_moment=unknowns[k + 1 :]
+    )
+    left = found.residuals.reshape(-1, k) * noise
+    return WeightCalibration(calibrated, covariance, np.sqrt((left**2).mean(axis=0)))
+
+
+def _tared(sensor: Sensor, y: Array, noise: Array) -> WeightCalibration:
+    k = y.shape[1]
+    bias = y.mean(axis=0)
+    covariance = np.zeros((k + 4, k + 4))
+    covariance[:k, :k] = np.diag(noise**2 / len(y))
+    left = np.sqrt(((y - bias) ** 2).mean(axis=0))
+    tared = replace(sensor, bias=bias, mass=0.0, mass_moment=np.zeros(3))
+    return WeightCalibration(tared, covariance, left)
+
+
+def _design(sensor: Sensor, rotations: Array, gravity: Array) -> Array:
+    """∂y/∂(b, m, μ), shape (n, k, k + 4)."""
+    g = gravity @ rotations
+    h = sensor.base_mixing
+    n, k = len(g), len(h)
+    out = np.zeros((n, k, k + 4))
+    out[:, :, :k] = np.eye(k)
+    out[:, :, k] = g @ h[:, :3].T
+    out[:, :, k + 1 :] = -h[:, 3:] @ cross_matrix(g)  # μ × g = -g × μ
+    return out

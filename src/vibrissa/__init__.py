@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from vibrissa import samples
-    from vibrissa.io import load_whisker
+    from vibrissa.io import load_array, load_whisker
     from vibrissa.mapping import (
         ContactMap,
         Estimate,
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from vibrissa.rod import Deflection, PegContact, PointContact, PointForce, deflect
     from vibrissa.signals import base_signals
     from vibrissa.status import Status
-    from vibrissa.whisker import Whisker
+    from vibrissa.whisker import Whisker, WhiskerArray, whisker_array
 
 __version__ = "0.1.0"
 
@@ -42,6 +42,7 @@ __all__ = [
     "PointForce",
     "Status",
     "Whisker",
+    "WhiskerArray",
     "WrenchEstimate",
     "__version__",
     "base_signals",
@@ -49,11 +50,13 @@ __all__ = [
     "critical_cones",
     "deflect",
     "estimate_from_wrench",
+    "load_array",
     "load_whisker",
     "samples",
     "sensitivity",
     "sensitivity_findings",
     "uniqueness",
+    "whisker_array",
 ]
 
 _HOMES = {
@@ -66,16 +69,19 @@ _HOMES = {
     "PointForce": "vibrissa.rod",
     "Status": "vibrissa.status",
     "Whisker": "vibrissa.whisker",
+    "WhiskerArray": "vibrissa.whisker",
     "WrenchEstimate": "vibrissa.mapping",
     "base_signals": "vibrissa.signals",
     "best_triplet": "vibrissa.mapping",
     "critical_cones": "vibrissa.mapping",
     "deflect": "vibrissa.rod",
     "estimate_from_wrench": "vibrissa.mapping",
+    "load_array": "vibrissa.io",
     "load_whisker": "vibrissa.io",
     "sensitivity": "vibrissa.mapping",
     "sensitivity_findings": "vibrissa.mapping",
     "uniqueness": "vibrissa.mapping",
+    "whisker_array": "vibrissa.whisker",
 }
 _MODULES = {"samples"}
 

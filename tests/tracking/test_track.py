@@ -6,9 +6,9 @@ import pytest
 from vibrissa.status import Status
 from vibrissa.tracking import TrackOptions, rest_shape, trace_video, track, whisker_at_rest
 from vibrissa.tracking.banded import Smoother
-from vibrissa.tracking.pose import angles_of
 from vibrissa.trial import recorded_whisker
 from vibrissa.trial.motion import base_rotation
+from vibrissa.whisker.emergence import angles_of
 
 
 @pytest.fixture(scope="module")

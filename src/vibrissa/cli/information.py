@@ -59,10 +59,15 @@ def _file(path: Path) -> Iterator[tuple[str, str]]:
     from vibrissa.io import Kind, check_readable, recognise
     from vibrissa.io.load import READERS
 
+    if path.is_dir():
+        yield from _array(path, "folder of centrelines")
+        return
     check_readable(path)
     yield "file", f"{path}, {path.stat().st_size / 1e6:.3g} MB"
     kind = recognise(path)
-    if kind in (Kind.RECORDING, Kind.NETCDF):
+    if kind in (Kind.ARRAY, Kind.ARRAY_TABLE):
+        yield from _array(path, kind)
+    elif kind in (Kind.RECORDING, Kind.NETCDF):
         yield from _groups(path)
     elif kind in (Kind.TRACKS, *READERS):
         yield from _tracks(path, kind)
@@ -75,6 +80,19 @@ def _file(path: Path) -> Iterator[tuple[str, str]]:
         raise ValueError(f"{path} is of no kind that is known. Known are: {known}")
     else:
         yield from _table(path)
+
+
+def _array(path: Path, kind: str) -> Iterator[tuple[str, str]]:
+    """The whiskers of an array, a line each."""
+    from vibrissa.io import load_array
+
+    array = load_array(path)
+    yield "kind", kind
+    sides = [array.identity(name).side for name in array]
+    yield "whiskers", f"{len(array)}: {sides.count('left')} left, {sides.count('right')} right"
+    for name, whisker in array.items():
+        x, y, z = whisker.pose.origin * 1e3
+        yield name, f"base at ({x:.2f}, {y:.2f}, {z:.2f}) mm; {repr(whisker).split(': ', 1)[1]}"
 
 
 def _video(path: Path) -> Iterator[tuple[str, str]]:

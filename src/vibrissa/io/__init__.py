@@ -1,6 +1,7 @@
 """Files and nothing else: one module a format."""
 
 from vibrissa.io.anipose import load_anipose
+from vibrissa.io.array import load_array, save_array
 from vibrissa.io.centerline import load_centerline, load_whisker, save_centerline
 from vibrissa.io.contacts_table import load_contacts, save_contacts
 from vibrissa.io.corrections import load_corrections
@@ -33,6 +34,7 @@ __all__ = [
     "join_views",
     "kind_of",
     "load_anipose",
+    "load_array",
     "load_centerline",
     "load_contacts",
     "load_corrections",
@@ -51,6 +53,7 @@ __all__ = [
     "load_whiskers",
     "read_video",
     "recognise",
+    "save_array",
     "save_centerline",
     "save_contacts",
     "save_nwb",

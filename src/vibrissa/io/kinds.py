@@ -31,9 +31,11 @@ class Kind(StrEnum):
     TRACKS = "vibrissa tracks"
     TRACKS_TABLE = "table of points"
     RECORDING = "vibrissa recording"
+    ARRAY = "vibrissa whisker array"
     NETCDF = "NetCDF file"
     SIGNALS = "table of signals"
     CONTACTS = "table of contacts"
+    ARRAY_TABLE = "table of whiskers"
     CENTERLINE = "centreline of a whisker"
     CALIBRATION = "calibration of cameras"
     VIDEO = "video"
@@ -98,7 +100,7 @@ def _of_hdf5(path: Path) -> Kind:
             for item in file.values()
             if isinstance(item, h5py.Dataset)
         )
-    known = {str(kind): kind for kind in (Kind.TRACKS, Kind.RECORDING)}
+    known = {str(kind): kind for kind in (Kind.TRACKS, Kind.RECORDING, Kind.ARRAY)}
     return known.get(kind_of(path), Kind.NETCDF) if netcdf else Kind.UNKNOWN
 
 
@@ -123,6 +125,8 @@ def _of_text(path: Path) -> Kind:
         return Kind.CONTACTS
     if {"frame", "time"} & plain and ({"x", "y"} <= plain or {"column", "row"} <= plain):
         return Kind.TRACKS_TABLE
+    if {"name", "coefficient", "length"} <= plain:
+        return Kind.ARRAY_TABLE
     if {"x", "y"} <= plain:
         return Kind.CENTERLINE
     return Kind.UNKNOWN

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from vibrissa.tracking.filtering import CUTOFF, low_pass
 from vibrissa.tracking.rest import RestShape, aligned_lengths, motions
-from vibrissa.trial.motion import base_rotation
 from vibrissa.whisker import Whisker
+from vibrissa.whisker.emergence import angles_of, base_rotation
 
 Array = NDArray[np.float64]
 
@@ -127,28 +127,6 @@ def base_pose(curves: Array, shape: RestShape, whisker: Whisker) -> BasePose:
         angles = guess
         position[touching] = start[~free] - base_rotation(*angles[touching].T) @ offset
     return BasePose(position, *angles.T)
-
-
-def angles_of(rotation: Array) -> Array:
-    """Say the emergence angles of orientations of the base.
-
-    Parameters
-    ----------
-    rotation : array (..., 3, 3)
-        From the whisker's to the laboratory frame.
-
-    Returns
-    -------
-    array (..., 3)
-        Azimuth, elevation and roll, rad: the inverse of `vibrissa.trial.motion.base_rotation`.
-    """
-    azimuth = np.arctan2(rotation[..., 1, 0], rotation[..., 0, 0])
-    elevation = np.arcsin(np.clip(rotation[..., 2, 0], -1.0, 1.0))
-    level = base_rotation(azimuth, elevation, 0.0 * azimuth)
-    d1 = rotation[..., :, 1]
-    across = (level[..., :, 1] * d1).sum(-1)
-    up = (level[..., :, 2] * d1).sum(-1)
-    return np.stack([azimuth, elevation, np.arctan2(up, across)], axis=-1)
 
 
 def _tangents(shapes: Array, spacing: float, length: float) -> tuple[Array, Array]:

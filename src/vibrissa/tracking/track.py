@@ -15,7 +15,7 @@ from vibrissa.io.recording import KIND
 from vibrissa.quantities import attributes
 from vibrissa.status import Status
 from vibrissa.tracking.filtering import CUTOFF
-from vibrissa.tracking.pose import BasePose, angles_of, base_pose
+from vibrissa.tracking.pose import BasePose, base_pose
 from vibrissa.tracking.refine import Refined, RefineOptions, refine
 from vibrissa.tracking.rest import RestShape, rest_shape, whisker_at_rest
 from vibrissa.tracking.sight import Sight
@@ -25,6 +25,7 @@ from vibrissa.tracking.trace import Trace
 from vibrissa.trial.cameras import Camera, cameras_dataset
 from vibrissa.trial.recording import recorded
 from vibrissa.whisker import Whisker
+from vibrissa.whisker.emergence import angles_of
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
+from vibrissa.whisker.emergence import base_rotation
 from vibrissa.whisker.pose import ORTHOGONALITY
 
 Array = NDArray[np.float64]
@@ -132,36 +133,6 @@ class Motion:
 
     def __len__(self) -> int:
         return int(self.time.size)
-
-
-def base_rotation(azimuth: ArrayLike, elevation: ArrayLike, roll: ArrayLike) -> Array:
-    """Turn emergence angles into rotations.
-
-    Parameters
-    ----------
-    azimuth, elevation, roll : array_like (...)
-        Of the base, rad.
-
-    Returns
-    -------
-    array (..., 3, 3)
-        From the whisker's to the laboratory frame, R_z(azimuth) R_y(−elevation) R_x(roll).
-
-    Examples
-    --------
-    >>> base_rotation(np.pi / 2, 0.0, 0.0).round(3)[:, 0]
-    array([0., 1., 0.])
-    """
-    az, el, ro = np.broadcast_arrays(azimuth, elevation, roll)
-    ca, sa = np.cos(az), np.sin(az)
-    ce, se = np.cos(el), np.sin(el)
-    cr, sr = np.cos(ro), np.sin(ro)
-    tangent = np.stack([ca * ce, sa * ce, se], axis=-1)
-    level = np.stack([-sa, ca, np.zeros_like(ca)], axis=-1)
-    up = np.stack([-ca * se, -sa * se, ce], axis=-1)
-    d1 = cr[..., None] * level + sr[..., None] * up
-    d2 = cr[..., None] * up - sr[..., None] * level
-    return np.stack([tangent, d1, d2], axis=-1)
 
 
 def whisking(

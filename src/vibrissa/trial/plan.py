@@ -18,11 +18,11 @@ from vibrissa.trial.motion import (
     ELEVATION_PER_AZIMUTH,
     ROLL_PER_AZIMUTH,
     Motion,
-    base_rotation,
     whisking,
 )
 from vibrissa.trial.objects import Box, Peg, Sphere
 from vibrissa.whisker import Whisker
+from vibrissa.whisker.emergence import base_rotation
 
 Array = NDArray[np.float64]
 

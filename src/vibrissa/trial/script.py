@@ -19,10 +19,11 @@ from vibrissa.rod.surface import Surface
 from vibrissa.sensing import COMPONENTS, Sensor
 from vibrissa.trial.dynamics import Dynamics
 from vibrissa.trial.mesh import Mesh
-from vibrissa.trial.motion import Motion, base_rotation, tabulated, whisking
+from vibrissa.trial.motion import Motion, tabulated, whisking
 from vibrissa.trial.objects import Box, Peg, Plane, Sphere
 from vibrissa.trial.plan import facing_peg, sweep_past
 from vibrissa.whisker import Whisker
+from vibrissa.whisker.emergence import base_rotation
 
 Array = NDArray[np.float64]
 

@@ -1,0 +1,247 @@
+"""All whiskers of a face: an average rat's (`vibrissa.whisker.average`), or a lab's own.
+
+The pose of each whisker leads to the head's frame: origin at the tip of the snout, x to the
+animal's right, y forward along the midline, z up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vibrissa.whisker.array_dataset import array_tree, whiskers_of
+from vibrissa.whisker.identity import Identity, Side
+from vibrissa.whisker.model import Whisker
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+Array = NDArray[np.float64]
+
+BOTH: tuple[Side, Side] = ("left", "right")
+"""Sides of an animal."""
+
+
+class WhiskerArray(Mapping[str, Whisker]):
+    """Whiskers by name, each with its pose in the head's frame.
+
+    A name is that of `vibrissa.whisker.identity`: ``LC2``, ``Rγ``. Others are understood when a
+    whisker is asked for (``left C2``, ``Rgamma``), also without the side where only one side has
+    such a whisker.
+
+    Parameters
+    ----------
+    whiskers : iterable of Whisker
+        Their names say which they are; where one tells no side, that of its base counts.
+
+    Raises
+    ------
+    ValueError
+        If there are none, two are the same, a name is no whisker's, or a base is on the other side
+        than the name says.
+
+    Examples
+    --------
+    >>> whisker_array(side="right")["gamma"].length
+    0.0508...
+    """
+
+    def __init__(self, whiskers: Iterable[Whisker]) -> None:
+        found = sorted((_named(w) for w in whiskers), key=lambda pair: pair[0].sort_key)
+        names = [identity.name for identity, _ in found]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"no array of whiskers: there are two of {', '.join(twice)}")
+        if not found:
+            raise ValueError("no array of whiskers: there is none in it")
+        self._identities = {identity.name: identity for identity, _ in found}
+        self._whiskers = {whisker.name: whisker for _, whisker in found}
+
+    def __getitem__(self, name: str) -> Whisker:
+        """Give a whisker by any of its names."""
+        return self._whiskers[self._key(name)]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._whiskers)
+
+    def __len__(self) -> int:
+        return len(self._whiskers)
+
+    def _key(self, name: str) -> str:
+        if name in self._whiskers:
+            return name
+        try:
+            identity = Identity.of(name)
+        except ValueError as fault:
+            raise KeyError(str(fault)) from None
+        sides: Sequence[Side] = (identity.side,) if identity.side else ("left", "right")
+        keys = [k for k in (identity.on(side).name for side in sides) if k in self._whiskers]
+        if len(keys) != 1:
+            why = f"{' and '.join(keys)} are meant by it" if keys else "there is no such whisker"
+            raise KeyError(f"{name!r}: {why}; this array has {', '.join(self)}")
+        return keys[0]
+
+    def identity(self, name: str) -> Identity:
+        """Say side, row and column of a whisker.
+
+        Parameters
+        ----------
+        name : str
+            Any of its names.
+
+        Returns
+        -------
+        Identity
+        """
+        return self._identities[self._key(name)]
+
+    def select(
+        self,
+        *,
+        side: str = "both",
+        rows: Iterable[str] | None = None,
+        columns: Iterable[int] | None = None,
+        names: Iterable[str] | None = None,
+    ) -> WhiskerArray:
+        """Choose some of the whiskers.
+
+        Parameters
+        ----------
+        side : {"both", "left", "right"}
+            Whose to keep.
+        rows : iterable of str, optional
+            Rows to keep, such as ``"ABC"``; all by default.
+        columns : iterable of int, optional
+            Columns to keep, 0 being the Greek one; all by default.
+        names : iterable of str, optional
+            Whiskers to keep, on each of the sides unless they tell one; all by default.
+
+        Returns
+        -------
+        WhiskerArray
+            With these only.
+
+        Raises
+        ------
+        ValueError
+            If none is left, or a name is not there.
+        """
+        keep = None if rows is None else {row.upper() for row in rows}
+        which = None if columns is None else set(columns)
+        kept = [
+            name
+            for name, identity in self._identities.items()
+            if identity.side in sides(side)
+            and (keep is None or identity.row in keep)
+            and (which is None or identity.column in which)
+        ]
+        if names is not None:
+            wanted = [Identity.of(name) for name in names]
+            meant = {one.on(s).name for one in wanted for s in ((one.side,) if one.side else BOTH)}
+            kept = [name for name in kept if name in meant]
+            for one in wanted:
+                if not any(name.endswith(one.name) for name in kept):
+                    raise ValueError(f"{one.name} is not among {', '.join(self)}")
+        return WhiskerArray([self._whiskers[name] for name in kept])
+
+    def centerlines(self, n: int = 33) -> Array:
+        """Points of the whiskers at rest.
+
+        Parameters
+        ----------
+        n : int
+            Points of each, equally spaced in arc length.
+
+        Returns
+        -------
+        array (whisker, n, 3)
+            m, head's frame.
+        """
+        return np.stack([w.pose.to_source(w.centerline(n)) for w in self.values()])
+
+    def to_tree(self) -> xr.DataTree:
+        """Write the array as labelled datasets, without loss.
+
+        Returns
+        -------
+        xarray.DataTree
+            At the top, along the dimension ``whisker``: side, row, column, pose, length, radii and
+            centreline, head's frame. In the groups ``whiskers/0``, … each whisker's own dataset.
+        """
+        return array_tree(self.values(), self._identities.values())
+
+    @classmethod
+    def from_tree(cls, tree: xr.DataTree) -> WhiskerArray:
+        """Make an array again.
+
+        Parameters
+        ----------
+        tree : xarray.DataTree
+            Of `to_tree`.
+
+        Returns
+        -------
+        WhiskerArray
+
+        Raises
+        ------
+        ValueError
+            If it is no such tree.
+        """
+        return cls(whiskers_of(tree))
+
+    def __repr__(self) -> str:
+        """Say how many there are, which, and how long."""
+        lengths = [w.length * 1e3 for w in self.values()]
+        sides = [
+            f"{count} {side}"
+            for side in ("left", "right")
+            if (count := sum(i.side == side for i in self._identities.values()))
+        ]
+        return (
+            f"WhiskerArray: {len(self)} whiskers ({', '.join(sides)}), {min(lengths):.1f} to "
+            f"{max(lengths):.1f} mm long: {', '.join(self)}"
+        )
+
+
+def sides(side: str) -> tuple[Side, ...]:
+    """List the sides that are meant.
+
+    Parameters
+    ----------
+    side : {"both", "left", "right"}
+        In a word.
+
+    Returns
+    -------
+    tuple of {"left", "right"}
+
+    Raises
+    ------
+    ValueError
+        If it is none of these words.
+    """
+    meant = BOTH if side == "both" else tuple(one for one in BOTH if one == side)
+    if not meant:
+        raise ValueError(f"side is {side!r}; both, left or right is needed")
+    return meant
+
+
+def _named(whisker: Whisker) -> tuple[Identity, Whisker]:
+    """Say which whisker it is, and call it by its one name."""
+    identity = Identity.of(whisker.name)
+    x = float(whisker.pose.origin[0])
+    there: Side = "right" if x > 0.0 else "left"
+    if identity.side is None:
+        identity = identity.on(there)
+    elif x != 0.0 and identity.side != there:
+        raise ValueError(
+            f"{whisker.name} has its base at x = {x * 1e3:.2f} mm, which is on the {there} side: "
+            "in the head's frame x points to the animal's right"
+        )
+    same = whisker.name == identity.name
+    return identity, whisker if same else replace(whisker, name=identity.name)

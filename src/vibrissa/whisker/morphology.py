@@ -1,0 +1,287 @@
+r"""An average rat's whiskers by the published equations, as functions of row and column.
+
+Here rows are counted from 1 (A) to 5 (E) and columns from 0 (Greek) to 6, whatever the source does;
+each equation converts for itself. All results are in SI units.
+
+**The head's frame** is that of Towal et al. (2011): origin at the tip of the snout, x to the
+animal's right, y forward along the midline, z up; the rows of whiskers lie parallel to the x–y
+plane on average. The equations are those of the right side; the left one is its mirror image in the
+y–z plane.
+
+**Towal et al. (2011)**, *The morphology of the rat vibrissal array*, PLoS Comput Biol 7:e1001120,
+354 whiskers of six rats, counts the Greek column as 1 and column 1 as 2, … 6 as 7. It gives length,
+shape (a planar parabola y = A x²), base points on an ellipsoid, and four angles at which a whisker
+leaves the face. Three of these are angles of projections, to be turned into a rotation so:
+
+- θ, in the horizontal plane, from backward (0°) over sideways (90°) to forward (180°): the azimuth
+  is θ − 90° (`vibrissa.whisker.emergence`: 0 is sideways, forward is positive).
+- φ, in the frontal plane, from sideways (0°) to upward (90°): with the azimuth,
+  tan elevation = tan φ cos azimuth.
+- ψ, in the sagittal plane, from backward (0°) over upward (90°) to forward (180°). It is redundant:
+  the three projections of a direction obey an equation. It says more than φ only where a whisker
+  lies within 45° of the midline, and none of a rat's does at rest; so it is given and not used.
+- ζ, the roll about the tangent at the base: at 0° the whisker is concave downward, at 90° forward:
+  the roll is ζ − 90°.
+
+The measured points lie within 0.3 mm of a plane over the proximal 65 % of a whisker; farther out
+these equations were not tested, and real whiskers leave the plane.
+
+**Belli et al. (2017)**, *Variations in vibrissal geometry across the rat mystacial pad*,
+J Neurophysiol 117:1807, 519 whiskers of seven studies, counts the Greek column as 0. It gives base
+diameters and radius slopes. Both are fits of their own, and put together they give tips of no or
+negative radius for most whiskers of the middle columns (`tip_radius` says what is done then).
+
+**Quist & Hartmann (2012)**, J Neurophysiol 107:2298: an upper bound of A by length.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+MEASURED = {"A": range(5), "B": range(6), "C": range(7), "D": range(7), "E": range(1, 7)}
+"""Columns (0: Greek) of each row whose whiskers were measured: the range of validity."""
+
+MOST_TAPER = 36.0
+"""Base over tip radius, at most: the largest of the means that studies found (28 to 36)."""
+
+_TOWAL_GREEK = 1
+"""Column number of the Greek whiskers in Towal et al."""
+
+_BELLI_GREEK = 0
+"""Column number of the Greek whiskers in Belli et al."""
+
+_CENTER = 1e-3 * np.array([1.9128, -7.6549, -5.4439])
+_RADII = 1e-3 * np.array([9.5304, 5.5393, 6.9745])
+_TURNED = np.radians([106.51, -2.5211, -19.5401])
+"""Ellipsoid of the right cheek: m, and angles about z, y, x, rad, the last one turned first."""
+
+
+def arc_length(row: ArrayLike, column: ArrayLike) -> Array:
+    """Length of whiskers (Towal et al. 2011).
+
+    S = −7.9312 column + 2.2224 row + 52.1110 mm.
+
+    Parameters
+    ----------
+    row : array_like (...)
+        1 (A) to 5 (E).
+    column : array_like (...)
+        0 (Greek) to 6.
+
+    Returns
+    -------
+    array (...)
+        m. Not positive for columns far beyond those measured.
+    """
+    row, column = _towal(row, column)
+    return np.asarray(1e-3 * (-7.9312 * column + 2.2224 * row + 52.1110))
+
+
+def curvature_coefficient(column: ArrayLike) -> Array:
+    """Coefficient A of the shape y = A x² (Towal et al. 2011).
+
+    A = exp(1 / (−0.02052 column − 0.2045)) per mm. The table printed in the paper has a misprint;
+    this form gives the value of its text, 0.0233 per mm for C2.
+
+    Parameters
+    ----------
+    column : array_like (...)
+        0 (Greek) to 6.
+
+    Returns
+    -------
+    array (...)
+        1/m.
+    """
+    _, column = _towal(1, column)
+    return np.asarray(1e3 * np.exp(1.0 / (-0.02052 * column - 0.2045)))
+
+
+def curvature_bound(length: ArrayLike) -> Array:
+    """Say how large the coefficient A of a real whisker is at most (Quist & Hartmann 2012).
+
+    A ≤ 0.156 exp(−S / 15.6 mm) + 0.015 per mm.
+
+    Parameters
+    ----------
+    length : array_like (...)
+        Arc length, m.
+
+    Returns
+    -------
+    array (...)
+        1/m.
+    """
+    s = 1e3 * np.asarray(length, dtype=np.float64)
+    return np.asarray(1e3 * (0.156 * np.exp(-s / 15.6) + 0.015))
+
+
+def base_point(row: ArrayLike, column: ArrayLike) -> Array:
+    """Where whiskers of the right side leave the cheek (Towal et al. 2011).
+
+    On the ellipsoid of the cheek, in whose own axes the direction from its centre has the azimuth
+    15.2953 column − 144.2220 and the angle 18.2237 row + 34.7558 from the third axis, in degrees.
+
+    Parameters
+    ----------
+    row : array_like (...)
+        1 (A) to 5 (E).
+    column : array_like (...)
+        0 (Greek) to 6.
+
+    Returns
+    -------
+    array (..., 3)
+        m, head's frame.
+    """
+    row, column = _towal(row, column)
+    azimuth = np.radians(15.2953 * column - 144.2220)
+    polar = np.radians(18.2237 * row + 34.7558)
+    direction = np.stack(
+        [np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)], axis=-1
+    )
+    size = 1.0 / np.linalg.norm(direction / _RADII, axis=-1, keepdims=True)
+    return np.asarray(_CENTER + size * direction @ _cheek().T)
+
+
+def _cheek() -> Array:
+    """Rotation from the ellipsoid's axes to the head's, R_z R_y R_x."""
+    (cz, cy, cx), (sz, sy, sx) = np.cos(_TURNED), np.sin(_TURNED)
+    about_z = np.array([[cz, -sz, 0.0], [sz, cz, 0.0], [0.0, 0.0, 1.0]])
+    about_y = np.array([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]])
+    about_x = np.array([[1.0, 0.0, 0.0], [0.0, cx, -sx], [0.0, sx, cx]])
+    return np.asarray(about_z @ about_y @ about_x)
+
+
+def projection_angles(row: ArrayLike, column: ArrayLike) -> Array:
+    """Angles of whiskers as Towal et al. (2011) give them; see the module.
+
+    Parameters
+    ----------
+    row : array_like (...)
+        1 (A) to 5 (E).
+    column : array_like (...)
+        0 (Greek) to 6.
+
+    Returns
+    -------
+    array (..., 4)
+        θ, φ, ψ and ζ, rad.
+    """
+    row, column = _towal(row, column)
+    degrees = [
+        10.6475 * column + 37.3178,
+        1.0988 * column - 18.0334 * row + 50.6005,
+        18.5149 * column + 49.3499 * row - 50.5406,
+        18.7700 * column - 11.3485 * row - 4.9844,
+    ]
+    angles: Array = np.radians(np.stack(np.broadcast_arrays(*degrees), axis=-1))
+    return angles
+
+
+def emergence_angles(row: ArrayLike, column: ArrayLike) -> Array:
+    """How whiskers of the right side leave the face (Towal et al. 2011).
+
+    Parameters
+    ----------
+    row : array_like (...)
+        1 (A) to 5 (E).
+    column : array_like (...)
+        0 (Greek) to 6.
+
+    Returns
+    -------
+    array (..., 3)
+        Azimuth, elevation and roll, rad, head's frame, for `base_rotation`.
+    """
+    theta, phi, _, zeta = np.moveaxis(projection_angles(row, column), -1, 0)
+    azimuth = theta - np.pi / 2.0
+    elevation = np.arctan(np.tan(phi) * np.cos(azimuth))
+    return np.stack([azimuth, elevation, zeta - np.pi / 2.0], axis=-1)
+
+
+def base_radius(row: ArrayLike, column: ArrayLike, length: ArrayLike) -> Array:
+    """Radius of whiskers at the base (Belli et al. 2017).
+
+    Its diameter is 0.041 + 0.002 S + 0.011 row − 0.0039 column, mm, with the length S in mm.
+
+    Parameters
+    ----------
+    row : array_like (...)
+        1 (A) to 5 (E).
+    column : array_like (...)
+        0 (Greek) to 6.
+    length : array_like (...)
+        Arc length, m.
+
+    Returns
+    -------
+    array (...)
+        m.
+    """
+    row, column = _belli(row, column)
+    s = 1e3 * np.asarray(length, dtype=np.float64)
+    return np.asarray(0.5e-3 * (0.041 + 0.002 * s + 0.011 * row - 0.0039 * column))
+
+
+def radius_slope(row: ArrayLike, column: ArrayLike) -> Array:
+    """Radius that whiskers lose per length, from base to tip (Belli et al. 2017).
+
+    0.0012 + 0.00017 row − 0.000066 column + 0.00011 column².
+
+    Parameters
+    ----------
+    row : array_like (...)
+        1 (A) to 5 (E).
+    column : array_like (...)
+        0 (Greek) to 6.
+
+    Returns
+    -------
+    array (...)
+        m/m.
+    """
+    row, column = _belli(row, column)
+    return np.asarray(0.0012 + 0.00017 * row - 0.000066 * column + 0.00011 * column**2)
+
+
+def tip_radius(row: ArrayLike, column: ArrayLike, length: ArrayLike) -> Array:
+    """Radius of whiskers at the tip, by base radius and slope as far as these go together.
+
+    Where the slope would lead to less than the base radius over `MOST_TAPER` (often to less than
+    nothing), that is taken instead.
+
+    Parameters
+    ----------
+    row : array_like (...)
+        1 (A) to 5 (E).
+    column : array_like (...)
+        0 (Greek) to 6.
+    length : array_like (...)
+        Arc length, m.
+
+    Returns
+    -------
+    array (...)
+        m.
+    """
+    base = base_radius(row, column, length)
+    by_slope = base - radius_slope(row, column) * np.asarray(length)
+    return np.asarray(np.maximum(by_slope, base / MOST_TAPER))
+
+
+def _towal(row: ArrayLike, column: ArrayLike) -> tuple[Array, Array]:
+    """Row and column as Towal et al. count them."""
+    return _numbers(row), _numbers(column) + _TOWAL_GREEK
+
+
+def _belli(row: ArrayLike, column: ArrayLike) -> tuple[Array, Array]:
+    """Row and column as Belli et al. count them."""
+    return _numbers(row), _numbers(column) + _BELLI_GREEK
+
+
+def _numbers(value: ArrayLike) -> Array:
+    return np.asarray(value, dtype=np.float64)

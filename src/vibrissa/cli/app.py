@@ -18,6 +18,7 @@ from vibrissa.cli import (
     sensing,
     simulating,
     tracking,
+    viewing,
     whole_job,
 )
 from vibrissa.cli.terminal import errors, output
@@ -44,6 +45,7 @@ app.command("track")(tracking.track)
 app.command("sensitivity")(sensing.sensitivity)
 app.command("estimate")(locating.estimate)
 app.command("figures")(figures.figures)
+app.command("view")(viewing.view)
 app.command("info")(information.info)
 
 

@@ -1,0 +1,27 @@
+"""Whiskers, maps and trials on a page in the browser, to take hold of and turn about.
+
+What turns states into drawings and texts is pure; only the binding imports viser (extra ``view``).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from vibrissa.viewer.server import Viewer, view
+
+__all__ = ["Viewer", "view"]
+
+
+def __getattr__(name: str) -> object:
+    if name not in __all__:
+        raise AttributeError(f"module 'vibrissa.viewer' has no attribute {name!r}")
+    try:
+        from vibrissa.viewer import server
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] == "vibrissa":
+            raise
+        raise ModuleNotFoundError(
+            "the viewer needs viser: pip install 'vibrissa[view]'", name=error.name
+        ) from error
+    return getattr(server, name)

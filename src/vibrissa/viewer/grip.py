@@ -1,0 +1,86 @@
+"""What is taken hold of with the mouse: a ball that goes anywhere, and arrows along the axes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import viser
+from viser import transforms
+
+from vibrissa.quantities import quantity
+from vibrissa.viewer.drawing import Array
+
+_MM = quantity("length").display_factor
+
+Moved = Callable[[Array, Array], None]
+"""Called with the place (3,), m, and the orientation (3, 3) to which it was dragged."""
+
+
+class Grip:
+    """A ball and a gizmo at one place of the scene.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+        In whose scene.
+    size : float
+        How long the gizmo's arrows are, mm.
+    moved : callable
+        Told while it is dragged.
+    """
+
+    def __init__(self, server: viser.ViserServer, size: float, moved: Moved) -> None:
+        self._moved = moved
+        self._place: Array = np.zeros(3)
+        self._gizmo = server.scene.add_transform_controls(
+            "/grip",
+            scale=size,
+            line_width=2.5,
+            disable_rotations=True,
+            depth_test=False,
+            opacity=0.75,
+            visible=False,
+        )
+        self._ball = server.scene.add_icosphere(
+            "/grip ball", radius=0.12 * size, color=(213, 94, 0), opacity=0.35, visible=False
+        )
+        self._turning = False
+
+        # Coroutines run one after the other, so that no older place can overtake a newer one.
+        @self._gizmo.on_update
+        async def _(event: viser.TransformControlsEvent) -> None:
+            if event.phase == "update":
+                self._ball.position = event.target.position
+                self._tell()
+
+        @self._ball.on_drag
+        async def _(event: viser.SceneNodeDragEvent[viser.IcosphereHandle]) -> None:
+            if event.phase == "update":
+                self._ball.position = event.end_position
+                self._gizmo.position = event.end_position
+                self._tell()
+
+    def _tell(self) -> None:
+        turn = np.array(transforms.SO3(self._gizmo.wxyz).as_matrix(), dtype=np.float64)
+        self._moved(np.array(self._ball.position) / _MM, turn)
+
+    def show(self, place: Array | None, turning: bool = False) -> None:
+        """Stand at a place (3,), m, with arcs for turning or without; None hides it."""
+        visible = place is not None
+        if place is not None:
+            x, y, z = (_MM * place).tolist()
+            self._gizmo.position = self._ball.position = (x, y, z)
+        if turning != self._turning:
+            self._gizmo.disable_rotations = not turning
+            self._turning = turning
+        self._gizmo.visible = self._ball.visible = visible
+
+    def orient(self, rotation: Array) -> None:
+        """Turn the gizmo's arcs."""
+        self._gizmo.wxyz = transforms.SO3.from_matrix(rotation).wxyz
+
+    def remove(self) -> None:
+        """Take it away."""
+        self._gizmo.remove()
+        self._ball.remove()

@@ -1,0 +1,118 @@
+"""Shapes as triangles: tubes along whiskers, cylinders, ellipsoids, whatever stands in the way.
+
+All lengths go in and come out in the same unit.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vibrissa.rod.surface import Surface
+from vibrissa.trial import Box, Mesh, Peg, Plane, Sphere
+from vibrissa.viewer.drawing import Array, Ints
+
+SIDES = 12
+
+
+def across(direction: Array) -> tuple[Array, Array]:
+    """Two unit vectors that make a right-handed frame with a direction (3,)."""
+    along = direction / np.linalg.norm(direction)
+    helper = np.eye(3)[np.argmin(np.abs(along))]
+    first = np.cross(along, helper)
+    first /= np.linalg.norm(first)
+    return first, np.cross(along, first)
+
+
+def tube(line: Array, radius: Array, sides: int = SIDES) -> tuple[Array, Ints]:
+    """Vertices and triangles of a closed tube about a line (n, 3) with radii (n,).
+
+    Its sections do not twist: the normal of each is that of the one before, made perpendicular to
+    the tangent.
+    """
+    tangents = np.gradient(line, axis=0)
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    normals = np.empty_like(line)
+    normal = across(tangents[0])[0]
+    for i, tangent in enumerate(tangents):
+        normal = normal - (normal @ tangent) * tangent
+        normal = normal / np.linalg.norm(normal)
+        normals[i] = normal
+    turn = np.linspace(0.0, 2.0 * np.pi, sides, endpoint=False)
+    ring = np.cos(turn)[:, None] * normals[:, None]
+    ring += np.sin(turn)[:, None] * np.cross(tangents, normals)[:, None]
+    walls = line[:, None] + radius[:, None, None] * ring
+    return np.concatenate([walls.reshape(-1, 3), line[[0, -1]]]), _tube_faces(len(line), sides)
+
+
+def _tube_faces(count: int, sides: int) -> Ints:
+    ring, side = np.meshgrid(np.arange(count - 1), np.arange(sides), indexing="ij")
+    here, beside = ring * sides + side, ring * sides + (side + 1) % sides
+    walls = [(here, beside, beside + sides), (here, beside + sides, here + sides)]
+    around = np.arange(sides)
+    beyond = (around + 1) % sides
+    first, last = count * sides, (count - 1) * sides
+    ends = [
+        (np.full(sides, first), beyond, around),
+        (np.full(sides, first + 1), last + around, last + beyond),
+    ]
+    return np.concatenate([np.stack([p.ravel() for p in part], axis=1) for part in walls + ends])
+
+
+def cylinder(
+    origin: Array, axis: Array, radius: float, length: float, sides: int = 32
+) -> tuple[Array, Ints]:
+    """Vertices and triangles of a cylinder with its middle at the origin."""
+    along = 0.5 * length * axis / np.linalg.norm(axis)
+    return tube(np.stack([origin - along, origin + along]), np.full(2, radius), sides)
+
+
+def ellipsoid(centre: Array, axes: Array, around: int = 24) -> tuple[Array, Ints]:
+    """Vertices and triangles of an ellipsoid; the columns of axes (3, 3) are its semi-axes."""
+    latitude = np.linspace(-np.pi / 2, np.pi / 2, around // 2 + 1)
+    longitude = np.linspace(0.0, 2.0 * np.pi, around, endpoint=False)
+    lat, lon = np.meshgrid(latitude, longitude, indexing="ij")
+    ball = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=-1)
+    axes = axes * np.where(np.linalg.det(axes) < 0.0, np.array([1.0, 1.0, -1.0]), 1.0)
+    faces = _tube_faces(len(latitude), around)[: 2 * (len(latitude) - 1) * around]
+    return centre + ball.reshape(-1, 3) @ axes.T, faces
+
+
+def error_ellipsoid(centre: Array, covariance: Array, sigmas: float) -> tuple[Array, Ints]:
+    """Vertices and triangles of the ellipsoid of so many standard deviations."""
+    values, directions = np.linalg.eigh(covariance)
+    return ellipsoid(centre, directions * (sigmas * np.sqrt(np.clip(values, 0.0, None))))
+
+
+def patch(centre: Array, normal: Array, size: float) -> tuple[Array, Ints]:
+    """Two triangles: a square of an edge length, normal to a direction."""
+    first, second = across(normal)
+    corners = [(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)]
+    vertices = np.array([centre + size * (a * first + b * second) for a, b in corners])
+    return vertices, np.array([[0, 1, 2], [0, 2, 3]])
+
+
+_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+_SIDES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+
+
+def box(centre: Array, size: Array, rotation: Array) -> tuple[Array, Ints]:
+    """Vertices and triangles of a box whose own axes are the columns of a rotation."""
+    faces = [(a, b, c) for a, b, c, _ in _SIDES] + [(a, c, d) for a, _, c, d in _SIDES]
+    return centre + (_CORNERS * size) @ rotation.T, np.array(faces)
+
+
+def of_object(thing: Surface, extent: float, near: Array) -> tuple[Array, Ints]:
+    """Vertices and triangles of an object, m; what has no end reaches so far about a place."""
+    if isinstance(thing, Peg):
+        middle = thing.origin + ((near - thing.origin) @ thing.axis) * thing.axis
+        return cylinder(middle, thing.axis, thing.radius, extent)
+    if isinstance(thing, Sphere):
+        return ellipsoid(thing.origin, thing.radius * np.eye(3), 48)
+    if isinstance(thing, Plane):
+        foot = near - ((near - thing.origin) @ thing.normal) * thing.normal
+        return patch(foot, thing.normal, extent)
+    if isinstance(thing, Box):
+        return box(thing.origin, thing.size, thing.rotation)
+    if isinstance(thing, Mesh):
+        return np.asarray(thing.vertices), np.asarray(thing.faces, dtype=np.int64)
+    raise ValueError(f"no picture of a {type(thing).__name__} is known")

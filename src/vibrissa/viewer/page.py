@@ -1,0 +1,204 @@
+"""The page: one scene, one panel, and the modes between which one chooses.
+
+Everything that happens on the page ends in one thread (:class:`~vibrissa.viewer.latest.Latest`),
+which changes the state and draws it, so that no state is ever changed by two at a time.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+import viser
+
+from vibrissa.mapping import ContactMap
+from vibrissa.quantities import to_display
+from vibrissa.viewer.bending import Bend, begin, moved, with_whisker
+from vibrissa.viewer.charting import Chart, charted
+from vibrissa.viewer.drawing import Array
+from vibrissa.viewer.grip import Grip
+from vibrissa.viewer.latest import Latest
+from vibrissa.viewer.shaping import shape_of, shaped
+from vibrissa.viewer.stage import Stage
+from vibrissa.whisker import Whisker
+
+EXAGGERATION = 8.0
+
+Transition = Callable[[Bend], Bend]
+
+
+class Mode(Protocol):
+    """One way to look: its own controls, its own things in the scene."""
+
+    name: str
+
+    def enter(self) -> None:
+        """Show controls and things."""
+
+    def leave(self) -> None:
+        """Hide them."""
+
+    def redraw(self) -> None:
+        """Follow a change of the whisker or of its load."""
+
+
+class Page:
+    """What all modes share.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+        That serves it.
+    whisker : Whisker
+        That is looked at.
+    contacts : ContactMap, optional
+        Its map, if there is one already.
+    """
+
+    def __init__(
+        self, server: viser.ViserServer, whisker: Whisker, contacts: ContactMap | None = None
+    ) -> None:
+        self.server = server
+        self.stage = Stage(server)
+        self.work = Latest(self._fault)
+        self._slow_work = Latest(self._fault)
+        self.original = whisker
+        self._contacts = contacts
+        self.chart: Chart | None = None
+        self.shape = shape_of(whisker)
+        self.bend = begin(whisker)
+        self.exaggeration = EXAGGERATION
+        self.mode: Mode | None = None
+        self.modes: dict[str, Mode] = {}
+        self.grip = Grip(server, float(to_display("length", 0.16 * whisker.length)), self._dragged)
+
+    # What happens
+
+    def _dragged(self, place: Array, turn: Array) -> None:
+        self.change("drag", lambda bend: moved(bend, place, turn[:, 2]), dragging=True)
+
+    def change(self, topic: str, transition: Transition, dragging: bool = False) -> None:
+        """Change what is bent as soon as there is time; a newer change replaces an older one."""
+
+        def job() -> None:
+            self.bend = transition(self.bend)
+            self.redraw(dragging)
+
+        self.work.put(topic, job)
+
+    def reshape(self, **asked: float) -> None:
+        """Change the whisker: length, turn, taper, modulus (SI)."""
+        values = {**vars(self.shape), **asked}
+        self.shape = type(self.shape)(**values)
+
+        def job() -> None:
+            whisker = shaped(self.original, self.shape)
+            self.bend = with_whisker(self.bend, whisker)
+            self.chart = None
+            self.redraw()
+            self.prepare()
+
+        self.work.put("shape", job)
+
+    def prepare(self) -> None:
+        """Chart the whisker's contacts beside everything else, and redraw when that is done."""
+        whisker = self.bend.whisker
+        own = self._contacts if whisker is self.original else None
+
+        def ready(chart: Chart) -> None:
+            if chart.whisker is self.bend.whisker:
+                self.chart = chart
+                self.redraw()
+
+        def job() -> None:
+            chart = charted(whisker, own)
+            self.work.put("chart", lambda: ready(chart))
+
+        self._slow_work.put("chart", job)
+
+    def settle(self, timeout: float = 60.0) -> bool:
+        """Wait, s, until nothing is left to do; tell whether that came true."""
+        return self.work.wait(timeout) and self._slow_work.wait(timeout) and self.work.wait(timeout)
+
+    def thicken(self, factor: float) -> None:
+        """Draw the whisker so many times as thick as it is."""
+
+        def job() -> None:
+            self.exaggeration = factor
+            self.redraw()
+
+        self.work.put("thickness", job)
+
+    def choose(self, name: str) -> None:
+        """Go over to another mode."""
+
+        def job() -> None:
+            if self.mode is not None:
+                self.mode.leave()
+            self.mode = self.modes[name]
+            self.mode.enter()
+            self.redraw()
+
+        self.work.put("mode", job)
+
+    def redraw(self, dragging: bool = False) -> None:
+        """Draw the mode; what is being dragged stays where the mouse has it."""
+        if self.mode is not None:
+            self.mode.redraw()
+        self.server.flush()
+        if not dragging:
+            self.place_grip()
+
+    def place_grip(self) -> None:
+        """Put what can be dragged where the load is."""
+        bend = self.bend
+        draggable = self.mode is not None and self.mode.name in ("Bend", "Locate")
+        if not draggable or bend.kind == "force":
+            self.grip.show(None)
+            return
+        self.grip.show(bend.target, turning=bend.kind == "peg")
+
+    def _fault(self, error: Exception) -> None:
+        traceback.print_exception(error)
+        self.say("Something went wrong", str(error) or type(error).__name__, "red")
+
+    def say(self, title: str, body: str, colour: Any = None, seconds: float | None = 8.0) -> None:
+        """Tell everyone who looks."""
+        for client in self.server.get_clients().values():
+            client.add_notification(title, body, color=colour, auto_close_seconds=seconds)
+
+    def close(self) -> None:
+        """End everything."""
+        self._slow_work.close()
+        self.work.close()
+        self.server.stop()
+
+
+def asked(handle: viser.GuiInputHandle[Any], then: Callable[[Any], None]) -> None:
+    """Call with the value of a control when someone changes it on the page (not when we do)."""
+
+    @handle.on_update
+    async def _(event: Any) -> None:
+        if event.client is not None:
+            then(event.target.value)
+
+
+def put(handle: viser.GuiInputHandle[Any], value: Any) -> None:
+    """Show a value in a control."""
+    control: Any = handle  # type checkers take its value for read-only
+    control.value = value
+
+
+def look_at(
+    server: viser.ViserServer, centre: Array, distance: float, way: Sequence[float]
+) -> None:
+    """Let everyone look at a place, mm, from a direction, now and when they come."""
+    direction = np.asarray(way, dtype=np.float64)
+    position = centre + distance * direction / np.linalg.norm(direction)
+    cameras: list[Any] = [server.initial_camera]
+    cameras += [client.camera for client in server.get_clients().values()]
+    for camera in cameras:
+        camera.position = tuple(position.tolist())
+        camera.look_at = tuple(np.asarray(centre, dtype=np.float64).tolist())

@@ -1,0 +1,130 @@
+"""Serve the page on this machine."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import socket
+import time
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+import viser
+from viser import _messages
+
+from vibrissa.quantities import to_display
+from vibrissa.viewer.bend_panel import BendMode
+from vibrissa.viewer.page import Page, look_at
+from vibrissa.viewer.whisker_panel import WhiskerControls
+from vibrissa.whisker import Whisker
+
+HOST = "127.0.0.1"
+PORT = 8080
+
+# The page sends the mouse every 50 ms, which is 20 positions a second; a whisker follows faster.
+_OFTEN = """
+(() => {
+  const later = window.setTimeout.bind(window);
+  window.setTimeout = (job, delay, ...rest) => later(job, delay === 50 ? 16 : delay, ...rest);
+})();
+"""
+
+
+class Viewer:
+    """A page that is being served; ends with its ``with`` block.
+
+    Parameters
+    ----------
+    page : Page
+        What is served.
+    """
+
+    def __init__(self, page: Page) -> None:
+        self.page = page
+
+    @property
+    def url(self) -> str:
+        """Where the page is."""
+        host = self.page.server.get_host()
+        shown = "127.0.0.1" if host in ("0.0.0.0", "") else host
+        return f"http://{f'[{shown}]' if ':' in shown else shown}:{self.page.server.get_port()}"
+
+    def wait(self) -> None:
+        """Serve until interrupted."""
+        while True:
+            time.sleep(3600.0)
+
+    def close(self) -> None:
+        """Stop serving."""
+        with contextlib.redirect_stdout(io.StringIO()):  # it would say so
+            self.page.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def view(whisker: Whisker, *, host: str = HOST, port: int | None = None) -> Viewer:
+    """Serve a page on which a whisker can be bent.
+
+    Parameters
+    ----------
+    whisker : Whisker
+        To look at.
+    host : str
+        Address to listen on; the default can only be reached from this machine.
+    port : int, optional
+        To listen on; a free one by default.
+
+    Returns
+    -------
+    Viewer
+        Until it is closed.
+    """
+    server = _served(host, port)
+    page = Page(server, whisker)
+    modes = [BendMode(page)]
+    page.modes = {mode.name: mode for mode in modes}
+    WhiskerControls(page)
+    length = float(to_display("length", whisker.length))
+    look_at(server, np.array([0.56, 0.1, 0.0]) * length, 1.1 * length, (0.15, -0.8, 0.6))
+    page.choose("Bend")
+    page.prepare()
+    page.settle()
+    return Viewer(page)
+
+
+def _served(host: str, port: int | None) -> viser.ViserServer:
+    if port is None:
+        port = _free_port(host)
+    with contextlib.redirect_stdout(io.StringIO()):  # it would announce itself
+        server = viser.ViserServer(host=host, port=port, label="vibrissa", verbose=False)
+    server.gui.configure_theme(
+        control_width="large", show_logo=False, show_share_button=False, brand_color=(0, 114, 178)
+    )
+    server.scene.set_up_direction("+z")
+    server.scene.world_axes.visible = False
+    connection: Any = server.gui._websock_interface
+    connection.queue_message(_messages.RunJavascriptMessage(_OFTEN))
+    return server
+
+
+def _free_port(host: str) -> int:
+    """The first free port from the usual one on."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    for port in range(PORT, PORT + 200):
+        with socket.socket(family, socket.SOCK_STREAM) as probe:
+            try:
+                probe.bind((host, port))
+            except OSError:
+                continue
+            return port
+    raise OSError(f"no free port from {PORT} to {PORT + 199} on {host}")

@@ -1,0 +1,106 @@
+"""The page in a real browser: it loads in silence, follows the mouse, and says why it cannot."""
+
+import numpy as np
+import pytest
+
+import vibrissa as vb
+from vibrissa.viewer.readout import number
+
+SIGNALS = ("Fx", "FT", "FD", "Mx", "MB", "MD")
+SIZE = {"width": 900, "height": 480}
+
+
+class Looking:
+    """Someone who looks at a page with a mouse, and hears what it complains of."""
+
+    def __init__(self, browser, viewer):
+        self.viewer = viewer
+        self.complaints = []
+        self.page = browser.new_page(viewport=SIZE)
+        self.page.on("console", self._hear)
+        self.faults = []
+        self.page.on("pageerror", lambda error: self.faults.append(str(error)))
+        self.requests = []
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.page.goto(viewer.url)
+        self.page.wait_for_selector('[data-quantity="MB"]')
+        self.page.wait_for_function("document.querySelector('canvas') !== null")
+
+    def _hear(self, message):
+        if message.type == "error":
+            self.complaints.append(message.text)
+
+    def pixel(self, place):
+        """Where a place, m, is on the screen."""
+        deadline = 200
+        while not (clients := self.viewer.page.server.get_clients()) and deadline:
+            self.page.wait_for_timeout(50)
+            deadline -= 1
+        camera = next(iter(clients.values())).camera
+        w, *v = camera.wxyz
+        v = -np.array(v)  # from the world to the camera: right, down, forward
+        away = 1e3 * np.asarray(place) - camera.position
+        turned = away + 2.0 * np.cross(v, np.cross(v, away) + w * away)
+        focal = 0.5 * SIZE["height"] / np.tan(0.5 * camera.fov)
+        middle = 0.5 * np.array([SIZE["width"], SIZE["height"]])
+        return middle + focal * turned[:2] / turned[2]
+
+    def drag(self, start, by, steps=5):
+        """Take hold at a pixel and move the mouse by so many pixels."""
+        mouse = self.page.mouse
+        mouse.move(*start)
+        mouse.down()
+        for share in np.linspace(0.0, 1.0, steps + 1)[1:]:
+            mouse.move(*(start + share * np.asarray(by)))
+            self.page.wait_for_timeout(25)
+        mouse.up()
+        self.page.wait_for_timeout(150)
+        assert self.viewer.page.settle()
+
+    def text(self, name):
+        """What is shown for a quantity."""
+        return self.page.locator(f'[data-quantity="{name}"]').first.inner_text()
+
+    def wait_for(self, selector, text=None):
+        """Wait until something is on the page."""
+        self.page.locator(selector, has_text=text).first.wait_for()
+
+
+@pytest.fixture(scope="module")
+def looking(browser):
+    from vibrissa.viewer import view
+
+    with view(vb.samples.gamma()) as viewer:
+        person = Looking(browser, viewer)
+        yield person
+        person.page.close()
+
+
+def test_the_page_loads_in_silence_and_asks_nobody_else(looking):
+    looking.page.wait_for_timeout(500)
+    assert looking.complaints == looking.faults == []
+    assert all(url.startswith((looking.viewer.url, "blob:")) for url in looking.requests)
+
+
+def test_a_drag_shows_what_deflect_says(looking):
+    before = looking.text("MB")
+    start = looking.viewer.page.bend.point
+    looking.drag(looking.pixel(start), [0.0, -18.0])
+    point = looking.viewer.page.bend.point
+    assert np.linalg.norm(point - start) > 0.3e-3
+    bent = vb.deflect(looking.viewer.page.bend.whisker, vb.PointContact(point))
+    assert vb.Status(int(bent.status)).ok
+    signals = vb.base_signals(bent.force, bent.moment)
+    looking.wait_for('[data-quantity="MB"]', number("MB", float(signals.MB)))
+    for name in SIGNALS:
+        assert looking.text(name) == number(name, float(signals[name]))
+    assert looking.text("MB") != before
+
+
+def test_out_of_reach_the_reason_is_shown(looking):
+    looking.drag(looking.pixel(looking.viewer.page.bend.point), [0.0, -170.0])
+    bend = looking.viewer.page.bend
+    assert bend.status in (vb.Status.BEYOND_FOLD, vb.Status.BEYOND_TIP)
+    looking.wait_for(f'[data-status="{bend.status.name}"]', bend.status.explanation)
+    assert looking.viewer.page.stage.node("bend", "ghost") is not None
+    assert looking.faults == []

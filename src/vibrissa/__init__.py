@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from vibrissa import samples
+    from vibrissa.display import show
     from vibrissa.io import load_array, load_whisker
     from vibrissa.mapping import (
         ContactMap,
@@ -55,6 +56,7 @@ __all__ = [
     "samples",
     "sensitivity",
     "sensitivity_findings",
+    "show",
     "uniqueness",
     "whisker_array",
 ]
@@ -80,6 +82,7 @@ _HOMES = {
     "load_whisker": "vibrissa.io",
     "sensitivity": "vibrissa.mapping",
     "sensitivity_findings": "vibrissa.mapping",
+    "show": "vibrissa.display",
     "uniqueness": "vibrissa.mapping",
     "whisker_array": "vibrissa.whisker",
 }

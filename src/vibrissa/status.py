@@ -216,3 +216,27 @@ def flag_attributes() -> dict[str, NDArray[np.int8] | str]:
         "flag_values": np.array([int(status) for status in Status], dtype=np.int8),
         "flag_meanings": " ".join(status.name.lower() for status in Status),
     }
+
+
+def counted(codes: ArrayLike) -> str:
+    """Count the statuses of many rows, in short.
+
+    Parameters
+    ----------
+    codes : array_like of int, any shape
+        Numbers of :class:`Status`.
+
+    Returns
+    -------
+    str
+        Names and how often they occur, by rising number.
+
+    Examples
+    --------
+    >>> counted([0, 0, 2])
+    'ok 2, no contact 1'
+    """
+    return ", ".join(
+        f"{Status(code).name.lower().replace('_', ' ')} {count}"
+        for code, count in zip(*np.unique(codes, return_counts=True), strict=True)
+    )

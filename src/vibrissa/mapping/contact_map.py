@@ -27,7 +27,8 @@ from vibrissa.rod.discretize import STEPS
 from vibrissa.rod.loads import PointContact
 from vibrissa.rod.preimage import Preimages
 from vibrissa.rod.reach import CELLS, PROXIMAL, Reach, reach, with_normal_force
-from vibrissa.signals import base_signals, concave_backward, selection, within_cone
+from vibrissa.signals import SIGNALS, base_signals, concave_backward, selection, within_cone
+from vibrissa.sketch import CONTACT, REST, Mark, card, shown, symbol, views
 from vibrissa.status import Status, flag_attributes
 from vibrissa.whisker import Whisker
 
@@ -250,6 +251,23 @@ class ContactMap:
         nodes = " × ".join(str(n) for n in self.chart.values.shape[:3])
         grid = "" if self.grid is None else f", paper's grid of {self.grid.status.size} points"
         return f"<ContactMap of {self.whisker!r}: {nodes} nodes{grid}>"
+
+    def _repr_html_(self) -> str:
+        """Show the contact points that the whisker can hold, with the range of each signal."""
+        data = self._samples
+        points = data.contact_point.transpose(..., "space").to_numpy()
+        picture = views(
+            [
+                Mark(points, CONTACT, dots=True, width=1.5),
+                Mark(self.whisker.centerline(41), REST, width=2.5),
+            ]
+        )
+        rows = [("whisker", repr(self.whisker)), ("contacts at nodes", str(data.status.size))]
+        if self.grid is not None:
+            reached = int((self.grid.status == Status.OK).sum())
+            rows.append(("paper's grid", f"{reached} of {self.grid.status.size} points reached"))
+        rows += [(symbol(name), shown(name, data[name])) for name in (*SIGNALS, "r")]
+        return card("ContactMap", rows, picture)
 
 
 def within_paper_bounds(whisker: Whisker, points: Array) -> AnyArray:

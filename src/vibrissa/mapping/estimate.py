@@ -22,10 +22,11 @@ from vibrissa.mapping.approximation import APPROXIMATE, by_approximation
 from vibrissa.mapping.contact_map import spherical
 from vibrissa.mapping.explanation import Explanation, by_least_squares, by_triplet, undetermined
 from vibrissa.mapping.noise import SensorNoise
+from vibrissa.mapping.showing import estimate_card
 from vibrissa.quantities import attributes
 from vibrissa.rod.arrays import AnyArray, Array, IntArray
 from vibrissa.signals import CIRCULAR, SIGNALS, Coordinates, measured, selection, signal_scales
-from vibrissa.status import Status, flag_attributes
+from vibrissa.status import counted, flag_attributes
 
 if TYPE_CHECKING:
     from vibrissa.mapping.contact_map import ContactMap
@@ -167,13 +168,14 @@ class Estimate:
 
     def __repr__(self) -> str:
         """Say how many there are and what became of them."""
-        counts = ", ".join(
-            f"{Status(code).name.lower().replace('_', ' ')} {count}"
-            for code, count in zip(*np.unique(self.status, return_counts=True), strict=True)
-        )
-        return (
-            f"<Estimate of {self.status.shape or 'one'} from ({', '.join(self.triplet)}): {counts}>"
-        )
+        return f"<{self._title()}: {counted(self.status)}>"
+
+    def _repr_html_(self) -> str:
+        """Show the contact points about the base, with the numbers."""
+        return estimate_card(self._title(), self)
+
+    def _title(self) -> str:
+        return f"Estimate of {self.status.shape or 'one'} from ({', '.join(self.triplet)})"
 
 
 def estimate(

@@ -104,6 +104,29 @@ def verdict_table(found: xr.Dataset) -> str:
     str
         A row for each triplet: the critical cone in each region, with the verdict; in short.
     """
+    rows, notes = verdict_rows(found)
+    width = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    lines = [
+        "  ".join(c.ljust(w) for c, w in zip(row, width, strict=True)).rstrip() for row in rows
+    ]
+    return "\n".join([*lines, "", *notes])
+
+
+def verdict_rows(found: xr.Dataset) -> tuple[list[list[str]], list[str]]:
+    """Write verdicts as the cells of a table, with what is to be known to read it.
+
+    Parameters
+    ----------
+    found : Dataset
+        From :func:`vibrissa.uniqueness`.
+
+    Returns
+    -------
+    rows : list of list of str
+        A heading, and a row for each triplet as in :func:`verdict_table`.
+    notes : list of str
+        Sentences.
+    """
     regions = [str(r) for r in found.region.to_numpy()]
     rows = [["triplet", *regions, "in short"]]
     for triplet in found.triplet.to_numpy():
@@ -116,21 +139,15 @@ def verdict_table(found: xr.Dataset) -> str:
                 f"{np.rad2deg(float(cell.critical_cone)):.1f}°" if word == NOT_UNIQUE else mark
             )
         rows.append([*row, str(found.notation.sel(triplet=triplet).item())])
-    width = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    lines = [
-        "  ".join(c.ljust(w) for c, w in zip(row, width, strict=True)).rstrip() for row in rows
-    ]
     chosen, region = found.attrs["chosen_triplet"], found.attrs["chosen_region"]
     use = f"({chosen.replace(' ', ', ')}), unique in: {region}" if chosen else "none is unique"
     cone = np.rad2deg(found.attrs["cone"])
-    lines += [
-        "",
+    return rows, [
         f"An angle: not unique; twins exist that far from rest. *: off {_surface(found)}.",
         f"Contacts within {cone:.3g}° of rest left out; domain: {found.attrs['domain']}; contacts "
         f"nearer than {1e3 * found.attrs['min_separation']:.3g} mm count as one.",
         f"The triplet to use: {use}.",
     ]
-    return "\n".join(lines)
 
 
 def _surface(found: xr.Dataset) -> str:

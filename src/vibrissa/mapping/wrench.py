@@ -26,6 +26,7 @@ from vibrissa.mapping.contact_map import spherical
 from vibrissa.mapping.fitting import Fits, fit
 from vibrissa.mapping.minima import Candidates, candidates, reliable, unknowns_covariance
 from vibrissa.mapping.noise import SensorNoise
+from vibrissa.mapping.showing import estimate_card
 from vibrissa.mapping.whitening import INDISTINCT, explained, rank, trusted, whitening
 from vibrissa.quantities import attributes
 from vibrissa.rod.arrays import AnyArray, Array, IntArray
@@ -33,7 +34,8 @@ from vibrissa.rod.batch import solve_forces
 from vibrissa.rod.discretize import Discretization, discretize
 from vibrissa.rod.wrench import vanishing_moments
 from vibrissa.signals import Coordinates, labelled_wrench
-from vibrissa.status import Status, flag_attributes
+from vibrissa.sketch import shown
+from vibrissa.status import Status, counted, flag_attributes
 
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
@@ -165,11 +167,15 @@ class WrenchEstimate:
 
     def __repr__(self) -> str:
         """Say how many there are and what became of them."""
-        counts = ", ".join(
-            f"{Status(code).name.lower().replace('_', ' ')} {count}"
-            for code, count in zip(*np.unique(self.status, return_counts=True), strict=True)
-        )
-        return f"<WrenchEstimate of {self.status.shape or 'one'}: {counts}>"
+        return f"<{self._title()}: {counted(self.status)}>"
+
+    def _repr_html_(self) -> str:
+        """Show the contact points about the base, with the numbers."""
+        extra = [("friction angle", shown("friction_angle", self.friction_angle))]
+        return estimate_card(self._title(), self, extra)
+
+    def _title(self) -> str:
+        return f"WrenchEstimate of {self.status.shape or 'one'}"
 
 
 def estimate_from_wrench(

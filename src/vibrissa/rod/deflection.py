@@ -15,7 +15,8 @@ from vibrissa.rod.pegs import Pegs, Rest, nearest_side, solve_from_contact, solv
 from vibrissa.rod.points import Solutions, point_solver
 from vibrissa.rod.reach import PROXIMAL
 from vibrissa.rod.shape import shapes
-from vibrissa.status import Status
+from vibrissa.sketch import BENT, CONTACT, MOST_CURVES, REST, Mark, card, shown, thinned, views
+from vibrissa.status import Status, counted
 
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
@@ -75,24 +76,43 @@ class Deflection:
         """
         if n < 2:
             raise ValueError(f"a centreline needs at least 2 points; got n={n}")
+        rows = np.arange(self.status.size)
+        return self._centerlines(rows, n).reshape(*self.status.shape, n, 3)
+
+    def _centerlines(self, rows: IntArray, n: int) -> Array:
+        """Centrelines (rows, n, 3) of some loads, counted without regard to their shape."""
         d = discretize(self.whisker, self.steps)
         values = np.concatenate([self.force / d.force, self.contact_point / d.length], axis=-1)
-        arc = self.arc_length / d.length
-        values, arc = values.reshape(-1, 6), arc.reshape(-1).copy()
-        free = np.flatnonzero(self.status.reshape(-1) == Status.NO_CONTACT)
+        values = values.reshape(-1, 6)[rows]
+        arc = self.arc_length.reshape(-1)[rows] / d.length
+        free = np.flatnonzero(self.status.reshape(-1)[rows] == Status.NO_CONTACT)
         values[free, 3:], arc[free] = 0.0, 0.0
-        places = shapes(d, values, arc, np.linspace(0.0, 1.0, n)) * d.length
-        return places.reshape(*self.status.shape, n, 3)
+        return shapes(d, values, arc, np.linspace(0.0, 1.0, n)) * d.length
 
     def __repr__(self) -> str:
         """Say how many loads there are and what became of them."""
-        counts = ", ".join(
-            f"{Status(code).name.lower().replace('_', ' ')} {count}"
-            for code, count in zip(*np.unique(self.status, return_counts=True), strict=True)
-        )
         return (
-            f"<Deflection of {self.status.shape or 'one'} by {type(self.load).__name__}: {counts}>"
+            f"<Deflection of {self.status.shape or 'one'} by {type(self.load).__name__}: "
+            f"{counted(self.status)}>"
         )
+
+    def _repr_html_(self) -> str:
+        """Show the bent whiskers, the resting one and the contacts, with the numbers."""
+        rest = Mark(self.whisker.centerline(41), REST)
+        bent = self._centerlines(thinned(np.arange(self.status.size), MOST_CURVES), 41)
+        picture = views(
+            [rest, Mark(bent, BENT), Mark(self.contact_point, CONTACT, dots=True, width=4.0)]
+        )
+        size = np.linalg.norm
+        rows = [
+            ("status", counted(self.status)),
+            ("contact, distance from base", shown("r", size(self.contact_point, axis=-1))),
+            ("contact, arc length", shown("arc_length", self.arc_length)),
+            ("force", shown("force", size(self.force, axis=-1))),
+            ("moment", shown("moment", size(self.moment, axis=-1))),
+        ]
+        title = f"Deflection of {self.status.shape or 'one'} by {type(self.load).__name__}"
+        return card(title, rows, picture)
 
 
 def deflect(

@@ -19,6 +19,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
+from vibrissa.quantities import quantity
+from vibrissa.sketch import BENT, Mark, card, shown, views
 from vibrissa.whisker.dataset import whisker_dataset, whisker_fields
 from vibrissa.whisker.digitized import digitize
 from vibrissa.whisker.parabola import parabola_curvature
@@ -548,6 +550,14 @@ class Whisker:
             f"{self.base_radius * 1e6:.1f} µm at the base and {self.tip_radius * 1e6:.1f} µm at "
             f"the tip, {bend}{base}"
         )
+
+    def _repr_html_(self) -> str:
+        """Show its shape, with size and material."""
+        names = ("length", "base_radius", "tip_radius", "youngs_modulus", "poisson_ratio")
+        rows = [(quantity(name).long_name, shown(name, getattr(self, name))) for name in names]
+        rows += [("note", note) for note in self.notes]
+        picture = views([Mark(self.centerline(81), BENT, width=2.0)])
+        return card(f"Whisker {self.name!r}", rows, picture)
 
 
 def _break_faults(breaks: Sequence[float], length: float) -> list[str]:

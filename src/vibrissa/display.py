@@ -1,0 +1,120 @@
+"""What the results that are plain datasets look like in a notebook or a terminal.
+
+Whiskers, deflections, maps and estimates show themselves. Verdicts on triplets and recordings are
+xarray's own types, whose display lists variables; `show` says what they mean.
+"""
+
+from __future__ import annotations
+
+from html import escape
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from vibrissa.io.recording import KIND
+from vibrissa.mapping.summary import verdict_rows, verdict_table
+from vibrissa.sketch import BENT, CONTACT, MOST_CURVES, REST, Mark, card, table, thinned, views
+from vibrissa.trial import recorded_objects
+
+
+class Shown:
+    """Something to look at: HTML in a notebook, text in a terminal.
+
+    Parameters
+    ----------
+    html, text : str
+        The same in both forms.
+    """
+
+    def __init__(self, html: str, text: str) -> None:
+        self.html = html
+        self.text = text
+
+    def _repr_html_(self) -> str:
+        return self.html
+
+    def __repr__(self) -> str:
+        """Show the text."""
+        return self.text
+
+
+def show(result: Any) -> Shown:
+    """Show a result at a glance.
+
+    Parameters
+    ----------
+    result : Dataset or DataTree or other
+        Verdicts of :func:`vibrissa.uniqueness`; a recording; or anything that shows itself in a
+        notebook, such as a `Whisker`.
+
+    Returns
+    -------
+    Shown
+        A small picture and a table with units; in a terminal, the table.
+
+    Raises
+    ------
+    ValueError
+        If it is none of these.
+    """
+    if isinstance(result, xr.Dataset) and "verdict" in result and "critical_cone" in result:
+        rows, notes = verdict_rows(result)
+        told = "".join(f"{escape(note)}<br>" for note in notes)
+        return Shown(
+            f"<div>{table(rows[1:], rows[0])}<small>{told}</small></div>", verdict_table(result)
+        )
+    if isinstance(result, xr.DataTree) and result.attrs.get("kind") == KIND:
+        facts = _facts(result)
+        width = max(len(name) for name, _ in facts)
+        text = "\n".join(f"{name:{width}}  {value}" for name, value in facts)
+        return Shown(card("Recording", facts, _picture(result)), text)
+    if hasattr(result, "_repr_html_") and not isinstance(result, xr.Dataset | xr.DataTree):
+        return Shown(result._repr_html_(), repr(result))
+    raise ValueError(
+        f"got {type(result).__name__}; verdicts of uniqueness, a recording, or a result of "
+        "vibrissa is needed"
+    )
+
+
+def _facts(recording: xr.DataTree) -> list[tuple[str, str]]:
+    """What a recording is of, in words."""
+    root = recording.to_dataset()
+    time = root["time"].values
+    facts = [("origin", str(recording.attrs.get("origin", "not told")))]
+    if time.size > 1:
+        rate = 1.0 / float(np.median(np.diff(time)))
+        facts.append(("time", f"{time.size} frames, {np.ptp(time):.4g} s, {rate:.6g} a second"))
+    else:
+        facts.append(("time", f"{time.size} frames"))
+    if "whisker" in root.sizes:
+        names = [str(name) for name in root["whisker"].values] if "whisker" in root.coords else []
+        told = f": {', '.join(names[:8])}{', …' if len(names) > 8 else ''}" if names else ""
+        facts.append(("whiskers", f"{root.sizes['whisker']}{told}"))
+    if "in_contact" in root:
+        share = 100.0 * float(root["in_contact"].mean())
+        facts.append(("in contact", f"{share:.3g} % of the frames"))
+    facts += [("object", repr(thing)) for thing in recorded_objects(recording)]
+    if "cameras" in recording.children:
+        facts.append(("cameras", str(recording["cameras"].to_dataset().sizes.get("view", 0))))
+    return [*facts, ("groups", ", ".join(sorted(recording.children)))]
+
+
+def _picture(recording: xr.DataTree) -> str:
+    """The whisker now and then, where its base was, and the contact points, laboratory frame."""
+    marks = []
+    sources = [recording.to_dataset()]
+    if "truth" in recording.children:
+        sources.append(recording["truth"].to_dataset())
+    for name, colour, dots in (
+        ("centerline", BENT, False),
+        ("base_position", REST, True),
+        ("contact_point", CONTACT, True),
+    ):
+        found = next((data[name] for data in sources if name in data), None)
+        if found is None:
+            continue
+        values = found.transpose("time", ..., "space").values
+        values = values if dots else thinned(values, MOST_CURVES)
+        marks.append(Mark(values, colour, dots, 3.0 if dots else 0.7))
+    return views(marks) if marks else ""

@@ -1,0 +1,75 @@
+"""How estimates show themselves in a notebook."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+
+from vibrissa.rod.arrays import Array, IntArray
+from vibrissa.sketch import CONTACT, REST, Mark, card, shown, views
+from vibrissa.status import counted
+
+
+class _Found(Protocol):
+    """What estimates from some signals and from force and moment whole have in common."""
+
+    @property
+    def point(self) -> Array:
+        """Contact points (..., 3), m."""
+
+    @property
+    def spherical(self) -> Array:
+        """The same as (r, θ, φ)."""
+
+    @property
+    def covariance(self) -> Array:
+        """Their covariances (..., 3, 3), m²."""
+
+    @property
+    def candidates(self) -> Array:
+        """All candidates (..., k, 3), m."""
+
+    @property
+    def n_candidates(self) -> IntArray:
+        """How many."""
+
+    @property
+    def status(self) -> IntArray:
+        """A status each."""
+
+
+def estimate_card(title: str, found: _Found, rows: Sequence[tuple[str, str]] = ()) -> str:
+    """Lay out contact points about the base, with the numbers.
+
+    Parameters
+    ----------
+    title : str
+        What it is.
+    found : Estimate or WrenchEstimate
+        What was found.
+    rows : sequence of (str, str)
+        What is to be said besides.
+
+    Returns
+    -------
+    str
+        HTML.
+    """
+    marks = [
+        Mark(np.zeros((1, 3)), REST, dots=True, width=7.0),
+        Mark(found.candidates, REST, dots=True, width=3.0),
+        Mark(found.point, CONTACT, dots=True, width=4.0),
+    ]
+    r, theta, phi = np.moveaxis(found.spherical, -1, 0)
+    sigma = np.sqrt(np.einsum("...ii->...i", found.covariance).max(axis=-1))
+    numbers = [
+        ("status", counted(found.status)),
+        ("r", shown("r", r)),
+        ("θ", shown("theta", theta)),
+        ("φ", shown("phi", phi)),
+        ("largest standard deviation of x, y, z", shown("r", sigma)),
+        ("candidates", shown("candidates", found.n_candidates)),
+    ]
+    return card(title, [*numbers, *rows], views(marks))

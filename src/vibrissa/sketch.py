@@ -1,0 +1,243 @@
+"""How results show themselves in a notebook: a small picture and a table with units.
+
+The picture is a few lines of SVG, so that showing a value never loads a plotting library: the
+whisker's x–y and x–z planes at one scale, with a bar of round length. Figures are in
+`vibrissa.plots`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vibrissa.quantities import quantity, to_display
+
+Array = NDArray[np.float64]
+_Kind = TypeVar("_Kind", bound=np.generic)
+
+REST = "#8a8a8a"
+BENT = "#0072b2"
+CONTACT = "#d55e00"
+
+MOST_CURVES = 40
+MOST_POINTS = 800
+
+_PANEL, _MARGIN, _GAP = 260.0, 14.0, 18.0
+_LEAST = 0.25
+"""Height of a panel over its width, at least and (inverse) at most."""
+
+_STYLE = "border-collapse:collapse;font-size:90%"
+_CELL = "text-align:left;padding:1px 10px 1px 0;vertical-align:top"
+
+
+@dataclass(frozen=True)
+class Mark:
+    """Curves or points of one colour.
+
+    Parameters
+    ----------
+    places : array_like (..., n, 3) or (n, 3)
+        m, in any one frame; what is NaN is left out.
+    colour : str
+        As CSS has it.
+    dots : bool
+        Points rather than curves.
+    width : float
+        Of a line, or diameter of a dot, pixels.
+    """
+
+    places: ArrayLike
+    colour: str
+    dots: bool = False
+    width: float = 1.5
+
+
+def views(marks: Sequence[Mark]) -> str:
+    """Draw marks in the x–y and in the x–z plane, at one scale.
+
+    Parameters
+    ----------
+    marks : sequence of Mark
+        From back to front.
+
+    Returns
+    -------
+    str
+        An SVG element; empty if nothing is known of any place.
+    """
+    every = np.concatenate([np.asarray(mark.places, dtype=float).reshape(-1, 3) for mark in marks])
+    every = every[np.isfinite(every).all(axis=1)]
+    if not len(every):
+        return ""
+    low, high = every.min(axis=0), every.max(axis=0)
+    extent = float((high - low).max()) or 1.0
+    scale = (_PANEL - 2.0 * _MARGIN) / extent
+    heights = [max(_LEAST * _PANEL, scale * (high - low)[j] + 2.0 * _MARGIN) for j in (1, 2)]
+    height = max(heights)
+    parts = []
+    for k, j in enumerate((1, 2)):
+        left = k * (_PANEL + _GAP)
+        middle = 0.5 * (low + high)[[0, j]]
+        centre = np.array([left + 0.5 * _PANEL, 0.5 * height])
+        for mark in marks:
+            flat = np.asarray(mark.places, dtype=float)[..., [0, j]]
+            pixels = centre + (flat - middle) * scale * [1.0, -1.0]
+            parts.append(_drawn(mark, pixels))
+        parts.append(_text(left + 2.0, 11.0, f"x–{'xyz'[j]}"))
+    parts.append(_bar(extent, scale, height))
+    width = 2.0 * _PANEL + _GAP
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.0f}" height="{height + 16:.0f}" '
+        f'viewBox="0 0 {width:.0f} {height + 16:.0f}" role="img">{"".join(parts)}</svg>'
+    )
+
+
+def _drawn(mark: Mark, pixels: Array) -> str:
+    """SVG of one mark, places (..., n, 2) in pixels."""
+    if mark.dots:
+        points = pixels.reshape(-1, 2)
+        points = thinned(points[np.isfinite(points).all(axis=1)], MOST_POINTS)
+        # A line of no length with round ends is a dot: one element for all of them.
+        path = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in points)
+        ends = ' stroke-linecap="round"'
+    else:
+        curves = thinned(pixels.reshape(-1, *pixels.shape[-2:]), MOST_CURVES)
+        known = [curve[np.isfinite(curve).all(axis=1)] for curve in curves]
+        path = "".join("M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in c) for c in known if len(c))
+        ends = ""
+    return (
+        f'<path d="{path}" fill="none" stroke="{mark.colour}" stroke-width="{mark.width}"{ends}/>'
+    )
+
+
+def thinned(values: NDArray[_Kind], most: int) -> NDArray[_Kind]:
+    """Take at most so many rows, evenly among all of them.
+
+    Parameters
+    ----------
+    values : array (n, ...)
+        The rows.
+    most : int
+        How many at most.
+
+    Returns
+    -------
+    array
+        The rows taken, first and last among them.
+    """
+    if len(values) <= most:
+        return values
+    rows: NDArray[_Kind] = values[np.linspace(0, len(values) - 1, most).astype(int)]
+    return rows
+
+
+def _bar(extent: float, scale: float, height: float) -> str:
+    """A bar of round length, m, below the left panel."""
+    aim = extent / 3.0
+    power = 10.0 ** np.floor(np.log10(aim))
+    length = max(step * power for step in (1.0, 2.0, 5.0) if step * power <= aim)
+    y, x = height + 6.0, _MARGIN
+    line = f'<path d="M{x} {y}h{length * scale:.1f}" stroke="currentColor" stroke-width="2"/>'
+    return line + _text(x + length * scale + 5.0, y + 4.0, f"{length * 1e3:g} mm")
+
+
+def _text(x: float, y: float, text: str) -> str:
+    return (
+        f'<text x="{x:.1f}" y="{y:.1f}" font-size="11" fill="currentColor" '
+        f'font-family="sans-serif">{escape(text)}</text>'
+    )
+
+
+def card(title: str, rows: Sequence[tuple[str, str]], picture: str = "") -> str:
+    """Lay out a title, a picture and a table of names and values.
+
+    Parameters
+    ----------
+    title : str
+        Plain text.
+    rows : sequence of (str, str)
+        Names and values with their units, plain text.
+    picture : str
+        SVG.
+
+    Returns
+    -------
+    str
+        HTML.
+    """
+    return f"<div><strong>{escape(title)}</strong><br>{picture}{table(rows)}</div>"
+
+
+def table(rows: Sequence[Sequence[str]], heading: Sequence[str] = ()) -> str:
+    """Lay out a table.
+
+    Parameters
+    ----------
+    rows : sequence of sequence of str
+        Plain text.
+    heading : sequence of str
+        Of the columns; none by default.
+
+    Returns
+    -------
+    str
+        HTML.
+    """
+    head = "".join(f'<th style="{_CELL}">{escape(cell)}</th>' for cell in heading)
+    body = "".join(
+        "<tr>" + "".join(f'<td style="{_CELL}">{escape(cell)}</td>' for cell in row) + "</tr>"
+        for row in rows
+    )
+    head = f"<tr>{head}</tr>" if head else ""
+    return f'<table style="{_STYLE}">{head}{body}</table>'
+
+
+def shown(name: str, values: ArrayLike) -> str:
+    """Write a quantity: the one value, or the median and the range of several.
+
+    Parameters
+    ----------
+    name : str
+        A name of `vibrissa.quantities.QUANTITIES`.
+    values : array_like
+        SI units; NaN is left out.
+
+    Returns
+    -------
+    str
+        In the display unit, such as ``12.3 mm`` or ``12.3 mm (4.5 to 20.1)``; a dash if nothing is
+        known.
+    """
+    known = to_display(name, values).reshape(-1)
+    known = known[np.isfinite(known)]
+    if not known.size:
+        return "–"
+    unit = quantity(name).display_unit
+    middle = f"{np.median(known):.4g}{'' if unit in ('', '°') else ' '}{unit}"
+    if known.size > 1 and np.ptp(known) > 0.0:
+        middle += f" ({known.min():.4g} to {known.max():.4g})"
+    return middle.replace("-", "−")
+
+
+def symbol(name: str) -> str:
+    """Write the symbol of a quantity without mathtext.
+
+    Parameters
+    ----------
+    name : str
+        A name of `vibrissa.quantities.QUANTITIES`.
+
+    Returns
+    -------
+    str
+        Such as ``F_x``.
+    """
+    plain = quantity(name).symbol.replace("\\mathrm", "")
+    for command, letter in (("\\theta", "θ"), ("\\phi", "φ"), ("\\varphi", "φ")):
+        plain = plain.replace(command, letter)
+    return plain.replace("{", "").replace("}", "")

@@ -1,0 +1,137 @@
+"""What results look like in a notebook and in a terminal."""
+
+import re
+import xml.etree.ElementTree as ET
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import vibrissa as vb
+from vibrissa.sketch import BENT, CONTACT, MOST_CURVES, MOST_POINTS, Mark, shown, symbol, views
+from vibrissa.trial import facing_peg, measure, simulate, sweep_past
+
+WHISKER = vb.samples.gamma()
+
+
+def paths(html, colour):
+    """The paths of one colour, panel by panel, as lists of curves in pixels."""
+    svg = re.search(r"<svg.*?</svg>", html, re.DOTALL)
+    assert svg is not None
+    elements = ET.fromstring(svg[0])
+    found = [e.get("d") for e in elements if e.tag.endswith("path") and e.get("stroke") == colour]
+    return [
+        [
+            np.array(re.findall(r"-?[\d.]+", part), float).reshape(-1, 2)
+            for part in d.replace("h0", "").split("M")[1:]
+        ]
+        for d in found
+    ]
+
+
+@pytest.fixture(scope="module")
+def bent():
+    heights = np.linspace(-4e-3, 4e-3, 5)
+    return vb.deflect(WHISKER, vb.PointContact([[25e-3, 0.0, z] for z in heights]))
+
+
+def test_a_whisker_is_drawn_true_to_scale():
+    top, front = paths(WHISKER._repr_html_(), BENT)
+    line = WHISKER.centerline(81)
+    for (curve,), axis in ((top, 1), (front, 2)):
+        extent = np.ptp(curve, axis=0)
+        np.testing.assert_allclose(
+            extent[1] / extent[0], np.ptp(line[:, axis]) / np.ptp(line[:, 0]), atol=1e-3
+        )
+    assert top[0][0, 1] > top[0][-1, 1]  # the tip, at +y, is higher up on the page
+
+
+def test_a_whisker_tells_its_size_and_material():
+    html = WHISKER._repr_html_()
+    for text in ("gamma", "40 mm", "100 µm", "6.667 µm", "3 GPa", "0.38"):
+        assert text in html
+
+
+def test_a_deflection_shows_every_shape_and_what_became_of_the_loads(bent):
+    top, _ = paths(bent._repr_html_(), BENT)
+    assert len(top) == 5
+    assert "ok 5" in bent._repr_html_()
+    many = vb.deflect(WHISKER, vb.PointForce(np.full(500, 30e-3), np.linspace(0, 1e-4, 500), 0.0))
+    assert len(paths(many._repr_html_(), BENT)[0]) == MOST_CURVES
+
+
+def test_without_an_answer_nothing_is_drawn_but_the_reason_is_told():
+    lost = vb.deflect(WHISKER, vb.PointContact([[1.0, 0.0, 0.0]]))
+    html = lost._repr_html_()
+    assert "beyond tip 1" in html
+    assert "nan" not in html.lower()
+
+
+def test_a_map_shows_where_contacts_are_and_their_signals():
+    contacts = vb.ContactMap.simulate(WHISKER, grid=False)
+    html = contacts._repr_html_()
+    (top, _front) = paths(html, CONTACT)
+    assert len(top) == MOST_POINTS
+    for name in ("F_x", "F_T", "F_D", "M_x", "M_B", "M_D"):
+        assert name in html
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_estimates_show_points_and_their_uncertainty(bent, whole):
+    noise = np.diag(np.repeat([1e-12, 4e-16], 3))
+    if whole:
+        found = vb.estimate_from_wrench(WHISKER, bent.force, bent.moment, noise=noise)
+    else:
+        contacts = vb.ContactMap.simulate(WHISKER, grid=False)
+        found = contacts.estimate(vb.base_signals(bent.force, bent.moment), noise=noise)
+    html = found._repr_html_()
+    assert len(paths(html, CONTACT)[0]) == 5
+    sigma = np.sqrt(np.einsum("nii->ni", found.covariance).max(axis=1))
+    assert f"{1e3 * np.median(sigma):.4g} mm" in html
+    assert "unique 5" in html
+
+
+def test_a_recording_shows_what_it_holds():
+    peg = facing_peg(WHISKER)
+    motion = sweep_past(WHISKER, peg, duration=0.2, rate=100.0)
+    seen = vb.show(measure(simulate(WHISKER, motion, peg)))
+    assert "20 frames, 0.19 s, 100 a second" in repr(seen)
+    assert "Peg(" in repr(seen)
+    assert "quasi-static" in seen._repr_html_()
+    assert len(paths(seen._repr_html_(), BENT)[0]) > 1
+
+
+def test_verdicts_show_as_a_table():
+    contacts = vb.ContactMap.simulate(vb.Whisker.straight(40e-3), grid=False)
+    found = vb.uniqueness(contacts, triplets=["Fx MB MD"], regions=["all"], samples=256)
+    seen = vb.show(found)
+    assert "<th" in seen._repr_html_()
+    assert "Fx MB MD" in seen._repr_html_()
+    assert "The triplet to use: (Fx, MB, MD)" in repr(seen)
+
+
+def test_what_shows_itself_is_shown_as_it_is():
+    assert vb.show(WHISKER)._repr_html_() == WHISKER._repr_html_()
+    assert repr(vb.show(WHISKER)) == repr(WHISKER)
+
+
+@pytest.mark.parametrize("thing", [3, xr.Dataset({"x": 1})])
+def test_other_things_are_refused(thing):
+    with pytest.raises(ValueError, match=type(thing).__name__):
+        vb.show(thing)
+
+
+def test_names_are_escaped():
+    whisker = vb.Whisker.straight(40e-3, name="<b>&")
+    assert "&lt;b&gt;&amp;" in whisker._repr_html_()
+
+
+def test_numbers_and_symbols():
+    assert shown("r", [1e-3, np.nan, 3e-3]) == "2 mm (1 to 3)"
+    assert shown("theta", -np.pi / 2) == "−90°"
+    assert shown("force", np.nan) == "–"
+    assert [symbol(name) for name in ("Fx", "theta")] == ["F_x", "θ"]
+
+
+def test_nothing_known_gives_no_picture():
+    assert views([Mark(np.full((3, 3), np.nan), BENT)]) == ""

@@ -411,6 +411,20 @@ _ROWS: tuple[tuple[str, str, _Unit, str, str], ...] = (
         "1 where nothing hides it and it is inside the frame, 0 elsewhere.",
     ),
     (
+        "base_position_head",
+        r"\mathbf{o}_\mathrm{b,h}",
+        _MM,
+        "position of the base on the head",
+        "Where the whisker leaves the face, in the head's frame.",
+    ),
+    (
+        "contact_difference",
+        r"|\Delta\mathbf{p}|",
+        _MICROMETRE,
+        "difference of the contact points",
+        "Distance of a contact point that was found otherwise from that of the rod.",
+    ),
+    (
         "head_rotation",
         r"R_\mathrm{h}",
         _NUMBER,

@@ -5,8 +5,17 @@ import pytest
 
 from vibrissa import Whisker
 from vibrissa.cli.app import app
-from vibrissa.io import load_recording, load_traces, save_traces
-from vibrissa.trial import Motion, Peg, film, orthogonal_views, save_cameras, simulate
+from vibrissa.io import load_recording, load_traces, save_centerline, save_traces
+from vibrissa.trial import (
+    Motion,
+    Peg,
+    film,
+    orthogonal_views,
+    recorded_objects,
+    recorded_whisker,
+    save_cameras,
+    simulate,
+)
 
 typer_testing = pytest.importorskip("typer.testing")
 CAMERAS = orthogonal_views(size=(192, 192), center=(4e-3, 0.0, 0.0))
@@ -79,6 +88,34 @@ def test_what_is_traced_is_not_traced_again(videos, tmp_path, monkeypatch):
     assert done.exit_code == 0, done.exception
     assert len(calls) == 20 + (32 - 19)
     assert out.exists()
+
+
+def test_what_is_known_besides_the_videos_is_used(videos, tmp_path):
+    out, head = tmp_path / "trial.nc", tmp_path / "head.csv"
+    names = "frame,x,y,z,azimuth,elevation,roll"
+    head.write_text("\n".join([names, *(f"{i},0.001,0,0,0,0,0" for i in range(16))]))
+    objects = tmp_path / "peg.toml"
+    objects.write_text("[[object]]\nposition = [5.0, 1.3, 0.0]\ndiameter = 1.0\n")
+    whisker = tmp_path / "whisker.csv"
+    save_centerline(whisker, Whisker.parabola(length=8e-3, coefficient=15.0).centerline(60))
+    words = arguments(videos, "--cameras", videos / "cameras.toml", "-o", out)
+    done = run(*words, "--head", head, "--object", objects, "--whisker", whisker)
+    assert done.exit_code == 0, done.exception
+    assert "contact point (nearest to the object)" in done.stdout
+    recording = load_recording(out)
+    place = recording["base_position"].values - recording["base_position_head"].values
+    np.testing.assert_allclose(place[:, 0], np.tile([1e-3, 0.0, 0.0], (16, 1)), atol=1e-12)
+    assert len(recorded_objects(recording)) == 1
+    assert recorded_whisker(recording).length == pytest.approx(8e-3, rel=1e-3)
+    told = run("info", out).stdout
+    assert "contact point (nearest to the object)" in " ".join(told.split())
+    for table, kind in ((head, "the head's pose"), (whisker, "centreline of a whisker")):
+        assert kind in run("info", table).stdout
+    head.write_text(head.read_text().rsplit("\n", 3)[0])
+    done = run(*words, "--head", head)
+    assert "missing for 3 frames of the video, the first of which is 13" in str(done.exception)
+    done = run(*words, "--contact", head, "--object", objects)
+    assert "give one of them" in str(done.exception)
 
 
 @pytest.mark.parametrize(

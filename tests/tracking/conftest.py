@@ -72,3 +72,9 @@ def whisk(whisker, peg, frames=FRAMES):
 def filmed():
     whisker = Whisker.parabola(length=10e-3, coefficient=15.0)
     return Filmed(whisk(whisker, Peg([6e-3, 1.2e-3, 0.0], [0.0, 0.0, 1.0], 0.5e-3)))
+
+
+@pytest.fixture(scope="session")
+def make_filmed():
+    """Film any trial."""
+    return Filmed

@@ -7,8 +7,7 @@ from vibrissa.status import Status
 from vibrissa.tracking import TrackOptions, rest_shape, trace_video, track, whisker_at_rest
 from vibrissa.tracking.banded import Smoother
 from vibrissa.trial import recorded_whisker
-from vibrissa.trial.motion import base_rotation
-from vibrissa.whisker.emergence import angles_of
+from vibrissa.whisker.emergence import angles_of, base_rotation
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
@@ -69,6 +69,8 @@ def _file(path: Path) -> Iterator[tuple[str, str]]:
         yield from _array(path, kind)
     elif kind in (Kind.RECORDING, Kind.NETCDF):
         yield from _groups(path)
+        if kind == Kind.RECORDING:
+            yield from _compared(path)
     elif kind in (Kind.TRACKS, *READERS):
         yield from _tracks(path, kind)
     elif kind == Kind.VIDEO:
@@ -196,17 +198,37 @@ def _groups(path: Path) -> Iterator[tuple[str, str]]:
             group.close()
 
 
+def _compared(path: Path) -> Iterator[tuple[str, str]]:
+    """How contact points that do not come from the rod compare with those that do."""
+    from vibrissa.cli.tracking import compared_contacts
+    from vibrissa.io import load_recording
+
+    recording = load_recording(path)
+    for k, name in enumerate(recording.coords["whisker"].values):
+        for sentence in compared_contacts(recording, k):
+            yield str(name), sentence
+
+
 def _table(path: Path) -> Iterator[tuple[str, str]]:
-    """What a CSV file is: signals, contacts or a centreline."""
+    """What a CSV file is."""
     from collections.abc import Callable
-    from typing import Any
 
-    from vibrissa.io import load_contacts, load_signals, load_whisker
-    from vibrissa.status import describe
+    from vibrissa.io import (
+        load_contact_points,
+        load_contacts,
+        load_corrections,
+        load_head,
+        load_signals,
+        load_whisker,
+    )
 
+    # A centreline comes last: other tables have columns x, y and z too.
     readers: tuple[tuple[str, Callable[[Path], Any]], ...] = (
         ("contacts", load_contacts),
         ("signals", load_signals),
+        ("the head's pose", load_head),
+        ("contact points", load_contact_points),
+        ("corrections", load_corrections),
         ("whisker", load_whisker),
     )
     faults = []
@@ -217,14 +239,27 @@ def _table(path: Path) -> Iterator[tuple[str, str]]:
             faults.append(f"as {kind}: {fault}")
             continue
         yield "kind", f"table of {kind}" if kind != "whisker" else "centreline of a whisker"
-        if kind == "whisker":
-            yield "whisker", repr(data)
-            yield from (("note", note) for note in data.notes)
-            return
+        yield from _rows(kind, data)
+        return
+    raise ValueError(f"{path} is no table that is known. " + " ".join(faults))
+
+
+def _rows(kind: str, data: Any) -> Iterator[tuple[str, str]]:
+    """What a table holds."""
+    from vibrissa.status import describe
+
+    if kind == "whisker":
+        yield "whisker", repr(data)
+        yield from (("note", note) for note in data.notes)
+    elif kind == "corrections":
+        for view, each in data.items():
+            yield f"view {view}", f"{len(each)} corrected traces"
+    elif "frame" in data.dims:
+        first, last = data["frame"].values.min(), data["frame"].values.max()
+        yield "rows", f"{data.sizes['frame']}, from frame {first} to {last}"
+    else:
         time = data["time"].values
         yield "rows", f"{time.size}, from {np.nanmin(time):g} to {np.nanmax(time):g} s"
         if kind == "contacts":
             for sentence, count in describe(data["status"].values).most_common():
                 yield str(count), sentence
-        return
-    raise ValueError(f"{path} is no table that is known. " + " ".join(faults))

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from vibrissa.cli.sources import whisker_from
 from vibrissa.cli.terminal import Tell, numbers, output, progress_bars, shown
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     import xarray as xr
 
@@ -66,7 +67,43 @@ def track(
         str, typer.Option(help="Frames by which the second camera began earlier, or auto.")
     ] = "0",
     cutoff: Annotated[float, typer.Option(help="Low pass of the base's pose, Hz; 0: none.")] = 85.0,
-    base_radius: Annotated[float, typer.Option(help="Of the whisker at its base, µm.")] = 100.0,
+    whisker: Annotated[
+        Path | None,
+        typer.Option(
+            help="The whisker at rest, where it is known: digitised (CSV), or of a recording or "
+            "map (.nc). By default it is taken from the frames without contact.",
+            metavar="FILE",
+        ),
+    ] = None,
+    base_radius: Annotated[
+        float | None,
+        typer.Option(help="Of the whisker at its base, µm; by default 100, or as in --whisker."),
+    ] = None,
+    head: Annotated[
+        Path | None,
+        typer.Option(
+            help="How the head moves: CSV of frame (or time), x, y, z and qw, qx, qy, qz (or a "
+            "matrix, or azimuth, elevation, roll), or a recording.",
+            metavar="FILE",
+        ),
+    ] = None,
+    contact: Annotated[
+        Path | None,
+        typer.Option(
+            help="Contact points tracked otherwise, to compare with: CSV of frame (or time), x, "
+            "y, z, m, or of view, frame, x, y in pixels.",
+            metavar="FILE",
+        ),
+    ] = None,
+    thing: Annotated[
+        Path | None,
+        typer.Option(
+            "--object",
+            help="What stands there: TOML with [[object]] as a trial has, or a recording; the "
+            "contact is also taken where the whisker is nearest to it.",
+            metavar="FILE",
+        ),
+    ] = None,
     width: Annotated[
         float, typer.Option(help="Of the whisker's base in the images, pixels, at least 3.")
     ] = 3.0,
@@ -96,8 +133,9 @@ def track(
     trials = [videos[i : i + count] for i in range(0, len(videos), count)]
     files = [recording]
     if len(trials) > 1:
-        if corrections is not None:
-            raise ValueError("--corrections are for one trial; track it by itself")
+        for name, given in (("corrections", corrections), ("head", head), ("contact", contact)):
+            if given is not None:
+                raise ValueError(f"--{name} is for one trial; track it by itself")
         if not recording.is_dir():
             raise ValueError(f"--output is {recording}; for several trials a folder is needed")
         files = [recording / f"{trial[0].stem}.nc" for trial in trials]
@@ -110,14 +148,22 @@ def track(
     unknown = sorted(view for view in fixed if view >= count)
     if unknown:
         raise ValueError(f"{corrections} corrects view {unknown[0]}; views are counted from 0")
+    properties: dict[str, Any] = (
+        {} if base_radius is None else {"base_radius": base_radius * _MICRO}
+    )
+    known = None if whisker is None else whisker_from(whisker).with_properties(**properties)
     how = TrackOptions(
         cutoff=cutoff or None,
         offset=None if offset == "auto" else int(offset),
-        properties={"base_radius": base_radius * _MICRO},
+        properties=properties,
+        whisker=known,
     )
+    beside = _beside(head, contact, thing)
+    if "head" in beside:
+        _check_head(beside["head"], videos[0], fps)
     trace = TraceOptions(scale=max(width / 3.0, 1.0), jump=jump)
     for trial, file in zip(trials, files, strict=True):
-        _tracked(trial, file, views, fps, places, fixed, trace, how)
+        _tracked(trial, file, views, fps, places, fixed, trace, how, beside)
 
 
 def _tracked(
@@ -129,6 +175,7 @@ def _tracked(
     corrections: Any,
     options: TraceOptions,
     how: TrackOptions,
+    beside: Mapping[str, Any],
 ) -> None:
     """Track one trial and say what was found."""
     from vibrissa.io import save_recording
@@ -139,7 +186,7 @@ def _tracked(
             _traced(path, recording, view, places[view], corrections.get(view, {}), options, tell)
             for view, path in enumerate(videos)
         ]
-        result = tracked(cameras, traces, fps, how, progress=tell)
+        result = tracked(cameras, traces, fps, how, progress=tell, **beside)
     save_recording(recording, result)
     for view in range(len(videos)):
         _partial(recording, view).unlink(missing_ok=True)
@@ -167,6 +214,46 @@ def _cameras(videos: Sequence[Path], path: Path | None, pixel_size: float) -> tu
     if len(set(sizes)) > 1:
         raise ValueError(f"the videos differ in size, {sorted(set(sizes))}: give --cameras")
     return orthogonal_views(pixel_size, sizes[0])
+
+
+def _beside(head: Path | None, contact: Path | None, thing: Path | None) -> dict[str, Any]:
+    """What is known besides the videos."""
+    from vibrissa.io import load_contact_points, load_head, load_recording
+    from vibrissa.io.paths import NETCDF
+    from vibrissa.io.table import read_text
+    from vibrissa.trial import recorded_objects
+    from vibrissa.trial.script import read_objects
+
+    if contact is not None and thing is not None:
+        raise ValueError("--contact and --object both say where the contact is; give one of them")
+    beside: dict[str, Any] = {}
+    if head is not None and head.suffix.lower() in NETCDF:
+        beside["head"] = load_recording(head).to_dataset()
+        if "head_rotation" not in beside["head"]:
+            raise ValueError(f"{head} is a recording that tells of no head")
+    elif head is not None:
+        beside["head"] = load_head(head)
+    if contact is not None:
+        beside["contacts"] = load_contact_points(contact)
+    if thing is not None and thing.suffix.lower() in NETCDF:
+        beside["objects"] = recorded_objects(load_recording(thing))
+        if not beside["objects"]:
+            raise ValueError(f"{thing} is a recording without objects")
+    elif thing is not None:
+        beside["objects"] = read_objects(read_text(thing), thing.parent)
+    return beside
+
+
+def _check_head(head: xr.Dataset, video: Path, fps: float) -> None:
+    """Find out before the work whether the head is known in all frames."""
+    import numpy as np
+
+    from vibrissa.io import video_info
+    from vibrissa.tracking import HeadPose
+
+    frames = video_info(video).frames
+    if frames:
+        HeadPose.of(head, np.arange(frames), fps)
 
 
 def _bases(texts: Sequence[str], views: int) -> list[list[list[float]] | None]:
@@ -248,4 +335,46 @@ def _report(result: xr.DataTree, path: Path) -> None:
                 highlight=False,
                 soft_wrap=True,
             )
+        for line in compared_contacts(result, k):
+            output.print(f"  {line}", highlight=False, soft_wrap=True)
     output.print(f"wrote {path}", highlight=False, soft_wrap=True)
+
+
+def compared_contacts(recording: xr.DataTree, whisker: int) -> Iterator[str]:
+    """Say how contact points found otherwise compare with those of the rod.
+
+    Parameters
+    ----------
+    recording : xarray.DataTree
+        Tracked.
+    whisker : int
+        Which.
+
+    Yields
+    ------
+    str
+        A sentence, if there is anything to compare.
+    """
+    import numpy as np
+
+    measured = recording.children.get("measured")
+    if measured is None or "contact_difference" not in measured:
+        return
+    one = measured.to_dataset().isel(whisker=whisker)
+    away = one["contact_difference"].values
+    of_rod = recording.to_dataset()["arc_length"].isel(whisker=whisker)
+    along = one["arc_length"].values - of_rod.values
+    both = np.isfinite(away) & np.isfinite(along)
+    found = int(np.isfinite(one["contact_point"].values).all(axis=-1).sum())
+    source = one["contact_point"].attrs["source"]
+    if not both.any():
+        yield f"contact point ({source}): in {found} frames, in none of them has the rod one"
+        return
+    half, most = np.percentile(away[both], [50.0, 95.0])
+    yield (
+        f"contact point ({source}): in {found} frames; in {int(both.sum())} the rod has one too, "
+        f"{shown('contact_difference', half, 3)} away (median; 95 % within "
+        f"{shown('contact_difference', most, 3)}), "
+        f"{shown('contact_difference', float(np.median(along[both])), 3)} farther out along the "
+        "whisker"
+    )

@@ -3,9 +3,11 @@
 from vibrissa.io.anipose import load_anipose
 from vibrissa.io.array import load_array, save_array
 from vibrissa.io.centerline import load_centerline, load_whisker, save_centerline
+from vibrissa.io.contact_points import load_contact_points
 from vibrissa.io.contacts_table import load_contacts, save_contacts
 from vibrissa.io.corrections import load_corrections
 from vibrissa.io.deeplabcut import load_deeplabcut
+from vibrissa.io.head import load_head
 from vibrissa.io.kinds import Kind, recognise
 from vibrissa.io.load import load_tracks
 from vibrissa.io.matlab import load_matlab
@@ -36,9 +38,11 @@ __all__ = [
     "load_anipose",
     "load_array",
     "load_centerline",
+    "load_contact_points",
     "load_contacts",
     "load_corrections",
     "load_deeplabcut",
+    "load_head",
     "load_matlab",
     "load_measurements",
     "load_movement",

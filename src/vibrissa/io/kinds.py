@@ -8,7 +8,9 @@ from pathlib import Path
 
 import h5py
 
+from vibrissa.io.corrections import COLUMNS as CORRECTIONS
 from vibrissa.io.hdf5 import opened
+from vibrissa.io.head import ANGLES, MATRIX, QUATERNION
 from vibrissa.io.netcdf import kind_of
 from vibrissa.io.pandas_table import pandas_tables
 from vibrissa.io.paths import check_readable
@@ -35,6 +37,8 @@ class Kind(StrEnum):
     NETCDF = "NetCDF file"
     SIGNALS = "table of signals"
     CONTACTS = "table of contacts"
+    HEAD = "table of the head's pose"
+    CORRECTIONS = "table of corrections"
     ARRAY_TABLE = "table of whiskers"
     CENTERLINE = "centreline of a whisker"
     CALIBRATION = "calibration of cameras"
@@ -123,7 +127,12 @@ def _of_text(path: Path) -> Kind:
         return Kind.SIGNALS
     if {"theta", "phi", "status"} <= set(names):
         return Kind.CONTACTS
-    if {"frame", "time"} & plain and ({"x", "y"} <= plain or {"column", "row"} <= plain):
+    if tuple(names) == CORRECTIONS:
+        return Kind.CORRECTIONS
+    moments = {"frame", "time"} & plain
+    if moments and any(set(way) <= set(names) for way in (QUATERNION, MATRIX, ANGLES)):
+        return Kind.HEAD
+    if moments and ({"x", "y"} <= plain or {"column", "row"} <= plain):
         return Kind.TRACKS_TABLE
     if {"name", "coefficient", "length"} <= plain:
         return Kind.ARRAY_TABLE

@@ -3,6 +3,7 @@
 from vibrissa.tracking.filtering import low_pass
 from vibrissa.tracking.find import Found, find_whiskers
 from vibrissa.tracking.follow import Follower, start_at
+from vibrissa.tracking.head import HeadPose
 from vibrissa.tracking.pose import BasePose, base_pose
 from vibrissa.tracking.refine import Refined, RefineOptions, refine
 from vibrissa.tracking.rest import RestShape, rest_shape, whisker_at_rest
@@ -17,6 +18,7 @@ __all__ = [
     "BasePose",
     "Follower",
     "Found",
+    "HeadPose",
     "RefineOptions",
     "Refined",
     "RestShape",

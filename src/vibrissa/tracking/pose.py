@@ -107,7 +107,9 @@ def base_pose(curves: Array, shape: RestShape, whisker: Whisker) -> BasePose:
         angles[:, 2] = np.where(np.isfinite(angles[:, 2]), 0.0, np.nan)
         rotation = base_rotation(*angles.T)
     touching = np.flatnonzero(seen)[~free]
-    if touching.size and free.any():
+    if touching.size and not free.any():
+        angles[seen], position[seen] = _always_bent(shapes, spacing, angles[seen], shape, whisker)
+    elif touching.size:
         local, start = _tangents(shapes, spacing, whisker.length)
         # The fitted tangent differs from the whisker's by what it differs without contact.
         bias = np.median(np.einsum("tji,tj->ti", rotation[seen][free], local[free]), axis=0)
@@ -127,6 +129,24 @@ def base_pose(curves: Array, shape: RestShape, whisker: Whisker) -> BasePose:
         angles = guess
         position[touching] = start[~free] - base_rotation(*angles[touching].T) @ offset
     return BasePose(position, *angles.T)
+
+
+def _always_bent(
+    shapes: Array, spacing: float, angles: Array, shape: RestShape, whisker: Whisker
+) -> tuple[Array, Array]:
+    """Angles (time, 3) and places (time, 3) where no frame is free; the roll stays as it is."""
+    local, start = _tangents(shapes, spacing, whisker.length)
+    # The known shape says by what the fitted tangent and its start differ from the whisker's.
+    unit, begin = _tangents(shape.points[None], spacing, whisker.length)
+    upright = whisker.pose.rotation.T
+    angles = angles.copy()
+    for _ in range(3):
+        turned = base_rotation(*angles.T)
+        direction = local - (turned @ (upright @ unit[0]) - turned[:, :, 0])
+        angles[:, 0] = np.arctan2(direction[:, 1], direction[:, 0])
+        angles[:, 1] = np.arctan2(direction[:, 2], np.hypot(*direction[:, :2].T))
+    turned = base_rotation(*angles.T)
+    return angles, start - turned @ (upright @ (begin[0] - whisker.pose.origin))
 
 
 def _tangents(shapes: Array, spacing: float, length: float) -> tuple[Array, Array]:

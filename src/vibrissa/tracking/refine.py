@@ -20,20 +20,16 @@ from scipy.spatial.transform import Rotation
 
 from vibrissa.rod.batch import solve_forces
 from vibrissa.rod.discretize import Discretization, discretize
-from vibrissa.rod.shape import shapes
 from vibrissa.tracking.banded import Smoother
+from vibrissa.tracking.head import HeadPose
 from vibrissa.tracking.pose import BasePose
+from vibrissa.tracking.rods import UNKNOWNS, State, bent, first_contacts, rods, tangents
 from vibrissa.tracking.sight import Sight
 from vibrissa.trial.cameras import Camera
 from vibrissa.whisker import Whisker
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-
-_SAMPLES = 48
-_STARTS = np.array([0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9])
-_LIMITS = (0.1, 0.995)
-_STEP = 1e-5
 
 
 @dataclass(frozen=True)
@@ -110,20 +106,6 @@ class Refined:
     misfit: Array
 
 
-@dataclass(frozen=True, eq=False)
-class _State:
-    rotation: Array  # (t, 3, 3)
-    position: Array  # (t, 3), units of L
-    contact: Array  # (t, 4): s_c, f_x, f_y, f_z
-
-    def moved(self, step: Array) -> _State:
-        """Change by (t, 10): shift, turn about laboratory axes, contact."""
-        turn = Rotation.from_rotvec(step[:, 3:6]).as_matrix()
-        contact = self.contact + step[:, 6:]
-        contact[:, 0] = np.clip(contact[:, 0], *_LIMITS)
-        return _State(turn @ self.rotation, self.position + step[:, :3], contact)
-
-
 def refine(
     cameras: Sequence[Camera],
     sight: Sight,
@@ -134,6 +116,7 @@ def refine(
     rate: float,
     options: RefineOptions | None = None,
     nodes: int = 65,
+    head: HeadPose | None = None,
 ) -> Refined:
     """Fit the rod to the traces of a whole trial.
 
@@ -146,17 +129,20 @@ def refine(
     whisker : Whisker
         The whisker at rest.
     pose : BasePose
-        How it is held, about.
+        How it is held, about, relative to the head.
     touching : array (time,)
         Frames in contact.
     curves : array (time, node, 3)
-        The whisker in the laboratory, about, m; to start from.
+        The whisker, about, relative to the head, m; to start from.
     rate : float
         Frames per second.
     options : RefineOptions, optional
         How smooth.
     nodes : int
         Points of the fitted centrelines.
+    head : HeadPose, optional
+        The head in these frames, relative to which the base moves smoothly; by default it does not
+        move, and its frame is that of the laboratory.
 
     Returns
     -------
@@ -168,14 +154,16 @@ def refine(
     known = np.isfinite(pose.rotation).all(axis=(1, 2)) & np.isfinite(curves).all(axis=(1, 2))
     frames = np.flatnonzero(known)
     sight, touching = sight.rows(frames), touching[frames]
-    start = _State(
+    head = (head or HeadPose.still(len(curves))).rows(frames)
+    start = State(
         pose.rotation[frames], pose.position[frames] / d.length, np.zeros((len(frames), 4))
     )
     start.contact[:, 0] = 0.5
-    start.contact[touching] = _first_contacts(d, start, curves[frames], touching)
-    problem = _Problem(d, cameras, sight, touching, frames, start, rate, options)
+    start.contact[touching] = first_contacts(d, start, curves[frames], touching)[0]
+    problem = _Problem(d, cameras, sight, touching, frames, start, rate, options, head)
     state, smoother, misfit = problem.solved()
-    return _answer(d, state, smoother.covariances(), touching, misfit, frames, len(curves), nodes)
+    found = _answer(d, state, smoother.covariances(), touching, misfit, nodes)
+    return _whole(_in_laboratory(found, head), frames, len(curves))
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,11 +173,12 @@ class _Problem:
     sight: Sight
     touching: Mask
     frames: NDArray[np.intp]
-    start: _State
+    start: State
     rate: float
     options: RefineOptions
+    head: HeadPose
 
-    def solved(self) -> tuple[_State, Smoother, Array]:
+    def solved(self) -> tuple[State, Smoother, Array]:
         """Gauss–Newton with Levenberg's damping."""
         state, damping = self.start, 1e-3
         smoother, cost, misfit = self._linear(state)
@@ -209,15 +198,17 @@ class _Problem:
                     break
         return state, smoother, misfit
 
-    def _linear(self, state: _State) -> tuple[Smoother, float, Array]:
+    def _linear(self, state: State) -> tuple[Smoother, float, Array]:
         """Normal equations at a state, the cost, and each frame's misfit."""
         points, slopes = bent(self.d, state, self.touching)
+        points = self.head.put_in(points * self.d.length)
+        slopes = np.einsum("tij,tnjk->tnik", self.head.rotation, slopes)
         with_ends = np.concatenate([slopes, slopes[:, [0, -1]]], axis=1)
         hessian = np.zeros((len(points), UNKNOWNS, UNKNOWNS))
         gradient = np.zeros((len(points), UNKNOWNS))
         total, count = np.zeros(len(points)), np.zeros(len(points))
         for view, camera in enumerate(self.cameras):
-            pixels, by_point = camera.project_with_slopes(points * self.d.length)
+            pixels, by_point = camera.project_with_slopes(points)
             rows, misses = self.sight.equations(view, pixels, by_point * self.d.length)
             design = np.einsum("tni,tnij->tnj", rows, with_ends)
             hessian += np.einsum("tni,tnj->tij", design, design)
@@ -229,10 +220,10 @@ class _Problem:
         cost = float(total.sum()) + self._priors(smoother, state)
         return smoother, cost, misfit
 
-    def _priors(self, smoother: Smoother, state: _State) -> float:
+    def _priors(self, smoother: Smoother, state: State) -> float:
         o = self.options
         slower = (1000.0 / self.rate) ** 2
-        # How it turned since the start, in laboratory axes.
+        # How it turned since the start, in the head's axes.
         turn = Rotation.from_matrix(
             state.rotation @ np.swapaxes(self.start.rotation, 1, 2)
         ).as_rotvec()
@@ -262,9 +253,6 @@ class _Problem:
         return cost
 
 
-UNKNOWNS = 10
-"""Of a frame: shift (3), turn (3), s_c, f_x, f_y, f_z."""
-
 _RUBBING = 1e-4
 _REST = np.array([0.5, 0.0, 0.0, 0.0])
 
@@ -275,130 +263,26 @@ def _turning(rotation: Array) -> Array:
     return np.asarray(Rotation.from_matrix(step).as_rotvec())
 
 
-def bent(d: Discretization, state: _State, touching: Mask) -> tuple[Array, Array]:
-    """Points of the bent rods and their derivatives.
-
-    Parameters
-    ----------
-    d : Discretization
-        The whisker.
-    state : _State
-        Pose and contact of every frame.
-    touching : array (time,)
-        Frames in contact.
-
-    Returns
-    -------
-    points : array (time, n, 3)
-        Equally spaced, laboratory frame, units of L.
-    slopes : array (time, n, 3, 10)
-        By shift, turn and contact.
-    """
-    s = np.linspace(0.0, 1.0, _SAMPLES)
-    local = _rods(d, state.contact, s)
-    turned = np.einsum("tij,tnj->tni", state.rotation, local)
-    slopes = np.zeros((*local.shape, UNKNOWNS))
-    slopes[..., :3] = np.eye(3)
-    x, y, z = np.moveaxis(turned, -1, 0)
-    slopes[..., 0, 4], slopes[..., 0, 5] = z, -y
-    slopes[..., 1, 3], slopes[..., 1, 5] = -z, x
-    slopes[..., 2, 3], slopes[..., 2, 4] = y, -x
-    rows = np.flatnonzero(touching)
-    for k in range(4):
-        ahead, back = (state.contact[rows].copy() for _ in range(2))
-        step = _STEP if k == 0 else 1e-4
-        ahead[:, k] += step
-        back[:, k] -= step
-        change = (_rods(d, ahead, s) - _rods(d, back, s)) / (2.0 * step)
-        slopes[rows, :, :, 6 + k] = np.einsum("tij,tnj->tni", state.rotation[rows], change)
-    return turned + state.position[:, None], slopes
-
-
-def _rods(d: Discretization, contact: Array, s: Array) -> Array:
-    """Places (t, n, 3) of rods with contacts (t, 4), whisker frame, units of L."""
-    values, _ = solve_forces(d, contact)
-    return shapes(d, values, np.ascontiguousarray(contact[:, 0]), s)
-
-
-def _tangents(d: Discretization, contact: Array) -> Array:
-    """Derivatives (t, 6, 4) of base force and contact point by the contact."""
-    columns = []
-    for k in range(4):
-        step = np.zeros(4)
-        step[k] = _STEP if k == 0 else 1e-4
-        ahead, back = (solve_forces(d, contact + sign * step)[0] for sign in (1.0, -1.0))
-        columns.append((ahead - back) / (2.0 * step[k]))
-    return np.stack(columns, axis=-1)
-
-
-def _first_contacts(d: Discretization, state: _State, curves: Array, touching: Mask) -> Array:
-    """Contacts (n, 4) of the touching frames that make the rod look most like the curves."""
-    rows = np.flatnonzero(touching)
-    if not rows.size:
-        return np.empty((0, 4))
-    s = np.linspace(0.0, 0.95, 25)
-    target = _at_lengths(curves[rows], s * d.length) / d.length
-    away = target - state.position[rows, None]
-    wanted = np.einsum("tji,tnj->tni", state.rotation[rows], away).reshape(len(rows), -1)
-    known = np.isfinite(wanted)
-    wanted = np.where(known, wanted, 0.0)
-    best, least = np.zeros((len(rows), 4)), np.full(len(rows), np.inf)
-    for place in _STARTS:
-        contact = np.zeros((len(rows), 4))
-        contact[:, 0] = place
-        for _ in range(5):
-            now = _rods(d, contact, s).reshape(len(rows), -1) * known
-            columns = []
-            for k in (2, 3):
-                ahead = contact.copy()
-                ahead[:, k] += 1e-4
-                columns.append((_rods(d, ahead, s).reshape(len(rows), -1) * known - now) / 1e-4)
-            design = np.stack(columns, axis=-1)
-            square = np.swapaxes(design, 1, 2) @ design
-            right = (np.swapaxes(design, 1, 2) @ (wanted - now)[..., None])[..., 0]
-            step = np.linalg.solve(square + 1e-9 * np.eye(2), right[..., None])[..., 0]
-            size = np.linalg.norm(step, axis=1, keepdims=True)
-            limit = 2.0 / place**2
-            contact[:, 2:] += step * np.minimum(1.0, limit / np.maximum(size, 1e-12))
-        missed = _rods(d, contact, s).reshape(len(rows), -1) * known - wanted
-        cost = (missed**2).sum(axis=1)
-        better = cost < least
-        best[better], least[better] = contact[better], cost[better]
-    return best
-
-
-def _at_lengths(curves: Array, s: Array) -> Array:
-    """Points (t, n, 3) of curves at arc lengths (n,), m; NaN beyond their ends."""
-    out = np.empty((len(curves), len(s), 3))
-    for i, curve in enumerate(curves):
-        at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
-        for k in range(3):
-            out[i, :, k] = np.interp(s, at, curve[:, k], right=np.nan)
-    return out
-
-
 def _answer(
     d: Discretization,
-    state: _State,
+    state: State,
     covariance: Array,
     touching: Mask,
     misfit: Array,
-    frames: NDArray[np.intp],
-    count: int,
     nodes: int,
 ) -> Refined:
-    """Results in SI units, all frames."""
+    """Results in SI units, relative to the head."""
     values, _ = solve_forces(d, state.contact)
-    tangents = _tangents(d, state.contact)
-    n = len(frames)
+    slope = tangents(d, state.contact)
+    n = len(touching)
     force, point = values[:, :3], values[:, 3:]
     wrench = np.concatenate([force * d.force, np.cross(point, force) * d.moment], axis=1)
     by_contact = np.concatenate(
         [
-            tangents[:, :3] * d.force,
+            slope[:, :3] * d.force,
             np.stack(
                 [
-                    np.cross(tangents[:, 3:, k], force) + np.cross(point, tangents[:, :3, k])
+                    np.cross(slope[:, 3:, k], force) + np.cross(point, slope[:, :3, k])
                     for k in range(4)
                 ],
                 axis=-1,
@@ -414,12 +298,12 @@ def _answer(
     slopes[:, 0, 4], slopes[:, 0, 5] = z, -y
     slopes[:, 1, 3], slopes[:, 1, 5] = -z, x
     slopes[:, 2, 3], slopes[:, 2, 4] = y, -x
-    slopes[:, :, 6:] = state.rotation @ tangents[:, 3:]
+    slopes[:, :, 6:] = state.rotation @ slope[:, 3:]
     inside = covariance[:, 6:, 6:]
-    line = _rods(d, state.contact, np.linspace(0.0, 1.0, nodes))
+    line = rods(d, state.contact, np.linspace(0.0, 1.0, nodes))
     line = np.einsum("tij,tnj->tni", state.rotation, line) + state.position[:, None]
     none = np.where(touching, 1.0, np.nan)
-    found = Refined(
+    return Refined(
         rotation=state.rotation,
         position=state.position * d.length,
         arc_length=state.contact[:, 0] * d.length * none,
@@ -438,9 +322,26 @@ def _answer(
         centerline=line * d.length,
         misfit=misfit,
     )
+
+
+def _in_laboratory(found: Refined, head: HeadPose) -> Refined:
+    """Take poses and points from the head's frame to the laboratory's."""
+    turn = head.rotation
+    return replace(
+        found,
+        rotation=turn @ found.rotation,
+        position=head.put_in(found.position),
+        contact_point=head.put_in(found.contact_point),
+        contact_covariance=turn @ found.contact_covariance @ np.swapaxes(turn, 1, 2),
+        centerline=head.put_in(found.centerline),
+    )
+
+
+def _whole(found: Refined, frames: NDArray[np.intp], count: int) -> Refined:
+    """Put the frames in their places among all."""
     whole = {}
     for name, values in vars(found).items():
         out = np.full((count, *values.shape[1:]), np.nan)
         out[frames] = values
         whole[name] = out
-    return replace(found, **whole)
+    return Refined(**whole)

@@ -24,6 +24,8 @@ _LEAST = 0.4
 """Share of that which must be seen to say whether the whisker is bent."""
 
 _NEAR = 4.0
+_LONGER = 1.1
+_STILL = 0.01
 _SMOOTH = 4.0
 _ROUNDS = 4
 
@@ -106,6 +108,57 @@ def rest_shape(curves: Array, least: float = 0.1) -> RestShape:
     out[seen] = np.where(np.isfinite(deviation), deviation, np.nan)
     with np.errstate(invalid="ignore"):
         free = out < max(_NEAR * noise, 1e-9)
+    return RestShape(points, free, out, noise)
+
+
+def known_rest(curves: Array, whisker: Whisker, least: float = 0.1) -> RestShape:
+    """Find the frames in which a known whisker is at rest.
+
+    Parameters
+    ----------
+    curves : array (time, node, 3)
+        The whisker in every frame, equally spaced from base to tip, m; NaN where it is missing.
+    whisker : Whisker
+        At rest; it begins where the curves begin.
+    least : float
+        Share of the frames that are free of contact, if any is.
+
+    Returns
+    -------
+    RestShape
+        The known points. No frame is free if even those that come nearest to the whisker at rest
+        are a hundredth of its length away from it.
+
+    Raises
+    ------
+    ValueError
+        If the whisker is seen in less than three frames, or is shorter than it is seen.
+    """
+    seen = np.isfinite(curves).all(axis=(1, 2))
+    if seen.sum() < 3:
+        raise ValueError(f"the whisker is seen in {int(seen.sum())} frames; 3 are needed at least")
+    spacing, shapes = aligned_lengths(curves[seen])
+    shown = spacing * (curves.shape[1] - 1)
+    if shown > _LONGER * whisker.length:
+        raise ValueError(
+            f"the whisker is seen over {shown * 1e3:.1f} mm, but the known one is "
+            f"{whisker.length * 1e3:.1f} mm long: it is another, or the scale is wrong"
+        )
+    s = np.arange(int(whisker.length / spacing) + 1) * spacing
+    points = whisker.pose.to_source(whisker.position(np.minimum(s, whisker.length)))
+    compared = int(_COMMON * (curves.shape[1] - 1)) + 1
+    known = np.isfinite(shapes[:, :, 0]).sum(axis=1)
+    out = np.full(len(curves), np.nan)
+    for row, shape, count in zip(np.flatnonzero(seen), shapes, known, strict=True):
+        n = min(int(count), len(points), compared)
+        if n >= _LEAST * compared:
+            out[row] = _deviations(shape[None, :n], points[:n])[0]
+    lowest = np.sort(out[np.isfinite(out)])
+    noise = float(np.median(lowest[: max(3, round(least * len(lowest)))]))
+    free = np.zeros(len(curves), dtype=bool)
+    if noise < _STILL * whisker.length:
+        with np.errstate(invalid="ignore"):
+            free = out < _NEAR * noise
     return RestShape(points, free, out, noise)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -11,21 +11,21 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from vibrissa.io.recording import KIND
-from vibrissa.quantities import attributes
-from vibrissa.status import Status
+from vibrissa.rod.surface import Surface
+from vibrissa.tracking.contact import Contacts, contacts_at, given_contacts
+from vibrissa.tracking.dataset import tracked_recording
 from vibrissa.tracking.filtering import CUTOFF
+from vibrissa.tracking.head import HeadPose
 from vibrissa.tracking.pose import BasePose, base_pose
 from vibrissa.tracking.refine import Refined, RefineOptions, refine
-from vibrissa.tracking.rest import RestShape, rest_shape, whisker_at_rest
+from vibrissa.tracking.rest import RestShape, known_rest, rest_shape, whisker_at_rest
+from vibrissa.tracking.roll import rolled
 from vibrissa.tracking.sight import Sight
 from vibrissa.tracking.space import merge
 from vibrissa.tracking.timing import paired_frames
 from vibrissa.tracking.trace import Trace
-from vibrissa.trial.cameras import Camera, cameras_dataset
-from vibrissa.trial.recording import recorded
+from vibrissa.trial.cameras import Camera
 from vibrissa.whisker import Whisker
-from vibrissa.whisker.emergence import angles_of
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -33,7 +33,7 @@ Mask = NDArray[np.bool_]
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, and how much of how much is."""
 
-IMAGE = ("time", "whisker", "view", "node", "image_axis")
+_ANY_ROLL = np.radians(10.0)
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,9 @@ class TrackOptions:
         Of the fit of the rod.
     properties : mapping
         Radius and material of the whisker; see `vibrissa.Whisker`.
+    whisker : Whisker, optional
+        The whisker at rest, where it is known: its base is where it leaves the face. By default it
+        is taken from the frames that are free of contact.
     """
 
     cutoff: float | None = CUTOFF
@@ -59,6 +62,7 @@ class TrackOptions:
     free: float = 0.1
     refine: RefineOptions = field(default_factory=RefineOptions)
     properties: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+    whisker: Whisker | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,11 +82,15 @@ class Tracked:
     shape : RestShape
         What it was taken from.
     pose : BasePose
-        How it is held, filtered, the paper's way.
+        How it is held relative to the head, filtered, the paper's way.
     touching : array (time,)
         Frames in contact.
     refined : Refined
         The rod that fits the traces.
+    head : HeadPose
+        The head in these frames.
+    contacts : Contacts, optional
+        Contact points that do not come from the rod.
     """
 
     whisker: Whisker
@@ -93,6 +101,8 @@ class Tracked:
     pose: BasePose
     touching: Mask
     refined: Refined
+    head: HeadPose
+    contacts: Contacts | None = None
 
 
 def track(
@@ -102,6 +112,9 @@ def track(
     options: TrackOptions | None = None,
     *,
     names: Sequence[str] | None = None,
+    head: xr.Dataset | None = None,
+    contacts: xr.Dataset | None = None,
+    objects: Sequence[Surface] = (),
     progress: Progress | None = None,
 ) -> xr.DataTree:
     """Make a recording of the traces of one or more whiskers.
@@ -118,6 +131,14 @@ def track(
         How.
     names : sequence of str, optional
         Of the whiskers.
+    head : xarray.Dataset, optional
+        How the head moves; see `vibrissa.io.load_head`. The motion of the base is then smoothed,
+        filtered and given as angles relative to the head.
+    contacts : xarray.Dataset, optional
+        Contact points that were tracked otherwise; see `vibrissa.io.load_contact_points`.
+    objects : sequence of Surface, optional
+        What stands there, laboratory frame. Without ``contacts``, the point of the whisker nearest
+        to any of them is where the contact is.
     progress : callable, optional
         Called as ``progress(stage, done, total)``.
 
@@ -126,7 +147,8 @@ def track(
     xarray.DataTree
         A recording. Its base pose, contact and wrench are those of the rod that fits the traces;
         the group ``measured`` holds what was measured before: the whisker merged from the views
-        with its uncertainty, and the pose the paper's way.
+        with its uncertainty, the pose the paper's way, and the contact points of ``contacts`` or
+        ``objects`` beside those of the rod.
 
     Raises
     ------
@@ -143,12 +165,19 @@ def track(
     if not (np.isfinite(rate) and rate > 0.0):
         raise ValueError(f"rate is {rate!r}; it must be positive, in frames per second")
     pairs = paired_frames(cameras, [view[0] for view in traces], options.offset)
+    moving = None if head is None else HeadPose.of(head, pairs[:, 0], rate)
     found = []
     for k in range(counts.pop()):
         rows = [[view[k][i] for i in pairs[:, v]] for v, view in enumerate(traces)]
         name = names[k] if names is not None else f"whisker {k}"
-        found.append(track_whisker(cameras, rows, rate, options, name, progress))
-    return tracked_recording(cameras, found, pairs, rate)
+        one = track_whisker(cameras, rows, rate, options, name, progress, moving)
+        other = None
+        if contacts is not None:
+            other = given_contacts(contacts, cameras, pairs, rate, k, one.refined)
+        elif objects:
+            other = contacts_at(objects, one.curves, one.touching, one.refined)
+        found.append(replace(one, contacts=other))
+    return tracked_recording(cameras, found, pairs, rate, moving, objects)
 
 
 def track_whisker(
@@ -158,6 +187,7 @@ def track_whisker(
     options: TrackOptions,
     name: str = "whisker",
     progress: Progress | None = None,
+    head: HeadPose | None = None,
 ) -> Tracked:
     """Track one whisker in space.
 
@@ -175,6 +205,8 @@ def track_whisker(
         Of the whisker.
     progress : callable, optional
         Called as ``progress(stage, done, total)``.
+    head : HeadPose, optional
+        The head in these frames; by default it does not move.
 
     Returns
     -------
@@ -193,133 +225,34 @@ def track_whisker(
         tell(f"{name} in space", i + 1, count)
     points = np.array([curve.points for curve in curves])
     tell(f"contact of {name}", 0, 2)
-    shape = rest_shape(points, options.free)
-    whisker = whisker_at_rest(shape, name, **options.properties)
-    pose = base_pose(points, shape, whisker).filtered(rate, options.cutoff)
+    head = head or HeadPose.still(count)
+    on_head = head.seen_from(points)
+    shape, whisker = _at_rest(on_head, options, name)
+    pose = base_pose(on_head, shape, whisker).filtered(rate, options.cutoff)
     tell(f"contact of {name}", 1, 2)
     known = np.isfinite(points).all(axis=(1, 2))
     touching = known & ~shape.free
     sight = Sight.of(traces)
+    how = options.refine
+    if not shape.free.any():
+        # Nothing but the bent shapes shows how the whisker is rolled.
+        pose = rolled(pose, on_head, whisker)
+        how = replace(how, roll=max(how.roll, _ANY_ROLL))
     refined = refine(
-        cameras, sight, whisker, pose, touching, points, rate, options.refine, points.shape[1]
+        cameras, sight, whisker, pose, touching, on_head, rate, how, points.shape[1], head
     )
     tell(f"contact of {name}", 2, 2)
     covariance = np.array([curve.covariance for curve in curves])
-    return Tracked(whisker, sight, points, covariance, shape, pose, touching, refined)
+    return Tracked(whisker, sight, points, covariance, shape, pose, touching, refined, head)
 
 
-def tracked_recording(
-    cameras: Sequence[Camera], found: Sequence[Tracked], pairs: NDArray[np.int64], rate: float
-) -> xr.DataTree:
-    """Write tracked whiskers as a recording.
-
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        The views.
-    found : sequence of Tracked
-        The whiskers.
-    pairs : array (time, view)
-        Frame numbers.
-    rate : float
-        Frames per second.
-
-    Returns
-    -------
-    xarray.DataTree
-        See `track`.
-    """
-    coordinates = {
-        "time": xr.Variable("time", pairs[:, 0] / rate, attributes("time")),
-        "whisker": [one.whisker.name for one in found],
-        "view": [camera.name for camera in cameras],
-        "space": list("xyz"),
-        "whisker_axis": list("xyz"),
-        "image_axis": ["column", "row"],
-    }
-    root = xr.concat([_variables(one) for one in found], "whisker").assign_coords(coordinates)
-    frame = {"units": "1", "long_name": "frame of each video"}
-    root = root.assign(frame=xr.Variable(("time", "view"), pairs, frame))
-    root.attrs = {"kind": KIND, "origin": "tracked in video"}
-    measured = xr.concat([_measured(one) for one in found], "whisker")
-    groups = {
-        "/": root,
-        "/measured": measured,
-        "/cameras": cameras_dataset(cameras).drop_vars("view"),
-    }
-    for k, one in enumerate(found):
-        groups[f"/whiskers/{k}"] = one.whisker.to_dataset().drop_dims("node")
-    return xr.DataTree.from_dict(groups)
-
-
-def _variables(one: Tracked) -> xr.Dataset:
-    """What is known of one whisker, dim whisker of length 1."""
-    r = one.refined
-    angles = angles_of(r.rotation)
-    status = np.full(len(r.misfit), int(Status.MISSING), dtype=np.int8)
-    fitted = np.isfinite(r.misfit)
-    status[fitted] = int(Status.NO_CONTACT)
-    status[fitted & one.touching] = int(Status.OK)
-    confidence = np.where(fitted, one.sight.confidence.min(axis=1), 0.0)
-    values = {
-        "base_position": r.position,
-        "base_rotation": r.rotation,
-        "base_azimuth": angles[:, 0],
-        "base_elevation": angles[:, 1],
-        "base_roll": angles[:, 2],
-        "centerline": r.centerline,
-        "contact_point": r.contact_point,
-        "contact_point_whisker": r.contact_point_whisker,
-        "arc_length": r.arc_length,
-        "force": r.force,
-        "moment": r.moment,
-        "in_contact": one.touching,
-        "confidence": confidence,
-        "status": status,
-    }
-    data = {name: recorded(name, array) for name, array in values.items()}
-    spread = ("time", "whisker", "space", "space_")
-    data["contact_covariance"] = xr.Variable(
-        spread, r.contact_covariance[:, None], attributes("contact_covariance")
-    )
-    data["wrench_covariance"] = xr.Variable(
-        ("time", "whisker", "component", "component_"),
-        r.wrench_covariance[:, None],
-        attributes("wrench_covariance"),
-    )
-    data["trace_misfit"] = xr.Variable(
-        ("time", "whisker"), r.misfit[:, None], attributes("trace_misfit")
-    )
-    data["trace"] = xr.Variable(IMAGE, one.sight.line[:, None], attributes("trace"))
-    for name, array in (
-        ("trace_sigma", one.sight.sigma),
-        ("trace_visible", one.sight.seen),
-        ("trace_confidence", one.sight.confidence),
-    ):
-        dims = IMAGE[: array.ndim + 1]
-        data[name] = xr.Variable(dims, array[:, None], attributes(name))
-    return xr.Dataset(data)
-
-
-def _measured(one: Tracked) -> xr.Dataset:
-    """What was measured before the rod was fitted."""
-    values = {
-        "centerline": one.curves,
-        "base_position": one.pose.position,
-        "base_rotation": one.pose.rotation,
-        "base_azimuth": one.pose.azimuth,
-        "base_elevation": one.pose.elevation,
-        "base_roll": one.pose.roll,
-    }
-    data = {name: recorded(name, array) for name, array in values.items()}
-    sigma = np.sqrt(np.einsum("tnii->tni", one.covariance))
-    about = attributes("centerline_sigma")
-    dims = ("time", "whisker", "node", "space")
-    data["centerline_sigma"] = xr.Variable(dims, sigma[:, None], about)
-    data["deviation"] = xr.Variable(
-        ("time", "whisker"), one.shape.deviation[:, None], attributes("deviation")
-    )
-    return xr.Dataset(data)
+def _at_rest(curves: Array, options: TrackOptions, name: str) -> tuple[RestShape, Whisker]:
+    """Take the rest shape from the frames, or as it is known."""
+    if options.whisker is not None:
+        whisker = options.whisker.with_properties(name=name)
+        return known_rest(curves, whisker, options.free), whisker
+    shape = rest_shape(curves, options.free)
+    return shape, whisker_at_rest(shape, name, **options.properties)
 
 
 def _silent(stage: str, done: int, total: int) -> None:

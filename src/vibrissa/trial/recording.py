@@ -36,6 +36,7 @@ Array = NDArray[np.float64]
 
 _FRAMES = {
     "base_position": "laboratory",
+    "base_position_head": "head",
     "centerline": "laboratory",
     "contact_point": "laboratory",
     "contact_point_whisker": "whisker",
@@ -48,6 +49,7 @@ _FRAMES = {
 }
 _DIMS: Mapping[str, tuple[str, ...]] = {
     "base_position": ("time", "whisker", "space"),
+    "base_position_head": ("time", "whisker", "space"),
     "base_rotation": ("time", "whisker", "space", "whisker_axis"),
     "base_azimuth": ("time", "whisker"),
     "base_elevation": ("time", "whisker"),
@@ -68,6 +70,7 @@ _DIMS: Mapping[str, tuple[str, ...]] = {
     "sliding": ("time", "whisker"),
     "overlap": ("time", "whisker"),
     "second_contact": ("time", "whisker"),
+    "contact_difference": ("time", "whisker"),
 }
 _OF_HEAD: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {"head_position": ("time", "space"), "head_rotation": ("time", "space", "head_axis")}
@@ -133,7 +136,8 @@ def trial_recording(
     }
     wrench = {name: truth[name] for name in ("force", "moment")}
     root = xr.Dataset(
-        {name: recorded(name, values) for name, values in (pose | wrench).items()} | _head(motion),
+        {name: recorded(name, values) for name, values in (pose | wrench).items()}
+        | head_variables(motion.head_position, motion.head_rotation),
         _coordinates(motion.time, [whisker.name]),
         {"kind": KIND, "origin": origin},
     )
@@ -150,9 +154,22 @@ def trial_recording(
     return xr.DataTree.from_dict(groups)
 
 
-def _head(motion: Motion) -> dict[str, xr.Variable]:
-    """How the head moves, if it does."""
-    values = {"head_position": motion.head_position, "head_rotation": motion.head_rotation}
+def head_variables(position: Array | None, rotation: Array | None) -> dict[str, xr.Variable]:
+    """Label how the head moves, if it does.
+
+    Parameters
+    ----------
+    position : array (time, 3), optional
+        Origin of the head's in the laboratory frame, m.
+    rotation : array (time, 3, 3), optional
+        From the head's to the laboratory frame.
+
+    Returns
+    -------
+    dict of str to xarray.Variable
+        ``head_position`` and ``head_rotation``, those that are given.
+    """
+    values = {"head_position": position, "head_rotation": rotation}
     return {
         name: xr.Variable(
             _OF_HEAD[name],

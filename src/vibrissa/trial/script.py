@@ -157,10 +157,7 @@ def read_script(
     ValueError
         If it is no TOML, has unknown keys, or says what cannot be.
     """
-    try:
-        said: dict[str, Any] = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"the trial is no TOML: {error}") from None
+    said = _parsed(text)
     given = {name: value for name, value in changes.items() if value is not None}
     said |= {k: given[k] for k in ("duration", "rate", "friction", "seed") if k in given}
     _only(said, _TOP, "the trial")
@@ -190,6 +187,39 @@ def read_script(
         seed=seed,
         dynamics=_dynamics(said, given.get("dynamic") is True),
     )
+
+
+def read_objects(text: str, folder: Path) -> tuple[Surface, ...]:
+    """Read the objects of a trial, and nothing else of it.
+
+    Parameters
+    ----------
+    text : str
+        TOML with ``[[object]]``.
+    folder : Path
+        Where files that it names are.
+
+    Returns
+    -------
+    tuple
+        Laboratory frame.
+
+    Raises
+    ------
+    ValueError
+        If it is no TOML, has no object, or an object says what cannot be.
+    """
+    things = _parsed(text).get("object", [])
+    if not isinstance(things, list) or not things:
+        raise ValueError("there is no object; one is written as [[object]], in double brackets")
+    return tuple(_object(thing, folder) for thing in things)
+
+
+def _parsed(text: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"the trial is no TOML: {error}") from None
 
 
 def _dynamics(said: Mapping[str, Any], wanted: bool) -> Dynamics | None:

@@ -1,0 +1,179 @@
+"""Contact points that do not come from the rod: seen by a person, or nearest to a known object.
+
+They are compared with the contact points of the fitted rod, which knows nothing of them: where both
+agree, each is right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from vibrissa.rod.surface import Surface
+from vibrissa.tracking.refine import Refined
+from vibrissa.trial.cameras import Camera, triangulate
+
+Array = NDArray[np.float64]
+
+_NEAR = 0.5
+"""How near to a frame's time a row of a table must be to tell of it, frames."""
+
+
+class Contacts(NamedTuple):
+    """Contact points of one whisker.
+
+    Parameters
+    ----------
+    points : array (time, 3)
+        Laboratory frame, m; NaN where there is none.
+    arc_length : array (time,)
+        Of the place of the fitted rod that is nearest to them, m.
+    difference : array (time,)
+        Their distance from the contact point of the rod, m.
+    source : str
+        Where they come from.
+    """
+
+    points: Array
+    arc_length: Array
+    difference: Array
+    source: str
+
+
+def contacts_at(
+    objects: Sequence[Surface], curves: Array, touching: NDArray[np.bool_], rod: Refined
+) -> Contacts:
+    """Take the point of the whisker that is nearest to an object for the contact point.
+
+    Parameters
+    ----------
+    objects : sequence of Surface
+        Laboratory frame.
+    curves : array (time, node, 3)
+        The whisker as it was measured, laboratory frame, m; NaN where it is missing.
+    touching : array (time,)
+        Frames in contact.
+    rod : Refined
+        To compare with.
+
+    Returns
+    -------
+    Contacts
+        In frames in contact.
+    """
+    points = np.full((len(curves), 3), np.nan)
+    rows = np.flatnonzero(touching & np.isfinite(curves).all(axis=(1, 2)))
+    if rows.size:
+        distance = np.min([thing.signed_distance(curves[rows]) for thing in objects], axis=0)
+        points[rows] = _at(curves[rows], _lowest(distance))
+    return _compared(points, rod, "nearest to the object")
+
+
+def given_contacts(
+    table: xr.Dataset,
+    cameras: Sequence[Camera],
+    pairs: NDArray[np.int64],
+    rate: float,
+    whisker: int,
+    rod: Refined,
+) -> Contacts:
+    """Take contact points from a table.
+
+    Parameters
+    ----------
+    table : xarray.Dataset
+        Of `vibrissa.io.load_contact_points`: points in the laboratory, or in the views.
+    cameras : sequence of Camera
+        The views.
+    pairs : array (time, view)
+        Frames of the videos that belong together.
+    rate : float
+        Frames per second.
+    whisker : int
+        Which.
+    rod : Refined
+        To compare with.
+
+    Returns
+    -------
+    Contacts
+        In frames of which the table tells.
+
+    Raises
+    ------
+    ValueError
+        If the table tells of other whiskers or views than there are, or of no frame of the videos.
+    """
+    points = np.full((len(pairs), 3), np.nan)
+    number = table["whisker"].values
+    if not np.isin(whisker, number):
+        return _compared(points, rod, "table")
+    one = table.isel(whisker=int(np.flatnonzero(number == whisker)[0]))
+    if "contact_pixel" in one:
+        views = one["view"].values
+        if views.max() >= len(cameras):
+            raise ValueError(f"contact points are given in view {views.max()}, counted from 0")
+        pixels = np.full((len(cameras), len(pairs), 2), np.nan)
+        for column, view in enumerate(views):
+            rows, known = _rows(one["frame"].values, pairs[:, view], 0.0)
+            pixels[view, rows] = one["contact_pixel"].values[known, column]
+        seen = np.isfinite(pixels).all(axis=(0, 2))
+        if seen.any():
+            points[seen] = triangulate(cameras, pixels[:, seen])[0]
+    elif "time" in one.dims:
+        rows, known = _rows(one["time"].values * rate, pairs[:, 0].astype(float), _NEAR)
+        points[rows] = one["contact_point"].values[known]
+    else:
+        rows, known = _rows(one["frame"].values, pairs[:, 0], 0.0)
+        points[rows] = one["contact_point"].values[known]
+    if not np.isfinite(points).any():
+        raise ValueError("the table of contact points tells of no frame of the videos")
+    return _compared(points, rod, "table")
+
+
+def _rows(
+    known: NDArray[np.generic], wanted: NDArray[np.generic], within: float
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Places of wanted moments that are known, and of what is known of them."""
+    order = np.argsort(known, kind="stable")
+    sorted_ = np.asarray(known, dtype=np.float64)[order]
+    target = np.asarray(wanted, dtype=np.float64)
+    right = np.clip(np.searchsorted(sorted_, target), 0, len(sorted_) - 1)
+    left = np.maximum(right - 1, 0)
+    nearer = np.abs(sorted_[left] - target) < np.abs(sorted_[right] - target)
+    at = np.where(nearer, left, right)
+    rows = np.flatnonzero(np.abs(sorted_[at] - target) <= within)
+    return rows, order[at[rows]]
+
+
+def _lowest(distance: Array) -> Array:
+    """Place (t,) of the least of rows (t, n), between the samples by a parabola."""
+    n = distance.shape[1]
+    row = np.arange(len(distance))
+    k = np.clip(np.argmin(distance, axis=1), 1, n - 2)
+    a, b, c = distance[row, k - 1], distance[row, k], distance[row, k + 1]
+    bend = a - 2.0 * b + c
+    shift = np.where(bend > 0.0, 0.5 * (a - c) / np.where(bend > 0.0, bend, 1.0), 0.0)
+    return np.asarray(np.clip(k + np.clip(shift, -1.0, 1.0), 0.0, n - 1.0))
+
+
+def _at(curves: Array, place: Array) -> Array:
+    """Points (t, 3) of curves (t, n, 3) at places between their nodes."""
+    row = np.arange(len(curves))
+    low = np.minimum(place.astype(int), curves.shape[1] - 2)
+    share = (place - low)[:, None]
+    return np.asarray((1.0 - share) * curves[row, low] + share * curves[row, low + 1])
+
+
+def _compared(points: Array, rod: Refined, source: str) -> Contacts:
+    away = np.linalg.norm(rod.centerline - points[:, None], axis=2)
+    known = np.isfinite(away).all(axis=1)
+    arc = np.full(len(points), np.nan)
+    steps = np.linalg.norm(np.diff(rod.centerline[known], axis=1), axis=2)
+    arc[known] = _lowest(away[known] ** 2) * steps.mean(axis=1)
+    difference = np.linalg.norm(points - rod.contact_point, axis=1)
+    return Contacts(points, arc, difference, source)

@@ -1,0 +1,170 @@
+"""What is known besides the videos: the head, the whisker, the contact."""
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy.spatial.transform import Rotation
+
+from vibrissa import Whisker
+from vibrissa.tracking import HeadPose, TrackOptions, trace_video, track
+from vibrissa.trial import Motion, Peg, recorded_objects, recorded_whisker, simulate
+
+FRAMES = 30
+RATE = 1000.0
+
+
+@pytest.fixture(scope="module")
+def nodding(make_filmed):
+    """A whisk past a peg by a head that turns to and fro, fast."""
+    t = np.arange(FRAMES) / RATE
+    azimuth = np.linspace(-0.10, 0.7, FRAMES)
+    motion = Motion(t, azimuth, 0.05 + 0.2 * azimuth, 0.2 * azimuth, np.zeros((FRAMES, 3)))
+    nod = 0.04 * np.sin(2.0 * np.pi * 60.0 * t)
+    turn = Rotation.from_euler("ZY", np.stack([nod, 0.3 * nod], axis=1)).as_matrix()
+    place = np.stack([0.2e-3 * np.sin(2.0 * np.pi * 60.0 * t), 0.02 * t, 0.0 * t], axis=1)
+    whisker = Whisker.parabola(length=10e-3, coefficient=15.0)
+    peg = Peg([6e-3, 1.2e-3, 0.0], [0.0, 0.0, 1.0], 0.5e-3)
+    return make_filmed(simulate(whisker, motion.on_head(turn, place), peg))
+
+
+@pytest.fixture(scope="module")
+def traces(nodding):
+    return [trace_video(frames) for frames in nodding.frames]
+
+
+@pytest.fixture(scope="module")
+def recording(nodding, traces):
+    head = nodding.recording.to_dataset()[["head_position", "head_rotation"]]
+    things = recorded_objects(nodding.recording)
+    return track(nodding.cameras, traces, RATE, head=head, objects=things)
+
+
+def test_the_pose_is_given_relative_to_the_head(nodding, recording):
+    truth = nodding.recording.to_dataset().isel(whisker=0)
+    found = recording.to_dataset().isel(whisker=0)
+    for name in ("base_azimuth", "base_elevation"):
+        assert np.median(np.abs(found[name].values - truth[name].values)) < np.radians(1.0)
+    assert np.median(np.linalg.norm(found["base_position_head"].values, axis=1)) < 80e-6
+    away = found["base_position"].values - truth["base_position"].values
+    assert np.median(np.linalg.norm(away, axis=1)) < 80e-6
+    turned = found["base_rotation"].values[:, :, 0] - truth["base_rotation"].values[:, :, 0]
+    assert np.median(np.linalg.norm(turned, axis=1)) < 0.02
+    np.testing.assert_allclose(
+        found["head_rotation"].values, truth["head_rotation"].values, atol=1e-12
+    )
+    assert found["base_position_head"].attrs["reference_frame"] == "head"
+
+
+def test_what_the_head_does_is_not_taken_for_whisking(nodding, traces, recording):
+    """Filtered relative to the head, the pose keeps the head's fast motion; filtered alone not."""
+    options = TrackOptions(cutoff=40.0)
+    head = nodding.recording.to_dataset()[["head_position", "head_rotation"]]
+    truth = nodding.recording.to_dataset().isel(whisker=0)["base_position"].values
+    errors = []
+    for known in (head, None):
+        measured = track(nodding.cameras, traces, RATE, options, head=known)["measured"]
+        place = measured["base_position"].values[:, 0]
+        errors.append(np.sqrt(((place - truth) ** 2).sum(axis=1).mean()))
+    assert errors[0] < 0.7 * errors[1]
+
+
+def test_the_contact_nearest_to_the_object_agrees(nodding, recording):
+    measured = recording["measured"].to_dataset().isel(whisker=0)
+    found = recording.to_dataset().isel(whisker=0)
+    touching = (found["in_contact"].values > 0) & (nodding.truth["in_contact"].values > 0)
+    away = measured["contact_point"].values - nodding.truth["contact_point"].values
+    assert touching.sum() > 8
+    assert np.median(np.linalg.norm(away[touching], axis=1)) < 250e-6
+    expected = np.linalg.norm(
+        measured["contact_point"].values - found["contact_point"].values, axis=1
+    )
+    np.testing.assert_allclose(measured["contact_difference"].values, expected)
+    assert np.isnan(measured["contact_point"].values[found["in_contact"].values == 0]).all()
+    assert measured["contact_point"].attrs["source"] == "nearest to the object"
+    assert isinstance(recorded_objects(recording)[0], Peg)
+
+
+def test_contact_points_of_a_table_are_compared(nodding, traces, recording):
+    """Truth as a table, in space by time and in pixels by frame, comes out as it went in."""
+    true = nodding.truth["contact_point"].values
+    rows = np.flatnonzero(np.isfinite(true).all(axis=1))
+    by_time = xr.Dataset(
+        {"contact_point": (("time", "whisker", "space"), true[rows][:, None])},
+        {"time": rows / RATE + 0.2e-3, "whisker": [0]},
+    )
+    pixels = np.stack([camera.project(true[rows]) for camera in nodding.cameras], axis=1)
+    by_view = xr.Dataset(
+        {"contact_pixel": (("frame", "whisker", "view", "image_axis"), pixels[:, None])},
+        {"frame": rows, "whisker": [0], "view": [0, 1]},
+    )
+    for table in (by_time, by_view):
+        tracked = track(nodding.cameras, traces, RATE, contacts=table)
+        measured = tracked["measured"].to_dataset().isel(whisker=0)
+        np.testing.assert_allclose(measured["contact_point"].values, true, atol=1e-9)
+        both = np.isfinite(measured["contact_difference"].values)
+        arc = nodding.truth["arc_length"].values
+        assert np.abs(measured["arc_length"].values - arc)[both].max() < 300e-6
+    late = by_time.assign_coords(time=by_time["time"] + 1.0)
+    with pytest.raises(ValueError, match="no frame of the videos"):
+        track(nodding.cameras, traces, RATE, contacts=late)
+
+
+def test_a_known_whisker_needs_no_free_frames(filmed):
+    """All frames in contact: without the whisker's shape nothing says that it is bent."""
+    whisker = recorded_whisker(filmed.recording)
+    touching = np.flatnonzero(filmed.truth["in_contact"].values > 0)
+    # After the first touch, so that no frame is nearly free.
+    rows = touching[len(touching) // 2 :]
+    cut = [[view[i] for i in rows] for view in filmed.frames]
+    traces = [trace_video(frames) for frames in cut]
+    known = track(filmed.cameras, traces, RATE, TrackOptions(whisker=whisker)).to_dataset()
+    known = known.isel(whisker=0)
+    assert (known["in_contact"].values > 0).all()
+    away = known["contact_point"].values - filmed.truth["contact_point"].values[rows]
+    assert np.median(np.linalg.norm(away, axis=1)) < 150e-6
+    for name in ("force", "moment"):
+        true = filmed.truth[name].values[rows]
+        error = np.linalg.norm(known[name].values - true, axis=1) / np.linalg.norm(true, axis=1)
+        assert np.median(error) < 0.1
+    assert recorded_whisker(
+        track(filmed.cameras, traces, RATE, TrackOptions(whisker=whisker))
+    ).length == pytest.approx(whisker.length)
+
+
+def test_a_known_whisker_tells_contact_from_none(filmed):
+    whisker = recorded_whisker(filmed.recording)
+    traces = [trace_video(frames) for frames in filmed.frames]
+    found = track(filmed.cameras, traces, RATE, TrackOptions(whisker=whisker)).to_dataset()
+    truly = filmed.truth["in_contact"].values > 0
+    assert (truly == (found["in_contact"].values[:, 0] > 0)).mean() > 0.9
+    with pytest.raises(ValueError, match="another, or the scale is wrong"):
+        track(filmed.cameras, traces, RATE, TrackOptions(whisker=Whisker.straight(length=5e-3)))
+
+
+def head_table(dim, values, turns=None):
+    n = len(values)
+    turns = np.broadcast_to(np.eye(3), (n, 3, 3)) if turns is None else turns
+    return xr.Dataset(
+        {
+            "head_position": ((dim, "space"), np.outer(values, [1.0, 0.0, 0.0])),
+            "head_rotation": ((dim, "space", "head_axis"), turns),
+        },
+        {dim: values},
+    )
+
+
+def test_a_head_is_found_in_every_frame():
+    turns = Rotation.from_euler("Z", [[0.0], [0.2], [0.6]]).as_matrix()
+    table = head_table("time", np.array([0.0, 2e-3, 6e-3]), turns)
+    head = HeadPose.of(table, np.arange(7), RATE)
+    np.testing.assert_allclose(head.position[:, 0], np.arange(7) * 1e-3, atol=1e-15)
+    angle = np.arctan2(head.rotation[:, 1, 0], head.rotation[:, 0, 0])
+    np.testing.assert_allclose(angle, 0.1 * np.arange(7), atol=1e-12)
+    points = np.random.default_rng(0).normal(size=(7, 4, 3))
+    np.testing.assert_allclose(head.put_in(head.seen_from(points)), points, atol=1e-12)
+    with pytest.raises(ValueError, match=r"from 0 to 0\.006 s in 3 rows; the video lasts"):
+        HeadPose.of(table, np.arange(9), RATE)
+    rows = head_table("frame", np.array([0, 1, 2, 4, 5]))
+    np.testing.assert_array_equal(HeadPose.of(rows, np.array([1, 4]), RATE).position[:, 0], [1, 4])
+    with pytest.raises(ValueError, match="missing for 1 frames of the video, the first"):
+        HeadPose.of(rows, np.arange(6), RATE)

@@ -311,6 +311,13 @@ _ROWS: tuple[tuple[str, str, _Unit, str, str], ...] = (
         "Distance of the estimated from the true contact point.",
     ),
     (
+        "separation",
+        r"d_\mathrm{c}",
+        _MM,
+        "distance of the farthest candidate",
+        "From a contact to the farthest one that feels the same.",
+    ),
+    (
         "misfit",
         r"\chi",
         _NUMBER,

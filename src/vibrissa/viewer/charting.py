@@ -10,10 +10,9 @@ import xarray as xr
 from vibrissa.mapping import ContactMap
 from vibrissa.plots.chart import column, fine_chart
 from vibrissa.quantities import to_display
-from vibrissa.viewer.drawing import CLOUD, Array, Body, Cloud
+from vibrissa.viewer.drawing import CLOUD, Array, Body, Bytes, Cloud
 from vibrissa.whisker import Whisker
 
-_CELLS = (20, 48, 8)
 _SKIN = (36, 72, 12)
 _POINT = 0.008
 """Width of a point of the cloud, over L."""
@@ -51,9 +50,11 @@ def charted(whisker: Whisker, contacts: ContactMap | None = None) -> Chart:
     """Sample all stable contacts of a whisker; its map is made unless it is given."""
     contacts = contacts or ContactMap.simulate(whisker, grid=False)
     samples, line = contacts.to_dataset(), whisker.centerline()
-    nodes = fine_chart(samples, line, shape=_CELLS)
+    # As fine as the map itself, so that every contact is one of its own, exactly.
+    cells = [samples.sizes[dim] - 1 for dim in ("station", "bearing", "load")]
+    nodes = fine_chart(samples, line, shape=(cells[0], cells[1], cells[2]))
     # The last bearing is the first again, and no load is no contact.
-    rows = nodes[:, :-1, 1:].reshape(-1, nodes.shape[-1])
+    rows = nodes[:, :-1, 2::2].reshape(-1, nodes.shape[-1])
     return Chart(contacts, samples, line, rows[rows[:, column("deflection")] > 0.0])
 
 
@@ -76,7 +77,6 @@ def envelope(chart: Chart) -> Body:
     return Body(to_display("contact_point", sheet.reshape(-1, 3)), faces, CLOUD, 0.35, "back")
 
 
-def coloured_cloud(chart: Chart, points: Array, colours: Array) -> Cloud:
-    """The reachable space in the colours (n, 3), 0 to 1, of its points."""
-    size = float(to_display("length", _POINT * chart.whisker.length))
-    return Cloud(points, np.asarray(255.0 * colours, dtype=np.uint8), size)
+def coloured_cloud(chart: Chart, points: Array, colours: Bytes) -> Cloud:
+    """Contacts (n, 3), mm, in their colours (n, 3)."""
+    return Cloud(points, colours, float(to_display("length", _POINT * chart.whisker.length)))

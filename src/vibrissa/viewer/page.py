@@ -15,7 +15,7 @@ import viser
 
 from vibrissa.mapping import ContactMap
 from vibrissa.quantities import to_display
-from vibrissa.viewer.bending import Bend, begin, moved, with_whisker
+from vibrissa.viewer.bending import Bend, begin, loaded, moved, with_whisker
 from vibrissa.viewer.charting import Chart, charted
 from vibrissa.viewer.drawing import Array
 from vibrissa.viewer.grip import Grip
@@ -63,7 +63,7 @@ class Page:
         self.server = server
         self.stage = Stage(server)
         self.work = Latest(self._fault)
-        self._slow_work = Latest(self._fault)
+        self.slow_work = Latest(self._fault)
         self.original = whisker
         self._contacts = contacts
         self.chart: Chart | None = None
@@ -116,11 +116,15 @@ class Page:
             chart = charted(whisker, own)
             self.work.put("chart", lambda: ready(chart))
 
-        self._slow_work.put("chart", job)
+        self.slow_work.put("chart", job)
 
     def settle(self, timeout: float = 60.0) -> bool:
         """Wait, s, until nothing is left to do; tell whether that came true."""
-        return self.work.wait(timeout) and self._slow_work.wait(timeout) and self.work.wait(timeout)
+        return self.work.wait(timeout) and self.slow_work.wait(timeout) and self.work.wait(timeout)
+
+    def bend_by_point(self) -> Bend:
+        """The bend that a point makes where the load now acts."""
+        return loaded(self.bend, "point")
 
     def thicken(self, factor: float) -> None:
         """Draw the whisker so many times as thick as it is."""
@@ -171,7 +175,7 @@ class Page:
 
     def close(self) -> None:
         """End everything."""
-        self._slow_work.close()
+        self.slow_work.close()
         self.work.close()
         self.server.stop()
 

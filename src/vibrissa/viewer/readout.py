@@ -24,7 +24,7 @@ def plain(text: str) -> str:
 def symbol(name: str) -> str:
     """Write the symbol of a quantity: `F_x` as F with an index."""
     text = re.sub(r"\\math(?:rm|bf){(\w+)}", r"\1", quantity(name).symbol)
-    text = re.sub(r"\\(\w+)", lambda found: _GREEK.get(found[1], found[1]), text)
+    text = re.sub(r"\\([a-z]+)", lambda found: _GREEK.get(found[1], found[1]), text)
     return re.sub(r"_(\w)", r"<sub>\1</sub>", text)
 
 

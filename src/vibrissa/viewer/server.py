@@ -15,7 +15,8 @@ from viser import _messages
 
 from vibrissa.quantities import to_display
 from vibrissa.viewer.bend_panel import BendMode
-from vibrissa.viewer.page import Page, look_at
+from vibrissa.viewer.locate_panel import LocateMode
+from vibrissa.viewer.page import Mode, Page, look_at
 from vibrissa.viewer.whisker_panel import WhiskerControls
 from vibrissa.whisker import Whisker
 
@@ -91,7 +92,9 @@ def view(whisker: Whisker, *, host: str = HOST, port: int | None = None) -> View
     """
     server = _served(host, port)
     page = Page(server, whisker)
-    modes = [BendMode(page)]
+    choice = server.gui.add_button_group("Look at", ("Bend", "Locate"))
+    choice.on_click(lambda event: page.choose(event.target.value))
+    modes: list[Mode] = [BendMode(page), LocateMode(page)]
     page.modes = {mode.name: mode for mode in modes}
     WhiskerControls(page)
     length = float(to_display("length", whisker.length))

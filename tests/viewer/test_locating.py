@@ -1,0 +1,83 @@
+"""What three signals tell, as it is shown: all candidates, their shapes, their errors."""
+
+import numpy as np
+import pytest
+
+import vibrissa as vb
+from vibrissa.viewer.bending import begin, moved
+from vibrissa.viewer.charting import charted
+from vibrissa.viewer.locate_drawing import locate_drawing, of_located
+from vibrissa.viewer.locating import COLOURS, Sensor, coloured, located
+from vibrissa.viewer.shading import counted, shaded
+
+
+@pytest.fixture(scope="module")
+def chart():
+    return charted(vb.samples.gamma())
+
+
+@pytest.fixture(scope="module")
+def bend(chart):
+    return moved(begin(chart.whisker), [24e-3, 3e-3, 4e-3])
+
+
+def test_ghosts_feel_the_same(chart, bend):
+    sensor = Sensor(("Fx", "FT", "MB"))
+    found = located(chart, bend, sensor)
+    others = found.others(chart.whisker.length)
+    assert others.size >= 1
+    ghosts = vb.deflect(chart.whisker, vb.PointContact(found.points))
+    signals = vb.base_signals(ghosts.force, ghosts.moment)
+    for name in sensor.triplet:
+        np.testing.assert_allclose(signals[name], float(found.signals[name]), rtol=1e-6)
+    # Each shape passes through its contact.
+    for point, line in zip(found.points, found.lines, strict=True):
+        assert np.linalg.norm(line - point, axis=1).min() < 0.3e-3
+    drawn = locate_drawing(chart.whisker, found, 5.0)
+    assert sum(name.startswith("ghost") for name in drawn) == others.size
+    words = of_located(chart.whisker, found, bend.status)
+    assert vb.Status.AMBIGUOUS.explanation in words
+
+
+def test_a_unique_contact_has_no_ghost_but_an_error(chart, bend):
+    quiet = located(chart, bend, Sensor())
+    drawn = locate_drawing(chart.whisker, quiet, 5.0)
+    assert not any(name.startswith("ghost") for name in drawn)
+    loud = located(chart, bend, Sensor(force_noise=2e-6, moment_noise=4e-8))
+    small, large = (
+        np.ptp(locate_drawing(chart.whisker, found, 5.0)["error 0"].vertices, axis=0)
+        for found in (quiet, loud)
+    )
+    np.testing.assert_allclose(large, 2.0 * small, rtol=1e-9)
+    silent = located(chart, bend, Sensor(force_noise=0.0))
+    assert "error 0" not in locate_drawing(chart.whisker, silent, 5.0)
+
+
+def test_nothing_is_located_where_nothing_touches(chart, bend):
+    far = moved(bend, [10e-3, 30e-3, 0.0])
+    assert located(chart, far, Sensor()) is None
+    assert far.status.explanation in of_located(chart.whisker, None, far.status)
+
+
+@pytest.mark.parametrize("what", COLOURS)
+def test_every_contact_of_the_cloud_has_a_colour(chart, what):
+    colours, legend = coloured(chart, what, Sensor())
+    assert colours.shape == (len(chart.rows), 3)
+    assert len(np.unique(colours, axis=0)) > 1
+    assert "data-legend" in legend.html()
+
+
+def test_unknown_colours_are_refused(chart):
+    with pytest.raises(ValueError, match="colours are one of uniqueness"):
+        coloured(chart, "taste", Sensor())
+
+
+def test_colours_follow_values():
+    colours, _ = shaded("MD", np.array([-np.pi, np.pi]))
+    assert np.abs(colours[0].astype(int) - colours[1]).max() < 6  # once around
+    colours, _ = shaded("Mx", np.array([-1e-7, 0.0, 1e-7]))
+    assert colours[0, 2] > colours[0, 0]
+    assert colours[2, 0] > colours[2, 2]
+    colours, legend = counted(np.array([1, 2, 9]))
+    assert len(np.unique(colours, axis=0)) == 3
+    assert "more" in legend.html()

@@ -4,9 +4,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vibrissa.trial import Camera, calibrate
+from vibrissa.cli.app import app
+from vibrissa.io import load_series, write_video
+from vibrissa.trial import Camera, calibrate, load_cameras, triangulate
 
-pytest.importorskip("cv2")
+cv2 = pytest.importorskip("cv2")
+typer_testing = pytest.importorskip("typer.testing")
 
 SQUARE = 2e-3
 CORNERS = (7, 5)
@@ -79,3 +82,61 @@ def test_too_few_boards_say_so(images):
         calibrate(few, CORNERS, SQUARE)
     with pytest.raises(ValueError, match="as many each"):
         calibrate({"left": images["left"]}, CORNERS, SQUARE)
+
+
+def run(*words):
+    return typer_testing.CliRunner().invoke(app, [str(word) for word in words])
+
+
+@pytest.fixture
+def files(images, tmp_path):
+    for name, series in images.items():
+        for i, image in enumerate(series):
+            cv2.imwrite(str(tmp_path / f"{name}_{i:02d}.png"), image)
+    return tmp_path
+
+
+def test_the_verb_writes_cameras_that_see_the_same_points(files):
+    out = files / "cameras.toml"
+    words = ["calibrate", "--pattern", "7x5", "--square", SQUARE, *sorted(files.glob("*.png"))]
+    done = run(*words, "-o", out)
+    assert done.exit_code == 0, done.exception
+    assert "reprojection error 0.0" in done.stdout
+    cameras = load_cameras(out)
+    # Distances between points that both cameras see do not depend on the laboratory frame.
+    points = np.random.default_rng(0).uniform(-5e-3, 5e-3, (20, 3))
+    seen = triangulate(cameras, np.stack([view.project(points) for view in PAIR]))[0]
+    true, found = (np.linalg.norm(p[:, None] - p[None], axis=2) for p in (points, seen))
+    assert np.abs(found - true).max() < 0.02 * true.max()
+
+
+def test_the_verb_takes_a_video_of_each_camera(images, tmp_path):
+    for name, series in images.items():
+        write_video(tmp_path / f"{name}.mkv", series)
+    videos = [tmp_path / "left.mkv", tmp_path / "right.mkv"]
+    series = load_series(videos, most=4)
+    assert list(series) == ["left", "right"]
+    for name, frames in series.items():
+        np.testing.assert_array_equal(frames, [images[name][i] for i in (0, 3, 6, 9)])
+    out = tmp_path / "cameras.toml"
+    done = run("calibrate", "--pattern", "7x5", "--square", SQUARE, *videos, "-o", out)
+    assert done.exit_code == 0, done.exception
+    assert [camera.name for camera in load_cameras(out)] == ["left", "right"]
+
+
+def test_what_cannot_be_calibrated_says_why(files):
+    def said(*words, pattern="7x5", square=SQUARE):
+        done = run("calibrate", "--pattern", pattern, "--square", square, *words)
+        assert done.exit_code != 0
+        return str(done.exception)
+
+    images = sorted(files.glob("*.png"))
+    out = ("-o", files / "c.toml")
+    assert "in m is needed" in said(*images, *out, square=2.0)
+    assert "as 9x6" in said(*images, *out, pattern="seven")
+    assert "camera right has no image 9" in said(*images[:-1], *out)
+    assert ".toml is needed" in said(*images, "-o", files / "c.csv")
+    (files / "plain.png").write_bytes(images[0].read_bytes())
+    assert "has no number" in said(*images, files / "plain.png", *out)
+    cv2.imwrite(str(files / "left_00.png"), np.zeros((30, 40), np.uint8))
+    assert "differ in size" in said(*images, *out)

@@ -10,7 +10,9 @@ from rich.markup import escape
 
 from vibrissa.cli import (
     bend,
+    calibrating,
     charting,
+    correcting,
     figures,
     information,
     judging,
@@ -42,6 +44,8 @@ app.command("map")(charting.chart)
 app.command("uniqueness")(judging.uniqueness)
 app.command("simulate")(simulating.simulate)
 app.command("track")(tracking.track)
+app.command("correct")(correcting.correct)
+app.command("calibrate")(calibrating.calibrate)
 app.command("sensitivity")(sensing.sensitivity)
 app.command("estimate")(locating.estimate)
 app.command("figures")(figures.figures)

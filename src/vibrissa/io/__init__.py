@@ -5,8 +5,9 @@ from vibrissa.io.array import load_array, save_array
 from vibrissa.io.centerline import load_centerline, load_whisker, save_centerline
 from vibrissa.io.contact_points import load_contact_points
 from vibrissa.io.contacts_table import load_contacts, save_contacts
-from vibrissa.io.corrections import load_corrections
+from vibrissa.io.corrections import load_corrections, save_corrections
 from vibrissa.io.deeplabcut import load_deeplabcut
+from vibrissa.io.frames import FrameReader
 from vibrissa.io.head import load_head
 from vibrissa.io.kinds import Kind, recognise
 from vibrissa.io.load import load_tracks
@@ -17,6 +18,7 @@ from vibrissa.io.nwb import load_nwb
 from vibrissa.io.nwb_writing import Session, save_nwb
 from vibrissa.io.paths import check_folder, check_readable, check_writable
 from vibrissa.io.recording import load_recording, save_recording
+from vibrissa.io.series import load_series
 from vibrissa.io.signals_table import load_signals, save_signals
 from vibrissa.io.sleap import load_sleap
 from vibrissa.io.traces import load_traces, save_traces
@@ -26,6 +28,7 @@ from vibrissa.io.video import VideoInfo, read_video, video_info, write_video
 from vibrissa.io.whisk import load_measurements, load_whiskers
 
 __all__ = [
+    "FrameReader",
     "Kind",
     "Session",
     "VideoInfo",
@@ -48,6 +51,7 @@ __all__ = [
     "load_movement",
     "load_nwb",
     "load_recording",
+    "load_series",
     "load_signals",
     "load_sleap",
     "load_traces",
@@ -60,6 +64,7 @@ __all__ = [
     "save_array",
     "save_centerline",
     "save_contacts",
+    "save_corrections",
     "save_nwb",
     "save_recording",
     "save_signals",

@@ -6,12 +6,14 @@ Columns ``view,frame,whisker,x,y``: the points of a whisker in one frame of one 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from vibrissa.io.replace import replacing
 from vibrissa.io.table import read_text, table_rows
 
 Array = NDArray[np.float64]
@@ -65,3 +67,39 @@ def load_corrections(path: str | PathLike[str]) -> dict[int, dict[tuple[int, int
             "to tip at least two are needed"
         )
     return {view: {key: np.array(p) for key, p in each.items()} for view, each in points.items()}
+
+
+def save_corrections(
+    path: str | PathLike[str], corrections: Mapping[int, Mapping[tuple[int, int], ArrayLike]]
+) -> None:
+    """Write corrected traces so that `load_corrections` reads them.
+
+    Parameters
+    ----------
+    path : str or path
+        CSV file; an existing one is replaced once the new one is complete.
+    corrections : mapping
+        By view: by frame and whisker the points (n, 2) from base to tip, column and row.
+
+    Raises
+    ------
+    ValueError
+        If a trace has less than two points, or one that is not finite.
+    """
+    lines = [",".join(COLUMNS)]
+    for view, each in sorted(corrections.items()):
+        for (frame, whisker), points in sorted(each.items()):
+            array = np.asarray(points, dtype=np.float64)
+            if array.ndim != 2 or array.shape[1:] != (2,) or len(array) < 2:
+                raise ValueError(
+                    f"whisker {whisker} in frame {frame} of view {view}: points of shape "
+                    f"{array.shape}; (n, 2), n ≥ 2, is needed"
+                )
+            if not np.isfinite(array).all():
+                raise ValueError(
+                    f"whisker {whisker} in frame {frame} of view {view} has points that are not "
+                    "finite"
+                )
+            lines += [f"{view},{frame},{whisker},{x!r},{y!r}" for x, y in array.tolist()]
+    with replacing(path) as part:
+        part.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -48,6 +48,10 @@ def calibrate(
     counts = {name: len(series) for name, series in images.items()}
     if len(counts) < 2 or len(set(counts.values())) != 1:
         raise ValueError(f"images of the cameras: {counts}; two cameras, as many each, are needed")
+    for name, series in images.items():
+        sizes = {np.shape(image)[::-1] for image in series}
+        if len(sizes) > 1:
+            raise ValueError(f"images of camera {name} differ in size: {sorted(sizes)}")
     board: Board = np.zeros((corners[0] * corners[1], 3), np.float32)
     board[:, :2] = np.indices(corners).T.reshape(-1, 2) * square
     seen = {

@@ -1,0 +1,75 @@
+"""`vibrissa correct`: a window in which traces are put right."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from vibrissa.cli.terminal import output
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+
+def correct(
+    video: Annotated[Path, typer.Argument(help="The video of one view.", metavar="VIDEO")],
+    corrections: Annotated[
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            help="Corrections to write, CSV; those that it holds already are kept.",
+            metavar="FILE",
+        ),
+    ],
+    trace: Annotated[
+        Path | None,
+        typer.Option(help="Tracked recording whose traces are shown, .nc.", metavar="FILE"),
+    ] = None,
+    view: Annotated[int, typer.Option(help="Which view the video is, from 0.")] = 0,
+) -> None:
+    """Click the right trace of a whisker in some frames, for `vibrissa track --corrections`.
+
+    Click points from base to tip; arrows go to other frames, s saves, q saves and closes; all keys
+    are shown in the window. Example: `vibrissa correct top.mp4 -o corrections.csv --trace trial.nc`
+    """
+    from vibrissa.io import FrameReader, load_corrections, save_corrections, video_info
+    from vibrissa.io.paths import check_writable
+    from vibrissa.plots.correcting import correct as corrected
+
+    if view < 0:
+        raise ValueError(f"--view is {view}; views are counted from 0")
+    check_writable(corrections, (".csv",))
+    all_ = load_corrections(corrections) if corrections.exists() else {}
+    traces = {} if trace is None else _traces(trace, view)
+
+    def save(found: dict[tuple[int, int], NDArray[np.float64]]) -> None:
+        save_corrections(corrections, {**all_, view: found})
+
+    count = video_info(video).frames or 1 << 31
+    found = corrected(FrameReader(video), count, all_.get(view), traces, save)
+    output.print(f"{len(found)} corrected traces of view {view}", highlight=False)
+    output.print(
+        f"use them: vibrissa track … --corrections {corrections}", highlight=False, soft_wrap=True
+    )
+
+
+def _traces(path: Path, view: int) -> dict[tuple[int, int], Any]:
+    """Traces of a recording, by frame of the video and whisker."""
+    from vibrissa.io import load_recording
+
+    data = load_recording(path).to_dataset()
+    if "trace" not in data:
+        raise ValueError(f"{path} is a recording without traces")
+    if view >= data.sizes["view"]:
+        raise ValueError(f"{path} has {data.sizes['view']} views; there is no view {view}")
+    lines = data["trace"].isel(view=view).values
+    numbers = data["frame"].isel(view=view).values if "frame" in data else range(len(lines))
+    return {
+        (int(frame), whisker): line
+        for frame, row in zip(numbers, lines, strict=True)
+        for whisker, line in enumerate(row)
+    }

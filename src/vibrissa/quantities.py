@@ -74,6 +74,7 @@ _GIGAPASCAL = _Unit("Pa", "GPa", 1e-9)
 _STIFFNESS = _Unit("N m^2", "nN·m²", 1e9)
 _JOINT_STIFFNESS = _Unit("N m/rad", "µN·m/rad", 1e6)
 _SPRING = _Unit("N/m", "N/m", 1.0)
+_PARAMETERS = _Unit("(m, 1)^2", "(m, 1)²", 1.0)
 _PIXEL = _Unit("pixel", "px", 1.0)
 _WRENCH_SQUARED = _Unit("(N, N m)^2", "(N, N·m)²", 1.0)
 # The columns of these Jacobians, (s_c, f_y, f_z), differ in unit: it is given column by column.
@@ -522,6 +523,22 @@ _ROWS: tuple[tuple[str, str, _Unit, str, str], ...] = (
         "Axis or outward normal, a unit vector in the laboratory frame.",
     ),
     ("object_radius", "R", _MM, "object's radius", "Of its surface."),
+    (
+        "parameter_covariance",
+        r"\Sigma",
+        _PARAMETERS,
+        "covariance of a fitted shape's parameters",
+        "Of its place, direction and radius.",
+    ),
+    (
+        "surface_distance",
+        r"d",
+        _MICROMETRE,
+        "distance from the surface",
+        "Signed distance of the whisker's surface from the object's at the contact, positive "
+        "outside.",
+    ),
+    ("inlier", r"\mathrm{inlier}", _NUMBER, "whether a contact is no outlier", "1 or 0."),
     ("object_size", r"\mathbf{l}", _MM, "object's edges", "Lengths along its own axes."),
     (
         "object_rotation",

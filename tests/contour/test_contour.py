@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vibrissa.contour import (
@@ -47,6 +47,7 @@ def drawn(generator, covariance):
     return np.einsum("nij,nj->ni", root, generator.normal(size=covariance.shape[:2]))
 
 
+@settings(max_examples=25)
 @given(seed=st.integers(0, 10_000), normals=st.booleans(), known=st.booleans())
 def test_exact_points_give_the_cylinder_back(seed, normals, known):
     generator = np.random.default_rng(seed)

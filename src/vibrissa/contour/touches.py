@@ -1,0 +1,231 @@
+"""Contacts as fits take them: checked, about their mean, in units of their extent."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+FLOOR = 1e-7
+"""Smallest standard deviation, as a share of the points' extent, where their noise is zero."""
+
+_FINE = 1e-12
+"""Variance of the least noisy combination as a share of that of the point or normal, at least."""
+
+_NEGATIVE = 1e-8
+"""How negative an eigenvalue of a covariance may be by rounding, as a share of the largest."""
+
+
+class Touches(NamedTuple):
+    """Contacts in units of their extent, and what is known of them.
+
+    Parameters
+    ----------
+    position : array (n, 3)
+        On the whisker's centreline, about their mean.
+    whisker_radius : array (n,)
+        Of the whisker there.
+    normal : array (n, 3) or None
+        Outward unit normals of the surface.
+    covariance : array (n, 3, 3), (n, 6, 6) or None
+        Of the points, or of points and normals.
+    """
+
+    position: Array
+    whisker_radius: Array
+    normal: Array | None
+    covariance: Array | None
+
+    def rows(self, which: Mask) -> Touches:
+        """Pick some."""
+        normal = None if self.normal is None else self.normal[which]
+        spread = None if self.covariance is None else self.covariance[which]
+        return Touches(self.position[which], self.whisker_radius[which], normal, spread)
+
+    @property
+    def joint(self) -> bool:
+        """Whether the normals' covariance is known too."""
+        return self.covariance is not None and self.covariance.shape[1] == 6
+
+    def weights(self) -> Array:
+        """How much each point counts, (n,), whatever the direction of its error; at most 1."""
+        if self.covariance is None:
+            return np.ones(len(self.position))
+        spread = np.trace(self.covariance[:, :3, :3], axis1=1, axis2=2) + FLOOR**2
+        return np.asarray(spread.min() / spread)
+
+    @property
+    def point_covariance(self) -> Array | None:
+        """Of the points alone, (n, 3, 3)."""
+        return None if self.covariance is None else self.covariance[:, :3, :3]
+
+
+@dataclass(frozen=True, eq=False)
+class Checked:
+    """What of the given contacts can be used.
+
+    Attributes
+    ----------
+    usable : array (m,) of bool
+        Which of the m given ones.
+    touches : Touches
+        Those.
+    mean : array (3,)
+        Of their points, m.
+    extent : float
+        Root mean square distance of their points from the mean, m.
+    """
+
+    usable: Mask
+    touches: Touches
+    mean: Array
+    extent: float
+
+
+def checked(
+    what: str,
+    points: ArrayLike,
+    covariance: ArrayLike | None = None,
+    whisker_radius: ArrayLike | None = None,
+    normals: ArrayLike | None = None,
+    normal_covariance: ArrayLike | None = None,
+    point_normal_covariance: ArrayLike | None = None,
+    *,
+    least: int,
+) -> Checked:
+    """Check contacts and bring them into units of their extent.
+
+    Parameters
+    ----------
+    what : str
+        Is to be fitted, for messages.
+    points : array_like (n, 3)
+        Contact points on the whisker's centreline, m; rows with NaN in anything are left out.
+    covariance : array_like (n, 3, 3), optional
+        Of the points, m².
+    whisker_radius : array_like (n,) or float, optional
+        Of the whisker, m; 0 by default.
+    normals : array_like (n, 3), optional
+        Outward normals, of any length but zero.
+    normal_covariance : array_like (n, 3, 3), optional
+        Of the unit normals.
+    point_normal_covariance : array_like (n, 3, 3), optional
+        Of points (rows) with unit normals (columns), m; none by default.
+    least : int
+        How many contacts are needed.
+
+    Returns
+    -------
+    Checked
+        What can be used.
+
+    Raises
+    ------
+    ValueError
+        If shapes are wrong, a covariance is none, too few contacts are left, or all lie on a line.
+    """
+    n = _number(what, points)
+    given: dict[str, tuple[ArrayLike | None, list[tuple[int, ...]]]] = {
+        "points": (points, [(n, 3)]),
+        "whisker_radius": (0.0 if whisker_radius is None else whisker_radius, [(n,), ()]),
+        "covariance": (covariance, [(n, 3, 3)]),
+        "normals": (normals, [(n, 3)]),
+        "normal_covariance": (normal_covariance, [(n, 3, 3)]),
+        "point_normal_covariance": (point_normal_covariance, [(n, 3, 3)]),
+    }
+    arrays, faults = {}, []
+    for name, (values, shapes) in given.items():
+        if values is None:
+            continue
+        arrays[name] = np.asarray(values, dtype=np.float64)
+        if arrays[name].shape not in shapes:
+            wanted = " or ".join(map(str, shapes))
+            faults.append(f"{name} has shape {arrays[name].shape}; {wanted} is needed")
+    needs = {
+        "normal_covariance": ("normals", "covariance"),
+        "point_normal_covariance": ("normal_covariance",),
+    }
+    for name, others in needs.items():
+        lacking = [other for other in others if other not in arrays]
+        if name in arrays and lacking:
+            faults.append(f"{name} is given without {' and '.join(lacking)}")
+    if faults:
+        raise ValueError(f"no {what}: " + "; ".join(faults))
+    arrays["whisker_radius"] = np.broadcast_to(arrays["whisker_radius"], (n,))
+    return _scaled(what, arrays, n, least)
+
+
+def _number(what: str, points: ArrayLike) -> int:
+    shape = np.shape(points)
+    if len(shape) != 2 or shape[1] != 3:
+        raise ValueError(f"no {what}: points have shape {shape}; (n, 3) is needed")
+    return int(shape[0])
+
+
+def _scaled(what: str, arrays: dict[str, Array], n: int, least: int) -> Checked:
+    usable = np.ones(n, dtype=bool)
+    for values in arrays.values():
+        usable &= np.isfinite(values.reshape(n, -1)).all(axis=1)
+    if "normals" in arrays:
+        length = np.linalg.norm(arrays["normals"], axis=1)
+        usable &= length > 0.0
+    if usable.sum() < least:
+        raise ValueError(f"no {what}: {usable.sum()} usable points; at least {least} are needed")
+    kept = {name: values[usable] for name, values in arrays.items()}
+    mean = kept["points"].mean(axis=0)
+    centered = kept["points"] - mean
+    extent = float(np.sqrt((centered**2).sum(axis=1).mean()))
+    size = np.linalg.svd(centered, compute_uv=False)
+    if not size[1] > FLOOR * size[0]:
+        raise ValueError(f"no {what}: all points lie on a line, or are the same")
+    normal = kept["normals"] / length[usable][:, None] if "normals" in kept else None
+    spread = _covariance(what, kept, np.flatnonzero(usable), extent)
+    touches = Touches(centered / extent, kept["whisker_radius"] / extent, normal, spread)
+    return Checked(usable, touches, mean, extent)
+
+
+def _covariance(
+    what: str, kept: dict[str, Array], rows: NDArray[np.intp], extent: float
+) -> Array | None:
+    """Covariances (n, 3, 3) or (n, 6, 6), in units of the extent; or none."""
+    if "covariance" not in kept:
+        return None
+    out = kept["covariance"] / extent**2
+    if "normal_covariance" in kept:
+        cross = kept.get("point_normal_covariance", np.zeros_like(out)) / extent
+        turned = np.swapaxes(cross, 1, 2)
+        out = np.block([[out, cross], [turned, kept["normal_covariance"]]])
+    least, largest = np.linalg.eigvalsh(out)[:, [0, -1]].T
+    bad = np.flatnonzero(least < -_NEGATIVE * np.abs(largest))
+    if bad.size:
+        raise ValueError(
+            f"no {what}: the covariance of point {rows[bad[0]]} is none, a variance being negative"
+        )
+    return np.asarray(out)
+
+
+def whitened(misses: Array, covariance: Array) -> Array:
+    """Express misses in standard deviations.
+
+    Parameters
+    ----------
+    misses : array (n, m)
+        By how much equations are missed.
+    covariance : array (n, m, m)
+        Of them.
+
+    Returns
+    -------
+    array (n, m)
+        Uncorrelated, of unit variance.
+    """
+    m = misses.shape[1]
+    # Rounding must not make the least noisy combination look exact.
+    floor = FLOOR**2 + _FINE * np.trace(covariance, axis1=1, axis2=2)
+    root = np.linalg.cholesky(covariance + floor[:, None, None] * np.eye(m))
+    return np.asarray(np.linalg.solve(root, misses[..., None])[..., 0])

@@ -1,0 +1,213 @@
+"""Shapes are found again from contacts whose points and normals err together, as they say."""
+
+import numpy as np
+import pytest
+
+from vibrissa.contour import (
+    axis_offset,
+    fit_cylinder,
+    fit_plane,
+    fit_sphere,
+    shape_from_dataset,
+    surface_distances,
+)
+
+CENTER = np.array([25e-3, 1e-3, -2e-3])
+RADIUS = 2e-3
+FITS = {"cylinder": fit_cylinder, "sphere": fit_sphere, "plane": fit_plane}
+
+
+def touched(kind, generator, n):
+    """Contacts on part of a shape about CENTER: points, normals, whisker radii."""
+    whisker = generator.uniform(20e-6, 60e-6, n)
+    if kind == "plane":
+        flat = generator.uniform(-4e-3, 4e-3, (n, 2))
+        normal = np.broadcast_to([0.0, -0.6, 0.8], (n, 3)).copy()
+        inside = flat @ np.array([[1.0, 0.0, 0.0], [0.0, 0.8, 0.6]])
+        return CENTER + inside + whisker[:, None] * normal, normal, whisker
+    azimuth = generator.uniform(-0.8, 0.8, n) + np.where(np.arange(n) % 2, 0.5, -0.5) * np.pi
+    high = generator.uniform(-3e-3, 3e-3, n) if kind == "cylinder" else np.zeros(n)
+    tilt = np.zeros(n) if kind == "cylinder" else generator.uniform(-0.6, 0.6, n)
+    normal = np.stack(
+        [np.cos(tilt) * np.cos(azimuth), np.cos(tilt) * np.sin(azimuth), np.sin(tilt)], axis=1
+    )
+    upward = high[:, None] * np.array([0.0, 0.0, 1.0])
+    return CENTER + upward + (RADIUS + whisker)[:, None] * normal, normal, whisker
+
+
+def joint_errors(generator, normal):
+    """Matrices (n, 6, 3) from three unknowns to the errors of point, m, and of normal.
+
+    As for a whisker: the point errs most along one direction across the normal, and where it does
+    the normal is turned.
+    """
+    n = len(normal)
+    along = np.cross(normal, generator.normal(size=(n, 3)))
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    third = np.cross(normal, along)
+    size = np.exp(generator.uniform(*np.log([5e-5, 4e-4]), n))[:, None]
+    out = np.zeros((n, 6, 3))
+    out[:, :3, 0] = size * (along + 0.2 * normal)
+    out[:, :3, 1] = 4e-5 * normal
+    out[:, :3, 2] = 3e-5 * third
+    out[:, 3:, 0] = 50.0 * size * along
+    out[:, 3:, 1] = 2e-3 * along
+    out[:, 3:, 2] = 6e-3 * third
+    return out
+
+
+def noisy(kind, generator, n):
+    points, normal, whisker = touched(kind, generator, n)
+    errors = joint_errors(generator, normal)
+    drawn = np.einsum("nij,nj->ni", errors, generator.normal(size=(n, 3)))
+    covariance = errors @ np.swapaxes(errors, 1, 2)
+    known = {
+        "covariance": covariance[:, :3, :3],
+        "whisker_radius": whisker,
+        "normals": normal + drawn[:, 3:],
+        "normal_covariance": covariance[:, 3:, 3:],
+        "point_normal_covariance": covariance[:, :3, 3:],
+    }
+    return points + drawn[:, :3], known
+
+
+def scores(kind, fit):
+    """Errors of a fit in standard deviations."""
+    sigma = fit.sigma
+    if kind == "plane":
+        height = (fit.origin - CENTER) @ np.array([0.0, -0.6, 0.8])
+        tilt = fit.normal[:2] - np.array([0.0, -0.6])
+        spread = np.array([0.0, -0.6, 0.8])
+        away = np.sqrt(spread @ fit.covariance[:3, :3] @ spread)
+        return [height / away, *(tilt / [sigma["normal_x"], sigma["normal_y"]])]
+    out = [(fit.radius - RADIUS) / sigma["radius"]]
+    if kind == "cylinder":
+        offset, _ = axis_offset(fit.origin, fit.axis, CENTER, (0.0, 0.0, 1.0))
+        out += list(offset[:2] / [sigma["origin_x"], sigma["origin_y"]])
+        return out + list(fit.axis[:2] / [sigma["axis_x"], sigma["axis_y"]])
+    return out + list((fit.origin - CENTER) / np.sqrt(np.diag(fit.covariance)[:3]))
+
+
+@pytest.mark.parametrize("kind", ["cylinder", "sphere", "plane"])
+def test_no_bias_and_an_honest_spread(kind):
+    """Over thirty draws errors are as large as the covariance says, and have no bias."""
+    found = []
+    for seed in range(30):
+        points, known = noisy(kind, np.random.default_rng(seed), 150)
+        found.append(scores(kind, FITS[kind](points, **known)))
+    z = np.array(found)
+    k = z.shape[1]
+    # The mean of 30 scores has a standard deviation of 0.18, their spread one of 0.13.
+    assert (np.abs(z.mean(axis=0)) < 0.6).all()
+    assert (z.std(axis=0) > 0.65).all()
+    assert (z.std(axis=0) < 1.45).all()
+    # 95 % of 30 k nearly independent scores, within three standard deviations
+    assert abs((np.abs(z) < 1.96).mean() - 0.95) < 3.0 * np.sqrt(0.05 * 0.95 / (30 * k))
+
+
+def test_normals_with_their_covariance_tell_the_axis():
+    for seed in range(3):
+        points, known = noisy("cylinder", np.random.default_rng(seed), 150)
+        exact = {name: known[name] for name in ("covariance", "whisker_radius", "normals")}
+        sigma, coarse = fit_cylinder(points, **known).sigma, fit_cylinder(points, **exact).sigma
+        assert sigma["axis_x"] < 0.7 * coarse["axis_x"]
+        assert sigma["radius"] < coarse["radius"]
+
+
+@pytest.mark.parametrize("kind", ["cylinder", "sphere", "plane"])
+@pytest.mark.parametrize("normals", [False, True])
+def test_exact_contacts_give_the_shape_back(kind, normals):
+    generator = np.random.default_rng(5)
+    points, normal, whisker = touched(kind, generator, 40)
+    given = {"normals": normal} if normals else {}
+    if kind == "plane" and not normals:
+        given["outside"] = CENTER + np.array([0.0, -1e-2, 1e-2])
+    fit = FITS[kind](points, whisker_radius=whisker, **given)
+    np.testing.assert_allclose(fit.signed_distance(points), whisker, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(fit.outward_normals(points), normal, rtol=0, atol=1e-6)
+    assert fit.rms < 1e-10
+    assert fit.inliers.all()
+    assert fit.kind in repr(fit)
+
+
+@pytest.mark.parametrize("kind", ["cylinder", "sphere", "plane"])
+@pytest.mark.parametrize("known", [False, True])
+def test_outliers_do_little_harm(kind, known):
+    generator = np.random.default_rng(7)
+    points, _, whisker = touched(kind, generator, 200)
+    points = points + generator.normal(scale=1e-5, size=points.shape)
+    points[::10] += generator.normal(scale=2e-3, size=points[::10].shape)
+    covariance = np.broadcast_to(1e-10 * np.eye(3), (200, 3, 3)) if known else None
+    fit = FITS[kind](points, covariance, whisker)
+    if kind == "plane":
+        assert abs(fit.normal @ [0.0, -0.6, 0.8]) > np.cos(2e-3)
+    else:
+        assert abs(fit.radius - RADIUS) < 15e-6
+        origin = axis_offset(fit.origin, (0, 0, 1), CENTER, (0, 0, 1))[0]
+        assert np.linalg.norm(origin) < 15e-6
+    assert fit.inliers[::10].mean() < 0.3
+    assert np.delete(fit.inliers, slice(0, None, 10)).mean() > 0.97
+
+
+def test_a_plane_faces_the_free_side():
+    generator = np.random.default_rng(1)
+    points, normal, whisker = touched("plane", generator, 30)
+    assert fit_plane(points, normals=-normal).normal @ normal[0] < -0.999
+    assert fit_plane(points).normal[2] > 0.0
+    below = fit_plane(points, outside=CENTER - normal[0], whisker_radius=whisker)
+    assert below.normal @ normal[0] < -0.99
+
+
+@pytest.mark.parametrize("kind", ["cylinder", "sphere", "plane"])
+def test_datasets_keep_fits(kind):
+    points, known = noisy(kind, np.random.default_rng(2), 60)
+    points[7] = np.nan
+    fit = FITS[kind](points, **known)
+    stored = fit.to_dataset(("time", "whisker"), (30, 2), {"time": np.arange(30) * 1e-3})
+    assert stored["surface_distance"].dims == ("time", "whisker")
+    assert stored.attrs["shape"] == kind
+    assert stored["object_position"].attrs["units"] == "m"
+    again = shape_from_dataset(stored)
+    for name in (*fit.fields, "covariance", "residuals", "inliers"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(fit, name))
+    with pytest.raises(ValueError, match="lacks inlier"):
+        shape_from_dataset(stored.drop_vars("inlier"))
+    with pytest.raises(ValueError, match="None"):
+        shape_from_dataset(stored.assign_attrs(shape=None))
+
+
+def test_residuals_of_a_sphere_are_distances():
+    points, known = noisy("sphere", np.random.default_rng(3), 60)
+    fit = fit_sphere(points, **known)
+    expected = np.linalg.norm(points - fit.origin, axis=1) - fit.radius - known["whisker_radius"]
+    np.testing.assert_allclose(fit.residuals, expected, rtol=0, atol=1e-12)
+    cylinder = fit_cylinder(points, **known)
+    gap = surface_distances(points, cylinder.origin, cylinder.axis, cylinder.radius)
+    np.testing.assert_allclose(cylinder.signed_distance(points), gap, rtol=0, atol=1e-12)
+
+
+def test_what_is_no_shape_is_refused():
+    points, known = noisy("sphere", np.random.default_rng(4), 40)
+    angle = np.linspace(0.0, 2.0 * np.pi, 40)
+    circle = np.stack([np.cos(angle), np.sin(angle), np.zeros(40)], axis=1)
+    with pytest.raises(ValueError, match="do not determine one"):
+        fit_sphere(circle)
+    assert fit_sphere(circle, normals=circle).radius == pytest.approx(1.0)
+    line = np.linspace(0, 1, 20)[:, None] * [1e-3, 2e-3, 3e-3]
+    for fit in (fit_sphere, fit_plane):
+        with pytest.raises(ValueError, match="on a line"):
+            fit(line)
+    with pytest.raises(ValueError, match="4 usable points; at least 5"):
+        fit_sphere(points[:4])
+    with pytest.raises(ValueError, match="3 usable points; at least 4"):
+        fit_plane(points[:3])
+    with pytest.raises(ValueError, match="without normals and covariance"):
+        fit_sphere(points, normal_covariance=known["normal_covariance"])
+    with pytest.raises(ValueError, match="without normal_covariance"):
+        fit_sphere(points, point_normal_covariance=known["point_normal_covariance"])
+    wrong = known["covariance"].copy()
+    wrong[3, 0, 0] = -1.0
+    with pytest.raises(ValueError, match="point 3"):
+        fit_sphere(points, wrong)
+    with pytest.raises(ValueError, match="outside is"):
+        fit_plane(points, outside=[0.0, 1.0])

@@ -87,7 +87,12 @@ class Deflection:
         arc = self.arc_length.reshape(-1)[rows] / d.length
         free = np.flatnonzero(self.status.reshape(-1)[rows] == Status.NO_CONTACT)
         values[free, 3:], arc[free] = 0.0, 0.0
-        return shapes(d, values, arc, np.linspace(0.0, 1.0, n)) * d.length
+        # All that are free are the same: the first of them stands for the others.
+        own = np.delete(np.arange(arc.size), free[1:])
+        places = np.empty((arc.size, n, 3))
+        places[own] = shapes(d, values[own], arc[own], np.linspace(0.0, 1.0, n)) * d.length
+        places[free[1:]] = places[free[:1]]
+        return places
 
     def __repr__(self) -> str:
         """Say how many loads there are and what became of them."""

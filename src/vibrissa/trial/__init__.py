@@ -1,6 +1,7 @@
 """A whisking trial: what stands in the way, how the base moves, what the whisker then feels."""
 
 from vibrissa.sensing import Sensor
+from vibrissa.trial.array_motion import array_whisking, head_path, protracted
 from vibrissa.trial.calibration import calibrate
 from vibrissa.trial.cameras import Camera, load_cameras, orthogonal_views, save_cameras, triangulate
 from vibrissa.trial.dynamics import Dynamics, resonances
@@ -29,12 +30,15 @@ __all__ = [
     "Plane",
     "Sensor",
     "Sphere",
+    "array_whisking",
     "calibrate",
     "facing_peg",
     "film",
+    "head_path",
     "load_cameras",
     "measure",
     "orthogonal_views",
+    "protracted",
     "recorded_cameras",
     "recorded_objects",
     "recorded_pegs",

@@ -77,15 +77,15 @@ _OF_HEAD: Mapping[str, tuple[str, ...]] = MappingProxyType(
 )
 
 
-def recorded(name: str, values: Any) -> xr.Variable:
-    """Label one variable of a recording of one whisker.
+def recorded(name: str, *values: Any) -> xr.Variable:
+    """Label one variable of a recording.
 
     Parameters
     ----------
     name : str
         Of the variable, as in the module's table of dimensions.
-    values : array_like (time, ...)
-        Without the dimension ``whisker``, which is put in.
+    *values : array_like (time, ...)
+        One for each whisker, without the dimension ``whisker``, along which they are joined.
 
     Returns
     -------
@@ -97,28 +97,29 @@ def recorded(name: str, values: Any) -> xr.Variable:
         about["reference_frame"] = _FRAMES[name]
     if name == "status":
         about |= flag_attributes()
-    return xr.Variable(_DIMS[name], np.asarray(values)[:, None], about)
+    return xr.Variable(_DIMS[name], np.stack(values, axis=1), about)
 
 
 def trial_recording(
-    whisker: Whisker,
-    motion: Motion,
+    whiskers: Sequence[Whisker],
+    motions: Sequence[Motion],
     objects: Sequence[Surface],
-    truth: Mapping[str, Any],
+    truths: Sequence[Mapping[str, Any]],
     origin: str,
 ) -> xr.DataTree:
     """Write a simulated trial as a recording.
 
     Parameters
     ----------
-    whisker : Whisker
+    whiskers : sequence of Whisker
         That whisked.
-    motion : Motion
-        Of its base, n frames.
+    motions : sequence of Motion
+        Of their bases, one a whisker, all with the same n frames and on the same head.
     objects : sequence
-        That it may have met.
-    truth : mapping
-        Variables by name, arrays (n, ...); force and moment are what a perfect sensor reads.
+        That they may have met.
+    truths : sequence of mapping
+        One a whisker: variables by name, arrays (n, ...); force and moment are what a perfect
+        sensor reads.
     origin : str
         How it was simulated.
 
@@ -128,26 +129,28 @@ def trial_recording(
         The recording.
     """
     pose = {
-        "base_position": motion.base_position,
-        "base_rotation": motion.base_rotation,
-        "base_azimuth": motion.azimuth,
-        "base_elevation": motion.elevation,
-        "base_roll": motion.roll,
+        "base_position": [motion.base_position for motion in motions],
+        "base_rotation": [motion.base_rotation for motion in motions],
+        "base_azimuth": [motion.azimuth for motion in motions],
+        "base_elevation": [motion.elevation for motion in motions],
+        "base_roll": [motion.roll for motion in motions],
     }
-    wrench = {name: truth[name] for name in ("force", "moment")}
+    known = {name: [truth[name] for truth in truths] for name in truths[0]}
+    wrench = {name: known[name] for name in ("force", "moment")}
     root = xr.Dataset(
-        {name: recorded(name, values) for name, values in (pose | wrench).items()}
-        | head_variables(motion.head_position, motion.head_rotation),
-        _coordinates(motion.time, [whisker.name]),
+        {name: recorded(name, *values) for name, values in (pose | wrench).items()}
+        | head_variables(motions[0].head_position, motions[0].head_rotation),
+        _coordinates(motions[0].time, [whisker.name for whisker in whiskers]),
         {"kind": KIND, "origin": origin},
     )
     groups: dict[str, xr.Dataset] = {
         "/": root,
-        "/truth": xr.Dataset({name: recorded(name, values) for name, values in truth.items()}),
-        # Its centreline is for readers of lone whisker files, and its nodes are others than ours.
-        "/whiskers/0": whisker.to_dataset().drop_dims("node"),
+        "/truth": xr.Dataset({name: recorded(name, *values) for name, values in known.items()}),
         "/objects": xr.Dataset(attrs={"reference_frame": "laboratory"}),
     }
+    for i, whisker in enumerate(whiskers):
+        # Its centreline is for readers of lone whisker files, and its nodes are others than ours.
+        groups[f"/whiskers/{i}"] = whisker.to_dataset().drop_dims("node")
     for name, dataset in objects_datasets(objects).items():
         # The coordinates of the root are seen from below.
         groups[f"/objects/{name}"] = dataset.drop_vars("space")

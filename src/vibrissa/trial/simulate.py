@@ -10,13 +10,16 @@ One contact is simulated at a time, that with the object met first. Where the be
 into another object, or into the same one elsewhere, the truth says so (``second_contact``) and how
 far (``overlap``): there the wrench lacks what the second contact would add.
 
+Several whiskers are simulated one after the other: they do not touch each other.
+
 With `vibrissa.trial.dynamics` the whisker has inertia and damping: it collides, rings after it has
 slipped, and may touch at several places, of which the strongest is recorded.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import TypeVar
 
 import numpy as np
 import xarray as xr
@@ -51,9 +54,14 @@ Progress = Callable[[int, int], None]
 """Called with the number of frames done and of all frames."""
 
 
+T = TypeVar("T")
+Whiskers = Whisker | Sequence[Whisker] | Mapping[str, Whisker]
+Motions = Motion | Sequence[Motion] | Mapping[str, Motion]
+
+
 def simulate(
-    whisker: Whisker,
-    motion: Motion,
+    whisker: Whiskers,
+    motion: Motions,
     objects: Surface | Sequence[Surface],
     *,
     friction: float = 0.0,
@@ -61,14 +69,15 @@ def simulate(
     nodes: int = NODES,
     progress: Progress | None = None,
 ) -> xr.DataTree:
-    """Simulate a trial of one whisker among objects.
+    """Simulate a trial of one whisker, or of several, among objects.
 
     Parameters
     ----------
-    whisker : Whisker
-        That whisks.
-    motion : Motion
-        Of its base.
+    whisker : Whisker, sequence or mapping of Whisker
+        That whisks; several, such as a `WhiskerArray`, do so together.
+    motion : Motion, sequence or mapping of Motion
+        Of its base; as many as there are whiskers, in the same order or by the same names, with
+        the same frames and on the same head.
     objects : Peg, Sphere, Plane, Box, Mesh or a sequence of them
         In the laboratory. The one met first holds the whisker.
     friction : float
@@ -78,7 +87,7 @@ def simulate(
     nodes : int
         Points of the recorded centrelines, equally spaced in arc length.
     progress : callable, optional
-        Told after every frame how many are done, of how many.
+        Told after every frame of every whisker how many are done, of how many.
 
     Returns
     -------
@@ -89,32 +98,73 @@ def simulate(
     Raises
     ------
     ValueError
-        If the friction is negative.
+        If the friction is negative, or whiskers and motions do not belong together.
     """
+    pairs = _pairs(whisker, motion)
     solids = list(objects) if isinstance(objects, Sequence) else [objects]
     touch = "frictionless" if friction == 0.0 else f"friction {friction:g}"
+    how = "quasi-static"
     if dynamics is not None:
-        moments = move_dynamically(
-            whisker, solids, motion, dynamics, friction=friction, progress=progress
+        how = f"with inertia, damping ratio {dynamics.damping_ratio:g}"
+    truths: list[dict[str, Array]] = []
+    for one, moves in pairs:
+        before, total = len(truths) * len(moves), len(pairs) * len(moves)
+
+        def told(done: int, _: int, before: int = before, total: int = total) -> None:
+            if progress is not None:
+                progress(before + done, total)
+
+        if dynamics is not None:
+            moments = move_dynamically(
+                one, solids, moves, dynamics, friction=friction, progress=told
+            )
+            truths.append(_dynamic_truth(one, moves, moments, nodes))
+            continue
+        found = follow_surfaces(
+            one,
+            solids,
+            moves.base_rotation,
+            moves.base_position,
+            friction=friction,
+            progress=told,
         )
-        truth = _dynamic_truth(whisker, motion, moments, nodes)
-        said = f"simulated: with inertia, damping ratio {dynamics.damping_ratio:g}, {touch}"
-        return trial_recording(whisker, motion, solids, truth, said)
-    found = follow_surfaces(
-        whisker,
-        solids,
-        motion.base_rotation,
-        motion.base_position,
-        friction=friction,
-        progress=progress,
-    )
-    return trial_recording(
-        whisker,
-        motion,
-        solids,
-        _truth(whisker, motion, solids, found, nodes),
-        f"simulated: quasi-static, {touch}",
-    )
+        truths.append(_truth(one, moves, solids, found, nodes))
+    whiskers, motions = zip(*pairs, strict=True)
+    return trial_recording(whiskers, motions, solids, truths, f"simulated: {how}, {touch}")
+
+
+def _pairs(whisker: Whiskers, motion: Motions) -> list[tuple[Whisker, Motion]]:
+    """Whiskers with their motions."""
+    if isinstance(whisker, Mapping) and isinstance(motion, Mapping):
+        missing = [name for name in whisker if name not in motion]
+        if missing:
+            raise ValueError(f"there is no motion of {', '.join(missing)}")
+        motion = [motion[name] for name in whisker]
+    whiskers = [whisker] if isinstance(whisker, Whisker) else _listed(whisker)
+    motions = [motion] if isinstance(motion, Motion) else _listed(motion)
+    if not whiskers or len(whiskers) != len(motions):
+        raise ValueError(
+            f"there are {len(whiskers)} whiskers and {len(motions)} motions; one motion a whisker, "
+            "and at least one, is needed"
+        )
+    names = [one.name for one in whiskers]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ValueError(f"several whiskers are called {', '.join(twice)}; names must differ")
+    first = motions[0]
+    for name, other in zip(names, motions, strict=True):
+        for what in ("time", "head_rotation", "head_position"):
+            if not _same(getattr(first, what), getattr(other, what)):
+                raise ValueError(f"the motions of {names[0]} and {name} differ in {what}")
+    return list(zip(whiskers, motions, strict=True))
+
+
+def _listed(things: Sequence[T] | Mapping[str, T]) -> list[T]:
+    return list(things.values() if isinstance(things, Mapping) else things)
+
+
+def _same(a: Array | None, b: Array | None) -> bool:
+    return a is b if a is None or b is None else np.array_equal(a, b)
 
 
 def _truth(
@@ -200,6 +250,8 @@ def _overlap(
     deepest = np.zeros(len(motion))
     # A whisker at rest was looked at when it was found to be free.
     touching = np.flatnonzero(np.isin(bent.status, (Status.OK, Status.TIP_CONTACT)))
+    if not touching.size:
+        return deepest
     lines = bent.centerline(_LOOK_AT)
     for first in range(0, touching.size, _FRAMES_AT_ONCE):
         rows = touching[first : first + _FRAMES_AT_ONCE]

@@ -14,6 +14,7 @@ from vibrissa.cli import (
     charting,
     correcting,
     figures,
+    filming,
     information,
     judging,
     locating,
@@ -50,6 +51,7 @@ app.command("sensitivity")(sensing.sensitivity)
 app.command("estimate")(locating.estimate)
 app.command("figures")(figures.figures)
 app.command("view")(viewing.view)
+app.command("movie")(filming.movie)
 app.command("info")(information.info)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
@@ -44,6 +46,34 @@ def progress_bars() -> Iterator[Tell]:
             bars.update(tasks[stage], completed=done, total=total)
 
         yield tell
+
+
+@contextmanager
+def stoppable() -> Iterator[Callable[[], bool]]:
+    """Take Ctrl-C as the wish to stop soon; a second one stops at once.
+
+    Yields
+    ------
+    callable
+        Tells whether to stop.
+    """
+    asked = False
+
+    def ask(number: int, frame: object) -> None:
+        nonlocal asked
+        if asked:
+            raise KeyboardInterrupt
+        asked = True
+
+    # Elsewhere than in the main thread there is no Ctrl-C to take.
+    before = None
+    if threading.current_thread() is threading.main_thread():
+        before = signal.signal(signal.SIGINT, ask)
+    try:
+        yield lambda: asked
+    finally:
+        if before is not None:
+            signal.signal(signal.SIGINT, before)
 
 
 def shown(name: str, value: float, digits: int = 4) -> str:

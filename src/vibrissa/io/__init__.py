@@ -13,6 +13,7 @@ from vibrissa.io.kinds import Kind, recognise
 from vibrissa.io.load import load_tracks
 from vibrissa.io.matlab import load_matlab
 from vibrissa.io.movement import load_movement
+from vibrissa.io.movie import write_movie
 from vibrissa.io.netcdf import is_netcdf, kind_of
 from vibrissa.io.nwb import load_nwb
 from vibrissa.io.nwb_writing import Session, save_nwb
@@ -24,7 +25,7 @@ from vibrissa.io.sleap import load_sleap
 from vibrissa.io.traces import load_traces, save_traces
 from vibrissa.io.tracks import join_views
 from vibrissa.io.tracks_file import load_tracks_table, save_tracks
-from vibrissa.io.video import VideoInfo, read_video, video_info, write_video
+from vibrissa.io.video import VideoInfo, read_video, video_frames, video_info, write_video
 from vibrissa.io.whisk import load_measurements, load_whiskers
 
 __all__ = [
@@ -70,6 +71,8 @@ __all__ = [
     "save_signals",
     "save_traces",
     "save_tracks",
+    "video_frames",
     "video_info",
+    "write_movie",
     "write_video",
 ]

@@ -6,9 +6,11 @@ grey frames: FFV1 (lossless) in Matroska by default, H.264 in MP4.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import chain, pairwise
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -125,6 +127,73 @@ def read_video(path: str | PathLike[str]) -> Iterator[Frame]:
             raise ValueError(f"{path} is damaged after frame {done}: {error.strerror}") from error
 
 
+def video_frames(path: str | PathLike[str], numbers: Iterable[int]) -> Iterator[Frame]:
+    """Read some frames of a video, and decode no more than need be.
+
+    Parameters
+    ----------
+    path : str or path
+        Of the video.
+    numbers : iterable of int
+        Of the frames, counted from 0, never falling; one may come several times.
+
+    Yields
+    ------
+    array (height, width)
+        Grey values, one array for each number.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If numbers fall or are negative, the video has fewer frames, or it is none or damaged.
+    """
+    wanted = [int(number) for number in numbers]
+    if any(b < a for a, b in pairwise([0, *wanted])):
+        raise ValueError("numbers of frames must not be negative and must not fall")
+    found = _decoded(Path(path), set(wanted))
+    number, image = -1, None
+    for want in wanted:
+        while number < want or image is None:
+            number, frame = next(found, (-1, None))
+            if frame is None:
+                raise ValueError(f"{path} has no frame {want}")
+            image = _grey(frame) if number == want else None
+        yield image
+
+
+def _decoded(path: Path, wanted: set[int]) -> Iterator[tuple[int, Any]]:
+    """Numbers and frames, in order: those wanted, and what decoding them takes."""
+    import av
+
+    with _opened(path) as container:
+        stream = container.streams.video[0]
+        stream.thread_type = "AUTO"
+        last = max(wanted, default=-1)
+        sent: deque[int] = deque()
+        try:
+            for number, (packet, following) in enumerate(_with_next(container.demux(stream))):
+                # Between two key frames nothing else depends on a frame.
+                alone = packet.is_keyframe and following is not None and following.is_keyframe
+                if alone and number not in wanted:
+                    continue
+                if packet.size:
+                    sent.append(number)
+                for frame in stream.decode(packet):
+                    at = sent.popleft()
+                    yield at, frame
+                    if at >= last:
+                        return
+        except av.FFmpegError as error:
+            raise ValueError(f"{path} is damaged: {error.strerror}") from error
+
+
+def _with_next(packets: Iterable[Any]) -> Iterator[tuple[Any, Any]]:
+    """Each packet and the one that follows; of the last one that is None."""
+    return pairwise(chain(packets, [None]))
+
+
 def write_video(
     path: str | PathLike[str],
     frames: Iterable[Frame],
@@ -164,7 +233,8 @@ def write_video(
     if codec is None:
         raise ValueError(f"{path} ends on {path.suffix!r}; one of {', '.join(CODECS)} is needed")
     container_format = {"ffv1": "matroska", "h264": "mp4"}[codec]
-    options = {"ffv1": {"level": "3", "slices": "4"}}.get(
+    # Of FFV1 every frame is a key frame, so that one can be read without those before it.
+    options = {"ffv1": {"level": "3", "slices": "4", "g": "1"}}.get(
         codec, {"crf": str(quality), "preset": "ultrafast"}
     )
     count = 0

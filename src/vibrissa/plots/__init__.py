@@ -2,9 +2,13 @@
 
 from vibrissa.plots.clouds import signal_clouds
 from vibrissa.plots.contour import contour_views
+from vibrissa.plots.contour_movie import contour_frames
+from vibrissa.plots.course import Course, course_of
 from vibrissa.plots.estimates import estimated_against_true
 from vibrissa.plots.evidence import critical_cones, resolution
 from vibrissa.plots.sensitivity import sensitivity_panels
+from vibrissa.plots.sights import Sight
+from vibrissa.plots.signal_movie import signal_frames
 from vibrissa.plots.signals import signals_over_time
 from vibrissa.plots.slices import solid_slices
 from vibrissa.plots.style import save
@@ -14,14 +18,19 @@ from vibrissa.plots.whisker import whisker_views
 from vibrissa.plots.witness import witness_pair
 
 __all__ = [
+    "Course",
+    "Sight",
     "contact_surfaces",
+    "contour_frames",
     "contour_views",
+    "course_of",
     "critical_cones",
     "estimated_against_true",
     "resolution",
     "save",
     "sensitivity_panels",
     "signal_clouds",
+    "signal_frames",
     "signals_over_time",
     "solid_slices",
     "verdict_table",

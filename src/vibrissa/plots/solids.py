@@ -172,8 +172,8 @@ def refined(triangles: Array, chosen: Mask, times: int = 3) -> Array:
     return np.concatenate([triangles[~chosen], pieces])
 
 
-def solid(nodes: Array, closed: bool, outside: int, also: int | None = None) -> Array:
-    """Triangles around the contacts where a column is positive.
+def solid(nodes: Array, closed: bool, *columns: int) -> Array:
+    """Triangles around the contacts where some columns are positive.
 
     Parameters
     ----------
@@ -181,18 +181,19 @@ def solid(nodes: Array, closed: bool, outside: int, also: int | None = None) -> 
         Rows.
     closed : bool
         Whether the bearings go round once.
-    outside : int
-        The column that must be positive.
-    also : int, optional
-        Another that must be.
+    *columns : int
+        Which must be positive.
 
     Returns
     -------
     array (n, 3, k)
         Triangles of a closed surface.
     """
-    around = [clipped(skin(nodes, closed), outside), level(nodes, outside, 0.0)]
-    if also is not None:
-        around = [clipped(part, also) for part in around]
-        around.append(clipped(level(nodes, also, 0.0), outside))
+    around = []
+    for cut in (None, *columns):
+        part = skin(nodes, closed) if cut is None else level(nodes, cut, 0.0)
+        for other in columns:
+            if other != cut:
+                part = clipped(part, other)
+        around.append(part)
     return np.concatenate(around)

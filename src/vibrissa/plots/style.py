@@ -35,7 +35,8 @@ SHADE = "#e3ebf2"
 BLUE = "#0072b2"
 ORANGE = "#d55e00"
 GREEN = "#009e73"
-"""Text, what is secondary, shaded areas, and three colours of lines."""
+RED = "#e8000b"
+"""Text, what is secondary, shaded areas, three colours of lines, and that of a traced whisker."""
 
 LOOK: Mapping[str, Any] = MappingProxyType(
     {
@@ -138,7 +139,49 @@ def new_figure(width: Width, height: float, layout: Literal["constrained"] | Non
     ValueError
         If there is no such width.
     """
-    return _StyledFigure(figsize=(page_width(width) / 25.4, height / 25.4), layout=layout)
+    return sized_figure(page_width(width), height, layout)
+
+
+def sized_figure(
+    width: float, height: float, layout: Literal["constrained"] | None = None
+) -> Figure:
+    """Make an empty figure of any size.
+
+    Parameters
+    ----------
+    width, height : float
+        In mm.
+    layout : {"constrained"} or None
+        Whether Matplotlib arranges the axes.
+
+    Returns
+    -------
+    Figure
+        In which :func:`looking` should be active while axes are added.
+    """
+    return _StyledFigure(figsize=(width / 25.4, height / 25.4), layout=layout)
+
+
+def box_axes(figure: Figure, box: tuple[float, float, float, float], **settings: Any) -> Axes:
+    """Add a panel at a place in mm.
+
+    Parameters
+    ----------
+    figure : Figure
+        Where to.
+    box : tuple of float
+        Left, bottom, width and height, mm.
+    **settings
+        What else axes take.
+
+    Returns
+    -------
+    Axes
+        The panel.
+    """
+    wide, tall = 25.4 * figure.get_size_inches()
+    left, bottom, width, height = box
+    return figure.add_axes((left / wide, bottom / tall, width / wide, height / tall), **settings)
 
 
 def page_width(width: Width) -> float:

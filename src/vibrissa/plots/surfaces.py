@@ -1,7 +1,6 @@
 """Surfaces of equal r, θ and φ, and what they become in the space of (F_x, M_B, M_D) (Fig. 3).
 
-Signals are drawn in a cylinder: M_B is the distance from the axis, M_D the angle about it, and F_x
-the height. M_B and F_x are drawn on square-root scales: most contacts are gentle.
+Signals are drawn in a cylinder (:mod:`vibrissa.plots.cylinder`).
 """
 
 from __future__ import annotations
@@ -18,31 +17,21 @@ from numpy.typing import ArrayLike
 
 from vibrissa.plots.chart import column, fine_chart, values_of
 from vibrissa.plots.colours import sequential
+from vibrissa.plots.cylinder import Box, felt, signal_axes, signal_limits, square
 from vibrissa.plots.solids import clipped, level, solid
 from vibrissa.plots.space import bounds, name_axes, paint, painted, space_axes
 from vibrissa.plots.style import (
-    INK,
-    MUTED,
     Array,
     Width,
     looking,
     new_figure,
     plain,
     robust_limits,
-    root,
 )
 from vibrissa.quantities import axis_label, quantity, to_display
 
-Box = tuple[float, float, float, float]
-"""Left, bottom, width and height, mm."""
-
 _COORDINATES = ("r", "theta", "phi")
 _LEVELS = 3
-_VIEW = (16.0, -152.0)
-_ASPECT = (1.0, 1.0, 0.85)
-_FRONT = 222.0
-"""Direction, degrees, in which rings carry their labels: toward the viewer."""
-
 _OPEN = (np.pi, 2.5 * np.pi)
 """Bearings drawn where solids and surfaces are cut open: all but a quarter."""
 
@@ -93,25 +82,25 @@ def contact_surfaces(
     line = to_display("centerline", centerline)
     contacts = bounds(np.concatenate([_places(body).reshape(-1, 3), line]))
     shell = solid(whole, True, outside)
-    signals = _signal_limits(shell)
+    signals = signal_limits(felt(shell))
     with looking():
         height, panels, rails = _sheet(width)
         figure = new_figure(width, height, None)
         for i, name in enumerate(_COORDINATES):
-            norm, marks = _levels(name, shell)
+            norm, marks = levels(name, shell)
             among, into, inside = panels[3 * i : 3 * i + 3]
             axes = _contact_axes(figure, among, contacts)
             surface, hues = _level_sets(whole, name, norm, marks)
             paint(axes, _places(surface), hues)
             axes.plot(*line.T, color="black", linewidth=1.2, zorder=10)
-            axes = _signal_axes(figure, into, signals)
+            axes = _cylinder(figure, into, signals)
             if name == "r":  # its surfaces lie one within the other
                 surface, hues = _level_sets(opened, name, norm, marks)
-            paint(axes, _felt(surface), hues)
-            axes = _signal_axes(figure, inside, signals)
+            paint(axes, felt(surface), hues)
+            axes = _cylinder(figure, inside, signals)
             values = to_display(name, values_of(name, body))
-            paint(axes, _felt(body), painted(values, norm, sequential()), flat=0.8)
-            _bar(figure, rails[i], name, norm, marks)
+            paint(axes, felt(body), painted(values, norm, sequential()), flat=0.8)
+            coordinate_bar(figure, rails[i], name, norm, marks)
         return figure
 
 
@@ -127,31 +116,27 @@ def _level_sets(
     return np.concatenate(surfaces), np.concatenate(hues)
 
 
-_FLOOR: dict[str, Any] = {"color": "#c8c8c8", "linewidth": 0.4, "zorder": 0}
-
-
 def _places(triangles: Array) -> Array:
     return to_display("contact_point", triangles[..., :3])
 
 
-def _felt(triangles: Array) -> Array:
-    """Signals of triangles as places in the cylinder, square roots of display units."""
-    size = np.sqrt(to_display("MB", values_of("MB", triangles)))
-    turn = values_of("MD", triangles)
-    height = root(to_display("Fx", values_of("Fx", triangles)))
-    return np.stack([size * np.cos(turn), size * np.sin(turn), height], axis=-1)
+def levels(name: str, shell: Array) -> tuple[Normalize, list[float]]:
+    """Limits of the colours, and round values for surfaces.
 
+    Parameters
+    ----------
+    name : {"r", "theta", "phi"}
+        Which coordinate.
+    shell : array (..., columns)
+        Rows of a chart.
 
-def _signal_limits(triangles: Array) -> Array:
-    places = _felt(triangles)
-    reach = float(np.hypot(places[..., 0], places[..., 1]).max()) * 1.02
-    low, high = float(places[..., 2].min()), float(places[..., 2].max())
-    room = 0.02 * (high - low)
-    return np.array([[-reach, reach], [-reach, reach], [low - room, max(high, 0.0) + room]])
-
-
-def _levels(name: str, shell: Array) -> tuple[Normalize, list[float]]:
-    """Limits of the colours, and round values for surfaces, in display units."""
+    Returns
+    -------
+    norm : Normalize
+        Limits that leave out the outermost 2 %, display units.
+    marks : list of float
+        Round values about evenly between them, display units.
+    """
     values = to_display(name, values_of(name, shell))
     low, high = robust_limits(values)
     locator = MaxNLocator(12, steps=[1, 2, 2.5, 5, 10])
@@ -202,85 +187,38 @@ def _head(figure: Figure, panel: _Panel) -> None:
         )
 
 
-def _square(box: Box) -> Box:
-    left, bottom, width, height = box
-    side = max(width, height)
-    return left + 0.5 * (width - side), bottom - 1.0 + 0.5 * (height - side), side, side
-
-
 def _contact_axes(figure: Figure, panel: _Panel, limits: Array) -> Any:
     _head(figure, panel)
-    left, bottom, width, height = _square(panel.box)
+    left, bottom, width, height = square(panel.box)
     zoom = 0.87 if width > 50.0 else 0.82
     axes = space_axes(figure, (left - 2.0, bottom + 1.5, width, height), limits, zoom=zoom)
     name_axes(axes, (-8.0, -9.0, -10.5))
     return axes
 
 
-def _signal_axes(figure: Figure, panel: _Panel, limits: Array) -> Any:
-    """Axes for a cylinder of signals: rings of equal M_B and rays of equal M_D on its floor."""
+def _cylinder(figure: Figure, panel: _Panel, limits: Array) -> Any:
     _head(figure, panel)
-    left, bottom, side, _ = _square(panel.box)
-    box = left + 3.5, bottom + 0.5, side, side
-    zoom = 0.98 if side > 50.0 else 0.86  # lettering does not shrink with the panel
-    axes = space_axes(figure, box, limits, _VIEW, zoom=zoom, frame=False, aspect=_ASPECT)
-    reach, floor = limits[0, 1], limits[2, 0]
-    turn = np.linspace(0.0, 2.0 * np.pi, 181)
-    rings = _round_squares(0.0, reach)[1:]
-    for ring in rings:
-        places = np.sqrt(ring) * np.stack([np.cos(turn), np.sin(turn)])
-        axes.plot(*places, floor, **_FLOOR)
-        near = 1.0 if ring < rings[-1] else 1.15
-        size, unit = quantity("MB").symbol, quantity("MB").display_unit
-        label = f"{ring:g}" if ring < rings[-1] else f"${size}$ = {ring:g} {unit}"
-        _write(axes, _FRONT, np.sqrt(ring) * near, floor, label, ha="left", va="top", color=MUTED)
-    for angle in (0, 90, 180, -90):
-        axes.plot(*np.outer(_toward(angle), [0.0, reach]), floor, **_FLOOR)
-        label = f"{angle}°" if angle != 180 else f"${quantity('MD').symbol}$ = 180°"
-        # The ray to the left ends beside the solid, whose edge would hide a centred word.
-        far = {"ha": "right"} if angle == 90 else {}
-        _write(axes, angle, 1.17 * reach, floor, label.replace("-", "−"), **far)
-    _height_axis(axes, limits)
-    return axes
+    return signal_axes(figure, panel.box, limits)
 
 
-def _height_axis(axes: Any, limits: Array) -> None:
-    """The axis of F_x, upright at the left."""
-    reach, (floor, top) = limits[0, 1], limits[2]
-    left = _VIEW[1] - 90.0
-    place = 1.4 * reach * _toward(left)
-    axes.plot(*np.repeat(place[:, None], 2, axis=1), [floor, top], color=INK, linewidth=0.5)
-    for mark in _round_squares(floor, top):
-        height = float(root(mark))
-        tick = np.outer(_toward(left), [1.4 * reach, 1.45 * reach])
-        axes.plot(*tick, height, color=INK, linewidth=0.5)
-        label = f"{mark:g}".replace("-", "−")
-        _write(axes, left, 1.49 * reach, height, label, ha="right")
-    _write(axes, left, 1.4 * reach, top + 0.1 * (top - floor), axis_label("Fx"), fontsize=6.0)
+def coordinate_bar(
+    figure: Figure, place: Box, name: str, norm: Normalize, marks: list[float]
+) -> None:
+    """Draw a colour bar for a coordinate.
 
-
-def _toward(angle: float) -> Array:
-    return np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])
-
-
-def _write(axes: Any, angle: float, size: float, height: float, text: str, **look: Any) -> None:
-    """A word in the cylinder, behind what is painted."""
-    plain_look = {"fontsize": 5.5, "ha": "center", "va": "center", "zorder": 0}
-    axes.text(*(size * _toward(angle)), height, text, **(plain_look | look))
-
-
-def _round_squares(low: float, high: float) -> list[float]:
-    """Round numbers about evenly spread between the squares of two roots, with their signs."""
-    largest = max(abs(low), abs(high)) ** 2
-    step = 10.0 ** np.floor(np.log10(largest))
-    step *= max(f for f in (1.0, 2.0, 4.0) if f * step <= largest)
-    marks = [sign * f * step for sign in (-1.0, 1.0) for f in (1.0, 0.25)]
-    return sorted(
-        [0.0, *(m for m in marks if low <= np.sign(m) * np.sqrt(abs(m)) <= high)], key=abs
-    )
-
-
-def _bar(figure: Figure, place: Box, name: str, norm: Normalize, marks: list[float]) -> None:
+    Parameters
+    ----------
+    figure : Figure
+        Where to.
+    place : tuple of float
+        Left, bottom, width and height, mm; upright if it is higher than wide.
+    name : {"r", "theta", "phi"}
+        Which coordinate.
+    norm : Normalize
+        Limits, display units.
+    marks : list of float
+        Where ticks are, display units.
+    """
     wide, tall = 25.4 * figure.get_size_inches()
     left, bottom, width, height = place
     rail = figure.add_axes((left / wide, bottom / tall, width / wide, height / tall))

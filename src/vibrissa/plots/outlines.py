@@ -1,0 +1,127 @@
+"""Objects as they are seen from a side, for anything that knows its signed distance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import ArrayLike
+
+from vibrissa.plots.style import MUTED, ORANGE, Array
+
+_CELLS, _DEPTHS = 97, 33
+_FULL = 0.97
+"""Share of a panel from which an object is taken to fill it, so that it is no use drawing it."""
+
+
+class Body(Protocol):
+    """An object in the laboratory, m."""
+
+    def signed_distance(self, points: ArrayLike) -> Array:
+        """Distances (...) of points (..., 3) from its surface, negative inside."""
+
+
+def draw_body(axes: Axes, body: Body, view: tuple[int, int], limits: Array, look: str) -> None:
+    """Draw the outline of an object, or rather of what of it lies within limits.
+
+    Parameters
+    ----------
+    axes : Axes
+        In mm.
+    body : object
+        With ``signed_distance``, laboratory frame, m.
+    view : tuple of int
+        Which of x, y, z are to the right and up; one looks along the third.
+    limits : array (3, 2)
+        Of x, y and z, mm.
+    look : {"true", "fitted"}
+        Filled grey, or dashed.
+    """
+    i, j = view
+    k = 3 - i - j
+    right, up = (np.linspace(limits[n, 0], limits[n, 1], _CELLS) for n in view)
+    points: Array = np.empty((_CELLS, _CELLS, _DEPTHS, 3))
+    points[..., i] = right[None, :, None]
+    points[..., j] = up[:, None, None]
+    points[..., k] = np.linspace(limits[k, 0], limits[k, 1], _DEPTHS)
+    nearest = body.signed_distance(1e-3 * points).min(axis=-1)
+    if not 0.0 < np.mean(nearest < 0.0) < _FULL:
+        return
+    if look == "true":
+        axes.contourf(right, up, nearest, [-np.inf, 0.0], colors=["#ececec"], zorder=1)
+        axes.contour(right, up, nearest, [0.0], colors=[MUTED], linewidths=0.8, zorder=1.5)
+        return
+    dashes: Any = [(0, (4, 2))]
+    lines: dict[str, Any] = {"linewidths": 1.0, "linestyles": dashes, "zorder": 4}
+    axes.contour(right, up, nearest, [0.0], colors=[ORANGE], **lines)
+
+
+def room_for(places: Array, bodies: Sequence[Body], least: float = 1.0) -> Array:
+    """Limits that hold most places, and the objects there as far as they end nearby.
+
+    Parameters
+    ----------
+    places : array (n, 3)
+        Contact points, mm, finite, at least one.
+    bodies : sequence of object
+        With ``signed_distance``, laboratory frame, m.
+    least : float
+        By which the limits lie outside of the places, mm.
+
+    Returns
+    -------
+    array (3, 2)
+        Of x, y and z, mm.
+    """
+    low, high = np.quantile(places, [0.02, 0.98], axis=0)
+    half = 0.5 * (high - low)
+    near = np.array([[-1.0], [1.0]]) * (2.0 * half.max() + 3.0 * least)
+    lines = 0.5 * (low + high) + near  # lower and upper ends of a cube
+    steps = np.linspace(lines[0], lines[1], 25)
+    grid = np.stack(np.meshgrid(*steps.T, indexing="ij"), axis=-1)
+    for body in bodies:
+        inside = grid[body.signed_distance(1e-3 * grid) < 0.0]
+        for n in range(3):
+            if (
+                inside.size
+                and inside[:, n].min() > lines[0, n]
+                and inside[:, n].max() < lines[1, n]
+            ):
+                low[n], high[n] = min(low[n], inside[:, n].min()), max(high[n], inside[:, n].max())
+    margin = np.maximum(0.15 * (high - low), least)
+    return np.stack([low - margin, high + margin], axis=1)
+
+
+def one_scale(limits: Array, views: Sequence[tuple[int, int]], sizes: Sequence[Any]) -> Array:
+    """Widen limits so that panels of given sizes show all of them to one scale.
+
+    Parameters
+    ----------
+    limits : array (3, 2)
+        Of x, y and z.
+    views : sequence of tuple of int
+        For each panel, which of x, y, z are to the right and up.
+    sizes : sequence of (float, float)
+        Width and height of each panel.
+
+    Returns
+    -------
+    array (panels, 2, 2)
+        For each panel the limits to the right and up.
+    """
+    middle, span = limits.mean(axis=1), np.ptp(limits, axis=1)
+    scale = max(
+        max(span[i] / wide, span[j] / tall)
+        for (i, j), (wide, tall) in zip(views, sizes, strict=True)
+    )
+    return np.array(
+        [
+            [
+                [middle[n] - 0.5 * scale * size, middle[n] + 0.5 * scale * size]
+                for n, size in zip(view, both, strict=True)
+            ]
+            for view, both in zip(views, sizes, strict=True)
+        ]
+    )

@@ -1,0 +1,233 @@
+"""What cameras see: a part of an image with the traced whisker in red and the contact point."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike, NDArray
+
+from vibrissa.plots.course import Course
+from vibrissa.plots.cylinder import Box
+from vibrissa.plots.style import INK, Array, box_axes
+
+Grey = NDArray[np.uint8]
+
+_ROOM = 0.08
+_LIGHT = 235
+"""Grey value beyond the edge of an image."""
+
+
+class _View(Protocol):
+    """A camera."""
+
+    @property
+    def name(self) -> str:
+        """Of the view."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of its images, pixels."""
+
+    def project(self, points: ArrayLike) -> Array:
+        """Column and row (..., 2), pixels, of points (..., 3), laboratory frame, m."""
+
+
+class Sight(NamedTuple):
+    """One view of a trial.
+
+    Parameters
+    ----------
+    view : _View
+        The camera.
+    images : iterable of array (height, width)
+        8 bit grey images, one for each frame that is drawn.
+    """
+
+    view: _View
+    images: Iterable[Grey]
+
+
+def seen(course: Course, views: Sequence[_View], number: int) -> tuple[Array, Array]:
+    """Tell where whisker and contact are in the images of a view.
+
+    Parameters
+    ----------
+    course : Course
+        Of the trial.
+    views : sequence of _View
+        All of its cameras.
+    number : int
+        Which of them.
+
+    Returns
+    -------
+    line : array (n, k, 2)
+        The traced whisker or else the whisker in space as the camera sees it, pixels; NaN where
+        neither is known.
+    contact : array (n, 2)
+        The contact point.
+    """
+    count = len(course.time)
+    if number < len(course.traces):
+        line = course.traces[number]
+    elif course.centerline is not None:
+        line = views[number].project(course.centerline)
+    else:
+        line = np.full((count, 2, 2), np.nan)
+    if course.places is None:
+        return line, np.full((count, 2), np.nan)
+    return line, views[number].project(course.places)
+
+
+def part_of(lines: Array, shape: tuple[float, float], size: tuple[int, int]) -> tuple[Array, Array]:
+    """Choose the part of images in which a whisker moves.
+
+    Parameters
+    ----------
+    lines : array (..., 2)
+        Where it is, column and row; NaN is left out.
+    shape : tuple of float
+        Width and height of the panel, in any unit.
+    size : tuple of int
+        Width and height of the images, pixels.
+
+    Returns
+    -------
+    low, high : array (2,)
+        Column and row of two corners, pixels; in the shape of the panel. It reaches beyond the
+        image only if it must.
+    """
+    places = lines.reshape(-1, 2)
+    places = places[np.isfinite(places).all(axis=1)]
+    whole = np.asarray(size, dtype=np.float64)
+    if len(places):
+        low, high = np.quantile(places, [0.002, 0.998], axis=0)
+    else:
+        low, high = np.zeros(2), whole
+    span = (1.0 + 2.0 * _ROOM) * np.maximum(high - low, 16.0)
+    extent = max(span / np.asarray(shape)) * np.asarray(shape)
+    low = 0.5 * (low + high - extent)
+    inside = np.clip(low, 0.0, whole - extent)
+    low = np.where(extent <= whole, inside, 0.5 * (whole - extent))
+    return low - 0.5, low + extent - 0.5
+
+
+class Window:
+    """A part of images, brought to the size of a panel by averaging over areas.
+
+    Parameters
+    ----------
+    low, high : array (2,)
+        Of :func:`part_of`.
+    size : tuple of int
+        Width and height of the images, pixels.
+    panel : tuple of int
+        Width and height of the panel, pixels.
+    """
+
+    def __init__(
+        self, low: Array, high: Array, size: tuple[int, int], panel: tuple[int, int]
+    ) -> None:
+        across, down = (_averaging(low[n], high[n], size[n], panel[n]) for n in (0, 1))
+        self._size = size
+        self._down, self._across = down, across.T.tocsr()
+        covered = np.outer(down.sum(axis=1), across.sum(axis=1))
+        self._beyond = np.float32(_LIGHT) * (1.0 - covered.astype(np.float32))
+
+    def of(self, image: Grey) -> Grey:
+        """Show the part.
+
+        Parameters
+        ----------
+        image : array (height, width)
+            8 bit grey.
+
+        Returns
+        -------
+        array
+            8 bit grey of the panel's size; light grey lies beyond the image.
+
+        Raises
+        ------
+        ValueError
+            If the image has another size than the camera's.
+        """
+        if image.shape != self._size[::-1]:
+            raise ValueError(
+                f"an image has {image.shape[1]} × {image.shape[0]} pixels; the camera has "
+                f"{self._size[0]} × {self._size[1]}"
+            )
+        part = self._down @ image.astype(np.float32) @ self._across + self._beyond
+        return np.asarray(part + 0.5, dtype=np.uint8)
+
+
+def _averaging(low: float, high: float, size: int, count: int) -> Any:
+    """Matrix (count, size) of the share of each pixel of an image in each of a panel."""
+    from scipy.sparse import csr_matrix
+
+    ends = np.linspace(low, high, count + 1) + 0.5
+    pixels = np.arange(size)
+    first, last = ends[:-1, None], ends[1:, None]
+    shares = np.clip(np.minimum(last, pixels + 1.0) - np.maximum(first, pixels), 0.0, None)
+    return csr_matrix((shares / (last - first)).astype(np.float32))
+
+
+def sight_axes(figure: Figure, box: Box, low: Array, high: Array) -> Axes:
+    """Add a panel for a part of an image.
+
+    Parameters
+    ----------
+    figure : Figure
+        Where to.
+    box : tuple of float
+        Left, bottom, width and height, mm.
+    low, high : array (2,)
+        Of :func:`part_of`.
+
+    Returns
+    -------
+    Axes
+        In pixels of the whole image, without the image.
+    """
+    axes = box_axes(figure, box, xlim=(low[0], high[0]), ylim=(high[1], low[1]))
+    axes.set_axis_off()
+    return axes
+
+
+def scale_bar(axes: Axes, course: Course, view: _View, length: float = 5e-3) -> None:
+    """Draw a bar as long as some millimetres below the right end of an image.
+
+    Parameters
+    ----------
+    axes : Axes
+        Of :func:`sight_axes`.
+    course : Course
+        Of the trial: the scale is that at the base.
+    view : _View
+        The camera.
+    length : float
+        Of the bar, m.
+    """
+    base = np.nanmean(course.position, axis=0)
+    ends = view.project(base + 0.5e-3 * np.concatenate([np.eye(3), -np.eye(3)]))
+    pixels = 1e3 * length * float(np.linalg.norm(ends[:3] - ends[3:], axis=1).max())
+    left, right = axes.get_xlim()
+    share = pixels / (right - left)
+    if not 0.0 < share < 1.0:
+        return
+    place: dict[str, Any] = {"transform": axes.transAxes, "clip_on": False}
+    axes.plot([1.0 - share, 1.0], [-0.035, -0.035], color=INK, linewidth=1.2, **place)
+    axes.annotate(
+        f"{1e3 * length:g} mm",
+        (1.0 - share, -0.035),
+        xycoords="axes fraction",
+        xytext=(-3.0, 0.0),
+        textcoords="offset points",
+        ha="right",
+        va="center",
+        fontsize=6.0,
+    )

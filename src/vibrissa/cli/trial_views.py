@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from vibrissa.rod.surface import Surface
     from vibrissa.trial import Camera
 
-_LIGHT, _DARK = 225.0, 70.0
+_LIGHT, _DARK = 235.0, 70.0
 _MOST = 2
 
 

@@ -34,7 +34,7 @@ from vibrissa.quantities import axis_label, to_display
 _SIDES = ((0, 1), (0, 2), (1, 2))
 _SIDE_BOXES = ((13.0, 9.5, 48.0, 40.0), (76.0, 9.5, 48.0, 40.0), (139.0, 9.5, 48.0, 40.0))
 _SIGHT_BOXES = ((2.5, 57.0, 64.0, 48.0), (69.0, 57.0, 64.0, 48.0))
-_SPACE_BOX = (133.5, 46.5, 66.0, 66.0)
+_SPACE_BOX = (131.5, 46.0, 66.0, 66.0)
 _RAIL = (191.5, 9.5, 1.8, 30.0)
 _CONTACT: dict[str, Any] = {
     "marker": "o",
@@ -199,7 +199,7 @@ def _about_whisker(
     if course.centerline is not None:
         lines = to_display("centerline", course.at_base(course.centerline))
     shown = [rest, points[span].reshape(-1, 3), lines[span][course.touching[span]].reshape(-1, 3)]
-    axes = space_axes(figure, _SPACE_BOX, bounds(np.concatenate(shown)), zoom=0.93)
+    axes = space_axes(figure, _SPACE_BOX, bounds(np.concatenate(shown)), zoom=0.9)
     name_axes(axes, (-7.0, -8.0, -9.0))
     axes.plot(*rest.T, color="black", linewidth=1.2)
     figure.text(0.72, 0.958, "contacts about the resting whisker", va="top", fontsize=7.0)

@@ -131,6 +131,13 @@ class Status(enum.IntEnum):
         "cannot see.",
         "",
     )
+    UNDERDETERMINED = (
+        27,
+        False,
+        "Fewer than three signals: a whole curve or surface of contacts explains them.",
+        "The candidates are samples of it, and the covariance spans it: add a signal, or filter "
+        "over time while the base moves.",
+    )
 
     def __new__(
         cls, code: int, ok: bool = False, explanation: str = "", advice: str = ""

@@ -21,7 +21,9 @@ from vibrissa.signals.base import signals_of, wrench_derivatives
 
 #: What can be fitted to: the signals, and the components that they are made of.
 CHANNELS = (*SIGNALS, "Fy", "Fz", "My", "Mz")
-#: Which of them are angles.
+#: What can be held on to as well: arc length and contact point, over L.
+FITTED = (*CHANNELS, "s", "px", "py", "pz")
+#: Which of the channels are angles.
 CIRCULAR = (*CIRCULAR_SIGNALS, False, False, False, False)
 #: The six components of force and moment.
 WRENCH = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
@@ -91,16 +93,19 @@ class Channels:
             Non-dimensional; not finite where a direction of nothing is measured.
         """
         if sensor is not None and sensor.deviations is not None:
-            return self._by_deviations(sensor.deviations, measured, discretization)
-        if sensor is None or sensor.wrench is None:
-            wrench = np.concatenate([values[:, :3], np.cross(values[:, 3:], values[:, :3])], axis=1)
-            components = trusted(wrench)
-        else:
-            sizes = np.repeat([discretization.force, discretization.moment], 3)
-            components = sensor.wrench / np.outer(sizes, sizes)
+            own = self._by_deviations(sensor.deviations, measured, discretization)
+            if sensor.stiffness == 0.0:
+                return own
+        wrench = np.concatenate([values[:, :3], np.cross(values[:, 3:], values[:, :3])], axis=1)
         g = channel_gradients(values, self.names)
         with np.errstate(invalid="ignore"):
-            return np.asarray(g @ components @ np.swapaxes(g, -1, -2))
+            if sensor is None:
+                return np.asarray(g @ trusted(wrench) @ np.swapaxes(g, -1, -2))
+            if sensor.wrench is not None:
+                sizes = np.repeat([discretization.force, discretization.moment], 3)
+                components = sensor.wrench / np.outer(sizes, sizes)
+                own = np.asarray(g @ components @ np.swapaxes(g, -1, -2))
+            return own + sensor.common(g, wrench)
 
     def _by_deviations(
         self, deviations: dict[str, float], measured: Array, discretization: Discretization

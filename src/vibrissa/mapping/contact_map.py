@@ -119,6 +119,7 @@ class ContactMap:
         triplet: str | tuple[str, ...] = ("Fx", "MB", "MD"),
         noise: Mapping[str, float] | ArrayLike | None = None,
         method: str = "exact",
+        stiffness_sigma: float = 0.0,
     ) -> Estimate:
         """Find the contacts that explain measured signals.
 
@@ -135,6 +136,10 @@ class ContactMap:
             Exact; or, for comparison, the paper's ways, from three signals: its look-up table,
             natural-neighbour or linear, which needs the grid, or a network, trained on first use
             (ten seconds). They see one contact where there are several.
+        stiffness_sigma : float
+            Relative standard deviation of the whisker's bending stiffness E r⁴, such as
+            ``fit_stiffness`` tells or √(σ_E² + 16 σ_r²) of those of modulus and radius; it adds to
+            the covariances, and needs noise.
 
         Returns
         -------
@@ -143,7 +148,7 @@ class ContactMap:
         """
         from vibrissa.mapping.estimate import estimate  # it knows this class
 
-        return estimate(self, signals, triplet, noise, method)
+        return estimate(self, signals, triplet, noise, method, stiffness_sigma)
 
     def tree(self, triplet: tuple[str, ...]) -> Preimages:
         """Return the search tree of three signals, made on first use.

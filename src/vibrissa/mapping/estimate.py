@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from vibrissa.mapping.approximation import APPROXIMATE, by_approximation
 from vibrissa.mapping.contact_map import spherical
 from vibrissa.mapping.explanation import Explanation, by_least_squares, by_triplet, undetermined
-from vibrissa.mapping.noise import SensorNoise
+from vibrissa.mapping.noise import SensorNoise, sensor_noise
 from vibrissa.mapping.showing import estimate_card
 from vibrissa.quantities import attributes
 from vibrissa.rod.arrays import AnyArray, Array, IntArray
@@ -184,6 +184,7 @@ def estimate(
     triplet: str | tuple[str, ...] = ("Fx", "MB", "MD"),
     noise: Mapping[str, float] | ArrayLike | None = None,
     method: str = "exact",
+    stiffness_sigma: float = 0.0,
 ) -> Estimate:
     """Find all frictionless contacts of a whisker that explain measured signals.
 
@@ -202,6 +203,8 @@ def estimate(
     method : {"exact", "lookup", "lookup-linear", "network"}
         Exact, or one of the paper's ways (:mod:`~vibrissa.mapping.approximation`), for three
         signals: its look-up table, by natural neighbours or linear, or a network.
+    stiffness_sigma : float
+        Relative standard deviation of the whisker's bending stiffness E r⁴, in the covariances.
 
     Returns
     -------
@@ -215,7 +218,7 @@ def estimate(
     """
     explain = _method(method)
     names = selection(triplet)
-    sensor = None if noise is None else SensorNoise.of(noise, names)
+    sensor = sensor_noise(noise, names, stiffness_sigma)
     values, dims, coords = measured(signals, names)
     check_signals(values, names)
     shape = values.shape[:-1]

@@ -1,8 +1,12 @@
 """One measurement at a time, in microseconds: for streams, without labelled datasets around it.
 
 Each measurement is searched for in the whole map, so that no candidate is lost by looking only near
-the last one. The contact that was followed so far is one more place to start from (for three
-signals, where candidates have become fewer), and it tells which candidate goes on from it.
+the last one; the search tree leads to the contacts in the time that a fit from the last one takes.
+The contact that was followed so far is one more place to start from, and it tells which candidate
+goes on from it.
+
+Fewer than three signals leave a curve or a surface of contacts: see
+:mod:`~vibrissa.mapping.ambiguity`.
 """
 
 from __future__ import annotations
@@ -13,25 +17,24 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.mapping.channels import Channels
-from vibrissa.mapping.estimate import check_signals
-from vibrissa.mapping.explanation import Bounds, why_none
-from vibrissa.mapping.fitting import Fits, charted
-from vibrissa.mapping.inversion import invert, polish
-from vibrissa.mapping.least_squares import (
-    by_doubt,
-    largest_misfit,
-    least_squares,
-    nearby,
-    seeding_triplet,
-)
+from vibrissa.mapping.ambiguity import Ambiguity
+from vibrissa.mapping.explanation import why_none
+from vibrissa.mapping.fitting import Fits
+from vibrissa.mapping.inversion import polish
+from vibrissa.mapping.least_squares import by_doubt, least_squares
 from vibrissa.mapping.minima import same
-from vibrissa.mapping.noise import SensorNoise
+from vibrissa.mapping.noise import sensor_noise
+from vibrissa.mapping.readout import Measurement, Mixed, Named, independent
 from vibrissa.mapping.uncertainty import point_covariances
-from vibrissa.mapping.whitening import INDISTINCT
-from vibrissa.rod.arrays import Array
+from vibrissa.mapping.weighing import explain, spread
+from vibrissa.mapping.whitening import INDISTINCT, explained
+from vibrissa.rod.arrays import AnyArray, Array
+from vibrissa.rod.batch import solve_forces
+from vibrissa.rod.kernels import evaluate
 from vibrissa.rod.newton import TOLERANCE
-from vibrissa.signals import CIRCULAR, SIGNALS, selection, signal_scales
+from vibrissa.sensing import COMPONENTS, Sensor
+from vibrissa.sensing.sensor import GRAVITY
+from vibrissa.signals import SIGNALS, selection
 from vibrissa.status import Status
 
 if TYPE_CHECKING:
@@ -39,6 +42,11 @@ if TYPE_CHECKING:
 
 # A contact moves no farther than this (over L) from one measurement to the next.
 _NEAR = 0.02
+_UNKNOWNS = 3
+# Unknowns of a contact without friction, among all.
+_FREE = [0, 2, 3]
+# Components that together are signals; a sensor that reads these reads signals by name.
+_BY_NAME = (("Fx",), ("Fy", "Fz"), ("Mx",), ("My", "Mz"))
 
 
 class Located(NamedTuple):
@@ -51,17 +59,24 @@ class Located(NamedTuple):
     status : Status
         ``UNIQUE``, ``AMBIGUOUS``, ``NOT_FRICTIONLESS`` (no contact on the map explains it; of more
         than three signals ``point`` is the one that comes nearest), ``OUTSIDE_MAP``,
-        ``DEGENERATE`` or ``MISSING``, as in :class:`Estimate`.
+        ``DEGENERATE`` or ``MISSING``, as in :class:`Estimate`. Of fewer than three signals
+        ``UNDERDETERMINED``: the candidates are samples of the curve or surface of contacts that
+        explain them, ``point`` the one in their middle.
     candidates : (k, 3) array
         All contact points, in the order of :class:`Estimate`, m.
     arc_lengths : (k,) array
         Their arc lengths, m.
     covariance : (3, 3) array
-        Covariance of ``point``, m²; NaN without noise.
+        Covariance of ``point``, m²; NaN without noise. Of fewer than three signals that of the
+        samples about it.
     misfit : float
         As in :class:`Estimate`.
     continuing : int
         Number of the candidate that goes on from the measurement before; 0 where there was none.
+    forces : (k, 3) array
+        Base forces of the candidates, whisker frame, N.
+    covariances : (k, 3, 3) array
+        Covariances of all candidates, m²; NaN without noise.
     """
 
     point: Array
@@ -71,6 +86,8 @@ class Located(NamedTuple):
     covariance: Array
     misfit: float
     continuing: int
+    forces: Array
+    covariances: Array
 
 
 class Estimator:
@@ -81,10 +98,18 @@ class Estimator:
     contacts : ContactMap
         The whisker's map.
     triplet : str or sequence of str
-        The signals that the stream carries, three or more, in this order.
+        The signals that the stream carries, in this order; fewer than three do not determine a
+        contact, but leave a curve or surface of them.
     noise : mapping or (6, 6) array_like, optional
         Standard deviation of each signal, or covariance of (F, M), SI units: gives covariances, and
         weighs more than three signals.
+    stiffness_sigma : float
+        Relative standard deviation of the whisker's bending stiffness E r⁴, in the covariances:
+        √(σ_E² + 16 σ_r²) of those of modulus and radius. It needs noise.
+
+    See Also
+    --------
+    Estimator.of_sensor : From the raw readings of a sensor, however it mixes and is mounted.
     """
 
     def __init__(
@@ -92,42 +117,95 @@ class Estimator:
         contacts: ContactMap,
         triplet: str | Sequence[str] = ("Fx", "MB", "MD"),
         noise: Mapping[str, float] | ArrayLike | None = None,
+        stiffness_sigma: float = 0.0,
     ) -> None:
-        self.names = selection(triplet)
+        names = selection(triplet, least=1)
         order = triplet.replace(",", " ").split() if isinstance(triplet, str) else list(triplet)
-        self._order = [order.index(name) for name in self.names]
-        self._sensor = None if noise is None else SensorNoise.of(noise, self.names)
+        sensor = sensor_noise(noise, names, stiffness_sigma)
+        self._order: list[int] | None = [order.index(name) for name in names]
+        self._start(contacts, Named(contacts, names, sensor), len(names))
+
+    @classmethod
+    def of_sensor(
+        cls, contacts: ContactMap, sensor: Sensor, stiffness_sigma: float = 0.0
+    ) -> Estimator:
+        """Locate contacts from a sensor's raw readings.
+
+        Parameters
+        ----------
+        contacts : ContactMap
+            The whisker's map.
+        sensor : Sensor
+            What it reads, how it is mounted and its noise; offset and weight are taken away.
+        stiffness_sigma : float
+            Relative standard deviation of the whisker's bending stiffness.
+
+        Returns
+        -------
+        Estimator
+            To be called with readings, and where the sensor carries a mass with the rotation.
+
+        Raises
+        ------
+        ValueError
+            If a channel has no noise, or channels do not tell anything.
+        """
+        out = cls.__new__(cls)
+        h, covariance = sensor.base_mixing, sensor.covariance()
+        noise = np.diag(covariance)
+        if not (noise > 0.0).all():
+            silent = [n for n, v in zip(sensor.channels, noise, strict=True) if not v > 0.0]
+            raise ValueError(f"readings are weighed by their noise; {', '.join(silent)} has none")
+        if not h.any():
+            raise ValueError("the sensor's channels read nothing of force and moment")
+        readout = _by_name(contacts, h, covariance, stiffness_sigma)
+        out._order = None
+        out._start(contacts, readout, len(sensor.channels))
+        out._sensor = sensor
+        return out
+
+    def _start(self, contacts: ContactMap, readout: _ByName | Named | Mixed, width: int) -> None:
+        self._sensor: Sensor | None = None
+        self._components = readout if isinstance(readout, _ByName) else None
+        self._readout = readout.named if isinstance(readout, _ByName) else readout
+        self._width = width
         self._contacts, self._chart = contacts, contacts.chart
-        self._determining = contacts.determines(self.names)
-        self._three = self.names
-        if len(self.names) > 3:
-            self._three = seeding_triplet(self._chart, self.names)
-        self._where = [self.names.index(name) for name in self._three]
-        self._tree = contacts.tree(self._three)
-        self._channels = Channels.of(self.names)
-        self._limit = largest_misfit(self._channels, self._sensor, contacts)
-        d = self._chart.discretization
-        self._length = d.length
-        self._scale = signal_scales(self.names, d.force, d.moment)
-        self._bounds = Bounds.of(contacts, self.names)
-        circular = np.array([CIRCULAR[SIGNALS.index(name)] for name in self.names])
-        size = np.isin(self.names, ("FT", "MB"))
-        self._most = np.where(circular, 2.0 * np.pi, np.inf)
-        self._least = np.where(size, 0.0, -self._most)
+        told = self._readout.told
+        self._ambiguity = Ambiguity(contacts.chart, self._readout) if told < _UNKNOWNS else None
+        named = isinstance(self._readout, Named)
+        self._determining = told < _UNKNOWNS or not named or contacts.determines(self.names)
+        self._limit = explained(independent(contacts, self._readout) - _UNKNOWNS)
+        self._length = self._chart.discretization.length
+        sensor = self._readout.sensor if isinstance(self._readout, Named) else None
+        self._noisy = sensor is not None or not named
         self.reset()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Signals that contacts are found from, in canonical order; none of a mix of components."""
+        return self._readout.names if isinstance(self._readout, Named) else ()
 
     def reset(self) -> None:
         """Forget the measurement before, as when the whisker has lost touch."""
         self._last: tuple[Array, Array] | None = None  # ξ and (F, p) of the contact followed
         self._number = 0  # of candidates
 
-    def __call__(self, signals: ArrayLike) -> Located:
+    def __call__(
+        self,
+        signals: ArrayLike,
+        rotation: ArrayLike | None = None,
+        gravity: ArrayLike = GRAVITY,
+    ) -> Located:
         """Locate one measurement.
 
         Parameters
         ----------
         signals : (k,) array_like
-            The signals in the order they were announced, SI units.
+            The signals in the order they were announced, SI units; or the sensor's readings.
+        rotation : (3, 3) array_like, optional
+            From the whisker's to the laboratory frame, for a sensor that carries a mass.
+        gravity : (3,) array_like
+            In the laboratory frame, m/s².
 
         Returns
         -------
@@ -137,43 +215,45 @@ class Estimator:
         Raises
         ------
         ValueError
-            If there are not as many numbers as signals were announced, a size is negative, or an
-            angle is more than a full turn.
+            If there are not as many numbers as signals were announced, a size is negative, an
+            angle is more than a full turn, or the rotation is needed but not given.
         """
         try:
             values = np.asarray(signals, dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise ValueError(
-                f"one measurement has {len(self.names)} numbers; got {signals!r}"
+                f"one measurement has {self._width} numbers; got {signals!r}"
             ) from error
-        if values.shape != (len(self.names),):
-            raise ValueError(
-                f"one measurement has {len(self.names)} signals; got shape {values.shape}"
-            )
-        values = values[self._order]
-        if ((values < self._least) | (values > self._most)).any():
-            check_signals(values, self.names)
-        targets = (values / self._scale)[None]
-        if not np.isfinite(targets).all():
+        if values.shape != (self._width,):
+            raise ValueError(f"one measurement has {self._width} signals; got shape {values.shape}")
+        if self._sensor is not None:
+            values = self._sensor.felt(values, rotation, gravity)
+            if self._components is not None:
+                values = self._components.signals(values)
+        elif self._order is not None:
+            values = values[self._order]
+        measurement = self._readout.scaled(values)
+        if not np.isfinite(measurement.measured).all():
             self.reset()
             return self._nowhere(Status.MISSING)
         if not self._determining:
             return self._nowhere(Status.DEGENERATE)
-        if len(self.names) == 3:
-            return self._by_triplet(targets)
-        return self._by_least_squares(targets)
+        if self._ambiguity is not None:
+            return self._set(measurement, self._ambiguity)
+        if len(self.names) == _UNKNOWNS:
+            return self._by_triplet(measurement)
+        return self._by_least_squares(measurement)
 
-    def _by_triplet(self, targets: Array) -> Located:
-        found = invert(self._chart, self._tree, self.names, targets)
-        n = int(found.number[0])
-        xi, values = found.contacts[0, :n], found.values[0, :n]
-        if n < self._number and not self._follows(values):
-            xi, values = self._followed(targets, xi, values)
+    def _by_triplet(self, measurement: Measurement) -> Located:
+        xi, values = self._readout.seeds(measurement)
+        assert values is not None
+        if len(xi) < self._number and not self._follows(values):
+            xi, values = self._followed(measurement.measured[None], xi, values)
         if not len(xi):
-            why, misfit = why_none(self._contacts, self.names, targets)
+            why, misfit = why_none(self._contacts, self.names, measurement.measured[None])
             return self._nowhere(Status(int(why[0])), float(misfit[0]))
         status = Status.UNIQUE if len(xi) == 1 else Status.AMBIGUOUS
-        return self._located(xi, values, status, 0.0)
+        return self._located(measurement, xi, values, status, 0.0)
 
     def _follows(self, values: Array) -> bool:
         """Whether a candidate is near the contact followed so far."""
@@ -192,74 +272,251 @@ class Estimator:
         order = np.argsort(np.hypot(xi[:, 1], xi[:, 2]))
         return xi[order], values[order]
 
-    def _by_least_squares(self, targets: Array) -> Located:
-        if self._bounds.nothing(targets)[0]:
+    def _by_least_squares(self, measurement: Measurement) -> Located:
+        if self._readout.nothing(measurement):
             return self._nowhere(Status.DEGENERATE)
-        if self._bounds.exceeded(targets)[0]:
+        if self._readout.beyond(measurement):
             return self._nowhere(Status.OUTSIDE_MAP)
-        exact = invert(self._chart, self._tree, self._three, targets[:, self._where])
-        n = int(exact.number[0])
-        starts, values = exact.contacts[0, :n], exact.values[0, :n]
+        starts, values = self._readout.seeds(measurement)
         if self._last is not None:
             starts = np.concatenate([starts, self._last[0][None]])
-            values = np.concatenate([values, self._last[1][None]])
+            if values is not None:
+                values = np.concatenate([values, self._last[1][None]])
         if len(starts):
-            rows = np.repeat(targets, len(starts), axis=0)
-            fits = nearby(
-                self._chart, self._channels, self._sensor, rows, starts, self._limit, values
-            )
-            inside = charted(self._chart, fits, self._chart.proximal)
+            fits, inside = self._fitted(measurement, starts, values)
             if (inside & (fits.misfits <= self._limit)).any():
-                return self._chosen(Fits(*(part[inside] for part in fits)))
-        # Nothing explains it: look everywhere, and find out why.
-        found, status = least_squares(self._contacts, self.names, targets, self._sensor)
-        n = int(found.number[0])
+                return self._chosen(measurement, _those(fits, inside))
+        return self._searched(measurement)
+
+    def _fitted(
+        self, measurement: Measurement, starts: Array, values: Array | None
+    ) -> tuple[Fits, AnyArray]:
+        """Fits from some starts, and which of them are stable contacts on the map."""
+        n, chart = len(starts), self._chart
+        x = _with_normal_force(starts)
+        if values is None:
+            values, _ = solve_forces(chart.discretization, x)
+        fits = Fits(
+            x, np.array(values), np.zeros((n, 6, 4)), np.full(n, np.inf), np.ones(n, np.bool_)
+        )
+        inside = np.zeros(n, np.bool_)
+        readout = self._readout
+        explain(
+            chart.discretization.rod,
+            chart.fold,
+            chart.proximal,
+            readout.how,
+            measurement.target,
+            measurement.measured,
+            readout.passes,
+            self._limit + INDISTINCT,
+            fits.contacts,
+            fits.values,
+            fits.tangents,
+            fits.misfits,
+            inside,
+        )
+        return fits, inside
+
+    def _searched(self, measurement: Measurement) -> Located:
+        """Nothing explains it: look everywhere, and find out why."""
+        if isinstance(self._readout, Named):
+            named = self._readout
+            found, statuses = least_squares(
+                self._contacts, named.names, measurement.measured[None], named.sensor
+            )
+            n = int(found.number[0])
+            return self._located(
+                measurement,
+                found.contacts[0, :n][:, _FREE],
+                found.values[0, :n],
+                Status(int(statuses[0])),
+                float(found.misfits[0, 0]),
+            )
+        nodes = self._readout.nearest(measurement)
+        starts = self._chart.contacts.reshape(-1, 3)[nodes]
+        fits, inside = self._fitted(measurement, starts, None)
+        good = fits.misfits <= self._limit
+        if (inside & good).any():
+            return self._chosen(measurement, _those(fits, inside))
+        if not inside.any():
+            return self._nowhere(Status.OUTSIDE_MAP)
+        best = int(np.argmin(np.where(inside, fits.misfits, np.inf)))
+        status = Status.OUTSIDE_MAP if good.any() else Status.NOT_FRICTIONLESS
+        xi = fits.contacts[[best]][:, _FREE]
         return self._located(
-            found.contacts[0, :n][:, [0, 2, 3]],
-            found.values[0, :n],
-            Status(int(status[0])),
-            float(found.misfits[0, 0]),
+            measurement, xi, fits.values[[best]], status, float(fits.misfits[best])
         )
 
-    def _chosen(self, fits: Fits) -> Located:
+    def _chosen(self, measurement: Measurement, fits: Fits) -> Located:
         """The same choice as in a batch, of few fits."""
-        best = float(fits.misfits.min())
-        most = min(best + INDISTINCT, self._limit)
+        misfits = fits.misfits.tolist()
+        most = min(min(misfits) + INDISTINCT, self._limit)
         kept: list[int] = []
-        for row in np.argsort(by_doubt(fits)).tolist():
-            if fits.misfits[row] <= most and not any(
+        order = [0] if len(misfits) == 1 else np.argsort(by_doubt(fits)).tolist()
+        for row in order:
+            if misfits[row] <= most and not any(
                 same(fits.contacts[row], fits.contacts[other]) for other in kept
             ):
                 kept.append(row)
         status = Status.UNIQUE if len(kept) == 1 else Status.AMBIGUOUS
-        xi = fits.contacts[kept][:, [0, 2, 3]]
-        return self._located(xi, fits.values[kept], status, float(fits.misfits[kept[0]]))
+        some = fits if len(kept) == len(misfits) == 1 else Fits(*(part[kept] for part in fits))
+        return self._located(
+            measurement,
+            some.contacts[:, _FREE],
+            some.values,
+            status,
+            misfits[kept[0]],
+            some.tangents[:, :, _FREE],
+        )
+
+    def _set(self, measurement: Measurement, ambiguity: Ambiguity) -> Located:
+        """Samples of the curve or surface of contacts that explain fewer than three signals."""
+        if self._readout.nothing(measurement):
+            return self._nowhere(Status.DEGENERATE)
+        found = ambiguity.samples(measurement)
+        if not len(found.contacts):
+            return self._nowhere(
+                Status.OUTSIDE_MAP if self._readout.beyond(measurement) else Status.NOT_FRICTIONLESS
+            )
+        points = found.values[:, 3:] * self._length
+        middle = int(np.argmin(((points - points.mean(axis=0)) ** 2).sum(axis=1)))
+        away = points - points[middle]
+        local = found.covariances * self._length**2
+        covariance = away.T @ away / len(points) + local.mean(axis=0)
+        d = self._chart.discretization
+        self._last = None
+        return Located(
+            points[middle],
+            Status.UNDERDETERMINED,
+            points,
+            found.contacts[:, 0] * self._length,
+            covariance if self._noisy else np.full((3, 3), np.nan),
+            0.0,
+            middle,
+            found.values[:, :3] * d.force,
+            local if self._noisy else np.full_like(local, np.nan),
+        )
 
     def _nowhere(self, status: Status, misfit: float = np.nan) -> Located:
-        return self._located(np.empty((0, 3)), np.empty((0, 6)), status, misfit)
+        self._last, self._number = None, 0
+        none = np.full(3, np.nan)
+        return Located(
+            none,
+            status,
+            np.empty((0, 3)),
+            np.empty(0),
+            np.full((3, 3), np.nan),
+            misfit,
+            0,
+            np.empty((0, 3)),
+            np.empty((0, 3, 3)),
+        )
 
-    def _located(self, xi: Array, values: Array, status: Status, misfit: float) -> Located:
+    def _located(
+        self,
+        measurement: Measurement,
+        xi: Array,
+        values: Array,
+        status: Status,
+        misfit: float,
+        tangents: Array | None = None,
+    ) -> Located:
         """Everything in SI units; remember which candidate goes on from the one before."""
         continuing, self._number = 0, len(xi)
-        if len(xi):
-            if self._last is not None:
-                away = values[:, 3:] - self._last[1][3:]
-                continuing = int((away * away).sum(axis=1).argmin())
-            self._last = xi[continuing], values[continuing]
-        else:
-            self._last = None
+        if self._last is not None and len(xi) > 1:
+            away = values[:, 3:] - self._last[1][3:]
+            continuing = int((away * away).sum(axis=1).argmin())
+        self._last = xi[continuing], values[continuing]
         points = values[:, 3:] * self._length
-        covariance = np.full((3, 3), np.nan)
-        if len(xi) and self._sensor is not None:
-            d = self._chart.discretization
-            covariance = point_covariances(d, self.names, xi[:1], self._sensor)[0][0]
-            covariance *= self._length**2
+        covariances = self._covariances(measurement, xi, values, tangents)
         return Located(
-            points[0] if len(xi) else np.full(3, np.nan),
+            points[0],
             status,
             points,
             xi[:, 0] * self._length,
-            covariance,
+            covariances[0],
             misfit,
             continuing,
+            values[:, :3] * self._chart.discretization.force,
+            covariances,
         )
+
+    def _covariances(
+        self, measurement: Measurement, xi: Array, values: Array, tangents: Array | None
+    ) -> Array:
+        """Of candidates, m²."""
+        n, d = len(xi), self._chart.discretization
+        out = np.full((n, 3, 3), np.nan)
+        if not self._noisy:
+            return out
+        if tangents is None:
+            tangents = np.empty((n, 6, 3))
+            evaluate(d.rod, _with_normal_force(xi), np.empty((n, 6)), tangents, 0, n)
+        readout = self._readout
+        if not spread(readout.how, measurement.measured, xi, values, tangents, out):
+            assert isinstance(readout, Named)
+            assert readout.sensor is not None
+            out = point_covariances(d, readout.names, xi, readout.sensor)[0]
+        return out * self._length**2
+
+
+def _with_normal_force(xi: Array) -> Array:
+    """(s, f_y, f_z) as (s, 0, f_y, f_z), for few rows."""
+    out = np.zeros((len(xi), 4))
+    out[:, _FREE] = xi
+    return out
+
+
+def _those(fits: Fits, rows: AnyArray) -> Fits:
+    return fits if rows.all() else Fits(*(part[rows] for part in fits))
+
+
+class _ByName:
+    """A sensor whose channels tell whole signals: its readings as those."""
+
+    def __init__(self, named: Named, back: Array, places: list[int]) -> None:
+        self.named, self._back, self._places = named, back, places
+        self._wrench = np.zeros(6)
+
+    def signals(self, values: Array) -> Array:
+        """Turn readings (k,) into the signals."""
+        w = self._wrench
+        w[self._places] = self._back @ values
+        fx, fy, fz, mx, my, mz = w.tolist()
+        known = {
+            "Fx": fx,
+            "FT": float(np.hypot(fy, fz)),
+            "FD": float(np.arctan2(fz, fy)),
+            "Mx": mx,
+            "MB": float(np.hypot(my, mz)),
+            "MD": float(np.arctan2(mz, my)),
+        }
+        return np.array([known[name] for name in self.named.names])
+
+
+def _by_name(
+    contacts: ContactMap, h: Array, covariance: Array, stiffness: float
+) -> _ByName | Mixed:
+    """Signals by name if the channels tell these and nothing else, or a mix."""
+    read = [name for name, column in zip(COMPONENTS, h.T, strict=True) if column.any()]
+    whole = [group for group in _BY_NAME if set(group) <= set(read)]
+    places = [COMPONENTS.index(name) for name in read]
+    own = h[:, places]
+    complete = sum(map(len, whole)) == len(read) and len(read) >= _UNKNOWNS
+    if not complete or np.linalg.matrix_rank(own / np.linalg.norm(own, axis=0)) < len(read):
+        return Mixed(contacts, h, covariance, stiffness)
+    root = np.linalg.inv(np.linalg.cholesky(covariance))
+    back = np.linalg.pinv(root @ own) @ root
+    wrench = np.zeros((6, 6))
+    wrench[np.ix_(places, places)] = back @ covariance @ back.T
+    names = {
+        ("Fx",): ("Fx",),
+        ("Fy", "Fz"): ("FT", "FD"),
+        ("Mx",): ("Mx",),
+        ("My", "Mz"): ("MB", "MD"),
+    }
+    chosen = [name for group in whole for name in names[group]]
+    signals = tuple(name for name in SIGNALS if name in chosen)
+    noise = sensor_noise(0.5 * (wrench + wrench.T), signals, stiffness)
+    return _ByName(Named(contacts, signals, noise), np.asarray(back, dtype=np.float64), places)

@@ -57,6 +57,10 @@ class Bounds(NamedTuple):
         """Whether signals (n, k) are far larger than any on the map, shape (n,)."""
         return np.asarray((np.abs(targets[:, self.sizes]) > _FAR_BEYOND * self.largest).any(axis=1))
 
+    def most(self) -> list[tuple[int, float]]:
+        """For each of these signals, what it can be at most."""
+        return list(zip(self.sizes, (_FAR_BEYOND * self.largest).tolist(), strict=True))
+
 
 class Explanation(NamedTuple):
     """Rows × candidates, non-dimensional, NaN-padded.

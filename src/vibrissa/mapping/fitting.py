@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.mapping.channels import CHANNELS
+from vibrissa.mapping.channels import FITTED
 from vibrissa.rod.arrays import AnyArray, Array, IntArray, Rod
 from vibrissa.rod.batch import share_out
 from vibrissa.rod.compiled import copy, inlined, kernel
@@ -58,9 +58,15 @@ class Fits(NamedTuple):
 
 @inlined
 def channel_equations(
-    v: Array, t: Array, codes: IntArray, targets: Array, residual: Array, jacobian: Array
+    x: Array,
+    v: Array,
+    t: Array,
+    codes: IntArray,
+    targets: Array,
+    residual: Array,
+    jacobian: Array,
 ) -> None:
-    """Channels of (F, p) minus targets (k,), and their derivatives by x (k, 4)."""
+    """Channels of x and (F, p) minus targets (k,), and their derivatives by x (k, 4)."""
     fx, fy, fz = v[0], v[1], v[2]
     px, py, pz = v[3], v[4], v[5]
     mx, my, mz = py * fz - pz * fy, pz * fx - px * fz, px * fy - py * fx
@@ -85,8 +91,12 @@ def channel_equations(
             value = fz
         elif w == 8:
             value = my
-        else:
+        elif w == 9:
             value = mz
+        elif w == 10:
+            value = x[0]
+        else:
+            value = v[w - 8]
         residual[k] = value - targets[k]
         if w == 2 or w == 5:
             residual[k] = wrapped(residual[k])
@@ -116,8 +126,12 @@ def channel_equations(
                 d = dfz
             elif w == 8:
                 d = dmy
-            else:
+            elif w == 9:
                 d = dmz
+            elif w == 10:
+                d = 1.0 if c == 0 else 0.0
+            else:
+                d = t[w - 8, c]
             jacobian[k, c] = d
 
 
@@ -268,7 +282,7 @@ def _fit(
                     for a in range(6):
                         t[a, 1] = third[a, 0]
                 at = row + i
-                channel_equations(value, t, codes, targets[at], residual, jacobian)
+                channel_equations(to[i], value, t, codes, targets[at], residual, jacobian)
                 misfit = _whiten(weights[at], residual, jacobian, k, trial_r, trial_j)
                 if misfit < misfits[at]:
                     damping[i] = 0.0 if damping[i] < 1e-5 else 0.1 * damping[i]
@@ -348,7 +362,7 @@ def fit(
     discretization : Discretization
         The whisker.
     channels : tuple of str
-        What was measured, of :data:`CHANNELS`.
+        What was measured, of :data:`FITTED`.
     targets : (n, k) array
         Measured values, non-dimensional.
     weights : (n, k, k) array
@@ -403,7 +417,7 @@ def _once(
         np.full(n, np.inf),
         np.zeros(n, np.bool_),
     )
-    codes = np.array([CHANNELS.index(name) for name in channels])
+    codes = np.array([FITTED.index(name) for name in channels])
     rod = discretization.rod
     targets, weights = np.ascontiguousarray(targets), np.ascontiguousarray(weights)
     share_out(

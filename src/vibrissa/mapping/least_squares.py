@@ -165,6 +165,13 @@ def largest_misfit(channels: Channels, sensor: SensorNoise | None, contacts: Con
     return explained(degrees - _UNKNOWNS)
 
 
+def constant_weights(channels: Channels, sensor: SensorNoise | None) -> bool:
+    """Whether the weights of channels are the same for all contacts."""
+    if sensor is None or sensor.stiffness > 0.0:
+        return False
+    return sensor.deviations is not None or not set(channels.names) & {"FT", "FD", "MB", "MD"}
+
+
 def _weights(
     chart: Reach, channels: Channels, sensor: SensorNoise | None, measured: Array, values: Array
 ) -> Array:
@@ -210,9 +217,7 @@ def nearby(
         values, _ = solve_forces(d, contacts)
     targets = channels.targets(measured)
     # Weights that depend on the contact are taken there once it is nearly known.
-    settled = sensor is not None and (
-        sensor.deviations is not None or not set(channels.names) & {"FT", "FD", "MB", "MD"}
-    )
+    settled = constant_weights(channels, sensor)
     for _ in range(1 if settled else 2):
         weights = _weights(chart, channels, sensor, measured, values)
         fits = fit(

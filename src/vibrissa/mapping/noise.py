@@ -34,13 +34,18 @@ class SensorNoise:
         Standard deviation of each signal.
     wrench : (6, 6) array or None
         Covariance of (F, M).
+    stiffness : float
+        Relative standard deviation of the whisker's bending stiffness, to which all forces and
+        moments are proportional: of E r⁴, so √(σ_E² + 16 σ_r²) of those of modulus and radius. It
+        is the same error in every measurement.
     """
 
     deviations: dict[str, float] | None
     wrench: Array | None
+    stiffness: float = 0.0
 
     @classmethod
-    def of(cls, noise: Noise, names: tuple[str, ...]) -> SensorNoise:
+    def of(cls, noise: Noise, names: tuple[str, ...], stiffness: float = 0.0) -> SensorNoise:
         """Read noise and check it.
 
         Parameters
@@ -49,6 +54,8 @@ class SensorNoise:
             Standard deviation of each signal, or covariance of (F, M), SI units.
         names : tuple of str
             The signals, or components of force and moment, that a mapping must have.
+        stiffness : float
+            Relative standard deviation of the whisker's bending stiffness.
 
         Returns
         -------
@@ -60,6 +67,10 @@ class SensorNoise:
         ValueError
             If it lacks a signal, or is no covariance.
         """
+        if not 0.0 <= stiffness < np.inf:
+            raise ValueError(
+                f"the stiffness's relative standard deviation is not negative; got {stiffness}"
+            )
         if isinstance(noise, Mapping):
             missing = [name for name in names if name not in noise]
             if missing:
@@ -73,7 +84,7 @@ class SensorNoise:
                 raise ValueError(f"noise must be standard deviations ≥ 0; got {given}") from error
             if not all(0.0 <= value < np.inf for value in sigma.values()):
                 raise ValueError(f"noise must be standard deviations ≥ 0; got {sigma}")
-            return cls(sigma, None)
+            return cls(sigma, None, float(stiffness))
         try:
             wrench = np.asarray(noise, dtype=np.float64)
         except (TypeError, ValueError) as error:
@@ -95,7 +106,7 @@ class SensorNoise:
             raise ValueError(
                 f"a covariance has no negative eigenvalue; that of its correlations is {least:.3g}"
             )
-        return cls(None, wrench)
+        return cls(None, wrench, float(stiffness))
 
     def covariance(self, names: tuple[str, ...], force: Array, moment: Array) -> Array:
         """Covariance of signals.
@@ -115,12 +126,67 @@ class SensorNoise:
         if self.wrench is None:
             assert self.deviations is not None
             sigma = np.array([self.deviations[name] for name in names])
-            return np.broadcast_to(np.diag(sigma**2), (len(force), len(names), len(names)))
+            own = np.broadcast_to(np.diag(sigma**2), (len(force), len(names), len(names)))
+            if self.stiffness == 0.0:
+                return own
         g = wrench_derivatives(force, moment)[:, [SIGNALS.index(name) for name in names]]
         with np.errstate(invalid="ignore"):
-            out = np.asarray(g @ self.wrench @ np.swapaxes(g, -1, -2))
+            if self.wrench is not None:
+                own = np.asarray(g @ self.wrench @ np.swapaxes(g, -1, -2))
+            out = own + self.common(g, np.concatenate([force, moment], axis=-1))
         out[~np.isfinite(out)] = np.nan
         return out
+
+    def common(self, gradients: Array, wrenches: Array) -> Array:
+        """Covariance that the uncertainty of the stiffness adds to channels.
+
+        Parameters
+        ----------
+        gradients : (n, k, 6) array
+            ∂(channels)/∂(F, M).
+        wrenches : (n, 6) array
+            (F, M), in the same units.
+
+        Returns
+        -------
+        (n, k, k) array
+            Of rank one: all channels grow together.
+        """
+        grown = self.stiffness * np.einsum("nki,ni->nk", gradients, wrenches)
+        return np.asarray(grown[:, :, None] * grown[:, None, :])
+
+
+def sensor_noise(
+    noise: Noise | None, names: tuple[str, ...], stiffness: float = 0.0
+) -> SensorNoise | None:
+    """Read noise if there is any.
+
+    Parameters
+    ----------
+    noise : mapping, (6, 6) array_like or None
+        As for :meth:`SensorNoise.of`.
+    names : tuple of str
+        The signals.
+    stiffness : float
+        Relative standard deviation of the whisker's bending stiffness.
+
+    Returns
+    -------
+    SensorNoise or None
+        None for none.
+
+    Raises
+    ------
+    ValueError
+        If the noise does not fit, or the stiffness is uncertain but no noise is known.
+    """
+    if noise is not None:
+        return SensorNoise.of(noise, names, stiffness)
+    if stiffness != 0.0:
+        raise ValueError(
+            "the uncertainty of the stiffness adds to that of a sensor: give its noise"
+        )
+    return None
 
 
 def ellipsoids(covariance: Array, dims: tuple[str, ...], shape: tuple[int, ...]) -> xr.Dataset:

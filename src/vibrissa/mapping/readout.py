@@ -1,0 +1,254 @@
+"""What a stream carries, ready for one measurement at a time: signals by name, or a linear mix.
+
+A readout turns a measurement into channels with weights (:class:`~vibrissa.mapping.weighing`), and
+knows where contacts that explain it may lie: from a search tree of three quantities over the map.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vibrissa.mapping.channels import CHANNELS, FITTED, WRENCH, Channels
+from vibrissa.mapping.estimate import check_signals
+from vibrissa.mapping.explanation import Bounds
+from vibrissa.mapping.inversion import MOST_CANDIDATES, _invert
+from vibrissa.mapping.least_squares import constant_weights, seeding_triplet
+from vibrissa.mapping.noise import SensorNoise
+from vibrissa.mapping.weighing import Weighing, tree_seeds
+from vibrissa.mapping.whitening import TRUSTED, rank
+from vibrissa.rod.arrays import Array, IntArray
+from vibrissa.rod.preimage import MOST_SEEDS, Preimages
+from vibrissa.signals import CIRCULAR, SIGNALS, signal_scales
+
+if TYPE_CHECKING:
+    from vibrissa.mapping.contact_map import ContactMap
+
+# A direction of the readings in which contacts of the map vary so much less than the noise and the
+# others tells nothing.
+_UNTOLD = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """One measurement, non-dimensional: what was measured, and what the channels should be."""
+
+    measured: Array
+    target: Array
+
+
+class Named:
+    """Signals by name, and components of force and moment.
+
+    Parameters
+    ----------
+    contacts : ContactMap
+        The map.
+    names : tuple of str
+        Signals in canonical order.
+    sensor : SensorNoise or None
+        Their noise.
+    """
+
+    def __init__(
+        self, contacts: ContactMap, names: tuple[str, ...], sensor: SensorNoise | None
+    ) -> None:
+        chart = contacts.chart
+        d = chart.discretization
+        self.names, self.sensor, self.channels = names, sensor, Channels.of(names)
+        self.scale = signal_scales(names, d.force, d.moment)
+        self._pairs = self.channels.pairs()
+        self._circular = [CIRCULAR[SIGNALS.index(name)] for name in names]
+        self._sizes = [i for i, name in enumerate(names) if name in ("FT", "MB")]
+        self._most = Bounds.of(contacts, names).most()
+        self._straight = [i for i, turns in enumerate(self._circular) if not turns]
+        self.how = _weighing(self.channels, sensor, d.force, d.moment, self.scale)
+        self.passes = 1 if constant_weights(self.channels, sensor) else 2
+        self.told = len(names)
+        if len(names) >= 3:
+            three = names if len(names) == 3 else seeding_triplet(chart, names)
+            self._chart, self._tree = chart, contacts.tree(three).tree
+            self._where = [names.index(name) for name in three]
+            self._row = np.zeros((1, 6))
+            self._row[0, 3:] = [SIGNALS.index(name) for name in three]
+            self._number = np.zeros(1, np.int64)
+            self._found = np.full((1, MOST_CANDIDATES, 3), np.nan)
+            self._values = np.full((1, MOST_CANDIDATES, 6), np.nan)
+
+    def scaled(self, values: Array) -> Measurement:
+        """Check one measurement (k,), SI units, and make it non-dimensional; NaN stays NaN."""
+        for i, value in enumerate(values.tolist()):
+            if self._circular[i]:
+                if abs(value) > 2.0 * math.pi:
+                    check_signals(values, self.names)
+            elif value < 0.0 and i in self._sizes:
+                check_signals(values, self.names)
+        measured = values / self.scale
+        if not self._pairs:
+            return Measurement(measured, measured)
+        target = measured.copy()
+        for i in self._pairs:
+            size, angle = measured[i], measured[i + 1]
+            target[i], target[i + 1] = size * math.cos(angle), size * math.sin(angle)
+        return Measurement(measured, target)
+
+    def nothing(self, measurement: Measurement) -> bool:
+        """Whether the whisker touches nothing."""
+        return bool(self._straight) and not measurement.measured[self._straight].any()
+
+    def beyond(self, measurement: Measurement) -> bool:
+        """Whether the signals are far larger than any on the map."""
+        values = measurement.measured.tolist()
+        return any(abs(values[i]) > most for i, most in self._most)
+
+    def seeds(self, measurement: Measurement) -> tuple[Array, Array]:
+        """Contacts ξ (n, 3) that give three of the signals exactly, with (F, p) (n, 6)."""
+        chart = self._chart
+        self._row[0, :3] = measurement.measured[self._where]
+        self._number[0] = 0
+        _invert(
+            chart.discretization.rod,
+            chart.fold,
+            self._tree,
+            chart.proximal,
+            self._row,
+            self._number,
+            self._found,
+            self._values,
+            0,
+            1,
+        )
+        n = int(self._number[0])
+        return self._found[0, :n].copy(), self._values[0, :n].copy()
+
+
+class Mixed:
+    """A linear mix of force and moment, z = H (F, M) + noise.
+
+    Parameters
+    ----------
+    contacts : ContactMap
+        The map.
+    mixing : (k, 6) array
+        H, at the whisker's base, SI units.
+    covariance : (k, k) array
+        Of the noise.
+    stiffness : float
+        Relative standard deviation of the whisker's bending stiffness.
+    """
+
+    def __init__(
+        self, contacts: ContactMap, mixing: Array, covariance: Array, stiffness: float = 0.0
+    ) -> None:
+        chart = contacts.chart
+        d = chart.discretization
+        sizes = np.repeat([d.force, d.moment], 3)
+        size, axes = np.linalg.eigh(covariance)
+        if not size[0] > 0.0:
+            raise ValueError(
+                "a mix of force and moment can only be weighed with noise in all of it"
+            )
+        whiten = axes.T / np.sqrt(size)[:, None]
+        known = chart.values.reshape(-1, 6)
+        wrenches = np.concatenate([known[:, :3], np.cross(known[:, 3:], known[:, :3])], axis=1)
+        typical = np.sqrt((wrenches**2).mean(axis=0))
+        # Singular directions of what contacts make of whitened readings, the strongest first.
+        u, strength, _ = np.linalg.svd(whiten @ (mixing * sizes) * typical)
+        self.told = int((strength > _UNTOLD * strength[0]).sum())
+        self._reduce = (u.T @ whiten)[: self.told]
+        h = self._reduce @ (mixing * sizes)
+        self.how = Weighing(
+            np.array([FITTED.index(name) for name in WRENCH]),
+            np.ascontiguousarray(h),
+            np.eye(self.told),
+            np.zeros((6, 6)),
+            0.0,
+            np.full(6, np.nan),
+            float(stiffness),
+        )
+        self.passes = 2 if stiffness > 0.0 else 1
+        self._back = np.linalg.pinv(h)
+        self._chart, self._seen = chart, wrenches @ h.T
+        self._largest = 10.0 * np.abs(self._seen).max(axis=0)
+        n, m, k = chart.values.shape[:3]
+        i, j, _ = np.meshgrid(np.arange(n), np.arange(m), np.arange(k), indexing="ij")
+        self._part = (4 * (4 * i // n) + (4 * j // m) % 4).reshape(-1)
+        if self.told >= 3:
+            three = h[:3]
+            values = self._seen[:, :3].reshape(n, m, k, 3)
+            force, point = chart.tangents[..., :3, :], chart.tangents[..., 3:, :]
+            moment = np.cross(point, chart.values[..., :3, None], axis=-2)
+            moment = moment + np.cross(chart.values[..., 3:, None], force, axis=-2)
+            slopes = three @ np.concatenate([force, moment], axis=-2)
+            straight = (False, False, False)
+            self._tree = Preimages.of(chart, np.ascontiguousarray(values), slopes, straight).tree
+            self._found = np.empty((MOST_SEEDS, 3))
+            size = np.linalg.norm(slopes, axis=-1, keepdims=True)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                volume = np.abs(np.linalg.det(slopes / size))
+            if np.nanmedian(volume) < _UNTOLD:
+                self.told = 2
+
+    def scaled(self, values: Array) -> Measurement:
+        """Make one measurement (k,) non-dimensional and white; NaN stays NaN."""
+        z = self._reduce @ values
+        return Measurement(z, self._back @ z)
+
+    def nothing(self, measurement: Measurement) -> bool:
+        """Whether the whisker touches nothing."""
+        return not measurement.measured.any()
+
+    def beyond(self, measurement: Measurement) -> bool:
+        """Whether the readings are far larger than any on the map."""
+        return bool((np.abs(measurement.measured) > self._largest).any())
+
+    def seeds(self, measurement: Measurement) -> tuple[Array, Array | None]:
+        """Contacts ξ (n, 3) that about give three combinations of the readings."""
+        fold = self._chart.fold
+        n = tree_seeds(
+            fold, self._tree, np.ascontiguousarray(measurement.measured[:3]), self._found
+        )
+        return self._found[:n].copy(), None
+
+    def nearest(self, measurement: Measurement) -> IntArray:
+        """Nodes of the chart that come nearest, one in each of sixteen parts."""
+        away = ((self._seen - measurement.measured) ** 2).sum(axis=1)
+        order = np.argsort(away)
+        _, first = np.unique(self._part[order], return_index=True)
+        return np.asarray(order[first])
+
+
+def _weighing(
+    channels: Channels, sensor: SensorNoise | None, force: float, moment: float, scale: Array
+) -> Weighing:
+    k = len(channels.names)
+    sizes = np.repeat([force, moment], 3)
+    components, deviations = np.zeros((6, 6)), np.full(k, np.nan)
+    if sensor is not None and sensor.wrench is not None:
+        components = sensor.wrench / np.outer(sizes, sizes)
+    elif sensor is not None and sensor.deviations is not None:
+        deviations = np.array([sensor.deviations[name] for name in channels.signals]) / scale
+    return Weighing(
+        np.array([CHANNELS.index(name) for name in channels.names]),
+        np.eye(k),
+        np.zeros((k, k)),
+        np.ascontiguousarray(components, dtype=np.float64),
+        TRUSTED if sensor is None else 0.0,
+        deviations,
+        0.0 if sensor is None else sensor.stiffness,
+    )
+
+
+def independent(contacts: ContactMap, readout: Named | Mixed) -> int:
+    """How many independent numbers a measurement tells."""
+    if isinstance(readout, Mixed):
+        return len(readout.how.own)
+    sensor, channels = readout.sensor, readout.channels
+    if sensor is None or sensor.wrench is None:
+        return len(channels.names)
+    node = contacts.chart.values[-1, :1, -1]
+    ones = np.ones((1, len(channels.names)))
+    return rank(channels.covariance(sensor, ones, node, contacts.chart.discretization)[0])

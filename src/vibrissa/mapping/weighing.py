@@ -1,0 +1,361 @@
+"""One measurement through compiled code: its weights, its fits, and the covariance of each contact.
+
+What batches do with arrays (:mod:`~vibrissa.mapping.whitening`, :mod:`~vibrissa.mapping.channels`),
+here for one row at a time, where NumPy's overhead would be ten times the work. A measurement is
+z = A c(x) + noise: a mix A of channels c, the identity for signals by name.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from vibrissa.mapping.fitting import _fit, channel_equations
+from vibrissa.rod.arrays import AnyArray, Array, IntArray, Rod
+from vibrissa.rod.compiled import copy, inlined, kernel
+from vibrissa.rod.newton import point_determinant, stable
+from vibrissa.rod.preimage import MOST_SEEDS, Tree, seeds
+from vibrissa.rod.reach import LEAST_ARC, Fold, chart_to_contact
+
+# Of a channel's variance, what others do not explain; below this the covariance is singular.
+_SINGULAR = 1e-10
+_TIMES = 8
+# Unknowns that a measurement tells this much worse than others (as a share) it does not tell.
+_OPEN = 1e-14
+
+
+class Weighing(NamedTuple):
+    """How a measurement is weighed, non-dimensional.
+
+    Parameters
+    ----------
+    codes : (k,) int array
+        The channels.
+    mixing : (q, k) array
+        A.
+    own : (q, q) array
+        Covariance of z that is always there.
+    components : (6, 6) array
+        Covariance of (F, M).
+    share : float
+        Standard deviation of components of F and M relative to |F| and |M|.
+    deviations : (k,) array
+        Standard deviations of signals by name; NaN for none.
+    stiffness : float
+        Relative standard deviation of the stiffness.
+    """
+
+    codes: IntArray
+    mixing: Array
+    own: Array
+    components: Array
+    share: float
+    deviations: Array
+    stiffness: float
+
+
+@inlined
+def _gradients(codes: IntArray, force: Array, moment: Array, out: Array) -> None:
+    """∂(channels)/∂(F, M), (k, 6)."""
+    for k in range(codes.shape[0]):
+        for a in range(6):
+            out[k, a] = 0.0
+        w = codes[k]
+        if w == 0 or w == 3:
+            out[k, w] = 1.0
+        elif w == 6 or w == 7:
+            out[k, w - 5] = 1.0
+        elif w == 8 or w == 9:
+            out[k, w - 4] = 1.0
+        else:
+            first = 0 if w < 3 else 3
+            y, z = (force[1], force[2]) if w < 3 else (moment[1], moment[2])
+            size = np.sqrt(y * y + z * z)
+            if w == 1 or w == 4:
+                out[k, first + 1], out[k, first + 2] = y / size, z / size
+            else:
+                out[k, first + 1], out[k, first + 2] = -z / size**2, y / size**2
+
+
+@inlined
+def _covariance(how: Weighing, value: Array, measured: Array, sigma: Array) -> None:
+    """Covariance (k, k) of the channels at a contact with (F, p)."""
+    codes, components, deviations = how.codes, how.components, how.deviations
+    k = codes.shape[0]
+    force, moment, g = np.empty(3), np.empty(3), np.empty((k, 6))
+    copy(value[:3], force)
+    px, py, pz = value[3], value[4], value[5]
+    moment[0] = py * force[2] - pz * force[1]
+    moment[1] = pz * force[0] - px * force[2]
+    moment[2] = px * force[1] - py * force[0]
+    _gradients(codes, force, moment, g)
+    f2 = force[0] ** 2 + force[1] ** 2 + force[2] ** 2
+    m2 = moment[0] ** 2 + moment[1] ** 2 + moment[2] ** 2
+    grown = np.zeros(k)
+    for i in range(k):
+        for a in range(3):
+            grown[i] += how.stiffness * (g[i, a] * force[a] + g[i, 3 + a] * moment[a])
+    for i in range(k):
+        for j in range(k):
+            total = grown[i] * grown[j]
+            for a in range(6):
+                size = f2 if a < 3 else m2
+                total += how.share**2 * size * g[i, a] * g[j, a]
+                for c in range(6):
+                    total += g[i, a] * components[a, c] * g[j, c]
+            sigma[i, j] = total
+    if not deviations[0] >= 0.0:
+        return
+    for i in range(k):
+        w = codes[i]
+        if w == 6 or w == 8:  # a size is followed by its direction
+            size, cos, sin = measured[i], np.cos(measured[i + 1]), np.sin(measured[i + 1])
+            along, across = deviations[i] ** 2, (size * deviations[i + 1]) ** 2
+            sigma[i, i] += cos * cos * along + sin * sin * across
+            sigma[i + 1, i + 1] += sin * sin * along + cos * cos * across
+            sigma[i, i + 1] += cos * sin * (along - across)
+            sigma[i + 1, i] += cos * sin * (along - across)
+        elif w != 7 and w != 9:
+            sigma[i, i] += deviations[i] ** 2
+
+
+@kernel
+def weigh(how: Weighing, value: Array, measured: Array, out: Array) -> bool:
+    """Fill weights W (k, k), rows beyond q zero, for a contact with (F, p).
+
+    Parameters
+    ----------
+    how : Weighing
+        Of the measurement.
+    value : (6,) array
+        (F, p) of about the contact.
+    measured : (k,) array
+        Signals by name, where these have deviations.
+    out : (k, k) array
+        Filled: WᵀW = Aᵀ Σ⁻¹ A.
+
+    Returns
+    -------
+    bool
+        False where the covariance is singular or not finite.
+    """
+    mixing = how.mixing
+    q, k = mixing.shape
+    sigma, mixed, low = np.empty((k, k)), np.zeros((q, k)), np.zeros((q, q))
+    _covariance(how, value, measured, sigma)
+    for i in range(q):
+        for j in range(k):
+            for a in range(k):
+                mixed[i, j] += mixing[i, a] * sigma[a, j]
+    for i in range(q):
+        for j in range(i + 1):
+            total = how.own[i, j]
+            for a in range(k):
+                total += mixed[i, a] * mixing[j, a]
+            whole = total
+            for a in range(j):
+                total -= low[i, a] * low[j, a]
+            if i > j:
+                low[i, j] = total / low[j, j]
+            elif total > _SINGULAR * whole and total < np.inf:
+                low[i, i] = np.sqrt(total)
+            else:
+                return False
+    for j in range(k):
+        for i in range(k):
+            total = mixing[i, j] if i < q else 0.0
+            if i < q:
+                for a in range(i):
+                    total -= low[i, a] * out[a, j]
+                total /= low[i, i]
+            out[i, j] = total
+    return True
+
+
+@kernel
+def explain(
+    rod: Rod,
+    fold: Fold,
+    proximal: float,
+    how: Weighing,
+    target: Array,
+    measured: Array,
+    passes: int,
+    worth: float,
+    contacts: Array,
+    values: Array,
+    tangents: Array,
+    misfits: Array,
+    inside: AnyArray,
+) -> bool:
+    """Fit one measurement from several starts; see :func:`~vibrissa.mapping.fitting.fit`.
+
+    Parameters
+    ----------
+    rod : tuple of arrays
+        Of the whisker.
+    fold : tuple of arrays
+        Of the chart.
+    proximal : float
+        Smallest arc length on the map, over L.
+    how : Weighing
+        Of the measurement.
+    target : (k,) array
+        What the channels should be.
+    measured : (k,) array
+        Signals by name, where these have deviations.
+    passes : int
+        How often weights are taken anew at where the last fit ended.
+    worth : float
+        Fits that are slow to come to rest are given up while χ² is above this.
+    contacts, values, tangents, misfits : (n, 4), (n, 6), (n, 6, 4), (n,) arrays
+        Where to start, with (F, p) there; filled with the fits.
+    inside : (n,) bool array
+        Filled: whether a fit is a stable contact on the map.
+
+    Returns
+    -------
+    bool
+        False where there are no weights.
+    """
+    n, k = contacts.shape[0], how.codes.shape[0]
+    targets, weights = np.empty((n, k)), np.empty((n, k, k))
+    converged = np.zeros(n, np.bool_)
+    for row in range(n):
+        copy(target, targets[row])
+    codes = how.codes
+    for _ in range(passes):
+        for row in range(n):
+            if not weigh(how, values[row], measured, weights[row]):
+                return False
+        _fit(
+            rod,
+            False,
+            LEAST_ARC,
+            codes,
+            targets,
+            weights,
+            contacts,
+            values,
+            tangents,
+            misfits,
+            converged,
+            0,
+            n,
+        )
+        for row in range(n):
+            for _ in range(_TIMES):
+                if converged[row] or not misfits[row] <= worth:
+                    break
+                _fit(
+                    rod,
+                    False,
+                    LEAST_ARC,
+                    codes,
+                    targets,
+                    weights,
+                    contacts,
+                    values,
+                    tangents,
+                    misfits,
+                    converged,
+                    row,
+                    row + 1,
+                )
+    xi, by_xi = np.empty(3), np.empty((6, 3))
+    for row in range(n):
+        xi[0], xi[1], xi[2] = contacts[row, 0], contacts[row, 2], contacts[row, 3]
+        for a in range(6):
+            t = tangents[row, a]
+            by_xi[a, 0], by_xi[a, 1], by_xi[a, 2] = t[0], t[2], t[3]
+        finite = misfits[row] < np.inf
+        inside[row] = finite and stable(fold, proximal, xi, point_determinant(by_xi))
+    return True
+
+
+@kernel
+def spread(
+    how: Weighing,
+    measured: Array,
+    contacts: Array,
+    values: Array,
+    tangents: Array,
+    covariances: Array,
+) -> bool:
+    """Covariances of contact points.
+
+    Parameters
+    ----------
+    how : Weighing
+        Of the measurement.
+    measured : (k,) array
+        Signals by name, where these have deviations.
+    contacts, values, tangents : (n, 3), (n, 6), (n, 6, 3) arrays
+        ξ, (F, p) and ∂(F, p)/∂ξ of the contacts found.
+    covariances : (n, 3, 3) array
+        Filled, non-dimensional; NaN where the measurement does not determine the contact.
+
+    Returns
+    -------
+    bool
+        False where a measurement cannot be weighed.
+    """
+    n, k = values.shape[0], how.codes.shape[0]
+    x, t, low, root = np.zeros(4), np.zeros((6, 4)), np.zeros((3, 3)), np.empty((3, 3))
+    residual, jacobian, target = np.empty(k), np.empty((k, 4)), np.zeros(k)
+    weights, j, size = np.empty((k, k)), np.empty((k, 3)), np.empty(3)
+    for row in range(n):
+        if not weigh(how, values[row], measured, weights):
+            return False
+        x[0] = contacts[row, 0]
+        for a in range(6):
+            d = tangents[row, a]
+            t[a, 0], t[a, 2], t[a, 3] = d[0], d[1], d[2]
+        channel_equations(x, values[row], t, how.codes, target, residual, jacobian)
+        for c in range(3):
+            size[c] = 0.0
+            for i in range(k):
+                total = 0.0
+                for a in range(k):
+                    total += weights[i, a] * jacobian[a, 0 if c == 0 else c + 1]
+                j[i, c] = total
+                size[c] += total * total
+            size[c] = np.sqrt(size[c])
+        known = True
+        for p in range(3):  # Cholesky of JᵀJ, columns scaled to one
+            for q in range(p + 1):
+                total = 0.0
+                for i in range(k):
+                    total += j[i, p] * j[i, q] / (size[p] * size[q])
+                for i in range(q):
+                    total -= low[p, i] * low[q, i]
+                if p > q:
+                    low[p, q] = total / low[q, q]
+                elif total > _OPEN:
+                    low[p, p] = np.sqrt(total)
+                else:
+                    known = False
+                    low[p, p] = 1.0
+        for a in range(3):  # rows: L⁻¹ (∂p/∂ξ)ᵀ
+            for p in range(3):
+                total = tangents[row, 3 + a, p] / size[p]
+                for i in range(p):
+                    total -= low[p, i] * root[i, a]
+                root[p, a] = total / low[p, p]
+        for a in range(3):
+            for c in range(3):
+                total = root[0, a] * root[0, c] + root[1, a] * root[1, c] + root[2, a] * root[2, c]
+                covariances[row, a, c] = total if known else np.nan
+    return True
+
+
+@kernel
+def tree_seeds(fold: Fold, tree: Tree, target: Array, contacts: Array) -> int:
+    """Fill contacts ξ (MOST_SEEDS, 3) that about give three quantities; return how many."""
+    found, quality = np.empty((MOST_SEEDS, 3)), np.empty(MOST_SEEDS, np.int64)
+    slopes = np.empty((MOST_SEEDS, 3, 3))
+    n = seeds(tree, target, found, slopes, quality)
+    for i in range(n):
+        chart_to_contact(fold, found[i], contacts[i])
+    return int(n)

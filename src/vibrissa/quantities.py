@@ -77,6 +77,8 @@ _SPRING = _Unit("N/m", "N/m", 1.0)
 _PARAMETERS = _Unit("(m, 1)^2", "(m, 1)²", 1.0)
 _PIXEL = _Unit("pixel", "px", 1.0)
 _WRENCH_SQUARED = _Unit("(N, N m)^2", "(N, N·m)²", 1.0)
+_POSE_SQUARED = _Unit("(m, rad)^2", "(m, rad)²", 1.0)
+_POSE_AND_WRENCH = _Unit("(m, rad)(N, N m)", "(m, rad)(N, N·m)", 1.0)
 # The columns of these Jacobians, (s_c, f_y, f_z), differ in unit: it is given column by column.
 _POINT_PER_LOAD = _Unit("m/(m, N, N)", "m/(m, N, N)", 1.0)
 _FORCE_PER_LOAD = _Unit("N/(m, N, N)", "N/(m, N, N)", 1.0)
@@ -405,6 +407,41 @@ _ROWS: tuple[tuple[str, str, _Unit, str, str], ...] = (
         "In Fx, Fy, Fz, Mx, My, Mz.",
     ),
     (
+        "pose_covariance",
+        r"\Sigma_o",
+        _POSE_SQUARED,
+        "covariance of the base's pose",
+        "Of its position and of a small turn about the laboratory's axes.",
+    ),
+    (
+        "pose_wrench_covariance",
+        r"\Sigma_{ow}",
+        _POSE_AND_WRENCH,
+        "covariance of the base's pose with force and moment",
+        "Of position and turn with Fx, Fy, Fz, Mx, My, Mz, where all come from the same images.",
+    ),
+    (
+        "contact_normal",
+        r"\mathbf{n}",
+        _NUMBER,
+        "normal of the surface at the contact",
+        "Direction of the contact force without its part along the whisker; laboratory frame.",
+    ),
+    (
+        "normal_covariance",
+        r"\Sigma_n",
+        _NUMBER,
+        "covariance of the normal at the contact",
+        "Of the unit vector, so that it is zero along it; laboratory frame.",
+    ),
+    (
+        "point_normal_covariance",
+        r"\Sigma_{pn}",
+        _MM,
+        "covariance of contact point and normal",
+        "Both come from the same signals; laboratory frame.",
+    ),
+    (
         "deviation",
         "d",
         _MM,
@@ -552,6 +589,17 @@ _ROWS: tuple[tuple[str, str, _Unit, str, str], ...] = (
     ("object_vertices", r"\mathbf{v}", _MM, "mesh's vertices", "Laboratory frame."),
     ("object_faces", "f", _NUMBER, "mesh's triangles", "Numbers of their vertices."),
     ("object_resolution", "h", _MM, "mesh's resolution", "Grid spacing of its signed distance."),
+    (
+        "object_distance",
+        r"d_\mathrm{object}",
+        _MM,
+        "distance from the known object",
+        "Of the whisker's surface at the estimated contact from it, positive outside.",
+    ),
+    ("axis_offset", r"\Delta\mathbf{c}", _MM, "offset of the axis", "Of a fitted object."),
+    ("axis_tilt", r"\Delta\mathbf{a}", _DEGREE, "tilt of the axis", "Of a fitted object."),
+    ("center_offset", r"\Delta\mathbf{c}", _MM, "offset of the centre", "Of a fitted object."),
+    ("diameter_error", r"\Delta D", _MM, "error of the diameter", "Of a fitted object."),
     ("peg_position", r"\mathbf{c}", _MM, "peg position", "A point of its axis, laboratory frame."),
     ("peg_axis", r"\mathbf{a}", _NUMBER, "peg axis", "Unit vector, laboratory frame."),
     ("peg_radius", r"R_\mathrm{peg}", _MM, "peg radius", "Of its surface."),

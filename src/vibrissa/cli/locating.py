@@ -82,9 +82,9 @@ def estimate(
     Example: `vibrissa estimate signals.csv --map map.nc --signals Fx,FT,MB,MD -o contacts.csv`
     """
     from vibrissa.cli.sources import wrench_from
-    from vibrissa.demo import contact_columns, locate, locate_from_wrench
     from vibrissa.io import save_contacts
     from vibrissa.io.paths import CSV, check_writable
+    from vibrissa.pipeline import contact_columns, locate, locate_from_wrench
     from vibrissa.signals import selection
     from vibrissa.status import describe
 
@@ -140,8 +140,8 @@ def _noise(path: Path | None, force_noise: float, moment_noise: float) -> tuple[
     """Covariance of force and moment, SI units, and how it was given."""
     import numpy as np
 
-    from vibrissa.demo import component_noise
     from vibrissa.io.table import read_text, table_rows
+    from vibrissa.pipeline import component_noise
 
     if path is None:
         covariance = component_noise(force_noise * 1e-6, moment_noise * 1e-6)

@@ -79,9 +79,9 @@ def _contacts_of(path: Path, moment_noise: float) -> Dataset:
     As for estimates, a contact is felt where M_B exceeds five standard deviations of its noise.
     """
     from vibrissa.cli.sources import wrench_from
-    from vibrissa.demo.locate import FELT
     from vibrissa.io import kind_of, load_recording
     from vibrissa.io.netcdf import is_netcdf
+    from vibrissa.pipeline import FELT
     from vibrissa.signals import base_signals
 
     if is_netcdf(path) and kind_of(path) == "vibrissa recording":

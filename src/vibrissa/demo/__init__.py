@@ -1,12 +1,5 @@
 """The main job from end to end: from a whisker's signals to the contour of what it touched."""
 
-from vibrissa.demo.locate import (
-    component_noise,
-    contact_columns,
-    in_laboratory,
-    locate,
-    locate_from_wrench,
-)
 from vibrissa.demo.run import DemoResult, run_demo
 from vibrissa.demo.scores import ErrorRow, Scores
 
@@ -14,10 +7,5 @@ __all__ = [
     "DemoResult",
     "ErrorRow",
     "Scores",
-    "component_noise",
-    "contact_columns",
-    "in_laboratory",
-    "locate",
-    "locate_from_wrench",
     "run_demo",
 ]

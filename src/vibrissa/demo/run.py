@@ -11,17 +11,19 @@ import numpy as np
 import xarray as xr
 
 from vibrissa import samples
-from vibrissa.contour import CylinderFit, fit_cylinder
-from vibrissa.demo.locate import (
-    TRIPLET,
-    component_noise,
-    contact_columns,
-    in_laboratory,
-    locate,
-)
+from vibrissa.contour import CylinderFit
 from vibrissa.demo.scores import Scores, contact_errors, score
 from vibrissa.io import save_contacts, save_recording
 from vibrissa.mapping import ContactMap
+from vibrissa.pipeline import (
+    TRIPLET,
+    component_noise,
+    contact_columns,
+    fit_contacts,
+    in_laboratory,
+    locate,
+    whisker_radii,
+)
 from vibrissa.sensing import FORCE_NOISE, MOMENT_NOISE
 from vibrissa.trial import Motion, Peg, facing_peg, measure, simulate, sweep_past
 from vibrissa.trial.recording import recorded
@@ -29,9 +31,6 @@ from vibrissa.whisker import Whisker
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, and how much of how much is."""
-
-SOLVED_TO = 1e-6
-"""Uncertainty of every contact apart from the sensor's, m: what the mechanics is solved to."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +134,7 @@ def run_demo(
     )
     contacts = in_laboratory(contacts, motion.base_rotation, motion.base_position)
     tell("contact points from signals", 1, 1)
-    fit = fit_peg(contacts, whisker)
+    fit = fit_contacts(contacts.expand_dims("whisker", 1), [whisker])
     truth = _truth(recording, whisker, peg)
     errors = contact_errors(contacts, truth, whisker, seed)
     recording = with_estimates(recording, contacts)
@@ -157,45 +156,11 @@ def _silent(stage: str, done: int, total: int) -> None:
     pass
 
 
-def fit_peg(contacts: xr.Dataset, whisker: Whisker) -> CylinderFit:
-    """Fit a peg to contacts in the laboratory.
-
-    Parameters
-    ----------
-    contacts : xarray.Dataset
-        Of `vibrissa.demo.in_laboratory`.
-    whisker : Whisker
-        That touched it.
-
-    Returns
-    -------
-    CylinderFit
-        From contacts that are known with their covariance: each counts by it, and tells the normal
-        of the surface by the direction of its force.
-    """
-    spread = contacts["contact_covariance"].values + SOLVED_TO**2 * np.eye(3)
-    arc_length = contacts["arc_length"].values
-    return fit_cylinder(
-        contacts["contact_point"].values,
-        spread,
-        _radius(whisker, arc_length),
-        normals=contacts["contact_normal"].values,
-    )
-
-
-def _radius(whisker: Whisker, arc_length: np.ndarray) -> np.ndarray:
-    """Radius of the whisker, m; NaN where the arc length is."""
-    known = np.isfinite(arc_length)
-    radius = np.full(arc_length.shape, np.nan)
-    radius[known] = whisker.radius(arc_length[known])
-    return radius
-
-
 def _truth(recording: xr.DataTree, whisker: Whisker, peg: Peg) -> xr.Dataset:
     """What truly happened, dim time, with the peg and the whisker's radius at the contact."""
     truth = recording["truth"].to_dataset().isel(whisker=0)
     return truth.assign(
-        radius=("time", _radius(whisker, truth["arc_length"].values)),
+        radius=("time", whisker_radii(truth.expand_dims("whisker", 1), [whisker])[:, 0]),
         peg_position=("space", peg.origin),
         peg_axis=("space", peg.axis),
         peg_radius=((), peg.radius),
@@ -210,7 +175,7 @@ def with_estimates(recording: xr.DataTree, contacts: xr.Dataset) -> xr.DataTree:
     recording : xarray.DataTree
         The recording.
     contacts : xarray.Dataset
-        Of `vibrissa.demo.in_laboratory`.
+        Of `vibrissa.pipeline.in_laboratory`.
 
     Returns
     -------

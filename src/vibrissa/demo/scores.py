@@ -107,7 +107,7 @@ def contact_errors(
     Parameters
     ----------
     contacts : xarray.Dataset
-        Of `vibrissa.demo.locate`, dim time.
+        Of `vibrissa.pipeline.locate`, dim time.
     truth : xarray.Dataset
         Of the recording, dim time: ``contact_point_whisker``.
     whisker : Whisker
@@ -156,7 +156,7 @@ def score(contacts: xr.Dataset, truth: xr.Dataset, errors: xr.Dataset, fit: Cyli
     Parameters
     ----------
     contacts : xarray.Dataset
-        Of `vibrissa.demo.in_laboratory`, dim time.
+        Of `vibrissa.pipeline.in_laboratory`, dim time.
     truth : xarray.Dataset
         Dim time: ``in_contact``; and the peg's ``peg_position``, ``peg_axis``, ``peg_radius``.
     errors : xarray.Dataset

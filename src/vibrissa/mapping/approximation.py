@@ -117,7 +117,9 @@ def by_approximation(
         covariances = slope @ sigma @ np.swapaxes(slope, -1, -2) / d.length**2
     return Explanation(
         number=np.where(found, 1, 0),
-        arc_lengths=bent.arc_length[:, None] / d.length,
+        contacts=np.concatenate(
+            [bent.arc_length[:, None] / d.length, bent.contact_force / d.force], axis=1
+        )[:, None],
         values=np.concatenate([bent.force / d.force, point / d.length], axis=1)[:, None],
         covariances=covariances[:, None],
         misfit=_misfit(signals, bent.force, bent.moment, names, _ranges(contacts, names)),

@@ -75,6 +75,8 @@ class Estimate:
         Their arc lengths, m.
     candidate_forces : (..., k, 3) array
         Their base forces, N.
+    candidate_contact_forces : (..., k, 3) array
+        Their forces in the material frame at the contact (tangent, d1, d2), N.
     n_candidates : (...) int array
         How many.
     triplet : tuple of str
@@ -97,6 +99,7 @@ class Estimate:
     candidate_covariances: Array
     candidate_arc_lengths: Array
     candidate_forces: Array
+    candidate_contact_forces: Array
     n_candidates: IntArray
     triplet: tuple[str, ...]
     dims: tuple[str, ...]
@@ -237,13 +240,14 @@ def estimate(
         linear=whole(found.linear),
         status=whole(found.status),
         misfit=whole(found.misfit),
-        arc_length=whole(found.arc_lengths[:, 0] * d.length),
+        arc_length=whole(found.contacts[:, 0, 0] * d.length),
         force=whole(forces[:, 0]),
         moment=whole(np.cross(points[:, 0], forces[:, 0])),
         candidates=whole(points[:, :most]),
         candidate_covariances=whole(found.covariances[:, :most] * d.length**2),
-        candidate_arc_lengths=whole(found.arc_lengths[:, :most] * d.length),
+        candidate_arc_lengths=whole(found.contacts[:, :most, 0] * d.length),
         candidate_forces=whole(forces[:, :most]),
+        candidate_contact_forces=whole(found.contacts[:, :most, 1:] * d.force),
         n_candidates=whole(found.number),
         triplet=names,
         dims=dims,

@@ -13,6 +13,7 @@ from vibrissa.mapping.noise import SensorNoise
 from vibrissa.mapping.uncertainty import point_covariances
 from vibrissa.rod.arrays import AnyArray, Array, IntArray
 from vibrissa.rod.newton import TOLERANCE
+from vibrissa.rod.reach import with_normal_force
 from vibrissa.signals import CIRCULAR, SIGNALS, circular_among, within_turn
 from vibrissa.signals.base import signals_of
 from vibrissa.status import Status
@@ -65,12 +66,13 @@ class Bounds(NamedTuple):
 class Explanation(NamedTuple):
     """Rows × candidates, non-dimensional, NaN-padded.
 
-    Their number (n,), arc lengths (n, k), (F, p) (n, k, 6), covariances of p (n, k, 3, 3); of each
-    row misfit, status and whether the covariance of the first can be relied on (n,).
+    Their number (n,), arc length and force in the material frame (n, k, 4), (F, p) (n, k, 6),
+    covariances of p (n, k, 3, 3); of each row misfit, status and whether the covariance of the
+    first can be relied on (n,).
     """
 
     number: IntArray
-    arc_lengths: Array
+    contacts: Array
     values: Array
     covariances: Array
     misfit: Array
@@ -108,9 +110,8 @@ def by_triplet(
     if rows.size:
         status[rows], misfit[rows] = why_none(contacts, names, targets[rows])
     covariances, linear = _uncertain(contacts, names, found.number, found.contacts, sensor)
-    return Explanation(
-        found.number, found.contacts[..., 0], found.values, covariances, misfit, status, linear
-    )
+    xi = with_normal_force(found.contacts.reshape(-1, 3)).reshape(*found.contacts.shape[:2], 4)
+    return Explanation(found.number, xi, found.values, covariances, misfit, status, linear)
 
 
 def by_least_squares(
@@ -152,7 +153,8 @@ def by_least_squares(
         found.values,
     )
     covariances, linear = _uncertain(contacts, names, number, xi, sensor)
-    return Explanation(number, xi[..., 0], values, covariances, misfit, status, linear)
+    whole = with_normal_force(xi.reshape(-1, 3)).reshape(n, most, 4)
+    return Explanation(number, whole, values, covariances, misfit, status, linear)
 
 
 def undetermined(targets: Array) -> Explanation:
@@ -172,7 +174,7 @@ def undetermined(targets: Array) -> Explanation:
     known = np.isfinite(targets).all(axis=1)
     return Explanation(
         number=np.zeros(n, np.int64),
-        arc_lengths=np.full((n, 1), np.nan),
+        contacts=np.full((n, 1, 4), np.nan),
         values=np.full((n, 1, 6), np.nan),
         covariances=np.full((n, 1, 3, 3), np.nan),
         misfit=np.full(n, np.nan),

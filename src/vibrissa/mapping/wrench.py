@@ -96,6 +96,12 @@ class WrenchEstimate:
     candidates : (..., k, 3) array
         Contact points of all contacts that cannot be told apart (χ² within 10.8 of the least), by
         rising χ² + (friction angle / 20°)²; m, padded with NaN.
+    candidate_arc_lengths : (..., k) array
+        Their arc lengths, m.
+    candidate_forces : (..., k, 3) array
+        Their base forces, N.
+    candidate_contact_forces : (..., k, 3) array
+        Their forces in the material frame at the contact, N.
     n_candidates : (...) int array
         How many.
     dims : tuple of str
@@ -116,6 +122,9 @@ class WrenchEstimate:
     linear: AnyArray
     status: IntArray
     candidates: Array
+    candidate_arc_lengths: Array
+    candidate_forces: Array
+    candidate_contact_forces: Array
     n_candidates: IntArray
     dims: tuple[str, ...]
     coords: Coordinates
@@ -396,6 +405,9 @@ def _estimate(
         linear=whole(found.linear, missing=False),
         status=status.reshape(shape),
         candidates=whole(solved.values[:, :most, 3:] * d.length),
+        candidate_arc_lengths=whole(solved.contacts[:, :most, 0] * d.length),
+        candidate_forces=whole(solved.values[:, :most, :3] * d.force),
+        candidate_contact_forces=whole(solved.contacts[:, :most, 1:] * d.force),
         n_candidates=whole(solved.number, missing=0),
         dims=dims,
         coords=coords,

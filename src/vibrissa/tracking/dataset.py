@@ -14,6 +14,7 @@ from vibrissa.quantities import attributes
 from vibrissa.rod.surface import Surface
 from vibrissa.status import Status
 from vibrissa.tracking.contact import Contacts
+from vibrissa.tracking.filtering import CUTOFF
 from vibrissa.tracking.head import HeadPose
 from vibrissa.trial.cameras import Camera, cameras_dataset
 from vibrissa.trial.object_files import objects_datasets
@@ -33,6 +34,7 @@ def tracked_recording(
     rate: float,
     head: HeadPose | None = None,
     objects: Sequence[Surface] = (),
+    cutoff: float | None = CUTOFF,
 ) -> xr.DataTree:
     """Write tracked whiskers as a recording.
 
@@ -50,6 +52,8 @@ def tracked_recording(
         How the head moved, if that is known.
     objects : sequence of Surface
         What stands there.
+    cutoff : float, optional
+        Of the filter on the whiskers' poses, Hz; None if they are not filtered.
 
     Returns
     -------
@@ -73,6 +77,8 @@ def tracked_recording(
         root = root.assign(head_variables(head.position, head.rotation))
     root.attrs = {"kind": KIND, "origin": "tracked in video"}
     measured = xr.concat([_measured(one) for one in found], "whisker")
+    if cutoff is not None:
+        measured.attrs["cutoff"] = cutoff
     groups = {
         "/": root,
         "/measured": measured,
@@ -123,6 +129,11 @@ def _variables(one: Tracked) -> xr.Dataset:
         r.wrench_covariance[:, None],
         attributes("wrench_covariance"),
     )
+    for name, covariance, axes in (
+        ("pose_covariance", r.pose_covariance, ("pose", "pose_")),
+        ("pose_wrench_covariance", r.pose_wrench_covariance, ("pose", "component_")),
+    ):
+        data[name] = xr.Variable(("time", "whisker", *axes), covariance[:, None], attributes(name))
     data["trace_misfit"] = xr.Variable(
         ("time", "whisker"), r.misfit[:, None], attributes("trace_misfit")
     )
@@ -148,6 +159,16 @@ def _measured(one: Tracked) -> xr.Dataset:
         "base_roll": one.pose.roll,
     }
     data = {name: recorded(name, array) for name, array in values.items()}
+    # What another cut-off is tried on.
+    for name, array in (
+        ("base_position", one.head.put_in(one.unfiltered.position)),
+        ("base_azimuth", one.unfiltered.azimuth),
+        ("base_elevation", one.unfiltered.elevation),
+        ("base_roll", one.unfiltered.roll),
+    ):
+        raw = recorded(name, array)
+        raw.attrs["long_name"] += ", unfiltered"
+        data[f"unfiltered_{name}"] = raw
     sigma = np.sqrt(np.einsum("tnii->tni", one.covariance))
     about = attributes("centerline_sigma")
     dims = ("time", "whisker", "node", "space")

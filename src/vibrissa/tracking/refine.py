@@ -87,6 +87,10 @@ class Refined:
         At the base, whisker's frame, N and N·m; 0 without contact.
     wrench_covariance : array (time, 6, 6)
         Of both.
+    pose_covariance : array (time, 6, 6)
+        Of the base's position, m, and of a small turn about the laboratory's axes, rad.
+    pose_wrench_covariance : array (time, 6, 6)
+        Of these with force and moment: both come from the same traces.
     centerline : array (time, node, 3)
         The fitted rod, laboratory frame, m.
     misfit : array (time,)
@@ -102,6 +106,8 @@ class Refined:
     force: Array
     moment: Array
     wrench_covariance: Array
+    pose_covariance: Array
+    pose_wrench_covariance: Array
     centerline: Array
     misfit: Array
 
@@ -300,6 +306,9 @@ def _answer(
     slopes[:, 2, 3], slopes[:, 2, 4] = y, -x
     slopes[:, :, 6:] = state.rotation @ slope[:, 3:]
     inside = covariance[:, 6:, 6:]
+    size = np.repeat([d.length, 1.0], 3)
+    held = covariance[:, :6, :6] * np.outer(size, size)
+    both = covariance[:, :6, 6:] * size[:, None] @ np.swapaxes(by_contact, 1, 2)
     line = rods(d, state.contact, np.linspace(0.0, 1.0, nodes))
     line = np.einsum("tij,tnj->tni", state.rotation, line) + state.position[:, None]
     none = np.where(touching, 1.0, np.nan)
@@ -319,6 +328,8 @@ def _answer(
         @ inside
         @ np.swapaxes(by_contact, 1, 2)
         * touching[:, None, None],
+        pose_covariance=held,
+        pose_wrench_covariance=both * touching[:, None, None],
         centerline=line * d.length,
         misfit=misfit,
     )
@@ -327,12 +338,16 @@ def _answer(
 def _in_laboratory(found: Refined, head: HeadPose) -> Refined:
     """Take poses and points from the head's frame to the laboratory's."""
     turn = head.rotation
+    both = np.zeros((len(turn), 6, 6))
+    both[:, :3, :3] = both[:, 3:, 3:] = turn
     return replace(
         found,
         rotation=turn @ found.rotation,
         position=head.put_in(found.position),
         contact_point=head.put_in(found.contact_point),
         contact_covariance=turn @ found.contact_covariance @ np.swapaxes(turn, 1, 2),
+        pose_covariance=both @ found.pose_covariance @ np.swapaxes(both, 1, 2),
+        pose_wrench_covariance=both @ found.pose_wrench_covariance,
         centerline=head.put_in(found.centerline),
     )
 

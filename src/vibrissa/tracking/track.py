@@ -83,6 +83,8 @@ class Tracked:
         What it was taken from.
     pose : BasePose
         How it is held relative to the head, filtered, the paper's way.
+    unfiltered : BasePose
+        The same before filtering.
     touching : array (time,)
         Frames in contact.
     refined : Refined
@@ -99,6 +101,7 @@ class Tracked:
     covariance: Array
     shape: RestShape
     pose: BasePose
+    unfiltered: BasePose
     touching: Mask
     refined: Refined
     head: HeadPose
@@ -177,7 +180,7 @@ def track(
         elif objects:
             other = contacts_at(objects, one.curves, one.touching, one.refined)
         found.append(replace(one, contacts=other))
-    return tracked_recording(cameras, found, pairs, rate, moving, objects)
+    return tracked_recording(cameras, found, pairs, rate, moving, objects, options.cutoff)
 
 
 def track_whisker(
@@ -228,7 +231,8 @@ def track_whisker(
     head = head or HeadPose.still(count)
     on_head = head.seen_from(points)
     shape, whisker = _at_rest(on_head, options, name)
-    pose = base_pose(on_head, shape, whisker).filtered(rate, options.cutoff)
+    unfiltered = base_pose(on_head, shape, whisker)
+    pose = unfiltered.filtered(rate, options.cutoff)
     tell(f"contact of {name}", 1, 2)
     known = np.isfinite(points).all(axis=(1, 2))
     touching = known & ~shape.free
@@ -243,7 +247,9 @@ def track_whisker(
     )
     tell(f"contact of {name}", 2, 2)
     covariance = np.array([curve.covariance for curve in curves])
-    return Tracked(whisker, sight, points, covariance, shape, pose, touching, refined, head)
+    return Tracked(
+        whisker, sight, points, covariance, shape, pose, unfiltered, touching, refined, head
+    )
 
 
 def _at_rest(curves: Array, options: TrackOptions, name: str) -> tuple[RestShape, Whisker]:

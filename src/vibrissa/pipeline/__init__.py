@@ -1,0 +1,46 @@
+"""The stages between tracks and a contour, each from a recording to a dataset of its own."""
+
+from vibrissa.pipeline.estimates import estimates_of
+from vibrissa.pipeline.laboratory import contact_columns, in_laboratory
+from vibrissa.pipeline.locate import FELT, TRIPLET, component_noise, locate, locate_from_wrench
+from vibrissa.pipeline.reconstruct import SOLVED_TO, Shape, fit_contacts, reconstruct, whisker_radii
+from vibrissa.pipeline.signals import (
+    Source,
+    default_source,
+    placed_by,
+    sensor_noise,
+    signals_of,
+)
+from vibrissa.pipeline.stages import (
+    STAGES,
+    with_contour,
+    with_estimates,
+    with_group,
+    with_signals,
+)
+
+__all__ = [
+    "FELT",
+    "SOLVED_TO",
+    "STAGES",
+    "TRIPLET",
+    "Shape",
+    "Source",
+    "component_noise",
+    "contact_columns",
+    "default_source",
+    "estimates_of",
+    "fit_contacts",
+    "in_laboratory",
+    "locate",
+    "locate_from_wrench",
+    "placed_by",
+    "reconstruct",
+    "sensor_noise",
+    "signals_of",
+    "whisker_radii",
+    "with_contour",
+    "with_estimates",
+    "with_group",
+    "with_signals",
+]

@@ -1,0 +1,177 @@
+"""Contact points of every frame and whisker from the signals of a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+
+from vibrissa.mapping import ContactMap
+from vibrissa.pipeline.laboratory import in_laboratory
+from vibrissa.pipeline.locate import TRIPLET, locate, locate_from_wrench
+from vibrissa.pipeline.signals import sensor_noise
+from vibrissa.signals import selection
+from vibrissa.status import is_ok
+from vibrissa.trial.recording import recorded_whisker
+from vibrissa.whisker import Whisker
+
+Array = NDArray[np.float64]
+
+Progress = Callable[[str, int, int], None]
+"""Called with what is being done, and how much of how much is."""
+
+WHOLE = "wrench"
+"""Instead of names of signals: force and moment whole."""
+
+_KEPT = (
+    "contact_point",
+    "contact_covariance",
+    "contact_normal",
+    "normal_covariance",
+    "point_normal_covariance",
+    "contact_point_whisker",
+    "covariance",
+    "arc_length",
+    "force",
+    "friction_angle",
+    "candidates",
+    "in_contact",
+    "status",
+)
+
+
+def estimates_of(
+    recording: xr.DataTree,
+    signals: str | Sequence[str] = TRIPLET,
+    *,
+    noise: ArrayLike | None = None,
+    contact_maps: Sequence[ContactMap] | None = None,
+    whiskers: Sequence[Whisker] | None = None,
+    method: str = "exact",
+    progress: Progress | None = None,
+) -> xr.Dataset:
+    """Estimate the contact point in every frame in which a contact is felt.
+
+    Parameters
+    ----------
+    recording : xarray.DataTree
+        With a group ``signals``; see `signals_of`.
+    signals : str or sequence of str
+        Three or more of the six, or "wrench": force and moment whole, which allows for friction.
+    noise : array_like (6, 6), optional
+        Covariance of (F, M), SI units; by default what the signals say of themselves. Signals of a
+        sensor have to have one or the other; without any there are no covariances.
+    contact_maps : sequence of ContactMap, optional
+        One for each whisker; simulated by default.
+    whiskers : sequence of Whisker, optional
+        One for each, where there are no maps; by default those of the recording.
+    method : {"exact", "lookup", "lookup-linear", "network"}
+        As of ``ContactMap.estimate``.
+    progress : callable, optional
+        Called as ``progress(stage, done, total)``.
+
+    Returns
+    -------
+    xarray.Dataset
+        Dims time, whisker, space, the group ``estimates`` of a recording. In the laboratory
+        ``contact_point`` with ``contact_covariance``, ``contact_normal`` with
+        ``normal_covariance``, and ``point_normal_covariance``; in the whisker's frame
+        ``contact_point_whisker`` with ``covariance``, ``arc_length`` and ``force``; how many
+        ``candidates`` there were, of which the one that goes on from the frames around is taken;
+        ``in_contact`` (felt) and ``status``. Attributes ``signals``, ``source`` and ``felt_above``,
+        M_B from which contacts are felt, N·m. Frames whose signals have no answer keep the status
+        that says why.
+
+    Raises
+    ------
+    ValueError
+        If there are no signals, their noise is not known, or names or numbers do not fit.
+
+    Notes
+    -----
+    Covariances come from the noise of the signals and from that of the base's pose: of signals of
+    the rod both, with what they have in common; of a sensor's the pose's where a camera tells it
+    (`placed_by`). Signals of the tracked contact point take the paper's pose as exact: its errors
+    do not move the point in the laboratory, as the same pose leads there and back, but they turn
+    the normal, which is left out.
+    """
+    group = recording.children.get("signals")
+    if group is None:
+        got = ", ".join(sorted(recording.children)) or "no groups"
+        raise ValueError(
+            f"the recording has no group signals (it has {got}): make them first, by signals_of or "
+            "`vibrissa signals`"
+        )
+    whole = signals == WHOLE
+    names = TRIPLET if whole else selection(signals)
+    data = group.to_dataset()
+    count = data.sizes["whisker"]
+    tell = progress or _silent
+    if whiskers is None:
+        if contact_maps is not None:
+            whiskers = [one.whisker for one in contact_maps]
+        else:
+            whiskers = [recorded_whisker(recording, k) for k in range(count)]
+    for given in (whiskers, contact_maps):
+        if given is not None and len(given) != count:
+            raise ValueError(f"there are signals of {count} whiskers; {len(given)} are given")
+    if noise is None and data.attrs.get("source") == "sensor" and sensor_noise(data) is None:
+        raise ValueError("the sensor's noise is not known: give the covariance of (F, M) as noise")
+    parts = []
+    for k, whisker in enumerate(whiskers):
+        tell("contact points", k, count)
+        one = data.isel(whisker=k)
+        sigma = sensor_noise(one) if noise is None else np.asarray(noise, dtype=np.float64)
+        wrench = one[["force", "moment"]]
+        if data.attrs.get("source") != "sensor":
+            wrench = wrench.assign(in_contact=one["in_contact"])
+        if whole:
+            found = locate_from_wrench(whisker, wrench, sigma)
+        else:
+            if contact_maps is not None:
+                chart = contact_maps[k]
+            else:
+                tell("map of all contacts", k, count)
+                chart = ContactMap.simulate(whisker, grid=method.startswith("lookup"))
+                tell("map of all contacts", k + 1, count)
+            found = locate(chart, wrench, names, noise=sigma, method=method)
+        parts.append(_placed(one, found, given=noise is not None))
+        tell("contact points", k + 1, count)
+    out = xr.concat(parts, "whisker").transpose("time", "whisker", ...)
+    about = {
+        "signals": WHOLE if whole else " ".join(names),
+        "source": str(data.attrs.get("source", "not known")),
+        "felt_above": float(np.median([part.attrs["felt_above"] for part in parts])),
+    }
+    if method != "exact":
+        about["method"] = method
+    out.attrs = about
+    return out.assign_coords({n: data[n].variable for n in ("time", "whisker", "space")})
+
+
+def _silent(stage: str, done: int, total: int) -> None:
+    pass
+
+
+def _placed(signals: xr.Dataset, found: xr.Dataset, *, given: bool) -> xr.Dataset:
+    """Contacts of one whisker in the laboratory, with what became of frames without signals."""
+    pose = {
+        name: signals[name].transpose("time", ...).values
+        for name in ("pose_covariance", "pose_wrench_covariance")
+        if name in signals
+    }
+    if given:
+        # The noise given is that of another instrument.
+        pose.pop("pose_wrench_covariance", None)
+    placed = in_laboratory(
+        found,
+        signals["base_rotation"].transpose("time", "space", "whisker_axis").values,
+        signals["base_position"].transpose("time", "space").values,
+        **pose,
+    )
+    said = signals["status"].values
+    status = np.where(is_ok(said), placed["status"].values, said).astype(np.int8)
+    placed["status"] = placed["status"].copy(data=status)
+    return placed[[name for name in _KEPT if name in placed]]

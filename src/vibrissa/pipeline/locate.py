@@ -1,0 +1,269 @@
+"""From the measured wrench to contact points in the whisker's frame.
+
+A contact is felt where the bending moment M_B exceeds five standard deviations of its noise. Where
+several contacts explain the signals, the one with the least force is taken, until their places in
+the laboratory tell which goes on from the frames around (`vibrissa.pipeline.laboratory`).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+
+from vibrissa.mapping import ContactMap, estimate_from_wrench
+from vibrissa.mapping.channels import WRENCH
+from vibrissa.pipeline.slopes import contact_normals, gains
+from vibrissa.quantities import attributes
+from vibrissa.signals import base_signals, selection
+from vibrissa.status import Status, flag_attributes
+from vibrissa.whisker import Whisker
+
+Array = NDArray[np.float64]
+
+TRIPLET = ("Fx", "MB", "MD")
+"""What contacts are estimated from by default."""
+
+FELT = 5.0
+"""Bending moment from which a contact is felt, in standard deviations of its noise."""
+
+_WHISKER = {"reference_frame": "whisker"}
+
+
+class _Candidates(NamedTuple):
+    """Of the frames in which a contact is felt: rows × candidates, padded with NaN, SI units."""
+
+    points: Array
+    arc_lengths: Array
+    forces: Array
+    contact_forces: Array
+    number: NDArray[np.int64]
+    status: NDArray[np.int64]
+
+
+def component_noise(force_noise: float, moment_noise: float) -> Array:
+    """Covariance of a sensor whose components have independent noise.
+
+    Parameters
+    ----------
+    force_noise, moment_noise : float
+        Standard deviation of a component of force, N, and of moment, N·m.
+
+    Returns
+    -------
+    array (6, 6)
+        Of (F, M), SI units.
+    """
+    return np.diag(np.repeat([force_noise**2, moment_noise**2], 3))
+
+
+def locate(
+    contact_map: ContactMap,
+    wrench: xr.Dataset,
+    triplet: tuple[str, ...] = TRIPLET,
+    *,
+    noise: ArrayLike | None,
+    method: str = "exact",
+) -> xr.Dataset:
+    """Estimate the contact point in every frame in which a contact is felt.
+
+    Parameters
+    ----------
+    contact_map : ContactMap
+        Of the whisker.
+    wrench : xarray.Dataset
+        Dims time, space: ``force`` and ``moment`` as measured, whisker's frame, N and N·m. Where it
+        has ``in_contact``, nothing is felt in other frames.
+    triplet : tuple of str
+        The signals to estimate from, three or more.
+    noise : array_like (6, 6) or (time, 6, 6), optional
+        Covariance of (F, M), SI units, of all frames or of each; see `component_noise`. None: not
+        known; then there are no covariances, and a contact is felt wherever M_B is not zero.
+    method : {"exact", "lookup", "lookup-linear", "network"}
+        As of ``ContactMap.estimate``.
+
+    Returns
+    -------
+    xarray.Dataset
+        Dim time, all frames of ``wrench``: ``contact_point_whisker`` with ``covariance``,
+        ``arc_length``, ``force`` at the base as the contact found would make it, the same of all
+        candidates (``candidate_points``, ``candidate_covariance``, ...), their number
+        ``candidates``, ``in_contact`` (felt) and ``status``; and of the candidates what leads from
+        an error of the wrench to one of the contact, ``candidate_gain``, with the noise of the
+        wrench, ``wrench_covariance``. Covariances are those of the exact way in every method.
+        Where nothing is felt all is NaN and the status ``NO_CONTACT``.
+
+    Raises
+    ------
+    ValueError
+        If the noise does not fit.
+    """
+    names = selection(triplet)
+    felt = _Felt.of(wrench, noise)
+    signals = base_signals(felt.force[felt.rows], felt.moment[felt.rows])
+    found = contact_map.estimate(signals, names, felt.typical, method)
+    candidates = _Candidates(
+        found.candidates,
+        found.candidate_arc_lengths,
+        found.candidate_forces,
+        found.candidate_contact_forces,
+        found.n_candidates,
+        found.status,
+    )
+    return _located(contact_map.whisker, names, felt, candidates)
+
+
+def locate_from_wrench(whisker: Whisker, wrench: xr.Dataset, noise: ArrayLike | None) -> xr.Dataset:
+    """Locate contacts from all six components, with friction or without.
+
+    Parameters
+    ----------
+    whisker : Whisker
+        What is touched.
+    wrench : xarray.Dataset
+        As for `locate`.
+    noise : array_like (6, 6) or (time, 6, 6), optional
+        As for `locate`.
+
+    Returns
+    -------
+    xarray.Dataset
+        As of `locate`, with ``friction_angle``.
+    """
+    felt = _Felt.of(wrench, noise)
+    found = estimate_from_wrench(
+        whisker, felt.force[felt.rows], felt.moment[felt.rows], noise=felt.typical
+    )
+    candidates = _Candidates(
+        found.candidates,
+        found.candidate_arc_lengths,
+        found.candidate_forces,
+        found.candidate_contact_forces,
+        found.n_candidates,
+        found.status,
+    )
+    return _located(whisker, WRENCH, felt, candidates)
+
+
+class _Felt(NamedTuple):
+    """What is measured: force, moment (n, 3), their covariance (n, 6, 6), NaN if not known.
+
+    And in which frames they are known and in which a contact is felt, (n,); the noise of all frames
+    together, (6, 6), if there is any; and M_B from which contacts are felt, N·m.
+    """
+
+    time: xr.Variable
+    force: Array
+    moment: Array
+    covariance: Array
+    known: NDArray[np.bool_]
+    rows: NDArray[np.bool_]
+    typical: Array | None
+    above: float
+
+    @classmethod
+    def of(cls, wrench: xr.Dataset, noise: ArrayLike | None) -> _Felt:
+        """Look at a measured wrench."""
+        force, moment = (
+            np.asarray(wrench[name].transpose("time", "space").values, dtype=np.float64)
+            for name in ("force", "moment")
+        )
+        n = len(force)
+        covariance = _noise_of_frames(noise, n)
+        known = np.isfinite(force.sum(axis=1) + moment.sum(axis=1))
+        size = np.hypot(moment[:, 1], moment[:, 2])
+        least = 0.0 * size
+        if noise is not None:
+            least = FELT * np.sqrt(0.5 * (covariance[:, 4, 4] + covariance[:, 5, 5]))
+        with np.errstate(invalid="ignore"):
+            rows = known & (size > least)
+        if "in_contact" in wrench:
+            rows &= wrench["in_contact"].values.astype(bool)
+        above = float(np.median(least[rows])) if rows.any() else float(np.nanmax(least, initial=0))
+        typical = None
+        if noise is not None:
+            typical = covariance[0] if np.ndim(noise) == 2 else _typical(covariance[rows])
+        return cls(wrench["time"].variable, force, moment, covariance, known, rows, typical, above)
+
+
+def _noise_of_frames(noise: ArrayLike | None, n: int) -> Array:
+    """Covariances (n, 6, 6)."""
+    if noise is None:
+        return np.full((n, 6, 6), np.nan)
+    array = np.asarray(noise, dtype=np.float64)
+    if array.shape not in ((6, 6), (n, 6, 6)):
+        raise ValueError(f"noise has shape {array.shape}; (6, 6) or ({n}, 6, 6) is needed")
+    return np.broadcast_to(array, (n, 6, 6))
+
+
+def _typical(covariance: Array) -> Array | None:
+    """Of sensors as noisy as those of the frames (n, 6, 6) usually are, equally in all axes."""
+    variances = np.diagonal(covariance, axis1=1, axis2=2)
+    variances = variances[np.isfinite(variances).all(axis=1)]
+    if not variances.size:
+        return None
+    force, moment = (np.sqrt(np.median(v.mean(axis=1))) for v in np.hsplit(variances, 2))
+    return component_noise(float(force), float(moment))
+
+
+def _located(
+    whisker: Whisker, names: tuple[str, ...], felt: _Felt, found: _Candidates
+) -> xr.Dataset:
+    """Write candidates of the felt frames as a dataset of all frames."""
+    rows = felt.rows
+    shape = found.arc_lengths.shape
+    flat = (found.arc_lengths.reshape(-1), found.contact_forces.reshape(-1, 3))
+    gain = gains(whisker, names, *flat, felt.typical).reshape(*shape, 6, 6)
+    normals = contact_normals(whisker, *flat).reshape(*shape, 3)
+    point_gain = gain[..., :3, :]
+    spread = point_gain @ felt.covariance[rows][:, None] @ np.swapaxes(point_gain, -1, -2)
+    status = np.where(felt.known, int(Status.NO_CONTACT), int(Status.MISSING)).astype(np.int8)
+    status[rows] = found.status
+    number = np.zeros(rows.size, dtype=np.int64)
+    number[rows] = found.number
+    columns = {
+        "points": ("contact_point_whisker", found.points),
+        "covariance": ("covariance", spread),
+        "arc_length": ("arc_length", found.arc_lengths),
+        "force": ("force", found.forces),
+    }
+    data: dict[str, Any] = {}
+    for short, (name, values) in columns.items():
+        dims = ("time", "candidate", "space", "space_2")[: values.ndim]
+        everywhere = _everywhere(rows, values)
+        data[name] = ((dims[0], *dims[2:]), everywhere[:, 0], attributes(name))
+        data[f"candidate_{short}"] = (dims, everywhere, attributes(name))
+    data["candidate_normal"] = (
+        ("time", "candidate", "space"),
+        _everywhere(rows, normals),
+        attributes("contact_normal") | _WHISKER,
+    )
+    data["candidate_gain"] = (
+        ("time", "candidate", "contact_component", "component"),
+        _everywhere(rows, gain),
+        {"units": "(m, 1)/(N, N m)", "long_name": "contact point and normal by force and moment"},
+    )
+    if names == WRENCH:
+        angle = np.arctan2(
+            found.contact_forces[:, 0, 0], np.linalg.norm(found.contact_forces[:, 0, 1:], axis=-1)
+        )
+        data["friction_angle"] = ("time", _everywhere(rows, angle), attributes("friction_angle"))
+    data["wrench_covariance"] = (
+        ("time", "component", "component_"),
+        felt.covariance,
+        attributes("wrench_covariance"),
+    )
+    data["candidates"] = ("time", number, attributes("candidates"))
+    data["in_contact"] = ("time", rows, attributes("in_contact"))
+    data["status"] = ("time", status, {**attributes("status"), **flag_attributes()})
+    about = {"triplet": " ".join(names), "felt_above": felt.above}
+    return xr.Dataset(data, {"time": felt.time, "space": list("xyz")}, about)
+
+
+def _everywhere(rows: NDArray[np.bool_], values: Array) -> Array:
+    """Values (n, ...) of some rows as values of all rows, the others NaN."""
+    out = np.full((rows.size, *values.shape[1:]), np.nan)
+    out[rows] = values
+    return out

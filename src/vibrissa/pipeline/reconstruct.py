@@ -1,0 +1,222 @@
+"""The object that estimated contacts lie on, and how far it is from objects that are known.
+
+Contact points lie on the whisker's centreline, its radius off the surface, which the fit takes into
+account. All whiskers of a recording count together: they touch one object.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal, get_args
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+
+from vibrissa.contour import (
+    CylinderFit,
+    FittedShape,
+    SphereFit,
+    axis_offset,
+    fit_cylinder,
+    fit_plane,
+    fit_sphere,
+)
+from vibrissa.quantities import attributes
+from vibrissa.rod.surface import Surface
+from vibrissa.trial import Peg, Sphere
+from vibrissa.trial.recording import recorded_objects, recorded_whisker
+from vibrissa.whisker import Whisker
+
+Array = NDArray[np.float64]
+
+Shape = Literal["cylinder", "sphere", "plane"]
+"""What can be fitted to contacts."""
+
+SOLVED_TO = 1e-6
+"""Uncertainty of every contact apart from the signals', m: what the mechanics is solved to."""
+
+_EACH = ("time", "whisker")
+
+
+def reconstruct(
+    recording: xr.DataTree,
+    shape: Shape = "cylinder",
+    *,
+    axis: ArrayLike | None = None,
+    whiskers: Sequence[Whisker] | None = None,
+    objects: Sequence[Surface] | None = None,
+) -> xr.Dataset:
+    """Fit an object to the estimated contacts of a recording.
+
+    Parameters
+    ----------
+    recording : xarray.DataTree
+        With a group ``estimates``; see `estimates_of`.
+    shape : {"cylinder", "sphere", "plane"}
+        What the object is taken for.
+    axis : array_like (3,), optional
+        Direction of a cylinder's axis, laboratory frame, where it is known.
+    whiskers : sequence of Whisker, optional
+        One for each along the dimension ``whisker``; by default those of the recording.
+    objects : sequence of Surface, optional
+        Known objects in the laboratory to compare with; by default those of the recording.
+
+    Returns
+    -------
+    xarray.Dataset
+        The group ``contour`` of a recording, laboratory frame: ``object_position``,
+        ``object_axis`` and ``object_radius``, as far as the shape has them, with
+        ``parameter_covariance``; dims time, whisker: ``surface_distance`` from the fitted object
+        and ``inlier``; attribute ``shape``. `vibrissa.contour.shape_from_dataset` makes the shape
+        again. With known objects also ``object_distance`` of each contact from the one that is
+        nearest to them (attribute ``object``, its number), and for a cylinder beside a peg
+        ``axis_offset``, ``axis_tilt`` and ``diameter_error``, for spheres ``center_offset`` and
+        ``diameter_error``.
+
+    Raises
+    ------
+    ValueError
+        If there are no estimates, or too few, or they do not determine the object.
+    """
+    if shape not in get_args(Shape):
+        raise ValueError(f"shape is {shape!r}; one of {', '.join(get_args(Shape))} is needed")
+    group = recording.children.get("estimates")
+    if group is None:
+        got = ", ".join(sorted(recording.children)) or "no groups"
+        raise ValueError(
+            f"the recording has no group estimates (it has {got}): make them first, by "
+            "estimates_of or `vibrissa estimate`"
+        )
+    estimates = group.to_dataset()
+    count = estimates.sizes["whisker"]
+    if whiskers is None:
+        whiskers = [recorded_whisker(recording, k) for k in range(count)]
+    known = recorded_objects(recording) if objects is None else tuple(objects)
+    fit = fit_contacts(estimates, whiskers, shape, axis=axis)
+    each = {n: estimates[n].variable for n in _EACH if n in estimates.coords}
+    out = fit.to_dataset(_EACH, tuple(estimates.sizes[n] for n in _EACH), each)
+    out.attrs["reference_frame"] = "laboratory"
+    out.attrs |= {n: estimates.attrs[n] for n in ("signals", "source") if n in estimates.attrs}
+    if known:
+        out = out.assign(_compared(fit, estimates, whiskers, known))
+    return out
+
+
+def fit_contacts(
+    estimates: xr.Dataset,
+    whiskers: Sequence[Whisker],
+    shape: Shape = "cylinder",
+    *,
+    axis: ArrayLike | None = None,
+) -> FittedShape:
+    """Fit a shape to contacts in the laboratory.
+
+    Parameters
+    ----------
+    estimates : xarray.Dataset
+        Of `estimates_of`, dims time, whisker.
+    whiskers : sequence of Whisker
+        That touched it.
+    shape : {"cylinder", "sphere", "plane"}
+        Which.
+    axis : array_like (3,), optional
+        Direction of a cylinder's axis where it is known.
+
+    Returns
+    -------
+    CylinderFit, SphereFit or PlaneFit
+        Each contact counts by its covariance, where that is known, and tells the normal of the
+        surface by the direction of its force. Rows are frames × whiskers.
+
+    Raises
+    ------
+    ValueError
+        If there are too few contacts, or they do not determine the shape.
+    """
+    if shape not in get_args(Shape):
+        raise ValueError(f"shape is {shape!r}; one of {', '.join(get_args(Shape))} is needed")
+    if axis is not None and shape != "cylinder":
+        raise ValueError(f"an axis is given; a {shape} has none")
+    count = estimates.sizes["whisker"]
+    if len(whiskers) != count:
+        raise ValueError(f"there are estimates of {count} whiskers; {len(whiskers)} are given")
+    points = _rows(estimates["contact_point"])
+    known = {
+        "normals": _rows(estimates["contact_normal"]),
+        "whisker_radius": whisker_radii(estimates, whiskers).reshape(-1),
+    }
+    spread = _rows(estimates["contact_covariance"])
+    if np.isfinite(spread).any():
+        known["covariance"] = spread + SOLVED_TO**2 * np.eye(3)
+        for name in ("normal_covariance", "point_normal_covariance"):
+            known[name] = _rows(estimates[name])
+    try:
+        if shape == "cylinder":
+            return fit_cylinder(points, axis=axis, **known)
+        return (fit_sphere if shape == "sphere" else fit_plane)(points, **known)
+    except ValueError as fault:
+        found = int(np.isfinite(points).all(axis=1).sum())
+        raise ValueError(
+            f"{fault} (contacts were estimated in {found} of {len(points)} frames)"
+        ) from None
+
+
+def whisker_radii(estimates: xr.Dataset, whiskers: Sequence[Whisker]) -> Array:
+    """Give the whiskers' radii where they touch.
+
+    Parameters
+    ----------
+    estimates : xarray.Dataset
+        Dims time, whisker: ``arc_length``.
+    whiskers : sequence of Whisker
+        One for each.
+
+    Returns
+    -------
+    array (time, whisker)
+        m; NaN where the arc length is.
+    """
+    arc_length = estimates["arc_length"].transpose(*_EACH).values
+    radius = np.full(arc_length.shape, np.nan)
+    for k, whisker in enumerate(whiskers):
+        known = np.isfinite(arc_length[:, k])
+        radius[known, k] = whisker.radius(arc_length[known, k])
+    return radius
+
+
+def _rows(variable: xr.DataArray) -> Array:
+    """Values (frames × whiskers, ...)."""
+    values = variable.transpose(*_EACH, ...).values
+    return np.asarray(values.reshape(-1, *values.shape[2:]))
+
+
+def _compared(
+    fit: FittedShape,
+    estimates: xr.Dataset,
+    whiskers: Sequence[Whisker],
+    objects: Sequence[Surface],
+) -> dict[str, Any]:
+    """Distances of contacts from the known object nearest to them, and of the fit from it."""
+    points = estimates["contact_point"].transpose(*_EACH, "space").values
+    radius = whisker_radii(estimates, whiskers)
+    there = np.isfinite(points).all(axis=-1)
+    gaps = np.full((len(objects), *there.shape), np.nan)
+    for i, thing in enumerate(objects):
+        gaps[i, there] = thing.signed_distance(points[there]) - radius[there]
+    number = int(np.argmin(np.nanmedian(np.abs(gaps), axis=(1, 2))))
+    about = attributes("object_distance") | {"object": number}
+    out: dict[str, Any] = {"object_distance": (_EACH, gaps[number], about)}
+    true = objects[number]
+    if isinstance(true, Peg) and isinstance(fit, CylinderFit):
+        offset, tilt = axis_offset(fit.origin, fit.axis, true.origin, true.axis)
+        out["axis_offset"] = ("space", offset, attributes("axis_offset"))
+        out["axis_tilt"] = ((), tilt, attributes("axis_tilt"))
+    elif isinstance(true, Sphere) and isinstance(fit, SphereFit):
+        offset = fit.origin - true.origin
+        out["center_offset"] = ("space", offset, attributes("center_offset"))
+    else:
+        return out
+    error = float(fit.diameter - 2.0 * true.radius)
+    out["diameter_error"] = ((), error, attributes("diameter_error"))
+    return out

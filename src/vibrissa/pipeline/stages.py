@@ -1,0 +1,132 @@
+"""The stages one after the other: a recording in, a recording with one more group out.
+
+A stage does the stages before it that are missing, and takes away what was made of the group that
+it makes anew. Nothing else of the recording is touched, and the recording given stays as it is.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from vibrissa.pipeline.estimates import Progress, estimates_of
+from vibrissa.pipeline.reconstruct import reconstruct
+from vibrissa.pipeline.signals import check_recording, signals_of
+
+STAGES = ("signals", "estimates", "contour")
+"""Groups in the order in which they are made."""
+
+
+def with_group(recording: xr.DataTree, name: str, dataset: xr.Dataset) -> xr.DataTree:
+    """Add what a stage made to a recording.
+
+    Parameters
+    ----------
+    recording : xarray.DataTree
+        The recording.
+    name : {"signals", "estimates", "contour"}
+        Of the group.
+    dataset : xarray.Dataset
+        With as many frames and whiskers as the recording.
+
+    Returns
+    -------
+    xarray.DataTree
+        A new one; the group is replaced if there is one, and those of later stages are left out.
+
+    Raises
+    ------
+    ValueError
+        If the name is none of these, or frames or whiskers differ.
+    """
+    if name not in STAGES:
+        raise ValueError(f"the group is called {name!r}; one of {', '.join(STAGES)} is needed")
+    check_recording(recording)
+    root = recording.to_dataset()
+    shapes = [tuple(data.sizes.get(d) for d in ("time", "whisker")) for data in (dataset, root)]
+    if shapes[0] != shapes[1] or not np.allclose(dataset["time"], root["time"], rtol=0, atol=1e-6):
+        raise ValueError(
+            f"the {name} have frames and whiskers {shapes[0]}, the recording {shapes[1]}, or they "
+            "are of other times"
+        )
+    own = dataset.drop_vars([n for n in dataset.coords if n in root.coords])
+    later = STAGES[STAGES.index(name) :]
+    groups = {
+        group.path: group.to_dataset(inherit=False)
+        for group in recording.subtree
+        if group.path.split("/")[1] not in later
+    }
+    return xr.DataTree.from_dict({**groups, f"/{name}": own})
+
+
+def with_signals(recording: xr.DataTree, *args: Any, **options: Any) -> xr.DataTree:
+    """Add the group ``signals``.
+
+    Parameters
+    ----------
+    recording : xarray.DataTree
+        Tracked, simulated or measured.
+    *args, **options
+        Of `signals_of`.
+
+    Returns
+    -------
+    xarray.DataTree
+        With it.
+    """
+    return with_group(recording, "signals", signals_of(recording, *args, **options))
+
+
+def with_estimates(
+    recording: xr.DataTree, *args: Any, progress: Progress | None = None, **options: Any
+) -> xr.DataTree:
+    """Add the group ``estimates``, and ``signals`` where there are none.
+
+    Parameters
+    ----------
+    recording : xarray.DataTree
+        Tracked, simulated or measured.
+    *args
+        Of `estimates_of`.
+    progress : callable, optional
+        Called as ``progress(stage, done, total)``.
+    **options
+        Of `estimates_of`.
+
+    Returns
+    -------
+    xarray.DataTree
+        With it.
+    """
+    if "signals" not in recording.children:
+        recording = with_signals(recording, whiskers=options.get("whiskers"))
+    estimates = estimates_of(recording, *args, progress=progress, **options)
+    return with_group(recording, "estimates", estimates)
+
+
+def with_contour(
+    recording: xr.DataTree, *args: Any, progress: Progress | None = None, **options: Any
+) -> xr.DataTree:
+    """Add the group ``contour``, and ``signals`` and ``estimates`` where there are none.
+
+    Parameters
+    ----------
+    recording : xarray.DataTree
+        Tracked, simulated or measured.
+    *args
+        Of `reconstruct`.
+    progress : callable, optional
+        Called as ``progress(stage, done, total)``.
+    **options
+        Of `reconstruct`.
+
+    Returns
+    -------
+    xarray.DataTree
+        With it.
+    """
+    if "estimates" not in recording.children:
+        recording = with_estimates(recording, whiskers=options.get("whiskers"), progress=progress)
+    return with_group(recording, "contour", reconstruct(recording, *args, **options))

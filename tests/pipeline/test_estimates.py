@@ -1,0 +1,237 @@
+"""Estimates are as good as their noise says, whatever the signals and wherever they come from."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from vibrissa.io import load_recording, save_recording
+from vibrissa.pipeline import (
+    component_noise,
+    estimates_of,
+    placed_by,
+    reconstruct,
+    signals_of,
+    with_contour,
+    with_estimates,
+    with_group,
+    with_signals,
+)
+from vibrissa.status import Status
+from vibrissa.trial import recorded_pegs, recorded_whisker
+
+ALL = "Fx FT FD Mx MB MD"
+
+
+def spread(error, covariance, axes=3):
+    """Robust standard deviation of errors along the longest axes of their covariance, over its own.
+
+    It is 1 where the covariance is right.
+    """
+    size, along = np.linalg.eigh(covariance)
+    z = np.einsum("tji,tj->ti", along, error)[:, -axes:] / np.sqrt(size[:, -axes:])
+    return np.median(np.abs(z)) / 0.6745
+
+
+def errors(estimates, trial):
+    """Errors of points in both frames, where the whisker is bent enough for derivatives to hold."""
+    truth = trial["truth"].to_dataset().isel(whisker=0)
+    one = estimates.isel(whisker=0)
+    strong = np.linalg.norm(truth["moment"].values, axis=1) > 1e-6
+    rows = np.flatnonzero(one["in_contact"].values & strong & (one["candidates"].values > 0))
+    return truth.isel(time=rows), one.isel(time=rows)
+
+
+@pytest.fixture(scope="module")
+def felt(trial):
+    return with_signals(trial)
+
+
+@pytest.mark.parametrize("signals", ["Fx MB MD", "Fx FT MB MD", ALL, "wrench"])
+def test_a_sensor_finds_contacts_as_its_noise_allows(felt, trial, contact_map, signals):
+    estimates = estimates_of(felt, signals, contact_maps=[contact_map])
+    truth, one = errors(estimates, trial)
+    assert one.sizes["time"] > 30
+    away = one["contact_point"].values - truth["contact_point"].values
+    assert 0.75 < spread(away, one["contact_covariance"].values) < 1.35
+    local = one["contact_point_whisker"].values - truth["contact_point_whisker"].values
+    assert 0.75 < spread(local, one["covariance"].values) < 1.35
+    normal = one["contact_normal"].values - truth["surface_normal"].values
+    assert 0.75 < spread(normal, one["normal_covariance"].values, 2) < 1.35
+    assert estimates.attrs["signals"] == " ".join(signals.split())
+
+
+def test_point_and_normal_err_together_as_they_say(felt, trial, contact_map):
+    """Half a diameter back along the normal the axis is found: its error needs all covariances."""
+    truth, one = errors(estimates_of(felt, contact_maps=[contact_map]), trial)
+    r = 5e-3
+    away = one["contact_point"] - truth["contact_point"]
+    turned = one["contact_normal"] - truth["surface_normal"]
+    error = away.values - r * turned.values
+    cross = one["point_normal_covariance"].values
+    total = one["contact_covariance"].values + r**2 * one["normal_covariance"].values
+    total = total - r * (cross + np.swapaxes(cross, 1, 2))
+    assert 0.75 < spread(error, total) < 1.35
+
+
+def test_the_contact_point_comes_back_the_papers_way(tracked, contact_map):
+    """Its signals know the point, so it comes back, and with it its covariance."""
+    estimates = estimates_of(with_signals(tracked), contact_maps=[contact_map])
+    there = estimates["in_contact"].values[:, 0] & (estimates["candidates"].values[:, 0] == 1)
+    assert there.sum() > 40
+    np.testing.assert_allclose(
+        estimates["contact_point"].values[there], tracked["contact_point"].values[there], atol=1e-7
+    )
+    got = estimates["contact_covariance"].values[there]
+    expected = tracked["contact_covariance"].values[there]
+    np.testing.assert_allclose(got, expected, atol=1e-3 * expected.max())
+
+
+def test_errors_of_the_pose_count(tracked, trial, contact_map):
+    placed = with_group(tracked, "signals", placed_by(signals_of(trial), tracked))
+    sharp = component_noise(1e-9, 1e-11)
+    estimates = estimates_of(placed, noise=sharp, contact_maps=[contact_map])
+    _, one = errors(estimates, trial)
+    # The sensor in the recording has more noise than is said here; the pose makes up for some.
+    honest = estimates_of(placed, contact_maps=[contact_map])
+    truth, other = errors(honest, trial)
+    pose = np.trace(one["contact_covariance"].values, axis1=1, axis2=2)
+    arm = np.linalg.norm(one["contact_point_whisker"].values, axis=1)
+    np.testing.assert_allclose(pose, 3 * (8e-6) ** 2 + 2 * (arm * 1e-3) ** 2, rtol=0.01)
+    np.testing.assert_allclose(
+        np.trace(one["normal_covariance"].values, axis1=1, axis2=2), 2e-6, rtol=0.1
+    )
+    away = other["contact_point"].values - truth["contact_point"].values
+    assert 0.75 < spread(away, other["contact_covariance"].values) < 1.35
+
+
+def test_the_rod_knows_what_pose_and_wrench_have_in_common(tracked, trial, contact_map):
+    """If pose and wrench always err so that they cancel, the contact point is exact."""
+    data = signals_of(trial).drop_attrs().assign_attrs(source="rod")
+    n = data.sizes["time"]
+    wrench = np.tile(component_noise(1e-6, 2e-8), (n, 1, 1, 1))
+    pose = np.tile(np.diag(np.repeat([1e-10, 1e-6], 3)), (n, 1, 1, 1))
+    data["wrench_covariance"] = (("time", "whisker", "component", "component_"), wrench)
+    apart = data.assign(pose_covariance=(("time", "whisker", "pose", "pose_"), pose))
+    alone = estimates_of(with_group(trial, "signals", data), contact_maps=[contact_map])
+    both = estimates_of(with_group(trial, "signals", apart), contact_maps=[contact_map])
+    tied = apart.assign(
+        pose_wrench_covariance=(
+            ("time", "whisker", "pose", "component_"),
+            1e-3 * np.sqrt(np.einsum("twii,twjj->twij", pose, wrench)),
+        )
+    )
+    other = estimates_of(with_group(trial, "signals", tied), contact_maps=[contact_map])
+    felt = alone["in_contact"].values[:, 0] & (alone["candidates"].values[:, 0] == 1)
+    sizes = [
+        np.trace(e["contact_covariance"].values[felt, 0], axis1=1, axis2=2) for e in (alone, both)
+    ]
+    assert (sizes[1] > sizes[0]).all()
+    change = other["contact_covariance"].values[felt] - both["contact_covariance"].values[felt]
+    assert np.abs(change).max() > 0
+    np.testing.assert_allclose(change, np.swapaxes(change, -1, -2), atol=1e-20)
+
+
+def test_frames_keep_why_they_have_no_signals(tracked, contact_map):
+    data = tracked.copy()
+    point = tracked["contact_point"].values.copy()
+    row = int(np.flatnonzero(tracked["in_contact"].values[:, 0])[0])
+    point[row, 0] += [0.0, 0.0, 0.05]
+    dims = tracked["contact_point"].dims
+    data.dataset = tracked.to_dataset().assign(contact_point=(dims, point))
+    estimates = estimates_of(with_signals(data), contact_maps=[contact_map])
+    assert estimates["status"].values[row, 0] in (Status.BEYOND_FOLD, Status.BEYOND_TIP)
+    assert np.isnan(estimates["contact_point"].values[row]).all()
+
+
+def test_a_peg_is_found_from_a_recording_alone(quiet):
+    told = []
+    done = with_contour(quiet, progress=lambda *step: told.append(step))
+    contour = done["contour"].to_dataset()
+    assert {stage for stage, *_ in told} == {"map of all contacts", "contact points"}
+    assert np.linalg.norm(contour["axis_offset"]) < 1e-7
+    assert float(contour["axis_tilt"]) < 1e-5
+    assert abs(float(contour["diameter_error"])) < 1e-7
+    felt = done["estimates"]["in_contact"].values
+    assert (contour["inlier"].values <= felt).all()
+    assert contour["inlier"].values.sum() > 0.9 * felt.sum()
+    assert np.nanmedian(np.abs(contour["object_distance"].values[felt])) < 1e-8
+    np.testing.assert_array_equal(done["force"], quiet["force"])
+    assert set(quiet.children) == set(done.children) - {"signals", "estimates", "contour"}
+
+
+def test_a_peg_is_found_with_noise(trial):
+    contour = with_contour(trial)["contour"].to_dataset()
+    assert np.linalg.norm(contour["axis_offset"]) < 0.2e-3
+    sigma = np.sqrt(np.diag(contour["object_covariance"]))
+    assert (np.abs(contour["axis_offset"].values[:2]) < 5 * sigma[:2]).all()
+
+
+def test_what_stages_add_is_kept_in_a_file(trial, tmp_path):
+    done = with_contour(trial, axis=[0, 0, 1.0])
+    save_recording(tmp_path / "t.nc", done)
+    xr.testing.assert_identical(load_recording(tmp_path / "t.nc"), done)
+    again = with_estimates(load_recording(tmp_path / "t.nc"), "Fx FT MB MD")
+    assert "contour" not in again.children
+    assert again["signals"].attrs["source"] == "sensor"
+
+
+def test_two_whiskers_touch_one_peg(quiet):
+    trial = quiet
+    two = xr.DataTree.from_dict(
+        {
+            "/": xr.concat([trial.to_dataset()] * 2, "whisker").assign_coords(whisker=["a", "b"]),
+            "/whiskers/0": trial["whiskers/0"].to_dataset(inherit=False),
+            "/whiskers/1": trial["whiskers/0"].to_dataset(inherit=False),
+        }
+    )
+    done = with_estimates(two)
+    alone = with_estimates(trial)
+    for k in range(2):
+        np.testing.assert_array_equal(
+            done["estimates"]["contact_point"].values[:, k],
+            alone["estimates"]["contact_point"].values[:, 0],
+        )
+    contour = reconstruct(done, objects=recorded_pegs(trial))
+    assert contour["inlier"].shape == (trial.sizes["time"], 2)
+    one = reconstruct(alone, objects=recorded_pegs(trial))
+    np.testing.assert_allclose(contour["object_radius"], one["object_radius"], atol=1e-6)
+    assert "object_distance" not in reconstruct(done)
+    ratio = np.diag(one["object_covariance"])[6] / np.diag(contour["object_covariance"])[6]
+    assert ratio == pytest.approx(2.0, rel=0.05)
+
+
+def test_what_cannot_be_done_is_said(trial, felt, contact_map):
+    with pytest.raises(ValueError, match="no group signals"):
+        estimates_of(trial)
+    with pytest.raises(ValueError, match="no group estimates"):
+        reconstruct(felt)
+    with pytest.raises(ValueError, match="different signals"):
+        estimates_of(felt, "Fx MB")
+    with pytest.raises(ValueError, match="noise has shape"):
+        estimates_of(felt, noise=np.eye(3), contact_maps=[contact_map])
+    with pytest.raises(ValueError, match="signals of 1 whiskers; 2 are given"):
+        estimates_of(felt, contact_maps=[contact_map] * 2)
+    with pytest.raises(ValueError, match="'cube'; one of cylinder"):
+        reconstruct(felt, "cube")
+    unknown = trial.copy()
+    root = trial.to_dataset()
+    unknown.dataset = root.assign({name: root[name].drop_attrs() for name in ("force", "moment")})
+    with pytest.raises(ValueError, match="noise is not known"):
+        with_estimates(unknown, contact_maps=[contact_map])
+    few = with_estimates(trial.isel(time=slice(0, 5)), contact_maps=[contact_map])
+    with pytest.raises(ValueError, match=r"no cylinder.*contacts were estimated in \d of 5 frames"):
+        reconstruct(few)
+    with pytest.raises(ValueError, match="frames and whiskers"):
+        with_group(trial, "signals", felt["signals"].to_dataset().isel(time=slice(5)))
+    with pytest.raises(ValueError, match="one of signals, estimates, contour"):
+        with_group(trial, "other", felt["signals"].to_dataset())
+
+
+def test_without_noise_there_is_no_covariance_but_a_fit(trial):
+    """Signals of the contact point whose covariance nobody knows."""
+    data = signals_of(trial).drop_attrs().assign_attrs(source="contact point")
+    done = with_estimates(with_group(trial, "signals", data))
+    assert np.isnan(done["estimates"]["contact_covariance"].values).all()
+    assert recorded_whisker(done).length == pytest.approx(40e-3)
+    contour = reconstruct(done)
+    assert float(contour["object_radius"]) > 0

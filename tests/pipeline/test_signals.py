@@ -1,0 +1,200 @@
+"""Signals of a recording are those of the truth, as far as their source knows it."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from vibrissa.pipeline import default_source, placed_by, sensor_noise, signals_of, with_signals
+from vibrissa.signals import SIGNALS, base_signals
+from vibrissa.status import Status
+from vibrissa.tracking.filtering import low_pass
+
+
+def exact(tracked, trial):
+    """Contact point and pose as they truly are."""
+    root = tracked.to_dataset()
+    pose = trial.to_dataset()[["base_position", "base_rotation"]]
+    point = trial["truth"].to_dataset()["contact_point"]
+    out = tracked.copy()
+    out.dataset = root.assign(contact_point=point, **pose)
+    return out
+
+
+def test_a_sensor_is_taken_as_it_reads(trial):
+    signals = signals_of(trial)
+    assert signals.attrs["source"] == "sensor"
+    np.testing.assert_array_equal(signals["force"], trial["force"])
+    six = base_signals(trial["force"], trial["moment"])
+    for name in SIGNALS:
+        np.testing.assert_array_equal(signals[name], six[name])
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(sensor_noise(signals))), np.repeat([1e-6, 2e-8], 3), rtol=1e-12
+    )
+    truth = trial["truth"]["in_contact"].values
+    assert (signals["in_contact"].values <= truth).all()
+    assert signals["in_contact"].values.sum() > 0.9 * truth.sum()
+
+
+def test_the_true_contact_point_gives_the_true_wrench(tracked, trial):
+    signals = signals_of(exact(tracked, trial), "contact point", None)
+    truth = trial["truth"].to_dataset()
+    for name in ("force", "moment"):
+        size = np.abs(truth[name].values).max()
+        np.testing.assert_allclose(signals[name], truth[name], atol=1e-5 * size)
+    np.testing.assert_array_equal(signals["status"], truth["status"])
+    for name, variable in signals.data_vars.items():
+        assert {"units", "long_name"} <= set(variable.attrs), name
+
+
+def test_the_covariance_of_the_wrench_is_how_it_scatters(tracked, trial):
+    scattered = tracked.copy()
+    pose = trial.to_dataset()[["base_position", "base_rotation"]]
+    scattered.dataset = tracked.to_dataset().assign(pose)
+    signals = signals_of(scattered, "contact point", None)
+    truth = trial["truth"].to_dataset()
+    there = truth["in_contact"].values[:, 0] & (signals["status"].values[:, 0] == Status.OK)
+    error = np.concatenate([signals[n].values - truth[n].values for n in ("force", "moment")], -1)
+    covariance = sensor_noise(signals)[there, 0]
+    z = error[there, 0] / np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    assert 0.8 < np.sqrt(np.median(z**2) / 0.455) < 1.25
+
+
+def test_points_that_are_out_of_reach_keep_their_frame(tracked, trial):
+    data = exact(tracked, trial)
+    point = data["contact_point"].values.copy()
+    touching = np.flatnonzero(data["in_contact"].values[:, 0])
+    point[touching[0], 0] += [0.0, 0.0, 0.05]
+    point[touching[1], 0] = data["base_position"].values[touching[1], 0]
+    point[touching[2], 0] = np.nan
+    data.dataset = data.to_dataset().assign(contact_point=(("time", "whisker", "space"), point))
+    signals = signals_of(data, "contact point", None)
+    status = signals["status"].values[touching[:3], 0]
+    assert set(status[:2]) <= {Status.BEYOND_TIP, Status.BEYOND_FOLD, Status.TOO_PROXIMAL}
+    assert status[2] == Status.MISSING
+    assert np.isnan(signals["force"].values[touching[:3], 0]).all()
+    assert signals.sizes["time"] == trial.sizes["time"]
+
+
+def test_frames_without_a_pose_are_missing(tracked):
+    data = tracked.copy()
+    rotation = tracked["base_rotation"].values.copy()
+    rotation[5] = np.nan
+    dims = tracked["base_rotation"].dims
+    data.dataset = tracked.to_dataset().assign(base_rotation=(dims, rotation))
+    signals = signals_of(data)
+    assert signals["status"].values[5, 0] == Status.MISSING
+    assert np.isnan(signals["Fx"].values[5, 0])
+    assert not signals["in_contact"].values[5, 0]
+
+
+@pytest.mark.parametrize("cutoff", [None, 20.0, 60.0])
+def test_the_pose_is_filtered_as_asked(tracked, cutoff):
+    signals = signals_of(tracked, "contact point", cutoff)
+    expected = low_pass(tracked["base_position"].values[:, 0], 300.0, cutoff)
+    np.testing.assert_allclose(signals["base_position"].values[:, 0], expected, atol=1e-12)
+    turned = signals["base_rotation"].values[:, 0]
+    np.testing.assert_allclose(
+        turned @ np.swapaxes(turned, 1, 2), np.eye(3)[None] + 0 * turned, atol=1e-12
+    )
+    assert signals.attrs.get("cutoff") == cutoff
+
+
+def measured(tracked, unfiltered=True):
+    """With the pose of before the rod was fitted in its group."""
+    from vibrissa.tracking.pose import BasePose, angles_of
+
+    root = tracked.to_dataset()
+    pose = BasePose(
+        root["base_position"].values[:, 0], *angles_of(root["base_rotation"].values[:, 0]).T
+    )
+    smooth = pose.filtered(300.0, 85.0)
+    data = {}
+    for prefix, one in (("", smooth), *((("unfiltered_", pose),) if unfiltered else ())):
+        data[f"{prefix}base_position"] = (("time", "whisker", "space"), one.position[:, None])
+        for name, angle in (
+            ("azimuth", one.azimuth),
+            ("elevation", one.elevation),
+            ("roll", one.roll),
+        ):
+            data[f"{prefix}base_{name}"] = (("time", "whisker"), angle[:, None])
+    tree = tracked.copy()
+    tree["measured"] = xr.DataTree(xr.Dataset(data, attrs={"cutoff": 85.0}))
+    return tree
+
+
+def test_another_cutoff_is_tried_on_the_unfiltered_pose(tracked):
+    for cutoff in (85.0, 30.0):
+        direct = signals_of(tracked, "contact point", cutoff)
+        again = signals_of(measured(tracked), "contact point", cutoff)
+        np.testing.assert_allclose(again["force"], direct["force"], rtol=1e-6, atol=1e-9)
+    old = measured(tracked, unfiltered=False)
+    np.testing.assert_allclose(
+        signals_of(old, "contact point")["force"],
+        signals_of(tracked, "contact point")["force"],
+        rtol=1e-6,
+        atol=1e-9,
+    )
+    with pytest.raises(ValueError, match="track the videos again"):
+        signals_of(old, "contact point", 30.0)
+
+
+def test_a_rod_is_no_sensor_and_a_sensor_no_rod(tracked, trial):
+    rod = tracked.copy()
+    truth = trial["truth"].to_dataset()
+    n = tracked.sizes["time"]
+    covariance = (("time", "whisker", "component", "component_"), np.tile(np.eye(6), (n, 1, 1, 1)))
+    rod.dataset = tracked.to_dataset().assign(
+        force=truth["force"], moment=truth["moment"], wrench_covariance=covariance
+    )
+    signals = signals_of(rod, "rod")
+    np.testing.assert_array_equal(signals["in_contact"], truth["in_contact"])
+    np.testing.assert_array_equal(signals["force"], truth["force"])
+    assert sensor_noise(signals).shape == (n, 1, 6, 6)
+    assert "pose_covariance" in signals
+    assert default_source(rod) == "contact point"
+    with pytest.raises(ValueError, match="source 'rod'"):
+        signals_of(rod, "sensor")
+    with pytest.raises(ValueError, match="wrench_covariance"):
+        signals_of(trial, "rod")
+
+
+def test_a_sensor_is_placed_by_what_a_camera_saw(tracked, trial):
+    signals = signals_of(trial)
+    renamed = tracked.copy()
+    later = tracked.to_dataset().isel(time=slice(10, None, 2))
+    renamed = xr.DataTree(later.assign_coords(whisker=["seen"], time=later["time"] + 1e-9))
+    placed = placed_by(signals, renamed)
+    assert list(placed["whisker"].values) == ["seen"]
+    np.testing.assert_array_equal(placed["time"], renamed["time"])
+    np.testing.assert_array_equal(placed["Fx"].values, signals["Fx"].values[10::2])
+    np.testing.assert_array_equal(placed["base_position"], renamed["base_position"])
+    assert "pose_covariance" in placed
+    far = xr.DataTree(later.assign_coords(time=later["time"] + 10.0))
+    nowhere = placed_by(signals, far)
+    assert (nowhere["status"].values == Status.MISSING).all()
+    assert not nowhere["in_contact"].values.any()
+    assert nowhere["in_contact"].dtype == bool
+    with pytest.raises(ValueError, match="2 whiskers"):
+        placed_by(xr.concat([signals, signals], "whisker"), tracked)
+
+
+def test_what_is_missing_is_said(tracked, trial):
+    bare = xr.DataTree(trial.to_dataset()[["base_position"]])
+    with pytest.raises(ValueError, match="force and moment, or contact_point"):
+        signals_of(bare)
+    with pytest.raises(ValueError, match="need contact_point"):
+        signals_of(trial, "contact point")
+    with pytest.raises(ValueError, match="'magic'; one of contact point, rod, sensor"):
+        signals_of(trial, "magic")
+    with pytest.raises(ValueError, match="lacks the dimensions time, whisker"):
+        signals_of(xr.DataTree(xr.Dataset()))
+    without = xr.DataTree.from_dict({"/": tracked.to_dataset()})
+    with pytest.raises(ValueError, match="carries 0 of them"):
+        with_signals(without)
+    with pytest.raises(ValueError, match="below half of"):
+        signals_of(tracked, "contact point", 200.0)
+    mixed = trial.to_dataset().drop_vars(["force", "moment"])
+    mixed = mixed.assign(reading=(("time", "channel"), np.zeros((trial.sizes["time"], 2))))
+    mixed = mixed.assign_coords(channel=["Fx", "Mz"])
+    with pytest.raises(ValueError, match="reads Fx, Mz, not force and moment"):
+        signals_of(xr.DataTree(mixed), "sensor")

@@ -73,9 +73,10 @@ def test_point_and_normal_err_together_as_they_say(felt, trial, contact_map):
     assert 0.75 < spread(error, total) < 1.35
 
 
-def test_the_contact_point_comes_back_the_papers_way(tracked, contact_map):
+def test_the_contact_point_comes_back_the_papers_way(tracked, trial, contact_map):
     """Its signals know the point, so it comes back, and with it its covariance."""
-    estimates = estimates_of(with_signals(tracked), contact_maps=[contact_map])
+    signals = with_signals(tracked, "contact point", None)
+    estimates = estimates_of(signals, contact_maps=[contact_map])
     there = estimates["in_contact"].values[:, 0] & (estimates["candidates"].values[:, 0] == 1)
     assert there.sum() > 40
     np.testing.assert_allclose(
@@ -84,6 +85,9 @@ def test_the_contact_point_comes_back_the_papers_way(tracked, contact_map):
     got = estimates["contact_covariance"].values[there]
     expected = tracked["contact_covariance"].values[there]
     np.testing.assert_allclose(got, expected, atol=1e-3 * expected.max())
+    truth = trial["truth"].to_dataset().isel(whisker=0, time=there)
+    normal = estimates["contact_normal"].values[there, 0] - truth["surface_normal"].values
+    assert 0.7 < spread(normal, estimates["normal_covariance"].values[there, 0], 2) < 1.4
 
 
 def test_errors_of_the_pose_count(tracked, trial, contact_map):
@@ -162,7 +166,7 @@ def test_a_peg_is_found_from_a_recording_alone(quiet):
 def test_a_peg_is_found_with_noise(trial):
     contour = with_contour(trial)["contour"].to_dataset()
     assert np.linalg.norm(contour["axis_offset"]) < 0.2e-3
-    sigma = np.sqrt(np.diag(contour["object_covariance"]))
+    sigma = np.sqrt(np.diag(contour["parameter_covariance"]))
     assert (np.abs(contour["axis_offset"].values[:2]) < 5 * sigma[:2]).all()
 
 
@@ -196,7 +200,7 @@ def test_two_whiskers_touch_one_peg(quiet):
     one = reconstruct(alone, objects=recorded_pegs(trial))
     np.testing.assert_allclose(contour["object_radius"], one["object_radius"], atol=1e-6)
     assert "object_distance" not in reconstruct(done)
-    ratio = np.diag(one["object_covariance"])[6] / np.diag(contour["object_covariance"])[6]
+    ratio = np.diag(one["parameter_covariance"])[6] / np.diag(contour["parameter_covariance"])[6]
     assert ratio == pytest.approx(2.0, rel=0.05)
 
 
@@ -211,7 +215,7 @@ def test_what_cannot_be_done_is_said(trial, felt, contact_map):
         estimates_of(felt, noise=np.eye(3), contact_maps=[contact_map])
     with pytest.raises(ValueError, match="signals of 1 whiskers; 2 are given"):
         estimates_of(felt, contact_maps=[contact_map] * 2)
-    with pytest.raises(ValueError, match="'cube'; one of cylinder"):
+    with pytest.raises(ValueError, match="'cube'; one of cylinder, sphere, plane"):
         reconstruct(felt, "cube")
     unknown = trial.copy()
     root = trial.to_dataset()

@@ -135,6 +135,7 @@ def run_demo(
     contacts = in_laboratory(contacts, motion.base_rotation, motion.base_position)
     tell("contact points from signals", 1, 1)
     fit = fit_contacts(contacts.expand_dims("whisker", 1), [whisker])
+    assert isinstance(fit, CylinderFit)
     truth = _truth(recording, whisker, peg)
     errors = contact_errors(contacts, truth, whisker, seed)
     recording = with_estimates(recording, contacts)

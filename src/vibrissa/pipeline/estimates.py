@@ -92,10 +92,9 @@ def estimates_of(
     Notes
     -----
     Covariances come from the noise of the signals and from that of the base's pose: of signals of
-    the rod both, with what they have in common; of a sensor's the pose's where a camera tells it
-    (`placed_by`). Signals of the tracked contact point take the paper's pose as exact: its errors
-    do not move the point in the laboratory, as the same pose leads there and back, but they turn
-    the normal, which is left out.
+    the rod and of the tracked contact point both, with what they have in common; of a sensor's the
+    pose's where a camera tells it (`placed_by`). So an error of the pose does not move a contact
+    point that was tracked, as the same pose leads there and back, but it turns the normal.
     """
     group = recording.children.get("signals")
     if group is None:

@@ -108,7 +108,7 @@ def _placed_covariance(
     if pose is not None:
         held = np.zeros((len(gain), 6, 6))
         held[:, :3, :3] = np.eye(3)
-        held[:, :3, 3:], held[:, 3:, 3:] = -_cross(arm), -_cross(normal)
+        held[:, :3, 3:], held[:, 3:, 3:] = -cross_matrices(arm), -cross_matrices(normal)
         out = out + held @ pose @ np.swapaxes(held, 1, 2)
         if pose_wrench is not None:
             both = held @ pose_wrench @ np.swapaxes(felt, 1, 2)
@@ -116,8 +116,19 @@ def _placed_covariance(
     return np.asarray(out)
 
 
-def _cross(vectors: Array) -> Array:
-    """Matrices (n, 3, 3) whose product with a vector is the cross product of these with it."""
+def cross_matrices(vectors: Array) -> Array:
+    """Write cross products with vectors as matrices.
+
+    Parameters
+    ----------
+    vectors : array (n, 3)
+        The first factors.
+
+    Returns
+    -------
+    array (n, 3, 3)
+        What the second factors are multiplied by.
+    """
     x, y, z = vectors.T
     zero = np.zeros_like(x)
     return np.stack([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)

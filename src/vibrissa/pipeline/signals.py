@@ -3,8 +3,8 @@
 **The contact point** (the paper's way): the contact point that was tracked in the laboratory is
 expressed in the frame of the whisker's base, whose pose is filtered without phase shift; the
 frictionless rod that passes through it tells force and moment (`vibrissa.deflect`). Points that the
-rod cannot reach keep their frame and say why. The covariance of the point becomes one of the
-wrench; that of the paper's pose is not known and counts as zero.
+rod cannot reach keep their frame and say why. The wrench has the covariance of the point, and of
+the pose: how far it usually is from that of the rod, where that is known.
 
 **The rod**: force and moment of the rod that fits the whisker's images, with their covariance.
 
@@ -14,12 +14,14 @@ wrench; that of the paper's pose is not known and counts as zero.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from vibrissa.pipeline.laboratory import cross_matrices
 from vibrissa.pipeline.locate import FELT
 from vibrissa.pipeline.slopes import wrench_slopes
 from vibrissa.quantities import attributes
@@ -102,11 +104,12 @@ def signals_of(
         return _by_rod(root)
     count = root.sizes["whisker"]
     known = [recorded_whisker(recording, k) for k in range(count)] if whiskers is None else whiskers
+    _needed(root, ("contact_point",), "contact point")
     if len(known) != count:
         raise ValueError(f"{len(known)} whiskers are given; the recording has {count}")
     pose = _paper_pose(recording, cutoff)
     data = xr.concat(
-        [_by_point(root, pose, k, one, proximal) for k, one in enumerate(known)], "whisker"
+        [_by_point(root, pose[k], k, one, proximal) for k, one in enumerate(known)], "whisker"
     )
     about: dict[str, Any] = {"source": chosen}
     if cutoff is not None:
@@ -273,58 +276,84 @@ def _with_coordinates(data: xr.Dataset, root: xr.Dataset, about: Mapping[str, An
     return data.assign_coords({"space": list("xyz"), **coordinates}).assign_attrs(about)
 
 
-def _paper_pose(recording: xr.DataTree, cutoff: float | None) -> list[tuple[Array, Array]]:
-    """Rotation (time, 3, 3) and position (time, 3) of each whisker's base, filtered, laboratory.
+class _Pose(NamedTuple):
+    """How one whisker is held: rotation (time, 3, 3), position (time, 3), laboratory frame.
 
-    It is the pose from before the rod was fitted, or the recording's own; what is filtered is how
-    the whisker is held relative to the head.
+    And the covariance of position and a small turn, (time, 6, 6); zero where it is not known.
+    """
+
+    rotation: Array
+    position: Array
+    covariance: Array
+
+
+def _paper_pose(recording: xr.DataTree, cutoff: float | None) -> list[_Pose]:
+    """How each whisker is held, filtered: from before the rod was fitted, or the recording's own.
+
+    What is filtered is how it is held relative to the head.
     """
     root = recording.to_dataset()
     head = HeadPose.still(root.sizes["time"])
     if {"head_position", "head_rotation"} <= set(root.data_vars):
         head = HeadPose(root["head_position"].values, root["head_rotation"].values)
     rate = 1.0 / float(np.median(np.diff(root["time"].values))) if root.sizes["time"] > 1 else 1.0
-    measured = recording.children.get("measured")
-    if measured is None or "base_azimuth" not in measured:
+    group = recording.children.get("measured")
+    measured = None if group is None or "base_azimuth" not in group else group.to_dataset()
+    prefix = "unfiltered_"
+    if measured is None:
         _needed(root, ("contact_point", "base_position", "base_rotation"), "contact point")
-        data, prefix = root, ""
-    else:
-        data, prefix = measured.to_dataset(), "unfiltered_"
-        if f"{prefix}base_azimuth" not in data:
-            if data.attrs.get("cutoff", CUTOFF) != cutoff:
-                raise ValueError(
-                    f"the pose of this recording is kept as it was filtered; a cut-off of {cutoff} "
-                    "Hz needs the unfiltered one: track the videos again"
-                )
-            prefix, cutoff = "", None
-    place = data[f"{prefix}base_position"].transpose("time", "whisker", "space").values
+    elif f"{prefix}base_azimuth" not in measured:
+        if measured.attrs.get("cutoff", CUTOFF) != cutoff:
+            raise ValueError(
+                f"the pose of this recording is kept as it was filtered; a cut-off of {cutoff} Hz "
+                "needs the unfiltered one: track the videos again"
+            )
+        prefix, cutoff = "", None
     poses = []
     for k in range(root.sizes["whisker"]):
-        local = head.seen_from(place[:, k])
-        pose = BasePose(local, *_angles(data.isel(whisker=k), prefix, head)).filtered(rate, cutoff)
-        poses.append((head.rotation @ pose.rotation, head.put_in(pose.position)))
+        own = root.isel(whisker=k)
+        if measured is None:
+            place = own["base_position"].transpose("time", "space").values
+            turned = own["base_rotation"].transpose("time", "space", "whisker_axis").values
+            angles = angles_of(np.swapaxes(head.rotation, 1, 2) @ turned).T
+        else:
+            one = measured.isel(whisker=k)
+            place = one[f"{prefix}base_position"].transpose("time", "space").values
+            names = ("azimuth", "elevation", "roll")
+            angles = np.stack([one[f"{prefix}base_{name}"].values for name in names])
+        pose = BasePose(head.seen_from(place), *angles).filtered(rate, cutoff)
+        rotation, position = head.rotation @ pose.rotation, head.put_in(pose.position)
+        poses.append(_Pose(rotation, position, _pose_covariance(own, rotation, position)))
     return poses
 
 
-def _angles(one: xr.Dataset, prefix: str, head: HeadPose) -> Array:
-    """Emergence angles (3, time) of one whisker, relative to the head."""
-    names = [f"{prefix}base_{name}" for name in ("azimuth", "elevation", "roll")]
-    if set(names) <= set(one.data_vars):
-        return np.stack([one[name].values for name in names])
-    rotation = one["base_rotation"].transpose("time", "space", "whisker_axis").values
-    return np.asarray(angles_of(np.swapaxes(head.rotation, 1, 2) @ rotation).T)
+def _pose_covariance(own: xr.Dataset, rotation: Array, position: Array) -> Array:
+    """Covariance (time, 6, 6) of a pose beside that of the recording.
+
+    As far as they differ, which is hardly of the same cause, the recording's counts as the truth,
+    within its own covariance.
+    """
+    out = np.zeros((len(rotation), 6, 6))
+    if "pose_covariance" not in own:
+        return out
+    out += own["pose_covariance"].transpose("time", "pose", "pose_").values
+    turned = own["base_rotation"].transpose("time", "space", "whisker_axis").values
+    there = np.isfinite(turned.sum(axis=(1, 2)) + rotation.sum(axis=(1, 2)))
+    if "in_contact" in own:
+        there &= own["in_contact"].values.astype(bool)
+    if not there.any():
+        return out
+    turn = Rotation.from_matrix(rotation[there] @ np.swapaxes(turned[there], 1, 2)).as_rotvec()
+    shift = (position - own["base_position"].transpose("time", "space").values)[there]
+    away = np.concatenate([shift, turn], axis=1)
+    return np.asarray(out + away.T @ away / len(away))
 
 
 def _by_point(
-    root: xr.Dataset,
-    poses: Sequence[tuple[Array, Array]],
-    k: int,
-    whisker: Whisker,
-    proximal: float,
+    root: xr.Dataset, pose: _Pose, k: int, whisker: Whisker, proximal: float
 ) -> xr.Dataset:
     """Signals of the rod that passes through the tracked contact point."""
-    _needed(root, ("contact_point",), "contact point")
-    rotation, position = poses[k]
+    rotation, position = pose.rotation, pose.position
     one = root.isel(whisker=k)
     point = one["contact_point"].transpose("time", "space").values
     held = np.isfinite(rotation.sum(axis=(1, 2)) + position.sum(axis=1))
@@ -335,7 +364,6 @@ def _by_point(
     bent = deflect(whisker, PointContact(local[touching]), proximal=proximal)
     status = np.where(held, int(Status.NO_CONTACT), int(Status.MISSING))
     status[touching] = bent.status
-    felt = touching & np.isin(status, [int(Status.OK), int(Status.TIP_CONTACT)])
     wrench = {}
     for name, values in (("force", bent.force), ("moment", bent.moment)):
         wrench[name] = np.where(held[:, None], 0.0, np.nan) * np.ones(3)
@@ -351,19 +379,29 @@ def _by_point(
     )
     if "contact_covariance" not in one:
         return data
+    slopes = np.zeros((len(point), 6, 3))
+    slopes[touching] = wrench_slopes(whisker, bent.arc_length, bent.contact_force)
+    slopes = slopes @ np.swapaxes(rotation, 1, 2)
     spread = one["contact_covariance"].transpose("time", "space", ...).values
-    spread = np.swapaxes(rotation, 1, 2) @ spread @ rotation
-    slopes = wrench_slopes(whisker, bent.arc_length, bent.contact_force)
-    covariance = np.full((len(point), 6, 6), np.nan)
-    covariance[touching] = slopes @ spread[touching] @ np.swapaxes(slopes, 1, 2)
-    covariance[held & ~touching] = 0.0
-    covariance[touching & ~felt] = np.nan
+    spread = np.where(touching[:, None, None], spread, 0.0)
+    # The point is seen from a base that is a little elsewhere and turned by a little.
+    moved = np.concatenate(
+        [-np.eye(3) + np.zeros_like(spread), cross_matrices(point - position)], 2
+    )
+    moved = np.where(touching[:, None, None], moved, 0.0)
+    both = pose.covariance @ np.swapaxes(moved, 1, 2)
+    squares = {
+        "wrench_covariance": slopes @ (spread + moved @ both) @ np.swapaxes(slopes, 1, 2),
+        "pose_covariance": pose.covariance,
+        "pose_wrench_covariance": both @ np.swapaxes(slopes, 1, 2),
+    }
     return data.assign(
-        wrench_covariance=xr.Variable(
-            ("time", "whisker", *_SQUARES["wrench_covariance"]),
-            covariance[:, None],
-            attributes("wrench_covariance"),
-        )
+        {
+            name: xr.Variable(
+                ("time", "whisker", *_SQUARES[name]), square[:, None], attributes(name)
+            )
+            for name, square in squares.items()
+        }
     )
 
 

@@ -32,3 +32,17 @@ def browser():
         browser = play.chromium.launch(executable_path=found, args=ARGUMENTS)
         yield browser
         browser.close()
+
+
+@pytest.fixture(scope="session")
+def recording():
+    """A short trial against a peg, with the cameras that saw it."""
+    import vibrissa as vb
+    from vibrissa.trial import facing_peg, simulate, sweep_past, views_of
+    from vibrissa.trial.film import with_true_traces
+
+    whisker = vb.samples.gamma()
+    peg = facing_peg(whisker)
+    motion = sweep_past(whisker, peg, duration=0.4, rate=250.0)
+    trial = simulate(whisker, motion, [peg])
+    return with_true_traces(trial, views_of(trial, 120e-6))

@@ -63,7 +63,7 @@ class Looking:
 
     def wait_for(self, selector, text=None):
         """Wait until something is on the page."""
-        self.page.locator(selector, has_text=text).first.wait_for()
+        self.page.locator(selector, has_text=text).first.wait_for(state="attached")
 
 
 @pytest.fixture(scope="module")
@@ -104,3 +104,29 @@ def test_out_of_reach_the_reason_is_shown(looking):
     looking.wait_for(f'[data-status="{bend.status.name}"]', bend.status.explanation)
     assert looking.viewer.page.stage.node("bend", "ghost") is not None
     assert looking.faults == []
+
+
+def test_a_trial_plays(browser, recording):
+    from vibrissa.trial import recorded_whisker
+    from vibrissa.viewer import view
+
+    with view(recorded_whisker(recording), recording=recording) as viewer:
+        person = Looking(browser, viewer)
+        trial = viewer.page.modes["Trial"]
+        person.page.get_by_role("button", name="Next contact").click()
+        start = float(trial.trial.time[trial.trial.next_contact(0)])
+        share = start / float(np.ptp(trial.trial.time))
+        person.wait_for(f'[data-cursor="{share:.4f}"]')
+        person.page.get_by_role("button", name="Play").click()
+        person.page.wait_for_function(
+            "share => document.querySelector('[data-cursor]').dataset.cursor > share + 0.02",
+            arg=share,
+        )
+        person.page.get_by_role("button", name="Pause").click()
+        assert viewer.page.settle()
+        frame = trial.frame
+        assert trial.trial.time[frame] > start
+        shown = number("MB", float(trial.trial.signals["MB"][frame, 0]))
+        person.wait_for('[data-quantity="MB"]', shown)
+        assert person.faults == []
+        person.page.close()

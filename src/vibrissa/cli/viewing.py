@@ -19,6 +19,14 @@ def view(
             metavar="[WHISKER | MAP | TRIAL]",
         ),
     ] = None,
+    videos: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--video",
+            help="Of a trial: the video of each of its cameras, in their order.",
+            metavar="FILE",
+        ),
+    ] = None,
     host: Annotated[
         str,
         typer.Option(help="Address to listen on; 0.0.0.0 lets other machines in.", metavar="HOST"),
@@ -29,14 +37,31 @@ def view(
     ] = None,
     browser: Annotated[bool, typer.Option(help="Whether the browser is opened.")] = True,
 ) -> None:
-    """Bend a whisker with the mouse and see what it feels.
+    """Bend a whisker with the mouse and see what it feels; look at a map; watch a trial.
 
-    Serves a page on this machine until Ctrl-C. Example: `vibrissa view whisker.csv`
+    Serves a page on this machine until Ctrl-C. Example: `vibrissa view trial.nc --video top.mp4
+    --video front.mp4`
     """
-    from vibrissa.cli.sources import whisker_from
+    from vibrissa.cli.sources import map_from, whisker_from
+    from vibrissa.io import is_netcdf, kind_of, load_recording
     from vibrissa.viewer import view as serve
 
-    with serve(whisker_from(path), host=host, port=port) as viewer:
+    whisker, contacts, recording = whisker_from(path), None, None
+    kind = kind_of(path) if path is not None and is_netcdf(path) else ""
+    if kind == "vibrissa contact map" and path is not None:
+        contacts = map_from(path)
+        whisker = contacts.whisker
+    elif kind == "vibrissa recording" and path is not None:
+        recording = load_recording(path)
+    viewer = serve(
+        whisker,
+        contacts=contacts,
+        recording=recording,
+        videos=videos or (),
+        host=host,
+        port=port,
+    )
+    with viewer:
         output.print(f"{viewer.url}   Ctrl-C ends it", highlight=False, soft_wrap=True)
         if browser:
             import webbrowser

@@ -78,7 +78,7 @@ def video_info(path: str | PathLike[str]) -> VideoInfo:
     ValueError
         If it is no video, or a damaged one.
     """
-    with _opened(path) as container:
+    with opened_video(path) as container:
         stream = container.streams.video[0]
         context = stream.codec_context
         frames = stream.frames
@@ -115,13 +115,13 @@ def read_video(path: str | PathLike[str]) -> Iterator[Frame]:
     """
     import av
 
-    with _opened(path) as container:
+    with opened_video(path) as container:
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
         done = 0
         try:
             for frame in container.decode(stream):
-                yield _grey(frame)
+                yield grey_frame(frame)
                 done += 1
         except av.FFmpegError as error:
             raise ValueError(f"{path} is damaged after frame {done}: {error.strerror}") from error
@@ -266,7 +266,8 @@ def write_video(
     return count
 
 
-def _opened(path: str | PathLike[str]) -> InputContainer:
+def opened_video(path: str | PathLike[str]) -> InputContainer:
+    """Open a file that holds a video, or raise what says why not."""
     import av
 
     path = Path(path)
@@ -282,7 +283,7 @@ def _opened(path: str | PathLike[str]) -> InputContainer:
     return container
 
 
-def _grey(frame: Any) -> Frame:
+def grey_frame(frame: Any) -> Frame:
     """Luminance over the full range, whatever the video's own format."""
     if frame.format.name in ("gray", "yuvj420p", "yuvj422p", "yuvj444p"):
         plane = frame.planes[0]

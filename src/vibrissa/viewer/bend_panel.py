@@ -64,6 +64,7 @@ class BendMode:
     def enter(self) -> None:
         """Show controls."""
         self._folder.visible = True
+        self._page.face_whisker()
 
     def leave(self) -> None:
         """Hide controls and things."""

@@ -61,6 +61,7 @@ class LocateMode:
     def enter(self) -> None:
         """Show controls."""
         self._folder.visible = True
+        self._page.face_whisker()
         self._drawn = None
         if self._page.bend.kind != "point":
             self._page.bend = self._page.bend_by_point()

@@ -72,6 +72,8 @@ class Page:
         self.exaggeration = EXAGGERATION
         self.mode: Mode | None = None
         self.modes: dict[str, Mode] = {}
+        self.whisker_controls: viser.GuiFolderHandle | None = None
+        self.closing: list[Callable[[], None]] = []
         self.grip = Grip(server, float(to_display("length", 0.16 * whisker.length)), self._dragged)
 
     # What happens
@@ -142,6 +144,8 @@ class Page:
             if self.mode is not None:
                 self.mode.leave()
             self.mode = self.modes[name]
+            if self.whisker_controls is not None:
+                self.whisker_controls.visible = name != "Trial"
             self.mode.enter()
             self.redraw()
 
@@ -164,6 +168,11 @@ class Page:
             return
         self.grip.show(bend.target, turning=bend.kind == "peg")
 
+    def face_whisker(self) -> None:
+        """Let everyone look at the whisker."""
+        length = float(to_display("length", self.bend.whisker.length))
+        look_at(self.server, np.array([0.4, 0.1, 0.0]) * length, 1.1 * length, (0.15, -0.8, 0.6))
+
     def _fault(self, error: Exception) -> None:
         traceback.print_exception(error)
         self.say("Something went wrong", str(error) or type(error).__name__, "red")
@@ -175,6 +184,8 @@ class Page:
 
     def close(self) -> None:
         """End everything."""
+        for end in self.closing:
+            end()
         self.slow_work.close()
         self.work.close()
         self.server.stop()
@@ -198,11 +209,17 @@ def put(handle: viser.GuiInputHandle[Any], value: Any) -> None:
 def look_at(
     server: viser.ViserServer, centre: Array, distance: float, way: Sequence[float]
 ) -> None:
-    """Let everyone look at a place, mm, from a direction, now and when they come."""
+    """Let everyone look at a place, mm, from a direction, now and when they come.
+
+    The panel hides the right of the scene, so the place is put a little to the left.
+    """
     direction = np.asarray(way, dtype=np.float64)
-    position = centre + distance * direction / np.linalg.norm(direction)
+    direction = direction / np.linalg.norm(direction)
+    right = np.cross([0.0, 0.0, 1.0], direction)
+    middle = centre + 0.17 * distance * right / np.linalg.norm(right)
+    position = middle + distance * direction
     cameras: list[Any] = [server.initial_camera]
     cameras += [client.camera for client in server.get_clients().values()]
     for camera in cameras:
         camera.position = tuple(position.tolist())
-        camera.look_at = tuple(np.asarray(centre, dtype=np.float64).tolist())
+        camera.look_at = tuple(middle.tolist())

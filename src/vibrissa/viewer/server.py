@@ -6,17 +6,22 @@ import contextlib
 import io
 import socket
 import time
+from collections.abc import Sequence
+from os import PathLike
 from types import TracebackType
 from typing import Any, Self
 
-import numpy as np
 import viser
+import xarray as xr
 from viser import _messages
 
-from vibrissa.quantities import to_display
+from vibrissa.io.footage import Footage
+from vibrissa.mapping import ContactMap
 from vibrissa.viewer.bend_panel import BendMode
 from vibrissa.viewer.locate_panel import LocateMode
-from vibrissa.viewer.page import Mode, Page, look_at
+from vibrissa.viewer.page import Mode, Page
+from vibrissa.viewer.trial_panel import TrialMode
+from vibrissa.viewer.watching import Watched, watched
 from vibrissa.viewer.whisker_panel import WhiskerControls
 from vibrissa.whisker import Whisker
 
@@ -73,13 +78,27 @@ class Viewer:
         self.close()
 
 
-def view(whisker: Whisker, *, host: str = HOST, port: int | None = None) -> Viewer:
-    """Serve a page on which a whisker can be bent.
+def view(
+    whisker: Whisker,
+    *,
+    contacts: ContactMap | None = None,
+    recording: xr.DataTree | None = None,
+    videos: Sequence[str | PathLike[str]] = (),
+    host: str = HOST,
+    port: int | None = None,
+) -> Viewer:
+    """Serve a page on which a whisker can be bent, its map looked at, and a trial watched.
 
     Parameters
     ----------
     whisker : Whisker
         To look at.
+    contacts : ContactMap, optional
+        Its map, if there is one already.
+    recording : DataTree, optional
+        A trial to watch.
+    videos : sequence of path
+        Of the recording, one for each of its cameras, in their order.
     host : str
         Address to listen on; the default can only be reached from this machine.
     port : int, optional
@@ -89,20 +108,39 @@ def view(whisker: Whisker, *, host: str = HOST, port: int | None = None) -> View
     -------
     Viewer
         Until it is closed.
+
+    Raises
+    ------
+    ValueError
+        If the recording has nothing to look at, or there are not as many videos as cameras.
     """
+    trial = None if recording is None else watched(recording)
+    footage = _footage(trial, videos)
     server = _served(host, port)
-    page = Page(server, whisker)
-    choice = server.gui.add_button_group("Look at", ("Bend", "Locate"))
+    page = Page(server, whisker, contacts)
+    names = ("Bend", "Locate") if trial is None else ("Bend", "Locate", "Trial")
+    choice = server.gui.add_button_group("Look at", names)
     choice.on_click(lambda event: page.choose(event.target.value))
     modes: list[Mode] = [BendMode(page), LocateMode(page)]
+    if trial is not None:
+        modes.append(TrialMode(page, trial, footage))
     page.modes = {mode.name: mode for mode in modes}
-    WhiskerControls(page)
-    length = float(to_display("length", whisker.length))
-    look_at(server, np.array([0.56, 0.1, 0.0]) * length, 1.1 * length, (0.15, -0.8, 0.6))
-    page.choose("Bend")
+    page.closing += [film.close for film in footage]
+    page.whisker_controls = WhiskerControls(page).folder
+    page.choose("Bend" if trial is None else "Trial")
     page.prepare()
     page.settle()
     return Viewer(page)
+
+
+def _footage(trial: Watched | None, videos: Sequence[str | PathLike[str]]) -> tuple[Footage, ...]:
+    """Open the videos of a trial."""
+    if not videos:
+        return ()
+    if trial is None or len(videos) != len(trial.cameras):
+        count = 0 if trial is None else len(trial.cameras)
+        raise ValueError(f"the trial has {count} cameras; got {len(videos)} videos")
+    return tuple(Footage(path) for path in videos)
 
 
 def _served(host: str, port: int | None) -> viser.ViserServer:
@@ -115,6 +153,7 @@ def _served(host: str, port: int | None) -> viser.ViserServer:
     )
     server.scene.set_up_direction("+z")
     server.scene.world_axes.visible = False
+    server.scene.configure_default_lights(cast_shadow=False)
     connection: Any = server.gui._websock_interface
     connection.queue_message(_messages.RunJavascriptMessage(_OFTEN))
     return server

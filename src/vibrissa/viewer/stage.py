@@ -106,8 +106,8 @@ def _changed(handle: viser.SceneNodeHandle, old: Thing, new: Thing) -> bool:
         case Body(), Body() if old.side == new.side and np.array_equal(old.faces, new.faces):
             node.vertices = new.vertices.astype(np.float32)
             node.color, node.opacity = new.colour, new.opacity
-        case Cloud(), Cloud() if old.points is new.points and old.size == new.size:
-            node.colors = new.colours
+        case Cloud(), Cloud() if old.size == new.size:
+            node.points, node.colors = new.points.astype(np.float32), new.colours
         case Arrow(), Arrow() if (old.colour, old.thickness) == (new.colour, new.thickness):
             node.points = np.stack([new.start, new.end])[None].astype(np.float32)
         case Line(), Line() if _alike(old, new):

@@ -1,0 +1,183 @@
+"""A trial as it is shown: what is known of it, in space, in images, over time."""
+
+import re
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import vibrissa as vb
+from vibrissa.io import write_video
+from vibrissa.io.footage import Footage
+from vibrissa.trial import recorded_pegs
+from vibrissa.viewer.signal_chart import chart, cursor
+from vibrissa.viewer.trial_drawing import fitted_body, moment_drawing, surroundings, touched
+from vibrissa.viewer.views import picture, views
+from vibrissa.viewer.watching import watched
+
+MM = 1e3
+
+
+@pytest.fixture(scope="module")
+def trial(recording):
+    return watched(recording)
+
+
+def test_a_trial_is_what_was_simulated(trial, recording):
+    truth = recording["truth"].to_dataset()
+    touching = truth["in_contact"].values.astype(bool)
+    np.testing.assert_array_equal(trial.felt, touching)
+    np.testing.assert_array_equal(trial.lines, truth["centerline"].values)
+    np.testing.assert_array_equal(trial.contacts[touching], truth["contact_point"].values[touching])
+    assert np.isnan(trial.contacts[~touching]).all()
+    signals = vb.base_signals(recording["force"].values, recording["moment"].values)
+    np.testing.assert_array_equal(trial.signals["MB"], signals["MB"])
+    # A force in the laboratory is as large as at the base.
+    sizes = np.linalg.norm(recording["force"].values, axis=-1)
+    np.testing.assert_allclose(np.linalg.norm(trial.forces, axis=-1), sizes, atol=1e-12)
+
+
+def test_stages_count_before_the_truth(recording):
+    other = recording.copy()
+    point = recording["truth"]["contact_point"] + 1e-3
+    felt = recording["truth"]["in_contact"]
+    other["estimates"] = xr.DataTree(
+        xr.Dataset({"contact_point": point.drop_vars("time", errors="ignore"), "in_contact": felt})
+    )
+    shifted, plain = watched(other), watched(recording)
+    np.testing.assert_allclose(shifted.contacts, plain.contacts + 1e-3)
+
+
+def test_poses_alone_are_enough(recording):
+    bare = recording.copy()
+    bare.dataset = bare.to_dataset()[["base_position", "base_rotation"]]
+    bare.dataset.attrs |= recording.attrs
+    for group in ("truth", "cameras", "objects"):
+        del bare[group]
+    trial = watched(bare)
+    rest = vb.samples.gamma().length
+    size = np.linalg.norm(np.diff(trial.lines, axis=2), axis=-1).sum(axis=-1)
+    np.testing.assert_allclose(size, rest, rtol=1e-3)
+    assert not trial.felt.any()
+    assert touched(trial, trial.frames - 1) == {}
+    assert "whisker 0" in moment_drawing(trial, 3, 5.0)
+    assert views(trial) == ()
+    assert trial.next_contact(5) == 5
+
+
+def test_contacts_appear_one_by_one(trial):
+    counts = [
+        len(drawn["contacts"].points) if (drawn := touched(trial, frame)) else 0
+        for frame in range(trial.frames)
+    ]
+    np.testing.assert_array_equal(counts, np.cumsum(trial.felt[:, 0]))
+
+
+def test_the_next_contact_is_an_onset(trial):
+    frame = trial.next_contact(0)
+    assert trial.felt[frame, 0]
+    assert not trial.felt[frame - 1, 0]
+    onsets = trial.onsets()
+    assert trial.next_contact(int(onsets[-1])) == onsets[0]
+
+
+def test_a_moment_shows_whisker_contact_and_force(trial):
+    frame = int(np.argmax(np.nan_to_num(trial.signals["MB"][:, 0]) * trial.felt[:, 0]))
+    drawn = moment_drawing(trial, frame, 5.0)
+    assert {"whisker 0", "contact 0", "force 0"} <= drawn.keys()
+    np.testing.assert_allclose(drawn["force 0"].end, trial.contacts[frame, 0] * MM)
+    free = int(np.flatnonzero(~trial.felt[:, 0])[0])
+    assert drawn.keys() - moment_drawing(trial, free, 5.0).keys() == {"contact 0", "force 0"}
+
+
+@pytest.mark.parametrize("shape", ["cylinder", "sphere", "plane", "free", "unheard of"])
+def test_a_fitted_shape_lies_where_it_was_fitted(trial, recording, shape):
+    peg = recorded_pegs(recording)[0]
+    contour = xr.Dataset(
+        {"object_position": ("space", peg.origin), "object_axis": ("space", peg.axis)},
+        attrs={"shape": shape},
+    ).assign(object_radius=peg.radius)
+    if shape == "free":
+        contour = xr.Dataset(
+            {
+                "object_vertices": (("vertex", "space"), np.eye(3)),
+                "object_faces": (("face", "corner"), [[0, 1, 2]]),
+            },
+            attrs={"shape": shape},
+        )
+    near = trial.contacts[trial.felt]
+    body = fitted_body(contour, near)
+    if shape == "unheard of":
+        assert body is None
+        return
+    vertices, faces = body
+    assert faces.max() < len(vertices)
+    if shape == "cylinder":
+        np.testing.assert_allclose(peg.signed_distance(vertices[:-2]), 0.0, atol=1e-9)
+        along = (vertices - peg.origin) @ peg.axis
+        assert along.min() < ((near - peg.origin) @ peg.axis).min()
+
+
+def test_surroundings_can_be_hidden(trial):
+    assert set(surroundings(trial)) == {"object 0"}
+    assert surroundings(trial, objects=False) == {}
+
+
+def test_pictures_show_the_trace_where_the_camera_sees_the_whisker(trial, recording):
+    shown = views(trial)
+    assert [view.name for view in shown] == ["top", "front"]
+    frame = trial.next_contact(0)
+    for view in shown:
+        image = picture(view, trial, frame)
+        orange = (image == [255, 96, 0]).all(axis=-1)
+        places = trial.traces[frame, 0, view.number]
+        inside = np.round((places - view.box[:2]) * view.scale).astype(int)
+        height, width = orange.shape
+        for x, y in inside[3:-3]:
+            near = orange[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2]
+            blue = image[min(y, height - 1), min(x, width - 1), 2] == 255  # the contact covers it
+            assert near.any() or blue
+        dark = np.full(recording["cameras"]["image_size"].values[view.number][::-1], 9, np.uint8)
+        assert (picture(view, trial, frame, dark) == 9).any()
+
+
+def test_a_video_is_read_in_any_order(tmp_path):
+    frames = [np.full((48, 64), value, np.uint8) for value in range(0, 250, 2)]
+    for name, tolerance in (("a.mkv", 0), ("a.mp4", 3)):
+        write_video(tmp_path / name, iter(frames), 50.0)
+        footage = Footage(tmp_path / name)
+        for number in (0, 1, 2, 100, 99, 98, 3, 124, 64, 64, 0):
+            shown = footage.frame(number).astype(int)
+            assert np.abs(shown - 2 * number).max() <= tolerance
+        with pytest.raises(ValueError, match="ends before frame 125"):
+            footage.frame(125)
+        with pytest.raises(ValueError, match="numbered from 0"):
+            footage.frame(-1)
+        footage.close()
+
+
+def test_the_chart_has_six_lines_and_shades_contacts(trial):
+    signals = {name: values[:, 0] for name, values in trial.signals.items()}
+    drawn = chart(trial.time, signals, trial.felt[:, 0])
+    assert len(re.findall("<path ", drawn)) == 6
+    assert len(re.findall("<rect ", drawn)) == len(trial.onsets())
+    assert "nan" not in drawn
+    assert 'data-cursor="0.5000"' in cursor(0.5)
+
+
+def test_a_long_line_keeps_its_extremes():
+    time = np.arange(20000) * 1e-3
+    values = np.zeros(20000)
+    values[12345] = 1e-6
+    none = {name: np.zeros(20000) for name in ("FT", "FD", "Mx", "MB", "MD")}
+    drawn = chart(time, {"Fx": values, **none}, values > 0.0)
+    line = re.findall('<path d="([^"]*)"', drawn)[0]
+    heights = [float(word) for word in re.findall(r"[ML][\d.]+ ([\d.]+)", line)]
+    assert len(heights) < 1500
+    assert max(heights) - min(heights) > 40.0
+
+
+def test_a_recording_without_frames_is_refused():
+    empty = xr.DataTree(xr.Dataset(coords={"time": np.empty(0), "whisker": ["a"]}))
+    with pytest.raises(ValueError, match="no frames"):
+        watched(empty)

@@ -159,7 +159,7 @@ def video_frames(path: str | PathLike[str], numbers: Iterable[int]) -> Iterator[
             number, frame = next(found, (-1, None))
             if frame is None:
                 raise ValueError(f"{path} has no frame {want}")
-            image = _grey(frame) if number == want else None
+            image = grey_frame(frame) if number == want else None
         yield image
 
 
@@ -167,7 +167,7 @@ def _decoded(path: Path, wanted: set[int]) -> Iterator[tuple[int, Any]]:
     """Numbers and frames, in order: those wanted, and what decoding them takes."""
     import av
 
-    with _opened(path) as container:
+    with opened_video(path) as container:
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
         last = max(wanted, default=-1)

@@ -56,9 +56,11 @@ def figures(
     """Draw the figures that a map allows: whisker, signals over space, surfaces, sensitivity.
 
     With a saved result of `vibrissa uniqueness` also the verdicts, the resolution and pairs of
-    contacts that feel the same. Example: `vibrissa figures map.nc -o figures --width single`
+    contacts that feel the same. Of an array of whiskers, or of a trial of several: the face, the
+    whiskers, and what they touch. Example: `vibrissa figures map.nc -o figures --width single`
     """
     endings = _chosen(formats, width)
+    from vibrissa.cli.array_figures import array_drawings
     from vibrissa.cli.sources import map_from
     from vibrissa.io.paths import check_folder
     from vibrissa.plots import save
@@ -66,8 +68,9 @@ def figures(
     check_folder(folder)
     verdicts = None if uniqueness is None else _dataset(uniqueness, "verdict")
     sweep = None if cones is None else _dataset(cones, "critical_cone")
-    contacts = map_from(path)
-    drawings = dict(_drawings(contacts, width, verdicts, sweep))
+    drawings = array_drawings(path, width)
+    if not drawings:
+        drawings = dict(_drawings(map_from(path), width, verdicts, sweep))
     folder.mkdir(parents=True, exist_ok=True)
     files = []
     with progress_bars() as tell:

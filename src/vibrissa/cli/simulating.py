@@ -25,7 +25,29 @@ def simulate(
         Path | None,
         typer.Option(help="Centreline as CSV; by default a built-in γ whisker.", metavar="FILE"),
     ] = None,
-    duration: Annotated[float | None, typer.Option(help="Of the trial, s; 3.5 by default.")] = None,
+    array: Annotated[
+        str | None,
+        typer.Option(
+            help="All whiskers of a face: `average` for an average rat's, or a file or folder.",
+            metavar="FILE|average",
+        ),
+    ] = None,
+    side: Annotated[
+        str | None, typer.Option(help="Of the array: both (by default), left or right.")
+    ] = None,
+    whiskers: Annotated[
+        str | None,
+        typer.Option(help="Of the array: names, such as `C1,C2,gamma`.", metavar="NAMES"),
+    ] = None,
+    thing: Annotated[
+        str | None,
+        typer.Option(
+            "--object", help="What stands within reach: peg, sphere, box or plane.", metavar="KIND"
+        ),
+    ] = None,
+    duration: Annotated[
+        float | None, typer.Option(help="Of the trial, s; 3.5 by default, 0.5 of an array.")
+    ] = None,
     rate: Annotated[float | None, typer.Option(help="Frames per second; 1000 by default.")] = None,
     frequency: Annotated[
         float | None, typer.Option(help="Whisks per second; 5 by default.")
@@ -56,7 +78,8 @@ def simulate(
     """Simulate a whisking trial among objects, with its truth.
 
     By default the trial of the demo: a γ whisker sweeps past a peg and back. Options count more
-    than the file. Example: `vibrissa simulate --duration 0.5 --friction 0.3 -o trial.nc`
+    than the file. Examples: `vibrissa simulate --duration 0.5 --friction 0.3 -o trial.nc`;
+    `vibrissa simulate --array average --object sphere -o face.nc`
     """
     from vibrissa.cli.sources import whisker_from
     from vibrissa.io import save_recording
@@ -77,6 +100,10 @@ def simulate(
             Path() if script is None else script.parent,
             whisker_from,
             whisker=whisker,
+            array=array,
+            side=side,
+            whiskers=None if whiskers is None else whiskers.replace(",", " ").split(),
+            object=thing,
             duration=duration,
             rate=rate,
             frequency=frequency,
@@ -99,8 +126,8 @@ def simulate(
         trial = measure(trial, seed=plan.seed, sensor=plan.sensor)
         save_recording(path, trial)
     output.print(f"{plan.whisker!r}", highlight=False, soft_wrap=True)
-    for thing in plan.objects:
-        output.print(f"{thing!r}", highlight=False, soft_wrap=True)
+    for solid in plan.objects:
+        output.print(f"{solid!r}", highlight=False, soft_wrap=True)
     _tell(trial)
     output.print(f"wrote {path}", highlight=False, soft_wrap=True)
     if film is not None:
@@ -113,22 +140,29 @@ def _tell(trial: xr.DataTree) -> None:
 
     from vibrissa.status import describe
 
-    truth = trial["truth"].to_dataset().isel(whisker=0)
-    for sentence, count in describe(truth["status"].values).most_common():
+    truth = trial["truth"].to_dataset()
+    names = trial.to_dataset()["whisker"].values.tolist()
+    for sentence, count in describe(truth["status"].values.ravel()).most_common():
         output.print(f"{count:6d} frames: {sentence}", highlight=False, soft_wrap=True)
     contact = truth["in_contact"].values.astype(bool)
-    begun = int(contact[0]) + int((np.diff(contact.astype(int)) == 1).sum())
+    begun = contact[0].astype(int) + (np.diff(contact.astype(int), axis=0) == 1).sum(axis=0)
+    if len(names) > 1:
+        touched = [f"{name} {count}" for name, count in zip(names, begun, strict=True) if count]
+        who = f"{len(touched)} of {len(names)} whiskers touched; contacts: "
+        output.print(who + (", ".join(touched) or "none"), highlight=False, soft_wrap=True)
     largest = [
         shown(name, float(np.nanmax(np.linalg.norm(truth[name].values, axis=-1))), 3)
         for name in ("force", "moment")
     ]
     output.print(
-        f"{begun} contacts, up to {largest[0]} and {largest[1]}", highlight=False, soft_wrap=True
+        f"{begun.sum()} contacts, up to {largest[0]} and {largest[1]}",
+        highlight=False,
+        soft_wrap=True,
     )
     second = int(truth["second_contact"].values.sum())
     if second:
         output.print(
-            f"in {second} frames the whisker would touch elsewhere too (second_contact), which is "
+            f"in {second} frames a whisker would touch elsewhere too (second_contact), which is "
             "not in the forces",
             highlight=False,
             soft_wrap=True,

@@ -1,5 +1,6 @@
 """Datasets and arrays to figures, one function each; nothing is solved here."""
 
+from vibrissa.plots.array import array_views
 from vibrissa.plots.clouds import signal_clouds
 from vibrissa.plots.contour import contour_views
 from vibrissa.plots.contour_movie import contour_frames
@@ -20,6 +21,7 @@ from vibrissa.plots.witness import witness_pair
 __all__ = [
     "Course",
     "Sight",
+    "array_views",
     "contact_surfaces",
     "contour_frames",
     "contour_views",

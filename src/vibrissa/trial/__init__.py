@@ -1,7 +1,7 @@
 """A whisking trial: what stands in the way, how the base moves, what the whisker then feels."""
 
 from vibrissa.sensing import Sensor
-from vibrissa.trial.array_motion import array_whisking, head_path, protracted
+from vibrissa.trial.array_motion import array_whisking, head_path, protracted, shared_whisking
 from vibrissa.trial.calibration import calibrate
 from vibrissa.trial.cameras import Camera, load_cameras, orthogonal_views, save_cameras, triangulate
 from vibrissa.trial.dynamics import Dynamics, resonances
@@ -9,7 +9,7 @@ from vibrissa.trial.film import Look, film, views_of
 from vibrissa.trial.mesh import Mesh
 from vibrissa.trial.motion import Motion, tabulated, whisking
 from vibrissa.trial.objects import Box, Peg, Plane, Sphere
-from vibrissa.trial.plan import facing_peg, sweep_past
+from vibrissa.trial.plan import facing_peg, sweep_past, within_reach
 from vibrissa.trial.recording import (
     recorded_cameras,
     recorded_objects,
@@ -45,10 +45,12 @@ __all__ = [
     "recorded_whisker",
     "resonances",
     "save_cameras",
+    "shared_whisking",
     "simulate",
     "sweep_past",
     "tabulated",
     "triangulate",
     "views_of",
     "whisking",
+    "within_reach",
 ]

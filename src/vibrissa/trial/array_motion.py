@@ -25,9 +25,6 @@ def array_whisking(
     duration: float = 0.5,
     rate: float = 1000.0,
     *,
-    frequency: float = 8.0,
-    amplitude: float = np.radians(20.0),
-    set_point: float = np.radians(10.0),
     head_rotation: ArrayLike | None = None,
     head_position: ArrayLike | None = None,
     **motion: Any,
@@ -42,19 +39,12 @@ def array_whisking(
         Of the trial, s.
     rate : float
         Frames per second.
-    frequency : float
-        Whisks per second.
-    amplitude : float
-        Half of the sweep, rad; 0 holds the whiskers still, but for drifts.
-    set_point : float
-        How far the middle of the sweep lies before the pose of rest, rad.
     head_rotation : array_like (n, 3, 3) or (3, 3), optional
         From the head's to the laboratory frame; by default they are the same.
     head_position : array_like (n, 3) or (3,), optional
         The snout in the laboratory, m; by default its origin.
     **motion
-        What else `whisking` takes, but for ``row`` and the ratios, which are those of each row.
-        There is no drift of position by default.
+        What else `shared_whisking` takes: frequency, amplitude, set point, …
 
     Returns
     -------
@@ -72,18 +62,60 @@ def array_whisking(
     >>> sorted(array_whisking(whisker_array("left", rows="C", columns=[1, 2]), duration=0.1))
     ['LC1', 'LC2']
     """
-    motion.setdefault("position_drift", 0.0)
-    common = whisking(
+    common = shared_whisking(duration, rate, **motion)
+    return protracted(array, common, head_rotation, head_position)
+
+
+def shared_whisking(
+    duration: float = 0.5,
+    rate: float = 1000.0,
+    *,
+    frequency: float = 8.0,
+    amplitude: float = np.radians(25.0),
+    set_point: float = np.radians(25.0),
+    position_drift: float = 0.0,
+    **motion: Any,
+) -> Motion:
+    """Whisk about rest, in the way that all whiskers of an array share.
+
+    Parameters
+    ----------
+    duration : float
+        Of the trial, s.
+    rate : float
+        Frames per second.
+    frequency : float
+        Whisks per second.
+    amplitude : float
+        Half of the sweep, rad; 0 holds the whiskers still, but for drifts.
+    set_point : float
+        How far forward of the pose of rest the middle of the sweep lies, rad.
+    position_drift : float
+        Largest drift of the bases on the face, m.
+    **motion
+        What else `whisking` takes, but for ``row`` and the ratios, which are those of each row.
+
+    Returns
+    -------
+    Motion
+        Its azimuth is the protraction from rest; for `protracted`.
+
+    Raises
+    ------
+    ValueError
+        As `whisking` does.
+    """
+    return whisking(
         duration,
         rate,
         frequency=frequency,
         amplitude=amplitude,
         set_point=set_point,
+        position_drift=position_drift,
         elevation_per_azimuth=0.0,
         roll_per_azimuth=0.0,
         **motion,
     )
-    return protracted(array, common, head_rotation, head_position)
 
 
 def protracted(

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vibrissa.rod.surface import Surface
 from vibrissa.rod.surfaces import follow_surfaces
 from vibrissa.status import Status
 from vibrissa.trial.motion import (
@@ -20,8 +21,8 @@ from vibrissa.trial.motion import (
     Motion,
     whisking,
 )
-from vibrissa.trial.objects import Box, Peg, Sphere
-from vibrissa.whisker import Whisker
+from vibrissa.trial.objects import Box, Peg, Plane, Sphere
+from vibrissa.whisker import Whisker, WhiskerArray
 from vibrissa.whisker.emergence import base_rotation
 
 Array = NDArray[np.float64]
@@ -66,6 +67,55 @@ def facing_peg(whisker: Whisker, distance: float = 0.65, radius: float = PEG_RAD
             "thinner peg or a larger distance"
         )
     return Peg(np.array([distance * reach, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]), radius)
+
+
+def within_reach(whisker: Whisker | WhiskerArray, kind: str | None = None) -> Surface:
+    """Stand something in the way of a whisker, or of the whiskers of a face.
+
+    Parameters
+    ----------
+    whisker : Whisker or WhiskerArray
+        That is to meet it.
+    kind : {"peg", "sphere", "box", "plane"}, optional
+        What; by default a peg for a whisker, and a sphere for an array.
+
+    Returns
+    -------
+    Peg, Sphere, Box or Plane
+        Beside the base of the whisker; or before the right side of a face which is at the origin of
+        the laboratory, out of the reach of whiskers at rest, for whoever moves forward by 14 mm (a
+        plane stands square in the way).
+
+    Raises
+    ------
+    ValueError
+        If there is no such kind.
+    """
+    things: dict[str, Surface]
+    if isinstance(whisker, Whisker):
+        reach = float(np.linalg.norm(whisker.centerline(401), axis=1).max())
+        place = np.array([0.65 * reach, 0.0, 0.0])
+        things = {
+            "peg": facing_peg(whisker),
+            "sphere": Sphere(place, 0.12 * reach),
+            "box": Box(place, np.full(3, 0.2 * reach), edge_radius=0.02 * reach),
+            "plane": Plane(np.array([0.0, 0.3 * reach, 0.0]), np.array([0.0, -1.0, 0.0])),
+        }
+    else:
+        ahead = 1e-3 * np.array([22.0, 27.0, -8.0])
+        things = {
+            "sphere": Sphere(ahead, 12e-3),
+            "peg": Peg(1e-3 * np.array([20.0, 22.0, 0.0]), np.array([0.0, 0.0, 1.0]), PEG_RADIUS),
+            "box": Box(ahead, 1e-3 * np.array([24.0, 20.0, 24.0]), edge_radius=1e-3),
+            "plane": Plane(np.array([0.0, 24e-3, 0.0]), np.array([0.0, -1.0, 0.0])),
+        }
+    chosen = next(iter(things)) if kind is None else kind
+    if chosen not in things:
+        raise ValueError(
+            f"the object is of kind {kind!r}; one of {', '.join(things)} is needed (a mesh is "
+            "written in the trial's text)"
+        )
+    return things[chosen]
 
 
 def sweep_past(

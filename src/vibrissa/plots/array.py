@@ -1,0 +1,311 @@
+"""The face, its whiskers, what they touch and where: from above, from the front, from the side.
+
+Of an array of whiskers they are drawn at rest; of a recording, as they are at one moment, with the
+contact points of all of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
+
+from vibrissa.plots.space import paint, space_axes
+from vibrissa.plots.style import (
+    INK,
+    MUTED,
+    Array,
+    Mask,
+    Width,
+    head,
+    looking,
+    new_figure,
+    page_width,
+    say,
+)
+from vibrissa.plots.things import ends_nearby, eye_triangles, head_triangles, object_triangles
+from vibrissa.quantities import axis_label, to_display
+from vibrissa.whisker.identity import Identity
+
+ROW_COLOURS: Mapping[str, str] = MappingProxyType(
+    {"A": "#0072b2", "B": "#56b4e9", "C": "#009e73", "D": "#e69f00", "E": "#d55e00"}
+)
+"""One colour a row, from the top down; whiskers of no known row are black."""
+
+_HEAD, _THING, _EDGE = "#e9e2da", "#d5d9de", "#b3aba2"
+_AT_REST, _IN_A_TRIAL = (22.0, 38.0), (26.0, -22.0)
+"""From where space is seen: elevation and azimuth, degrees; from before the animal's right, and
+from behind it, where one sees the side of things that whiskers touch."""
+
+_CLEAR = 0.7
+"""Opacity of objects in space, which hide what touches them from behind."""
+
+Box = tuple[float, float, float, float]
+"""Left, bottom, width and height, mm."""
+
+_PANELS = (
+    # letter, title, right and up, sense of the axis to the right, axis toward the viewer
+    ("a", "from above", (0, 1), 1.0, 2),
+    ("c", "from the front", (0, 2), -1.0, 1),
+    ("d", "from its right", (1, 2), 1.0, 0),
+)
+_LEFT, _GAP, _BOTTOM, _TOP, _RIGHT = 10.0, 13.0, 8.5, 6.5, 3.0
+"""Room around and between the panels, mm."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Scene:
+    """What is drawn, mm: at one moment, but for the contact points."""
+
+    lines: Array  # (whisker, node, 3)
+    names: list[str]
+    touching: Mask  # (whisker,)
+    points: list[Array]  # of all moments, (n, 3) each
+    now: Array  # (whisker, 3)
+    objects: list[xr.Dataset]
+    head: tuple[Array, Array]
+    moment: str
+
+    @property
+    def colours(self) -> list[str]:
+        return [_colour(name) for name in self.names]
+
+    @property
+    def limits(self) -> Array:
+        """Limits (3, 2) that hold whiskers, head and objects with an end."""
+        parts = [self.lines.reshape(-1, 3), head_triangles(*self.head).reshape(-1, 3)]
+        everywhere = np.zeros((3, 2))
+        parts += [
+            object_triangles(o, everywhere).reshape(-1, 3) for o in self.objects if ends_nearby(o)
+        ]
+        parts += self.points
+        places = np.concatenate(parts)
+        places = places[np.isfinite(places).all(axis=1)]
+        low, high = places.min(axis=0), places.max(axis=0)
+        margin = 0.03 * (high - low).max()
+        return np.stack([low - margin, high + margin], axis=1)
+
+
+def array_views(
+    tree: xr.DataTree,
+    *,
+    frame: int | None = None,
+    contacts: str = "truth",
+    width: Width = "double",
+) -> Figure:
+    """Draw the whiskers of a face, and what they touch, from three sides and in space.
+
+    Parameters
+    ----------
+    tree : DataTree
+        An array of whiskers (`WhiskerArray.to_tree`), which is drawn at rest in the head's frame;
+        or a recording of a trial, in the laboratory frame.
+    frame : int, optional
+        Moment of a recording at which whiskers and head are drawn; by default that at which most
+        whiskers touch.
+    contacts : str
+        Group of a recording whose ``contact_point`` are drawn, at all times where ``in_contact``,
+        such as ``truth`` or ``estimates``; ``/`` is the top.
+    width : {"single", "double"}
+        Columns of the page.
+
+    Returns
+    -------
+    Figure
+        Four panels; a colour each row of whiskers, and the head as a sketch. Dots are contact
+        points, those of the moment that is drawn ringed.
+
+    Raises
+    ------
+    ValueError
+        If there are no centrelines, the frame is none of the recording, or there is no such group.
+    """
+    scene = _scene(tree, frame, contacts)
+    with looking():
+        if scene is None:
+            figure = new_figure(width, 40.0, None)
+            say(figure, "no whisker")
+            return figure
+        return _drawn(scene, width)
+
+
+def _drawn(scene: _Scene, width: Width) -> Figure:
+    limits, page = scene.limits, page_width(width)
+    x, y, z = np.ptp(limits, axis=1)
+    scale = (page - _LEFT - _GAP - _RIGHT) / (x + y)  # mm on paper per mm
+    height = _BOTTOM + scale * (z + y) + _GAP + _TOP
+    figure = new_figure(width, height, None)
+    above, aside = _BOTTOM + scale * z + _GAP, _LEFT + scale * x + _GAP
+    places = {"a": (_LEFT, above), "c": (_LEFT, _BOTTOM), "d": (aside, _BOTTOM)}
+    for letter, title, view, sense, toward in _PANELS:
+        (i, j), (left, bottom) = view, places[letter]
+        size = scale * np.ptp(limits, axis=1)
+        box = (left / page, bottom / height, size[i] / page, size[j] / height)
+        axes = figure.add_axes(box, xlim=limits[i][:: int(sense)], ylim=limits[j])
+        axes.set(xlabel=axis_label("xyz"[i]), ylabel=axis_label("xyz"[j]))
+        head(axes, letter, title)
+        _panel(axes, scene, limits, view, toward)
+        if letter == "a":
+            _legend(axes, scene)
+    room = scale * float(y)
+    _space(figure, (aside - 6.0, above - 6.0, room + 8.0, room + 10.0), scene, limits)
+    if scene.moment:
+        at = (1.0 - _RIGHT / page, 1.0 - 2.0 / height)
+        figure.text(*at, scene.moment, ha="right", va="top", color=MUTED, fontsize=6.0)
+    return figure
+
+
+def _panel(axes: Axes, scene: _Scene, limits: Array, view: tuple[int, int], toward: int) -> None:
+    """Draw one view, what is farther away first."""
+    skull, eyes = head_triangles(*scene.head), eye_triangles(*scene.head)
+    middle = scene.head[1] * 1e3
+    for thing in scene.objects:
+        _flat(axes, object_triangles(thing, limits)[..., view], _THING, "#9aa3ad", 1.0)
+    _flat(axes, skull[..., view], _HEAD, _EDGE, 2.0)
+    if toward != 1:
+        near = eyes[eyes[..., toward].mean(axis=1) > skull[..., toward].mean()]
+        _flat(axes, near[..., view], INK, INK, 2.2)
+    for line, colour, touching in zip(scene.lines, scene.colours, scene.touching, strict=True):
+        # Whiskers of the far side are behind the head, those beside or on it before.
+        behind = toward == 0 and line[0, 0] < middle[0]
+        look: dict[str, Any] = {"color": colour, "linewidth": 1.1 if touching else 0.7}
+        axes.plot(*line[:, view].T, zorder=1.5 if behind else 3.0, **look)
+    for dots, colour in zip(scene.points, scene.colours, strict=True):
+        axes.plot(*dots[:, view].T, ".", color=colour, markersize=1.6, zorder=3.5, alpha=0.6)
+    now = scene.now[scene.touching]
+    axes.plot(*now[:, view].T, "o", color=INK, markersize=3.2, fillstyle="none", zorder=4.0)
+
+
+def _flat(axes: Axes, triangles: Array, colour: str, edge: str, order: float) -> None:
+    """Draw triangles (n, 3, 2) in one colour, and the outline of them all."""
+    rim: Any = {"edgecolors": edge, "facecolors": edge, "linewidths": 1.2, "zorder": order}
+    axes.add_collection(PolyCollection(list(triangles), **rim), autolim=False)
+    fill: Any = {"edgecolors": colour, "facecolors": colour, "linewidths": 0.2}
+    axes.add_collection(PolyCollection(list(triangles), **fill, zorder=order), autolim=False)
+
+
+def _space(figure: Figure, box: Box, scene: _Scene, limits: Array) -> None:
+    """Draw all of it in space, what is farther away first."""
+    view = _AT_REST if not scene.moment else _IN_A_TRIAL
+    axes = space_axes(figure, box, limits, view, zoom=1.3, frame=False)
+    elevation, azimuth = np.radians(view)
+    flat = np.cos(elevation)
+    eye = np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
+
+    def solid(triangles: Array, colour: str, order: float) -> None:
+        paint(axes, triangles, to_rgba(colour), opacity=_CLEAR if colour == _THING else 1.0)
+        axes.collections[-1].set_zorder(order)
+
+    def skull(order: float) -> None:
+        triangles, eyes = head_triangles(*scene.head), eye_triangles(*scene.head)
+        solid(triangles, _HEAD, order)
+        solid(eyes[(eyes @ eye).mean(axis=1) > (triangles @ eye).mean()], INK, order + 0.5)
+
+    def whisker(i: int, order: float) -> None:
+        look: dict[str, Any] = {"color": scene.colours[i], "zorder": order}
+        axes.plot(*scene.lines[i].T, linewidth=1.1 if scene.touching[i] else 0.7, **look)
+        axes.plot(*scene.points[i].T, ".", markersize=1.6, **look)
+
+    things = [object_triangles(thing, limits) for thing in scene.objects]
+    items = [(float((head_triangles(*scene.head) @ eye).mean()), skull)]
+    items += [(float((t @ eye).mean()), partial(solid, t, _THING)) for t in things]
+    # A whisker's base counts as well: it grows out of its side of the head.
+    sides = 0.5 * (scene.lines[:, 0] + scene.lines.mean(axis=1)) @ eye
+    items += [(float(side), partial(whisker, i)) for i, side in enumerate(sides)]
+    for order, (_, draw) in enumerate(sorted(items, key=lambda item: item[0])):
+        draw(order)
+    now = scene.now[scene.touching]
+    axes.plot(*now.T, "o", color=INK, markersize=3.2, fillstyle="none", zorder=len(items))
+    axes.text2D(0.02, 0.98, "b", transform=axes.transAxes, fontsize=8.0, fontweight="bold")
+
+
+def _legend(axes: Axes, scene: _Scene) -> None:
+    """Name the rows in their colours."""
+    rows = [
+        "rows",
+        *sorted({Identity.of(name).row for name in scene.names if _colour(name) != INK}),
+    ]
+    for i, row in enumerate(rows):
+        look: dict[str, Any] = {"fontweight": "bold", "ha": "right", "va": "bottom"}
+        axes.annotate(
+            row,
+            (1.0, 1.0),
+            xycoords="axes fraction",
+            xytext=(-8.0 * (len(rows) - 1 - i) - (2.0 if i == 0 else 0.0), 4.0),
+            textcoords="offset points",
+            color=ROW_COLOURS.get(row, INK),
+            fontsize=7.0,
+            **look,
+        )
+
+
+def _colour(name: str) -> str:
+    try:
+        return ROW_COLOURS[Identity.of(name).row]
+    except ValueError:
+        return INK
+
+
+def _scene(tree: xr.DataTree, frame: int | None, contacts: str) -> _Scene | None:
+    """Collect what is to be drawn."""
+    root = tree.to_dataset()
+    truth = tree.children["truth"].to_dataset() if "truth" in tree.children else root
+    held = truth if "centerline" in truth else root
+    if "centerline" not in held:
+        raise ValueError("there are no centrelines of whiskers to draw")
+    line = held["centerline"]
+    names = [str(name) for name in np.atleast_1d(root["whisker"].values)]
+    if "time" not in line.dims:
+        lines = to_display("centerline", line.transpose("whisker", "node", "space").values)
+        none = np.zeros(len(names), dtype=bool)
+        empty = [np.empty((0, 3)) for _ in names]
+        still = np.eye(3), np.zeros(3)
+        return _Scene(lines, names, none, empty, np.full((len(names), 3), np.nan), [], still, "")
+    touching, places = _contacts(tree, contacts)
+    most = int(touching.sum(axis=1).argmax())
+    at = most if frame is None else frame
+    if not 0 <= at < len(touching):
+        raise ValueError(f"frame is {frame}; from 0 to {len(touching) - 1} is needed")
+    lines = line.transpose("time", "whisker", "node", "space").values[at]
+    if not np.isfinite(lines).any():
+        return None
+    turn, place = np.eye(3), np.zeros(3)
+    if "head_position" in root:
+        place = root["head_position"].transpose("time", "space").values[at]
+        turn = root["head_rotation"].transpose("time", "space", "head_axis").values[at]
+    group = tree.children.get("objects")
+    things = {} if group is None else group.children
+    return _Scene(
+        lines=to_display("centerline", lines),
+        names=names,
+        touching=touching[at],
+        points=[places[touching[:, i], i] for i in range(len(names))],
+        now=places[at],
+        objects=[things[k].to_dataset() for k in sorted(things, key=int)],
+        head=(turn, place),
+        moment=f"{float(root['time'].values[at]):.3f} s",
+    )
+
+
+def _contacts(tree: xr.DataTree, group: str) -> tuple[Mask, Array]:
+    """Whether (time, whisker) whiskers touch, and where (time, whisker, 3), mm."""
+    part = tree if group in ("/", "") else tree.children.get(group)
+    if part is None or "contact_point" not in part:
+        raise ValueError(f"the recording has no contact points in its group {group!r}")
+    data = part.to_dataset()
+    places = to_display(
+        "contact_point", data["contact_point"].transpose("time", "whisker", "space").values
+    )
+    touching: Mask = np.asarray(np.isfinite(places).all(axis=-1))
+    if "in_contact" in data:
+        touching &= data["in_contact"].transpose("time", "whisker").values.astype(bool)
+    return touching, places

@@ -35,28 +35,7 @@ def touched(kind, generator, n):
     return CENTER + upward + (RADIUS + whisker)[:, None] * normal, normal, whisker
 
 
-def joint_errors(generator, normal):
-    """Matrices (n, 6, 3) from three unknowns to the errors of point, m, and of normal.
-
-    As for a whisker: the point errs most along one direction across the normal, and where it does
-    the normal is turned.
-    """
-    n = len(normal)
-    along = np.cross(normal, generator.normal(size=(n, 3)))
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    third = np.cross(normal, along)
-    size = np.exp(generator.uniform(*np.log([5e-5, 4e-4]), n))[:, None]
-    out = np.zeros((n, 6, 3))
-    out[:, :3, 0] = size * (along + 0.2 * normal)
-    out[:, :3, 1] = 4e-5 * normal
-    out[:, :3, 2] = 3e-5 * third
-    out[:, 3:, 0] = 50.0 * size * along
-    out[:, 3:, 1] = 2e-3 * along
-    out[:, 3:, 2] = 6e-3 * third
-    return out
-
-
-def noisy(kind, generator, n):
+def noisy(kind, joint_errors, generator, n):
     points, normal, whisker = touched(kind, generator, n)
     errors = joint_errors(generator, normal)
     drawn = np.einsum("nij,nj->ni", errors, generator.normal(size=(n, 3)))
@@ -89,11 +68,11 @@ def scores(kind, fit):
 
 
 @pytest.mark.parametrize("kind", ["cylinder", "sphere", "plane"])
-def test_no_bias_and_an_honest_spread(kind):
+def test_no_bias_and_an_honest_spread(kind, joint_errors):
     """Over thirty draws errors are as large as the covariance says, and have no bias."""
     found = []
     for seed in range(30):
-        points, known = noisy(kind, np.random.default_rng(seed), 150)
+        points, known = noisy(kind, joint_errors, np.random.default_rng(seed), 150)
         found.append(scores(kind, FITS[kind](points, **known)))
     z = np.array(found)
     k = z.shape[1]
@@ -105,9 +84,9 @@ def test_no_bias_and_an_honest_spread(kind):
     assert abs((np.abs(z) < 1.96).mean() - 0.95) < 3.0 * np.sqrt(0.05 * 0.95 / (30 * k))
 
 
-def test_normals_with_their_covariance_tell_the_axis():
+def test_normals_with_their_covariance_tell_the_axis(joint_errors):
     for seed in range(3):
-        points, known = noisy("cylinder", np.random.default_rng(seed), 150)
+        points, known = noisy("cylinder", joint_errors, np.random.default_rng(seed), 150)
         exact = {name: known[name] for name in ("covariance", "whisker_radius", "normals")}
         sigma, coarse = fit_cylinder(points, **known).sigma, fit_cylinder(points, **exact).sigma
         assert sigma["axis_x"] < 0.7 * coarse["axis_x"]
@@ -159,8 +138,8 @@ def test_a_plane_faces_the_free_side():
 
 
 @pytest.mark.parametrize("kind", ["cylinder", "sphere", "plane"])
-def test_datasets_keep_fits(kind):
-    points, known = noisy(kind, np.random.default_rng(2), 60)
+def test_datasets_keep_fits(kind, joint_errors):
+    points, known = noisy(kind, joint_errors, np.random.default_rng(2), 60)
     points[7] = np.nan
     fit = FITS[kind](points, **known)
     stored = fit.to_dataset(("time", "whisker"), (30, 2), {"time": np.arange(30) * 1e-3})
@@ -176,8 +155,8 @@ def test_datasets_keep_fits(kind):
         shape_from_dataset(stored.assign_attrs(shape=None))
 
 
-def test_residuals_of_a_sphere_are_distances():
-    points, known = noisy("sphere", np.random.default_rng(3), 60)
+def test_residuals_of_a_sphere_are_distances(joint_errors):
+    points, known = noisy("sphere", joint_errors, np.random.default_rng(3), 60)
     fit = fit_sphere(points, **known)
     expected = np.linalg.norm(points - fit.origin, axis=1) - fit.radius - known["whisker_radius"]
     np.testing.assert_allclose(fit.residuals, expected, rtol=0, atol=1e-12)
@@ -186,8 +165,8 @@ def test_residuals_of_a_sphere_are_distances():
     np.testing.assert_allclose(cylinder.signed_distance(points), gap, rtol=0, atol=1e-12)
 
 
-def test_what_is_no_shape_is_refused():
-    points, known = noisy("sphere", np.random.default_rng(4), 40)
+def test_what_is_no_shape_is_refused(joint_errors):
+    points, known = noisy("sphere", joint_errors, np.random.default_rng(4), 40)
     angle = np.linspace(0.0, 2.0 * np.pi, 40)
     circle = np.stack([np.cos(angle), np.sin(angle), np.zeros(40)], axis=1)
     with pytest.raises(ValueError, match="do not determine one"):

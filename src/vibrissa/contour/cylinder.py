@@ -76,6 +76,15 @@ class CylinderFit(FittedShape):
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray(across / np.linalg.norm(across, axis=-1, keepdims=True))
 
+    def _curvature(self, points: Array) -> Array:
+        tangent = np.cross(self.axis, self._normals(points))
+        return np.asarray(tangent[..., :, None] * tangent[..., None, :] / self.radius)
+
+    def _slopes(self, points: Array) -> Array:
+        normal = self._normals(points)
+        along = ((points - self.origin) @ self.axis)[..., None]
+        return np.concatenate([-normal, -along * normal, -np.ones_like(along)], axis=-1)
+
     def _across(self, points: Array) -> Array:
         away = points - self.origin
         return np.asarray(away - (away @ self.axis)[..., None] * self.axis)

@@ -51,6 +51,12 @@ class PlaneFit(FittedShape):
     def _normals(self, points: Array) -> Array:
         return np.array(np.broadcast_to(self.normal, np.shape(points)))
 
+    def _curvature(self, points: Array) -> Array:
+        return np.zeros((*points.shape, 3))
+
+    def _slopes(self, points: Array) -> Array:
+        return np.concatenate([-self._normals(points), points - self.origin], axis=-1)
+
 
 @dataclass(frozen=True, eq=False)
 class _Plane(Candidate):

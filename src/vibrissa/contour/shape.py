@@ -75,6 +75,23 @@ class FittedShape(ABC):
         """
         return self._normals(np.asarray(points, dtype=np.float64))
 
+    def distance_sigma(self, points: ArrayLike) -> Array:
+        """Tell how surely distances from its surface are known.
+
+        Parameters
+        ----------
+        points : array_like (..., 3)
+            In the frame of the fit, m.
+
+        Returns
+        -------
+        array (...)
+            Standard deviation by the uncertainty of the parameters, m.
+        """
+        slopes = self._slopes(np.asarray(points, dtype=np.float64))
+        variance = np.einsum("...i,ij,...j->...", slopes, self.covariance, slopes)
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
     @abstractmethod
     def _distance(self, points: Array) -> Array:
         """See `signed_distance`."""
@@ -82,6 +99,14 @@ class FittedShape(ABC):
     @abstractmethod
     def _normals(self, points: Array) -> Array:
         """See `outward_normals`."""
+
+    @abstractmethod
+    def _curvature(self, points: Array) -> Array:
+        """Derivatives (..., 3, 3) of the normals where the surface is."""
+
+    @abstractmethod
+    def _slopes(self, points: Array) -> Array:
+        """Derivatives (..., k) of the distance by the parameters."""
 
     def __repr__(self) -> str:
         """Show it in mm, with standard deviations."""

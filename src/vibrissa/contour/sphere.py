@@ -60,6 +60,15 @@ class SphereFit(FittedShape):
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray(away / np.linalg.norm(away, axis=-1, keepdims=True))
 
+    def _curvature(self, points: Array) -> Array:
+        normal = self._normals(points)
+        flat = np.eye(3) - normal[..., :, None] * normal[..., None, :]
+        return np.asarray(flat / self.radius)
+
+    def _slopes(self, points: Array) -> Array:
+        normal = self._normals(points)
+        return np.concatenate([-normal, -np.ones((*normal.shape[:-1], 1))], axis=-1)
+
 
 @dataclass(frozen=True, eq=False)
 class _Sphere(Candidate):

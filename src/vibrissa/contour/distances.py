@@ -1,0 +1,207 @@
+"""How far contact points lie from an object that is known, and how far their covariance says.
+
+Distances are those of the whisker's surface from the object's, d(p) − ρ. What to expect is drawn,
+not linearised: each point is put where the object's surface should be, moved by errors of its
+covariance as many times as there are replicates, and its distance taken again. So a point that is
+uncertain along a small round object is expected outside of it.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike
+
+from vibrissa.contour.shape import Body
+from vibrissa.contour.touches import Array
+from vibrissa.quantities import QUANTITIES, attributes, to_display
+
+REPLICATES = 20
+CLASSES = 5
+"""How many classes are made where their edges are not given."""
+
+_STEP = 1e-6
+"""Of differences, m."""
+
+
+def compare_with(
+    body: Body,
+    points: ArrayLike,
+    covariance: ArrayLike | None = None,
+    whisker_radius: ArrayLike = 0.0,
+    *,
+    dims: Sequence[str] = ("point",),
+    coords: Any = None,
+    seed: int = 0,
+) -> xr.Dataset:
+    """Compare contact points with an object that is known.
+
+    Parameters
+    ----------
+    body : object of a trial, or fitted shape
+        Anything with ``signed_distance(points)``, m, in the frame of the points.
+    points : array_like (..., 3)
+        Contact points on the whisker's centreline, m; NaN gives NaN.
+    covariance : array_like (..., 3, 3), optional
+        Of the points, m²; without it nothing is predicted.
+    whisker_radius : array_like (...)
+        Of the whisker at the contacts, m.
+    dims : sequence of str
+        Of the points, without that of space.
+    coords : mapping, optional
+        Of these dims.
+    seed : int
+        Of the draws.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``surface_distance``, m, positive outside, and with a covariance
+        ``surface_distance_predicted``: ``REPLICATES`` of them as they would be if points erred by
+        it alone.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit.
+    """
+    p = np.asarray(points, dtype=np.float64)
+    if p.ndim != len(dims) + 1 or p.shape[-1] != 3:
+        raise ValueError(f"points have shape {p.shape}; {(*dims, 3)} is needed")
+    radius = np.broadcast_to(np.asarray(whisker_radius, dtype=np.float64), p.shape[:-1])
+    known = np.isfinite(p).all(axis=-1) & np.isfinite(radius)
+    gap = np.full(p.shape[:-1], np.nan)
+    gap[known] = body.signed_distance(p[known]) - radius[known]
+    data: dict[str, Any] = {"surface_distance": (tuple(dims), gap, attributes("surface_distance"))}
+    if covariance is not None:
+        spread = np.asarray(covariance, dtype=np.float64)
+        if spread.shape != (*p.shape, 3):
+            raise ValueError(f"covariance has shape {spread.shape}; {(*p.shape, 3)} is needed")
+        known = known & np.isfinite(spread).all(axis=(-2, -1))
+        drawn = np.full((REPLICATES, *gap.shape), np.nan)
+        drawn[:, known] = _drawn(body, p[known], spread[known], gap[known], radius[known], seed)
+        name = "surface_distance_predicted"
+        data[name] = (("replicate", *dims), drawn, attributes(name))
+    return xr.Dataset(data, coords)
+
+
+def _drawn(body: Body, points: Array, spread: Array, gap: Array, radius: Array, seed: int) -> Array:
+    """Distances (replicates, n) of points that err by their covariance from the surface."""
+    steps = _STEP * np.eye(3)
+    ahead, back = (body.signed_distance(points[:, None] + sign * steps) for sign in (1.0, -1.0))
+    normal = (ahead - back) / (2.0 * _STEP)
+    touching = points - gap[:, None] * normal
+    size, direction = np.linalg.eigh(spread)
+    root = direction * np.sqrt(np.maximum(size, 0.0))[:, None, :]
+    draw = np.random.default_rng(seed).normal(size=(REPLICATES, len(points), 3))
+    moved = touching + np.einsum("nij,rnj->rni", root, draw)
+    return np.asarray(body.signed_distance(moved) - radius)
+
+
+def distances_by(
+    compared: xr.Dataset,
+    quantity: str,
+    values: ArrayLike,
+    edges: ArrayLike | None = None,
+) -> xr.Dataset:
+    """Sum up sizes of distances by classes of something else.
+
+    Parameters
+    ----------
+    compared : xarray.Dataset
+        Of `compare_with`.
+    quantity : str
+        What the classes are of, such as ``"deflection_angle"``, ``"r"`` or ``"MB"``.
+    values : array_like (...)
+        It at each contact, SI units.
+    edges : array_like (k + 1,), optional
+        Of the classes, rising; the last class holds its upper edge. By default five classes of as
+        many contacts each.
+
+    Returns
+    -------
+    xarray.Dataset
+        Dim class with its label: ``lower``, ``upper``, the number of ``contacts``, ``median`` and
+        ``largest_95`` (95 %) of the size of the distance, and both as predicted, m. Classes
+        without contacts are there, with NaN.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit, the quantity is unknown, or the edges do not rise.
+    """
+    if quantity not in QUANTITIES:
+        raise ValueError(f"{quantity!r} is no known quantity")
+    size = np.abs(compared["surface_distance"].values)
+    v = np.asarray(values, dtype=np.float64)
+    if v.shape != size.shape:
+        raise ValueError(f"values have shape {v.shape}; {size.shape} is needed")
+    known = np.isfinite(size) & np.isfinite(v)
+    limits = _edges(v[known]) if edges is None else np.asarray(edges, dtype=np.float64)
+    if limits.ndim != 1 or limits.size < 2 or not (np.diff(limits) > 0.0).all():
+        raise ValueError(f"edges are {limits.tolist()}; two or more, rising, are needed")
+    predicted = compared.get("surface_distance_predicted")
+    drawn = None if predicted is None else np.abs(predicted.values)
+    rows: dict[str, list[Any]] = {name: [] for name in ("contacts", *_SUMS)}
+    for low, high in itertools.pairwise(limits):
+        within = known & (v >= low) & ((v < high) | ((high == limits[-1]) & (v == high)))
+        rows["contacts"].append(int(within.sum()))
+        sums = (*_sums(size[within]), *_predicted(drawn, within))
+        for name, number in zip(_SUMS, sums, strict=True):
+            rows[name].append(number)
+    data: dict[str, Any] = {
+        "lower": ("class", limits[:-1], attributes(quantity)),
+        "upper": ("class", limits[1:], attributes(quantity)),
+        "contacts": ("class", rows["contacts"], {"units": "1", "long_name": "number of contacts"}),
+    }
+    for name in _SUMS:
+        about = {"units": "m", "long_name": _SUMS[name]}
+        data[name] = ("class", np.asarray(rows[name]), about)
+    labels = {"label": ("class", [_label(quantity, *pair) for pair in itertools.pairwise(limits)])}
+    return xr.Dataset(data, labels, {"quantity": quantity})
+
+
+_SUMS = {
+    "median": "median distance from the surface",
+    "largest_95": "95 % of distances from the surface are smaller",
+    "median_predicted": "median distance as the covariance predicts it",
+    "largest_95_predicted": "95 % of distances, as the covariance predicts it",
+}
+
+
+def _edges(values: Array) -> Array:
+    """Edges of classes of as many values each."""
+    if values.size == 0:
+        raise ValueError("no classes: no contact has a distance and a value")
+    edges = np.unique(np.quantile(values, np.linspace(0.0, 1.0, CLASSES + 1)))
+    return edges if edges.size > 1 else np.array([edges[0], np.nextafter(edges[0], np.inf)])
+
+
+def _sums(size: Array) -> tuple[float, float]:
+    """Median and 95 %; NaN of nothing."""
+    if size.size == 0:
+        return float("nan"), float("nan")
+    median, most = np.quantile(size, [0.5, 0.95])
+    return float(median), float(most)
+
+
+def _predicted(drawn: Array | None, within: Any) -> tuple[float, float]:
+    """The same of draws, the median over replicates."""
+    if drawn is None:
+        return float("nan"), float("nan")
+    rows = drawn[:, within]
+    rows = rows[:, np.isfinite(rows).all(axis=0)]
+    if rows.size == 0:
+        return float("nan"), float("nan")
+    both = np.median(np.quantile(rows, [0.5, 0.95], axis=1), axis=1)
+    return float(both[0]), float(both[1])
+
+
+def _label(quantity: str, low: float, high: float) -> str:
+    """Name a class by its edges, as shown."""
+    ends = to_display(quantity, [low, high])
+    return f"{ends[0]:.3g}–{ends[1]:.3g}"

@@ -1,0 +1,263 @@
+"""Contacts to a free surface: its base, what deviates from it, and how far and fast that varies.
+
+a and ℓ maximise the likelihood within bounds. a is at least a twentieth of the points' extent,
+even if no deviation is seen: that an object is a cylinder where it was touched does not say that
+it is one elsewhere. ℓ is at most that extent, and no less than a tenth. Normals make the base shape
+and tell where under the whisker's centreline the surface is.
+
+The cost grows with the third power of the number of points; at most 600 are used, neighbours being
+merged (`vibrissa.contour.merging`), 200 for a and ℓ.
+
+A contact that is missed by more than four standard deviations is an outlier, judged by the surface
+through the others, and by how far these scatter.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from vibrissa.contour.cylinder import fit_cylinder
+from vibrissa.contour.free import FreeFit
+from vibrissa.contour.merging import Support, merged
+from vibrissa.contour.plane import fit_plane
+from vibrissa.contour.shape import FittedShape
+from vibrissa.contour.sphere import fit_sphere
+from vibrissa.contour.touches import FLOOR, Array, Mask, checked
+
+BASES = ("plane", "sphere", "cylinder")
+"""What a free surface may deviate from, the simpler first."""
+
+_FITS: dict[str, Callable[..., FittedShape]] = {
+    "plane": fit_plane,
+    "sphere": fit_sphere,
+    "cylinder": fit_cylinder,
+}
+
+_BETTER = 0.6
+"""How much smaller deviations from a less simple base must be for it to be taken."""
+
+_MOST = 0.9
+"""Share of the contacts that these deviations are not exceeded by."""
+
+_AMPLITUDES = (0.05, 2.0)
+_LENGTHS = (0.1, 1.0)
+"""Bounds of amplitude and length, as shares of the points' extent."""
+
+_FOR_BOUNDS = 200
+_OUTLIER = 4.0
+_WIDE = 0.5
+"""Standard deviation, as a share of radius and extent, from which points are left out."""
+
+_FEW = 20
+"""If not as many others are left."""
+
+_TINY = 1e-12
+
+_ROUNDS = 2
+
+_NOISES = (1e-10, 1e-2)
+"""Bounds of the variance of what no covariance tells, in units of the extent squared."""
+
+_TO_SIGMA = 1.4826
+
+
+def fit_free(
+    points: ArrayLike,
+    covariance: ArrayLike | None = None,
+    whisker_radius: ArrayLike | None = None,
+    normals: ArrayLike | None = None,
+    normal_covariance: ArrayLike | None = None,
+    point_normal_covariance: ArrayLike | None = None,
+    base: str | None = None,
+    most: int = 600,
+) -> FreeFit:
+    """Fit a smooth surface of any shape to contact points on parts of it.
+
+    Parameters
+    ----------
+    points : array_like (n, 3)
+        Contact points on the whisker's centreline, m, in any one frame; rows with NaN are left out.
+    covariance : array_like (n, 3, 3), optional
+        Of each point, m². Without it all points count the same, and their scatter tells the noise.
+    whisker_radius : array_like (n,) or float, optional
+        Of the whisker at each contact, m; 0 by default.
+    normals : array_like (n, 3), optional
+        Outward normals of the surface at the contacts, such as the directions of the contact
+        forces; of any length but zero.
+    normal_covariance : array_like (n, 3, 3), optional
+        Of each unit normal.
+    point_normal_covariance : array_like (n, 3, 3), optional
+        Of each point (rows) with its unit normal (columns), m; none by default.
+    base : {"plane", "sphere", "cylinder"}, optional
+        What the surface deviates from; by default the simplest from which less simple ones are
+        not much nearer to the points.
+    most : int
+        To how many places the points are merged at most; the time grows with the third power.
+
+    Returns
+    -------
+    FreeFit
+        The surface with its uncertainty.
+
+    Raises
+    ------
+    ValueError
+        If shapes are wrong, if there are fewer than 6 points, if a covariance is none, if the base
+        is unknown, or if the points determine none, as on a line.
+    """
+    if base is not None and base not in BASES:
+        raise ValueError(f"base is {base!r}; one of {', '.join(BASES)} is known")
+    if most < 6:
+        raise ValueError(f"most is {most}; at least 6 places are needed")
+    given = checked(
+        "surface",
+        points,
+        covariance,
+        whisker_radius,
+        normals,
+        normal_covariance,
+        point_normal_covariance,
+        least=6,
+    )
+    # Rows that are not usable for the base are not usable for what deviates from it.
+    rows = np.flatnonzero(given.usable)
+    known = {
+        "covariance": covariance,
+        "normals": normals,
+        "normal_covariance": normal_covariance,
+        "point_normal_covariance": point_normal_covariance,
+    }
+    picked = {n: np.asarray(v, dtype=np.float64)[rows] for n, v in known.items() if v is not None}
+    p = np.asarray(points, dtype=np.float64)[rows]
+    radius = given.touches.whisker_radius * given.extent
+    shape = _base(p, radius, picked, (base,) if base else BASES)
+    surface = p - radius[:, None] * (
+        shape.outward_normals(p) if given.touches.normal is None else given.touches.normal
+    )
+    spread = picked.get("covariance", np.zeros((len(p), 3, 3)))
+    fit, inside = _surface(shape, surface, spread, given.extent, most)
+    residuals = np.full(given.usable.size, np.nan)
+    residuals[rows] = fit.signed_distance(p) - radius
+    inliers = np.zeros(given.usable.size, dtype=bool)
+    inliers[rows] = inside
+    return _made(shape, fit.support, fit.amplitude, fit.length, residuals, inliers)
+
+
+def _base(
+    points: Array, radius: Array, known: dict[str, Array], kinds: tuple[str, ...]
+) -> FittedShape:
+    """The simplest shape from which less simple ones are not much nearer to the points."""
+    best, least, said = None, np.inf, ""
+    # On an object of another shape points and normals may contradict each other.
+    alone = {name: v for name, v in known.items() if name == "covariance"}
+    for kind, given in ((kind, given) for kind in kinds for given in (known, alone)):
+        if given is alone and len(known) == len(alone):
+            continue
+        try:
+            fit = _FITS[kind](points, whisker_radius=radius, **given)
+        except ValueError as error:
+            said = str(error)
+            continue
+        sigma = np.ones(len(points))
+        if "covariance" in known:
+            sigma = np.maximum(_across(fit.outward_normals(points), known["covariance"]), _TINY)
+        miss = float(np.quantile(np.abs(fit.residuals) / sigma, _MOST))
+        if miss < _BETTER * least:
+            best, least = fit, miss
+    if best is None:
+        raise ValueError(f"no surface: {said}")
+    if best.kind == "plane" and "normals" in known:
+        turned = float(np.median(known["normals"] @ best.outward_normals(points[:1])[0]))
+        if turned < 0.0:
+            best = fit_plane(points, known.get("covariance"), radius, known["normals"])
+    return best
+
+
+def _across(normal: Array, covariance: Array) -> Array:
+    """Standard deviations (n,) along normals."""
+    variance = np.einsum("ni,nij,nj->n", normal, covariance, normal)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+
+def _surface(
+    base: FittedShape, surface: Array, spread: Array, extent: float, most: int
+) -> tuple[FreeFit, Mask]:
+    """Fit the deviation from a base, twice: the second time with its slopes, without outliers."""
+    bent = base._curvature(surface) @ spread
+    # A point that is scattered along a curved surface lies farther out in the mean.
+    shift = 0.5 * np.trace(bent, axis1=1, axis2=2)
+    extra = 0.5 * np.einsum("nij,nji->n", bent, bent) + (FLOOR * extent) ** 2
+    gap = base.signed_distance(surface)
+    feet, value = surface - gap[:, None] * base.outward_normals(surface), shift - gap
+    known = np.sqrt(np.linalg.eigvalsh(spread)[:, -1].clip(0.0)) < _WIDE * min(extent, _size(base))
+    if known.sum() < _FEW:
+        known = np.ones(len(surface), dtype=bool)
+    inside, normal = known, base.outward_normals(surface)
+    for _ in range(_ROUNDS):
+        variance = _across(normal, spread) ** 2 + extra
+        support = Support(feet[inside], value[inside], variance[inside])
+        amplitude, length, noise = _varying(merged(support, min(_FOR_BOUNDS, most)), extent)
+        few = merged(support._replace(variance=support.variance + noise), most)
+        fit = _made(base, few, amplitude, length, np.empty(0), np.empty(0, dtype=bool))
+        mean, unsure = fit.deviation(surface)
+        normal = fit.outward_normals(surface)
+        miss = np.abs(value - mean) / np.sqrt(variance + unsure**2)
+        usual = max(1.0, _TO_SIGMA * float(np.median(miss[known])))
+        inside = known & (miss < _OUTLIER * usual)
+    return fit, inside
+
+
+def _size(base: FittedShape) -> float:
+    return float(getattr(base, "radius", np.inf))
+
+
+def _made(
+    base: FittedShape,
+    support: Support,
+    amplitude: float,
+    length: float,
+    residuals: Array,
+    inliers: Mask,
+) -> FreeFit:
+    return FreeFit(
+        covariance=base.covariance,
+        residuals=residuals,
+        inliers=inliers,
+        base=base,
+        support=support,
+        amplitude=amplitude,
+        length=length,
+    )
+
+
+def _varying(support: Support, extent: float) -> tuple[float, float, float]:
+    """Amplitude and length, m, and the variance of what no covariance tells, m²."""
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
+
+    squares = (_AMPLITUDES[0] ** 2, _AMPLITUDES[1] ** 2)
+    best, most = None, -np.inf
+    for start in _LENGTHS:
+        kernel = ConstantKernel(squares[0] * 4.0, squares) * Matern(start, _LENGTHS, nu=2.5)
+        process = GaussianProcessRegressor(
+            kernel + WhiteKernel(1e-6, _NOISES), alpha=support.variance / extent**2
+        )
+        with warnings.catch_warnings():
+            # That a bound is reached is what bounds are for.
+            warnings.simplefilter("ignore", ConvergenceWarning)
+            process.fit(support.place / extent, support.value / extent)
+        likelihood = float(process.log_marginal_likelihood_value_)
+        if likelihood > most:
+            best, most = process.kernel_, likelihood
+    assert best is not None
+    amplitude = float(np.sqrt(best.k1.k1.constant_value)) * extent
+    return (
+        amplitude,
+        float(best.k1.k2.length_scale) * extent,
+        float(best.k2.noise_level) * extent**2,
+    )

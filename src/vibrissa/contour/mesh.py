@@ -1,0 +1,123 @@
+"""Fitted shapes as grids of points, as far as they were touched: for drawing and export."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike
+
+from vibrissa.contour.cylinder import CylinderFit
+from vibrissa.contour.free import FreeFit
+from vibrissa.contour.plane import PlaneFit
+from vibrissa.contour.shape import FittedShape
+from vibrissa.contour.sphere import SphereFit
+from vibrissa.contour.touches import Array
+from vibrissa.quantities import attributes
+
+_INWARD = 0.9
+"""How far inside of its base a surface may be, as a share of the radius."""
+
+_ROUND = np.pi / 3.0
+"""Gap between azimuths from which a shape is drawn open."""
+
+
+def surface_grid(
+    shape: FittedShape, points: ArrayLike, count: int = 41, margin: float = 0.15
+) -> xr.Dataset:
+    """Lay a grid over the part of a fitted shape that was touched.
+
+    Parameters
+    ----------
+    shape : CylinderFit, SphereFit, PlaneFit or FreeFit
+        The shape.
+    points : array_like (n, 3)
+        Contact points, in its frame, m; rows with NaN are left out.
+    count : int
+        Points of the grid in each of its two directions.
+    margin : float
+        How far it goes beyond the points, as a share of their width.
+
+    Returns
+    -------
+    xarray.Dataset
+        Dims u, v, space: ``surface_grid_point`` and its standard deviation ``surface_sigma``
+        across the surface, m.
+
+    Raises
+    ------
+    ValueError
+        If there are no points, or the grid has less than two points in a direction.
+    """
+    if count < 2:
+        raise ValueError(f"count is {count}; at least 2 are needed")
+    p = np.asarray(points, dtype=np.float64)
+    p = p[np.isfinite(p).all(axis=-1)].reshape(-1, 3)
+    if not len(p):
+        raise ValueError("no grid: no points")
+    base = shape.base if isinstance(shape, FreeFit) else shape
+    grid = _over(base, p, count, margin)
+    if isinstance(shape, FreeFit):
+        added, _ = shape.deviation(grid)
+        # Where nothing is known the surface must not pass through the middle of the base.
+        added = np.minimum(added, _INWARD * getattr(base, "radius", np.inf))
+        grid = grid - added[..., None] * base.outward_normals(grid)
+    data = {
+        "surface_grid_point": (("u", "v", "space"), grid, attributes("surface_grid_point")),
+        "surface_sigma": (("u", "v"), shape.distance_sigma(grid), attributes("surface_sigma")),
+    }
+    return xr.Dataset(data, {"space": list("xyz")}, {"shape": shape.kind})
+
+
+def _over(base: FittedShape, points: Array, count: int, margin: float) -> Array:
+    """Points (count, count, 3) of a simple shape."""
+    if isinstance(base, PlaneFit):
+        first, second = np.linalg.svd(points - points.mean(axis=0), full_matrices=True)[2][:2]
+        first = first - (first @ base.normal) * base.normal
+        first = first / np.linalg.norm(first)
+        second = np.cross(base.normal, first)
+        away = points - base.origin
+        u, v = (_range(away @ axis, count, margin) for axis in (first, second))
+        return np.asarray(base.origin + u[:, None, None] * first + v[:, None] * second)
+    if isinstance(base, CylinderFit):
+        across = _across(base.axis)
+        away = points - base.origin
+        u = _turn(np.arctan2(away @ across[1], away @ across[0]), count, margin)[:, None, None]
+        v = _range(away @ base.axis, count, margin)[:, None]
+        round_ = np.cos(u) * across[0] + np.sin(u) * across[1]
+        return np.asarray(base.origin + base.radius * round_ + v * base.axis)
+    assert isinstance(base, SphereFit)
+    normal = base.outward_normals(points)
+    pole = np.linalg.svd(normal, full_matrices=True)[2][-1]
+    across = _across(pole)
+    u = _turn(np.arctan2(normal @ across[1], normal @ across[0]), count, margin)[:, None, None]
+    latitude = np.arcsin(np.clip(normal @ pole, -1.0, 1.0))
+    v = np.clip(_range(latitude, count, margin), -0.5 * np.pi, 0.5 * np.pi)[:, None]
+    round_ = np.cos(v) * (np.cos(u) * across[0] + np.sin(u) * across[1]) + np.sin(v) * pole
+    return np.asarray(base.origin + base.radius * round_)
+
+
+def _across(axis: Array) -> Array:
+    """Two unit vectors (2, 3) across an axis."""
+    first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
+    first = first / np.linalg.norm(first)
+    return np.stack([first, np.cross(axis, first)])
+
+
+def _range(values: Array, count: int, margin: float) -> Array:
+    """Evenly from the least to the largest, and beyond by a margin."""
+    low, high = float(values.min()), float(values.max())
+    beyond = margin * (high - low)
+    return np.linspace(low - beyond, high + beyond, count)
+
+
+def _turn(angles: Array, count: int, margin: float) -> Array:
+    """Evenly over the part of the circle that is covered."""
+    order = np.sort(angles)
+    gaps = np.diff(order, append=order[0] + 2.0 * np.pi)
+    widest = int(np.argmax(gaps))
+    if gaps[widest] < _ROUND:
+        return np.linspace(-np.pi, np.pi, count)
+    start = order[(widest + 1) % len(order)]
+    width = 2.0 * np.pi - gaps[widest]
+    beyond = min(margin * width, 0.5 * gaps[widest])
+    return np.linspace(start - beyond, start + width + beyond, count)

@@ -19,7 +19,9 @@ from vibrissa.io.footage import Footage
 from vibrissa.mapping import ContactMap
 from vibrissa.viewer.bend_panel import BendMode
 from vibrissa.viewer.locate_panel import LocateMode
+from vibrissa.viewer.map_panel import MapMode
 from vibrissa.viewer.page import Mode, Page
+from vibrissa.viewer.save_panel import SaveControls
 from vibrissa.viewer.trial_panel import TrialMode
 from vibrissa.viewer.watching import Watched, watched
 from vibrissa.viewer.whisker_panel import WhiskerControls
@@ -118,16 +120,17 @@ def view(
     footage = _footage(trial, videos)
     server = _served(host, port)
     page = Page(server, whisker, contacts)
-    names = ("Bend", "Locate") if trial is None else ("Bend", "Locate", "Trial")
+    names = ("Bend", "Locate", "Map") if trial is None else ("Bend", "Locate", "Map", "Trial")
     choice = server.gui.add_button_group("Look at", names)
     choice.on_click(lambda event: page.choose(event.target.value))
-    modes: list[Mode] = [BendMode(page), LocateMode(page)]
+    modes: list[Mode] = [BendMode(page), LocateMode(page), MapMode(page)]
     if trial is not None:
         modes.append(TrialMode(page, trial, footage))
     page.modes = {mode.name: mode for mode in modes}
     page.closing += [film.close for film in footage]
     page.whisker_controls = WhiskerControls(page).folder
-    page.choose("Bend" if trial is None else "Trial")
+    SaveControls(page, recording)
+    page.choose("Trial" if trial is not None else "Map" if contacts is not None else "Bend")
     page.prepare()
     page.settle()
     return Viewer(page)

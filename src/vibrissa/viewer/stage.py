@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 import viser
 
-from vibrissa.viewer.drawing import Arrow, Body, Cloud, Drawing, Label, Line, Painted, Thing
+from vibrissa.viewer.drawing import Arrow, Body, Bytes, Cloud, Drawing, Label, Line, Painted, Thing
 
 
 class Stage:
@@ -59,14 +59,9 @@ class Stage:
                     receive_shadow=False,
                 )
             case Painted():
-                count = len(thing.triangles)
-                mesh = trimesh.Trimesh(
-                    thing.triangles.reshape(-1, 3),
-                    np.arange(3 * count).reshape(-1, 3),
-                    vertex_colors=thing.colours.reshape(-1, 3),
-                    process=False,
+                return scene.add_mesh_trimesh(
+                    path, _coloured(thing), cast_shadow=False, receive_shadow=False
                 )
-                return scene.add_mesh_trimesh(path, mesh, cast_shadow=False, receive_shadow=False)
             case Cloud():
                 return scene.add_point_cloud(
                     path,
@@ -97,6 +92,29 @@ class Stage:
                 return scene.add_label(
                     path, thing.text, position=_vector(thing.position), anchor="bottom-left"
                 )
+
+
+def _coloured(thing: Painted) -> trimesh.Trimesh:
+    """A mesh that is dull, seen from both sides, and has the colours of its corners."""
+    count = 3 * len(thing.triangles)
+    mesh = trimesh.Trimesh(
+        thing.triangles.reshape(-1, 3), np.arange(count).reshape(-1, 3), process=False
+    )
+    dull = trimesh.visual.material.PBRMaterial(
+        metallicFactor=0.0, roughnessFactor=0.9, doubleSided=True
+    )
+    mesh.visual = trimesh.visual.TextureVisuals(material=dull)
+    opaque = np.full((count, 1), 255, dtype=np.uint8)
+    colours = _linear(thing.colours.reshape(-1, 3))
+    mesh.visual.vertex_attributes["color"] = np.concatenate([colours, opaque], axis=1)
+    return mesh
+
+
+def _linear(colours: Bytes) -> Bytes:
+    """Colours as light, which meshes with colours of their own are given in."""
+    share = colours / 255.0
+    light = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    return np.asarray(np.round(255.0 * light), dtype=np.uint8)
 
 
 def _changed(handle: viser.SceneNodeHandle, old: Thing, new: Thing) -> bool:

@@ -1,0 +1,87 @@
+"""What is on the page as files: bytes, ready to be downloaded."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from vibrissa.io import save_centerline
+from vibrissa.mapping import ContactMap
+from vibrissa.quantities import attributes
+from vibrissa.rod import Deflection
+from vibrissa.signals import base_signals
+from vibrissa.status import flag_attributes
+from vibrissa.whisker import Whisker
+
+NODES = 200
+
+
+def whisker_csv(whisker: Whisker) -> bytes:
+    """The resting centreline as a table, which `vibrissa.load_whisker` reads."""
+    return _written("whisker.csv", lambda path: save_centerline(path, whisker.centerline(NODES)))
+
+
+def whisker_netcdf(whisker: Whisker) -> bytes:
+    """The whisker without loss: shape, radius, material."""
+    return netcdf(whisker.to_dataset())
+
+
+def map_netcdf(contacts: ContactMap) -> bytes:
+    """A map without loss, which `ContactMap.load` reads."""
+    return _written("map.nc", contacts.save)
+
+
+def netcdf(data: xr.Dataset | xr.DataTree) -> bytes:
+    """A dataset as a file."""
+    return _written("data.nc", lambda path: data.to_netcdf(path, engine="h5netcdf"))
+
+
+def deflection_dataset(bent: Deflection) -> xr.Dataset:
+    """One bent whisker as a labelled dataset.
+
+    Parameters
+    ----------
+    bent : Deflection
+        By one load.
+
+    Returns
+    -------
+    Dataset
+        Centreline over ``node``, force, moment, contact point, arc length, the six signals and
+        the status, in the whisker frame and SI units; missing is NaN.
+    """
+    values: dict[str, Any] = {
+        "centerline": (("node", "space"), bent.centerline(NODES), attributes("centerline")),
+        "force": ("space", np.asarray(bent.force), attributes("force")),
+        "moment": ("space", np.asarray(bent.moment), attributes("moment")),
+        "contact_point": (
+            "space",
+            np.asarray(bent.contact_point),
+            attributes("contact_point_whisker"),
+        ),
+        "arc_length": ((), float(bent.arc_length), attributes("arc_length")),
+        "status": ((), int(bent.status), {**attributes("status"), **flag_attributes()}),
+    }
+    out = xr.Dataset(values, {"space": list("xyz")}, {"reference_frame": "whisker"})
+    return out.merge(base_signals(out["force"], out["moment"]))
+
+
+def png(image: np.ndarray[Any, np.dtype[np.uint8]]) -> bytes:
+    """A picture (height, width, 3 or 4) as PNG."""
+    import imageio.v3 as imageio
+
+    encoded: bytes = imageio.imwrite("<bytes>", image, extension=".png")
+    return encoded
+
+
+def _written(name: str, write: Callable[[Path], object]) -> bytes:
+    """What a writer of files writes."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / name
+        write(path)
+        return path.read_bytes()

@@ -1,0 +1,49 @@
+"""What is saved from the page is what was on it."""
+
+import numpy as np
+import xarray as xr
+
+import vibrissa as vb
+from vibrissa.viewer.bending import begin
+from vibrissa.viewer.saving import (
+    deflection_dataset,
+    map_netcdf,
+    netcdf,
+    png,
+    whisker_csv,
+    whisker_netcdf,
+)
+
+
+def test_a_whisker_comes_back(tmp_path):
+    whisker = vb.samples.gamma()
+    (tmp_path / "a.csv").write_bytes(whisker_csv(whisker))
+    back = vb.load_whisker(tmp_path / "a.csv")
+    np.testing.assert_allclose(back.length, whisker.length, rtol=1e-4)
+    (tmp_path / "a.nc").write_bytes(whisker_netcdf(whisker))
+    with xr.open_dataset(tmp_path / "a.nc", engine="h5netcdf") as data:
+        same = vb.Whisker.from_dataset(data.load())
+    np.testing.assert_array_equal(same.centerline(), whisker.centerline())
+
+
+def test_a_bent_whisker_is_a_labelled_dataset(tmp_path):
+    bent = begin(vb.samples.gamma()).deflection
+    (tmp_path / "bent.nc").write_bytes(netcdf(deflection_dataset(bent)))
+    with xr.open_dataset(tmp_path / "bent.nc", engine="h5netcdf") as data:
+        np.testing.assert_array_equal(data["force"], bent.force)
+        signals = vb.base_signals(bent.force, bent.moment)
+        assert float(data["MB"]) == float(signals.MB)
+        assert all(v.attrs.get("units") for v in data.data_vars.values())
+        assert all(v.attrs.get("long_name") for v in data.data_vars.values())
+
+
+def test_a_map_comes_back(tmp_path):
+    contacts = vb.ContactMap.simulate(vb.samples.curved(), grid=False, cells=(8, 16, 8))
+    (tmp_path / "map.nc").write_bytes(map_netcdf(contacts))
+    back = vb.ContactMap.load(tmp_path / "map.nc")
+    np.testing.assert_array_equal(back.chart.values, contacts.chart.values)
+
+
+def test_a_picture_is_a_png():
+    image = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
+    assert png(image).startswith(b"\x89PNG")

@@ -1,4 +1,4 @@
-"""`vibrissa figures`: everything that can be drawn from a map."""
+"""`vibrissa figures`: everything that can be drawn from a map, or from a trial."""
 
 from __future__ import annotations
 
@@ -31,7 +31,9 @@ _AGREE = 1e-6
 
 
 def figures(
-    path: Annotated[Path, typer.Argument(help="A map of contacts, NetCDF.", metavar="MAP")],
+    path: Annotated[
+        Path, typer.Argument(help="A map of contacts, or the recording of a trial, NetCDF.")
+    ],
     folder: Annotated[
         Path, typer.Option("--output", "-o", help="Where figures go.", metavar="DIR")
     ] = Path("figures"),
@@ -52,28 +54,48 @@ def figures(
         Path | None,
         typer.Option(help="Critical cones by curvature and taper, NetCDF.", metavar="FILE"),
     ] = None,
+    videos: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--video", help="Of a trial: the video of a view, top and then front.", metavar="FILE"
+        ),
+    ] = None,
+    chart: Annotated[
+        Path | None,
+        typer.Option("--map", help="Of a trial's whisker; simulated by default.", metavar="MAP"),
+    ] = None,
+    whisker: Annotated[int, typer.Option(help="Of a trial: which whisker, from 0.")] = 0,
 ) -> None:
-    """Draw the figures that a map allows: whisker, signals over space, surfaces, sensitivity.
+    """Draw the figures that a map or a trial allows.
 
-    With a saved result of `vibrissa uniqueness` also the verdicts, the resolution and pairs of
-    contacts that feel the same. Of an array of whiskers, or of a trial of several: the face, the
+    A map: whisker, signals over space, surfaces, sensitivity; with a saved result of `vibrissa
+    uniqueness` also the verdicts, the resolution and pairs of contacts that feel the same. A trial:
+    frames, signals and their way through the solids of a map, contacts about the whisker and in the
+    laboratory, estimates, contour. An array of whiskers, or a trial of several: the face, the
     whiskers, and what they touch. Example: `vibrissa figures map.nc -o figures --width single`
     """
     endings = _chosen(formats, width)
     from vibrissa.cli.array_figures import array_drawings
     from vibrissa.cli.sources import map_from
+    from vibrissa.cli.trial_figures import trial_drawings
+    from vibrissa.io import Kind, recognise
     from vibrissa.io.paths import check_folder
     from vibrissa.plots import save
 
     check_folder(folder)
     verdicts = None if uniqueness is None else _dataset(uniqueness, "verdict")
     sweep = None if cones is None else _dataset(cones, "critical_cone")
-    drawings = array_drawings(path, width)
-    if not drawings:
-        drawings = dict(_drawings(map_from(path), width, verdicts, sweep))
-    folder.mkdir(parents=True, exist_ok=True)
-    files = []
     with progress_bars() as tell:
+        drawings = array_drawings(path, width)
+        if not path.is_dir() and recognise(path) == Kind.RECORDING:
+            _refuse({"--uniqueness": uniqueness, "--cones": cones}, f"{path} is a recording")
+            drawings |= trial_drawings(path, width, videos or [], chart, whisker, tell)
+        else:
+            _refuse({"--video": videos, "--map": chart}, f"{path} is no recording")
+        if not drawings:
+            drawings = dict(_drawings(map_from(path), width, verdicts, sweep))
+        folder.mkdir(parents=True, exist_ok=True)
+        files = []
         for i, (name, draw) in enumerate(drawings.items()):
             tell("figures", i, len(drawings))
             files += save(draw(), folder / name, endings)
@@ -91,6 +113,13 @@ def _chosen(formats: list[str] | None, width: str) -> list[str]:
     if width not in _WIDTHS:
         raise ValueError(f"--width is {width!r}; one of {', '.join(_WIDTHS)} is needed")
     return endings
+
+
+def _refuse(options: dict[str, Any], reason: str) -> None:
+    """Raise if options are given that do not go with what is drawn."""
+    given = [name for name, value in options.items() if value]
+    if given:
+        raise ValueError(f"{', '.join(given)} cannot be used: {reason}")
 
 
 def _dataset(path: Path, needed: str) -> xr.Dataset:

@@ -192,13 +192,13 @@ def _contour_frames(
     chart: Path | None,
     tell: Tell,
 ) -> Iterator[Any]:
-    from vibrissa.cli.trial_views import bodies_of, sights_of
+    from vibrissa.cli.trial_views import bodies_of, fits_of, sights_of
     from vibrissa.plots import contour_frames
     from vibrissa.trial import recorded_whisker
 
     rest = recorded_whisker(trial, whisker).centerline(101)
     sights = sights_of(trial, course, videos, rows)
-    return contour_frames(course, rest, sights, rows, bodies_of(trial))
+    return contour_frames(course, rest, sights, rows, bodies_of(trial), fits_of(trial))
 
 
 _FRAMES = {"signals": _signal_frames, "contour": _contour_frames}

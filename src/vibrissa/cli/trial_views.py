@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import NDArray
 
+    from vibrissa.contour import FittedShape
     from vibrissa.mapping import ContactMap
     from vibrissa.plots import Course, Sight
     from vibrissa.rod.surface import Surface
@@ -128,6 +129,27 @@ def bodies_of(trial: xr.DataTree) -> list[Surface]:
     from vibrissa.trial import recorded_objects
 
     return list(recorded_objects(trial))
+
+
+def fits_of(trial: xr.DataTree) -> list[FittedShape]:
+    """List the shapes that were fitted to the contacts of a trial.
+
+    Parameters
+    ----------
+    trial : DataTree
+        A recording.
+
+    Returns
+    -------
+    list of FittedShape
+        A cylinder, sphere or plane of the group ``contour``, or nothing.
+    """
+    from vibrissa.contour import CylinderFit, PlaneFit, SphereFit, shape_from_dataset
+
+    known = {fit.kind for fit in (CylinderFit, PlaneFit, SphereFit)}
+    if "contour" not in trial.children or trial["contour"].attrs.get("shape") not in known:
+        return []
+    return [shape_from_dataset(trial["contour"].to_dataset())]
 
 
 def map_of(trial: xr.DataTree, path: Path | None, whisker: int, tell: Any) -> ContactMap:

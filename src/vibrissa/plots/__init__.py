@@ -4,9 +4,11 @@ from vibrissa.plots.array import array_views
 from vibrissa.plots.clouds import signal_clouds
 from vibrissa.plots.contour import contour_views
 from vibrissa.plots.contour_movie import contour_frames
-from vibrissa.plots.course import Course, course_of
+from vibrissa.plots.course import Course, course_of, deflection_angles
 from vibrissa.plots.estimates import estimated_against_true
 from vibrissa.plots.evidence import critical_cones, resolution
+from vibrissa.plots.overview import telling_rows, trial_overview
+from vibrissa.plots.places import contact_places
 from vibrissa.plots.sensitivity import sensitivity_panels
 from vibrissa.plots.sights import Sight
 from vibrissa.plots.signal_movie import signal_frames
@@ -22,11 +24,13 @@ __all__ = [
     "Course",
     "Sight",
     "array_views",
+    "contact_places",
     "contact_surfaces",
     "contour_frames",
     "contour_views",
     "course_of",
     "critical_cones",
+    "deflection_angles",
     "estimated_against_true",
     "resolution",
     "save",
@@ -35,6 +39,8 @@ __all__ = [
     "signal_frames",
     "signals_over_time",
     "solid_slices",
+    "telling_rows",
+    "trial_overview",
     "verdict_table",
     "whisker_views",
     "witness_pair",

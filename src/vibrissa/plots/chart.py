@@ -173,6 +173,27 @@ def outside_cone(points: Array, centerline: Array) -> Array:
     array (n,)
         Distance from the resting whisker less tan 2° times the arc length there, m.
     """
+    distance, arc_length = nearest_at_rest(points, centerline)
+    return np.asarray(distance - arc_length * np.tan(_CONE))
+
+
+def nearest_at_rest(points: Array, centerline: Array) -> tuple[Array, Array]:
+    """How far contacts lie from the resting whisker.
+
+    Parameters
+    ----------
+    points : array (n, 3)
+        Contact points, whisker frame, m, finite.
+    centerline : array (k, 3)
+        Of the resting whisker from its base, m.
+
+    Returns
+    -------
+    distance : array (n,)
+        To the resting whisker, m.
+    arc_length : array (n,)
+        Of the point of it that is nearest, m.
+    """
     from scipy.spatial import cKDTree
 
     count = max(2000, len(centerline))
@@ -181,4 +202,4 @@ def outside_cone(points: Array, centerline: Array) -> Array:
     step = np.linalg.norm(np.diff(fine, axis=0), axis=1)
     arc_length = np.concatenate([[0.0], np.cumsum(step)])
     distance, nearest = cKDTree(fine).query(points)
-    return np.asarray(distance - arc_length[nearest] * np.tan(_CONE))
+    return np.asarray(distance), arc_length[nearest]

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 
+from vibrissa.plots.chart import nearest_at_rest
 from vibrissa.plots.style import Array, Mask
 
 TRIPLET = ("Fx", "MB", "MD")
@@ -45,6 +47,8 @@ class Course:
         From the whisker's to the laboratory frame.
     frames : array (n, views) of int, optional
         Which frame of each view's video belongs to each time.
+    head : tuple of array (n, 3) and array (n, 3, 3), optional
+        Position of the head, laboratory frame, m, and rotation from its frame to the laboratory's.
     """
 
     time: Array
@@ -60,6 +64,7 @@ class Course:
     position: Array
     rotation: Array
     frames: Array | None
+    head: tuple[Array, Array] | None
 
     def at_base(self, points: Array) -> Array:
         """Take points of the laboratory to the whisker's frame, frame by frame.
@@ -137,6 +142,7 @@ def course_of(trial: xr.DataTree, whisker: int = 0) -> Course:
         position=np.asarray(root["base_position"].values, dtype=np.float64),
         rotation=np.asarray(root["base_rotation"].values, dtype=np.float64),
         frames=root["frame"].values if "frame" in root else None,
+        head=_head(root),
     )
 
 
@@ -175,6 +181,11 @@ def _touching(order: tuple[xr.Dataset, ...], count: int) -> Mask:
     return np.zeros(count, dtype=bool)
 
 
+def _head(root: xr.Dataset) -> tuple[Array, Array] | None:
+    position, rotation = (_values(root, name) for name in ("head_position", "head_rotation"))
+    return None if position is None or rotation is None else (position, rotation)
+
+
 def _traces(root: xr.Dataset, truth: xr.Dataset) -> tuple[Array, ...]:
     """Traces in each view: tracked ones, or else true ones."""
     for data in (root, truth):
@@ -183,8 +194,45 @@ def _traces(root: xr.Dataset, truth: xr.Dataset) -> tuple[Array, ...]:
     return ()
 
 
+def deflection_angles(course: Course, centerline: ArrayLike) -> Array:
+    """Angle by which contacts lie beside the resting whisker.
+
+    Parameters
+    ----------
+    course : Course
+        Of the trial.
+    centerline : array_like (k, 3)
+        Of the resting whisker, whisker frame, m.
+
+    Returns
+    -------
+    array (n,)
+        Of each frame, rad: its tangent is the distance of the contact from the resting whisker over
+        the arc length of the point of it that is nearest; NaN without contact.
+    """
+    angles = np.full(len(course.time), np.nan)
+    if course.places is None:
+        return angles
+    own = course.at_base(course.places)
+    rows = np.isfinite(own).all(axis=1)
+    if rows.any():
+        angles[rows] = np.arctan2(*nearest_at_rest(own[rows], np.asarray(centerline, np.float64)))
+    return angles
+
+
 def spherical(points: Array) -> Array:
-    """(r, θ, φ) (..., 3) of points (..., 3): m and rad; NaN where the points are."""
+    """Give the spherical coordinates of contact points.
+
+    Parameters
+    ----------
+    points : array (..., 3)
+        Whisker frame, m.
+
+    Returns
+    -------
+    array (..., 3)
+        r, θ and φ, m and rad; NaN where the points are.
+    """
     x, y, z = np.moveaxis(points, -1, 0)
     away = np.hypot(x, y)
     return np.stack([np.hypot(away, z), np.arctan2(y, x), np.arctan2(z, away)], axis=-1)

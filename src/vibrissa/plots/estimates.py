@@ -33,6 +33,7 @@ def estimated_against_true(
     time: ArrayLike | None = None,
     colour: ArrayLike | None = None,
     colour_name: str = "deflection_angle",
+    known_as: str = "true",
 ) -> Figure:
     """Draw estimated against true r, θ and φ; below, over time: their course, and the error.
 
@@ -46,6 +47,8 @@ def estimated_against_true(
         What colours the points, in SI units: by default the time, if known.
     colour_name : str
         Which quantity ``colour`` is.
+    known_as : str
+        What those that count as true are called on the axes, such as "tracked".
 
     Returns
     -------
@@ -74,7 +77,7 @@ def estimated_against_true(
         look = shading(shade)
         for i, axis in enumerate(_COORDINATES):
             pair = to_display(axis, true[:, i]), to_display(axis, estimated[:, i])
-            dots = _against(panels[0, i], axis, pair, look)
+            dots = against(panels[0, i], axis, pair, look, known_as)
             head(panels[0, i], "abc"[i], quantity(axis).long_name)
             if seconds is not None:
                 _course(panels[1, i], axis, seconds, pair, look)
@@ -136,15 +139,35 @@ def _range(true: Array, estimated: Array) -> Array:
     return np.array([low - room, high + room])
 
 
-def _against(
-    axes: Axes, name: str, pair: tuple[Array, Array], look: dict[str, Any]
+def against(
+    axes: Axes, name: str, pair: tuple[Array, Array], look: dict[str, Any], known_as: str = "true"
 ) -> PathCollection:
+    """Draw an estimated coordinate against the true one.
+
+    Parameters
+    ----------
+    axes : Axes
+        Where to.
+    name : {"r", "theta", "phi"}
+        Which coordinate.
+    pair : tuple of array (n,)
+        True and estimated values, display units, finite.
+    look : dict
+        As of ``Axes.scatter``.
+    known_as : str
+        What the first of the pair is called.
+
+    Returns
+    -------
+    PathCollection
+        The dots.
+    """
     true, estimated = pair
     limits = _range(*pair)
     axes.plot(limits, limits, color=MUTED, linewidth=0.6, zorder=1)
     dots = axes.scatter(true, estimated, s=4.0, zorder=2, **look)
     axes.set(xlim=limits, ylim=limits, aspect="equal")
-    axes.set(xlabel=f"true {axis_label(name)}", ylabel=f"estimated {axis_label(name)}")
+    axes.set(xlabel=f"{known_as} {axis_label(name)}", ylabel=f"estimated {axis_label(name)}")
     outside = int(((estimated < limits[0]) | (estimated > limits[1])).sum())
     if outside:
         _remark(axes, f"{outside} of {true.size} outside")

@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike
 
 from vibrissa.plots.style import MUTED, ORANGE, Array
 
-_CELLS, _DEPTHS = 97, 33
+_CELLS, _STEPS = 121, 300
+_DEEP = 4.0
 _FULL = 0.97
 """Share of a panel from which an object is taken to fill it, so that it is no use drawing it."""
 
@@ -40,13 +41,10 @@ def draw_body(axes: Axes, body: Body, view: tuple[int, int], limits: Array, look
         Filled grey, or dashed.
     """
     i, j = view
-    k = 3 - i - j
     right, up = (np.linspace(limits[n, 0], limits[n, 1], _CELLS) for n in view)
-    points: Array = np.empty((_CELLS, _CELLS, _DEPTHS, 3))
-    points[..., i] = right[None, :, None]
-    points[..., j] = up[:, None, None]
-    points[..., k] = np.linspace(limits[k, 0], limits[k, 1], _DEPTHS)
-    nearest = body.signed_distance(1e-3 * points).min(axis=-1)
+    points: Array = np.empty((_CELLS, _CELLS, 3))
+    points[..., i], points[..., j] = right, up[:, None]
+    nearest = _nearest(body, points.reshape(-1, 3), limits, 3 - i - j).reshape(_CELLS, _CELLS)
     if not 0.0 < np.mean(nearest < 0.0) < _FULL:
         return
     if look == "true":
@@ -56,6 +54,26 @@ def draw_body(axes: Axes, body: Body, view: tuple[int, int], limits: Array, look
     dashes: Any = [(0, (4, 2))]
     lines: dict[str, Any] = {"linewidths": 1.0, "linestyles": dashes, "zorder": 4}
     axes.contour(right, up, nearest, [0.0], colors=[ORANGE], **lines)
+
+
+def _nearest(body: Body, points: Array, limits: Array, depth: int) -> Array:
+    """Least distance from a body along lines of sight through points (n, 3), mm.
+
+    The distance to a body is also how far one may go without meeting it, so few steps lead past it.
+    """
+    start, end = limits[depth]
+    least_step = (end - start) / _STEPS
+    at = np.full(len(points), start)
+    least = np.full(len(points), np.inf)
+    active = np.arange(len(points))
+    while active.size:
+        points[active, depth] = at[active]
+        distance = 1e3 * body.signed_distance(1e-3 * points[active])
+        least[active] = np.minimum(least[active], distance)
+        at[active] += np.maximum(np.abs(distance), least_step)
+        # Inside nothing more is to be known but how deep: as deep as a cell is enough.
+        active = active[(at[active] <= end) & (least[active] > -_DEEP * least_step)]
+    return least
 
 
 def room_for(places: Array, bodies: Sequence[Body], least: float = 1.0) -> Array:

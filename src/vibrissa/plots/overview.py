@@ -1,0 +1,243 @@
+"""A trial at a glance: frames, signals, their way through the solids, estimates (Fig. 4)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike, NDArray
+
+from vibrissa.plots.colours import shading
+from vibrissa.plots.course import TRIPLET, Course, spherical
+from vibrissa.plots.curves import curve_legend, curves_over_time
+from vibrissa.plots.cylinder import Box, signal_places
+from vibrissa.plots.estimates import against
+from vibrissa.plots.sights import Sight, Window, part_of, scale_bar, seen, sight_axes
+from vibrissa.plots.solid_panels import COORDINATES, solid_panels
+from vibrissa.plots.style import (
+    MUTED,
+    ORANGE,
+    RED,
+    Width,
+    box_axes,
+    looking,
+    new_figure,
+    page_width,
+    plain,
+)
+from vibrissa.quantities import axis_label, to_display
+
+_DOTS_PER_MM = 300.0 / 25.4
+_CONTACT: dict[str, Any] = {"facecolor": "#f0e442", "edgecolor": "black", "linewidths": 0.5}
+
+
+class _Sheet(NamedTuple):
+    """Where panels lie, mm."""
+
+    height: float
+    sights: tuple[Box, ...]
+    curves: tuple[Box, ...]
+    legend: float
+    solids: tuple[Box, ...]
+    rails: tuple[Box, ...]
+    against: tuple[Box, ...]
+
+
+def telling_rows(course: Course) -> NDArray[np.intp]:
+    """Choose two frames in contact that tell most of a trial.
+
+    Parameters
+    ----------
+    course : Course
+        Of the trial.
+
+    Returns
+    -------
+    array (2,) of int
+        Rising: where the whisker is bent most, and where most among the contacts to the other
+        side, if there are such, by M_D; without signals at a third and two thirds of the contacts.
+    """
+    rows = np.flatnonzero(course.touching)
+    if not rows.size:
+        return np.array([0, len(course.time) - 1], dtype=np.intp)
+    if course.signals is None:
+        return rows[[rows.size // 3, 2 * rows.size // 3]]
+    size = np.nan_to_num(course.signals["MB"][rows])
+    turn = course.signals["MD"][rows]
+    most = int(np.argmax(size))
+    across = np.cos(turn - turn[most]) < 0.0
+    other = int(np.argmax(np.where(across, size, -1.0))) if across.any() else rows.size // 2
+    return np.sort(rows[[most, other]])
+
+
+def trial_overview(
+    course: Course,
+    samples: xr.Dataset,
+    centerline: ArrayLike,
+    sights: Sequence[Sight] = (),
+    rows: ArrayLike = (),
+    *,
+    width: Width = "double",
+) -> Figure:
+    """Draw a trial: what cameras see, signals and contacts over time, solids, estimates.
+
+    Frames show the traced whisker in red and the contact point. Below the three signals and the
+    coordinates of the contact over time, with contact shaded; the trial's way through the solids of
+    all signals, coloured by r, θ and φ; and, two columns wide only, estimated against known
+    coordinates.
+
+    Parameters
+    ----------
+    course : Course
+        Of the trial, with signals.
+    samples : Dataset
+        ``ContactMap.to_dataset()`` of the whisker.
+    centerline : array_like (k, 3)
+        Of the resting whisker, whisker frame, m.
+    sights : sequence of Sight
+        One or two views, each with an image for each row.
+    rows : array_like (m,) of int
+        Frames of the trial to be shown, one or two, rising.
+    width : {"single", "double"}
+        Columns of the page.
+
+    Returns
+    -------
+    Figure
+        Images, six axes over time in display units, three 3D axes, and scatter plots.
+
+    Raises
+    ------
+    ValueError
+        If the trial has no signals, or there are more than two views or rows.
+    """
+    if course.signals is None:
+        raise ValueError("the trial has no signals: F_x, M_B and M_D are needed")
+    shown = np.asarray(rows, dtype=np.intp).reshape(-1)
+    if len(sights) > 2 or shown.size > 2:
+        raise ValueError(f"{len(sights)} views in {shown.size} frames; two in two can be shown")
+    most = 2 if width == "double" else 1
+    shown = shown[-most:] if sights else shown[:0]
+    compared = width == "double" and course.known is not None and course.estimated is not None
+    sheet = _sheet(width, len(sights) * shown.size, compared)
+    with looking():
+        figure = new_figure(width, sheet.height, None)
+        _images(figure, sheet.sights, course, sights, shown)
+        whole = slice(0, len(course.time))
+        curves = curves_over_time(figure, sheet.curves, course, course.signals, whole)
+        curve_legend(figure, course, (1.0 - 2.0 / page_width(width), sheet.legend / sheet.height))
+        for row in shown:
+            for axes, _ in curves:
+                axes.axvline(float(course.time[row]), color=ORANGE, linewidth=0.6)
+        _way(figure, sheet, course, samples, centerline)
+        if compared:
+            _compared(figure, sheet.against, course)
+        _letters(figure, sheet)
+        return figure
+
+
+def _sheet(width: Width, images: int, compared: bool) -> _Sheet:
+    """Lay the panels out from below."""
+    if width == "double":
+        bottom = 56.0 if compared else 0.0
+        scatter = tuple((14.0 + 55.0 * i, 10.0, 38.0, 38.0) for i in range(3)) if compared else ()
+        solids = tuple((56.0 * i, bottom, 56.0, 46.5) for i in range(3))
+        rails = tuple((56.0 * i + 49.5, bottom + 10.5, 1.6, 22.0) for i in range(3))
+        low = bottom + 59.0
+        curves = tuple(
+            (left, low + 16.5 * (2 - i), 74.0, 14.0) for left in (12.0, 102.0) for i in range(3)
+        )
+        top = low + 47.0
+        legend = top + 1.5
+        wide = (178.0 - 3.0 * 1.5) / 4.0
+        sights = tuple((i * (wide + 1.5), top + 11.5, wide, 34.0) for i in range(images))
+        height = top + (50.5 if images else 7.0)
+    else:
+        solids = ((0.0, 38.0, 42.5, 38.0), (42.5, 38.0, 42.5, 38.0), (0.0, 0.0, 42.5, 38.0))
+        rails = tuple((48.0, 32.0 - 12.0 * i, 32.0, 1.6) for i in range(3))
+        scatter = ()
+        low = 86.5
+        # All six share one axis of time.
+        curves = tuple((12.0, low + 13.0 * (5 - i), 71.0, 11.0) for i in range(6))
+        top = low + 76.0
+        legend = top + 1.5
+        sights = tuple((i * 43.25, top + 11.5, 41.75, 34.0) for i in range(images))
+        height = top + (50.5 if images else 7.0)
+    return _Sheet(height, sights, curves, legend, solids, rails, scatter)
+
+
+def _images(
+    figure: Figure,
+    boxes: Sequence[Box],
+    course: Course,
+    sights: Sequence[Sight],
+    rows: NDArray[np.intp],
+) -> None:
+    """Frame by frame all views."""
+    views = [sight.view for sight in sights]
+    streams = [iter(sight.images) for sight in sights]
+    places = iter(boxes)
+    for count, row in enumerate(rows):
+        for number, (view, stream) in enumerate(zip(views, streams, strict=True)):
+            box = next(places)
+            lines, dots = seen(course, views, number)
+            low, high = part_of(lines[course.touching], box[2:], view.size)
+            axes = sight_axes(figure, box, low, high)
+            panel = round(box[2] * _DOTS_PER_MM), round(box[3] * _DOTS_PER_MM)
+            part = Window(low, high, view.size, panel).of(next(stream))
+            extent = (low[0], high[0], high[1], low[1])
+            axes.imshow(part, cmap="gray", vmin=0, vmax=255, extent=extent, aspect="auto")
+            axes.plot(*lines[row].T, color=RED, linewidth=0.8)
+            axes.scatter(dots[row, 0], dots[row, 1], 9.0, zorder=5, **_CONTACT)
+            when = f"{to_display('time', course.time[row]):.3f} s"
+            axes.set_title(f"{view.name}, {when}", loc="right", fontsize=6.5, pad=2.0)
+            if count == 0:
+                scale_bar(axes, course, view)
+
+
+def _way(
+    figure: Figure, sheet: _Sheet, course: Course, samples: xr.Dataset, centerline: ArrayLike
+) -> None:
+    """Solids, and the way of the trial through them."""
+    assert course.signals is not None
+    felt = np.stack([course.signals[name] for name in TRIPLET], axis=1)
+    felt[~course.touching] = np.nan
+    way = signal_places(*felt.T)
+    for axes in solid_panels(figure, samples, centerline, sheet.solids, sheet.rails, felt):
+        axes.plot(*way.T, color=ORANGE, linewidth=0.7, zorder=12)
+
+
+def _compared(figure: Figure, boxes: Sequence[Box], course: Course) -> None:
+    """Estimated against known coordinates, coloured by time."""
+    assert course.known is not None
+    assert course.estimated is not None
+    known, estimated = spherical(course.known), spherical(course.estimated)
+    rows = np.isfinite(known).all(axis=1) & np.isfinite(estimated).all(axis=1)
+    if not rows.any():
+        figure.text(0.5, 0.5 * boxes[0][3] / boxes[0][1], "no contacts", color=MUTED, ha="center")
+        return
+    look = shading(to_display("time", course.time[rows]))
+    for i, (name, box) in enumerate(zip(COORDINATES, boxes, strict=True)):
+        pair = to_display(name, known[rows, i]), to_display(name, estimated[rows, i])
+        dots = against(box_axes(figure, box), name, pair, look, course.known_as)
+    left, bottom, wide, tall = boxes[-1]
+    rail = box_axes(figure, (left + wide + 2.5, bottom, 1.8, 0.6 * tall))
+    plain(figure.colorbar(dots, cax=rail, label=axis_label("time")))
+
+
+def _letters(figure: Figure, sheet: _Sheet) -> None:
+    """Bold letters, row by row."""
+    wide, tall = 25.4 * figure.get_size_inches()
+    rows = [
+        [(box[0], box[1] + box[3] + 1.0) for box in sheet.sights[:1]],
+        [(0.0, sheet.curves[0][1] + sheet.curves[0][3] + 1.5)],
+        [(box[0], box[1] + box[3] - 2.5) for box in sheet.solids],
+        [(box[0] - 11.0, box[1] + box[3] + 3.0) for box in sheet.against],
+    ]
+    places = [place for row in rows for place in row]
+    for letter, (x, y) in zip("abcdefghij", places, strict=False):
+        place = (max(x, 0.0) + 1.0) / wide, y / tall
+        figure.text(*place, letter, fontsize=8.0, fontweight="bold", va="bottom")

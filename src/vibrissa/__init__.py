@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from vibrissa.display import show
     from vibrissa.io import load_array, load_whisker
     from vibrissa.mapping import (
+        ContactFilter,
         ContactMap,
         Estimate,
         Estimator,
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
+    "ContactFilter",
     "ContactMap",
     "Deflection",
     "Estimate",
@@ -62,6 +64,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "ContactFilter": "vibrissa.mapping",
     "ContactMap": "vibrissa.mapping",
     "Deflection": "vibrissa.rod",
     "Estimate": "vibrissa.mapping",

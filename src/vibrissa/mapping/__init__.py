@@ -6,6 +6,7 @@ from vibrissa.mapping.contact_map import ContactMap
 from vibrissa.mapping.estimate import Estimate
 from vibrissa.mapping.estimator import Estimator, Located
 from vibrissa.mapping.findings import sensitivity_findings
+from vibrissa.mapping.following import ContactFilter, Followed
 from vibrissa.mapping.lookup import LookupTable
 from vibrissa.mapping.natural import NaturalNeighbour
 from vibrissa.mapping.network import NetworkSolver, train_network
@@ -16,9 +17,11 @@ from vibrissa.mapping.verdicts import uniqueness
 from vibrissa.mapping.wrench import WrenchEstimate, estimate_from_wrench
 
 __all__ = [
+    "ContactFilter",
     "ContactMap",
     "Estimate",
     "Estimator",
+    "Followed",
     "Located",
     "LookupTable",
     "NaturalNeighbour",

@@ -43,6 +43,8 @@ if TYPE_CHECKING:
 # A contact moves no farther than this (over L) from one measurement to the next.
 _NEAR = 0.02
 _UNKNOWNS = 3
+# Fits end within this (over L, and relative to the force) of a minimum that a fold makes flat.
+_FLAT = 0.02
 # Unknowns of a contact without friction, among all.
 _FREE = [0, 2, 3]
 # Components that together are signals; a sensor that reads these reads signals by name.
@@ -77,6 +79,8 @@ class Located(NamedTuple):
         Base forces of the candidates, whisker frame, N.
     covariances : (k, 3, 3) array
         Covariances of all candidates, m²; NaN without noise.
+    contact_forces : (k, 3) array
+        Forces in the material frame at the contacts (tangent, d1, d2), N; the first is 0.
     """
 
     point: Array
@@ -88,6 +92,19 @@ class Located(NamedTuple):
     continuing: int
     forces: Array
     covariances: Array
+    contact_forces: Array
+
+
+class Explanations(NamedTuple):
+    """Contacts that explain one measurement about as well as noise allows, non-dimensional.
+
+    Contacts x (n, 4), (F, p) (n, 6), covariances (n, 3, 3), NaN where not determined, and χ² (n,).
+    """
+
+    contacts: Array
+    values: Array
+    covariances: Array
+    misfits: Array
 
 
 class Estimator:
@@ -106,6 +123,9 @@ class Estimator:
     stiffness_sigma : float
         Relative standard deviation of the whisker's bending stiffness E r⁴, in the covariances:
         √(σ_E² + 16 σ_r²) of those of modulus and radius. It needs noise.
+    felt_above : float
+        Signals within so many standard deviations of zero are ``NO_CONTACT``; 0, the default,
+        locates all. It needs noise.
 
     See Also
     --------
@@ -118,16 +138,23 @@ class Estimator:
         triplet: str | Sequence[str] = ("Fx", "MB", "MD"),
         noise: Mapping[str, float] | ArrayLike | None = None,
         stiffness_sigma: float = 0.0,
+        felt_above: float = 0.0,
     ) -> None:
         names = selection(triplet, least=1)
         order = triplet.replace(",", " ").split() if isinstance(triplet, str) else list(triplet)
         sensor = sensor_noise(noise, names, stiffness_sigma)
         self._order: list[int] | None = [order.index(name) for name in names]
-        self._start(contacts, Named(contacts, names, sensor), len(names))
+        if felt_above > 0.0 and sensor is None:
+            raise ValueError("what is felt is judged by the noise, and there is none")
+        self._start(contacts, Named(contacts, names, sensor), len(names), felt_above)
 
     @classmethod
     def of_sensor(
-        cls, contacts: ContactMap, sensor: Sensor, stiffness_sigma: float = 0.0
+        cls,
+        contacts: ContactMap,
+        sensor: Sensor,
+        stiffness_sigma: float = 0.0,
+        felt_above: float = 0.0,
     ) -> Estimator:
         """Locate contacts from a sensor's raw readings.
 
@@ -139,6 +166,8 @@ class Estimator:
             What it reads, how it is mounted and its noise; offset and weight are taken away.
         stiffness_sigma : float
             Relative standard deviation of the whisker's bending stiffness.
+        felt_above : float
+            Readings within so many standard deviations of zero are ``NO_CONTACT``; 0 locates all.
 
         Returns
         -------
@@ -160,30 +189,37 @@ class Estimator:
             raise ValueError("the sensor's channels read nothing of force and moment")
         readout = _by_name(contacts, h, covariance, stiffness_sigma)
         out._order = None
-        out._start(contacts, readout, len(sensor.channels))
+        out._start(contacts, readout, len(sensor.channels), felt_above)
         out._sensor = sensor
         return out
 
-    def _start(self, contacts: ContactMap, readout: _ByName | Named | Mixed, width: int) -> None:
+    def _start(
+        self,
+        contacts: ContactMap,
+        readout: _ByName | Named | Mixed,
+        width: int,
+        felt_above: float,
+    ) -> None:
+        self.felt_above = float(felt_above)
         self._sensor: Sensor | None = None
         self._components = readout if isinstance(readout, _ByName) else None
-        self._readout = readout.named if isinstance(readout, _ByName) else readout
+        self.readout = readout.named if isinstance(readout, _ByName) else readout
         self._width = width
-        self._contacts, self._chart = contacts, contacts.chart
-        told = self._readout.told
-        self._ambiguity = Ambiguity(contacts.chart, self._readout) if told < _UNKNOWNS else None
-        named = isinstance(self._readout, Named)
+        self.contacts, self._chart = contacts, contacts.chart
+        told = self.readout.told
+        self._ambiguity = Ambiguity(contacts.chart, self.readout) if told < _UNKNOWNS else None
+        named = isinstance(self.readout, Named)
         self._determining = told < _UNKNOWNS or not named or contacts.determines(self.names)
-        self._limit = explained(independent(contacts, self._readout) - _UNKNOWNS)
+        self._limit = explained(independent(contacts, self.readout) - _UNKNOWNS)
         self._length = self._chart.discretization.length
-        sensor = self._readout.sensor if isinstance(self._readout, Named) else None
-        self._noisy = sensor is not None or not named
+        sensor = self.readout.sensor if isinstance(self.readout, Named) else None
+        self.noisy = sensor is not None or not named
         self.reset()
 
     @property
     def names(self) -> tuple[str, ...]:
         """Signals that contacts are found from, in canonical order; none of a mix of components."""
-        return self._readout.names if isinstance(self._readout, Named) else ()
+        return self.readout.names if isinstance(self.readout, Named) else ()
 
     def reset(self) -> None:
         """Forget the measurement before, as when the whisker has lost touch."""
@@ -218,6 +254,30 @@ class Estimator:
             If there are not as many numbers as signals were announced, a size is negative, an
             angle is more than a full turn, or the rotation is needed but not given.
         """
+        return self.locate(self.measurement(signals, rotation, gravity))
+
+    def measurement(
+        self,
+        signals: ArrayLike,
+        rotation: ArrayLike | None = None,
+        gravity: ArrayLike = GRAVITY,
+    ) -> Measurement:
+        """Check one measurement and make it non-dimensional; as for calling the estimator.
+
+        Parameters
+        ----------
+        signals : (k,) array_like
+            The signals or readings.
+        rotation : (3, 3) array_like, optional
+            From the whisker's to the laboratory frame.
+        gravity : (3,) array_like
+            In the laboratory frame, m/s².
+
+        Returns
+        -------
+        Measurement
+            For `locate`; NaN for what is missing.
+        """
         try:
             values = np.asarray(signals, dtype=np.float64)
         except (TypeError, ValueError) as error:
@@ -232,25 +292,95 @@ class Estimator:
                 values = self._components.signals(values)
         elif self._order is not None:
             values = values[self._order]
-        measurement = self._readout.scaled(values)
-        if not np.isfinite(measurement.measured).all():
-            self.reset()
-            return self._nowhere(Status.MISSING)
-        if not self._determining:
-            return self._nowhere(Status.DEGENERATE)
+        return self.readout.scaled(values)
+
+    def locate(self, measurement: Measurement) -> Located:
+        """Locate one measurement.
+
+        Parameters
+        ----------
+        measurement : Measurement
+            Of `measurement`.
+
+        Returns
+        -------
+        Located
+            The contact, all candidates, and the status.
+        """
+        nothing = self.nothing_in(measurement)
+        if nothing is not None:
+            return self._nowhere(nothing)
         if self._ambiguity is not None:
             return self._set(measurement, self._ambiguity)
         if len(self.names) == _UNKNOWNS:
             return self._by_triplet(measurement)
         return self._by_least_squares(measurement)
 
+    def nothing_in(self, measurement: Measurement) -> Status | None:
+        """Why a measurement is not worth a search: ``MISSING``, ``NO_CONTACT``, ``DEGENERATE``.
+
+        Parameters
+        ----------
+        measurement : Measurement
+            Of `measurement`.
+
+        Returns
+        -------
+        Status or None
+            None where it is worth one.
+        """
+        if not np.isfinite(measurement.measured).all():
+            return Status.MISSING
+        if self.felt_above > 0.0 and not self.readout.felt(measurement, self.felt_above):
+            return Status.NO_CONTACT
+        return None if self._determining else Status.DEGENERATE
+
+    def explanations(self, measurement: Measurement) -> Explanations:
+        """All minima of χ² that noise may explain: also those that miss the measurement a little.
+
+        Three signals with noise may lie where no contact is, just across a fold from the true one.
+
+        Parameters
+        ----------
+        measurement : Measurement
+            Of three signals or more.
+
+        Returns
+        -------
+        Explanations
+            Found from all parts of the map; a millisecond.
+        """
+        readout, chart = self.readout, self._chart
+        nodes = readout.nearest(measurement)
+        exact, _ = readout.seeds(measurement)
+        starts = np.concatenate([exact, chart.contacts.reshape(-1, 3)[nodes]])
+        fits, inside = self._fitted(measurement, starts, None)
+        limit = explained(len(readout.how.own))
+        kept: list[int] = []
+        for row in np.argsort(fits.misfits).tolist():
+            x = fits.contacts[row]
+            good = inside[row] and fits.misfits[row] <= limit
+            if good and not any(_close(x, fits.contacts[other]) for other in kept):
+                kept.append(row)
+        some = Fits(*(part[kept] for part in fits))
+        covariances = np.full((len(kept), 3, 3), np.nan)
+        spread(
+            readout.how,
+            measurement.measured,
+            some.contacts[:, _FREE],
+            some.values,
+            some.tangents[:, :, _FREE],
+            covariances,
+        )
+        return Explanations(some.contacts, some.values, covariances, some.misfits)
+
     def _by_triplet(self, measurement: Measurement) -> Located:
-        xi, values = self._readout.seeds(measurement)
+        xi, values = self.readout.seeds(measurement)
         assert values is not None
         if len(xi) < self._number and not self._follows(values):
             xi, values = self._followed(measurement.measured[None], xi, values)
         if not len(xi):
-            why, misfit = why_none(self._contacts, self.names, measurement.measured[None])
+            why, misfit = why_none(self.contacts, self.names, measurement.measured[None])
             return self._nowhere(Status(int(why[0])), float(misfit[0]))
         status = Status.UNIQUE if len(xi) == 1 else Status.AMBIGUOUS
         return self._located(measurement, xi, values, status, 0.0)
@@ -273,11 +403,11 @@ class Estimator:
         return xi[order], values[order]
 
     def _by_least_squares(self, measurement: Measurement) -> Located:
-        if self._readout.nothing(measurement):
+        if self.readout.nothing(measurement):
             return self._nowhere(Status.DEGENERATE)
-        if self._readout.beyond(measurement):
+        if self.readout.beyond(measurement):
             return self._nowhere(Status.OUTSIDE_MAP)
-        starts, values = self._readout.seeds(measurement)
+        starts, values = self.readout.seeds(measurement)
         if self._last is not None:
             starts = np.concatenate([starts, self._last[0][None]])
             if values is not None:
@@ -300,7 +430,7 @@ class Estimator:
             x, np.array(values), np.zeros((n, 6, 4)), np.full(n, np.inf), np.ones(n, np.bool_)
         )
         inside = np.zeros(n, np.bool_)
-        readout = self._readout
+        readout = self.readout
         explain(
             chart.discretization.rod,
             chart.fold,
@@ -320,10 +450,10 @@ class Estimator:
 
     def _searched(self, measurement: Measurement) -> Located:
         """Nothing explains it: look everywhere, and find out why."""
-        if isinstance(self._readout, Named):
-            named = self._readout
+        if isinstance(self.readout, Named):
+            named = self.readout
             found, statuses = least_squares(
-                self._contacts, named.names, measurement.measured[None], named.sensor
+                self.contacts, named.names, measurement.measured[None], named.sensor
             )
             n = int(found.number[0])
             return self._located(
@@ -333,7 +463,7 @@ class Estimator:
                 Status(int(statuses[0])),
                 float(found.misfits[0, 0]),
             )
-        nodes = self._readout.nearest(measurement)
+        nodes = self.readout.nearest(measurement)
         starts = self._chart.contacts.reshape(-1, 3)[nodes]
         fits, inside = self._fitted(measurement, starts, None)
         good = fits.misfits <= self._limit
@@ -372,12 +502,12 @@ class Estimator:
 
     def _set(self, measurement: Measurement, ambiguity: Ambiguity) -> Located:
         """Samples of the curve or surface of contacts that explain fewer than three signals."""
-        if self._readout.nothing(measurement):
+        if self.readout.nothing(measurement):
             return self._nowhere(Status.DEGENERATE)
         found = ambiguity.samples(measurement)
         if not len(found.contacts):
             return self._nowhere(
-                Status.OUTSIDE_MAP if self._readout.beyond(measurement) else Status.NOT_FRICTIONLESS
+                Status.OUTSIDE_MAP if self.readout.beyond(measurement) else Status.NOT_FRICTIONLESS
             )
         points = found.values[:, 3:] * self._length
         middle = int(np.argmin(((points - points.mean(axis=0)) ** 2).sum(axis=1)))
@@ -391,11 +521,12 @@ class Estimator:
             Status.UNDERDETERMINED,
             points,
             found.contacts[:, 0] * self._length,
-            covariance if self._noisy else np.full((3, 3), np.nan),
+            covariance if self.noisy else np.full((3, 3), np.nan),
             0.0,
             middle,
             found.values[:, :3] * d.force,
-            local if self._noisy else np.full_like(local, np.nan),
+            local if self.noisy else np.full_like(local, np.nan),
+            found.contacts[:, 1:] * d.force,
         )
 
     def _nowhere(self, status: Status, misfit: float = np.nan) -> Located:
@@ -411,6 +542,7 @@ class Estimator:
             0,
             np.empty((0, 3)),
             np.empty((0, 3, 3)),
+            np.empty((0, 3)),
         )
 
     def _located(
@@ -440,6 +572,7 @@ class Estimator:
             continuing,
             values[:, :3] * self._chart.discretization.force,
             covariances,
+            _with_normal_force(xi)[:, 1:] * self._chart.discretization.force,
         )
 
     def _covariances(
@@ -448,12 +581,12 @@ class Estimator:
         """Of candidates, m²."""
         n, d = len(xi), self._chart.discretization
         out = np.full((n, 3, 3), np.nan)
-        if not self._noisy:
+        if not self.noisy:
             return out
         if tangents is None:
             tangents = np.empty((n, 6, 3))
             evaluate(d.rod, _with_normal_force(xi), np.empty((n, 6)), tangents, 0, n)
-        readout = self._readout
+        readout = self.readout
         if not spread(readout.how, measurement.measured, xi, values, tangents, out):
             assert isinstance(readout, Named)
             assert readout.sensor is not None
@@ -466,6 +599,13 @@ def _with_normal_force(xi: Array) -> Array:
     out = np.zeros((len(xi), 4))
     out[:, _FREE] = xi
     return out
+
+
+def _close(a: Array, b: Array) -> bool:
+    """Whether two minima are one: where a fold makes them flat, fits end a little apart."""
+    force = max(float(np.hypot(a[2], a[3])), float(np.hypot(b[2], b[3])))
+    apart = float(np.hypot(a[2] - b[2], a[3] - b[3]))
+    return abs(float(a[0] - b[0])) < _FLAT and apart < _FLAT * force
 
 
 def _those(fits: Fits, rows: AnyArray) -> Fits:

@@ -16,7 +16,7 @@ from vibrissa.mapping.channels import CHANNELS, FITTED, WRENCH, Channels
 from vibrissa.mapping.estimate import check_signals
 from vibrissa.mapping.explanation import Bounds
 from vibrissa.mapping.inversion import MOST_CANDIDATES, _invert
-from vibrissa.mapping.least_squares import constant_weights, seeding_triplet
+from vibrissa.mapping.least_squares import constant_weights, nearest_nodes, seeding_triplet
 from vibrissa.mapping.noise import SensorNoise
 from vibrissa.mapping.weighing import Weighing, tree_seeds
 from vibrissa.mapping.whitening import TRUSTED, rank
@@ -58,6 +58,7 @@ class Named:
     ) -> None:
         chart = contacts.chart
         d = chart.discretization
+        self._chart = chart
         self.names, self.sensor, self.channels = names, sensor, Channels.of(names)
         self.scale = signal_scales(names, d.force, d.moment)
         self._pairs = self.channels.pairs()
@@ -68,15 +69,30 @@ class Named:
         self.how = _weighing(self.channels, sensor, d.force, d.moment, self.scale)
         self.passes = 1 if constant_weights(self.channels, sensor) else 2
         self.told = len(names)
+        self._noise = [] if sensor is None else self._deviations(sensor)
         if len(names) >= 3:
             three = names if len(names) == 3 else seeding_triplet(chart, names)
-            self._chart, self._tree = chart, contacts.tree(three).tree
+            self._tree = contacts.tree(three).tree
             self._where = [names.index(name) for name in three]
             self._row = np.zeros((1, 6))
             self._row[0, 3:] = [SIGNALS.index(name) for name in three]
             self._number = np.zeros(1, np.int64)
             self._found = np.full((1, MOST_CANDIDATES, 3), np.nan)
             self._values = np.full((1, MOST_CANDIDATES, 6), np.nan)
+
+    def _deviations(self, sensor: SensorNoise) -> list[tuple[int, float]]:
+        """Standard deviations of signals that are no directions, where nothing is felt."""
+        out = []
+        for i in self._straight:
+            name, scale = self.names[i], float(self.scale[i])
+            if sensor.deviations is not None:
+                sigma = sensor.deviations[name]
+            else:
+                assert sensor.wrench is not None
+                parts = {"Fx": [0], "FT": [1, 2], "Mx": [3], "MB": [4, 5]}[name]
+                sigma = float(np.sqrt(np.diag(sensor.wrench)[parts].mean()))
+            out.append((i, sigma / scale))
+        return out
 
     def scaled(self, values: Array) -> Measurement:
         """Check one measurement (k,), SI units, and make it non-dimensional; NaN stays NaN."""
@@ -98,6 +114,11 @@ class Named:
     def nothing(self, measurement: Measurement) -> bool:
         """Whether the whisker touches nothing."""
         return bool(self._straight) and not measurement.measured[self._straight].any()
+
+    def felt(self, measurement: Measurement, above: float) -> bool:
+        """Whether a signal other than a direction is so many standard deviations from zero."""
+        values = measurement.measured.tolist()
+        return any(abs(values[i]) > above * sigma for i, sigma in self._noise)
 
     def beyond(self, measurement: Measurement) -> bool:
         """Whether the signals are far larger than any on the map."""
@@ -123,6 +144,11 @@ class Named:
         )
         n = int(self._number[0])
         return self._found[0, :n].copy(), self._values[0, :n].copy()
+
+    def nearest(self, measurement: Measurement) -> IntArray:
+        """Nodes of the chart that come nearest, one in each of sixteen parts."""
+        nodes = nearest_nodes(self._chart, self.channels, measurement.measured[None])[0]
+        return np.asarray(nodes[nodes >= 0])
 
 
 class Mixed:
@@ -200,6 +226,11 @@ class Mixed:
     def nothing(self, measurement: Measurement) -> bool:
         """Whether the whisker touches nothing."""
         return not measurement.measured.any()
+
+    def felt(self, measurement: Measurement, above: float) -> bool:
+        """Whether all readings together are so many standard deviations from zero."""
+        size = float((measurement.measured**2).sum())
+        return size > len(measurement.measured) - 1 + above**2
 
     def beyond(self, measurement: Measurement) -> bool:
         """Whether the readings are far larger than any on the map."""

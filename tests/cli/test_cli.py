@@ -13,7 +13,8 @@ from vibrissa.cli.app import app, main
 from vibrissa.cli.terminal import fixed, numbers, shown
 from vibrissa.io import load_contacts, save_centerline, save_signals
 
-VERBS = ("demo", "deflect", "map", "uniqueness", "sensitivity", "estimate", "figures", "info")
+VERBS = ("demo", "deflect", "map", "uniqueness", "sensitivity", "signals", "estimate")
+VERBS += ("reconstruct", "figures", "info")
 
 
 def run(*arguments):

@@ -12,7 +12,9 @@ from vibrissa.cli import (
     bend,
     calibrating,
     charting,
+    contouring,
     correcting,
+    feeling,
     figures,
     filming,
     information,
@@ -48,7 +50,9 @@ app.command("track")(tracking.track)
 app.command("correct")(correcting.correct)
 app.command("calibrate")(calibrating.calibrate)
 app.command("sensitivity")(sensing.sensitivity)
+app.command("signals")(feeling.signals)
 app.command("estimate")(locating.estimate)
+app.command("reconstruct")(contouring.reconstruct)
 app.command("figures")(figures.figures)
 app.command("view")(viewing.view)
 app.command("movie")(filming.movie)

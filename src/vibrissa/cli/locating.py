@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from vibrissa.cli.terminal import errors, output, progress_bars, shown
+from vibrissa.cli.terminal import Tell, progress_bars, shown
 
 if TYPE_CHECKING:
-    from xarray import Dataset
+    from collections.abc import Sequence
 
-    from vibrissa.mapping import ContactMap
+    import xarray as xr
+
     from vibrissa.rod.arrays import Array
     from vibrissa.whisker import Whisker
 
@@ -21,27 +22,36 @@ def estimate(
     signals: Annotated[
         Path,
         typer.Argument(
-            help="Table with time, Fx, Fy, Fz, Mx, My, Mz in SI units, or a recording.",
+            help="A recording, .nc; or a table with time, Fx, Fy, Fz, Mx, My, Mz in SI units.",
             metavar="SIGNALS",
         ),
     ],
-    chart: Annotated[
-        Path | None,
-        typer.Option("--map", help="Of the whisker; simulated if not given.", metavar="FILE"),
+    charts: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--map",
+            help="Of the whisker (of several: one for each, in their order); simulated if not "
+            "given.",
+            metavar="FILE",
+        ),
     ] = None,
     whisker: Annotated[
         Path | None,
-        typer.Option(help="Centreline as CSV, where no map is given.", metavar="FILE"),
+        typer.Option(
+            help="Centreline as CSV, where no map is given and it is not that of the recording.",
+            metavar="FILE",
+        ),
     ] = None,
     triplet: Annotated[
-        str,
+        str | None,
         typer.Option(
             "--signals",
             "--triplet",
-            help="The signals to use, three or more of Fx, FT, FD, Mx, MB, MD.",
+            help="The signals to use, three or more of Fx, FT, FD, Mx, MB, MD; by default "
+            "Fx,MB,MD, but of signals of the rod --wrench.",
             metavar="A,B,C",
         ),
-    ] = "Fx,MB,MD",
+    ] = None,
     method: Annotated[
         str,
         typer.Option(
@@ -57,11 +67,21 @@ def estimate(
         ),
     ] = False,
     force_noise: Annotated[
-        float, typer.Option(help="Standard deviation of a force component, µN.", min=0.0)
-    ] = 1.0,
+        float | None,
+        typer.Option(
+            help="Standard deviation of a force component, µN; by default what the recording says, "
+            "or 1.",
+            min=0.0,
+        ),
+    ] = None,
     moment_noise: Annotated[
-        float, typer.Option(help="Standard deviation of a moment component, µN·m.", min=0.0)
-    ] = 0.02,
+        float | None,
+        typer.Option(
+            help="Standard deviation of a moment component, µN·m; by default what the recording "
+            "says, or 0.02.",
+            min=0.0,
+        ),
+    ] = None,
     noise: Annotated[
         Path | None,
         typer.Option(
@@ -71,53 +91,230 @@ def estimate(
         ),
     ] = None,
     path: Annotated[
-        Path, typer.Option("--output", "-o", help="The contacts, CSV.", metavar="FILE")
-    ] = Path("contacts.csv"),
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            help="Where a recording goes with the contacts added, .nc, by default to where it is; "
+            "or the contacts as a table, .csv, by default contacts.csv.",
+            metavar="FILE",
+        ),
+    ] = None,
 ) -> None:
-    """Find the contact point for each row of signals, with its uncertainty.
+    """Find the contact point in each frame or row of signals, with its uncertainty.
 
     From three signals all contacts that give them exactly, from more by least squares; with
-    --wrench whatever the friction, and no map is needed. Rows in which nothing is felt (M_B within
-    five standard deviations of zero) have the status no_contact.
+    --wrench whatever the friction, and no map is needed. Where nothing is felt (M_B within five
+    standard deviations of zero) the status is no_contact. To a recording they are added as a group
+    `estimates`, in the laboratory too, where continuity tells which of several contacts it was;
+    signals are made first where there are none (see `vibrissa signals`), and a contour that was
+    made of other contacts is left out. A table goes to a table.
     Example: `vibrissa estimate signals.csv --map map.nc --signals Fx,FT,MB,MD -o contacts.csv`
     """
-    from vibrissa.cli.sources import wrench_from
-    from vibrissa.io import save_contacts
-    from vibrissa.io.paths import CSV, check_writable
-    from vibrissa.pipeline import contact_columns, locate, locate_from_wrench
-    from vibrissa.signals import selection
-    from vibrissa.status import describe
+    from vibrissa.cli.recordings import is_recording, noise_from
+    from vibrissa.io.paths import CSV, NETCDF, check_writable
 
-    check_writable(path, CSV)
-    names = selection(triplet)
-    _check_method(method, names, all_six)
-    covariance, said = _noise(noise, force_noise, moment_noise)
-    wrench, carried = wrench_from(signals)
+    recorded = is_recording(signals)
+    if path is None:
+        path = signals if recorded else Path("contacts.csv")
+    check_writable(path, (*NETCDF, *CSV) if recorded else CSV)
+    how = how_to(triplet, method, all_six, charts, whisker)
+    sigma = noise_from(noise, force_noise, moment_noise)
+    if recorded:
+        _from_recording(signals, path, how, sigma)
+    else:
+        _from_table(signals, path, how, sigma)
+
+
+class How(NamedTuple):
+    """By which signals, by which method, whole or not, on which maps or of which whisker."""
+
+    names: tuple[str, ...] | None
+    method: str
+    all_six: bool
+    charts: tuple[Path, ...]
+    whisker: Path | None
+
+    @property
+    def grid(self) -> bool:
+        """Whether the paper's grid is looked up in."""
+        return self.method.startswith("lookup")
+
+    def used(self, names: str) -> str:
+        """Say by which signals."""
+        by = "" if self.method == "exact" else f" by {self.method}"
+        if names == "wrench":
+            return "force and moment whole"
+        return f"signals ({', '.join(names.split())}){by}"
+
+
+def how_to(
+    triplet: str | None,
+    method: str,
+    all_six: bool,
+    charts: Sequence[Path] | None,
+    whisker: Path | None,
+) -> How:
+    """Read how to estimate from options of the command line.
+
+    Parameters
+    ----------
+    triplet : str or None
+        Names of signals; None for the default.
+    method : str
+        As of ``ContactMap.estimate``.
+    all_six : bool
+        Whether force and moment are used whole.
+    charts : sequence of Path or None
+        Maps.
+    whisker : Path or None
+        A whisker.
+
+    Returns
+    -------
+    How
+        Checked.
+
+    Raises
+    ------
+    ValueError
+        If options do not go together.
+    """
+    from vibrissa.pipeline import TRIPLET
+    from vibrissa.signals import selection
+
+    names = None if triplet is None else selection(triplet)
+    _check_method(method, names or TRIPLET, all_six)
+    if charts and whisker is not None:
+        raise ValueError("give either --map or --whisker: a map already has its whisker")
+    return How(names, method, all_six, tuple(charts or ()), whisker)
+
+
+def _from_table(signals: Path, path: Path, how: How, noise: tuple[Array, str] | None) -> None:
+    """Contacts in the whisker's frame, as a table."""
+    from vibrissa.cli.recordings import (
+        maps_from,
+        maps_of,
+        noise_from,
+        say,
+        tell_statuses,
+        tell_written,
+    )
+    from vibrissa.cli.sources import whisker_from, wrench_from
+    from vibrissa.io import save_contacts
+    from vibrissa.pipeline import TRIPLET, contact_columns, locate, locate_from_wrench
+    from vibrissa.sensing import FORCE_NOISE
+
+    covariance, said = noise or noise_from(None, FORCE_NOISE * 1e6, None) or (None, "")
+    wrench, _ = wrench_from(signals)
+    maps = maps_from(how.charts, 1, how.grid) if how.charts else []
+    known = maps[0].whisker if maps else whisker_from(how.whisker)
+    _check_scale(signals, wrench, known)
     with progress_bars() as tell:
-        if all_six:
-            touched = _whisker(chart, whisker, carried)
-            _check_scale(signals, wrench, touched)
-            tell("contact points", 0, 1)
-            found = locate_from_wrench(touched, wrench, covariance)
+        if not maps and not how.all_six:
+            maps = maps_of([known], tell, how.grid)
+        tell("contact points", 0, 1)
+        if how.all_six:
+            found = locate_from_wrench(known, wrench, covariance)
         else:
-            contacts = _map(chart, whisker, carried, tell, grid=method.startswith("lookup"))
-            _check_scale(signals, wrench, contacts.whisker)
-            tell("contact points", 0, 1)
-            found = locate(contacts, wrench, names, noise=covariance, method=method)
+            found = locate(
+                maps[0], wrench, how.names or TRIPLET, noise=covariance, method=how.method
+            )
         tell("contact points", 1, 1)
     save_contacts(path, contact_columns(found))
-    used = "force and moment whole" if all_six else f"signals ({', '.join(names)})"
-    if method != "exact":
-        used += f" by {method}"
-    errors.print(
-        f"{used}; {said}; "
-        f"contacts are felt where M_B exceeds {shown('MB', found.attrs['felt_above'])}",
-        highlight=False,
-        soft_wrap=True,
+    felt = shown("MB", found.attrs["felt_above"])
+    used = how.used("wrench" if how.all_six else found.attrs["triplet"])
+    say(f"{used}; {said}; contacts are felt where M_B exceeds {felt}")
+    tell_statuses(found["status"].values)
+    tell_written(path)
+
+
+def _from_recording(signals: Path, path: Path, how: How, noise: tuple[Array, str] | None) -> None:
+    """Contacts added to a recording, or as a table."""
+    from vibrissa.cli.feeling import described
+    from vibrissa.cli.recordings import recording_from, say, tell_statuses, tell_written
+    from vibrissa.io import save_contacts, save_recording
+    from vibrissa.io.paths import CSV
+    from vibrissa.pipeline import contact_columns
+
+    tree = recording_from(signals)
+    table = path.suffix.lower() in CSV
+    if table and tree.sizes["whisker"] != 1:
+        raise ValueError(
+            f"{signals} is a recording of {tree.sizes['whisker']} whiskers; a table has the "
+            "contacts of one: give an --output that ends in .nc"
+        )
+    with progress_bars() as tell:
+        done, said = estimated(tree, how, noise, tell, str(signals))
+    say(f"{described(done)}; {said}")
+    found = done["estimates"].to_dataset()
+    tell_statuses(found["status"].values)
+    if table:
+        save_contacts(path, contact_columns(found.isel(whisker=0)))
+    else:
+        save_recording(path, done)
+    tell_written(path)
+
+
+def estimated(
+    tree: xr.DataTree, how: How, noise: tuple[Array, str] | None, tell: Tell, name: str
+) -> tuple[xr.DataTree, str]:
+    """Add contacts to a recording, and signals where there are none.
+
+    Parameters
+    ----------
+    tree : DataTree
+        The recording.
+    how : How
+        By which signals and maps.
+    noise : tuple or None
+        Covariance of (F, M) and how it was given; by default what the recording says.
+    tell : callable
+        Of progress.
+    name : str
+        Of the file, for messages.
+
+    Returns
+    -------
+    tree : DataTree
+        With signals and contacts.
+    said : str
+        How they were estimated.
+    """
+    from vibrissa.cli.feeling import signal_options
+    from vibrissa.cli.recordings import maps_from, maps_of, noise_from, whiskers_for
+    from vibrissa.pipeline import sensor_noise, with_estimates, with_signals
+    from vibrissa.sensing import FORCE_NOISE
+    from vibrissa.tracking.filtering import CUTOFF
+
+    if "signals" not in tree.children:
+        tree = with_signals(tree, **signal_options(tree, None, CUTOFF, how.whisker))
+    signals = tree["signals"].to_dataset()
+    if noise is None and sensor_noise(signals) is None and signals.attrs.get("source") == "sensor":
+        noise = noise_from(None, FORCE_NOISE * 1e6, None)
+    maps = maps_from(how.charts, tree.sizes["whisker"], how.grid) if how.charts else []
+    whiskers = [one.whisker for one in maps] if maps else whiskers_for(tree, how.whisker)
+    for k, whisker in enumerate(whiskers):
+        _check_scale(name, signals.isel(whisker=k), whisker)
+    all_six = how.all_six or (how.names is None and signals.attrs.get("source") == "rod")
+    if not maps and not all_six:
+        maps = maps_of(whiskers, tell, how.grid)
+    options: dict[str, Any] = {"contact_maps": maps} if maps else {"whiskers": whiskers}
+    done = with_estimates(
+        tree,
+        "wrench" if all_six else how.names,
+        noise=None if noise is None else noise[0],
+        method=how.method,
+        progress=tell,
+        **options,
     )
-    for sentence, count in describe(found["status"].values).most_common():
-        output.print(f"{count:6d}  {sentence}", highlight=False, soft_wrap=True)
-    output.print(f"wrote {path}", highlight=False, soft_wrap=True)
+    said = "noise as the recording says" if noise is None else noise[1]
+    about = done["estimates"].attrs
+    felt = shown("MB", float(about["felt_above"]), 3)
+    return (
+        done,
+        f"{how.used(str(about['signals']))}; {said}; contacts are felt where M_B exceeds {felt}",
+    )
 
 
 def _check_method(method: str, names: tuple[str, ...], all_six: bool) -> None:
@@ -136,64 +333,10 @@ def _check_method(method: str, names: tuple[str, ...], all_six: bool) -> None:
         )
 
 
-def _noise(path: Path | None, force_noise: float, moment_noise: float) -> tuple[Array, str]:
-    """Covariance of force and moment, SI units, and how it was given."""
-    import numpy as np
-
-    from vibrissa.io.table import read_text, table_rows
-    from vibrissa.pipeline import component_noise
-
-    if path is None:
-        covariance = component_noise(force_noise * 1e-6, moment_noise * 1e-6)
-        return covariance, f"noise {force_noise:g} µN and {moment_noise:g} µN·m"
-    try:
-        rows = [[float(cell) for cell in cells] for _, cells in table_rows(read_text(path))]
-        covariance = np.array(rows, dtype=np.float64)
-    except ValueError as fault:
-        raise ValueError(f"{path} is no covariance: {fault}") from None
-    if covariance.shape != (6, 6):
-        raise ValueError(f"{path} must hold six lines of six numbers; got {covariance.shape}")
-    return covariance, f"noise of {path}"
-
-
-def _whisker(chart: Path | None, whisker: Path | None, carried: Whisker | None) -> Whisker:
-    """The whisker of a map, a file or a recording."""
-    from vibrissa.cli.sources import map_from, whisker_from
-
-    if chart is not None and whisker is not None:
-        raise ValueError("give either --map or --whisker: a map already has its whisker")
-    if chart is not None:
-        return map_from(chart).whisker
-    return carried if carried is not None and whisker is None else whisker_from(whisker)
-
-
-def _check_scale(path: Path, wrench: Dataset, whisker: Whisker) -> None:
+def _check_scale(path: Path | str, wrench: xr.Dataset, whisker: Whisker) -> None:
     from vibrissa.io.signals_table import check_scale
 
     try:
         check_scale(wrench, whisker)
     except ValueError as fault:
         raise ValueError(f"{path}: {fault}") from None
-
-
-def _map(
-    chart: Path | None, whisker: Path | None, carried: Whisker | None, tell: object, grid: bool
-) -> ContactMap:
-    """Read the map, or simulate that of the whisker, and say which; with the grid if needed."""
-    from vibrissa.cli.sources import map_from
-    from vibrissa.mapping import ContactMap
-
-    if chart is not None and whisker is None:
-        contacts = map_from(chart)
-        if grid and contacts.grid is None:
-            raise ValueError(
-                f"{chart} has no grid to look up in: make it by `vibrissa map` without --no-grid"
-            )
-        return contacts
-    chosen = _whisker(chart, whisker, carried)
-    errors.print(f"no map given; simulating that of {chosen!r}", highlight=False, soft_wrap=True)
-    assert callable(tell)
-    tell("map of all contacts", 0, 1)
-    contacts = ContactMap.simulate(chosen, grid=grid)
-    tell("map of all contacts", 1, 1)
-    return contacts

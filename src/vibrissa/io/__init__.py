@@ -5,6 +5,7 @@ from vibrissa.io.array import load_array, save_array
 from vibrissa.io.centerline import load_centerline, load_whisker, save_centerline
 from vibrissa.io.contact_points import load_contact_points
 from vibrissa.io.contacts_table import load_contacts, save_contacts
+from vibrissa.io.contour_table import save_contour
 from vibrissa.io.corrections import load_corrections, save_corrections
 from vibrissa.io.deeplabcut import load_deeplabcut
 from vibrissa.io.frames import FrameReader
@@ -65,6 +66,7 @@ __all__ = [
     "save_array",
     "save_centerline",
     "save_contacts",
+    "save_contour",
     "save_corrections",
     "save_nwb",
     "save_recording",

@@ -3,7 +3,14 @@
 from vibrissa.pipeline.estimates import estimates_of
 from vibrissa.pipeline.laboratory import contact_columns, in_laboratory
 from vibrissa.pipeline.locate import FELT, TRIPLET, component_noise, locate, locate_from_wrench
-from vibrissa.pipeline.reconstruct import SOLVED_TO, Shape, fit_contacts, reconstruct, whisker_radii
+from vibrissa.pipeline.reconstruct import (
+    SOLVED_TO,
+    Shape,
+    contour_points,
+    fit_contacts,
+    reconstruct,
+    whisker_radii,
+)
 from vibrissa.pipeline.signals import (
     Source,
     default_source,
@@ -28,6 +35,7 @@ __all__ = [
     "Source",
     "component_noise",
     "contact_columns",
+    "contour_points",
     "default_source",
     "estimates_of",
     "fit_contacts",

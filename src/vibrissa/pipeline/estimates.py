@@ -44,7 +44,7 @@ _KEPT = (
 
 def estimates_of(
     recording: xr.DataTree,
-    signals: str | Sequence[str] = TRIPLET,
+    signals: str | Sequence[str] | None = None,
     *,
     noise: ArrayLike | None = None,
     contact_maps: Sequence[ContactMap] | None = None,
@@ -58,8 +58,9 @@ def estimates_of(
     ----------
     recording : xarray.DataTree
         With a group ``signals``; see `signals_of`.
-    signals : str or sequence of str
-        Three or more of the six, or "wrench": force and moment whole, which allows for friction.
+    signals : str or sequence of str, optional
+        Three or more of the six, or "wrench": force and moment whole, which allows for friction. By
+        default `TRIPLET`, but of the rod "wrench", as its wrench has some friction in it.
     noise : array_like (6, 6), optional
         Covariance of (F, M), SI units; by default what the signals say of themselves. Signals of a
         sensor have to have one or the other; without any there are no covariances.
@@ -103,9 +104,11 @@ def estimates_of(
             f"the recording has no group signals (it has {got}): make them first, by signals_of or "
             "`vibrissa signals`"
         )
+    data = group.to_dataset()
+    if signals is None:
+        signals = WHOLE if data.attrs.get("source") == "rod" else TRIPLET
     whole = signals == WHOLE
     names = TRIPLET if whole else selection(signals)
-    data = group.to_dataset()
     count = data.sizes["whisker"]
     tell = progress or _silent
     if whiskers is None:

@@ -177,6 +177,7 @@ class _Felt(NamedTuple):
         least = 0.0 * size
         if noise is not None:
             least = FELT * np.sqrt(0.5 * (covariance[:, 4, 4] + covariance[:, 5, 5]))
+            least = np.nan_to_num(least)
         with np.errstate(invalid="ignore"):
             rows = known & (size > least)
         if "in_contact" in wrench:

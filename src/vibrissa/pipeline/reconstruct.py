@@ -7,6 +7,7 @@ account. All whiskers of a recording count together: they touch one object.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -69,10 +70,11 @@ def reconstruct(
         ``object_axis`` and ``object_radius``, as far as the shape has them, with
         ``parameter_covariance``; dims time, whisker: ``surface_distance`` from the fitted object
         and ``inlier``; attribute ``shape``. `vibrissa.contour.shape_from_dataset` makes the shape
-        again. With known objects also ``object_distance`` of each contact from the one that is
-        nearest to them (attribute ``object``, its number), and for a cylinder beside a peg
-        ``axis_offset``, ``axis_tilt`` and ``diameter_error``, for spheres ``center_offset`` and
-        ``diameter_error``.
+        again. The covariance counts contacts of following frames as one where they err together:
+        so many of them as the attribute ``frames_together`` says. With known objects also
+        ``object_distance`` of each contact from the one that is nearest to them (attribute
+        ``object``, its number), and for a cylinder beside a peg ``axis_offset``, ``axis_tilt`` and
+        ``diameter_error``, for spheres ``center_offset`` and ``diameter_error``.
 
     Raises
     ------
@@ -81,26 +83,71 @@ def reconstruct(
     """
     if shape not in get_args(Shape):
         raise ValueError(f"shape is {shape!r}; one of {', '.join(get_args(Shape))} is needed")
-    group = recording.children.get("estimates")
-    if group is None:
-        got = ", ".join(sorted(recording.children)) or "no groups"
-        raise ValueError(
-            f"the recording has no group estimates (it has {got}): make them first, by "
-            "estimates_of or `vibrissa estimate`"
-        )
-    estimates = group.to_dataset()
-    count = estimates.sizes["whisker"]
-    if whiskers is None:
-        whiskers = [recorded_whisker(recording, k) for k in range(count)]
+    estimates = estimates_in(recording)
+    whiskers = _whiskers(recording, estimates) if whiskers is None else whiskers
     known = recorded_objects(recording) if objects is None else tuple(objects)
     fit = fit_contacts(estimates, whiskers, shape, axis=axis)
+    together = frames_together(_scores(fit, estimates))
+    fit = replace(fit, covariance=together * fit.covariance)
     each = {n: estimates[n].variable for n in _EACH if n in estimates.coords}
     out = fit.to_dataset(_EACH, tuple(estimates.sizes[n] for n in _EACH), each)
-    out.attrs["reference_frame"] = "laboratory"
+    out.attrs |= {"reference_frame": "laboratory", "frames_together": together}
     out.attrs |= {n: estimates.attrs[n] for n in ("signals", "source") if n in estimates.attrs}
     if known:
         out = out.assign(_compared(fit, estimates, whiskers, known))
     return out
+
+
+def _scores(fit: FittedShape, estimates: xr.Dataset) -> Array:
+    """Residuals of the inliers (time, whisker) over their standard deviation; NaN elsewhere."""
+    normal, spread = (_rows(estimates[n]) for n in ("contact_normal", "contact_covariance"))
+    variance = np.einsum("ni,nij,nj->n", normal, spread, normal) + SOLVED_TO**2
+    scores = fit.residuals / np.sqrt(np.where(np.isfinite(variance), variance, 1.0))
+    scores[~fit.inliers] = np.nan
+    return scores.reshape(tuple(estimates.sizes[name] for name in _EACH))
+
+
+def frames_together(scores: ArrayLike) -> float:
+    """Tell how many following frames err together, on average.
+
+    Contacts that were tracked err alike from frame to frame, as the whisker's shape and the base's
+    pose do, so that a hundred of them tell less than a hundred of a sensor.
+
+    Parameters
+    ----------
+    scores : array_like (time, whisker)
+        Errors, each over its standard deviation; NaN where there is none.
+
+    Returns
+    -------
+    float
+        The correlation time 1 + 2 Σ ρ_k, summed over the lags k until the correlation ρ_k is no
+        more than chance; 1 for errors that are independent.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> white = np.random.default_rng(0).normal(size=(900, 1))
+    >>> frames_together(white), frames_together(np.repeat(white, 3, axis=0)) > 2.0
+    (1.0, True)
+    """
+    z = np.asarray(scores, dtype=np.float64)
+    known = np.isfinite(z)
+    z = np.where(known, z, 0.0)
+    count = int(known.sum())
+    if count < 2 or not z.any():
+        return 1.0
+    variance = float((z**2).sum()) / count
+    total = 1.0
+    for lag in range(1, len(z)):
+        pairs = int((known[lag:] & known[:-lag]).sum())
+        if pairs == 0:
+            break
+        correlation = float((z[lag:] * z[:-lag]).sum()) / pairs / variance
+        if correlation < 2.0 / np.sqrt(pairs):
+            break
+        total += 2.0 * correlation
+    return total
 
 
 def fit_contacts(
@@ -183,6 +230,80 @@ def whisker_radii(estimates: xr.Dataset, whiskers: Sequence[Whisker]) -> Array:
         known = np.isfinite(arc_length[:, k])
         radius[known, k] = whisker.radius(arc_length[known, k])
     return radius
+
+
+def contour_points(recording: xr.DataTree, whiskers: Sequence[Whisker] | None = None) -> xr.Dataset:
+    """List the contacts of all whiskers as points of a contour, laboratory frame.
+
+    Parameters
+    ----------
+    recording : xarray.DataTree
+        With a group ``estimates``, and ``contour`` if an object was fitted.
+    whiskers : sequence of Whisker, optional
+        By default those of the recording.
+
+    Returns
+    -------
+    xarray.Dataset
+        Dim contact, by time: ``time``, ``whisker``, the contact point ``x``, ``y``, ``z`` with
+        ``sigma_x``, …, ``normal_x``, …, the point ``surface_x``, … of the object's surface, one
+        whisker radius away, and where an object was fitted ``surface_distance`` and ``inlier``;
+        the columns of `vibrissa.io.save_contour`.
+
+    Raises
+    ------
+    ValueError
+        If there are no estimates.
+    """
+    estimates = estimates_in(recording)
+    known = _whiskers(recording, estimates) if whiskers is None else whiskers
+    point = _rows(estimates["contact_point"])
+    normal = _rows(estimates["contact_normal"])
+    radius = whisker_radii(estimates, known).reshape(-1, 1)
+    variance = np.einsum("nii->ni", _rows(estimates["contact_covariance"]))
+    vectors = {"": point, "sigma_": np.sqrt(variance), "normal_": normal}
+    vectors["surface_"] = point - radius * normal
+    there = np.isfinite(point).all(axis=1)
+    time, name = np.meshgrid(estimates["time"], estimates["whisker"], indexing="ij")
+    columns = {"time": time.reshape(-1), "whisker": name.reshape(-1)}
+    for prefix, values in vectors.items():
+        columns |= {f"{prefix}{letter}": values[:, i] for i, letter in enumerate("xyz")}
+    if "contour" in recording.children:
+        contour = recording["contour"].to_dataset()
+        columns |= {n: _rows(contour[n]) for n in ("surface_distance", "inlier")}
+    return xr.Dataset({column: ("contact", v[there]) for column, v in columns.items()})
+
+
+def estimates_in(recording: xr.DataTree) -> xr.Dataset:
+    """Find the estimates in a recording.
+
+    Parameters
+    ----------
+    recording : xarray.DataTree
+        The recording.
+
+    Returns
+    -------
+    xarray.Dataset
+        Its group ``estimates``.
+
+    Raises
+    ------
+    ValueError
+        If it has none.
+    """
+    group = recording.children.get("estimates")
+    if group is None:
+        got = ", ".join(sorted(recording.children)) or "no groups"
+        raise ValueError(
+            f"the recording has no group estimates (it has {got}): make them first, by "
+            "estimates_of or `vibrissa estimate`"
+        )
+    return group.to_dataset()
+
+
+def _whiskers(recording: xr.DataTree, estimates: xr.Dataset) -> list[Whisker]:
+    return [recorded_whisker(recording, k) for k in range(estimates.sizes["whisker"])]
 
 
 def _rows(variable: xr.DataArray) -> Array:

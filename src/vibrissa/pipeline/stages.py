@@ -12,8 +12,9 @@ import numpy as np
 import xarray as xr
 
 from vibrissa.pipeline.estimates import Progress, estimates_of
+from vibrissa.pipeline.frames import check_recording
 from vibrissa.pipeline.reconstruct import reconstruct
-from vibrissa.pipeline.signals import check_recording, signals_of
+from vibrissa.pipeline.signals import signals_of
 
 STAGES = ("signals", "estimates", "contour")
 """Groups in the order in which they are made."""

@@ -1,0 +1,135 @@
+"""What stages share: which variables a recording has to have, and how signals are labelled."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from vibrissa.signals import base_signals
+from vibrissa.trial.recording import recorded
+
+SQUARES = {
+    "wrench_covariance": ("component", "component_"),
+    "pose_covariance": ("pose", "pose_"),
+    "pose_wrench_covariance": ("pose", "component_"),
+}
+"""Dimensions of covariances beside time and whisker."""
+
+
+def check_recording(recording: xr.DataTree) -> None:
+    """Make sure that a recording has frames and whiskers.
+
+    Parameters
+    ----------
+    recording : xarray.DataTree
+        Perhaps one.
+
+    Raises
+    ------
+    ValueError
+        If it has no time, or no dimension ``whisker``.
+    """
+    root = recording.to_dataset(inherit=False)
+    missing = [name for name in ("time", "whisker") if name not in root.dims]
+    if missing:
+        got = ", ".join(str(name) for name in root.dims) or "none"
+        raise ValueError(
+            f"the recording lacks the dimensions {', '.join(missing)}; it has {got}: one that was "
+            "tracked, simulated or measured is needed"
+        )
+
+
+def names_of(data: xr.Dataset) -> str:
+    """List the variables of a dataset, for a message.
+
+    Parameters
+    ----------
+    data : xarray.Dataset
+        Any.
+
+    Returns
+    -------
+    str
+        Their names.
+    """
+    return ", ".join(sorted(map(str, data.data_vars))) or "no variables"
+
+
+def needed(root: xr.Dataset, names: Sequence[str], source: str) -> None:
+    """Make sure that variables are there.
+
+    Parameters
+    ----------
+    root : xarray.Dataset
+        Of a recording.
+    names : sequence of str
+        The variables.
+    source : str
+        What they are needed for signals from.
+
+    Raises
+    ------
+    ValueError
+        If one is missing; says which there are.
+    """
+    missing = [name for name in names if name not in root]
+    if not missing:
+        return
+    if "reading" in root and "force" in missing:
+        channels = ", ".join(map(str, root["channel"].values))
+        raise ValueError(
+            f"the sensor of this recording reads {channels}, not force and moment; see its reading "
+            "and mixing"
+        )
+    raise ValueError(
+        f"signals from the {source} need {', '.join(missing)}; the recording has {names_of(root)}"
+    )
+
+
+def one_whisker(values: Mapping[str, Any], status: NDArray[np.int64]) -> xr.Dataset:
+    """Give signals of one whisker as a dataset with a dimension ``whisker`` of length one.
+
+    Parameters
+    ----------
+    values : mapping
+        Variables of a recording by name, arrays (time, ...), force and moment among them.
+    status : array (time,)
+        What became of each frame.
+
+    Returns
+    -------
+    xarray.Dataset
+        With the six signals.
+    """
+    data = {name: recorded(name, array) for name, array in values.items()}
+    data["status"] = recorded("status", np.asarray(status, dtype=np.int8))
+    six = base_signals(values["force"], values["moment"])
+    for name, signal in six.data_vars.items():
+        data[str(name)] = xr.Variable(("time", "whisker"), signal.values[:, None], signal.attrs)
+    return xr.Dataset(data)
+
+
+def with_coordinates(data: xr.Dataset, root: xr.Dataset, about: Mapping[str, Any]) -> xr.Dataset:
+    """Take coordinates from a recording.
+
+    Parameters
+    ----------
+    data : xarray.Dataset
+        Without them.
+    root : xarray.Dataset
+        Of the recording.
+    about : mapping
+        Attributes.
+
+    Returns
+    -------
+    xarray.Dataset
+        With coordinates and attributes.
+    """
+    names = ("time", "whisker", "space", "whisker_axis")
+    coordinates = {name: root[name].variable for name in names if name in root.coords}
+    return data.assign_coords({"space": list("xyz"), **coordinates}).assign_attrs(about)

@@ -1,0 +1,208 @@
+"""The paper's way to signals: the tracked contact point, seen from the filtered base.
+
+A table of contact points that was given to the tracker counts more than the points it found.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from vibrissa.pipeline.frames import SQUARES, needed, one_whisker
+from vibrissa.pipeline.laboratory import cross_matrices
+from vibrissa.pipeline.slopes import wrench_slopes
+from vibrissa.quantities import attributes
+from vibrissa.rod.deflection import deflect
+from vibrissa.rod.loads import PointContact
+from vibrissa.status import Status
+from vibrissa.tracking.filtering import CUTOFF
+from vibrissa.tracking.head import HeadPose
+from vibrissa.tracking.pose import BasePose
+from vibrissa.whisker import Whisker
+from vibrissa.whisker.emergence import angles_of
+
+Array = NDArray[np.float64]
+
+
+class Pose(NamedTuple):
+    """How one whisker is held, frame by frame, laboratory frame.
+
+    Parameters
+    ----------
+    rotation : array (time, 3, 3)
+        From the whisker's frame.
+    position : array (time, 3)
+        Of the base, m.
+    covariance : array (time, 6, 6)
+        Of position and of a small turn about the laboratory's axes; zero where it is not known.
+    """
+
+    rotation: Array
+    position: Array
+    covariance: Array
+
+
+def paper_pose(recording: xr.DataTree, cutoff: float | None) -> list[Pose]:
+    """How each whisker is held, filtered: from before the rod was fitted, or the recording's own.
+
+    What is filtered is how it is held relative to the head.
+
+    Parameters
+    ----------
+    recording : xarray.DataTree
+        Tracked, or with the pose at its top.
+    cutoff : float, optional
+        Of the low pass, Hz; None filters nothing.
+
+    Returns
+    -------
+    list of Pose
+        Whisker by whisker.
+
+    Raises
+    ------
+    ValueError
+        If there is no pose, or only one that was filtered otherwise.
+    """
+    root = recording.to_dataset()
+    head = HeadPose.still(root.sizes["time"])
+    if {"head_position", "head_rotation"} <= set(root.data_vars):
+        head = HeadPose(root["head_position"].values, root["head_rotation"].values)
+    rate = 1.0 / float(np.median(np.diff(root["time"].values))) if root.sizes["time"] > 1 else 1.0
+    group = recording.children.get("measured")
+    measured = None if group is None or "base_azimuth" not in group else group.to_dataset()
+    prefix = "unfiltered_"
+    if measured is None:
+        needed(root, ("contact_point", "base_position", "base_rotation"), "contact point")
+    elif f"{prefix}base_azimuth" not in measured:
+        if measured.attrs.get("cutoff", CUTOFF) != cutoff:
+            raise ValueError(
+                f"the pose of this recording is kept as it was filtered; a cut-off of {cutoff} Hz "
+                "needs the unfiltered one: track the videos again"
+            )
+        prefix, cutoff = "", None
+    poses = []
+    for k in range(root.sizes["whisker"]):
+        own = root.isel(whisker=k)
+        if measured is None:
+            place = own["base_position"].transpose("time", "space").values
+            turned = own["base_rotation"].transpose("time", "space", "whisker_axis").values
+            angles = angles_of(np.swapaxes(head.rotation, 1, 2) @ turned).T
+        else:
+            one = measured.isel(whisker=k)
+            place = one[f"{prefix}base_position"].transpose("time", "space").values
+            names = ("azimuth", "elevation", "roll")
+            angles = np.stack([one[f"{prefix}base_{name}"].values for name in names])
+        pose = BasePose(head.seen_from(place), *angles).filtered(rate, cutoff)
+        rotation, position = head.rotation @ pose.rotation, head.put_in(pose.position)
+        poses.append(Pose(rotation, position, _pose_covariance(own, rotation, position)))
+    return poses
+
+
+def _pose_covariance(own: xr.Dataset, rotation: Array, position: Array) -> Array:
+    """Covariance (time, 6, 6) of a pose beside that of the recording.
+
+    As far as they differ, which is hardly of the same cause, the recording's counts as the truth,
+    within its own covariance.
+    """
+    out = np.zeros((len(rotation), 6, 6))
+    if "pose_covariance" not in own:
+        return out
+    out += own["pose_covariance"].transpose("time", "pose", "pose_").values
+    turned = own["base_rotation"].transpose("time", "space", "whisker_axis").values
+    there = np.isfinite(turned.sum(axis=(1, 2)) + rotation.sum(axis=(1, 2)))
+    if "in_contact" in own:
+        there &= own["in_contact"].values.astype(bool)
+    if not there.any():
+        return out
+    turn = Rotation.from_matrix(rotation[there] @ np.swapaxes(turned[there], 1, 2)).as_rotvec()
+    shift = (position - own["base_position"].transpose("time", "space").values)[there]
+    away = np.concatenate([shift, turn], axis=1)
+    return np.asarray(out + away.T @ away / len(away))
+
+
+def signals_by_point(
+    one: xr.Dataset,
+    given: xr.DataArray | None,
+    pose: Pose,
+    whisker: Whisker,
+    proximal: float,
+) -> xr.Dataset:
+    """Give the signals of the rod that passes through the tracked contact point.
+
+    Parameters
+    ----------
+    one : xarray.Dataset
+        The recording's root, of one whisker.
+    given : xarray.DataArray or None
+        Contact points from a table, dims time, space, which count more where they are known.
+    pose : Pose
+        How the whisker is held.
+    whisker : Whisker
+        The whisker.
+    proximal : float
+        Smallest arc length of a contact, as a fraction of the length.
+
+    Returns
+    -------
+    xarray.Dataset
+        Dim whisker of length one.
+    """
+    rotation, position = pose.rotation, pose.position
+    point = one["contact_point"].transpose("time", "space").values
+    told = np.zeros(len(point), dtype=bool)
+    if given is not None:
+        told = np.asarray(np.isfinite(given.transpose("time", "space").values).all(axis=1))
+        point = np.where(told[:, None], given.transpose("time", "space").values, point)
+    held = np.isfinite(rotation.sum(axis=(1, 2)) + position.sum(axis=1))
+    touching = np.isfinite(point).all(axis=1)
+    if "in_contact" in one:
+        touching = told | one["in_contact"].values.astype(bool)
+    local = np.einsum("tji,tj->ti", rotation, point - position)
+    bent = deflect(whisker, PointContact(local[touching]), proximal=proximal)
+    status = np.where(held, int(Status.NO_CONTACT), int(Status.MISSING))
+    status[touching] = bent.status
+    wrench = {}
+    for name, values in (("force", bent.force), ("moment", bent.moment)):
+        wrench[name] = np.where(held[:, None], 0.0, np.nan) * np.ones(3)
+        wrench[name][touching] = values
+    data = one_whisker(
+        {
+            **wrench,
+            "base_position": position,
+            "base_rotation": rotation,
+            "in_contact": touching & held,
+        },
+        status,
+    )
+    if "contact_covariance" not in one:
+        return data
+    slopes = np.zeros((len(point), 6, 3))
+    slopes[touching] = wrench_slopes(whisker, bent.arc_length, bent.contact_force)
+    slopes = slopes @ np.swapaxes(rotation, 1, 2)
+    spread = one["contact_covariance"].transpose("time", "space", ...).values
+    spread = np.where(touching[:, None, None], spread, 0.0)
+    spread[told] = np.nan
+    # The point is seen from a base that is a little elsewhere and turned by a little.
+    moved = np.concatenate(
+        [-np.eye(3) + np.zeros_like(spread), cross_matrices(point - position)], 2
+    )
+    moved = np.where(touching[:, None, None], moved, 0.0)
+    both = pose.covariance @ np.swapaxes(moved, 1, 2)
+    squares = {
+        "wrench_covariance": slopes @ (spread + moved @ both) @ np.swapaxes(slopes, 1, 2),
+        "pose_covariance": pose.covariance,
+        "pose_wrench_covariance": both @ np.swapaxes(slopes, 1, 2),
+    }
+    return data.assign(
+        {
+            name: xr.Variable(
+                ("time", "whisker", *SQUARES[name]), square[:, None], attributes(name)
+            )
+            for name, square in squares.items()
+        }
+    )

@@ -91,6 +91,7 @@ class BendMode:
             put(self._size, round(_UN * bend.magnitude, 1))
             put(self._way, round(np.rad2deg(bend.direction)))
         else:
+            put(self._radius, round(_MM * bend.radius, 2))
             x, y, z = np.round(_MM * bend.target, 3).tolist()
             put(self._target, (x, y, z))
 

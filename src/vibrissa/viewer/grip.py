@@ -10,6 +10,7 @@ from viser import transforms
 
 from vibrissa.quantities import quantity
 from vibrissa.viewer.drawing import Array
+from vibrissa.viewer.meshes import across
 
 _MM = quantity("length").display_factor
 
@@ -65,20 +66,21 @@ class Grip:
         turn = np.array(transforms.SO3(self._gizmo.wxyz).as_matrix(), dtype=np.float64)
         self._moved(np.array(self._ball.position) / _MM, turn)
 
-    def show(self, place: Array | None, turning: bool = False) -> None:
-        """Stand at a place (3,), m, with arcs for turning or without; None hides it."""
-        visible = place is not None
+    def show(self, place: Array | None, axis: Array | None = None) -> None:
+        """Stand at a place (3,), m; with arcs that turn an axis, if there is one; None hides it."""
         if place is not None:
             x, y, z = (_MM * place).tolist()
             self._gizmo.position = self._ball.position = (x, y, z)
-        if turning != self._turning:
-            self._gizmo.disable_rotations = not turning
-            self._turning = turning
-        self._gizmo.visible = self._ball.visible = visible
-
-    def orient(self, rotation: Array) -> None:
-        """Turn the gizmo's arcs."""
-        self._gizmo.wxyz = transforms.SO3.from_matrix(rotation).wxyz
+        if axis is not None:
+            first, second = across(axis)
+            turn = np.stack([first, second, axis / np.linalg.norm(axis)], axis=1)
+            self._gizmo.wxyz = transforms.SO3.from_matrix(turn).wxyz
+        elif self._turning:
+            self._gizmo.wxyz = (1.0, 0.0, 0.0, 0.0)
+        if (axis is not None) != self._turning:
+            self._turning = axis is not None
+            self._gizmo.disable_rotations = not self._turning
+        self._gizmo.visible = self._ball.visible = place is not None
 
     def remove(self) -> None:
         """Take it away."""

@@ -166,7 +166,7 @@ class Page:
         if not draggable or bend.kind == "force":
             self.grip.show(None)
             return
-        self.grip.show(bend.target, turning=bend.kind == "peg")
+        self.grip.show(bend.target, bend.axis if bend.kind == "peg" else None)
 
     def face_whisker(self) -> None:
         """Let everyone look at the whisker."""

@@ -148,7 +148,7 @@ def _footage(trial: Watched | None, videos: Sequence[str | PathLike[str]]) -> tu
 
 def _served(host: str, port: int | None) -> viser.ViserServer:
     if port is None:
-        port = _free_port(host)
+        port = free_port(host)
     with contextlib.redirect_stdout(io.StringIO()):  # it would announce itself
         server = viser.ViserServer(host=host, port=port, label="vibrissa", verbose=False)
     server.gui.configure_theme(
@@ -162,7 +162,7 @@ def _served(host: str, port: int | None) -> viser.ViserServer:
     return server
 
 
-def _free_port(host: str) -> int:
+def free_port(host: str) -> int:
     """The first free port from the usual one on."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     for port in range(PORT, PORT + 200):

@@ -1,0 +1,48 @@
+"""`vibrissa view` serves a page, says where, and ends when it is told to."""
+
+import re
+import signal
+import socket
+import subprocess
+import sys
+import urllib.request
+
+import pytest
+
+pytest.importorskip("viser", reason="viser is not installed", exc_type=ImportError)
+
+COMMAND = [sys.executable, "-c", "from vibrissa.cli import main; main()", "view", "--no-browser"]
+
+
+def test_the_page_is_served_until_interrupted():
+    serving = subprocess.Popen(COMMAND, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        said = serving.stdout.readline()
+        url = re.match(r"http://127\.0\.0\.1:\d+", said)[0]
+        with urllib.request.urlopen(url) as answer:
+            assert b"<!doctype html>" in answer.read().lower()
+    finally:
+        serving.send_signal(signal.SIGINT)
+        rest, complaints = serving.communicate(timeout=30)
+    assert serving.returncode == 0
+    assert rest.strip() == "stopped"
+    assert complaints == ""
+
+
+def test_videos_need_a_trial(tmp_path):
+    import vibrissa as vb
+    from vibrissa.viewer import view
+
+    with pytest.raises(ValueError, match="the trial has 0 cameras; got 1 videos"):
+        view(vb.samples.gamma(), videos=[tmp_path / "top.mp4"])
+
+
+def test_a_taken_port_is_passed_over():
+    from vibrissa.viewer.server import PORT, free_port
+
+    first = free_port("127.0.0.1")
+    assert first >= PORT
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", first))
+        taken.listen()
+        assert free_port("127.0.0.1") > first

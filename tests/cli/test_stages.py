@@ -152,8 +152,11 @@ def test_files_that_are_no_recordings_are_refused(folder, tmp_path, verb):
         (("signals", "tracked.nc", "--cutoff", 400), "below half of"),
         (("signals", "sim.nc", "-o", "s.txt"), ".csv is needed"),
         (("estimate", "sim.nc", "--map", "map.nc", "--map", "map.nc"), "2 --map for 1 whiskers"),
-        (("reconstruct", "sim.nc", "--shape", "cube"), "one of cylinder, sphere, plane"),
-        (("reconstruct", "sim.nc", "--shape", "plane", "--axis", "0,0,1"), "a plane has none"),
+        (("reconstruct", "sim.nc", "--shape", "cube"), "one of cylinder, sphere, plane, free"),
+        (
+            ("reconstruct", "sim.nc", "--shape", "plane", "--axis", "0,0,1"),
+            "--axis is for a cylinder",
+        ),
         (("reconstruct", "sim.nc", "--axis", "1,2"), "X,Y,Z are needed"),
         (("reconstruct", "sim.nc", "-o", "s.csv"), ".nc"),
         (("reconstruct", "bare.nc"), "--whisker"),

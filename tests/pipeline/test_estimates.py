@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from vibrissa.contour import shape_from_dataset
 from vibrissa.io import load_recording, save_recording
 from vibrissa.pipeline import (
     component_noise,
@@ -16,6 +17,7 @@ from vibrissa.pipeline import (
     with_group,
     with_signals,
 )
+from vibrissa.pipeline.reconstruct import frames_together, whisker_radii
 from vibrissa.status import Status
 from vibrissa.trial import recorded_pegs, recorded_whisker
 
@@ -163,6 +165,27 @@ def test_a_peg_is_found_from_a_recording_alone(quiet):
     assert set(quiet.children) == set(done.children) - {"signals", "estimates", "contour"}
 
 
+@pytest.mark.parametrize("shape", ["sphere", "plane", "free"])
+def test_other_shapes_are_fitted_and_come_back_from_a_file(quiet, tmp_path, shape):
+    done = with_contour(quiet, shape)
+    save_recording(tmp_path / "t.nc", done)
+    contour = load_recording(tmp_path / "t.nc")["contour"].to_dataset()
+    fit = shape_from_dataset(contour)
+    assert fit.kind == shape == contour.attrs["shape"]
+    points = done["estimates"]["contact_point"].values[:, 0]
+    radius = whisker_radii(done["estimates"].to_dataset(), [recorded_whisker(done)])[:, 0]
+    there = contour["inlier"].values[:, 0]
+    np.testing.assert_allclose(
+        fit.signed_distance(points[there]) - radius[there],
+        contour["surface_distance"].values[there, 0],
+        atol=1e-9,
+    )
+    # A free surface is one of a peg too; a sphere and a plane are not.
+    median = np.nanmedian(np.abs(contour["surface_distance"]))
+    assert (median < 1e-5) == (shape == "free")
+    assert np.nanmedian(np.abs(contour["object_distance"])) < 1e-8
+
+
 def test_a_peg_is_found_with_noise(trial):
     contour = with_contour(trial)["contour"].to_dataset()
     assert np.linalg.norm(contour["axis_offset"]) < 0.2e-3
@@ -177,6 +200,22 @@ def test_what_stages_add_is_kept_in_a_file(trial, tmp_path):
     again = with_estimates(load_recording(tmp_path / "t.nc"), "Fx FT MB MD")
     assert "contour" not in again.children
     assert again["signals"].attrs["source"] == "sensor"
+
+
+def test_frames_that_err_together_are_counted():
+    generator = np.random.default_rng(0)
+    white = generator.normal(size=(2000, 2))
+    assert frames_together(white) == pytest.approx(1.0, abs=0.1)
+    red = np.empty_like(white)
+    red[0] = white[0]
+    for i in range(1, len(red)):
+        red[i] = 0.8 * red[i - 1] + white[i]
+    # (1 + a) / (1 − a) for a first-order process.
+    assert frames_together(red) == pytest.approx(9.0, rel=0.2)
+    gaps = red.copy()
+    gaps[::7] = np.nan
+    assert frames_together(gaps) == pytest.approx(9.0, rel=0.25)
+    assert frames_together(np.full((5, 1), np.nan)) == 1.0
 
 
 def test_two_whiskers_touch_one_peg(quiet):
@@ -215,7 +254,7 @@ def test_what_cannot_be_done_is_said(trial, felt, contact_map):
         estimates_of(felt, noise=np.eye(3), contact_maps=[contact_map])
     with pytest.raises(ValueError, match="signals of 1 whiskers; 2 are given"):
         estimates_of(felt, contact_maps=[contact_map] * 2)
-    with pytest.raises(ValueError, match="'cube'; one of cylinder, sphere, plane"):
+    with pytest.raises(ValueError, match="'cube'; one of cylinder, sphere, plane, free"):
         reconstruct(felt, "cube")
     unknown = trial.copy()
     root = trial.to_dataset()

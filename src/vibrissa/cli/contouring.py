@@ -42,7 +42,7 @@ def reconstruct(
         ),
     ] = None,
     shape: Annotated[
-        str, typer.Option(help="What was touched: cylinder, sphere or plane.")
+        str, typer.Option(help="What was touched: cylinder, sphere, plane or free.")
     ] = "cylinder",
     axis: Annotated[
         str | None,
@@ -165,7 +165,7 @@ def _check_shape(shape: str, axis: bool) -> None:
     if shape not in get_args(Shape):
         raise ValueError(f"--shape is {shape!r}; one of {', '.join(get_args(Shape))} is needed")
     if axis and shape != "cylinder":
-        raise ValueError(f"--axis is for a cylinder; a {shape} has none")
+        raise ValueError(f"--axis is for a cylinder; --shape is {shape}")
 
 
 def _table(fit: FittedShape, contour: xr.Dataset, known: tuple[Surface, ...]) -> Table:
@@ -173,8 +173,15 @@ def _table(fit: FittedShape, contour: xr.Dataset, known: tuple[Surface, ...]) ->
     import numpy as np
     from rich.table import Table
 
+    from vibrissa.contour import FreeFit
+
     true = _matching(fit, contour, known)
-    table = Table(title=f"The {fit.kind}", title_justify="left", caption_justify="left")
+    title = f"The {fit.kind}"
+    if isinstance(fit, FreeFit):
+        deviation = fixed("surface_distance", fit.amplitude, 0)
+        title = f"A surface within about {deviation} of this {fit.base.kind}"
+        fit = fit.base
+    table = Table(title=title, title_justify="left")
     for name in ("", "fitted", "sigma", *(("known", "error") if true else ())):
         table.add_column(name, justify="right" if name else "left")
     for name, value, sigma in _parameters(fit):

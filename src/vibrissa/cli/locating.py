@@ -127,7 +127,21 @@ def estimate(
 
 
 class How(NamedTuple):
-    """By which signals, by which method, whole or not, on which maps or of which whisker."""
+    """How contacts are estimated.
+
+    Parameters
+    ----------
+    names : tuple of str or None
+        The signals; None for the default.
+    method : str
+        As of ``ContactMap.estimate``.
+    all_six : bool
+        Whether force and moment are used whole.
+    charts : tuple of Path
+        Maps; none: to be simulated.
+    whisker : Path or None
+        Where it is not that of the recording.
+    """
 
     names: tuple[str, ...] | None
     method: str

@@ -27,7 +27,7 @@ as inputs the surface may close round a cylinder or a sphere without a seam.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -205,9 +205,8 @@ class FreeFit(FittedShape):
             is made from: ``support_point``, ``support_value``, ``support_variance``,
             ``shape_amplitude``, ``shape_length``; attributes ``shape`` and ``base``.
         """
-        data = self.base.to_dataset(dims, shape, coords)
-        for name, values in (("surface_distance", self.residuals), ("inlier", self.inliers)):
-            data[name] = data[name].copy(data=values.reshape(data[name].shape))
+        base = replace(self.base, residuals=self.residuals, inliers=self.inliers)
+        data = base.to_dataset(dims, shape, coords)
         rows: dict[str, tuple[tuple[str, ...], Any]] = {
             "support_point": (("support", "space"), self.support.place),
             "support_value": (("support",), self.support.value),

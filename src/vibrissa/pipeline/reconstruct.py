@@ -6,7 +6,7 @@ account. All whiskers of a recording count together: they touch one object.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Literal, get_args
 
@@ -17,9 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 from vibrissa.contour import (
     CylinderFit,
     FittedShape,
+    FreeFit,
     SphereFit,
     axis_offset,
     fit_cylinder,
+    fit_free,
     fit_plane,
     fit_sphere,
 )
@@ -31,12 +33,18 @@ from vibrissa.whisker import Whisker
 
 Array = NDArray[np.float64]
 
-Shape = Literal["cylinder", "sphere", "plane"]
+Shape = Literal["cylinder", "sphere", "plane", "free"]
 """What can be fitted to contacts."""
 
 SOLVED_TO = 1e-6
 """Uncertainty of every contact apart from the signals', m: what the mechanics is solved to."""
 
+_FITS: dict[str, Callable[..., FittedShape]] = {
+    "cylinder": fit_cylinder,
+    "sphere": fit_sphere,
+    "plane": fit_plane,
+    "free": fit_free,
+}
 _EACH = ("time", "whisker")
 
 
@@ -54,8 +62,8 @@ def reconstruct(
     ----------
     recording : xarray.DataTree
         With a group ``estimates``; see `estimates_of`.
-    shape : {"cylinder", "sphere", "plane"}
-        What the object is taken for.
+    shape : {"cylinder", "sphere", "plane", "free"}
+        What the object is taken for; free: any smooth surface.
     axis : array_like (3,), optional
         Direction of a cylinder's axis, laboratory frame, where it is known.
     whiskers : sequence of Whisker, optional
@@ -88,7 +96,7 @@ def reconstruct(
     known = recorded_objects(recording) if objects is None else tuple(objects)
     fit = fit_contacts(estimates, whiskers, shape, axis=axis)
     together = frames_together(_scores(fit, estimates))
-    fit = replace(fit, covariance=together * fit.covariance)
+    fit = _less_sure(fit, together)
     each = {n: estimates[n].variable for n in _EACH if n in estimates.coords}
     out = fit.to_dataset(_EACH, tuple(estimates.sizes[n] for n in _EACH), each)
     out.attrs |= {"reference_frame": "laboratory", "frames_together": together}
@@ -105,6 +113,16 @@ def _scores(fit: FittedShape, estimates: xr.Dataset) -> Array:
     scores = fit.residuals / np.sqrt(np.where(np.isfinite(variance), variance, 1.0))
     scores[~fit.inliers] = np.nan
     return scores.reshape(tuple(estimates.sizes[name] for name in _EACH))
+
+
+def _less_sure(fit: FittedShape, together: float) -> FittedShape:
+    """The same fit with all variances larger by a factor."""
+    covariance = together * fit.covariance
+    if not isinstance(fit, FreeFit):
+        return replace(fit, covariance=covariance)
+    support = fit.support._replace(variance=together * fit.support.variance)
+    base = replace(fit.base, covariance=covariance)
+    return replace(fit, base=base, support=support, covariance=covariance)
 
 
 def frames_together(scores: ArrayLike) -> float:
@@ -165,14 +183,14 @@ def fit_contacts(
         Of `estimates_of`, dims time, whisker.
     whiskers : sequence of Whisker
         That touched it.
-    shape : {"cylinder", "sphere", "plane"}
+    shape : {"cylinder", "sphere", "plane", "free"}
         Which.
     axis : array_like (3,), optional
         Direction of a cylinder's axis where it is known.
 
     Returns
     -------
-    CylinderFit, SphereFit or PlaneFit
+    CylinderFit, SphereFit, PlaneFit or FreeFit
         Each contact counts by its covariance, where that is known, and tells the normal of the
         surface by the direction of its force. Rows are frames × whiskers.
 
@@ -184,7 +202,7 @@ def fit_contacts(
     if shape not in get_args(Shape):
         raise ValueError(f"shape is {shape!r}; one of {', '.join(get_args(Shape))} is needed")
     if axis is not None and shape != "cylinder":
-        raise ValueError(f"an axis is given; a {shape} has none")
+        raise ValueError(f"an axis is given; only a cylinder has one, and the shape is {shape!r}")
     count = estimates.sizes["whisker"]
     if len(whiskers) != count:
         raise ValueError(f"there are estimates of {count} whiskers; {len(whiskers)} are given")
@@ -199,9 +217,9 @@ def fit_contacts(
         for name in ("normal_covariance", "point_normal_covariance"):
             known[name] = _rows(estimates[name])
     try:
-        if shape == "cylinder":
+        if axis is not None:
             return fit_cylinder(points, axis=axis, **known)
-        return (fit_sphere if shape == "sphere" else fit_plane)(points, **known)
+        return _FITS[shape](points, **known)
     except ValueError as fault:
         found = int(np.isfinite(points).all(axis=1).sum())
         raise ValueError(

@@ -72,7 +72,7 @@ def paper_pose(recording: xr.DataTree, cutoff: float | None) -> list[Pose]:
     head = HeadPose.still(root.sizes["time"])
     if {"head_position", "head_rotation"} <= set(root.data_vars):
         head = HeadPose(root["head_position"].values, root["head_rotation"].values)
-    rate = 1.0 / float(np.median(np.diff(root["time"].values))) if root.sizes["time"] > 1 else 1.0
+    rate, cutoff = _rate(root["time"].values, cutoff)
     group = recording.children.get("measured")
     measured = None if group is None or "base_azimuth" not in group else group.to_dataset()
     prefix = "unfiltered_"
@@ -101,6 +101,16 @@ def paper_pose(recording: xr.DataTree, cutoff: float | None) -> list[Pose]:
         rotation, position = head.rotation @ pose.rotation, head.put_in(pose.position)
         poses.append(Pose(rotation, position, _pose_covariance(own, rotation, position)))
     return poses
+
+
+def _rate(time: Array, cutoff: float | None) -> tuple[float, float | None]:
+    """Frames per second, and the cut-off; a single frame is not filtered."""
+    if time.size < 2:
+        return 1.0, None
+    step = float(np.median(np.diff(time)))
+    if not step > 0.0:
+        raise ValueError(f"the times of the frames must rise; the usual step is {step} s")
+    return 1.0 / step, cutoff
 
 
 def _pose_covariance(own: xr.Dataset, rotation: Array, position: Array) -> Array:

@@ -8,6 +8,7 @@ from vibrissa.io import load_recording, save_recording
 from vibrissa.rod.surfaces import follow_surfaces
 from vibrissa.trial import (
     Dynamics,
+    Look,
     Motion,
     Plane,
     Sphere,
@@ -18,7 +19,9 @@ from vibrissa.trial import (
     recorded_objects,
     recorded_whisker,
     simulate,
+    views_of,
 )
+from vibrissa.trial.film import film_frames
 from vibrissa.trial.motion import ELEVATION_PER_AZIMUTH, ROLL_PER_AZIMUTH
 from vibrissa.whisker.emergence import angles_of, base_rotation
 
@@ -207,3 +210,16 @@ def test_whiskers_and_motions_must_belong_together(motions):
     free = array_whisking(ARRAY, 0.15, 400.0, head_position=[0.0, 0.0, 1e-3])["LC2"]
     with pytest.raises(ValueError, match="differ in head"):
         simulate(pair, [both[0], free], Sphere([0.0, 0.05, 0.0], 5e-3))
+
+
+def test_a_film_shows_the_face_between_the_whiskers(trial):
+    (top, _) = views_of(trial)
+    first = next(iter(film_frames(trial, top, Look(unevenness=0.0))))
+    snout = top.project(trial["base_position"].values[0].mean(axis=0))
+    shaft = top.project(trial["truth"]["centerline"].values[0, 0, 10])
+    column, row = snout.round().astype(int)
+    assert first[row, column] < 40
+    column, row = shaft.round().astype(int)
+    around = first[row - 2 : row + 3, column - 2 : column + 3]
+    assert np.median(first) > 150
+    assert around.min() < np.median(first) - 15

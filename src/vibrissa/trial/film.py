@@ -36,6 +36,9 @@ Progress = Callable[[int, int], None]
 _STEP = 2.0
 """Length of a piece of painted whisker, pixels."""
 
+_CHEEK = 0.5e-3
+"""How far the face of several whiskers reaches beyond their bases, m."""
+
 _FUR = 2.0
 """Softness of the face's edge, standard deviation, pixels."""
 
@@ -64,6 +67,7 @@ class Look:
         Standard deviation, grey values.
     face : tuple of float
         Half the length, width and height of the face, m. The base is on its surface. Zeros: none.
+        That of several whiskers is as large as they stand on it.
     """
 
     light: float = 200.0
@@ -226,7 +230,7 @@ def film_frames(
     for i in range(len(lines)):
         if all(look.face):
             light[box[0] : box[1], box[2] : box[3]] = scene[box[0] : box[1], box[2] : box[3]]
-            middle, inverse, box = _face(camera, lines[i, 0, 0], look)
+            middle, inverse, box = _face(camera, lines[i, :, 0], look)
             painting.shade(light, middle, inverse, look.dark, _FUR, box)
         total[:] = 0.0
         for whisker, line, move in zip(whiskers, lines[i], moves[i], strict=True):
@@ -339,11 +343,15 @@ def _scene(camera: Camera, objects: Sequence[Surface], look: Look, center: Array
     return np.asarray(light, dtype=np.float32)
 
 
-def _face(camera: Camera, base: Array, look: Look) -> tuple[Array, Array, NDArray[np.int64]]:
+def _face(camera: Camera, bases: Array, look: Look) -> tuple[Array, Array, NDArray[np.int64]]:
     """Middle (2,) and matrix (2, 2) of the ellipse that the face shows, and the box around it."""
-    center = base - np.array([look.face[0], 0.0, 0.0])
+    if len(bases) == 1:
+        center, size = bases[0] - [look.face[0], 0.0, 0.0], np.array(look.face)
+    else:
+        center = bases.mean(axis=0)
+        size = np.abs(bases - center).max(axis=0) + _CHEEK
     middle, slopes = camera.project_with_slopes(center)
-    half = slopes * np.array(look.face)
+    half = slopes * size
     square = half @ half.T
     reach = np.sqrt(np.diag(square)) + 4.0 * _FUR
     ends = np.stack([middle - reach, middle + reach + 1.0])[:, ::-1].T.reshape(-1)

@@ -102,9 +102,9 @@ def within_reach(whisker: Whisker | WhiskerArray, kind: str | None = None) -> Su
             "plane": Plane(np.array([0.0, 0.3 * reach, 0.0]), np.array([0.0, -1.0, 0.0])),
         }
     else:
-        ahead = 1e-3 * np.array([22.0, 27.0, -8.0])
+        ahead = 1e-3 * np.array([22.0, 28.0, -10.0])
         things = {
-            "sphere": Sphere(ahead, 12e-3),
+            "sphere": Sphere(ahead, 15e-3),
             "peg": Peg(1e-3 * np.array([20.0, 22.0, 0.0]), np.array([0.0, 0.0, 1.0]), PEG_RADIUS),
             "box": Box(ahead, 1e-3 * np.array([24.0, 20.0, 24.0]), edge_radius=1e-3),
             "plane": Plane(np.array([0.0, 24e-3, 0.0]), np.array([0.0, -1.0, 0.0])),

@@ -182,7 +182,7 @@ def _truth(
     return {
         "force": bent.force,
         "moment": bent.moment,
-        "centerline": np.einsum(turn, rotation, bent.centerline(nodes)) + position[:, None],
+        "centerline": bent.centerline(nodes) @ np.swapaxes(rotation, 1, 2) + position[:, None],
         "contact_point": np.einsum(turn, rotation, bent.contact_point) + position,
         "contact_point_whisker": bent.contact_point,
         "arc_length": bent.arc_length,
@@ -255,7 +255,7 @@ def _overlap(
     lines = bent.centerline(_LOOK_AT)
     for first in range(0, touching.size, _FRAMES_AT_ONCE):
         rows = touching[first : first + _FRAMES_AT_ONCE]
-        line = np.einsum("tij,tkj->tki", rotation[rows], lines[rows]) + position[rows, None]
+        line = lines[rows] @ np.swapaxes(rotation[rows], 1, 2) + position[rows, None]
         beside = np.abs(s - bent.arc_length[rows, None]) < _ASIDE * whisker.length
         for i, solid in enumerate(solids):
             gap = solid.signed_distance(line) - radius

@@ -20,6 +20,8 @@ import vibrissa as vb
 from vibrissa import plots
 from vibrissa.cli.figures import witnesses
 from vibrissa.mapping import critical_cones, error_solid, signal_slice
+from vibrissa.pipeline import with_estimates
+from vibrissa.trial import array_whisking, head_path, measure, simulate, within_reach
 
 WIDTH = 1200
 CURVATURES = np.arange(8) / 5.0
@@ -56,7 +58,19 @@ def line() -> np.ndarray:
     return chart().whisker.centerline(101)
 
 
+def touching_array() -> Figure:
+    """All whiskers of a face and a sphere, with the contacts that are estimated."""
+    rat = vb.whisker_array()
+    time = np.arange(500) / 1000
+    turn, place = head_path(time, to_position=[0, 14e-3, 0])
+    motions = array_whisking(rat, 0.5, 1000, head_rotation=turn, head_position=place)
+    trial = measure(simulate(rat, motions, within_reach(rat, "sphere")))
+    return plots.array_views(with_estimates(trial), contacts="estimates")
+
+
 FIGURES: dict[str, Callable[[], Figure]] = {
+    "array": lambda: plots.array_views(vb.whisker_array().to_tree()),
+    "array_trial": touching_array,
     "signal_space": lambda: plots.signal_clouds(chart().to_dataset(), line()),
     "contact_surfaces": lambda: plots.contact_surfaces(chart().to_dataset(), line()),
     "sensitivity": lambda: plots.sensitivity_panels(vb.sensitivity(chart(), at="grid")),

@@ -8,6 +8,8 @@ from typing import Any
 
 Draw = Callable[[], Any]
 
+_CONTACTS = ("estimates", "truth")
+
 
 def array_drawings(path: Path, width: Any) -> dict[str, Draw]:
     """Say what can be drawn of a face.
@@ -23,7 +25,8 @@ def array_drawings(path: Path, width: Any) -> dict[str, Draw]:
     -------
     dict of str to callable
         Names of figures, and what draws them: none, unless it holds an array of whiskers, or is the
-        recording of a simulated trial of several.
+        recording of several, whose contact points are drawn as they were estimated, or else as they
+        truly are or were tracked.
 
     Raises
     ------
@@ -37,11 +40,15 @@ def array_drawings(path: Path, width: Any) -> dict[str, Draw]:
 
     kind = None if path.is_dir() else recognise(path)
     if kind in (None, Kind.ARRAY, Kind.ARRAY_TABLE):
-        tree = load_array(path).to_tree()
-    elif kind == Kind.RECORDING:
-        tree = load_recording(path)
-        if tree.sizes.get("whisker", 0) < 2 or "truth" not in tree.children:
-            return {}
-    else:
+        face = load_array(path).to_tree()
+        return {"array": lambda: plots.array_views(face, width=width)}
+    if kind != Kind.RECORDING:
         return {}
-    return {"array": lambda: plots.array_views(tree, width=width)}
+    trial = load_recording(path)
+    groups = {name: group for name in _CONTACTS if (group := trial.get(name)) is not None}
+    groups["/"] = trial
+    contacts = [name for name, group in groups.items() if "contact_point" in group.data_vars]
+    lines = any("centerline" in group.data_vars for group in groups.values())
+    if trial.sizes.get("whisker", 0) < 2 or not contacts or not lines:
+        return {}
+    return {"array": lambda: plots.array_views(trial, contacts=contacts[0], width=width)}

@@ -22,6 +22,7 @@ from vibrissa.cli import (
     locating,
     sensing,
     simulating,
+    streaming,
     tracking,
     viewing,
     whole_job,
@@ -53,6 +54,7 @@ app.command("sensitivity")(sensing.sensitivity)
 app.command("signals")(feeling.signals)
 app.command("estimate")(locating.estimate)
 app.command("reconstruct")(contouring.reconstruct)
+app.command("stream")(streaming.stream)
 app.command("figures")(figures.figures)
 app.command("view")(viewing.view)
 app.command("movie")(filming.movie)

@@ -221,6 +221,14 @@ class Estimator:
         """Signals that contacts are found from, in canonical order; none of a mix of components."""
         return self.readout.names if isinstance(self.readout, Named) else ()
 
+    @property
+    def announced(self) -> tuple[str, ...]:
+        """Names of the numbers of one measurement, in their order."""
+        if self._sensor is not None:
+            return tuple(self._sensor.channels)
+        order = np.argsort(self._order or range(len(self.names))).tolist()
+        return tuple(self.names[i] for i in order)
+
     def reset(self) -> None:
         """Forget the measurement before, as when the whisker has lost touch."""
         self._last: tuple[Array, Array] | None = None  # ξ and (F, p) of the contact followed

@@ -1,0 +1,257 @@
+"""`vibrissa stream`: contacts while signals come in."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from vibrissa.cli.terminal import errors
+
+if TYPE_CHECKING:
+    from vibrissa.io.rosbag import ContactBag
+    from vibrissa.mapping import ContactMap, Estimator
+    from vibrissa.sensing import Sensor
+    from vibrissa.streaming import ContactStream
+
+
+def stream(
+    source: Annotated[
+        Path | None,
+        typer.Argument(
+            help="A file, named pipe or serial device with lines, or a ROS bag; by default "
+            "standard input.",
+            metavar="[SOURCE]",
+        ),
+    ] = None,
+    udp: Annotated[
+        str | None,
+        typer.Option(help="Receive lines as UDP datagrams here instead.", metavar="HOST:PORT"),
+    ] = None,
+    chart: Annotated[
+        Path | None,
+        typer.Option("--map", help="Of the whisker; simulated if not given.", metavar="FILE"),
+    ] = None,
+    whisker: Annotated[
+        Path | None,
+        typer.Option(help="Centreline as CSV, where no map is given.", metavar="FILE"),
+    ] = None,
+    sensor: Annotated[
+        Path | None,
+        typer.Option(
+            help="Description of the sensor, TOML: the lines then carry its channels, raw.",
+            metavar="FILE",
+        ),
+    ] = None,
+    signals: Annotated[
+        str,
+        typer.Option(
+            help="Without a sensor: the signals to use, of Fx, FT, FD, Mx, MB, MD. The lines carry "
+            "these, or Fx, Fy, Fz, Mx, My, Mz.",
+            metavar="A,B,C",
+        ),
+    ] = "Fx,MB,MD",
+    force_noise: Annotated[
+        float, typer.Option(help="Standard deviation of a force component, µN.", min=0.0)
+    ] = 1.0,
+    moment_noise: Annotated[
+        float, typer.Option(help="Standard deviation of a moment component, µN·m.", min=0.0)
+    ] = 0.02,
+    stiffness_sigma: Annotated[
+        float,
+        typer.Option(help="Standard deviation of the whisker's bending stiffness, %.", min=0.0),
+    ] = 0.0,
+    felt: Annotated[
+        float,
+        typer.Option(help="Standard deviations from zero at which a contact is felt.", min=0.0),
+    ] = 5.0,
+    follow: Annotated[
+        bool,
+        typer.Option(
+            "--filter",
+            help="Follow contacts over time, with the pose of the base if lines carry base_x, "
+            "base_y, base_z (m) and base_qw, base_qx, base_qy, base_qz.",
+        ),
+    ] = False,
+    speed: Annotated[
+        float | None,
+        typer.Option(
+            help="How fast contacts move in the laboratory, for the filter, mm/s; by default a "
+            "quarter of the whisker's length a second.",
+        ),
+    ] = None,
+    topic: Annotated[
+        str | None,
+        typer.Option(help="Of WrenchStamped in a bag, where there are several.", metavar="NAME"),
+    ] = None,
+    bag: Annotated[
+        Path | None,
+        typer.Option(
+            "--bag-out",
+            help="Write PointStamped and PointCloud2 to this new ROS 2 bag as well.",
+            metavar="FOLDER",
+        ),
+    ] = None,
+    count: Annotated[
+        int | None, typer.Option(help="Stop after so many lines.", min=1, metavar="N")
+    ] = None,
+) -> None:
+    """Find contacts while signals come in, one line of JSON each.
+
+    Lines are CSV with a header, or JSON objects, in SI units; a column time is passed on. A line
+    that cannot be read gives a line with its number and the error. Points are in the whisker's
+    frame, m; with --filter also in the laboratory's (lab_x, ...). Stop with Ctrl-C.
+    Example: `vibrissa stream --udp 127.0.0.1:5005 --sensor sensor.toml --whisker wire.csv`
+    """
+    from vibrissa.io.rosbag import is_bag
+    from vibrissa.sensing import load_sensor
+
+    if source is not None and udp is not None:
+        raise ValueError("give either a source or --udp")
+    described = None if sensor is None else load_sensor(sensor)
+    from_bag = source is not None and is_bag(source)
+    with ExitStack() as opened:
+        writer = None if bag is None else opened.enter_context(_bag(bag, follow))
+        lines = (
+            _bag_lines(source, topic)
+            if source is not None and from_bag
+            else _lines(source, udp, opened)
+        )
+        contacts = _map(chart, whisker)
+        estimator = _estimator(
+            contacts, described, signals, (force_noise, moment_noise), stiffness_sigma, felt
+        )
+        running = _stream(estimator, described, from_bag, follow, speed)
+        with suppress(KeyboardInterrupt):  # the usual end
+            _write(running, islice(lines, count), writer)
+    errors.print(
+        f"{running.samples} samples, {running.faults} lines that could not be read",
+        highlight=False,
+    )
+
+
+def _lines(source: Path | None, udp: str | None, opened: ExitStack) -> Iterator[str]:
+    """Lines as they come; a socket is open before the map is made, so that none are lost."""
+    from vibrissa.streaming.sources import file_lines, udp_address, udp_lines, udp_socket
+
+    if udp is not None:
+        heard = opened.enter_context(udp_socket(*udp_address(udp)))
+        host, port = heard.getsockname()[:2]
+        errors.print(f"listening at {host}:{port}", highlight=False)
+        return udp_lines(heard)
+    if source is None or str(source) == "-":
+        return iter(sys.stdin.readline, "")
+    if not source.exists():
+        raise FileNotFoundError(f"there is no file {source}")
+    return file_lines(source)
+
+
+def _bag_lines(source: Path, topic: str | None) -> Iterator[str]:
+    import json
+
+    from vibrissa.io.rosbag import bag_wrenches
+    from vibrissa.streaming.contacts import COMPONENTS
+
+    for time, wrench, _ in bag_wrenches(source, topic):
+        values = dict(zip(COMPONENTS, wrench.tolist(), strict=True))
+        yield json.dumps({"time": time} | values)
+
+
+def _map(chart: Path | None, whisker: Path | None) -> ContactMap:
+    from vibrissa.cli.sources import map_from, whisker_from
+    from vibrissa.mapping import ContactMap
+
+    if chart is not None and whisker is not None:
+        raise ValueError("give either --map or --whisker: a map already has its whisker")
+    if chart is not None:
+        return map_from(chart)
+    chosen = whisker_from(whisker)
+    errors.print(f"no map given; simulating that of {chosen!r}", highlight=False, soft_wrap=True)
+    return ContactMap.simulate(chosen, grid=False)
+
+
+def _estimator(
+    contacts: ContactMap,
+    sensor: Sensor | None,
+    signals: str,
+    noise: tuple[float, float],
+    stiffness_sigma: float,
+    felt: float,
+) -> Estimator:
+    import numpy as np
+
+    from vibrissa.mapping import Estimator
+
+    share = 0.01 * stiffness_sigma
+    if sensor is not None:
+        return Estimator.of_sensor(contacts, sensor, share, felt)
+    covariance = np.diag(np.repeat([1e-6 * noise[0], 1e-6 * noise[1]], 3) ** 2)
+    return Estimator(contacts, signals, covariance, share, felt)
+
+
+def _stream(
+    estimator: Estimator,
+    sensor: Sensor | None,
+    from_bag: bool,
+    follow: bool,
+    speed: float | None,
+) -> ContactStream:
+    from vibrissa.mapping import ContactFilter
+    from vibrissa.streaming import ContactStream
+
+    filtered = None
+    if follow:
+        filtered = ContactFilter(estimator, speed=None if speed is None else 1e-3 * speed)
+    elif speed is not None:
+        raise ValueError("--speed is of the filter: add --filter")
+    names = None if sensor is None else tuple(sensor.channels)
+    if from_bag and sensor is not None and not set(names or ()) <= set(_wrench_names()):
+        raise ValueError(
+            f"a bag of wrenches carries {', '.join(_wrench_names())}; the sensor has "
+            f"{', '.join(sensor.channels)}"
+        )
+    return ContactStream(estimator, names, filtered)
+
+
+def _wrench_names() -> tuple[str, ...]:
+    from vibrissa.streaming.contacts import COMPONENTS
+
+    return COMPONENTS
+
+
+def _bag(path: Path, follow: bool) -> ContactBag:
+    from vibrissa.io.rosbag import ContactBag
+
+    return ContactBag(path, frame="laboratory" if follow else "whisker")
+
+
+def _write(running: ContactStream, lines: Iterator[str], writer: ContactBag | None) -> None:
+    """Print records as they come, each at once; stop quietly when nobody reads any more."""
+    from vibrissa.streaming.contacts import as_json
+
+    try:
+        for record in running.records(lines):
+            sys.stdout.write(as_json(record) + "\n")
+            sys.stdout.flush()
+            if writer is not None and "error" not in record:
+                _put(writer, record)
+    except BrokenPipeError:
+        # What is flushed at the end must not fail again.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _put(writer: ContactBag, record: dict[str, Any]) -> None:
+    import numpy as np
+
+    followed = "hypotheses" in record
+    points = np.reshape(record.get("hypotheses", record.get("candidates", [])), (-1, 3))
+    likely = record.get("probabilities", [1.0 / len(points)] * len(points) if len(points) else [])
+    names = ("lab_x", "lab_y", "lab_z") if followed else ("x", "y", "z")
+    point = np.array([record[name] for name in names]) if "x" in record else None
+    writer.write(record["time"], point, points, np.array(likely))

@@ -1,0 +1,207 @@
+"""From samples to contacts, as plain records that are written as JSON lines."""
+
+from __future__ import annotations
+
+import json
+import math
+import time as clock
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vibrissa.mapping import ContactFilter, Estimator, Followed, Located
+from vibrissa.mapping.contact_map import spherical
+from vibrissa.signals import SIGNALS
+from vibrissa.signals.base import signals_of
+from vibrissa.streaming.lines import Lines, Sample
+
+Array = NDArray[np.float64]
+
+COMPONENTS = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
+"""What signals are computed from, where a stream carries these."""
+
+
+class ContactStream:
+    """Lines in, records out.
+
+    Parameters
+    ----------
+    estimator : Estimator
+        Locates single samples.
+    names : sequence of str, optional
+        What a line must carry: a sensor's channels, in their order. By default the estimator's
+        signals, or components of force and moment from which these are computed, whichever the
+        first line has.
+    follow : ContactFilter, optional
+        Follows contacts over time with the base's pose, if a line has one; made of the same
+        estimator.
+    """
+
+    def __init__(
+        self,
+        estimator: Estimator,
+        names: tuple[str, ...] | None = None,
+        follow: ContactFilter | None = None,
+    ) -> None:
+        by_name = estimator.announced
+        self.lines = Lines(names or by_name, *(() if names else (_components(by_name),)))
+        self.samples, self.faults = 0, 0
+        self._estimator, self._follow = estimator, follow
+        self._which = [SIGNALS.index(name) for name in by_name] if names is None else []
+        self._begun = clock.monotonic()
+
+    def records(self, lines: Iterable[str]) -> Iterator[dict[str, Any]]:
+        """Turn lines into records, one for each sample, and one for each line that is none.
+
+        Parameters
+        ----------
+        lines : iterable of str
+            As they come.
+
+        Yields
+        ------
+        dict
+            Ready for JSON: ``time``, ``status`` and what is known of the contact; or ``line`` and
+            ``error``.
+        """
+        for line in lines:
+            try:
+                sample = self.lines(line)
+                if sample is None:
+                    continue
+                record = self.record(sample)
+            except ValueError as fault:
+                self.faults += 1
+                yield {"line": self.lines.number, "error": str(fault)}
+                continue
+            self.samples += 1
+            yield record
+
+    def record(self, sample: Sample) -> dict[str, Any]:
+        """Locate one sample.
+
+        Parameters
+        ----------
+        sample : Sample
+            With the values in the order of the names.
+
+        Returns
+        -------
+        dict
+            Ready for JSON.
+
+        Raises
+        ------
+        ValueError
+            If the estimator or the filter refuses it.
+        """
+        time = sample.time if math.isfinite(sample.time) else clock.monotonic() - self._begun
+        values = sample.values
+        if self._which and sample.names != self._estimator.announced:
+            wrench = np.zeros(6)
+            wrench[[COMPONENTS.index(name) for name in sample.names]] = values
+            values = signals_of(wrench[:3], wrench[3:])[self._which]
+        if self._follow is None:
+            found = self._estimator(values, sample.rotation)
+            return {"time": time} | located_record(found)
+        known = self._follow(time, values, sample.rotation, sample.position)
+        return {"time": time} | followed_record(known)
+
+
+def _components(signals: tuple[str, ...]) -> tuple[str, ...]:
+    """Components of force and moment that signals are computed from."""
+    of = {"Fx": "Fx", "FT": "Fy Fz", "FD": "Fy Fz", "Mx": "Mx", "MB": "My Mz", "MD": "My Mz"}
+    needed = " ".join(of[name] for name in signals).split()
+    return tuple(name for name in COMPONENTS if name in needed)
+
+
+def located_record(found: Located) -> dict[str, Any]:
+    """What a single sample tells, in the whisker's frame and SI units.
+
+    Parameters
+    ----------
+    found : Located
+        Of an estimator.
+
+    Returns
+    -------
+    dict
+        ``status``, and of a contact ``x``, ``y``, ``z``, ``r``, ``theta``, ``phi``,
+        ``arc_length``, ``force`` at the base, ``sigma_x``, ..., and all ``candidates``.
+    """
+    record: dict[str, Any] = {"status": found.status.name.lower()}
+    if not len(found.candidates):
+        return record
+    record |= _place(found.point)
+    which = int(np.argmin(((found.candidates - found.point) ** 2).sum(axis=1)))
+    record["arc_length"] = float(found.arc_lengths[which])
+    record["force"] = found.forces[which].tolist()
+    record |= _sigma(found.covariance)
+    record["misfit"] = float(found.misfit)
+    record["continuing"] = found.continuing
+    record["candidates"] = found.candidates.tolist()
+    return record
+
+
+def followed_record(known: Followed) -> dict[str, Any]:
+    """What a filter knows.
+
+    Parameters
+    ----------
+    known : Followed
+        Of a filter.
+
+    Returns
+    -------
+    dict
+        As of a single sample in the whisker's frame, but deviations and ``hypotheses`` with their
+        ``probabilities`` are in the laboratory, as are ``lab_x``, ``lab_y``, ``lab_z`` and
+        ``velocity``.
+    """
+    record: dict[str, Any] = {"status": known.status.name.lower()}
+    if not len(known.points):
+        return record
+    record |= _place(known.point_whisker)
+    record |= dict(zip(("lab_x", "lab_y", "lab_z"), known.point.tolist(), strict=True))
+    record |= _sigma(known.covariance)
+    record["velocity"] = known.velocity.tolist()
+    record["probability"] = known.probability
+    record["hypotheses"] = known.points.tolist()
+    record["probabilities"] = known.probabilities.tolist()
+    return record
+
+
+def as_json(record: dict[str, Any]) -> str:
+    """One line of JSON; what is not finite is null.
+
+    Parameters
+    ----------
+    record : dict
+        Of numbers, texts and lists.
+
+    Returns
+    -------
+    str
+        Without an end of line.
+    """
+    return json.dumps(_finite(record), ensure_ascii=False)
+
+
+def _place(point: Array) -> dict[str, float]:
+    values = np.concatenate([point, spherical(point)]).tolist()
+    return dict(zip(("x", "y", "z", "r", "theta", "phi"), values, strict=True))
+
+
+def _sigma(covariance: Array) -> dict[str, float]:
+    sigma = np.sqrt(np.diag(covariance)).tolist()
+    return dict(zip(("sigma_x", "sigma_y", "sigma_z"), sigma, strict=True))
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _finite(part) for name, part in value.items()}
+    if isinstance(value, list):
+        return [_finite(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,162 @@
+"""Lines of signals: CSV with a header, or one JSON object a line.
+
+Both carry numbers by name, in SI units. The pose of the base may ride along: ``base_x``, ``base_y``
+and ``base_z`` (m, laboratory), and a unit quaternion ``base_qw``, ``base_qx``, ``base_qy``,
+``base_qz`` that turns the whisker's into the laboratory frame.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+POSITION = ("base_x", "base_y", "base_z")
+"""Columns with the position of the base."""
+
+QUATERNION = ("base_qw", "base_qx", "base_qy", "base_qz")
+"""Columns with its orientation."""
+
+# A quaternion that was rounded is no longer of unit length by this much.
+_UNIT = 0.01
+
+
+class Sample(NamedTuple):
+    """One line: its number, the named values, and the pose of the base, where it is there.
+
+    Parameters
+    ----------
+    line : int
+        Number of the line, from 1.
+    time : float
+        Of the sample, s; NaN where the line has none.
+    names : tuple of str
+        Which of the choices asked for it has.
+    values : (k,) array
+        In that order.
+    rotation : (3, 3) array or None
+        From the whisker's to the laboratory frame.
+    position : (3,) array or None
+        Of the base in the laboratory, m.
+    """
+
+    line: int
+    time: float
+    names: tuple[str, ...]
+    values: Array
+    rotation: Array | None
+    position: Array | None
+
+
+class Lines:
+    """Takes lines apart; the first one that is no JSON is a header.
+
+    Parameters
+    ----------
+    *names : sequence of str
+        The values wanted, or several choices of them: the first that a line has counts.
+    """
+
+    def __init__(self, *names: tuple[str, ...]) -> None:
+        self.names = names
+        self.number = 0
+        self._header: list[str] | None = None
+
+    def __call__(self, line: str) -> Sample | None:
+        """Read one line.
+
+        Parameters
+        ----------
+        line : str
+            With or without its end.
+
+        Returns
+        -------
+        Sample or None
+            None for a header, an empty line, and a comment after ``#``.
+
+        Raises
+        ------
+        ValueError
+            If it is neither, or lacks a value; what is wrong with it.
+        """
+        self.number += 1
+        text = line.strip().lstrip("\ufeff")
+        if not text or text.startswith("#"):
+            return None
+        known = self._object(text) if text.startswith("{") else self._row(text)
+        return None if known is None else self._sample(known)
+
+    def _chosen(self, what: str, there: list[str]) -> tuple[str, ...]:
+        for names in self.names:
+            if set(names) <= set(there):
+                return names
+        choices = "; or ".join(
+            ", ".join(name for name in names if name not in there) for names in self.names
+        )
+        raise ValueError(f"{what} lacks {choices} (it has {', '.join(there)})")
+
+    def _object(self, text: str) -> dict[str, object]:
+        try:
+            known = json.loads(text)
+        except json.JSONDecodeError as error:
+            raise ValueError(f"no JSON: {error}") from None
+        return {str(name): value for name, value in known.items()}
+
+    def _row(self, text: str) -> dict[str, object] | None:
+        cells = [cell.strip() for cell in next(csv.reader([text]))]
+        if self._header is None:
+            self._chosen("the header", cells)
+            self._header = cells
+            return None
+        if cells == self._header:  # a sender that has begun anew
+            return None
+        if len(cells) != len(self._header):
+            raise ValueError(f"{len(cells)} cells; the header has {len(self._header)}")
+        return dict(zip(self._header, cells, strict=True))
+
+    def _sample(self, known: dict[str, object]) -> Sample:
+        names = self._chosen("it", list(known))
+        time = _number("time", known["time"]) if "time" in known else math.nan
+        values = np.array([_number(name, known[name]) for name in names])
+        rotation = position = None
+        if set(POSITION) <= set(known):
+            position = np.array([_number(name, known[name]) for name in POSITION])
+        if set(QUATERNION) <= set(known):
+            rotation = _rotation(np.array([_number(name, known[name]) for name in QUATERNION]))
+        return Sample(self.number, time, names, values, rotation, position)
+
+
+def _number(name: str, value: object) -> float:
+    """Of a cell; empty and null are missing."""
+    if value is None or value == "":
+        return math.nan
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        raise ValueError(f"{name} is {value!r}, which is no number")
+    try:
+        return float(value)
+    except ValueError:
+        raise ValueError(f"{name} is {value!r}, which is no number") from None
+
+
+def _rotation(q: Array) -> Array | None:
+    """The matrix of a quaternion (w, x, y, z); None for NaN."""
+    size = float(np.linalg.norm(q))
+    if not math.isfinite(size):
+        return None
+    if abs(size - 1.0) > _UNIT:
+        raise ValueError(f"the quaternion {q.tolist()} is of length {size:.4g}, not 1")
+    w, x, y, z = (q / size).tolist()
+    return np.array(
+        [
+            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+            [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+        ]
+    )

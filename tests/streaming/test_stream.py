@@ -1,0 +1,273 @@
+"""Lines in, contacts out: by pipe, UDP and bag; bad lines are said and passed over."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import vibrissa as vb
+from vibrissa.cli.streaming import stream
+from vibrissa.mapping import ContactFilter, Estimator
+from vibrissa.sensing import Sensor, SensorFrame, save_sensor
+from vibrissa.streaming import ContactStream
+from vibrissa.streaming.contacts import COMPONENTS, as_json
+
+START = "from vibrissa.cli import main; main()"
+NOISE = np.repeat([1e-6, 2e-8], 3)
+
+
+@pytest.fixture(scope="module")
+def gamma_map():
+    return vb.ContactMap.simulate(vb.samples.gamma(), grid=False)
+
+
+@pytest.fixture(scope="module")
+def bent(gamma_map):
+    t = np.linspace(0.0, 1.0, 12)
+    load = vb.PointForce((0.8 - 0.3 * t) * 40e-3, 3e-5 + 6e-5 * t, 0.5 + 1.5 * t)
+    return vb.deflect(gamma_map.whisker, load)
+
+
+@pytest.fixture(scope="module")
+def wrench(bent):
+    return np.concatenate([bent.force, bent.moment], axis=1)
+
+
+@pytest.fixture(scope="module")
+def map_file(gamma_map, tmp_path_factory):
+    path = tmp_path_factory.mktemp("stream") / "map.nc"
+    gamma_map.save(path)
+    return path
+
+
+def csv_lines(wrench):
+    yield "time," + ",".join(COMPONENTS)
+    for i, row in enumerate(wrench):
+        yield f"{0.001 * i}," + ",".join(repr(float(x)) for x in row)
+
+
+def estimator(contacts, names="Fx MB MD", **options):
+    return Estimator(contacts, names, np.diag(NOISE**2), **options)
+
+
+@pytest.mark.parametrize("names", ["Fx MB MD", "MD Fx MB", "Fx FT FD Mx MB MD"])
+@pytest.mark.parametrize("kind", ["components", "signals", "json"])
+def test_lines_give_the_contacts(gamma_map, bent, wrench, names, kind):
+    lines = list(csv_lines(wrench))
+    known = vb.base_signals(bent.force, bent.moment)
+    rows = np.stack([known[name] for name in names.split()], axis=-1)
+    if kind == "signals":
+        lines = [",".join(["time", *names.split()])]
+        lines += [f"{0.001 * i}," + ",".join(map(repr, row.tolist())) for i, row in enumerate(rows)]
+    if kind == "json":
+        lines = [json.dumps(dict(zip(names.split(), row.tolist(), strict=True))) for row in rows]
+    running = ContactStream(estimator(gamma_map, names))
+    records = list(running.records(lines))
+    assert len(records) == len(wrench) == running.samples
+    for i, record in enumerate(records):
+        assert record["status"] in ("unique", "ambiguous")
+        away = np.linalg.norm(np.array(record["candidates"]) - bent.contact_point[i], axis=1)
+        assert away.min() < 1e-8
+        assert record["sigma_x"] > 0.0
+        if kind != "json":
+            assert record["time"] == 0.001 * i
+
+
+def test_bad_lines_are_said_and_passed_over(gamma_map, wrench):
+    good = list(csv_lines(wrench))
+    lines = [
+        "# a comment",
+        good[0],
+        good[1],
+        "1.0,2.0",
+        "",
+        good[2].replace(good[2].split(",")[1], "abc"),
+        "{broken",
+        '{"Fx": 1e-5}',
+        '{"Fx": true, "MB": 1e-6, "MD": 0.5}',
+        '{"Fx": 1e-5, "MB": -1e-6, "MD": 0.5}',
+        good[3].rsplit(",", 1)[0] + ",",
+        good[0],
+        good[4],
+    ]
+    running = ContactStream(estimator(gamma_map))
+    records = list(running.records(lines))
+    faults = {record["line"]: record["error"] for record in records if "error" in record}
+    assert set(faults) == {4, 6, 7, 8, 9, 10}
+    assert running.faults == 6
+    assert "2 cells" in faults[4]
+    assert "'abc', which is no number" in faults[6]
+    assert "no JSON" in faults[7]
+    assert "lacks MB, MD" in faults[8]
+    assert "no number" in faults[9]
+    assert "cannot be negative" in faults[10]
+    found = [record["status"] for record in records if "status" in record]
+    assert found == ["unique", "missing", "unique"]
+    header = ContactStream(estimator(gamma_map))
+    (record,) = header.records(["time,Fx,My"])
+    assert "the header lacks MB, MD; or Mz" in record["error"]
+
+
+def test_records_are_json_whatever_is_missing(gamma_map):
+    running = ContactStream(Estimator(gamma_map, "Fx MB MD"))
+    (record,) = running.records(['{"time": 1.0, "Fx": null, "MB": 1e-6, "MD": 0.5}'])
+    assert json.loads(as_json(record)) == {"time": 1.0, "status": "missing"}
+    assert (
+        as_json({"a": [np.inf, 1.0], "b": {"c": np.nan}}) == '{"a": [null, 1.0], "b": {"c": null}}'
+    )
+
+
+def test_a_filter_gives_the_laboratory_by_the_pose_in_the_line(gamma_map, bent, wrench):
+    contacts = estimator(gamma_map)
+    running = ContactStream(contacts, follow=ContactFilter(contacts))
+    half = np.sqrt(0.5)  # a quarter turn about z
+    pose = {"base_x": 0.1, "base_y": 0.2, "base_z": 0.3}
+    pose |= {"base_qw": half, "base_qx": 0.0, "base_qy": 0.0, "base_qz": half}
+    row = dict(zip(COMPONENTS, wrench[8].tolist(), strict=True))
+    (record,) = running.records([json.dumps({"time": 0.0} | row | pose)])
+    x, y, z = bent.contact_point[8]
+    lab = [record[name] for name in ("lab_x", "lab_y", "lab_z")]
+    np.testing.assert_allclose(lab, [0.1 - y, 0.2 + x, 0.3 + z], atol=1e-7)
+    np.testing.assert_allclose([record[n] for n in "xyz"], bent.contact_point[8], atol=1e-7)
+    late = json.dumps({"time": 0.0} | row | pose)
+    bent_quaternion = json.dumps({"time": 1.0} | row | pose | {"base_qw": 3.0})
+    errors = [record["error"] for record in running.records([late, bent_quaternion])]
+    assert "time goes on" in errors[0]
+    assert "not 1" in errors[1]
+
+
+@contextmanager
+def run(*options):
+    """The verb, stopped at the end come what may."""
+    with subprocess.Popen(
+        [sys.executable, "-c", START, "stream", *map(str, options)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONUNBUFFERED": ""},
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def test_the_verb_answers_each_line_at_once_and_ends_cleanly(map_file, bent, wrench):
+    lines = list(csv_lines(wrench))
+    with run("--map", map_file) as process:
+        process.stdin.write("\n".join(lines[:2]) + "\n")
+        process.stdin.flush()
+        first = json.loads(process.stdout.readline())  # while its input stays open
+        assert first["status"] == "unique"
+        process.stdin.write("nonsense\n" + lines[2] + "\n")
+        process.stdin.flush()
+        assert "error" in json.loads(process.stdout.readline())
+        second = json.loads(process.stdout.readline())
+        np.testing.assert_allclose([second[n] for n in "xyz"], bent.contact_point[1], atol=1e-8)
+        process.send_signal(signal.SIGINT)
+        rest, told = process.communicate(timeout=60)
+        assert rest == ""
+        assert "2 samples, 1 lines that could not be read" in told
+        assert "Traceback" not in told
+        assert process.returncode == 0
+
+
+def test_the_verb_listens_to_udp_with_a_sensor(map_file, bent, wrench, tmp_path):
+    """Two lines in one datagram, one in the next; channels of a sensor that sits askew."""
+    sensor = Sensor(
+        ("a", "b", "c"),
+        np.eye(6)[[0, 4, 5]] * [1e5, 1, 1, 1, 1e7, 1e7],
+        noise=0.1,
+        bias=[1.0, 2.0, 3.0],
+        frame=SensorFrame(("x", "z", "-y")),
+    )
+    save_sensor(tmp_path / "sensor.toml", sensor)
+    readings = wrench @ sensor.base_mixing.T + sensor.bias
+    with run(
+        "--udp",
+        "127.0.0.1:0",
+        "--map",
+        map_file,
+        "--sensor",
+        tmp_path / "sensor.toml",
+        "--count",
+        3,
+    ) as process:
+        heard = process.stderr.readline()
+        port = int(heard.rsplit(":", 1)[1])
+        lines = [json.dumps(dict(zip("abc", row, strict=True))) for row in readings[:3].tolist()]
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+            out.sendto("\n".join(lines[:2]).encode(), ("127.0.0.1", port))
+            time.sleep(0.05)
+            out.sendto(lines[2].encode(), ("127.0.0.1", port))
+        output, _ = process.communicate(timeout=120)
+    records = [json.loads(line) for line in output.splitlines()]
+    assert len(records) == 3
+    for record, point in zip(records, bent.contact_point[:3], strict=True):
+        np.testing.assert_allclose([record[n] for n in "xyz"], point, atol=1e-7)
+
+
+def test_a_bag_goes_in_and_a_bag_comes_out(map_file, bent, wrench, tmp_path, capsys):
+    pytest.importorskip("rosbags")
+    from rosbags.highlevel import AnyReader
+    from rosbags.rosbag2 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    t = store.types
+    with Writer(tmp_path / "in", version=Writer.VERSION_LATEST) as writer:
+        kind = "geometry_msgs/msg/WrenchStamped"
+        topic = writer.add_connection("/wrench", kind, typestore=store)
+        for i, row in enumerate(wrench):
+            stamp = t["builtin_interfaces/msg/Time"](sec=7, nanosec=1_000_000 * i)
+            header = t["std_msgs/msg/Header"](stamp=stamp, frame_id="sensor")
+            force = t["geometry_msgs/msg/Vector3"](*row[:3].tolist())
+            torque = t["geometry_msgs/msg/Vector3"](*row[3:].tolist())
+            both = t["geometry_msgs/msg/Wrench"](force=force, torque=torque)
+            message = t[kind](header=header, wrench=both)
+            raw = store.serialize_cdr(message, kind)
+            writer.write(topic, 7_000_000_000 + 1_000_000 * i, raw)
+    stream(tmp_path / "in", chart=map_file, bag=tmp_path / "out")
+    output = capsys.readouterr().out
+    records = [json.loads(line) for line in output.splitlines()]
+    assert [record["time"] for record in records] == pytest.approx(7.0 + 1e-3 * np.arange(12))
+    with AnyReader([tmp_path / "out"], default_typestore=store) as reader:
+        found = {c.topic: [] for c in reader.connections}
+        for connection, stamp, raw in reader.messages():
+            message = reader.deserialize(raw, connection.msgtype)
+            found[connection.topic].append((stamp, message))
+    points = [(m.point.x, m.point.y, m.point.z) for _, m in found["/contact_point"]]
+    np.testing.assert_allclose(points, bent.contact_point, atol=1e-8)
+    stamp, first = found["/contact_point"][3]
+    assert stamp == 7_003_000_000
+    assert (first.header.stamp.sec, first.header.stamp.nanosec) == (7, 3_000_000)
+    assert first.header.frame_id == "whisker"
+    for record, (_, cloud) in zip(records, found["/contact_candidates"], strict=True):
+        table = np.frombuffer(cloud.data.tobytes(), "<f8").reshape(cloud.width, 4)
+        np.testing.assert_array_equal(table[:, :3], record["candidates"])
+        assert [field.name for field in cloud.fields] == ["x", "y", "z", "probability"]
+        assert cloud.row_step == cloud.data.size == 32 * cloud.width
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"source": Path("nothing.csv")}, "there is no file"),
+        ({"udp": "here"}, "HOST:PORT"),
+        ({"source": Path("x"), "udp": "127.0.0.1:0"}, "either a source or --udp"),
+        ({"sensor": Path("none.toml")}, r"none\.toml"),
+        ({"udp": "127.0.0.1:0", "speed": 1.0}, "add --filter"),
+    ],
+)
+def test_what_cannot_be_is_said(options, message, map_file):
+    with pytest.raises((ValueError, OSError), match=message):
+        stream(chart=map_file, **options)

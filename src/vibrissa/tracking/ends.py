@@ -58,7 +58,7 @@ def traced(
             # Where nothing is seen, nothing holds the line apart.
             return Trace.lost(), False
     line, from_face = with_base(frame, line, before)
-    if before > OUTSIDE:
+    if before > OUTSIDE and len(line) >= FEWEST:
         # What was only guessed is measured before it counts.
         line = even(smoothed(frame, line, 3, noise, options, _FUR if from_face else 0)[0])
     if len(line) < FEWEST:

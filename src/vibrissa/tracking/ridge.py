@@ -30,6 +30,9 @@ FLANK = 5
 WIDTH = 1.4
 """Standard deviation of g, in steps."""
 
+TURNING = 2.8
+"""By how much a whisker turns from base to tip at most, rad: what goes round is none."""
+
 
 def _fit_rows() -> tuple[Array, float, float]:
     """Rows that give −A and A δ, and their variances for unit noise."""
@@ -76,29 +79,41 @@ def fit(p: Any, j: int, rows: Any, out: Any) -> None:
     out[1] = product / amplitude if amplitude > 1e-9 else 0.0
 
 
+@inlined
+def middle_of(histogram: Any, count: int, width: int) -> Any:
+    """Median of numbers that lie at multiples of a width, each being anywhere within it."""
+    seen = 0
+    for d in range(0, histogram.size, width):
+        if 2 * (seen + histogram[d]) >= count:
+            return d - 0.5 * width + width * (0.5 * count - seen) / max(histogram[d], 1)
+        seen += histogram[d]
+    return 0.0
+
+
 @kernel
 def noise_level(frame: Any) -> float:
-    """Standard deviation of the noise, from second differences on a sparse grid."""
+    """Standard deviation of the noise, from second differences on a sparse grid.
+
+    Compression takes away fine noise and leaves coarse; differences of single pixels and those that
+    `depth` takes are both looked at, and the larger noise counts.
+    """
     rows, columns = frame.shape
-    histogram = np.zeros(1024, np.int64)
+    fine, coarse = np.zeros(4096, np.int64), np.zeros(4096, np.int64)
     count = 0
-    for row in range(3, rows - 3, 7):
-        for column in range(3, columns - 3, 5):
-            d = abs(
-                2 * int(frame[row, column])
-                - int(frame[row, column - 2])
-                - int(frame[row, column + 2])
-            )
-            histogram[min(d, 1023)] += 1
+    for row in range(3, rows - 3, 9):
+        for column in range(5, columns - 5, 7):
+            p = frame[row, column - 5 : column + 6]
+            d = abs(2 * int(p[5]) - int(p[3]) - int(p[7]))
+            left = int(p[0]) + int(p[1]) + int(p[2])
+            right = int(p[8]) + int(p[9]) + int(p[10])
+            middle = int(p[4]) + 2 * int(p[5]) + int(p[6])
+            fine[min(12 * d, 4095)] += 1
+            coarse[min(abs(4 * (left + right) - 6 * middle), 4095)] += 1
             count += 1
-    seen = 0
-    for d in range(1024):
-        if 2 * (seen + histogram[d]) >= count:
-            # The median of |x| is 0.6745 standard deviations; a second difference has √6 of them.
-            inside = float((0.5 * count - seen) / max(histogram[d], 1))
-            return max((float(d) - 0.5 + inside) / (0.6745 * 2.449), 0.3)
-        seen += histogram[d]
-    return 0.3
+    # Variances of both for unit noise; the median of |x| is 0.6745 standard deviations.
+    a = middle_of(fine, count, 12) / (12.0 * 0.6745 * math.sqrt(6.0))
+    b = middle_of(coarse, count, 2) / (12.0 * 0.6745 * math.sqrt(13.0 / 6.0))
+    return float(max(a, b, 0.3))
 
 
 @kernel
@@ -159,6 +174,7 @@ def march(
     found = np.empty(2)
     sd = 0.8 * noise
     last, steps = 0, line.shape[0]
+    turned = 0.0
     for k in range(steps):
         if k > 0:
             h = step
@@ -166,6 +182,9 @@ def march(
             x += h * math.cos(angle + 0.5 * kappa * h)
             y += h * math.sin(angle + 0.5 * kappa * h)
             angle += kappa * h
+            turned += kappa * h
+            if abs(turned) > TURNING:
+                break
             # P ← F P Fᵀ + Q with F = [[1, h, h²/2], [0, 1, h], [0, 0, 1]]
             a01 = p01 + h * p11 + 0.5 * h * h * p12
             a02 = p02 + h * p12 + 0.5 * h * h * p22
@@ -203,6 +222,7 @@ def march(
                 x += k0 * offset * nx
                 y += k0 * offset * ny
                 angle += k1 * offset
+                turned += k1 * offset
                 bend += k2 * offset
                 p22 -= k2 * p02
                 p12 -= k1 * p02

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from vibrissa.io.video import Frame
 from vibrissa.tracking.find import find_whiskers, overlap
 from vibrissa.tracking.follow import Follower, start_at
+from vibrissa.tracking.row import follow_row
 from vibrissa.tracking.trace import Trace, TraceOptions, given
 
 Array = NDArray[np.float64]
@@ -24,7 +25,6 @@ Corrections = Mapping[tuple[int, int], ArrayLike]
 KEPT = 64
 """How many frames a correction can change before its own."""
 
-_SAME = 0.5
 _AGREES = 0.9
 
 
@@ -129,7 +129,7 @@ def _check(corrections: Corrections, count: int) -> None:
 def follow_all(
     followers: Sequence[Follower], frame: Frame, known: Mapping[int, ArrayLike]
 ) -> list[Trace]:
-    """Find every whisker in the next frame; no two are the same.
+    """Find every whisker in the next frame.
 
     Parameters
     ----------
@@ -143,28 +143,16 @@ def follow_all(
     Returns
     -------
     list of Trace
-        One a whisker; of two that lie on each other the one that began farther from where it was
-        expected is lost.
+        One a whisker; several are told apart by `vibrissa.tracking.row.follow_row`.
     """
-    expected = [follower.base.copy() for follower in followers]
-    memories = [follower.memory() for follower in followers]
-    found = []
-    for k, follower in enumerate(followers):
-        if k in known:
-            trace = given(known[k])
-            follower.restart(trace)
-        else:
-            trace = follower.follow(frame)
-        found.append(trace)
-    for a in range(len(found)):
-        for b in range(a):
-            if overlap(found[a].line, found[b].line) < _SAME:
-                continue
-            away = [float(np.linalg.norm(found[k].line[0] - expected[k])) for k in (a, b)]
-            loser = b if (a in known or away[0] < away[1]) and b not in known else a
-            found[loser] = Trace.lost()
-            followers[loser].forget(memories[loser])
-    return found
+    if len(followers) > 1:
+        return follow_row(followers, frame, known)
+    (follower,) = followers
+    if not known:
+        return [follower.follow(frame)]
+    trace = given(known[0])
+    follower.restart(trace)
+    return [trace]
 
 
 def _backward(

@@ -1,0 +1,137 @@
+"""Several whiskers of one view, told apart: a filmed row whose truth is known."""
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy.interpolate import CubicSpline
+from scipy.spatial import cKDTree
+
+from vibrissa import Whisker
+from vibrissa.tracking import Trace, ridge, start_at, trace_video
+from vibrissa.tracking.row import follow_row
+from vibrissa.trial import Look, Motion, orthogonal_views, simulate
+from vibrissa.trial.film import film_frames, with_true_traces
+
+COUNT = 6
+FRAMES = 50
+RATE = 250.0
+GAP = 0.5e-3
+CAMERA = orthogonal_views(size=(420, 360), center=(9e-3, 0.0, 0.0))[0]
+
+
+def one(index, generator):
+    """A whisker of the row, whisking at 10 Hz: up to 6° from frame to frame."""
+    t = np.arange(FRAMES) / RATE
+    place = index - 0.5 * (COUNT - 1)
+    amplitude = np.radians(25.0) * (1.0 + 0.1 * generator.normal())
+    azimuth = np.radians(5.0) * place + amplitude * np.sin(20.0 * np.pi * t - 0.15 * index)
+    elevation = np.radians(4.0 * generator.normal()) + 0.1 * azimuth
+    whisker = Whisker.parabola(
+        length=(20.0 - 2.0 * index) * 1e-3, coefficient=10.0 + 3.0 * index, name=f"w{index}"
+    )
+    base = np.tile([0.0, GAP * place, 0.0], (FRAMES, 1))
+    return simulate(whisker, Motion(t, azimuth, elevation, 0.2 * azimuth, base), [])
+
+
+@pytest.fixture(scope="module")
+def row():
+    """Frames of six whiskers, 9 pixels from each other, and their true middles."""
+    generator = np.random.default_rng(0)
+    # The face is where the first one is: one in the middle.
+    trials = [one(k, generator) for k in sorted(range(COUNT), key=lambda k: abs(k - 2.5))]
+    groups = {
+        "/": xr.concat([trial.to_dataset() for trial in trials], "whisker"),
+        "/truth": xr.concat([t["truth"].to_dataset(inherit=False) for t in trials], "whisker"),
+    }
+    for k, trial in enumerate(trials):
+        groups[f"/whiskers/{k}"] = trial["whiskers/0"].to_dataset(inherit=False)
+    recording = with_true_traces(xr.DataTree.from_dict(groups), [CAMERA])
+    look = Look(face=(30e-3, 30e-3, 30e-3))
+    frames = list(film_frames(recording, CAMERA, look, seed=1))
+    return frames, recording["truth"]["trace"].values[:, :, 0]
+
+
+def curve(nodes):
+    return CubicSpline(np.linspace(0.0, 1.0, len(nodes)), nodes)(np.linspace(0.0, 1.0, 400))
+
+
+def whose(line, nodes):
+    """Number of the true whisker on which a line lies over its first two thirds; −1 if on none."""
+    part = line[: max(12, 2 * len(line) // 3)]
+    away = [np.median(cKDTree(curve(each)).query(part)[0]) for each in nodes]
+    return int(np.argmin(away)) if min(away) < 1.5 else -1
+
+
+def names(traces, truth, first=0):
+    """Whose each trace is, (time, whisker); −2 where it is lost."""
+    return np.array(
+        [
+            [whose(t.line, truth[first + i]) if len(t.line) else -2 for t in each]
+            for i, each in enumerate(zip(*traces, strict=True))
+        ]
+    )
+
+
+def test_nobody_is_taken_for_another(row):
+    frames, truth = row
+    traces = trace_video(frames, truth[0, :, 0] + 1.5)
+    found = names(traces, truth)
+    right = found == np.arange(COUNT)
+    assert right[found != -2].mean() >= 0.999
+    assert (found == -2).mean() < 0.02
+
+
+def test_a_frame_without_whiskers_mixes_nobody_up(row):
+    """Three frames are missing, in which the row moves by more than its spacing."""
+    frames, truth = row
+    seen = [frames[i] if i not in (8, 9, 10) else np.full_like(frames[0], 190) for i in range(20)]
+    found = names(trace_video(seen, truth[0, :, 0]), truth)
+    assert (found[8:11] == -2).all()
+    right = found == np.arange(COUNT)
+    assert right[found != -2].all()
+    assert right[-5:].mean() > 0.6
+
+
+def test_a_whisker_that_is_gone_is_lost_and_not_its_neighbour(row):
+    """Painted over from the third frame on, its follower stays without a trace."""
+    frames, truth = row
+    followers = [start_at(base) for base in truth[0, :, 0]]
+    traces = [follow_row(followers, frames[i], {}) for i in (0, 1)]
+    for i in range(2, 12):
+        frame = frames[i].copy()
+        for x, y in curve(truth[i, 2]).astype(int):
+            if x < 58:
+                continue
+            frame[y - 3 : y + 4, x - 2 : x + 3] = frame[y - 4 : y - 3, x - 2 : x + 3]
+        traces.append(follow_row(followers, frame, {}))
+    found = names(list(zip(*traces, strict=True)), truth)
+    assert (found[1] == np.arange(COUNT)).all()
+    others = [k for k in range(COUNT) if k != 2]
+    assert (found[1:, others] == others).mean() > 0.97
+    assert not np.isin(found[2:, 2], others).any()
+
+
+def test_what_is_given_is_nobody_elses(row):
+    frames, truth = row
+    followers = [start_at(base) for base in truth[0, :2, 0]]
+    traces = follow_row(followers, frames[0], {1: curve(truth[0, 0])[::40]})
+    assert not len(traces[0].line)
+    assert whose(traces[1].line, truth[0]) == 0
+
+
+def test_nothing_is_found_in_nothing():
+    frame = np.clip(np.random.default_rng(0).normal(180.0, 3.0, (90, 120)), 0, 255)
+    followers = [start_at((20.0, 30.0)), start_at((20.0, 40.0))]
+    for _ in range(2):
+        traces = follow_row(followers, frame.astype(np.uint8), {})
+        assert [len(trace.line) for trace in traces] == [0, 0]
+    assert isinstance(traces[0], Trace)
+
+
+def test_noise_of_compressed_video_is_what_lines_stand_out_from():
+    """Averaged over 3×3 pixels noise hardly differs from pixel to pixel, but is there."""
+    generator = np.random.default_rng(0)
+    white = generator.normal(size=(300, 300))
+    smooth = sum(np.roll(white, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)) / 3.0
+    level = ridge.noise_level(np.clip(150.0 + 6.0 * smooth, 0, 255).astype(np.uint8))
+    assert level > 6.0

@@ -7,7 +7,7 @@ critical cones ten minutes or more. ``contour.png`` is a figure of ``vibrissa de
 
 import io
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 
@@ -19,11 +19,26 @@ from PIL import Image
 import vibrissa as vb
 from vibrissa import plots
 from vibrissa.cli.figures import witnesses
+from vibrissa.contour import shape_from_dataset
 from vibrissa.mapping import critical_cones, error_solid, signal_slice
-from vibrissa.pipeline import with_estimates
-from vibrissa.trial import array_whisking, head_path, measure, simulate, within_reach
+from vibrissa.pipeline import with_contour, with_estimates
+from vibrissa.trial import (
+    array_whisking,
+    facing_peg,
+    head_path,
+    measure,
+    simulate,
+    sweep_past,
+    views_of,
+    within_reach,
+)
+from vibrissa.trial.film import film_frames, with_true_traces
+from vibrissa.trial.recording import recorded_objects
 
 WIDTH = 1200
+LEVELS = {"trial": 32, "movie_signals": 64, "movie_contour": 64}
+"""Of red, green and blue in figures for which 256 colours are too few."""
+
 CURVATURES = np.arange(8) / 5.0
 TAPER_RATIOS = (1.0, 2.0, 4.0, 8.0, 15.0, 30.0, 60.0)
 
@@ -53,6 +68,51 @@ def c2() -> Figure:
     return witness(whisker, found, "Fx MB MD")
 
 
+@cache
+def trial() -> xr.DataTree:
+    """Half a second of whisking past a peg, felt with a noisy sensor, and its contour."""
+    whisker = chart().whisker
+    peg = facing_peg(whisker)
+    motion = sweep_past(whisker, peg, 0.5, seed=1)
+    felt = measure(simulate(whisker, motion, peg), seed=1)
+    return with_contour(with_true_traces(felt, views_of(felt)))
+
+
+def filmed(rows: Sequence[int]) -> list[plots.Sight]:
+    """Both views of some of its frames."""
+    shown = trial().isel(time=rows)
+    return [plots.Sight(camera, film_frames(shown, camera)) for camera in views_of(trial())]
+
+
+def overview() -> Figure:
+    """The trial at a glance."""
+    course = plots.course_of(trial())
+    rows = plots.telling_rows(course)
+    return plots.trial_overview(course, chart().to_dataset(), line(), filmed(rows), rows)
+
+
+def places() -> Figure:
+    """Its contacts about the whisker and in the laboratory."""
+    course, fit = plots.course_of(trial()), shape_from_dataset(trial()["contour"].to_dataset())
+    return plots.contact_places(course, line(), recorded_objects(trial()), [fit])
+
+
+def signal_movie() -> np.ndarray:
+    """A frame of the movie of signals."""
+    course = plots.course_of(trial())
+    rows = [0, plots.telling_rows(course)[-1] - 4, len(course.time) - 1]
+    return list(plots.signal_frames(course, chart().to_dataset(), line(), rows))[1]
+
+
+def contour_movie() -> np.ndarray:
+    """A frame of the movie of the contour."""
+    course = plots.course_of(trial())
+    rows = [0, plots.telling_rows(course)[-1] - 4]
+    return list(
+        plots.contour_frames(course, line(), filmed(rows), rows, recorded_objects(trial()))
+    )[-1]
+
+
 def line() -> np.ndarray:
     """Centreline of the γ whisker."""
     return chart().whisker.centerline(101)
@@ -64,11 +124,11 @@ def touching_array() -> Figure:
     time = np.arange(500) / 1000
     turn, place = head_path(time, to_position=[0, 14e-3, 0])
     motions = array_whisking(rat, 0.5, 1000, head_rotation=turn, head_position=place)
-    trial = measure(simulate(rat, motions, within_reach(rat, "sphere")))
-    return plots.array_views(with_estimates(trial), contacts="estimates")
+    felt = measure(simulate(rat, motions, within_reach(rat, "sphere")))
+    return plots.array_views(with_estimates(felt), contacts="estimates")
 
 
-FIGURES: dict[str, Callable[[], Figure]] = {
+FIGURES: dict[str, Callable[[], Figure | np.ndarray]] = {
     "array": lambda: plots.array_views(vb.whisker_array().to_tree()),
     "array_trial": touching_array,
     "signal_space": lambda: plots.signal_clouds(chart().to_dataset(), line()),
@@ -79,18 +139,30 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "resolution": lambda: plots.resolution(verdicts()),
     "witness_Mx_MB_MD": lambda: witness(chart().whisker, verdicts(), "Mx MB MD"),
     "witness_curved": c2,
+    "trial": overview,
+    "contact_places": places,
+    "movie_signals": signal_movie,
+    "movie_contour": contour_movie,
     "critical_cones": lambda: plots.critical_cones(critical_cones(CURVATURES, TAPER_RATIOS)),
 }
 
 
-def save(figure: Figure, path: Path) -> None:
-    """Write a figure for the screen: 1200 pixels wide, in 256 colours."""
-    drawn = io.BytesIO()
-    figure.savefig(drawn, format="png")
-    image = Image.open(drawn).convert("RGB")
+def save(figure: Figure | np.ndarray, path: Path) -> None:
+    """Write a figure or a frame of a movie: 1200 pixels wide, in as many colours as need be."""
+    if isinstance(figure, Figure):
+        drawn = io.BytesIO()
+        figure.savefig(drawn, format="png")
+        image = Image.open(drawn).convert("RGB")
+    else:
+        image = Image.fromarray(figure[..., :3])
     height = round(image.height * WIDTH / image.width)
     small = image.resize((WIDTH, height), Image.Resampling.LANCZOS)
-    small.quantize(256, Image.Quantize.MEDIANCUT).save(path, optimize=True)
+    if path.stem in LEVELS:
+        steps = LEVELS[path.stem] - 1
+        rounded = [round(round(v / 255 * steps) * 255 / steps) for v in range(256)]
+        small.point(rounded * 3).save(path, optimize=True)
+    else:
+        small.quantize(256, Image.Quantize.MEDIANCUT).save(path, optimize=True)
 
 
 def main() -> None:

@@ -55,7 +55,7 @@ _CHI2_95 = 5.991464547107979
 """95 % of a chi-square of two degrees of freedom."""
 
 _MOST_ELLIPSES = 60
-_LEFT, _GAP, _BAR, _BOTTOM, _TOP = 10.0, 10.0, 12.0, 8.5, 11.0
+_LEFT, _GAP, _BAR, _BOTTOM, _TOP = 12.0, 10.0, 12.0, 8.5, 11.0
 """Room around and between the views, mm on paper."""
 
 

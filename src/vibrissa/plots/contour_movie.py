@@ -204,7 +204,10 @@ def _about_whisker(
     axes.plot(*rest.T, color="black", linewidth=1.2)
     figure.text(0.72, 0.958, "contacts about the resting whisker", va="top", fontsize=7.0)
     cloud = CircleCollection(
-        [5.0], offsets=np.empty((0, 2)), offset_transform=axes.transData, animated=True
+        [0.7 * _dot_size(int(np.isfinite(points[span]).all(axis=1).sum()))],
+        offsets=np.empty((0, 2)),
+        offset_transform=axes.transData,
+        animated=True,
     )
     figure.add_artist(cloud)
     line = flat_line(axes, color=RED, linewidth=0.8, animated=True)
@@ -241,7 +244,7 @@ def _sides(
             for body in group:
                 draw_body(axes, body, view, _window(limits, view, both), look)
         cloud = CircleCollection(
-            [7.0],
+            [_dot_size(len(known))],
             offsets=np.empty((0, 2)),
             offset_transform=axes.transData,
             animated=True,
@@ -252,6 +255,11 @@ def _sides(
         dot = moving_line(axes, **_CONTACT)
         there = points[:, list(view)]
         yield _Part(moving, line[..., list(view)], dot, there), _Cloud(cloud, there)
+
+
+def _dot_size(count: int) -> float:
+    """Area of the dots for so many contacts, square points: many are drawn small."""
+    return float(np.clip(7.0 * (300.0 / max(count, 1)) ** 0.7, 1.5, 7.0))
 
 
 def _window(limits: Array, view: tuple[int, int], both: Array) -> Array:

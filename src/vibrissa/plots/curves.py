@@ -68,7 +68,9 @@ def curves_over_time(
                 values = np.where(course.touching, values, np.nan)
             _signal(axes, name, time[span], values[span])
         else:
-            values = _coordinate(axes, name, time, span, (known, estimated), i - len(TRIPLET))
+            true = course.known_as == "true"
+            column = i - len(TRIPLET)
+            values = _coordinate(axes, name, time, span, (known, estimated), column, true)
         axes.set_xlim(first, max(last, first + 1e-3))
         axes.set_ylabel(axis_label(name), fontsize=6.0)
         axes.locator_params(axis="y", nbins=4)
@@ -100,32 +102,38 @@ def _coordinate(
     span: slice,
     points: tuple[Array | None, Array | None],
     column: int,
+    true: bool,
 ) -> Array:
-    """Draw a coordinate over time; what the dot follows."""
+    """Draw a coordinate over time; give what was drawn last."""
     shown = np.full(time.size, np.nan)
     limits = []
     known, estimated = points
     if known is not None:
         shown = to_display(name, known[:, column])
         axes.plot(time[span], shown[span], color=MUTED, linewidth=1.6, zorder=1)
-        limits.append(shown[span])
+        # What is tracked may be wrong now and then, what is true is not.
+        limits.append(_ends(shown[span], 0.0 if true else 0.01))
     if estimated is not None:
         shown = to_display(name, estimated[:, column])
         axes.plot(time[span], shown[span], ".", color=BLUE, markersize=1.6, zorder=2)
-        limits.append(shown[span])
-    if limits:
-        axes.set_ylim(*_limits(limits))
+        limits.append(_ends(shown[span], 0.01))
+    found = np.array(limits).reshape(-1, 2)
+    found = found[np.isfinite(found).all(axis=1)]
+    if len(found):
+        low, high = found[:, 0].min(), found[:, 1].max()
+        room = max(0.06 * (high - low), 1e-3)
+        axes.set_ylim(low - room, high + room)
     else:
         axes.text(0.5, 0.5, "not known", transform=axes.transAxes, ha="center", color=MUTED)
     return shown
 
 
-def _limits(courses: list[Array]) -> tuple[float, float]:
-    """All of the first, and of others most."""
-    ends = [np.nanquantile(v, q) for v, q in zip(courses, ([0.0, 1.0], [0.01, 0.99]), strict=False)]
-    low, high = min(e[0] for e in ends), max(e[1] for e in ends)
-    room = max(0.06 * (high - low), 1e-3)
-    return float(low - room), float(high + room)
+def _ends(values: Array, left_out: float) -> Array:
+    """Lowest and highest value, but for a share at either end; NaN if there are none."""
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return np.full(2, np.nan)
+    return np.asarray(np.quantile(finite, [left_out, 1.0 - left_out]))
 
 
 def curve_legend(figure: Figure, course: Course, place: tuple[float, float]) -> None:

@@ -93,7 +93,7 @@ def room_for(places: Array, bodies: Sequence[Body], least: float = 1.0) -> Array
     array (3, 2)
         Of x, y and z, mm.
     """
-    low, high = np.quantile(places, [0.02, 0.98], axis=0)
+    low, high = np.quantile(places, [0.04, 0.96], axis=0)
     half = 0.5 * (high - low)
     near = np.array([[-1.0], [1.0]]) * (2.0 * half.max() + 3.0 * least)
     lines = 0.5 * (low + high) + near  # lower and upper ends of a cube

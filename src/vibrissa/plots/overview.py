@@ -144,8 +144,8 @@ def _sheet(width: Width, images: int, compared: bool) -> _Sheet:
     if width == "double":
         bottom = 56.0 if compared else 0.0
         scatter = tuple((14.0 + 55.0 * i, 10.0, 38.0, 38.0) for i in range(3)) if compared else ()
-        solids = tuple((56.0 * i, bottom, 56.0, 46.5) for i in range(3))
-        rails = tuple((56.0 * i + 49.5, bottom + 10.5, 1.6, 22.0) for i in range(3))
+        solids = tuple((59.0 * i, bottom, 56.0, 46.5) for i in range(3))
+        rails = tuple((59.0 * i + 52.5, bottom + 10.5, 1.6, 22.0) for i in range(3))
         low = bottom + 59.0
         curves = tuple(
             (left, low + 16.5 * (2 - i), 74.0, 14.0) for left in (12.0, 102.0) for i in range(3)

@@ -90,7 +90,7 @@ def _frames(
         places = signal_places(*felt.T)
         ways = [flattened(axes, places) for axes in solids]
         for axes, way in zip(solids, ways, strict=True):
-            path = flat_line(axes, color=INK, linewidth=0.35, alpha=0.6)
+            path = flat_line(axes, color=INK, linewidth=0.3, alpha=0.4)
             path.set_data(*way[first : last + 1].T)
         curves = curves_over_time(figure, _BOXES, course, signals, slice(first, last + 1))
         curve_legend(figure, course, (1.0 - 2.0 / WIDTH, 48.0 / HEIGHT))

@@ -1,0 +1,1 @@
+"""The honest test, in parts: `studies/honest_test.py`."""

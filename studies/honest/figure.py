@@ -1,0 +1,113 @@
+"""The figure of the page, from the results."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from honest.conditions import CONDITIONS
+from honest.summaries import LABELS
+from honest.ways import OTHER, SIX, TRIPLET, WAYS, WRENCH
+from vibrissa.plots.style import BLUE, GREEN, INK, MUTED, ORANGE, head, looking, new_figure
+
+COLOURS = dict(zip(WAYS, (BLUE, MUTED, GREEN, ORANGE), strict=True))
+SYMBOLS = {
+    TRIPLET: "$F_x$, $M_B$, $M_D$",
+    OTHER: "$F_x$, $F_T$, $M_D$",
+    SIX: "six signals",
+    WRENCH: "force and moment",
+}
+SHOWN = ("friction-0", "friction-03", "dynamic")
+RUBBED = LABELS[-1]
+
+
+def draw(results: Mapping[str, Any]) -> Figure:
+    """Errors by class in three trials, by friction; flags; the pose's filter, if filmed."""
+    labels = {c.name: c.label for c in CONDITIONS}
+    with looking():
+        figure = new_figure("double", 108.0, "constrained")
+        panels = figure.subplots(2, 3)
+        for axes, letter, name in zip(panels[0], "abc", SHOWN, strict=True):
+            errors(axes, results[name]["true"])
+            head(axes, letter, labels[name])
+        limits = np.array([axes.get_ylim() for axes in panels[0]])
+        for axes in panels[0]:
+            axes.set_ylim(limits[:, 0].min(), limits[:, 1].max())
+        panels[0, 0].set_ylabel("3D error, median (mm)")
+        lines = [Line2D([], [], color=COLOURS[way], label=SYMBOLS[way]) for way in WAYS]
+        predicted = Line2D([], [], color=INK, linestyle=":", label="predicted")
+        panels[0, 0].legend(handles=[*lines, predicted], loc="upper right")
+        by_friction(panels[1, 0], results)
+        head(panels[1, 0], "d", f"by friction, {RUBBED}")
+        flags(panels[1, 1], results, labels)
+        head(panels[1, 1], "e", "flagged by six signals")
+        if any("cutoffs" in one for one in results.values()):
+            cutoffs(panels[1, 2], results)
+            head(panels[1, 2], "f", "the pose's filter")
+        else:
+            panels[1, 2].set_axis_off()
+        return figure
+
+
+def errors(axes: Axes, one: Mapping[str, Any]) -> None:
+    for way in WAYS:
+        rows = [one[way]["classes"][label] for label in LABELS]
+        for name, style in (("median", "o-"), ("predicted", ":")):
+            values = [row[name] * 1e3 for row in rows]
+            axes.plot(range(len(LABELS)), values, style, color=COLOURS[way], markersize=2.5)
+    axes.set_yscale("log")
+    by_class(axes)
+
+
+def by_class(axes: Axes) -> None:
+    axes.set_xticks(range(len(LABELS)), [label.replace("over ", ">") for label in LABELS])
+    axes.set_xlabel("deflection")
+
+
+def by_friction(axes: Axes, results: Mapping[str, Any]) -> None:
+    still = [c for c in CONDITIONS if not c.dynamic]
+    at = [c.friction for c in still]
+    for way in WAYS:
+        rows = [results[c.name]["true"][way]["classes"][RUBBED] for c in still]
+        for name, style in (("median", "o-"), ("predicted", ":")):
+            values = [row[name] * 1e3 for row in rows]
+            axes.plot(at, values, style, color=COLOURS[way], markersize=2.5)
+    axes.set_yscale("log")
+    axes.set_xticks(at)
+    axes.set_xlabel("coefficient of friction")
+    axes.set_ylabel("3D error, median (mm)")
+
+
+def flags(axes: Axes, results: Mapping[str, Any], labels: Mapping[str, str]) -> None:
+    shades = dict(zip(labels, (BLUE, "#56b4e9", ORANGE, INK, GREEN), strict=False))
+    for name, colour in shades.items():
+        classes = results[name]["true"][SIX]["classes"]
+        values = [100 * classes[label]["flagged"] for label in LABELS]
+        axes.plot(
+            range(len(LABELS)), values, "o-", color=colour, label=labels[name], markersize=2.5
+        )
+    axes.set_ylim(-3, 145)  # room for the legend
+    axes.set_yticks(range(0, 101, 20))
+    axes.set_ylabel("share of contacts (%)")
+    axes.legend(loc="upper center", ncols=2, columnspacing=1.0)
+    by_class(axes)
+
+
+def cutoffs(axes: Axes, results: Mapping[str, Any]) -> None:
+    """What the pose alone adds, and what the paper's way makes of the contact."""
+    shown = (("friction-0", BLUE), ("dynamic", GREEN), ("fast", ORANGE))
+    said = {"friction-0": "5 whisks a second", "dynamic": "inertia", "fast": "10 a second"}
+    for name, colour in shown:
+        rows = results.get(name, {}).get("cutoffs")
+        if not rows:
+            continue
+        values = np.array([row["moved"][0] for row in rows.values()]) * 1e6
+        axes.plot(range(len(rows)), values, "o-", color=colour, label=said[name], markersize=2.5)
+        axes.set_xticks(range(len(rows)), list(rows))
+    axes.set_xlabel("cut-off (Hz)")
+    axes.set_ylabel("contact moved by the pose (µm)")
+    axes.set_ylim(bottom=0.0)
+    axes.legend()

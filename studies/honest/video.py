@@ -1,0 +1,121 @@
+"""What video alone gives: the paper's own test, and the filter of the base's pose."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+import vibrissa as vb
+from honest.conditions import RATE, Recorded
+from honest.ways import TRIPLET, Pose, Truth, chart, located, poses_of, scored, truth_of
+from vibrissa.tracking.pose import base_pose
+from vibrissa.tracking.rest import rest_shape
+from vibrissa.trial import recorded_whisker
+from vibrissa.whisker import Whisker
+
+CUTOFFS = (30.0, 50.0, 85.0, 120.0, 200.0, None)
+
+
+def paper_test(trials: Sequence[Recorded]) -> dict[str, Any]:
+    """Tracked contacts → signals of the frictionless model → contacts by its inverse.
+
+    ``agreement`` is between the contact put in and the one that comes out, ``error`` that of the
+    latter against the truth, in the laboratory; m. ``force`` and ``moment`` are the relative errors
+    of the signals.
+    """
+    columns: dict[str, list[np.ndarray]] = {
+        name: [] for name in ("agreement", "error", "force", "moment", "answered")
+    }
+    for trial in trials:
+        truth, whisker = truth_of(trial.true), recorded_whisker(trial.tracked)
+        rotation, position = poses_of(trial.tracked)["85 Hz"]
+        root = trial.tracked.to_dataset().isel(whisker=0)
+        point = in_whisker(root["contact_point"].values, (rotation, position))
+        rows = np.flatnonzero(truth.touching & np.isfinite(point).all(axis=1))
+        bent = vb.deflect(whisker, vb.PointContact(point[rows]))
+        signals = vb.base_signals(bent.force, bent.moment)
+        found = chart(whisker).estimate(signals, tuple(TRIPLET.split()))
+        placed = np.einsum("tij,tj->ti", rotation[rows], found.point) + position[rows]
+        columns["answered"].append(np.isfinite(found.point).all(axis=1))
+        columns["agreement"].append(size(found.point - point[rows]))
+        columns["error"].append(size(placed - truth.point[rows]))
+        columns["force"].append(relative(bent.force, truth.force[rows]))
+        columns["moment"].append(relative(bent.moment, truth.moment[rows]))
+    values = {name: np.concatenate(parts) for name, parts in columns.items()}
+    answered = values.pop("answered")
+    out = {name: middle(value) for name, value in values.items()}
+    return {**out, "count": int(answered.size), "none": float(1.0 - answered.mean())}
+
+
+def cutoffs(trials: Sequence[Recorded]) -> dict[str, Any]:
+    """Errors in contact by the cut-off of the pose; medians and 95 %."""
+    out = {}
+    for cutoff in CUTOFFS:
+        columns: dict[str, list[np.ndarray]] = {}
+        for trial in trials:
+            for name, values in filtered_errors(trial, cutoff).items():
+                columns.setdefault(name, []).append(values)
+        name = "none" if cutoff is None else f"{cutoff:g}"
+        out[name] = {key: middle(np.concatenate(parts)) for key, parts in columns.items()}
+    return out
+
+
+def filtered_errors(trial: Recorded, cutoff: float | None) -> dict[str, np.ndarray]:
+    """Of the pose, of the signals the paper's way, of contacts from the sensor, frame by frame."""
+    truth, whisker = truth_of(trial.true), recorded_whisker(trial.tracked)
+    curves = trial.tracked["measured"].to_dataset().isel(whisker=0)["centerline"].values
+    pose = base_pose(curves, rest_shape(curves), whisker).filtered(RATE, cutoff)
+    return pose_errors(trial, truth, whisker, (pose.rotation, pose.position))
+
+
+def pose_errors(
+    trial: Recorded, truth: Truth, whisker: Whisker, pose: Pose
+) -> dict[str, np.ndarray]:
+    rotation, position = pose
+    root = trial.tracked.to_dataset().isel(whisker=0)
+    point = in_whisker(root["contact_point"].values, pose)
+    rows = np.flatnonzero(truth.touching & np.isfinite(point).all(axis=1))
+    bent = vb.deflect(whisker, vb.PointContact(point[rows]))
+    found = located(TRIPLET, trial.true, chart(recorded_whisker(trial.true)))
+    sensed = scored(found, truth, pose, trial.true)
+    direction = (rotation[rows, :, 0] * truth.pose[0][rows, :, 0]).sum(axis=1)
+    turned = np.swapaxes(truth.pose[0][rows], 1, 2) @ rotation[rows]
+    return {
+        "place": size(position[rows] - truth.pose[1][rows]),
+        "direction": np.arccos(np.clip(direction, -1.0, 1.0)),
+        "roll": np.abs(np.arctan2(turned[:, 2, 1], turned[:, 1, 1])),
+        "contact": size(point[rows] - truth.point_whisker[rows]),
+        "force": relative(bent.force, truth.force[rows]),
+        "moment": relative(bent.moment, truth.moment[rows]),
+        "moved": sensed["pose_error"].values[rows],
+        "sensed": sensed["distance"].values[rows],
+    }
+
+
+def in_whisker(points: np.ndarray, pose: Pose) -> np.ndarray:
+    return np.einsum("tji,tj->ti", pose[0], points - pose[1])
+
+
+def size(vectors: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(vectors, axis=-1)
+
+
+def relative(found: np.ndarray, true: np.ndarray) -> np.ndarray:
+    return size(found - true) / size(true)
+
+
+def middle(values: np.ndarray) -> list[float]:
+    """Median and 95 % of what is known."""
+    known = values[np.isfinite(values)]
+    return np.quantile(known, [0.5, 0.95]).tolist() if known.size else [np.nan, np.nan]
+
+
+def tracked_scores(trial: Recorded, way: str) -> dict[str, xr.Dataset]:
+    """One way, placed by the tracked poses; with the true whisker's map and with the tracked's."""
+    truth, poses = truth_of(trial.true), poses_of(trial.tracked)
+    true, seen = (chart(recorded_whisker(tree)) for tree in (trial.true, trial.tracked))
+    found = located(way, trial.true, true)
+    out = {name: scored(found, truth, pose, trial.true) for name, pose in poses.items()}
+    out["whisker"] = scored(located(way, trial.true, seen), truth, poses["rod"], trial.true)
+    return out

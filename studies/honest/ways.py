@@ -1,0 +1,198 @@
+"""Ways from the sensor's wrench to contacts, and how far these are from the truth."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from scipy.interpolate import CubicSpline
+
+import vibrissa as vb
+from vibrissa.contour import axis_offset
+from vibrissa.demo import component_noise, in_laboratory, locate
+from vibrissa.demo.run import fit_peg
+from vibrissa.demo.scores import REPLICATES
+from vibrissa.mapping import ContactMap, WrenchEstimate
+from vibrissa.signals import SIGNALS, nearest_on_rest
+from vibrissa.trial import recorded_pegs, recorded_whisker
+from vibrissa.trial.sensors import FORCE_NOISE, MOMENT_NOISE
+from vibrissa.whisker import Whisker
+
+NOISE = component_noise(FORCE_NOISE, MOMENT_NOISE)
+TRIPLET = "Fx MB MD"
+OTHER = "Fx FT MD"
+SIX = "six signals"
+WRENCH = "wrench"
+WAYS = (TRIPLET, OTHER, SIX, WRENCH)
+
+Pose = tuple[np.ndarray, np.ndarray]
+"""Rotation (n, 3, 3) and position (n, 3) of the base in every frame."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What truly happened in every frame, laboratory frame if not said otherwise."""
+
+    touching: np.ndarray
+    at_tip: np.ndarray
+    point: np.ndarray
+    point_whisker: np.ndarray
+    force: np.ndarray
+    moment: np.ndarray
+    axes: np.ndarray
+    """(n, 3, 3): along the whisker toward its tip, away from the object, and across both."""
+    deflection: np.ndarray
+    friction_angle: np.ndarray
+    """Of the force from the plane normal to the whisker, positive toward the tip, rad."""
+    pose: Pose
+
+
+def truth_of(trial: xr.DataTree) -> Truth:
+    true = trial["truth"].to_dataset().isel(whisker=0)
+    root = trial.to_dataset().isel(whisker=0)
+    whisker = recorded_whisker(trial)
+    s, touching = true["arc_length"].values, true["in_contact"].values.astype(bool)
+    line = true["centerline"].values
+    nodes = np.linspace(0.0, whisker.length, line.shape[1])
+    axes = np.full((len(s), 3, 3), np.nan)
+    for i in np.flatnonzero(touching):
+        axes[i, 0] = CubicSpline(nodes, line[i])(s[i], 1)
+    axes[:, 0] /= np.linalg.norm(axes[:, 0], axis=1, keepdims=True)
+    normal = true["surface_normal"].values
+    axes[:, 2] = np.cross(axes[:, 0], normal)
+    axes[:, 2] /= np.linalg.norm(axes[:, 2], axis=1, keepdims=True)
+    axes[:, 1] = np.cross(axes[:, 2], axes[:, 0])
+    force = true["contact_force"].values
+    along = (force * axes[:, 0]).sum(axis=1) / np.linalg.norm(force, axis=1)
+    point = true["contact_point_whisker"].values
+    distance, nearest = nearest_on_rest(whisker, point)
+    return Truth(
+        touching=touching,
+        at_tip=true["status"].values == vb.Status.TIP_CONTACT,
+        point=true["contact_point"].values,
+        point_whisker=point,
+        force=true["force"].values,
+        moment=true["moment"].values,
+        axes=axes,
+        deflection=np.degrees(np.arctan2(distance, nearest)),
+        friction_angle=np.arcsin(np.clip(along, -1.0, 1.0)),
+        pose=(root["base_rotation"].values, root["base_position"].values),
+    )
+
+
+def poses_of(tracked: xr.DataTree) -> Mapping[str, Pose]:
+    """Of the rod that fits the traces, and the paper's, filtered at 85 Hz."""
+    groups = {"rod": tracked.to_dataset(), "85 Hz": tracked["measured"].to_dataset()}
+    return {
+        name: tuple(
+            group.isel(whisker=0)[part].values for part in ("base_rotation", "base_position")
+        )
+        for name, group in groups.items()
+    }
+
+
+def chart(whisker: Whisker) -> ContactMap:
+    return ContactMap.simulate(whisker, grid=False)
+
+
+def located(way: str, trial: xr.DataTree, contacts: ContactMap) -> xr.Dataset:
+    """Contacts from the sensor's wrench, whisker frame."""
+    wrench = trial.to_dataset()[["force", "moment"]].isel(whisker=0)
+    names = SIGNALS if way == SIX else tuple((TRIPLET if way == WRENCH else way).split())
+    found = locate(contacts, wrench, names, noise=NOISE)
+    return _with_friction(contacts.whisker, wrench, found) if way == WRENCH else found
+
+
+def _with_friction(whisker: Whisker, wrench: xr.Dataset, felt: xr.Dataset) -> xr.Dataset:
+    """The same where a contact is felt, from the wrench."""
+    rows = felt["in_contact"].values
+    force, moment = (wrench[name].values for name in ("force", "moment"))
+    e = vb.estimate_from_wrench(whisker, force[rows], moment[rows], noise=NOISE)
+
+    def whole(values: np.ndarray, missing: float = np.nan) -> np.ndarray:
+        out = np.full((rows.size, *values.shape[1:]), missing)
+        out[rows] = values
+        return out
+
+    space = ("time", "candidate", "space")
+    return xr.Dataset(
+        {
+            "in_contact": felt["in_contact"],
+            "status": ("time", np.where(rows, whole(e.status, 0), felt["status"].values)),
+            "candidates": ("time", whole(e.n_candidates, 0)),
+            "candidate_points": (space, whole(e.point)[:, None]),
+            "candidate_covariance": ((*space, "space_2"), whole(e.covariance)[:, None]),
+            "candidate_arc_length": (space[:2], whole(e.arc_length)[:, None]),
+            # Its direction is that of the surface's normal: what pulls along is friction.
+            "candidate_force": (space, whole(_pressing(whisker, e))[:, None]),
+            "friction_angle": ("time", whole(e.friction_angle)),
+            "friction_angle_sigma": ("time", whole(e.friction_angle_sigma)),
+        },
+        felt.coords,
+    )
+
+
+def _pressing(whisker: Whisker, e: WrenchEstimate) -> np.ndarray:
+    """Base forces (n, 3) without what pulls along the whisker."""
+    known = np.isfinite(e.arc_length)
+    out = np.full(e.force.shape, np.nan)
+    load = vb.PointForce(e.arc_length[known], components=tuple(e.contact_force[known].T))
+    line = vb.deflect(whisker, load).centerline(401)
+    tangent = np.gradient(line, axis=1)
+    row = np.round(e.arc_length[known] / whisker.length * 400).astype(int)
+    tangent = tangent[np.arange(len(row)), row]
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    force = e.force[known]
+    out[known] = force - (force * tangent).sum(axis=1, keepdims=True) * tangent
+    return out
+
+
+def scored(found: xr.Dataset, truth: Truth, pose: Pose, trial: xr.DataTree) -> xr.Dataset:
+    """Place contacts and compare them with the truth, frame by frame; m and rad.
+
+    ``predicted`` are errors drawn from the covariance, ``pose_error`` is how far the pose alone
+    moves the true contact.
+    """
+    placed = in_laboratory(found, *pose)
+    error = placed["contact_point"].values - truth.point
+    covariance = placed["contact_covariance"].values
+    known = np.isfinite(covariance).all(axis=(1, 2))
+    size, direction = np.linalg.eigh(np.where(known[:, None, None], covariance, 0.0))
+    root = direction * np.sqrt(np.maximum(size, 0.0))[:, None]
+    draws = np.random.default_rng(0).normal(size=(REPLICATES, len(error), 3))
+    drawn = np.linalg.norm(np.einsum("tij,rtj->rti", root, draws), axis=-1)
+    moved = np.einsum("tij,tj->ti", pose[0], truth.point_whisker) + pose[1]
+    out = {
+        "touching": truth.touching,
+        "felt": found["in_contact"].values,
+        "at_tip": truth.at_tip,
+        "deflection": truth.deflection,
+        "status": found["status"].values,
+        "candidates": found["candidates"].values,
+        "distance": np.linalg.norm(error, axis=1),
+        "pose_error": np.linalg.norm(moved - truth.point, axis=1),
+        "friction_angle": truth.friction_angle,
+    }
+    if "friction_angle" in found:
+        out["friction_found"] = found["friction_angle"].values
+        out["friction_sigma"] = found["friction_angle_sigma"].values
+    data = {name: ("frame", values) for name, values in out.items()}
+    data["error"] = (("frame", "axis"), np.einsum("tij,tj->ti", truth.axes, error))
+    data["predicted"] = (("frame", "replicate"), np.where(known, drawn, np.nan).T)
+    alone = placed.where(xr.DataArray(truth.touching, dims="time"))
+    pegs = peg_error(placed, trial)
+    pegs |= {f"touching_{name}": value for name, value in peg_error(alone, trial).items()}
+    return xr.Dataset(data).assign_attrs(pegs)
+
+
+def peg_error(placed: xr.Dataset, trial: xr.DataTree) -> dict[str, float]:
+    """Of the cylinder fitted to the contacts: metres and radians; NaN where there is none."""
+    (peg,) = recorded_pegs(trial)
+    names = ("offset", "tilt", "diameter_error", "diameter_sigma")
+    try:
+        fit = fit_peg(placed, recorded_whisker(trial))
+    except ValueError:
+        return dict.fromkeys(names, np.nan)
+    offset, tilt = axis_offset(fit.origin, fit.axis, peg.origin, peg.axis)
+    values = (np.linalg.norm(offset), tilt, fit.diameter - 2.0 * peg.radius, fit.diameter_sigma)
+    return {name: float(value) for name, value in zip(names, values, strict=True)}

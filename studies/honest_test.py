@@ -1,0 +1,111 @@
+"""The honest test: contacts from the true wrench with a sensor's noise, against the truth.
+
+`python studies/honest_test.py [FOLDER]`; with `--quick` one short trial of each kind, with
+`--no-video` nothing is filmed. Recordings and results are kept in the folder (`output/honest_test`
+by default), condition by condition: stopped, it goes on from there. `--again` computes the results
+anew from the recordings; remove the folder to simulate, film and track anew. `--page` writes the
+tables into `docs/honest-test.md` and the figure beside it, else they are written to the folder.
+"""
+
+import argparse
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+from honest.conditions import CONDITIONS, FAST, Condition, Recorded, recorded
+from honest.figure import draw
+from honest.summaries import summary
+from honest.tables import TABLES, write
+from honest.video import cutoffs, paper_test, tracked_scores
+from honest.ways import WAYS, chart, located, scored, truth_of
+from matplotlib.figure import Figure
+from PIL import Image
+
+from vibrissa.trial import recorded_whisker
+
+WIDTH = 1200
+ROOT = Path(__file__).parent.parent
+
+
+def from_wrench(trials: list[Recorded]) -> dict[str, Any]:
+    """All ways, placed by the true pose."""
+    out = {}
+    for way in WAYS:
+        rows = []
+        for trial in trials:
+            truth, contacts = truth_of(trial.true), chart(recorded_whisker(trial.true))
+            found = located(way, trial.true, contacts)
+            rows.append(scored(found, truth, truth.pose, trial.true))
+        out[way] = summary(rows)
+    return out
+
+
+def from_video(trials: list[Recorded]) -> dict[str, Any]:
+    """All ways, placed by tracked poses; and what video alone gives."""
+    out: dict[str, Any] = {}
+    for way in WAYS:
+        placed = [tracked_scores(trial, way) for trial in trials]
+        for pose in placed[0]:
+            out.setdefault(pose, {})[way] = summary([one[pose] for one in placed])
+    return out | {"paper": paper_test(trials), "cutoffs": cutoffs(trials)}
+
+
+def results_of(
+    condition: Condition, seeds: int, duration: float, folder: Path, video: bool, again: bool
+) -> dict[str, Any]:
+    """Of one condition; what is in the folder is not computed again."""
+    path = folder / f"{condition.name}.json"
+    kept = json.loads(path.read_text()) if path.exists() and not again else {}
+    about = {"seeds": seeds, "duration": duration}
+    if kept.get("about") != about:
+        kept = {"about": about}
+    missing = ["true"] * ("true" not in kept) + ["rod"] * (video and "rod" not in kept)
+    if missing:
+        trials = [recorded(condition, seed, duration, folder, video) for seed in range(seeds)]
+        print(f"{condition.label}: contacts", flush=True)
+        if "true" in missing:
+            kept["true"] = from_wrench(trials)
+        if "rod" in missing:
+            kept |= from_video(trials)
+        path.write_text(json.dumps(kept, indent=1))
+    return kept
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure for the screen, in 256 colours."""
+    drawn = io.BytesIO()
+    figure.savefig(drawn, format="png")
+    image = Image.open(drawn).convert("RGB")
+    height = round(image.height * WIDTH / image.width)
+    small = image.resize((WIDTH, height), Image.Resampling.LANCZOS)
+    small.quantize(256, Image.Quantize.MEDIANCUT).save(path, optimize=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("folder", nargs="?", type=Path, default=ROOT / "output" / "honest_test")
+    parser.add_argument("--quick", action="store_true", help="one trial of 0.4 s of each kind")
+    parser.add_argument("--no-video", action="store_true", help="true pose only")
+    parser.add_argument("--again", action="store_true", help="new results from old recordings")
+    parser.add_argument("--page", action="store_true", help="write the documentation's tables")
+    chosen = parser.parse_args()
+    folder = chosen.folder / "quick" if chosen.quick else chosen.folder
+    folder.mkdir(parents=True, exist_ok=True)
+    seeds, duration = (1, 0.4) if chosen.quick else (3, 1.0)
+    conditions = CONDITIONS if chosen.no_video else (*CONDITIONS, FAST)
+    results = {
+        one.name: results_of(one, seeds, duration, folder, not chosen.no_video, chosen.again)
+        for one in conditions
+    }
+    for name, make in TABLES.items():
+        print(f"\n{name}\n{make(results)}")
+    page = ROOT / "docs" / "honest-test.md" if chosen.page else None
+    if page is not None:
+        write(page, results)
+    images = folder if page is None else page.parent / "images"
+    save(draw(results), images / "honest_test.png")
+
+
+if __name__ == "__main__":
+    main()

@@ -170,3 +170,16 @@ def test_offset_and_tilt():
     offset, tilt = axis_offset([1.0, 2.0, 9.0], [0, 1e-8, -1.0], [0.5, 2.0, 0.0], [0, 0, 5.0])
     np.testing.assert_allclose(offset, [0.5, 0.0, 0.0])
     assert tilt == pytest.approx(1e-8)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 4])
+def test_normals_that_contradict_the_points_give_no_hollow_cylinder(seed):
+    generator = np.random.default_rng(seed)
+    n = 100
+    points, normal, radius = touches(generator, n)
+    normal = normal + generator.normal(size=(n, 3))
+    points = points + 2e-3 * generator.normal(size=(n, 3))
+    normal = normal * np.where(generator.uniform(size=(n, 1)) < 0.5, -1.0, 1.0)
+    covariance = noise_along_x(generator, n, across=1e-4, along=(1e-4, 1e-3))
+    with pytest.raises(ValueError, match="no cylinder"):
+        fit_cylinder(points, covariance, radius, normals=normal)

@@ -162,6 +162,12 @@ def fitted(
             used = narrow
             best = _best(what, [best], touches.rows(used))
     best = best.moved(_solved(best, touches.rows(used), 1e-15).x)
+    if not best.size > 0.0:
+        # Equations with normals are linear in the radius and know no sign.
+        raise ValueError(
+            f"no {what}: points and normals fit only a hollow one, of negative radius; forces are "
+            "no normals where there is friction or inertia: leave the normals out"
+        )
     best = best if arranged is None else arranged(best)
     covariance, inside = _uncertainty(what, best, touches.rows(used))
     residuals = np.full(given.usable.size, np.nan)

@@ -109,11 +109,9 @@ def friction(rows: xr.Dataset) -> dict[str, float]:
 
 
 def pegs(values: Sequence[float]) -> list[float]:
-    """Median over the trials, and the one farthest from zero."""
-    known = np.array([v for v in values if np.isfinite(v)])
-    if not known.size:
-        return [np.nan, np.nan]
-    return [float(np.median(known)), float(known[np.argmax(np.abs(known))])]
+    """Median over the trials that have a fit, and how many do."""
+    known = [v for v in values if np.isfinite(v)]
+    return [float(np.median(known)) if known else float("nan"), len(known)]
 
 
 def share(which: np.ndarray) -> float:

@@ -142,16 +142,18 @@ def pegs(results: Results) -> str:
                 [
                     label,
                     NAMES[way],
+                    str(row["offset"][1]),
                     mm(row["offset"][0]),
                     degrees(row["tilt"][0]),
                     mm(row["diameter_error"][0]),
                     mm(row["diameter_sigma"][0]),
+                    str(row["touching_offset"][1]),
                     mm(row["touching_offset"][0]),
                     mm(row["touching_diameter_error"][0]),
                 ]
             )
-    head = ["trial", "from", "axis, mm", "tilt, °", "diameter, mm", "its σ, mm"]
-    return table([*head, "axis*, mm", "diameter*, mm"], rows, 2)
+    head = ["trial", "from", "fits", "axis, mm", "tilt, °", "diameter, mm", "its σ, mm"]
+    return table([*head, "fits*", "axis*, mm", "diameter*, mm"], rows, 2)
 
 
 def tracked(results: Results) -> str:

@@ -6,16 +6,21 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from scipy.interpolate import CubicSpline
+from vibrissa.pipeline import (
+    component_noise,
+    fit_contacts,
+    in_laboratory,
+    locate,
+    locate_from_wrench,
+)
 
 import vibrissa as vb
 from vibrissa.contour import axis_offset
-from vibrissa.demo import component_noise, in_laboratory, locate
-from vibrissa.demo.run import fit_peg
 from vibrissa.demo.scores import REPLICATES
-from vibrissa.mapping import ContactMap, WrenchEstimate
+from vibrissa.mapping import ContactMap
+from vibrissa.sensing import FORCE_NOISE, MOMENT_NOISE
 from vibrissa.signals import SIGNALS, nearest_on_rest
 from vibrissa.trial import recorded_pegs, recorded_whisker
-from vibrissa.trial.sensors import FORCE_NOISE, MOMENT_NOISE
 from vibrissa.whisker import Whisker
 
 NOISE = component_noise(FORCE_NOISE, MOMENT_NOISE)
@@ -98,53 +103,17 @@ def chart(whisker: Whisker) -> ContactMap:
 def located(way: str, trial: xr.DataTree, contacts: ContactMap) -> xr.Dataset:
     """Contacts from the sensor's wrench, whisker frame."""
     wrench = trial.to_dataset()[["force", "moment"]].isel(whisker=0)
-    names = SIGNALS if way == SIX else tuple((TRIPLET if way == WRENCH else way).split())
-    found = locate(contacts, wrench, names, noise=NOISE)
-    return _with_friction(contacts.whisker, wrench, found) if way == WRENCH else found
-
-
-def _with_friction(whisker: Whisker, wrench: xr.Dataset, felt: xr.Dataset) -> xr.Dataset:
-    """The same where a contact is felt, from the wrench."""
-    rows = felt["in_contact"].values
-    force, moment = (wrench[name].values for name in ("force", "moment"))
-    e = vb.estimate_from_wrench(whisker, force[rows], moment[rows], noise=NOISE)
-
-    def whole(values: np.ndarray, missing: float = np.nan) -> np.ndarray:
-        out = np.full((rows.size, *values.shape[1:]), missing)
-        out[rows] = values
-        return out
-
-    space = ("time", "candidate", "space")
-    return xr.Dataset(
-        {
-            "in_contact": felt["in_contact"],
-            "status": ("time", np.where(rows, whole(e.status, 0), felt["status"].values)),
-            "candidates": ("time", whole(e.n_candidates, 0)),
-            "candidate_points": (space, whole(e.point)[:, None]),
-            "candidate_covariance": ((*space, "space_2"), whole(e.covariance)[:, None]),
-            "candidate_arc_length": (space[:2], whole(e.arc_length)[:, None]),
-            # Its direction is that of the surface's normal: what pulls along is friction.
-            "candidate_force": (space, whole(_pressing(whisker, e))[:, None]),
-            "friction_angle": ("time", whole(e.friction_angle)),
-            "friction_angle_sigma": ("time", whole(e.friction_angle_sigma)),
-        },
-        felt.coords,
-    )
-
-
-def _pressing(whisker: Whisker, e: WrenchEstimate) -> np.ndarray:
-    """Base forces (n, 3) without what pulls along the whisker."""
-    known = np.isfinite(e.arc_length)
-    out = np.full(e.force.shape, np.nan)
-    load = vb.PointForce(e.arc_length[known], components=tuple(e.contact_force[known].T))
-    line = vb.deflect(whisker, load).centerline(401)
-    tangent = np.gradient(line, axis=1)
-    row = np.round(e.arc_length[known] / whisker.length * 400).astype(int)
-    tangent = tangent[np.arange(len(row)), row]
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-    force = e.force[known]
-    out[known] = force - (force * tangent).sum(axis=1, keepdims=True) * tangent
-    return out
+    if way != WRENCH:
+        names = SIGNALS if way == SIX else tuple(way.split())
+        return locate(contacts, wrench, names, noise=NOISE)
+    found = locate_from_wrench(contacts.whisker, wrench, NOISE)
+    rows = found["in_contact"].values
+    force, moment = (wrench[name].values[rows] for name in ("force", "moment"))
+    sigma = np.full(rows.size, np.nan)
+    sigma[rows] = vb.estimate_from_wrench(
+        contacts.whisker, force, moment, noise=NOISE
+    ).friction_angle_sigma
+    return found.assign(friction_angle_sigma=("time", sigma))
 
 
 def scored(found: xr.Dataset, truth: Truth, pose: Pose, trial: xr.DataTree) -> xr.Dataset:
@@ -190,7 +159,7 @@ def peg_error(placed: xr.Dataset, trial: xr.DataTree) -> dict[str, float]:
     (peg,) = recorded_pegs(trial)
     names = ("offset", "tilt", "diameter_error", "diameter_sigma")
     try:
-        fit = fit_peg(placed, recorded_whisker(trial))
+        fit = fit_contacts(placed.expand_dims(whisker=1, axis=1), [recorded_whisker(trial)])
     except ValueError:
         return dict.fromkeys(names, np.nan)
     offset, tilt = axis_offset(fit.origin, fit.axis, peg.origin, peg.axis)

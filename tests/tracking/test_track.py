@@ -115,6 +115,35 @@ def test_friction_is_found_in_the_shape(share):
     assert away.max() < 100e-6
 
 
+def test_a_step_to_a_contact_that_no_rod_withstands_is_not_taken():
+    from vibrissa import samples
+    from vibrissa.rod.discretize import discretize
+    from vibrissa.tracking import RefineOptions, Sight, Trace
+    from vibrissa.tracking.head import HeadPose
+    from vibrissa.tracking.refine import _Problem
+    from vibrissa.tracking.rods import State
+    from vibrissa.tracking.trace import even
+    from vibrissa.trial import orthogonal_views
+
+    whisker = samples.gamma()
+    pair = orthogonal_views(center=(0.012, 0.005, 0.0))
+    lines = [even(camera.project(whisker.centerline(101))) for camera in pair]
+    seen = [Trace(one, np.full(len(one), 0.02), np.ones(len(one), bool), 1.0) for one in lines]
+    sight = Sight.of([[one, one] for one in seen])
+    # Near the thin tip this force is far beyond what any rod is in balance with.
+    contact = np.array([[0.5, 0.0, 0.1, 0.0], [0.93, 1.4, -40.0, -40.0]])
+    state = State(np.array([np.eye(3)] * 2), np.zeros((2, 3)), contact)
+    touching, frames = np.ones(2, dtype=bool), np.arange(2)
+    still = HeadPose.still(2)
+    problem = _Problem(
+        discretize(whisker), pair, sight, touching, frames, state, 1000.0, RefineOptions(), still
+    )
+    smoother, cost, _, wild = problem._linear(state)
+    assert wild.tolist() == [False, True]
+    assert cost == np.inf
+    assert np.isfinite(smoother.solved(1.0)).all()
+
+
 def test_the_covariance_of_the_contact_is_of_the_size_of_its_errors(filmed, found, both):
     away = (found["contact_point"].values - filmed.truth["contact_point"].values)[both]
     spread = found["contact_covariance"].values[both]

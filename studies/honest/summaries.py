@@ -43,7 +43,7 @@ def summary(trials: Sequence[xr.Dataset], classes: bool = True) -> dict[str, Any
         "pulled": pulled(here),
         "all": errors(here),
         "unflagged": errors(here.isel(frame=~np.isin(here["status"].values, FLAGS))),
-        "peg": {name: pegs([t.attrs[name] for t in trials]) for name in trials[0].attrs},
+        "peg": {name: middle([t.attrs[name] for t in trials]) for name in trials[0].attrs},
     }
     angle = here["deflection"].values
     pairs = zip(LABELS, itertools.pairwise(ANGLES), strict=True)
@@ -108,10 +108,10 @@ def friction(rows: xr.Dataset) -> dict[str, float]:
     }
 
 
-def pegs(values: Sequence[float]) -> list[float]:
-    """Median over the trials that have a fit, and how many do."""
+def middle(values: Sequence[float]) -> float:
+    """Median of what is known."""
     known = [v for v in values if np.isfinite(v)]
-    return [float(np.median(known)) if known else float("nan"), len(known)]
+    return float(np.median(known)) if known else float("nan")
 
 
 def share(which: np.ndarray) -> float:

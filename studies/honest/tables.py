@@ -134,26 +134,21 @@ def friction(results: Results) -> str:
 
 
 def pegs(results: Results) -> str:
+    shown = [f"felt {name}" for name in ("offset", "tilt", "diameter", "sigma")]
+    shown += [
+        f"{kind} {name}" for kind in ("touching", "points") for name in ("offset", "diameter")
+    ]
     rows = []
     for label, one in picked(results, "true"):
         for way in WAYS:
             row = one[way]["peg"]
-            rows.append(
-                [
-                    label,
-                    NAMES[way],
-                    str(row["offset"][1]),
-                    mm(row["offset"][0]),
-                    degrees(row["tilt"][0]),
-                    mm(row["diameter_error"][0]),
-                    mm(row["diameter_sigma"][0]),
-                    str(row["touching_offset"][1]),
-                    mm(row["touching_offset"][0]),
-                    mm(row["touching_diameter_error"][0]),
-                ]
-            )
-    head = ["trial", "from", "fits", "axis, mm", "tilt, °", "diameter, mm", "its σ, mm"]
-    return table([*head, "fits*", "axis*, mm", "diameter*, mm"], rows, 2)
+            cells = [
+                degrees(row[name]) if name.endswith("tilt") else mm(row[name]) for name in shown
+            ]
+            rows.append([label, NAMES[way], *cells])
+    head = ["trial", "from", "axis, mm", "tilt, °", "diameter, mm", "its σ, mm"]
+    head += ["axis*, mm", "diameter*, mm", "axis†, mm", "diameter†, mm"]
+    return table(head, rows, 2)
 
 
 def tracked(results: Results) -> str:
@@ -176,7 +171,7 @@ def poses(results: Results) -> str:
         cells = [mm(trial[of][TRIPLET]["all"]["median"]) for of in ("true", "rod", "85 Hz")]
         cells.append(mm(trial["whisker"][TRIPLET]["all"]["median"]))
         cells += [mm(trial[of][TRIPLET]["all"]["pose"]) for of in ("rod", "85 Hz")]
-        pegs = [trial[of][TRIPLET]["peg"]["touching_offset"][0] for of in ("true", "rod", "85 Hz")]
+        pegs = [trial[of][TRIPLET]["peg"]["touching offset"] for of in ("true", "rod", "85 Hz")]
         rows.append([label, *cells, *(mm(value) for value in pegs)])
     head = ["trial", "true pose", "rod", "85 Hz", "rod, tracked shape"]
     head += ["rod, pose alone", "85 Hz, pose alone", "axis, true pose", "axis, rod", "axis, 85 Hz"]

@@ -50,35 +50,39 @@ def paper_test(trials: Sequence[Recorded]) -> dict[str, Any]:
 
 def cutoffs(trials: Sequence[Recorded]) -> dict[str, Any]:
     """Errors in contact by the cut-off of the pose; medians and 95 %."""
+    contacts = [
+        located(TRIPLET, trial.true, chart(recorded_whisker(trial.true))) for trial in trials
+    ]
     out = {}
     for cutoff in CUTOFFS:
         columns: dict[str, list[np.ndarray]] = {}
-        for trial in trials:
-            for name, values in filtered_errors(trial, cutoff).items():
+        for trial, found in zip(trials, contacts, strict=True):
+            for name, values in filtered_errors(trial, found, cutoff).items():
                 columns.setdefault(name, []).append(values)
         name = "none" if cutoff is None else f"{cutoff:g}"
         out[name] = {key: middle(np.concatenate(parts)) for key, parts in columns.items()}
     return out
 
 
-def filtered_errors(trial: Recorded, cutoff: float | None) -> dict[str, np.ndarray]:
+def filtered_errors(
+    trial: Recorded, found: xr.Dataset, cutoff: float | None
+) -> dict[str, np.ndarray]:
     """Of the pose, of the signals the paper's way, of contacts from the sensor, frame by frame."""
     truth, whisker = truth_of(trial.true), recorded_whisker(trial.tracked)
     curves = trial.tracked["measured"].to_dataset().isel(whisker=0)["centerline"].values
     pose = base_pose(curves, rest_shape(curves), whisker).filtered(RATE, cutoff)
-    return pose_errors(trial, truth, whisker, (pose.rotation, pose.position))
+    return pose_errors(trial, truth, whisker, found, (pose.rotation, pose.position))
 
 
 def pose_errors(
-    trial: Recorded, truth: Truth, whisker: Whisker, pose: Pose
+    trial: Recorded, truth: Truth, whisker: Whisker, found: xr.Dataset, pose: Pose
 ) -> dict[str, np.ndarray]:
     rotation, position = pose
     root = trial.tracked.to_dataset().isel(whisker=0)
     point = in_whisker(root["contact_point"].values, pose)
     rows = np.flatnonzero(truth.touching & np.isfinite(point).all(axis=1))
     bent = vb.deflect(whisker, vb.PointContact(point[rows]))
-    found = located(TRIPLET, trial.true, chart(recorded_whisker(trial.true)))
-    sensed = scored(found, truth, pose, trial.true)
+    sensed = scored(found, truth, pose, trial.true, fits=False)
     direction = (rotation[rows, :, 0] * truth.pose[0][rows, :, 0]).sum(axis=1)
     turned = np.swapaxes(truth.pose[0][rows], 1, 2) @ rotation[rows]
     return {

@@ -6,18 +6,19 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from scipy.interpolate import CubicSpline
+
+import vibrissa as vb
+from vibrissa.contour import axis_offset, fit_cylinder
+from vibrissa.demo.scores import REPLICATES
+from vibrissa.mapping import ContactMap
 from vibrissa.pipeline import (
+    SOLVED_TO,
     component_noise,
     fit_contacts,
     in_laboratory,
     locate,
     locate_from_wrench,
 )
-
-import vibrissa as vb
-from vibrissa.contour import axis_offset
-from vibrissa.demo.scores import REPLICATES
-from vibrissa.mapping import ContactMap
 from vibrissa.sensing import FORCE_NOISE, MOMENT_NOISE
 from vibrissa.signals import SIGNALS, nearest_on_rest
 from vibrissa.trial import recorded_pegs, recorded_whisker
@@ -28,6 +29,7 @@ TRIPLET = "Fx MB MD"
 OTHER = "Fx FT MD"
 SIX = "six signals"
 WRENCH = "wrench"
+PEG = ("offset", "tilt", "diameter", "sigma")
 WAYS = (TRIPLET, OTHER, SIX, WRENCH)
 
 Pose = tuple[np.ndarray, np.ndarray]
@@ -116,7 +118,9 @@ def located(way: str, trial: xr.DataTree, contacts: ContactMap) -> xr.Dataset:
     return found.assign(friction_angle_sigma=("time", sigma))
 
 
-def scored(found: xr.Dataset, truth: Truth, pose: Pose, trial: xr.DataTree) -> xr.Dataset:
+def scored(
+    found: xr.Dataset, truth: Truth, pose: Pose, trial: xr.DataTree, fits: bool = True
+) -> xr.Dataset:
     """Place contacts and compare them with the truth, frame by frame; m and rad.
 
     ``predicted`` are errors drawn from the covariance, ``pose_error`` is how far the pose alone
@@ -148,20 +152,36 @@ def scored(found: xr.Dataset, truth: Truth, pose: Pose, trial: xr.DataTree) -> x
     data = {name: ("frame", values) for name, values in out.items()}
     data["error"] = (("frame", "axis"), np.einsum("tij,tj->ti", truth.axes, error))
     data["predicted"] = (("frame", "replicate"), np.where(known, drawn, np.nan).T)
-    alone = placed.where(xr.DataArray(truth.touching, dims="time"))
-    pegs = peg_error(placed, trial)
-    pegs |= {f"touching_{name}": value for name, value in peg_error(alone, trial).items()}
+    if not fits:
+        return xr.Dataset(data)
+    touching = placed.where(xr.DataArray(truth.touching, dims="time"))
+    pegs = {
+        f"{kind} {name}": value
+        for kind, (contacts, normals) in {
+            "felt": (placed, True),
+            "touching": (touching, True),
+            "points": (touching, False),
+        }.items()
+        for name, value in peg_error(contacts, trial, normals).items()
+    }
     return xr.Dataset(data).assign_attrs(pegs)
 
 
-def peg_error(placed: xr.Dataset, trial: xr.DataTree) -> dict[str, float]:
+def peg_error(placed: xr.Dataset, trial: xr.DataTree, normals: bool) -> dict[str, float]:
     """Of the cylinder fitted to the contacts: metres and radians; NaN where there is none."""
-    (peg,) = recorded_pegs(trial)
-    names = ("offset", "tilt", "diameter_error", "diameter_sigma")
+    (peg,), whisker = recorded_pegs(trial), recorded_whisker(trial)
     try:
-        fit = fit_contacts(placed.expand_dims(whisker=1, axis=1), [recorded_whisker(trial)])
+        if normals:
+            fit = fit_contacts(placed.expand_dims(whisker=1, axis=1), [whisker])
+        else:
+            spread = placed["contact_covariance"].values + SOLVED_TO**2 * np.eye(3)
+            arc_length = placed["arc_length"].values
+            known = np.isfinite(arc_length)
+            radius = np.full(known.shape, np.nan)
+            radius[known] = whisker.radius(arc_length[known])
+            fit = fit_cylinder(placed["contact_point"].values, spread, radius)
     except ValueError:
-        return dict.fromkeys(names, np.nan)
+        return dict.fromkeys(PEG, np.nan)
     offset, tilt = axis_offset(fit.origin, fit.axis, peg.origin, peg.axis)
     values = (np.linalg.norm(offset), tilt, fit.diameter - 2.0 * peg.radius, fit.diameter_sigma)
-    return {name: float(value) for name, value in zip(names, values, strict=True)}
+    return {name: float(value) for name, value in zip(PEG, values, strict=True)}

@@ -5,9 +5,11 @@ import pytest
 import xarray as xr
 
 from vibrissa.pipeline import default_source, placed_by, sensor_noise, signals_of, with_signals
+from vibrissa.sensing import Sensor
 from vibrissa.signals import SIGNALS, base_signals
 from vibrissa.status import Status
 from vibrissa.tracking.filtering import low_pass
+from vibrissa.trial import measure
 
 
 def exact(tracked, trial):
@@ -33,6 +35,20 @@ def test_a_sensor_is_taken_as_it_reads(trial):
     truth = trial["truth"]["in_contact"].values
     assert (signals["in_contact"].values <= truth).all()
     assert signals["in_contact"].values.sum() > 0.9 * truth.sum()
+
+
+def test_channels_that_tell_all_are_brought_back_to_force_and_moment(trial):
+    generator = np.random.default_rng(1)
+    mixing = generator.normal(size=(8, 6)) * np.repeat([1.0, 50.0], 3)
+    sensor = Sensor([f"gauge {i}" for i in range(8)], mixing, noise=1e-6)
+    signals = signals_of(measure(trial, sensor=sensor, seed=4))
+    assert signals.attrs["source"] == "sensor"
+    truth = trial["truth"].to_dataset()
+    error = np.concatenate([signals[n].values - truth[n].values for n in ("force", "moment")], -1)
+    covariance = sensor_noise(signals.isel(whisker=0))
+    assert covariance.shape == (trial.sizes["time"], 6, 6)
+    z = np.einsum("ti,tij,tj->t", error[:, 0], np.linalg.inv(covariance), error[:, 0])
+    assert 5.4 < z.mean() < 6.6
 
 
 def test_the_true_contact_point_gives_the_true_wrench(tracked, trial):
@@ -191,8 +207,60 @@ def test_what_is_missing_is_said(tracked, trial):
         with_signals(without)
     with pytest.raises(ValueError, match="below half of"):
         signals_of(tracked, "contact point", 200.0)
-    mixed = trial.to_dataset().drop_vars(["force", "moment"])
-    mixed = mixed.assign(reading=(("time", "channel"), np.zeros((trial.sizes["time"], 2))))
-    mixed = mixed.assign_coords(channel=["Fx", "Mz"])
-    with pytest.raises(ValueError, match="reads Fx, Mz, not force and moment"):
-        signals_of(xr.DataTree(mixed), "sensor")
+    with pytest.raises(ValueError, match="do not tell all six components"):
+        signals_of(measure(trial, sensor=Sensor(("Fx", "My", "Mz"))))
+
+
+def test_a_moving_head_takes_everything_along(tracked):
+    """Seen from the head nothing changes, so the filter lets it pass unharmed."""
+    from scipy.spatial.transform import Rotation
+
+    root = tracked.to_dataset()
+    n = root.sizes["time"]
+    fast = 0.3 * np.sin(np.linspace(0.0, 60.0, n))
+    turn = Rotation.from_rotvec(fast[:, None] * [0.2, -0.4, 0.9]).as_matrix()
+    shift = np.stack([0.01 * fast, 0.02 * np.cos(fast), -0.01 * fast], axis=1)
+
+    def moved(name):
+        points = np.einsum("tij,twj->twi", turn, root[name].values)
+        return root[name].dims, points + shift[:, None]
+
+    rotation = np.einsum("tij,twjk->twik", turn, root["base_rotation"].values)
+    square = np.einsum("tij,twjk,tlk->twil", turn, root["contact_covariance"].values, turn)
+    other = root.assign(
+        contact_point=moved("contact_point"),
+        base_position=moved("base_position"),
+        base_rotation=(root["base_rotation"].dims, rotation),
+        contact_covariance=(root["contact_covariance"].dims, square),
+        head_position=(("time", "space"), shift),
+        head_rotation=(("time", "space", "head_axis"), turn),
+    )
+    tree = tracked.copy()
+    tree.dataset = other
+    still, moving = (signals_of(one, "contact point", 40.0) for one in (tracked, tree))
+    for name in ("force", "moment"):
+        size = np.nanmax(np.abs(still[name]))
+        np.testing.assert_allclose(moving[name], still[name], atol=1e-7 * size)
+    turned = np.einsum("tij,twjk->twik", turn, still["base_rotation"].values)
+    np.testing.assert_allclose(moving["base_rotation"], turned, atol=1e-9)
+
+
+def test_contact_points_from_a_table_count_more(tracked, trial):
+    data = measured(tracked)
+    n = data.sizes["time"]
+    touching = np.flatnonzero(tracked["in_contact"].values[:, 0])
+    point = np.full((n, 1, 3), np.nan)
+    point[touching[:3]] = tracked["contact_point"].values[touching[:3]] + [2e-4, 0.0, 0.0]
+    for source in ("table", "nearest to the object"):
+        given = data.copy()
+        about = {"source": source}
+        given["measured"] = xr.DataTree(
+            data["measured"]
+            .to_dataset(inherit=False)
+            .assign(contact_point=(("time", "whisker", "space"), point, about))
+        )
+        before, after = signals_of(data, cutoff=None), signals_of(given, cutoff=None)
+        changed = np.flatnonzero((before["force"] != after["force"]).any(("whisker", "space")))
+        assert changed.tolist() == (touching[:3].tolist() if source == "table" else [])
+    unknown = np.isnan(signals_of(given, cutoff=None)["wrench_covariance"].values)
+    assert not unknown[touching[3:]].any()

@@ -79,12 +79,6 @@ def needed(root: xr.Dataset, names: Sequence[str], source: str) -> None:
     missing = [name for name in names if name not in root]
     if not missing:
         return
-    if "reading" in root and "force" in missing:
-        channels = ", ".join(map(str, root["channel"].values))
-        raise ValueError(
-            f"the sensor of this recording reads {channels}, not force and moment; see its reading "
-            "and mixing"
-        )
     raise ValueError(
         f"signals from the {source} need {', '.join(missing)}; the recording has {names_of(root)}"
     )

@@ -185,7 +185,8 @@ class _Felt(NamedTuple):
         above = float(np.median(least[rows])) if rows.any() else float(np.nanmax(least, initial=0))
         typical = None
         if noise is not None:
-            typical = covariance[0] if np.ndim(noise) == 2 else _typical(covariance[rows])
+            same = bool((covariance == covariance[:1]).all())
+            typical = covariance[0] if same else _typical(covariance[rows])
         return cls(wrench["time"].variable, force, moment, covariance, known, rows, typical, above)
 
 

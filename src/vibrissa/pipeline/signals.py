@@ -8,7 +8,8 @@ the pose: how far it usually is from that of the rod, where that is known.
 
 **The rod**: force and moment of the rod that fits the whisker's images, with their covariance.
 
-**A sensor**: force and moment as they were read, in a simulated or a robot's recording.
+**A sensor**: force and moment as they were read, in a simulated or a robot's recording; or what its
+channels read, if these are six or more that tell force and moment.
 """
 
 from __future__ import annotations
@@ -30,7 +31,9 @@ from vibrissa.pipeline.frames import (
 )
 from vibrissa.pipeline.locate import FELT
 from vibrissa.pipeline.tracked_points import paper_pose, signals_by_point
+from vibrissa.quantities import attributes
 from vibrissa.rod.reach import PROXIMAL
+from vibrissa.sensing import Sensor
 from vibrissa.status import Status
 from vibrissa.tracking.filtering import CUTOFF
 from vibrissa.trial.recording import recorded_whisker
@@ -141,7 +144,8 @@ def default_source(recording: xr.DataTree) -> Source:
         If it has neither.
     """
     root = recording.to_dataset()
-    if {"force", "moment"} <= set(root.data_vars) and "wrench_covariance" not in root:
+    felt = {"force", "moment"} <= set(root.data_vars) or "reading" in root
+    if felt and "wrench_covariance" not in root:
         return "sensor"
     if "contact_point" in root:
         return "contact point"
@@ -161,30 +165,60 @@ def _given_points(recording: xr.DataTree) -> xr.DataArray | None:
 
 
 def _by_sensor(root: xr.Dataset) -> xr.Dataset:
-    needed(root, ("force", "moment", "base_position", "base_rotation"), "sensor")
+    if "force" not in root and {"reading", "mixing"} <= set(root.data_vars):
+        root, covariance = _from_channels(root)
+    else:
+        needed(root, ("force", "moment"), "sensor")
+        covariance = _own_noise(root)
+    needed(root, ("base_position", "base_rotation"), "sensor")
     if "wrench_covariance" in root:
         raise ValueError(
             "no sensor was there: force and moment of this recording are those of the rod that "
             "fits its images; take them from the source 'rod'"
         )
-    noise = np.concatenate(
+    wrench = root[["force", "moment"]]
+    known = _known(wrench)
+    least = 0.0
+    if covariance is not None:
+        least = FELT * float(np.sqrt(0.5 * (covariance[4, 4] + covariance[5, 5])))
+    moment = wrench["moment"].transpose("time", "whisker", "space").values
+    touching = known & (np.hypot(moment[..., 1], moment[..., 2]) > least)
+    status = np.where(touching, int(Status.OK), int(Status.NO_CONTACT))
+    status[~known] = int(Status.MISSING)
+    data = _labelled(root, wrench, touching, status, {"source": "sensor"})
+    if covariance is None:
+        return data
+    if (covariance == np.diag(np.diag(covariance))).all():
+        return data.assign_attrs(noise=np.sqrt(np.diag(covariance)))
+    whole = np.broadcast_to(covariance, (*known.shape, 6, 6))
+    dims = ("time", "whisker", *SQUARES["wrench_covariance"])
+    about = attributes("wrench_covariance")
+    return data.assign(wrench_covariance=xr.Variable(dims, whole, about))
+
+
+def _own_noise(root: xr.Dataset) -> Array | None:
+    """Covariance (6, 6) of force and moment, where they say how noisy they are."""
+    deviations = np.concatenate(
         [
             np.broadcast_to(np.asarray(root[name].attrs.get("noise", np.nan), np.float64), 3)
             for name in ("force", "moment")
         ]
     )
-    about: dict[str, Any] = {"source": "sensor"}
-    wrench = root[["force", "moment"]]
-    known = _known(wrench)
-    least = 0.0
-    if np.isfinite(noise).all():
-        about["noise"] = noise
-        least = FELT * float(np.sqrt(0.5 * (noise[4] ** 2 + noise[5] ** 2)))
-    moment = wrench["moment"].transpose("time", "whisker", "space").values
-    touching = known & (np.hypot(moment[..., 1], moment[..., 2]) > least)
-    status = np.where(touching, int(Status.OK), int(Status.NO_CONTACT))
-    status[~known] = int(Status.MISSING)
-    return _labelled(root, wrench, touching, status, about)
+    return np.diag(deviations**2) if np.isfinite(deviations).all() else None
+
+
+def _from_channels(root: xr.Dataset) -> tuple[xr.Dataset, Array]:
+    """Force and moment, and their covariance (6, 6), from what other channels read of them."""
+    reading = root["reading"].transpose("time", "whisker", "channel")
+    sensor = Sensor(
+        [str(name) for name in root["channel"].values],
+        root["mixing"].transpose("channel", "component").values,
+        noise=reading.attrs.get("noise"),
+    )
+    wrench, covariance = sensor.to_wrench(reading.values)
+    dims = ("time", "whisker", "space")
+    parts = {"force": (dims, wrench[..., :3]), "moment": (dims, wrench[..., 3:])}
+    return root.assign(parts), covariance
 
 
 def _by_rod(root: xr.Dataset) -> xr.Dataset:

@@ -36,6 +36,9 @@ def test_simulated_looked_into_and_drawn(own, tmp_path):
     np.testing.assert_allclose(recording["head_position"].values[-1], [0, 14e-3, 0], atol=1e-12)
     done("figures", trial, "-o", tmp_path, "--format", "png")
     assert (tmp_path / "array.png").stat().st_size > 10_000
+    told = done("info", trial)
+    assert "4: LC2, LC3, RC2, RC3" in told
+    assert "curvature_knots" not in told
 
 
 def test_an_array_is_looked_into_and_drawn(own, tmp_path):

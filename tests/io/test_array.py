@@ -96,6 +96,12 @@ def test_what_is_wrong_is_told(tmp_path, text, said):
         load_array(written(tmp_path, text))
 
 
+def test_what_is_more_curved_than_any_whisker_is_warned_of(tmp_path):
+    path = written(tmp_path, f"{HEADER}\nC2,6,-4,1,10,5,-90,30,0.2\n")
+    with pytest.warns(UserWarning, match="C2: its coefficient, 0.2 per mm.*check the units"):
+        load_array(path)
+
+
 def test_other_files_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError):
         load_array(tmp_path / "none.csv")

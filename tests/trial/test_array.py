@@ -214,6 +214,9 @@ def test_whiskers_and_motions_must_belong_together(motions):
 
 def test_a_film_shows_the_face_between_the_whiskers(trial):
     (top, _) = views_of(trial)
+    tips = top.project(trial["truth"]["centerline"].values[:, :, -1])
+    assert (tips > 0).all()
+    assert (tips < np.array(top.size) - 1).all()
     first = next(iter(film_frames(trial, top, Look(unevenness=0.0))))
     snout = top.project(trial["base_position"].values[0].mean(axis=0))
     shaft = top.project(trial["truth"]["centerline"].values[0, 0, 10])

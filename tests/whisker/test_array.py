@@ -221,6 +221,9 @@ def test_outside_the_range_of_the_equations_it_warns():
     with pytest.warns(UserWarning, match="A5: outside the range"):
         whisker = vb.whisker_array("left", names=["A5"])["A5"]
     assert any("outside the range" in note for note in whisker.notes)
+    with pytest.warns(UserWarning, match="outside"):
+        own = vb.whisker_array("left", names=["A5"], base_radius=1e-4)["A5"]
+    assert any("outside the range" in note for note in own.notes)
     with pytest.raises(ValueError, match="reach to column 6"):
         vb.whisker_array(names=["A7"])
     with warnings.catch_warnings():
@@ -260,6 +263,13 @@ def test_an_array_is_made_of_any_whiskers():
         vb.WhiskerArray([replace(own, name="LD3")])
     with pytest.raises(ValueError, match="two of RD3"):
         vb.WhiskerArray([own, replace(own, name="Rd3")])
+
+
+def test_it_shows_itself_in_a_notebook():
+    html = ARRAY._repr_html_()
+    assert "62: Lα" in html
+    assert "3.3" in html
+    assert "<svg" in html
 
 
 def test_datasets_without_loss():

@@ -184,8 +184,9 @@ def _groups(path: Path) -> Iterator[tuple[str, str]]:
     yield "kind", kind_of(path) or "unknown"
     groups = xr.open_groups(path, engine="h5netcdf")
     try:
+        several = sum(name.startswith("/whiskers/") for name in groups)
         for name, group in groups.items():
-            if not group.data_vars:
+            if not group.data_vars or (several > 1 and name.startswith("/whiskers/")):
                 continue
             sizes = ", ".join(f"{dim} {size}" for dim, size in group.sizes.items())
             yield name, f"[dim]{sizes or 'no dimensions'}[/]"
@@ -193,6 +194,9 @@ def _groups(path: Path) -> Iterator[tuple[str, str]]:
                 units = data.attrs.get("units", "")
                 dims = ", ".join(map(str, data.dims))
                 yield f"  {variable}", f"({dims}) {'' if units == '1' else units}"
+        if several > 1:
+            names = ", ".join(map(str, groups["/"]["whisker"].values))
+            yield "/whiskers", f"{several}: {names}"
     finally:
         for group in groups.values():
             group.close()

@@ -69,6 +69,11 @@ def load_array(
         If there is no such file or folder.
     ValueError
         If it holds no whiskers, a name is no whisker's, a column is missing or a cell no number.
+
+    Warns
+    -----
+    UserWarning
+        If a whisker of a table is more curved than any of a rat.
     """
     path = Path(path)
     if not path.exists():

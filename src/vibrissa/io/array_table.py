@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from vibrissa.whisker.array import WhiskerArray
 from vibrissa.whisker.average import published_radii
 from vibrissa.whisker.emergence import angles_of, base_rotation
 from vibrissa.whisker.identity import Identity
+from vibrissa.whisker.morphology import curvature_bound
 from vibrissa.whisker.parabola import parabola_curvature
 from vibrissa.whisker.pose import Pose
 
@@ -78,6 +80,13 @@ def _whisker(
     """One line's whisker."""
     stated: Any = published_radii(Identity.of(name), length) | radii
     whisker = Whisker.parabola(length, coefficient, name=name, **stated)
+    bound = float(curvature_bound(length))
+    if abs(coefficient) > bound:
+        warnings.warn(
+            f"{name}: its coefficient, {coefficient * 1e-3:.4g} per mm, is larger than that of any "
+            f"rat's whisker of this length ({bound * 1e-3:.4f} per mm): check the units",
+            stacklevel=4,
+        )
     # A negative coefficient turns the whisker's frame within that of the table.
     return replace(whisker, pose=Pose(pose.rotation @ whisker.pose.rotation, pose.origin))
 

@@ -23,7 +23,7 @@ from scipy.interpolate import CubicSpline
 from vibrissa.io.video import Frame, write_video
 from vibrissa.quantities import attributes
 from vibrissa.rod.surface import Surface
-from vibrissa.trial.cameras import Camera, cameras_dataset, orthogonal_views
+from vibrissa.trial.cameras import PIXEL_SIZE, Camera, cameras_dataset, orthogonal_views
 from vibrissa.trial.recording import recorded_objects, recorded_whisker
 from vibrissa.trial.shadows import hidden, silhouette
 
@@ -38,6 +38,9 @@ _STEP = 2.0
 
 _CHEEK = 0.5e-3
 """How far the face of several whiskers reaches beyond their bases, m."""
+
+_MARGIN = 0.05
+"""Room around several whiskers, as a share of how far they reach."""
 
 _FUR = 2.0
 """Softness of the face's edge, standard deviation, pixels."""
@@ -110,22 +113,21 @@ def views_of(recording: xr.DataTree, pixel_size: float | None = None) -> tuple[C
     recording : xarray.DataTree
         Of a simulated trial.
     pixel_size : float, optional
-        What a pixel sees, m; 58 µm by default.
+        What a pixel sees, m; by default 58 µm, or for several whiskers what it takes to see all.
 
     Returns
     -------
     tuple of Camera
         Top and front view.
     """
-    line = _truth(recording)["centerline"].values.reshape(-1, 3)
-    middle = 0.5 * (np.nanmin(line, axis=0) + np.nanmax(line, axis=0))
+    lines = _truth(recording)["centerline"].values
+    low, high = np.nanmin(lines, axis=(0, 1, 2)), np.nanmax(lines, axis=(0, 1, 2))
     # A whole tenth of a millimetre is easier to write down.
-    middle = np.round(middle, 4)
-    return (
-        orthogonal_views(center=middle)
-        if pixel_size is None
-        else orthogonal_views(pixel_size, center=middle)
-    )
+    middle = np.round(0.5 * (low + high), 4)
+    if pixel_size is None:
+        whole = (1.0 + _MARGIN) * float((high - low).max()) / min(orthogonal_views()[0].size)
+        pixel_size = PIXEL_SIZE if lines.shape[1] == 1 else max(PIXEL_SIZE, whole)
+    return orthogonal_views(pixel_size, center=middle)
 
 
 def film(

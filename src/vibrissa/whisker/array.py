@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from vibrissa.sketch import BENT, Mark, card, shown, views
 from vibrissa.whisker.array_dataset import array_tree, whiskers_of
 from vibrissa.whisker.identity import Identity, Side
 from vibrissa.whisker.model import Whisker
@@ -206,6 +207,15 @@ class WhiskerArray(Mapping[str, Whisker]):
             f"WhiskerArray: {len(self)} whiskers ({', '.join(sides)}), {min(lengths):.1f} to "
             f"{max(lengths):.1f} mm long: {', '.join(self)}"
         )
+
+    def _repr_html_(self) -> str:
+        """Show all whiskers in the head's frame, from above and from behind."""
+        lengths = [w.length for w in self.values()]
+        rows = [
+            ("whiskers", f"{len(self)}: {', '.join(self)}"),
+            ("lengths", f"{shown('length', min(lengths))} to {shown('length', max(lengths))}"),
+        ]
+        return card("WhiskerArray", rows, views([Mark(self.centerlines(), BENT)]))
 
 
 def sides(side: str) -> tuple[Side, ...]:

@@ -113,12 +113,12 @@ def average_whisker(identity: Identity, **properties: Unpack[Properties]) -> Whi
     for note in notes:
         warnings.warn(f"{identity.name}: {note}", UserWarning, stacklevel=3)
     radii = published_radii(identity, length)
-    if radii["tip_radius"] == radii["base_radius"] / morphology.MOST_TAPER:
+    own = {"base_radius", "tip_radius", "radius"} & set(properties)
+    if not own and radii["tip_radius"] == radii["base_radius"] / morphology.MOST_TAPER:
         notes.append(
             "the published radius slope leaves it no tip (or too thin a one); its base radius over "
             f"{morphology.MOST_TAPER:g} is taken instead"
         )
-    own = {"base_radius", "tip_radius", "radius"} & set(properties)
     stated: Any = ({} if own else radii) | dict(properties) | {"name": identity.name}
     whisker = Whisker.parabola(length, coefficient, **stated)
     angles = morphology.emergence_angles(row, column)
@@ -126,7 +126,7 @@ def average_whisker(identity: Identity, **properties: Unpack[Properties]) -> Whi
     if identity.side == "left":
         angles, place = mirrored(angles), place * [-1.0, 1.0, 1.0]
     pose = Pose(base_rotation(*angles), place)
-    return replace(whisker, pose=pose, notes=(*whisker.notes, *([] if own else notes)))
+    return replace(whisker, pose=pose, notes=(*whisker.notes, *notes))
 
 
 def published_radii(identity: Identity, length: float) -> dict[str, float]:

@@ -165,6 +165,7 @@ def _given_points(recording: xr.DataTree) -> xr.DataArray | None:
 
 
 def _by_sensor(root: xr.Dataset) -> xr.Dataset:
+    covariance: Array | None
     if "force" not in root and {"reading", "mixing"} <= set(root.data_vars):
         root, covariance = _from_channels(root)
     else:

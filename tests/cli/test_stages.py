@@ -175,6 +175,8 @@ def test_a_whisker_that_is_missing_can_be_given(folder, tmp_path):
     done("estimate", out, "--map", folder / "map.nc")
     done("reconstruct", out, "--whisker", folder / "map.nc")
     assert "contour" in load_recording(out).children
+    done("reconstruct", folder / "bare.nc", "--map", folder / "map.nc", "-o", out)
+    assert "contour" in load_recording(out).children
 
 
 def test_too_few_contacts_are_said_and_nothing_is_written(folder, tmp_path):

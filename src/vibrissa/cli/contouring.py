@@ -134,14 +134,14 @@ def reconstruct(
         if source is not None or cutoff is not None or "signals" not in tree.children:
             tell("signals", 0, 1)
             wanted = CUTOFF if cutoff is None else cutoff
-            tree = with_signals(tree, **signal_options(tree, source, wanted, whisker))
+            tree = with_signals(tree, **signal_options(tree, source, wanted, how.known))
             tell("signals", 1, 1)
         say(described(tree))
         asked = triplet is not None or all_six or charts or noise is not None
         if asked or "estimates" not in tree.children:
             tree, said = estimated(tree, how, noise, tell, str(recording))
             say(said)
-        whiskers = whiskers_for(tree, whisker)
+        whiskers = whiskers_for(tree, how.known)
         tell(shape, 0, 1)
         tree = with_contour(tree, shape, axis=direction, whiskers=whiskers, objects=known)
         tell(shape, 1, 1)

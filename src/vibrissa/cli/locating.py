@@ -150,6 +150,11 @@ class How(NamedTuple):
     whisker: Path | None
 
     @property
+    def known(self) -> Path | None:
+        """The file that holds the one whisker, if one is given."""
+        return self.charts[0] if len(self.charts) == 1 else self.whisker
+
+    @property
     def grid(self) -> bool:
         """Whether the paper's grid is looked up in."""
         return self.method.startswith("lookup")
@@ -302,7 +307,7 @@ def estimated(
     from vibrissa.tracking.filtering import CUTOFF
 
     if "signals" not in tree.children:
-        tree = with_signals(tree, **signal_options(tree, None, CUTOFF, how.whisker))
+        tree = with_signals(tree, **signal_options(tree, None, CUTOFF, how.known))
     signals = tree["signals"].to_dataset()
     if noise is None and sensor_noise(signals) is None and signals.attrs.get("source") == "sensor":
         noise = noise_from(None, FORCE_NOISE * 1e6, None)

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from vibrissa.cli.sources import whisker_from
-from vibrissa.cli.terminal import Tell, numbers, output, progress_bars, shown
+from vibrissa.cli.terminal import numbers, output, progress_bars, shown
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     import xarray as xr
 
-    from vibrissa.tracking import Trace, TraceOptions, TrackOptions
+    from vibrissa.tracking import TraceOptions, TrackOptions
     from vibrissa.trial import Camera
 
 _MICRO = 1e-6
@@ -179,17 +180,26 @@ def _tracked(
 ) -> None:
     """Track one trial and say what was found."""
     from vibrissa.io import save_recording
+    from vibrissa.tracking import partial_traces, trace_file
     from vibrissa.tracking import track as tracked
 
+    kept = [partial_traces(recording, view) for view in range(len(videos))]
     with progress_bars() as tell:
         traces = [
-            _traced(path, recording, view, places[view], corrections.get(view, {}), options, tell)
+            trace_file(
+                path,
+                kept[view],
+                places[view],
+                options,
+                corrections=corrections.get(view, {}),
+                progress=partial(tell, f"trace {path.name}"),
+            )
             for view, path in enumerate(videos)
         ]
         result = tracked(cameras, traces, fps, how, progress=tell, **beside)
     save_recording(recording, result)
-    for view in range(len(videos)):
-        _partial(recording, view).unlink(missing_ok=True)
+    for file in kept:
+        file.unlink(missing_ok=True)
     _report(result, recording)
 
 
@@ -265,50 +275,6 @@ def _bases(texts: Sequence[str], views: int) -> list[list[list[float]] | None]:
         raise ValueError(f"there are {len(places)} --base for {views} views; each needs as many")
     each = len(places) // views
     return [places[v * each : (v + 1) * each] for v in range(views)]
-
-
-def _partial(recording: Path, view: int) -> Path:
-    return recording.with_name(f".{recording.name}.view{view}.npz")
-
-
-def _traced(
-    video: Path,
-    recording: Path,
-    view: int,
-    bases: Any,
-    corrections: Any,
-    options: TraceOptions,
-    tell: Tell,
-) -> list[list[Trace]]:
-    """Trace a video, or go on where it was stopped."""
-    from vibrissa.io import load_traces, read_video, save_traces, video_info
-    from vibrissa.tracking import Trace, trace_video
-
-    info = video_info(video)
-    about = video.stat()
-    fixed = sorted((key, points.tolist()) for key, points in corrections.items())
-    key = f"{video.resolve()} {about.st_size} {about.st_mtime_ns} {bases} {fixed} {options}"
-    begun = load_traces(_partial(recording, view), key) or []
-    rows = [[Trace(*row) for row in whisker] for whisker in begun]
-    kept: list[list[Trace]] = []
-    stage = f"trace {video.name}"
-    total = max(info.frames, 1)
-    try:
-        traces = trace_video(
-            read_video(video),
-            bases,
-            options,
-            corrections=corrections,
-            begun=rows,
-            kept=kept,
-            progress=lambda done: tell(stage, done, max(total, done)),
-        )
-    finally:
-        if kept and kept[0]:
-            done = min(len(row) for row in kept)
-            save_traces(_partial(recording, view), key, [[(*t,) for t in r[:done]] for r in kept])
-    tell(stage, len(traces[0]), len(traces[0]))
-    return traces
 
 
 def _report(result: xr.DataTree, path: Path) -> None:

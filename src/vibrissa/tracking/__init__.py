@@ -12,6 +12,7 @@ from vibrissa.tracking.space import SpaceCurve, merge
 from vibrissa.tracking.timing import paired_frames
 from vibrissa.tracking.trace import Trace, TraceOptions
 from vibrissa.tracking.track import Tracked, TrackOptions, track, track_whisker
+from vibrissa.tracking.video_file import partial_traces, trace_file
 from vibrissa.tracking.view import trace_video
 
 __all__ = [
@@ -33,9 +34,11 @@ __all__ = [
     "low_pass",
     "merge",
     "paired_frames",
+    "partial_traces",
     "refine",
     "rest_shape",
     "start_at",
+    "trace_file",
     "trace_video",
     "track",
     "track_whisker",

@@ -12,7 +12,10 @@ from vibrissa.cli.terminal import output, progress_bars, shown
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from vibrissa.demo import DemoResult, ErrorRow
+    from vibrissa.demo import DemoResult, ErrorRow, Located, TrackingScores
+
+_SENSED = "felt by a sensor"
+_SEEN = "the paper's way"
 
 
 def demo(
@@ -23,25 +26,40 @@ def demo(
     folder: Annotated[
         Path, typer.Option("--output", "-o", help="Where files go.", metavar="DIR")
     ] = Path("vibrissa-demo"),
+    full: Annotated[
+        bool,
+        typer.Option("--full/--quick", help="3.5 s of video, as in the paper, or half a second."),
+    ] = False,
     seed: Annotated[int, typer.Option(help="Of the whisks and of the noise.")] = 0,
     noise: Annotated[
         bool, typer.Option(help="Whether the sensor has noise: 1 µN and 0.02 µN·m.")
     ] = True,
-    duration: Annotated[float, typer.Option(help="Of the trial, s.")] = 3.0,
+    video: Annotated[
+        bool,
+        typer.Option(help="Whether the trial is filmed and tracked, or the true pose is taken."),
+    ] = True,
+    duration: Annotated[
+        float | None, typer.Option(help="Of the trial, s, instead of --quick or --full.")
+    ] = None,
     rate: Annotated[float, typer.Option(help="Frames per second.")] = 1000.0,
 ) -> None:
-    """Whisk against a peg, feel it at the base, and find it again.
+    """Whisk against a peg, film it, feel it at the base, and find the peg again.
 
-    A whisker sweeps past a peg and back; from three signals at its base come contact points, and
-    from those the peg. Example: `vibrissa demo --output try --seed 1`
+    A whisker sweeps past a peg and back before two cameras. Its track tells how its base is held,
+    three signals at its base where it touches, and the contact points draw the peg. All stages are
+    compared with the truth. Stopped with Ctrl-C it goes on from there when it is called again.
+    Example: `vibrissa demo --output try --seed 1`
     """
     from vibrissa.cli.sources import whisker_from
     from vibrissa.demo import run_demo
+    from vibrissa.demo.run import DURATION, FULL_DURATION
     from vibrissa.io.paths import check_folder
 
     check_folder(folder)
     chosen = whisker_from(whisker)
     output.print(f"{chosen!r}", highlight=False, soft_wrap=True)
+    if duration is None:
+        duration = FULL_DURATION if full else DURATION
     with progress_bars() as tell:
         result = run_demo(
             chosen,
@@ -50,33 +68,90 @@ def demo(
             noise=noise,
             duration=duration,
             rate=rate,
+            video=video,
             progress=tell,
         )
     _report(result, noise)
 
 
 def _report(result: DemoResult, noise: bool) -> None:
-    scores = result.scores
+    sensed = result.sensed
+    scores = sensed.scores
     none, one, several = scores.candidates
-    felt = shown("MB", result.contacts.attrs["felt_above"], 3)
+    felt = shown("MB", sensed.contacts.attrs["felt_above"], 3)
     output.print()
     for line in (
-        f"{result.contacts.sizes['time']} frames, {scores.touching} in contact",
+        f"{sensed.contacts.sizes['time']} frames, {scores.touching} in contact",
         f"{scores.felt} contacts felt (M_B over {felt}), {scores.false} of them false",
-        f"estimated from ({', '.join(result.contacts.attrs['triplet'].split())}) only",
+        f"estimated from ({', '.join(sensed.contacts.attrs['signals'].split())}) only",
         f"{100 * scores.share_with_one:.1f} % have exactly one candidate ({one}); {none} none, as "
         f"noise can have it; {several} several, of which the one that goes on from the frames "
         "around is taken",
     ):
         output.print(line, highlight=False, soft_wrap=True)
     output.print()
+    if result.tracking is not None:
+        output.print(_tracking_table(result.tracking))
+    if result.seen is not None:
+        output.print(_signal_table(sensed, result.seen))
     output.print(_table("Error of the contact point", "of", scores.errors, noise, _coordinate))
     output.print(
         _table("3D error by deflection angle", "angle", scores.by_angle, noise, lambda r: r.label)
     )
+    if result.seen is not None:
+        rows = result.seen.scores.by_angle
+        title = f"The same {_SEEN}*, signals and map being of one model"
+        output.print(_table(title, "angle", rows, False, lambda r: r.label))
+        output.print("* " + _CIRCULAR, highlight=False, soft_wrap=True)
+        output.print()
     output.print(_peg_table(result))
     for file in result.files:
         output.print(f"wrote {file}", highlight=False, soft_wrap=True)
+
+
+_CIRCULAR = (
+    "The model gives signals for the contact point that was tracked, and is asked where they come "
+    "from: this tests tracking and inversion, not what a whisker feels."
+)
+
+
+def _tracking_table(scores: TrackingScores) -> Table:
+    from rich.table import Table
+
+    title = f"Tracking: {scores.lost} of {scores.frames} frames lost, contact told from none in "
+    table = Table(title=f"{title}{100 * scores.told:.1f} %", title_justify="left")
+    table.add_column("error of")
+    for name in ("median", "95 %"):
+        table.add_column(name, justify="right")
+    for name, pixels in zip(("top", "front"), scores.trace, strict=True):
+        table.add_row(f"trace, {name}", *(f"{value:.3f} px" for value in pixels))
+    for name, lengths in (
+        ("centreline in space", scores.centerline),
+        ("base", scores.base),
+        ("contact point", scores.contact),
+    ):
+        table.add_row(name, *(f"{1e6 * value:.1f} µm" for value in lengths))
+    return table
+
+
+def _signal_table(sensed: Located, seen: Located) -> Table:
+    """Errors of force and moment by deflection angle, from both sources."""
+    from rich.table import Table
+
+    table = Table(title="Signals, median error by deflection angle", title_justify="left")
+    table.add_column("angle")
+    for name in ("force", "moment"):
+        table.add_column(f"{name}: sensor", justify="right")
+        table.add_column(_SEEN, justify="right")
+    of_seen = {row.label: row for row in seen.signals}
+    for row in sensed.signals:
+        cells = []
+        for name in ("force", "moment"):
+            for source in (row, of_seen.get(row.label)):
+                error = None if source is None else getattr(source, name)[0]
+                cells.append("–" if error is None else f"{100 * error:.2g} %")
+        table.add_row(row.label, *cells)
+    return table
 
 
 def _coordinate(row: ErrorRow) -> str:
@@ -108,18 +183,25 @@ def _peg_table(result: DemoResult) -> Table:
     """The peg, fitted and true."""
     from rich.table import Table
 
-    fit, peg, scores = result.fit, result.peg, result.scores
-    away = shown("peg_position", float((scores.offset**2).sum() ** 0.5), 2)
+    found = {_SENSED: result.sensed}
+    if result.seen is not None:
+        found[_SEEN] = result.seen
     table = Table(title="The peg", title_justify="left", caption_justify="left")
     for name in ("", "fitted", "true", "error", "its sigma"):
         table.add_column(name, justify="right" if name else "left")
-    true = fit.origin - scores.offset
-    for i, name in enumerate("xy"):
-        values = (fit.origin[i], true[i], scores.offset[i], fit.origin_sigma[i])
-        cells = (f"{1e3 * float(value):.4f} mm" for value in values)
-        table.add_row(f"axis, {name}", *cells)
-    diameters = (fit.diameter, 2 * peg.radius, scores.diameter_error, fit.diameter_sigma)
-    table.add_row("diameter", *(f"{1e3 * float(value):.4f} mm" for value in diameters))
-    table.add_row("tilt", "", "", shown("base_azimuth", scores.tilt, 2), "")
-    table.caption = f"its axis is {away} from the true one"
+    for name, one in found.items():
+        fit, scores = one.fit, one.scores
+        true = fit.origin - scores.offset
+        if len(found) > 1:
+            table.add_row(f"[bold]{name}")
+        for i, axis in enumerate("xy"):
+            values = (fit.origin[i], true[i], scores.offset[i], fit.origin_sigma[i])
+            cells = (f"{1e3 * float(value):.4f} mm" for value in values)
+            table.add_row(f"axis, {axis}", *cells)
+        lengths = (fit.diameter, 2 * result.peg.radius, scores.diameter_error, fit.diameter_sigma)
+        table.add_row("diameter", *(f"{1e3 * float(value):.4f} mm" for value in lengths))
+        table.add_row("tilt", "", "", shown("base_azimuth", scores.tilt, 2), "")
+        table.add_section()
+    away = shown("peg_position", float((result.sensed.scores.offset**2).sum() ** 0.5), 2)
+    table.caption = f"its axis, {_SENSED}, is {away} from the true one"
     return table

@@ -1,11 +1,15 @@
 """The main job from end to end: from a whisker's signals to the contour of what it touched."""
 
-from vibrissa.demo.run import DemoResult, run_demo
+from vibrissa.demo.run import DemoResult, Located, run_demo
 from vibrissa.demo.scores import ErrorRow, Scores
+from vibrissa.demo.stages import SignalRow, TrackingScores
 
 __all__ = [
     "DemoResult",
     "ErrorRow",
+    "Located",
     "Scores",
+    "SignalRow",
+    "TrackingScores",
     "run_demo",
 ]

@@ -37,19 +37,19 @@ def draw(result: DemoResult, folder: Path, progress: Callable[[int, int], None])
     """
     from vibrissa import plots
 
-    whisker, contacts = result.whisker, result.contacts
+    whisker, contacts = result.contact_map.whisker, result.sensed.contacts
     line = whisker.centerline(_NODES)
     radius = whisker.radius(np.linspace(0.0, whisker.length, _NODES))
     felt = contacts["in_contact"].values
-    truth = result.recording["truth"].to_dataset().isel(whisker=0)
-    angle = result.errors["deflection_angle"].values
+    truth = result.simulated["truth"].to_dataset().isel(whisker=0)
+    angle = result.sensed.errors["deflection_angle"].values
     space = result.contact_map.to_dataset()
     figures: dict[str, Callable[[], Any]] = {
         "whisker": lambda: plots.whisker_views(line, radius, name=whisker.name),
         "signal_space": lambda: plots.signal_clouds(space, line),
         "signals": lambda: plots.signals_over_time(
-            _signals(result.recording.to_dataset(), contacts["in_contact"]),
-            _signals(result.recording["truth"].to_dataset(), truth["in_contact"]),
+            _signals(result.sensed.recording["signals"].to_dataset(), contacts["in_contact"]),
+            _signals(result.simulated["truth"].to_dataset(), truth["in_contact"]),
         ),
         "estimates": lambda: plots.estimated_against_true(
             spherical(truth["contact_point_whisker"].values[felt]),
@@ -60,7 +60,7 @@ def draw(result: DemoResult, folder: Path, progress: Callable[[int, int], None])
         "contour": lambda: plots.contour_views(
             contacts["contact_point"].values[felt],
             result.peg,
-            result.fit,
+            result.sensed.fit,
             colour=angle[felt],
         ),
     }

@@ -2,35 +2,81 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
 from os import PathLike
 from pathlib import Path
 
-import numpy as np
 import xarray as xr
 
 from vibrissa import samples
 from vibrissa.contour import CylinderFit
+from vibrissa.demo.filming import SIMULATED, TRACKED, begin, filmed, tracked, video_files
 from vibrissa.demo.scores import Scores, contact_errors, score
+from vibrissa.demo.stages import SignalRow, TrackingScores, signal_errors, tracking_scores
 from vibrissa.io import save_contacts, save_recording
 from vibrissa.mapping import ContactMap
 from vibrissa.pipeline import (
-    TRIPLET,
-    component_noise,
     contact_columns,
     fit_contacts,
-    in_laboratory,
-    locate,
+    placed_by,
+    signals_of,
     whisker_radii,
+    with_contour,
+    with_estimates,
+    with_group,
 )
+from vibrissa.pipeline.estimates import Progress
 from vibrissa.sensing import FORCE_NOISE, MOMENT_NOISE
-from vibrissa.trial import Motion, Peg, facing_peg, measure, simulate, sweep_past
-from vibrissa.trial.recording import recorded
+from vibrissa.trial import (
+    Peg,
+    facing_peg,
+    measure,
+    recorded_objects,
+    recorded_whisker,
+    simulate,
+    sweep_past,
+)
 from vibrissa.whisker import Whisker
 
-Progress = Callable[[str, int, int], None]
-"""Called with what is being done, and how much of how much is."""
+DURATION = 0.5
+"""Of the trial, s."""
+
+FULL_DURATION = 3.5
+"""Of a trial like the paper's, s."""
+
+DIM = {"whisker": 0}
+
+
+@dataclass(frozen=True, eq=False)
+class Located:
+    """Contact points estimated from signals of one source, and how good they are.
+
+    Parameters
+    ----------
+    recording : xarray.DataTree
+        With the groups ``signals``, ``estimates`` and ``contour``.
+    contacts : xarray.Dataset
+        The estimates, dim time.
+    errors : xarray.Dataset
+        Of the contacts, dim time.
+    fit : CylinderFit
+        The peg fitted to them.
+    scores : Scores
+        The errors in numbers.
+    signals : tuple of SignalRow
+        Errors of the signals by deflection angle.
+    """
+
+    recording: xr.DataTree
+    contacts: xr.Dataset
+    errors: xr.Dataset
+    fit: CylinderFit
+    scores: Scores
+    signals: tuple[SignalRow, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,30 +89,29 @@ class DemoResult:
         That whisked.
     peg : Peg
         That it met.
+    simulated : xarray.DataTree
+        The trial with its truth and what the sensor read.
     contact_map : ContactMap
-        Of the whisker.
-    recording : xarray.DataTree
-        The trial: motion, measured wrench and estimated contacts; the truth in its group.
-    contacts : xarray.Dataset
-        The estimated contacts, dim time, whisker's and laboratory frame.
-    errors : xarray.Dataset
-        Of the contacts, dim time.
-    fit : CylinderFit
-        The peg fitted to them.
-    scores : Scores
-        The errors in numbers.
+        By which contacts were found: of the whisker as it was tracked, or without video of the one
+        that whisked.
+    sensed : Located
+        From what the sensor read, in the laboratory by the pose that was tracked, or without video
+        by the true one.
+    seen : Located or None
+        The paper's way: from signals that the model gives for the contact point that was tracked.
+    tracking : TrackingScores or None
+        Errors of what was tracked.
     files : tuple of Path
         What was written.
     """
 
     whisker: Whisker
     peg: Peg
+    simulated: xr.DataTree
     contact_map: ContactMap
-    recording: xr.DataTree
-    contacts: xr.Dataset
-    errors: xr.Dataset
-    fit: CylinderFit
-    scores: Scores
+    sensed: Located
+    seen: Located | None
+    tracking: TrackingScores | None
     files: tuple[Path, ...]
 
 
@@ -76,27 +121,30 @@ def run_demo(
     *,
     seed: int = 0,
     noise: bool = True,
-    duration: float = 3.0,
+    duration: float = DURATION,
     rate: float = 1000.0,
+    video: bool = True,
     progress: Progress | None = None,
 ) -> DemoResult:
-    """Whisk against a peg, feel it at the base, and find it again.
+    """Whisk against a peg, film it, feel it at the base, and find the peg again.
 
     Parameters
     ----------
     whisker : Whisker, optional
         By default the built-in γ whisker.
     output : str or path, optional
-        Folder for ``trial.nc``, ``contacts.csv``, ``map.nc`` and the figures, made if need be; by
-        default nothing is written.
+        Folder for the recordings, videos, tables and figures, made if need be; by default nothing
+        is kept. What is there already of the same trial is not done again.
     seed : int
-        Of the trial's drifts and the sensor's noise.
+        Of the trial's drifts, the sensor's noise and the videos'.
     noise : bool
         Whether the sensor has noise: 1 µN and 0.02 µN·m standard deviation a component.
     duration : float
         Of the trial, s.
     rate : float
         Frames per second.
+    video : bool
+        Whether the trial is filmed and tracked. If not, the base's true pose is taken.
     progress : callable, optional
         Called as ``progress(stage, done, total)``.
 
@@ -108,106 +156,119 @@ def run_demo(
     Raises
     ------
     ValueError
-        If the whisker cannot whisk past the peg, or too few contacts are felt to fit it.
+        If the whisker cannot whisk past the peg, too few contacts are felt to fit it, or files are
+        in the way.
     """
     tell = progress or _silent
     whisker = samples.gamma() if whisker is None else whisker
-    force_noise, moment_noise = (FORCE_NOISE, MOMENT_NOISE) if noise else (0.0, 0.0)
-    peg = facing_peg(whisker)
-    tell("how far to whisk", 0, 1)
-    motion = sweep_past(whisker, peg, duration, rate, seed=seed)
-    tell("how far to whisk", 1, 1)
-    tell("map of all contacts", 0, 1)
-    contact_map = ContactMap.simulate(
-        whisker, progress=lambda done, total: tell("map of all contacts", done, total)
-    )
-    trial = simulate(
-        whisker, motion, peg, progress=lambda done, total: tell("whisking trial", done, total)
-    )
-    recording = measure(trial, force_noise, moment_noise, seed)
-    tell("contact points from signals", 0, 1)
-    contacts = locate(
-        contact_map,
-        recording.to_dataset()[["force", "moment"]].isel(whisker=0),
-        TRIPLET,
-        noise=component_noise(force_noise, moment_noise),
-    )
-    contacts = in_laboratory(contacts, motion.base_rotation, motion.base_position)
-    tell("contact points from signals", 1, 1)
-    fit = fit_contacts(contacts.expand_dims("whisker", 1), [whisker])
-    assert isinstance(fit, CylinderFit)
-    truth = _truth(recording, whisker, peg)
-    errors = contact_errors(contacts, truth, whisker, seed)
-    recording = with_estimates(recording, contacts)
-    result = DemoResult(
-        whisker=whisker,
-        peg=peg,
-        contact_map=contact_map,
-        recording=recording,
-        contacts=contacts,
-        errors=errors,
-        fit=fit,
-        scores=score(contacts, truth, errors, fit),
-        files=(),
-    )
-    return result if output is None else _written(result, Path(output), motion, tell)
+    with _folder(output) as folder:
+        begin(folder, whisker, seed=seed, noise=noise, duration=duration, rate=rate, video=video)
+        trial = _simulated(whisker, seed, noise, duration, rate, tell)
+        held, scores, seen = trial, None, None
+        if video:
+            trial = filmed(trial, folder, seed, tell)
+            held = tracked(trial, folder, tell)
+            scores = tracking_scores(held.to_dataset().isel(DIM), trial)
+            held = _with_truth(held, trial)
+        tell("map of all contacts", 0, 1)
+        chart = ContactMap.simulate(recorded_whisker(held), grid=False)
+        tell("map of all contacts", 1, 1)
+        read = placed_by(signals_of(trial, "sensor"), held) if video else signals_of(trial)
+        sensed = _located(with_group(held, "signals", read), trial, chart, seed)
+        tell("contact points", 1, 2 if video else 1)
+        if video:
+            read = signals_of(held, "contact point")
+            seen = _located(with_group(held, "signals", read), trial, chart, seed)
+            tell("contact points", 2, 2)
+        (peg,) = recorded_objects(trial)
+        assert isinstance(peg, Peg)
+        result = DemoResult(whisker, peg, trial, chart, sensed, seen, scores, ())
+        return result if output is None else _written(result, folder, tell)
 
 
 def _silent(stage: str, done: int, total: int) -> None:
     pass
 
 
-def _truth(recording: xr.DataTree, whisker: Whisker, peg: Peg) -> xr.Dataset:
-    """What truly happened, dim time, with the peg and the whisker's radius at the contact."""
-    truth = recording["truth"].to_dataset().isel(whisker=0)
-    return truth.assign(
-        radius=("time", whisker_radii(truth.expand_dims("whisker", 1), [whisker])[:, 0]),
+@contextmanager
+def _folder(output: str | PathLike[str] | None) -> Iterator[Path]:
+    """The folder that is asked for, or one that goes away again."""
+    if output is not None:
+        yield Path(output)
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        yield Path(folder)
+
+
+def _simulated(
+    whisker: Whisker, seed: int, noise: bool, duration: float, rate: float, tell: Progress
+) -> xr.DataTree:
+    """The trial, with what a sensor at the whisker's base reads."""
+    force_noise, moment_noise = (FORCE_NOISE, MOMENT_NOISE) if noise else (0.0, 0.0)
+    peg = facing_peg(whisker)
+    tell("how far to whisk", 0, 1)
+    motion = sweep_past(whisker, peg, duration, rate, seed=seed)
+    tell("how far to whisk", 1, 1)
+    trial = simulate(whisker, motion, peg, progress=partial(tell, "whisking trial"))
+    return measure(trial, force_noise, moment_noise, seed)
+
+
+def _with_truth(held: xr.DataTree, trial: xr.DataTree) -> xr.DataTree:
+    """Put what is known of the trial beside what was tracked of it."""
+    groups = {group.path: group.to_dataset(inherit=False) for group in held.subtree}
+    for group in trial.subtree:
+        if group.path.split("/")[1] in ("truth", "objects"):
+            # The curves of the truth have other nodes; they are in the simulated recording.
+            groups[group.path] = group.to_dataset(inherit=False).drop_dims("node", errors="ignore")
+    return xr.DataTree.from_dict(groups)
+
+
+def _located(recording: xr.DataTree, trial: xr.DataTree, chart: ContactMap, seed: int) -> Located:
+    """Estimate contacts from a recording's signals, fit the peg, and compare with the truth."""
+    recording = with_contour(with_estimates(recording, contact_maps=[chart]))
+    estimates = recording["estimates"].to_dataset()
+    contacts = estimates.isel(DIM)
+    fit = fit_contacts(estimates, [chart.whisker])
+    assert isinstance(fit, CylinderFit)
+    whisker = recorded_whisker(trial)
+    truth = trial["truth"].to_dataset()
+    (peg,) = recorded_objects(trial)
+    assert isinstance(peg, Peg)
+    known = truth.isel(DIM).assign(
+        radius=("time", whisker_radii(truth, [whisker])[:, 0]),
         peg_position=("space", peg.origin),
         peg_axis=("space", peg.axis),
         peg_radius=((), peg.radius),
     )
+    errors = contact_errors(contacts, known, whisker, seed)
+    angle = errors["deflection_angle"].values
+    signals = recording["signals"].to_dataset().isel(DIM)
+    return Located(
+        recording=recording,
+        contacts=contacts,
+        errors=errors,
+        fit=fit,
+        scores=score(contacts, known, errors, fit),
+        signals=signal_errors(signals, trial, angle),
+    )
 
 
-def with_estimates(recording: xr.DataTree, contacts: xr.Dataset) -> xr.DataTree:
-    """Add estimated contacts to a recording of one whisker.
-
-    Parameters
-    ----------
-    recording : xarray.DataTree
-        The recording.
-    contacts : xarray.Dataset
-        Of `vibrissa.pipeline.in_laboratory`.
-
-    Returns
-    -------
-    xarray.DataTree
-        A new one, with contact points, arc length, status, whether a contact is felt, and a
-        confidence of one over the number of candidates.
-    """
-    number = contacts["candidates"].values
-    confidence = np.where(number > 0, 1.0 / np.maximum(number, 1), 0.0)
-    names = ("contact_point", "contact_point_whisker", "arc_length", "in_contact", "status")
-    values = {name: contacts[name].values for name in names} | {"confidence": confidence}
-    out = recording.copy()
-    estimated = {name: recorded(name, array) for name, array in values.items()}
-    out.dataset = recording.to_dataset().assign(estimated)
-    return out
-
-
-def _written(result: DemoResult, folder: Path, motion: Motion, tell: Progress) -> DemoResult:
+def _written(result: DemoResult, folder: Path, tell: Progress) -> DemoResult:
     """Write everything and say where."""
-    from dataclasses import replace
-
     from vibrissa.demo.pictures import draw
 
-    folder.mkdir(parents=True, exist_ok=True)
-    files = [folder / name for name in ("trial.nc", "contacts.csv", "map.nc")]
-    tell("files", 0, 3)
-    save_recording(files[0], result.recording)
-    tell("files", 1, 3)
-    save_contacts(files[1], contact_columns(result.contacts))
-    tell("files", 2, 3)
-    result.contact_map.save(files[2])
-    tell("files", 3, 3)
-    pictures = draw(result, folder, lambda done, total: tell("figures", done, total))
+    recordings = {"trial.nc": result.sensed.recording}
+    if result.seen is not None:
+        recordings["seen.nc"] = result.seen.recording
+    for i, (name, recording) in enumerate(recordings.items()):
+        tell("files", i, len(recordings) + 2)
+        save_recording(folder / name, recording)
+    tell("files", len(recordings), len(recordings) + 2)
+    save_contacts(folder / "contacts.csv", contact_columns(result.sensed.contacts))
+    result.contact_map.save(folder / "map.nc")
+    tell("files", len(recordings) + 2, len(recordings) + 2)
+    pictures = draw(result, folder, partial(tell, "figures"))
+    files = [folder / name for name in (*recordings, "contacts.csv", "map.nc")]
+    if result.tracking is not None:
+        files = [folder / SIMULATED, *video_files(folder), folder / TRACKED, *files]
     return replace(result, files=(*files, *pictures))

@@ -107,9 +107,9 @@ def contact_errors(
     Parameters
     ----------
     contacts : xarray.Dataset
-        Of `vibrissa.pipeline.locate`, dim time.
+        Of `vibrissa.pipeline.estimates_of`, of one whisker, dim time.
     truth : xarray.Dataset
-        Of the recording, dim time: ``contact_point_whisker``.
+        Of the recording, dim time: ``contact_point``, ``contact_point_whisker``.
     whisker : Whisker
         That touched.
     seed : int
@@ -118,13 +118,17 @@ def contact_errors(
     Returns
     -------
     xarray.Dataset
-        Dims time, replicate: the size of each error, ``…_predicted`` and ``deflection_angle``.
+        Dims time, replicate: the size of each error, ``…_predicted`` and ``deflection_angle``. r,
+        θ and φ are in the whisker's frame, and the error in space is in the laboratory, so that it
+        includes what places the whisker there.
     """
     point, true = (d["contact_point_whisker"].values for d in (contacts, truth))
-    errors = _errors(point, true)
-    root = _roots(contacts["covariance"].values)
     draw = np.random.default_rng(seed).normal(size=(REPLICATES, len(point), 3))
-    drawn = _errors(point + np.einsum("tij,rtj->rti", root, draw), point)
+    deviation = np.einsum("tij,rtj->rti", _roots(contacts["covariance"].values), draw)
+    placed = np.einsum("tij,rtj->rti", _roots(contacts["contact_covariance"].values), draw)
+    away = contacts["contact_point"].values - truth["contact_point"].values
+    errors = _with_size(_errors(point, true), away)
+    drawn = _with_size(_errors(point + deviation, point), placed)
     distance, arc_length = nearest_on_rest(whisker, true)
     angle = np.arctan2(distance, arc_length)
     data = {name: ("time", errors[..., i]) for i, name in enumerate(ERRORS)}
@@ -136,10 +140,14 @@ def contact_errors(
 
 
 def _errors(estimated: Array, true: Array) -> Array:
-    """Sizes (..., 4) of the errors in r, θ, φ and in space."""
+    """Sizes (..., 3) of the errors in r, θ, φ."""
     away = within_turn(spherical(estimated) - spherical(true), [False, True, False])
-    distance = np.linalg.norm(estimated - true, axis=-1)
-    return np.concatenate([np.abs(away), distance[..., None]], axis=-1)
+    return np.asarray(np.abs(away))
+
+
+def _with_size(errors: Array, away: Array) -> Array:
+    """Add the size of errors in space as a fourth column."""
+    return np.concatenate([errors, np.linalg.norm(away, axis=-1, keepdims=True)], axis=-1)
 
 
 def _roots(covariance: Array) -> Array:
@@ -156,7 +164,7 @@ def score(contacts: xr.Dataset, truth: xr.Dataset, errors: xr.Dataset, fit: Cyli
     Parameters
     ----------
     contacts : xarray.Dataset
-        Of `vibrissa.pipeline.in_laboratory`, dim time.
+        Of `vibrissa.pipeline.estimates_of`, of one whisker, dim time.
     truth : xarray.Dataset
         Dim time: ``in_contact``; and the peg's ``peg_position``, ``peg_axis``, ``peg_radius``.
     errors : xarray.Dataset
@@ -176,9 +184,9 @@ def score(contacts: xr.Dataset, truth: xr.Dataset, errors: xr.Dataset, fit: Cyli
     angle = np.degrees(errors["deflection_angle"].values)
     by_angle = []
     for low, high in itertools.pairwise(ANGLES):
-        label = f"{low:g}–{high:g}°" if high < 90.0 else f"over {low:g}°"
         rows = known & (angle >= low) & (angle < high)
         if rows.any():
+            label = angle_label(low, high)
             by_angle.append(_row(errors, "error_distance", label, rows))
     origin, axis = truth["peg_position"].values, truth["peg_axis"].values
     radius = float(truth["peg_radius"])
@@ -197,6 +205,22 @@ def score(contacts: xr.Dataset, truth: xr.Dataset, errors: xr.Dataset, fit: Cyli
         diameter_error=float(fit.diameter - 2.0 * radius),
         surface=_quantiles(np.abs(gap)),
     )
+
+
+def angle_label(low: float, high: float) -> str:
+    """Name a class of deflection angle.
+
+    Parameters
+    ----------
+    low, high : float
+        Its bounds, degrees.
+
+    Returns
+    -------
+    str
+        Such as ``2–5°``.
+    """
+    return f"{low:g}–{high:g}°" if high < ANGLES[-1] else f"over {low:g}°"
 
 
 def _row(errors: xr.Dataset, name: str, label: str, rows: NDArray[np.bool_]) -> ErrorRow:

@@ -1,0 +1,147 @@
+"""A trial in the folder of the demo: filmed and tracked. What is there is not done again."""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+import vibrissa
+from vibrissa.io import load_recording, save_recording
+from vibrissa.pipeline.estimates import Progress
+from vibrissa.tracking import TrackOptions, partial_traces, trace_file, track
+from vibrissa.trial import film, recorded_cameras, recorded_whisker, views_of
+from vibrissa.trial.film import with_true_traces
+from vibrissa.whisker import Whisker
+
+SIMULATED, TRACKED = "simulated.nc", "tracked.nc"
+_SETTINGS = ".settings.json"
+VIEWS = ("top", "front")
+_PLACES = 9
+_PROPERTIES = ("base_radius", "tip_radius", "youngs_modulus", "poisson_ratio")
+"""What no camera sees, and a lab has from elsewhere."""
+
+
+def begin(folder: Path, whisker: Whisker, **settings: object) -> None:
+    """Make the folder, and clear away what was made there with other settings.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the demo.
+    whisker : Whisker
+        That whisks.
+    **settings
+        What else the trial hangs on, numbers.
+
+    Raises
+    ------
+    ValueError
+        If files are in the way that were not made here.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    places = np.linspace(0.0, whisker.length, _PLACES)
+    shape = np.column_stack([whisker.centerline(_PLACES), whisker.radius(places)])
+    said = {**settings, "whisker": shape.tolist(), "version": vibrissa.__version__}
+    text = json.dumps(said, sort_keys=True)
+    path = folder / _SETTINGS
+    if path.exists() and path.read_text(encoding="utf-8") == text:
+        return
+    files = [folder / SIMULATED, folder / TRACKED, *video_files(folder)]
+    there = [file.name for file in files if file.exists()]
+    if there and not path.exists():
+        raise ValueError(
+            f"{folder} holds {', '.join(there)}, which this would replace: choose another folder"
+        )
+    for file in files:
+        file.unlink(missing_ok=True)
+    path.write_text(text, encoding="utf-8")
+
+
+def video_files(folder: Path) -> list[Path]:
+    """Say where the videos of the demo are.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the demo.
+
+    Returns
+    -------
+    list of Path
+        View by view.
+    """
+    return [folder / f"{name}.mp4" for name in VIEWS]
+
+
+def filmed(trial: xr.DataTree, folder: Path, seed: int, tell: Progress) -> xr.DataTree:
+    """Film a trial, and keep it beside the videos.
+
+    Parameters
+    ----------
+    trial : xarray.DataTree
+        Simulated and measured.
+    folder : Path
+        Where to.
+    seed : int
+        Of the noise.
+    tell : callable
+        Called as ``tell(stage, done, total)``.
+
+    Returns
+    -------
+    xarray.DataTree
+        The trial with cameras and true traces; as it is in the folder, if it is there.
+    """
+    path = folder / SIMULATED
+    if path.exists():
+        return load_recording(path)
+    cameras = views_of(trial)
+    for view, (camera, file) in enumerate(zip(cameras, video_files(folder), strict=True)):
+        # A video is there only if it is whole.
+        if not file.exists():
+            told = partial(tell, f"filming, {camera.name}")
+            film(trial, {camera.name: file}, [camera], seed=seed + view, progress=told)
+    done = with_true_traces(trial, cameras)
+    save_recording(path, done)
+    return done
+
+
+def tracked(trial: xr.DataTree, folder: Path, tell: Progress) -> xr.DataTree:
+    """Track the whisker in the videos of a trial.
+
+    Parameters
+    ----------
+    trial : xarray.DataTree
+        Of `filmed`; of what is known only its cameras, and radius and material of its whisker, are
+        used.
+    folder : Path
+        Where the videos are.
+    tell : callable
+        Called as ``tell(stage, done, total)``.
+
+    Returns
+    -------
+    xarray.DataTree
+        Of `vibrissa.tracking.track`; as it is in the folder, if it is there.
+    """
+    path = folder / TRACKED
+    if path.exists():
+        return load_recording(path)
+    cameras = recorded_cameras(trial)
+    kept = [partial_traces(path, view) for view in range(len(VIEWS))]
+    traces = [
+        trace_file(file, kept[view], progress=partial(tell, f"tracing, {file.stem}"))
+        for view, file in enumerate(video_files(folder))
+    ]
+    rate = 1.0 / float(np.median(np.diff(trial.to_dataset()["time"].values)))
+    own = recorded_whisker(trial)
+    properties = {name: getattr(own, name) for name in _PROPERTIES}
+    found = track(cameras, traces, rate, TrackOptions(properties=properties), progress=tell)
+    save_recording(path, found)
+    for file in kept:
+        file.unlink(missing_ok=True)
+    return found

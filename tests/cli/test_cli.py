@@ -173,10 +173,12 @@ def test_estimate_without_a_map_simulates_one_and_says_so(folder, table):
 
 def test_demo_writes_and_reports(folder):
     out = folder / "demo"
-    text = run("demo", "--output", out, "--duration", 0.4, "--rate", 250)
+    text = run("demo", "--output", out, "--no-video", "--duration", 0.4, "--rate", 250)
     for words in ("exactly one candidate", "3D error by deflection angle", "diameter", "median*"):
         assert words in text
-    assert {"trial.nc", "contacts.csv", "map.nc"} <= {file.name for file in out.iterdir()}
+    written = {file.name for file in out.iterdir()}
+    assert {"trial.nc", "contacts.csv", "map.nc"} <= written
+    assert {"trial.png", "contact_places.png", "contour.png", "signal_space.png"} <= written
     # Each stage works from the recording alone.
     again = folder / "again.csv"
     run("estimate", out / "trial.nc", "--map", out / "map.nc", "-o", again)
@@ -189,6 +191,15 @@ def test_demo_writes_and_reports(folder):
     text = run("info", out / "trial.nc")
     assert "vibrissa recording" in text
     assert "/truth" in text
+
+
+def test_demo_from_video_reports_every_stage(folder):
+    out = folder / "filmed"
+    text = run("demo", "-o", out, "--duration", 0.4, "--rate", 200, "--seed", 2)
+    for words in ("0 of 80 frames lost", "contact point", "px", "Signals, median", "paper's way"):
+        assert words in text
+    assert {"top.mp4", "front.mp4", "tracked.nc"} <= {file.name for file in out.iterdir()}
+    assert "cylinder" in run("reconstruct", out / "tracked.nc")
 
 
 def test_info(folder, table, chart):

@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vibrissa.cli.terminal import output, progress_bars, shown
+from vibrissa.cli.terminal import Tell, output, progress_bars, shown
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from vibrissa.demo import DemoResult, ErrorRow, Located, TrackingScores
 
+_NODES = 101
 _SENSED = "felt by a sensor"
 _SEEN = "the paper's way"
 
@@ -71,7 +72,29 @@ def demo(
             video=video,
             progress=tell,
         )
+        pictures = _pictures(result, folder, tell)
     _report(result, noise)
+    for file in (*result.files, *pictures):
+        output.print(f"wrote {file}", highlight=False, soft_wrap=True)
+
+
+def _pictures(result: DemoResult, folder: Path, tell: Tell) -> list[Path]:
+    """The figures of the trial, and signals over the space of all contacts."""
+    from vibrissa import plots
+    from vibrissa.cli.trial_figures import trial_drawings
+    from vibrissa.demo.filming import video_files
+
+    videos = [] if result.tracking is None else video_files(folder)
+    drawings = trial_drawings(folder / "trial.nc", "double", videos, folder / "map.nc", 0, tell)
+    chart = result.contact_map
+    line = chart.whisker.centerline(_NODES)
+    drawings["signal_space"] = lambda: plots.signal_clouds(chart.to_dataset(), line)
+    files = []
+    for i, (name, draw) in enumerate(drawings.items()):
+        tell("figures", i, len(drawings))
+        files += plots.save(draw(), folder / name, formats=("png",))
+    tell("figures", len(drawings), len(drawings))
+    return files
 
 
 def _report(result: DemoResult, noise: bool) -> None:
@@ -105,8 +128,6 @@ def _report(result: DemoResult, noise: bool) -> None:
         output.print("* " + _CIRCULAR, highlight=False, soft_wrap=True)
         output.print()
     output.print(_peg_table(result))
-    for file in result.files:
-        output.print(f"wrote {file}", highlight=False, soft_wrap=True)
 
 
 _CIRCULAR = (

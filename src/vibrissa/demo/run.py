@@ -133,8 +133,8 @@ def run_demo(
     whisker : Whisker, optional
         By default the built-in γ whisker.
     output : str or path, optional
-        Folder for the recordings, videos, tables and figures, made if need be; by default nothing
-        is kept. What is there already of the same trial is not done again.
+        Folder for the recordings, videos and tables, made if need be; by default nothing is kept.
+        What is there already of the same trial is not done again.
     seed : int
         Of the trial's drifts, the sensor's noise and the videos'.
     noise : bool
@@ -255,8 +255,6 @@ def _located(recording: xr.DataTree, trial: xr.DataTree, chart: ContactMap, seed
 
 def _written(result: DemoResult, folder: Path, tell: Progress) -> DemoResult:
     """Write everything and say where."""
-    from vibrissa.demo.pictures import draw
-
     recordings = {"trial.nc": result.sensed.recording}
     if result.seen is not None:
         recordings["seen.nc"] = result.seen.recording
@@ -267,8 +265,7 @@ def _written(result: DemoResult, folder: Path, tell: Progress) -> DemoResult:
     save_contacts(folder / "contacts.csv", contact_columns(result.sensed.contacts))
     result.contact_map.save(folder / "map.nc")
     tell("files", len(recordings) + 2, len(recordings) + 2)
-    pictures = draw(result, folder, partial(tell, "figures"))
     files = [folder / name for name in (*recordings, "contacts.csv", "map.nc")]
     if result.tracking is not None:
         files = [folder / SIMULATED, *video_files(folder), folder / TRACKED, *files]
-    return replace(result, files=(*files, *pictures))
+    return replace(result, files=tuple(files))

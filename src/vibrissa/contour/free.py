@@ -41,6 +41,7 @@ from vibrissa.contour.shape import FittedShape
 from vibrissa.contour.touches import FLOOR, Array
 from vibrissa.quantities import attributes
 
+_AT_ONCE = 4096
 _STEP = 1e-4
 """Of differences, as a share of the length."""
 
@@ -66,7 +67,7 @@ class FreeFit(FittedShape):
         Distances of the whisker's surface from the fitted one, m, positive outside; NaN for
         points that were missing.
     inliers : array (n,) of bool
-        Points that were used and lie within four standard deviations.
+        Points that lie within four standard deviations.
     """
 
     base: FittedShape
@@ -119,12 +120,15 @@ class FreeFit(FittedShape):
         """
         p = np.asarray(points, dtype=np.float64)
         rows = self._feet(p.reshape(-1, 3))
-        shared = self._kernel(rows, self.support.place)
-        mean = shared @ self._weights
-        known = solve_triangular(self._root, shared.T, lower=True)
-        prior = self.amplitude**2 + self.base._slopes(rows) ** 2 @ self._loose
-        variance = np.maximum(prior - (known**2).sum(axis=0), 0.0)
-        return mean.reshape(p.shape[:-1]), np.sqrt(variance).reshape(p.shape[:-1])
+        mean, variance = np.empty(len(rows)), np.empty(len(rows))
+        for part in _parts(len(rows)):
+            shared = self._kernel(rows[part], self.support.place)
+            mean[part] = shared @ self._weights
+            told = solve_triangular(self._root, shared.T, lower=True)
+            prior = self.amplitude**2 + self.base._slopes(rows[part]) ** 2 @ self._loose
+            variance[part] = prior - (told**2).sum(axis=0)
+        sigma = np.sqrt(np.maximum(variance, 0.0))
+        return mean.reshape(p.shape[:-1]), sigma.reshape(p.shape[:-1])
 
     def distance_sigma(self, points: ArrayLike) -> Array:
         """Tell how surely distances from the surface are known.
@@ -164,7 +168,9 @@ class FreeFit(FittedShape):
     def _level(self, points: Array) -> Array:
         """F (...)."""
         feet = self._feet(points.reshape(-1, 3))
-        added = self._kernel(feet, self.support.place) @ self._weights
+        added = np.empty(len(feet))
+        for part in _parts(len(feet)):
+            added[part] = self._kernel(feet[part], self.support.place) @ self._weights
         return np.asarray(self.base.signed_distance(points) + added.reshape(points.shape[:-1]))
 
     def _gradient(self, points: Array) -> Array:
@@ -216,3 +222,8 @@ class FreeFit(FittedShape):
         }
         made = {name: (d, values, attributes(name)) for name, (d, values) in rows.items()}
         return data.assign(made).assign_attrs(shape=self.kind, base=self.base.kind)
+
+
+def _parts(count: int) -> list[slice]:
+    """Rows to be done at once, so that what is between does not fill the memory."""
+    return [slice(start, start + _AT_ONCE) for start in range(0, count, _AT_ONCE)]

@@ -1,15 +1,16 @@
 """Contacts to a free surface: its base, what deviates from it, and how far and fast that varies.
 
-a and ℓ maximise the likelihood within bounds. a is at least a twentieth of the points' extent,
-even if no deviation is seen: that an object is a cylinder where it was touched does not say that
-it is one elsewhere. ℓ is at most that extent, and no less than a tenth. Normals make the base shape
-and tell where under the whisker's centreline the surface is.
+a and ℓ maximise the likelihood within bounds. a is at least a tenth of the points' extent, or of
+the radius of the base if that is smaller, even if no deviation is seen: that an object is a
+cylinder where it was touched does not say that it is one elsewhere. ℓ is at most that size, and no
+less than a tenth of it. Normals help to find the base, and to tell where on it the contacts are
+(`vibrissa.contour.placing`).
 
 The cost grows with the third power of the number of points; at most 600 are used, neighbours being
 merged (`vibrissa.contour.merging`), 200 for a and ℓ.
 
-A contact that is missed by more than four standard deviations is an outlier, judged by the surface
-through the others, and by how far these scatter.
+A contact that is missed by more than four standard deviations is an outlier: at first by the median
+of its neighbours, then by the surface, and in both cases by how far the others scatter.
 """
 
 from __future__ import annotations
@@ -19,10 +20,12 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial import cKDTree
 
 from vibrissa.contour.cylinder import fit_cylinder
 from vibrissa.contour.free import FreeFit
 from vibrissa.contour.merging import Support, merged
+from vibrissa.contour.placing import Contacts, placed
 from vibrissa.contour.plane import fit_plane
 from vibrissa.contour.shape import FittedShape
 from vibrissa.contour.sphere import fit_sphere
@@ -37,31 +40,41 @@ _FITS: dict[str, Callable[..., FittedShape]] = {
     "cylinder": fit_cylinder,
 }
 
-_BETTER = 0.6
-"""How much smaller deviations from a less simple base must be for it to be taken."""
+_BETTER = {"plane": 1.0, "sphere": 0.9, "cylinder": 0.5}
+"""How much smaller than those from simpler bases deviations must be for a base to be taken.
 
-_MOST = 0.9
+Where a sphere goes, a plane is no worse only if the object is flat; a cylinder must fit, as what is
+round at its ends does not deviate smoothly from one.
+"""
+
+_MOST = 0.95
 """Share of the contacts that these deviations are not exceeded by."""
 
-_AMPLITUDES = (0.05, 2.0)
+_AMPLITUDES = (0.1, 2.0)
 _LENGTHS = (0.1, 1.0)
-"""Bounds of amplitude and length, as shares of the points' extent."""
+"""Bounds of amplitude and length, as shares of the points' extent or the base's radius."""
 
 _FOR_BOUNDS = 200
 _OUTLIER = 4.0
-_WIDE = 0.5
-"""Standard deviation, as a share of radius and extent, from which points are left out."""
+_SHARP = 0.1
+"""Standard deviation, as a share of radius and extent, up to which contacts are used.
 
-_FEW = 20
-"""If not as many others are left."""
+What is seen far along a round surface mostly is there by error, and always outside of it.
+"""
 
-_TINY = 1e-12
+_FEW = 50
+"""If that leaves fewer, or less than a quarter, as many of the sharpest are used."""
 
+_SLOPE, _LEAST_SLOPE = 0.2, 0.02
+"""Standard deviation of the surface's slope against its base, at first and at least."""
+
+_NEIGHBOURS = 9
 _ROUNDS = 2
 
 _NOISES = (1e-10, 1e-2)
 """Bounds of the variance of what no covariance tells, in units of the extent squared."""
 
+_TINY = 1e-12
 _TO_SIGMA = 1.4826
 
 
@@ -135,11 +148,12 @@ def fit_free(
     p = np.asarray(points, dtype=np.float64)[rows]
     radius = given.touches.whisker_radius * given.extent
     shape = _base(p, radius, picked, (base,) if base else BASES)
-    surface = p - radius[:, None] * (
-        shape.outward_normals(p) if given.touches.normal is None else given.touches.normal
-    )
-    spread = picked.get("covariance", np.zeros((len(p), 3, 3)))
-    fit, inside = _surface(shape, surface, spread, given.extent, most)
+    touches = given.touches
+    normal = shape.outward_normals(p) if touches.normal is None else touches.normal
+    spread = np.zeros((len(p), 3, 3)) if touches.covariance is None else touches.covariance
+    unit = np.repeat([given.extent, 1.0], 3)[: spread.shape[1]]
+    contacts = Contacts(p - radius[:, None] * normal, touches.normal, spread * unit[:, None] * unit)
+    fit, inside = _surface(shape, contacts, given.extent, most)
     residuals = np.full(given.usable.size, np.nan)
     residuals[rows] = fit.signed_distance(p) - radius
     inliers = np.zeros(given.usable.size, dtype=bool)
@@ -166,7 +180,7 @@ def _base(
         if "covariance" in known:
             sigma = np.maximum(_across(fit.outward_normals(points), known["covariance"]), _TINY)
         miss = float(np.quantile(np.abs(fit.residuals) / sigma, _MOST))
-        if miss < _BETTER * least:
+        if miss < _BETTER[kind] * least:
             best, least = fit, miss
     if best is None:
         raise ValueError(f"no surface: {said}")
@@ -184,31 +198,50 @@ def _across(normal: Array, covariance: Array) -> Array:
 
 
 def _surface(
-    base: FittedShape, surface: Array, spread: Array, extent: float, most: int
+    base: FittedShape, contacts: Contacts, extent: float, most: int
 ) -> tuple[FreeFit, Mask]:
-    """Fit the deviation from a base, twice: the second time with its slopes, without outliers."""
-    bent = base._curvature(surface) @ spread
-    # A point that is scattered along a curved surface lies farther out in the mean.
-    shift = 0.5 * np.trace(bent, axis1=1, axis2=2)
-    extra = 0.5 * np.einsum("nij,nji->n", bent, bent) + (FLOOR * extent) ** 2
-    gap = base.signed_distance(surface)
-    feet, value = surface - gap[:, None] * base.outward_normals(surface), shift - gap
-    known = np.sqrt(np.linalg.eigvalsh(spread)[:, -1].clip(0.0)) < _WIDE * min(extent, _size(base))
-    if known.sum() < _FEW:
-        known = np.ones(len(surface), dtype=bool)
-    inside, normal = known, base.outward_normals(surface)
+    """Fit the deviation from a base, again and again: with its slopes, without outliers."""
+    scale = min(extent, _size(base))
+    slope, inside, fit = _SLOPE, None, None
     for _ in range(_ROUNDS):
-        variance = _across(normal, spread) ** 2 + extra
-        support = Support(feet[inside], value[inside], variance[inside])
-        amplitude, length, noise = _varying(merged(support, min(_FOR_BOUNDS, most)), extent)
+        there = placed(base, contacts, slope)
+        known = _sharp(there.covariance, scale)
+        bent = base._curvature(there.foot) @ there.covariance
+        # A point that is scattered along a curved surface lies farther out in the mean.
+        value = 0.5 * np.trace(bent, axis1=1, axis2=2) - there.height
+        normal = (base if fit is None else fit).outward_normals(there.foot)
+        variance = _across(normal, there.covariance) ** 2 + (FLOOR * extent) ** 2
+        variance = variance + 0.5 * np.einsum("nij,nji->n", bent, bent)
+        if inside is None:
+            inside = _like_neighbours(there.foot, value, variance)
+        rows = known & inside
+        support = Support(there.foot[rows], value[rows], variance[rows])
+        amplitude, length, noise = _varying(merged(support, min(_FOR_BOUNDS, most)), scale)
         few = merged(support._replace(variance=support.variance + noise), most)
         fit = _made(base, few, amplitude, length, np.empty(0), np.empty(0, dtype=bool))
-        mean, unsure = fit.deviation(surface)
-        normal = fit.outward_normals(surface)
+        mean, unsure = fit.deviation(there.foot)
         miss = np.abs(value - mean) / np.sqrt(variance + unsure**2)
         usual = max(1.0, _TO_SIGMA * float(np.median(miss[known])))
-        inside = known & (miss < _OUTLIER * usual)
+        inside = np.asarray(miss < _OUTLIER * usual)
+        slope = max(_LEAST_SLOPE, np.sqrt(5.0 / 3.0) * amplitude / length)
+    assert fit is not None
+    assert inside is not None
     return fit, inside
+
+
+def _sharp(covariance: Array, scale: float) -> Mask:
+    """Contacts whose place is known well, or at least better than that of most."""
+    widest = np.sqrt(np.linalg.eigvalsh(covariance)[:, -1].clip(0.0))
+    enough = min(len(widest), max(_FEW, len(widest) // 4))
+    return np.asarray(widest <= max(_SHARP * scale, np.sort(widest)[enough - 1]))
+
+
+def _like_neighbours(place: Array, value: Array, variance: Array) -> Mask:
+    """Contacts that are not far from the median of those about them."""
+    _, near = cKDTree(place).query(place, min(_NEIGHBOURS, len(place)))
+    away = value - np.median(value[near], axis=1)
+    usual = _TO_SIGMA * float(np.median(np.abs(away)))
+    return np.asarray(np.abs(away) < _OUTLIER * np.sqrt(variance + usual**2))
 
 
 def _size(base: FittedShape) -> float:
@@ -234,7 +267,7 @@ def _made(
     )
 
 
-def _varying(support: Support, extent: float) -> tuple[float, float, float]:
+def _varying(support: Support, scale: float) -> tuple[float, float, float]:
     """Amplitude and length, m, and the variance of what no covariance tells, m²."""
     from sklearn.exceptions import ConvergenceWarning
     from sklearn.gaussian_process import GaussianProcessRegressor
@@ -245,19 +278,19 @@ def _varying(support: Support, extent: float) -> tuple[float, float, float]:
     for start in _LENGTHS:
         kernel = ConstantKernel(squares[0] * 4.0, squares) * Matern(start, _LENGTHS, nu=2.5)
         process = GaussianProcessRegressor(
-            kernel + WhiteKernel(1e-6, _NOISES), alpha=support.variance / extent**2
+            kernel + WhiteKernel(1e-6, _NOISES), alpha=support.variance / scale**2
         )
         with warnings.catch_warnings():
             # That a bound is reached is what bounds are for.
             warnings.simplefilter("ignore", ConvergenceWarning)
-            process.fit(support.place / extent, support.value / extent)
+            process.fit(support.place / scale, support.value / scale)
         likelihood = float(process.log_marginal_likelihood_value_)
         if likelihood > most:
             best, most = process.kernel_, likelihood
     assert best is not None
-    amplitude = float(np.sqrt(best.k1.k1.constant_value)) * extent
+    amplitude = float(np.sqrt(best.k1.k1.constant_value)) * scale
     return (
         amplitude,
-        float(best.k1.k2.length_scale) * extent,
-        float(best.k2.noise_level) * extent**2,
+        float(best.k1.k2.length_scale) * scale,
+        float(best.k2.noise_level) * scale**2,
     )

@@ -5,6 +5,7 @@ from vibrissa.plots.clouds import signal_clouds
 from vibrissa.plots.contour import contour_views
 from vibrissa.plots.contour_movie import contour_frames
 from vibrissa.plots.course import Course, course_of, deflection_angles
+from vibrissa.plots.distances import distances_by_class
 from vibrissa.plots.estimates import estimated_against_true
 from vibrissa.plots.evidence import critical_cones, resolution
 from vibrissa.plots.overview import telling_rows, trial_overview
@@ -31,6 +32,7 @@ __all__ = [
     "course_of",
     "critical_cones",
     "deflection_angles",
+    "distances_by_class",
     "estimated_against_true",
     "resolution",
     "save",

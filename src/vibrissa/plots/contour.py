@@ -1,11 +1,14 @@
-"""Contact points and the peg that they outline, from above and from the side (the paper's Fig. 6C).
+"""Contact points and the object that they outline, from three sides (the paper's Fig. 6C).
 
 Contact points lie on the whisker's centreline, one whisker radius (some 50 µm) off the surface.
+Pegs and fitted cylinders are drawn in outline. Of other objects the section at the median place of
+the contacts is, from the side the silhouette where they are known; a fitted surface has its 95 %
+band about it, and ends where it is not known.
 """
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,6 +19,8 @@ from matplotlib.patches import Polygon
 from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.plots.colours import shading
+from vibrissa.plots.outlines import Body, draw_body
+from vibrissa.plots.sections import BAND, draw_section, has_band, is_cylinder, outline
 from vibrissa.plots.style import (
     MUTED,
     ORANGE,
@@ -31,23 +36,6 @@ from vibrissa.plots.style import (
 )
 from vibrissa.quantities import axis_label, to_display
 
-
-class _Cylinder(Protocol):
-    """What a peg and a fitted cylinder have in common: laboratory frame, m."""
-
-    @property
-    def origin(self) -> Array:
-        """Point (3,) of the axis."""
-
-    @property
-    def axis(self) -> Array:
-        """Direction (3,) of the axis."""
-
-    @property
-    def radius(self) -> float:
-        """Of the surface."""
-
-
 _VIEWS = ((0, 1), (0, 2), (1, 2))
 _NAMES = "xyz"
 _TITLES = ("top", "front", "side")
@@ -61,8 +49,8 @@ _LEFT, _GAP, _BAR, _BOTTOM, _TOP = 12.0, 10.0, 12.0, 8.5, 11.0
 
 def contour_views(
     points: ArrayLike,
-    peg: _Cylinder | None = None,
-    fitted: _Cylinder | None = None,
+    known: Body | None = None,
+    fitted: Body | None = None,
     *,
     colour: ArrayLike | None = None,
     colour_name: str = "deflection_angle",
@@ -75,10 +63,11 @@ def contour_views(
     ----------
     points : array_like (n, 3)
         Contact points, laboratory frame, m; rows with NaN are left out.
-    peg, fitted : cylinder, optional
-        The true peg, filled grey, and the one fitted to the points, dashed: anything with
-        ``origin`` (3,), m, ``axis`` (3,) and ``radius``, m, in the laboratory frame. From above a
-        cylinder is cut at the median height of the points; from the side its outline is drawn.
+    known, fitted : object, optional
+        What was touched, filled grey, and what was fitted to the points, dashed: anything with
+        ``signed_distance(points)``, m, in the laboratory frame, such as objects of a trial and
+        fitted shapes. With ``distance_sigma(points)``, m, its 95 % band is drawn. What has
+        ``origin`` (3,), m, ``axis`` (3,) and ``radius``, m, is a cylinder.
     colour : array_like (n,), optional
         What colours the points, in SI units, such as deflection angle or time; the largest values
         are drawn last.
@@ -104,27 +93,27 @@ def contour_views(
     shade = None if colour is None else to_display(colour_name, colour)
     spread = None if covariance is None else to_display("covariance", covariance)
     rows = _usable(places, shade, spread)
-    pegs = [(c, look) for c, look in ((peg, _PEG), (fitted, _FITTED)) if c is not None]
+    both = ((known, "true"), (fitted, "fitted"))
+    bodies = [(body, look) for body, look in both if body is not None]
     with looking():
         if rows.size == 0:
             figure = new_figure(width, 40.0, None)
             say(figure, "no contacts")
             return figure
         places, shade = places[rows], None if shade is None else shade[rows]
-        limits = _limits(places, pegs[0][0] if pegs else None)
-        room = _BAR if shade is not None else 3.0, _TOP if pegs else 6.5
+        limits = _limits(places, bodies[0][0] if bodies else None)
+        room = _BAR if shade is not None else 3.0, _TOP if bodies else 6.5
         figure, panels = _panels(limits, width, *room)
         for axes, view in zip(panels, _VIEWS, strict=True):
-            for cylinder, look in pegs:
-                outline = _outline(cylinder, view, float(np.median(places[:, 2])), limits)
-                axes.add_patch(Polygon(outline, closed=True, **look))
+            for body, look in bodies:
+                _draw(axes, body, look, view, np.median(places, axis=0), limits)
             if spread is not None:
                 _ellipses(axes, places, spread[rows], view)
             across, up = places[:, view].T
             size = 5.0 if view == (0, 1) else 2.5
             dots = axes.scatter(across, up, size, zorder=3, **shading(shade))
         _note_outside(panels[0], places, limits)
-        _legend(figure, panels, peg, fitted, spread is not None)
+        _legend(figure, panels, known, fitted, spread is not None)
         if shade is not None:
             rail = figure.add_axes(_rail(figure))
             plain(figure.colorbar(dots, cax=rail, label=axis_label(colour_name)))
@@ -138,6 +127,21 @@ def _rail(figure: Figure) -> tuple[float, float, float, float]:
     return (page - _BAR + 2.0) / page, _BOTTOM / height, 2.0 / page, tall / height
 
 
+def _draw(
+    axes: Axes, body: Body, look: str, view: tuple[int, int], middle: Array, limits: Array
+) -> None:
+    """Draw an object from one side."""
+    if is_cylinder(body):
+        shown = outline(body, view, float(middle[2]), limits)
+        axes.add_patch(Polygon(shown, closed=True, **_LOOKS[look]))
+    elif look == "true" and view != (0, 1):
+        draw_body(axes, body, view, limits, look)
+    else:
+        depth = float(middle[3 - sum(view)])
+        draw_section(axes, body, view, depth, limits, look)
+    axes.set(xlim=limits[view[0]], ylim=limits[view[1]])
+
+
 _PEG: dict[str, Any] = {"facecolor": "#ececec", "edgecolor": MUTED, "linewidth": 0.8, "zorder": 1}
 _FITTED: dict[str, Any] = {
     "facecolor": "none",
@@ -146,6 +150,7 @@ _FITTED: dict[str, Any] = {
     "linestyle": (0, (4, 2)),
     "zorder": 4,
 }
+_LOOKS = {"true": _PEG, "fitted": _FITTED}
 
 
 def _usable(places: Array, shade: Array | None, spread: Array | None) -> NDArray[np.intp]:
@@ -170,14 +175,14 @@ def _usable(places: Array, shade: Array | None, spread: Array | None) -> NDArray
     return rows[np.argsort(shade[rows], kind="stable")]
 
 
-def _limits(places: Array, peg: _Cylinder | None) -> Array:
-    """Limits (3, 2), mm: as wide along x as along y, and so that the peg fills the view."""
+def _limits(places: Array, body: Body | None) -> Array:
+    """Limits (3, 2), mm: as wide along x as along y, and so that what is round fills the view."""
     limits = np.array([robust_limits(c) for c in places.T])
-    if peg is None:
+    radius = float(to_display("object_radius", getattr(body, "radius", np.nan)))
+    if np.isnan(radius):
         middle, half = limits[:2].mean(axis=1), 0.55 * np.ptp(limits[:2], axis=1).max()
     else:
-        middle = to_display("peg_position", peg.origin)[:2]
-        radius = float(to_display("peg_radius", peg.radius))
+        middle = to_display("object_position", getattr(body, "origin"))[:2]  # noqa: B009
         away = np.abs(places[:, :2] - middle).max(axis=1)
         half = np.clip(1.1 * np.quantile(away, 0.9), 1.5 * radius, 2.5 * radius)
     limits[:2] = middle[:, None] + half * np.array([-1.0, 1.0])
@@ -204,33 +209,6 @@ def _panels(limits: Array, width: Width, right: float, above: float) -> tuple[Fi
         panels.append(axes)
         left += wide + _GAP
     return figure, panels
-
-
-def _outline(cylinder: _Cylinder, view: tuple[int, int], height: float, limits: Array) -> Array:
-    """Outline (k, 2), mm: from above the section at a height, from the side the silhouette."""
-    origin = to_display("peg_position", cylinder.origin)
-    radius = float(to_display("peg_radius", cylinder.radius))
-    axis = np.asarray(cylinder.axis, dtype=np.float64)
-    axis = axis / np.linalg.norm(axis)
-    if view == (0, 1) and abs(axis[2]) > 0.2:
-        first = np.cross(axis, [0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0])
-        first /= np.linalg.norm(first)
-        turn = np.linspace(0.0, 2.0 * np.pi, 181)[:, None]
-        circle = origin + radius * (np.cos(turn) * first + np.sin(turn) * np.cross(axis, first))
-        # Along the axis, until all of the circle is at this height.
-        circle += (height - circle[:, 2:]) / axis[2] * axis
-        return np.asarray(circle[:, :2])
-    i, j = view
-    along = np.array([axis[i], axis[j]])
-    along = along / max(float(np.linalg.norm(along)), 1e-12)
-    across = radius * np.array([-along[1], along[0]])
-    far = 2.0 * float(np.ptp(limits, axis=1).max()) * along
-    middle = origin[[i, j]]
-    # From where the axis passes nearest to the middle of the view.
-    middle = middle + ((limits[[i, j]].mean(axis=1) - middle) @ along) * along
-    return np.array(
-        [middle - far + across, middle + far + across, middle + far - across, middle - far - across]
-    )
 
 
 def _ellipses(axes: Axes, places: Array, spread: Array, view: tuple[int, int]) -> None:
@@ -271,18 +249,19 @@ def _note_outside(axes: Axes, places: Array, limits: Array) -> None:
 def _legend(
     figure: Figure,
     panels: list[Axes],
-    peg: _Cylinder | None,
-    fitted: _Cylinder | None,
+    known: Body | None,
+    fitted: Body | None,
     spread: bool,
 ) -> None:
     handles: list[Line2D | Polygon] = []
     corner = np.zeros((1, 2))
-    if peg is not None:
-        diameter = 2.0 * float(to_display("peg_radius", peg.radius))
-        handles.append(Polygon(corner, label=f"peg, {diameter:.2f} mm", **_PEG))
+    if known is not None:
+        name = "peg" if is_cylinder(known) else "object"
+        handles.append(Polygon(corner, label=f"{name}{_across(known)}", **_PEG))
     if fitted is not None:
-        diameter = 2.0 * float(to_display("peg_radius", fitted.radius))
-        handles.append(Polygon(corner, label=f"fitted, {diameter:.2f} mm", **_FITTED))
+        handles.append(Polygon(corner, label=f"fitted{_across(fitted)}", **_FITTED))
+        if has_band(fitted):
+            handles.append(Polygon(corner, label="95 % band", **BAND))
     if spread:
         look: dict[str, Any] = {"marker": "o", "markerfacecolor": "none", "linestyle": "none"}
         handles.append(Line2D([], [], color=MUTED, label="95 % ellipses", **look))
@@ -295,3 +274,9 @@ def _legend(
             ncols=len(handles),
             borderaxespad=0.3,
         )
+
+
+def _across(body: Body) -> str:
+    """Its diameter, where it has one."""
+    radius = getattr(body, "radius", None)
+    return "" if radius is None else f", {2.0 * float(to_display('object_radius', radius)):.2f} mm"

@@ -9,6 +9,7 @@ from vibrissa.io import load_recording, save_recording
 from vibrissa.pipeline import (
     component_noise,
     estimates_of,
+    locate,
     placed_by,
     reconstruct,
     signals_of,
@@ -17,6 +18,7 @@ from vibrissa.pipeline import (
     with_group,
     with_signals,
 )
+from vibrissa.pipeline.locate import unfelt
 from vibrissa.pipeline.reconstruct import frames_together, whisker_radii
 from vibrissa.status import Status
 from vibrissa.trial import recorded_pegs, recorded_whisker
@@ -216,6 +218,20 @@ def test_frames_that_err_together_are_counted():
     gaps[::7] = np.nan
     assert frames_together(gaps) == pytest.approx(9.0, rel=0.25)
     assert frames_together(np.full((5, 1), np.nan)) == 1.0
+
+
+def test_where_nothing_is_felt_no_map_is_needed(trial, contact_map):
+    free = ~trial["truth"]["in_contact"].values[:, 0]
+    wrench = trial.to_dataset().isel(whisker=0, time=free)[["force", "moment"]]
+    noise = component_noise(1e-6, 0.02e-6)
+    without = unfelt(contact_map.whisker, wrench, noise=noise)
+    found = locate(contact_map, wrench, noise=noise)
+    assert without is not None
+    for name in ("contact_point_whisker", "covariance", "arc_length", "status", "in_contact"):
+        xr.testing.assert_identical(without[name], found[name])
+    assert without.attrs == found.attrs
+    felt = trial.to_dataset().isel(whisker=0)[["force", "moment"]]
+    assert unfelt(contact_map.whisker, felt, noise=noise) is None
 
 
 def test_two_whiskers_touch_one_peg(quiet):

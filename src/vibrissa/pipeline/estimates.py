@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.mapping import ContactMap
 from vibrissa.pipeline.laboratory import in_laboratory
-from vibrissa.pipeline.locate import TRIPLET, locate, locate_from_wrench
+from vibrissa.pipeline.locate import TRIPLET, locate, locate_from_wrench, unfelt
 from vibrissa.pipeline.signals import sensor_noise
 from vibrissa.signals import selection
 from vibrissa.status import is_ok
@@ -65,7 +65,7 @@ def estimates_of(
         Covariance of (F, M), SI units; by default what the signals say of themselves. Signals of a
         sensor have to have one or the other; without any there are no covariances.
     contact_maps : sequence of ContactMap, optional
-        One for each whisker; simulated by default.
+        One for each whisker; by default simulated for those that feel a contact.
     whiskers : sequence of Whisker, optional
         One for each, where there are no maps; by default those of the recording.
     method : {"exact", "lookup", "lookup-linear", "network"}
@@ -129,9 +129,10 @@ def estimates_of(
         wrench = one[["force", "moment"]]
         if data.attrs.get("source") != "sensor":
             wrench = wrench.assign(in_contact=one["in_contact"])
+        found = None if whole else unfelt(whisker, wrench, names, noise=sigma)
         if whole:
             found = locate_from_wrench(whisker, wrench, sigma)
-        else:
+        elif found is None:
             if contact_maps is not None:
                 chart = contact_maps[k]
             else:

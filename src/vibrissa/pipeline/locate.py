@@ -115,6 +115,39 @@ def locate(
     return _located(contact_map.whisker, names, felt, candidates)
 
 
+def unfelt(
+    whisker: Whisker,
+    wrench: xr.Dataset,
+    triplet: tuple[str, ...] = TRIPLET,
+    *,
+    noise: ArrayLike | None,
+) -> xr.Dataset | None:
+    """Say what `locate` would, without a map, where no contact is felt in any frame.
+
+    Parameters
+    ----------
+    whisker : Whisker
+        Whose signals these are.
+    wrench : xarray.Dataset
+        As for `locate`.
+    triplet : tuple of str
+        As for `locate`.
+    noise : array_like (6, 6) or (time, 6, 6), optional
+        As for `locate`.
+
+    Returns
+    -------
+    xarray.Dataset or None
+        As of `locate`; None where a contact is felt.
+    """
+    felt = _Felt.of(wrench, noise)
+    if felt.rows.any():
+        return None
+    points, numbers = np.empty((0, 1, 3)), np.empty(0, dtype=np.int64)
+    none = _Candidates(points, points[..., 0], points, points, numbers, numbers)
+    return _located(whisker, selection(triplet), felt, none)
+
+
 def locate_from_wrench(whisker: Whisker, wrench: xr.Dataset, noise: ArrayLike | None) -> xr.Dataset:
     """Locate contacts from all six components, with friction or without.
 

@@ -27,7 +27,7 @@ def stream(
         typer.Argument(
             help="A file, named pipe or serial device with lines, or a ROS bag; by default "
             "standard input.",
-            metavar="[SOURCE]",
+            metavar="SOURCE",
         ),
     ] = None,
     udp: Annotated[

@@ -28,7 +28,8 @@ COLUMNS = ("time", "Fx", "Fy", "Fz", "Mx", "My", "Mz")
 """Names of the columns, in the order in which they are written."""
 
 _UNITS = {"time": "s", "F": "N", "M": "Nm"}
-_LARGEST = {"F": (10.0, "N"), "M": (1.0, "N·m")}
+# What a wire of steel as thick as a finger holds.
+_LARGEST = {"F": (1e4, "N"), "M": (1e3, "N·m")}
 _LEVER_ARMS = (1e-4, 1.0)
 # Of whiskers bent to their fold 0.3 L from the base, forces and moments stay below 40 times these.
 _LARGEST_SCALES = 100.0
@@ -200,8 +201,8 @@ def _check_magnitudes(path: Path, table: Array) -> None:
             faults.append(f"{name} has infinite values")
     if faults:
         raise ValueError(
-            f"{path}: {'; '.join(faults)}. A whisker feels millinewtons at most: the table must be "
-            "in N and N·m"
+            f"{path}: {'; '.join(faults)}. An animal's whisker feels millinewtons at most, a "
+            "robot's a hundred newtons: the table must be in N and N·m"
         )
 
 

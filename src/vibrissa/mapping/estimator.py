@@ -19,9 +19,9 @@ from numpy.typing import ArrayLike
 
 from vibrissa.mapping.ambiguity import Ambiguity
 from vibrissa.mapping.explanation import why_none
-from vibrissa.mapping.fitting import Fits
+from vibrissa.mapping.fitting import Fits, charted
 from vibrissa.mapping.inversion import polish
-from vibrissa.mapping.least_squares import by_doubt, least_squares
+from vibrissa.mapping.least_squares import by_doubt
 from vibrissa.mapping.minima import same
 from vibrissa.mapping.noise import sensor_noise
 from vibrissa.mapping.readout import Measurement, Mixed, Named, independent
@@ -31,7 +31,8 @@ from vibrissa.mapping.whitening import INDISTINCT, explained
 from vibrissa.rod.arrays import AnyArray, Array
 from vibrissa.rod.batch import solve_forces
 from vibrissa.rod.kernels import evaluate
-from vibrissa.rod.newton import TOLERANCE
+from vibrissa.rod.newton import ROUNDING, TOLERANCE
+from vibrissa.rod.reach import LEAST_ARC
 from vibrissa.sensing import COMPONENTS, Sensor
 from vibrissa.sensing.sensor import GRAVITY
 from vibrissa.signals import SIGNALS, selection
@@ -420,11 +421,18 @@ class Estimator:
             starts = np.concatenate([starts, self._last[0][None]])
             if values is not None:
                 values = np.concatenate([values, self._last[1][None]])
-        if len(starts):
-            fits, inside = self._fitted(measurement, starts, values)
-            if (inside & (fits.misfits <= self._limit)).any():
-                return self._chosen(measurement, _those(fits, inside))
-        return self._searched(measurement)
+        fits, inside = self._fitted(measurement, starts, values)
+        if not (inside & (fits.misfits <= self._limit)).any():
+            # Nothing explains it: look everywhere.
+            nodes = self.readout.nearest(measurement)
+            starts = self._chart.contacts.reshape(-1, 3)[nodes]
+            others, there = self._fitted(measurement, starts, None)
+            fits = Fits(*(np.concatenate(pair) for pair in zip(fits, others, strict=True)))
+            inside = np.concatenate([inside, there])
+        good = fits.misfits <= self._limit
+        if (inside & good).any():
+            return self._chosen(measurement, _those(fits, inside))
+        return self._unexplained(measurement, fits, inside, good)
 
     def _fitted(
         self, measurement: Measurement, starts: Array, values: Array | None
@@ -456,35 +464,17 @@ class Estimator:
         )
         return fits, inside
 
-    def _searched(self, measurement: Measurement) -> Located:
-        """Nothing explains it: look everywhere, and find out why."""
-        if isinstance(self.readout, Named):
-            named = self.readout
-            found, statuses = least_squares(
-                self.contacts, named.names, measurement.measured[None], named.sensor
-            )
-            n = int(found.number[0])
-            return self._located(
-                measurement,
-                found.contacts[0, :n][:, _FREE],
-                found.values[0, :n],
-                Status(int(statuses[0])),
-                float(found.misfits[0, 0]),
-            )
-        nodes = self.readout.nearest(measurement)
-        starts = self._chart.contacts.reshape(-1, 3)[nodes]
-        fits, inside = self._fitted(measurement, starts, None)
-        good = fits.misfits <= self._limit
-        if (inside & good).any():
-            return self._chosen(measurement, _those(fits, inside))
+    def _unexplained(
+        self, measurement: Measurement, fits: Fits, inside: AnyArray, good: AnyArray
+    ) -> Located:
+        """The contact that comes nearest, and why none explains the measurement."""
+        nearer = charted(self._chart, fits, LEAST_ARC + ROUNDING) & ~inside & good
+        status = Status.OUTSIDE_MAP if nearer.any() else Status.NOT_FRICTIONLESS
         if not inside.any():
-            return self._nowhere(Status.OUTSIDE_MAP)
-        best = int(np.argmin(np.where(inside, fits.misfits, np.inf)))
-        status = Status.OUTSIDE_MAP if good.any() else Status.NOT_FRICTIONLESS
-        xi = fits.contacts[[best]][:, _FREE]
-        return self._located(
-            measurement, xi, fits.values[[best]], status, float(fits.misfits[best])
-        )
+            return self._nowhere(status)
+        best = [int(np.argmin(np.where(inside, fits.misfits, np.inf)))]
+        xi, misfit = fits.contacts[best][:, _FREE], float(fits.misfits[best[0]])
+        return self._located(measurement, xi, fits.values[best], status, misfit)
 
     def _chosen(self, measurement: Measurement, fits: Fits) -> Located:
         """The same choice as in a batch, of few fits."""

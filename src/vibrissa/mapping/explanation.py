@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -204,13 +205,9 @@ def why_none(
     misfit : (n,) array
         How far the nearest signals that some contact gives are, in shares of their ranges.
     """
-    chart = contacts.chart
-    which = [SIGNALS.index(name) for name in names]
-    values = chart.values.reshape(-1, 6)
-    known = signals_of(values[:, :3], np.cross(values[:, 3:], values[:, :3]))[:, which]
-    turned = circular_among(names)
-    size = np.where(turned, 1.0, np.ptp(known, axis=0))
-    _, nearest = cKDTree(_on_circle(known, which, size)).query(_on_circle(targets, which, size))
+    chart, turned = contacts.chart, circular_among(names)
+    known, size, tree, bounds = _seen(contacts, names)
+    _, nearest = tree.query(_on_circle(targets, turned, size))
     away = within_turn(known[nearest] - targets, turned)
     span = np.where(turned, 2.0 * np.pi, size)
     misfit = np.abs(away / span).max(axis=1)
@@ -218,19 +215,30 @@ def why_none(
     start = chart.contacts.reshape(-1, 3)[nearest]
     xi, _, residual, sign = polish(chart, names, targets, start)
     nearer = (residual <= TOLERANCE) & (sign > 0.0) & (xi[:, 0] < chart.proximal)
-    bounds = Bounds.of(contacts, names)
     nearer |= bounds.exceeded(targets)
     status = np.where(nearer, int(Status.OUTSIDE_MAP), int(Status.NOT_FRICTIONLESS))
     status[bounds.nothing(targets)] = int(Status.DEGENERATE)
     return status, misfit
 
 
-def _on_circle(values: Array, which: list[int], size: Array) -> Array:
+@lru_cache(maxsize=16)
+def _seen(contacts: ContactMap, names: tuple[str, ...]) -> tuple[Array, Array, cKDTree, Bounds]:
+    """Signals (n, k) at the chart's nodes, their ranges, the same as a tree, and their bounds."""
+    values = contacts.chart.values.reshape(-1, 6)
+    which = [SIGNALS.index(name) for name in names]
+    known = signals_of(values[:, :3], np.cross(values[:, 3:], values[:, :3]))[:, which]
+    turned = circular_among(names)
+    size = np.where(turned, 1.0, np.ptp(known, axis=0))
+    tree = cKDTree(_on_circle(known, turned, size))
+    return known, size, tree, Bounds.of(contacts, names)
+
+
+def _on_circle(values: Array, turned: AnyArray, size: Array) -> Array:
     """Signals as places in a space where distance means difference: angles on the unit circle."""
     parts = []
-    for k, w in enumerate(which):
+    for k, turns in enumerate(turned.tolist()):
         v = values[:, k]
-        parts += [np.cos(v), np.sin(v)] if CIRCULAR[w] else [v / size[k]]
+        parts += [np.cos(v), np.sin(v)] if turns else [v / size[k]]
     return np.stack(parts, axis=1)
 
 

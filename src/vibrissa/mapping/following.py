@@ -413,9 +413,7 @@ class ContactFilter:
         before, first = self._hypotheses, not self._hypotheses
         self._hypotheses = [one for one in before if not one.vague]
         for x, value, own, misfit, gap in zip(*found, gaps, strict=True):
-            known = bool(np.isfinite(own).all())
-            vague = not known or (not curve and not self._known_well(measurement, x, value))
-            by_stiffness = np.zeros(6)
+            known, by_stiffness = bool(np.isfinite(own).all()), np.zeros(6)
             if known and self._stiffness > 0.0:
                 own, by_stiffness[:3] = self._parts(measurement, x, value, turn)
             covariance = _bounded(own) if known else _VAGUE**2 * np.eye(3)
@@ -425,6 +423,7 @@ class ContactFilter:
             its = [one for one in before if self._accounts(one, point, spread)]
             if any(not one.vague for one in its):
                 continue
+            vague = not known or (not curve and not self._known_well(measurement, x, value))
             # All places on the map are alike beforehand; its volume is about that of L³.
             weight = 0.5 * float(np.linalg.slogdet(spread)[1]) + 1.5 * math.log(2.0 * math.pi)
             weight += (0.0 if first else self._birth) - 0.5 * float(misfit)

@@ -1,0 +1,127 @@
+# ruff: noqa: T201 -- a script that reports
+"""How long one measurement takes, from Python, on one thread: median, 99 % and worst.
+
+    python benchmarks/stream_latency.py [SAMPLES]
+
+A contact glides along the built-in γ whisker and around it while it is pushed harder and lighter,
+with the noise of a sensor (1 µN, 0.02 µN·m); every answer is checked against the truth. Each sample
+is timed by the clock on the wall, and by the time that the thread itself was running, which other
+work on the machine does not lengthen by waiting.
+"""
+
+import gc
+import os
+import sys
+import time
+
+os.environ["VIBRISSA_THREADS"] = "1"
+
+import numpy as np
+
+import vibrissa as vb
+from vibrissa.rod.discretize import discretize
+from vibrissa.rod.reach import fold_force, reach
+from vibrissa.sensing import Sensor
+from vibrissa.signals import SIGNALS
+
+NOISE = np.repeat([1e-6, 2e-8], 3)
+
+
+def glide(whisker, n):
+    """Contacts between 0.5 L and 0.85 L, all around, at 20 to 80 % of what slips off."""
+    t = np.linspace(0.0, 1.0, n)
+    s, bearing = 0.675 + 0.175 * np.cos(9.0 * t), (0.5 + 6.0 * t) % (2.0 * np.pi)
+    fold, unit = reach(whisker).fold, discretize(whisker).force
+    most = np.array([fold_force(fold, *at) for at in zip(s, bearing, strict=True)])
+    share = 0.5 - 0.3 * np.cos(31.0 * t)
+    return vb.deflect(whisker, vb.PointForce(s * whisker.length, share * most * unit, bearing))
+
+
+def measured(locate, rows):
+    """Durations on the wall and of the thread, µs, and answers."""
+    for row in rows[:50]:
+        locate(row)
+    wall, own, answers = np.empty(len(rows)), np.empty(len(rows)), []
+    gc.collect()
+    gc.disable()
+    for i, row in enumerate(rows):
+        a, b = time.perf_counter(), time.thread_time()
+        answers.append(locate(row))
+        own[i], wall[i] = time.thread_time() - b, time.perf_counter() - a
+    gc.enable()
+    return wall * 1e6, own * 1e6, answers
+
+
+def main(samples=3000):
+    whisker = vb.samples.gamma()
+    contacts = vb.ContactMap.simulate(whisker, grid=False)
+    bent = glide(whisker, samples)
+    wrench = np.concatenate([bent.force, bent.moment], axis=1)
+    wrench += NOISE * np.random.default_rng(0).normal(size=wrench.shape)
+    signals = vb.base_signals(wrench[:, :3], wrench[:, 3:])
+    clean = vb.base_signals(bent.force, bent.moment)
+    covariance = np.diag(NOISE**2)
+    cases = {}
+    for what, names, noise in (
+        ("three signals", ("Fx", "MB", "MD"), None),
+        ("three signals, with covariance", ("Fx", "MB", "MD"), covariance),
+        ("four signals, with covariance", ("Fx", "FT", "MB", "MD"), covariance),
+        ("six signals", SIGNALS, None),
+        ("six signals, with covariance", SIGNALS, covariance),
+    ):
+        felt = clean if noise is None else signals
+        rows = np.stack([felt[name].to_numpy() for name in names], axis=-1)
+        cases[what] = (vb.Estimator(contacts, names, noise), rows)
+    rows = np.stack([clean[name].to_numpy() for name in SIGNALS], axis=-1)
+    rubbed = rows * np.where(np.arange(6) == 0, 1.5, 1.0)
+    cases["six signals that no contact explains"] = (
+        vb.Estimator(contacts, SIGNALS, covariance),
+        rubbed[: samples // 5],
+    )
+    mixing = np.random.default_rng(3).normal(size=(4, 6)) / np.repeat([1e-5, 2e-7], 3)
+    mixed = Sensor("abcd", mixing, np.sqrt(mixing**2 @ NOISE**2))
+    cases["four channels that mix all components"] = (
+        vb.Estimator.of_sensor(contacts, mixed),
+        wrench @ mixing.T,
+    )
+    pair = Sensor(("My", "Mz"), noise=NOISE[4:])
+    cases["two moments: a curve of contacts"] = (
+        vb.Estimator.of_sensor(contacts, pair),
+        wrench[: samples // 10, 4:],
+    )
+    filters = {
+        "filter, three signals": vb.Estimator(contacts, ("Fx", "MB", "MD"), covariance),
+        "filter, two moments": vb.Estimator.of_sensor(contacts, pair),
+    }
+    for what, estimator in filters.items():
+        rows = np.stack([signals[name].to_numpy() for name in ("Fx", "MB", "MD")], axis=-1)
+        rows = wrench[:, 4:] if "two" in what else rows
+        cases[what] = (Stepped(vb.ContactFilter(estimator, speed=0.5)), rows[: samples // 3])
+    print(f"{'µs':40}{'wall: median':>14}{'99 %':>8}{'worst':>8}{'own: median':>14}{'99 %':>8}")
+    for what, (locate, rows) in cases.items():
+        wall, own, answers = measured(locate, rows)
+        if "filter" not in what and "no contact" not in what:
+            points = bent.contact_point[: len(answers)]
+            near = [
+                np.linalg.norm(one.candidates - point, axis=1).min(initial=np.inf)
+                for one, point in zip(answers, points, strict=True)
+            ]
+            assert np.median(near) < 0.1 * whisker.length
+        figures = [np.median(wall), np.quantile(wall, 0.99), wall.max()]
+        print(f"{what:40}{figures[0]:14.0f}{figures[1]:8.0f}{figures[2]:8.0f}", end="")
+        print(f"{np.median(own):14.0f}{np.quantile(own, 0.99):8.0f}")
+
+
+class Stepped:
+    """A filter that is given the time of each sample: one millisecond after the last."""
+
+    def __init__(self, follow):
+        self.follow, self.time = follow, 0.0
+
+    def __call__(self, row):
+        self.time += 1e-3
+        return self.follow(self.time, row)
+
+
+if __name__ == "__main__":
+    main(*(int(text) for text in sys.argv[1:2]))

@@ -62,7 +62,7 @@ def test_nothing_is_located_where_nothing_touches(chart, bend):
 @pytest.mark.parametrize("what", COLOURS)
 def test_every_contact_of_the_cloud_has_a_colour(chart, what):
     colours, legend = coloured(chart, what, Sensor())
-    assert colours.shape == (len(chart.rows), 3)
+    assert colours.shape == (len(chart.points), 3)
     assert len(np.unique(colours, axis=0)) > 1
     assert "data-legend" in legend.html()
 
@@ -81,3 +81,10 @@ def test_colours_follow_values():
     colours, legend = counted(np.array([1, 2, 9]))
     assert len(np.unique(colours, axis=0)) == 3
     assert "more" in legend.html()
+
+
+def test_every_contact_of_the_cloud_is_found_again(chart):
+    """So that a grey point means that signals determine nothing, not that a search failed."""
+    for triplet in ("Fx MB MD", "Fx FT MB"):
+        felt = {name: chart.signals[name] for name in triplet.split()}
+        assert (chart.contacts.estimate(felt, triplet).n_candidates > 0).all()

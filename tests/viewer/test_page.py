@@ -17,6 +17,7 @@ class Looking:
         self.viewer = viewer
         self.complaints = []
         self.page = browser.new_page(viewport=SIZE)
+        self.page.set_default_timeout(90e3)  # 3D is drawn by software, perhaps on a busy machine
         self.page.on("console", self._hear)
         self.faults = []
         self.page.on("pageerror", lambda error: self.faults.append(str(error)))

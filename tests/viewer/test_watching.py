@@ -7,6 +7,7 @@ import pytest
 import xarray as xr
 
 import vibrissa as vb
+from vibrissa.contour import fit_cylinder, fit_free, fit_plane, fit_sphere
 from vibrissa.io import write_video
 from vibrissa.io.footage import Footage
 from vibrissa.trial import recorded_pegs
@@ -90,32 +91,34 @@ def test_a_moment_shows_whisker_contact_and_force(trial):
     assert drawn.keys() - moment_drawing(trial, free, 5.0).keys() == {"contact 0", "force 0"}
 
 
-@pytest.mark.parametrize("shape", ["cylinder", "sphere", "plane", "free", "unheard of"])
-def test_a_fitted_shape_lies_where_it_was_fitted(trial, recording, shape):
+def test_a_fitted_cylinder_lies_where_it_was_fitted(trial, recording):
     peg = recorded_pegs(recording)[0]
-    contour = xr.Dataset(
-        {"object_position": ("space", peg.origin), "object_axis": ("space", peg.axis)},
-        attrs={"shape": shape},
-    ).assign(object_radius=peg.radius)
-    if shape == "free":
-        contour = xr.Dataset(
-            {
-                "object_vertices": (("vertex", "space"), np.eye(3)),
-                "object_faces": (("face", "corner"), [[0, 1, 2]]),
-            },
-            attrs={"shape": shape},
-        )
     near = trial.contacts[trial.felt]
-    body = fitted_body(contour, near)
-    if shape == "unheard of":
-        assert body is None
-        return
-    vertices, faces = body
+    normals = recording["truth"]["surface_normal"].values[trial.felt]
+    fit = fit_cylinder(near, whisker_radius=np.full(len(near), 50e-6), normals=normals)
+    vertices, faces = fitted_body(fit.to_dataset(), near)
     assert faces.max() < len(vertices)
-    if shape == "cylinder":
-        np.testing.assert_allclose(peg.signed_distance(vertices[:-2]), 0.0, atol=1e-9)
-        along = (vertices - peg.origin) @ peg.axis
-        assert along.min() < ((near - peg.origin) @ peg.axis).min()
+    np.testing.assert_allclose(fit.signed_distance(vertices[:-2]), 0.0, atol=1e-9)
+    heights = [(points - peg.origin) @ peg.axis for points in (vertices, near)]
+    assert heights[0].min() < heights[1].min() < heights[1].max() < heights[0].max()
+
+
+@pytest.mark.parametrize("fit", [fit_sphere, fit_plane, fit_free])
+def test_other_fitted_shapes_have_a_picture_too(fit):
+    rng = np.random.default_rng(0)
+    toward = rng.normal(size=(60, 3)) * [0.4, 0.4, 0.0] + [0.0, 0.0, 1.0]
+    points = 8e-3 * toward / np.linalg.norm(toward, axis=1, keepdims=True)
+    shape = fit(points)
+    vertices, faces = fitted_body(shape.to_dataset(), points)
+    assert np.isfinite(vertices).all()
+    assert faces.max() < len(vertices)
+    np.testing.assert_allclose(shape.signed_distance(vertices), 0.0, atol=2e-4)
+
+
+def test_an_unknown_shape_has_no_picture(trial):
+    assert (
+        fitted_body(xr.Dataset(attrs={"shape": "unheard of"}), trial.contacts[trial.felt]) is None
+    )
 
 
 def test_surroundings_can_be_hidden(trial):

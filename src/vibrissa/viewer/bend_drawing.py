@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from vibrissa.quantities import to_display
@@ -96,11 +98,7 @@ def bend_drawing(bend: Bend, exaggeration: float) -> Drawing:
         In the whisker frame, mm.
     """
     whisker, held, ok = bend.whisker, bend.held, bend.status.ok
-    out: dict[str, Thing] = {
-        "follicle": follicle(whisker, exaggeration),
-        **axes(whisker),
-        "rest": whisker_body(whisker, whisker.centerline(NODES), 0.7 * exaggeration, REST, 0.35),
-    }
+    out = dict(_resting(whisker, exaggeration))
     line = held.centerline(NODES)
     if ok:
         out["whisker"] = whisker_body(whisker, line, exaggeration)
@@ -113,6 +111,16 @@ def bend_drawing(bend: Bend, exaggeration: float) -> Drawing:
     elif ok:
         out["contact"] = _ball(held, exaggeration)
     return out
+
+
+@lru_cache(maxsize=4)
+def _resting(whisker: Whisker, exaggeration: float) -> dict[str, Thing]:
+    """What stays as it is while a whisker is bent."""
+    return {
+        "follicle": follicle(whisker, exaggeration),
+        **axes(whisker),
+        "rest": whisker_body(whisker, whisker.centerline(NODES), 0.7 * exaggeration, REST, 0.35),
+    }
 
 
 def _peg(bend: Bend) -> Body:

@@ -8,9 +8,11 @@ import numpy as np
 import xarray as xr
 
 from vibrissa.mapping import ContactMap
-from vibrissa.plots.chart import column, fine_chart
+from vibrissa.plots.chart import fine_chart
 from vibrissa.quantities import to_display
+from vibrissa.signals import SIGNALS
 from vibrissa.viewer.drawing import CLOUD, Array, Body, Bytes, Cloud
+from vibrissa.viewer.meshes import sheet
 from vibrissa.whisker import Whisker
 
 _SKIN = (36, 72, 12)
@@ -30,15 +32,17 @@ class Chart:
         Its nodes, ``ContactMap.to_dataset()``.
     line : array (k, 3)
         Centreline of the resting whisker, m.
-    rows : array (n, columns)
-        Contacts of the cloud and their signals, as of :mod:`vibrissa.plots.chart`; those within 2°
-        of rest are left out.
+    points : array (n, 3)
+        Contacts of the cloud, m; those within 2° of rest are left out.
+    signals : mapping of str to array (n,)
+        What they feel like, SI units.
     """
 
     contacts: ContactMap
     samples: xr.Dataset
     line: Array
-    rows: Array
+    points: Array
+    signals: dict[str, Array]
 
     @property
     def whisker(self) -> Whisker:
@@ -50,31 +54,25 @@ def charted(whisker: Whisker, contacts: ContactMap | None = None) -> Chart:
     """Sample all stable contacts of a whisker; its map is made unless it is given."""
     contacts = contacts or ContactMap.simulate(whisker, grid=False)
     samples, line = contacts.to_dataset(), whisker.centerline()
-    # As fine as the map itself, so that every contact is one of its own, exactly.
-    cells = [samples.sizes[dim] - 1 for dim in ("station", "bearing", "load")]
-    nodes = fine_chart(samples, line, shape=(cells[0], cells[1], cells[2]))
     # The last bearing is the first again, and no load is no contact.
-    rows = nodes[:, :-1, 2::2].reshape(-1, nodes.shape[-1])
-    return Chart(contacts, samples, line, rows[rows[:, column("deflection")] > 0.0])
+    kept = samples.isel(bearing=slice(0, -1), load=slice(2, None, 2))
+    aside = ~kept["small_deflection"].to_numpy().astype(bool)
+    signals = {name: kept[name].to_numpy()[aside] for name in SIGNALS}
+    return Chart(contacts, samples, line, kept["contact_point"].to_numpy()[aside], signals)
 
 
 def places(chart: Chart) -> Array:
     """Contact points (n, 3) of the cloud, mm."""
-    return to_display("contact_point", chart.rows[:, :3])
+    return to_display("contact_point", chart.points)
 
 
 def envelope(chart: Chart) -> Body:
     """The surface at which the whisker slips off, seen from inside, so that it hides nothing."""
     nodes = fine_chart(chart.samples, chart.line, shape=_SKIN)[..., :3]
     # The end near the base stays open.
-    sheet = np.concatenate([nodes[:, :, -1], nodes[-1, :, -2::-1].swapaxes(0, 1)])
-    count, around = sheet.shape[:2]
-    i, j = np.meshgrid(np.arange(count - 1), np.arange(around - 1), indexing="ij")
-    corner = (i * around + j).ravel()
-    first = np.stack([corner, corner + 1, corner + around + 1], axis=1)
-    second = np.stack([corner, corner + around + 1, corner + around], axis=1)
-    faces = np.concatenate([first, second])
-    return Body(to_display("contact_point", sheet.reshape(-1, 3)), faces, CLOUD, 0.35, "back")
+    skin = np.concatenate([nodes[:, :, -1], nodes[-1, :, -2::-1].swapaxes(0, 1)])
+    vertices, faces = sheet(to_display("contact_point", skin))
+    return Body(vertices, faces, CLOUD, 0.35, "back")
 
 
 def coloured_cloud(chart: Chart, points: Array, colours: Bytes) -> Cloud:

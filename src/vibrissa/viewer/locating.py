@@ -8,7 +8,6 @@ import numpy as np
 import xarray as xr
 
 from vibrissa.mapping import Estimate, sensitivity
-from vibrissa.plots.chart import values_of
 from vibrissa.rod import PointContact, deflect
 from vibrissa.signals import SIGNALS, base_signals
 from vibrissa.status import Status
@@ -118,25 +117,23 @@ def coloured(chart: Chart, what: str, sensor: Sensor) -> tuple[Bytes, Legend]:
         Of the colours.
     """
     if what in SIGNALS:
-        return shaded(what, values_of(what, chart.rows))
+        return shaded(what, chart.signals[what])
     if what == "sensitivity":
         return shaded("predicted_error", _predicted_error(chart, sensor))
-    felt = {name: values_of(name, chart.rows) for name in sensor.triplet}
+    felt = {name: chart.signals[name] for name in sensor.triplet}
     estimate = chart.contacts.estimate(felt, sensor.triplet)
     if what == "uniqueness":
-        # The contact itself feels the same, even where a search on a fold does not meet it.
-        undetermined = estimate.status == Status.DEGENERATE
-        return counted(np.where(undetermined, 0, np.maximum(1, estimate.n_candidates)))
+        return counted(estimate.n_candidates)
     if what == "ambiguity":
-        return shaded("separation", _separation(estimate, chart.rows[:, :3]))
+        return shaded("separation", _separation(estimate, chart.points))
     raise ValueError(f"colours are one of {', '.join(COLOURS)}; got {what!r}")
 
 
 def _predicted_error(chart: Chart, sensor: Sensor) -> Array:
     """RMS 3D error (n,), m, of the contacts of the cloud."""
     if sensor.covariance is None:
-        return np.full(len(chart.rows), np.nan)
-    found = sensitivity(chart.contacts, sensor.triplet, chart.rows[:, :3], noise=sensor.covariance)
+        return np.full(len(chart.points), np.nan)
+    found = sensitivity(chart.contacts, sensor.triplet, chart.points, noise=sensor.covariance)
     return np.asarray(found["predicted_error"].to_numpy(), dtype=np.float64)
 
 

@@ -5,6 +5,9 @@ All lengths go in and come out in the same unit.
 
 from __future__ import annotations
 
+from functools import lru_cache
+from math import sqrt
+
 import numpy as np
 
 from vibrissa.rod.surface import Surface
@@ -31,12 +34,7 @@ def tube(line: Array, radius: Array, sides: int = SIDES) -> tuple[Array, Ints]:
     """
     tangents = np.gradient(line, axis=0)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
-    normals = np.empty_like(line)
-    normal = across(tangents[0])[0]
-    for i, tangent in enumerate(tangents):
-        normal = normal - (normal @ tangent) * tangent
-        normal = normal / np.linalg.norm(normal)
-        normals[i] = normal
+    normals = np.array(_transported(across(tangents[0])[0].tolist(), tangents.tolist()))
     turn = np.linspace(0.0, 2.0 * np.pi, sides, endpoint=False)
     ring = np.cos(turn)[:, None] * normals[:, None]
     ring += np.sin(turn)[:, None] * np.cross(tangents, normals)[:, None]
@@ -44,6 +42,20 @@ def tube(line: Array, radius: Array, sides: int = SIDES) -> tuple[Array, Ints]:
     return np.concatenate([walls.reshape(-1, 3), line[[0, -1]]]), _tube_faces(len(line), sides)
 
 
+def _transported(normal: list[float], tangents: list[list[float]]) -> list[list[float]]:
+    """A normal carried along; in plain numbers, which are faster than small arrays."""
+    x, y, z = normal
+    out = []
+    for a, b, c in tangents:
+        along = x * a + y * b + z * c
+        x, y, z = x - along * a, y - along * b, z - along * c
+        size = sqrt(x * x + y * y + z * z)
+        x, y, z = x / size, y / size, z / size
+        out.append([x, y, z])
+    return out
+
+
+@lru_cache(maxsize=32)
 def _tube_faces(count: int, sides: int) -> Ints:
     ring, side = np.meshgrid(np.arange(count - 1), np.arange(sides), indexing="ij")
     here, beside = ring * sides + side, ring * sides + (side + 1) % sides
@@ -89,6 +101,16 @@ def patch(centre: Array, normal: Array, size: float) -> tuple[Array, Ints]:
     corners = [(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)]
     vertices = np.array([centre + size * (a * first + b * second) for a, b in corners])
     return vertices, np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def sheet(grid: Array) -> tuple[Array, Ints]:
+    """Vertices and triangles of a surface that is given as a grid (m, n, 3) of its points."""
+    count, beside = grid.shape[:2]
+    i, j = np.meshgrid(np.arange(count - 1), np.arange(beside - 1), indexing="ij")
+    corner = (i * beside + j).ravel()
+    first = np.stack([corner, corner + 1, corner + beside + 1], axis=1)
+    second = np.stack([corner, corner + beside + 1, corner + beside], axis=1)
+    return grid.reshape(-1, 3), np.concatenate([first, second])
 
 
 _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])

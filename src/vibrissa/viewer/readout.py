@@ -10,7 +10,8 @@ import numpy as np
 
 from vibrissa.quantities import quantity
 from vibrissa.rod import Deflection
-from vibrissa.signals import SIGNALS, base_signals
+from vibrissa.signals import SIGNALS
+from vibrissa.signals.base import signals_of
 from vibrissa.status import Status
 
 _GREEK = {"theta": "θ", "varphi": "φ", "sigma": "σ"}
@@ -87,8 +88,8 @@ def _framed(body: str) -> str:
 
 def of_deflection(bent: Deflection) -> str:
     """What the base feels, where the contact is, and what became of the load."""
-    signals = base_signals(np.asarray(bent.force), np.asarray(bent.moment))
-    felt = {name: float(signals[name]) for name in SIGNALS}
+    signals = signals_of(np.asarray(bent.force), np.asarray(bent.moment))
+    felt = dict(zip(SIGNALS, signals.tolist(), strict=True))
     x, y, z = np.asarray(bent.contact_point)
     where = {
         "arc_length": float(bent.arc_length),

@@ -13,11 +13,13 @@ from typing import Any, Self
 
 import viser
 import xarray as xr
+from numpy.typing import ArrayLike
 from viser import _messages
 
 from vibrissa.io.footage import Footage
 from vibrissa.mapping import ContactMap
 from vibrissa.viewer.bend_panel import BendMode
+from vibrissa.viewer.bending import loaded, moved
 from vibrissa.viewer.locate_panel import LocateMode
 from vibrissa.viewer.map_panel import MapMode
 from vibrissa.viewer.page import Mode, Page
@@ -57,6 +59,17 @@ class Viewer:
         host = self.page.server.get_host()
         shown = "127.0.0.1" if host in ("0.0.0.0", "") else host
         return f"http://{f'[{shown}]' if ':' in shown else shown}:{self.page.server.get_port()}"
+
+    def put_contact(self, point: ArrayLike) -> None:
+        """Put the wanted contact point where it would otherwise be dragged to.
+
+        Parameters
+        ----------
+        point : array_like (3,)
+            Whisker frame, m.
+        """
+        self.page.change("drag", lambda bend: moved(loaded(bend, "point"), point))
+        self.page.settle()
 
     def wait(self) -> None:
         """Serve until interrupted."""

@@ -90,7 +90,7 @@ def shaded(name: str, values: Array) -> tuple[Bytes, Legend]:
 def counted(numbers: Ints) -> tuple[Bytes, Legend]:
     """Colours of numbers of candidates, and their legend."""
     rgb = np.array(_COUNTS)[np.clip(numbers, 0, 3)]
-    words = ("undetermined", "one", "two", "more")
+    words = ("none found", "one", "two", "more")
     steps = tuple((_css(np.array(c)), word) for c, word in zip(_COUNTS, words, strict=True))
     return _bytes(rgb), Legend("Contacts that feel the same", steps, smooth=False)
 

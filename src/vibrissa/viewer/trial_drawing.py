@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
+from vibrissa.contour import CylinderFit, SphereFit, shape_from_dataset, surface_grid
 from vibrissa.quantities import to_display
 from vibrissa.viewer.bend_drawing import whisker_body
 from vibrissa.viewer.bending import force_scale
@@ -22,7 +23,7 @@ from vibrissa.viewer.drawing import (
     Ints,
     Thing,
 )
-from vibrissa.viewer.meshes import cylinder, ellipsoid, of_object, patch
+from vibrissa.viewer.meshes import cylinder, ellipsoid, of_object, sheet
 from vibrissa.viewer.watching import Watched
 
 POINTS = 4000
@@ -124,33 +125,30 @@ def fitted_body(contour: xr.Dataset, near: Array) -> tuple[Array, Ints] | None:
     Parameters
     ----------
     contour : Dataset
-        With the attribute ``shape`` and the shape's parameters.
+        The group ``contour`` of a recording.
     near : array (n, 3)
-        The contacts, m: a cylinder and a plane reach a little beyond them.
+        The contacts, m: what has no end reaches a little beyond them.
 
     Returns
     -------
     tuple of arrays, or None
         Vertices and triangles.
     """
-    shape = contour.attrs.get("shape")
-    if "object_vertices" in contour:
-        faces = contour["object_faces"].to_numpy().astype(np.int64)
-        return np.asarray(contour["object_vertices"].to_numpy()), faces
-    if shape not in ("cylinder", "sphere", "plane") or not near.size:
+    try:
+        shape = shape_from_dataset(contour)
+    except ValueError:
         return None
-    place = contour["object_position"].to_numpy()
-    if shape == "sphere":
-        return ellipsoid(place, float(contour["object_radius"]) * np.eye(3), 48)
-    axis = contour["object_axis"].to_numpy()
-    along = (near - place) @ axis
-    if shape == "plane":
-        middle = near.mean(axis=0)
-        foot = middle - ((middle - place) @ axis) * axis
-        return patch(foot, axis, 1.6 * float(np.ptp(near, axis=0).max()))
-    middle = place + 0.5 * (along.min() + along.max()) * axis
-    radius = float(contour["object_radius"])
-    return cylinder(middle, axis, radius, 1.3 * float(np.ptp(along)) + 2.0 * radius)
+    if isinstance(shape, SphereFit):
+        return ellipsoid(shape.origin, shape.radius * np.eye(3), 48)
+    if not near.size:
+        return None
+    if isinstance(shape, CylinderFit):
+        along = (near - shape.origin) @ shape.axis
+        middle = shape.origin + 0.5 * (along.min() + along.max()) * shape.axis
+        length = 1.3 * float(np.ptp(along)) + 2.0 * shape.radius
+        return cylinder(middle, shape.axis, shape.radius, length)
+    grid = surface_grid(shape, near)["surface_grid_point"].to_numpy()
+    return sheet(grid)
 
 
 def _mm(values: object) -> Array:

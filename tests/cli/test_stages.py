@@ -64,6 +64,7 @@ def test_a_recording_goes_through_the_stages(folder, tmp_path):
     assert "The cylinder" in text
     assert "diameter" in text
     assert "2.7000 mm" in text
+    assert "deflection angle" in text
     after = load_recording(work)
     before = load_recording(folder / "sim.nc")
     for group in before.subtree:

@@ -7,21 +7,24 @@ import xarray as xr
 from vibrissa.contour import shape_from_dataset
 from vibrissa.io import load_recording, save_recording
 from vibrissa.pipeline import (
+    compare_contacts,
     component_noise,
+    distances_by_class,
     estimates_of,
     locate,
     placed_by,
     reconstruct,
     signals_of,
+    whisker_radii,
     with_contour,
     with_estimates,
     with_group,
     with_signals,
 )
 from vibrissa.pipeline.locate import unfelt
-from vibrissa.pipeline.reconstruct import frames_together, whisker_radii
+from vibrissa.pipeline.reconstruct import frames_together
 from vibrissa.status import Status
-from vibrissa.trial import recorded_pegs, recorded_whisker
+from vibrissa.trial import Sphere, recorded_pegs, recorded_whisker
 
 ALL = "Fx FT FD Mx MB MD"
 
@@ -294,3 +297,25 @@ def test_without_noise_there_is_no_covariance_but_a_fit(trial):
     assert recorded_whisker(done).length == pytest.approx(40e-3)
     contour = reconstruct(done)
     assert float(contour["object_radius"]) > 0
+
+
+def test_contacts_are_as_far_from_the_known_object_as_predicted(trial):
+    done = with_estimates(trial)
+    other = Sphere([0.1, 0.1, 0.1], 1e-3)
+    compared = compare_contacts(done, [other, *recorded_pegs(trial)])
+    assert compared.attrs["object"] == 1
+    there = done["estimates"]["candidates"].values > 0
+    assert (np.isfinite(compared["surface_distance"].values) == there).all()
+    tables = distances_by_class(compared)
+    assert set(tables) == {"deflection_angle", "r", "MB"}
+    by_moment = tables["MB"]
+    assert int(by_moment["contacts"].sum()) == there.sum()
+    # The more is felt the less it errs, and as the covariance says.
+    median = by_moment["median"].values
+    assert median[-1] < 0.3 * median[0]
+    assert 0.5 < np.median(median / by_moment["median_predicted"].values) < 2.0
+    with pytest.raises(ValueError, match="no object is known"):
+        compare_contacts(done, [])
+    nothing = with_group(done, "estimates", done["estimates"].to_dataset() * np.nan)
+    with pytest.raises(ValueError, match="no contacts"):
+        compare_contacts(nothing)

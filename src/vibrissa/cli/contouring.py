@@ -116,7 +116,13 @@ def reconstruct(
     from vibrissa.contour import shape_from_dataset
     from vibrissa.io import save_contour, save_recording
     from vibrissa.io.paths import CSV, NETCDF, check_writable
-    from vibrissa.pipeline import contour_points, with_contour, with_signals
+    from vibrissa.pipeline import (
+        compare_contacts,
+        contour_points,
+        distances_by_class,
+        with_contour,
+        with_signals,
+    )
     from vibrissa.tracking.filtering import CUTOFF
     from vibrissa.trial import recorded_objects
 
@@ -149,8 +155,10 @@ def reconstruct(
     tell_statuses(tree["estimates"]["status"].values)
     fit = shape_from_dataset(contour)
     output.print(_table(fit, contour, known))
-    for line in _summary(fit, contour):
-        output.print(line, highlight=False, soft_wrap=True)
+    output.print(_summary(fit, contour), highlight=False, soft_wrap=True)
+    if known:
+        compared = compare_contacts(tree, known, whiskers)
+        output.print(_distances(distances_by_class(compared)["deflection_angle"]))
     save_recording(target, tree)
     save_contour(points, contour_points(tree, whiskers))
     tell_written(target)
@@ -185,13 +193,12 @@ def _table(fit: FittedShape, contour: xr.Dataset, known: tuple[Surface, ...]) ->
     for name in ("", "fitted", "sigma", *(("known", "error") if true else ())):
         table.add_column(name, justify="right" if name else "left")
     for name, value, sigma in _parameters(fit):
-        unit = "radius" if name == "diameter" else name
-        digits, factor, said = (4, 1e3, " mm") if unit not in _TURNED else (4, 1.0, "")
+        factor, unit = (1.0, "") if name in _TURNED else (1e3, " mm")
         values = np.atleast_1d(value)
-        for i, one in enumerate(values):
+        for i, pair in enumerate(zip(values, np.atleast_1d(sigma), strict=True)):
             label = name if values.size == 1 else f"{name}, {'xyz'[i]}"
-            cells = [f"{factor * float(one):.{digits}f}{said}"]
-            cells.append(f"{factor * float(np.atleast_1d(sigma)[i]):.{digits}f}{said}")
+            # Adding zero turns −0 into 0.
+            cells = [f"{round(factor * float(x), 4) + 0.0:.4f}{unit}" for x in pair]
             if true:
                 cells += true.get(label, ["", ""])
             table.add_row(label, *cells)
@@ -233,20 +240,39 @@ def _matching(
     return rows
 
 
-def _summary(fit: FittedShape, contour: xr.Dataset) -> list[str]:
-    """How well contacts agree with the fitted and with the known object."""
+def _summary(fit: FittedShape, contour: xr.Dataset) -> str:
+    """How well contacts agree with the fitted object."""
     import numpy as np
 
     inside = int(fit.inliers.sum())
     found = int(np.isfinite(fit.residuals).sum())
     said = f"{inside} of {found} contacts agree with it, to {fixed('surface_distance', fit.rms, 1)}"
     together = float(contour.attrs["frames_together"])
-    if together > 1.0:
+    if together > 1.5:
         said += f"; about {together:.0f} frames err together, which sigma takes into account"
-    if "object_distance" not in contour:
-        return [said]
-    away = np.abs(contour["object_distance"].values)
-    median, most = (
-        fixed("surface_distance", float(q), 1) for q in np.nanquantile(away, [0.5, 0.95])
+    return said
+
+
+def _distances(rows: xr.Dataset) -> Table:
+    """Distances of contacts from the known object, by how far the whisker is bent."""
+    import numpy as np
+    from rich.table import Table
+
+    predicted = bool(np.isfinite(rows["median_predicted"]).any())
+    table = Table(
+        title="Distance of contacts from the known object",
+        title_justify="left",
+        caption="* what the estimates' own covariance predicts" if predicted else None,
+        caption_justify="left",
     )
-    return [said, f"distance of contacts from the known object: median {median}, 95 % {most}"]
+    columns = ["median", "largest_95"]
+    columns += ["median_predicted", "largest_95_predicted"] if predicted else []
+    table.add_column("deflection angle")
+    for name in ("contacts", "median", "95 %", *(("median*", "95 %*") if predicted else ())):
+        table.add_column(name, justify="right")
+    for k in range(rows.sizes["class"]):
+        row = rows.isel({"class": k})
+        if int(row["contacts"]):
+            cells = [fixed("surface_distance", float(row[name]), 1) for name in columns]
+            table.add_row(f"{row['label'].item()}°", str(int(row["contacts"])), *cells)
+    return table

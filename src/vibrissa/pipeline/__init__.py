@@ -1,6 +1,8 @@
 """The stages between tracks and a contour, each from a recording to a dataset of its own."""
 
+from vibrissa.pipeline.comparison import compare_contacts, distances_by_class
 from vibrissa.pipeline.estimates import estimates_of
+from vibrissa.pipeline.frames import whisker_radii
 from vibrissa.pipeline.laboratory import contact_columns, in_laboratory
 from vibrissa.pipeline.locate import FELT, TRIPLET, component_noise, locate, locate_from_wrench
 from vibrissa.pipeline.reconstruct import (
@@ -9,7 +11,6 @@ from vibrissa.pipeline.reconstruct import (
     contour_points,
     fit_contacts,
     reconstruct,
-    whisker_radii,
 )
 from vibrissa.pipeline.signals import (
     Source,
@@ -33,10 +34,12 @@ __all__ = [
     "TRIPLET",
     "Shape",
     "Source",
+    "compare_contacts",
     "component_noise",
     "contact_columns",
     "contour_points",
     "default_source",
+    "distances_by_class",
     "estimates_of",
     "fit_contacts",
     "in_laboratory",

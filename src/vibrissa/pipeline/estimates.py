@@ -9,12 +9,12 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.mapping import ContactMap
+from vibrissa.pipeline.frames import whiskers_in
 from vibrissa.pipeline.laboratory import in_laboratory
 from vibrissa.pipeline.locate import TRIPLET, locate, locate_from_wrench, unfelt
 from vibrissa.pipeline.signals import sensor_noise
 from vibrissa.signals import selection
 from vibrissa.status import is_ok
-from vibrissa.trial.recording import recorded_whisker
 from vibrissa.whisker import Whisker
 
 Array = NDArray[np.float64]
@@ -115,7 +115,7 @@ def estimates_of(
         if contact_maps is not None:
             whiskers = [one.whisker for one in contact_maps]
         else:
-            whiskers = [recorded_whisker(recording, k) for k in range(count)]
+            whiskers = whiskers_in(recording)
     for given in (whiskers, contact_maps):
         if given is not None and len(given) != count:
             raise ValueError(f"there are signals of {count} whiskers; {len(given)} are given")

@@ -10,7 +10,13 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa.signals import base_signals
-from vibrissa.trial.recording import recorded
+from vibrissa.trial.recording import recorded, recorded_whisker
+from vibrissa.whisker import Whisker
+
+Array = NDArray[np.float64]
+
+EACH = ("time", "whisker")
+"""What contacts run along."""
 
 SQUARES = {
     "wrench_covariance": ("component", "component_"),
@@ -127,3 +133,75 @@ def with_coordinates(data: xr.Dataset, root: xr.Dataset, about: Mapping[str, Any
     names = ("time", "whisker", "space", "whisker_axis")
     coordinates = {name: root[name].variable for name in names if name in root.coords}
     return data.assign_coords({"space": list("xyz"), **coordinates}).assign_attrs(about)
+
+
+def whiskers_in(recording: xr.DataTree) -> list[Whisker]:
+    """Make the whiskers of a recording again.
+
+    Parameters
+    ----------
+    recording : xarray.DataTree
+        The recording.
+
+    Returns
+    -------
+    list of Whisker
+        Along the dimension ``whisker``.
+
+    Raises
+    ------
+    ValueError
+        If it does not carry them all.
+    """
+    return [recorded_whisker(recording, k) for k in range(recording.sizes["whisker"])]
+
+
+def estimates_in(recording: xr.DataTree) -> xr.Dataset:
+    """Find the estimates in a recording.
+
+    Parameters
+    ----------
+    recording : xarray.DataTree
+        The recording.
+
+    Returns
+    -------
+    xarray.Dataset
+        Its group ``estimates``.
+
+    Raises
+    ------
+    ValueError
+        If it has none.
+    """
+    group = recording.children.get("estimates")
+    if group is None:
+        got = ", ".join(sorted(recording.children)) or "no groups"
+        raise ValueError(
+            f"the recording has no group estimates (it has {got}): make them first, by "
+            "estimates_of or `vibrissa estimate`"
+        )
+    return group.to_dataset()
+
+
+def whisker_radii(estimates: xr.Dataset, whiskers: Sequence[Whisker]) -> Array:
+    """Give the whiskers' radii where they touch.
+
+    Parameters
+    ----------
+    estimates : xarray.Dataset
+        Dims time, whisker: ``arc_length``.
+    whiskers : sequence of Whisker
+        One for each.
+
+    Returns
+    -------
+    array (time, whisker)
+        m; NaN where the arc length is.
+    """
+    arc_length = estimates["arc_length"].transpose(*EACH).values
+    radius = np.full(arc_length.shape, np.nan)
+    for k, whisker in enumerate(whiskers):
+        known = np.isfinite(arc_length[:, k])
+        radius[known, k] = whisker.radius(arc_length[known, k])
+    return radius

@@ -25,10 +25,12 @@ from vibrissa.contour import (
     fit_plane,
     fit_sphere,
 )
+from vibrissa.pipeline.comparison import nearest_object
+from vibrissa.pipeline.frames import EACH, estimates_in, whisker_radii, whiskers_in
 from vibrissa.quantities import attributes
 from vibrissa.rod.surface import Surface
 from vibrissa.trial import Peg, Sphere
-from vibrissa.trial.recording import recorded_objects, recorded_whisker
+from vibrissa.trial.recording import recorded_objects
 from vibrissa.whisker import Whisker
 
 Array = NDArray[np.float64]
@@ -45,7 +47,6 @@ _FITS: dict[str, Callable[..., FittedShape]] = {
     "plane": fit_plane,
     "free": fit_free,
 }
-_EACH = ("time", "whisker")
 
 
 def reconstruct(
@@ -92,13 +93,13 @@ def reconstruct(
     if shape not in get_args(Shape):
         raise ValueError(f"shape is {shape!r}; one of {', '.join(get_args(Shape))} is needed")
     estimates = estimates_in(recording)
-    whiskers = _whiskers(recording, estimates) if whiskers is None else whiskers
+    whiskers = whiskers_in(recording) if whiskers is None else whiskers
     known = recorded_objects(recording) if objects is None else tuple(objects)
     fit = fit_contacts(estimates, whiskers, shape, axis=axis)
     together = frames_together(_scores(fit, estimates))
     fit = _less_sure(fit, together)
-    each = {n: estimates[n].variable for n in _EACH if n in estimates.coords}
-    out = fit.to_dataset(_EACH, tuple(estimates.sizes[n] for n in _EACH), each)
+    each = {n: estimates[n].variable for n in EACH if n in estimates.coords}
+    out = fit.to_dataset(EACH, tuple(estimates.sizes[n] for n in EACH), each)
     out.attrs |= {"reference_frame": "laboratory", "frames_together": together}
     out.attrs |= {n: estimates.attrs[n] for n in ("signals", "source") if n in estimates.attrs}
     if known:
@@ -112,7 +113,7 @@ def _scores(fit: FittedShape, estimates: xr.Dataset) -> Array:
     variance = np.einsum("ni,nij,nj->n", normal, spread, normal) + SOLVED_TO**2
     scores = fit.residuals / np.sqrt(np.where(np.isfinite(variance), variance, 1.0))
     scores[~fit.inliers] = np.nan
-    return scores.reshape(tuple(estimates.sizes[name] for name in _EACH))
+    return scores.reshape(tuple(estimates.sizes[name] for name in EACH))
 
 
 def _less_sure(fit: FittedShape, together: float) -> FittedShape:
@@ -227,29 +228,6 @@ def fit_contacts(
         ) from None
 
 
-def whisker_radii(estimates: xr.Dataset, whiskers: Sequence[Whisker]) -> Array:
-    """Give the whiskers' radii where they touch.
-
-    Parameters
-    ----------
-    estimates : xarray.Dataset
-        Dims time, whisker: ``arc_length``.
-    whiskers : sequence of Whisker
-        One for each.
-
-    Returns
-    -------
-    array (time, whisker)
-        m; NaN where the arc length is.
-    """
-    arc_length = estimates["arc_length"].transpose(*_EACH).values
-    radius = np.full(arc_length.shape, np.nan)
-    for k, whisker in enumerate(whiskers):
-        known = np.isfinite(arc_length[:, k])
-        radius[known, k] = whisker.radius(arc_length[known, k])
-    return radius
-
-
 def contour_points(recording: xr.DataTree, whiskers: Sequence[Whisker] | None = None) -> xr.Dataset:
     """List the contacts of all whiskers as points of a contour, laboratory frame.
 
@@ -274,7 +252,7 @@ def contour_points(recording: xr.DataTree, whiskers: Sequence[Whisker] | None = 
         If there are no estimates.
     """
     estimates = estimates_in(recording)
-    known = _whiskers(recording, estimates) if whiskers is None else whiskers
+    known = whiskers_in(recording) if whiskers is None else whiskers
     point = _rows(estimates["contact_point"])
     normal = _rows(estimates["contact_normal"])
     radius = whisker_radii(estimates, known).reshape(-1, 1)
@@ -292,41 +270,9 @@ def contour_points(recording: xr.DataTree, whiskers: Sequence[Whisker] | None = 
     return xr.Dataset({column: ("contact", v[there]) for column, v in columns.items()})
 
 
-def estimates_in(recording: xr.DataTree) -> xr.Dataset:
-    """Find the estimates in a recording.
-
-    Parameters
-    ----------
-    recording : xarray.DataTree
-        The recording.
-
-    Returns
-    -------
-    xarray.Dataset
-        Its group ``estimates``.
-
-    Raises
-    ------
-    ValueError
-        If it has none.
-    """
-    group = recording.children.get("estimates")
-    if group is None:
-        got = ", ".join(sorted(recording.children)) or "no groups"
-        raise ValueError(
-            f"the recording has no group estimates (it has {got}): make them first, by "
-            "estimates_of or `vibrissa estimate`"
-        )
-    return group.to_dataset()
-
-
-def _whiskers(recording: xr.DataTree, estimates: xr.Dataset) -> list[Whisker]:
-    return [recorded_whisker(recording, k) for k in range(estimates.sizes["whisker"])]
-
-
 def _rows(variable: xr.DataArray) -> Array:
     """Values (frames × whiskers, ...)."""
-    values = variable.transpose(*_EACH, ...).values
+    values = variable.transpose(*EACH, ...).values
     return np.asarray(values.reshape(-1, *values.shape[2:]))
 
 
@@ -337,15 +283,14 @@ def _compared(
     objects: Sequence[Surface],
 ) -> dict[str, Any]:
     """Distances of contacts from the known object nearest to them, and of the fit from it."""
-    points = estimates["contact_point"].transpose(*_EACH, "space").values
-    radius = whisker_radii(estimates, whiskers)
+    number = nearest_object(estimates, whiskers, objects)
+    points = estimates["contact_point"].transpose(*EACH, "space").values
     there = np.isfinite(points).all(axis=-1)
-    gaps = np.full((len(objects), *there.shape), np.nan)
-    for i, thing in enumerate(objects):
-        gaps[i, there] = thing.signed_distance(points[there]) - radius[there]
-    number = int(np.argmin(np.nanmedian(np.abs(gaps), axis=(1, 2))))
+    gap = np.full(there.shape, np.nan)
+    gap[there] = objects[number].signed_distance(points[there])
+    gap -= whisker_radii(estimates, whiskers)
     about = attributes("object_distance") | {"object": number}
-    out: dict[str, Any] = {"object_distance": (_EACH, gaps[number], about)}
+    out: dict[str, Any] = {"object_distance": (EACH, gap, about)}
     true = objects[number]
     if isinstance(true, Peg) and isinstance(fit, CylinderFit):
         offset, tilt = axis_offset(fit.origin, fit.axis, true.origin, true.axis)

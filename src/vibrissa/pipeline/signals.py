@@ -27,6 +27,7 @@ from vibrissa.pipeline.frames import (
     names_of,
     needed,
     one_whisker,
+    whiskers_in,
     with_coordinates,
 )
 from vibrissa.pipeline.locate import FELT
@@ -36,7 +37,6 @@ from vibrissa.rod.reach import PROXIMAL
 from vibrissa.sensing import Sensor
 from vibrissa.status import Status
 from vibrissa.tracking.filtering import CUTOFF
-from vibrissa.trial.recording import recorded_whisker
 from vibrissa.whisker import Whisker
 
 Array = NDArray[np.float64]
@@ -99,7 +99,7 @@ def signals_of(
     if chosen == "rod":
         return _by_rod(root)
     count = root.sizes["whisker"]
-    known = [recorded_whisker(recording, k) for k in range(count)] if whiskers is None else whiskers
+    known = whiskers_in(recording) if whiskers is None else whiskers
     needed(root, ("contact_point",), "contact point")
     if len(known) != count:
         raise ValueError(f"{len(known)} whiskers are given; the recording has {count}")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from vibrissa.status import Status
-from vibrissa.tracking import TraceOptions, find_whiskers, ridge, trace_video
+from vibrissa.tracking import Trace, TraceOptions, find_whiskers, ridge, trace_video
 from vibrissa.tracking.ends import traced
 
 
@@ -132,6 +132,26 @@ def test_corrected_frames_are_taken_and_followed_both_ways():
     for i, trace in enumerate(row):
         expected = np.interp(trace.line[:, 0], np.arange(200), two_lines(shifts[i])[1][1])
         assert np.median(np.abs(trace.line[:, 1] - expected)) < 0.1
+
+
+def test_what_is_done_is_gone_on_with_as_if_it_never_stopped(filmed):
+    """Stopped after 15 frames, of which one showed nothing; then with whiskers never seen."""
+    frames = [frame.copy() for frame in filmed.frames[0][:25]]
+    frames[13][:] = 190
+    base = filmed.truth["trace"].values[0, 0, 0]
+    (whole,) = trace_video(frames, [base])
+    begun = [whole[:15]]
+    for bases in ([base], None):
+        (again,) = trace_video(frames, bases, begun=begun)
+        for a, b in zip(again[:15], whole[:15], strict=True):
+            assert a is b
+        for a, b in zip(again, whole, strict=True):
+            np.testing.assert_allclose(a.line, b.line, atol=1e-3)
+    lost = [Trace.lost()] * 15
+    found = trace_video(frames, [base, base + 60.0], begun=[whole[:15], lost])
+    assert len(found[0][-1].line)
+    with pytest.raises(ValueError, match="show no whisker"):
+        trace_video(frames, begun=[lost])
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -78,7 +78,10 @@ def trace_video(
     for i, frame in enumerate(frames):
         if i == 0:
             if done:
-                followers = [_resumed(row, options) for row in begun]
+                starts = bases if bases is not None else [None] * len(begun)
+                followers = [
+                    _resumed(row, base, options) for row, base in zip(begun, starts, strict=True)
+                ]
             else:
                 followers = [start_at(base, options) for base in _bases(frame, bases, options)]
             traces[:] = [list(row) for row in begun] or [[] for _ in followers]
@@ -109,14 +112,18 @@ def _bases(
     return [found[0].trace.line[0]]
 
 
-def _resumed(row: Sequence[Trace], options: TraceOptions) -> Follower:
-    """Go on after traces that are done."""
-    seen = [trace for trace in row if len(trace.line)]
-    if not seen:
+def _resumed(row: Sequence[Trace], base: ArrayLike | None, options: TraceOptions) -> Follower:
+    """Go on after traces that are done, as if they had just been made."""
+    if base is None:
+        base = next((trace.line[0] for trace in row if len(trace.line)), None)
+    if base is None:
         raise ValueError("the frames that were traced before show no whisker")
-    follower = Follower(seen[-1].line[0], options)
-    for trace in seen[-2:]:
-        follower.restart(trace)
+    follower = start_at(base, options)
+    for trace in row:
+        if len(trace.line):
+            follower.accept(trace)
+        else:
+            follower.lose()
     return follower
 
 

@@ -140,11 +140,22 @@ def _sphere(thing: xr.Dataset, limits: Array) -> Array:
 def _peg(thing: xr.Dataset, limits: Array) -> Array:
     axis, origin = thing["object_axis"].values, _mm(thing, "object_position")
     first, second = _across(axis)
-    middle, half = limits.mean(axis=1), np.linalg.norm(np.ptp(limits, axis=1))
-    middle = origin + ((middle - origin) @ axis) * axis
+    ends = _within(limits, origin, axis)
     turn = np.linspace(0.0, 2.0 * np.pi, 49)[:, None]
     ring = _mm(thing, "object_radius") * (np.cos(turn) * first + np.sin(turn) * second)
-    return _quilt(middle + np.array([-half, half])[:, None, None] * axis + ring)
+    return _quilt(origin + ends[:, None, None] * axis + ring)
+
+
+def _within(limits: Array, origin: Array, axis: Array) -> Array:
+    """From where to where (2,) a line is seen; if nowhere, where it comes nearest to the middle."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = np.sort((limits - origin[:, None]) / axis[:, None], axis=1)
+    crossing = np.abs(axis) > 1e-9
+    first, last = ends[crossing, 0].max(), ends[crossing, 1].min()
+    if first < last:
+        return np.array([first, last])
+    middle = float((limits.mean(axis=1) - origin) @ axis)
+    return np.asarray(middle + 0.5 * np.ptp(limits, axis=1).max() * np.array([-1.0, 1.0]))
 
 
 def _plane(thing: xr.Dataset, limits: Array) -> Array:

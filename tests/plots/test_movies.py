@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 import vibrissa as vb
 from vibrissa.cli import filming
 from vibrissa.cli.app import app, main
+from vibrissa.cli.trial_views import sights_of
 from vibrissa.io import save_recording, video_frames, video_info, write_movie, write_video
 from vibrissa.plots import Sight, contour_frames, course_of, signal_frames
 from vibrissa.plots.contour_movie import _SIDE_BOXES, _SIGHT_BOXES
@@ -214,6 +215,22 @@ def test_videos_are_shown(known, trial, tmp_path):
         row, column = int(SIZE[1] - bottom - 0.9 * tall), int(left + 0.5 * wide)
         seen = [int(frame[row, column]) for frame in frames]
         np.testing.assert_allclose(seen, grey + np.arange(2, 5), atol=2.0)
+
+
+def test_frames_are_those_that_belong_to_the_times(known, tmp_path):
+    trial = known.recording()
+    late = np.stack([np.arange(12), np.arange(12) + 3], axis=1)
+    trial.dataset = trial.to_dataset().assign(frame=(("time", "view"), late))
+    videos = []
+    for view in known.views:
+        videos.append(tmp_path / f"{view.name}.mkv")
+        write_video(videos[-1], repeat_frames(50, 15))
+    sights = sights_of(trial, course_of(trial), videos, np.array([0, 5, 11]))
+    shown = [[int(image[0, 0]) for image in sight.images] for sight in sights]
+    assert shown == [[50, 55, 61], [53, 58, 64]]
+    write_video(videos[1], repeat_frames(50, 14))
+    with pytest.raises(ValueError, match="has 14 frames; frame 14 is needed"):
+        sights_of(trial, course_of(trial), videos, np.array([0, 11]))
 
 
 def repeat_frames(grey, count):

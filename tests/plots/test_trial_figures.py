@@ -243,12 +243,14 @@ def test_the_verb_draws_a_trial(known, tmp_path):
 def test_the_verb_says_what_a_trial_lacks(known, tmp_path):
     path = tmp_path / "trial.nc"
     save_recording(path, known.recording(signals=False, estimates=False))
-    done = run(path, "-o", tmp_path / "out", "--format", "png")
+    done = run(path, "-o", tmp_path / "out", "--format", "png", "--colour", "deflection")
     said = " ".join(done.output.split())
     assert done.exit_code == 0, done.output
     assert f"no signals: `vibrissa signals {path}` makes them" in said
     assert f"no estimated contacts: `vibrissa estimate {path}` makes them" in said
     names = {file.stem for file in (tmp_path / "out").iterdir()}
     assert names == {"whisker", "contact_places", "contour"}
+    wrong = run(path, "-o", tmp_path / "out", "--colour", "size")
+    assert "--colour is 'size'" in str(wrong.exception)
     refused = run(path, "-o", tmp_path / "out", "--cones", path)
     assert isinstance(refused.exception, ValueError)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 Draw = Callable[[], Any]
 _FORMATS = ("png", "pdf", "svg")
 _WIDTHS = ("single", "double")
+_COLOURS = ("time", "deflection")
 _NODES = 101
 _AGREE = 1e-6
 """How closely signals of a saved witness must agree with those of the map's whisker."""
@@ -65,6 +66,9 @@ def figures(
         typer.Option("--map", help="Of a trial's whisker; simulated by default.", metavar="MAP"),
     ] = None,
     whisker: Annotated[int, typer.Option(help="Of a trial: which whisker, from 0.")] = 0,
+    colour: Annotated[
+        str, typer.Option(help="Of a trial's contacts in both frames: time or deflection.")
+    ] = "time",
 ) -> None:
     """Draw the figures that a map or a trial allows.
 
@@ -75,6 +79,8 @@ def figures(
     whiskers, and what they touch. Example: `vibrissa figures map.nc -o figures --width single`
     """
     endings = _chosen(formats, width)
+    if colour not in _COLOURS:
+        raise ValueError(f"--colour is {colour!r}; one of {', '.join(_COLOURS)} is needed")
     from vibrissa.cli.array_figures import array_drawings
     from vibrissa.cli.sources import map_from
     from vibrissa.cli.trial_figures import trial_drawings
@@ -89,7 +95,7 @@ def figures(
         drawings = array_drawings(path, width)
         if not path.is_dir() and recognise(path) == Kind.RECORDING:
             _refuse({"--uniqueness": uniqueness, "--cones": cones}, f"{path} is a recording")
-            drawings |= trial_drawings(path, width, videos or [], chart, whisker, tell)
+            drawings |= trial_drawings(path, (width, colour), videos or [], chart, whisker, tell)
         else:
             _refuse({"--video": videos, "--map": chart}, f"{path} is no recording")
         if not drawings:

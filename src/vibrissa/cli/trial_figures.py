@@ -22,7 +22,7 @@ _NODES = 101
 
 def trial_drawings(
     path: Path,
-    width: Any,
+    look: tuple[Any, str],
     videos: Sequence[Path],
     chart: Path | None,
     whisker: int,
@@ -34,8 +34,9 @@ def trial_drawings(
     ----------
     path : Path
         Of the recording.
-    width : {"single", "double"}
-        Columns of the page.
+    look : tuple of str
+        Columns of the page, "single" or "double", and what colours contacts in both frames, "time"
+        or "deflection".
     videos : sequence of Path
         One for each view, or none.
     chart : Path or None
@@ -65,9 +66,9 @@ def trial_drawings(
     course = course_of(trial, whisker)
     _say_what_is_lacking(course, path)
     bent = recorded_whisker(trial, whisker)
-    drawings = dict(_of_contacts(trial, course, bent, width))
+    drawings = dict(_of_contacts(trial, course, bent, look))
     if course.signals is not None:
-        drawings |= _of_signals(trial, course, bent, width, (videos, chart, whisker, tell))
+        drawings |= _of_signals(trial, course, bent, look[0], (videos, chart, whisker, tell))
     return drawings
 
 
@@ -84,7 +85,7 @@ def _say_what_is_lacking(course: Course, path: Path) -> None:
 
 
 def _of_contacts(
-    trial: xr.DataTree, course: Course, whisker: Whisker, width: Any
+    trial: xr.DataTree, course: Course, whisker: Whisker, look: tuple[Any, str]
 ) -> Iterator[tuple[str, Draw]]:
     """Figures of the whisker and of contact points."""
     from vibrissa import plots
@@ -93,6 +94,8 @@ def _of_contacts(
     from vibrissa.mapping.contact_map import spherical
     from vibrissa.trial import Peg
 
+    width, colour = look
+    by: Any = "time" if colour == "time" else "deflection_angle"
     line = whisker.centerline(_NODES)
     radius = whisker.radius(np.linspace(0.0, whisker.length, _NODES))
     yield "whisker", lambda: plots.whisker_views(line, radius, name=whisker.name, width=width)
@@ -104,7 +107,7 @@ def _of_contacts(
         fit = next((shape for shape in fits if isinstance(shape, CylinderFit)), None)
         yield (
             "contact_places",
-            lambda: plots.contact_places(course, line, bodies, fits, width=width),
+            lambda: plots.contact_places(course, line, bodies, fits, colour=by, width=width),
         )
         yield (
             "contour",

@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike
 
 from vibrissa.plots.style import MUTED, ORANGE, Array
 
-_CELLS, _STEPS = 121, 300
-_DEEP = 4.0
+_CELLS, _COARSE = 121, 4
 _FULL = 0.97
 """Share of a panel from which an object is taken to fill it, so that it is no use drawing it."""
 
@@ -44,7 +43,7 @@ def draw_body(axes: Axes, body: Body, view: tuple[int, int], limits: Array, look
     right, up = (np.linspace(limits[n, 0], limits[n, 1], _CELLS) for n in view)
     points: Array = np.empty((_CELLS, _CELLS, 3))
     points[..., i], points[..., j] = right, up[:, None]
-    nearest = _nearest(body, points.reshape(-1, 3), limits, 3 - i - j).reshape(_CELLS, _CELLS)
+    nearest = _nearest(body, points, limits, 3 - i - j)
     if not 0.0 < np.mean(nearest < 0.0) < _FULL:
         return
     if look == "true":
@@ -57,12 +56,34 @@ def draw_body(axes: Axes, body: Body, view: tuple[int, int], limits: Array, look
 
 
 def _nearest(body: Body, points: Array, limits: Array, depth: int) -> Array:
+    """Least distance from a body along lines of sight through points (m, m, 3), mm.
+
+    Finely only where the outline is near: some bodies take their time to tell distances.
+    """
+    from scipy.interpolate import RegularGridInterpolator
+
+    rough = np.arange(0, _CELLS, _COARSE)
+    corners = points[np.ix_(rough, rough)]
+    cell = float(np.ptp(corners[:2, :2].reshape(-1, 3), axis=0).max())
+    coarse = _marched(body, corners.reshape(-1, 3), limits, depth, 2.0 * cell)
+    table = RegularGridInterpolator((rough, rough), coarse.reshape(rough.size, rough.size))
+    rows, columns = np.indices((_CELLS, _CELLS))
+    nearest = np.asarray(table((rows, columns)), dtype=np.float64)
+    # Within a cell a distance changes by no more than the way.
+    near = np.abs(nearest) < 1.5 * cell
+    nearest[near] = _marched(body, points[near], limits, depth, 2.0 * cell)
+    return nearest
+
+
+def _marched(body: Body, points: Array, limits: Array, depth: int, deep: float) -> Array:
     """Least distance from a body along lines of sight through points (n, 3), mm.
 
-    The distance to a body is also how far one may go without meeting it, so few steps lead past it.
+    Lines that go as deep into the body as ``deep`` are followed no farther. The distance to a body
+    is also how far one may go without meeting it, so few steps lead past it.
     """
     start, end = limits[depth]
-    least_step = (end - start) / _STEPS
+    least_step = 0.25 * deep
+    points = points.copy()
     at = np.full(len(points), start)
     least = np.full(len(points), np.inf)
     active = np.arange(len(points))
@@ -71,8 +92,7 @@ def _nearest(body: Body, points: Array, limits: Array, depth: int) -> Array:
         distance = 1e3 * body.signed_distance(1e-3 * points[active])
         least[active] = np.minimum(least[active], distance)
         at[active] += np.maximum(np.abs(distance), least_step)
-        # Inside nothing more is to be known but how deep: as deep as a cell is enough.
-        active = active[(at[active] <= end) & (least[active] > -_DEEP * least_step)]
+        active = active[(at[active] <= end) & (least[active] > -deep)]
     return least
 
 

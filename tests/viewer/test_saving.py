@@ -4,12 +4,14 @@ import numpy as np
 import xarray as xr
 
 import vibrissa as vb
+from vibrissa.io import load_recording
 from vibrissa.viewer.bending import begin
 from vibrissa.viewer.saving import (
     deflection_dataset,
     map_netcdf,
     netcdf,
     png,
+    recording_netcdf,
     whisker_csv,
     whisker_netcdf,
 )
@@ -42,6 +44,13 @@ def test_a_map_comes_back(tmp_path):
     (tmp_path / "map.nc").write_bytes(map_netcdf(contacts))
     back = vb.ContactMap.load(tmp_path / "map.nc")
     np.testing.assert_array_equal(back.chart.values, contacts.chart.values)
+
+
+def test_a_trial_comes_back(tmp_path, recording):
+    (tmp_path / "trial.nc").write_bytes(recording_netcdf(recording))
+    back = load_recording(tmp_path / "trial.nc")
+    assert set(back.children) == set(recording.children)
+    np.testing.assert_array_equal(back["force"], recording["force"])
 
 
 def test_a_picture_is_a_png():

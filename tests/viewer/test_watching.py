@@ -184,3 +184,23 @@ def test_a_recording_without_frames_is_refused():
     empty = xr.DataTree(xr.Dataset(coords={"time": np.empty(0), "whisker": ["a"]}))
     with pytest.raises(ValueError, match="no frames"):
         watched(empty)
+
+
+def test_several_whiskers_are_drawn_each_in_its_colour(recording):
+    both = {"/": recording.to_dataset(), "/truth": recording["truth"].to_dataset(inherit=False)}
+    both = {
+        name: xr.concat([data, data], "whisker", data_vars="minimal") for name, data in both.items()
+    }
+    both["/"] = both["/"].assign_coords(whisker=["left", "right"])
+    groups = {**both, "/objects": recording["objects"].to_dataset(inherit=False)}
+    groups["/objects/0"] = recording["objects/0"].to_dataset(inherit=False)
+    for k in "01":
+        groups[f"/whiskers/{k}"] = recording["whiskers/0"].to_dataset(inherit=False)
+    trial = watched(xr.DataTree.from_dict(groups))
+    assert trial.names == ("left", "right")
+    frame = trial.next_contact(0) + 3
+    drawn = moment_drawing(trial, frame, 5.0)
+    assert {"whisker 0", "whisker 1", "contact 0", "contact 1"} <= drawn.keys()
+    cloud = touched(trial, frame)["contacts"]
+    assert len(cloud.points) == 2 * int(trial.felt[: frame + 1, 0].sum())
+    assert len(np.unique(cloud.colours, axis=0)) == 2

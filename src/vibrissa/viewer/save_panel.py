@@ -15,6 +15,7 @@ from vibrissa.viewer.saving import (
     map_netcdf,
     netcdf,
     png,
+    recording_netcdf,
     whisker_csv,
     whisker_netcdf,
 )
@@ -59,7 +60,7 @@ class SaveControls:
         page, recording = self._page, self._recording
         mode = "" if page.mode is None else page.mode.name
         if mode == "Trial" and recording is not None:
-            return "trial.nc", lambda: netcdf(recording)
+            return "trial.nc", lambda: recording_netcdf(recording)
         chart = page.chart
         if mode == "Map" and chart is not None:
             return "map.nc", lambda: map_netcdf(chart.contacts)

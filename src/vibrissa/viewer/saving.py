@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from vibrissa.io import save_centerline
+from vibrissa.io import save_centerline, save_recording
 from vibrissa.mapping import ContactMap
 from vibrissa.quantities import attributes
 from vibrissa.rod import Deflection
@@ -36,7 +36,12 @@ def map_netcdf(contacts: ContactMap) -> bytes:
     return _written("map.nc", contacts.save)
 
 
-def netcdf(data: xr.Dataset | xr.DataTree) -> bytes:
+def recording_netcdf(recording: xr.DataTree) -> bytes:
+    """A trial with all its groups, which every verb reads."""
+    return _written("trial.nc", lambda path: save_recording(path, recording))
+
+
+def netcdf(data: xr.Dataset) -> bytes:
     """A dataset as a file."""
     return _written("data.nc", lambda path: data.to_netcdf(path, engine="h5netcdf"))
 

@@ -301,7 +301,7 @@ def estimated(
         How they were estimated.
     """
     from vibrissa.cli.feeling import signal_options
-    from vibrissa.cli.recordings import maps_from, maps_of, noise_from, whiskers_for
+    from vibrissa.cli.recordings import maps_from, noise_from, say, whiskers_for
     from vibrissa.pipeline import sensor_noise, with_estimates, with_signals
     from vibrissa.sensing import FORCE_NOISE
     from vibrissa.tracking.filtering import CUTOFF
@@ -317,7 +317,9 @@ def estimated(
         _check_scale(name, signals.isel(whisker=k), whisker)
     all_six = how.all_six or (how.names is None and signals.attrs.get("source") == "rod")
     if not maps and not all_six:
-        maps = maps_of(whiskers, tell, how.grid)
+        one = f"no map given; simulating that of {whiskers[0]!r}"
+        several = "no maps given; simulating those of the whiskers that feel a contact"
+        say(one if len(whiskers) == 1 else several)
     options: dict[str, Any] = {"contact_maps": maps} if maps else {"whiskers": whiskers}
     done = with_estimates(
         tree,

@@ -4,9 +4,11 @@ from vibrissa.mapping.best_triplet import best_triplet
 from vibrissa.mapping.cones import critical_cones
 from vibrissa.mapping.contact_map import ContactMap
 from vibrissa.mapping.estimate import Estimate
-from vibrissa.mapping.estimator import Estimator, Located
+from vibrissa.mapping.estimator import Estimator
 from vibrissa.mapping.findings import sensitivity_findings
-from vibrissa.mapping.following import ContactFilter, Followed
+from vibrissa.mapping.following import ContactFilter
+from vibrissa.mapping.hypotheses import Followed
+from vibrissa.mapping.located import Located
 from vibrissa.mapping.lookup import LookupTable
 from vibrissa.mapping.natural import NaturalNeighbour
 from vibrissa.mapping.network import NetworkSolver, train_network

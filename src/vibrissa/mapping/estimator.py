@@ -12,7 +12,7 @@ Fewer than three signals leave a curve or a surface of contacts: see
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,9 +22,11 @@ from vibrissa.mapping.explanation import why_none
 from vibrissa.mapping.fitting import Fits, charted
 from vibrissa.mapping.inversion import polish
 from vibrissa.mapping.least_squares import by_doubt
+from vibrissa.mapping.located import Explanations, Located
 from vibrissa.mapping.minima import same
 from vibrissa.mapping.noise import sensor_noise
 from vibrissa.mapping.readout import Measurement, Mixed, Named, independent
+from vibrissa.mapping.sensor_readout import ByName, readout_of
 from vibrissa.mapping.uncertainty import point_covariances
 from vibrissa.mapping.weighing import explain, spread
 from vibrissa.mapping.whitening import INDISTINCT, explained
@@ -33,9 +35,9 @@ from vibrissa.rod.batch import solve_forces
 from vibrissa.rod.kernels import evaluate
 from vibrissa.rod.newton import ROUNDING, TOLERANCE
 from vibrissa.rod.reach import LEAST_ARC
-from vibrissa.sensing import COMPONENTS, Sensor
+from vibrissa.sensing import Sensor
 from vibrissa.sensing.sensor import GRAVITY
-from vibrissa.signals import SIGNALS, selection
+from vibrissa.signals import selection
 from vibrissa.status import Status
 
 if TYPE_CHECKING:
@@ -48,64 +50,6 @@ _UNKNOWNS = 3
 _FLAT = 0.02
 # Unknowns of a contact without friction, among all.
 _FREE = [0, 2, 3]
-# Components that together are signals; a sensor that reads these reads signals by name.
-_BY_NAME = (("Fx",), ("Fy", "Fz"), ("Mx",), ("My", "Mz"))
-
-
-class Located(NamedTuple):
-    """What one measurement tells.
-
-    Parameters
-    ----------
-    point : (3,) array
-        Contact point of the most plausible candidate, whisker frame, m; NaN if there is none.
-    status : Status
-        ``UNIQUE``, ``AMBIGUOUS``, ``NOT_FRICTIONLESS`` (no contact on the map explains it; of more
-        than three signals ``point`` is the one that comes nearest), ``OUTSIDE_MAP``,
-        ``DEGENERATE`` or ``MISSING``, as in :class:`Estimate`. Of fewer than three signals
-        ``UNDERDETERMINED``: the candidates are samples of the curve or surface of contacts that
-        explain them, ``point`` the one in their middle.
-    candidates : (k, 3) array
-        All contact points, in the order of :class:`Estimate`, m.
-    arc_lengths : (k,) array
-        Their arc lengths, m.
-    covariance : (3, 3) array
-        Covariance of ``point``, m²; NaN without noise. Of fewer than three signals that of the
-        samples about it.
-    misfit : float
-        As in :class:`Estimate`.
-    continuing : int
-        Number of the candidate that goes on from the measurement before; 0 where there was none.
-    forces : (k, 3) array
-        Base forces of the candidates, whisker frame, N.
-    covariances : (k, 3, 3) array
-        Covariances of all candidates, m²; NaN without noise.
-    contact_forces : (k, 3) array
-        Forces in the material frame at the contacts (tangent, d1, d2), N; the first is 0.
-    """
-
-    point: Array
-    status: Status
-    candidates: Array
-    arc_lengths: Array
-    covariance: Array
-    misfit: float
-    continuing: int
-    forces: Array
-    covariances: Array
-    contact_forces: Array
-
-
-class Explanations(NamedTuple):
-    """Contacts that explain one measurement about as well as noise allows, non-dimensional.
-
-    Contacts x (n, 4), (F, p) (n, 6), covariances (n, 3, 3), NaN where not determined, and χ² (n,).
-    """
-
-    contacts: Array
-    values: Array
-    covariances: Array
-    misfits: Array
 
 
 class Estimator:
@@ -188,7 +132,7 @@ class Estimator:
             raise ValueError(f"readings are weighed by their noise; {', '.join(silent)} has none")
         if not h.any():
             raise ValueError("the sensor's channels read nothing of force and moment")
-        readout = _by_name(contacts, h, covariance, stiffness_sigma)
+        readout = readout_of(contacts, h, covariance, stiffness_sigma)
         out._order = None
         out._start(contacts, readout, len(sensor.channels), felt_above)
         out._sensor = sensor
@@ -197,14 +141,14 @@ class Estimator:
     def _start(
         self,
         contacts: ContactMap,
-        readout: _ByName | Named | Mixed,
+        readout: ByName | Named | Mixed,
         width: int,
         felt_above: float,
     ) -> None:
         self.felt_above = float(felt_above)
         self._sensor: Sensor | None = None
-        self._components = readout if isinstance(readout, _ByName) else None
-        self.readout = readout.named if isinstance(readout, _ByName) else readout
+        self._components = readout if isinstance(readout, ByName) else None
+        self.readout = readout.named if isinstance(readout, ByName) else readout
         self._width = width
         self.contacts, self._chart = contacts, contacts.chart
         told = self.readout.told
@@ -608,53 +552,3 @@ def _close(a: Array, b: Array) -> bool:
 
 def _those(fits: Fits, rows: AnyArray) -> Fits:
     return fits if rows.all() else Fits(*(part[rows] for part in fits))
-
-
-class _ByName:
-    """A sensor whose channels tell whole signals: its readings as those."""
-
-    def __init__(self, named: Named, back: Array, places: list[int]) -> None:
-        self.named, self._back, self._places = named, back, places
-        self._wrench = np.zeros(6)
-
-    def signals(self, values: Array) -> Array:
-        """Turn readings (k,) into the signals."""
-        w = self._wrench
-        w[self._places] = self._back @ values
-        fx, fy, fz, mx, my, mz = w.tolist()
-        known = {
-            "Fx": fx,
-            "FT": float(np.hypot(fy, fz)),
-            "FD": float(np.arctan2(fz, fy)),
-            "Mx": mx,
-            "MB": float(np.hypot(my, mz)),
-            "MD": float(np.arctan2(mz, my)),
-        }
-        return np.array([known[name] for name in self.named.names])
-
-
-def _by_name(
-    contacts: ContactMap, h: Array, covariance: Array, stiffness: float
-) -> _ByName | Mixed:
-    """Signals by name if the channels tell these and nothing else, or a mix."""
-    read = [name for name, column in zip(COMPONENTS, h.T, strict=True) if column.any()]
-    whole = [group for group in _BY_NAME if set(group) <= set(read)]
-    places = [COMPONENTS.index(name) for name in read]
-    own = h[:, places]
-    complete = sum(map(len, whole)) == len(read) and len(read) >= _UNKNOWNS
-    if not complete or np.linalg.matrix_rank(own / np.linalg.norm(own, axis=0)) < len(read):
-        return Mixed(contacts, h, covariance, stiffness)
-    root = np.linalg.inv(np.linalg.cholesky(covariance))
-    back = np.linalg.pinv(root @ own) @ root
-    wrench = np.zeros((6, 6))
-    wrench[np.ix_(places, places)] = back @ covariance @ back.T
-    names = {
-        ("Fx",): ("Fx",),
-        ("Fy", "Fz"): ("FT", "FD"),
-        ("Mx",): ("Mx",),
-        ("My", "Mz"): ("MB", "MD"),
-    }
-    chosen = [name for group in whole for name in names[group]]
-    signals = tuple(name for name in SIGNALS if name in chosen)
-    noise = sensor_noise(0.5 * (wrench + wrench.T), signals, stiffness)
-    return _ByName(Named(contacts, signals, noise), np.asarray(back, dtype=np.float64), places)

@@ -24,15 +24,23 @@ depends on it, b = ∂(p, v)/∂log(EI), is carried along, and σ²bbᵀ is part
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.mapping.channels import CHANNELS, channel_derivatives, channel_gradients
-from vibrissa.mapping.estimator import Estimator, Explanations, Located
+from vibrissa.mapping.estimator import Estimator
 from vibrissa.mapping.fitting import Fits, charted, fit
+from vibrissa.mapping.hypotheses import (
+    VAGUE,
+    Followed,
+    Hypothesis,
+    bounded,
+    gaps_between,
+    linear,
+    same,
+)
+from vibrissa.mapping.located import Explanations, Located
 from vibrissa.mapping.minima import reliable, unknowns_covariance
 from vibrissa.mapping.readout import Measurement
 from vibrissa.mapping.weighing import weigh
@@ -48,80 +56,15 @@ _UNKNOWNS = 3
 _LEAST = 1e-6
 # At most so many are kept, and of a curve or surface of candidates so many start.
 _MOST = 24
-# Two points within this (Mahalanobis distance squared) are one.
-_ONE = 1.0
 # A candidate so far (the same) from every hypothesis is a new one.
 _NEW = 16.0
 # What is surer than this is no longer ambiguous.
 _SURE = 0.99
-# Errors of a contact's force and arc length (relative to the force, and to L) up to which noise
-# moves it about linearly; a light touch whose place is not known so well teaches nothing yet.
-_LINEAR_FORCE = 0.3
-_LINEAR_ARC = 0.1
-# Standard deviation, over L, with which a hypothesis starts that is not known so well.
-_VAGUE = 0.2
 # For so many samples after the first it is looked for all that noise may explain.
 _YOUNG = 20
 # Smallest standard deviation of a starting hypothesis, over L, so that matrices stay regular.
 _FINEST = 1e-7
 _PLACE = ("px", "py", "pz")
-
-
-class Followed(NamedTuple):
-    """What a filter knows after a sample.
-
-    Parameters
-    ----------
-    point : (3,) array
-        Contact point of the most probable hypothesis, laboratory frame, m; NaN if there is none.
-    covariance : (3, 3) array
-        Of the contact point about it, m²: of all hypotheses, weighed by their probabilities.
-    velocity : (3,) array
-        Of the contact point in the laboratory, m/s.
-    probability : float
-        Of that hypothesis, among those there are; 0 if there is none.
-    status : Status
-        ``UNIQUE`` where that is above 0.99, else ``AMBIGUOUS``; or why there is no contact.
-    points : (k, 3) array
-        Contact points of all hypotheses, the most probable first, laboratory frame, m.
-    probabilities : (k,) array
-        Theirs.
-    point_whisker : (3,) array
-        ``point`` in the whisker's frame, m.
-    located : Located or None
-        What this sample alone tells, where it was looked for: not of fewer than three signals that
-        a hypothesis explains.
-    """
-
-    point: Array
-    covariance: Array
-    velocity: Array
-    probability: float
-    status: Status
-    points: Array
-    probabilities: Array
-    point_whisker: Array
-    located: Located | None
-
-
-@dataclass
-class _Hypothesis:
-    """Gaussian over (p, v), laboratory, in L and L/s; ξ as x (4,); its log weight.
-
-    A vague one stands for a light touch whose place noise does not leave a Gaussian: it is put in
-    place anew by each sample, and keeps its share of the probability, until its place is known.
-    """
-
-    mean: Array
-    spread: Array
-    x: Array
-    weight: float
-    vague: bool = False
-    by_stiffness: Array = field(default_factory=lambda: np.zeros(6))
-
-    def total(self, stiffness: float) -> Array:
-        b = stiffness * self.by_stiffness
-        return np.asarray(self.spread + np.outer(b, b))
 
 
 class ContactFilter:
@@ -183,7 +126,7 @@ class ContactFilter:
 
     def reset(self) -> None:
         """Forget everything, as when the whisker has lost touch."""
-        self._hypotheses: list[_Hypothesis] = []
+        self._hypotheses: list[Hypothesis] = []
         self._time: float | None = None
         self._age = 0  # samples in a row that a hypothesis explained
         self.estimator.reset()
@@ -335,7 +278,7 @@ class ContactFilter:
 
     def _moved(
         self,
-        one: _Hypothesis,
+        one: Hypothesis,
         fits: Fits,
         i: int,
         weights: Array,
@@ -357,7 +300,7 @@ class ContactFilter:
             return False
         one.x = fits.contacts[i]
         told = self.estimator.readout.told >= _UNKNOWNS
-        if told and not _linear(by_point @ after @ by_point.T, one.x):
+        if told and not linear(by_point @ after @ by_point.T, one.x):
             one.vague = True
             return True
         ratio = np.linalg.slogdet(after)[1] - np.linalg.slogdet(before)[1]
@@ -409,14 +352,16 @@ class ContactFilter:
         number = len(found.contacts)
         if not number:
             return
-        gaps = _gaps(found.values[:, 3:]) if curve and number > 1 else np.zeros((number, 3, 3))
+        gaps = (
+            gaps_between(found.values[:, 3:]) if curve and number > 1 else np.zeros((number, 3, 3))
+        )
         before, first = self._hypotheses, not self._hypotheses
         self._hypotheses = [one for one in before if not one.vague]
         for x, value, own, misfit, gap in zip(*found, gaps, strict=True):
             known, by_stiffness = bool(np.isfinite(own).all()), np.zeros(6)
             if known and self._stiffness > 0.0:
                 own, by_stiffness[:3] = self._parts(measurement, x, value, turn)
-            covariance = _bounded(own) if known else _VAGUE**2 * np.eye(3)
+            covariance = bounded(own) if known else VAGUE**2 * np.eye(3)
             covariance = covariance + _FINEST**2 * np.eye(3) + gap
             point = turn @ value[3:] + base
             spread = turn @ covariance @ turn.T + self._pose
@@ -430,10 +375,10 @@ class ContactFilter:
             if its:
                 weight = float(np.logaddexp.reduce([one.weight for one in its]))
             whole = np.zeros((6, 6))
-            whole[:3, :3] = spread + (_VAGUE**2 * np.eye(3) if vague else 0.0)
+            whole[:3, :3] = spread + (VAGUE**2 * np.eye(3) if vague else 0.0)
             whole[3:, 3:] = self._speed**2 * np.eye(3)
             mean = np.concatenate([point, np.zeros(3)])
-            self._hypotheses.append(_Hypothesis(mean, whole, x, weight, vague, by_stiffness))
+            self._hypotheses.append(Hypothesis(mean, whole, x, weight, vague, by_stiffness))
 
     def _known_well(self, measurement: Measurement, x: Array, value: Array) -> bool:
         """Whether noise moves a contact about as its covariance says."""
@@ -458,7 +403,7 @@ class ContactFilter:
         d, k = self.estimator.contacts.chart.discretization, len(self._names)
         weights = np.zeros((k, k))
         if not weigh(self._quiet, value, measurement.measured, weights):
-            return _VAGUE**2 * np.eye(3), np.zeros(3)
+            return VAGUE**2 * np.eye(3), np.zeros(3)
         _, slope = solve_forces(d, x[None], tangents=True)
         force = np.hypot(x[2], x[3])
         unit = slope[0] * np.array([1.0, force, force])
@@ -468,7 +413,7 @@ class ContactFilter:
         grown = weights @ channel_gradients(value, self._names) @ wrench
         return np.asarray(root @ root.T), np.asarray(turn @ (root @ grown))
 
-    def _accounts(self, one: _Hypothesis, point: Array, spread: Array) -> bool:
+    def _accounts(self, one: Hypothesis, point: Array, spread: Array) -> bool:
         away = point - one.mean[:3]
         both = one.total(self._stiffness)[:3, :3] + spread
         return bool(away @ np.linalg.solve(both, away) < _NEW)
@@ -479,11 +424,11 @@ class ContactFilter:
             return
         ranked = sorted(self._hypotheses, key=lambda one: -one.weight)
         best = ranked[0].weight
-        kept: list[_Hypothesis] = []
+        kept: list[Hypothesis] = []
         for one in ranked:
             if one.weight < best + math.log(_LEAST) or len(kept) >= _MOST:
                 break
-            twin = next((other for other in kept if _same(one, other)), None)
+            twin = next((other for other in kept if same(one, other)), None)
             if twin is None:
                 kept.append(one)
             else:
@@ -526,33 +471,3 @@ class ContactFilter:
             turn.T @ (best.mean[:3] - base) * unit,
             located,
         )
-
-
-def _linear(covariance: Array, x: Array) -> bool:
-    """Whether a contact x with this covariance of ξ is known well enough to linearise about it."""
-    arc, force = covariance[0, 0], np.trace(covariance[1:, 1:])
-    size = x[2] ** 2 + x[3] ** 2
-    return bool(0.0 <= arc < _LINEAR_ARC**2 and 0.0 <= force < _LINEAR_FORCE**2 * size)
-
-
-def _bounded(covariance: Array) -> Array:
-    """A covariance with no standard deviation beyond that of a vague contact."""
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(vectors * np.clip(values, 0.0, _VAGUE**2) @ vectors.T)
-
-
-def _same(one: _Hypothesis, other: _Hypothesis) -> bool:
-    """Whether two hypotheses say the same: the less probable lies within the other's spread."""
-    away = one.mean[:3] - other.mean[:3]
-    return bool(away @ np.linalg.solve(other.spread[:3, :3], away) < _ONE)
-
-
-def _gaps(points: Array) -> Array:
-    """Covariances (n, 3, 3) with which samples of a curve or surface fill what lies between them.
-
-    Along the ways to the nearest two others, half way.
-    """
-    apart = points[None] - points[:, None]
-    order = np.argsort((apart**2).sum(axis=2), axis=1)[:, 1:3]
-    near = np.take_along_axis(apart, order[:, :, None], axis=1)
-    return np.asarray(0.25 * np.einsum("nki,nkj->nij", near, near) / near.shape[1])

@@ -41,7 +41,7 @@ def draw_body(axes: Axes, body: Body, view: tuple[int, int], limits: Array, look
     """
     i, j = view
     right, up = (np.linspace(limits[n, 0], limits[n, 1], _CELLS) for n in view)
-    points: Array = np.empty((_CELLS, _CELLS, 3))
+    points: Array = np.zeros((_CELLS, _CELLS, 3))
     points[..., i], points[..., j] = right, up[:, None]
     nearest = _nearest(body, points, limits, 3 - i - j)
     if not 0.0 < np.mean(nearest < 0.0) < _FULL:

@@ -19,9 +19,10 @@ from PIL import Image
 import vibrissa as vb
 from vibrissa import plots
 from vibrissa.cli.figures import witnesses
-from vibrissa.contour import shape_from_dataset
+from vibrissa.contour import compare_with, distances_by, shape_from_dataset
 from vibrissa.mapping import critical_cones, error_solid, signal_slice
 from vibrissa.pipeline import with_contour, with_estimates
+from vibrissa.signals import nearest_on_rest
 from vibrissa.trial import (
     array_whisking,
     facing_peg,
@@ -128,6 +129,56 @@ def touching_array() -> Figure:
     return plots.array_views(with_estimates(felt), contacts="estimates")
 
 
+def free_surface() -> Figure:
+    """A box that all whiskers of a face touch, and a surface of any shape through the contacts."""
+    rat = vb.whisker_array()
+    time = np.arange(500) / 1000
+    turn, place = head_path(time, to_position=[0, 14e-3, 0])
+    motions = array_whisking(rat, 0.5, 1000, head_rotation=turn, head_position=place)
+    box = within_reach(rat, "box")
+    felt = with_contour(measure(simulate(rat, motions, box)), "free")
+    estimates = felt["estimates"].to_dataset()
+    points = estimates["contact_point"].transpose("time", "whisker", "space").values
+    spread = estimates["contact_covariance"].transpose("time", "whisker", ...).values
+    when = np.repeat(time, points.shape[1])
+    return plots.contour_views(
+        points.reshape(-1, 3),
+        box,
+        shape_from_dataset(felt["contour"].to_dataset()),
+        colour=when,
+        colour_name="time",
+        covariance=spread.reshape(-1, 3, 3),
+    )
+
+
+def distances() -> Figure:
+    """Contacts of the trial from the peg that was touched."""
+    estimates = trial()["estimates"].to_dataset().isel(whisker=0)
+    whisker, (peg,) = chart().whisker, recorded_objects(trial())
+    own = estimates["contact_point_whisker"].values
+    away, along = nearest_on_rest(whisker, own)
+    arc_length = estimates["arc_length"].values
+    radius = np.full(arc_length.shape, np.nan)
+    known = np.isfinite(arc_length)
+    radius[known] = whisker.radius(arc_length[known])
+    compared = compare_with(
+        peg,
+        estimates["contact_point"].values,
+        estimates["contact_covariance"].values,
+        radius,
+        dims=("time",),
+    )
+    felt = trial()["signals"].to_dataset().isel(whisker=0)
+    classes = np.radians([0.0, 5.0, 10.0, 15.0, 90.0])
+    return plots.distances_by_class(
+        [
+            distances_by(compared, "deflection_angle", np.arctan2(away, along), classes),
+            distances_by(compared, "r", np.linalg.norm(own, axis=-1)),
+            distances_by(compared, "MB", felt["MB"].values),
+        ]
+    )
+
+
 FIGURES: dict[str, Callable[[], Figure | np.ndarray]] = {
     "array": lambda: plots.array_views(vb.whisker_array().to_tree()),
     "array_trial": touching_array,
@@ -143,6 +194,8 @@ FIGURES: dict[str, Callable[[], Figure | np.ndarray]] = {
     "contact_places": places,
     "movie_signals": signal_movie,
     "movie_contour": contour_movie,
+    "contour_free": free_surface,
+    "contour_distances": distances,
     "critical_cones": lambda: plots.critical_cones(critical_cones(CURVATURES, TAPER_RATIOS)),
 }
 

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.plots.colours import shading
 from vibrissa.plots.outlines import Body, draw_body
-from vibrissa.plots.sections import BAND, draw_section, has_band, is_cylinder, outline
+from vibrissa.plots.sections import BAND, draw_section, has_band, is_cylinder, lies_flat, outline
 from vibrissa.plots.style import (
     MUTED,
     ORANGE,
@@ -43,7 +43,7 @@ _CHI2_95 = 5.991464547107979
 """95 % of a chi-square of two degrees of freedom."""
 
 _MOST_ELLIPSES = 60
-_LEFT, _GAP, _BAR, _BOTTOM, _TOP = 12.0, 10.0, 12.0, 8.5, 11.0
+_LEFT, _GAP, _BAR, _BOTTOM, _TOP = 12.0, 12.0, 15.0, 8.5, 11.0
 """Room around and between the views, mm on paper."""
 
 
@@ -106,7 +106,7 @@ def contour_views(
         figure, panels = _panels(limits, width, *room)
         for axes, view in zip(panels, _VIEWS, strict=True):
             for body, look in bodies:
-                _draw(axes, body, look, view, np.median(places, axis=0), limits)
+                _draw(axes, body, look, view, places, limits)
             if spread is not None:
                 _ellipses(axes, places, spread[rows], view)
             across, up = places[:, view].T
@@ -128,15 +128,16 @@ def _rail(figure: Figure) -> tuple[float, float, float, float]:
 
 
 def _draw(
-    axes: Axes, body: Body, look: str, view: tuple[int, int], middle: Array, limits: Array
+    axes: Axes, body: Body, look: str, view: tuple[int, int], places: Array, limits: Array
 ) -> None:
-    """Draw an object from one side."""
+    """Draw an object from one side; nothing of a fitted one that lies flat in the picture."""
+    middle = np.median(places, axis=0)
     if is_cylinder(body):
         shown = outline(body, view, float(middle[2]), limits)
         axes.add_patch(Polygon(shown, closed=True, **_LOOKS[look]))
     elif look == "true" and view != (0, 1):
         draw_body(axes, body, view, limits, look)
-    else:
+    elif look == "true" or not lies_flat(body, view, places):
         depth = float(middle[3 - sum(view)])
         draw_section(axes, body, view, depth, limits, look)
     axes.set(xlim=limits[view[0]], ylim=limits[view[1]])

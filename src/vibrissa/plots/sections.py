@@ -16,6 +16,7 @@ BAND: dict[str, Any] = {"facecolor": ORANGE, "alpha": 0.25, "linewidth": 0.0, "z
 
 _CELLS = 91
 _NORMAL_95 = 1.959963984540054
+_FLAT = 0.8
 _UNKNOWN = 0.05
 """Standard deviation, as a share of the view's width, from which a surface is not drawn."""
 
@@ -50,6 +51,30 @@ def has_band(body: Body) -> bool:
         Whether it knows how uncertain it is, and is drawn by sections.
     """
     return hasattr(body, "distance_sigma") and not is_cylinder(body)
+
+
+def lies_flat(body: Body, view: tuple[int, int], places: Array) -> bool:
+    """Tell whether one looks straight at a surface, so that a section would lie in it.
+
+    Parameters
+    ----------
+    body : object
+        With ``outward_normals``, or any.
+    view : tuple of int
+        Which of x, y, z are to the right and up.
+    places : array (n, 3)
+        Contact points, mm.
+
+    Returns
+    -------
+    bool
+        Whether most of its normals there point to the viewer or away; False if it has none.
+    """
+    normals = getattr(body, "outward_normals", None)
+    if normals is None:
+        return False
+    toward = np.abs(normals(1e-3 * places)[:, 3 - sum(view)])
+    return bool(np.nanmedian(toward) > _FLAT)
 
 
 def outline(cylinder: Any, view: tuple[int, int], height: float, limits: Array) -> Array:

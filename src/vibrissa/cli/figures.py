@@ -95,7 +95,7 @@ def figures(
         drawings = array_drawings(path, width)
         if not path.is_dir() and recognise(path) == Kind.RECORDING:
             _refuse({"--uniqueness": uniqueness, "--cones": cones}, f"{path} is a recording")
-            drawings |= trial_drawings(path, (width, colour), videos or [], chart, whisker, tell)
+            drawings |= trial_drawings(path, width, videos or [], chart, whisker, tell, colour)
         else:
             _refuse({"--video": videos, "--map": chart}, f"{path} is no recording")
         if not drawings:

@@ -22,11 +22,12 @@ _NODES = 101
 
 def trial_drawings(
     path: Path,
-    look: tuple[Any, str],
+    width: Any,
     videos: Sequence[Path],
     chart: Path | None,
     whisker: int,
     tell: Tell,
+    colour: str = "time",
 ) -> dict[str, Draw]:
     """Say what can be drawn of a trial; what cannot is told, with the verb that makes it.
 
@@ -34,9 +35,8 @@ def trial_drawings(
     ----------
     path : Path
         Of the recording.
-    look : tuple of str
-        Columns of the page, "single" or "double", and what colours contacts in both frames, "time"
-        or "deflection".
+    width : {"single", "double"}
+        Columns of the page.
     videos : sequence of Path
         One for each view, or none.
     chart : Path or None
@@ -45,6 +45,8 @@ def trial_drawings(
         Which whisker.
     tell : callable
         Told of the progress: ``tell(stage, done, total)``.
+    colour : {"time", "deflection"}
+        What colours contacts in both frames.
 
     Returns
     -------
@@ -66,9 +68,9 @@ def trial_drawings(
     course = course_of(trial, whisker)
     _say_what_is_lacking(course, path)
     bent = recorded_whisker(trial, whisker)
-    drawings = dict(_of_contacts(trial, course, bent, look))
+    drawings = dict(_of_contacts(trial, course, bent, (width, colour)))
     if course.signals is not None:
-        drawings |= _of_signals(trial, course, bent, look[0], (videos, chart, whisker, tell))
+        drawings |= _of_signals(trial, course, bent, width, (videos, chart, whisker, tell))
     return drawings
 
 

@@ -25,6 +25,7 @@ from PIL import Image
 from vibrissa.trial import recorded_whisker
 
 WIDTH = 1200
+TRIALS = 3
 ROOT = Path(__file__).parent.parent
 
 
@@ -92,21 +93,21 @@ def main() -> None:
     chosen = parser.parse_args()
     folder = chosen.folder / "quick" if chosen.quick else chosen.folder
     folder.mkdir(parents=True, exist_ok=True)
-    counts, duration = ((1, 1), 0.4) if chosen.quick else ((3, 2), 1.0)
-    if chosen.no_video:
-        counts = (counts[0], 0)
-    results = {
-        one.name: results_of(one, counts, duration, folder, chosen.again) for one in CONDITIONS
-    }
-    if not chosen.no_video:
-        results[FAST.name] = results_of(FAST, (0, 1), duration, folder, chosen.again)
+    most, duration = (1, 0.4) if chosen.quick else (TRIALS, 1.0)
+
+    def results(condition: Condition, count: int) -> dict[str, Any]:
+        filmed = 0 if chosen.no_video else min(most, condition.filmed)
+        return results_of(condition, (count, filmed), duration, folder, chosen.again)
+
+    found = {one.name: results(one, most) for one in CONDITIONS}
+    found[FAST.name] = results(FAST, 0)
     for name, make in TABLES.items():
-        print(f"\n{name}\n{make(results)}")
+        print(f"\n{name}\n{make(found)}")
     page = ROOT / "docs" / "honest-test.md" if chosen.page else None
     if page is not None:
-        write(page, results)
+        write(page, found)
     images = folder if page is None else page.parent / "images"
-    save(draw(results), images / "honest_test.png")
+    save(draw(found), images / "honest_test.png")
 
 
 if __name__ == "__main__":

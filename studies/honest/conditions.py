@@ -33,6 +33,8 @@ class Condition:
     friction: float = 0.0
     dynamic: bool = False
     frequency: float = 5.0
+    filmed: int = 2
+    """How many of its trials are filmed."""
 
 
 CONDITIONS = (
@@ -40,11 +42,11 @@ CONDITIONS = (
     Condition("friction-01", "friction 0.1", 0.1),
     Condition("friction-03", "friction 0.3", 0.3),
     Condition("friction-05", "friction 0.5", 0.5),
-    Condition("dynamic", "inertia", dynamic=True),
+    Condition("dynamic", "inertia", dynamic=True, filmed=1),
     Condition("dynamic-friction-03", "inertia, friction 0.3", 0.3, dynamic=True),
 )
 
-FAST = Condition("fast", "no friction, 10 whisks a second", frequency=10.0)
+FAST = Condition("fast", "no friction, 10 whisks a second", frequency=10.0, filmed=1)
 """For the filter of the base's pose only."""
 
 

@@ -98,8 +98,8 @@ def flags(axes: Axes, results: Mapping[str, Any], labels: Mapping[str, str]) -> 
 
 def cutoffs(axes: Axes, results: Mapping[str, Any]) -> None:
     """What the pose alone adds, and what the paper's way makes of the contact."""
-    shown = (("friction-0", BLUE), ("dynamic", GREEN), ("fast", ORANGE))
-    said = {"friction-0": "5 whisks a second", "dynamic": "inertia", "fast": "10 a second"}
+    shown = (("friction-0", BLUE), ("friction-03", GREEN), ("fast", ORANGE))
+    said = {"friction-0": "5 whisks a second", "friction-03": "friction 0.3", "fast": "10 a second"}
     for name, colour in shown:
         rows = results.get(name, {}).get("cutoffs")
         if not rows:

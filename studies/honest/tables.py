@@ -135,9 +135,7 @@ def friction(results: Results) -> str:
 
 def pegs(results: Results) -> str:
     shown = [f"felt {name}" for name in ("offset", "tilt", "diameter", "sigma")]
-    shown += [
-        f"{kind} {name}" for kind in ("touching", "points") for name in ("offset", "diameter")
-    ]
+    shown += [f"{kind} {name}" for kind in ("exact", "points") for name in ("offset", "diameter")]
     rows = []
     for label, one in picked(results, "true"):
         for way in WAYS:
@@ -171,7 +169,7 @@ def poses(results: Results) -> str:
         cells = [mm(trial[of][TRIPLET]["all"]["median"]) for of in ("true", "rod", "85 Hz")]
         cells.append(mm(trial["whisker"][TRIPLET]["all"]["median"]))
         cells += [mm(trial[of][TRIPLET]["all"]["pose"]) for of in ("rod", "85 Hz")]
-        pegs = [trial[of][TRIPLET]["peg"]["touching offset"] for of in ("true", "rod", "85 Hz")]
+        pegs = [trial[of][TRIPLET]["peg"]["exact offset"] for of in ("true", "rod", "85 Hz")]
         rows.append([label, *cells, *(mm(value) for value in pegs)])
     head = ["trial", "true pose", "rod", "85 Hz", "rod, tracked shape"]
     head += ["rod, pose alone", "85 Hz, pose alone", "axis, true pose", "axis, rod", "axis, 85 Hz"]
@@ -182,7 +180,7 @@ def circular(results: Results) -> str:
     rows = []
     for label, one in picked(results, "paper"):
         pairs = ("agreement", "error", "force", "moment")
-        micrometres = [f"{v * 1e6:.2g}" for v in one["agreement"]]
+        micrometres = ["< 0.001" if v < 1e-9 else f"{v * 1e6:.3f}" for v in one["agreement"]]
         rows.append(
             [label, str(one["count"]), percent(one["none"])]
             + micrometres

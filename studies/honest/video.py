@@ -120,6 +120,8 @@ def tracked_scores(trial: Recorded, way: str) -> dict[str, xr.Dataset]:
     truth, poses = truth_of(trial.true), poses_of(trial.tracked)
     true, seen = (chart(recorded_whisker(tree)) for tree in (trial.true, trial.tracked))
     found = located(way, trial.true, true)
-    out = {name: scored(found, truth, pose, trial.true) for name, pose in poses.items()}
-    out["whisker"] = scored(located(way, trial.true, seen), truth, poses["rod"], trial.true)
-    return out
+    # Pegs are shown of the triplet only.
+    fits = way == TRIPLET
+    out = {name: scored(found, truth, pose, trial.true, fits) for name, pose in poses.items()}
+    found = located(way, trial.true, seen)
+    return out | {"whisker": scored(found, truth, poses["rod"], trial.true, fits=False)}

@@ -18,6 +18,7 @@ from vibrissa.pipeline import (
     in_laboratory,
     locate,
     locate_from_wrench,
+    whisker_radii,
 )
 from vibrissa.sensing import FORCE_NOISE, MOMENT_NOISE
 from vibrissa.signals import SIGNALS, nearest_on_rest
@@ -155,31 +156,36 @@ def scored(
     if not fits:
         return xr.Dataset(data)
     touching = placed.where(xr.DataArray(truth.touching, dims="time"))
+    kinds = {
+        "felt": (placed, "uncertain"),
+        "exact": (touching, "exact"),
+        "points": (touching, "no"),
+    }
     pegs = {
         f"{kind} {name}": value
-        for kind, (contacts, normals) in {
-            "felt": (placed, True),
-            "touching": (touching, True),
-            "points": (touching, False),
-        }.items()
+        for kind, (contacts, normals) in kinds.items()
         for name, value in peg_error(contacts, trial, normals).items()
     }
     return xr.Dataset(data).assign_attrs(pegs)
 
 
-def peg_error(placed: xr.Dataset, trial: xr.DataTree, normals: bool) -> dict[str, float]:
-    """Of the cylinder fitted to the contacts: metres and radians; NaN where there is none."""
+def peg_error(placed: xr.Dataset, trial: xr.DataTree, normals: str) -> dict[str, float]:
+    """Of the cylinder fitted to the contacts: metres and radians; NaN where there is none.
+
+    With normals that are uncertain (as `vibrissa reconstruct` does), exact, or with no normals.
+    """
     (peg,), whisker = recorded_pegs(trial), recorded_whisker(trial)
+    each = placed.expand_dims(whisker=1, axis=1)
     try:
-        if normals:
-            fit = fit_contacts(placed.expand_dims(whisker=1, axis=1), [whisker])
+        if normals == "uncertain":
+            fit = fit_contacts(each, [whisker])
         else:
-            spread = placed["contact_covariance"].values + SOLVED_TO**2 * np.eye(3)
-            arc_length = placed["arc_length"].values
-            known = np.isfinite(arc_length)
-            radius = np.full(known.shape, np.nan)
-            radius[known] = whisker.radius(arc_length[known])
-            fit = fit_cylinder(placed["contact_point"].values, spread, radius)
+            fit = fit_cylinder(
+                placed["contact_point"].values,
+                placed["contact_covariance"].values + SOLVED_TO**2 * np.eye(3),
+                whisker_radii(each, [whisker])[:, 0],
+                normals=placed["contact_normal"].values if normals == "exact" else None,
+            )
     except ValueError:
         return dict.fromkeys(PEG, np.nan)
     offset, tilt = axis_offset(fit.origin, fit.axis, peg.origin, peg.axis)

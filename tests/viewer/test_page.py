@@ -107,6 +107,29 @@ def test_out_of_reach_the_reason_is_shown(looking):
     assert looking.faults == []
 
 
+def test_a_click_on_a_solid_marks_the_contact_in_all_spaces(looking):
+    page = looking.viewer.page
+    looking.page.get_by_role("button", name="Map").click()
+    looking.wait_for("[data-note]", "Click on a solid")
+    assert page.settle()
+    mode = page.modes["Map"]
+    solids = mode._solids
+    places = solids.seen(solids.skin(), None).mean(axis=1)[::40] / 1e3
+    for _ in range(40):  # until the camera has moved and the solids are drawn
+        pixels = np.array([looking.pixel(place) for place in places])
+        # Away from the panel, and from what the page may have to say at its upper left.
+        nearest = np.argmin(np.linalg.norm(pixels - [330, 260], axis=1))
+        looking.page.mouse.click(*pixels[nearest])
+        looking.page.wait_for_timeout(500)
+        assert page.settle()
+        if mode.row is not None:
+            break
+    looking.wait_for('[data-quantity="arc_length"]')
+    for space in (None, 0, 1, 2):
+        assert page.stage.node("picked", f"mark {space}") is not None
+    assert looking.faults == []
+
+
 def test_a_trial_plays(browser, recording):
     from vibrissa.trial import recorded_whisker
     from vibrissa.viewer import view
@@ -118,12 +141,14 @@ def test_a_trial_plays(browser, recording):
         start = float(trial.trial.time[trial.trial.next_contact(0)])
         share = start / float(np.ptp(trial.trial.time))
         person.wait_for(f'[data-cursor="{share:.4f}"]')
+        trial.hurry("1 : 50")  # so that it is still playing when a busy machine looks
         person.page.get_by_role("button", name="Play").click()
         person.page.wait_for_function(
-            "share => document.querySelector('[data-cursor]').dataset.cursor > share + 0.02",
+            "share => document.querySelector('[data-cursor]').dataset.cursor > share + 0.005",
             arg=share,
         )
-        person.page.get_by_role("button", name="Pause").click()
+        person.wait_for("button", "Pause")
+        trial.pause()
         assert viewer.page.settle()
         frame = trial.frame
         assert trial.trial.time[frame] > start

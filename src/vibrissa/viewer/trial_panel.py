@@ -79,7 +79,7 @@ class TrialMode:
             self._window.dock_left()
             self._window.set_width(330.0)
         asked(self._time, lambda value: self.go(float(trial.time[0]) + value / _MS))
-        asked(speed, self._hurry)
+        asked(speed, self.hurry)
         asked(objects, lambda on: self._see(objects=on))
         asked(fit, lambda on: self._see(fit=on))
         self._play.on_click(lambda _: self.toggle())
@@ -96,8 +96,7 @@ class TrialMode:
 
     def leave(self) -> None:
         """Stop, and hide controls and things."""
-        self._player.pause()
-        self._play.label = "Play"
+        self.pause()
         self._folder.visible = False
         if self._window is not None:
             self._window.visible = False
@@ -143,6 +142,15 @@ class TrialMode:
             self._player.play()
         self._play.label = "Pause" if self._player.playing else "Play"
 
+    def pause(self) -> None:
+        """Let time stand still."""
+        self._player.pause()
+        self._play.label = "Play"
+
+    def hurry(self, words: str) -> None:
+        """Play as fast as one of :data:`SPEEDS` says."""
+        self._speed = SPEEDS[words]
+
     def jump(self) -> None:
         """Go to where the next contact begins."""
         self.go(float(self.trial.time[self.trial.next_contact(self.frame)]))
@@ -150,13 +158,9 @@ class TrialMode:
     def _tick(self, passed: float) -> None:
         time = self._now + self._speed * passed
         if time >= self.trial.time[-1]:
-            self._player.pause()
-            self._play.label = "Play"
+            self.pause()
         self._now = time
         self.go(time)
-
-    def _hurry(self, words: str) -> None:
-        self._speed = SPEEDS[words]
 
     def _choose(self, name: str) -> None:
         self._whisker = self.trial.names.index(name)

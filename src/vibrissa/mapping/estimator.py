@@ -361,7 +361,7 @@ class Estimator:
         if self.readout.beyond(measurement):
             return self._nowhere(Status.OUTSIDE_MAP)
         starts, values = self.readout.seeds(measurement)
-        if self._last is not None:
+        if self._last is not None and not (values is not None and self._follows(values)):
             starts = np.concatenate([starts, self._last[0][None]])
             if values is not None:
                 values = np.concatenate([values, self._last[1][None]])
@@ -432,7 +432,9 @@ class Estimator:
             ):
                 kept.append(row)
         status = Status.UNIQUE if len(kept) == 1 else Status.AMBIGUOUS
-        some = fits if len(kept) == len(misfits) == 1 else Fits(*(part[kept] for part in fits))
+        first = kept[0]
+        which = slice(first, first + 1) if len(kept) == 1 else kept
+        some = Fits(*(part[which] for part in fits))
         return self._located(
             measurement,
             some.contacts[:, _FREE],

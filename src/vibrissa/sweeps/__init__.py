@@ -1,0 +1,18 @@
+"""Studies of many whiskers: plain data in, one labelled store out, on one machine or many."""
+
+from vibrissa.sweeps.run import Outcome, run_sweep
+from vibrissa.sweeps.store import Busy, Store, failures, open_sweep
+from vibrissa.sweeps.study import EXAMPLE, Cell, Study, read_study
+
+__all__ = [
+    "EXAMPLE",
+    "Busy",
+    "Cell",
+    "Outcome",
+    "Store",
+    "Study",
+    "failures",
+    "open_sweep",
+    "read_study",
+    "run_sweep",
+]

@@ -1,0 +1,284 @@
+"""Whiskers of a study: each a name, numbers that describe it, and how it is made.
+
+A study may have thousands: a `Specimen` is a few numbers, and its whisker is made when it is
+needed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vibrissa.trial.said import only
+from vibrissa.whisker import Whisker, whisker_array
+
+PARAMETERS: Mapping[str, tuple[float, float, float]] = {
+    "length": (39.4, 1e-3, 0.0),
+    "taper_ratio": (15.0, 1.0, 0.0),
+    "curvature": (0.0, 1.0, -np.inf),
+    "bend": (0.0, np.pi / 180.0, -np.inf),
+    "corkscrew": (0.0, np.pi / 180.0, -np.inf),
+    "base_radius": (100.0, 1e-6, 0.0),
+    "youngs_modulus": (3.0, 1e9, 0.0),
+    "trim": (1.0, 1.0, 0.0),
+}
+"""Of a grid or a random population: by default, to SI units, and what each must exceed.
+
+``curvature`` is A·L of the parabola y = A x². ``bend`` instead turns the tangent at a constant
+rate by so many degrees from base to tip, and ``corkscrew`` turns the plane of bending by so many.
+``trim`` is the share of the length that is left, the radius being what it was.
+"""
+
+
+@dataclass(frozen=True)
+class Specimen:
+    """A whisker that can be made.
+
+    Parameters
+    ----------
+    name : str
+        Its name, one of a kind in the study.
+    said : mapping
+        Of a grid or a random population: its parameters as in `PARAMETERS`.
+    identity : str
+        What it is, as a hash; of the same whisker it is the same anywhere.
+    make : callable
+        Makes the whisker.
+    """
+
+    name: str
+    said: Mapping[str, float]
+    identity: str
+    make: Callable[[], Whisker]
+
+
+def population(tables: Sequence[Any], folder: Path, seed: int) -> list[Specimen]:
+    """List the whiskers of a study.
+
+    Parameters
+    ----------
+    tables : sequence of dict
+        The ``[[whiskers]]`` of a study.
+    folder : Path
+        That its file names are relative to.
+    seed : int
+        Of random populations.
+
+    Returns
+    -------
+    list of Specimen
+        In the order in which they are stated.
+
+    Raises
+    ------
+    ValueError
+        If something is said that is not known, numbers are out of range, files hold no whisker, or
+        two whiskers share a name.
+    """
+    found: list[Specimen] = []
+    for number, table in enumerate(tables):
+        where = f"[[whiskers]] {number + 1}"
+        if not isinstance(table, Mapping):
+            raise ValueError(f"{where} is {table!r}; a table is needed")
+        kind = table.get("kind", "grid")
+        if kind not in _KINDS:
+            raise ValueError(f"{where}: kind is {kind!r}; one of {', '.join(_KINDS)} is needed")
+        said = {key: value for key, value in table.items() if key != "kind"}
+        try:
+            found += _KINDS[kind](said, folder, [seed, number])
+        except (ValueError, OSError) as fault:
+            raise ValueError(f"{where}: {fault}") from None
+    names = [specimen.name for specimen in found]
+    twice = (
+        sorted({name for name in names if names.count(name) > 1})
+        if len(set(names)) < len(names)
+        else []
+    )
+    if twice:
+        raise ValueError(f"whiskers share the names {', '.join(twice[:5])}: give each a prefix")
+    if not found:
+        raise ValueError("the study has no whiskers: at least one [[whiskers]] is needed")
+    return found
+
+
+def _grid(said: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iterator[Specimen]:
+    """All combinations of values."""
+    only(said, {"prefix", *PARAMETERS}, "a grid")
+    names = [name for name in PARAMETERS if name in said]
+    values = [_numbers(name, said[name]) for name in names]
+    for row in itertools.product(*values):
+        yield _formula(dict(zip(names, row, strict=True)), str(said.get("prefix", "")))
+
+
+def _random(said: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iterator[Specimen]:
+    """Values drawn between bounds."""
+    only(said, {"prefix", "count", "logarithmic", *PARAMETERS}, "a random population")
+    count = said.get("count")
+    if not isinstance(count, int) or isinstance(count, bool) or count < 1:
+        raise ValueError(f"count is {count!r}; a whole number from 1 is needed")
+    logarithmic = said.get("logarithmic", [])
+    if unknown := sorted(set(logarithmic) - set(PARAMETERS)):
+        raise ValueError(f"logarithmic names {', '.join(unknown)}; known: {', '.join(PARAMETERS)}")
+    generator = np.random.default_rng(list(seed))
+    columns = {}
+    for name in PARAMETERS:
+        if name not in said:
+            continue
+        bounds = _numbers(name, said[name])
+        if len(bounds) > 2 or bounds[0] > bounds[-1]:
+            raise ValueError(f"{name} is {said[name]!r}; a number or [least, largest] is needed")
+        low, high = bounds[0], bounds[-1]
+        share = generator.random(count)
+        if name in logarithmic:
+            if low <= 0.0:
+                raise ValueError(f"{name} is logarithmic; its bounds {bounds} must be positive")
+            columns[name] = low * (high / low) ** share
+        else:
+            columns[name] = low + (high - low) * share
+    digits = len(str(count - 1))
+    prefix = str(said.get("prefix", "random "))
+    for i in range(count):
+        row = {name: float(column[i]) for name, column in columns.items()}
+        yield _formula(row, "", f"{prefix}{i:0{digits}d}")
+
+
+def _files(said: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iterator[Specimen]:
+    """Digitised whiskers, one a file."""
+    only(said, {"prefix", "files", "base_radius", "youngs_modulus"}, "files")
+    pattern = said.get("files")
+    if not isinstance(pattern, str):
+        raise ValueError(f"files is {pattern!r}; a pattern such as 'whiskers/*.csv' is needed")
+    base = Path(pattern)
+    root, rest = (
+        (Path(base.anchor), str(base.relative_to(base.anchor)))
+        if base.anchor
+        else (
+            folder,
+            pattern,
+        )
+    )
+    paths = sorted(path for path in root.glob(rest) if path.is_file())
+    if not paths:
+        raise ValueError(f"no file is called {pattern} in {folder.resolve()}")
+    prefix = str(said.get("prefix", ""))
+    changes = {
+        name: _numbers(name, said[name])[0] * PARAMETERS[name][1]
+        for name in ("base_radius", "youngs_modulus")
+        if name in said
+    }
+    for path in paths:
+        identity = _hash([hashlib.sha256(path.read_bytes()).hexdigest(), changes])
+        yield Specimen(f"{prefix}{path.stem}", {}, identity, _FromFile(path.resolve(), changes))
+
+
+def _array(said: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iterator[Specimen]:
+    """Whiskers of an average rat's face."""
+    only(said, {"prefix", "side", "rows", "columns", "whiskers"}, "an array")
+    choice = {key: value for key, value in said.items() if key != "prefix"}
+    choice.setdefault("side", "right")
+    prefix = str(said.get("prefix", ""))
+    for name, whisker in whisker_array(**choice).items():
+        identity = _hash(["array", choice["side"], name])
+        yield Specimen(f"{prefix}{name}", {}, identity, _Made(whisker))
+
+
+_KINDS: Mapping[str, Callable[..., Iterator[Specimen]]] = {
+    "grid": _grid,
+    "random": _random,
+    "files": _files,
+    "array": _array,
+}
+
+
+def _formula(said: dict[str, float], prefix: str, name: str | None = None) -> Specimen:
+    if said.get("curvature", 0.0) and (said.get("bend", 0.0) or said.get("corkscrew", 0.0)):
+        raise ValueError("curvature is that of a parabola; it does not go with bend or corkscrew")
+    whole = {key: said.get(key, PARAMETERS[key][0]) for key in PARAMETERS}
+    if name is None:
+        varied = [f"{key.replace('_', ' ')} {value:g}" for key, value in said.items()]
+        name = prefix + (", ".join(varied) or "default")
+    return Specimen(name, whole, _hash(["formula", whole]), _Formula(name, whole))
+
+
+@dataclass(frozen=True)
+class _Formula:
+    """Makes a parabola or an arc."""
+
+    name: str
+    said: Mapping[str, float]
+
+    def __call__(self) -> Whisker:
+        value = {key: self.said[key] * PARAMETERS[key][1] for key in PARAMETERS}
+        length, bend, corkscrew = value["length"], value["bend"], value["corkscrew"]
+        properties: dict[str, Any] = {
+            "base_radius": value["base_radius"],
+            "tip_radius": value["base_radius"] / value["taper_ratio"],
+            "youngs_modulus": value["youngs_modulus"],
+            "name": self.name,
+        }
+        if bend or corkscrew:
+
+            def curvature(s: Any) -> Any:
+                turned = corkscrew * np.asarray(s) / length
+                rate = bend / length
+                # About d2: it bends toward +y at the base.
+                return np.stack([0 * turned, -rate * np.sin(turned), rate * np.cos(turned)], -1)
+
+            whisker = Whisker.from_curvature(length, curvature, **properties)
+        elif value["curvature"]:
+            whisker = Whisker.parabola(length, value["curvature"] / length, **properties)
+        else:
+            whisker = Whisker.straight(length, **properties)
+        return whisker if value["trim"] == 1.0 else whisker.trimmed(value["trim"] * length)
+
+
+@dataclass(frozen=True)
+class _FromFile:
+    """Reads a whisker."""
+
+    path: Path
+    changes: Mapping[str, float]
+
+    def __call__(self) -> Whisker:
+        from vibrissa.io import load_whisker
+
+        whisker = load_whisker(self.path)
+        return whisker.with_properties(**self.changes) if self.changes else whisker  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class _Made:
+    """Gives a whisker that is there."""
+
+    whisker: Whisker
+
+    def __call__(self) -> Whisker:
+        return self.whisker
+
+
+def _numbers(name: str, value: Any) -> list[float]:
+    """One number or several of a parameter, within its bounds."""
+    values = value if isinstance(value, list) else [value]
+    least = PARAMETERS[name][2]
+    for one in values:
+        if isinstance(one, bool) or not isinstance(one, int | float) or not np.isfinite(one):
+            raise ValueError(f"{name} is {value!r}; a number or a list of numbers is needed")
+        if one <= least:
+            raise ValueError(f"{name} is {one!r}; it must be above {least:g}")
+        if name == "trim" and one > 1.0:
+            raise ValueError(f"trim is {one!r}; it is the share that is left, at most 1")
+    if not values:
+        raise ValueError(f"{name} is an empty list")
+    return [float(one) for one in values]
+
+
+def _hash(content: Any) -> str:
+    text = json.dumps(content, sort_keys=True, default=float)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -1,0 +1,246 @@
+"""A study as plain data: which whiskers, and what is asked of each."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tomllib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from vibrissa.sweeps.population import Specimen, population
+from vibrissa.sweeps.tasks import TASKS, Settings, settings_of
+
+EXAMPLE = """\
+# A study for `vibrissa sweep`: lengths in mm, radii in µm, moduli in GPa, angles in degrees.
+
+name = "taper and curvature"
+seed = 0
+
+# Whiskers; repeat [[whiskers]] for more of them.
+[[whiskers]]
+kind = "grid"                    # all combinations of the values
+length = 39.4
+taper_ratio = [1, 2, 5, 15, 60]  # base radius over tip radius
+curvature = [0.0, 0.4, 0.8]      # A L of the parabola y = A x²
+# bend = 180                     # or: what the tangent turns by, at a constant rate,
+# corkscrew = 360                # and what the plane of bending turns by
+# base_radius = 100.0
+# youngs_modulus = 3.0
+# trim = 1.0                     # share of the length that is left
+
+# [[whiskers]]
+# kind = "random"                # values between [least, largest]
+# count = 100
+# length = [20, 60]
+# taper_ratio = [2, 60]
+# logarithmic = ["taper_ratio"]
+
+# [[whiskers]]
+# kind = "files"                 # digitised centrelines
+# files = "whiskers/*.csv"
+
+# [[whiskers]]
+# kind = "array"                 # an average rat's
+# side = "right"
+# rows = "ABCDE"
+
+[[tasks]]
+kind = "uniqueness"
+triplets = ["Fx MB MD", "Mx MB MD", "Fx FD MD"]   # or "all"
+regions = ["all"]
+cone = 2.0                       # about rest, left out, degrees
+samples = 1024
+resolution = true
+
+[[tasks]]
+kind = "estimation"
+signals = ["Fx MB MD", "wrench"]
+contacts = 1000
+force_noise = 1.0                # µN
+moment_noise = 0.02              # µN·m
+
+# Others: "map"; "sensitivity" (triplets, noise); "friction" (triplet, friction, contacts).
+"""
+
+
+class Cell(NamedTuple):
+    """One task for one whisker.
+
+    Attributes
+    ----------
+    task : str
+        Name of the task in the study.
+    kind : str
+        Which one of `vibrissa.sweeps.tasks`.
+    settings : mapping
+        Of the task.
+    index : int
+        Number of the whisker.
+    specimen : Specimen
+        The whisker.
+    seed : int
+        The same for the same whisker in any study with the same seed.
+    identity : str
+        Of what is asked of what, as a hash.
+    """
+
+    task: str
+    kind: str
+    settings: Settings
+    index: int
+    specimen: Specimen
+    seed: int
+    identity: str
+
+
+@dataclass(frozen=True)
+class Study:
+    """Whiskers × tasks.
+
+    Parameters
+    ----------
+    name : str
+        Its name.
+    seed : int
+        Of all that is random.
+    specimens : tuple of Specimen
+        The whiskers.
+    tasks : mapping
+        Kind and settings of each task by its name.
+    """
+
+    name: str
+    seed: int
+    specimens: tuple[Specimen, ...]
+    tasks: Mapping[str, tuple[str, Settings]]
+
+    def cells(self) -> Iterator[Cell]:
+        """List what is to be done, one whisker after the other.
+
+        Yields
+        ------
+        Cell
+            One task for one whisker.
+        """
+        for index, specimen in enumerate(self.specimens):
+            for task, (kind, settings) in self.tasks.items():
+                asked = json.dumps(
+                    [specimen.identity, kind, dict(settings), self.seed], default=list
+                )
+                digest = hashlib.sha256(asked.encode()).hexdigest()
+                # The seed is the whisker's: a study with more whiskers has the same cells again.
+                own = hashlib.sha256(f"{self.seed} {specimen.identity}".encode()).hexdigest()
+                yield Cell(task, kind, settings, index, specimen, int(own[:7], 16), digest[:16])
+
+    @property
+    def size(self) -> int:
+        """Number of cells."""
+        return len(self.specimens) * len(self.tasks)
+
+    @property
+    def seconds(self) -> float:
+        """What it takes on one core, roughly, s."""
+        each = sum(TASKS[kind].seconds(settings) for kind, settings in self.tasks.values())
+        return each * len(self.specimens)
+
+
+def read_study(text: str, folder: Path) -> Study:
+    """Read a study.
+
+    Parameters
+    ----------
+    text : str
+        TOML, as `EXAMPLE`.
+    folder : Path
+        That file names are relative to.
+
+    Returns
+    -------
+    Study
+        Checked, nothing done.
+
+    Raises
+    ------
+    ValueError
+        If it is no TOML, or says what is not known or out of range.
+    """
+    try:
+        said = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as fault:
+        raise ValueError(f"this is no TOML: {fault}") from None
+    known = {"name", "seed", "whiskers", "tasks"}
+    if unknown := sorted(set(said) - known):
+        raise ValueError(
+            f"the study has {', '.join(unknown)}; known are {', '.join(sorted(known))}"
+        )
+    seed = said.get("seed", 0)
+    if not isinstance(seed, int) or isinstance(seed, bool) or seed < 0:
+        raise ValueError(f"seed is {seed!r}; a whole number from 0 is needed")
+    tables = {name: said.get(name, []) for name in ("whiskers", "tasks")}
+    for name, table in tables.items():
+        if not isinstance(table, list) or not table:
+            raise ValueError(f"the study has no {name}: at least one [[{name}]] is needed")
+    tasks: dict[str, tuple[str, Settings]] = {}
+    for number, table in enumerate(tables["tasks"]):
+        where = f"[[tasks]] {number + 1}"
+        if not isinstance(table, Mapping):
+            raise ValueError(f"{where} is {table!r}; a table is needed")
+        kind, settings = settings_of(table, where)
+        name = str(table.get("name", kind))
+        if name in tasks or not name.replace("_", "").replace("-", "").isalnum():
+            raise ValueError(
+                f"{where} is called {name!r}; letters and digits, and another name for each, "
+                "are needed (name = ...)"
+            )
+        tasks[name] = (kind, settings)
+    specimens = population(tables["whiskers"], folder, seed)
+    return Study(str(said.get("name", "study")), seed, tuple(specimens), tasks)
+
+
+def answer(cell: Cell) -> dict[str, Any]:
+    """Do one task for one whisker, wherever this runs.
+
+    Parameters
+    ----------
+    cell : Cell
+        What to do.
+
+    Returns
+    -------
+    dict
+        ``result`` (Dataset), ``whisker`` (numbers that describe it, SI units) and ``seconds`` of
+        CPU; or ``failure``, the traceback as text.
+    """
+    import time
+    import traceback
+
+    started = time.process_time()
+    try:
+        whisker = cell.specimen.make()
+        result = TASKS[cell.kind].run(whisker, cell.settings, cell.seed)
+        tangent = whisker.frame(whisker.length)[:, 0]
+        described = {
+            "length": whisker.length,
+            "base_radius": whisker.base_radius,
+            "tip_radius": whisker.tip_radius,
+            "taper_ratio": whisker.base_radius / whisker.tip_radius,
+            "youngs_modulus": whisker.youngs_modulus,
+            "tip_turn": float(_angle(tangent)),
+        }
+    except Exception:
+        return {"failure": traceback.format_exc(), "seconds": time.process_time() - started}
+    return {
+        "result": result.load(),
+        "whisker": described,
+        "seconds": time.process_time() - started,
+    }
+
+
+def _angle(tangent: Any) -> float:
+    """Angle between the tip's tangent and that of the base, rad."""
+    import numpy as np
+
+    return float(np.arctan2(np.hypot(tangent[1], tangent[2]), tangent[0]))

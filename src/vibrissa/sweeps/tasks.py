@@ -1,0 +1,351 @@
+"""What a study asks of every whisker: each task gives the same few numbers for any whisker.
+
+A task is a function from a whisker's map, its settings and a seed to a dataset whose dimensions and
+coordinates follow from the settings alone. Words are written as numbers of CF flags.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from vibrissa.mapping import ContactMap, estimate_from_wrench, uniqueness
+from vibrissa.mapping.best_triplet import best_triplet
+from vibrissa.quantities import attributes
+from vibrissa.rod import PointForce, deflect
+from vibrissa.sensing import FORCE_NOISE, MOMENT_NOISE
+from vibrissa.signals import REGIONS, SIGNALS, TRIPLETS, base_signals, selection
+from vibrissa.status import Status
+
+if TYPE_CHECKING:
+    from vibrissa.whisker import Whisker
+
+Array = NDArray[np.float64]
+Settings = Mapping[str, Any]
+
+PAPERS = ("Fx MB MD", "Mx MB MD", "Fx FD MD")
+"""The triplets that the paper found unique."""
+
+VERDICTS = ("unique", "unique off a surface", "not unique")
+_MICRO = 1e-6
+_MM = 1e-3
+
+
+@dataclass(frozen=True)
+class Task:
+    """One question to every whisker.
+
+    Parameters
+    ----------
+    run : callable
+        ``run(whisker, settings, seed)`` gives a dataset.
+    defaults : mapping
+        What can be set, with its default.
+    check : callable
+        Raises a ValueError where settings do not fit.
+    seconds : callable
+        What a whisker takes on one core, roughly, by the settings; s.
+    """
+
+    run: Callable[[Whisker, Settings, int], xr.Dataset]
+    defaults: Settings
+    check: Callable[[Settings], None]
+    seconds: Callable[[Settings], float]
+
+
+def settings_of(said: Mapping[str, Any], where: str) -> tuple[str, Settings]:
+    """Read what a study says of a task.
+
+    Parameters
+    ----------
+    said : mapping
+        The ``[[tasks]]``.
+    where : str
+        For messages.
+
+    Returns
+    -------
+    kind : str
+        Name of the task.
+    settings : mapping
+        All that can be set.
+
+    Raises
+    ------
+    ValueError
+        If the task or a setting is not known, or out of range.
+    """
+    kind = said.get("kind")
+    if kind not in TASKS:
+        raise ValueError(f"{where}: kind is {kind!r}; one of {', '.join(TASKS)} is needed")
+    task = TASKS[kind]
+    given = {key: value for key, value in said.items() if key not in ("kind", "name")}
+    if unknown := sorted(set(given) - set(task.defaults)):
+        allowed = ", ".join(task.defaults) or "nothing"
+        raise ValueError(f"{where} sets {', '.join(unknown)}; of {kind} can be set: {allowed}")
+    settings = {**task.defaults, **given}
+    try:
+        task.check(settings)
+    except (TypeError, ValueError) as fault:
+        raise ValueError(f"{where}: {fault}") from None
+    return str(kind), settings
+
+
+def _map_summary(whisker: Whisker, settings: Settings, seed: int) -> xr.Dataset:
+    """Extents of the reachable space and of the signals."""
+    data = ContactMap.simulate(whisker, grid=False).to_dataset()
+    names = ("r", "theta", "phi", *SIGNALS)
+    ranges = np.array([[float(data[name].min()), float(data[name].max())] for name in names])
+    force = np.linalg.norm(data["force"].transpose(..., "space").values, axis=-1)
+    load = data.sizes["load"] - 1
+    fold = np.nanmin(force.reshape(-1, load + 1)[:, -1].reshape(data.sizes["station"], -1), axis=1)
+    out = {
+        f"{name}_{end}": ((), ranges[i, k], attributes(name))
+        for i, name in enumerate(names)
+        for k, end in enumerate(("least", "largest"))
+    }
+    about = {"units": "N", "long_name": "least force at which the whisker slips off"}
+    at = {"units": "1", "long_name": "arc length of the contact over the whisker's"}
+    return xr.Dataset(
+        {**out, "slip_force": ("station", fold, about)},
+        {"station": ("station", data["station"].values, at)},
+    )
+
+
+def _uniqueness(whisker: Whisker, settings: Settings, seed: int) -> xr.Dataset:
+    """Verdicts with the numbers behind them."""
+    found = uniqueness(
+        ContactMap.simulate(whisker, grid=False),
+        _triplets(settings),
+        list(settings["regions"]),
+        cone=np.radians(float(settings["cone"])),
+        samples=int(settings["samples"]),
+        resolution=bool(settings["resolution"]),
+        seed=seed,
+    )
+    codes = np.select([found["verdict"].values == word for word in VERDICTS], range(3), -1)
+    flags = {
+        "flag_values": np.arange(3, dtype=np.int8),
+        "flag_meanings": " ".join(word.replace(" ", "_") for word in VERDICTS),
+    }
+    kept = ["critical_cone", "twin_share", "minority_share"]
+    if settings["resolution"]:
+        kept.append("ambiguous_share")
+    verdict = found["verdict"].copy(data=codes.astype(np.int8)).assign_attrs(flags)
+    out = found[kept].assign(verdict=verdict)
+    return out.drop_vars([name for name in out.coords if name not in out.dims])
+
+
+def _sensitivity(whisker: Whisker, settings: Settings, seed: int) -> xr.Dataset:
+    """Errors that a sensor's noise leads to, triplet by triplet."""
+    found = best_triplet(
+        ContactMap.simulate(whisker, grid=False), _noise(settings), triplets=_triplets(settings)
+    )
+    return found[["median_error", "determined", "share"]].drop_vars(
+        [name for name in found.coords if name != "triplet"], errors="ignore"
+    )
+
+
+def _estimation(whisker: Whisker, settings: Settings, seed: int) -> xr.Dataset:
+    """Errors of contacts estimated from noisy signals."""
+    chart = ContactMap.simulate(whisker, grid=False)
+    s, load = _some_contacts(chart, int(settings["contacts"]), seed)
+    bent = deflect(whisker, PointForce(s, components=tuple(load)))
+    noise = _noise(settings)
+    generator = np.random.default_rng(seed + 1)
+    scatter = generator.multivariate_normal(np.zeros(6), noise, size=len(s))
+    measured = np.concatenate([bent.force, bent.moment], axis=-1) + scatter
+    force, moment = measured[:, :3], measured[:, 3:]
+    sets = _sets(settings)
+    rows = []
+    for names in sets:
+        if names == "wrench":
+            found: Any = estimate_from_wrench(whisker, force, moment, noise=noise)
+        else:
+            found = chart.estimate(base_signals(force, moment), tuple(names.split()), noise=noise)
+        error = np.linalg.norm(found.point - bent.contact_point, axis=-1)
+        predicted = np.sqrt(np.einsum("nii->n", found.covariance))
+        rows.append(
+            [
+                *_quantiles(error),
+                _quantiles(predicted)[0],
+                float(np.isfinite(error).mean()),
+                float((found.status == Status.UNIQUE).mean()),
+            ]
+        )
+    columns = ("median_error", "error_95", "predicted_rms", "found_share", "unique_share")
+    return _table(columns, rows, "signals", list(sets))
+
+
+def _friction(whisker: Whisker, settings: Settings, seed: int) -> xr.Dataset:
+    """Errors where friction, fully mobilised along the whisker, is not looked for."""
+    chart = ContactMap.simulate(whisker, grid=False)
+    s, (_, fy, fz) = _some_contacts(chart, int(settings["contacts"]), seed)
+    across = np.hypot(fy, fz)
+    sign = np.random.default_rng(seed + 1).choice([-1.0, 1.0], size=len(s))
+    rows = []
+    for mu in settings["friction"]:
+        bent = deflect(whisker, PointForce(s, components=(mu * sign * across, fy, fz)))
+        found = chart.estimate(
+            base_signals(bent.force, bent.moment), selection(settings["triplet"], exactly=3)
+        )
+        whole = estimate_from_wrench(whisker, bent.force, bent.moment)
+        error = np.linalg.norm(found.point - bent.contact_point, axis=-1)
+        of_wrench = np.linalg.norm(whole.point - bent.contact_point, axis=-1)
+        rows.append(
+            [*_quantiles(error), float(np.isfinite(error).mean()), _quantiles(of_wrench)[0]]
+        )
+    columns = ("median_error", "error_95", "found_share", "wrench_median_error")
+    return _table(columns, rows, "friction", [float(mu) for mu in settings["friction"]])
+
+
+def _some_contacts(chart: ContactMap, count: int, seed: int) -> tuple[Array, Array]:
+    """Arc lengths (n,) and material forces (3, n) of contacts spread over the reachable space."""
+    data = chart.to_dataset()
+    fold = _fold_forces(data)
+    generator = np.random.default_rng(seed)
+    i = generator.integers(1, data.sizes["station"], count)
+    j = generator.integers(0, data.sizes["bearing"], count)
+    share = generator.uniform(0.05, 0.9, count)
+    size = share**2 * fold[i, j]
+    bearing = data["bearing"].values[j]
+    s = data["station"].values[i] * chart.whisker.length
+    zero = np.zeros(count)
+    return s, np.stack([zero, size * np.cos(bearing), size * np.sin(bearing)])
+
+
+def _fold_forces(data: xr.Dataset) -> Array:
+    """Force (station, bearing) at which the whisker slips off, N."""
+    force = data["force"].transpose("station", "bearing", "load", "space").values
+    return np.asarray(np.linalg.norm(force[:, :, -1], axis=-1))
+
+
+def _quantiles(values: Array) -> tuple[float, float]:
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return np.nan, np.nan
+    median, high = np.percentile(known, [50.0, 95.0])
+    return float(median), float(high)
+
+
+def _table(
+    columns: Sequence[str], rows: Sequence[Sequence[float]], dim: str, labels: Sequence[Any]
+) -> xr.Dataset:
+    values = np.array(rows, dtype=np.float64)
+    data = {}
+    for k, name in enumerate(columns):
+        units = "1" if name.endswith("share") else "m"
+        about = {"units": units, "long_name": name.replace("_", " ")}
+        data[name] = (dim, values[:, k], about)
+    return xr.Dataset(data, {dim: labels})
+
+
+def _triplets(settings: Settings) -> list[str]:
+    if settings["triplets"] == "all":
+        return [" ".join(triplet) for triplet in TRIPLETS]
+    return [" ".join(selection(one, exactly=3)) for one in settings["triplets"]]
+
+
+def _sets(settings: Settings) -> list[str]:
+    return [
+        "wrench" if one == "wrench" else " ".join(selection(one)) for one in settings["signals"]
+    ]
+
+
+def _noise(settings: Settings) -> Array:
+    sigma = np.repeat([settings["force_noise"] * _MICRO, settings["moment_noise"] * _MICRO], 3)
+    return np.diag(sigma**2)
+
+
+def _check_uniqueness(settings: Settings) -> None:
+    _triplets(settings)
+    unknown = [region for region in settings["regions"] if region not in REGIONS]
+    if unknown or not settings["regions"] or isinstance(settings["regions"], str):
+        raise ValueError(f"regions is {settings['regions']!r}; a list of {', '.join(REGIONS)}")
+    _check_number(settings, "samples", 16)
+    _check_number(settings, "cone", 0.0)
+
+
+def _check_noise(settings: Settings) -> None:
+    for name in ("force_noise", "moment_noise"):
+        _check_number(settings, name, 0.0)
+
+
+def _check_sensitivity(settings: Settings) -> None:
+    _triplets(settings)
+    _check_noise(settings)
+
+
+def _check_estimation(settings: Settings) -> None:
+    _sets(settings)
+    _check_noise(settings)
+    _check_number(settings, "contacts", 1)
+
+
+def _check_friction(settings: Settings) -> None:
+    selection(settings["triplet"], exactly=3)
+    _check_number(settings, "contacts", 1)
+    values = settings["friction"]
+    if not isinstance(values, list | tuple) or not values or min(values) < 0.0:
+        raise ValueError(f"friction is {values!r}; a list of coefficients from 0 is needed")
+
+
+def _check_number(settings: Settings, name: str, least: float) -> None:
+    value = settings[name]
+    if isinstance(value, bool) or not isinstance(value, int | float) or value < least:
+        raise ValueError(f"{name} is {value!r}; a number from {least:g} is needed")
+
+
+def _nothing(settings: Settings) -> None:
+    pass
+
+
+def _uniqueness_seconds(settings: Settings) -> float:
+    # Measured: 60 s of one core for 20 triplets × 6 regions, 4096 samples, with resolution.
+    share = len(_triplets(settings)) / 20.0 * settings["samples"] / 4096.0
+    return 1.0 + 60.0 * share
+
+
+_SENSOR = {"force_noise": FORCE_NOISE / _MICRO, "moment_noise": MOMENT_NOISE / _MICRO}
+
+TASKS: Mapping[str, Task] = MappingProxyType(
+    {
+        "map": Task(_map_summary, {}, _nothing, lambda settings: 0.3),
+        "uniqueness": Task(
+            _uniqueness,
+            {
+                "triplets": PAPERS,
+                "regions": ("all",),
+                "cone": 2.0,
+                "samples": 1024,
+                "resolution": True,
+            },
+            _check_uniqueness,
+            _uniqueness_seconds,
+        ),
+        "sensitivity": Task(
+            _sensitivity,
+            {"triplets": PAPERS, **_SENSOR},
+            _check_sensitivity,
+            lambda settings: 0.5,
+        ),
+        "estimation": Task(
+            _estimation,
+            {"signals": ("Fx MB MD", "wrench"), "contacts": 1000, **_SENSOR},
+            _check_estimation,
+            lambda settings: 0.5 + 1e-4 * settings["contacts"] * len(settings["signals"]),
+        ),
+        "friction": Task(
+            _friction,
+            {"triplet": "Fx MB MD", "friction": (0.0, 0.1, 0.3, 0.5), "contacts": 1000},
+            _check_friction,
+            lambda settings: 0.5 + 1e-4 * settings["contacts"] * len(settings["friction"]),
+        ),
+    }
+)

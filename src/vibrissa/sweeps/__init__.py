@@ -1,7 +1,8 @@
 """Studies of many whiskers: plain data in, one labelled store out, on one machine or many."""
 
+from vibrissa.sweeps.results import failures, open_sweep
 from vibrissa.sweeps.run import Outcome, run_sweep
-from vibrissa.sweeps.store import Busy, Store, failures, open_sweep
+from vibrissa.sweeps.store import Busy, Store
 from vibrissa.sweeps.study import EXAMPLE, Cell, Study, read_study
 
 __all__ = [

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import contextlib
+from collections.abc import Generator, Iterable, Iterator
 from typing import Any
 
 from vibrissa.sweeps.study import Cell, answer
 
 _AHEAD = 2
 _PATIENCE = 20.0
-"""How long to wait for a scheduler, s."""
+"""How long to wait for a scheduler and its first worker, s."""
+_DIED = "the workers that had this cell died (killed, or out of memory)\n"
 
 
 def answers_by_dask(
     cells: Iterable[Cell], scheduler: str, workers: int
-) -> Iterator[tuple[Cell, dict[str, Any]]]:
+) -> Generator[tuple[Cell, dict[str, Any]], None, None]:
     """Answers from a Dask cluster.
 
     Parameters
@@ -36,13 +38,13 @@ def answers_by_dask(
     Raises
     ------
     ValueError
-        If there is no such scheduler, or it goes away; what was written before is whole.
+        If there is no such scheduler, it has no workers or those of another version, or it goes
+        away.
     ModuleNotFoundError
         If Dask is not installed.
     """
     try:
-        from distributed import Client, LocalCluster, as_completed
-        from distributed.scheduler import KilledWorker
+        from distributed import Client, LocalCluster
     except ModuleNotFoundError as missing:
         raise ModuleNotFoundError(
             "a Dask cluster needs the extra: pip install 'vibrissa[cluster]'"
@@ -60,32 +62,74 @@ def answers_by_dask(
         client = Client(local or scheduler, timeout=_PATIENCE)
     except OSError as fault:
         raise ValueError(f"there is no Dask scheduler at {scheduler}: {fault}") from None
-    waiting = iter(cells)
     try:
-        under_way = as_completed()
-        asked: dict[str, Cell] = {}
-
-        def submit() -> None:
-            cell = next(waiting, None)
-            if cell is not None:
-                future = client.submit(
-                    answer, cell, key=f"{cell.task}-{cell.index}-{cell.identity}"
-                )
-                asked[future.key] = cell
-                under_way.add(future)
-
-        for _ in range(_AHEAD * max(sum(client.nthreads().values()), 1)):
-            submit()
-        for future in under_way:
-            cell = asked.pop(future.key)
-            submit()
-            if future.status == "cancelled":
-                raise ValueError(f"the Dask scheduler at {scheduler} is gone: call again to go on")
-            try:
-                yield cell, future.result()
-            except KilledWorker as fault:
-                yield cell, {"failure": f"{fault}\n", "seconds": float("nan")}
+        _check(client, scheduler)
+        killed: list[Cell] = []
+        for cell, found in _round(client, scheduler, cells):
+            if found is None:
+                killed.append(cell)
+            else:
+                yield cell, found
+        # A worker that dies takes others' cells with it: who is to blame shows when it is alone.
+        for suspect in killed:
+            for cell, found in _round(client, scheduler, [suspect]):
+                yield cell, found or {"failure": _DIED, "seconds": float("nan")}
     finally:
-        client.close()
+        with contextlib.suppress(OSError, TimeoutError):
+            client.close()
         if local is not None:
             local.close()
+
+
+def _round(
+    client: Any, scheduler: str, cells: Iterable[Cell]
+) -> Iterator[tuple[Cell, dict[str, Any] | None]]:
+    """Answers, as they come; None for a cell with which workers died."""
+    from concurrent.futures import CancelledError
+
+    from distributed import as_completed
+    from distributed.scheduler import KilledWorker
+
+    waiting, asked = iter(cells), dict[str, Cell]()
+    under_way = as_completed()
+
+    def submit() -> None:
+        if (cell := next(waiting, None)) is None:
+            return
+        key = f"{cell.task}-{cell.index}-{cell.identity}"
+        asked[key] = cell
+        under_way.add(client.submit(answer, cell, key=key))
+
+    for _ in range(_AHEAD * max(sum(client.nthreads().values()), 1)):
+        submit()
+    for future in under_way:
+        cell = asked.pop(future.key)
+        submit()
+        try:
+            yield cell, future.result()
+        except KilledWorker:
+            yield cell, None
+        except (CancelledError, OSError) as fault:
+            raise ValueError(
+                f"the Dask scheduler at {scheduler} is gone. What is written is whole; the same "
+                "call goes on from it"
+            ) from fault
+
+
+def _check(client: Any, scheduler: str) -> None:
+    """Whether there are workers that compute as this process does."""
+    from vibrissa import __version__
+
+    try:
+        client.wait_for_workers(1, timeout=_PATIENCE)
+    except TimeoutError:
+        raise ValueError(f"the Dask scheduler at {scheduler} has no workers") from None
+    for worker, version in client.run(_version).items():
+        if version != __version__:
+            raise ValueError(f"{worker} has vibrissa {version}; {__version__} is needed, as here")
+
+
+def _version() -> str:
+    from vibrissa import __version__
+
+    return __version__

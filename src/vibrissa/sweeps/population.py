@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -93,15 +94,10 @@ def population(tables: Sequence[Any], folder: Path, seed: int) -> list[Specimen]
         said = {key: value for key, value in table.items() if key != "kind"}
         try:
             found += _KINDS[kind](said, folder, [seed, number])
-        except (ValueError, OSError) as fault:
+        except (TypeError, ValueError, OSError) as fault:
             raise ValueError(f"{where}: {fault}") from None
-    names = [specimen.name for specimen in found]
-    twice = (
-        sorted({name for name in names if names.count(name) > 1})
-        if len(set(names)) < len(names)
-        else []
-    )
-    if twice:
+    counts = Counter(specimen.name for specimen in found)
+    if twice := sorted(name for name, count in counts.items() if count > 1):
         raise ValueError(f"whiskers share the names {', '.join(twice[:5])}: give each a prefix")
     if not found:
         raise ValueError("the study has no whiskers: at least one [[whiskers]] is needed")
@@ -155,18 +151,12 @@ def _files(said: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iterat
     pattern = said.get("files")
     if not isinstance(pattern, str):
         raise ValueError(f"files is {pattern!r}; a pattern such as 'whiskers/*.csv' is needed")
-    base = Path(pattern)
-    root, rest = (
-        (Path(base.anchor), str(base.relative_to(base.anchor)))
-        if base.anchor
-        else (
-            folder,
-            pattern,
-        )
-    )
+    path = folder / pattern
+    root = Path(path.anchor) if path.anchor else Path()
+    rest = str(path.relative_to(root))
     paths = sorted(path for path in root.glob(rest) if path.is_file())
     if not paths:
-        raise ValueError(f"no file is called {pattern} in {folder.resolve()}")
+        raise ValueError(f"no file is called {path}")
     prefix = str(said.get("prefix", ""))
     changes = {
         name: _numbers(name, said[name])[0] * PARAMETERS[name][1]

@@ -11,7 +11,6 @@ was killed. Groups are made aside and renamed as well.
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import json
 import shutil
@@ -24,7 +23,7 @@ import xarray as xr
 import zarr
 from numpy.typing import NDArray
 
-from vibrissa.sweeps.study import Cell, Study
+from vibrissa.sweeps.study import TAKEN, Cell, Study
 
 Array = NDArray[np.float64]
 
@@ -39,7 +38,8 @@ DESCRIBED = {
 }
 """What is told of every whisker, and its unit."""
 
-_LOCK, _STUDY, _FAILURES = ".lock", ".study.json", ".failures"
+STUDY, FAILURES = ".study.json", ".failures"
+_LOCK = ".sweep.lock"
 _HASH = 16
 
 
@@ -105,15 +105,17 @@ class Store:
         for left in self.path.glob(".new-*"):
             shutil.rmtree(left)
         said = _described(self.study)
-        if not self._known(_STUDY):
+        if not self._known(STUDY):
+            for begun in TAKEN:  # perhaps for another study
+                shutil.rmtree(self.path / begun, ignore_errors=True)
             self._make("whiskers", self._make_whiskers)
             self._make("cells", self._make_cells)
             root = zarr.open_group(self.path, mode="a", zarr_format=2)
             root.attrs.update({"kind": "vibrissa sweep", "study": self.study.name})
-            part = self.path / f"{_STUDY}.part"
+            part = self.path / f"{STUDY}.part"
             part.write_text(json.dumps(said), encoding="utf-8")
-            part.replace(self.path / _STUDY)
-        kept = json.loads((self.path / _STUDY).read_text(encoding="utf-8"))
+            part.replace(self.path / STUDY)
+        kept = json.loads((self.path / STUDY).read_text(encoding="utf-8"))
         differing = [name for name in said if kept.get(name) != said[name]]
         if differing:
             raise ValueError(
@@ -180,7 +182,7 @@ class Store:
                 status[at] = said[at]
         return status
 
-    def write(self, cell: Cell, answer: dict[str, Any]) -> None:
+    def write(self, cell: Cell, answer: dict[str, Any]) -> bool:
         """Keep what became of a cell.
 
         Parameters
@@ -189,37 +191,59 @@ class Store:
             What was asked.
         answer : dict
             Of `vibrissa.sweeps.study.answer`.
-        """
-        at = cell.index, self._columns[cell.task]
-        failure = self.path / _FAILURES / f"{cell.task}-{cell.index}.txt"
-        if "failure" in answer:
-            failure.parent.mkdir(exist_ok=True)
-            part = failure.with_suffix(".part")
-            part.write_text(f"{cell.specimen.name}\n{answer['failure']}", encoding="utf-8")
-            part.replace(failure)
-        else:
-            self._write_result(cell, answer["result"])
-            for name, value in answer["whisker"].items():
-                self._whiskers[name][cell.index] = value
-            failure.unlink(missing_ok=True)
-        self._cells["seconds"][at] = answer["seconds"]
-        self._cells["status"][at] = FAILED if "failure" in answer else DONE
-        self._cells["identity"][at] = cell.identity.encode()
 
-    def _write_result(self, cell: Cell, result: xr.Dataset) -> None:
+        Returns
+        -------
+        bool
+            Whether it is done; false if it failed, also where its result does not go with those
+            of other whiskers.
+
+        Raises
+        ------
+        OSError
+            If it cannot be written; it is then as if it had not been done, and what was written
+            before is whole.
+        """
+        try:
+            failure = answer.get("failure") or self._write_result(cell, answer["result"])
+            self._write_failure(cell, failure)
+            if not failure:
+                for name, value in answer["whisker"].items():
+                    self._whiskers[name][cell.index] = value
+            at = cell.index, self._columns[cell.task]
+            self._cells["seconds"][at] = answer["seconds"]
+            self._cells["status"][at] = FAILED if failure else DONE
+            self._cells["identity"][at] = cell.identity.encode()
+        except OSError as fault:
+            raise OSError(
+                fault.errno,
+                f"{fault.strerror or fault}: nothing more can be written to {self.path}. What is "
+                "there is whole; the same call goes on from it",
+            ) from fault
+        return not failure
+
+    def _write_failure(self, cell: Cell, failure: str) -> None:
+        path = self.path / FAILURES / f"{cell.task}-{cell.index}.txt"
+        if not failure:
+            path.unlink(missing_ok=True)
+            return
+        path.parent.mkdir(exist_ok=True)
+        part = path.with_suffix(".part")
+        part.write_text(f"{cell.specimen.name}\n{failure}", encoding="utf-8")
+        part.replace(path)
+
+    def _write_result(self, cell: Cell, result: xr.Dataset) -> str:
+        """Write a result, or say why it cannot be kept beside those of other whiskers."""
         if cell.task not in self._results:
             self._make(cell.task, lambda group: self._fill_task(group, result))
             group = zarr.open_group(self.path / cell.task, mode="r+", zarr_format=2)
             self._results[cell.task] = group
         group = self._results[cell.task]
+        if misfit := _misfit(group, result):
+            return misfit
         for name, variable in result.data_vars.items():
-            array = group[str(name)]
-            if array.shape[1:] != variable.shape:
-                raise ValueError(
-                    f"{name} of {cell.specimen.name} has shape {variable.shape}, that of other "
-                    f"whiskers {array.shape[1:]}"
-                )
-            array[cell.index] = variable.values
+            group[str(name)][cell.index] = variable.values
+        return ""
 
     def _fill_task(self, group: zarr.Group, result: xr.Dataset) -> None:
         """Make the arrays of a task like those of a first result."""
@@ -251,6 +275,27 @@ class Store:
             )
 
 
+def _misfit(group: zarr.Group, result: xr.Dataset) -> str:
+    """What keeps a result from being one of a group's."""
+    for name, variable in result.variables.items():
+        if name not in group:
+            return f"{name} is no result of other whiskers\n"
+        array = group[str(name)]
+        others = array.shape if name in result.coords else array.shape[1:]
+        if others != variable.shape:
+            return f"{name} has shape {variable.shape}, that of other whiskers has {others}\n"
+        if name in result.coords and not _same(array[...], variable.values):
+            return f"{name} is {variable.values}, that of other whiskers {array[...]}\n"
+    return ""
+
+
+def _same(first: NDArray[Any], second: NDArray[Any]) -> bool:
+    """Whether coordinates agree, to what another machine's rounding may change."""
+    if first.dtype.kind == "f":
+        return bool(np.allclose(first, second, rtol=1e-12, atol=0.0))
+    return bool(np.array_equal(first, second))
+
+
 def _described(study: Study) -> dict[str, Any]:
     """What two studies must have in common to share a store."""
     return {
@@ -265,74 +310,3 @@ def _described(study: Study) -> dict[str, Any]:
 
 def _plain(value: Any) -> Any:
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
-
-
-def open_sweep(path: str | PathLike[str]) -> xr.Dataset:
-    """Open the results of a study as one dataset.
-
-    Parameters
-    ----------
-    path : str or path
-        Of the store; it may be written to meanwhile.
-
-    Returns
-    -------
-    Dataset
-        Over ``whisker`` and the dimensions of the tasks. Variables are called after their task and
-        their name, ``uniqueness_verdict``; verdicts are words. With them what is told of every
-        whisker, and ``status`` and ``seconds`` over ``task``. NaN, or no word, where nothing is
-        known yet.
-
-    Raises
-    ------
-    ValueError
-        If it is no store.
-    """
-    path = Path(path)
-    if not (path / _STUDY).exists():
-        raise ValueError(f"{path} is no store of a sweep")
-    parts = [_group(path / "whiskers").set_coords(list(DESCRIBED))]
-    cells = _group(path / "cells")
-    parts.append(cells[["status", "seconds"]])
-    for task in cells["task"].values:
-        if (path / str(task)).exists():
-            found = _group(path / str(task))
-            parts.append(found.rename({name: f"{task}_{name}" for name in found.data_vars}))
-    out = xr.merge(parts, join="outer", combine_attrs="drop")
-    out.attrs = {"study": json.loads((path / _STUDY).read_text(encoding="utf-8"))["name"]}
-    return out
-
-
-def _group(path: Path) -> xr.Dataset:
-    data = xr.open_zarr(path, consolidated=False, zarr_format=2, chunks=None, decode_cf=False)
-    data = data.drop_attrs(deep=False)
-    for name, variable in data.data_vars.items():
-        meanings = variable.attrs.get("flag_meanings")
-        if meanings:
-            words = np.array([*(word.replace("_", " ") for word in meanings.split()), ""])
-            data[name] = variable.copy(data=words[variable.values])
-            data[name].attrs = {
-                key: value for key, value in variable.attrs.items() if not key.startswith("flag_")
-            }
-    return data
-
-
-def failures(path: str | PathLike[str]) -> dict[str, str]:
-    """Read what went wrong.
-
-    Parameters
-    ----------
-    path : str or path
-        Of the store.
-
-    Returns
-    -------
-    dict
-        By task and number of the whisker, such as ``uniqueness-12``: the whisker's name and the
-        traceback.
-    """
-    found = {}
-    for file in sorted((Path(path) / _FAILURES).glob("*.txt")):
-        with contextlib.suppress(FileNotFoundError):
-            found[file.stem] = file.read_text(encoding="utf-8")
-    return found

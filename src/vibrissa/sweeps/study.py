@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import hashlib
 import json
+import time
 import tomllib
+import traceback
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
+
+import numpy as np
+from threadpoolctl import threadpool_limits
 
 from vibrissa.sweeps.population import Specimen, population
 from vibrissa.sweeps.tasks import TASKS, Settings, settings_of
+from vibrissa.whisker import Whisker
 
 EXAMPLE = """\
 # A study for `vibrissa sweep`: lengths in mm, radii in µm, moduli in GPa, angles in degrees.
@@ -65,11 +71,15 @@ moment_noise = 0.02              # µN·m
 # Others: "map"; "sensitivity" (triplets, noise); "friction" (triplet, friction, contacts).
 """
 
+TAKEN = ("cells", "whiskers")
+"""Names that no task can have: a store keeps other things under them."""
 
-class Cell(NamedTuple):
+
+@dataclass(frozen=True)
+class Cell:
     """One task for one whisker.
 
-    Attributes
+    Parameters
     ----------
     task : str
         Name of the task in the study.
@@ -190,10 +200,10 @@ def read_study(text: str, folder: Path) -> Study:
             raise ValueError(f"{where} is {table!r}; a table is needed")
         kind, settings = settings_of(table, where)
         name = str(table.get("name", kind))
-        if name in tasks or not name.replace("_", "").replace("-", "").isalnum():
+        if name in tasks or name in TAKEN or not name.replace("_", "").isalnum():
             raise ValueError(
-                f"{where} is called {name!r}; letters and digits, and another name for each, "
-                "are needed (name = ...)"
+                f"{where} is called {name!r}; letters and digits are needed, for each task "
+                f"another name (name = ...), and not {' or '.join(TAKEN)}"
             )
         tasks[name] = (kind, settings)
     specimens = population(tables["whiskers"], folder, seed)
@@ -214,33 +224,29 @@ def answer(cell: Cell) -> dict[str, Any]:
         ``result`` (Dataset), ``whisker`` (numbers that describe it, SI units) and ``seconds`` of
         CPU; or ``failure``, the traceback as text.
     """
-    import time
-    import traceback
-
     started = time.process_time()
     try:
         whisker = cell.specimen.make()
-        result = TASKS[cell.kind].run(whisker, cell.settings, cell.seed)
-        tangent = whisker.frame(whisker.length)[:, 0]
-        described = {
-            "length": whisker.length,
-            "base_radius": whisker.base_radius,
-            "tip_radius": whisker.tip_radius,
-            "taper_ratio": whisker.base_radius / whisker.tip_radius,
-            "youngs_modulus": whisker.youngs_modulus,
-            "tip_turn": float(_angle(tangent)),
-        }
+        # Threads of linear algebra would change the last digits with their number.
+        with threadpool_limits(1):
+            result = TASKS[cell.kind].run(whisker, cell.settings, cell.seed).load()
+        described = _described(whisker)
     except Exception:
         return {"failure": traceback.format_exc(), "seconds": time.process_time() - started}
     return {
-        "result": result.load(),
+        "result": result,
         "whisker": described,
         "seconds": time.process_time() - started,
     }
 
 
-def _angle(tangent: Any) -> float:
-    """Angle between the tip's tangent and that of the base, rad."""
-    import numpy as np
-
-    return float(np.arctan2(np.hypot(tangent[1], tangent[2]), tangent[0]))
+def _described(whisker: Whisker) -> dict[str, float]:
+    tangent = whisker.frame(whisker.length)[:, 0]
+    return {
+        "length": whisker.length,
+        "base_radius": whisker.base_radius,
+        "tip_radius": whisker.tip_radius,
+        "taper_ratio": whisker.base_radius / whisker.tip_radius,
+        "youngs_modulus": whisker.youngs_modulus,
+        "tip_turn": float(np.arctan2(np.hypot(tangent[1], tangent[2]), tangent[0])),
+    }

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 from vibrissa.mapping import ContactMap, estimate_from_wrench, uniqueness
 from vibrissa.mapping.best_triplet import best_triplet
@@ -34,7 +35,7 @@ PAPERS = ("Fx MB MD", "Mx MB MD", "Fx FD MD")
 
 VERDICTS = ("unique", "unique off a surface", "not unique")
 _MICRO = 1e-6
-_MM = 1e-3
+_STATIONS = np.linspace(0.3, 1.0, 15)
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,7 @@ def settings_of(said: Mapping[str, Any], where: str) -> tuple[str, Settings]:
         If the task or a setting is not known, or out of range.
     """
     kind = said.get("kind")
-    if kind not in TASKS:
+    if not isinstance(kind, str) or kind not in TASKS:
         raise ValueError(f"{where}: kind is {kind!r}; one of {', '.join(TASKS)} is needed")
     task = TASKS[kind]
     given = {key: value for key, value in said.items() if key not in ("kind", "name")}
@@ -94,27 +95,24 @@ def settings_of(said: Mapping[str, Any], where: str) -> tuple[str, Settings]:
         task.check(settings)
     except (TypeError, ValueError) as fault:
         raise ValueError(f"{where}: {fault}") from None
-    return str(kind), settings
+    return kind, settings
 
 
 def _map_summary(whisker: Whisker, settings: Settings, seed: int) -> xr.Dataset:
     """Extents of the reachable space and of the signals."""
     data = ContactMap.simulate(whisker, grid=False).to_dataset()
     names = ("r", "theta", "phi", *SIGNALS)
-    ranges = np.array([[float(data[name].min()), float(data[name].max())] for name in names])
-    force = np.linalg.norm(data["force"].transpose(..., "space").values, axis=-1)
-    load = data.sizes["load"] - 1
-    fold = np.nanmin(force.reshape(-1, load + 1)[:, -1].reshape(data.sizes["station"], -1), axis=1)
-    out = {
-        f"{name}_{end}": ((), ranges[i, k], attributes(name))
-        for i, name in enumerate(names)
-        for k, end in enumerate(("least", "largest"))
-    }
+    out = {}
+    for name in names:
+        for end, value in (("least", data[name].min()), ("largest", data[name].max())):
+            out[f"{name}_{end}"] = ((), float(value), attributes(name))
+    # Its stations are the map's own; smooth between them is the logarithm of the force.
+    least = np.log(np.nanmin(_fold_forces(data), axis=1))
+    slip = np.exp(CubicSpline(data["station"].values, least)(_STATIONS))
     about = {"units": "N", "long_name": "least force at which the whisker slips off"}
     at = {"units": "1", "long_name": "arc length of the contact over the whisker's"}
     return xr.Dataset(
-        {**out, "slip_force": ("station", fold, about)},
-        {"station": ("station", data["station"].values, at)},
+        {**out, "slip_force": ("station", slip, about)}, {"station": ("station", _STATIONS, at)}
     )
 
 
@@ -249,13 +247,21 @@ def _table(
 def _triplets(settings: Settings) -> list[str]:
     if settings["triplets"] == "all":
         return [" ".join(triplet) for triplet in TRIPLETS]
-    return [" ".join(selection(one, exactly=3)) for one in settings["triplets"]]
+    return [" ".join(selection(one, exactly=3)) for one in _several(settings, "triplets")]
 
 
 def _sets(settings: Settings) -> list[str]:
     return [
-        "wrench" if one == "wrench" else " ".join(selection(one)) for one in settings["signals"]
+        "wrench" if one == "wrench" else " ".join(selection(one))
+        for one in _several(settings, "signals")
     ]
+
+
+def _several(settings: Settings, name: str) -> Sequence[Any]:
+    value = settings[name]
+    if isinstance(value, str) or not value or len(set(value)) < len(value):
+        raise ValueError(f"{name} is {value!r}; a list without repetitions is needed")
+    return tuple(value)
 
 
 def _noise(settings: Settings) -> Array:
@@ -265,9 +271,10 @@ def _noise(settings: Settings) -> Array:
 
 def _check_uniqueness(settings: Settings) -> None:
     _triplets(settings)
-    unknown = [region for region in settings["regions"] if region not in REGIONS]
-    if unknown or not settings["regions"] or isinstance(settings["regions"], str):
-        raise ValueError(f"regions is {settings['regions']!r}; a list of {', '.join(REGIONS)}")
+    if unknown := [region for region in _several(settings, "regions") if region not in REGIONS]:
+        raise ValueError(f"regions has {unknown[0]!r}; known are {', '.join(REGIONS)}")
+    if not isinstance(settings["resolution"], bool):
+        raise ValueError(f"resolution is {settings['resolution']!r}; true or false is needed")
     _check_number(settings, "samples", 16)
     _check_number(settings, "cone", 0.0)
 
@@ -291,8 +298,8 @@ def _check_estimation(settings: Settings) -> None:
 def _check_friction(settings: Settings) -> None:
     selection(settings["triplet"], exactly=3)
     _check_number(settings, "contacts", 1)
-    values = settings["friction"]
-    if not isinstance(values, list | tuple) or not values or min(values) < 0.0:
+    values = _several(settings, "friction")
+    if not all(isinstance(mu, int | float) and mu >= 0.0 for mu in values):
         raise ValueError(f"friction is {values!r}; a list of coefficients from 0 is needed")
 
 
@@ -308,7 +315,7 @@ def _nothing(settings: Settings) -> None:
 
 def _uniqueness_seconds(settings: Settings) -> float:
     # Measured: 60 s of one core for 20 triplets × 6 regions, 4096 samples, with resolution.
-    share = len(_triplets(settings)) / 20.0 * settings["samples"] / 4096.0
+    share = len(_triplets(settings)) / 20.0 * float(settings["samples"]) / 4096.0
     return 1.0 + 60.0 * share
 
 

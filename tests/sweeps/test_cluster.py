@@ -1,0 +1,117 @@
+"""Studies on a Dask cluster: the same results, whatever dies."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("zarr", reason="zarr (extra sweeps) is not installed")
+pytest.importorskip("distributed", reason="dask[distributed] (extra cluster) is not installed")
+
+import dask
+import xarray as xr
+
+from vibrissa.sweeps import Study, failures, open_sweep, read_study, run_sweep
+from vibrissa.sweeps.population import Specimen
+
+TEXT = """
+[[whiskers]]
+taper_ratio = [5, 15]
+curvature = 0.4
+[[tasks]]
+kind = "map"
+"""
+
+
+@pytest.fixture
+def study() -> Study:
+    return read_study(TEXT, Path())
+
+
+@pytest.fixture
+def scheduler(tmp_path):
+    """A scheduler and a worker of their own, found by the address in a file."""
+    address = tmp_path / "scheduler.json"
+    common = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": tmp_path}
+    head = subprocess.Popen(
+        [
+            sys.executable,
+            "-m",
+            "distributed.cli.dask_scheduler",
+            "--port",
+            "0",
+            "--no-dashboard",
+            "--host",
+            "127.0.0.1",
+            "--scheduler-file",
+            str(address),
+        ],
+        **common,
+    )
+    hand = subprocess.Popen(
+        [
+            sys.executable,
+            "-m",
+            "distributed.cli.dask_worker",
+            "--scheduler-file",
+            str(address),
+            "--nthreads",
+            "1",
+            "--no-dashboard",
+            "--no-nanny",
+            "--death-timeout",
+            "60",
+        ],
+        **common,
+    )
+    try:
+        end = time.monotonic() + 60.0
+        while not address.exists():
+            assert time.monotonic() < end, "the scheduler does not start"
+            time.sleep(0.05)
+        yield json.loads(address.read_text())["address"], head
+    finally:
+        for process in (hand, head):
+            process.kill()
+            process.wait()
+
+
+def test_a_local_cluster_gives_the_same_and_a_cell_that_kills_fails_alone(study, tmp_path):
+    run_sweep(study, tmp_path / "here", workers=0)
+    bad = Specimen("bad", {}, "bad", partial(signal.raise_signal, signal.SIGKILL))
+    spoilt = Study("spoilt", 0, (*study.specimens, bad), study.tasks)
+    # By default Dask gives a cell to four workers, one after the other, before it gives up.
+    with dask.config.set({"distributed.scheduler.allowed-failures": 0}):
+        outcome = run_sweep(spoilt, tmp_path / "there", workers=1, scheduler="local")
+    assert (outcome.done, outcome.failed) == (3, 1)
+    assert "died" in failures(tmp_path / "there")["map-2"]
+    found = open_sweep(tmp_path / "there").isel(whisker=slice(2)).drop_vars(["seconds", "whisker"])
+    here = open_sweep(tmp_path / "here").drop_vars(["seconds", "whisker"])
+    xr.testing.assert_identical(found.load().drop_attrs(), here.load().drop_attrs())
+
+
+def test_a_scheduler_that_is_killed_ends_the_run_and_leaves_what_is_done(
+    study, scheduler, tmp_path
+):
+    address, head = scheduler
+
+    def kill(done: int, total: int) -> None:
+        if done == 1:
+            head.kill()
+
+    slow = Specimen("slow", {}, "slow", partial(time.sleep, 600))
+    longer = Study("longer", 0, (study.specimens[0], slow), study.tasks)
+    with pytest.raises(ValueError, match="is gone"):
+        run_sweep(longer, tmp_path / "s", scheduler=address, progress=kill)
+    assert list(open_sweep(tmp_path / "s")["status"].values[:, 0]) == [1, 0]
+
+
+def test_no_scheduler_is_told(study, tmp_path, monkeypatch):
+    monkeypatch.setattr("vibrissa.sweeps.cluster._PATIENCE", 0.2)
+    with pytest.raises(ValueError, match=r"no Dask scheduler at tcp://127\.0\.0\.1:9"):
+        run_sweep(study, tmp_path / "s", scheduler="tcp://127.0.0.1:9")

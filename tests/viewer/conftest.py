@@ -1,37 +1,13 @@
-"""A real browser without a window, where there is one."""
-
-import shutil
+"""What the page shows, in a real browser where there is one."""
 
 import pytest
 
-ARGUMENTS = [
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-]
-
 
 @pytest.fixture(scope="session")
-def browser():
-    """Chromium, which draws 3D in software."""
-    driver = pytest.importorskip(
-        "playwright.sync_api", reason="playwright is not installed", exc_type=ImportError
-    )
+def browser(browser):
+    """The one of all tests, if there is a page to be shown in it."""
     pytest.importorskip("viser", reason="viser is not installed", exc_type=ImportError)
-    found = shutil.which("chromium") or shutil.which("chromium-browser")
-    if found is None:
-        pytest.skip("no browser called chromium is installed")
-    with driver.sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=found, args=ARGUMENTS)
-        yield browser
-        browser.close()
+    return browser
 
 
 @pytest.fixture(scope="session")

@@ -20,6 +20,7 @@ from vibrissa.cli import (
     information,
     judging,
     locating,
+    reporting,
     sensing,
     simulating,
     streaming,
@@ -58,6 +59,7 @@ app.command("stream")(streaming.stream)
 app.command("figures")(figures.figures)
 app.command("view")(viewing.view)
 app.command("movie")(filming.movie)
+app.command("report")(reporting.report)
 app.command("info")(information.info)
 
 

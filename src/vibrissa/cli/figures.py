@@ -89,8 +89,8 @@ def figures(
     from vibrissa.plots import save
 
     check_folder(folder)
-    verdicts = None if uniqueness is None else _dataset(uniqueness, "verdict")
-    sweep = None if cones is None else _dataset(cones, "critical_cone")
+    verdicts = None if uniqueness is None else dataset_with(uniqueness, "verdict")
+    sweep = None if cones is None else dataset_with(cones, "critical_cone")
     with progress_bars() as tell:
         drawings = array_drawings(path, width)
         if not path.is_dir() and recognise(path) == Kind.RECORDING:
@@ -99,7 +99,7 @@ def figures(
         else:
             _refuse({"--video": videos, "--map": chart}, f"{path} is no recording")
         if not drawings:
-            drawings = dict(_drawings(map_from(path), width, verdicts, sweep))
+            drawings = dict(map_drawings(map_from(path), width, verdicts, sweep))
         folder.mkdir(parents=True, exist_ok=True)
         files = []
         for i, (name, draw) in enumerate(drawings.items()):
@@ -128,8 +128,26 @@ def _refuse(options: dict[str, Any], reason: str) -> None:
         raise ValueError(f"{', '.join(given)} cannot be used: {reason}")
 
 
-def _dataset(path: Path, needed: str) -> xr.Dataset:
-    """Read a dataset that holds a variable."""
+def dataset_with(path: Path, needed: str) -> xr.Dataset:
+    """Read a dataset that holds a variable.
+
+    Parameters
+    ----------
+    path : Path
+        NetCDF.
+    needed : str
+        The variable.
+
+    Returns
+    -------
+    Dataset
+        The data.
+
+    Raises
+    ------
+    ValueError
+        If it is a table, or does not hold the variable.
+    """
     import xarray as xr
 
     from vibrissa.io import kind_of
@@ -146,10 +164,32 @@ def _dataset(path: Path, needed: str) -> xr.Dataset:
     return data
 
 
-def _drawings(
+def map_drawings(
     contacts: ContactMap, width: Any, verdicts: xr.Dataset | None, cones: xr.Dataset | None
 ) -> Iterator[tuple[str, Draw]]:
-    """Names and what draws them."""
+    """Say what can be drawn of a map.
+
+    Parameters
+    ----------
+    contacts : ContactMap
+        The map.
+    width : {"single", "double"}
+        Columns of the page.
+    verdicts : Dataset or None
+        Of :func:`vibrissa.uniqueness`.
+    cones : Dataset or None
+        Critical cones by curvature and taper.
+
+    Yields
+    ------
+    str, callable
+        Names of figures, and what draws them.
+
+    Raises
+    ------
+    ValueError
+        If the verdicts are those of another whisker.
+    """
     from vibrissa import plots
 
     whisker = contacts.whisker

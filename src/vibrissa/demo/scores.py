@@ -181,13 +181,7 @@ def score(contacts: xr.Dataset, truth: xr.Dataset, errors: xr.Dataset, fit: Cyli
     touching = truth["in_contact"].values
     number = contacts["candidates"].values[felt]
     known = np.isfinite(errors["error_distance"].values)
-    angle = np.degrees(errors["deflection_angle"].values)
-    by_angle = []
-    for low, high in itertools.pairwise(ANGLES):
-        rows = known & (angle >= low) & (angle < high)
-        if rows.any():
-            label = angle_label(low, high)
-            by_angle.append(_row(errors, "error_distance", label, rows))
+    of_all, by_angle = error_rows(errors)
     origin, axis = truth["peg_position"].values, truth["peg_axis"].values
     radius = float(truth["peg_radius"])
     offset, tilt = axis_offset(fit.origin, fit.axis, origin, axis)
@@ -198,13 +192,38 @@ def score(contacts: xr.Dataset, truth: xr.Dataset, errors: xr.Dataset, fit: Cyli
         felt=int(felt.sum()),
         false=int((felt & ~touching).sum()),
         candidates=np.array([(number == 0).sum(), (number == 1).sum(), (number > 1).sum()]),
-        errors=tuple(_row(errors, name, "all", known) for name in ERRORS),
-        by_angle=tuple(by_angle),
+        errors=of_all,
+        by_angle=by_angle,
         offset=offset,
         tilt=tilt,
         diameter_error=float(fit.diameter - 2.0 * radius),
         surface=_quantiles(np.abs(gap)),
     )
+
+
+def error_rows(errors: xr.Dataset) -> tuple[tuple[ErrorRow, ...], tuple[ErrorRow, ...]]:
+    """Sum up errors of contacts.
+
+    Parameters
+    ----------
+    errors : xarray.Dataset
+        Of `contact_errors`.
+
+    Returns
+    -------
+    of_all : tuple of ErrorRow
+        Of r, θ, φ and in space, all contacts that have an estimate.
+    by_angle : tuple of ErrorRow
+        In space, for each class of deflection angle that there is.
+    """
+    known = np.isfinite(errors["error_distance"].values)
+    angle = np.degrees(errors["deflection_angle"].values)
+    by_angle = []
+    for low, high in itertools.pairwise(ANGLES):
+        rows = known & (angle >= low) & (angle < high)
+        if rows.any():
+            by_angle.append(_row(errors, "error_distance", angle_label(low, high), rows))
+    return tuple(_row(errors, name, "all", known) for name in ERRORS), tuple(by_angle)
 
 
 def angle_label(low: float, high: float) -> str:

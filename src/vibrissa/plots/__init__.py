@@ -15,8 +15,9 @@ from vibrissa.plots.sights import Sight
 from vibrissa.plots.signal_movie import signal_frames
 from vibrissa.plots.signals import signals_over_time
 from vibrissa.plots.slices import solid_slices
-from vibrissa.plots.style import save
+from vibrissa.plots.style import png, save
 from vibrissa.plots.surfaces import contact_surfaces
+from vibrissa.plots.things import object_triangles
 from vibrissa.plots.verdicts import verdict_table
 from vibrissa.plots.whisker import whisker_views
 from vibrissa.plots.witness import witness_pair
@@ -34,6 +35,8 @@ __all__ = [
     "deflection_angles",
     "distances_by_class",
     "estimated_against_true",
+    "object_triangles",
+    "png",
     "resolution",
     "save",
     "sensitivity_panels",

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
+from io import BytesIO
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
@@ -373,3 +374,24 @@ def save(
         for file, ending in zip(files, formats, strict=True):
             figure.savefig(file, format=ending, metadata=dated.get(ending))
     return files
+
+
+def png(figure: Figure, dots: float = 200.0) -> bytes:
+    """Write a figure into memory.
+
+    Parameters
+    ----------
+    figure : Figure
+        The figure.
+    dots : float
+        Per inch.
+
+    Returns
+    -------
+    bytes
+        A PNG file.
+    """
+    file = BytesIO()
+    with looking():
+        figure.savefig(file, format="png", dpi=dots)
+    return file.getvalue()

@@ -1,0 +1,235 @@
+"""The contour, or all contacts of a map, as a picture in 3D that can be turned.
+
+Numbers are in mm, in the laboratory frame for a trial and in the whisker's for a map. The drawing
+library is an extra: it is loaded here only, and its script goes into the page once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from vibrissa.contour import FittedShape
+from vibrissa.contour.mesh import surface_grid
+from vibrissa.plots import Course, object_triangles
+from vibrissa.quantities import quantity, to_display
+from vibrissa.report.page import Section, paragraph
+from vibrissa.sketch import BENT, REST, thinned
+
+Array = NDArray[np.float64]
+
+MISSING = "No 3D picture: `pip install 'vibrissa[report]'` makes it possible."
+"""What is said where the drawing library is not installed."""
+
+_MOST_POINTS = 4000
+_SHAPES = 7
+"""How many bent whiskers are drawn."""
+_ROOM = 0.15
+"""Left about the contacts, as a share of their extent."""
+_CAMERA = {"eye": {"x": 1.4, "y": -1.5, "z": 0.9}}
+
+
+def can_draw() -> bool:
+    """Tell whether the drawing library is installed.
+
+    Returns
+    -------
+    bool
+        False: pictures are left out.
+    """
+    return find_spec("plotly") is not None
+
+
+def contacts_in_space(
+    course: Course, objects: Sequence[xr.Dataset] = (), fits: Sequence[FittedShape] = ()
+) -> Any:
+    """Draw contact points in the laboratory with the object, as it is known and as it was fitted.
+
+    Parameters
+    ----------
+    course : Course
+        Of a trial, with places.
+    objects : sequence of Dataset
+        The groups of a recording's ``objects``.
+    fits : sequence of FittedShape
+        In the laboratory.
+
+    Returns
+    -------
+    plotly.graph_objects.Figure
+        Axes in mm.
+
+    Raises
+    ------
+    ValueError
+        If there are no contact points.
+    """
+    import plotly.graph_objects as go
+
+    places = course.places
+    known = np.zeros(0, bool) if places is None else np.isfinite(places).all(axis=-1)
+    if places is None or not known.any():
+        raise ValueError("there are no contact points to be drawn")
+    points = 1e3 * places[known]
+    drawn = [_points(points, "time", course.time[known], f"{course.places_as} contacts")]
+    limits = _limits(points)
+    for thing in objects:
+        corners = object_triangles(thing, limits).reshape(-1, 3)
+        drawn.append(_triangles(corners, f"{thing.attrs['kind']}, as known"))
+    for fit in fits:
+        grid = 1e3 * surface_grid(fit, places[known])["surface_grid_point"].values
+        x, y, z = np.moveaxis(grid, -1, 0)
+        colours = [[0.0, BENT], [1.0, BENT]]
+        drawn.append(
+            go.Surface(
+                x=x,
+                y=y,
+                z=z,
+                opacity=0.4,
+                showscale=False,
+                colorscale=colours,
+                name=f"{fit.kind}, fitted",
+                showlegend=True,
+            )
+        )
+    if course.centerline is not None:
+        drawn += _whiskers(course.centerline[known])
+    return _framed(drawn, points, "laboratory")
+
+
+def reachable_space(samples: xr.Dataset, centerline: Array, colour: str = "MB") -> Any:
+    """Draw all contacts that a whisker can hold.
+
+    Parameters
+    ----------
+    samples : Dataset
+        ``ContactMap.to_dataset()``.
+    centerline : array (k, 3)
+        Of the resting whisker, m.
+    colour : str
+        The signal that colours them.
+
+    Returns
+    -------
+    plotly.graph_objects.Figure
+        Axes in mm.
+    """
+    points = 1e3 * samples["contact_point"].transpose(..., "space").values.reshape(-1, 3)
+    values = samples[colour].values.reshape(-1)
+    known = np.isfinite(points).all(axis=1) & np.isfinite(values)
+    both = np.column_stack([points[known], values[known]])
+    # Any even choice will do, but not one that follows the grid.
+    both = thinned(np.random.default_rng(0).permutation(both), _MOST_POINTS)
+    drawn = [_points(both[:, :3], colour, both[:, 3], "contacts")]
+    return _framed(
+        [*drawn, *_whiskers(centerline[None], "resting whisker")], both[:, :3], "whisker"
+    )
+
+
+def space_section(figure: Any, about: str) -> tuple[Section, str]:
+    """Put a picture into the page.
+
+    Parameters
+    ----------
+    figure : plotly.graph_objects.Figure
+        The picture.
+    about : str
+        What it shows, plain text.
+
+    Returns
+    -------
+    section : Section
+        With the picture.
+    script : str
+        The library that draws it, for `vibrissa.report.document`.
+    """
+    from plotly.offline import get_plotlyjs
+
+    drawn = figure.to_html(
+        full_html=False,
+        include_plotlyjs=False,
+        div_id="space-picture",
+        default_height="100%",
+        config={"displaylogo": False, "responsive": True, "showSendToCloud": False},
+    )
+    told = paragraph(f"{about} Drag to turn, scroll to zoom, click a name to hide it.", "note")
+    body = f'<div class="space" role="img" aria-label="{escape(about)}">{drawn}</div>{told}'
+    return Section("space", "In space", body), get_plotlyjs()
+
+
+def _points(points: Array, name: str, values: Array, label: str) -> Any:
+    """Dots coloured by a quantity, SI units."""
+    import plotly.graph_objects as go
+
+    known = quantity(name)
+    unit = f" ({known.display_unit})" if known.display_unit else ""
+    bar = {"title": {"text": f"{known.long_name}{unit}"}, "thickness": 12, "len": 0.6, "x": 0.93}
+    look = {"size": 2.5, "color": to_display(name, values), "colorscale": "Viridis"}
+    x, y, z = points.T
+    return go.Scatter3d(x=x, y=y, z=z, mode="markers", marker={**look, "colorbar": bar}, name=label)
+
+
+def _triangles(corners: Array, label: str) -> Any:
+    """Triangles whose corners (3n, 3) follow each other, mm."""
+    import plotly.graph_objects as go
+
+    x, y, z = corners.T
+    i, j, k = np.arange(len(corners)).reshape(-1, 3).T
+    return go.Mesh3d(
+        x=x, y=y, z=z, i=i, j=j, k=k, color=REST, opacity=0.35, name=label, showlegend=True
+    )
+
+
+def _whiskers(lines: Array, label: str = "whisker") -> list[Any]:
+    """Some of the whiskers (n, k, 3), m."""
+    import plotly.graph_objects as go
+
+    some = thinned(lines[np.isfinite(lines).all(axis=(1, 2))], _SHAPES)
+    drawn = []
+    for count, line in enumerate(some):
+        x, y, z = 1e3 * line.T
+        look = {"color": "#a0522d", "width": 3}
+        drawn.append(
+            go.Scatter3d(
+                x=x,
+                y=y,
+                z=z,
+                mode="lines",
+                line=look,
+                name=label,
+                legendgroup=label,
+                showlegend=count == 0,
+                hoverinfo="skip",
+            )
+        )
+    return drawn
+
+
+def _limits(points: Array) -> Array:
+    """What is seen (3, 2), with room about the points."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    room = _ROOM * max(float((high - low).max()), 1.0)
+    return np.stack([low - room, high + room], axis=1)
+
+
+def _framed(drawn: list[Any], points: Array, frame: str) -> Any:
+    """Put things into axes of one scale."""
+    import plotly.graph_objects as go
+
+    titles = {f"{axis}axis": {"title": {"text": f"{axis} (mm)"}} for axis in "xyz"}
+    return go.Figure(
+        drawn,
+        {
+            "template": "plotly_white",
+            "scene": {**titles, "aspectmode": "data", "camera": _CAMERA},
+            "margin": {"l": 0, "r": 30, "t": 36, "b": 0},
+            "legend": {"x": 0.0, "y": 1.0},
+            "title": {"text": f"{frame} frame", "font": {"size": 13}, "x": 0.5},
+        },
+    )

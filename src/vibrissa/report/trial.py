@@ -1,0 +1,338 @@
+"""What is said of a trial: what it is, what was done with it, and how well it was done.
+
+Errors are told where the truth is part of the recording; without it there is still what fits say of
+themselves. What a recording lacks is named with the verb that makes it.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from vibrissa.contour import shape_from_dataset
+from vibrissa.demo.scores import ANGLES, ErrorRow, angle_label, contact_errors, error_rows
+from vibrissa.demo.stages import spread
+from vibrissa.display import show
+from vibrissa.pipeline import compare_contacts, distances_by_class
+from vibrissa.quantities import QUANTITIES, quantity, to_display
+from vibrissa.report.page import Section, paragraph, table
+from vibrissa.signals import nearest_on_rest
+from vibrissa.status import describe
+from vibrissa.trial import recorded_objects, recorded_whisker
+from vibrissa.whisker import Whisker
+
+Array = NDArray[np.float64]
+
+STAGES = {"signals": "signals", "estimates": "estimate", "contour": "reconstruct"}
+"""Groups of a recording, and the verbs that make them."""
+
+# What can be compared.
+_TRACKED = ("contact_point", "in_contact")
+_FELT = ("force", "moment", "in_contact")
+_FOUND = ("contact_point", "contact_point_whisker", "in_contact")
+_SPREADS = ("covariance", "contact_covariance", "candidates")
+
+_SPREAD = ("median", "95 %")
+
+
+def trial_sections(recording: xr.DataTree, whisker: int = 0, seed: int = 0) -> list[Section]:
+    """Tell what a recording is, what was done with it and how well.
+
+    Parameters
+    ----------
+    recording : DataTree
+        A trial.
+    whisker : int
+        Which one, from 0.
+    seed : int
+        Of the draws of what covariances predict.
+
+    Returns
+    -------
+    list of Section
+        The recording; settings; then tracking, signals, estimates and the contour, as far as
+        they are there; statuses.
+
+    Raises
+    ------
+    ValueError
+        If there is no such whisker.
+    """
+    bent = recorded_whisker(recording, whisker)
+    groups = {name: _one(recording, name, whisker) for name in ("", "signals", "estimates")}
+    truth = _one(recording, "truth", whisker)
+    parts = [
+        Section("recording", "What was recorded", show(recording).html + bent._repr_html_()),
+        Section("settings", "What was done, with which settings", _settings(recording)),
+    ]
+    if truth is not None:
+        parts += _against_truth(recording, groups, truth, bent, seed)
+    if "contour" in recording.children:
+        parts.append(Section("contour", "The contour", _contour(recording, seed)))
+    counted = _statuses(groups)
+    return [*parts, Section("statuses", "Statuses", counted)] if counted else parts
+
+
+def _one(recording: xr.DataTree, name: str, whisker: int) -> xr.Dataset | None:
+    """A group for one whisker."""
+    if name and name not in recording.children:
+        return None
+    data = (recording[name] if name else recording).to_dataset()
+    return data.isel(whisker=whisker) if "whisker" in data.dims else data
+
+
+def _settings(recording: xr.DataTree) -> str:
+    """Attributes of the groups, and which stages are missing."""
+    rows = [
+        (str(group.path).strip("/") or "recording", str(name).replace("_", " "), _said(name, value))
+        for group in recording.subtree
+        if not group.path.startswith(("/whiskers", "/objects"))
+        for name, value in group.attrs.items()
+    ]
+    facts = table(
+        [(f"{where}: {name}", value) for where, name, value in rows], caption="Settings by stage"
+    )
+    lacking = [
+        f"There is no group {group}: `vibrissa {verb}` makes it."
+        for group, verb in STAGES.items()
+        if group not in recording.children
+    ]
+    return facts + "".join(paragraph(each, "note") for each in lacking)
+
+
+def _said(name: object, value: object) -> str:
+    """Write an attribute; what is known to be a signal's size in its unit."""
+    if name == "felt_above":
+        return f"M_B over {_shown('MB', float(str(value)))}"
+    if name == "cutoff":
+        return f"{float(str(value)):g} Hz"
+    if isinstance(value, np.ndarray | list | tuple):
+        return ", ".join(_said("", each) for each in value)
+    return f"{value:.6g}" if isinstance(value, float | np.floating) else str(value)
+
+
+def _shown(name: str, value: float, digits: int = 4) -> str:
+    """An SI value with its display unit; a dash for NaN."""
+    if not np.isfinite(value):
+        return "–"
+    unit = quantity(name).display_unit
+    number = float(to_display(name, value))
+    text = f"{number:.0f}" if abs(number) >= 10.0**digits else f"{number:.{digits}g}"
+    return f"{text.replace('-', '−')}{'' if unit in ('', '°') else ' '}{unit}"
+
+
+def _against_truth(
+    recording: xr.DataTree,
+    groups: dict[str, xr.Dataset | None],
+    truth: xr.Dataset,
+    whisker: Whisker,
+    seed: int,
+) -> Iterator[Section]:
+    """Sections on stages that can be compared with the truth."""
+    root, signals, estimates = groups.values()
+    assert root is not None
+    if "measured" in recording.children and _has(_TRACKED, root, truth):
+        yield Section("tracking", "Tracking", _tracking(root, truth))
+    if _has(_FELT, signals, truth) and "contact_point_whisker" in truth:
+        assert signals is not None
+        rows = signal_rows(signals, truth, whisker)
+        heading = ("deflection angle", "contacts", "force", "moment", "force, 95 %", "moment, 95 %")
+        note = "Size of the error over that of the true vector, each in its own whisker frame."
+        told = table(rows, heading, "Error of force and moment, median", note)
+        yield Section("signals", "Signals", told)
+    if _has(_FOUND, estimates, truth) and _has(_SPREADS, estimates):
+        assert estimates is not None
+        errors = contact_errors(estimates, truth, whisker, seed)
+        told = _felt(estimates, truth) + _errors(*error_rows(errors))
+        yield Section("estimates", "Estimated contacts", told)
+
+
+def _has(names: Sequence[str], *data: xr.Dataset | None) -> bool:
+    """Whether all of some datasets have all of some variables."""
+    return all(each is not None and set(names) <= set(each.data_vars) for each in data)
+
+
+def _tracking(root: xr.Dataset, truth: xr.Dataset) -> str:
+    """Errors of what was tracked."""
+    touching = [data["in_contact"].values.astype(bool) for data in (root, truth)]
+    both = touching[0] & touching[1]
+    told = float((touching[0] == touching[1]).mean())
+    rows = []
+    for name in ("contact_point", "arc_length", "force", "moment"):
+        if name not in root or name not in truth:
+            continue
+        away = root[name].values[both] - truth[name].values[both]
+        size = np.linalg.norm(away, axis=-1) if away.ndim > 1 else np.abs(away)
+        rows.append((quantity(name).long_name, *(_shown(name, v) for v in spread(size))))
+    return table(
+        rows,
+        ("error of", *_SPREAD),
+        "Tracked against true",
+        f"Of {int(both.sum())} frames that are in contact and were found to be. Contact is told "
+        f"from none in {100 * told:.1f} % of {both.size} frames.",
+    )
+
+
+def signal_rows(
+    signals: xr.Dataset, truth: xr.Dataset, whisker: Whisker
+) -> list[tuple[str, str, str, str, str, str]]:
+    """Sum up errors of force and moment by deflection angle.
+
+    Parameters
+    ----------
+    signals, truth : Dataset
+        Of one whisker, dim time: ``force``, ``moment``, ``in_contact``, and the true
+        ``contact_point_whisker``.
+    whisker : Whisker
+        That touched.
+
+    Returns
+    -------
+    list of tuple of str
+        Class, contacts, medians of both errors and 95 % of both, as shares of the true size.
+    """
+    distance, arc_length = nearest_on_rest(whisker, truth["contact_point_whisker"].values)
+    angle = np.degrees(np.arctan2(distance, arc_length))
+    known = truth["in_contact"].values.astype(bool) & signals["in_contact"].values.astype(bool)
+    errors = []
+    for name in ("force", "moment"):
+        true = truth[name].values
+        with np.errstate(invalid="ignore", divide="ignore"):
+            away = np.linalg.norm(signals[name].values - true, axis=-1)
+            errors.append(away / np.linalg.norm(true, axis=-1))
+        known &= np.isfinite(errors[-1])
+    rows = []
+    for low, high in itertools.pairwise(ANGLES):
+        some = known & (angle >= low) & (angle < high)
+        if some.any():
+            (force, force_most), (moment, moment_most) = (spread(e[some]) for e in errors)
+            shares = (f"{100 * v:.3g} %" for v in (force, moment, force_most, moment_most))
+            rows.append((angle_label(low, high), str(int(some.sum())), *shares))
+    return rows  # type: ignore[return-value]
+
+
+def _felt(estimates: xr.Dataset, truth: xr.Dataset) -> str:
+    """How many contacts were felt and found."""
+    felt = estimates["in_contact"].values.astype(bool)
+    touching = truth["in_contact"].values.astype(bool)
+    number = estimates["candidates"].values[felt]
+    rows = [
+        ("frames in contact", str(int(touching.sum()))),
+        ("contacts felt", str(int(felt.sum()))),
+        ("of these false", str(int((felt & ~touching).sum()))),
+        ("with no candidate", str(int((number == 0).sum()))),
+        ("with exactly one candidate", str(int((number == 1).sum()))),
+        ("with several candidates", str(int((number > 1).sum()))),
+    ]
+    return table(rows, caption="Contacts")
+
+
+def _errors(of_all: Sequence[ErrorRow], by_angle: Sequence[ErrorRow]) -> str:
+    """Errors of estimated contacts, and what their covariance predicts."""
+    names = (*_SPREAD, "largest", *(f"{name}*" for name in _SPREAD))
+    note = "* what the estimates' own covariance predicts"
+    all_rows = [(quantity(row.quantity).long_name, *_cells(row)) for row in of_all]
+    class_rows = [(row.label, *_cells(row)) for row in by_angle]
+    told = table(all_rows, ("of", "contacts", *names), "Error of the contact point", note)
+    return told + table(
+        class_rows,
+        ("deflection angle", "contacts", *names),
+        "Error in space by deflection angle",
+        note,
+    )
+
+
+def _cells(row: ErrorRow) -> list[str]:
+    values = (*row.measured, *row.predicted[:2])
+    return [str(row.contacts), *(_shown(row.quantity, float(value)) for value in values)]
+
+
+def _contour(recording: xr.DataTree, seed: int) -> str:
+    """The fit with its uncertainty, and how far it and the contacts are from a known object."""
+    data = recording["contour"].to_dataset()
+    fit = shape_from_dataset(data)
+    sigma = fit.sigma
+    rows = []
+    for name, meant in fit.fields.items():
+        values = np.atleast_1d(getattr(fit, name))
+        own = [p for p in fit.parameters if p.startswith(name)]
+        for parameter, value in zip(own, values, strict=True):
+            label = parameter.replace("_", ", ")
+            rows.append((label, _shown(meant, float(value), 6), _shown(meant, sigma[parameter], 3)))
+    told = table(
+        rows,
+        ("parameter", "fitted", "standard deviation"),
+        f"The fitted {fit.kind}",
+        f"{int(fit.inliers.sum())} contacts fit; root mean square of their distances: "
+        f"{_shown('surface_distance', fit.rms)}.",
+    )
+    compared = [
+        (quantity(name).long_name, _component_text(name, data[name].values))
+        for name in ("axis_offset", "axis_tilt", "diameter_error", "radius_error", "center_offset")
+        if name in data and name in QUANTITIES
+    ]
+    if compared:
+        told += table(compared, caption="Fitted less known object")
+    return told + _distances(recording, seed)
+
+
+def _component_text(name: str, values: Array) -> str:
+    """A number, or a vector in parentheses with its size."""
+    if values.ndim == 0:
+        return _shown(name, float(values))
+    each = ", ".join(_shown(name, float(value)) for value in values)
+    return f"({each}); size {_shown(name, float(np.linalg.norm(values)))}"
+
+
+def _distances(recording: xr.DataTree, seed: int) -> str:
+    """Distances of contacts from the object that is known."""
+    estimates = _one(recording, "estimates", 0)
+    if not _has(("contact_point", "contact_covariance"), estimates):
+        return ""
+    assert estimates is not None
+    points = recording["estimates"].to_dataset()["contact_point"].values
+    if not recorded_objects(recording) or not np.isfinite(points).any():
+        return ""
+    classes = distances_by_class(compare_contacts(recording, seed=seed))
+    parts = []
+    for name, sums in classes.items():
+        known = quantity(name)
+        unit = f" ({known.display_unit})" if known.display_unit else ""
+        rows = [
+            (
+                str(sums["label"].values[i]),
+                str(int(sums["contacts"].values[i])),
+                *(
+                    _shown("surface_distance", float(sums[column].values[i]))
+                    for column in (
+                        "median",
+                        "largest_95",
+                        "median_predicted",
+                        "largest_95_predicted",
+                    )
+                ),
+            )
+            for i in range(sums.sizes["class"])
+        ]
+        heading = (f"{known.long_name}{unit}", "contacts", *_SPREAD, *(f"{s}*" for s in _SPREAD))
+        caption = f"Distance of contacts from the known object, by {known.long_name}"
+        parts.append(table(rows, heading, caption))
+    return "".join(parts) + paragraph("* what the covariance of the contacts predicts", "note")
+
+
+def _statuses(groups: dict[str, xr.Dataset | None]) -> str:
+    """In how many frames each group has which status."""
+    counts = {
+        name or "recording": describe(data["status"].values)
+        for name, data in groups.items()
+        if data is not None and "status" in data
+    }
+    if not counts:
+        return ""
+    sentences = dict.fromkeys(sentence for each in counts.values() for sentence in each)
+    rows = [(each, *(str(count[each]) for count in counts.values())) for each in sentences]
+    return table(rows, ("status", *counts), "Number of frames")

@@ -1,0 +1,325 @@
+"""`vibrissa report`: what the page says is what the datasets hold, and it needs nothing else."""
+
+import base64
+import hashlib
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+import xarray as xr
+from typer.testing import CliRunner
+
+import vibrissa as vb
+from vibrissa import __version__
+from vibrissa.cli.app import app
+from vibrissa.io import load_recording, save_recording
+from vibrissa.mapping import ContactMap
+from vibrissa.report import document, figure_sections, movies_section, table, trial_sections
+from vibrissa.report.page import Section
+from vibrissa.status import describe
+from vibrissa.trial import recorded_whisker
+
+VOID = {"meta", "br", "img", "path", "link", "input", "hr"}
+
+
+class Page(HTMLParser):
+    """What is in a page: tables by caption, attributes that load or lead somewhere, tags."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tables, self.addresses, self.sheets, self.open = {}, [], [], []
+        self.sections, self.images, self.scripts = [], [], 0
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag, attrs):
+        known = dict(attrs)
+        for name in ("src", "href", "data", "poster", "srcset", "action", "xlink:href"):
+            if name in known:
+                self.addresses.append((tag, name, known[name]))
+        if tag == "section":
+            self.sections.append(known["id"])
+        if tag == "img":
+            self.images.append(known)
+        self.scripts += tag == "script"
+        if tag == "table":
+            self.rows, self.caption = [], ""
+        if tag == "tr":
+            self.rows.append([])
+        if tag in ("td", "th"):
+            self.rows[-1].append("")
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.handle_starttag(tag, attrs)
+        if tag not in VOID:
+            self.handle_endtag(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open, f"</{tag}> closes nothing"
+        assert self.open[-1] == tag, f"</{tag}> closes <{self.open[-1]}>"
+        self.open.pop()
+        if tag == "table":
+            self.tables[self.caption] = self.rows
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] == "style":
+            self.sheets.append(data)
+        elif "caption" in self.open:
+            self.caption += data
+        elif self.open and self.open[-1] in ("td", "th"):
+            self.rows[-1][-1] += data
+
+
+def run(*words):
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    assert result.exit_code == 0, result.exception
+    return result.stdout
+
+
+def fault(*words):
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    assert isinstance(result.exception, ValueError | OSError), result.exception
+    return str(result.exception)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A simulated trial with all groups, and the map of its whisker."""
+    path = tmp_path_factory.mktemp("report")
+    run("simulate", "--duration", 0.5, "--rate", 250, "--seed", 2, "-o", path / "trial.nc")
+    whisker = recorded_whisker(load_recording(path / "trial.nc"))
+    ContactMap.simulate(whisker, grid=False, cells=(8, 16, 8)).save(path / "map.nc")
+    (path / "bare.nc").write_bytes((path / "trial.nc").read_bytes())
+    run("signals", path / "trial.nc")
+    run("estimate", path / "trial.nc")
+    run("reconstruct", path / "trial.nc")
+    return path
+
+
+@pytest.fixture(scope="module")
+def written(folder):
+    """The page of the trial."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SOURCE_DATE_EPOCH", "1700000000")
+        words = (folder / "trial.nc", "--map", folder / "map.nc", "-o", folder / "trial.html")
+        assert "wrote" in run("report", *words, "--seed", 3)
+    return folder / "trial.html"
+
+
+def number(cell):
+    """The first number of a cell."""
+    return float(re.match(r"[−\d.e+]+", cell)[0].replace("−", "-"))
+
+
+def nothing_is_loaded(page):
+    for tag, name, address in page.addresses:
+        assert address.startswith(("data:", "#")), (tag, name, address[:80])
+        assert (tag, name) in {("img", "src"), ("a", "href"), ("video", "src")}
+    for sheet in page.sheets:
+        assert "@import" not in sheet
+        assert "http" not in sheet
+
+
+def test_the_page_is_whole_and_loads_nothing(written):
+    text = written.read_text(encoding="utf-8")
+    assert len(text.encode()) < 15e6
+    page = Page(text)
+    assert not page.open
+    nothing_is_loaded(page)
+    assert "default-src 'none'" in text
+    assert page.sections[:2] == ["recording", "settings"]
+    wanted = {"signals", "estimates", "contour", "statuses", "figures", "provenance"}
+    assert wanted <= set(page.sections)
+    assert len(page.sections) == len(set(page.sections))
+    assert len(page.images) >= 6
+    for image in page.images:
+        assert image["alt"]
+        png = base64.b64decode(image["src"].removeprefix("data:image/png;base64,"), validate=True)
+        assert png.startswith(b"\x89PNG")
+
+
+def test_numbers_are_those_of_the_recording(written, folder):
+    tables = Page(written.read_text(encoding="utf-8")).tables
+    trial = load_recording(folder / "trial.nc")
+    found, truth, fit = (trial[name].to_dataset() for name in ("estimates", "truth", "contour"))
+    away = (found["contact_point"] - truth["contact_point"]).transpose(..., "space").values
+    size = 1e3 * np.linalg.norm(away, axis=-1)
+    size = size[np.isfinite(size)]
+    row = tables["Error of the contact point"][-1]
+    assert row[0] == "3D error"
+    assert int(row[1]) == size.size
+    expected = [np.median(size), np.quantile(size, 0.95), size.max()]
+    np.testing.assert_allclose([number(cell) for cell in row[2:5]], expected, rtol=1e-3)
+    classes = tables["Error in space by deflection angle"][1:]
+    assert sum(int(row[1]) for row in classes) == size.size
+
+    counts = dict(tables["Contacts"])
+    assert int(counts["frames in contact"]) == int(truth["in_contact"].sum())
+    assert int(counts["contacts felt"]) == int(found["in_contact"].sum())
+
+    rows = {row[0]: row for row in tables[f"The fitted {fit.attrs['shape']}"]}
+    sigma = np.sqrt(np.diag(fit["parameter_covariance"].values))
+    names = list(fit["parameter"].values)
+    assert number(rows["radius"][1]) == pytest.approx(1e3 * float(fit["object_radius"]), rel=1e-5)
+    assert number(rows["radius"][2]) == pytest.approx(1e3 * sigma[names.index("radius")], rel=5e-3)
+    x = 1e3 * float(fit["object_position"].sel(space="x"))
+    assert number(rows["origin, x"][1]) == pytest.approx(x, rel=1e-5)
+
+    heading, *rows = tables["Number of frames"]
+    for column, name in enumerate(heading[1:], 1):
+        data = trial if name == "recording" else trial[name]
+        expected = describe(data["status"].values)
+        assert {r[0]: int(r[column]) for r in rows if int(r[column])} == dict(expected)
+
+
+def test_errors_of_signals_are_shares_of_the_truth(folder):
+    trial = load_recording(folder / "trial.nc")
+    # All forces a tenth too large and moments exact.
+    truth = trial["truth"].to_dataset()
+    wrong = trial["signals"].to_dataset().assign(force=1.1 * truth["force"], moment=truth["moment"])
+    trial["signals"] = xr.DataTree(wrong)
+    parts = {part.name: part.body for part in trial_sections(trial)}
+    _, *rows = Page(parts["signals"]).tables["Error of force and moment, median"]
+    assert rows
+    for row in rows:
+        assert row[2:] == ["10 %", "0 %", "10 %", "0 %"]
+
+
+def test_where_it_comes_from(written, folder):
+    tables = Page(written.read_text(encoding="utf-8")).tables
+    files = {row[0]: row[2] for row in tables["Files that were read"]}
+    for name in ("trial.nc", "map.nc"):
+        digest = hashlib.sha256((folder / name).read_bytes()).hexdigest()
+        assert files[str(folder / name)] == f"SHA-256 {digest}"
+    versions = dict(tables["Versions"])
+    assert versions["vibrissa"] == __version__
+    assert versions["numpy"] == np.__version__
+    facts = dict(tables[""])
+    assert facts["made"] == "2023-11-14 22:13:20 UTC"
+    assert facts["seed"].startswith("3")
+
+
+def test_the_same_command_gives_the_same_page(folder, monkeypatch):
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
+    pages = []
+    for _ in range(2):
+        run("report", folder / "map.nc", "-o", folder / "same.html")
+        pages.append((folder / "same.html").read_bytes())
+    assert pages[0] == pages[1]
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "yesterday")
+    told = fault("report", folder / "map.nc", "-o", folder / "same.html")
+    assert "'yesterday'" in told
+
+
+def test_a_map_with_verdicts(folder):
+    contacts = ContactMap.load(folder / "map.nc")
+    verdicts = vb.uniqueness(
+        contacts, [("Fx", "MB", "MD"), ("FT", "FD", "MD")], ["all", "ELD"], samples=256
+    )
+    path = folder / "uniqueness.nc"
+    vb.mapping.save_uniqueness(verdicts, path)
+    run("report", folder / "map.nc", "--uniqueness", path, "-o", folder / "map.html")
+    page = Page((folder / "map.html").read_text(encoding="utf-8"))
+    nothing_is_loaded(page)
+    heading, *rows = page.tables["Verdicts by region"]
+    assert heading == ["triplet", "all", "ELD", "in short"]
+    for row in rows:
+        cell = verdicts.sel(triplet=row[0])
+        assert row[-1] == str(cell.notation.item())
+        if str(cell.verdict.sel(region="all").item()) == "not unique":
+            cone = np.rad2deg(float(cell.critical_cone.sel(region="all")))
+            assert row[1] == f"{cone:.1f}°"
+    for row in page.tables["Farthest contacts that feel the same"][1:]:
+        apart = float(verdicts["witness_separation"].sel(triplet=row[0]).max())
+        assert number(row[2]) == pytest.approx(1e3 * apart, abs=1e-3)
+    samples = contacts.to_dataset()
+    ranges = {row[0]: row[1:] for row in page.tables["Over all contacts of the map"]}
+    most = number(ranges["bending moment (µN·m)"][1])
+    assert most == pytest.approx(1e6 * float(samples["MB"].max()), rel=1e-3)
+
+
+def test_what_is_missing_is_named_with_the_verb_that_makes_it(folder):
+    text = run("report", folder / "bare.nc", "-o", folder / "bare.html")
+    assert "no signals" in text
+    page = (folder / "bare.html").read_text(encoding="utf-8")
+    for verb in ("signals", "estimate", "reconstruct"):
+        assert f"`vibrissa {verb}` makes it" in page
+    assert "contour" not in Page(page).sections
+    recording = load_recording(folder / "trial.nc")
+    groups = {g.path: g.to_dataset(inherit=False) for g in recording.subtree}
+    blind = {path: data for path, data in groups.items() if path != "/truth"}
+    save_recording(folder / "blind.nc", xr.DataTree.from_dict(blind))
+    names = [part.name for part in trial_sections(load_recording(folder / "blind.nc"))]
+    assert names == ["recording", "settings", "contour", "statuses"]
+
+
+def test_without_the_drawing_library_the_picture_in_space_is_left_out(folder, monkeypatch):
+    monkeypatch.setattr("vibrissa.report.space.find_spec", lambda name: None)
+    text = run("report", folder / "map.nc", "-o", folder / "flat.html")
+    assert "vibrissa[report]" in text
+    page = Page((folder / "flat.html").read_text(encoding="utf-8"))
+    assert "space" not in page.sections
+    assert page.scripts == 0
+
+
+def test_wrong_input_is_refused(folder):
+    table_file = folder / "table.csv"
+    table_file.write_text("x,y,z\n0,0,0\n")
+    assert "recording of a trial or a map" in fault("report", table_file)
+    assert "does not exist" in fault("report", folder / "none.nc").replace(
+        "there is no", "does not exist"
+    )
+    assert "--video" in fault(
+        "report", folder / "map.nc", "--video", table_file, "-o", folder / "x.html"
+    )
+    assert "--uniqueness" in fault(
+        "report", folder / "trial.nc", "--uniqueness", folder / "map.nc", "-o", folder / "x.html"
+    )
+    assert ".html" in fault("report", folder / "map.nc", "-o", folder / "report.pdf")
+    assert not (folder / "x.html").exists()
+
+
+def test_movies_are_embedded_as_far_as_there_is_room(tmp_path):
+    small, large = tmp_path / "a <b>.mp4", tmp_path / "large.mp4"
+    small.write_bytes(bytes(range(100)))
+    large.write_bytes(bytes(3000))
+    page = Page(movies_section([large, small], tmp_path, 1000).body)
+    (_, _, link), (tag, _, address) = page.addresses
+    assert link == "large.mp4"
+    assert tag == "video"
+    data = address.removeprefix("data:video/mp4;base64,")
+    assert base64.b64decode(data) == small.read_bytes()
+
+
+def test_text_cannot_become_markup():
+    evil = '<script>alert("1")</script>&'
+    parts = [
+        Section("a", evil, table([(evil, evil)], ("b", evil), evil, evil)),
+        figure_sections({evil: b"png"}),
+    ]
+    text = document(evil, evil, parts)
+    assert "<script" not in text
+    page = Page(text)
+    assert page.tables[evil] == [["b", evil], [evil, evil]]
+
+
+def test_it_shows_itself_in_a_browser(written, browser):
+    page = browser.new_page()
+    said, asked = [], []
+    page.on("console", lambda message: said.append((message.type, message.text)))
+    page.on("pageerror", lambda error: said.append(("error", str(error))))
+    page.on("request", lambda request: asked.append(request.url))
+    page.goto(written.as_uri())
+    page.wait_for_selector("#space-picture canvas", timeout=30_000)
+    assert not [text for kind, text in said if kind == "error"]
+    others = {url.split(":")[0] for url in asked} - {"data", "blob"}
+    assert others == {"file"}
+    assert sum(url.startswith("file:") for url in asked) == 1
+    box = page.locator("#space-picture .gl-container").first.bounding_box()
+    assert box is not None
+    assert box["width"] > 300
+    assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+    page.close()

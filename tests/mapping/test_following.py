@@ -146,6 +146,9 @@ def test_a_filter_forgets_a_contact_that_is_lost_and_waits_for_what_is_missing(w
     assert missing.status == vb.Status.MISSING
     assert np.linalg.norm(missing.point - good.point) < 1e-3
     assert np.trace(missing.covariance) > np.trace(good.covariance)
+    lost = follow(time[1] + 1e-3, wrench[1], np.full((3, 3), np.nan), base[1])
+    assert lost.status == vb.Status.MISSING
+    assert np.linalg.norm(lost.point - good.point) < 1e-3
     gone = follow(time[2], np.zeros(6), turn[2], base[2])
     assert gone.status == vb.Status.NO_CONTACT
     assert np.isnan(gone.point).all()
@@ -153,6 +156,9 @@ def test_a_filter_forgets_a_contact_that_is_lost_and_waits_for_what_is_missing(w
     assert np.linalg.norm(again.point - point) < 0.01
     with pytest.raises(ValueError, match="time goes on"):
         follow(time[3], wrench[3], turn[3], base[3])
+    heavy = Sensor(noise=np.repeat([1e-3, 1e-4], 3), mass=1e-3)
+    with pytest.raises(ValueError, match="the rotation from whisker to laboratory is needed"):
+        vb.ContactFilter(vb.Estimator.of_sensor(wire, heavy))(0.0, wrench[0], position=base[0])
     with pytest.raises(ValueError, match="against the noise"):
         vb.ContactFilter(vb.Estimator(wire))
     with pytest.raises(ValueError, match="between 0 and 1"):

@@ -116,6 +116,39 @@ def test_bad_lines_are_said_and_passed_over(gamma_map, wrench):
     assert "the header lacks MB, MD; or Mz" in record["error"]
 
 
+@pytest.mark.parametrize(
+    ("line", "error"),
+    [
+        ("0.0,1e-5\r2,0,0,0,0,0", "no CSV"),
+        ('{"Fx": 1' + 400 * "0" + ', "MB": 1e-6, "MD": 0.5}', "larger than any number"),
+        ('{"Fx": ' + 100_000 * "[", "no JSON"),
+    ],
+)
+def test_no_line_ends_a_stream(gamma_map, wrench, line, error):
+    """Noise on a serial line and strangers' datagrams give faults, not exceptions."""
+    good = list(csv_lines(wrench))
+    records = list(ContactStream(estimator(gamma_map)).records([good[0], line, good[1]]))
+    assert error in records[0]["error"]
+    assert records[1]["status"] == "unique"
+
+
+def test_a_sender_that_begins_anew_may_begin_time_anew(gamma_map, bent, wrench):
+    contacts = estimator(gamma_map)
+    running = ContactStream(contacts, follow=ContactFilter(contacts))
+    signals = vb.base_signals(bent.force[:2], bent.moment[:2])
+    rows = np.stack([signals[name] for name in ("Fx", "MB", "MD")], axis=-1)
+    other = ["Fx,MB,MD,time"]  # also in other columns
+    other += [",".join(map(repr, [*row, 0.001 * i])) for i, row in enumerate(rows.tolist())]
+    first, again, changed = (
+        list(running.records(lines)) for lines in (*2 * (list(csv_lines(wrench[:2])),), other)
+    )
+    assert [record["status"] for record in first] == ["unique", "unique"]
+    for record, same, new in zip(first, again, changed, strict=True):
+        assert same == record
+        np.testing.assert_allclose([new[n] for n in "xyz"], [record[n] for n in "xyz"], rtol=1e-9)
+    assert running.faults == 0
+
+
 def test_records_are_json_whatever_is_missing(gamma_map):
     running = ContactStream(Estimator(gamma_map, "Fx MB MD"))
     (record,) = running.records(['{"time": 1.0, "Fx": null, "MB": 1e-6, "MD": 0.5}'])
@@ -137,6 +170,12 @@ def test_a_filter_gives_the_laboratory_by_the_pose_in_the_line(gamma_map, bent, 
     lab = [record[name] for name in ("lab_x", "lab_y", "lab_z")]
     np.testing.assert_allclose(lab, [0.1 - y, 0.2 + x, 0.3 + z], atol=1e-7)
     np.testing.assert_allclose([record[n] for n in "xyz"], bent.contact_point[8], atol=1e-7)
+    for lost in ({"base_qw": None}, {"base_x": None}):
+        contacts.reset()
+        (record,) = ContactStream(contacts, follow=ContactFilter(contacts)).records(
+            [json.dumps({"time": 0.0} | row | pose | lost)]
+        )
+        assert record == {"time": 0.0, "status": "missing"}
     late = json.dumps({"time": 0.0} | row | pose)
     bent_quaternion = json.dumps({"time": 1.0} | row | pose | {"base_qw": 3.0})
     errors = [record["error"] for record in running.records([late, bent_quaternion])]
@@ -168,13 +207,14 @@ def test_the_verb_answers_each_line_at_once_and_ends_cleanly(map_file, bent, wre
         process.stdin.flush()
         first = json.loads(process.stdout.readline())  # while its input stays open
         assert first["status"] == "unique"
-        process.stdin.write("nonsense\n" + lines[2] + "\n")
+        process.stdin.buffer.write(b"\xff nonsense\n" + lines[2].encode() + b"\n")
         process.stdin.flush()
         assert "error" in json.loads(process.stdout.readline())
         second = json.loads(process.stdout.readline())
         np.testing.assert_allclose([second[n] for n in "xyz"], bent.contact_point[1], atol=1e-8)
         process.send_signal(signal.SIGINT)
-        rest, told = process.communicate(timeout=60)
+        process.wait(timeout=60)  # while its input stays open, as a terminal's does
+        rest, told = process.communicate()
         assert rest == ""
         assert "2 samples, 1 lines that could not be read" in told
         assert "Traceback" not in told

@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
+from io import TextIOWrapper
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -146,6 +147,8 @@ def _lines(source: Path | None, udp: str | None, opened: ExitStack) -> Iterator[
         errors.print(f"listening at {host}:{port}", highlight=False)
         return udp_lines(heard)
     if source is None or str(source) == "-":
+        if isinstance(sys.stdin, TextIOWrapper):  # noise on a serial line must not end a stream
+            sys.stdin.reconfigure(errors="replace")
         return iter(sys.stdin.readline, "")
     if not source.exists():
         raise FileNotFoundError(f"there is no file {source}")

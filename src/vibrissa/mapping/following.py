@@ -148,9 +148,10 @@ class ContactFilter:
         signals : (k,) array_like
             As for the estimator.
         rotation : (3, 3) array_like, optional
-            From the whisker's to the laboratory frame; by default they are the same.
+            From the whisker's to the laboratory frame; by default they are the same. NaN where it
+            is not known: the sample then counts as missing.
         position : (3,) array_like, optional
-            Of the base in the laboratory, m; by default its origin.
+            Of the base in the laboratory, m; by default its origin. NaN as for the rotation.
         gravity : (3,) array_like
             In the laboratory frame, m/s².
 
@@ -162,7 +163,8 @@ class ContactFilter:
         Raises
         ------
         ValueError
-            If time does not go on, or the estimator refuses the signals.
+            If time does not go on, the estimator refuses the signals, or its sensor carries a mass
+            and the rotation is not given.
         """
         turn = np.eye(3) if rotation is None else np.asarray(rotation, dtype=np.float64)
         base = np.zeros(3) if position is None else np.asarray(position, dtype=np.float64)
@@ -170,12 +172,14 @@ class ContactFilter:
             raise ValueError(f"a pose is (3, 3) and (3,); got {turn.shape} and {base.shape}")
         if self._time is not None and not time > self._time:
             raise ValueError(f"time goes on; got {time} s after {self._time} s")
-        measurement = self.estimator.measurement(signals, turn, gravity)
+        measurement = self.estimator.measurement(signals, rotation, gravity)
         if self._time is not None:
             self._predict(time - self._time)
         self._time = time
         base = base / self._length
         nothing = self.estimator.nothing_in(measurement)
+        if nothing is None and not (np.isfinite(turn).all() and np.isfinite(base).all()):
+            nothing = Status.MISSING
         if nothing is not None:
             if nothing != Status.MISSING:
                 self._hypotheses, self._age = [], 0

@@ -51,6 +51,7 @@ class ContactStream:
         self._estimator, self._follow = estimator, follow
         self._which = [SIGNALS.index(name) for name in by_name] if names is None else []
         self._begun = clock.monotonic()
+        self._headers = 0
 
     def records(self, lines: Iterable[str]) -> Iterator[dict[str, Any]]:
         """Turn lines into records, one for each sample, and one for each line that is none.
@@ -70,6 +71,7 @@ class ContactStream:
             try:
                 sample = self.lines(line)
                 if sample is None:
+                    self._begin_anew()
                     continue
                 record = self.record(sample)
             except ValueError as fault:
@@ -78,6 +80,13 @@ class ContactStream:
                 continue
             self.samples += 1
             yield record
+
+    def _begin_anew(self) -> None:
+        """After a new header time may begin anew, and nothing goes on from what was before."""
+        if self.lines.headers == self._headers:
+            return
+        self._headers = self.lines.headers
+        (self._follow or self._estimator).reset()
 
     def record(self, sample: Sample) -> dict[str, Any]:
         """Locate one sample.

@@ -41,9 +41,9 @@ class Sample(NamedTuple):
     values : (k,) array
         In that order.
     rotation : (3, 3) array or None
-        From the whisker's to the laboratory frame.
+        From the whisker's to the laboratory frame; NaN where the line leaves it empty.
     position : (3,) array or None
-        Of the base in the laboratory, m.
+        Of the base in the laboratory, m; NaN where the line leaves it empty.
     """
 
     line: int
@@ -55,17 +55,24 @@ class Sample(NamedTuple):
 
 
 class Lines:
-    """Takes lines apart; the first one that is no JSON is a header.
+    """Takes lines apart; the first one that is no JSON is a header, others may follow.
 
     Parameters
     ----------
     *names : sequence of str
         The values wanted, or several choices of them: the first that a line has counts.
+
+    Attributes
+    ----------
+    number : int
+        Lines so far.
+    headers : int
+        Headers so far: another one comes from a sender that has begun anew.
     """
 
     def __init__(self, *names: tuple[str, ...]) -> None:
         self.names = names
-        self.number = 0
+        self.number, self.headers = 0, 0
         self._header: list[str] | None = None
 
     def __call__(self, line: str) -> Sample | None:
@@ -105,17 +112,20 @@ class Lines:
     def _object(self, text: str) -> dict[str, object]:
         try:
             known = json.loads(text)
-        except json.JSONDecodeError as error:
+        except (json.JSONDecodeError, RecursionError) as error:
             raise ValueError(f"no JSON: {error}") from None
         return {str(name): value for name, value in known.items()}
 
     def _row(self, text: str) -> dict[str, object] | None:
-        cells = [cell.strip() for cell in next(csv.reader([text]))]
+        try:
+            cells = [cell.strip() for cell in next(csv.reader([text]))]
+        except csv.Error as error:
+            raise ValueError(f"no CSV: {error}") from None
         if self._header is None:
             self._chosen("the header", cells)
+        if self._header is None or any(set(names) <= set(cells) for names in self.names):
             self._header = cells
-            return None
-        if cells == self._header:  # a sender that has begun anew
+            self.headers += 1
             return None
         if len(cells) != len(self._header):
             raise ValueError(f"{len(cells)} cells; the header has {len(self._header)}")
@@ -141,15 +151,17 @@ def _number(name: str, value: object) -> float:
         raise ValueError(f"{name} is {value!r}, which is no number")
     try:
         return float(value)
+    except OverflowError:
+        raise ValueError(f"{name} is larger than any number that can be used") from None
     except ValueError:
         raise ValueError(f"{name} is {value!r}, which is no number") from None
 
 
-def _rotation(q: Array) -> Array | None:
-    """The matrix of a quaternion (w, x, y, z); None for NaN."""
+def _rotation(q: Array) -> Array:
+    """The matrix of a quaternion (w, x, y, z); NaN for NaN."""
     size = float(np.linalg.norm(q))
     if not math.isfinite(size):
-        return None
+        return np.full((3, 3), np.nan)
     if abs(size - 1.0) > _UNIT:
         raise ValueError(f"the quaternion {q.tolist()} is of length {size:.4g}, not 1")
     w, x, y, z = (q / size).tolist()

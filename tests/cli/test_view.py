@@ -42,7 +42,5 @@ def test_a_taken_port_is_passed_over():
 
     first = free_port("127.0.0.1")
     assert first >= PORT
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", first))
-        taken.listen()
+    with socket.create_server(("127.0.0.1", first)):
         assert free_port("127.0.0.1") > first

@@ -39,6 +39,7 @@ def test_a_fault_is_told_and_the_thread_goes_on():
     assert done == ["b"]
     work.close()
     work.put("c", lambda: done.append("c"))
+    assert work.wait(0.0)  # nothing is pending that will never be done
     assert done == ["b"]
 
 

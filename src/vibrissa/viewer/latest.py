@@ -31,8 +31,10 @@ class Latest:
         self._thread.start()
 
     def put(self, topic: str, job: Job) -> None:
-        """Ask for a job, in place of a pending one of the same topic."""
+        """Ask for a job, in place of a pending one of the same topic; not once it is closed."""
         with self._wake:
+            if self._closed:
+                return
             self._jobs[topic] = job
             self._wake.notify_all()
 

@@ -183,11 +183,11 @@ class Page:
             client.add_notification(title, body, color=colour, auto_close_seconds=seconds)
 
     def close(self) -> None:
-        """End everything."""
-        for end in self.closing:
-            end()
+        """End everything; what is drawn from, such as a video, after what draws."""
         self.slow_work.close()
         self.work.close()
+        for end in self.closing:
+            end()
         self.server.stop()
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
+import os
 import socket
 import time
 from collections.abc import Sequence
@@ -20,6 +22,7 @@ from vibrissa.io.footage import Footage
 from vibrissa.mapping import ContactMap
 from vibrissa.viewer.bend_panel import BendMode
 from vibrissa.viewer.bending import loaded, moved
+from vibrissa.viewer.guard import guarded
 from vibrissa.viewer.locate_panel import LocateMode
 from vibrissa.viewer.map_panel import MapMode
 from vibrissa.viewer.page import Mode, Page
@@ -117,7 +120,7 @@ def view(
     host : str
         Address to listen on; the default can only be reached from this machine.
     port : int, optional
-        To listen on; a free one by default.
+        To listen on; by default the first free one from 8080.
 
     Returns
     -------
@@ -127,7 +130,8 @@ def view(
     Raises
     ------
     ValueError
-        If the recording has nothing to look at, or there are not as many videos as cameras.
+        If the recording has nothing to look at, there are not as many videos as cameras, or the
+        port is taken or not on this machine.
     """
     trial = None if recording is None else watched(recording)
     footage = _footage(trial, videos)
@@ -162,7 +166,9 @@ def _footage(trial: Watched | None, videos: Sequence[str | PathLike[str]]) -> tu
 def _served(host: str, port: int | None) -> viser.ViserServer:
     if port is None:
         port = free_port(host)
-    with contextlib.redirect_stdout(io.StringIO()):  # it would announce itself
+    elif not is_free(host, port):  # viser would take another one without a word
+        raise ValueError(f"port {port} of {host} is taken; leave it out for one that is free")
+    with guarded(host), contextlib.redirect_stdout(io.StringIO()):  # it would announce itself
         server = viser.ViserServer(host=host, port=port, label="vibrissa", verbose=False)
     server.gui.configure_theme(
         control_width="large", show_logo=False, show_share_button=False, brand_color=(0, 114, 178)
@@ -177,12 +183,28 @@ def _served(host: str, port: int | None) -> viser.ViserServer:
 
 def free_port(host: str) -> int:
     """The first free port from the usual one on."""
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
     for port in range(PORT, PORT + 200):
-        with socket.socket(family, socket.SOCK_STREAM) as probe:
-            try:
-                probe.bind((host, port))
-            except OSError:
-                continue
+        if is_free(host, port):
             return port
     raise OSError(f"no free port from {PORT} to {PORT + 199} on {host}")
+
+
+def is_free(host: str, port: int) -> bool:
+    """Whether one can listen on a port.
+
+    Raises
+    ------
+    ValueError
+        If that is not for being taken: the host is none of this machine's, the port no port.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family, socket.SOCK_STREAM) as probe:
+        if os.name == "posix":  # a port that was just given back is free
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except (OSError, OverflowError) as error:
+            if isinstance(error, OSError) and error.errno == errno.EADDRINUSE:
+                return False
+            raise ValueError(f"no page can be served at port {port} of {host}: {error}") from error
+    return True

@@ -201,15 +201,20 @@ FIGURES: dict[str, Callable[[], Figure | np.ndarray]] = {
 
 
 def save(figure: Figure | np.ndarray, path: Path) -> None:
-    """Write a figure or a frame of a movie: 1200 pixels wide, in as many colours as need be."""
+    """Write a figure or a frame of a movie."""
     if isinstance(figure, Figure):
         drawn = io.BytesIO()
         figure.savefig(drawn, format="png")
-        image = Image.open(drawn).convert("RGB")
+        image = Image.open(drawn)
     else:
         image = Image.fromarray(figure[..., :3])
+    save_small(image, path)
+
+
+def save_small(image: Image.Image, path: Path) -> None:
+    """Write an image 1200 pixels wide, in as many colours as need be."""
     height = round(image.height * WIDTH / image.width)
-    small = image.resize((WIDTH, height), Image.Resampling.LANCZOS)
+    small = image.convert("RGB").resize((WIDTH, height), Image.Resampling.LANCZOS)
     if path.stem in LEVELS:
         steps = LEVELS[path.stem] - 1
         rounded = [round(round(v / 255 * steps) * 255 / steps) for v in range(256)]

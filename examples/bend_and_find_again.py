@@ -6,9 +6,16 @@ error of the place, and several contacts may feel the same.
 """
 
 # %% A whisker: 40 mm long, tapered, curved, its tip bent out of the plane
+import sys
+from pathlib import Path
+
 import numpy as np
 
 import vibrissa as vb
+from vibrissa import plots
+
+folder = Path(sys.argv[1] if len(sys.argv) > 1 else "output")
+folder.mkdir(parents=True, exist_ok=True)
 
 whisker = vb.samples.gamma()
 print(whisker)
@@ -34,3 +41,10 @@ for true, guess, covariance, n in zip(
         sigma = np.sqrt(np.trace(covariance))
         error = np.linalg.norm(guess - true)
         print(f"{n} candidate(s), {error * 1e9:.3f} nm off, ± {sigma * 1e3:.2f} mm with the sensor")
+
+# %% The bent whiskers with the forces on them; what has slipped off is not there to be drawn
+names = [f"{1e6 * np.linalg.norm(force):.1f} µN" for force in bent.force]
+figure = plots.bent_views(
+    whisker.centerline(101), bent.centerline(101), bent.contact_point, bent.force, labels=names
+)
+plots.save(figure, folder / "bend_and_find_again", ["png"])

@@ -7,11 +7,18 @@ E r⁴ but not E; two signals leave a curve of contacts, and the motion of the b
 """
 
 # %% Wires and rods: the same 300 mm, forces from millinewtons to tens of newtons
+import sys
+from pathlib import Path
+
 import matplotlib.pyplot as plt
 import numpy as np
 
 import vibrissa as vb
+from vibrissa import plots
 from vibrissa.sensing import Sensor, calibrate_on_contacts, fit_stiffness
+
+folder = Path(sys.argv[1] if len(sys.argv) > 1 else "output")
+folder.mkdir(parents=True, exist_ok=True)
 
 STEEL = {"youngs_modulus": 200e9, "poisson_ratio": 0.29}
 PLASTIC = {"youngs_modulus": 2e9, "poisson_ratio": 0.40}
@@ -129,4 +136,4 @@ right.semilogy(time, error * 1e3, label="error")
 right.semilogy(time, sigma * 1e3, label="said to be")
 right.set(xlabel="time (s)", ylabel="contact point (mm)", title="with the motion of the base")
 right.legend(frameon=False)
-plt.show()
+plots.save(figure, folder / "robot_whisker", ["png"])

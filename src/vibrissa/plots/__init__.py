@@ -1,6 +1,7 @@
 """Datasets and arrays to figures, one function each; nothing is solved here."""
 
 from vibrissa.plots.array import array_views
+from vibrissa.plots.bent import bent_views
 from vibrissa.plots.clouds import signal_clouds
 from vibrissa.plots.contour import contour_views
 from vibrissa.plots.contour_movie import contour_frames
@@ -26,6 +27,7 @@ __all__ = [
     "Course",
     "Sight",
     "array_views",
+    "bent_views",
     "contact_places",
     "contact_surfaces",
     "contour_frames",

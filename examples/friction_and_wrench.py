@@ -1,0 +1,56 @@
+"""Friction, and what all six components of force and moment know about it.
+
+Aim: to find contacts of a whisker that rubs. Data: the built-in γ whisker, touched at the same
+place with and without friction along it. Lesson: three signals, read as if there were no friction,
+put the contact millimetres off; force and moment whole place it right, and tell the friction.
+"""
+
+# %% The same touch with a force that leans toward the tip, or toward the base, by 0.3 of itself
+import sys
+from pathlib import Path
+
+import numpy as np
+
+import vibrissa as vb
+from vibrissa import plots
+
+folder = Path(sys.argv[1] if len(sys.argv) > 1 else "output")
+folder.mkdir(parents=True, exist_ok=True)
+
+whisker = vb.samples.gamma()
+friction = np.array([0.0, 0.3, -0.3])
+press = 60e-6  # N, from the concave side and a little from above
+force = np.array([[mu * press, 0.8 * press, -0.6 * press] for mu in friction])
+bent = vb.deflect(whisker, vb.PointForce(0.7 * whisker.length, components=force))
+
+# %% A sensor reads all of force and moment, 1 µN and 0.02 µN·m
+rng = np.random.default_rng(2)
+noise = {"Fx": 1e-6, "Fy": 1e-6, "Fz": 1e-6, "Mx": 2e-8, "My": 2e-8, "Mz": 2e-8}
+sigma = np.array(list(noise.values())).reshape(2, 3)
+read_force, read_moment = (
+    true + rng.normal(size=true.shape) * s
+    for true, s in zip((bent.force, bent.moment), sigma, strict=True)
+)
+
+# %% Three signals that know of no friction, and the wrench
+contacts = vb.ContactMap.simulate(whisker, grid=False)
+signals = vb.base_signals(read_force, read_moment)
+three = contacts.estimate(signals, ("Fx", "MB", "MD"))
+six = vb.estimate_from_wrench(whisker, read_force, read_moment, noise=noise)
+for i, mu in enumerate(friction):
+    true = bent.contact_point[i]
+    off = [1e3 * np.linalg.norm(found.point[i] - true) for found in (three, six)]
+    said = 1e3 * np.sqrt(np.trace(six.covariance[i]))
+    angle, spread = np.degrees([six.friction_angle[i], six.friction_angle_sigma[i]])
+    print(
+        f"friction {mu:+.1f}: three signals {off[0]:5.2f} mm off, wrench {off[1]:.2f} mm", end=" "
+    )
+    print(f"(± {said:.2f}); angle {angle:.1f}° ± {spread:.1f}°, truly", end=" ")
+    print(f"{np.degrees(np.arctan(mu)):.1f}°")
+
+# %% The three bent whiskers with the forces on them: friction is a small part of the shape
+names = ["no friction", "0.3 toward the tip", "0.3 toward the base"]
+figure = plots.bent_views(
+    whisker.centerline(101), bent.centerline(101), bent.contact_point, bent.force, labels=names
+)
+plots.save(figure, folder / "friction_and_wrench", ["png"])

@@ -1,0 +1,35 @@
+"""Which three signals locate a contact, for this whisker?
+
+Aim: to choose what to measure. Data: the built-in γ whisker and three of the 20 triplets. Lesson:
+most triplets leave pairs of contacts that feel the same; for this whisker (F_x, M_B, M_D) does not.
+"""
+
+# %% Verdicts on three triplets; "all" 20 take about a minute
+import sys
+from pathlib import Path
+
+import vibrissa as vb
+from vibrissa import plots
+from vibrissa.mapping import verdict_table
+
+folder = Path(sys.argv[1] if len(sys.argv) > 1 else "output")
+folder.mkdir(parents=True, exist_ok=True)
+
+contacts = vb.ContactMap.simulate(vb.samples.gamma(), grid=False)
+triplets = ["Fx MB MD", "Fx FD MD", "Mx MB MD"]
+verdicts = vb.uniqueness(contacts, triplets, ["all", "CF", "CB"], samples=512, resolution=False)
+print(verdict_table(verdicts))
+
+# %% How surely: pairs that feel the same are proofs, found to rounding
+for triplet in triplets:
+    one = verdicts.sel(triplet=triplet, region="all")
+    if one.verdict == "unique":
+        print(f"{triplet}: no two contacts feel the same")
+    else:
+        print(
+            f"{triplet}: contacts {1e3 * one.witness_separation.max():.1f} mm apart share it",
+            f"to {one.witness_difference.max():.0e}",
+        )
+
+# %% The table as a figure
+plots.save(plots.verdict_table(verdicts), folder / "which_triplets", ["png"])

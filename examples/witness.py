@@ -1,0 +1,57 @@
+"""A witness: two contacts that a whisker cannot tell apart.
+
+Aim: to see what "not unique" means. Data: a whisker that is curved as strongly as a rat's C2,
+y = A x² with A·L = 0.82. Lesson: also (F_x, M_B, M_D), which is unique for less curved whiskers,
+has pairs of contacts a third of the whisker apart that feel the same.
+"""
+
+# %% A strongly curved whisker, and the search for such pairs
+import sys
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+import vibrissa as vb
+from vibrissa import plots
+
+folder = Path(sys.argv[1] if len(sys.argv) > 1 else "output")
+folder.mkdir(parents=True, exist_ok=True)
+
+triplet = "Fx MB MD"
+whisker = vb.Whisker.parabola(length=40e-3, coefficient=20.5)
+contacts = vb.ContactMap.simulate(whisker, grid=False)
+verdicts = vb.uniqueness(contacts, [triplet], ["all"], samples=1024, resolution=False)
+found = verdicts.sel(triplet=triplet, region="all")
+print(
+    f"({triplet}) is {found.verdict.item()};",
+    f"twins are found up to {np.degrees(found.critical_cone.item()):.1f}° from rest",
+)
+
+# %% The pair that lies farthest apart, bent anew: nothing is taken on trust
+pair = found.isel(witness=int(np.nanargmax(found.witness_separation)))
+forces = np.column_stack([np.zeros(2), pair.witness_contact_force.transpose("pair", "component")])
+bent = vb.deflect(whisker, vb.PointForce(pair.witness_arc_length.values, components=forces))
+felt = vb.base_signals(bent.force, bent.moment)
+for name in felt:
+    one, other = felt[name].values
+    print(f"{name}: {one:.10g} and {other:.10g} {felt[name].attrs['units']}")
+
+# %% An estimator that is asked gives both, and says so
+estimate = contacts.estimate(felt.isel(sample=0), tuple(triplet.split()))
+print(vb.Status(int(estimate.status)).explanation)
+print("candidates, mm:", (1e3 * estimate.candidates).round(2).tolist())
+
+# %% Both of them, and all six signals
+witness = xr.Dataset(
+    {
+        "rest": (("node", "space"), whisker.centerline(101)),
+        "centerline": (("pair", "node", "space"), bent.centerline(101)),
+        "contact_point": (("pair", "space"), bent.contact_point),
+        "force": (("pair", "space"), bent.force),
+        "arc_length": ("pair", bent.arc_length),
+        **{name: ("pair", felt[name].values) for name in felt},
+    },
+    attrs={"triplet": triplet},
+)
+plots.save(plots.witness_pair(witness), folder / "witness", ["png"])

@@ -1,11 +1,20 @@
 """`vibrissa track` on small videos."""
 
+from itertools import islice
+
 import numpy as np
 import pytest
 
 from vibrissa import Whisker
 from vibrissa.cli.app import app
-from vibrissa.io import load_recording, load_traces, save_centerline, save_traces
+from vibrissa.io import (
+    load_recording,
+    load_traces,
+    read_video,
+    save_centerline,
+    save_traces,
+    write_video,
+)
 from vibrissa.trial import (
     Motion,
     Peg,
@@ -124,12 +133,33 @@ def test_what_is_known_besides_the_videos_is_used(videos, tmp_path):
         (("--base", "20,30"), "each needs as many"),
         (("--offset", "some"), "a number of frames or auto"),
         (("--pixel-size", "0"), "pixel_size"),
+        (("--pixel-size", "0.058"), "11.136 m wide; it is in metres"),
+        (("--fps", "0"), "--fps is 0"),
+        (("--fps", "170"), "below half of 170 frames/s"),
+        (("--base-radius", "-1"), "--base-radius is -1"),
+        (("--base", "20,30", "--base", "20,192"), "outside of view 1, 192 × 192 pixels"),
     ],
 )
-def test_what_cannot_be_tracked_says_why(videos, tmp_path, more, said):
+def test_what_cannot_be_tracked_says_why_before_the_work(videos, tmp_path, monkeypatch, more, said):
+    monkeypatch.setattr("vibrissa.tracking.trace_file", None)
     done = run(*arguments(videos, *more, "-o", tmp_path / "t.nc"))
     assert done.exit_code != 0
     assert said in str(done.exception)
+
+
+def test_one_video_is_not_two_views(videos, tmp_path):
+    done = run("track", videos / "top.mkv", videos / "top.mkv", "-o", tmp_path / "t.nc")
+    assert "a video is there twice" in str(done.exception)
+
+
+def test_videos_that_differ_in_length_are_told(videos, tmp_path):
+    write_video(tmp_path / "front.mkv", islice(read_video(videos / "front.mkv"), 13))
+    words = ["track", videos / "top.mkv", tmp_path / "front.mkv"]
+    done = run(*words, "--cameras", videos / "cameras.toml", "-o", tmp_path / "t.nc")
+    assert done.exit_code == 0, done.exception
+    told = " ".join(done.stdout.split())
+    assert "front.mkv 13); 13 of each are used" in told
+    assert load_recording(tmp_path / "t.nc").sizes["time"] == 13
 
 
 def test_traces_are_kept_for_their_own_video_only(tmp_path):

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 _MICRO = 1e-6
 _POOR = 2.0
+_WIDEST = 1.0
+"""What views of a whisker may be wide at most, m."""
 
 
 def track(
@@ -144,7 +146,9 @@ def track(
             raise ValueError("two trials would have one file: their first videos share a name")
     for file in files:
         check_writable(file, NETCDF)
-    places = _bases(base or [], count)
+    _check_numbers(fps, cutoff, base_radius)
+    _check_twice(trials)
+    places = _bases(base or [], views)
     fixed = {} if corrections is None else load_corrections(corrections)
     unknown = sorted(view for view in fixed if view >= count)
     if unknown:
@@ -197,6 +201,7 @@ def _tracked(
             for view, path in enumerate(videos)
         ]
         result = tracked(cameras, traces, fps, how, progress=tell, **beside)
+    _tell_lengths(videos, traces, result.sizes["time"])
     save_recording(recording, result)
     for file in kept:
         file.unlink(missing_ok=True)
@@ -223,7 +228,33 @@ def _cameras(videos: Sequence[Path], path: Path | None, pixel_size: float) -> tu
     sizes = [(info.width, info.height) for info in map(video_info, videos)]
     if len(set(sizes)) > 1:
         raise ValueError(f"the videos differ in size, {sorted(set(sizes))}: give --cameras")
+    wide = pixel_size * sizes[0][0]
+    if wide > _WIDEST:
+        raise ValueError(
+            f"--pixel-size is {pixel_size:g} m, by which the views are {wide:g} m wide; it is in "
+            "metres, such as 58e-6"
+        )
     return orthogonal_views(pixel_size, sizes[0])
+
+
+def _check_numbers(fps: float, cutoff: float, base_radius: float | None) -> None:
+    """Find out before the work what would end it."""
+    if not 0.0 < fps < float("inf"):
+        raise ValueError(f"--fps is {fps:g}; frames per second, more than 0, are needed")
+    if not 0.0 <= cutoff < 0.5 * fps:
+        raise ValueError(
+            f"--cutoff is {cutoff:g} Hz; it must be below half of {fps:g} frames/s, or 0 for none"
+        )
+    if base_radius is not None and not 0.0 < base_radius < float("inf"):
+        raise ValueError(f"--base-radius is {base_radius:g} µm; it must be positive")
+
+
+def _check_twice(trials: Sequence[Sequence[Path]]) -> None:
+    """One video cannot show a whisker from two sides."""
+    for trial in trials:
+        if len({path.resolve() for path in trial}) < len(trial):
+            names = ", ".join(map(str, trial))
+            raise ValueError(f"{names}: a video is there twice; each view needs its own")
 
 
 def _beside(head: Path | None, contact: Path | None, thing: Path | None) -> dict[str, Any]:
@@ -266,15 +297,35 @@ def _check_head(head: xr.Dataset, video: Path, fps: float) -> None:
         HeadPose.of(head, np.arange(frames), fps)
 
 
-def _bases(texts: Sequence[str], views: int) -> list[list[list[float]] | None]:
+def _bases(texts: Sequence[str], cameras: Sequence[Camera]) -> list[list[list[float]] | None]:
     """Bases of each view; None: to be found."""
+    views = len(cameras)
     if not texts:
         return [None] * views
     places = [numbers(text, ("x", "y"), "--base") for text in texts]
     if len(places) % views:
         raise ValueError(f"there are {len(places)} --base for {views} views; each needs as many")
     each = len(places) // views
+    for i, (x, y) in enumerate(places):
+        width, height = cameras[i // each].size
+        if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
+            raise ValueError(
+                f"--base {texts[i]} lies outside of view {i // each}, {width} × {height} pixels"
+            )
     return [places[v * each : (v + 1) * each] for v in range(views)]
+
+
+def _tell_lengths(videos: Sequence[Path], traces: Sequence[Sequence[Any]], used: int) -> None:
+    """Say so where videos differ in length."""
+    frames = [len(view[0]) for view in traces]
+    if len(set(frames)) > 1:
+        listed = ", ".join(f"{path} {n}" for path, n in zip(videos, frames, strict=True))
+        output.print(
+            f"the videos differ in frames ({listed}); {used} of each are used: if the cameras did "
+            "not start together or dropped frames, track with --offset auto",
+            highlight=False,
+            soft_wrap=True,
+        )
 
 
 def _report(result: xr.DataTree, path: Path) -> None:

@@ -116,6 +116,21 @@ def test_what_is_asked_for_is_made_anew(folder, tmp_path):
     assert "estimates" not in load_recording(work).children
 
 
+def test_another_whisker_makes_signals_and_contacts_anew(folder, tmp_path):
+    work = tmp_path / "t.nc"
+    done("signals", folder / "tracked.nc", "--cutoff", 60, "-o", work)
+    done("reconstruct", work, "--map", folder / "map.nc")
+    first = load_recording(work)
+    soft = recorded_whisker(first).with_properties(youngs_modulus=1.5e9)
+    ContactMap.simulate(soft, grid=False).save(tmp_path / "soft.nc")
+    done("reconstruct", work, "--whisker", tmp_path / "soft.nc")
+    other = load_recording(work)
+    assert other["signals"].attrs == first["signals"].attrs
+    for group in ("signals", "estimates"):
+        half = 0.5 * first[group]["force"].values
+        np.testing.assert_allclose(other[group]["force"].values, half, rtol=1e-3, atol=1e-9)
+
+
 def test_tables_come_out_too(folder, tmp_path):
     done("signals", folder / "sim.nc", "-o", tmp_path / "s.csv")
     table = load_signals(tmp_path / "s.csv")

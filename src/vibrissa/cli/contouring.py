@@ -137,13 +137,17 @@ def reconstruct(
     tree = recording_from(recording)
     known = recorded_objects(tree if objects is None else recording_from(objects))
     with progress_bars() as tell:
-        if source is not None or cutoff is not None or "signals" not in tree.children:
+        made = tree["signals"].attrs if "signals" in tree.children else None
+        if made and whisker is not None and source is None and cutoff is None:
+            # The same way, by another whisker.
+            source, cutoff = made.get("source"), float(made.get("cutoff", 0.0))
+        if source is not None or cutoff is not None or made is None:
             tell("signals", 0, 1)
             wanted = CUTOFF if cutoff is None else cutoff
             tree = with_signals(tree, **signal_options(tree, source, wanted, how.known))
             tell("signals", 1, 1)
         say(described(tree))
-        asked = triplet is not None or all_six or charts or noise is not None
+        asked = triplet or all_six or charts or noise is not None or whisker is not None
         if asked or "estimates" not in tree.children:
             tree, said = estimated(tree, how, noise, tell, str(recording))
             say(said)

@@ -9,6 +9,7 @@ from vibrissa import samples
 from vibrissa.demo import filming, run_demo
 from vibrissa.demo.stages import from_curves
 from vibrissa.io import load_contacts, load_recording
+from vibrissa.pipeline import fit_contacts
 from vibrissa.trial import recorded_whisker
 
 SHORT = {"duration": 0.6, "rate": 300.0, "video": False}
@@ -57,6 +58,18 @@ def test_the_peg_is_found(result):
     z = [*scores.offset[:2] / fit.origin_sigma[:2]]
     z.append(scores.diameter_error / fit.diameter_sigma)
     assert np.abs(z).max() < 5.0
+
+
+def test_what_the_peg_is_known_to_counts_frames_that_err_together(from_video):
+    """The sigma that is printed is that of the recording's contour."""
+    for one in (from_video.sensed, from_video.seen):
+        contour = one.recording["contour"].to_dataset()
+        np.testing.assert_array_equal(one.fit.covariance, contour["parameter_covariance"].values)
+        together = contour.attrs["frames_together"]
+        alone = fit_contacts(
+            one.recording["estimates"].to_dataset(), [from_video.contact_map.whisker]
+        )
+        np.testing.assert_allclose(one.fit.covariance, together * alone.covariance, rtol=1e-9)
 
 
 def test_without_noise_contacts_are_exact():
@@ -184,11 +197,23 @@ def test_stopped_while_filming_it_goes_on_with_the_next_view(tmp_path, monkeypat
     assert filmed == ["top", "front", "front"]
 
 
-def test_files_of_others_are_left_alone(tmp_path):
-    (tmp_path / "top.mp4").write_bytes(b"mine")
-    with pytest.raises(ValueError, match=r"top\.mp4"):
+@pytest.mark.parametrize("name", ["top.mp4", "trial.nc", "contacts.csv", "map.nc"])
+def test_files_of_others_are_left_alone(tmp_path, name):
+    (tmp_path / name).write_bytes(b"mine")
+    with pytest.raises(ValueError, match=name.replace(".", r"\.")):
         run_demo(output=tmp_path, **FILMED)
-    assert (tmp_path / "top.mp4").read_bytes() == b"mine"
+    assert (tmp_path / name).read_bytes() == b"mine"
+    assert [file.name for file in tmp_path.iterdir()] == [name]
+
+
+def test_nothing_of_another_trial_stays(result, tmp_path):
+    """What was seen of a filmed trial does not lie beside one that was not filmed."""
+    filming.begin(tmp_path, result.whisker, video=True)
+    (tmp_path / "seen.nc").write_bytes(b"of the first")
+    filming.begin(tmp_path, result.whisker, video=True)
+    assert (tmp_path / "seen.nc").exists()
+    filming.begin(tmp_path, result.whisker, video=False)
+    assert not (tmp_path / "seen.nc").exists()
 
 
 def test_distances_from_curves():

@@ -18,6 +18,9 @@ from vibrissa.trial.film import with_true_traces
 from vibrissa.whisker import Whisker
 
 SIMULATED, TRACKED = "simulated.nc", "tracked.nc"
+WRITTEN = ("trial.nc", "seen.nc", "contacts.csv", "map.nc")
+"""What is made anew each time, in this order."""
+
 _SETTINGS = ".settings.json"
 VIEWS = ("top", "front")
 _PLACES = 9
@@ -51,12 +54,13 @@ def begin(folder: Path, whisker: Whisker, **settings: object) -> None:
     if path.exists() and path.read_text(encoding="utf-8") == text:
         return
     files = [folder / SIMULATED, folder / TRACKED, *video_files(folder)]
-    there = [file.name for file in files if file.exists()]
+    made = [*files, *(folder / name for name in WRITTEN)]
+    there = [file.name for file in made if file.exists()]
     if there and not path.exists():
         raise ValueError(
             f"{folder} holds {', '.join(there)}, which this would replace: choose another folder"
         )
-    for file in files:
+    for file in made:
         file.unlink(missing_ok=True)
     path.write_text(text, encoding="utf-8")
 

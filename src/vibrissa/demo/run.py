@@ -13,7 +13,7 @@ from pathlib import Path
 import xarray as xr
 
 from vibrissa import samples
-from vibrissa.contour import CylinderFit
+from vibrissa.contour import CylinderFit, shape_from_dataset
 from vibrissa.demo.filming import SIMULATED, TRACKED, begin, filmed, tracked, video_files
 from vibrissa.demo.scores import Scores, contact_errors, score
 from vibrissa.demo.stages import SignalRow, TrackingScores, signal_errors, tracking_scores
@@ -21,7 +21,6 @@ from vibrissa.io import save_contacts, save_recording
 from vibrissa.mapping import ContactMap
 from vibrissa.pipeline import (
     contact_columns,
-    fit_contacts,
     placed_by,
     signals_of,
     whisker_radii,
@@ -228,7 +227,7 @@ def _located(recording: xr.DataTree, trial: xr.DataTree, chart: ContactMap, seed
     recording = with_contour(with_estimates(recording, contact_maps=[chart]))
     estimates = recording["estimates"].to_dataset()
     contacts = estimates.isel(DIM)
-    fit = fit_contacts(estimates, [chart.whisker])
+    fit = shape_from_dataset(recording["contour"].to_dataset())
     assert isinstance(fit, CylinderFit)
     whisker = recorded_whisker(trial)
     truth = trial["truth"].to_dataset()

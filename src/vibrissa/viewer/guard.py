@@ -70,6 +70,11 @@ def guarded(host: str) -> Iterator[None]:
     host : str
         The address on which it will listen.
 
+    Yields
+    ------
+    None
+        While it starts.
+
     Warns
     -----
     UserWarning

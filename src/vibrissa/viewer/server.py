@@ -190,7 +190,19 @@ def free_port(host: str) -> int:
 
 
 def is_free(host: str, port: int) -> bool:
-    """Whether one can listen on a port.
+    """Tell whether a port can be listened on.
+
+    Parameters
+    ----------
+    host : str
+        Address on this machine.
+    port : int
+        Which.
+
+    Returns
+    -------
+    bool
+        False where it is taken.
 
     Raises
     ------

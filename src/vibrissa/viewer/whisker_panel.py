@@ -25,8 +25,9 @@ class WhiskerControls:
         own = shape_of(page.original)
         gui = page.server.gui
         self.folder = gui.add_folder("Whisker")
-        length, modulus = round(_MM * own.length, 2), round(_GPA * own.modulus, 3)
+        length, modulus = round(_MM * own.length, 2), _rounded(_GPA * own.modulus)
         turn, taper = round(float(np.rad2deg(own.turn)), 1), round(own.taper, 1)
+        step = 10.0 ** (np.floor(np.log10(modulus)) - 3.0)
         with self.folder:
             self._length = gui.add_slider(
                 "Length (mm)", round(0.5 * length, 2), round(1.5 * length, 2), 0.01, length
@@ -41,14 +42,14 @@ class WhiskerControls:
             )
             self._taper = gui.add_slider(
                 "Base : tip",
-                1.0,
+                min(1.0, taper),
                 max(30.0, taper),
                 0.1,
                 taper,
                 hint="Their radii",
             )
             self._modulus = gui.add_slider(
-                "Modulus (GPa)", round(0.1 * modulus, 3), round(3.0 * modulus, 3), 0.001, modulus
+                "Modulus (GPa)", _rounded(0.1 * modulus), _rounded(3.0 * modulus), step, modulus
             )
             self._thick = gui.add_slider(
                 "Drawn × thick", 1.0, 20.0, 0.5, EXAGGERATION, hint="Only in the picture"
@@ -72,3 +73,8 @@ class WhiskerControls:
             for slider, value in starts:
                 put(slider, value)
             page.reshape(**vars(own))
+
+
+def _rounded(value: float) -> float:
+    """To four digits, however small: rubber has a thousandth of a hair's modulus."""
+    return float(f"{value:.4g}")

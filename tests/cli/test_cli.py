@@ -14,7 +14,7 @@ from vibrissa.cli.terminal import fixed, numbers, shown
 from vibrissa.io import load_contacts, save_centerline, save_signals
 
 VERBS = ("demo", "deflect", "map", "uniqueness", "sensitivity", "signals", "estimate")
-VERBS += ("reconstruct", "figures", "info")
+VERBS += ("reconstruct", "figures", "sweep", "info")
 
 
 def run(*arguments):

@@ -24,6 +24,7 @@ from vibrissa.cli import (
     sensing,
     simulating,
     streaming,
+    sweeping,
     tracking,
     viewing,
     whole_job,
@@ -60,6 +61,7 @@ app.command("figures")(figures.figures)
 app.command("view")(viewing.view)
 app.command("movie")(filming.movie)
 app.command("report")(reporting.report)
+app.command("sweep")(sweeping.sweep)
 app.command("info")(information.info)
 
 

@@ -18,6 +18,7 @@ from vibrissa.plots.signals import signals_over_time
 from vibrissa.plots.slices import solid_slices
 from vibrissa.plots.style import png, save
 from vibrissa.plots.surfaces import contact_surfaces
+from vibrissa.plots.sweep import sweep_overview
 from vibrissa.plots.things import object_triangles
 from vibrissa.plots.verdicts import verdict_table
 from vibrissa.plots.whisker import whisker_views
@@ -46,6 +47,7 @@ __all__ = [
     "signal_frames",
     "signals_over_time",
     "solid_slices",
+    "sweep_overview",
     "telling_rows",
     "trial_overview",
     "verdict_table",

@@ -4,6 +4,7 @@ from vibrissa.sweeps.results import failures, open_sweep
 from vibrissa.sweeps.run import Outcome, run_sweep
 from vibrissa.sweeps.store import Busy, Store
 from vibrissa.sweeps.study import EXAMPLE, Cell, Study, read_study
+from vibrissa.sweeps.summary import sweep_summary
 
 __all__ = [
     "EXAMPLE",
@@ -16,4 +17,5 @@ __all__ = [
     "open_sweep",
     "read_study",
     "run_sweep",
+    "sweep_summary",
 ]

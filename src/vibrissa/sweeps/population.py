@@ -11,7 +11,7 @@ import itertools
 import json
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -52,12 +52,15 @@ class Specimen:
         What it is, as a hash; of the same whisker it is the same anywhere.
     make : callable
         Makes the whisker.
+    group : str
+        Which it belongs to in the study.
     """
 
     name: str
     said: Mapping[str, float]
     identity: str
     make: Callable[[], Whisker]
+    group: str = ""
 
 
 def population(tables: Sequence[Any], folder: Path, seed: int) -> list[Specimen]:
@@ -91,9 +94,11 @@ def population(tables: Sequence[Any], folder: Path, seed: int) -> list[Specimen]
         kind = table.get("kind", "grid")
         if kind not in _KINDS:
             raise ValueError(f"{where}: kind is {kind!r}; one of {', '.join(_KINDS)} is needed")
-        said = {key: value for key, value in table.items() if key != "kind"}
+        said = {key: value for key, value in table.items() if key not in ("kind", "group")}
+        group = str(table.get("group", kind))
         try:
-            found += _KINDS[kind](said, folder, [seed, number])
+            some = _KINDS[kind](said, folder, [seed, number])
+            found += [replace(specimen, group=group) for specimen in some]
         except (TypeError, ValueError, OSError) as fault:
             raise ValueError(f"{where}: {fault}") from None
     counts = Counter(specimen.name for specimen in found)
@@ -170,7 +175,7 @@ def _files(said: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iterat
 
 def _array(said: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iterator[Specimen]:
     """Whiskers of an average rat's face."""
-    only(said, {"prefix", "side", "rows", "columns", "whiskers"}, "an array")
+    only(said, {"prefix", "side", "rows", "columns", "names"}, "an array")
     choice = {key: value for key, value in said.items() if key != "prefix"}
     choice.setdefault("side", "right")
     prefix = str(said.get("prefix", ""))

@@ -27,8 +27,8 @@ def open_sweep(path: str | PathLike[str]) -> xr.Dataset:
         Over ``whisker`` and the dimensions of the tasks. Variables are called after their task and
         their name, ``uniqueness_verdict``; verdicts are words. A dimension along which a task has
         other values than one before it has the task's name before its own. With them what is told
-        of every whisker, and ``status`` (0 not done, 1 done, 2 failed) and ``seconds`` over
-        ``task``. NaN, or an empty word, where nothing is known yet.
+        of every whisker, and over ``task`` ``seconds`` and ``status``: 0 not done, 1 done, 2
+        failed, −1 not asked. NaN, or an empty word, where nothing is known yet.
 
     Raises
     ------
@@ -39,7 +39,7 @@ def open_sweep(path: str | PathLike[str]) -> xr.Dataset:
     if not (path / STUDY).exists():
         raise ValueError(f"{path} is no store of a sweep")
     cells = _group(path / "cells")
-    out = _group(path / "whiskers").set_coords(list(DESCRIBED))
+    out = _group(path / "whiskers").set_coords(["group", *DESCRIBED])
     out = out.merge(cells[["status", "seconds"]])
     for task in map(str, cells["task"].values):
         if (path / task).exists():

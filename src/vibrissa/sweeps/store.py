@@ -27,7 +27,7 @@ from vibrissa.sweeps.study import TAKEN, Cell, Study
 
 Array = NDArray[np.float64]
 
-DONE, FAILED = 1, 2
+NOT_ASKED, DONE, FAILED = -1, 1, 2
 DESCRIBED = {
     "length": "m",
     "base_radius": "m",
@@ -140,6 +140,8 @@ class Store:
         names = np.array([specimen.name for specimen in self.study.specimens])
         dims = {"_ARRAY_DIMENSIONS": ["whisker"]}
         group.create_array("whisker", data=names, chunks=names.shape, attributes=dims)
+        groups = np.array([specimen.group for specimen in self.study.specimens])
+        group.create_array("group", data=groups, chunks=groups.shape, attributes=dims)
         for name, unit in DESCRIBED.items():
             about = {"units": unit, "long_name": name.replace("_", " "), **dims}
             group.create_array(
@@ -157,6 +159,8 @@ class Store:
         tasks = np.array(list(self.study.tasks))
         about = {"_ARRAY_DIMENSIONS": ["task"]}
         group.create_array("task", data=tasks, chunks=tasks.shape, attributes=about)
+        study = self.study
+        asked = [[study.asks(task, one) for task in study.tasks] for one in study.specimens]
         for name, kind, fill in (
             ("status", "int8", 0),
             ("seconds", "float64", np.nan),
@@ -165,6 +169,7 @@ class Store:
             group.create_array(
                 name, shape=shape, chunks=(1, 1), dtype=kind, fill_value=fill, attributes=dims
             )
+        group["status"][...] = np.where(asked, 0, NOT_ASKED)
 
     def statuses(self) -> NDArray[np.int8]:
         """Say what is there.
@@ -301,10 +306,11 @@ def _described(study: Study) -> dict[str, Any]:
     return {
         "name": study.name,
         "seed": study.seed,
-        "whiskers": [[one.name, one.identity] for one in study.specimens],
+        "whiskers": [[one.name, one.group, one.identity] for one in study.specimens],
         "tasks": json.loads(
             json.dumps({name: [kind, dict(how)] for name, (kind, how) in study.tasks.items()})
         ),
+        "groups": {name: list(some) for name, some in study.groups.items()},
     }
 
 

@@ -8,7 +8,7 @@ import time
 import tomllib
 import traceback
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,7 @@ curvature = [0.0, 0.4, 0.8]      # A L of the parabola y = A x²
 # base_radius = 100.0
 # youngs_modulus = 3.0
 # trim = 1.0                     # share of the length that is left
+# group = "parabolas"            # a name; by default the kind
 
 # [[whiskers]]
 # kind = "random"                # values between [least, largest]
@@ -68,9 +69,12 @@ contacts = 1000
 force_noise = 1.0                # µN
 moment_noise = 0.02              # µN·m
 
+# groups = ["grid"]              # only of these; by default of all whiskers
+
 # Others: "map"; "sensitivity" (triplets, noise); "friction" (triplet, friction, contacts).
 """
 
+_FILES_A_CELL = 3
 TAKEN = ("cells", "whiskers")
 """Names that no task can have: a store keeps other things under them."""
 
@@ -120,12 +124,32 @@ class Study:
         The whiskers.
     tasks : mapping
         Kind and settings of each task by its name.
+    groups : mapping
+        By the task's name, the groups of whiskers that it is asked of; by default of all.
     """
 
     name: str
     seed: int
     specimens: tuple[Specimen, ...]
     tasks: Mapping[str, tuple[str, Settings]]
+    groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def asks(self, task: str, specimen: Specimen) -> bool:
+        """Tell whether a task is asked of a whisker.
+
+        Parameters
+        ----------
+        task : str
+            Its name.
+        specimen : Specimen
+            The whisker.
+
+        Returns
+        -------
+        bool
+            True unless the task is for other groups.
+        """
+        return task not in self.groups or specimen.group in self.groups[task]
 
     def cells(self) -> Iterator[Cell]:
         """List what is to be done, one whisker after the other.
@@ -137,6 +161,8 @@ class Study:
         """
         for index, specimen in enumerate(self.specimens):
             for task, (kind, settings) in self.tasks.items():
+                if not self.asks(task, specimen):
+                    continue
                 asked = json.dumps(
                     [specimen.identity, kind, dict(settings), self.seed], default=list
                 )
@@ -145,16 +171,40 @@ class Study:
                 own = hashlib.sha256(f"{self.seed} {specimen.identity}".encode()).hexdigest()
                 yield Cell(task, kind, settings, index, specimen, int(own[:7], 16), digest[:16])
 
+    def count(self, task: str) -> int:
+        """Count the whiskers of which a task is asked.
+
+        Parameters
+        ----------
+        task : str
+            Its name.
+
+        Returns
+        -------
+        int
+            How many.
+        """
+        return sum(self.asks(task, specimen) for specimen in self.specimens)
+
     @property
     def size(self) -> int:
         """Number of cells."""
-        return len(self.specimens) * len(self.tasks)
+        return sum(map(self.count, self.tasks))
 
     @property
     def seconds(self) -> float:
         """What it takes on one core, roughly, s."""
-        each = sum(TASKS[kind].seconds(settings) for kind, settings in self.tasks.values())
-        return each * len(self.specimens)
+        return sum(
+            TASKS[kind].seconds(settings) * self.count(task)
+            for task, (kind, settings) in self.tasks.items()
+        )
+
+    @property
+    def files(self) -> int:
+        """Number of files that it makes, roughly."""
+        kinds = {task: kind for task, (kind, _) in self.tasks.items()}
+        each = {task: TASKS[kind].results + _FILES_A_CELL for task, kind in kinds.items()}
+        return sum(each[task] * self.count(task) for task in kinds) + 6 * len(self.specimens)
 
 
 def read_study(text: str, folder: Path) -> Study:
@@ -194,11 +244,13 @@ def read_study(text: str, folder: Path) -> Study:
         if not isinstance(table, list) or not table:
             raise ValueError(f"the study has no {name}: at least one [[{name}]] is needed")
     tasks: dict[str, tuple[str, Settings]] = {}
+    groups: dict[str, tuple[str, ...]] = {}
     for number, table in enumerate(tables["tasks"]):
         where = f"[[tasks]] {number + 1}"
         if not isinstance(table, Mapping):
             raise ValueError(f"{where} is {table!r}; a table is needed")
-        kind, settings = settings_of(table, where)
+        asked = {key: value for key, value in table.items() if key != "groups"}
+        kind, settings = settings_of(asked, where)
         name = str(table.get("name", kind))
         if name in tasks or name in TAKEN or not name.replace("_", "").isalnum():
             raise ValueError(
@@ -206,8 +258,23 @@ def read_study(text: str, folder: Path) -> Study:
                 f"another name (name = ...), and not {' or '.join(TAKEN)}"
             )
         tasks[name] = (kind, settings)
-    specimens = population(tables["whiskers"], folder, seed)
-    return Study(str(said.get("name", "study")), seed, tuple(specimens), tasks)
+        if "groups" in table:
+            groups[name] = _groups(table["groups"], where)
+    specimens = tuple(population(tables["whiskers"], folder, seed))
+    known_groups = {specimen.group for specimen in specimens}
+    for name, some in groups.items():
+        if unknown := sorted(set(some) - known_groups):
+            raise ValueError(
+                f"task {name} is asked of the groups {', '.join(unknown)}; there are "
+                f"{', '.join(sorted(known_groups))}"
+            )
+    return Study(str(said.get("name", "study")), seed, specimens, tasks, groups)
+
+
+def _groups(value: Any, where: str) -> tuple[str, ...]:
+    if not isinstance(value, list) or not value or not all(isinstance(one, str) for one in value):
+        raise ValueError(f"{where}: groups is {value!r}; a list of names is needed")
+    return tuple(value)
 
 
 def answer(cell: Cell) -> dict[str, Any]:

@@ -6,6 +6,7 @@ coordinates follow from the settings alone. Words are written as numbers of CF f
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -52,12 +53,15 @@ class Task:
         Raises a ValueError where settings do not fit.
     seconds : callable
         What a whisker takes on one core, roughly, by the settings; s.
+    results : int
+        How many variables its dataset has.
     """
 
     run: Callable[[Whisker, Settings, int], xr.Dataset]
     defaults: Settings
     check: Callable[[Settings], None]
     seconds: Callable[[Settings], float]
+    results: int
 
 
 def settings_of(said: Mapping[str, Any], where: str) -> tuple[str, Settings]:
@@ -314,16 +318,16 @@ def _nothing(settings: Settings) -> None:
 
 
 def _uniqueness_seconds(settings: Settings) -> float:
-    # Measured: 60 s of one core for 20 triplets × 6 regions, 4096 samples, with resolution.
-    share = len(_triplets(settings)) / 20.0 * float(settings["samples"]) / 4096.0
-    return 1.0 + 60.0 * share
+    # Measured with one core, 512 to 4096 samples: they cost little beside the search for twins.
+    each = 0.6 + (1.0 if settings["resolution"] else 0.0)
+    return 0.7 + each * len(_triplets(settings)) * math.sqrt(len(settings["regions"]))
 
 
 _SENSOR = {"force_noise": FORCE_NOISE / _MICRO, "moment_noise": MOMENT_NOISE / _MICRO}
 
 TASKS: Mapping[str, Task] = MappingProxyType(
     {
-        "map": Task(_map_summary, {}, _nothing, lambda settings: 0.3),
+        "map": Task(_map_summary, {}, _nothing, lambda settings: 0.3, 19),
         "uniqueness": Task(
             _uniqueness,
             {
@@ -335,24 +339,28 @@ TASKS: Mapping[str, Task] = MappingProxyType(
             },
             _check_uniqueness,
             _uniqueness_seconds,
+            5,
         ),
         "sensitivity": Task(
             _sensitivity,
             {"triplets": PAPERS, **_SENSOR},
             _check_sensitivity,
             lambda settings: 0.5,
+            3,
         ),
         "estimation": Task(
             _estimation,
             {"signals": ("Fx MB MD", "wrench"), "contacts": 1000, **_SENSOR},
             _check_estimation,
             lambda settings: 0.5 + 1e-4 * settings["contacts"] * len(settings["signals"]),
+            5,
         ),
         "friction": Task(
             _friction,
             {"triplet": "Fx MB MD", "friction": (0.0, 0.1, 0.3, 0.5), "contacts": 1000},
             _check_friction,
             lambda settings: 0.5 + 1e-4 * settings["contacts"] * len(settings["friction"]),
+            4,
         ),
     }
 )

@@ -1,0 +1,160 @@
+"""`vibrissa sweep`: a study of many whiskers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from vibrissa.cli.terminal import errors, output, progress_bars
+
+if TYPE_CHECKING:
+    from vibrissa.sweeps import Study
+
+_SHOW = "show"
+_BLOCK = 4096
+"""What a small file takes on a disk, bytes."""
+
+
+def sweep(
+    study: Annotated[
+        str | None,
+        typer.Argument(
+            help="The study as TOML (`--example` prints one), or `show` and its results.",
+            metavar="STUDY.toml | show",
+        ),
+    ] = None,
+    store: Annotated[
+        Path | None, typer.Argument(help="After `show`: the results.", metavar="[STORE]")
+    ] = None,
+    path: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            help="Where results go, a Zarr folder; with `show`, the folder of the figure.",
+            metavar="FOLDER",
+        ),
+    ] = None,
+    workers: Annotated[
+        int, typer.Option(help="Processes on this machine; 0: none but this one.", min=0)
+    ] = 1,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            help="Of Dask instead: its address, or `local` for a cluster of `--workers` processes.",
+            metavar="ADDRESS",
+        ),
+    ] = None,
+    again: Annotated[bool, typer.Option("--again", help="Try again what failed before.")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Print number of cells, time and size, and stop.")
+    ] = False,
+    example: Annotated[
+        bool, typer.Option("--example", help="Print a study with all that one can say, and stop.")
+    ] = False,
+) -> None:
+    """Ask the same of many whiskers, here or on a cluster; stopped, it goes on where it was.
+
+    Example: `vibrissa sweep study.toml -o study.zarr`, then `vibrissa sweep show study.zarr`
+    """
+    try:
+        import zarr  # noqa: F401
+    except ModuleNotFoundError as missing:
+        raise ModuleNotFoundError(
+            "studies are kept with zarr: pip install 'vibrissa[sweeps]'"
+        ) from missing
+    from vibrissa.sweeps import EXAMPLE, read_study
+
+    if example:
+        output.print(EXAMPLE, end="", markup=False, highlight=False, soft_wrap=True)
+    elif study is None:
+        raise ValueError("a study is needed; `vibrissa sweep --example` prints one")
+    elif study == _SHOW:
+        _show(store, path)
+    elif store is not None:
+        raise ValueError(f"{store} is one word too many; the store is said with -o")
+    else:
+        text = Path(study).read_text(encoding="utf-8")
+        plan = read_study(text, Path(study).parent)
+        if dry_run:
+            _cost(plan, max(workers, 1))
+        else:
+            _run(plan, path or Path(study).with_suffix(".zarr"), workers, scheduler, again)
+
+
+def _run(plan: Study, path: Path, workers: int, scheduler: str | None, again: bool) -> None:
+    from vibrissa.sweeps import failures, open_sweep, run_sweep, sweep_summary
+
+    try:
+        with progress_bars() as tell:
+            outcome = run_sweep(
+                plan,
+                path,
+                workers=workers,
+                scheduler=scheduler,
+                again=again,
+                progress=lambda done, total: tell("cells", done, total),
+            )
+    except KeyboardInterrupt:
+        errors.print(
+            f"stopped; what is in {path} is whole, and the same command goes on from it",
+            highlight=False,
+            soft_wrap=True,
+        )
+        raise typer.Exit(130) from None
+    said = f"{outcome.done} cells done, {outcome.failed} of them failed"
+    if outcome.skipped:
+        said += f"; {outcome.skipped} were there before and skipped"
+    if outcome.failed_before:
+        said += f", {outcome.failed_before} of which had failed (--again tries them again)"
+    output.print(said, highlight=False, soft_wrap=True)
+    output.print(sweep_summary(open_sweep(path)), highlight=False, soft_wrap=True, markup=False)
+    _print_failures(failures(path))
+    output.print(f"results are in {path}", highlight=False, soft_wrap=True)
+
+
+def _cost(plan: Study, workers: int) -> None:
+    megabytes = plan.files * _BLOCK / 1e6
+    output.print(
+        f"{plan.size} cells: {len(plan.specimens)} whiskers, "
+        f"{', '.join(f'{task} of {plan.count(task)}' for task in plan.tasks)}\n"
+        f"about {plan.seconds / 60:.1f} min of one core, {plan.seconds / workers / 60:.1f} min "
+        f"with {workers} worker{'s' if workers > 1 else ''} on idle cores\n"
+        f"about {megabytes:.1f} MB in {plan.files} files",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def _show(store: Path | None, folder: Path | None) -> None:
+    if store is None:
+        raise ValueError("say what to show: vibrissa sweep show STORE")
+    from vibrissa import plots
+    from vibrissa.sweeps import failures, open_sweep, sweep_summary
+
+    found = open_sweep(store).load()
+    output.print(sweep_summary(found), highlight=False, soft_wrap=True, markup=False)
+    _print_failures(failures(store))
+    folder = folder or Path()
+    folder.mkdir(parents=True, exist_ok=True)
+    for task in map(str, found["task"].values):
+        if f"{task}_verdict" in found:
+            figure = plots.sweep_overview(found, task=task)
+            name = folder / (f"{store.resolve().stem}-{task}")
+            for file in plots.save(figure, name, ("png",)):
+                output.print(f"wrote {file}", highlight=False, soft_wrap=True)
+
+
+def _print_failures(faults: dict[str, str], most: int = 3) -> None:
+    for cell, text in list(faults.items())[:most]:
+        lines = text.strip().splitlines()
+        output.print(
+            f"failed: {cell.rpartition('-')[0]} of {lines[0]}: {lines[-1]}",
+            highlight=False,
+            soft_wrap=True,
+            markup=False,
+        )
+    if len(faults) > most:
+        output.print(f"and {len(faults) - most} more, in .failures of the store", highlight=False)

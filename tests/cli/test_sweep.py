@@ -1,0 +1,114 @@
+"""Studies on the command line: planned, done, stopped, gone on with, shown."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("zarr", reason="zarr (extra sweeps) is not installed")
+
+from typer.testing import CliRunner
+
+from vibrissa.cli.app import app
+from vibrissa.sweeps import open_sweep, read_study
+
+RUN = CliRunner()
+STUDY = """
+name = "small"
+[[whiskers]]
+taper_ratio = [5, 15]
+curvature = 0.4
+[[whiskers]]
+group = "others"
+curvature = 0.2
+[[tasks]]
+kind = "map"
+[[tasks]]
+kind = "uniqueness"
+groups = ["others"]
+triplets = ["Fx MB MD"]
+samples = 64
+resolution = false
+"""
+
+
+def done(*words):
+    result = RUN.invoke(app, [str(word) for word in words])
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+@pytest.fixture
+def study(tmp_path):
+    path = tmp_path / "study.toml"
+    path.write_text(STUDY)
+    return path
+
+
+def test_the_example_is_a_study():
+    assert read_study(done("sweep", "--example"), Path()).size == 30
+
+
+def test_a_dry_run_counts_and_does_nothing(study, tmp_path):
+    said = done("sweep", study, "-o", tmp_path / "s", "--dry-run", "--workers", 2)
+    assert "4 cells: 3 whiskers, map of 3, uniqueness of 1" in said
+    assert "min of one core" in said
+    assert "MB in" in said
+    assert not (tmp_path / "s").exists()
+
+
+def test_done_shown_and_not_done_again(study, tmp_path):
+    store = tmp_path / "s.zarr"
+    said = done("sweep", study, "-o", store, "--workers", 0)
+    assert "4 cells done, 0 of them failed" in said
+    assert "map: 3 done, 0 failed, 0 to do" in said
+    said = done("sweep", study, "-o", store, "--workers", 0)
+    assert "0 cells done, 0 of them failed; 4 were there before and skipped" in said
+    said = done("sweep", "show", store, "-o", tmp_path / "figures")
+    assert "uniqueness: 1 done" in said
+    assert "Fx MB MD" in said
+    assert (tmp_path / "figures" / "s-uniqueness.png").stat().st_size > 10_000
+    status = open_sweep(store)["status"]
+    assert status.sel(task="uniqueness").values.tolist() == [-1, -1, 1]
+
+
+def test_ctrl_c_stops_and_says_how_to_go_on(study, tmp_path):
+    study.write_text(STUDY.replace("taper_ratio = [5, 15]", f"length = {list(range(20, 60))}"))
+    store = tmp_path / "s.zarr"
+    command = "from vibrissa.cli import main; main()"
+    words = ["sweep", str(study), "-o", str(store), "--workers", "1"]
+    with subprocess.Popen(
+        [sys.executable, "-c", command, *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as client:
+        end = time.monotonic() + 120.0
+        while not list(store.glob("cells/identity/*.0")):
+            assert client.poll() is None
+            assert time.monotonic() < end
+            time.sleep(0.05)
+        # As a terminal does: to the workers as well.
+        os.killpg(client.pid, signal.SIGINT)
+        _, said = client.communicate(timeout=60)
+    assert client.returncode == 130
+    assert "the same command goes on from it" in " ".join(said.split())
+    assert "Traceback" not in said
+    assert (open_sweep(store)["status"] == 1).any()
+
+
+def test_what_is_wrong_is_told(study, tmp_path):
+    for words, said in (
+        (["sweep"], "a study is needed"),
+        (["sweep", "show"], "say what to show"),
+        (["sweep", str(study), "more"], "one word too many"),
+        (["sweep", "show", str(tmp_path)], "no store of a sweep"),
+    ):
+        result = RUN.invoke(app, words)
+        assert isinstance(result.exception, ValueError)
+        assert said in str(result.exception)

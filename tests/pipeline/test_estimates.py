@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from vibrissa import samples
 from vibrissa.contour import shape_from_dataset
 from vibrissa.io import load_recording, save_recording
 from vibrissa.pipeline import (
@@ -24,7 +25,15 @@ from vibrissa.pipeline import (
 from vibrissa.pipeline.locate import unfelt
 from vibrissa.pipeline.reconstruct import frames_together
 from vibrissa.status import Status
-from vibrissa.trial import Sphere, recorded_pegs, recorded_whisker
+from vibrissa.trial import (
+    Sphere,
+    facing_peg,
+    measure,
+    recorded_pegs,
+    recorded_whisker,
+    simulate,
+    sweep_past,
+)
 
 ALL = "Fx FT FD Mx MB MD"
 
@@ -196,6 +205,21 @@ def test_a_peg_is_found_with_noise(trial):
     assert np.linalg.norm(contour["axis_offset"]) < 0.2e-3
     sigma = np.sqrt(np.diag(contour["parameter_covariance"]))
     assert (np.abs(contour["axis_offset"].values[:2]) < 5 * sigma[:2]).all()
+
+
+def test_a_peg_that_rubs_is_found_where_normals_may_lean():
+    whisker = samples.gamma()
+    peg = facing_peg(whisker)
+    rubbed = simulate(whisker, sweep_past(whisker, peg, 0.5, 400.0, seed=2), peg, friction=0.3)
+    felt = with_estimates(measure(rubbed, seed=3), "wrench")
+    offsets = {
+        lean: np.linalg.norm(with_contour(felt, lean=lean)["contour/axis_offset"])
+        for lean in (None, 0.0)
+    }
+    assert offsets[None] < 0.15e-3
+    assert offsets[None] < 0.5 * offsets[0.0]
+    with pytest.raises(ValueError, match="lean"):
+        with_contour(felt, lean=-0.1)
 
 
 def test_what_stages_add_is_kept_in_a_file(trial, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -47,6 +48,13 @@ def reconstruct(
     axis: Annotated[
         str | None,
         typer.Option(help="Direction of a cylinder's axis, if it is known.", metavar="X,Y,Z"),
+    ] = None,
+    lean: Annotated[
+        float | None,
+        typer.Option(
+            help="How far normals may lean from forces, degrees (standard deviation): by default "
+            "5.7 for contacts from --wrench, which allows for friction, and else 0."
+        ),
     ] = None,
     source: Annotated[
         str | None,
@@ -153,7 +161,10 @@ def reconstruct(
             say(said)
         whiskers = whiskers_for(tree, how.known)
         tell(shape, 0, 1)
-        tree = with_contour(tree, shape, axis=direction, whiskers=whiskers, objects=known)
+        leaning = None if lean is None else math.radians(lean)
+        tree = with_contour(
+            tree, shape, axis=direction, lean=leaning, whiskers=whiskers, objects=known
+        )
         tell(shape, 1, 1)
     contour = tree["contour"].to_dataset()
     tell_statuses(tree["estimates"]["status"].values)

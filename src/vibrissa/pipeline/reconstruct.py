@@ -26,6 +26,7 @@ from vibrissa.contour import (
     fit_sphere,
 )
 from vibrissa.pipeline.comparison import nearest_object
+from vibrissa.pipeline.estimates import WHOLE
 from vibrissa.pipeline.frames import EACH, estimates_in, whisker_radii, whiskers_in
 from vibrissa.quantities import attributes
 from vibrissa.rod.surface import Surface
@@ -41,6 +42,14 @@ Shape = Literal["cylinder", "sphere", "plane", "free"]
 SOLVED_TO = 1e-6
 """Uncertainty of every contact apart from the signals', m: what the mechanics is solved to."""
 
+LEAN = 0.1
+"""How far the normal may lean from the force across the whisker where friction is allowed for.
+
+As a standard deviation, rad. Friction along the whisker is seen in the wrench, and taken off;
+across the whisker and along the object it is not. Pegs are found best with 0.05 to 0.3 at any
+coefficient of friction up to 0.5, and hardly worse without friction (docs/honest-test.md).
+"""
+
 _FITS: dict[str, Callable[..., FittedShape]] = {
     "cylinder": fit_cylinder,
     "sphere": fit_sphere,
@@ -54,6 +63,7 @@ def reconstruct(
     shape: Shape = "cylinder",
     *,
     axis: ArrayLike | None = None,
+    lean: float | None = None,
     whiskers: Sequence[Whisker] | None = None,
     objects: Sequence[Surface] | None = None,
 ) -> xr.Dataset:
@@ -67,6 +77,8 @@ def reconstruct(
         What the object is taken for; free: any smooth surface.
     axis : array_like (3,), optional
         Direction of a cylinder's axis, laboratory frame, where it is known.
+    lean : float, optional
+        See `fit_contacts`.
     whiskers : sequence of Whisker, optional
         One for each along the dimension ``whisker``; by default those of the recording.
     objects : sequence of Surface, optional
@@ -95,7 +107,7 @@ def reconstruct(
     estimates = estimates_in(recording)
     whiskers = whiskers_in(recording) if whiskers is None else whiskers
     known = recorded_objects(recording) if objects is None else tuple(objects)
-    fit = fit_contacts(estimates, whiskers, shape, axis=axis)
+    fit = fit_contacts(estimates, whiskers, shape, axis=axis, lean=lean)
     together = frames_together(_scores(fit, estimates))
     fit = _less_sure(fit, together)
     each = {n: estimates[n].variable for n in EACH if n in estimates.coords}
@@ -175,6 +187,7 @@ def fit_contacts(
     shape: Shape = "cylinder",
     *,
     axis: ArrayLike | None = None,
+    lean: float | None = None,
 ) -> FittedShape:
     """Fit a shape to contacts in the laboratory.
 
@@ -188,6 +201,10 @@ def fit_contacts(
         Which.
     axis : array_like (3,), optional
         Direction of a cylinder's axis where it is known.
+    lean : float, optional
+        Standard deviation of the angle between the surface's normal and the force across the
+        whisker, rad; by default `LEAN` for contacts from the whole wrench, which allows for
+        friction, and 0 for others, which are of a whisker without friction.
 
     Returns
     -------
@@ -207,6 +224,10 @@ def fit_contacts(
     count = estimates.sizes["whisker"]
     if len(whiskers) != count:
         raise ValueError(f"there are estimates of {count} whiskers; {len(whiskers)} are given")
+    if lean is None:
+        lean = LEAN if estimates.attrs.get("signals") == WHOLE else 0.0
+    if not (np.isfinite(lean) and lean >= 0.0):
+        raise ValueError(f"lean is {lean!r}; an angle from 0 is needed, rad")
     points = _rows(estimates["contact_point"])
     known = {
         "normals": _rows(estimates["contact_normal"]),
@@ -217,6 +238,8 @@ def fit_contacts(
         known["covariance"] = spread + SOLVED_TO**2 * np.eye(3)
         for name in ("normal_covariance", "point_normal_covariance"):
             known[name] = _rows(estimates[name])
+        across = np.eye(3) - known["normals"][:, :, None] * known["normals"][:, None, :]
+        known["normal_covariance"] = known["normal_covariance"] + lean**2 * across
     try:
         if axis is not None:
             return fit_cylinder(points, axis=axis, **known)

@@ -172,13 +172,13 @@ def scored(
 def peg_error(placed: xr.Dataset, trial: xr.DataTree, normals: str) -> dict[str, float]:
     """Of the cylinder fitted to the contacts: metres and radians; NaN where there is none.
 
-    With normals that are uncertain (as `vibrissa reconstruct` does), exact, or with no normals.
+    With normals that are as uncertain as their covariance says, exact, or with no normals.
     """
     (peg,), whisker = recorded_pegs(trial), recorded_whisker(trial)
     each = placed.expand_dims(whisker=1, axis=1)
     try:
         if normals == "uncertain":
-            fit = fit_contacts(each, [whisker])
+            fit = fit_contacts(each, [whisker], lean=0.0)
         else:
             fit = fit_cylinder(
                 placed["contact_point"].values,

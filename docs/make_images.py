@@ -69,6 +69,27 @@ def c2() -> Figure:
     return witness(whisker, found, "Fx MB MD")
 
 
+def up_to_the_fold() -> Figure:
+    """The γ whisker pushed aside at one point, forward and backward, until it would slip off."""
+    whisker = vb.samples.gamma()
+    start = whisker.centerline(1001)[650]
+    aside = np.linspace(0.0, 0.6, 601)[1:] * whisker.length
+    ways = np.array([[0.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
+    bent = vb.deflect(whisker, vb.PointContact(start + aside[:, None] * ways[:, None]))
+    shown = []
+    for way, status in enumerate(bent.status):
+        last = np.flatnonzero(status == vb.Status.OK)[-1]
+        rows = np.linspace(0, last, 4).round().astype(int)[1:]
+        shown += [(way, row) for row in (rows[::-1] if way == 0 else rows)]
+    these = tuple(np.transpose(shown))
+    return plots.bent_views(
+        whisker.centerline(101),
+        bent.centerline(101)[these],
+        bent.contact_point[these],
+        bent.force[these],
+    )
+
+
 @cache
 def trial() -> xr.DataTree:
     """Half a second of whisking past a peg, felt with a noisy sensor, and its contour."""
@@ -182,6 +203,7 @@ def distances() -> Figure:
 FIGURES: dict[str, Callable[[], Figure | np.ndarray]] = {
     "array": lambda: plots.array_views(vb.whisker_array().to_tree()),
     "array_trial": touching_array,
+    "bent": up_to_the_fold,
     "signal_space": lambda: plots.signal_clouds(chart().to_dataset(), line()),
     "contact_surfaces": lambda: plots.contact_surfaces(chart().to_dataset(), line()),
     "sensitivity": lambda: plots.sensitivity_panels(vb.sensitivity(chart(), at="grid")),

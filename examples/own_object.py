@@ -2,7 +2,7 @@
 
 Aim: to find the shape of something of which nothing is known. Data: a rounded stone as a closed
 mesh, and a whisker that whisks while its base rises. Lesson: a surface through the contacts tells
-the stone where it was touched, and how well; what was not touched it does not make up.
+the stone where it was touched, and how well; beyond, it can but go on smoothly.
 """
 
 # %% A stone: corners and triangles; your own is read with Mesh.load("stone.stl") (extra mesh)

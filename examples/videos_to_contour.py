@@ -1,7 +1,7 @@
 """Two videos to the contour of an object.
 
 Aim: from what two cameras see to the object that was touched. Data: a whisk of 0.2 s past a peg,
-simulated and filmed here, coarsely: 400 frames a second, 0.12 mm a pixel. Lesson: from two films
+simulated and filmed here, coarsely: 300 frames a second, 0.12 mm a pixel. Lesson: from two films
 come the whisker in space, where it is touched, how hard, and the peg.
 """
 
@@ -30,9 +30,9 @@ folder = Path(sys.argv[1] if len(sys.argv) > 1 else "output")
 folder.mkdir(parents=True, exist_ok=True)
 
 whisker = vb.samples.gamma()
-peg, rate = facing_peg(whisker), 400.0
+peg, rate = facing_peg(whisker), 300.0
 trial = simulate(whisker, sweep_past(whisker, peg, duration=0.2, rate=rate, seed=1), peg)
-cameras = orthogonal_views(0.12e-3, (400, 400), center=[15e-3, 2e-3, 0.0])
+cameras = orthogonal_views(0.12e-3, (360, 360), center=[15e-3, 2e-3, 0.0])
 files = {camera.name: folder / f"{camera.name}.mp4" for camera in cameras}
 film(trial, files, cameras, seed=1)
 

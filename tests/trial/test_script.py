@@ -125,6 +125,10 @@ def test_faulty_tables(tmp_path):
     (tmp_path / "motion.csv").write_text("time,pitch\n0,0\n1,0.01\n")
     with pytest.raises(ValueError, match="has columns time, pitch and 2 rows"):
         read('motion = {kind = "table", file = "motion.csv"}', tmp_path)
+    for rows in ("0,0\n2,0.01\n1,0.02", "0,0\n1,nan"):
+        (tmp_path / "head.csv").write_text(f"time,z\n{rows}\n")
+        with pytest.raises(ValueError, match="missing, or time that does not rise"):
+            read('head = {file = "head.csv"}', tmp_path)
 
 
 def test_the_command_writes_a_recording(tmp_path, capsys):

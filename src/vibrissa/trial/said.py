@@ -78,4 +78,6 @@ def columns_of(path: Path) -> dict[str, Array]:
             f"{path} has a cell that is no number, or rows of different length"
         ) from None
     columns = dict(zip(names, values.T, strict=True))
+    if not (np.isfinite(values).all() and (np.diff(columns["time"]) > 0.0).all()):
+        raise ValueError(f"{path} has a number that is missing, or time that does not rise")
     return {name: columns.get(name, np.zeros(len(values))) for name in COLUMNS}

@@ -188,8 +188,25 @@ def test_a_sensor_is_placed_by_what_a_camera_saw(tracked, trial):
     assert (nowhere["status"].values == Status.MISSING).all()
     assert not nowhere["in_contact"].values.any()
     assert nowhere["in_contact"].dtype == bool
+    for shift in (-0.4 / 300, 0.4 / 300):
+        near = xr.DataTree(later.assign_coords(time=later["time"] + shift))
+        np.testing.assert_array_equal(placed_by(signals, near)["Fx"].values, placed["Fx"].values)
     with pytest.raises(ValueError, match="2 whiskers"):
         placed_by(xr.concat([signals, signals], "whisker"), tracked)
+
+
+def test_a_fast_sensor_is_placed_in_little_memory(tracked, trial):
+    """A table of all samples by all frames would have 10¹⁰ numbers."""
+    felt = signals_of(trial)[["Fx", "status"]]
+    pose = tracked.to_dataset()[["base_position", "base_rotation"]]
+    times = [np.linspace(0.0, 1.0, count) for count in (200_000, 50_000)]
+    signals, seen = (
+        data.isel(time=np.zeros(time.size, dtype=int)).assign_coords(time=time)
+        for data, time in zip((felt, pose), times, strict=True)
+    )
+    signals["Fx"] = signals["Fx"].copy(data=times[0][:, None])
+    placed = placed_by(signals, xr.DataTree(seen))
+    np.testing.assert_allclose(placed["Fx"].values[:, 0], times[1], rtol=0, atol=0.51 / 199_999)
 
 
 def test_what_is_missing_is_said(tracked, trial):

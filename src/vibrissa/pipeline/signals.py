@@ -317,7 +317,9 @@ def placed_by(signals: xr.Dataset, recording: xr.DataTree) -> xr.Dataset:
             f"places them has {root.sizes['whisker']}"
         )
     time, wanted = signals["time"].values, root["time"].values
-    near = np.abs(time[:, None] - wanted).argmin(axis=0)
+    later = np.searchsorted(time, wanted).clip(0, time.size - 1)
+    earlier = np.maximum(later - 1, 0)
+    near = np.where(wanted - time[earlier] <= time[later] - wanted, earlier, later)
     step = np.median(np.diff(time)) if time.size > 1 else np.inf
     there = xr.DataArray(np.abs(time[near] - wanted) <= 0.5001 * step, dims="time")
     kept = signals.drop_vars([*SQUARES, *names], errors="ignore").isel(time=near)

@@ -116,6 +116,15 @@ def test_what_is_asked_for_is_made_anew(folder, tmp_path):
     assert "estimates" not in load_recording(work).children
 
 
+def test_a_shape_that_does_not_fit_is_said(folder, tmp_path):
+    work = tmp_path / "t.nc"
+    words = (folder / "sim.nc", "--map", folder / "map.nc", "-o", work)
+    assert "another shape" not in done("reconstruct", *words)
+    assert "another shape (--shape)" in " ".join(
+        done("reconstruct", work, "--shape", "plane").split()
+    )
+
+
 def test_another_whisker_makes_signals_and_contacts_anew(folder, tmp_path):
     work = tmp_path / "t.nc"
     done("signals", folder / "tracked.nc", "--cutoff", 60, "-o", work)

@@ -261,7 +261,11 @@ def _summary(fit: FittedShape, contour: xr.Dataset) -> str:
 
     inside = int(fit.inliers.sum())
     found = int(np.isfinite(fit.residuals).sum())
+    if not inside:
+        return f"none of {found} contacts agrees with it: the object has another shape (--shape)"
     said = f"{inside} of {found} contacts agree with it, to {fixed('surface_distance', fit.rms, 1)}"
+    if 2 * inside < found:
+        said += "; most are too uncertain, or the object has another shape (--shape)"
     together = float(contour.attrs["frames_together"])
     if together > 1.5:
         said += f"; about {together:.0f} frames err together, which sigma takes into account"

@@ -204,9 +204,14 @@ def _groups(path: Path) -> Iterator[tuple[str, str]]:
 
 def _compared(path: Path) -> Iterator[tuple[str, str]]:
     """How contact points that do not come from the rod compare with those that do."""
+    import h5netcdf
+
     from vibrissa.cli.tracking import compared_contacts
     from vibrissa.io import load_recording
 
+    with h5netcdf.File(path, "r") as file:  # a recording of many whiskers takes seconds to read
+        if "measured" not in file.groups:
+            return
     recording = load_recording(path)
     for k, name in enumerate(recording.coords["whisker"].values):
         for sentence in compared_contacts(recording, k):

@@ -21,8 +21,9 @@ CAPTIONS = {
     "(grey) and what was fitted (dashed).",
     "contour": "Contact points in the laboratory from three sides.",
     "whisker": "The resting whisker in its own frame, and how thick it is.",
-    "signal_space": "All contacts of the whisker in the space of three signals.",
-    "contact_surfaces": "Signals over the space of contacts.",
+    "signal_space": "All contacts that the whisker can hold, coloured by what they feel like.",
+    "contact_surfaces": "Contacts of equal r, θ and φ, and where they lie among all "
+    "contacts in the space of three signals.",
     "sensitivity": "How the contact moves when a signal changes.",
     "solid": "A slice of the solid of all contacts.",
     "critical_cones": "Critical cones by curvature and taper.",

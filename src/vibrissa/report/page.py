@@ -30,7 +30,7 @@ header p, figcaption, .note { color: var(--soft); }
 nav ul { padding: 0; display: flex; flex-wrap: wrap; gap: 0.3rem 1.2rem; list-style: none; }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; margin: 0.8rem 0; font-size: 0.92rem; }
-caption { text-align: left; font-weight: 600; padding: 0.2rem 0; }
+caption { text-align: left; font-weight: 600; padding: 0.2rem 0; white-space: nowrap; }
 th, td { padding: 0.15rem 1.1rem 0.15rem 0.3rem; text-align: left; vertical-align: top; }
 thead th { border-bottom: 2px solid var(--line); }
 tbody th { font-weight: 500; }

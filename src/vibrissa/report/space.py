@@ -169,7 +169,11 @@ def _points(points: Array, name: str, values: Array, label: str) -> Any:
 
     known = quantity(name)
     unit = f" ({known.display_unit})" if known.display_unit else ""
-    bar = {"title": {"text": f"{known.long_name}{unit}"}, "thickness": 12, "len": 0.6, "x": 0.93}
+    bar = {
+        "title": {"text": f"{known.long_name}{unit}", "side": "right"},
+        "thickness": 12,
+        "len": 0.6,
+    }
     look = {"size": 2.5, "color": to_display(name, values), "colorscale": "Viridis"}
     x, y, z = points.T
     return go.Scatter3d(x=x, y=y, z=z, mode="markers", marker={**look, "colorbar": bar}, name=label)

@@ -85,7 +85,9 @@ def test_results_are_one_labelled_dataset(done):
     assert (done["map_slip_force"].isel(station=-2).diff("whisker") < 0).all()
 
 
-def test_processes_give_the_same_to_the_bit(quick, done, tmp_path):
+def test_processes_give_the_same_to_the_bit(quick, done, tmp_path, monkeypatch):
+    # One process after the other, as in a large study.
+    monkeypatch.setattr("vibrissa.sweeps.workers._LIFE", 1)
     told = []
     outcome = run_sweep(
         quick, tmp_path / "s", workers=2, progress=lambda *so_far: told.append(so_far)

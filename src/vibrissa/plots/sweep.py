@@ -29,8 +29,9 @@ def sweep_overview(
     Parameters
     ----------
     found : Dataset
-        As of ``vibrissa.sweeps.open_sweep``: over ``whisker``, with ``taper_ratio``, ``tip_turn``
-        (rad), and ``TASK_verdict`` and ``TASK_critical_cone`` (rad) over triplet and region.
+        As of ``vibrissa.sweeps.open_sweep``: over ``whisker``, with ``taper_ratio``, ``turn`` (what
+        the tangent turns by from base to tip, rad), and ``TASK_verdict`` and
+        ``TASK_critical_cone`` (rad) over triplet and region.
     task : str, optional
         Name of the task; by default the first that has verdicts.
     width : {"single", "double"}
@@ -69,7 +70,7 @@ def sweep_overview(
             _panel(axes, found, verdict.isel(at), degrees.isel(at), norm, colours)
             head(axes, "abc"[i], triplet_label(str(triplets[i])))
         for axes in grid[:, 0]:
-            axes.set_ylabel("the tip's tangent turned from the base's (°)")
+            axes.set_ylabel("the tangent turns along the whisker (°)")
         for axes in grid[-1]:
             axes.set_xlabel("base / tip radius")
         marks = [
@@ -91,7 +92,7 @@ def _panel(
     norm: Normalize,
     colours: object,
 ) -> None:
-    x, y = found["taper_ratio"].values, np.degrees(found["tip_turn"].values)
+    x, y = found["taper_ratio"].values, np.degrees(found["turn"].values)
     for word, mark in _MARKS.items():
         here = verdict.values == word
         axes.scatter(

@@ -34,7 +34,7 @@ DESCRIBED = {
     "tip_radius": "m",
     "taper_ratio": "1",
     "youngs_modulus": "Pa",
-    "tip_turn": "rad",
+    "turn": "rad",
 }
 """What is told of every whisker, and its unit."""
 

@@ -308,12 +308,13 @@ def answer(cell: Cell) -> dict[str, Any]:
 
 
 def _described(whisker: Whisker) -> dict[str, float]:
-    tangent = whisker.frame(whisker.length)[:, 0]
+    tangent = whisker.frame(np.linspace(0.0, whisker.length, 401))[:, :, 0]
+    chord = np.linalg.norm(np.diff(tangent, axis=0), axis=1)
     return {
         "length": whisker.length,
         "base_radius": whisker.base_radius,
         "tip_radius": whisker.tip_radius,
         "taper_ratio": whisker.base_radius / whisker.tip_radius,
         "youngs_modulus": whisker.youngs_modulus,
-        "tip_turn": float(np.arctan2(np.hypot(tangent[1], tangent[2]), tangent[0])),
+        "turn": float(2.0 * np.arcsin(np.minimum(chord / 2.0, 1.0)).sum()),
     }

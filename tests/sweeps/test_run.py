@@ -259,7 +259,7 @@ def test_a_result_of_another_shape_is_a_failure(quick, tmp_path, monkeypatch):
         return found.isel(station=slice(5)) if 10 < ratio < 20 else found
 
     changed = tasks_module.Task(
-        shorter_for_the_second, {}, lambda settings: None, lambda settings: 0.1
+        shorter_for_the_second, {}, lambda settings: None, lambda settings: 0.1, 19
     )
     monkeypatch.setattr("vibrissa.sweeps.study.TASKS", {**tasks_module.TASKS, "map": changed})
     outcome = run_sweep(quick, tmp_path / "s", workers=0)

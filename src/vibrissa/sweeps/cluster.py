@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import uuid
 from collections.abc import Generator, Iterable, Iterator
 from typing import Any
 
@@ -96,7 +97,8 @@ def _round(
     def submit() -> None:
         if (cell := next(waiting, None)) is None:
             return
-        key = f"{cell.task}-{cell.index}-{cell.identity}"
+        # Never the same again: Dask would give the old answer to a question that failed before.
+        key = f"{cell.task}-{cell.index}-{uuid.uuid4().hex}"
         asked[key] = cell
         under_way.add(client.submit(answer, cell, key=key))
 

@@ -227,7 +227,7 @@ def _by_rod(root: xr.Dataset) -> xr.Dataset:
     needed(root, names, "rod")
     wrench = root[["force", "moment"]]
     known = _known(wrench)
-    touching = known & (wrench["force"] != 0.0).any("space").values
+    touching = known & (wrench["force"] != 0.0).any("space").transpose("time", "whisker").values
     if "in_contact" in root:
         touching &= root["in_contact"].transpose("time", "whisker").values.astype(bool)
     status = np.where(touching, int(Status.OK), int(Status.NO_CONTACT))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -19,6 +20,12 @@ _LINEAR_FORCE = 0.3
 _LINEAR_ARC = 0.1
 #: Standard deviation, over L, with which a hypothesis starts that is not known so well.
 VAGUE = 0.2
+#: Hypotheses less probable than this next to the best are dropped.
+LEAST = 1e-6
+#: At most so many are kept, and of a curve or surface of candidates so many start.
+MOST = 24
+# What is surer than this is no longer ambiguous.
+_SURE = 0.99
 
 
 class Followed(NamedTuple):
@@ -107,3 +114,101 @@ def gaps_between(points: Array) -> Array:
     order = np.argsort((apart**2).sum(axis=2), axis=1)[:, 1:3]
     near = np.take_along_axis(apart, order[:, :, None], axis=1)
     return np.asarray(0.25 * np.einsum("nki,nkj->nij", near, near) / near.shape[1])
+
+
+def tidied(hypotheses: list[Hypothesis]) -> list[Hypothesis]:
+    """Sort and normalise; drop what is improbable, and one of two that have become the same.
+
+    Parameters
+    ----------
+    hypotheses : list of Hypothesis
+        In any order; weights are changed.
+
+    Returns
+    -------
+    list of Hypothesis
+        The most probable first; the exponentials of their weights sum to one.
+    """
+    if not hypotheses:
+        return []
+    ranked = sorted(hypotheses, key=lambda one: -one.weight)
+    best = ranked[0].weight
+    kept: list[Hypothesis] = []
+    for one in ranked:
+        if one.weight < best + math.log(LEAST) or len(kept) >= MOST:
+            break
+        twin = next((other for other in kept if same(one, other)), None)
+        if twin is None:
+            kept.append(one)
+        else:
+            twin.weight = float(np.logaddexp(twin.weight, one.weight))
+    total = float(np.logaddexp.reduce([one.weight for one in kept]))
+    for one in kept:
+        one.weight -= total
+    return sorted(kept, key=lambda one: -one.weight)
+
+
+def told(
+    hypotheses: list[Hypothesis],
+    stiffness: float,
+    status: Status,
+    located: Located | None,
+    turn: Array,
+    base: Array,
+    length: float,
+) -> Followed:
+    """What hypotheses tell, in SI units.
+
+    Parameters
+    ----------
+    hypotheses : list of Hypothesis
+        The most probable first.
+    stiffness : float
+        Relative standard deviation of the whisker's stiffness.
+    status : Status
+        Of the sample: ``MISSING`` stays.
+    located : Located or None
+        What the sample alone tells.
+    turn, base : (3, 3), (3,) arrays
+        Pose of the base, in L.
+    length : float
+        L, m.
+
+    Returns
+    -------
+    Followed
+        Of them.
+    """
+    none = np.full(3, np.nan)
+    if not hypotheses:
+        return Followed(
+            none,
+            np.full((3, 3), np.nan),
+            none,
+            0.0,
+            status,
+            np.empty((0, 3)),
+            np.empty(0),
+            none,
+            located,
+        )
+    best = hypotheses[0]
+    weights = np.exp([one.weight for one in hypotheses])
+    weights = weights / weights.sum()
+    if status != Status.MISSING:
+        status = Status.UNIQUE if weights[0] > _SURE else Status.AMBIGUOUS
+    points = np.array([one.mean[:3] for one in hypotheses])
+    away = points - best.mean[:3]
+    spreads = [one.total(stiffness)[:3, :3] for one in hypotheses]
+    covariance = np.tensordot(weights, spreads, axes=1) + (away.T * weights) @ away
+    return Followed(
+        best.mean[:3] * length,
+        covariance * length**2,
+        best.mean[3:] * length,
+        float(weights[0]),
+        status,
+        points * length,
+        weights,
+        turn.T @ (best.mean[:3] - base) * length,
+        located,
+    )

@@ -1,0 +1,58 @@
+"""How contact points move in the laboratory, as a filter takes it beforehand.
+
+A velocity that forgets itself (Ornstein and Uhlenbeck):
+
+    dp = v dt,    dv = -v dt / τ + σ √(2 / τ) dW.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from vibrissa.rod.arrays import Array
+
+
+class Drift:
+    """The law of motion of (p, v).
+
+    Parameters
+    ----------
+    speed : float
+        σ, standard deviation of a component of the velocity, L/s.
+    persistence : float
+        τ, s.
+    """
+
+    def __init__(self, speed: float, persistence: float) -> None:
+        self.speed, self._tau = speed, persistence
+
+    def over(self, step: float) -> tuple[Array, Array]:
+        """What happens in some time.
+
+        Parameters
+        ----------
+        step : float
+            The time, s.
+
+        Returns
+        -------
+        by : (6, 6) array
+            (p, v) after, by (p, v) before.
+        noise : (6, 6) array
+            Covariance of what is added.
+        """
+        tau, speed = self._tau, self.speed
+        x = step / tau
+        a = math.exp(-x)
+        moved = tau * (1.0 - a)
+        by = np.eye(6)
+        by[:3, 3:], by[3:, 3:] = moved * np.eye(3), a * np.eye(3)
+        # 2x - 3 + 4a - a² loses its digits where x is small.
+        walked = 2.0 * x - 3.0 + 4.0 * a - a * a if x > 0.01 else x**3 * (2.0 / 3.0 - 0.5 * x)
+        noise = np.zeros((6, 6))
+        noise[:3, :3] = (speed * tau) ** 2 * walked * np.eye(3)
+        noise[:3, 3:] = noise[3:, :3] = speed**2 * tau * (1.0 - a) ** 2 * np.eye(3)
+        noise[3:, 3:] = speed**2 * (1.0 - a * a) * np.eye(3)
+        return by, noise

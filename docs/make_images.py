@@ -2,7 +2,7 @@
 
 The folder is ``docs/images`` by default; without names all are made. Nothing in them is random, so
 an unchanged program gives the same figures. Verdicts take a minute or two for each whisker, the
-critical cones ten minutes or more. ``contour.png`` is a figure of ``vibrissa demo``.
+critical cones ten minutes or more.
 """
 
 import io
@@ -15,6 +15,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 from PIL import Image
+from title_picture import title_picture
 
 import vibrissa as vb
 from vibrissa import plots
@@ -37,7 +38,8 @@ from vibrissa.trial.film import film_frames, with_true_traces
 from vibrissa.trial.recording import recorded_objects
 
 WIDTH = 1200
-LEVELS = {"trial": 32, "movie_signals": 64, "movie_contour": 64}
+WIDER = {"title": 1400}
+LEVELS = {"title": 48, "trial": 32, "movie_signals": 64, "movie_contour": 64}
 """Of red, green and blue in figures for which 256 colours are too few."""
 
 CURVATURES = np.arange(8) / 5.0
@@ -98,6 +100,26 @@ def trial() -> xr.DataTree:
     motion = sweep_past(whisker, peg, 0.5, seed=1)
     felt = measure(simulate(whisker, motion, peg), seed=1)
     return with_contour(with_true_traces(felt, views_of(felt)))
+
+
+@cache
+def long_trial() -> xr.DataTree:
+    """The same for one and a half seconds."""
+    whisker = chart().whisker
+    peg = facing_peg(whisker)
+    motion = sweep_past(whisker, peg, 1.5, seed=1)
+    return with_contour(measure(simulate(whisker, motion, peg), seed=1))
+
+
+def contour() -> Figure:
+    """Its contacts and the peg that was fitted to them."""
+    course, (peg,) = plots.course_of(long_trial()), recorded_objects(long_trial())
+    return plots.contour_views(
+        course.places,
+        peg,
+        shape_from_dataset(long_trial()["contour"].to_dataset()),
+        colour=plots.deflection_angles(course, line()),
+    )
 
 
 def filmed(rows: Sequence[int]) -> list[plots.Sight]:
@@ -201,6 +223,8 @@ def distances() -> Figure:
 
 
 FIGURES: dict[str, Callable[[], Figure | np.ndarray]] = {
+    "title": lambda: title_picture(long_trial(), chart()),
+    "contour": contour,
     "array": lambda: plots.array_views(vb.whisker_array().to_tree()),
     "array_trial": touching_array,
     "bent": up_to_the_fold,
@@ -234,9 +258,10 @@ def save(figure: Figure | np.ndarray, path: Path) -> None:
 
 
 def save_small(image: Image.Image, path: Path) -> None:
-    """Write an image 1200 pixels wide, in as many colours as need be."""
-    height = round(image.height * WIDTH / image.width)
-    small = image.convert("RGB").resize((WIDTH, height), Image.Resampling.LANCZOS)
+    """Write an image 1200 pixels wide, or wider, in as many colours as need be."""
+    width = WIDER.get(path.stem, WIDTH)
+    height = round(image.height * width / image.width)
+    small = image.convert("RGB").resize((width, height), Image.Resampling.LANCZOS)
     if path.stem in LEVELS:
         steps = LEVELS[path.stem] - 1
         rounded = [round(round(v / 255 * steps) * 255 / steps) for v in range(256)]

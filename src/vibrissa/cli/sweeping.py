@@ -139,12 +139,11 @@ def _show(store: Path | None, folder: Path | None) -> None:
     _print_failures(failures(store))
     folder = folder or Path()
     folder.mkdir(parents=True, exist_ok=True)
-    for task in map(str, found["task"].values):
-        if f"{task}_verdict" in found:
-            figure = plots.sweep_overview(found, task=task)
-            name = folder / (f"{store.resolve().stem}-{task}")
-            for file in plots.save(figure, name, ("png",)):
-                output.print(f"wrote {file}", highlight=False, soft_wrap=True)
+    for task in plots.drawable(found):
+        figure = plots.sweep_overview(found, task=task)
+        name = folder / (f"{store.resolve().stem}-{task}")
+        for file in plots.save(figure, name, ("png",)):
+            output.print(f"wrote {file}", highlight=False, soft_wrap=True)
 
 
 def _print_failures(faults: dict[str, str], most: int = 3) -> None:

@@ -18,7 +18,7 @@ from vibrissa.plots.signals import signals_over_time
 from vibrissa.plots.slices import solid_slices
 from vibrissa.plots.style import png, save
 from vibrissa.plots.surfaces import contact_surfaces
-from vibrissa.plots.sweep import sweep_overview
+from vibrissa.plots.sweep import drawable, sweep_overview
 from vibrissa.plots.things import object_triangles
 from vibrissa.plots.verdicts import verdict_table
 from vibrissa.plots.whisker import whisker_views
@@ -37,6 +37,7 @@ __all__ = [
     "critical_cones",
     "deflection_angles",
     "distances_by_class",
+    "drawable",
     "estimated_against_true",
     "object_triangles",
     "png",

@@ -1,4 +1,4 @@
-"""What a study found, whisker by whisker: how it tapers and curves, and what came of it."""
+"""What a study found: which whiskers are unique, how far, and how large errors are."""
 
 from __future__ import annotations
 
@@ -6,107 +6,259 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
+from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from vibrissa.plots.colours import sequential
-from vibrissa.plots.style import INK, MUTED, Width, head, looking, new_figure, plain
+from vibrissa.plots.style import (
+    BLUE,
+    GREEN,
+    INK,
+    MUTED,
+    ORANGE,
+    SHADE,
+    Array,
+    Width,
+    head,
+    looking,
+    new_figure,
+    plain,
+)
 from vibrissa.plots.verdicts import VERDICTS, triplet_label
 
 _MARKS = dict(zip(VERDICTS, ("o", "D", "X"), strict=True))
+_INKS = dict(zip(VERDICTS, (BLUE, GREEN, ORANGE), strict=True))
 _MOST = 3
-"""Panels that are drawn."""
+"""Triplets that get panels of their own; more share one."""
+
+_CONES = (0.0, 1.0, 2.0, 5.0, 10.0, 20.0, 40.0, 90.0)
+"""Classes of critical cones, degrees."""
+
+_TURNS = (0, 20, 50, 90, 180, 360)
+_ERRORS = (1e-4, 1e3)
+"""Errors that are told apart, mm: less is exact, more says nothing of where the contact is."""
+
+_ROW, _FRAME = 4.4, 20.0
+"""Height of a row of marks, and of what is around the rows, mm."""
 
 
 def sweep_overview(
     found: xr.Dataset, *, task: str | None = None, width: Width = "double"
 ) -> Figure:
-    """Draw a study's verdicts over the whiskers' taper and curvature.
+    """Draw what a task of a study found.
 
-    A mark for each whisker, its shape the verdict, its colour the critical cone; a panel for each
-    of the first three triplets.
+    Of verdicts: a row of panels for each triplet, where the left one shows every whisker by its
+    taper and by how much it turns, coloured by the critical cone, and the right one the critical
+    cones by group of whiskers; of more than three triplets the critical cones only, a line for
+    each triplet. Of errors: a line for each set of signals or friction coefficient. The shape of a
+    mark is the verdict.
 
     Parameters
     ----------
     found : Dataset
-        As of ``vibrissa.sweeps.open_sweep``: over ``whisker``, with ``taper_ratio``, ``turn`` (what
-        the tangent turns by from base to tip, rad), and ``TASK_verdict`` and
-        ``TASK_critical_cone`` (rad) over triplet and region.
+        As of ``vibrissa.sweeps.open_sweep``: over ``whisker``, with the names of tasks in ``task``,
+        ``group``, ``taper_ratio`` and ``turn`` (what the tangent turns by from base to tip, rad),
+        and either ``TASK_verdict`` and ``TASK_critical_cone`` (rad) over triplet and region, of
+        which the first is drawn, or ``TASK_median_error`` (m) over one more dimension.
     task : str, optional
-        Name of the task; by default the first that has verdicts.
+        Name of the task; by default the first that can be drawn.
     width : {"single", "double"}
         Columns of the page.
 
     Returns
     -------
     Figure
-        One axes for each triplet, and a colour bar.
+        As described.
 
     Raises
     ------
     ValueError
-        If there are no verdicts.
+        If there are neither verdicts nor errors.
     """
-    known = [str(name)[: -len("_verdict")] for name in found if str(name).endswith("_verdict")]
+    known = drawable(found)
     if not known or (task is not None and task not in known):
         raise ValueError(
-            f"the study has no verdicts{'' if task is None else f' of {task}'}; tasks that have: "
-            f"{', '.join(known) or 'none'}"
+            f"the study has no verdicts or errors{'' if task is None else f' of {task}'}; tasks "
+            f"that have: {', '.join(known) or 'none'}"
         )
     task = task or known[0]
-    verdict = found[f"{task}_verdict"]
-    triplets = verdict[verdict.dims[1]].values[:_MOST]
-    cone = found[f"{task}_critical_cone"]
-    degrees = cone.copy(data=np.degrees(cone.values))
-    norm, colours = Normalize(0.0, max(float(degrees.max()), 5.0)), sequential().reversed()
-    count = len(triplets)
     with looking():
-        shape = (1, count) if width == "double" else (count, 1)
-        tall = 78.0 if width == "double" else 56.0 * count + 18.0
-        figure = new_figure(width, tall, "constrained")
-        grid = figure.subplots(*shape, sharex=True, sharey=True, squeeze=False)
-        for i, axes in enumerate(grid.ravel()):
-            at = {verdict.dims[1]: i, verdict.dims[2]: 0}
-            _panel(axes, found, verdict.isel(at), degrees.isel(at), norm, colours)
-            head(axes, "abc"[i], triplet_label(str(triplets[i])))
-        for axes in grid[:, 0]:
-            axes.set_ylabel("the tangent turns along the whisker (°)")
-        for axes in grid[-1]:
-            axes.set_xlabel("base / tip radius")
-        marks = [
-            figure.axes[0].scatter([], [], marker=mark, color=MUTED, s=16, label=word)
-            for word, mark in _MARKS.items()
-        ]
-        figure.legend(handles=marks, loc="outside lower center", ncols=3, frameon=False)
-        bar = figure.colorbar(ScalarMappable(norm, colours), ax=list(grid.ravel()), aspect=30)
-        plain(bar)
-        bar.set_label("critical cone (°)")
+        if f"{task}_verdict" not in found:
+            return _errors(found, task, width)
+        verdict = found[f"{task}_verdict"]
+        verdict = verdict.isel({verdict.dims[2]: 0})
+        degrees = np.degrees(found[f"{task}_critical_cone"].values[:, :, 0])
+        done = (verdict.values != "").any(axis=1)
+        return _verdicts(found.isel(whisker=done), verdict[done], degrees[done], width)
+
+
+def drawable(found: xr.Dataset) -> list[str]:
+    """Say what of a study can be drawn.
+
+    Parameters
+    ----------
+    found : Dataset
+        As of ``vibrissa.sweeps.open_sweep``.
+
+    Returns
+    -------
+    list of str
+        Names of tasks with verdicts or with errors.
+    """
+    return [
+        task
+        for task in map(str, found["task"].values)
+        if f"{task}_verdict" in found or f"{task}_median_error" in found
+    ]
+
+
+def _verdicts(found: xr.Dataset, verdict: xr.DataArray, degrees: Array, width: Width) -> Figure:
+    names = [str(name) for name in verdict[verdict.dims[1]].values]
+    count = len(names)
+    if count > _MOST:
+        figure = new_figure(width, _FRAME + _ROW * count, "constrained")
+        axes = figure.subplots()
+        _lines(axes, [triplet_label(name) for name in names])
+        for i in range(count):
+            _spread(axes, degrees[:, i], verdict.values[:, i], np.full(len(degrees), i))
+        _cone_axis(axes)
+        _key(figure)
         return figure
+    groups = found["group"].values.astype(str)
+    rows = list(dict.fromkeys(groups))
+    tall = max(52.0, 16.0 + _ROW * len(rows)) * count + 8.0
+    figure = new_figure(width, tall if width == "double" else 1.7 * tall, "constrained")
+    shape = (count, 2) if width == "double" else (2 * count, 1)
+    panels = figure.subplots(*shape, squeeze=False).ravel()
+    norm, colours = BoundaryNorm(_CONES, 256), sequential().reversed()
+    for i, name in enumerate(names):
+        left, right = panels[2 * i], panels[2 * i + 1]
+        words = verdict.values[:, i]
+        _chart(left, found, words, degrees[:, i], norm)
+        head(left, "ace"[i], triplet_label(name))
+        _lines(right, rows)
+        at = np.array([rows.index(group) for group in groups], dtype=int)
+        _spread(right, degrees[:, i], words, at)
+        _cone_axis(right)
+        head(right, "bdf"[i], "by group of whiskers")
+    bar = figure.colorbar(
+        ScalarMappable(norm, colours), ax=list(panels[::2]), aspect=30, spacing="uniform"
+    )
+    plain(bar)
+    bar.set_label("critical cone (°)")
+    _key(figure)
+    return figure
 
 
-def _panel(
-    axes: Axes,
-    found: xr.Dataset,
-    verdict: xr.DataArray,
-    degrees: xr.DataArray,
-    norm: Normalize,
-    colours: object,
+def _chart(
+    axes: Axes, found: xr.Dataset, words: NDArray[np.str_], degrees: Array, norm: BoundaryNorm
 ) -> None:
+    """Every whisker by taper and turn; the widest cones below, so that none hides another."""
     x, y = found["taper_ratio"].values, np.degrees(found["turn"].values)
-    for word, mark in _MARKS.items():
-        here = verdict.values == word
-        axes.scatter(
-            x[here],
-            y[here],
-            c=degrees.values[here],
-            norm=norm,
-            cmap=colours,  # type: ignore[arg-type]
-            marker=mark,
-            s=20,
-            edgecolors=INK,
-            linewidths=0.4,
-        )
+    size = 10.0 + 26.0 * np.clip(degrees / _CONES[-1], 0.0, 1.0) ** 0.5
+    for k in np.argsort(-degrees):
+        if words[k]:
+            axes.scatter(
+                x[k],
+                y[k],
+                c=degrees[k : k + 1],
+                s=size[k],
+                norm=norm,
+                cmap=sequential().reversed(),
+                marker=_MARKS[str(words[k])],
+                edgecolors=INK,
+                linewidths=0.4,
+            )
     axes.set_xscale("log")
-    ticks = [tick for tick in (1, 2, 5, 15, 30, 60) if 0.9 * np.nanmin(x) <= tick <= np.nanmax(x)]
+    low, high = (np.nanmin(x), np.nanmax(x)) if x.size else (1.0, 60.0)
+    ticks = [tick for tick in (1, 2, 5, 15, 30, 60) if 0.9 * low <= tick <= 1.1 * high]
     axes.set_xticks(ticks, labels=[f"{tick}" for tick in ticks])
     axes.minorticks_off()
+    axes.set_xlabel("base / tip radius")
+    most = float(np.nanmax(y, initial=20.0))
+    axes.set_yscale("function", functions=_ROOT)
+    axes.set_yticks([turn for turn in _TURNS if turn <= 1.05 * most])
+    axes.set_ylim(-0.002 * most, 1.15 * most)  # marks at 0 stay whole
+    axes.set_ylabel("tangent turns, base to tip (°)")
+
+
+def _lines(axes: Axes, labels: list[str]) -> None:
+    axes.set_yticks(range(len(labels)), labels=labels)
+    axes.set_ylim(len(labels) - 0.5, -0.5)
+    axes.tick_params(axis="y", length=0.0)
+    axes.spines["left"].set_visible(False)
+    for line in range(1, len(labels)):
+        axes.axhline(line - 0.5, color=SHADE, linewidth=0.6, zorder=0)
+
+
+def _spread(axes: Axes, x: Array, words: NDArray[np.str_], line: NDArray[np.int_]) -> None:
+    """Marks along lines, neighbours a little above and below each other."""
+    place = np.argsort(np.argsort(x)) * 2 % 5
+    for word, mark in _MARKS.items():
+        here = words == word
+        axes.scatter(
+            x[here],
+            (line + 0.13 * (place - 2.0))[here],
+            marker=mark,
+            s=11,
+            color=_INKS[word],
+            alpha=0.75,
+            linewidths=0.0,
+        )
+
+
+def _cone_axis(axes: Axes) -> None:
+    axes.set_xscale("function", functions=_ROOT)
+    axes.set_xticks(_CONES[1:], labels=[f"{cone:.0f}" for cone in _CONES[1:]])
+    axes.set_xlim(-0.02, 1.08 * _CONES[-1])
+    axes.axvspan(-0.02, 2.0, color=SHADE, linewidth=0.0, zorder=-1)  # the cone the paper leaves out
+    axes.set_xlabel("critical cone (°; shaded: the paper's 2°)")
+
+
+def _key(figure: Figure) -> None:
+    marks = [
+        figure.axes[0].scatter([], [], marker=mark, color=_INKS[word], s=14, label=word)
+        for word, mark in _MARKS.items()
+    ]
+    figure.legend(handles=marks, loc="outside lower center", ncols=3, frameon=False)
+
+
+def _errors(found: xr.Dataset, task: str, width: Width) -> Figure:
+    error = found[f"{task}_median_error"]
+    dim = error.dims[1]
+    labels = [_label(value, str(dim)) for value in error[dim].values]
+    figure = new_figure(width, _FRAME + 1.6 * _ROW * len(labels), "constrained")
+    axes = figure.subplots()
+    _lines(axes, labels)
+    for i in range(len(labels)):
+        values = error.values[:, i] * 1e3
+        values = np.sort(np.clip(values[~np.isnan(values)], *_ERRORS))
+        place = np.arange(values.size) * 2 % 5 - 2.0
+        axes.scatter(values, i + 0.13 * place, s=11, color=BLUE, alpha=0.75, linewidths=0.0)
+        if values.size:
+            axes.plot(2 * [np.median(values)], [i - 0.42, i + 0.42], color=INK, linewidth=1.0)
+    axes.set_xscale("log")
+    axes.grid(axis="x", which="major")
+    axes.tick_params(axis="x", which="minor", color=MUTED)
+    axes.set_xlabel("median error of the contact point (mm); a mark for each whisker")
+    return figure
+
+
+def _label(value: object, dim: str) -> str:
+    text = str(value)
+    if isinstance(value, float):
+        return f"{dim.rpartition('_')[2]} {value:g}"
+    return text if text == "wrench" else triplet_label(text)
+
+
+def _root(x: Array) -> Array:
+    return np.sign(x) * np.sqrt(np.abs(x))
+
+
+def _square(x: Array) -> Array:
+    return np.sign(x) * np.square(x)
+
+
+_ROOT = (_root, _square)
+"""Room for the small without losing the large."""

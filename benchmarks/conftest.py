@@ -19,7 +19,7 @@ import vibrissa as vb
 from vibrissa import samples
 from vibrissa.rod.batch import solve_forces, threads
 from vibrissa.rod.discretize import discretize
-from vibrissa.rod.reach import fold_force, reach
+from vibrissa.rod.reach import fold_forces, reach
 
 _ROWS: list[tuple[str, float, float, str]] = []
 
@@ -53,7 +53,7 @@ class Contacts:
         rng = np.random.default_rng(8)
         s, bearing = rng.uniform(0.3, 1.0, n), rng.uniform(-np.pi, np.pi, n)
         fold = reach(whisker).fold
-        force = np.array([fold_force(fold, *at) for at in zip(s, bearing, strict=True)])
+        force = fold_forces(fold, np.stack([s, np.cos(bearing), np.sin(bearing)], axis=-1))
         force *= rng.uniform(0.0, 0.95, n)
         rows = np.stack([s, 0.0 * s, force * np.cos(bearing), force * np.sin(bearing)], axis=-1)
         return cls(rows, solve_forces(discretize(whisker), rows)[0][:, 3:] * whisker.length)
@@ -97,7 +97,8 @@ def scipy_solve(whisker):
         ]
 
     # A contact at 0.7 L, well bent.
-    force = 0.8 * fold_force(reach(whisker).fold, 0.7, 0.5)
+    place = np.array([[0.7, np.cos(0.5), np.sin(0.5)]])
+    force = 0.8 * fold_forces(reach(whisker).fold, place)[0]
     contact = np.array([[0.7, 0.0, force * np.cos(0.5), force * np.sin(0.5)]])
 
     def solve(rtol: float, atol: float = 1e-12) -> np.ndarray:

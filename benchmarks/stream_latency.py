@@ -20,7 +20,7 @@ import numpy as np
 
 import vibrissa as vb
 from vibrissa.rod.discretize import discretize
-from vibrissa.rod.reach import fold_force, reach
+from vibrissa.rod.reach import fold_forces, reach
 from vibrissa.sensing import Sensor
 from vibrissa.signals import SIGNALS
 
@@ -32,7 +32,7 @@ def glide(whisker, n):
     t = np.linspace(0.0, 1.0, n)
     s, bearing = 0.675 + 0.175 * np.cos(9.0 * t), (0.5 + 6.0 * t) % (2.0 * np.pi)
     fold, unit = reach(whisker).fold, discretize(whisker).force
-    most = np.array([fold_force(fold, *at) for at in zip(s, bearing, strict=True)])
+    most = fold_forces(fold, np.stack([s, np.cos(bearing), np.sin(bearing)], axis=-1))
     share = 0.5 - 0.3 * np.cos(31.0 * t)
     return vb.deflect(whisker, vb.PointForce(s * whisker.length, share * most * unit, bearing))
 

@@ -11,7 +11,7 @@ from hypothesis.extra import numpy as arrays
 
 import vibrissa as vb
 from vibrissa.rod.discretize import discretize
-from vibrissa.rod.reach import fold_force, reach
+from vibrissa.rod.reach import fold_forces, reach
 
 DATA = Path(__file__).parent.parent / "data"
 LENGTH = 39.4e-3
@@ -65,12 +65,9 @@ class Loads:
 
     def forces(self, whisker, most=1.0):
         """Forces in N, from a share of ``most`` of the fold force down to nothing."""
-        fold = reach(whisker).fold
-        force = [
-            share * fold_force(fold, s, bearing)
-            for s, bearing, share in zip(self.s, self.bearing, self.share, strict=True)
-        ]
-        return most * np.array(force) * discretize(whisker).force
+        places = np.stack([self.s, np.cos(self.bearing), np.sin(self.bearing)], axis=-1)
+        force = self.share * fold_forces(reach(whisker).fold, places)
+        return most * force * discretize(whisker).force
 
     def on(self, whisker, most=0.98):
         """The same as a load of a whisker."""

@@ -4,6 +4,10 @@ import subprocess
 import sys
 import textwrap
 
+import pytest
+
+from vibrissa.rod.compiled import copy
+
 
 def run(code, **environment):
     return subprocess.run(
@@ -95,3 +99,9 @@ def test_importing_the_package_loads_no_compiler():
         """
     )
     assert said.stdout.strip() == "[]"
+
+
+def test_what_is_inlined_cannot_be_called_from_python():
+    """It has no wrapper for that; without this guard the interpreter would crash."""
+    with pytest.raises(TypeError, match="copy can be called by kernels only"):
+        copy([0.0], [1.0])

@@ -22,6 +22,7 @@ from typing import Any, ParamSpec, TypeVar, cast
 import numba
 from numba.core import event
 from numba.core.caching import FunctionCache
+from numba.core.registry import CPUDispatcher
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -29,7 +30,12 @@ R = TypeVar("R")
 # Reassociation stays off: results must not depend on how the compiler orders a sum.
 _FASTMATH = {"contract", "nsz", "arcp"}
 _ROD = Path(__file__).parent
-_OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": _FASTMATH, "nogil": True}
+_OPTIONS: dict[str, Any] = {
+    "error_model": "numpy",
+    "fastmath": _FASTMATH,
+    "nogil": True,
+    "no_cfunc_wrapper": True,  # nobody calls a kernel from C
+}
 
 
 @cache
@@ -48,6 +54,13 @@ class _PackageCache(FunctionCache):
         return (*super()._index_key(sig, codegen), _sources(package))  # type: ignore[no-untyped-call]
 
 
+class _Inlined(CPUDispatcher):
+    """What only kernels can call: wrappers for Python would be a third of all compiling."""
+
+    def __call__(self, *args: object, **options: object) -> object:
+        raise TypeError(f"{self.py_func.__name__} can be called by kernels only")
+
+
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function that Python calls; cached on disk, releases the GIL."""
     compiled = numba.njit(**_OPTIONS)(function)
@@ -58,7 +71,11 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
 
 def inlined(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a small function into its callers, so that their lane loops still vectorise."""
-    return cast("Callable[P, R]", numba.njit(forceinline=True, **_OPTIONS)(function))
+    compiled: Any = numba.njit(**_OPTIONS | {"forceinline": True, "no_cpython_wrapper": True})(
+        function
+    )
+    compiled.__class__ = _Inlined
+    return cast("Callable[P, R]", compiled)
 
 
 @inlined

@@ -614,6 +614,14 @@ _ROWS: tuple[tuple[str, str, _Unit, str, str], ...] = (
     ("shape_amplitude", "a", _MM, "amplitude of the deviation", "Where nothing was touched."),
     ("shape_length", r"\ell", _MM, "length of the deviation", "Over which it changes."),
     ("inlier", r"\mathrm{inlier}", _NUMBER, "whether a contact is no outlier", "1 or 0."),
+    (
+        "chi_squared",
+        r"\chi^2",
+        _NUMBER,
+        "squared miss of a contact",
+        "By how much it misses the fitted shape, in standard deviations, squared; missing for "
+        "contacts that were not used.",
+    ),
     ("object_size", r"\mathbf{l}", _MM, "object's edges", "Lengths along its own axes."),
     (
         "object_rotation",

@@ -139,6 +139,14 @@ class Status(enum.IntEnum):
         "over time while the base moves.",
     )
 
+    NOT_FELT = (
+        28,
+        True,
+        "No contact is felt: force and moment are within their noise, so that nothing touches the "
+        "whisker, or too lightly to be told from nothing.",
+        "",
+    )
+
     def __new__(
         cls, code: int, ok: bool = False, explanation: str = "", advice: str = ""
     ) -> Status:

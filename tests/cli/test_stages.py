@@ -119,10 +119,14 @@ def test_what_is_asked_for_is_made_anew(folder, tmp_path):
 def test_a_shape_that_does_not_fit_is_said(folder, tmp_path):
     work = tmp_path / "t.nc"
     words = (folder / "sim.nc", "--map", folder / "map.nc", "-o", work)
-    assert "another shape" not in done("reconstruct", *words)
-    assert "another shape (--shape)" in " ".join(
-        done("reconstruct", work, "--shape", "plane").split()
-    )
+    text = done("reconstruct", *words)
+    assert "agree with it" in text
+    assert "another shape" not in text
+    assert "goes better" not in text
+    text = " ".join(done("reconstruct", work, "--shape", "plane").split())
+    assert "do not go with a plane" in text
+    assert "another shape (--shape)" in text
+    assert "A cylinder goes better with them" in text
 
 
 def test_another_whisker_makes_signals_and_contacts_anew(folder, tmp_path):
@@ -204,13 +208,16 @@ def test_a_whisker_that_is_missing_can_be_given(folder, tmp_path):
     assert "contour" in load_recording(out).children
 
 
-def test_too_few_contacts_are_said_and_nothing_is_written(folder, tmp_path):
+def test_too_few_contacts_are_said_and_what_was_made_is_kept(folder, tmp_path):
     trial = load_recording(folder / "sim.nc")
     short = tmp_path / "short.nc"
     save_recording(short, trial.isel(time=slice(0, 4)))
-    before = short.read_bytes()
     said = fault("reconstruct", short, "--map", folder / "map.nc")
     assert "no cylinder" in said
     assert "of 4 frames" in said
-    assert short.read_bytes() == before
+    assert "signals and estimates are in" in said
+    assert set(load_recording(short).children) >= {"signals", "estimates"}
     assert sorted(p.name for p in tmp_path.iterdir()) == ["short.nc"]
+    before = short.read_bytes()
+    assert "are in" not in fault("reconstruct", short)
+    assert short.read_bytes() == before

@@ -84,6 +84,27 @@ def test_no_bias_and_an_honest_spread(kind, joint_errors):
     assert abs((np.abs(z) < 1.96).mean() - 0.95) < 3.0 * np.sqrt(0.05 * 0.95 / (30 * k))
 
 
+@pytest.mark.parametrize("kind", ["cylinder", "sphere", "plane"])
+def test_a_wrong_shape_is_told_by_its_misfit_and_is_unsure(kind, joint_errors):
+    points, known = noisy(kind, joint_errors, np.random.default_rng(4), 150)
+    right = FITS[kind](points, **known)
+    # The median of 150 scores of three degrees of freedom has a standard deviation of 9 %.
+    assert right.misfit == pytest.approx(1.0, abs=0.3)
+    assert right.used.all()
+    wrong = [fit for name, fit in FITS.items() if name != kind and (kind, name) != ("plane", name)]
+    for fit in (one(points, **known) for one in wrong):
+        assert fit.misfit > 100.0
+        # What it claims to know of its place is as much worse.
+        assert fit.sigma["origin_x"] > 10.0 * right.sigma["origin_x"]
+    points[::10] += 2e-3
+    assert FITS[kind](points, **known).misfit == pytest.approx(1.0, abs=0.5)
+
+
+def test_without_noise_there_is_no_misfit():
+    points, normal, whisker = touched("sphere", np.random.default_rng(5), 40)
+    assert np.isnan(fit_sphere(points, whisker_radius=whisker, normals=normal).misfit)
+
+
 def test_normals_with_their_covariance_tell_the_axis(joint_errors):
     for seed in range(3):
         points, known = noisy("cylinder", joint_errors, np.random.default_rng(seed), 150)
@@ -147,7 +168,9 @@ def test_datasets_keep_fits(kind, joint_errors):
     assert stored.attrs["shape"] == kind
     assert stored["object_position"].attrs["units"] == "m"
     again = shape_from_dataset(stored)
-    for name in (*fit.fields, "covariance", "residuals", "inliers"):
+    assert again.equations == fit.equations == 3
+    assert again.misfit == fit.misfit
+    for name in (*fit.fields, "covariance", "residuals", "inliers", "chi_squared"):
         np.testing.assert_array_equal(getattr(again, name), getattr(fit, name))
     with pytest.raises(ValueError, match="lacks inlier"):
         shape_from_dataset(stored.drop_vars("inlier"))

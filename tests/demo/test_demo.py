@@ -107,7 +107,7 @@ def test_the_recording_keeps_what_is_known_and_what_is_true_apart(result):
     estimates = recording["estimates"].to_dataset()
     felt = estimates["in_contact"].values
     assert np.isnan(estimates["contact_point"].values[~felt]).all()
-    assert (estimates["status"].values[~felt] == vb.Status.NO_CONTACT).all()
+    assert (estimates["status"].values[~felt] == vb.Status.NOT_FELT).all()
     for group in ("", "signals", "estimates"):
         data = recording[group or "/"].to_dataset()
         for name, variable in data.data_vars.items():

@@ -150,7 +150,7 @@ def test_a_filter_forgets_a_contact_that_is_lost_and_waits_for_what_is_missing(w
     assert lost.status == vb.Status.MISSING
     assert np.linalg.norm(lost.point - good.point) < 1e-3
     gone = follow(time[2], np.zeros(6), turn[2], base[2])
-    assert gone.status == vb.Status.NO_CONTACT
+    assert gone.status == vb.Status.NOT_FELT
     assert np.isnan(gone.point).all()
     again = follow(time[3], wrench[3], turn[3], base[3])
     assert np.linalg.norm(again.point - point) < 0.01

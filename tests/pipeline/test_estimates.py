@@ -9,9 +9,11 @@ from vibrissa.contour import shape_from_dataset
 from vibrissa.io import load_recording, save_recording
 from vibrissa.pipeline import (
     compare_contacts,
+    compare_shapes,
     component_noise,
     distances_by_class,
     estimates_of,
+    fit_contacts,
     locate,
     placed_by,
     reconstruct,
@@ -24,6 +26,7 @@ from vibrissa.pipeline import (
 )
 from vibrissa.pipeline.locate import unfelt
 from vibrissa.pipeline.reconstruct import frames_together
+from vibrissa.pipeline.shapes import GOES, STRONG
 from vibrissa.status import Status
 from vibrissa.trial import (
     Sphere,
@@ -220,6 +223,43 @@ def test_a_peg_that_rubs_is_found_where_normals_may_lean():
     assert offsets[None] < 0.5 * offsets[0.0]
     with pytest.raises(ValueError, match="lean"):
         with_contour(felt, lean=-0.1)
+
+
+def test_what_is_below_the_noise_is_not_felt_and_what_is_zero_is_no_contact(
+    felt, quiet, tracked, contact_map
+):
+    estimates = estimates_of(felt, contact_maps=[contact_map])
+    for data in (felt["signals"].to_dataset(), estimates):
+        missed = ~data["in_contact"].values
+        assert missed.any()
+        assert (data["status"].values[missed] == Status.NOT_FELT).all()
+    truly = quiet["truth"]["in_contact"].values.astype(bool)
+    signals = signals_of(quiet)
+    assert (signals["status"].values[~truly] == Status.NO_CONTACT).all()
+    # Of a whisker that is seen to touch, but so lightly that its signals are within their noise.
+    seen = with_signals(tracked, "contact point")
+    loud = component_noise(1e-6, 0.5e-6)
+    estimates = estimates_of(seen, contact_maps=[contact_map], noise=loud)
+    touching = seen["signals"]["in_contact"].values.astype(bool)
+    light = touching & ~estimates["in_contact"].values
+    assert light.any()
+    assert (estimates["status"].values[light] == Status.NOT_FELT).all()
+    assert (estimates["status"].values[~touching] == Status.NO_CONTACT).all()
+
+
+def test_shapes_are_told_apart(felt, contact_map):
+    whiskers = [contact_map.whisker]
+    felt = estimates_of(felt, contact_maps=[contact_map])
+    found = compare_shapes(felt, whiskers)
+    assert found["evidence"].sel(shape="cylinder") == 0.0
+    assert found["misfit"].sel(shape="cylinder") < GOES
+    for other in ("sphere", "plane"):
+        assert found["evidence"].sel(shape=other) > 10.0 * STRONG
+        assert found["misfit"].sel(shape=other) > 100.0
+    unknown = felt.assign(contact_covariance=felt["contact_covariance"] * np.nan)
+    assert compare_shapes(unknown, whiskers)["evidence"].isnull().all()
+    with pytest.raises(ValueError, match="have no covariance"):
+        fit_contacts(unknown, whiskers, lean=0.1)
 
 
 def test_what_stages_add_is_kept_in_a_file(trial, tmp_path):

@@ -105,7 +105,7 @@ def estimate(
 
     From three signals all contacts that give them exactly, from more by least squares; with
     --wrench whatever the friction, and no map is needed. Where nothing is felt (M_B within five
-    standard deviations of zero) the status is no_contact. To a recording they are added as a group
+    standard deviations of zero) the status is not_felt. To a recording they are added as a group
     `estimates`, in the laboratory too, where continuity tells which of several contacts it was;
     signals are made first where there are none (see `vibrissa signals`), and a contour that was
     made of other contacts is left out. A table goes to a table.

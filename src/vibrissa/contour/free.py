@@ -68,6 +68,10 @@ class FreeFit(FittedShape):
         points that were missing.
     inliers : array (n,) of bool
         Points that lie within four standard deviations.
+    chi_squared : array (n,)
+        Squared distances of the points used, over their variance and that of the surface.
+    equations : int
+        1; 0 if the points' noise is not known.
     """
 
     base: FittedShape
@@ -211,7 +215,13 @@ class FreeFit(FittedShape):
             is made from: ``support_point``, ``support_value``, ``support_variance``,
             ``shape_amplitude``, ``shape_length``; attributes ``shape`` and ``base``.
         """
-        base = replace(self.base, residuals=self.residuals, inliers=self.inliers)
+        base = replace(
+            self.base,
+            residuals=self.residuals,
+            inliers=self.inliers,
+            chi_squared=self.chi_squared,
+            equations=self.equations,
+        )
         data = base.to_dataset(dims, shape, coords)
         rows: dict[str, tuple[tuple[str, ...], Any]] = {
             "support_point": (("support", "space"), self.support.place),

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,6 +25,7 @@ from scipy.spatial import cKDTree
 
 from vibrissa.contour.cylinder import fit_cylinder
 from vibrissa.contour.free import FreeFit
+from vibrissa.contour.goodness import excess_of
 from vibrissa.contour.merging import Support, merged
 from vibrissa.contour.placing import Contacts, placed
 from vibrissa.contour.plane import fit_plane
@@ -153,12 +155,19 @@ def fit_free(
     spread = np.zeros((len(p), 3, 3)) if touches.covariance is None else touches.covariance
     unit = np.repeat([given.extent, 1.0], 3)[: spread.shape[1]]
     contacts = Contacts(p - radius[:, None] * normal, touches.normal, spread * unit[:, None] * unit)
-    fit, inside = _surface(shape, contacts, given.extent, most)
-    residuals = np.full(given.usable.size, np.nan)
+    fit, squares, sharp = _surface(shape, contacts, given.extent, most)
+    residuals, chi_squared = np.full((2, given.usable.size), np.nan)
     residuals[rows] = fit.signed_distance(p) - radius
+    chi_squared[rows] = np.where(sharp, squares, np.nan)
     inliers = np.zeros(given.usable.size, dtype=bool)
-    inliers[rows] = inside
-    return _made(shape, fit.support, fit.amplitude, fit.length, residuals, inliers)
+    inliers[rows] = squares < _OUTLIER**2 * max(1.0, excess_of(squares[sharp], 1))
+    return replace(
+        fit,
+        residuals=residuals,
+        inliers=inliers,
+        chi_squared=chi_squared,
+        equations=0 if touches.covariance is None else 1,
+    )
 
 
 def _base(
@@ -199,8 +208,11 @@ def _across(normal: Array, covariance: Array) -> Array:
 
 def _surface(
     base: FittedShape, contacts: Contacts, extent: float, most: int
-) -> tuple[FreeFit, Mask]:
-    """Fit the deviation from a base, again and again: with its slopes, without outliers."""
+) -> tuple[FreeFit, Array, Mask]:
+    """Fit the deviation from a base, again and again: with its slopes, without outliers.
+
+    Also gives the squared misses (n,), in standard deviations, and which contacts were used.
+    """
     scale = min(extent, _size(base))
     slope, inside, fit = _SLOPE, None, None
     for _ in range(_ROUNDS):
@@ -218,15 +230,14 @@ def _surface(
         support = Support(there.foot[rows], value[rows], variance[rows])
         amplitude, length, noise = _varying(merged(support, min(_FOR_BOUNDS, most)), scale)
         few = merged(support._replace(variance=support.variance + noise), most)
-        fit = _made(base, few, amplitude, length, np.empty(0), np.empty(0, dtype=bool))
+        fit = _made(base, few, amplitude, length)
         mean, unsure = fit.deviation(there.foot)
         miss = np.abs(value - mean) / np.sqrt(variance + unsure**2)
         usual = max(1.0, _TO_SIGMA * float(np.median(miss[known])))
         inside = np.asarray(miss < _OUTLIER * usual)
         slope = max(_LEAST_SLOPE, np.sqrt(5.0 / 3.0) * amplitude / length)
     assert fit is not None
-    assert inside is not None
-    return fit, inside
+    return fit, miss**2, known
 
 
 def _sharp(covariance: Array, scale: float) -> Mask:
@@ -248,18 +259,14 @@ def _size(base: FittedShape) -> float:
     return float(getattr(base, "radius", np.inf))
 
 
-def _made(
-    base: FittedShape,
-    support: Support,
-    amplitude: float,
-    length: float,
-    residuals: Array,
-    inliers: Mask,
-) -> FreeFit:
+def _made(base: FittedShape, support: Support, amplitude: float, length: float) -> FreeFit:
+    """A surface, as yet without residuals."""
     return FreeFit(
         covariance=base.covariance,
-        residuals=residuals,
-        inliers=inliers,
+        residuals=np.empty(0),
+        inliers=np.empty(0, dtype=bool),
+        chi_squared=np.empty(0),
+        equations=0,
         base=base,
         support=support,
         amplitude=amplitude,

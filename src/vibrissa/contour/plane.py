@@ -37,6 +37,10 @@ class PlaneFit(FittedShape):
         that were missing.
     inliers : array (n,) of bool
         Points that were used and lie within what four standard deviations are in one dimension.
+    chi_squared : array (n,)
+        Squared misses of the points used, in standard deviations.
+    equations : int
+        Of each point; 0 if its noise is not known.
     """
 
     origin: Array
@@ -174,6 +178,8 @@ def fit_plane(
         covariance=found.covariance * scale[:, None] * scale,
         residuals=found.residuals,
         inliers=found.inliers,
+        chi_squared=found.chi_squared,
+        equations=found.equations,
     )
 
 

@@ -37,6 +37,7 @@ import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 from scipy.stats import chi2
 
+from vibrissa.contour.goodness import excess_of
 from vibrissa.contour.touches import FLOOR, Array, Checked, Mask, Touches, whitened
 
 _SOFT = 2.0
@@ -117,12 +118,19 @@ class Found(Generic[T]):
         Distances of the whisker's surface from the shape's, m; NaN for contacts not usable.
     inliers : array (m,) of bool
         Contacts that were used and are no outliers.
+    chi_squared : array (m,)
+        By how much their equations are missed, squared, in standard deviations; NaN for contacts
+        that were not used.
+    equations : int
+        How many each has; 0 if their covariance is not known.
     """
 
     shape: T
     covariance: Array
     residuals: Array
     inliers: Mask
+    chi_squared: Array
+    equations: int
 
 
 def fitted(
@@ -169,12 +177,14 @@ def fitted(
             "no normals where there is friction or inertia: leave the normals out"
         )
     best = best if arranged is None else arranged(best)
-    covariance, inside = _uncertainty(what, best, touches.rows(used))
-    residuals = np.full(given.usable.size, np.nan)
+    covariance, squares, equations = _uncertainty(what, best, touches.rows(used))
+    residuals, chi_squared = np.full((2, given.usable.size), np.nan)
     residuals[given.usable] = best.gaps(touches) * given.extent
-    inliers = np.zeros(given.usable.size, dtype=bool)
-    inliers[np.flatnonzero(given.usable)[used]] = inside
-    return Found(best, covariance, residuals, inliers)
+    chi_squared[np.flatnonzero(given.usable)[used]] = squares
+    inliers = np.asarray(chi_squared < chi2.isf(_OUTLIER, equations))
+    if given.touches.covariance is None:
+        equations = 0
+    return Found(best, covariance, residuals, inliers, chi_squared, equations)
 
 
 def _scattered(what: str, starts: Sequence[T], touches: Touches) -> tuple[Touches, Sequence[T]]:
@@ -243,8 +253,8 @@ def _best(what: str, starts: Sequence[T], touches: Touches) -> T:
     return best.moved(_solved(best, touches).x)
 
 
-def _uncertainty(what: str, shape: Candidate, touches: Touches) -> tuple[Array, Mask]:
-    """Covariance of the parameters, and which contacts are no outliers."""
+def _uncertainty(what: str, shape: Candidate, touches: Touches) -> tuple[Array, Array, int]:
+    """Covariance of the parameters; the squared miss of each contact, and its equations' number."""
     solved = _solved(shape, touches, most=1)
     design, z = np.asarray(solved.jac), np.asarray(solved.fun)
     size = np.linalg.norm(design, axis=0)
@@ -257,9 +267,12 @@ def _uncertainty(what: str, shape: Candidate, touches: Touches) -> tuple[Array, 
             f"no {what}: the points do not determine one; touch it in more places or on other sides"
         )
     free = max(z.size - shape.count, 1)
-    # Where points scatter more than they say, the fit is that much less certain.
-    excess = max(1.0, float((z**2 / np.sqrt(1.0 + (z / _SOFT) ** 2)).sum()) / free)
-    squares = (z.reshape(len(touches.position), -1)) ** 2
-    inside = squares.sum(axis=1) < chi2.isf(_OUTLIER, squares.shape[1])
+    misses = z.reshape(len(touches.position), -1)
+    squares, equations = (misses**2).sum(axis=1), misses.shape[1]
+    # Where points scatter more than they say, the fit is that much less certain: by a few that are
+    # far off a little, but fully where most of them are off, as on an object of another shape.
+    soft = float((z**2 / np.sqrt(1.0 + (z / _SOFT) ** 2)).sum()) / free
+    excess = max(1.0, soft, excess_of(squares, equations))
     steps = shape.steps()
-    return steps @ np.linalg.inv(design.T @ design) @ steps.T * excess, np.asarray(inside)
+    covariance = steps @ np.linalg.inv(design.T @ design) @ steps.T * excess
+    return covariance, squares, equations

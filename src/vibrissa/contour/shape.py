@@ -11,6 +11,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
+from vibrissa.contour.goodness import excess_of
 from vibrissa.contour.touches import Array, Mask
 from vibrissa.quantities import QUANTITIES, attributes
 
@@ -35,11 +36,19 @@ class FittedShape(ABC):
         points that were missing.
     inliers : array (n,) of bool
         Points that were used and lie within what four standard deviations are in one dimension.
+    chi_squared : array (n,)
+        By how much the equations of each point are missed, squared, in standard deviations; NaN for
+        points that were not used.
+    equations : int
+        How many each has: the distance and, where they count, those of its normal; 0 if the noise
+        is known from the scatter alone.
     """
 
     covariance: Array = field(repr=False)
     residuals: Array = field(repr=False)
     inliers: Mask = field(repr=False)
+    chi_squared: Array = field(repr=False)
+    equations: int = field(repr=False)
 
     kind: ClassVar[str]
     fields: ClassVar[dict[str, str]]
@@ -141,6 +150,20 @@ class FittedShape(ABC):
         return float(np.sqrt(np.mean(size**2))) if size.size else float("nan")
 
     @property
+    def used(self) -> Mask:
+        """Points (n,) that were used: not missing, nor too uncertain for a shape this small."""
+        return np.asarray(np.isfinite(self.chi_squared))
+
+    @property
+    def misfit(self) -> float:
+        """χ² per degree of freedom, by the median; NaN if the points' noise is not known.
+
+        1 where shape and noise are right; much more says that the points are of another shape, or
+        noisier than they say. Few outliers hardly change it. The covariance is as much larger.
+        """
+        return excess_of(self.chi_squared, self.equations)
+
+    @property
     def sigma(self) -> dict[str, float]:
         """Standard deviation of each parameter, SI units."""
         deviations = np.sqrt(np.diag(self.covariance))
@@ -167,8 +190,8 @@ class FittedShape(ABC):
         -------
         xarray.Dataset
             Its parameters as ``object_position``, ``object_axis`` and ``object_radius``,
-            ``parameter_covariance``, and along ``dims`` ``surface_distance`` and ``inlier``; the
-            attribute ``shape`` says what it is.
+            ``parameter_covariance``, and along ``dims`` ``surface_distance``, ``inlier`` and
+            ``chi_squared``; the attribute ``shape`` says what it is.
         """
         data: dict[str, Any] = {}
         for name, quantity in self.fields.items():
@@ -177,7 +200,13 @@ class FittedShape(ABC):
         size = self.residuals.shape if shape is None else shape
         square = ("parameter", "parameter_2")
         data["parameter_covariance"] = (square, self.covariance, attributes("parameter_covariance"))
-        for name, values in (("surface_distance", self.residuals), ("inlier", self.inliers)):
+        each = {
+            "surface_distance": self.residuals,
+            "inlier": self.inliers,
+            "chi_squared": self.chi_squared,
+        }
+        for name, values in each.items():
             data[name] = (tuple(dims), values.reshape(size), attributes(name))
         known = {"space": list("xyz"), "parameter": list(self.parameters)}
-        return xr.Dataset(data, {**(coords or {}), **known}, {"shape": self.kind})
+        about = {"shape": self.kind, "equations": self.equations}
+        return xr.Dataset(data, {**(coords or {}), **known}, about)

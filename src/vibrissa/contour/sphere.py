@@ -33,6 +33,10 @@ class SphereFit(FittedShape):
         points that were missing.
     inliers : array (n,) of bool
         Points that were used and lie within what four standard deviations are in one dimension.
+    chi_squared : array (n,)
+        Squared misses of the points used, in standard deviations.
+    equations : int
+        Of each point; 0 if its noise is not known.
     """
 
     origin: Array
@@ -169,6 +173,8 @@ def fit_sphere(
         covariance=found.covariance * given.extent**2,
         residuals=found.residuals,
         inliers=found.inliers,
+        chi_squared=found.chi_squared,
+        equations=found.equations,
     )
 
 

@@ -72,7 +72,8 @@ def _free(dataset: xr.Dataset) -> FreeFit:
 
 
 def _complete(dataset: xr.Dataset, kind: str, names: set[str]) -> None:
-    missing = sorted((names | {"surface_distance", "inlier"}) - set(dataset.data_vars))
+    each = {"surface_distance", "inlier", "chi_squared"}
+    missing = sorted((names | each) - set(dataset.data_vars))
     if missing:
         raise ValueError(f"a fitted {kind} lacks {', '.join(missing)}")
 
@@ -82,4 +83,6 @@ def _rows(dataset: xr.Dataset) -> dict[str, Any]:
     return {
         "residuals": dataset["surface_distance"].values.reshape(-1),
         "inliers": dataset["inlier"].values.reshape(-1).astype(bool),
+        "chi_squared": dataset["chi_squared"].values.reshape(-1),
+        "equations": int(dataset.attrs.get("equations", 0)),
     }

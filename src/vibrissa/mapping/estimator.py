@@ -54,7 +54,7 @@ class Estimator:
         Relative standard deviation of the whisker's bending stiffness E r⁴, in the covariances:
         √(σ_E² + 16 σ_r²) of those of modulus and radius. It needs noise.
     felt_above : float
-        Signals within so many standard deviations of zero are ``NO_CONTACT``; 0, the default,
+        Signals within so many standard deviations of zero are ``NOT_FELT``; 0, the default,
         locates all. It needs noise.
 
     See Also
@@ -97,7 +97,7 @@ class Estimator:
         stiffness_sigma : float
             Relative standard deviation of the whisker's bending stiffness.
         felt_above : float
-            Readings within so many standard deviations of zero are ``NO_CONTACT``; 0 locates all.
+            Readings within so many standard deviations of zero are ``NOT_FELT``; 0 locates all.
 
         Returns
         -------
@@ -257,7 +257,7 @@ class Estimator:
         return self._search(measurement) if nothing is None else self._answers.nowhere(nothing)
 
     def nothing_in(self, measurement: Measurement) -> Status | None:
-        """Why a measurement is not worth a search: ``MISSING``, ``NO_CONTACT``, ``DEGENERATE``.
+        """Why a measurement is not worth a search: ``MISSING``, ``NOT_FELT``, ``DEGENERATE``.
 
         Parameters
         ----------
@@ -272,7 +272,7 @@ class Estimator:
         if not np.isfinite(measurement.measured).all():
             return Status.MISSING
         if self.felt_above > 0.0 and not self.readout.felt(measurement, self.felt_above):
-            return Status.NO_CONTACT
+            return Status.NOT_FELT
         return None if self._determining else Status.DEGENERATE
 
     def explanations(self, measurement: Measurement) -> Explanations:

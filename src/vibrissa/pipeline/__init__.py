@@ -12,6 +12,7 @@ from vibrissa.pipeline.reconstruct import (
     fit_contacts,
     reconstruct,
 )
+from vibrissa.pipeline.shapes import compare_shapes
 from vibrissa.pipeline.signals import (
     Source,
     default_source,
@@ -35,6 +36,7 @@ __all__ = [
     "Shape",
     "Source",
     "compare_contacts",
+    "compare_shapes",
     "component_noise",
     "contact_columns",
     "contour_points",

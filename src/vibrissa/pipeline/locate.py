@@ -93,7 +93,8 @@ def locate(
         ``candidates``, ``in_contact`` (felt) and ``status``; and of the candidates what leads from
         an error of the wrench to one of the contact, ``candidate_gain``, with the noise of the
         wrench, ``wrench_covariance``. Covariances are those of the exact way in every method.
-        Where nothing is felt all is NaN and the status ``NO_CONTACT``.
+        Where nothing is felt all is NaN, and the status ``NOT_FELT``, or ``NO_CONTACT`` where force
+        and moment are zero or ``in_contact`` says so.
 
     Raises
     ------
@@ -183,8 +184,9 @@ def locate_from_wrench(whisker: Whisker, wrench: xr.Dataset, noise: ArrayLike | 
 class _Felt(NamedTuple):
     """What is measured: force, moment (n, 3), their covariance (n, 6, 6), NaN if not known.
 
-    And in which frames they are known and in which a contact is felt, (n,); the noise of all frames
-    together, (6, 6), if there is any; and M_B from which contacts are felt, N·m.
+    And in which frames they are known, in which a contact is felt and in which there is none, (n,);
+    the noise of all frames together, (6, 6), if there is any; and M_B from which contacts are
+    felt, N·m.
     """
 
     time: xr.Variable
@@ -193,6 +195,7 @@ class _Felt(NamedTuple):
     covariance: Array
     known: NDArray[np.bool_]
     rows: NDArray[np.bool_]
+    free: NDArray[np.bool_]
     typical: Array | None
     above: float
 
@@ -213,14 +216,19 @@ class _Felt(NamedTuple):
             least = np.nan_to_num(least)
         with np.errstate(invalid="ignore"):
             rows = known & (size > least)
+        free = known & ~force.any(axis=1) & ~moment.any(axis=1)
         if "in_contact" in wrench:
-            rows &= wrench["in_contact"].values.astype(bool)
+            touching = wrench["in_contact"].values.astype(bool)
+            rows &= touching
+            free |= known & ~touching
         above = float(np.median(least[rows])) if rows.any() else float(np.nanmax(least, initial=0))
         typical = None
         if noise is not None:
             same = bool((covariance == covariance[:1]).all())
             typical = covariance[0] if same else _typical(covariance[rows])
-        return cls(wrench["time"].variable, force, moment, covariance, known, rows, typical, above)
+        return cls(
+            wrench["time"].variable, force, moment, covariance, known, rows, free, typical, above
+        )
 
 
 def _noise_of_frames(noise: ArrayLike | None, n: int) -> Array:
@@ -254,7 +262,8 @@ def _located(
     normals = contact_normals(whisker, *flat).reshape(*shape, 3)
     point_gain = gain[..., :3, :]
     spread = point_gain @ felt.covariance[rows][:, None] @ np.swapaxes(point_gain, -1, -2)
-    status = np.where(felt.known, int(Status.NO_CONTACT), int(Status.MISSING)).astype(np.int8)
+    status = np.where(felt.known, int(Status.NOT_FELT), int(Status.MISSING)).astype(np.int8)
+    status[felt.free] = int(Status.NO_CONTACT)
     status[rows] = found.status
     number = np.zeros(rows.size, dtype=np.int64)
     number[rows] = found.number

@@ -89,9 +89,11 @@ def reconstruct(
     xarray.Dataset
         The group ``contour`` of a recording, laboratory frame: ``object_position``,
         ``object_axis`` and ``object_radius``, as far as the shape has them, with
-        ``parameter_covariance``; dims time, whisker: ``surface_distance`` from the fitted object
-        and ``inlier``; attribute ``shape``. `vibrissa.contour.shape_from_dataset` makes the shape
-        again. The covariance counts contacts of following frames as one where they err together:
+        ``parameter_covariance``; dims time, whisker: ``surface_distance`` from the fitted object,
+        ``inlier`` and ``chi_squared``; attributes ``shape`` and ``misfit``, χ² per degree of
+        freedom: much more than 1 says that the object has another shape.
+        `vibrissa.contour.shape_from_dataset` makes the shape again. The covariance is larger by the
+        misfit, and counts contacts of following frames as one where they err together:
         so many of them as the attribute ``frames_together`` says. With known objects also
         ``object_distance`` of each contact from the one that is nearest to them (attribute
         ``object``, its number), and for a cylinder beside a peg ``axis_offset``, ``axis_tilt`` and
@@ -108,19 +110,33 @@ def reconstruct(
     whiskers = whiskers_in(recording) if whiskers is None else whiskers
     known = recorded_objects(recording) if objects is None else tuple(objects)
     fit = fit_contacts(estimates, whiskers, shape, axis=axis, lean=lean)
-    together = frames_together(_scores(fit, estimates))
+    together = frames_together(scores_of(fit, estimates))
     fit = _less_sure(fit, together)
     each = {n: estimates[n].variable for n in EACH if n in estimates.coords}
     out = fit.to_dataset(EACH, tuple(estimates.sizes[n] for n in EACH), each)
     out.attrs |= {"reference_frame": "laboratory", "frames_together": together}
+    out.attrs["misfit"] = fit.misfit
     out.attrs |= {n: estimates.attrs[n] for n in ("signals", "source") if n in estimates.attrs}
     if known:
         out = out.assign(_compared(fit, estimates, whiskers, known))
     return out
 
 
-def _scores(fit: FittedShape, estimates: xr.Dataset) -> Array:
-    """Residuals of the inliers (time, whisker) over their standard deviation; NaN elsewhere."""
+def scores_of(fit: FittedShape, estimates: xr.Dataset) -> Array:
+    """Give the distances of contacts from a fitted shape in standard deviations.
+
+    Parameters
+    ----------
+    fit : FittedShape
+        Of `fit_contacts`.
+    estimates : xarray.Dataset
+        That it was fitted to.
+
+    Returns
+    -------
+    array (time, whisker)
+        Residuals over their standard deviation; NaN but for inliers.
+    """
     normal, spread = (_rows(estimates[n]) for n in ("contact_normal", "contact_covariance"))
     variance = np.einsum("ni,nij,nj->n", normal, spread, normal) + SOLVED_TO**2
     scores = fit.residuals / np.sqrt(np.where(np.isfinite(variance), variance, 1.0))
@@ -224,6 +240,12 @@ def fit_contacts(
     count = estimates.sizes["whisker"]
     if len(whiskers) != count:
         raise ValueError(f"there are estimates of {count} whiskers; {len(whiskers)} are given")
+    spread = _rows(estimates["contact_covariance"])
+    if lean and not np.isfinite(spread).any():
+        raise ValueError(
+            f"lean is {lean!r}, but these contacts have no covariance, without which it cannot "
+            "count: estimate them with the noise of the signals"
+        )
     if lean is None:
         lean = LEAN if estimates.attrs.get("signals") == WHOLE else 0.0
     if not (np.isfinite(lean) and lean >= 0.0):
@@ -233,7 +255,6 @@ def fit_contacts(
         "normals": _rows(estimates["contact_normal"]),
         "whisker_radius": whisker_radii(estimates, whiskers).reshape(-1),
     }
-    spread = _rows(estimates["contact_covariance"])
     if np.isfinite(spread).any():
         known["covariance"] = spread + SOLVED_TO**2 * np.eye(3)
         for name in ("normal_covariance", "point_normal_covariance"):

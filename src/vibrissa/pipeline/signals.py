@@ -184,7 +184,10 @@ def _by_sensor(root: xr.Dataset) -> xr.Dataset:
         least = FELT * float(np.sqrt(0.5 * (covariance[4, 4] + covariance[5, 5])))
     moment = wrench["moment"].transpose("time", "whisker", "space").values
     touching = known & (np.hypot(moment[..., 1], moment[..., 2]) > least)
-    status = np.where(touching, int(Status.OK), int(Status.NO_CONTACT))
+    force = wrench["force"].transpose("time", "whisker", "space").values
+    nothing = ~force.any(axis=-1) & ~moment.any(axis=-1)
+    status = np.where(nothing, int(Status.NO_CONTACT), int(Status.NOT_FELT))
+    status[touching] = int(Status.OK)
     status[~known] = int(Status.MISSING)
     data = _labelled(root, wrench, touching, status, {"source": "sensor"})
     if covariance is None:

@@ -1,10 +1,12 @@
 """Studies on a Dask cluster: the same results, whatever dies."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -95,10 +97,15 @@ def test_a_local_cluster_gives_the_same_and_a_cell_that_kills_fails_alone(study,
     xr.testing.assert_identical(found.load().drop_attrs(), here.load().drop_attrs())
 
 
-def test_a_scheduler_that_is_killed_ends_the_run_and_leaves_what_is_done(
-    study, scheduler, tmp_path
+def test_a_scheduler_that_is_killed_ends_the_run_and_the_next_goes_on(
+    study, scheduler, tmp_path, monkeypatch
 ):
     address, head = scheduler
+    with monkeypatch.context() as patch:
+        patch.setenv("ORIGIN", "newer")
+        patch.setattr("vibrissa.sweeps.cluster.origin", partial(os.getenv, "ORIGIN", "older"))
+        with pytest.raises(ValueError, match="has older; newer is needed"):
+            run_sweep(study, tmp_path / "other", scheduler=address)
 
     def kill(done: int, total: int) -> None:
         if done == 1:
@@ -109,6 +116,12 @@ def test_a_scheduler_that_is_killed_ends_the_run_and_leaves_what_is_done(
     with pytest.raises(ValueError, match="is gone"):
         run_sweep(longer, tmp_path / "s", scheduler=address, progress=kill)
     assert list(open_sweep(tmp_path / "s")["status"].values[:, 0]) == [1, 0]
+    # The same whisker, made sooner.
+    quicker = replace(slow, make=study.specimens[1].make)
+    resumed = Study("longer", 0, (study.specimens[0], quicker), study.tasks)
+    outcome = run_sweep(resumed, tmp_path / "s", workers=0)
+    assert (outcome.done, outcome.failed, outcome.skipped) == (1, 0, 1)
+    assert list(open_sweep(tmp_path / "s")["status"].values[:, 0]) == [1, 1]
 
 
 def test_no_scheduler_is_told(study, tmp_path, monkeypatch):

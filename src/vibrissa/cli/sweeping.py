@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from vibrissa.sweeps import Study
 
 _SHOW = "show"
-_BLOCK = 4096
-"""What a small file takes on a disk, bytes."""
 
 
 def sweep(
@@ -48,6 +46,10 @@ def sweep(
         ),
     ] = None,
     again: Annotated[bool, typer.Option("--again", help="Try again what failed before.")] = False,
+    any_version: Annotated[
+        bool,
+        typer.Option("--any-version", help="Go on though another version of vibrissa began."),
+    ] = False,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Print number of cells, time and size, and stop.")
     ] = False,
@@ -81,10 +83,17 @@ def sweep(
         if dry_run:
             _cost(plan, max(workers, 1))
         else:
-            _run(plan, path or Path(study).with_suffix(".zarr"), workers, scheduler, again)
+            _run(
+                plan,
+                path or Path(study).with_suffix(".zarr"),
+                workers=workers,
+                scheduler=scheduler,
+                again=again,
+                any_version=any_version,
+            )
 
 
-def _run(plan: Study, path: Path, workers: int, scheduler: str | None, again: bool) -> None:
+def _run(plan: Study, path: Path, **how: Any) -> None:
     from vibrissa.sweeps import failures, open_sweep, run_sweep, sweep_summary
 
     try:
@@ -92,9 +101,7 @@ def _run(plan: Study, path: Path, workers: int, scheduler: str | None, again: bo
             outcome = run_sweep(
                 plan,
                 path,
-                workers=workers,
-                scheduler=scheduler,
-                again=again,
+                **how,
                 progress=lambda done, total: tell("cells", done, total),
             )
     except KeyboardInterrupt:
@@ -116,13 +123,12 @@ def _run(plan: Study, path: Path, workers: int, scheduler: str | None, again: bo
 
 
 def _cost(plan: Study, workers: int) -> None:
-    megabytes = plan.files * _BLOCK / 1e6
     output.print(
         f"{plan.size} cells: {len(plan.specimens)} whiskers, "
         f"{', '.join(f'{task} of {plan.count(task)}' for task in plan.tasks)}\n"
         f"about {plan.seconds / 60:.1f} min of one core, {plan.seconds / workers / 60:.1f} min "
         f"with {workers} worker{'s' if workers > 1 else ''} on idle cores\n"
-        f"about {megabytes:.1f} MB in {plan.files} files",
+        f"about {max(plan.bytes / 1e6, 1.0):.0f} MB",
         highlight=False,
         soft_wrap=True,
     )

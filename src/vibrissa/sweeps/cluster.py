@@ -7,6 +7,7 @@ import uuid
 from collections.abc import Generator, Iterable, Iterator
 from typing import Any
 
+from vibrissa.sweeps.origin import origin
 from vibrissa.sweeps.study import Cell, answer
 
 _AHEAD = 2
@@ -120,18 +121,11 @@ def _round(
 
 def _check(client: Any, scheduler: str) -> None:
     """Whether there are workers that compute as this process does."""
-    from vibrissa import __version__
-
     try:
         client.wait_for_workers(1, timeout=_PATIENCE)
     except TimeoutError:
         raise ValueError(f"the Dask scheduler at {scheduler} has no workers") from None
-    for worker, version in client.run(_version).items():
-        if version != __version__:
-            raise ValueError(f"{worker} has vibrissa {version}; {__version__} is needed, as here")
-
-
-def _version() -> str:
-    from vibrissa import __version__
-
-    return __version__
+    mine = origin()
+    for worker, its in client.run(origin).items():
+        if its != mine:
+            raise ValueError(f"{worker} has {its}; {mine} is needed, as here")

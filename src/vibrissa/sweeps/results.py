@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from os import PathLike
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 
-from vibrissa.sweeps.store import DESCRIBED, FAILURES, STUDY
+from vibrissa.sweeps.store import DESCRIBED, DONE, FAILURES, noted
 
 
 def open_sweep(path: str | PathLike[str]) -> xr.Dataset:
@@ -27,8 +26,9 @@ def open_sweep(path: str | PathLike[str]) -> xr.Dataset:
         Over ``whisker`` and the dimensions of the tasks. Variables are called after their task and
         their name, ``uniqueness_verdict``; verdicts are words. A dimension along which a task has
         other values than one before it has the task's name before its own. With them what is told
-        of every whisker, and over ``task`` ``seconds`` and ``status``: 0 not done, 1 done, 2
-        failed, −1 not asked. NaN, or an empty word, where nothing is known yet.
+        of every whisker, and over ``task`` ``seconds``, ``status``: 0 not done, 1 done, 2 failed,
+        −1 not asked, and ``origin``, which of the codes in the attribute ``origins`` found it. NaN,
+        or an empty word, where nothing is known yet.
 
     Raises
     ------
@@ -36,18 +36,26 @@ def open_sweep(path: str | PathLike[str]) -> xr.Dataset:
         If it is no store.
     """
     path = Path(path)
-    if not (path / STUDY).exists():
-        raise ValueError(f"{path} is no store of a sweep")
-    cells = _group(path / "cells")
-    out = _group(path / "whiskers").set_coords(["group", *DESCRIBED])
-    out = out.merge(cells[["status", "seconds"]])
+    kept = noted(path)
+    # First, for what is done then is whole.
+    cells = _group(path / "cells")[["status", "seconds", "origin"]].load()
+    out = _group(path / "whiskers").set_coords(["group", *DESCRIBED]).merge(cells)
     for task in map(str, cells["task"].values):
         if (path / task).exists():
             found = _group(path / task)
+            status = cells["status"].sel(task=task, drop=True)
+            if (status == 0).any():
+                found = found.map(_known, done=status == DONE, keep_attrs=True)
+            found = _worded(found)
             found = found.rename({name: f"{task}_{name}" for name in found.data_vars})
             out = out.merge(found.rename(_differing(out, found, task)))
-    kept = json.loads((path / STUDY).read_text(encoding="utf-8"))
-    return out.assign_attrs(study=kept["name"])
+    return out.assign_attrs(study=kept["name"], origins=kept["origins"])
+
+
+def _known(data: xr.DataArray, done: xr.DataArray) -> xr.DataArray:
+    """Leave out what a run that was killed had begun to write."""
+    nothing = np.array(-1 if data.dtype.kind == "i" else np.nan, dtype=data.dtype)
+    return data.where(done, nothing)
 
 
 def _differing(out: xr.Dataset, found: xr.Dataset, task: str) -> dict[str, str]:
@@ -60,12 +68,15 @@ def _differing(out: xr.Dataset, found: xr.Dataset, task: str) -> dict[str, str]:
 
 
 def _group(path: Path) -> xr.Dataset:
-    data: xr.Dataset = xr.open_zarr(
-        path, consolidated=False, zarr_format=2, chunks=None, decode_cf=False
-    )
+    data: xr.Dataset = xr.open_zarr(path, chunks=None, decode_cf=False)
     data = data.drop_attrs(deep=False)
     for each in data.variables.values():
         each.attrs.pop("_FillValue", None)
+    return data
+
+
+def _worded(data: xr.Dataset) -> xr.Dataset:
+    """Put words in place of flags."""
     for name, variable in data.data_vars.items():
         meanings = variable.attrs.get("flag_meanings")
         if meanings:

@@ -47,6 +47,7 @@ def run_sweep(
     workers: int = 1,
     scheduler: str | None = None,
     again: bool = False,
+    any_version: bool = False,
     progress: Progress | None = None,
 ) -> Outcome:
     """Do what is not done yet of a study.
@@ -65,6 +66,8 @@ def run_sweep(
         this machine (extra ``cluster``).
     again : bool
         Whether cells that failed before are tried again.
+    any_version : bool
+        Whether a store that another version of vibrissa began is gone on with.
     progress : callable, optional
         Called as ``progress(done, total)``, cells that were there before included.
 
@@ -76,13 +79,14 @@ def run_sweep(
     Raises
     ------
     ValueError
-        If the store is of another study or being written to, or there is no such scheduler.
+        If the store is of another study or version or being written to, or there is no such
+        scheduler.
     OSError
         If a result cannot be written (what was written before is whole), or no process started.
     """
     if workers < 0:
         raise ValueError(f"workers is {workers}; 0 or more are needed")
-    with Store(path, study) as store:
+    with Store(path, study, any_version=any_version) as store:
         status = store.statuses()
         columns = {name: k for k, name in enumerate(study.tasks)}
         ready = [DONE] if again else [DONE, FAILED]

@@ -1,19 +1,20 @@
-"""Where a study's results are kept: Zarr, a chunk for each cell, so that any can be written alone.
+"""Where a study's results are kept: Zarr, in which each cell's numbers have their place.
 
     /whiskers   what each whisker is
-    /cells      per whisker and task: status, seconds of CPU, and the hash of what was asked
+    /cells      per whisker and task: status, seconds of CPU, which code found it, and the hash of
+                what was asked
     /TASK       the task's result for every whisker
 
-A chunk is written to a file of its own and put in place by renaming it. The hash of a cell is
-written after everything else of it, so that a cell whose hash is there is whole, whenever the run
-was killed. Groups are made aside and renamed as well.
+A cell's numbers are written once, in place (`vibrissa.sweeps.rows`), and its status, one byte,
+after everything else: a cell that is done is whole, whenever the run was killed, and of others
+nothing counts. Groups and files are made aside and renamed.
 """
 
 from __future__ import annotations
 
-import fcntl
 import json
 import shutil
+from collections.abc import Callable
 from os import PathLike
 from pathlib import Path
 from typing import IO, Any
@@ -23,9 +24,11 @@ import xarray as xr
 import zarr
 from numpy.typing import NDArray
 
+from vibrissa.sweeps.found import Found, lay_out
+from vibrissa.sweeps.lock import hold
+from vibrissa.sweeps.origin import origin, own
+from vibrissa.sweeps.rows import Rows, make_rows
 from vibrissa.sweeps.study import TAKEN, Cell, Study
-
-Array = NDArray[np.float64]
 
 NOT_ASKED, DONE, FAILED = -1, 1, 2
 DESCRIBED = {
@@ -38,9 +41,17 @@ DESCRIBED = {
 }
 """What is told of every whisker, and its unit."""
 
-STUDY, FAILURES = ".study.json", ".failures"
-_LOCK = ".sweep.lock"
+FAILURES = ".failures"
+_STUDY, _LOCK, _ALL = ".study.json", ".sweep.lock", ".zmetadata"
+_LAYOUT = 2
 _HASH = 16
+_CELLS: dict[str, tuple[str, Any]] = {
+    "status": ("int8", 0),
+    "seconds": ("float64", np.nan),
+    "origin": ("int16", -1),
+    "identity": (f"S{_HASH}", b""),
+}
+"""What is told of every cell: type, and what means that nothing is known."""
 
 
 class Busy(ValueError):
@@ -56,20 +67,25 @@ class Store:
         A folder, made if need be.
     study : Study
         Whose results.
+    any_version : bool
+        Whether it is gone on with though another version of vibrissa began it.
 
     Raises
     ------
     Busy
         If another run has it open.
     ValueError
-        If it holds the results of another study, or is no store.
+        If it holds the results of another study or of another version, or is no store.
     """
 
-    def __init__(self, path: str | PathLike[str], study: Study) -> None:
+    def __init__(
+        self, path: str | PathLike[str], study: Study, *, any_version: bool = False
+    ) -> None:
         self.path = Path(path)
         self.study = study
+        self._any_version = any_version
         self._lock: IO[str] | None = None
-        self._results: dict[str, zarr.Group] = {}
+        self._found: dict[str, Found] = {}
         self._columns = {name: k for k, name in enumerate(study.tasks)}
 
     def __enter__(self) -> Store:
@@ -79,11 +95,9 @@ class Store:
         if self.path.exists() and any(self.path.iterdir()) and not self._known(_LOCK):
             raise ValueError(f"{self.path} is a folder with other things in it, and no store")
         self.path.mkdir(parents=True, exist_ok=True)
-        self._lock = (self.path / _LOCK).open("a")
         try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            self._lock.close()
+            self._lock = hold(self.path / _LOCK)
+        except BlockingIOError:
             raise Busy(f"another run is writing to {self.path}; wait until it has ended") from None
         try:
             self._begin()
@@ -104,71 +118,88 @@ class Store:
     def _begin(self) -> None:
         for left in self.path.glob(".new-*"):
             shutil.rmtree(left)
-        said = _described(self.study)
-        if not self._known(STUDY):
+        if not self._known(_STUDY):
             for begun in TAKEN:  # perhaps for another study
                 shutil.rmtree(self.path / begun, ignore_errors=True)
-            self._make("whiskers", self._make_whiskers)
-            self._make("cells", self._make_cells)
+            self._make("whiskers", self._lay_out_whiskers)
+            self._make("cells", self._lay_out_cells)
             root = zarr.open_group(self.path, mode="a", zarr_format=2)
             root.attrs.update({"kind": "vibrissa sweep", "study": self.study.name})
-            part = self.path / f"{STUDY}.part"
-            part.write_text(json.dumps(said), encoding="utf-8")
-            part.replace(self.path / STUDY)
-        kept = json.loads((self.path / STUDY).read_text(encoding="utf-8"))
+            self._note(_STUDY, {**_described(self.study), "origins": []})
+        self._consolidate()
+        self._origin = self._admitted(noted(self.path))
+        self._cells = {name: Rows(self.path / "cells" / name) for name in _CELLS}
+        self._whiskers = {name: Rows(self.path / "whiskers" / name) for name in DESCRIBED}
+        for task in self.study.tasks:
+            if self._known(task):
+                self._found[task] = Found(self.path / task)
+
+    def _note(self, name: str, content: dict[str, Any]) -> None:
+        part = self.path / f"{name}.part"
+        part.write_text(json.dumps(content), encoding="utf-8")
+        part.replace(self.path / name)
+
+    def _consolidate(self) -> None:
+        """Tell Zarr of all groups in one file, so that it looks at nothing else that is here."""
+        metadata = {}
+        for path in sorted(self.path.glob(f"*/{_ALL}")):
+            known = json.loads(path.read_text(encoding="utf-8"))["metadata"]
+            metadata.update({f"{path.parent.name}/{key}": known[key] for key in known})
+        for name in (".zgroup", ".zattrs"):
+            metadata[name] = json.loads((self.path / name).read_text(encoding="utf-8"))
+        self._note(_ALL, {"zarr_consolidated_format": 1, "metadata": metadata})
+
+    def _admitted(self, kept: dict[str, Any]) -> int:
+        """Check that this study, done by this code, goes with what is there; number of the code."""
+        said = _described(self.study)
         differing = [name for name in said if kept.get(name) != said[name]]
         if differing:
             raise ValueError(
                 f"{self.path} holds the results of a study with other {' and '.join(differing)}: "
                 "give another store, or remove this one"
             )
-        self._cells = zarr.open_group(self.path / "cells", mode="r+", zarr_format=2)
-        self._whiskers = zarr.open_group(self.path / "whiskers", mode="r+", zarr_format=2)
-        for task in self.study.tasks:
-            if self._known(task):
-                self._results[task] = zarr.open_group(self.path / task, mode="r+", zarr_format=2)
+        origins: list[str] = kept["origins"]
+        mine = origin()
+        if mine not in origins:
+            if origins and own(mine) not in map(own, origins) and not self._any_version:
+                raise ValueError(
+                    f"the results in {self.path} are of {own(origins[-1])}, this is {own(mine)}, "
+                    "which may find others: give another store, or allow any version "
+                    "(--any-version) and the store tells which cell is of which"
+                )
+            origins.append(mine)
+            self._note(_STUDY, kept)
+        return origins.index(mine)
 
-    def _make(self, name: str, fill: Any) -> None:
+    def _make(self, name: str, fill: Callable[[zarr.Group], None]) -> None:
         """Make a group aside, and put it in place whole."""
         if self._known(name):
             return
         aside = self.path / f".new-{name}"
         fill(zarr.open_group(aside, mode="w", zarr_format=2))
+        zarr.consolidate_metadata(aside, zarr_format=2)
         aside.rename(self.path / name)
 
-    def _make_whiskers(self, group: zarr.Group) -> None:
-        names = np.array([specimen.name for specimen in self.study.specimens])
-        dims = {"_ARRAY_DIMENSIONS": ["whisker"]}
-        group.create_array("whisker", data=names, chunks=names.shape, attributes=dims)
-        groups = np.array([specimen.group for specimen in self.study.specimens])
-        group.create_array("group", data=groups, chunks=groups.shape, attributes=dims)
+    def _lay_out_whiskers(self, group: zarr.Group) -> None:
+        specimens = self.study.specimens
+        for name, words in (
+            ("whisker", [one.name for one in specimens]),
+            ("group", [one.group for one in specimens]),
+        ):
+            dims = {"_ARRAY_DIMENSIONS": ["whisker"]}
+            group.create_array(name, data=np.array(words), chunks=(len(words),), attributes=dims)
         for name, unit in DESCRIBED.items():
-            about = {"units": unit, "long_name": name.replace("_", " "), **dims}
-            group.create_array(
-                name,
-                shape=names.shape,
-                chunks=(1,),
-                dtype="float64",
-                fill_value=np.nan,
-                attributes=about,
-            )
+            about = {"units": unit, "long_name": name.replace("_", " ")}
+            make_rows(group, name, (len(specimens),), "float64", np.nan, ["whisker"], about)
 
-    def _make_cells(self, group: zarr.Group) -> None:
-        shape = (len(self.study.specimens), len(self.study.tasks))
-        dims = {"_ARRAY_DIMENSIONS": ["whisker", "task"]}
-        tasks = np.array(list(self.study.tasks))
+    def _lay_out_cells(self, group: zarr.Group) -> None:
+        study = self.study
+        tasks = np.array(list(study.tasks))
         about = {"_ARRAY_DIMENSIONS": ["task"]}
         group.create_array("task", data=tasks, chunks=tasks.shape, attributes=about)
-        study = self.study
         asked = [[study.asks(task, one) for task in study.tasks] for one in study.specimens]
-        for name, kind, fill in (
-            ("status", "int8", 0),
-            ("seconds", "float64", np.nan),
-            ("identity", f"S{_HASH}", b""),
-        ):
-            group.create_array(
-                name, shape=shape, chunks=(1, 1), dtype=kind, fill_value=fill, attributes=dims
-            )
+        for name, (kind, fill) in _CELLS.items():
+            make_rows(group, name, np.shape(asked), kind, fill, ["whisker", "task"])
         group["status"][...] = np.where(asked, 0, NOT_ASKED)
 
     def statuses(self) -> NDArray[np.int8]:
@@ -179,13 +210,12 @@ class Store:
         array (whisker, task) of int8
             0 where nothing is, 1 where a cell is done, 2 where it failed.
         """
-        status = np.zeros((len(self.study.specimens), len(self.study.tasks)), dtype=np.int8)
-        identity, said = self._cells["identity"][:], self._cells["status"][:]
+        cells = zarr.open_group(self.path / "cells", mode="r", zarr_format=2)
+        identity = np.zeros((len(self.study.specimens), len(self._columns)), dtype=f"S{_HASH}")
         for cell in self.study.cells():
-            at = cell.index, self._columns[cell.task]
-            if identity[at] == cell.identity.encode():
-                status[at] = said[at]
-        return status
+            identity[cell.index, self._columns[cell.task]] = cell.identity.encode()
+        known = (cells["identity"][...] == identity) & (identity != b"")
+        return np.where(known, cells["status"][...], np.int8(0))
 
     def write(self, cell: Cell, answer: dict[str, Any]) -> bool:
         """Keep what became of a cell.
@@ -210,15 +240,21 @@ class Store:
             before is whole.
         """
         try:
-            failure = answer.get("failure") or self._write_result(cell, answer["result"])
-            self._write_failure(cell, failure)
-            if not failure:
-                for name, value in answer["whisker"].items():
-                    self._whiskers[name][cell.index] = value
+            failure = answer.get("failure") or self._write_result(cell, answer)
+            said = self.path / FAILURES / f"{cell.task}-{cell.index}.txt"
+            if failure:
+                said.parent.mkdir(exist_ok=True)
+                part = said.with_suffix(".part")
+                part.write_text(f"{cell.specimen.name}\n{failure}", encoding="utf-8")
+                part.replace(said)
             at = cell.index, self._columns[cell.task]
-            self._cells["seconds"][at] = answer["seconds"]
-            self._cells["status"][at] = FAILED if failure else DONE
-            self._cells["identity"][at] = cell.identity.encode()
+            self._cells["seconds"].write(answer["seconds"], *at)
+            self._cells["origin"].write(self._origin, *at)
+            self._cells["identity"].write(cell.identity.encode(), *at)
+            # One byte, of which no half can be written: with it all of the above counts.
+            self._cells["status"].write(FAILED if failure else DONE, *at)
+            if not failure:
+                said.unlink(missing_ok=True)
         except OSError as fault:
             raise OSError(
                 fault.errno,
@@ -227,83 +263,56 @@ class Store:
             ) from fault
         return not failure
 
-    def _write_failure(self, cell: Cell, failure: str) -> None:
-        path = self.path / FAILURES / f"{cell.task}-{cell.index}.txt"
-        if not failure:
-            path.unlink(missing_ok=True)
-            return
-        path.parent.mkdir(exist_ok=True)
-        part = path.with_suffix(".part")
-        part.write_text(f"{cell.specimen.name}\n{failure}", encoding="utf-8")
-        part.replace(path)
-
-    def _write_result(self, cell: Cell, result: xr.Dataset) -> str:
+    def _write_result(self, cell: Cell, answer: dict[str, Any]) -> str:
         """Write a result, or say why it cannot be kept beside those of other whiskers."""
-        if cell.task not in self._results:
-            self._make(cell.task, lambda group: self._fill_task(group, result))
-            group = zarr.open_group(self.path / cell.task, mode="r+", zarr_format=2)
-            self._results[cell.task] = group
-        group = self._results[cell.task]
-        if misfit := _misfit(group, result):
+        result: xr.Dataset = answer["result"]
+        if cell.task not in self._found:
+            count = len(self.study.specimens)
+            self._make(cell.task, lambda group: lay_out(group, result, count))
+            self._consolidate()
+            self._found[cell.task] = Found(self.path / cell.task)
+        found = self._found[cell.task]
+        if misfit := found.misfit(result):
             return misfit
-        for name, variable in result.data_vars.items():
-            group[str(name)][cell.index] = variable.values
+        found.write(result, cell.index)
+        for name, value in answer["whisker"].items():
+            self._whiskers[name].write(value, cell.index)
         return ""
 
-    def _fill_task(self, group: zarr.Group, result: xr.Dataset) -> None:
-        """Make the arrays of a task like those of a first result."""
-        count = len(self.study.specimens)
-        for name, variable in result.data_vars.items():
-            words = variable.dtype.kind in "ib"
-            group.create_array(
-                str(name),
-                shape=(count, *variable.shape),
-                chunks=(1, *variable.shape),
-                dtype=np.int8 if words else np.float64,
-                fill_value=-1 if words else np.nan,
-                attributes={
-                    **{key: _plain(value) for key, value in variable.attrs.items()},
-                    "_ARRAY_DIMENSIONS": ["whisker", *map(str, variable.dims)],
-                },
-            )
-        for name, coordinate in result.coords.items():
-            values = coordinate.values
-            values = values.astype(str) if values.dtype.kind in "OU" else values
-            group.create_array(
-                str(name),
-                data=values,
-                chunks=values.shape or (),
-                attributes={
-                    **{key: _plain(value) for key, value in coordinate.attrs.items()},
-                    "_ARRAY_DIMENSIONS": [str(name)] if values.ndim else [],
-                },
-            )
 
+def noted(path: Path) -> dict[str, Any]:
+    """Read what a store says of itself.
 
-def _misfit(group: zarr.Group, result: xr.Dataset) -> str:
-    """What keeps a result from being one of a group's."""
-    for name, variable in result.variables.items():
-        if name not in group:
-            return f"{name} is no result of other whiskers\n"
-        array = group[str(name)]
-        others = array.shape if name in result.coords else array.shape[1:]
-        if others != variable.shape:
-            return f"{name} has shape {variable.shape}, that of other whiskers has {others}\n"
-        if name in result.coords and not _same(array[...], variable.values):
-            return f"{name} is {variable.values}, that of other whiskers {array[...]}\n"
-    return ""
+    Parameters
+    ----------
+    path : Path
+        Of the store.
 
+    Returns
+    -------
+    dict
+        What the study says, and ``origins``: which codes found the results.
 
-def _same(first: NDArray[Any], second: NDArray[Any]) -> bool:
-    """Whether coordinates agree, to what another machine's rounding may change."""
-    if first.dtype.kind == "f":
-        return bool(np.allclose(first, second, rtol=1e-12, atol=0.0))
-    return bool(np.array_equal(first, second))
+    Raises
+    ------
+    ValueError
+        If it is no store, or one that is laid out otherwise.
+    """
+    if not (path / _STUDY).exists():
+        raise ValueError(f"{path} is no store of a sweep")
+    kept: dict[str, Any] = json.loads((path / _STUDY).read_text(encoding="utf-8"))
+    if kept.get("layout") != _LAYOUT:
+        raise ValueError(
+            f"{path} is laid out as another version of vibrissa does: open it with that one, or "
+            "give another store"
+        )
+    return kept
 
 
 def _described(study: Study) -> dict[str, Any]:
     """What two studies must have in common to share a store."""
     return {
+        "layout": _LAYOUT,
         "name": study.name,
         "seed": study.seed,
         "whiskers": [[one.name, one.group, one.identity] for one in study.specimens],
@@ -312,7 +321,3 @@ def _described(study: Study) -> dict[str, Any]:
         ),
         "groups": {name: list(some) for name, some in study.groups.items()},
     }
-
-
-def _plain(value: Any) -> Any:
-    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value

@@ -74,7 +74,8 @@ moment_noise = 0.02              # µN·m
 # Others: "map"; "sensitivity" (triplets, noise); "friction" (triplet, friction, contacts).
 """
 
-_FILES_A_CELL = 3
+_OF_WHISKER, _OF_CELL = 16, 4
+"""Numbers kept of each whisker, with its name, and of each cell."""
 TAKEN = ("cells", "whiskers")
 """Names that no task can have: a store keeps other things under them."""
 
@@ -200,11 +201,10 @@ class Study:
         )
 
     @property
-    def files(self) -> int:
-        """Number of files that it makes, roughly."""
-        kinds = {task: kind for task, (kind, _) in self.tasks.items()}
-        each = {task: TASKS[kind].results + _FILES_A_CELL for task, kind in kinds.items()}
-        return sum(each[task] * self.count(task) for task in kinds) + 6 * len(self.specimens)
+    def bytes(self) -> int:
+        """What its results take on disk, roughly: eight bytes a number."""
+        each = sum(TASKS[kind].numbers(settings) for kind, settings in self.tasks.values())
+        return 8 * len(self.specimens) * (each + _OF_WHISKER + _OF_CELL * len(self.tasks))
 
 
 def read_study(text: str, folder: Path) -> Study:

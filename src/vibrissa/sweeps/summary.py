@@ -21,14 +21,17 @@ def sweep_summary(found: xr.Dataset) -> str:
     Returns
     -------
     str
-        Lines of text: by task, how many cells are done; by group of whiskers and triplet, for how
-        many it is unique, with the median and the largest critical cone; and the medians of errors.
+        Lines of text: which versions computed; by task, how many cells are done; by group of
+        whiskers and triplet, for how many it is unique, with the median and the largest critical
+        cone; and the medians of errors.
     """
     return "\n".join(_lines(found))
 
 
 def _lines(found: xr.Dataset) -> Iterator[str]:
     yield f"study {found.attrs.get('study', '')!r}: {found.sizes['whisker']} whiskers"
+    for number, origin in enumerate(found.attrs["origins"]):
+        yield f"  {int((found['origin'] == number).sum())} cells by {origin}"
     for task in found["task"].values:
         status = found["status"].sel(task=task).values
         counts = [int((status == code).sum()) for code in (1, 2, 0)]

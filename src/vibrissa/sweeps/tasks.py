@@ -53,15 +53,15 @@ class Task:
         Raises a ValueError where settings do not fit.
     seconds : callable
         What a whisker takes on one core, roughly, by the settings; s.
-    results : int
-        How many variables its dataset has.
+    numbers : callable
+        How many numbers its dataset has, by the settings.
     """
 
     run: Callable[[Whisker, Settings, int], xr.Dataset]
     defaults: Settings
     check: Callable[[Settings], None]
     seconds: Callable[[Settings], float]
-    results: int
+    numbers: Callable[[Settings], int]
 
 
 def settings_of(said: Mapping[str, Any], where: str) -> tuple[str, Settings]:
@@ -327,7 +327,7 @@ _SENSOR = {"force_noise": FORCE_NOISE / _MICRO, "moment_noise": MOMENT_NOISE / _
 
 TASKS: Mapping[str, Task] = MappingProxyType(
     {
-        "map": Task(_map_summary, {}, _nothing, lambda settings: 0.3, 19),
+        "map": Task(_map_summary, {}, _nothing, lambda settings: 0.3, lambda settings: 33),
         "uniqueness": Task(
             _uniqueness,
             {
@@ -339,28 +339,32 @@ TASKS: Mapping[str, Task] = MappingProxyType(
             },
             _check_uniqueness,
             _uniqueness_seconds,
-            5,
+            lambda settings: (
+                (8 if settings["resolution"] else 4)
+                * len(_triplets(settings))
+                * len(settings["regions"])
+            ),
         ),
         "sensitivity": Task(
             _sensitivity,
             {"triplets": PAPERS, **_SENSOR},
             _check_sensitivity,
             lambda settings: 0.5,
-            3,
+            lambda settings: 3 * len(_triplets(settings)),
         ),
         "estimation": Task(
             _estimation,
             {"signals": ("Fx MB MD", "wrench"), "contacts": 1000, **_SENSOR},
             _check_estimation,
             lambda settings: 0.5 + 1e-4 * settings["contacts"] * len(settings["signals"]),
-            5,
+            lambda settings: 5 * len(settings["signals"]),
         ),
         "friction": Task(
             _friction,
             {"triplet": "Fx MB MD", "friction": (0.0, 0.1, 0.3, 0.5), "contacts": 1000},
             _check_friction,
             lambda settings: 0.5 + 1e-4 * settings["contacts"] * len(settings["friction"]),
-            4,
+            lambda settings: 4 * len(settings["friction"]),
         ),
     }
 )

@@ -10,6 +10,7 @@ import contextlib
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections import Counter, deque
 from collections.abc import Generator, Iterable, Iterator
@@ -112,8 +113,17 @@ def _next(again: deque[Cell], waiting: Iterator[Cell]) -> Cell | None:
     return again.popleft() if again else next(waiting, None)
 
 
+def _context() -> Any:
+    """Processes that begin alike; where fork is safe, from one that has imported all they need."""
+    if sys.platform != "linux":
+        return multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["vibrissa.sweeps.study"])
+    return context
+
+
 def _hire(cell: Cell) -> _Worker:
-    context = multiprocessing.get_context("spawn")
+    context = _context()
     ours, theirs = context.Pipe()
     process = context.Process(target=_work, args=(theirs,), daemon=True)
     process.start()

@@ -1,0 +1,42 @@
+"""One run at a time: a lock that the system lets go of when its holder ends, however it ends."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import IO
+
+
+def hold(path: Path) -> IO[str]:
+    """Take a lock.
+
+    Parameters
+    ----------
+    path : Path
+        A file, made if need be, and left there.
+
+    Returns
+    -------
+    file
+        Holds the lock until it is closed or this process ends.
+
+    Raises
+    ------
+    BlockingIOError
+        If somebody else has it.
+    """
+    file = path.open("a", encoding="utf-8")
+    try:
+        if sys.platform == "win32":
+            import msvcrt
+
+            file.seek(0)
+            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+        else:
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as fault:
+        file.close()
+        raise BlockingIOError(fault.errno, f"{path} is locked") from fault
+    return file

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vibrissa.cli.terminal import fixed, numbers, output
+from vibrissa.cli.terminal import fixed, numbers, output, refuse
 
 if TYPE_CHECKING:
     from vibrissa.rod import Deflection
@@ -38,8 +38,9 @@ def bend(
         ),
     ] = None,
     axis: Annotated[
-        str, typer.Option(help="Direction of the peg's axis.", metavar="X,Y,Z")
-    ] = "0,0,1",
+        str | None,
+        typer.Option(help="Direction of the peg's axis; 0,0,1 by default.", metavar="X,Y,Z"),
+    ] = None,
     side: Annotated[
         str | None,
         typer.Option(
@@ -61,7 +62,7 @@ def bend(
 
 
 def _load(
-    point: str | None, force: str | None, peg: str | None, axis: str, side: str | None
+    point: str | None, force: str | None, peg: str | None, axis: str | None, side: str | None
 ) -> Load:
     """Make the one load that was asked for."""
     from vibrissa.rod import PegContact, PointContact, PointForce
@@ -70,6 +71,8 @@ def _load(
     if len(given) != 1:
         got = " and ".join(f"--{name}" for name in given) or "none of them"
         raise ValueError(f"one of --point, --force and --peg is needed; got {got}")
+    if peg is None:
+        refuse({"--axis": axis, "--side": side}, "they are of a --peg")
     if point is not None:
         place = numbers(point, ("X", "Y", "Z"), "--point")
         return PointContact([x * _MM for x in place])
@@ -78,7 +81,7 @@ def _load(
         return PointForce(s * _MM, size * _MICRO, math.radians(angle))
     assert peg is not None
     *origin, diameter = numbers(peg, ("X", "Y", "Z", "D"), "--peg")
-    direction = numbers(axis, ("X", "Y", "Z"), "--axis")
+    direction = numbers(axis or "0,0,1", ("X", "Y", "Z"), "--axis")
     push = None if side is None else numbers(side, ("X", "Y", "Z"), "--side")
     return PegContact([x * _MM for x in origin], direction, 0.5 * diameter * _MM, side=push)
 

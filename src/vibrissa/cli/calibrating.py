@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from vibrissa.cli.terminal import output
+from vibrissa.cli.terminal import output, refuse
 
 _POOR = 1.0
 """Reprojection error above which something is wrong, pixels."""
@@ -31,7 +31,9 @@ def calibrate(
         Path,
         typer.Option("--output", "-o", help="Cameras to write, TOML of Anipose.", metavar="FILE"),
     ],
-    frames: Annotated[int, typer.Option(help="Frames to take of a video, evenly spread.")] = 40,
+    frames: Annotated[
+        int | None, typer.Option(help="Frames to take of a video, evenly spread; 40 by default.")
+    ] = None,
 ) -> None:
     """Calibrate cameras by a checkerboard that they see at the same moments (extra cameras).
 
@@ -39,18 +41,20 @@ def calibrate(
     its laboratory frame is that of the board in the first moment in which all cameras see it.
     Example: `vibrissa calibrate --pattern 9x6 --square 5e-3 top_*.png front_*.png -o cameras.toml`
     """
-    from vibrissa.io import load_series
-    from vibrissa.io.paths import check_writable
+    from vibrissa.io import Kind, load_series, recognise
+    from vibrissa.io.paths import check_readable, check_writable
     from vibrissa.trial import calibrate as calibrated
     from vibrissa.trial import save_cameras
 
     corners = _corners(pattern)
     if not 0.0 < square < _LARGEST:
         raise ValueError(f"--square is {square:g}; the side of a square in m is needed, as 5e-3")
-    if frames < 2:
+    if frames is not None and frames < 2:
         raise ValueError(f"--frames is {frames}; a few dozen are needed")
     check_writable(cameras, (".toml",))
-    series = load_series(images, frames)
+    if not any(recognise(check_readable(image)) == Kind.VIDEO for image in images):
+        refuse({"--frames": frames}, "it is of videos, and these are images")
+    series = load_series(images, frames or 40)
     found, error = calibrated(series, corners, square)
     save_cameras(cameras, found)
     for camera in found:

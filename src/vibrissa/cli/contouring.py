@@ -191,19 +191,16 @@ def _stages(
     from vibrissa.cli.locating import estimated
     from vibrissa.cli.recordings import say
     from vibrissa.pipeline import with_contour, with_signals
-    from vibrissa.tracking.filtering import CUTOFF
 
     source, cutoff = wanted.source, wanted.cutoff
     made = tree["signals"].attrs if "signals" in tree.children else None
     if made and wanted.how.whisker is not None and source is None and cutoff is None:
         # The same way, by another whisker.
-        source, cutoff = made.get("source"), float(made.get("cutoff", 0.0))
+        source = made.get("source")
+        cutoff = float(made.get("cutoff", 0.0)) if source == "contact point" else None
     if source is not None or cutoff is not None or made is None:
         tell("signals", 0, 1)
-        options = signal_options(
-            tree, source, CUTOFF if cutoff is None else cutoff, wanted.how.known
-        )
-        tree = with_signals(tree, **options)
+        tree = with_signals(tree, **signal_options(tree, source, cutoff, wanted.how.known))
         tell("signals", 1, 1)
         yield "signals", tree
     say(described(tree))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vibrissa.cli.terminal import output, progress_bars, shown
+from vibrissa.cli.terminal import output, progress_bars, refuse, shown
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -37,9 +37,11 @@ def signals(
         ),
     ] = None,
     cutoff: Annotated[
-        float,
-        typer.Option(help="Low pass of the pose the contact point is seen from, Hz; 0: none."),
-    ] = 85.0,
+        float | None,
+        typer.Option(
+            help="Low pass of the pose the contact point is seen from, Hz; 85 by default, 0: none."
+        ),
+    ] = None,
     whisker: Annotated[
         Path | None,
         typer.Option(help="Centreline as CSV, if the recording has no whisker.", metavar="FILE"),
@@ -66,7 +68,10 @@ def signals(
         )
     with progress_bars() as tell:
         tell("signals", 0, 1)
-        done = with_signals(tree, **signal_options(tree, source, cutoff, whisker))
+        options = signal_options(tree, source, cutoff, whisker)
+        if options["whiskers"] is None:
+            refuse({"--whisker": whisker}, f"signals of the {options['source']} need none")
+        done = with_signals(tree, **options)
         tell("signals", 1, 1)
     say(described(done))
     found = done["signals"].to_dataset()
@@ -80,7 +85,7 @@ def signals(
 
 
 def signal_options(
-    tree: xr.DataTree, source: str | None, cutoff: float, whisker: Path | None
+    tree: xr.DataTree, source: str | None, cutoff: float | None, whisker: Path | None
 ) -> dict[str, Any]:
     """Turn options of the command line into those of `signals_of`.
 
@@ -90,8 +95,8 @@ def signal_options(
         The recording.
     source : str or None
         As given; a hyphen counts as a blank.
-    cutoff : float
-        Hz; 0 for none.
+    cutoff : float or None
+        Hz; 0 for none, None for the usual.
     whisker : Path or None
         As given.
 
@@ -103,14 +108,20 @@ def signal_options(
     Raises
     ------
     ValueError
-        If the recording has no source of signals, or no whisker where one is needed.
+        If the recording has no source of signals, or no whisker where one is needed, or a cut-off
+        is given for signals that do not come from the contact point.
     """
     from vibrissa.cli.recordings import whiskers_for
     from vibrissa.pipeline import default_source
+    from vibrissa.tracking.filtering import CUTOFF
 
     chosen = default_source(tree) if source is None else source.strip().replace("-", " ")
-    known = whiskers_for(tree, whisker) if chosen == "contact point" else None
-    return {"source": chosen, "cutoff": cutoff or None, "whiskers": known}
+    if chosen != "contact point":
+        if chosen in ("rod", "sensor"):
+            refuse({"--cutoff": cutoff}, f"signals of the {chosen} have a pose of their own")
+        return {"source": chosen, "whiskers": None}
+    wanted = CUTOFF if cutoff is None else cutoff or None
+    return {"source": chosen, "cutoff": wanted, "whiskers": whiskers_for(tree, whisker)}
 
 
 def described(tree: xr.DataTree) -> str:

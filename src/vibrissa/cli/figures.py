@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from vibrissa.cli.terminal import output, progress_bars
+from vibrissa.cli.terminal import output, progress_bars, refuse
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -65,10 +65,13 @@ def figures(
         Path | None,
         typer.Option("--map", help="Of a trial's whisker; simulated by default.", metavar="MAP"),
     ] = None,
-    whisker: Annotated[int, typer.Option(help="Of a trial: which whisker, from 0.")] = 0,
+    whisker: Annotated[
+        int | None, typer.Option(help="Of a trial: which whisker, from 0 (the default).")
+    ] = None,
     colour: Annotated[
-        str, typer.Option(help="Of a trial's contacts in both frames: time or deflection.")
-    ] = "time",
+        str | None,
+        typer.Option(help="Of a trial's contacts in both frames: time (by default) or deflection."),
+    ] = None,
 ) -> None:
     """Draw the figures that a map or a trial allows.
 
@@ -79,7 +82,7 @@ def figures(
     whiskers, and what they touch. Example: `vibrissa figures map.nc -o figures --width single`
     """
     endings = _chosen(formats, width)
-    if colour not in _COLOURS:
+    if colour not in (None, *_COLOURS):
         raise ValueError(f"--colour is {colour!r}; one of {', '.join(_COLOURS)} is needed")
     from vibrissa.cli.array_figures import array_drawings
     from vibrissa.cli.sources import map_from
@@ -94,10 +97,13 @@ def figures(
     with progress_bars() as tell:
         drawings = array_drawings(path, width)
         if not path.is_dir() and recognise(path) == Kind.RECORDING:
-            _refuse({"--uniqueness": uniqueness, "--cones": cones}, f"{path} is a recording")
-            drawings |= trial_drawings(path, width, videos or [], chart, whisker, tell, colour)
+            refuse({"--uniqueness": uniqueness, "--cones": cones}, f"{path} is a recording")
+            drawings |= trial_drawings(
+                path, width, videos or [], chart, whisker or 0, tell, colour or "time"
+            )
         else:
-            _refuse({"--video": videos, "--map": chart}, f"{path} is no recording")
+            options = {"--video": videos, "--map": chart, "--whisker": whisker, "--colour": colour}
+            refuse(options, f"{path} is no recording")
         if not drawings:
             drawings = dict(map_drawings(map_from(path), width, verdicts, sweep))
         folder.mkdir(parents=True, exist_ok=True)
@@ -119,13 +125,6 @@ def _chosen(formats: list[str] | None, width: str) -> list[str]:
     if width not in _WIDTHS:
         raise ValueError(f"--width is {width!r}; one of {', '.join(_WIDTHS)} is needed")
     return endings
-
-
-def _refuse(options: dict[str, Any], reason: str) -> None:
-    """Raise if options are given that do not go with what is drawn."""
-    given = [name for name, value in options.items() if value]
-    if given:
-        raise ValueError(f"{', '.join(given)} cannot be used: {reason}")
 
 
 def dataset_with(path: Path, needed: str) -> xr.Dataset:

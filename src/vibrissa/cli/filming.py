@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from vibrissa.cli.terminal import Tell, output, progress_bars, stoppable
+from vibrissa.cli.terminal import Tell, output, progress_bars, refuse, stoppable
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -64,6 +64,10 @@ def movie(
     from vibrissa.plots import course_of
 
     kinds = _chosen(kind)
+    if "signals" not in kinds:
+        refuse({"--map": chart}, "the movie of the contour shows no map")
+    if "contour" not in kinds:
+        refuse({"--video": videos}, "the movie of the signals shows no video")
     files = _files(target, path, kinds)
     trial = load_recording(path)
     course = course_of(trial, whisker)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from vibrissa.cli.terminal import Tell, progress_bars, shown
+from vibrissa.cli.terminal import Tell, progress_bars, refuse, shown
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -119,6 +119,9 @@ def estimate(
         path = signals if recorded else Path("contacts.csv")
     check_writable(path, (*NETCDF, *CSV) if recorded else CSV)
     how = how_to(triplet, method, all_six, charts, whisker)
+    if noise is not None:
+        options = {"--force-noise": force_noise, "--moment-noise": moment_noise}
+        refuse(options, "--noise tells it all")
     sigma = noise_from(noise, force_noise, moment_noise)
     if recorded:
         _from_recording(signals, path, how, sigma)
@@ -206,6 +209,8 @@ def how_to(
     _check_method(method, names or TRIPLET, all_six)
     if charts and whisker is not None:
         raise ValueError("give either --map or --whisker: a map already has its whisker")
+    if all_six:
+        refuse({"--signals": triplet}, "--wrench uses force and moment whole")
     return How(names, method, all_six, tuple(charts or ()), whisker)
 
 
@@ -304,10 +309,9 @@ def estimated(
     from vibrissa.cli.recordings import maps_from, noise_from, say, whiskers_for
     from vibrissa.pipeline import sensor_noise, with_estimates, with_signals
     from vibrissa.sensing import FORCE_NOISE
-    from vibrissa.tracking.filtering import CUTOFF
 
     if "signals" not in tree.children:
-        tree = with_signals(tree, **signal_options(tree, None, CUTOFF, how.known))
+        tree = with_signals(tree, **signal_options(tree, None, None, how.known))
     signals = tree["signals"].to_dataset()
     if noise is None and sensor_noise(signals) is None and signals.attrs.get("source") == "sensor":
         noise = noise_from(None, FORCE_NOISE * 1e6, None)
@@ -315,7 +319,8 @@ def estimated(
     whiskers = [one.whisker for one in maps] if maps else whiskers_for(tree, how.whisker)
     for k, whisker in enumerate(whiskers):
         _check_scale(name, signals.isel(whisker=k), whisker)
-    all_six = how.all_six or (how.names is None and signals.attrs.get("source") == "rod")
+    by_default = how.names is None and how.method == "exact"
+    all_six = how.all_six or (by_default and signals.attrs.get("source") == "rod")
     if not maps and not all_six:
         one = f"no map given; simulating that of {whiskers[0]!r}"
         several = "no maps given; simulating those of the whiskers that feel a contact"

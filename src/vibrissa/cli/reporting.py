@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vibrissa.cli.terminal import Tell, output, progress_bars
+from vibrissa.cli.terminal import Tell, output, progress_bars, refuse
 
 if TYPE_CHECKING:
     from vibrissa.report import Section
@@ -40,7 +40,9 @@ def report(
         Path | None,
         typer.Option("--map", help="Of a trial's whisker; simulated by default.", metavar="MAP"),
     ] = None,
-    whisker: Annotated[int, typer.Option(help="Of a trial: which whisker, from 0.")] = 0,
+    whisker: Annotated[
+        int | None, typer.Option(help="Of a trial: which whisker, from 0 (the default).")
+    ] = None,
     films: Annotated[
         list[Path] | None,
         typer.Option(
@@ -53,7 +55,10 @@ def report(
     make_movies: Annotated[
         bool, typer.Option("--movies", help="Of a trial: make its movies beside the page first.")
     ] = False,
-    seed: Annotated[int, typer.Option(help="Of the draws behind what is predicted.")] = 0,
+    seed: Annotated[
+        int | None,
+        typer.Option(help="Of a trial: of the draws behind what is predicted; 0 by default."),
+    ] = None,
 ) -> None:
     """Write a page that opens offline: what was done, how well, figures, a contour to turn.
 
@@ -70,18 +75,20 @@ def report(
     kind = _kind(path)
     with progress_bars() as tell:
         if kind == "trial":
-            _refuse("--uniqueness", uniqueness, f"{path} is a recording")
-            sections, script, drawings = _of_trial(path, videos or [], chart, whisker, seed, tell)
+            refuse({"--uniqueness": uniqueness}, f"{path} is a recording")
+            sections, script, drawings = _of_trial(
+                path, videos or [], chart, whisker or 0, seed or 0, tell
+            )
         else:
-            for name, value in (("--video", videos), ("--map", chart), ("--movies", make_movies)):
-                _refuse(name, value, f"{path} is a map")
+            options = {"--video": videos, "--map": chart, "--movies": make_movies}
+            refuse(options | {"--whisker": whisker, "--seed": seed}, f"{path} is a map")
             sections, script, drawings = _of_map(path, uniqueness)
         sections.append(figure_sections(_drawn(drawings, tell)))
     movies = list(films or [])
     if make_movies:
-        movies += _made(path, target, videos, chart, whisker)
+        movies += _made(path, target, videos, chart, whisker or 0)
     command = ["vibrissa", *sys.argv[1:]]
-    origin = provenance_section(provenance(command, given, seed))
+    origin = provenance_section(provenance(command, given, seed or 0))
     title = f"{'Trial' if kind == 'trial' else 'Map of contacts'}: {path.name}"
     about = "From what a whisker feels at its base to what it touched, by vibrissa."
     if movies:
@@ -103,11 +110,6 @@ def _kind(path: Path) -> str:
             "contacts is needed, as `vibrissa track` or `vibrissa map` writes them"
         )
     return kinds[kind]
-
-
-def _refuse(name: str, value: Any, reason: str) -> None:
-    if value:
-        raise ValueError(f"{name} cannot be used: {reason}")
 
 
 def _of_trial(

@@ -55,7 +55,13 @@ def simulate(
     protraction: Annotated[
         float | None, typer.Option(help="Share of a whisk that goes forward, 0.3 to 0.7.")
     ] = None,
-    row: Annotated[str | None, typer.Option(help="Row of the array, A to E; C by default.")] = None,
+    row: Annotated[
+        str | None,
+        typer.Option(
+            help="Of one whisker: its row, A to E, by which elevation and roll follow the azimuth; "
+            "C by default."
+        ),
+    ] = None,
     friction: Annotated[
         float | None, typer.Option(help="Coulomb's coefficient; 0 by default.")
     ] = None,

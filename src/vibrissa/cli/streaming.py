@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vibrissa.cli.terminal import errors
+from vibrissa.cli.terminal import errors, refuse
 
 if TYPE_CHECKING:
     from vibrissa.io.rosbag import ContactBag
@@ -51,19 +51,28 @@ def stream(
         ),
     ] = None,
     signals: Annotated[
-        str,
+        str | None,
         typer.Option(
-            help="Without a sensor: the signals to use, of Fx, FT, FD, Mx, MB, MD. The lines carry "
-            "these, or Fx, Fy, Fz, Mx, My, Mz.",
+            help="Without a sensor: the signals to use, of Fx, FT, FD, Mx, MB, MD; by default "
+            "Fx,MB,MD. The lines carry these, or Fx, Fy, Fz, Mx, My, Mz.",
             metavar="A,B,C",
         ),
-    ] = "Fx,MB,MD",
+    ] = None,
     force_noise: Annotated[
-        float, typer.Option(help="Standard deviation of a force component, µN.", min=0.0)
-    ] = 1.0,
+        float | None,
+        typer.Option(
+            help="Without a sensor: standard deviation of a force component, µN; 1 by default.",
+            min=0.0,
+        ),
+    ] = None,
     moment_noise: Annotated[
-        float, typer.Option(help="Standard deviation of a moment component, µN·m.", min=0.0)
-    ] = 0.02,
+        float | None,
+        typer.Option(
+            help="Without a sensor: standard deviation of a moment component, µN·m; 0.02 by "
+            "default.",
+            min=0.0,
+        ),
+    ] = None,
     stiffness_sigma: Annotated[
         float,
         typer.Option(help="Standard deviation of the whisker's bending stiffness, %.", min=0.0),
@@ -110,13 +119,20 @@ def stream(
     frame, m; with --filter also in the laboratory's (lab_x, ...). Stop with Ctrl-C.
     Example: `vibrissa stream --udp 127.0.0.1:5005 --sensor sensor.toml --whisker wire.csv`
     """
+    from vibrissa.cli.recordings import usual_noise
     from vibrissa.io.rosbag import is_bag
     from vibrissa.sensing import load_sensor
 
     if source is not None and udp is not None:
         raise ValueError("give either a source or --udp")
+    if sensor is not None:
+        options = {"--signals": signals, "--force-noise": force_noise}
+        reason = "channels and noise are those of the --sensor"
+        refuse(options | {"--moment-noise": moment_noise}, reason)
     described = None if sensor is None else load_sensor(sensor)
     from_bag = source is not None and is_bag(source)
+    if not from_bag:
+        refuse({"--topic": topic}, "it is of a ROS bag, and the source is none")
     with ExitStack() as opened:
         writer = None if bag is None else opened.enter_context(_bag(bag, follow))
         lines = (
@@ -126,7 +142,12 @@ def stream(
         )
         contacts = _map(chart, whisker)
         estimator = _estimator(
-            contacts, described, signals, (force_noise, moment_noise), stiffness_sigma, felt
+            contacts,
+            described,
+            signals or "Fx,MB,MD",
+            usual_noise(force_noise, moment_noise),
+            stiffness_sigma,
+            felt,
         )
         running = _stream(estimator, described, from_bag, follow, speed)
         with suppress(KeyboardInterrupt):  # the usual end

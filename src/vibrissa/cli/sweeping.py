@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vibrissa.cli.terminal import errors, output, progress_bars
+from vibrissa.cli.terminal import errors, output, progress_bars, refuse
 
 if TYPE_CHECKING:
     from vibrissa.sweeps import Study
@@ -36,8 +36,9 @@ def sweep(
         ),
     ] = None,
     workers: Annotated[
-        int, typer.Option(help="Processes on this machine; 0: none but this one.", min=0)
-    ] = 1,
+        int | None,
+        typer.Option(help="Processes on this machine, 1 by default; 0: none but this one.", min=0),
+    ] = None,
     scheduler: Annotated[
         str | None,
         typer.Option(
@@ -74,10 +75,15 @@ def sweep(
     elif study is None:
         raise ValueError("a study is needed; `vibrissa sweep --example` prints one")
     elif study == _SHOW:
+        options = {"--workers": workers, "--scheduler": scheduler, "--again": again}
+        refuse(options | {"--dry-run": dry_run}, "results are only shown")
         _show(store, path)
     elif store is not None:
         raise ValueError(f"{store} is one word too many; the store is said with -o")
     else:
+        if scheduler not in (None, "local"):
+            refuse({"--workers": workers}, f"the workers are those of {scheduler}")
+        workers = 1 if workers is None else workers
         text = Path(study).read_text(encoding="utf-8")
         plan = read_study(text, Path(study).parent)
         if dry_run:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 from rich.console import Console
@@ -152,3 +152,28 @@ def numbers(text: str, names: Sequence[str], option: str) -> list[float]:
     if len(values) != len(names):
         raise ValueError(f"{option} is {text!r}; {','.join(names)} are needed")
     return values
+
+
+def refuse(options: Mapping[str, object], reason: str) -> None:
+    """Raise if options are given that would have no effect.
+
+    Parameters
+    ----------
+    options : mapping
+        What was given, by the option's name; None, False or nothing if it was not.
+    reason : str
+        Why they have none.
+
+    Raises
+    ------
+    ValueError
+        If one is given.
+    """
+    given = [name for name, value in options.items() if not _nothing(value)]
+    if given:
+        raise ValueError(f"{', '.join(given)} cannot be used: {reason}")
+
+
+def _nothing(value: object) -> bool:
+    # Zero is a number that was given.
+    return value is None or value is False or value in ([], ())

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from vibrissa.cli.sources import whisker_from
-from vibrissa.cli.terminal import numbers, output, progress_bars, shown
+from vibrissa.cli.terminal import numbers, output, progress_bars, refuse, shown
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from vibrissa.trial import Camera
 
 _MICRO = 1e-6
+_PIXEL = 58e-6
+"""What a pixel sees unless it is told, m: as in the paper."""
+
 _POOR = 2.0
 _WIDEST = 1.0
 """What views of a whisker may be wide at most, m."""
@@ -44,8 +47,11 @@ def track(
         ),
     ],
     pixel_size: Annotated[
-        float, typer.Option(help="What a pixel of both views sees, m, without --cameras.")
-    ] = 58e-6,
+        float | None,
+        typer.Option(
+            help="What a pixel of both views sees, m, without --cameras; 58e-6 by default."
+        ),
+    ] = None,
     fps: Annotated[float, typer.Option(help="Frames per second at which it was filmed.")] = 1000.0,
     cameras: Annotated[
         Path | None,
@@ -208,12 +214,15 @@ def _tracked(
     _report(result, recording)
 
 
-def _cameras(videos: Sequence[Path], path: Path | None, pixel_size: float) -> tuple[Camera, ...]:
+def _cameras(
+    videos: Sequence[Path], path: Path | None, pixel_size: float | None
+) -> tuple[Camera, ...]:
     from vibrissa.io import load_recording, video_info
     from vibrissa.io.paths import NETCDF
     from vibrissa.trial import load_cameras, orthogonal_views, recorded_cameras
 
     if path is not None:
+        refuse({"--pixel-size": pixel_size}, "the --cameras tell it")
         if path.suffix.lower() in NETCDF:
             cameras = recorded_cameras(load_recording(path))
         else:
@@ -228,6 +237,7 @@ def _cameras(videos: Sequence[Path], path: Path | None, pixel_size: float) -> tu
     sizes = [(info.width, info.height) for info in map(video_info, videos)]
     if len(set(sizes)) > 1:
         raise ValueError(f"the videos differ in size, {sorted(set(sizes))}: give --cameras")
+    pixel_size = _PIXEL if pixel_size is None else pixel_size
     wide = pixel_size * sizes[0][0]
     if wide > _WIDEST:
         raise ValueError(

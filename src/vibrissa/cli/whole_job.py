@@ -28,9 +28,13 @@ def demo(
         Path, typer.Option("--output", "-o", help="Where files go.", metavar="DIR")
     ] = Path("vibrissa-demo"),
     full: Annotated[
-        bool,
-        typer.Option("--full/--quick", help="3.5 s of video, as in the paper, or half a second."),
-    ] = False,
+        bool | None,
+        typer.Option(
+            "--full/--quick",
+            help="3.5 s of video, as in the paper, or half a second.",
+            show_default="quick",
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Of the whisks and of the noise.")] = 0,
     noise: Annotated[
         bool, typer.Option(help="Whether the sensor has noise: 1 µN and 0.02 µN·m.")
@@ -56,6 +60,8 @@ def demo(
     from vibrissa.demo.run import DURATION, FULL_DURATION
     from vibrissa.io.paths import check_folder
 
+    if duration is not None and full is not None:
+        raise ValueError("give either --duration or one of --full and --quick")
     check_folder(folder)
     chosen = whisker_from(whisker)
     output.print(f"{chosen!r}", highlight=False, soft_wrap=True)

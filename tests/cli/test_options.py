@@ -1,0 +1,74 @@
+"""Options that would have no effect are refused before anything is computed."""
+
+import pytest
+
+import vibrissa as vb
+from vibrissa.cli.app import app
+from vibrissa.io import save_recording
+from vibrissa.mapping import ContactMap
+from vibrissa.pipeline import with_signals
+from vibrissa.trial import Motion, Peg, measure, simulate
+
+typer_testing = pytest.importorskip("typer.testing")
+
+
+def fault(*words):
+    result = typer_testing.CliRunner().invoke(app, [str(word) for word in words])
+    assert isinstance(result.exception, ValueError | OSError), result.output
+    return str(result.exception)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A recording of a few frames of a sensor, a map, and files that only have to be there."""
+    import numpy as np
+
+    path = tmp_path_factory.mktemp("options")
+    whisker = vb.Whisker.straight(length=30e-3)
+    still = Motion(np.arange(3) * 1e-3, *np.zeros((3, 3)), np.zeros((3, 3)))
+    far = Peg([0.02, 0.02, 0.0], [0.0, 0.0, 1.0], 1e-3)
+    save_recording(path / "t.nc", with_signals(measure(simulate(whisker, still, far))))
+    ContactMap.simulate(whisker, grid=False).save(path / "map.nc")
+    (path / "sensor.toml").write_text("")
+    (path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n")
+    for name in ("top.mkv", "front.mkv", "cameras.toml", "noise.csv"):
+        (path / name).write_text("x")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("signals t.nc --cutoff 0", "--cutoff cannot be used: signals of the sensor"),
+        ("signals t.nc --whisker map.nc", "--whisker cannot be used: signals of the sensor"),
+        ("estimate t.nc --wrench --signals Fx,MB,MD", "--signals cannot be used: --wrench uses"),
+        ("estimate t.nc --noise noise.csv --force-noise 2", "--force-noise cannot be used"),
+        ("reconstruct t.nc --wrench --signals Fx,MB,MD", "--signals cannot be used"),
+        ("reconstruct t.nc --cutoff 60", "--cutoff cannot be used"),
+        ("deflect --point 25,12,1 --axis 0,0,1", "--axis cannot be used: they are of a --peg"),
+        ("deflect --point 25,12,1 --side 0,1,0", "--side cannot be used"),
+        (
+            "track top.mkv front.mkv --cameras cameras.toml --pixel-size 58e-6 -o o.nc",
+            "--pixel-size cannot be used: the --cameras tell it",
+        ),
+        ("calibrate a.png --pattern 9x6 --square 5e-3 --frames 3 -o c.toml", "--frames cannot"),
+        ("stream --sensor sensor.toml --signals Fx,MB,MD", "--signals cannot be used"),
+        ("stream --sensor sensor.toml --moment-noise 0", "--moment-noise cannot be used"),
+        ("stream noise.csv --topic wrench", "--topic cannot be used"),
+        ("movie t.nc --kind contour --map map.nc", "--map cannot be used"),
+        ("movie t.nc --kind signals --video top.mkv", "--video cannot be used"),
+        ("figures map.nc --whisker 0", "--whisker cannot be used"),
+        ("figures map.nc --colour time --map map.nc", "--map, --colour cannot be used"),
+        ("report map.nc --seed 0", "--seed cannot be used"),
+        ("demo --full --duration 1", "give either --duration or one of --full and --quick"),
+        ("sweep show store --again", "--again cannot be used: results are only shown"),
+        ("sweep s.toml --scheduler tcp://a:1 --workers 3", "--workers cannot be used"),
+    ],
+)
+def test_options_without_effect_are_refused(folder, monkeypatch, words, said):
+    if words.startswith("sweep"):
+        pytest.importorskip("zarr")
+    monkeypatch.chdir(folder)
+    before = sorted(p.name for p in folder.iterdir())
+    assert said in fault(*words.split())
+    assert sorted(p.name for p in folder.iterdir()) == before

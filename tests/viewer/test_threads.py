@@ -1,6 +1,7 @@
 """What happens on the page happens one after the other, the newest wish first."""
 
 import threading
+import time
 
 from vibrissa.viewer.latest import Latest
 from vibrissa.viewer.player import Player
@@ -60,3 +61,20 @@ def test_a_player_tells_the_time_only_while_it_plays():
     player.pause()
     assert not player.playing
     player.close()
+
+
+def test_what_is_put_off_comes_in_its_time_and_after_what_is_due():
+    faults, done = [], []
+    work = Latest(faults.append)
+    due = time.monotonic() + 0.05
+    work.put("words", lambda: done.append(time.monotonic()), due)
+    work.put("words", lambda: done.append(time.monotonic()), due)
+    work.put("gone", lambda: done.append("gone"), due)
+    work.put("drag", lambda: done.append("drag"))
+    work.drop("gone")
+    assert work.wait(10.0)
+    assert done[0] == "drag"
+    assert len(done) == 2
+    assert done[1] >= due
+    assert faults == []
+    work.close()

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 
 from vibrissa.quantities import to_display
-from vibrissa.rod import Deflection
 from vibrissa.viewer.bending import Bend, force_scale
 from vibrissa.viewer.drawing import (
     CONTACT,
@@ -109,7 +109,8 @@ def bend_drawing(bend: Bend, exaggeration: float) -> Drawing:
     if bend.kind == "peg":
         out["peg"] = _peg(bend)
     elif ok:
-        out["contact"] = _ball(held, exaggeration)
+        x, y, z = _mm(held.contact_point).tolist()
+        out["contact"] = replace(_ball(whisker, exaggeration), place=(x, y, z))
     return out
 
 
@@ -131,11 +132,12 @@ def _peg(bend: Bend) -> Body:
     return Body(vertices, faces, OBJECT, 0.8)
 
 
-def _ball(held: Deflection, exaggeration: float) -> Body:
-    whisker = held.whisker
-    own = float(whisker.radius(min(float(held.arc_length), whisker.length)))
+@lru_cache(maxsize=4)
+def _ball(whisker: Whisker, exaggeration: float) -> Body:
+    """What marks the contact: it sticks out of the whisker where this can touch."""
+    own = float(whisker.radius(0.5 * whisker.length))
     radius = max(1.7 * exaggeration * own, 0.006 * whisker.length)
-    vertices, faces = ellipsoid(_mm(held.contact_point), _size(radius) * np.eye(3))
+    vertices, faces = ellipsoid(np.zeros(3), _size(radius) * np.eye(3))
     return Body(vertices, faces, CONTACT)
 
 

@@ -6,7 +6,15 @@ import numpy as np
 
 from vibrissa.quantities import quantity
 from vibrissa.viewer.bend_drawing import bend_drawing
-from vibrissa.viewer.bending import KINDS, Kind, force_scale, loaded, moved, with_force, with_radius
+from vibrissa.viewer.bending import (
+    KINDS,
+    Kind,
+    force_scale,
+    loaded,
+    moved,
+    with_force,
+    with_radius,
+)
 from vibrissa.viewer.charting import Chart, envelope
 from vibrissa.viewer.page import Page, asked, put
 from vibrissa.viewer.readout import of_deflection
@@ -74,13 +82,17 @@ class BendMode:
         self._page.stage.show("reachable", {})
 
     def redraw(self) -> None:
-        """Draw the whisker and write its signals."""
+        """Draw the whisker, and what it can reach."""
         page, bend = self._page, self._page.bend
         page.stage.show("bend", bend_drawing(bend, page.exaggeration))
         if page.chart is not self._clouded:
             self._clouded = page.chart
             cloud = {} if page.chart is None else {"envelope": envelope(page.chart)}
             page.stage.show("reachable", cloud)
+
+    def write(self) -> None:
+        """Write signals and contact, and where the load is."""
+        bend = self._page.bend
         self._numbers.content = of_deflection(bend.deflection)
         self._target.visible = bend.kind != "force"
         self._radius.visible = bend.kind == "peg"

@@ -44,6 +44,8 @@ class Body:
         From 0 to 1; without it nothing shines through.
     side : {"double", "front", "back"}
         From which it is seen.
+    place : tuple of float
+        Where the origin of the vertices is, mm: what only moves need not be sent again.
     """
 
     vertices: Array
@@ -51,6 +53,7 @@ class Body:
     colour: Colour
     opacity: float | None = None
     side: Literal["front", "back", "double"] = "double"
+    place: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)

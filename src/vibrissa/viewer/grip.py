@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import viser
+from numpy.typing import ArrayLike
 from viser import transforms
 
 from vibrissa.quantities import quantity
@@ -33,7 +34,6 @@ class Grip:
 
     def __init__(self, server: viser.ViserServer, size: float, moved: Moved) -> None:
         self._moved = moved
-        self._place: Array = np.zeros(3)
         self._gizmo = server.scene.add_transform_controls(
             "/grip",
             scale=size,
@@ -47,24 +47,33 @@ class Grip:
             "/grip ball", radius=0.12 * size, color=(213, 94, 0), opacity=0.35, visible=False
         )
         self._turning = False
+        self._by_ball = False
 
         # Coroutines run one after the other, so that no older place can overtake a newer one.
         @self._gizmo.on_update
         async def _(event: viser.TransformControlsEvent) -> None:
             if event.phase == "update":
-                self._ball.position = event.target.position
-                self._tell()
+                self._by_ball = False
+                self._tell(event.target.position)
 
         @self._ball.on_drag
         async def _(event: viser.SceneNodeDragEvent[viser.IcosphereHandle]) -> None:
+            # What is not held would only be drawn in vain.
+            self._gizmo.visible = event.phase == "end" and self._ball.visible
             if event.phase == "update":
-                self._ball.position = event.end_position
-                self._gizmo.position = event.end_position
-                self._tell()
+                self._by_ball = True
+                self._tell(event.end_position)
 
-    def _tell(self) -> None:
+    def _tell(self, place: ArrayLike) -> None:
         turn = np.array(transforms.SO3(self._gizmo.wxyz).as_matrix(), dtype=np.float64)
-        self._moved(np.array(self._ball.position) / _MM, turn)
+        self._moved(np.array(place, dtype=np.float64) / _MM, turn)
+
+    def follow(self, place: Array) -> None:
+        """Be where it was dragged to, (3,), m, as far as the mouse does not do that itself."""
+        x, y, z = (_MM * place).tolist()
+        self._ball.position = (x, y, z)
+        if self._by_ball:
+            self._gizmo.position = (x, y, z)
 
     def show(self, place: Array | None, axis: Array | None = None) -> None:
         """Stand at a place (3,), m; with arcs that turn an axis, if there is one; None hides it."""

@@ -77,11 +77,10 @@ class LocateMode:
         page, bend, chart = self._page, self._page.bend, self._page.chart
         page.stage.show("bend", bend_drawing(bend, page.exaggeration))
         if chart is None:
-            self._words.content = note("Charting all contacts of this whisker …")
+            self.found = None
             page.stage.show("candidates", {})
             return
         self.found = located(chart, bend, self._sensor)
-        self._words.content = of_located(bend.whisker, self.found, bend.status)
         drawing = (
             {}
             if self.found is None
@@ -89,6 +88,14 @@ class LocateMode:
         )
         page.stage.show("candidates", drawing)
         self._paint(chart)
+
+    def write(self) -> None:
+        """Write what the three signals tell."""
+        bend = self._page.bend
+        if self._page.chart is None:
+            self._words.content = note("Charting all contacts of this whisker …")
+        else:
+            self._words.content = of_located(bend.whisker, self.found, bend.status)
 
     def _paint(self, chart: Chart) -> None:
         """Colour the cloud beside everything else."""

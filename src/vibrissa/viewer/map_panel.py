@@ -81,6 +81,9 @@ class MapMode:
         self._paint(self._solids)
         self._mark()
 
+    def write(self) -> None:
+        """Nothing: all is written as it is drawn."""
+
     def _paint(self, found: Solids) -> None:
         what, share, by = str(self._slice.value), float(self._share.value), str(self._by.value)
         key = (found, what, share, by)

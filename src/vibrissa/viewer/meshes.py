@@ -14,7 +14,7 @@ from vibrissa.rod.surface import Surface
 from vibrissa.trial import Box, Mesh, Peg, Plane, Sphere
 from vibrissa.viewer.drawing import Array, Ints
 
-SIDES = 12
+SIDES = 8
 
 
 def across(direction: Array) -> tuple[Array, Array]:

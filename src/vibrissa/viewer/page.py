@@ -6,6 +6,7 @@ which changes the state and draws it, so that no state is ever changed by two at
 
 from __future__ import annotations
 
+import time
 import traceback
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
@@ -26,6 +27,10 @@ from vibrissa.whisker import Whisker
 
 EXAGGERATION = 8.0
 
+_READ = 0.1
+"""How often numbers change while something is dragged, s: the browser takes as long for a line of
+text as for a whisker, and nobody reads faster."""
+
 Transition = Callable[[Bend], Bend]
 
 
@@ -41,7 +46,10 @@ class Mode(Protocol):
         """Hide them."""
 
     def redraw(self) -> None:
-        """Follow a change of the whisker or of its load."""
+        """Follow a change of the whisker or of its load with what is in the scene."""
+
+    def write(self) -> None:
+        """Follow it with what is written in the panel."""
 
 
 class Page:
@@ -74,6 +82,7 @@ class Page:
         self.modes: dict[str, Mode] = {}
         self.whisker_controls: viser.GuiFolderHandle | None = None
         self.closing: list[Callable[[], None]] = []
+        self._written = 0.0
         self.grip = Grip(server, float(to_display("length", 0.16 * whisker.length)), self._dragged)
 
     # What happens
@@ -152,12 +161,33 @@ class Page:
         self.work.put("mode", job)
 
     def redraw(self, dragging: bool = False) -> None:
-        """Draw the mode; what is being dragged stays where the mouse has it."""
-        if self.mode is not None:
-            self.mode.redraw()
+        """Draw the mode; what is being dragged stays where the mouse has it.
+
+        All comes into sight together, as the browser draws anew for each part that comes alone.
+        """
+        now = time.monotonic()
+        words = not dragging or now >= self._written + _READ
+        with self.server.atomic():
+            if self.mode is not None:
+                self.mode.redraw()
+                if words:
+                    self.mode.write()
+            if dragging:
+                self.grip.follow(self.bend.target)
+            else:
+                self.place_grip()
         self.server.flush()
-        if not dragging:
-            self.place_grip()
+        if words:
+            self._written = now
+            self.work.drop("words")
+        else:
+            self.work.put("words", self._write, self._written + _READ)
+
+    def _write(self) -> None:
+        """Write what has waited."""
+        if self.mode is not None:
+            self.mode.write()
+        self._written = time.monotonic()
 
     def place_grip(self) -> None:
         """Put what can be dragged where the load is."""

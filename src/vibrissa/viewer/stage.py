@@ -55,6 +55,7 @@ class Stage:
                     color=thing.colour,
                     opacity=thing.opacity,
                     side=thing.side,
+                    position=thing.place,
                     cast_shadow=thing.opacity is None,
                     receive_shadow=False,
                 )
@@ -121,9 +122,12 @@ def _changed(handle: viser.SceneNodeHandle, old: Thing, new: Thing) -> bool:
     """Change what is on the page into a new thing, if it is near enough to the old one."""
     node = cast(Any, handle)  # every kind has attributes of its own
     match old, new:
-        case Body(), Body() if old.side == new.side and np.array_equal(old.faces, new.faces):
-            node.vertices = new.vertices.astype(np.float32)
+        case Body(), Body() if old.side == new.side and _same_faces(old, new):
+            if new.vertices is not old.vertices:
+                node.vertices = new.vertices.astype(np.float32)
             node.color, node.opacity = new.colour, new.opacity
+            if new.place != old.place:
+                node.position = new.place
         case Cloud(), Cloud() if old.size == new.size:
             node.points, node.colors = new.points.astype(np.float32), new.colours
         case Arrow(), Arrow() if (old.colour, old.thickness) == (new.colour, new.thickness):
@@ -135,6 +139,10 @@ def _changed(handle: viser.SceneNodeHandle, old: Thing, new: Thing) -> bool:
         case _:
             return False
     return True
+
+
+def _same_faces(old: Body, new: Body) -> bool:
+    return old.faces is new.faces or np.array_equal(old.faces, new.faces)
 
 
 def _alike(old: Line, new: Line) -> bool:

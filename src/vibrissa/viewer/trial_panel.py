@@ -115,6 +115,10 @@ class TrialMode:
         for view, shown in self._pictures:
             image = self._videos[view.number].frame(frame) if self._videos else None
             shown.image = picture(view, trial, frame, image)
+
+    def write(self) -> None:
+        """Write the signals of now, and where now is."""
+        trial, frame = self.trial, self.frame
         passed = float(trial.time[frame] - trial.time[0])
         put(self._time, _MS * passed)
         self._cursor.content = cursor(passed / max(float(np.ptp(trial.time)), 1e-12))
@@ -127,8 +131,7 @@ class TrialMode:
             self._now = time
             self.frame = self.trial.at(time)
             if self._page.mode is self:
-                self.redraw()
-                self._page.server.flush()
+                self._page.redraw()
 
         self._page.work.put("time", job)
 
@@ -165,12 +168,12 @@ class TrialMode:
     def _choose(self, name: str) -> None:
         self._whisker = self.trial.names.index(name)
         self._page.work.put("chart", self._draw_chart)
-        self._page.work.put("time", self.redraw)
+        self._page.work.put("time", self._page.redraw)
 
     def _see(self, objects: bool | None = None, fit: bool | None = None) -> None:
         self._objects = self._objects if objects is None else objects
         self._fit = self._fit if fit is None else fit
-        self._page.work.put("time", self.redraw)
+        self._page.work.put("time", self._page.redraw)
 
     def _draw_chart(self) -> None:
         trial, i = self.trial, self._whisker

@@ -1,9 +1,14 @@
-"""How every test runs: figures without a window, random inputs without a deadline, one browser."""
+"""How every test runs: figures without a window, one thread of BLAS, random inputs without a
+deadline, one browser."""
 
 import os
 import shutil
 
 os.environ.setdefault("MPLBACKEND", "Agg")
+# The matrices are small and there is a worker on every core: threads of BLAS, which wait by turning
+# on the spot, would only take the cores from each other. They are counted when NumPy is imported.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
 from hypothesis import settings

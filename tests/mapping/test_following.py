@@ -51,23 +51,23 @@ def followed(contacts, trial, names, seed):
     return np.array(squares), np.array(first), np.array(ours), surely_wrong / seen
 
 
-@pytest.mark.parametrize("names", ["Fx FT MD", "FT FD MB"])
-def test_the_right_one_of_several_contacts_is_followed(curved, names):
+@pytest.mark.parametrize(
+    ("names", "several"), [("Fx FT MD", 60), ("FT FD MB", 60), ("FT MB MD", 60), ("Fx MB MD", 15)]
+)
+def test_the_right_one_of_several_contacts_is_followed_as_surely_as_said(curved, names, several):
+    """More often than the contact of least force; the error has χ² of three degrees of freedom."""
     runs = [followed(*curved, names, seed) for seed in range(3)]
-    first, ours = (np.concatenate([run[i] for run in runs]) for i in (1, 2))
-    assert len(first) > 60
-    assert first.mean() < 0.9
-    assert ours.mean() > 0.85
-    assert (1.0 - ours.mean()) < 0.5 * (1.0 - first.mean())
-    assert np.mean([run[3] for run in runs]) < 0.06
-
-
-def test_a_filter_is_as_sure_as_it_says(curved):
-    """The error of three components has χ² of three degrees of freedom."""
-    squares = np.concatenate([followed(*curved, "Fx MB MD", seed)[0] for seed in range(4)])
-    assert len(squares) > 250
+    squares, first, ours = (np.concatenate([run[i] for run in runs]) for i in range(3))
+    assert len(first) > several
+    assert ours.mean() >= first.mean()
+    assert ours.mean() > 0.75
+    if several == 60:
+        assert ours.mean() > 0.9
+        assert (1.0 - ours.mean()) < 0.6 * (1.0 - first.mean())
+    assert len(squares) > 180
     assert 1.5 < squares.mean() < 4.5
-    assert np.mean(squares > 7.81) < 0.15  # 5 % in theory
+    assert np.mean(squares > 7.81) < 0.12  # 5 % in theory
+    assert np.mean([run[3] for run in runs]) < 0.01
 
 
 @pytest.fixture(scope="module")
@@ -156,6 +156,10 @@ def test_a_filter_forgets_a_contact_that_is_lost_and_waits_for_what_is_missing(w
     assert np.linalg.norm(again.point - point) < 0.01
     with pytest.raises(ValueError, match="time goes on"):
         follow(time[3], wrench[3], turn[3], base[3])
+    with pytest.raises(ValueError, match="finite"):
+        follow(np.nan, wrench[3], turn[3], base[3])
+    after_a_gap = follow(time[3] + 1e4, wrench[4], turn[4], base[4])
+    assert np.linalg.norm(after_a_gap.point - point) < 0.01
     heavy = Sensor(noise=np.repeat([1e-3, 1e-4], 3), mass=1e-3)
     with pytest.raises(ValueError, match="the rotation from whisker to laboratory is needed"):
         vb.ContactFilter(vb.Estimator.of_sensor(wire, heavy))(0.0, wrench[0], position=base[0])

@@ -326,3 +326,83 @@ def test_two_moments_tell_stiffness_too(wire, touched):
     assert abs(away) < 4.0
     with pytest.raises(ValueError, match="nothing is felt, or its sign"):
         fit_stiffness(wire, touched.contact_point, -readings, sensor)
+
+
+def test_a_weight_that_comes_out_negative_is_said(rng):
+    """Far from zero it is a fault of sign; within noise there is no mass."""
+    turn = Rotation.random(25, random_state=3).as_matrix()
+    noise = np.repeat([1e-3, 1e-5], 3)
+    heavy = Sensor(noise=noise, mass=0.03)
+    readings = heavy.read(np.arange(25.0), np.zeros((25, 6)), rotation=turn)
+    with pytest.raises(ValueError, match=r"weigh -30 ± .* g.*reaction"):
+        calibrate_weight(Sensor(noise=noise), readings, turn, gravity=(0.0, 0.0, 9.81))
+    bias = rng.normal(size=6)
+    empty = Sensor(noise=noise, bias=bias)
+    found = [
+        calibrate_weight(
+            Sensor(noise=noise), empty.read(np.arange(25.0), np.zeros((25, 6)), seed), turn
+        )
+        for seed in range(6)
+    ]
+    weightless = [one for one in found if one.sensor.mass == 0.0]
+    assert 0 < len(weightless) < 6
+    for one in weightless:
+        assert not one.covariance[6].any()
+        away = one.sensor.bias - bias
+        assert away @ np.linalg.solve(one.covariance[:6, :6], away) < 25.0
+
+
+def test_contacts_that_are_not_known_are_left_out(wire, touched):
+    readings = wrench_of(touched)[:, [4, 5]]
+    points = touched.contact_point.copy()
+    points[3] = np.nan
+    found, clean = (
+        calibrate_on_contacts(wire, p, y, components=("My", "Mz"))
+        for p, y in (
+            (points, readings),
+            (np.delete(points, 3, axis=0), np.delete(readings, 3, axis=0)),
+        )
+    )
+    np.testing.assert_allclose(found.sensor.mixing, clean.sensor.mixing, rtol=1e-9)
+    with pytest.raises(ValueError, match="none of 60 rows"):
+        calibrate_on_contacts(wire, np.full((60, 3), np.nan), readings)
+    with pytest.raises(ValueError, match=r"points are \(n, 3\)"):
+        calibrate_on_contacts(wire, points[:, :2], readings)
+
+
+def test_contacts_that_leave_something_open_are_refused_by_name(wire):
+    """All in one plane, all at one place, too few."""
+    flat = vb.deflect(wire, vb.PointForce(np.linspace(0.1, 0.3, 20), 0.03, np.zeros(20)))
+    readings = np.zeros((20, 2))
+    with pytest.raises(ValueError, match="say nothing about Fz, My: touch the whisker at other"):
+        calibrate_on_contacts(
+            wire, flat.contact_point, readings, components=("Fy", "Fz", "My", "Mz")
+        )
+    with pytest.raises(ValueError, match="3 equations do not determine 5 unknowns: touch"):
+        calibrate_on_contacts(
+            wire, flat.contact_point[:3], readings[:3], components=("Fy", "Fz", "My", "Mz")
+        )
+
+
+@pytest.mark.parametrize(
+    ("time", "said"), [([0.0, 0.2, 0.1], "0.1 s after 0.2 s"), ([0.0, np.nan, 1.0], "nan s")]
+)
+def test_time_that_falls_or_is_not_finite_is_refused(time, said):
+    with pytest.raises(ValueError, match=said):
+        Sensor(drift=1e-6).read(time, np.zeros((3, 6)))
+    with pytest.raises(ValueError, match=r"wrenches \(n, 6\) are needed"):
+        Sensor().read(np.arange(3.0), np.zeros((2, 6)))
+
+
+def test_a_saturated_reading_tells_nothing(tmp_path):
+    sensor = Sensor(("My", "Mz"), noise=1e-9, bias=[0.5, 0.0], largest=[1.0, np.inf])
+    readings = sensor.read(np.arange(3.0), np.outer([0.1, 0.4, 3.0], [0, 0, 0, 0, 1.0, 1.0]))
+    assert readings[2, 0] == 1.0
+    felt = sensor.felt(readings)
+    np.testing.assert_allclose(felt[:2, 0], [0.1, 0.4], atol=1e-7)
+    assert np.isnan(felt[2, 0])
+    assert np.isfinite(felt[:, 1]).all()
+    save_sensor(tmp_path / "sensor.toml", sensor)
+    np.testing.assert_array_equal(load_sensor(tmp_path / "sensor.toml").largest, sensor.largest)
+    with pytest.raises(ValueError, match=r"largest is 0\.0; it must be positive"):
+        Sensor(largest=0.0)

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 import vibrissa as vb
-from vibrissa.cli.streaming import stream
+from vibrissa.cli.streaming import _advice, stream
+from vibrissa.io.rosbag import bag_wrenches
 from vibrissa.mapping import ContactFilter, Estimator
 from vibrissa.sensing import Sensor, SensorFrame, save_sensor
 from vibrissa.streaming import ContactStream
@@ -122,6 +123,11 @@ def test_bad_lines_are_said_and_passed_over(gamma_map, wrench):
         ("0.0,1e-5\r2,0,0,0,0,0", "no CSV"),
         ('{"Fx": 1' + 400 * "0" + ', "MB": 1e-6, "MD": 0.5}', "larger than any number"),
         ('{"Fx": ' + 100_000 * "[", "no JSON"),
+        ("nan,0,0,0,0,0,0", "time is 'nan'; a finite number"),
+        (",0,0,0,0,0,0", "time is ''"),
+        ('{"time": Infinity, "Fx": 1e-5, "MB": 1e-6, "MD": 0.5}', "time is inf"),
+        ("0.1,1e-5,2e-5,0,0,3", "6 cells; the header has 7"),
+        ("0.1,1e-5,2e-5,0,0,1e-7,3.4e", "no number"),
     ],
 )
 def test_no_line_ends_a_stream(gamma_map, wrench, line, error):
@@ -130,6 +136,44 @@ def test_no_line_ends_a_stream(gamma_map, wrench, line, error):
     records = list(ContactStream(estimator(gamma_map)).records([good[0], line, good[1]]))
     assert error in records[0]["error"]
     assert records[1]["status"] == "unique"
+
+
+def test_garbage_gives_faults_only(gamma_map, wrench):
+    """Random bytes, as from a stranger's datagrams, and lines cut anywhere."""
+    rng = np.random.default_rng(7)
+    good = list(csv_lines(wrench))
+    garbage = [rng.bytes(n).decode("utf-8", errors="replace") for n in rng.integers(1, 80, 300)]
+    cut = [good[1][:n] for n in range(1, len(good[1]) - 30)]
+    running = ContactStream(estimator(gamma_map))
+    records = list(running.records([*garbage[:150], good[0], *garbage[150:], *cut, good[1]]))
+    assert all("error" in record for record in records[:-1])
+    assert records[-1]["status"] == "unique"
+    for record in records:
+        assert json.loads(as_json(record))
+
+
+def test_a_sender_of_json_may_begin_anew_as_well(gamma_map, wrench):
+    """JSON has no header: time that falls far tells; a little is a sample that comes too late."""
+    contacts = estimator(gamma_map)
+    running = ContactStream(contacts, follow=ContactFilter(contacts))
+    rows = [dict(zip(COMPONENTS, row, strict=True)) for row in wrench.tolist()]
+    times = (100.0, 100.001, 100.001, 100.0, 0.0, 0.001)
+    lines = [json.dumps({"time": t} | row) for t, row in zip(times, rows, strict=False)]
+    records = list(running.records(lines))
+    assert ["error" in record for record in records] == [False, False, True, True, False, False]
+    assert "time goes on" in records[2]["error"]
+    assert records[4]["status"] == "unique"
+
+
+@pytest.mark.parametrize(
+    ("factor", "advice"), [(1000.0, "larger than any"), (1e-3, "far from zero"), (1.0, "")]
+)
+def test_wrong_units_are_suspected(gamma_map, wrench, factor, advice):
+    running = ContactStream(estimator(gamma_map, "Fx FT MB MD", felt_above=5.0))
+    list(running.records(csv_lines(factor * wrench)))
+    said = _advice(running)
+    assert advice in said
+    assert bool(advice) == bool(said)
 
 
 def test_a_sender_that_begins_anew_may_begin_time_anew(gamma_map, bent, wrench):
@@ -170,6 +214,8 @@ def test_a_filter_gives_the_laboratory_by_the_pose_in_the_line(gamma_map, bent, 
     lab = [record[name] for name in ("lab_x", "lab_y", "lab_z")]
     np.testing.assert_allclose(lab, [0.1 - y, 0.2 + x, 0.3 + z], atol=1e-7)
     np.testing.assert_allclose([record[n] for n in "xyz"], bent.contact_point[8], atol=1e-7)
+    sigma, lab_sigma = ([record[f"{p}sigma_{n}"] for n in "xyz"] for p in ("", "lab_"))
+    np.testing.assert_allclose(lab_sigma, [sigma[1], sigma[0], sigma[2]], rtol=1e-6)
     for lost in ({"base_qw": None}, {"base_x": None}):
         contacts.reset()
         (record,) = ContactStream(contacts, follow=ContactFilter(contacts)).records(
@@ -256,26 +302,52 @@ def test_the_verb_listens_to_udp_with_a_sensor(map_file, bent, wrench, tmp_path)
         np.testing.assert_allclose([record[n] for n in "xyz"], point, atol=1e-7)
 
 
-def test_a_bag_goes_in_and_a_bag_comes_out(map_file, bent, wrench, tmp_path, capsys):
-    pytest.importorskip("rosbags")
-    from rosbags.highlevel import AnyReader
+def write_wrenches(path, topics, sec=7):
+    """A bag with WrenchStamped messages a millisecond apart."""
     from rosbags.rosbag2 import Writer
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
-    t = store.types
-    with Writer(tmp_path / "in", version=Writer.VERSION_LATEST) as writer:
-        kind = "geometry_msgs/msg/WrenchStamped"
-        topic = writer.add_connection("/wrench", kind, typestore=store)
-        for i, row in enumerate(wrench):
-            stamp = t["builtin_interfaces/msg/Time"](sec=7, nanosec=1_000_000 * i)
-            header = t["std_msgs/msg/Header"](stamp=stamp, frame_id="sensor")
-            force = t["geometry_msgs/msg/Vector3"](*row[:3].tolist())
-            torque = t["geometry_msgs/msg/Vector3"](*row[3:].tolist())
-            both = t["geometry_msgs/msg/Wrench"](force=force, torque=torque)
-            message = t[kind](header=header, wrench=both)
-            raw = store.serialize_cdr(message, kind)
-            writer.write(topic, 7_000_000_000 + 1_000_000 * i, raw)
+    t, kind = store.types, "geometry_msgs/msg/WrenchStamped"
+    with Writer(path, version=Writer.VERSION_LATEST) as writer:
+        for name, wrenches in topics.items():
+            topic = writer.add_connection(name, kind, typestore=store)
+            for i, row in enumerate(wrenches):
+                nanosec = 1_000_000 * i if sec else 0
+                stamp = t["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec)
+                header = t["std_msgs/msg/Header"](stamp=stamp, frame_id="sensor")
+                force = t["geometry_msgs/msg/Vector3"](*row[:3].tolist())
+                torque = t["geometry_msgs/msg/Vector3"](*row[3:].tolist())
+                both = t["geometry_msgs/msg/Wrench"](force=force, torque=torque)
+                raw = store.serialize_cdr(t[kind](header=header, wrench=both), kind)
+                writer.write(topic, 7_000_000_000 + 1_000_000 * i, raw)
+
+
+def test_bags_that_hold_something_else(wrench, tmp_path):
+    pytest.importorskip("rosbags")
+    write_wrenches(tmp_path / "two", {"/left": wrench[:2], "/right": wrench[2:3]})
+    with pytest.raises(ValueError, match=r"name one of those .*: /left, /right"):
+        list(bag_wrenches(tmp_path / "two"))
+    with pytest.raises(ValueError, match="no '/up' with wrenches; name one of those"):
+        list(bag_wrenches(tmp_path / "two", "/up"))
+    assert len(list(bag_wrenches(tmp_path / "two", "/right"))) == 1
+    write_wrenches(tmp_path / "empty", {"/wrench": wrench[:0]})
+    assert list(bag_wrenches(tmp_path / "empty")) == []
+    write_wrenches(tmp_path / "nothing", {})
+    with pytest.raises(ValueError, match="no topic with WrenchStamped messages, only none at all"):
+        list(bag_wrenches(tmp_path / "nothing"))
+    write_wrenches(tmp_path / "unstamped", {"/wrench": wrench[:3]}, sec=0)
+    times = [time for time, _, _ in bag_wrenches(tmp_path / "unstamped")]
+    assert times == pytest.approx([7.0, 7.001, 7.002])
+
+
+def test_a_bag_goes_in_and_a_bag_comes_out(map_file, bent, wrench, tmp_path, capsys):
+    pytest.importorskip("rosbags")
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    write_wrenches(tmp_path / "in", {"/wrench": wrench})
     stream(tmp_path / "in", chart=map_file, bag=tmp_path / "out")
     output = capsys.readouterr().out
     records = [json.loads(line) for line in output.splitlines()]

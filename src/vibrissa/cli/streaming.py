@@ -22,6 +22,10 @@ if TYPE_CHECKING:
     from vibrissa.streaming import ContactStream
 
 
+# A share of samples from which on something is wrong in general.
+_NEARLY_ALL = 0.9
+
+
 def stream(
     source: Annotated[
         Path | None,
@@ -156,6 +160,26 @@ def stream(
         f"{running.samples} samples, {running.faults} lines that could not be read",
         highlight=False,
     )
+    if advice := _advice(running):
+        errors.print(advice, highlight=False, soft_wrap=True)
+
+
+def _advice(running: ContactStream) -> str:
+    """What may be wrong where hardly any sample gave a contact."""
+    counts, all_of_them = running.statuses, running.samples
+    if not all_of_them:
+        return ""
+    if counts["outside_map"] > _NEARLY_ALL * all_of_them:
+        return (
+            "Nearly all signals are larger than any that this whisker can give: are they in N and "
+            "N·m, is the offset taken away, and is the whisker's stiffness right?"
+        )
+    if counts["no_contact"] == all_of_them:
+        return (
+            "No signal was so far from zero that a contact is felt: are they in N and N·m, and is "
+            "the noise as it was said to be?"
+        )
+    return ""
 
 
 def _lines(source: Path | None, udp: str | None, opened: ExitStack) -> Iterator[str]:

@@ -57,7 +57,7 @@ def bag_wrenches(
     Yields
     ------
     time : float
-        Of the message's header, s.
+        Of the message's header, s; where that is zero, when it was recorded.
     wrench : array (6,)
         Force, N, and torque, N·m.
     frame : str
@@ -86,17 +86,26 @@ def bag_wrenches(
         if topic is None and len(there) == 1:
             topic = there[0]
         if topic not in there:
-            said = ", ".join(there) or "none"
-            raise ValueError(f"{path}: name one topic of WrenchStamped messages; it has {said}")
+            raise ValueError(f"{path}: {_which_topic(reader.connections, there, topic)}")
         chosen = [c for c in reader.connections if c.topic == topic and c.msgtype == _WRENCH]
-        for connection, _, raw in reader.messages(connections=chosen):
+        for connection, recorded, raw in reader.messages(connections=chosen):
             message: Any = reader.deserialize(raw, connection.msgtype)
             stamp = message.header.stamp
             f, t = message.wrench.force, message.wrench.torque
             wrench = np.array([f.x, f.y, f.z, t.x, t.y, t.z])
-            yield stamp.sec + 1e-9 * stamp.nanosec, wrench, message.header.frame_id
+            time = stamp.sec + 1e-9 * stamp.nanosec or 1e-9 * recorded
+            yield time, wrench, message.header.frame_id
     finally:
         reader.close()
+
+
+def _which_topic(connections: Any, there: list[str], topic: str | None) -> str:
+    """Say why it is open from which topic wrenches are read."""
+    if there:
+        lacks = "" if topic is None else f"there is no {topic!r} with wrenches; "
+        return f"{lacks}name one of those with WrenchStamped messages: {', '.join(there)}"
+    others = sorted({f"{c.topic} ({c.msgtype})" for c in connections})
+    return f"it has no topic with WrenchStamped messages, only {', '.join(others) or 'none at all'}"
 
 
 class ContactBag:

@@ -28,7 +28,7 @@ class Drift:
     def __init__(self, speed: float, persistence: float) -> None:
         self.speed, self._tau = speed, persistence
 
-    def over(self, step: float) -> tuple[Array, Array]:
+    def over(self, step: float) -> tuple[float, float, Array]:
         """What happens in some time.
 
         Parameters
@@ -38,21 +38,23 @@ class Drift:
 
         Returns
         -------
-        by : (6, 6) array
-            (p, v) after, by (p, v) before.
-        noise : (6, 6) array
-            Covariance of what is added.
+        moved : float
+            How far p goes by v, s.
+        kept : float
+            Share of v that is left.
+        grown : (3,) array
+            Variances of a component that are added: of p, of p with v, and of v.
         """
         tau, speed = self._tau, self.speed
         x = step / tau
         a = math.exp(-x)
-        moved = tau * (1.0 - a)
-        by = np.eye(6)
-        by[:3, 3:], by[3:, 3:] = moved * np.eye(3), a * np.eye(3)
         # 2x - 3 + 4a - a² loses its digits where x is small.
         walked = 2.0 * x - 3.0 + 4.0 * a - a * a if x > 0.01 else x**3 * (2.0 / 3.0 - 0.5 * x)
-        noise = np.zeros((6, 6))
-        noise[:3, :3] = (speed * tau) ** 2 * walked * np.eye(3)
-        noise[:3, 3:] = noise[3:, :3] = speed**2 * tau * (1.0 - a) ** 2 * np.eye(3)
-        noise[3:, 3:] = speed**2 * (1.0 - a * a) * np.eye(3)
-        return by, noise
+        grown = np.array(
+            [
+                (speed * tau) ** 2 * walked,
+                speed**2 * tau * (1.0 - a) ** 2,
+                speed**2 * (1.0 - a * a),
+            ]
+        )
+        return tau * (1.0 - a), a, grown

@@ -2,23 +2,14 @@
 
 What a whisker touches mostly stands still, so in the laboratory the contact point moves smoothly
 while the base turns and travels. A hypothesis is a Gaussian over contact point p and velocity v,
-whose velocity forgets itself (Ornstein and Uhlenbeck):
+whose velocity forgets itself (:mod:`~vibrissa.mapping.drift`).
 
-    dp = v dt,    dv = -v dt / τ + σ √(2 / τ) dW.
-
-A measurement moves p to where χ² of the signals and of p - p_predicted together is least, with the
-exact rod in between; of two signals it moves p only across the curve of contacts that explains them
-(:mod:`~vibrissa.mapping.ambiguity`), and as the base moves, the curves of successive samples cross
-where the contact is. Each hypothesis is weighed by how well it predicted (Laplace's approximation),
-
-    log w ← log w - χ²/2 + ½ log(det P_after / det P_before),
-
-and every candidate that none of them accounts for starts another, as improbable as new contacts
-are, with all places on the map alike beforehand.
-
-An uncertain stiffness is the same error in all samples, which no averaging removes: how the state
-depends on it, b = ∂(p, v)/∂log(EI), is carried along, and σ²bbᵀ is part of the covariance (a
-"consider" parameter, as Schmidt had it).
+The first sample of a touch is taken apart into Gaussians (:mod:`~vibrissa.mapping.beginning`). Each
+further one moves them and weighs them by how well they predicted it
+(:mod:`~vibrissa.mapping.learning`); of two signals it moves p only across the curve of contacts
+that explains them (:mod:`~vibrissa.mapping.ambiguity`), and as the base moves, the curves of
+successive samples cross where the contact is. A candidate that no hypothesis accounts for starts
+another, as improbable as new contacts are.
 """
 
 from __future__ import annotations
@@ -28,20 +19,35 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.mapping.beginning import Beginning
+from vibrissa.mapping.beginning import Beginning, Gaussians
 from vibrissa.mapping.drift import Drift
 from vibrissa.mapping.estimator import Estimator
-from vibrissa.mapping.hypotheses import Followed, Hypothesis, tidied, told
-from vibrissa.mapping.learning import Learning
+from vibrissa.mapping.hypotheses import Followed, told
+from vibrissa.mapping.learning import learn
 from vibrissa.mapping.located import Located
+from vibrissa.mapping.mixture import Mixture, predict, room, tidy, unaccounted
 from vibrissa.mapping.readout import Measurement
-from vibrissa.rod.arrays import Array
+from vibrissa.mapping.whitening import explained
+from vibrissa.rod.arrays import AnyArray, Array
 from vibrissa.sensing.sensor import GRAVITY
 from vibrissa.status import Status
 
 _UNKNOWNS = 3
-# For so many samples after the first it is looked for all that noise may explain.
-_YOUNG = 20
+# Hypotheses less probable than this next to the best are dropped.
+_LEAST = 1e-6
+# At most so many are kept.
+_MOST = 24
+# Two hypotheses this near (Mahalanobis distance squared, by the sum of both covariances) are one.
+_ONE = 0.1
+# A candidate so far (the same) from every hypothesis is a new one.
+_NEW = 16.0
+# How far (over L) a whisker may have been bent before it was felt: where it is not known since when
+# it touches, and at least.
+_ANYWHERE = 0.3
+_LEAST_REACH = 0.01
+# After a gap in which a contact may have gone so far (over L) all begins anew if nothing is known
+# better than this (RMS error).
+_GAP, _FORGOTTEN = 0.1, 0.5
 
 
 class ContactFilter:
@@ -90,17 +96,19 @@ class ContactFilter:
             )
         self.estimator = estimator
         self._drift = Drift(speed / self._length, persistence)
-        pose = (pose_sigma / self._length) ** 2 * np.eye(3)
-        self._learning = Learning(estimator, pose)
-        self._beginning = Beginning(estimator, self._drift.speed, pose, math.log(birth))
-        self._stiffness = estimator.readout.how.stiffness
+        self._pose = (pose_sigma / self._length) ** 2
+        self._birth = math.log(birth)
+        self._beginning = Beginning(estimator)
+        how = estimator.readout.how
+        self._stiffness = how.stiffness
+        self._limit = explained(len(how.own))
         self.reset()
 
     def reset(self) -> None:
         """Forget everything, as when the whisker has lost touch."""
-        self._hypotheses: list[Hypothesis] = []
+        self._mixture = room(0)
         self._time: float | None = None
-        self._age = 0  # samples in a row that a hypothesis explained
+        self._free: tuple[float, Array, Array] | None = None  # when and where last nothing was felt
         self.estimator.reset()
 
     def __call__(
@@ -135,56 +143,140 @@ class ContactFilter:
         Raises
         ------
         ValueError
-            If time does not go on, the estimator refuses the signals, or its sensor carries a mass
-            and the rotation is not given.
+            If time does not go on or is not finite, the estimator refuses the signals, or its
+            sensor carries a mass and the rotation is not given.
         """
-        turn = np.eye(3) if rotation is None else np.asarray(rotation, dtype=np.float64)
-        base = np.zeros(3) if position is None else np.asarray(position, dtype=np.float64)
+        turn = np.ascontiguousarray(np.eye(3) if rotation is None else rotation, dtype=np.float64)
+        base = np.asarray(np.zeros(3) if position is None else position, dtype=np.float64)
         if turn.shape != (3, 3) or base.shape != (3,):
             raise ValueError(f"a pose is (3, 3) and (3,); got {turn.shape} and {base.shape}")
+        if not math.isfinite(time):
+            raise ValueError(f"time is a finite number, s; got {time!r}")
         if self._time is not None and not time > self._time:
             raise ValueError(f"time goes on; got {time} s after {self._time} s")
         measurement = self.estimator.measurement(signals, rotation, gravity)
+        base = base / self._length
         if self._time is not None:
             self._predict(time - self._time)
         self._time = time
-        base = base / self._length
         nothing = self.estimator.nothing_in(measurement)
         if nothing is None and not (np.isfinite(turn).all() and np.isfinite(base).all()):
             nothing = Status.MISSING
-        if nothing is not None:
-            if nothing != Status.MISSING:
-                self._hypotheses, self._age = [], 0
-            return self._known(nothing, None, turn, base)
-        self._hypotheses, explains = self._learning(self._hypotheses, measurement, turn, base)
-        self._age = self._age + 1 if explains else 0
-        located = None
-        if self.estimator.readout.told >= _UNKNOWNS or not explains:
-            located = self.estimator.locate(measurement)
-            self._start(measurement, located, turn, base)
-        self._hypotheses = tidied(self._hypotheses)
-        status = Status.AMBIGUOUS if located is None else located.status
-        return self._known(status, located, turn, base)
+        if nothing is None:
+            return self._known(*self._learned(measurement, turn, base), turn, base)
+        if nothing != Status.MISSING:
+            self._mixture = room(0)
+            felt = nothing != Status.NO_CONTACT or not np.isfinite(turn).all()
+            self._free = None if felt else (time, turn, base)
+        return self._known(nothing, None, turn, base)
 
-    def _start(self, measurement: Measurement, located: Located, turn: Array, base: Array) -> None:
-        """Start hypotheses from what one sample tells."""
-        curve = located.status == Status.UNDERDETERMINED
-        if not curve and self._age <= _YOUNG and self.estimator.readout.told >= _UNKNOWNS:
-            found = self.estimator.explanations(measurement)
-        elif curve or located.status in (Status.UNIQUE, Status.AMBIGUOUS):
-            found = self._beginning.candidates(located)
-        else:
-            return
-        self._hypotheses = self._beginning(
-            self._hypotheses, measurement, found, turn, base, curve=curve
-        )
+    def _learned(
+        self, measurement: Measurement, turn: Array, base: Array
+    ) -> tuple[Status, Located | None]:
+        """Take a measurement that is not empty: what it alone tells."""
+        three = self.estimator.readout.told >= _UNKNOWNS
+        located = self.estimator.locate(measurement) if three else None
+        x, values = np.empty((0, 4)), np.empty((0, 6))
+        if located is not None and located.status in (Status.UNIQUE, Status.AMBIGUOUS):
+            x, values = self._beginning.exact(located)
+        first = not len(self._mixture.weight)
+        explains = not first and self._update(measurement, x, values, turn, base)
+        if not three and not explains:
+            located = self.estimator.locate(measurement)
+        lost = not len(self._mixture.weight)
+        reach = self._reach(turn, base) if first else _ANYWHERE
+        prior = 0.0 if lost else self._birth
+        if three and lost:
+            assert located is not None
+            found = self._beginning.all_that_may_be(measurement, located, reach)
+            self._add(found, turn, base, prior)
+        elif len(x) and located is not None:
+            new = self._unaccounted(values, located, turn, base)
+            if new.any():
+                found = self._beginning.candidates(measurement, located, reach)
+                self._add(Gaussians(*(part[new] for part in found)), turn, base, prior)
+        elif located is not None and located.status == Status.UNDERDETERMINED:
+            found = self._beginning.samples(measurement, located, reach)
+            self._add(found, turn, base, prior)
+        self._free = None
+        return Status.AMBIGUOUS if located is None else located.status, located
+
+    def _update(
+        self, measurement: Measurement, x: Array, values: Array, turn: Array, base: Array
+    ) -> bool:
+        """Let all hypotheses learn; whether any of them explains the measurement."""
+        chart, readout = self.estimator.contacts.chart, self.estimator.readout
+        most = len(self._mixture.weight) * (1 + len(x))
+        out, misfits = room(most), np.empty(most)
+        try:
+            n = learn(
+                chart.discretization.rod,
+                chart.fold,
+                chart.proximal,
+                readout.how,
+                measurement.target,
+                measurement.measured,
+                readout.passes,
+                turn,
+                base,
+                self._pose,
+                self._mixture,
+                x,
+                values,
+                out,
+                misfits,
+            )
+        except np.linalg.LinAlgError:  # a covariance that rounding has made singular
+            n = 0
+        explains = bool((misfits[:n] < self._limit).any())
+        self._mixture = _tidied(out, n)
+        return explains
+
+    def _unaccounted(self, values: Array, located: Located, turn: Array, base: Array) -> AnyArray:
+        """Which candidates (n,) no hypothesis accounts for."""
+        own = turn @ (located.covariances / self._length**2) @ turn.T
+        out = np.empty(len(values), np.bool_)
+        points = values[:, 3:] @ turn.T + base
+        unaccounted(self._mixture, self._stiffness, points, own, _NEW, out)
+        return out
+
+    def _reach(self, turn: Array, base: Array) -> float:
+        """How far whisker and things may have moved toward each other since nothing was felt."""
+        if self._free is None or self._time is None:
+            return _ANYWHERE
+        time, *pose = self._free
+        moved = self._beginning.moved(turn, base, (pose[0], pose[1]))
+        moved += 3.0 * self._drift.speed * (self._time - time)
+        return min(max(moved, _LEAST_REACH), _ANYWHERE)
+
+    def _add(self, found: Gaussians, turn: Array, base: Array, log_prior: float) -> None:
+        """Put Gaussians of the whisker's frame to the hypotheses."""
+        n, old = len(found.weights), len(self._mixture.weight)
+        out = room(old + n)
+        for mine, before in zip(out, self._mixture, strict=True):
+            mine[:old] = before
+        out.mean[old:, :3] = found.values[:, 3:] @ turn.T + base
+        out.spread[old:, :3, :3] = turn @ found.covariances @ turn.T + self._pose * np.eye(3)
+        out.spread[old:, 3:, 3:] = self._drift.speed**2 * np.eye(3)
+        out.by_stiffness[old:, :3] = found.by_stiffness @ turn.T
+        out.contact[old:], out.value[old:] = found.contacts, found.values
+        out.weight[old:] = found.weights + log_prior
+        self._mixture = _tidied(out, old + n)
 
     def _predict(self, step: float) -> None:
-        by, noise = self._drift.over(step)
-        for one in self._hypotheses:
-            one.mean = by @ one.mean
-            one.spread = by @ one.spread @ by.T + noise
-            one.by_stiffness = by @ one.by_stiffness
+        if not len(self._mixture.weight):
+            return
+        predict(self._mixture, *self._drift.over(step))
+        if step * self._drift.speed < _GAP:
+            return
+        variance = np.trace(self._mixture.spread[:, :3, :3], axis1=1, axis2=2)
+        if (variance > _FORGOTTEN**2).all():
+            self._mixture = room(0)
 
     def _known(self, status: Status, located: Located | None, turn: Array, base: Array) -> Followed:
-        return told(self._hypotheses, self._stiffness, status, located, turn, base, self._length)
+        return told(self._mixture, self._stiffness, status, located, turn, base, self._length)
+
+
+def _tidied(mixture: Mixture, number: int) -> Mixture:
+    kept = tidy(mixture, number, _LEAST, _MOST, _ONE)
+    return Mixture(*(part[:kept] for part in mixture))

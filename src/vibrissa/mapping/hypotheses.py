@@ -1,31 +1,21 @@
-"""Hypotheses about where a contact is, and what a filter tells of them."""
+"""What a filter tells of its hypotheses."""
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
 from vibrissa.mapping.located import Located
-from vibrissa.rod.arrays import Array
+from vibrissa.mapping.mixture import Mixture
+from vibrissa.rod.arrays import Array, IntArray
 from vibrissa.status import Status
 
-# Two points within this (Mahalanobis distance squared) are one.
-_ONE = 1.0
-# Errors of a contact's force and arc length (relative to the force, and to L) up to which noise
-# moves it about linearly; a light touch whose place is not known so well teaches nothing yet.
-_LINEAR_FORCE = 0.3
-_LINEAR_ARC = 0.1
-#: Standard deviation, over L, with which a hypothesis starts that is not known so well.
-VAGUE = 0.2
-#: Hypotheses less probable than this next to the best are dropped.
-LEAST = 1e-6
-#: At most so many are kept, and of a curve or surface of candidates so many start.
-MOST = 24
 # What is surer than this is no longer ambiguous.
 _SURE = 0.99
+# Hypotheses nearer to each other (Mahalanobis distance squared, by the sum of both covariances) run
+# together: there is no gap between them.
+_TOGETHER = 4.0
 
 
 class Followed(NamedTuple):
@@ -34,13 +24,15 @@ class Followed(NamedTuple):
     Parameters
     ----------
     point : (3,) array
-        Contact point of the most probable hypothesis, laboratory frame, m; NaN if there is none.
+        Most probable contact point, laboratory frame, m; NaN if there is none. Where hypotheses run
+        together, as along the valley that a light touch leaves, it is their mean.
     covariance : (3, 3) array
         Of the contact point about it, m²: of all hypotheses, weighed by their probabilities.
     velocity : (3,) array
         Of the contact point in the laboratory, m/s.
     probability : float
-        Of that hypothesis, among those there are; 0 if there is none.
+        That the contact is there, within the spread of the hypotheses that run together; 0 if there
+        is none.
     status : Status
         ``UNIQUE`` where that is above 0.99, else ``AMBIGUOUS``; or why there is no contact.
     points : (k, 3) array
@@ -65,91 +57,17 @@ class Followed(NamedTuple):
     located: Located | None
 
 
-@dataclass
-class Hypothesis:
-    """Gaussian over (p, v), laboratory, in L and L/s; ξ as x (4,); its log weight.
-
-    A vague one stands for a light touch whose place noise does not leave a Gaussian: it is put in
-    place anew by each sample, and keeps its share of the probability, until its place is known.
-    """
-
-    mean: Array
-    spread: Array
-    x: Array
-    weight: float
-    vague: bool = False
-    by_stiffness: Array = field(default_factory=lambda: np.zeros(6))
-
-    def total(self, stiffness: float) -> Array:
-        """Covariance (6, 6) with that of the stiffness, by its relative standard deviation."""
-        b = stiffness * self.by_stiffness
-        return np.asarray(self.spread + np.outer(b, b))
-
-
-def linear(covariance: Array, x: Array) -> bool:
-    """Whether a contact x with this covariance of ξ is known well enough to linearise about it."""
-    arc, force = covariance[0, 0], np.trace(covariance[1:, 1:])
-    size = x[2] ** 2 + x[3] ** 2
-    return bool(0.0 <= arc < _LINEAR_ARC**2 and 0.0 <= force < _LINEAR_FORCE**2 * size)
-
-
-def bounded(covariance: Array) -> Array:
-    """A covariance with no standard deviation beyond that of a vague contact."""
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(vectors * np.clip(values, 0.0, VAGUE**2) @ vectors.T)
-
-
-def same(one: Hypothesis, other: Hypothesis) -> bool:
-    """Whether two hypotheses say the same: the less probable lies within the other's spread."""
-    away = one.mean[:3] - other.mean[:3]
-    return bool(away @ np.linalg.solve(other.spread[:3, :3], away) < _ONE)
-
-
-def gaps_between(points: Array) -> Array:
-    """Covariances (n, 3, 3) with which samples of a curve or surface fill what lies between them.
-
-    Along the ways to the nearest two others, half way.
-    """
-    apart = points[None] - points[:, None]
-    order = np.argsort((apart**2).sum(axis=2), axis=1)[:, 1:3]
-    near = np.take_along_axis(apart, order[:, :, None], axis=1)
-    return np.asarray(0.25 * np.einsum("nki,nkj->nij", near, near) / near.shape[1])
-
-
-def tidied(hypotheses: list[Hypothesis]) -> list[Hypothesis]:
-    """Sort and normalise; drop what is improbable, and one of two that have become the same.
-
-    Parameters
-    ----------
-    hypotheses : list of Hypothesis
-        In any order; weights are changed.
-
-    Returns
-    -------
-    list of Hypothesis
-        The most probable first; the exponentials of their weights sum to one.
-    """
-    if not hypotheses:
-        return []
-    ranked = sorted(hypotheses, key=lambda one: -one.weight)
-    best = ranked[0].weight
-    kept: list[Hypothesis] = []
-    for one in ranked:
-        if one.weight < best + math.log(LEAST) or len(kept) >= MOST:
-            break
-        twin = next((other for other in kept if same(one, other)), None)
-        if twin is None:
-            kept.append(one)
-        else:
-            twin.weight = float(np.logaddexp(twin.weight, one.weight))
-    total = float(np.logaddexp.reduce([one.weight for one in kept]))
-    for one in kept:
-        one.weight -= total
-    return sorted(kept, key=lambda one: -one.weight)
+def nothing_known(status: Status, located: Located | None) -> Followed:
+    """Tell that there is no hypothesis, and why."""
+    none = np.full(3, np.nan)
+    empty = np.empty((0, 3))
+    return Followed(
+        none, np.full((3, 3), np.nan), none, 0.0, status, empty, np.empty(0), none, located
+    )
 
 
 def told(
-    hypotheses: list[Hypothesis],
+    mixture: Mixture,
     stiffness: float,
     status: Status,
     located: Located | None,
@@ -161,8 +79,8 @@ def told(
 
     Parameters
     ----------
-    hypotheses : list of Hypothesis
-        The most probable first.
+    mixture : Mixture
+        The hypotheses, the most probable first.
     stiffness : float
         Relative standard deviation of the whisker's stiffness.
     status : Status
@@ -179,36 +97,58 @@ def told(
     Followed
         Of them.
     """
-    none = np.full(3, np.nan)
-    if not hypotheses:
-        return Followed(
-            none,
-            np.full((3, 3), np.nan),
-            none,
-            0.0,
-            status,
-            np.empty((0, 3)),
-            np.empty(0),
-            none,
-            located,
-        )
-    best = hypotheses[0]
-    weights = np.exp([one.weight for one in hypotheses])
-    weights = weights / weights.sum()
+    n = len(mixture.weight)
+    if not n:
+        return nothing_known(status, located)
+    weights = np.exp(mixture.weight)
+    points, spreads = mixture.mean[:, :3], mixture.spread[:, :3, :3]
+    if stiffness > 0.0:
+        b = stiffness * mixture.by_stiffness[:, :3]
+        spreads = spreads + b[:, :, None] * b[:, None, :]
+    if n == 1:
+        mean, probability, covariance = mixture.mean[0], 1.0, spreads[0]
+    else:
+        group = _groups(points, spreads)
+        shares = np.bincount(group, weights)
+        best = group == shares.argmax()
+        mean = weights[best] @ mixture.mean[best] / weights[best].sum()
+        probability = float(min(shares.max(), 1.0))
+        away = points - mean[:3]
+        covariance = np.tensordot(weights, spreads, axes=1) + (away.T * weights) @ away
     if status != Status.MISSING:
-        status = Status.UNIQUE if weights[0] > _SURE else Status.AMBIGUOUS
-    points = np.array([one.mean[:3] for one in hypotheses])
-    away = points - best.mean[:3]
-    spreads = [one.total(stiffness)[:3, :3] for one in hypotheses]
-    covariance = np.tensordot(weights, spreads, axes=1) + (away.T * weights) @ away
+        status = Status.UNIQUE if probability > _SURE else Status.AMBIGUOUS
     return Followed(
-        best.mean[:3] * length,
+        mean[:3] * length,
         covariance * length**2,
-        best.mean[3:] * length,
-        float(weights[0]),
+        mean[3:] * length,
+        probability,
         status,
         points * length,
         weights,
-        turn.T @ (best.mean[:3] - base) * length,
+        turn.T @ (mean[:3] - base) * length,
         located,
     )
+
+
+def _groups(points: Array, spreads: Array) -> IntArray:
+    """Number of the group (n,) that each hypothesis belongs to: those that run together."""
+    n = len(points)
+    apart = points[:, None] - points[None]
+    both = spreads[:, None] + spreads[None]
+    far = (apart * np.linalg.solve(both, apart[..., None])[..., 0]).sum(axis=-1)
+    near = far < _TOGETHER
+    group = np.full(n, -1)
+    number = 0
+    for i in range(n):
+        if group[i] >= 0:
+            continue
+        reached = np.zeros(n, np.bool_)
+        reached[i] = True
+        while True:
+            more = near[reached].any(axis=0) | reached
+            if (more == reached).all():
+                break
+            reached = more
+        group[reached] = number
+        number += 1
+    return group

@@ -1,9 +1,15 @@
-"""What hypotheses about a contact learn from one measurement.
+"""What hypotheses about a contact learn from one measurement, compiled.
 
-A measurement moves p to where χ² of the signals and of p - p_predicted together is least, with the
-exact rod in between. Each hypothesis is weighed by how well it predicted (Laplace's approximation),
+Each hypothesis is a Gaussian over (p, v). A measurement moves p to where χ² of the signals and of
+p - p_predicted together is least, with the exact rod in between. There may be several such places:
+two contacts that give the same signals part where they met, and a Gaussian that covers both becomes
+two. So the least is looked for from where the hypothesis was and from each contact that gives the
+signals exactly and is not far from the prediction. Each is weighed by Laplace's approximation,
 
-    log w ← log w - χ²/2 + ½ log(det P_after / det P_before).
+    log w ← log w - χ²/2 + ½ log(det P_after / det P_before) + log det W,
+
+with the weights W of the signals, which differ from contact to contact where noise of force and
+moment makes that of a direction.
 
 An uncertain stiffness is the same error in all samples, which no averaging removes: how the state
 depends on it, b = ∂(p, v)/∂log(EI), is carried along, and σ²bbᵀ is part of the covariance (a
@@ -12,165 +18,342 @@ depends on it, b = ∂(p, v)/∂log(EI), is carried along, and σ²bbᵀ is part
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
-from vibrissa.mapping.channels import CHANNELS, channel_derivatives, channel_gradients
-from vibrissa.mapping.estimator import Estimator
-from vibrissa.mapping.fitting import Fits, charted, fit
-from vibrissa.mapping.hypotheses import LEAST, Hypothesis, linear
-from vibrissa.mapping.readout import Measurement
-from vibrissa.mapping.weighing import weigh
-from vibrissa.mapping.whitening import explained
-from vibrissa.rod.arrays import Array
-from vibrissa.rod.batch import solve_forces
+from vibrissa.mapping.fitting import _fit, channel_equations
+from vibrissa.mapping.mixture import Mixture
+from vibrissa.mapping.weighing import Weighing, gradients, weigh
+from vibrissa.rod.arrays import Array, IntArray, Rod
+from vibrissa.rod.compiled import copy, inlined, kernel
+from vibrissa.rod.newton import point_determinant, stable
+from vibrissa.rod.reach import Fold
 
-_UNKNOWNS = 3
-_PLACE = ("px", "py", "pz")
+_TIMES = 8
+# A contact that gives the signals is a place to look from if it is no farther (Mahalanobis distance
+# squared) from the prediction.
+_GATE = 50.0
+# With one this near it is not looked for from where the hypothesis was as well.
+_NEAR = 4.0
+# Two places within this (over L, and ten times that relative to the force) are one.
+_SAME = 1e-3
+# Codes of px, py and pz among the channels.
+_PLACE = 11
 
 
-class Learning:
-    """Moves hypotheses to where measurement and prediction agree best.
+@inlined
+def _log_determinant(a: Array) -> float:
+    """Of a positive matrix (3, 3); -inf where it is not."""
+    d = (
+        a[0, 0] * (a[1, 1] * a[2, 2] - a[1, 2] * a[2, 1])
+        - a[0, 1] * (a[1, 0] * a[2, 2] - a[1, 2] * a[2, 0])
+        + a[0, 2] * (a[1, 0] * a[2, 1] - a[1, 1] * a[2, 0])
+    )
+    return float(np.log(d)) if d > 0.0 else -np.inf
+
+
+@kernel
+def log_weights(w: Array, q: int) -> float:
+    """Half the log determinant of W Wᵀ over its first q rows, for W (k, k)."""
+    low = np.zeros((q, q))
+    total = 0.0
+    for i in range(q):
+        for j in range(i + 1):
+            s = 0.0
+            for a in range(w.shape[1]):
+                s += w[i, a] * w[j, a]
+            for a in range(j):
+                s -= low[i, a] * low[j, a]
+            if i > j:
+                low[i, j] = s / low[j, j]
+            elif s > 0.0:
+                low[i, i] = np.sqrt(s)
+                total += np.log(low[i, i])
+            else:
+                return -np.inf
+    return total
+
+
+@inlined
+def _moment(value: Array) -> Array:
+    """P × F."""
+    out = np.empty(3)
+    out[0] = value[4] * value[2] - value[5] * value[1]
+    out[1] = value[5] * value[0] - value[3] * value[2]
+    out[2] = value[3] * value[1] - value[4] * value[0]
+    return out
+
+
+@kernel
+def _predictions(
+    mixture: Mixture,
+    turn: Array,
+    base: Array,
+    pose: float,
+    prior: Array,
+    before: Array,
+    root: Array,
+) -> None:
+    """Fill where hypotheses expect p in the whisker's frame, the covariance P, and P^(-1/2)."""
+    for i in range(len(mixture.weight)):
+        away = mixture.mean[i, :3] - base
+        for a in range(3):
+            prior[i, a] = turn[0, a] * away[0] + turn[1, a] * away[1] + turn[2, a] * away[2]
+        spread = mixture.spread[i, :3, :3].copy()
+        for a in range(3):
+            spread[a, a] += pose
+        before[i] = turn.T @ spread @ turn
+        root[i] = np.linalg.inv(np.linalg.cholesky(before[i]))
+
+
+@kernel
+def _starts(
+    mixture: Mixture,
+    prior: Array,
+    root: Array,
+    contacts: Array,
+    values: Array,
+    of: IntArray,
+    x: Array,
+    v: Array,
+) -> int:
+    """Fill from where the least is looked for, and of which hypothesis; how many."""
+    n, c = len(mixture.weight), len(contacts)
+    away, rows = np.empty(3), 0
+    for i in range(n):
+        near = False
+        for j in range(c):
+            for a in range(3):
+                away[a] = values[j, 3 + a] - prior[i, a]
+            far = 0.0
+            for a in range(3):
+                total = 0.0
+                for b in range(a + 1):
+                    total += root[i, a, b] * away[b]
+                far += total * total
+            if far > _GATE:
+                continue
+            near = near or far < _NEAR
+            copy(contacts[j], x[rows])
+            copy(values[j], v[rows])
+            of[rows] = i
+            rows += 1
+        if not near:
+            copy(mixture.contact[i], x[rows])
+            copy(mixture.value[i], v[rows])
+            of[rows] = i
+            rows += 1
+    return rows
+
+
+@kernel
+def _fits(
+    rod: Rod,
+    proximal: float,
+    how: Weighing,
+    target: Array,
+    measured: Array,
+    passes: int,
+    prior: Array,
+    root: Array,
+    of: IntArray,
+    rows: int,
+    x: Array,
+    v: Array,
+    t: Array,
+    chi: Array,
+) -> None:
+    """Move x to where χ² of measurement and prediction is least; fill the rest."""
+    k = how.codes.shape[0]
+    targets, weights = np.empty((rows, k + 3)), np.zeros((rows, k + 3, k + 3))
+    rest, own = np.zeros(rows, np.bool_), np.empty((k, k))
+    codes = np.empty(k + 3, np.int64)
+    codes[:k] = how.codes
+    for a in range(3):
+        codes[k + a] = _PLACE + a
+    for row in range(rows):
+        targets[row, :k], targets[row, k:] = target, prior[of[row]]
+        weights[row, k:, k:] = root[of[row]]
+    for _ in range(passes):
+        for row in range(rows):
+            if not weigh(how, v[row], measured, own):
+                own[:] = 0.0
+            weights[row, :k, :k] = own
+        _fit(rod, False, proximal, codes, targets, weights, x, v, t, chi, rest, 0, rows)
+        for row in range(rows):
+            for _ in range(_TIMES):
+                if rest[row] or not chi[row] < np.inf:
+                    break
+                _fit(
+                    rod, False, proximal, codes, targets, weights, x, v, t, chi, rest, row, row + 1
+                )
+
+
+@inlined
+def _known(x: Array, out: Mixture, first: int, found: int) -> bool:
+    """Whether a contact is one of those found before."""
+    force = np.hypot(x[2], x[3])
+    for other in range(first, found):
+        y = out.contact[other]
+        apart = np.hypot(y[2] - x[2], y[3] - x[3])
+        if abs(y[0] - x[0]) < _SAME and apart < 10.0 * _SAME * force:
+            return True
+    return False
+
+
+@kernel
+def _moved(
+    how: Weighing,
+    target: Array,
+    own: Array,
+    turn: Array,
+    pose: float,
+    mixture: Mixture,
+    i: int,
+    prior: Array,
+    before: Array,
+    root: Array,
+    x: Array,
+    v: Array,
+    t: Array,
+    chi: float,
+    out: Mixture,
+    row: int,
+) -> bool:
+    """Fill a row with what hypothesis i becomes at a least; False where that is no Gaussian."""
+    k = how.codes.shape[0]
+    residual, jacobian, slope = np.empty(k), np.empty((k, 4)), np.empty((k, 3))
+    by_xi = np.empty((3, 3))
+    for a in range(3):
+        by_xi[a, 0], by_xi[a, 1], by_xi[a, 2] = t[3 + a, 0], t[3 + a, 2], t[3 + a, 3]
+    channel_equations(x, v, t, how.codes, target, residual, jacobian)
+    for a in range(k):
+        slope[a, 0], slope[a, 1], slope[a, 2] = jacobian[a, 0], jacobian[a, 2], jacobian[a, 3]
+    seen = own @ slope @ np.linalg.inv(by_xi)
+    inverse = root.T @ root
+    after = np.linalg.inv(inverse + seen.T @ seen)
+    weight = 0.5 * (_log_determinant(after) - _log_determinant(before)) - 0.5 * chi
+    weight += log_weights(own, how.mixing.shape[0])
+    if not np.isfinite(weight):
+        return False
+    # In the laboratory; G carries what p learns over to v.
+    after, inverse = turn @ after @ turn.T, turn @ inverse @ turn.T
+    spread = mixture.spread[i]
+    gain = np.ascontiguousarray(spread[:, :3]) @ inverse
+    through = gain @ (np.eye(3) - after @ inverse)
+    keep = np.eye(6)
+    keep[:, :3] -= through
+    noise = after - after @ inverse @ after
+    b = mixture.by_stiffness[i].copy()
+    if how.stiffness > 0.0:
+        g, wrench = np.empty((k, 6)), np.empty(6)
+        wrench[:3], wrench[3:] = v[:3], _moment(v)
+        gradients(how.codes, wrench[:3], wrench[3:], g)
+        pushed = after @ (turn @ (seen.T @ (own @ (g @ wrench))))
+        for a in range(3):
+            for e in range(3):
+                noise[a, e] -= how.stiffness**2 * pushed[a] * pushed[e]
+        b = keep @ b + gain @ pushed
+    # What the base's own error adds passes through the same gain.
+    whole = keep @ spread @ keep.T + gain @ noise @ gain.T + pose * (through @ through.T)
+    step = gain @ (turn @ (v[3:] - prior))
+    for a in range(6):
+        out.mean[row, a] = mixture.mean[i, a] + step[a]
+        out.by_stiffness[row, a] = b[a]
+        out.value[row, a] = v[a]
+        for e in range(6):
+            out.spread[row, a, e] = 0.5 * (whole[a, e] + whole[e, a])
+    copy(x, out.contact[row])
+    out.weight[row] = mixture.weight[i] + weight
+    return True
+
+
+@kernel
+def learn(
+    rod: Rod,
+    fold: Fold,
+    proximal: float,
+    how: Weighing,
+    target: Array,
+    measured: Array,
+    passes: int,
+    turn: Array,
+    base: Array,
+    pose: float,
+    mixture: Mixture,
+    contacts: Array,
+    values: Array,
+    out: Mixture,
+    misfits: Array,
+) -> int:
+    """Update hypotheses.
 
     Parameters
     ----------
-    estimator : Estimator
-        Of single samples; it knows the noise.
-    pose : (3, 3) array
-        Covariance of the base's position, in L².
+    rod, fold, proximal : tuples of arrays, float
+        Of the whisker and its chart.
+    how : Weighing
+        Of the measurement.
+    target, measured : (k,) arrays
+        Of it.
+    passes : int
+        How often weights are taken anew at where the last fit ended.
+    turn, base : (3, 3), (3,) arrays
+        Pose of the base, in L.
+    pose : float
+        Variance of a component of its position.
+    mixture : Mixture
+        As predicted.
+    contacts, values : (c, 4), (c, 6) arrays
+        Contacts that give the signals, with (F, p).
+    out : Mixture
+        Filled; room for n (1 + c).
+    misfits : array
+        Filled: χ² of each.
+
+    Returns
+    -------
+    int
+        How many there are.
     """
-
-    def __init__(self, estimator: Estimator, pose: Array) -> None:
-        self._readout, self._chart = estimator.readout, estimator.contacts.chart
-        self._pose = pose
-        how = estimator.readout.how
-        self._names = tuple(CHANNELS[code] for code in how.codes)
-        self._limit = explained(len(how.own))
-
-    def __call__(
-        self, hypotheses: list[Hypothesis], measurement: Measurement, turn: Array, base: Array
-    ) -> tuple[list[Hypothesis], bool]:
-        """Update hypotheses.
-
-        Parameters
-        ----------
-        hypotheses : list of Hypothesis
-            As predicted; changed.
-        measurement : Measurement
-            That is not empty.
-        turn, base : (3, 3), (3,) arrays
-            Pose of the base, in L.
-
-        Returns
-        -------
-        hypotheses : list of Hypothesis
-            Those that can still be; vague ones as they were.
-        explained : bool
-            Whether any of them explains the measurement.
-        """
-        vague = [one for one in hypotheses if one.vague]
-        placed = [one for one in hypotheses if not one.vague]
-        share = math.fsum(math.exp(one.weight) for one in vague)
-        explains = False
-        if placed:
-            placed, explains = self._fitted(placed, measurement, turn, base)
-        if placed and vague:
-            total = float(np.logaddexp.reduce([one.weight for one in placed]))
-            for one in placed:
-                one.weight += math.log(max(1.0 - share, LEAST)) - total
-        return placed + vague, explains
-
-    def _fitted(
-        self, hypotheses: list[Hypothesis], measurement: Measurement, turn: Array, base: Array
-    ) -> tuple[list[Hypothesis], bool]:
-        """Update all hypotheses, none of them vague; whether any explains the measurement."""
-        how, chart = self._readout.how, self._chart
-        d, k, n = chart.discretization, len(self._names), len(hypotheses)
-        prior = np.empty((n, 3))
-        before = np.empty((n, 3, 3))
-        weights = np.zeros((n, k + 3, k + 3))
-        x = np.array([one.x for one in hypotheses])
-        for i, one in enumerate(hypotheses):
-            prior[i] = turn.T @ (one.mean[:3] - base)
-            before[i] = turn.T @ (one.spread[:3, :3] + self._pose) @ turn
-            weights[i, k:, k:] = np.linalg.inv(np.linalg.cholesky(before[i]))
-        values, _ = solve_forces(d, x)
-        usable = np.array(
-            [
-                self._weigh(measurement, value, out)
-                for value, out in zip(values, weights, strict=True)
-            ]
-        )
-        targets = np.column_stack([np.tile(measurement.target, (n, 1)), prior])
-        names = (*self._names, *_PLACE)
-        fits = fit(
-            d, names, targets, weights, x, friction=False, least=chart.proximal, worth=np.inf
-        )
-        good = usable & charted(chart, fits, chart.proximal) & np.isfinite(fits.misfits)
-        if how.stiffness > 0.0 or self._readout.passes > 1:
-            for i in np.flatnonzero(good).tolist():
-                self._weigh(measurement, fits.values[i], weights[i])
-        kept = []
-        for i in np.flatnonzero(good).tolist():
-            one = hypotheses[i]
-            if self._moved(one, fits, i, weights[i], before[i], prior[i], turn):
-                kept.append(one)
-        return kept, bool((good & (fits.misfits < self._limit)).any())
-
-    def _weigh(self, measurement: Measurement, value: Array, out: Array) -> bool:
-        k = len(self._names)
-        weights = np.empty((k, k))
-        good = weigh(self._readout.how, value, measurement.measured, weights)
-        out[:k, :k] = weights
-        return bool(good)
-
-    def _moved(
-        self,
-        one: Hypothesis,
-        fits: Fits,
-        i: int,
-        weights: Array,
-        before: Array,
-        prior: Array,
-        turn: Array,
-    ) -> bool:
-        """Update one hypothesis from its fit; False where that has no covariance."""
-        k, stiffness = len(self._names), self._readout.how.stiffness
-        value, slope = fits.values[i], fits.tangents[i][:, [0, 2, 3]]
-        try:
-            by_point = np.linalg.inv(slope[3:])  # ∂ξ/∂p
-            seen = weights[:k, :k] @ channel_derivatives(value, slope, self._names) @ by_point
-            inverse = np.linalg.inv(before)
-            after = np.linalg.inv(inverse + seen.T @ seen)
-        except np.linalg.LinAlgError:
-            return False
-        if not np.isfinite(after).all():
-            return False
-        one.x = fits.contacts[i]
-        told = self._readout.told >= _UNKNOWNS
-        if told and not linear(by_point @ after @ by_point.T, one.x):
-            one.vague = True
-            return True
-        ratio = np.linalg.slogdet(after)[1] - np.linalg.slogdet(before)[1]
-        one.weight += 0.5 * float(ratio) - 0.5 * float(fits.misfits[i])
-        # In the laboratory; G carries what p learns over to v.
-        after, inverse = turn @ after @ turn.T, turn @ inverse @ turn.T
-        gain = one.spread[:, :3] @ inverse
-        kept = np.eye(6)
-        kept[:, :3] -= gain @ (np.eye(3) - after @ inverse)
-        noise = after - after @ inverse @ after
-        b = one.by_stiffness
-        if stiffness > 0.0:
-            wrench = np.concatenate([value[:3], np.cross(value[3:], value[:3])])
-            grown = weights[:k, :k] @ channel_gradients(value, self._names) @ wrench
-            pushed = after @ (turn @ (seen.T @ grown))
-            noise = noise - stiffness**2 * np.outer(pushed, pushed)
-            b = kept @ b + gain @ pushed
-        # What the base's own error adds passes through the same gain.
-        through = gain @ (np.eye(3) - after @ inverse)
-        spread = kept @ one.spread @ kept.T + gain @ noise @ gain.T
-        spread = spread + through @ self._pose @ through.T
-        one.mean = one.mean + gain @ (turn @ (value[3:] - prior))
-        one.spread, one.by_stiffness = 0.5 * (spread + spread.T), b
-        return True
+    n, c, k = len(mixture.weight), len(contacts), how.codes.shape[0]
+    most = n * (1 + c)
+    prior, before, root = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3, 3))
+    _predictions(mixture, turn, base, pose, prior, before, root)
+    x, v, t = np.zeros((most, 4)), np.empty((most, 6)), np.zeros((most, 6, 4))
+    chi, of = np.full(most, np.inf), np.empty(most, np.int64)
+    rows = _starts(mixture, prior, root, contacts, values, of, x, v)
+    _fits(rod, proximal, how, target, measured, passes, prior, root, of, rows, x, v, t, chi)
+    found, first = 0, 0
+    xi, by_xi, own = np.empty(3), np.empty((6, 3)), np.empty((k, k))
+    for row in range(rows):
+        i = of[row]
+        if row > 0 and of[row - 1] != i:
+            first = found
+        xi[0], xi[1], xi[2] = x[row, 0], x[row, 2], x[row, 3]
+        for a in range(6):
+            by_xi[a, 0], by_xi[a, 1], by_xi[a, 2] = t[row, a, 0], t[row, a, 2], t[row, a, 3]
+        if not (chi[row] < np.inf and stable(fold, proximal, xi, point_determinant(by_xi))):
+            continue
+        if _known(x[row], out, first, found) or not weigh(how, v[row], measured, own):
+            continue
+        if _moved(
+            how,
+            target,
+            own,
+            turn,
+            pose,
+            mixture,
+            i,
+            prior[i],
+            before[i],
+            root[i],
+            x[row],
+            v[row],
+            t[row],
+            chi[row],
+            out,
+            found,
+        ):
+            misfits[found] = chi[row]
+            found += 1
+    return found

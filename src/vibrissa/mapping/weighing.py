@@ -56,7 +56,7 @@ class Weighing(NamedTuple):
 
 
 @inlined
-def _gradients(codes: IntArray, force: Array, moment: Array, out: Array) -> None:
+def gradients(codes: IntArray, force: Array, moment: Array, out: Array) -> None:
     """∂(channels)/∂(F, M), (k, 6)."""
     for k in range(codes.shape[0]):
         for a in range(6):
@@ -89,7 +89,7 @@ def _covariance(how: Weighing, value: Array, measured: Array, sigma: Array) -> N
     moment[0] = py * force[2] - pz * force[1]
     moment[1] = pz * force[0] - px * force[2]
     moment[2] = px * force[1] - py * force[0]
-    _gradients(codes, force, moment, g)
+    gradients(codes, force, moment, g)
     f2 = force[0] ** 2 + force[1] ** 2 + force[2] ** 2
     m2 = moment[0] ** 2 + moment[1] ** 2 + moment[2] ** 2
     grown = np.zeros(k)

@@ -32,15 +32,18 @@ def wrenches_of_contacts(whisker: Whisker, points: ArrayLike) -> Array:
     Returns
     -------
     array (n, 6)
-        (F, M), N and N·m.
+        (F, M), N and N·m; NaN where a point is not known.
 
     Raises
     ------
     ValueError
         If the whisker cannot be held at a point: how many, and why.
     """
-    bent = deflect(whisker, PointContact(np.asarray(points, dtype=np.float64)))
-    bad = ~is_ok(bent.status)
+    places = np.asarray(points, dtype=np.float64)
+    if places.ndim != 2 or places.shape[1] != 3:
+        raise ValueError(f"contact points are (n, 3), m; got {places.shape}")
+    bent = deflect(whisker, PointContact(places))
+    bad = ~is_ok(bent.status) & np.isfinite(places).all(axis=1)
     if bad.any():
         reasons = "; ".join(f"{n} × {text}" for text, n in describe(bent.status[bad]).items())
         raise ValueError(f"{bad.sum()} of {bad.size} contacts are not possible: {reasons}")
@@ -68,7 +71,7 @@ def calibrate_on_contacts(
     points : array_like (n, 3)
         Contact points on its centreline, whisker's frame, m; without friction.
     readings : array_like (n, k)
-        Of the channels at these contacts; rows with NaN are left out.
+        Of the channels at these contacts; rows with NaN, here or there, are left out.
     channels : sequence of str, optional
         Names of the k channels.
     components : sequence of str

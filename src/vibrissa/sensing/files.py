@@ -31,7 +31,7 @@ from vibrissa.io.table import read_text
 from vibrissa.sensing.frame import SensorFrame
 from vibrissa.sensing.sensor import Sensor
 
-_NUMBERS = ("noise", "bias", "drift", "resolution")
+_NUMBERS = ("noise", "bias", "drift", "resolution", "largest")
 _SHARES = ("relative_noise", "gain_error")
 _TOP = {"channels", "mixing", *_NUMBERS, *_SHARES, "frame", "weight"}
 _FRAME = {"axes", "position", "reaction"}

@@ -89,6 +89,11 @@ def calibrate_mixing(
         raise ValueError(f"{y.shape[1]} channels have {len(names)} names: {', '.join(names)}")
     which = [COMPONENTS.index(name) for name in components]
     known = np.isfinite(y).all(axis=1) & np.isfinite(w).all(axis=1)
+    if not known.any():
+        raise ValueError(
+            f"none of {len(y)} rows has both a reading and a load without NaN; at least "
+            f"{len(which) + 2} are needed"
+        )
     design = np.column_stack([_loaded(w[known])[:, which], np.ones(known.sum())])
     found = solve(design, y[known], (*components, "the offset"), _ADVICE)
     free = known.sum() - design.shape[1]

@@ -2,7 +2,7 @@
 
 A sensor has channels, each a linear mix of the six components (F_x, F_y, F_z, M_x, M_y, M_z):
 
-    reading = round((1 + g)(1 + ε)(A w) + b + d(t) + n),
+    reading = round((1 + g)(1 + ε)(A w) + b + d(t) + n),    at most ± the largest it can say,
 
 with the mixing A, an error of gain g and noise ε relative to the signal, a bias b, a drift d that
 is a random walk, white noise n, and rounding to the channel's resolution. The usual sensor has the
@@ -68,6 +68,9 @@ class Sensor:
         Standard deviation of a random walk after one second; it begins at zero.
     resolution : array_like
         Readings are rounded to multiples of this; 0 for none.
+    largest : array_like
+        Size of the largest reading; one that has come to it is saturated, and tells nothing.
+        Infinite, the default, for none.
     relative_noise : float
         Standard deviation of white noise relative to the signal.
     gain_error : float
@@ -96,6 +99,7 @@ class Sensor:
     bias: Any = 0.0
     drift: Any = 0.0
     resolution: Any = 0.0
+    largest: Any = np.inf
     relative_noise: float = 0.0
     gain_error: float = 0.0
     frame: SensorFrame = field(default_factory=SensorFrame)
@@ -123,13 +127,18 @@ class Sensor:
                 )
         usual = np.repeat([FORCE_NOISE, MOMENT_NOISE], 3)
         numbers = {"mixing": mixing, "channels": names}
-        for name in ("noise", "bias", "drift", "resolution"):
+        for name in ("noise", "bias", "drift", "resolution", "largest"):
             value = getattr(self, name)
             if value is None and mixing.shape == (len(names), 6):
                 value = np.sqrt(mixing**2 @ usual**2)
             array = np.asarray(value, dtype=np.float64)
-            if array.shape not in ((), (len(names),)) or not np.isfinite(array).all():
+            finite = np.isfinite(array) | ((name == "largest") & (array == np.inf))
+            if array.shape not in ((), (len(names),)):
                 faults.append(f"{name} has shape {array.shape}; () or ({len(names)},) is needed")
+            elif not finite.all():
+                faults.append(f"{name} is {array.tolist()}; it must be finite")
+            elif name == "largest" and not (array > 0.0).all():
+                faults.append(f"{name} is {array.tolist()}; it must be positive")
             elif name != "bias" and (array < 0.0).any():
                 faults.append(f"{name} is {array.tolist()}; it must not be negative")
             else:
@@ -218,7 +227,7 @@ class Sensor:
         Returns
         -------
         array (..., k)
-            In the units of the channels.
+            In the units of the channels; NaN for what is saturated.
 
         Raises
         ------
@@ -231,7 +240,7 @@ class Sensor:
                 f"readings of {', '.join(self.channels)} have a last axis of "
                 f"{len(self.channels)}; got shape {values.shape}"
             )
-        values = np.asarray(values - self.bias)
+        values = np.asarray(np.where(np.abs(values) < self.largest, values, np.nan) - self.bias)
         if self.mass == 0.0 and not self.mass_moment.any():
             return values
         if rotation is None:
@@ -294,7 +303,7 @@ class Sensor:
         Parameters
         ----------
         time : array_like (n,)
-            Of the samples, s.
+            Of the samples, s; it must not fall.
         wrench : array_like (n, 6)
             Force, N, and moment, N·m, at the whisker's base; NaN gives NaN.
         seed : int
@@ -310,9 +319,16 @@ class Sensor:
         Raises
         ------
         ValueError
-            If the orientation is not known but needed.
+            If shapes do not fit, time falls or is not finite, or the orientation is not known but
+            needed.
         """
         at, true = np.asarray(time, dtype=np.float64), np.asarray(wrench, dtype=np.float64)
+        if at.ndim != 1 or true.shape != (at.size, 6):
+            raise ValueError(
+                f"times (n,) and wrenches (n, 6) are needed; got {at.shape} and {true.shape}"
+            )
+        if not np.isfinite(at).all() or (np.diff(at) < 0.0).any():
+            raise ValueError(f"times are finite and do not fall; got {_first_fault(at)}")
         generator = np.random.default_rng(seed)
         if self.mass > 0.0 or self.mass_moment.any():
             if rotation is None:
@@ -332,4 +348,13 @@ class Sensor:
             reading = reading + np.cumsum(walk, axis=0)
         coarse = self.resolution > 0.0
         steps = np.where(coarse, self.resolution, 1.0)
-        return np.asarray(np.where(coarse, np.round(reading / steps) * steps, reading))
+        reading = np.where(coarse, np.round(reading / steps) * steps, reading)
+        return np.asarray(np.clip(reading, -self.largest, self.largest))
+
+
+def _first_fault(time: Array) -> str:
+    """Say where times fall or are not finite."""
+    bad = ~np.isfinite(time)
+    bad[1:] |= np.diff(time) < 0.0
+    i = int(bad.argmax())
+    return f"{time[i]} s" + (f" after {time[i - 1]} s" if i else "") + f" in place {i}"

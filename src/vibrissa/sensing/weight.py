@@ -13,10 +13,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.sensing.frame import cross_matrix
-from vibrissa.sensing.linear import solve
+from vibrissa.sensing.linear import Solution, solve
 from vibrissa.sensing.sensor import GRAVITY, Sensor
 
 Array = NDArray[np.float64]
+AnyArray = NDArray[np.bool_]
+
+# A mass so many standard deviations below zero is no noise.
+_SURELY = 4.0
 
 _ADVICE = (
     "hold the whisker free in more orientations, at least three that differ in how the weight pulls"
@@ -72,7 +76,8 @@ def calibrate_weight(
     Raises
     ------
     ValueError
-        If shapes do not fit, or the orientations do not tell weight from offset.
+        If shapes do not fit, the orientations do not tell weight from offset, or the weight comes
+        out negative.
     """
     y = np.asarray(readings, dtype=np.float64)
     k = len(sensor.channels)
@@ -96,6 +101,29 @@ def calibrate_weight(
     possible = _design(sensor, every, np.asarray(gravity, dtype=np.float64))[:, :, k:]
     effect = np.abs(possible).max(axis=(0, 1))
     felt = np.concatenate([np.ones(k, bool), effect > 1e-12 * max(float(effect.max()), 1e-300)])
+    found, unknowns, covariance = _solved(sensor, design, y, noise, felt)
+    if unknowns[k] < 0.0:
+        sigma = float(np.sqrt(covariance[k, k]))
+        if unknowns[k] < -_SURELY * sigma:
+            raise ValueError(
+                f"the readings weigh {1e3 * unknowns[k]:.3g} ± {1e3 * sigma:.2g} g: the sensor "
+                "reports a reaction (`reaction` of its frame), has other axes, or gravity or the "
+                "rotations point the other way"
+            )
+        felt[k] = False  # nothing that can be weighed
+        found, unknowns, covariance = _solved(sensor, design, y, noise, felt)
+    calibrated = replace(
+        sensor, bias=unknowns[:k], mass=float(unknowns[k]), mass_moment=unknowns[k + 1 :]
+    )
+    left = found.residuals.reshape(-1, k) * noise
+    return WeightCalibration(calibrated, covariance, np.sqrt((left**2).mean(axis=0)))
+
+
+def _solved(
+    sensor: Sensor, design: Array, y: Array, noise: Array, felt: AnyArray
+) -> tuple[Solution, Array, Array]:
+    """Solution for what is felt, all unknowns and their covariance."""
+    k = len(sensor.channels)
     names = [f"the offset of {name}" for name in sensor.channels] + list(_MASS)
     rows = (design / noise[:, None]).reshape(-1, k + 4)[:, felt]
     found = solve(
@@ -107,11 +135,7 @@ def calibrate_weight(
     unknowns, covariance = np.zeros(k + 4), np.zeros((k + 4, k + 4))
     unknowns[felt] = found.unknowns
     covariance[np.ix_(felt, felt)] = found.spread
-    calibrated = replace(
-        sensor, bias=unknowns[:k], mass=max(float(unknowns[k]), 0.0), mass_moment=unknowns[k + 1 :]
-    )
-    left = found.residuals.reshape(-1, k) * noise
-    return WeightCalibration(calibrated, covariance, np.sqrt((left**2).mean(axis=0)))
+    return found, unknowns, covariance
 
 
 def _tared(sensor: Sensor, y: Array, noise: Array) -> WeightCalibration:

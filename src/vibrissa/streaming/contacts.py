@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time as clock
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -18,6 +19,9 @@ from vibrissa.signals.base import signals_of
 from vibrissa.streaming.lines import Lines, Sample
 
 Array = NDArray[np.float64]
+
+# Time that falls by more than this comes from a sender that has begun anew, s.
+_ANEW = 1.0
 
 COMPONENTS = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 """What signals are computed from, where a stream carries these."""
@@ -50,7 +54,8 @@ class ContactStream:
         self.samples, self.faults = 0, 0
         self._estimator, self._follow = estimator, follow
         self._which = [SIGNALS.index(name) for name in by_name] if names is None else []
-        self._begun = clock.monotonic()
+        self._begun, self._time = clock.monotonic(), -math.inf
+        self.statuses: Counter[str] = Counter()
         self._headers = 0
 
     def records(self, lines: Iterable[str]) -> Iterator[dict[str, Any]]:
@@ -79,6 +84,7 @@ class ContactStream:
                 yield {"line": self.lines.number, "error": str(fault)}
                 continue
             self.samples += 1
+            self.statuses[record["status"]] += 1
             yield record
 
     def _begin_anew(self) -> None:
@@ -86,6 +92,10 @@ class ContactStream:
         if self.lines.headers == self._headers:
             return
         self._headers = self.lines.headers
+        self._forget()
+
+    def _forget(self) -> None:
+        self._time = -math.inf
         (self._follow or self._estimator).reset()
 
     def record(self, sample: Sample) -> dict[str, Any]:
@@ -106,7 +116,10 @@ class ContactStream:
         ValueError
             If the estimator or the filter refuses it.
         """
-        time = sample.time if math.isfinite(sample.time) else clock.monotonic() - self._begun
+        time = clock.monotonic() - self._begun if sample.time is None else sample.time
+        if time < self._time - _ANEW:
+            self._forget()
+        self._time = max(self._time, time)
         values = sample.values
         if self._which and sample.names != self._estimator.announced:
             wrench = np.zeros(6)
@@ -116,7 +129,7 @@ class ContactStream:
             found = self._estimator(values, sample.rotation)
             return {"time": time} | located_record(found)
         known = self._follow(time, values, sample.rotation, sample.position)
-        return {"time": time} | followed_record(known)
+        return {"time": time} | followed_record(known, sample.rotation)
 
 
 def _components(signals: tuple[str, ...]) -> tuple[str, ...]:
@@ -138,7 +151,8 @@ def located_record(found: Located) -> dict[str, Any]:
     -------
     dict
         ``status``, and of a contact ``x``, ``y``, ``z``, ``r``, ``theta``, ``phi``,
-        ``arc_length``, ``force`` at the base, ``sigma_x``, ..., and all ``candidates``.
+        ``arc_length``, ``force`` (N, on the whisker, as at its base), ``sigma_x``, ..., and all
+        ``candidates``.
     """
     record: dict[str, Any] = {"status": found.status.name.lower()}
     if not len(found.candidates):
@@ -154,27 +168,31 @@ def located_record(found: Located) -> dict[str, Any]:
     return record
 
 
-def followed_record(known: Followed) -> dict[str, Any]:
+def followed_record(known: Followed, rotation: Array | None = None) -> dict[str, Any]:
     """What a filter knows.
 
     Parameters
     ----------
     known : Followed
         Of a filter.
+    rotation : (3, 3) array, optional
+        From the whisker's to the laboratory frame; by default they are the same.
 
     Returns
     -------
     dict
-        As of a single sample in the whisker's frame, but deviations and ``hypotheses`` with their
-        ``probabilities`` are in the laboratory, as are ``lab_x``, ``lab_y``, ``lab_z`` and
-        ``velocity``.
+        ``x``, ``y``, ``z``, ``r``, ``theta``, ``phi`` and ``sigma_x``, ... in the whisker's frame;
+        ``lab_x``, ..., ``lab_sigma_x``, ..., ``velocity`` and ``hypotheses`` with their
+        ``probabilities`` in the laboratory.
     """
     record: dict[str, Any] = {"status": known.status.name.lower()}
     if not len(known.points):
         return record
     record |= _place(known.point_whisker)
     record |= dict(zip(("lab_x", "lab_y", "lab_z"), known.point.tolist(), strict=True))
-    record |= _sigma(known.covariance)
+    turn = np.eye(3) if rotation is None else rotation
+    record |= _sigma(turn.T @ known.covariance @ turn)
+    record |= {f"lab_{name}": value for name, value in _sigma(known.covariance).items()}
     record["velocity"] = known.velocity.tolist()
     record["probability"] = known.probability
     record["hypotheses"] = known.points.tolist()

@@ -34,8 +34,8 @@ class Sample(NamedTuple):
     ----------
     line : int
         Number of the line, from 1.
-    time : float
-        Of the sample, s; NaN where the line has none.
+    time : float or None
+        Of the sample, s; None where the line has none.
     names : tuple of str
         Which of the choices asked for it has.
     values : (k,) array
@@ -47,7 +47,7 @@ class Sample(NamedTuple):
     """
 
     line: int
-    time: float
+    time: float | None
     names: tuple[str, ...]
     values: Array
     rotation: Array | None
@@ -133,7 +133,9 @@ class Lines:
 
     def _sample(self, known: dict[str, object]) -> Sample:
         names = self._chosen("it", list(known))
-        time = _number("time", known["time"]) if "time" in known else math.nan
+        time = _number("time", known["time"]) if "time" in known else None
+        if time is not None and not math.isfinite(time):
+            raise ValueError(f"time is {known['time']!r}; a finite number is needed, s")
         values = np.array([_number(name, known[name]) for name in names])
         rotation = position = None
         if set(POSITION) <= set(known):

@@ -1,7 +1,7 @@
 # ruff: noqa: T201 -- a script that reports
 """How long one measurement takes, from Python, on one thread: median, 99 % and worst.
 
-    python benchmarks/stream_latency.py [SAMPLES]
+    python benchmarks/stream_latency.py [SAMPLES] [--json FILE]
 
 A contact glides along the built-in γ whisker and around it while it is pushed harder and lighter,
 with the noise of a sensor (1 µN, 0.02 µN·m); every answer is checked against the truth. Each sample
@@ -9,10 +9,12 @@ is timed by the clock on the wall, and by the time that the thread itself was ru
 work on the machine does not lengthen by waiting.
 """
 
+import argparse
 import gc
+import json
 import os
-import sys
 import time
+from pathlib import Path
 
 os.environ["VIBRISSA_THREADS"] = "1"
 
@@ -24,6 +26,7 @@ from vibrissa.rod.reach import fold_forces, reach
 from vibrissa.sensing import Sensor
 from vibrissa.signals import SIGNALS
 
+NAMES = ("wall_median", "wall_high", "wall_worst", "own_median", "own_high")
 NOISE = np.repeat([1e-6, 2e-8], 3)
 
 
@@ -52,7 +55,7 @@ def measured(locate, rows):
     return wall * 1e6, own * 1e6, answers
 
 
-def main(samples=3000):
+def main(samples, path=None):
     whisker = vb.samples.gamma()
     contacts = vb.ContactMap.simulate(whisker, grid=False)
     bent = glide(whisker, samples)
@@ -98,6 +101,7 @@ def main(samples=3000):
         rows = wrench[:, 4:] if "two" in what else rows
         cases[what] = (Stepped(vb.ContactFilter(estimator, speed=0.5)), rows[: samples // 3])
     print(f"{'µs':40}{'wall: median':>14}{'99 %':>8}{'worst':>8}{'own: median':>14}{'99 %':>8}")
+    found = []
     for what, (locate, rows) in cases.items():
         wall, own, answers = measured(locate, rows)
         if "filter" not in what and "no contact" not in what:
@@ -109,7 +113,11 @@ def main(samples=3000):
             assert np.median(near) < 0.1 * whisker.length
         figures = [np.median(wall), np.quantile(wall, 0.99), wall.max()]
         print(f"{what:40}{figures[0]:14.0f}{figures[1]:8.0f}{figures[2]:8.0f}", end="")
-        print(f"{np.median(own):14.0f}{np.quantile(own, 0.99):8.0f}")
+        figures += [np.median(own), np.quantile(own, 0.99)]
+        print(f"{figures[3]:14.0f}{figures[4]:8.0f}")
+        found.append({"what": what, **dict(zip(NAMES, map(float, figures), strict=True))})
+    if path is not None:
+        path.write_text(json.dumps(found))
 
 
 class Stepped:
@@ -124,4 +132,8 @@ class Stepped:
 
 
 if __name__ == "__main__":
-    main(*(int(text) for text in sys.argv[1:2]))
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("samples", nargs="?", type=int, default=3000)
+    parser.add_argument("--json", type=Path, help="file for the numbers, µs")
+    chosen = parser.parse_args()
+    main(chosen.samples, chosen.json)

@@ -16,6 +16,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 from PIL import Image
 from title_picture import title_picture
+from tracking_picture import tracking_picture
 
 import vibrissa as vb
 from vibrissa import plots
@@ -236,6 +237,7 @@ FIGURES: dict[str, Callable[[], Figure | np.ndarray]] = {
     "resolution": lambda: plots.resolution(verdicts()),
     "witness_Mx_MB_MD": lambda: witness(chart().whisker, verdicts(), "Mx MB MD"),
     "witness_curved": c2,
+    "tracking": tracking_picture,
     "trial": overview,
     "contact_places": places,
     "movie_signals": signal_movie,

@@ -8,7 +8,6 @@ tables into `docs/honest-test.md` and the figure beside it, else they are writte
 """
 
 import argparse
-import io
 import json
 from pathlib import Path
 from typing import Any
@@ -19,12 +18,10 @@ from honest.summaries import summary
 from honest.tables import TABLES, write
 from honest.video import cutoffs, paper_test, tracked_scores
 from honest.ways import WAYS, chart, located, scored, truth_of
-from matplotlib.figure import Figure
-from PIL import Image
+from pages import save
 
 from vibrissa.trial import recorded_whisker
 
-WIDTH = 1200
 TRIALS = 3
 ROOT = Path(__file__).parent.parent
 
@@ -71,16 +68,6 @@ def results_of(
         kept |= {part.__name__: about} | part(trials)
         path.write_text(json.dumps(kept, indent=1))
     return kept
-
-
-def save(figure: Figure, path: Path) -> None:
-    """Write a figure for the screen, in 256 colours."""
-    drawn = io.BytesIO()
-    figure.savefig(drawn, format="png")
-    image = Image.open(drawn).convert("RGB")
-    height = round(image.height * WIDTH / image.width)
-    small = image.resize((WIDTH, height), Image.Resampling.LANCZOS)
-    small.quantize(256, Image.Quantize.MEDIANCUT).save(path, optimize=True)
 
 
 def main() -> None:

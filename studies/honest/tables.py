@@ -1,10 +1,11 @@
 """The tables of the page, from the results; mm, degrees, per cent."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pages import put, table
 
 from honest.conditions import CONDITIONS, FAST
 from honest.summaries import LABELS, limit
@@ -23,22 +24,7 @@ CLASSES = (*LABELS, "all")
 
 def write(page: Path, results: Results) -> None:
     """Put the tables between their marks on the page."""
-    text = page.read_text()
-    for name, make in TABLES.items():
-        head, tail = f"<!-- {name} -->\n", "<!-- end -->\n"
-        if head not in text:
-            continue
-        before, rest = text.split(head, 1)
-        after = rest.split(tail, 1)[1]
-        text = f"{before}{head}\n{make(results)}\n\n{tail}{after}"
-    page.write_text(text)
-
-
-def table(head: Sequence[str], rows: Iterable[Sequence[str]], texts: int = 1) -> str:
-    """Markdown; the first columns are text, the others numbers."""
-    sides = [":---"] * texts + ["---:"] * (len(head) - texts)
-    lines = [head, sides, *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    put(page, {name: make(results) for name, make in TABLES.items()})
 
 
 def mm(value: float) -> str:

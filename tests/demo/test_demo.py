@@ -7,7 +7,7 @@ import xarray as xr
 import vibrissa as vb
 from vibrissa import samples
 from vibrissa.demo import filming, run_demo
-from vibrissa.demo.stages import from_curves
+from vibrissa.demo.stages import from_curves, refined
 from vibrissa.io import load_contacts, load_recording
 from vibrissa.pipeline import fit_contacts
 from vibrissa.trial import recorded_whisker
@@ -214,6 +214,17 @@ def test_nothing_of_another_trial_stays(result, tmp_path):
     assert (tmp_path / "seen.nc").exists()
     filming.begin(tmp_path, result.whisker, video=False)
     assert not (tmp_path / "seen.nc").exists()
+
+
+def test_a_coarse_circle_is_a_circle():
+    turn = np.linspace(0.0, 2.0, 33)
+    coarse = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    hidden = np.where(turn[:, None] < 1.0, coarse, np.nan)
+    circle, part = refined(np.stack([coarse, hidden]))
+    np.testing.assert_allclose(np.linalg.norm(circle, axis=1), 1.0, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(circle[::8], coarse, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(part[:8], np.linspace(*coarse[:2], 9)[:8], rtol=0, atol=1e-12)
+    assert np.isnan(part[-1]).all()
 
 
 def test_distances_from_curves():

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy.interpolate import make_interp_spline
 
 from vibrissa.demo.scores import ANGLES, angle_label
 
@@ -84,20 +85,20 @@ def tracking_scores(tracked: xr.Dataset, simulated: xr.DataTree) -> TrackingScor
     true_base = simulated.to_dataset()["base_position"].isel(whisker=0).values
     traced = tracked["trace"].transpose("view", "time", "node", "image_axis").values
     seen = tracked["trace_visible"].transpose("view", "time", "node").values.astype(bool)
-    drawn = truth["trace"].transpose("view", "time", "node", "image_axis").values
+    drawn = [refined(one) for one in truth["trace"].transpose("view", "time", ...).values]
     inside = [
         distances[visible]
         for distances, visible in zip(map(from_curves, traced, drawn), seen, strict=True)
     ]
     order = ("time", "node", "space")
-    lines = (data["centerline"].transpose(*order).values for data in (tracked, truth))
+    lines = [data["centerline"].transpose(*order).values for data in (tracked, truth)]
     away = np.linalg.norm(tracked["contact_point"].values - truth["contact_point"].values, axis=-1)
     touching = [data["in_contact"].values.astype(bool) for data in (tracked, truth)]
     return TrackingScores(
         frames=tracked.sizes["time"],
         lost=int((tracked["confidence"].values == 0.0).sum()),
         trace=np.array([spread(pixels) for pixels in inside]),
-        centerline=spread(from_curves(*lines)),
+        centerline=spread(from_curves(lines[0], refined(lines[1]))),
         base=spread(np.linalg.norm(tracked["base_position"].values - true_base, axis=-1)),
         contact=spread(away[touching[0] & touching[1]]),
         told=float((touching[0] == touching[1]).mean()),
@@ -140,6 +141,32 @@ def signal_errors(
             both = (spread(errors[name][some]) for name in ("force", "moment"))
             rows.append(SignalRow(angle_label(low, high), int(some.sum()), *both))
     return tuple(rows)
+
+
+def refined(curves: Array, times: int = 8) -> Array:
+    """Take more points of smooth curves, whose chords would cut their bends.
+
+    Parameters
+    ----------
+    curves : array (time, m, d)
+        Points at equal steps; a curve with NaN stays the polygon that it is.
+    times : int
+        How many steps for one.
+
+    Returns
+    -------
+    array (time, (m - 1) times + 1, d)
+        Cubics through the points.
+    """
+    steps = np.arange(curves.shape[1])
+    at = np.linspace(0.0, steps[-1], times * int(steps[-1]) + 1)
+    before = np.minimum(at.astype(int), steps[-1] - 1)
+    share = (at - before)[:, None]
+    fine = (1.0 - share) * curves[:, before] + share * curves[:, before + 1]
+    known = np.isfinite(curves).all(axis=(1, 2))
+    if known.any():
+        fine[known] = make_interp_spline(steps, curves[known], axis=1)(at)
+    return np.asarray(fine)
 
 
 def from_curves(points: Array, curves: Array) -> Array:

@@ -1,0 +1,1 @@
+"""What the page "What is measured" reports, part by part."""

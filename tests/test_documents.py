@@ -1,0 +1,88 @@
+"""What the first pages tell to type can be typed, and pictures stay small."""
+
+import re
+import shlex
+from functools import cache
+from pathlib import Path
+
+import pytest
+import typer
+
+import vibrissa as vb
+from vibrissa.cli.app import app
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = {page.name: page for page in (ROOT / "README.md", *sorted(DOCS.rglob("*.md")))}
+LARGEST = 300_000
+
+
+def blocks(page, *kinds):
+    """Fenced code of some languages."""
+    found = re.findall(r"^```(\w*)\n(.*?)^```", page.read_text(encoding="utf-8"), re.M | re.S)
+    return [text for kind, text in found if kind in kinds]
+
+
+def commands(text):
+    """Words of each call of the command line, of its own or in a pipe."""
+    calls = re.split(r"[\n|]|&&", text)
+    calls = [call.split(" #")[0].strip() for call in calls]
+    return [shlex.split(call)[1:] for call in calls if call.startswith("vibrissa ")]
+
+
+@cache
+def command():
+    return typer.main.get_command(app)
+
+
+def parse(words):
+    """Raise if there is no such verb or option."""
+    group = command()
+    verb = group.commands.get(words[0], group)
+    if verb is group and not words[0].startswith("-"):
+        raise ValueError(f"no verb {words[0]}")
+    verb.make_parser(typer.Context(verb)).parse_args(words[verb is not group :])
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_commands_have_these_verbs_and_options(name):
+    text = PAGES[name].read_text(encoding="utf-8")
+    inline = [code for code in re.findall(r"`(vibrissa [^`\n]+)`", text) if " " in code]
+    typed = [*blocks(PAGES[name], "", "sh", "bash", "console"), *inline]
+    for words in (words for one in typed for words in commands(one)):
+        # A verb alone is its name; VERB, MAP and the like stand for something.
+        if words[0].isupper():
+            continue
+        parse(words)
+
+
+def test_what_cannot_be_typed_is_noticed():
+    for words, message in (
+        (["deflect", "--pint", "24,14,2"], "o such option"),
+        (["bnd"], "no verb"),
+    ):
+        with pytest.raises(Exception, match=message):
+            parse(words)
+
+
+@pytest.mark.parametrize("name", ["README.md", "tutorial.md"])
+def test_the_tour_runs(name, monkeypatch, capsys):
+    """All of it, but maps without the paper's grid and verdicts from few samples."""
+    simulate, ask = vb.ContactMap.simulate, vb.uniqueness
+    few = {"samples": 32, "resolution": False}
+
+    def asked(contacts, triplets, **options):
+        return ask(contacts, triplets[:1], ["all"], **options | few)
+
+    monkeypatch.setattr(vb.ContactMap, "simulate", lambda whisker: simulate(whisker, grid=False))
+    monkeypatch.setattr(vb, "uniqueness", asked)
+    names = {}
+    for code in blocks(PAGES[name], "python"):
+        exec(compile(code, name, "exec"), names)
+    assert names["found"].point == pytest.approx(names["bent"].contact_point, abs=1e-9)
+    assert names["verdicts"].verdict.item() == "unique"
+
+
+@pytest.mark.parametrize("picture", sorted(DOCS.rglob("*.png")), ids=lambda path: path.name)
+def test_pictures_are_small(picture):
+    assert picture.stat().st_size < LARGEST

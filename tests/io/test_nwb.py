@@ -6,8 +6,17 @@ import h5py
 import numpy as np
 import pytest
 import xarray as xr
+from scipy.spatial.transform import Rotation
 
-from vibrissa.io import Session, join_views, load_nwb, load_tracks, recognise, save_nwb
+from vibrissa.io import (
+    Session,
+    join_views,
+    load_nwb,
+    load_nwb_series,
+    load_tracks,
+    recognise,
+    save_nwb,
+)
 from vibrissa.io.tracks import RawTracks, labelled
 from vibrissa.quantities import attributes
 
@@ -79,6 +88,41 @@ def test_written_and_read_again(tmp_path, recording):
     np.testing.assert_allclose(tracks["time"], data["time"], atol=1e-12)
     assert tracks["centerline"].attrs["units"] == "m"
     assert tracks["centerline"].attrs["reference_frame"] == "laboratory"
+
+
+def test_a_trial_that_nobody_traced_comes_back_with_its_poses(tmp_path, recording):
+    path = tmp_path / "simulated.nwb"
+    root = recording.to_dataset()[["force", "moment", "contact_point", "in_contact"]]
+    n, w = root.sizes["time"], root.sizes["whisker"]
+    turned = Rotation.random(n * w, random_state=1).as_matrix().reshape(n, w, 3, 3)
+    head = Rotation.random(n, random_state=2).as_matrix()
+    each = {"base_position": 1e-3 * turned[..., 0], "contact_point_whisker": 1e-2 * turned[..., 1]}
+    root = root.assign({k: (("time", "whisker", "space"), v) for k, v in each.items()})
+    root["base_rotation"] = (("time", "whisker", "space", "whisker_axis"), turned)
+    root["head_position"] = (("time", "space"), 1e-2 * head[..., 0])
+    root["head_rotation"] = (("time", "space", "head_axis"), head)
+    save_nwb(path, root, SESSION)
+    found = load_nwb_series(path)
+    assert set(found.data_vars) == set(root.data_vars) - {"in_contact"}
+    for name in found.data_vars:
+        assert found[name].dims == root[name].dims
+        np.testing.assert_array_equal(found[name].values, root[name].values)
+        assert found[name].attrs["units"]
+    np.testing.assert_allclose(found["time"], root["time"], atol=1e-12)
+    assert list(found["whisker"].values) == ["C1", "C2"]
+    with pytest.raises(ValueError, match="read by load_nwb_series"):
+        load_nwb(path)
+    nwbinspector = pytest.importorskip("nwbinspector")
+    bad = ("ERROR", "PYNWB_VALIDATION", "CRITICAL")
+    messages = nwbinspector.inspect_nwbfile(nwbfile_path=str(path))
+    assert [m.message for m in messages if m.importance.name in bad] == []
+
+
+def test_series_of_others_are_not_ours(tmp_path):
+    path = tmp_path / "other.nwb"
+    foreign(path, ())
+    with pytest.raises(ValueError, match="not written by save_nwb"):
+        load_nwb_series(path)
 
 
 def test_what_another_program_finds(tmp_path, recording):

@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from vibrissa.pipeline import default_source, placed_by, sensor_noise, signals_of, with_signals
+from vibrissa.pipeline import (
+    default_source,
+    estimates_of,
+    placed_by,
+    sensor_noise,
+    signals_of,
+    with_signals,
+)
 from vibrissa.sensing import Sensor
 from vibrissa.signals import SIGNALS, base_signals
 from vibrissa.status import Status
@@ -281,3 +288,29 @@ def test_contact_points_from_a_table_count_more(tracked, trial):
         assert changed.tolist() == (touching[:3].tolist() if source == "table" else [])
     unknown = np.isnan(signals_of(given, cutoff=None)["wrench_covariance"].values)
     assert not unknown[touching[3:]].any()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda d: d.assign(force=d["force"].isel(space=0, drop=True)), "force has the dim"),
+        (
+            lambda d: d.assign(base_rotation=2.0 * d["base_rotation"]),
+            "is no rotation",
+        ),
+        (lambda d: d.assign_coords(time=d["time"].values[::-1]), "its time does not rise"),
+        (lambda d: d.assign_coords(time=d["time"] * np.nan), "its time does not rise"),
+        (lambda d: d.assign(force=d["force"].astype(str)), "no numbers"),
+    ],
+)
+def test_recordings_from_elsewhere_are_checked(trial, change, said):
+    tree = xr.DataTree(change(trial.to_dataset()))
+    with pytest.raises(ValueError, match=said):
+        signals_of(tree)
+
+
+def test_what_a_group_lacks_is_said(trial):
+    tree = with_signals(trial)
+    tree["signals"] = xr.DataTree(tree["signals"].to_dataset(inherit=False).drop_vars("moment"))
+    with pytest.raises(ValueError, match=r"group signals .* lacks moment; make it anew"):
+        estimates_of(tree)

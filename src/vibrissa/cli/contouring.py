@@ -128,6 +128,8 @@ def reconstruct(
     check_writable(points, CSV)
     direction = None if axis is None else numbers(axis, ("X", "Y", "Z"), "--axis")
     _check_shape(shape, direction is not None)
+    if lean is not None and not 0.0 <= lean < 90.0:
+        raise ValueError(f"--lean is {lean:g}; degrees from 0 to 90 are needed")
     wanted = _Wanted(
         source=source,
         cutoff=cutoff,

@@ -176,43 +176,72 @@ def _listed(tracks: Dataset, dim: str) -> str:
 
 
 def _groups(path: Path) -> Iterator[tuple[str, str]]:
-    """Kind, groups and variables of a NetCDF file."""
-    import xarray as xr
+    """Kind, groups and variables of a NetCDF file; of its values only names are read."""
+    import h5netcdf
 
     from vibrissa.io import kind_of
 
     yield "kind", kind_of(path) or "unknown"
-    groups = xr.open_groups(path, engine="h5netcdf")
-    try:
-        several = sum(name.startswith("/whiskers/") for name in groups)
-        for name, group in groups.items():
-            if not group.data_vars or (several > 1 and name.startswith("/whiskers/")):
-                continue
-            sizes = ", ".join(f"{dim} {size}" for dim, size in group.sizes.items())
-            yield name, f"[dim]{sizes or 'no dimensions'}[/]"
-            for variable, data in group.data_vars.items():
-                units = data.attrs.get("units", "")
-                dims = ", ".join(map(str, data.dims))
-                yield f"  {variable}", f"({dims}) {'' if units == '1' else units}"
-        if several > 1:
-            names = ", ".join(map(str, groups["/"]["whisker"].values))
-            yield "/whiskers", f"{several}: {names}"
-    finally:
-        for group in groups.values():
-            group.close()
+    with h5netcdf.File(path, "r") as file:
+        whiskers = file.groups["whiskers"].groups if "whiskers" in file.groups else {}
+        for name, group in _within(file, "/"):
+            if not (len(whiskers) > 1 and name.startswith("/whiskers/")):
+                yield from _variables(name, group)
+        if len(whiskers) > 1:
+            names = [_text(one) for one in file.variables["whisker"][...]]
+            yield "/whiskers", f"{len(whiskers)}: {', '.join(names)}"
+
+
+def _within(group: Any, name: str) -> Iterator[tuple[str, Any]]:
+    """A group and those below it, by their paths."""
+    yield name, group
+    for key, below in group.groups.items():
+        yield from _within(below, f"{name.rstrip('/')}/{key}")
+
+
+def _variables(name: str, group: Any) -> Iterator[tuple[str, str]]:
+    """Sizes of a group and its variables; coordinates are known by their dimension."""
+    sizes: dict[str, int] = {}
+    beside: set[str] = set()
+    for variable in group.variables.values():
+        sizes |= dict(zip(variable.dimensions, variable.shape, strict=True))
+        beside |= set(_text(variable.attrs.get("coordinates", "")).split())
+    beside |= set(_text(group.attrs.get("coordinates", "")).split())
+    shown = {n: v for n, v in group.variables.items() if n not in sizes and n not in beside}
+    if not shown:
+        return
+    listed = ", ".join(f"{dim} {size}" for dim, size in sizes.items())
+    yield name, f"[dim]{listed or 'no dimensions'}[/]"
+    for variable, data in shown.items():
+        units = _text(data.attrs.get("units", ""))
+        yield f"  {variable}", f"({', '.join(data.dimensions)}) {'' if units == '1' else units}"
+
+
+def _text(value: Any) -> str:
+    return value.decode() if isinstance(value, bytes) else str(value)
 
 
 def _compared(path: Path) -> Iterator[tuple[str, str]]:
     """How contact points that do not come from the rod compare with those that do."""
     import h5netcdf
+    import xarray as xr
 
     from vibrissa.cli.tracking import compared_contacts
-    from vibrissa.io import load_recording
 
-    with h5netcdf.File(path, "r") as file:  # a recording of many whiskers takes seconds to read
-        if "measured" not in file.groups:
+    with h5netcdf.File(path, "r") as file:
+        measured = file.groups.get("measured")
+        if measured is None or "contact_difference" not in measured.variables:
             return
-    recording = load_recording(path)
+    # A recording of many whiskers takes seconds to read whole.
+    names = {
+        None: ["arc_length"],
+        "measured": ["contact_difference", "contact_point", "arc_length"],
+    }
+    parts = {}
+    for group, wanted in names.items():
+        with xr.open_dataset(path, engine="h5netcdf", group=group) as data:
+            parts[f"/{group or ''}"] = data[wanted].load()
+    recording = xr.DataTree.from_dict(parts)
     for k, name in enumerate(recording.coords["whisker"].values):
         for sentence in compared_contacts(recording, k):
             yield str(name), sentence
@@ -268,7 +297,9 @@ def _rows(kind: str, data: Any) -> Iterator[tuple[str, str]]:
         yield "rows", f"{data.sizes['frame']}, from frame {first} to {last}"
     else:
         time = data["time"].values
-        yield "rows", f"{time.size}, from {np.nanmin(time):g} to {np.nanmax(time):g} s"
+        told = time[np.isfinite(time)]
+        span = f"from {told.min():g} to {told.max():g} s" if told.size else "at times not told"
+        yield "rows", f"{time.size}, {span}"
         if kind == "contacts":
             for sentence, count in describe(data["status"].values).most_common():
                 yield str(count), sentence

@@ -112,9 +112,9 @@ def estimate(
     Example: `vibrissa estimate signals.csv --map map.nc --signals Fx,FT,MB,MD -o contacts.csv`
     """
     from vibrissa.cli.recordings import is_recording, noise_from
-    from vibrissa.io.paths import CSV, NETCDF, check_writable
+    from vibrissa.io.paths import CSV, NETCDF, check_readable, check_writable
 
-    recorded = is_recording(signals)
+    recorded = is_recording(check_readable(signals))
     if path is None:
         path = signals if recorded else Path("contacts.csv")
     check_writable(path, (*NETCDF, *CSV) if recorded else CSV)

@@ -57,7 +57,9 @@ def report(
     ] = False,
     seed: Annotated[
         int | None,
-        typer.Option(help="Of a trial: of the draws behind what is predicted; 0 by default."),
+        typer.Option(
+            help="Of a trial: of the draws behind what is predicted; 0 by default.", min=0
+        ),
     ] = None,
 ) -> None:
     """Write a page that opens offline: what was done, how well, figures, a contour to turn.

@@ -72,7 +72,7 @@ def simulate(
     noise: Annotated[
         bool, typer.Option(help="Whether the sensor has noise: by default 1 µN and 0.02 µN·m.")
     ] = True,
-    seed: Annotated[int | None, typer.Option(help="Of the whisks and of the noise.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Of the whisks and of the noise.", min=0)] = None,
     film: Annotated[
         Path | None,
         typer.Option(help="Where videos of the two views go as well.", metavar="DIR"),

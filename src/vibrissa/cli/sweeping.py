@@ -68,6 +68,8 @@ def sweep(
         raise ModuleNotFoundError(
             "studies are kept with zarr: pip install 'vibrissa[sweeps]'"
         ) from missing
+    from vibrissa.io.paths import check_readable
+    from vibrissa.io.table import read_text
     from vibrissa.sweeps import EXAMPLE, read_study
 
     if example:
@@ -84,8 +86,7 @@ def sweep(
         if scheduler not in (None, "local"):
             refuse({"--workers": workers}, f"the workers are those of {scheduler}")
         workers = 1 if workers is None else workers
-        text = Path(study).read_text(encoding="utf-8")
-        plan = read_study(text, Path(study).parent)
+        plan = read_study(read_text(check_readable(study)), Path(study).parent)
         if dry_run:
             _cost(plan, max(workers, 1))
         else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -143,13 +144,13 @@ def numbers(text: str, names: Sequence[str], option: str) -> list[float]:
     Raises
     ------
     ValueError
-        If there are more or fewer, or one is no number.
+        If there are more or fewer, or one is no number or not finite.
     """
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
         values = []
-    if len(values) != len(names):
+    if len(values) != len(names) or not all(map(math.isfinite, values)):
         raise ValueError(f"{option} is {text!r}; {','.join(names)} are needed")
     return values
 

@@ -35,7 +35,7 @@ def demo(
             show_default="quick",
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Of the whisks and of the noise.")] = 0,
+    seed: Annotated[int, typer.Option(help="Of the whisks and of the noise.", min=0)] = 0,
     noise: Annotated[
         bool, typer.Option(help="Whether the sensor has noise: 1 µN and 0.02 µN·m.")
     ] = True,

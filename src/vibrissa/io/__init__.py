@@ -17,6 +17,7 @@ from vibrissa.io.movement import load_movement
 from vibrissa.io.movie import write_movie
 from vibrissa.io.netcdf import is_netcdf, kind_of
 from vibrissa.io.nwb import load_nwb
+from vibrissa.io.nwb_series import load_nwb_series
 from vibrissa.io.nwb_writing import Session, save_nwb
 from vibrissa.io.paths import check_folder, check_readable, check_writable
 from vibrissa.io.recording import load_recording, save_recording
@@ -52,6 +53,7 @@ __all__ = [
     "load_measurements",
     "load_movement",
     "load_nwb",
+    "load_nwb_series",
     "load_recording",
     "load_series",
     "load_signals",

@@ -78,7 +78,10 @@ def read_nwb(path: str | PathLike[str]) -> RawTracks:
             raise ValueError(f"{path} is no NWB file: it has no nwb_version")
         space, image = _found(file)
     if not space and not image:
-        raise ValueError(f"{path} has no poses: no PoseEstimation holds any series of points")
+        raise ValueError(
+            f"{path} has no poses: no PoseEstimation holds any series of points; "
+            "what whiskers feel and how they are held is read by load_nwb_series"
+        )
     every = [*space.values(), *image.values()]
     time = every[0].time
     if any(not np.array_equal(one.time, time) for one in every):
@@ -175,7 +178,7 @@ def _series(group: h5py.Group) -> _Series | None:
     nodes = [str(name) for name in order if name in children]
     nodes += [name for name in children if name not in nodes]
     first = children[nodes[0]]
-    time = _time(first)
+    time = series_time(first)
     points, sure = [], []
     for name in nodes:
         data = children[name]["data"]
@@ -205,8 +208,19 @@ def _frame(item: Any) -> str:
     return "" if str(text) in ("", "unknown") else str(text)
 
 
-def _time(series: h5py.Group) -> Array:
-    """Times of the frames, s."""
+def series_time(series: h5py.Group) -> Array:
+    """Give the times of a series.
+
+    Parameters
+    ----------
+    series : h5py.Group
+        Of an NWB file.
+
+    Returns
+    -------
+    array (n,)
+        s.
+    """
     if "timestamps" in series:
         return np.asarray(series["timestamps"][:], dtype=np.float64)
     start = series["starting_time"]

@@ -3,8 +3,9 @@
     devices              a CalibratedCamera for each view whose calibration is known, else a Device
     processing/behavior  for each whisker a MultiCameraPoseEstimation: its centreline in space, node
                          by node, in metres, and a PoseEstimation in pixels for each view;
-                         ``contact_point_…`` and ``base_position_…`` in metres, ``force_…`` in
-                         newtons and ``moment_…`` in newton-metres
+                         ``contact_point_…`` and ``base_position_…`` in metres, ``base_rotation_…``
+                         (time, 3, 3), ``force_…`` in newtons and ``moment_…`` in newton-metres;
+                         and how the head is held, if it moves
     intervals/contacts   when which whisker touched something
 
 Missing is NaN. The truth of a simulated trial is left out.
@@ -40,6 +41,10 @@ _POINTS = {
     "contact_point": "Where the whisker touches the object",
     "contact_point_whisker": "Where the whisker touches the object",
     "base_position": "Base of the whisker",
+}
+_ROTATIONS = {
+    "base_rotation": "Rotation from the whisker's to the laboratory frame, of the whisker",
+    "head_rotation": "Rotation from the head's to the laboratory frame",
 }
 # Files without these are found faulty, and each says no more than that nobody knows.
 _NOBODY = {"subject_id": "unknown", "sex": "U", "age": "P0D/", "description": "not told"}
@@ -126,7 +131,7 @@ def _check(data: xr.Dataset) -> None:
         raise ValueError("the time of what is to be written is not in seconds: give fps")
     if "whisker" not in data.dims:
         raise ValueError("what is to be written has no dimension whisker")
-    known = {"trace", "centerline", *_FORCES, *_POINTS}
+    known = {"trace", "centerline", "base_rotation", *_FORCES, *_POINTS}
     if not known & set(data.data_vars):
         raise ValueError(f"there is nothing to write: none of {', '.join(sorted(known))}")
 
@@ -164,6 +169,8 @@ def _fill(file: NWBFile, data: xr.Dataset, cameras: xr.Dataset | None) -> None:
             behavior.add(_pose(name, whisker, clock, devices, skeletons))
         for series in _series(name, whisker, clock):
             behavior.add(series)
+    for series in _of_head(data, clock):
+        behavior.add(series)
     if "in_contact" in data:
         _add_contacts(file, data)
 
@@ -323,6 +330,9 @@ def _series(name: str, whisker: xr.Dataset, clock: dict[str, Any]) -> Iterator[A
                 reference_frame=str(values.attrs.get("reference_frame", "laboratory")),
                 **clock,
             )
+    if "base_rotation" in whisker:
+        rotation = whisker["base_rotation"]
+        yield _rotations(f"base_rotation_{name}", "base_rotation", rotation, clock)
     for variable, (unit, text) in _FORCES.items():
         if variable in whisker:
             values = whisker[variable].transpose("time", "space")
@@ -334,6 +344,36 @@ def _series(name: str, whisker: xr.Dataset, clock: dict[str, Any]) -> Iterator[A
                 unit=unit,
                 **clock,
             )
+
+
+def _rotations(name: str, variable: str, rotation: xr.DataArray, clock: dict[str, Any]) -> Any:
+    """Rotations over time: columns are the moving frame's axes in the laboratory."""
+    from pynwb import TimeSeries
+
+    return TimeSeries(
+        name=name,
+        description=f"{_ROTATIONS[variable]}; its columns are the axes",
+        data=_squeezed(rotation.transpose("time", "space", ...).values),
+        unit="n.a.",
+        **clock,
+    )
+
+
+def _of_head(data: xr.Dataset, clock: dict[str, Any]) -> Iterator[Any]:
+    """How the head is held."""
+    from pynwb.behavior import SpatialSeries
+
+    if "head_position" in data:
+        yield SpatialSeries(
+            name="head_position",
+            description="Origin of the head's frame; x, y, z",
+            data=_squeezed(data["head_position"].transpose("time", "space").values),
+            unit="meters",
+            reference_frame="laboratory",
+            **clock,
+        )
+    if "head_rotation" in data:
+        yield _rotations("head_rotation", "head_rotation", data["head_rotation"], clock)
 
 
 def _add_contacts(file: NWBFile, data: xr.Dataset) -> None:

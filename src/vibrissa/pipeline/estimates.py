@@ -9,7 +9,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.mapping import ContactMap
-from vibrissa.pipeline.frames import whiskers_in
+from vibrissa.pipeline.frames import signals_in, whiskers_in
 from vibrissa.pipeline.laboratory import in_laboratory
 from vibrissa.pipeline.locate import TRIPLET, locate, locate_from_wrench, unfelt
 from vibrissa.pipeline.signals import sensor_noise
@@ -97,14 +97,7 @@ def estimates_of(
     pose's where a camera tells it (`placed_by`). So an error of the pose does not move a contact
     point that was tracked, as the same pose leads there and back, but it turns the normal.
     """
-    group = recording.children.get("signals")
-    if group is None:
-        got = ", ".join(sorted(recording.children)) or "no groups"
-        raise ValueError(
-            f"the recording has no group signals (it has {got}): make them first, by signals_of or "
-            "`vibrissa signals`"
-        )
-    data = group.to_dataset()
+    data = signals_in(recording)
     if signals is None:
         signals = WHOLE if data.attrs.get("source") == "rod" else TRIPLET
     whole = signals == WHOLE

@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa.signals import base_signals
-from vibrissa.trial.recording import recorded, recorded_whisker
+from vibrissa.trial.recording import recorded, recorded_whisker, variable_faults
 from vibrissa.whisker import Whisker
 
 Array = NDArray[np.float64]
@@ -26,8 +26,28 @@ SQUARES = {
 """Dimensions of covariances beside time and whisker."""
 
 
+_SKEW = 1e-3
+"""How far a rotation times its transpose may be from the identity."""
+
+FELT_BY = ("force", "moment", "base_position", "base_rotation", "in_contact", "status")
+"""What the group ``signals`` must have."""
+
+ESTIMATED = (
+    "contact_point",
+    "contact_covariance",
+    "contact_normal",
+    "normal_covariance",
+    "point_normal_covariance",
+    "contact_point_whisker",
+    "arc_length",
+    "in_contact",
+    "status",
+)
+"""What the group ``estimates`` must have."""
+
+
 def check_recording(recording: xr.DataTree) -> None:
-    """Make sure that a recording has frames and whiskers.
+    """Make sure that a recording has frames and whiskers, and variables with their dimensions.
 
     Parameters
     ----------
@@ -37,7 +57,8 @@ def check_recording(recording: xr.DataTree) -> None:
     Raises
     ------
     ValueError
-        If it has no time, or no dimension ``whisker``.
+        If it has no time, or no dimension ``whisker``, if the time does not rise, or variables have
+        other dimensions than those of a recording, or are no numbers or no rotations.
     """
     root = recording.to_dataset(inherit=False)
     missing = [name for name in ("time", "whisker") if name not in root.dims]
@@ -47,6 +68,20 @@ def check_recording(recording: xr.DataTree) -> None:
             f"the recording lacks the dimensions {', '.join(missing)}; it has {got}: one that was "
             "tracked, simulated or measured is needed"
         )
+    faults = variable_faults(root)
+    if not faults and "base_rotation" in root:
+        turned = root["base_rotation"].transpose(*EACH, "space", "whisker_axis").values
+        known = turned[np.isfinite(turned).all(axis=(-2, -1))]
+        away = np.abs(np.swapaxes(known, -2, -1) @ known - np.eye(3)).max(initial=0.0)
+        if away > _SKEW or (np.linalg.det(known) < 0.0).any():
+            faults.append("base_rotation is no rotation in some frames")
+    time = np.asarray(root["time"].values)
+    if time.size == 0 or root.sizes["whisker"] == 0:
+        faults.append(f"it has {time.size} frames of {root.sizes['whisker']} whiskers")
+    elif time.dtype.kind not in "fiu" or not np.isfinite(time).all() or (np.diff(time) <= 0).any():
+        faults.append("its time does not rise from frame to frame, or is missing in some")
+    if faults:
+        raise ValueError(f"the recording cannot be used: {'; '.join(faults)}")
 
 
 def names_of(data: xr.Dataset) -> str:
@@ -172,7 +207,7 @@ def estimates_in(recording: xr.DataTree) -> xr.Dataset:
     Raises
     ------
     ValueError
-        If it has none.
+        If it has none, or some of it is missing.
     """
     group = recording.children.get("estimates")
     if group is None:
@@ -181,7 +216,51 @@ def estimates_in(recording: xr.DataTree) -> xr.Dataset:
             f"the recording has no group estimates (it has {got}): make them first, by "
             "estimates_of or `vibrissa estimate`"
         )
-    return group.to_dataset()
+    data = group.to_dataset()
+    _complete(data, "estimates", ESTIMATED)
+    return data
+
+
+def signals_in(recording: xr.DataTree) -> xr.Dataset:
+    """Find the signals in a recording.
+
+    Parameters
+    ----------
+    recording : xarray.DataTree
+        The recording.
+
+    Returns
+    -------
+    xarray.Dataset
+        Its group ``signals``.
+
+    Raises
+    ------
+    ValueError
+        If it has none, or some of it is missing.
+    """
+    group = recording.children.get("signals")
+    if group is None:
+        got = ", ".join(sorted(recording.children)) or "no groups"
+        raise ValueError(
+            f"the recording has no group signals (it has {got}): make them first, by signals_of or "
+            "`vibrissa signals`"
+        )
+    data = group.to_dataset()
+    _complete(data, "signals", FELT_BY)
+    return data
+
+
+def _complete(data: xr.Dataset, group: str, names: Sequence[str]) -> None:
+    """Raise where a group of a recording lacks what the stages after it need."""
+    missing = [name for name in names if name not in data]
+    faults = [f"it lacks {', '.join(missing)}"] if missing else []
+    faults += variable_faults(data)
+    if faults:
+        raise ValueError(
+            f"the group {group} of the recording cannot be used: {'; '.join(faults)}; make it anew "
+            f"by `vibrissa {group.removesuffix('s') if group == 'estimates' else group}`"
+        )
 
 
 def whisker_radii(estimates: xr.Dataset, whiskers: Sequence[Whisker]) -> Array:

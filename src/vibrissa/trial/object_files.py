@@ -99,12 +99,15 @@ def object_from_dataset(dataset: xr.Dataset) -> Surface:
     Raises
     ------
     ValueError
-        If it is of an unknown kind.
+        If it is of an unknown kind, or something is missing.
     """
     kind = dataset.attrs.get("kind")
     if kind not in _FIELDS:
         raise ValueError(f"the object is of kind {kind!r}; one of {', '.join(_FIELDS)} is known")
     known, fields = _FIELDS[kind]
+    missing = sorted({*fields.values(), *_STIFFNESS.values()} - set(dataset.data_vars))
+    if missing:
+        raise ValueError(f"a {kind} in a file lacks {', '.join(missing)}")
     values = {field: dataset[name].values for field, name in (fields | _STIFFNESS).items()}
     made: Surface = known(**values)
     return made

@@ -100,6 +100,35 @@ def recorded(name: str, *values: Any) -> xr.Variable:
     return xr.Variable(_DIMS[name], np.stack(values, axis=1), about)
 
 
+def variable_faults(data: xr.Dataset) -> list[str]:
+    """Say which variables of a recording, or of one of its groups, are not as they should be.
+
+    Parameters
+    ----------
+    data : xarray.Dataset
+        Of a file, perhaps made by another program.
+
+    Returns
+    -------
+    list of str
+        What is wrong: other dimensions, vectors not of three components, no numbers.
+    """
+    faults = []
+    for name, dims in _DIMS.items():
+        if name not in data:
+            continue
+        variable = data[name]
+        axes = [dim for dim in dims if dim in ("space", "whisker_axis")]
+        if set(variable.dims) != set(dims):
+            got = ", ".join(map(str, variable.dims))
+            faults.append(f"{name} has the dimensions ({got}); ({', '.join(dims)}) are needed")
+        elif any(variable.sizes[axis] != 3 for axis in axes):
+            faults.append(f"{name} has sizes {dict(variable.sizes)}; space is of 3 dimensions")
+        elif variable.dtype.kind not in "fiub":
+            faults.append(f"{name} holds {variable.dtype}, no numbers")
+    return faults
+
+
 def trial_recording(
     whiskers: Sequence[Whisker],
     motions: Sequence[Motion],

@@ -311,6 +311,9 @@ def _sensor(said: Mapping[str, Any]) -> Sensor:
         usual = (1.0, 0.02) if name == "noise" else (0.0, 0.0)
         force = number(said, f"force_{name}", usual[0]) * _MICRO
         moment = number(said, f"moment_{name}", usual[1]) * _MICRO
+        if name != "bias" and min(force, moment) < 0.0:
+            part = "force" if force < 0.0 else "moment"
+            raise ValueError(f"{part}_{name} is {said[f'{part}_{name}']}; 0 or more is needed")
         each = np.repeat([force, moment], 3)
         mix = np.asarray(plain.mixing)
         numbers[name] = mix @ each if name == "bias" else np.sqrt(mix**2 @ each**2)

@@ -1,11 +1,14 @@
 """Studies that are done: anywhere the same, whatever dies."""
 
+import gc
 import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 import time
+import weakref
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -18,6 +21,7 @@ pytest.importorskip("zarr", reason="zarr (extra sweeps) is not installed")
 from vibrissa import Whisker
 from vibrissa.sweeps import Study, failures, open_sweep, read_study, run_sweep
 from vibrissa.sweeps.population import Specimen
+from vibrissa.sweeps.study import answer
 from vibrissa.sweeps.tasks import TASKS
 
 QUICK = """
@@ -89,11 +93,8 @@ def numbers(found: xr.Dataset, task: str) -> int:
     return sum(found[name].size for name in found if str(name).startswith(f"{task}_"))
 
 
-def test_processes_give_the_same_to_the_bit_whatever_kills_them(
-    spoilt, done, tmp_path, monkeypatch
-):
-    # One whisker kills its process, somebody kills another, and each is replaced after two cells.
-    monkeypatch.setattr("vibrissa.sweeps.workers._LIFE", 2)
+def test_processes_give_the_same_to_the_bit_whatever_kills_them(spoilt, done, tmp_path):
+    # One whisker kills its process, and somebody kills another.
     told = []
 
     def kill_one(*so_far: int) -> None:
@@ -211,3 +212,29 @@ resolution = false
     assert list(np.isnan(found["length"].values)) == [False, True]
     kind, settings = good.tasks["others"]
     assert numbers(found, "others") == 2 * TASKS[kind].numbers(settings)
+
+
+@pytest.mark.parametrize(
+    "task",
+    [
+        'kind = "map"',
+        'kind = "uniqueness"\ntriplets = ["Fx MB MD"]\nsamples = 16',
+        'kind = "sensitivity"\ntriplets = ["Fx MB MD"]',
+        'kind = "estimation"\nsignals = ["Fx MB MD", "Fx FT FD MB", "wrench"]\ncontacts = 20',
+        'kind = "friction"\ncontacts = 20',
+    ],
+)
+def test_nothing_is_kept_of_a_whisker_that_is_done(task):
+    study = read_study(QUICK.replace('kind = "map"', task).replace("[5, 15, 30]", "[15]"), Path())
+    (cell,) = study.cells()
+    made = []
+
+    def make():
+        whisker = cell.specimen.make()
+        made.append(weakref.ref(whisker))
+        return whisker
+
+    found = answer(replace(cell, specimen=replace(cell.specimen, make=make)))
+    assert "result" in found
+    gc.collect()
+    assert made[0]() is None

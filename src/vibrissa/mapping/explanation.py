@@ -206,7 +206,7 @@ def why_none(
         How far the nearest signals that some contact gives are, in shares of their ranges.
     """
     chart, turned = contacts.chart, circular_among(names)
-    known, size, tree, bounds = _seen(contacts, names)
+    known, size, tree, bounds = seen(contacts, names)
     _, nearest = tree.query(_on_circle(targets, turned, size))
     away = within_turn(known[nearest] - targets, turned)
     span = np.where(turned, 2.0 * np.pi, size)
@@ -222,7 +222,7 @@ def why_none(
 
 
 @lru_cache(maxsize=16)
-def _seen(contacts: ContactMap, names: tuple[str, ...]) -> tuple[Array, Array, cKDTree, Bounds]:
+def seen(contacts: ContactMap, names: tuple[str, ...]) -> tuple[Array, Array, cKDTree, Bounds]:
     """Signals (n, k) at the chart's nodes, their ranges, the same as a tree, and their bounds."""
     values = contacts.chart.values.reshape(-1, 6)
     which = [SIGNALS.index(name) for name in names]

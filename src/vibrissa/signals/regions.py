@@ -29,7 +29,8 @@ _SAMPLES = 2049
 
 
 @lru_cache(maxsize=16)
-def _rest(whisker: Whisker) -> tuple[Array, Array, cKDTree]:
+def resting(whisker: Whisker) -> tuple[Array, Array, cKDTree]:
+    """Arc lengths (n,), places (n, 3) and a tree of them, of the resting whisker; cached."""
     s = np.linspace(0.0, whisker.length, _SAMPLES)
     places = whisker.position(s)
     return s, places, cKDTree(places)
@@ -55,7 +56,7 @@ def nearest_on_rest(whisker: Whisker, points: Array) -> tuple[Array, Array]:
     distance, arc_length = np.full(len(flat), np.nan), np.full(len(flat), np.nan)
     rows = np.flatnonzero(np.isfinite(flat).all(axis=1))
     if rows.size:
-        s, places, tree = _rest(whisker)
+        s, places, tree = resting(whisker)
         _, i = tree.query(flat[rows])
         # Between samples the curve is straight enough: the nearest place on the two chords beside
         # the sample.
@@ -159,7 +160,7 @@ def concave_backward(whisker: Whisker, points: Array) -> AnyArray:
     y = points[..., 1]
     if whisker.is_straight:
         return np.asarray(y > 0.0)
-    _, places, _ = _rest(whisker)
+    _, places, _ = resting(whisker)
     r_rest = np.linalg.norm(places, axis=1)
     r = np.linalg.norm(points, axis=-1)
     if np.all(np.diff(r_rest) > 0.0):

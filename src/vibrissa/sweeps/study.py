@@ -15,6 +15,12 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from vibrissa.mapping.explanation import seen
+from vibrissa.mapping.least_squares import seeding_triplet
+from vibrissa.rod.discretize import discretize
+from vibrissa.rod.points import point_solver
+from vibrissa.rod.reach import reach
+from vibrissa.signals.regions import resting
 from vibrissa.sweeps.population import Specimen, population
 from vibrissa.sweeps.tasks import TASKS, Settings, settings_of
 from vibrissa.whisker import Whisker
@@ -74,6 +80,8 @@ moment_noise = 0.02              # µN·m
 # Others: "map"; "sensitivity" (triplets, noise); "friction" (triplet, friction, contacts).
 """
 
+_KEPT = (discretize, reach, point_solver, resting, seen, seeding_triplet)
+"""Functions that keep what they found of the last whiskers; a study does not come back to any."""
 _OF_WHISKER, _OF_CELL = 16, 4
 """Numbers kept of each whisker, with its name, and of each cell."""
 TAKEN = ("cells", "whiskers")
@@ -300,6 +308,9 @@ def answer(cell: Cell) -> dict[str, Any]:
         described = _described(whisker)
     except Exception:
         return {"failure": traceback.format_exc(), "seconds": time.process_time() - started}
+    finally:
+        for kept in _KEPT:
+            kept.cache_clear()
     return {
         "result": result,
         "whisker": described,

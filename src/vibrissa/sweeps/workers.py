@@ -23,8 +23,6 @@ from vibrissa.sweeps.study import Cell, answer
 
 _TRIES = 2
 """A cell whose process dies may not be to blame: somebody killed it, or memory ran out."""
-_LIFE = 100
-"""Cells after which a process is replaced, so that what libraries keep in memory stays bounded."""
 _STARTS = 3
 """Processes that may die, one after the other, before they are ready."""
 _DIED = f"the process that worked on this cell died, {_TRIES} times: killed, or out of memory\n"
@@ -36,7 +34,6 @@ class _Worker:
     pipe: Connection
     cell: Cell
     ready: bool = False
-    answered: int = 0
 
 
 def answers_by_processes(
@@ -96,9 +93,8 @@ def answers_by_processes(
                     worker.ready, stillborn = True, 0
                     continue
                 done = worker.cell
-                worker.answered += 1
                 # It goes on before the answer is dealt with.
-                if worker.answered < _LIFE and (cell := _next(again, waiting)) is not None:
+                if (cell := _next(again, waiting)) is not None:
                     worker.cell = cell
                     _send(worker)
                 else:

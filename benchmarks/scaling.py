@@ -1,0 +1,163 @@
+# ruff: noqa: T201 -- a script that reports
+"""What simulating, tracking, estimating and keeping a study's cells cost as they grow.
+
+    python benchmarks/scaling.py [simulate] [track] [estimate] [store]
+
+prints a table in Markdown for docs/scaling.md: CPU time of this process, all its threads together,
+after a first call that is not counted, and memory of the results. Without arguments all of it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import vibrissa as vb
+from vibrissa.mapping.network import draw_contacts
+from vibrissa.signals import SIGNALS
+from vibrissa.tracking import TrackOptions, trace_video, track
+from vibrissa.trial import (
+    array_whisking,
+    facing_peg,
+    orthogonal_views,
+    simulate,
+    sweep_past,
+)
+from vibrissa.trial.film import film_frames
+
+RATE = 500.0
+TRIPLET = ("Fx", "MB", "MD")
+Row = tuple[str, str, float, float, str]
+"""What, how much of it, CPU s, CPU s of one, and what else is told."""
+
+
+def timed(work: Callable[[], Any]) -> tuple[Any, float]:
+    """What work gives, and the least of three times: others on the machine only add to it."""
+    taken = []
+    for _ in range(3):
+        begun = time.process_time()
+        found = work()
+        taken.append(time.process_time() - begun)
+    return found, min(taken)
+
+
+def simulated() -> Iterator[Row]:
+    whisker = vb.samples.gamma()
+    peg = facing_peg(whisker)
+
+    def trial(frames: int, copies: int) -> Any:
+        motion = sweep_past(whisker, peg, duration=frames / RATE, rate=RATE)
+        several = [whisker.with_properties(name=str(k)) for k in range(copies)]
+        return simulate(several, [motion] * copies, peg)
+
+    trial(20, 1)
+    for frames, copies in ((100, 1), (200, 1), (400, 1), (100, 2), (100, 4)):
+        tree, seconds = timed(lambda frames=frames, copies=copies: trial(frames, copies))
+        count = tree["time"].size * copies
+        size = sum(node.to_dataset().nbytes for node in tree.subtree)
+        told = f"{size / count / 1e3:.1f} kB a frame"
+        yield "simulate", f"{tree['time'].size} frames × {copies}", seconds, seconds / count, told
+    array = vb.whisker_array(side="right", rows="C")
+    motions = array_whisking(array, 40 / RATE, RATE)
+    tree, seconds = timed(lambda: simulate(array, motions, peg))
+    count = tree["time"].size * len(array)
+    size = f"{tree['time'].size} frames × {len(array)} of an array"
+    yield "simulate", size, seconds, seconds / count, ""
+
+
+def tracked() -> Iterator[Row]:
+    whisker = vb.samples.gamma()
+    peg, most = facing_peg(whisker), 120
+    motion = sweep_past(whisker, peg, duration=most / RATE, rate=RATE)
+    trial = simulate(whisker, motion, peg)
+    cameras = orthogonal_views(0.12e-3, (360, 360), center=[15e-3, 2e-3, 0.0])
+    films = [list(film_frames(trial, camera)) for camera in cameras]
+    known = {"base_radius": whisker.base_radius, "tip_radius": whisker.tip_radius}
+    options = TrackOptions(properties=known)
+    traces = [trace_video(film) for film in films]
+    for frames in (most // 4, most // 2, most):
+        _, seconds = timed(lambda n=frames: [trace_video(film[:n]) for film in films])
+        yield "trace, 360² pixels", f"{frames} frames × 2 views", seconds, seconds / frames / 2, ""
+    track(cameras, traces, RATE, options)
+    for frames, copies in ((most // 2, 1), (most, 1), (most, 2)):
+        some = [[one[:frames] for one in view] * copies for view in traces]
+        tree, seconds = timed(lambda some=some: track(cameras, some, RATE, options))
+        size = sum(node.to_dataset().nbytes for node in tree.subtree)
+        told = f"{size / frames / copies / 1e3:.1f} kB a frame"
+        each = seconds / frames / copies
+        yield "track, of traces", f"{frames} frames × {copies}", seconds, each, told
+
+
+def estimated() -> Iterator[Row]:
+    whisker = vb.samples.gamma()
+    chart = vb.ContactMap.simulate(whisker, grid=False)
+    for count in (100, 1_000, 10_000, 100_000):
+        signals = draw_contacts(chart, count, seed=1).signals
+        known = {name: signals[:, SIGNALS.index(name)] for name in TRIPLET}
+        chart.estimate({name: known[name][:10] for name in known}, TRIPLET)
+        _, seconds = timed(lambda known=known: chart.estimate(known, TRIPLET))
+        yield f"estimate, ({', '.join(TRIPLET)})", f"{count} frames", seconds, seconds / count, ""
+
+
+def kept() -> Iterator[Row]:
+    from vibrissa.sweeps import Store, open_sweep, read_study
+    from vibrissa.sweeps.study import answer
+
+    text = '[[whiskers]]\nkind = "random"\ncount = {}\nlength = [20, 60]\n[[tasks]]\nkind = "map"'
+    for count in (1_000, 10_000):
+        study, reading = timed(lambda n=count: read_study(text.format(n), Path()))
+        yield "sweep: read the study", f"{count} whiskers", reading, reading / count, ""
+        cells = list(study.cells())
+        found = answer(cells[0])
+        folder = Path(tempfile.mkdtemp())
+        try:
+            with Store(folder / "s", study) as store:
+                store.write(cells[0], found)
+                begun = time.process_time()
+                for cell in cells[1:]:
+                    store.write(cell, found)
+                seconds = time.process_time() - begun
+            files = [one for one in folder.rglob("*") if one.is_file()]
+            size = sum(one.stat().st_size for one in files)
+            told = f"{len(files)} files, {size / count:.0f} B a cell"
+            yield "sweep: write", f"{count} cells", seconds, seconds / count, told
+
+            def resume(path: Path = folder / "s", study: Any = study) -> None:
+                with Store(path, study) as store:
+                    assert (store.statuses() == 1).all()
+
+            _, seconds = timed(resume)
+            yield "sweep: go on from", f"{count} cells", seconds, seconds / count, ""
+            _, seconds = timed(lambda path=folder / "s": open_sweep(path).load())
+            yield "sweep: open", f"{count} cells", seconds, seconds / count, ""
+        finally:
+            shutil.rmtree(folder)
+
+
+PARTS = {"simulate": simulated, "track": tracked, "estimate": estimated, "store": kept}
+
+
+def readable(seconds: float) -> str:
+    if seconds >= 0.1:
+        return f"{seconds:.2f} s"
+    return f"{seconds * 1e3:.2f} ms" if seconds >= 1e-4 else f"{seconds * 1e6:.1f} µs"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("parts", nargs="*", choices=[*PARTS, []], help="by default all")
+    print("| what | how much | CPU | of one | |\n|---|---|---:|---:|---|")
+    for part in parser.parse_args().parts or PARTS:
+        for what, size, seconds, each, told in PARTS[part]():
+            print(
+                f"| {what} | {size} | {readable(seconds)} | {readable(each)} | {told} |", flush=True
+            )
+
+
+if __name__ == "__main__":
+    main()

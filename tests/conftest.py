@@ -1,8 +1,9 @@
 """How every test runs: figures without a window, one thread of BLAS, random inputs without a
-deadline, one browser."""
+deadline, one browser, and on several cores in an order that keeps them all busy."""
 
 import os
 import shutil
+from pathlib import Path
 
 os.environ.setdefault("MPLBACKEND", "Agg")
 # The matrices are small and there is a worker on every core: threads of BLAS, which wait by turning
@@ -17,6 +18,49 @@ from hypothesis import settings
 # the examples are the same in every run, so that a change fails by its own fault only.
 settings.register_profile("vibrissa", deadline=None, derandomize=bool(os.environ.get("CI")))
 settings.load_profile("vibrissa")
+
+# Where files are shared out to workers, these come first, in this order. The first compiles most
+# kernels; those after it need none, so that nobody compiles the same at the same time; then follow
+# those that take longest, so that no worker is left alone with one of them at the end.
+_FIRST = [
+    "mapping/test_uniqueness.py",
+    "whisker",
+    "contour",
+    "io",
+    "report",
+    "cli/test_cli.py",
+    "demo",
+    "viewer/test_page.py",
+    "viewer/test_watching.py",
+    "sweeps",
+    "mapping",
+    "rod",
+    "tracking",
+    "plots",
+    "trial",
+    "cli",
+]
+_HERE = Path(__file__).parent
+
+
+def _turn(path):
+    """When a file's turn is: the more particular line of ``_FIRST`` counts."""
+    name = path.relative_to(_HERE).as_posix() if path.is_relative_to(_HERE) else ""
+    for part in (name, name.partition("/")[0]):
+        if part in _FIRST:
+            return _FIRST.index(part)
+    return len(_FIRST)
+
+
+def pytest_configure(config):
+    """Workers take files in the order above, not by how many tests are in them."""
+    if hasattr(config.option, "loadscopereorder"):
+        config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(config, items):
+    if hasattr(config, "workerinput"):
+        items.sort(key=lambda item: _turn(item.path))
 
 
 _BROWSER = [

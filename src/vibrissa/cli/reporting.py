@@ -74,6 +74,9 @@ def report(
     given = [path, *(file for file in (uniqueness, chart) if file), *(videos or []), *(films or [])]
     for file in given:
         check_readable(file)
+    for film in films or []:
+        if film.suffix.lower() != ".mp4":
+            raise ValueError(f"--movie is {film}; a movie that ends in .mp4 is needed")
     kind = _kind(path)
     with progress_bars() as tell:
         if kind == "trial":

@@ -184,6 +184,7 @@ def _advice(running: ContactStream) -> str:
 
 def _lines(source: Path | None, udp: str | None, opened: ExitStack) -> Iterator[str]:
     """Lines as they come; a socket is open before the map is made, so that none are lost."""
+    from vibrissa.io.paths import check_readable
     from vibrissa.streaming.sources import file_lines, udp_address, udp_lines, udp_socket
 
     if udp is not None:
@@ -195,8 +196,8 @@ def _lines(source: Path | None, udp: str | None, opened: ExitStack) -> Iterator[
         if isinstance(sys.stdin, TextIOWrapper):  # noise on a serial line must not end a stream
             sys.stdin.reconfigure(errors="replace")
         return iter(sys.stdin.readline, "")
-    if not source.exists():
-        raise FileNotFoundError(f"there is no file {source}")
+    if source.is_dir() or not source.exists():
+        check_readable(source)
     return file_lines(source)
 
 

@@ -153,6 +153,9 @@ def track(
     for file in files:
         check_writable(file, NETCDF)
     _check_numbers(fps, cutoff, base_radius)
+    for name, pixels in (("width", width), ("jump", jump)):
+        if not 0.0 < pixels < float("inf"):
+            raise ValueError(f"--{name} is {pixels:g}; pixels, more than 0, are needed")
     _check_twice(trials)
     places = _bases(base or [], views)
     fixed = {} if corrections is None else load_corrections(corrections)
@@ -239,7 +242,7 @@ def _cameras(
         raise ValueError(f"the videos differ in size, {sorted(set(sizes))}: give --cameras")
     pixel_size = _PIXEL if pixel_size is None else pixel_size
     wide = pixel_size * sizes[0][0]
-    if wide > _WIDEST:
+    if not 0.0 < wide <= _WIDEST:
         raise ValueError(
             f"--pixel-size is {pixel_size:g} m, by which the views are {wide:g} m wide; it is in "
             "metres, such as 58e-6"

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from vibrissa.contour import CylinderFit, axis_offset, surface_distances
 from vibrissa.mapping.contact_map import spherical
+from vibrissa.pipeline.comparison import ANGLE_CLASSES
 from vibrissa.signals import nearest_on_rest, within_turn
 from vibrissa.whisker import Whisker
 
@@ -25,7 +26,7 @@ ERRORS = ("error_r", "error_theta", "error_phi", "error_distance")
 """Errors by name: of r, θ, φ, and in space."""
 
 REPLICATES = 25
-ANGLES = (0.0, 2.0, 5.0, 10.0, 15.0, 90.0)
+ANGLES = ANGLE_CLASSES
 """Edges of the classes of deflection angle, degrees."""
 
 _QUANTILES = (0.5, 0.95, 1.0)

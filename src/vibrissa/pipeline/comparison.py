@@ -15,8 +15,11 @@ from vibrissa.signals import nearest_on_rest
 from vibrissa.trial.recording import recorded_objects
 from vibrissa.whisker import Whisker
 
-ANGLES = np.deg2rad([0.0, 2.0, 5.0, 10.0, 15.0, 90.0])
-"""Edges of the classes of deflection angle, rad."""
+ANGLE_CLASSES = (0.0, 2.0, 5.0, 10.0, 15.0, 90.0)
+"""Edges of the classes of deflection angle, degrees."""
+
+ANGLES = np.deg2rad(ANGLE_CLASSES)
+"""The same, rad."""
 
 
 def nearest_object(

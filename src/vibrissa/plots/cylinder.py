@@ -128,15 +128,16 @@ def signal_axes(figure: Figure, panel: Box, limits: Array) -> Any:
     for ring in rings:
         places = np.sqrt(ring) * np.stack([np.cos(turn), np.sin(turn)])
         axes.plot(*places, floor, **_FLOOR)
-        near = 1.0 if ring < rings[-1] else 1.15
+        near = 1.0 if ring < rings[-1] else 1.28
         size, unit = quantity("MB").symbol, quantity("MB").display_unit
         label = f"{ring:g}" if ring < rings[-1] else f"${size}$ = {ring:g} {unit}"
         _write(axes, _FRONT, np.sqrt(ring) * near, floor, label, ha="left", va="top", color=MUTED)
     for angle in (0, 90, 180, -90):
         axes.plot(*np.outer(_toward(angle), [0.0, reach]), floor, **_FLOOR)
         label = f"{angle}°" if angle != 180 else f"${quantity('MD').symbol}$ = 180°"
-        # The ray to the left ends beside the solid, whose edge would hide a centred word.
-        far = {"ha": "right"} if angle == 90 else {}
+        # The rays to the left end beside the solid and beside the largest ring's label, which
+        # centred words would meet.
+        far = {"ha": "right"} if angle in (90, 180) else {}
         _write(axes, angle, 1.17 * reach, floor, label.replace("-", "−"), **far)
     _height_axis(axes, limits)
     return axes

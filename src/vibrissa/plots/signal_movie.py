@@ -83,7 +83,7 @@ def _frames(
     with looking():
         figure = screen_figure()
         panels = [(66.5 * i + 0.5, 52.5, 66.5, 58.0) for i in range(3)]
-        rails = [(66.5 * i + 62.0, 66.0, 1.6, 24.0) for i in range(3)]
+        rails = [(66.5 * i + 59.7, 66.0, 1.6, 24.0) for i in range(3)]
         felt = np.stack([signals[name] for name in TRIPLET], axis=1)
         felt[~course.touching] = np.nan
         solids = solid_panels(figure, samples, centerline, panels, rails, felt[first : last + 1])

@@ -50,14 +50,10 @@ def simulated() -> Iterator[Row]:
     whisker = vb.samples.gamma()
     peg = facing_peg(whisker)
 
-    def trial(frames: int, copies: int) -> Any:
-        motion = sweep_past(whisker, peg, duration=frames / RATE, rate=RATE)
-        several = [whisker.with_properties(name=str(k)) for k in range(copies)]
-        return simulate(several, [motion] * copies, peg)
-
-    trial(20, 1)
+    several = [whisker.with_properties(name=str(k)) for k in range(4)]
     for frames, copies in ((100, 1), (200, 1), (400, 1), (100, 2), (100, 4)):
-        tree, seconds = timed(lambda frames=frames, copies=copies: trial(frames, copies))
+        motion = sweep_past(whisker, peg, duration=frames / RATE, rate=RATE)
+        tree, seconds = timed(lambda m=motion, n=copies: simulate(several[:n], [m] * n, peg))
         count = tree["time"].size * copies
         size = sum(node.to_dataset().nbytes for node in tree.subtree)
         told = f"{size / count / 1e3:.1f} kB a frame"

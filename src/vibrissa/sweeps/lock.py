@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import sys
 from pathlib import Path
 from typing import IO
@@ -24,6 +25,8 @@ def hold(path: Path) -> IO[str]:
     ------
     BlockingIOError
         If somebody else has it.
+    OSError
+        If there can be no lock here.
     """
     file = path.open("a", encoding="utf-8")
     try:
@@ -38,5 +41,7 @@ def hold(path: Path) -> IO[str]:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as fault:
         file.close()
-        raise BlockingIOError(fault.errno, f"{path} is locked") from fault
+        if fault.errno in (errno.EAGAIN, errno.EACCES):
+            raise BlockingIOError(fault.errno, f"{path} is locked") from fault
+        raise
     return file

@@ -126,8 +126,8 @@ class Store:
             root = zarr.open_group(self.path, mode="a", zarr_format=2)
             root.attrs.update({"kind": "vibrissa sweep", "study": self.study.name})
             self._note(_STUDY, {**_described(self.study), "origins": []})
-        self._consolidate()
         self._origin = self._admitted(noted(self.path))
+        self._consolidate()
         self._cells = {name: Rows(self.path / "cells" / name) for name in _CELLS}
         self._whiskers = {name: Rows(self.path / "whiskers" / name) for name in DESCRIBED}
         for task in self.study.tasks:

@@ -5,6 +5,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import urllib.request
 
 import pytest
@@ -44,3 +45,33 @@ def test_a_taken_port_is_passed_over():
     assert first >= PORT
     with socket.create_server(("127.0.0.1", first)):
         assert free_port("127.0.0.1") > first
+
+
+def test_stopped_before_it_is_there_it_ends_as_well(monkeypatch):
+    from typer.testing import CliRunner
+
+    from vibrissa.cli.app import app
+
+    def stopped(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("vibrissa.viewer.server.view", stopped)
+    result = CliRunner().invoke(app, ["view", "--no-browser"])
+    assert result.exit_code == 0
+    assert result.stdout.strip() == "stopped"
+
+
+def test_what_was_opened_is_closed_if_a_later_step_fails(monkeypatch):
+    import vibrissa as vb
+    from vibrissa.viewer import view
+    from vibrissa.viewer.server import free_port, is_free
+
+    def broken(page):
+        raise RuntimeError("no such mode")
+
+    monkeypatch.setattr("vibrissa.viewer.server.MapMode", broken)
+    port = free_port("127.0.0.1")
+    with pytest.raises(RuntimeError, match="no such mode"):
+        view(vb.samples.gamma(), port=port)
+    assert is_free("127.0.0.1", port)
+    assert not {"viewer", "player"} & {thread.name for thread in threading.enumerate()}

@@ -3,6 +3,7 @@
 import base64
 import hashlib
 import re
+from functools import partial
 from html.parser import HTMLParser
 
 import numpy as np
@@ -11,15 +12,21 @@ import xarray as xr
 from typer.testing import CliRunner
 
 import vibrissa as vb
-from vibrissa import __version__
+from vibrissa import __version__, plots
+from vibrissa.cli import reporting
 from vibrissa.cli.app import app
-from vibrissa.io import load_recording, save_recording
+from vibrissa.cli.figures import dataset_with
+from vibrissa.io import load_recording, save_recording, video_info
 from vibrissa.mapping import ContactMap
+from vibrissa.quantities import quantity
 from vibrissa.report import document, figure_sections, movies_section, table, trial_sections
 from vibrissa.report.page import Section
+from vibrissa.report.trial import tracking_tables
+from vibrissa.signals import SIGNALS
 from vibrissa.status import describe
 from vibrissa.trial import recorded_whisker
 
+LINES = "Tracked and true lines"
 VOID = {"meta", "br", "img", "path", "link", "input", "hr"}
 
 
@@ -109,6 +116,22 @@ def written(folder):
     return folder / "trial.html"
 
 
+@pytest.fixture(scope="module")
+def map_page(folder):
+    """The page of the map, with verdicts, and the words that make it; figures are small."""
+    contacts = ContactMap.load(folder / "map.nc")
+    verdicts = vb.uniqueness(
+        contacts, [("Fx", "MB", "MD"), ("FT", "FD", "MD")], ["all", "ELD"], samples=256
+    )
+    vb.mapping.save_uniqueness(verdicts, folder / "uniqueness.nc")
+    words = (folder / "map.nc", "--uniqueness", folder / "uniqueness.nc")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SOURCE_DATE_EPOCH", "1700000000")
+        patch.setattr(plots, "png", partial(plots.png, dots=40.0))
+        run("report", *words, "-o", folder / "map.html")
+        yield folder / "map.html", words
+
+
 def number(cell):
     """The first number of a cell."""
     return float(re.match(r"[−\d.e+]+", cell)[0].replace("−", "-"))
@@ -186,6 +209,42 @@ def test_errors_of_signals_are_shares_of_the_truth(folder):
     assert rows
     for row in rows:
         assert row[2:] == ["10 %", "0 %", "10 %", "0 %"]
+    _, *six = Page(parts["signals"]).tables["Error of the six signals"]
+    assert [row[0] for row in six] == [quantity(name).long_name for name in SIGNALS]
+    touching = (truth["in_contact"] & wrong["in_contact"]).values[:, 0].astype(bool)
+    fx = 1e6 * np.abs(truth["force"].values[touching, 0, 0])
+    assert number(six[0][2]) == pytest.approx(0.1 * np.median(fx), rel=6e-3)
+    assert number(six[0][5]) == pytest.approx(np.median(fx), rel=6e-3)
+    for row in six[2:]:  # neither directions nor moments have changed
+        assert number(row[4]) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_errors_of_lines_are_distances_from_the_true_ones():
+    x = np.linspace(0.0, 1.0, 11)
+    frames = np.array([0.0, 1e-3, 2e-3])
+
+    def lines(name, dim, aside, dims):
+        curve = np.stack([x, 0.0 * x, 0.0 * x][: 2 if dims == "image_axis" else 3], axis=-1)
+        curve = np.repeat(curve[None], 3, axis=0)
+        curve[..., 1] += aside[:, None]
+        return xr.DataArray(curve, dims=("time", dim, dims), name=name)
+
+    away = 1e-3 * np.array([1.0, 2.0, 3.0])
+    tracked, truth = (
+        xr.Dataset(
+            {
+                "centerline": lines("centerline", dim, aside, "space"),
+                "trace": lines("trace", dim, 1e3 * aside, "image_axis").expand_dims(view=["top"]),
+                "in_contact": ("time", [True, True, False]),
+                "contact_point": (("time", "space"), np.zeros((3, 3))),
+            },
+            {"time": frames},
+        )
+        for dim, aside in (("node", away), ("true_node", 0.0 * away))
+    )
+    rows = {row[0]: row[1:] for row in Page(tracking_tables(tracked, truth)).tables[LINES]}
+    assert rows["centreline"] == ["33", "2 mm", "3 mm"]
+    assert rows["trace, top view"] == ["33", "2 px", "3 px"]
 
 
 def test_where_it_comes_from(written, folder):
@@ -202,27 +261,21 @@ def test_where_it_comes_from(written, folder):
     assert facts["seed"].startswith("3")
 
 
-def test_the_same_command_gives_the_same_page(folder, monkeypatch):
-    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
-    pages = []
-    for _ in range(2):
-        run("report", folder / "map.nc", "-o", folder / "same.html")
-        pages.append((folder / "same.html").read_bytes())
-    assert pages[0] == pages[1]
+def test_the_same_command_gives_the_same_page(map_page, folder, monkeypatch):
+    path, words = map_page
+    before = path.read_bytes()
+    run("report", *words, "-o", path)
+    assert path.read_bytes() == before
+    monkeypatch.setattr(reporting, "_drawn", lambda drawings, tell: {})
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "yesterday")
     told = fault("report", folder / "map.nc", "-o", folder / "same.html")
     assert "'yesterday'" in told
 
 
-def test_a_map_with_verdicts(folder):
+def test_a_map_with_verdicts(map_page, folder):
     contacts = ContactMap.load(folder / "map.nc")
-    verdicts = vb.uniqueness(
-        contacts, [("Fx", "MB", "MD"), ("FT", "FD", "MD")], ["all", "ELD"], samples=256
-    )
-    path = folder / "uniqueness.nc"
-    vb.mapping.save_uniqueness(verdicts, path)
-    run("report", folder / "map.nc", "--uniqueness", path, "-o", folder / "map.html")
-    page = Page((folder / "map.html").read_text(encoding="utf-8"))
+    verdicts = dataset_with(folder / "uniqueness.nc", "verdict")
+    page = Page(map_page[0].read_text(encoding="utf-8"))
     nothing_is_loaded(page)
     heading, *rows = page.tables["Verdicts by region"]
     assert heading == ["triplet", "all", "ELD", "in short"]
@@ -258,6 +311,7 @@ def test_what_is_missing_is_named_with_the_verb_that_makes_it(folder):
 
 def test_without_the_drawing_library_the_picture_in_space_is_left_out(folder, monkeypatch):
     monkeypatch.setattr("vibrissa.report.space.find_spec", lambda name: None)
+    monkeypatch.setattr(reporting, "_drawn", lambda drawings, tell: {})
     text = run("report", folder / "map.nc", "-o", folder / "flat.html")
     assert "vibrissa[report]" in text
     page = Page((folder / "flat.html").read_text(encoding="utf-8"))
@@ -292,6 +346,39 @@ def test_movies_are_embedded_as_far_as_there_is_room(tmp_path):
     assert tag == "video"
     data = address.removeprefix("data:video/mp4;base64,")
     assert base64.b64decode(data) == small.read_bytes()
+
+
+def test_movies_are_made_and_put_into_the_page(folder, tmp_path, monkeypatch):
+    """Of two frames; what is drawn in them is tested with the movies."""
+    recording = load_recording(folder / "trial.nc")
+    touching = int(recording["truth"]["in_contact"].values[:, 0].argmax())
+    few = slice(touching, touching + 2)
+    groups = {
+        group.path: data.isel(time=few) if "time" in data.dims else data
+        for group in recording.subtree
+        for data in [group.to_dataset(inherit=False)]
+    }
+    save_recording(tmp_path / "short.nc", xr.DataTree.from_dict(groups))
+    monkeypatch.setattr(reporting, "_drawn", lambda drawings, tell: {})
+    words = ("report", tmp_path / "short.nc", "--map", folder / "map.nc", "--movies")
+    run(*words, "-o", tmp_path / "short.html")
+    page = Page((tmp_path / "short.html").read_text(encoding="utf-8"))
+    assert page.sections.index("movies") == len(page.sections) - 2
+    films = [address for tag, _, address in page.addresses if tag == "video"]
+    for name, film in zip(("contour", "signals"), films, strict=True):
+        path = tmp_path / f"short-{name}.mp4"
+        data = film.removeprefix("data:video/mp4;base64,")
+        assert base64.b64decode(data) == path.read_bytes()
+        assert video_info(path).frames == 2
+    assert (tmp_path / "short.html").stat().st_size < 15e6
+
+    # Where there is no room left, they lie beside the page.
+    monkeypatch.setattr(reporting, "_LARGEST", 0)
+    given = ("--movie", tmp_path / "short-signals.mp4")
+    run("report", folder / "map.nc", *given, "-o", tmp_path / "linked.html")
+    page = Page((tmp_path / "linked.html").read_text(encoding="utf-8"))
+    assert ("a", "href", "short-signals.mp4") in page.addresses
+    assert "video" not in [tag for tag, _, _ in page.addresses]
 
 
 def test_text_cannot_become_markup():

@@ -158,3 +158,8 @@ def test_dynamics_are_asked_for():
     assert read("", duration=0.1, rate=250.0, dynamic=True).dynamics.segments == 32
     with pytest.raises(ValueError, match="density is 3"):
         read("[dynamics]\ndensity = 3", duration=0.1)
+
+
+def test_a_mesh_without_a_file_is_told_what_it_needs(tmp_path):
+    with pytest.raises(ValueError, match="an object of kind mesh is a file"):
+        read('[[object]]\nkind = "mesh"\n', tmp_path)

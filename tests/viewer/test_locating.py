@@ -7,7 +7,7 @@ import vibrissa as vb
 from vibrissa.viewer.bending import begin, moved
 from vibrissa.viewer.charting import charted
 from vibrissa.viewer.locate_drawing import locate_drawing, of_located
-from vibrissa.viewer.locating import COLOURS, Sensor, coloured, located
+from vibrissa.viewer.locating import COLOURS, Sensor, coloured, located, usual_sensor
 from vibrissa.viewer.shading import counted, shaded
 
 
@@ -88,3 +88,13 @@ def test_every_contact_of_the_cloud_is_found_again(chart):
     for triplet in ("Fx MB MD", "Fx FT MB"):
         felt = {name: chart.signals[name] for name in triplet.split()}
         assert (chart.contacts.estimate(felt, triplet).n_candidates > 0).all()
+
+
+def test_a_sensor_suits_what_stands_on_it():
+    rat, usual = usual_sensor(vb.samples.gamma()), Sensor()
+    assert rat.force_noise == pytest.approx(usual.force_noise)
+    assert rat.moment_noise == pytest.approx(usual.moment_noise)
+    # A rod of 300 mm and 1 mm radius: EI/L² is a hundred times that of a whisker, EI/L a thousand.
+    rod = vb.Whisker.straight(length=0.3, base_radius=1e-3, tip_radius=1e-3, youngs_modulus=2e9)
+    assert usual_sensor(rod).force_noise == pytest.approx(1e-4)
+    assert usual_sensor(rod).moment_noise == pytest.approx(2e-5)

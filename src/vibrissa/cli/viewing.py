@@ -53,21 +53,20 @@ def view(
         whisker = contacts.whisker
     elif kind == "vibrissa recording" and path is not None:
         recording = load_recording(path)
-    viewer = serve(
-        whisker,
-        contacts=contacts,
-        recording=recording,
-        videos=videos or (),
-        host=host,
-        port=port,
-    )
-    with viewer:
-        output.print(f"{viewer.url}   Ctrl-C ends it", highlight=False, soft_wrap=True)
-        if browser:
-            import webbrowser
+    try:
+        with serve(
+            whisker,
+            contacts=contacts,
+            recording=recording,
+            videos=videos or (),
+            host=host,
+            port=port,
+        ) as viewer:
+            output.print(f"{viewer.url}   Ctrl-C ends it", highlight=False, soft_wrap=True)
+            if browser:
+                import webbrowser
 
-            webbrowser.open(viewer.url)
-        try:
+                webbrowser.open(viewer.url)
             viewer.wait()
-        except KeyboardInterrupt:
-            output.print("stopped")
+    except KeyboardInterrupt:
+        output.print("stopped")

@@ -217,8 +217,9 @@ def _with_truth(held: xr.DataTree, trial: xr.DataTree) -> xr.DataTree:
     groups = {group.path: group.to_dataset(inherit=False) for group in held.subtree}
     for group in trial.subtree:
         if group.path.split("/")[1] in ("truth", "objects"):
-            # The curves of the truth have other nodes; they are in the simulated recording.
-            groups[group.path] = group.to_dataset(inherit=False).drop_dims("node", errors="ignore")
+            # The curves of the truth have nodes of their own.
+            data = group.to_dataset(inherit=False)
+            groups[group.path] = data.rename(node="true_node") if "node" in data.dims else data
     return xr.DataTree.from_dict(groups)
 
 

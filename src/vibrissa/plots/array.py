@@ -265,7 +265,7 @@ def _scene(tree: xr.DataTree, frame: int | None, contacts: str) -> _Scene | None
     line = held["centerline"]
     names = [str(name) for name in np.atleast_1d(root["whisker"].values)]
     if "time" not in line.dims:
-        lines = to_display("centerline", line.transpose("whisker", "node", "space").values)
+        lines = to_display("centerline", line.transpose("whisker", ..., "space").values)
         none = np.zeros(len(names), dtype=bool)
         empty = [np.empty((0, 3)) for _ in names]
         still = np.eye(3), np.zeros(3)
@@ -275,7 +275,7 @@ def _scene(tree: xr.DataTree, frame: int | None, contacts: str) -> _Scene | None
     at = most if frame is None else frame
     if not 0 <= at < len(touching):
         raise ValueError(f"frame is {frame}; from 0 to {len(touching) - 1} is needed")
-    lines = line.transpose("time", "whisker", "node", "space").values[at]
+    lines = line.transpose("time", "whisker", ..., "space").values[at]
     if not np.isfinite(lines).any():
         return None
     turn, place = np.eye(3), np.zeros(3)

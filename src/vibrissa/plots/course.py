@@ -190,7 +190,7 @@ def _traces(root: xr.Dataset, truth: xr.Dataset) -> tuple[Array, ...]:
     """Traces in each view: tracked ones, or else true ones."""
     for data in (root, truth):
         if "trace" in data and "view" in data["trace"].dims:
-            return tuple(data["trace"].transpose("view", "time", "node", "image_axis").values)
+            return tuple(data["trace"].transpose("view", "time", ..., "image_axis").values)
     return ()
 
 

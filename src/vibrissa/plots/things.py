@@ -10,10 +10,13 @@ from collections.abc import Callable
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
 from vibrissa.plots.style import Array
 from vibrissa.quantities import to_display
+
+Ints = NDArray[np.int64]
 
 _SECTIONS = np.array(
     [
@@ -107,6 +110,32 @@ def object_triangles(thing: xr.Dataset, limits: Array) -> Array:
     ValueError
         If it is of an unknown kind.
     """
+    vertices, faces = object_surface(thing, limits)
+    return vertices[faces]
+
+
+def object_surface(thing: xr.Dataset, limits: Array) -> tuple[Array, Ints]:
+    """Give the surface of an object as vertices that triangles share where it is smooth.
+
+    Parameters
+    ----------
+    thing : Dataset
+        As for `object_triangles`.
+    limits : array (3, 2)
+        What is seen, mm.
+
+    Returns
+    -------
+    vertices : array (n, 3)
+        mm.
+    faces : array (m, 3) of int
+        Numbers of the corners of triangles.
+
+    Raises
+    ------
+    ValueError
+        If it is of an unknown kind.
+    """
     kind = str(thing.attrs.get("kind"))
     if kind not in _KINDS:
         raise ValueError(f"an object is of kind {kind!r}; one of {', '.join(_KINDS)} is known")
@@ -133,17 +162,18 @@ def _mm(thing: xr.Dataset, name: str) -> Array:
     return to_display(name, thing[name].values)
 
 
-def _sphere(thing: xr.Dataset, limits: Array) -> Array:
-    return _mm(thing, "object_position") + _mm(thing, "object_radius") * _ball(48)
+def _sphere(thing: xr.Dataset, limits: Array) -> tuple[Array, Ints]:
+    vertices, faces = _net(_round(48))
+    return _mm(thing, "object_position") + _mm(thing, "object_radius") * vertices, faces
 
 
-def _peg(thing: xr.Dataset, limits: Array) -> Array:
+def _peg(thing: xr.Dataset, limits: Array) -> tuple[Array, Ints]:
     axis, origin = thing["object_axis"].values, _mm(thing, "object_position")
     first, second = _across(axis)
     ends = _within(limits, origin, axis)
     turn = np.linspace(0.0, 2.0 * np.pi, 49)[:, None]
     ring = _mm(thing, "object_radius") * (np.cos(turn) * first + np.sin(turn) * second)
-    return _quilt(origin + ends[:, None, None] * axis + ring)
+    return _net(origin + ends[:, None, None] * axis + ring)
 
 
 def _within(limits: Array, origin: Array, axis: Array) -> Array:
@@ -158,32 +188,31 @@ def _within(limits: Array, origin: Array, axis: Array) -> Array:
     return np.asarray(middle + 0.5 * np.ptp(limits, axis=1).max() * np.array([-1.0, 1.0]))
 
 
-def _plane(thing: xr.Dataset, limits: Array) -> Array:
+def _plane(thing: xr.Dataset, limits: Array) -> tuple[Array, Ints]:
     normal, origin = thing["object_axis"].values, _mm(thing, "object_position")
     first, second = _across(normal)
     middle, half = limits.mean(axis=1), 0.5 * np.ptp(limits, axis=1).max()
     foot = middle - ((middle - origin) @ normal) * normal
     side = np.linspace(-half, half, 13)
-    return _quilt(foot + side[:, None, None] * first + side[:, None] * second)
+    return _net(foot + side[:, None, None] * first + side[:, None] * second)
 
 
-def _box(thing: xr.Dataset, limits: Array) -> Array:
+def _box(thing: xr.Dataset, limits: Array) -> tuple[Array, Ints]:
     half = 0.5 * _mm(thing, "object_size")
     square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-    sides = []
-    for k in range(3):
-        for end in (-1.0, 1.0):
-            corners = np.insert(square, k, end, axis=1) * half
-            sides += [corners[[0, 1, 2]], corners[[0, 2, 3]]]
+    # Its sides share no corners, so that edges stay sharp.
+    sides = [np.insert(square, k, end, axis=1) * half for k in range(3) for end in (-1.0, 1.0)]
     rotation = thing["object_rotation"].values
-    return np.asarray(_mm(thing, "object_position") + np.array(sides) @ rotation.T)
+    faces = np.array([[0, 1, 2], [0, 2, 3]]) + 4 * np.arange(6)[:, None, None]
+    vertices = _mm(thing, "object_position") + np.concatenate(sides) @ rotation.T
+    return vertices, faces.reshape(-1, 3)
 
 
-def _mesh(thing: xr.Dataset, limits: Array) -> Array:
-    return np.asarray(_mm(thing, "object_vertices")[thing["object_faces"].values.astype(int)])
+def _mesh(thing: xr.Dataset, limits: Array) -> tuple[Array, Ints]:
+    return _mm(thing, "object_vertices"), thing["object_faces"].values.astype(np.int64)
 
 
-_KINDS: dict[str, Callable[[xr.Dataset, Array], Array]] = {
+_KINDS: dict[str, Callable[[xr.Dataset, Array], tuple[Array, Ints]]] = {
     "peg": _peg,
     "sphere": _sphere,
     "plane": _plane,
@@ -201,15 +230,27 @@ def _across(direction: Array) -> tuple[Array, Array]:
 
 def _ball(around: int) -> Array:
     """Triangles of a ball of radius 1."""
+    return _quilt(_round(around))
+
+
+def _round(around: int) -> Array:
+    """A grid on a ball of radius 1."""
     latitude = np.linspace(-0.5 * np.pi, 0.5 * np.pi, around // 2 + 1)[:, None]
     turn = np.linspace(0.0, 2.0 * np.pi, around + 1)
     flat = np.cos(latitude)
     parts = flat * np.cos(turn), flat * np.sin(turn), np.sin(latitude)
-    return _quilt(np.stack(np.broadcast_arrays(*parts), axis=-1))
+    return np.stack(np.broadcast_arrays(*parts), axis=-1)
 
 
 def _quilt(grid: Array) -> Array:
     """Triangles (n, 3, 3) between the points of a grid (rows, columns, 3)."""
-    a, b, c, d = grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]
+    vertices, faces = _net(grid)
+    return vertices[faces]
+
+
+def _net(grid: Array) -> tuple[Array, Ints]:
+    """The points of a grid (rows, columns, 3), and the triangles between them."""
+    number = np.arange(grid.shape[0] * grid.shape[1]).reshape(grid.shape[:2])
+    a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
     halves = np.stack([np.stack([a, b, c], axis=2), np.stack([a, c, d], axis=2)])
-    return halves.reshape(-1, 3, 3)
+    return grid.reshape(-1, 3), halves.reshape(-1, 3)

@@ -16,11 +16,11 @@ _POLICY = (
 )
 """What the page may load: only what is in it."""
 
+# Figures are those of the paper, dark on white, and the page is white as they are: on a dark one
+# they would glare.
 _STYLE = """
-:root { color-scheme: light dark; --ink: #1b1b1b; --paper: #ffffff; --soft: #5c5c5c;
+:root { color-scheme: only light; --ink: #1b1b1b; --paper: #ffffff; --soft: #5c5c5c;
   --line: #d5d0ca; --band: #f6f3ef; --link: #6b3d2e; }
-@media (prefers-color-scheme: dark) { :root { --ink: #e8e4df; --paper: #1b1a19; --soft: #a9a39c;
-  --line: #45413c; --band: #262422; --link: #e0a98f; } }
 body { margin: 0 auto; padding: 1.5rem; max-width: 70rem; color: var(--ink);
   background: var(--paper); font: 16px/1.5 system-ui, sans-serif; }
 a { color: var(--link); }
@@ -38,9 +38,8 @@ tbody th { font-weight: 500; }
 .number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
 code { overflow-wrap: anywhere; font-size: 0.92em; }
 figure { margin: 1.2rem 0; }
-figure img, video { display: block; max-width: 100%; height: auto; background: #ffffff;
-  border-radius: 4px; }
-.space { height: 34rem; background: #ffffff; border-radius: 4px; overflow: hidden; }
+figure img, video { display: block; max-width: 100%; height: auto; }
+.space { height: 34rem; overflow: hidden; }
 @media print { nav, .space { display: none; } }
 """
 

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from vibrissa.contour import shape_from_dataset
 from vibrissa.demo.scores import ANGLES, ErrorRow, angle_label, contact_errors, error_rows
-from vibrissa.demo.stages import spread
+from vibrissa.demo.stages import from_curves, spread
 from vibrissa.display import show
 from vibrissa.pipeline import compare_contacts, distances_by_class
 from vibrissa.quantities import QUANTITIES, quantity, to_display
 from vibrissa.report.page import Section, paragraph, table
-from vibrissa.signals import nearest_on_rest
+from vibrissa.signals import CIRCULAR, SIGNALS, base_signals, nearest_on_rest, within_turn
 from vibrissa.status import describe
 from vibrissa.trial import recorded_objects, recorded_whisker
 from vibrissa.whisker import Whisker
@@ -136,13 +136,19 @@ def _against_truth(
     root, signals, estimates = groups.values()
     assert root is not None
     if "measured" in recording.children and _has(_TRACKED, root, truth):
-        yield Section("tracking", "Tracking", _tracking(root, truth))
+        yield Section("tracking", "Tracking", tracking_tables(root, truth))
     if _has(_FELT, signals, truth) and "contact_point_whisker" in truth:
         assert signals is not None
         rows = signal_rows(signals, truth, whisker)
         heading = ("deflection angle", "contacts", "force", "moment", "force, 95 %", "moment, 95 %")
         note = "Size of the error over that of the true vector, each in its own whisker frame."
         told = table(rows, heading, "Error of force and moment, median", note)
+        heading = ("signal", "contacts", *_SPREAD, "largest", "true, median size")
+        note = (
+            "Felt less true, each in its own whisker frame, where the whisker touches and was felt "
+            "to; directions on the circle."
+        )
+        told += table(six_rows(signals, truth), heading, "Error of the six signals", note)
         yield Section("signals", "Signals", told)
     if _has(_FOUND, estimates, truth) and _has(_SPREADS, estimates):
         assert estimates is not None
@@ -156,8 +162,20 @@ def _has(names: Sequence[str], *data: xr.Dataset | None) -> bool:
     return all(each is not None and set(names) <= set(each.data_vars) for each in data)
 
 
-def _tracking(root: xr.Dataset, truth: xr.Dataset) -> str:
-    """Errors of what was tracked."""
+def tracking_tables(root: xr.Dataset, truth: xr.Dataset) -> str:
+    """Tell the errors of what was tracked.
+
+    Parameters
+    ----------
+    root, truth : Dataset
+        Of one whisker in the same frames: ``in_contact``, and what else is to be compared.
+
+    Returns
+    -------
+    str
+        HTML: tables of lines, and of contacts.
+    """
+    lines = _line_rows(root, truth)
     touching = [data["in_contact"].values.astype(bool) for data in (root, truth)]
     both = touching[0] & touching[1]
     told = float((touching[0] == touching[1]).mean())
@@ -168,13 +186,73 @@ def _tracking(root: xr.Dataset, truth: xr.Dataset) -> str:
         away = root[name].values[both] - truth[name].values[both]
         size = np.linalg.norm(away, axis=-1) if away.ndim > 1 else np.abs(away)
         rows.append((quantity(name).long_name, *(_shown(name, v) for v in spread(size))))
-    return table(
+    drawn = table(
+        lines,
+        ("distance from the true line", "points", *_SPREAD),
+        "Tracked and true lines",
+        "Of every point that was tracked.",
+    )
+    return (drawn if lines else "") + table(
         rows,
         ("error of", *_SPREAD),
         "Tracked against true",
         f"Of {int(both.sum())} frames that are in contact and were found to be. Contact is told "
         f"from none in {100 * told:.1f} % of {both.size} frames.",
     )
+
+
+def _line_rows(root: xr.Dataset, truth: xr.Dataset) -> list[tuple[str, str, str, str]]:
+    """Distances of traces, by view, and of centrelines from the true ones."""
+    rows = []
+    if "trace" in root and "trace" in truth:
+        pair = [
+            data["trace"].transpose("view", "time", ..., "image_axis") for data in (root, truth)
+        ]
+        names = [str(name) for name in np.atleast_1d(root["view"].values)]
+        for name, found, true in zip(names, *(each.values for each in pair), strict=True):
+            rows.append((f"trace, {name} view", *_away(from_curves(found, true), "trace")))
+    if "centerline" in root and "centerline" in truth:
+        pair = [data["centerline"].transpose("time", ..., "space") for data in (root, truth)]
+        away = from_curves(*(each.values for each in pair))
+        rows.append(("centreline", *_away(away, "centerline")))
+    return rows
+
+
+def _away(distances: Array, name: str) -> tuple[str, str, str]:
+    """How many distances are known, their median and 95 %."""
+    known = distances[np.isfinite(distances)]
+    middle, most = spread(known)
+    return str(known.size), _shown(name, float(middle), 3), _shown(name, float(most), 3)
+
+
+def six_rows(signals: xr.Dataset, truth: xr.Dataset) -> list[tuple[str, ...]]:
+    """Sum up the errors of the six signals.
+
+    Parameters
+    ----------
+    signals, truth : Dataset
+        Of one whisker, dim time: ``force``, ``moment`` in the whisker's frame, ``in_contact``.
+
+    Returns
+    -------
+    list of tuple of str
+        Name, contacts, median, 95 % and largest error, and the median size of the true signal; a
+        dash for that of a direction.
+    """
+    both = truth["in_contact"].values.astype(bool) & signals["in_contact"].values.astype(bool)
+    felt, true = (base_signals(data["force"], data["moment"]) for data in (signals, truth))
+    rows = []
+    for name, direction in zip(SIGNALS, CIRCULAR, strict=True):
+        away = within_turn(felt[name].values[both] - true[name].values[both], direction)
+        size = np.abs(away)
+        size = size[np.isfinite(size)]
+        if not size.size:
+            continue
+        values = (*spread(size), size.max())
+        usual = np.nan if direction else float(np.nanmedian(np.abs(true[name].values[both])))
+        cells = (_shown(name, float(value), 3) for value in (*values, usual))
+        rows.append((quantity(name).long_name, str(size.size), *cells))
+    return rows
 
 
 def signal_rows(

@@ -57,9 +57,13 @@ def object_of(said: Any, folder: Path) -> Surface:
     only(said, keys[kind] | {"kind", "stiffness"}, f"an object of kind {kind}")
     stiffness = number(said, "stiffness", np.inf)
     if kind == "mesh":
+        if "file" not in said:
+            raise ValueError(
+                'an object of kind mesh is a file: file = "body.stl" (STL, OBJ or PLY) is needed'
+            )
         resolution = said.get("resolution")
         return Mesh.load(
-            folder / str(said.get("file", "")),
+            folder / str(said["file"]),
             number(said, "unit", 1.0) * MM,
             resolution=None if resolution is None else number(said, "resolution", 0.0) * MM,
             stiffness=stiffness,

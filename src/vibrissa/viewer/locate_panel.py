@@ -8,7 +8,7 @@ from vibrissa.viewer.bend_drawing import bend_drawing
 from vibrissa.viewer.charting import Chart, coloured_cloud, places
 from vibrissa.viewer.drawing import Bytes
 from vibrissa.viewer.locate_drawing import locate_drawing, of_located
-from vibrissa.viewer.locating import COLOURS, Located, Sensor, coloured, located
+from vibrissa.viewer.locating import COLOURS, Located, Sensor, coloured, located, usual_sensor
 from vibrissa.viewer.page import Page, asked
 from vibrissa.viewer.readout import note
 from vibrissa.viewer.shading import Legend
@@ -30,7 +30,7 @@ class LocateMode:
 
     def __init__(self, page: Page) -> None:
         self._page = page
-        self._sensor = Sensor()
+        self._sensor = usual_sensor(page.original)
         self._what = "uniqueness"
         self._cut = True
         self._drawn: tuple[object, ...] | None = None
@@ -44,10 +44,9 @@ class LocateMode:
                 tuple(" ".join(names) for names in TRIPLETS),
                 initial_value=" ".join(self._sensor.triplet),
             )
-            force = gui.add_slider("Noise (µN)", 0.0, 10.0, 0.1, _UN * self._sensor.force_noise)
-            moment = gui.add_slider(
-                "Noise (µN·m)", 0.0, 0.2, 0.002, _UNM * self._sensor.moment_noise
-            )
+            noise, turning = _UN * self._sensor.force_noise, _UNM * self._sensor.moment_noise
+            force = gui.add_slider("Noise (µN)", 0.0, 10.0 * noise, 0.1 * noise, noise)
+            moment = gui.add_slider("Noise (µN·m)", 0.0, 10.0 * turning, 0.1 * turning, turning)
             colour = gui.add_dropdown("Colours", COLOURS, initial_value=self._what)
             cut = gui.add_checkbox("Only z < 0", self._cut, hint="Cut the cloud open")
             self._legend = gui.add_html("")

@@ -16,6 +16,10 @@ from vibrissa.viewer.bending import Bend
 from vibrissa.viewer.charting import Chart
 from vibrissa.viewer.drawing import Array, Bytes, Ints
 from vibrissa.viewer.shading import Legend, counted, shaded
+from vibrissa.whisker import Whisker
+
+_RAT = (1.5e-4, 6e-6)
+"""EI/L², N, and EI/L, N·m, of a rat's whisker."""
 
 COLOURS = ("uniqueness", "ambiguity", "sensitivity", *SIGNALS)
 _APART = 0.005
@@ -43,6 +47,29 @@ class Sensor:
         """Of force and moment (6, 6); None where there is no noise."""
         sigma = np.repeat([self.force_noise, self.moment_noise], 3)
         return np.diag(sigma**2) if (sigma > 0.0).all() else None
+
+
+def usual_sensor(whisker: Whisker) -> Sensor:
+    """A sensor that suits a whisker: as exact for a rod as 1 µN and 0.02 µN·m are for a rat's.
+
+    Parameters
+    ----------
+    whisker : Whisker
+        That stands on it.
+
+    Returns
+    -------
+    Sensor
+        Its noise goes with EI/L² and EI/L, in powers of ten.
+    """
+    moment = whisker.base_bending_stiffness / whisker.length
+    powers = np.log10([moment / whisker.length / _RAT[0], moment / _RAT[1]])
+    force, turning = 10.0 ** np.round(powers)
+    usual = Sensor()
+    return Sensor(
+        force_noise=float(force * usual.force_noise),
+        moment_noise=float(turning * usual.moment_noise),
+    )
 
 
 @dataclass(frozen=True, eq=False)

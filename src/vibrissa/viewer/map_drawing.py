@@ -59,7 +59,8 @@ def frame_drawing(solids: Solids, exaggeration: float) -> Drawing:
         out[f"floor {name}"] = Line(np.concatenate(rings), (205, 209, 214), 1.0)
         pole = np.array([[0.0, 0.0, floor], [0.0, 0.0, -floor]]) + centre
         out[f"axis {name}"] = Line(pieces(pole), (120, 126, 134), 1.0)
-        out[f"axis {name} name"] = Label(pole[1], "Fx")
+        above = np.array([0.0, 0.0, 0.07 * length])  # where Fx is never positive, 0 is at the top
+        out[f"axis {name} name"] = Label(pole[1] + above, "Fx")
         out[f"zero {name}"] = Label(centre + np.array([0.0, 0.0, solids.axis_height()]), "0")
         edge = 0.5 * length * np.array([np.cos(TURN), np.sin(TURN), 0.0])
         out[f"rim {name}"] = Label(bottom + edge, "MD = 0°")

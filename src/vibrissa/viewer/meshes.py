@@ -1,4 +1,4 @@
-"""Shapes as triangles: tubes along whiskers, cylinders, ellipsoids, whatever stands in the way.
+"""Shapes as triangles: tubes along whiskers, cylinders, ellipsoids, sheets.
 
 All lengths go in and come out in the same unit.
 """
@@ -10,8 +10,6 @@ from math import sqrt
 
 import numpy as np
 
-from vibrissa.rod.surface import Surface
-from vibrissa.trial import Box, Mesh, Peg, Plane, Sphere
 from vibrissa.viewer.drawing import Array, Ints
 
 SIDES = 8
@@ -95,14 +93,6 @@ def error_ellipsoid(centre: Array, covariance: Array, sigmas: float) -> tuple[Ar
     return ellipsoid(centre, directions * (sigmas * np.sqrt(np.clip(values, 0.0, None))))
 
 
-def patch(centre: Array, normal: Array, size: float) -> tuple[Array, Ints]:
-    """Two triangles: a square of an edge length, normal to a direction."""
-    first, second = across(normal)
-    corners = [(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)]
-    vertices = np.array([centre + size * (a * first + b * second) for a, b in corners])
-    return vertices, np.array([[0, 1, 2], [0, 2, 3]])
-
-
 def sheet(grid: Array) -> tuple[Array, Ints]:
     """Vertices and triangles of a surface that is given as a grid (m, n, 3) of its points."""
     count, beside = grid.shape[:2]
@@ -111,30 +101,3 @@ def sheet(grid: Array) -> tuple[Array, Ints]:
     first = np.stack([corner, corner + 1, corner + beside + 1], axis=1)
     second = np.stack([corner, corner + beside + 1, corner + beside], axis=1)
     return grid.reshape(-1, 3), np.concatenate([first, second])
-
-
-_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-_SIDES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
-
-
-def box(centre: Array, size: Array, rotation: Array) -> tuple[Array, Ints]:
-    """Vertices and triangles of a box whose own axes are the columns of a rotation."""
-    faces = [(a, b, c) for a, b, c, _ in _SIDES] + [(a, c, d) for a, _, c, d in _SIDES]
-    return centre + (_CORNERS * size) @ rotation.T, np.array(faces)
-
-
-def of_object(thing: Surface, extent: float, near: Array) -> tuple[Array, Ints]:
-    """Vertices and triangles of an object, m; what has no end reaches so far about a place."""
-    if isinstance(thing, Peg):
-        middle = thing.origin + ((near - thing.origin) @ thing.axis) * thing.axis
-        return cylinder(middle, thing.axis, thing.radius, extent)
-    if isinstance(thing, Sphere):
-        return ellipsoid(thing.origin, thing.radius * np.eye(3), 48)
-    if isinstance(thing, Plane):
-        foot = near - ((near - thing.origin) @ thing.normal) * thing.normal
-        return patch(foot, thing.normal, extent)
-    if isinstance(thing, Box):
-        return box(thing.origin, thing.size, thing.rotation)
-    if isinstance(thing, Mesh):
-        return np.asarray(thing.vertices), np.asarray(thing.faces, dtype=np.int64)
-    raise ValueError(f"no picture of a {type(thing).__name__} is known")

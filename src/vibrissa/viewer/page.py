@@ -99,6 +99,11 @@ class Page:
 
         self.work.put(topic, job)
 
+    @property
+    def has_map(self) -> bool:
+        """Whether a map was given, rather than made."""
+        return self._contacts is not None
+
     def reshape(self, **asked: float) -> None:
         """Change the whisker: length, turn, taper, modulus (SI)."""
         values = {**vars(self.shape), **asked}

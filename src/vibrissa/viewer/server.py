@@ -134,42 +134,58 @@ def view(
         port is taken or not on this machine.
     """
     trial = None if recording is None else watched(recording)
-    footage = _footage(trial, videos)
-    server = _served(host, port)
-    page = Page(server, whisker, contacts)
+    with contextlib.ExitStack() as opened:  # closed again if a later step fails
+        footage = _footage(trial, videos, opened)
+        page = Page(_served(host, port, opened), whisker, contacts)
+        opened.pop_all()
+        page.closing += [film.close for film in footage]
+        viewer = Viewer(page)
+        opened.push(viewer)
+        _furnished(page, recording, trial, footage)
+        opened.pop_all()
+    return viewer
+
+
+def _furnished(
+    page: Page, recording: xr.DataTree | None, trial: Watched | None, footage: Sequence[Footage]
+) -> None:
+    """Give a page its controls and its modes, and begin with the one that shows most."""
     names = ("Bend", "Locate", "Map") if trial is None else ("Bend", "Locate", "Map", "Trial")
-    choice = server.gui.add_button_group("Look at", names)
+    choice = page.server.gui.add_button_group("Look at", names)
     choice.on_click(lambda event: page.choose(event.target.value))
     modes: list[Mode] = [BendMode(page), LocateMode(page), MapMode(page)]
     if trial is not None:
         modes.append(TrialMode(page, trial, footage))
     page.modes = {mode.name: mode for mode in modes}
-    page.closing += [film.close for film in footage]
     page.whisker_controls = WhiskerControls(page).folder
     SaveControls(page, recording)
-    page.choose("Trial" if trial is not None else "Map" if contacts is not None else "Bend")
+    page.choose("Trial" if trial is not None else "Map" if page.has_map else "Bend")
     page.prepare()
     page.settle()
-    return Viewer(page)
 
 
-def _footage(trial: Watched | None, videos: Sequence[str | PathLike[str]]) -> tuple[Footage, ...]:
+def _footage(
+    trial: Watched | None,
+    videos: Sequence[str | PathLike[str]],
+    opened: contextlib.ExitStack,
+) -> tuple[Footage, ...]:
     """Open the videos of a trial."""
     if not videos:
         return ()
     if trial is None or len(videos) != len(trial.cameras):
         count = 0 if trial is None else len(trial.cameras)
         raise ValueError(f"the trial has {count} cameras; got {len(videos)} videos")
-    return tuple(Footage(path) for path in videos)
+    return tuple(opened.enter_context(contextlib.closing(Footage(path))) for path in videos)
 
 
-def _served(host: str, port: int | None) -> viser.ViserServer:
+def _served(host: str, port: int | None, opened: contextlib.ExitStack) -> viser.ViserServer:
     if port is None:
         port = free_port(host)
     elif not is_free(host, port):  # viser would take another one without a word
         raise ValueError(f"port {port} of {host} is taken; leave it out for one that is free")
     with guarded(host), contextlib.redirect_stdout(io.StringIO()):  # it would announce itself
         server = viser.ViserServer(host=host, port=port, label="vibrissa", verbose=False)
+    opened.callback(server.stop)
     server.gui.configure_theme(
         control_width="large", show_logo=False, show_share_button=False, brand_color=(0, 114, 178)
     )

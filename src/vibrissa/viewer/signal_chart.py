@@ -10,7 +10,7 @@ from vibrissa.viewer.drawing import Array
 from vibrissa.viewer.readout import symbol
 
 ROWS = (("Fx", "FT"), ("Mx", "MB"), ("FD", "MD"))
-WIDTH, ROW, LEFT = 300.0, 62.0, 34.0
+WIDTH, ROW, LEFT = 300.0, 62.0, 40.0
 _COLOURS = ("#0072b2", "#d55e00")
 _MOST = 700
 """Points of a line; each stands for the least and the largest value around it."""

@@ -6,7 +6,10 @@ import numpy as np
 import xarray as xr
 
 from vibrissa.contour import CylinderFit, SphereFit, shape_from_dataset, surface_grid
+from vibrissa.plots.things import object_surface
 from vibrissa.quantities import to_display
+from vibrissa.rod.surface import Surface
+from vibrissa.trial.object_files import objects_datasets
 from vibrissa.viewer.bend_drawing import whisker_body
 from vibrissa.viewer.bending import force_scale
 from vibrissa.viewer.drawing import (
@@ -23,7 +26,7 @@ from vibrissa.viewer.drawing import (
     Ints,
     Thing,
 )
-from vibrissa.viewer.meshes import cylinder, ellipsoid, of_object, sheet
+from vibrissa.viewer.meshes import cylinder, ellipsoid, sheet
 from vibrissa.viewer.watching import Watched
 
 POINTS = 4000
@@ -102,16 +105,22 @@ def surroundings(trial: Watched, objects: bool = True, fit: bool = True) -> Draw
     near = _known(trial)
     centre = np.mean(near, axis=0) if near.size else middle / to_display("length", 1.0)
     out: dict[str, Thing] = {}
-    reach = size / float(to_display("length", 1.0))
     if objects:
         for i, thing in enumerate(trial.objects):
-            vertices, faces = of_object(thing, 0.6 * reach, centre)
-            out[f"object {i}"] = Body(_mm(vertices), faces, OBJECT, 0.55)
+            out[f"object {i}"] = object_body(thing, 0.6 * size, _mm(centre))
     if fit and trial.contour is not None:
         body = fitted_body(trial.contour, near)
         if body is not None:
             out["fit"] = Body(_mm(body[0]), body[1], FIT, 0.4)
     return out
+
+
+def object_body(thing: Surface, extent: float, near: Array) -> Body:
+    """An object; what has no end is shown within a cube, mm wide, about a place (3,), mm."""
+    half = 0.5 * extent
+    (held,) = objects_datasets([thing]).values()
+    vertices, faces = object_surface(held, np.stack([near - half, near + half], axis=1))
+    return Body(vertices, faces, OBJECT, 0.55)
 
 
 def _known(trial: Watched) -> Array:

@@ -55,7 +55,7 @@ class TrialMode:
         gui, trial = server.gui, self.trial
         self._folder = gui.add_folder("Trial", visible=False)
         end = _MS * float(trial.time[-1] - trial.time[0])
-        step = max(end / max(trial.frames - 1, 1), 1e-3)
+        step = max(round(end / max(trial.frames - 1, 1), 3), 1e-3)
         with self._folder:
             self._time = gui.add_slider("Time (ms)", 0.0, max(end, step), step, 0.0)
             self._play = gui.add_button("Play", color="blue")

@@ -2,15 +2,20 @@
 
 `python studies/signal_sets.py [MICRONEWTON [MICRONEWTON_METRE]]`, 1 and 0.02 by default, prints a
 row for each set of signals; about a minute. 2048 contacts outside the 2° cone stand for equal
-volumes of space; to each one's force and moment the sensor's noise is added once.
+volumes of space; to each one's force and moment the sensor's noise is added once. `--figure` draws
+the errors for this noise and for ten times as much into `docs/images/signal_sets.png`.
 """
 
-import sys
+import argparse
+from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
+from pages import save
 
 import vibrissa as vb
 from vibrissa.mapping.places import sample, spread
+from vibrissa.plots.style import BLUE, GREEN, INK, MUTED, ORANGE, head, looking, new_figure
 
 SETS = (
     ("Fx", "MB", "MD"),
@@ -21,34 +26,55 @@ SETS = (
     ("Fx", "Mx", "MB", "MD"),
     ("Fx", "FT", "FD", "Mx", "MB", "MD"),
 )
+WRENCH = "wrench"
+SHOWN = {
+    "Fx MB MD": ("$F_x$, $M_B$, $M_D$", BLUE),
+    "Fx FT MD": ("$F_x$, $F_T$, $M_D$", ORANGE),
+    "Mx MB MD": ("$M_x$, $M_B$, $M_D$", MUTED),
+    "Fx FT FD Mx MB MD": ("all six", INK),
+    WRENCH: ("force and moment, friction allowed", GREEN),
+}
 NUMBER = 2048
-
-force_noise = float(sys.argv[1]) * 1e-6 if len(sys.argv) > 1 else 1e-6
-moment_noise = float(sys.argv[2]) * 1e-6 if len(sys.argv) > 2 else 2e-8
-rng = np.random.default_rng(0)
-whisker = vb.samples.gamma()
-contacts = vb.ContactMap.simulate(whisker, grid=False)
-scale = contacts.chart.discretization
-
-spread_out = sample(contacts, spread(8 * NUMBER, 0), "reachable")
-volume = spread_out.volume * (spread_out.places.inside & (spread_out.places.angle > np.deg2rad(2)))
-rows = rng.choice(len(volume), NUMBER, p=volume / volume.sum())
-values = spread_out.places.values[rows]
-point = values[:, 3:] * scale.length
-force = values[:, :3] * scale.force
-moment = np.cross(point, force)
-
-felt_force = force + force_noise * rng.standard_normal(force.shape)
-felt_moment = moment + moment_noise * rng.standard_normal(moment.shape)
-noise = np.diag([force_noise] * 3 + [moment_noise] * 3) ** 2
-felt = vb.base_signals(felt_force, felt_moment)
+IMAGE = Path(__file__).parents[1] / "docs" / "images" / "signal_sets.png"
 
 
-def report(name, found):
-    """Print errors in mm, of the candidate named first and of the nearest one."""
+def drawn(contacts):
+    """Contact points and forces that stand for equal volumes."""
+    rng, scale = np.random.default_rng(0), contacts.chart.discretization
+    spread_out = sample(contacts, spread(8 * NUMBER, 0), "reachable")
+    places = spread_out.places
+    volume = spread_out.volume * (places.inside & (places.angle > np.deg2rad(2)))
+    values = places.values[rng.choice(len(volume), NUMBER, p=volume / volume.sum())]
+    return values[:, 3:] * scale.length, values[:, :3] * scale.force, rng
+
+
+def located(force_noise, moment_noise):
+    """Contact points and, by set of signals, what is found."""
+    whisker = vb.samples.gamma()
+    contacts = vb.ContactMap.simulate(whisker, grid=False)
+    point, force, rng = drawn(contacts)
+    moment = np.cross(point, force)
+    felt_force = force + force_noise * rng.standard_normal(force.shape)
+    felt_moment = moment + moment_noise * rng.standard_normal(moment.shape)
+    noise = np.diag([force_noise] * 3 + [moment_noise] * 3) ** 2
+    felt = vb.base_signals(felt_force, felt_moment)
+    found = {" ".join(names): contacts.estimate(felt, names, noise=noise) for names in SETS}
+    found[WRENCH] = vb.estimate_from_wrench(whisker, felt_force, felt_moment, noise=noise)
+    return point, found
+
+
+def errors(point, found):
+    """3D errors in mm of the candidate named first and of the nearest one; infinite without any."""
     first = 1e3 * np.linalg.norm(found.point - point, axis=1)
     nearest = 1e3 * np.linalg.norm(found.candidates - point[:, None], axis=2)
-    best = np.where(np.isfinite(nearest), nearest, np.inf).min(axis=1)
+    return np.where(np.isfinite(first), first, np.inf), np.where(
+        np.isfinite(nearest), nearest, np.inf
+    ).min(axis=1)
+
+
+def report(name, point, found):
+    """Print a row of the table."""
+    first, best = errors(point, found)
     none, several = found.n_candidates == 0, found.n_candidates > 1
     shown = [*np.quantile(first[~none], [0.5, 0.9]), np.quantile(best[~none], 0.9)]
     shares = [100 * several.mean(), 100 * none.mean()]
@@ -57,7 +83,44 @@ def report(name, found):
     )
 
 
-print(f"{'mm and %':18}{'median':>10}{'90 %':>10}{'nearest':>10}{'several':>9}{'none':>9}")
-for names in SETS:
-    report(" ".join(names), contacts.estimate(felt, names, noise=noise))
-report("wrench", vb.estimate_from_wrench(whisker, felt_force, felt_moment, noise=noise))
+def picture(results) -> Figure:
+    """Share of contacts that are found to within an error, for each noise."""
+    share = np.arange(1, NUMBER + 1) / NUMBER
+    with looking():
+        figure = new_figure("double", 62.0, "constrained")
+        panels = figure.subplots(1, 2, sharey=True)
+        for axes, letter, (title, (point, found)) in zip(
+            panels, "ab", results.items(), strict=True
+        ):
+            for name, (label, colour) in SHOWN.items():
+                first = np.sort(errors(point, found[name])[0])
+                axes.step(first, 100.0 * share, where="post", color=colour, label=label)
+            axes.set(xscale="log", xlim=(1e-3, 30.0), ylim=(0.0, 100.0), xlabel="3D error (mm)")
+            axes.set_xticks([0.001, 0.01, 0.1, 1, 10], ["0.001", "0.01", "0.1", "1", "10"])
+            head(axes, letter, title)
+        panels[0].set_ylabel("contacts with a smaller error (%)")
+        panels[1].legend(loc="upper left")
+        return figure
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("force_noise", nargs="?", type=float, default=1.0, help="µN")
+    parser.add_argument("moment_noise", nargs="?", type=float, default=0.02, help="µN·m")
+    parser.add_argument("--figure", action="store_true", help=f"draw {IMAGE.name}")
+    chosen = parser.parse_args()
+    results = {}
+    for times in (1.0, 10.0) if chosen.figure else (1.0,):
+        force, moment = times * chosen.force_noise, times * chosen.moment_noise
+        title = f"noise of {force:g} µN and {moment:g} µN·m"
+        results[title] = located(1e-6 * force, 1e-6 * moment)
+        print(f"{title}; mm and %")
+        print(f"{'':18}{'median':>10}{'90 %':>10}{'nearest':>10}{'several':>9}{'none':>9}")
+        for name, found in results[title][1].items():
+            report(name, results[title][0], found)
+    if chosen.figure:
+        save(picture(results), IMAGE)
+
+
+if __name__ == "__main__":
+    main()

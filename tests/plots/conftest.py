@@ -8,7 +8,7 @@ import vibrissa as vb
 from vibrissa.io.recording import KIND
 from vibrissa.quantities import attributes
 from vibrissa.trial import Peg, orthogonal_views
-from vibrissa.trial.cameras import cameras_dataset
+from vibrissa.trial.camera_files import cameras_dataset
 from vibrissa.trial.object_files import objects_datasets
 
 COUNT, LENGTH, NODES = 12, 40e-3, 21

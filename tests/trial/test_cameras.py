@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vibrissa.trial import Camera, load_cameras, orthogonal_views, save_cameras, triangulate
-from vibrissa.trial.cameras import cameras_dataset, cameras_from_dataset
+from vibrissa.trial.camera_files import cameras_dataset, cameras_from_dataset
 
 
 def perspective(turn, distance=0.3, name="camera"):

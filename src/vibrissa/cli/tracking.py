@@ -20,9 +20,6 @@ if TYPE_CHECKING:
     from vibrissa.trial import Camera
 
 _MICRO = 1e-6
-_PIXEL = 58e-6
-"""What a pixel sees unless it is told, m: as in the paper."""
-
 _POOR = 2.0
 _WIDEST = 1.0
 """What views of a whisker may be wide at most, m."""
@@ -223,6 +220,7 @@ def _cameras(
     from vibrissa.io import load_recording, video_info
     from vibrissa.io.paths import NETCDF
     from vibrissa.trial import load_cameras, orthogonal_views, recorded_cameras
+    from vibrissa.trial.cameras import PIXEL_SIZE
 
     if path is not None:
         refuse({"--pixel-size": pixel_size}, "the --cameras tell it")
@@ -240,7 +238,7 @@ def _cameras(
     sizes = [(info.width, info.height) for info in map(video_info, videos)]
     if len(set(sizes)) > 1:
         raise ValueError(f"the videos differ in size, {sorted(set(sizes))}: give --cameras")
-    pixel_size = _PIXEL if pixel_size is None else pixel_size
+    pixel_size = PIXEL_SIZE if pixel_size is None else pixel_size
     wide = pixel_size * sizes[0][0]
     if not 0.0 < wide <= _WIDEST:
         raise ValueError(

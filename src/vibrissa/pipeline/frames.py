@@ -209,16 +209,7 @@ def estimates_in(recording: xr.DataTree) -> xr.Dataset:
     ValueError
         If it has none, or some of it is missing.
     """
-    group = recording.children.get("estimates")
-    if group is None:
-        got = ", ".join(sorted(recording.children)) or "no groups"
-        raise ValueError(
-            f"the recording has no group estimates (it has {got}): make them first, by "
-            "estimates_of or `vibrissa estimate`"
-        )
-    data = group.to_dataset()
-    _complete(data, "estimates", ESTIMATED)
-    return data
+    return _group_in(recording, "estimates", ESTIMATED)
 
 
 def signals_in(recording: xr.DataTree) -> xr.Dataset:
@@ -239,28 +230,33 @@ def signals_in(recording: xr.DataTree) -> xr.Dataset:
     ValueError
         If it has none, or some of it is missing.
     """
-    group = recording.children.get("signals")
+    return _group_in(recording, "signals", FELT_BY)
+
+
+_VERBS = {"signals": ("signals_of", "signals"), "estimates": ("estimates_of", "estimate")}
+"""What makes a group, in Python and on the command line."""
+
+
+def _group_in(recording: xr.DataTree, name: str, needs: Sequence[str]) -> xr.Dataset:
+    """A group of a recording that has what the stages after it need."""
+    group = recording.children.get(name)
+    function, verb = _VERBS[name]
     if group is None:
         got = ", ".join(sorted(recording.children)) or "no groups"
         raise ValueError(
-            f"the recording has no group signals (it has {got}): make them first, by signals_of or "
-            "`vibrissa signals`"
+            f"the recording has no group {name} (it has {got}): make them first, by {function} or "
+            f"`vibrissa {verb}`"
         )
     data = group.to_dataset()
-    _complete(data, "signals", FELT_BY)
-    return data
-
-
-def _complete(data: xr.Dataset, group: str, names: Sequence[str]) -> None:
-    """Raise where a group of a recording lacks what the stages after it need."""
-    missing = [name for name in names if name not in data]
+    missing = [variable for variable in needs if variable not in data]
     faults = [f"it lacks {', '.join(missing)}"] if missing else []
     faults += variable_faults(data)
     if faults:
         raise ValueError(
-            f"the group {group} of the recording cannot be used: {'; '.join(faults)}; make it anew "
-            f"by `vibrissa {group.removesuffix('s') if group == 'estimates' else group}`"
+            f"the group {name} of the recording cannot be used: {'; '.join(faults)}; make it anew "
+            f"by `vibrissa {verb}`"
         )
+    return data
 
 
 def whisker_radii(estimates: xr.Dataset, whiskers: Sequence[Whisker]) -> Array:

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from vibrissa.rod.surface import Surface
 from vibrissa.tracking.refine import Refined
-from vibrissa.trial.cameras import Camera, triangulate
+from vibrissa.trial.cameras import Camera
+from vibrissa.trial.triangulation import triangulate
 
 Array = NDArray[np.float64]
 

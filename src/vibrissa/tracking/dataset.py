@@ -16,7 +16,8 @@ from vibrissa.status import Status
 from vibrissa.tracking.contact import Contacts
 from vibrissa.tracking.filtering import CUTOFF
 from vibrissa.tracking.head import HeadPose
-from vibrissa.trial.cameras import Camera, cameras_dataset
+from vibrissa.trial.camera_files import cameras_dataset
+from vibrissa.trial.cameras import Camera
 from vibrissa.trial.object_files import objects_datasets
 from vibrissa.trial.recording import head_variables, recorded
 from vibrissa.whisker.emergence import angles_of

@@ -20,7 +20,8 @@ from scipy.interpolate import BSpline
 
 from vibrissa.rod.compiled import kernel
 from vibrissa.tracking.trace import Trace
-from vibrissa.trial.cameras import Camera, triangulate
+from vibrissa.trial.cameras import Camera
+from vibrissa.trial.triangulation import triangulate
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vibrissa.tracking.trace import Trace
-from vibrissa.trial.cameras import Camera, triangulate
+from vibrissa.trial.cameras import Camera
+from vibrissa.trial.triangulation import triangulate
 
 Array = NDArray[np.float64]
 Pairs = NDArray[np.int64]

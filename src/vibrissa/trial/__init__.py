@@ -3,7 +3,8 @@
 from vibrissa.sensing import Sensor
 from vibrissa.trial.array_motion import array_whisking, head_path, protracted, shared_whisking
 from vibrissa.trial.calibration import calibrate
-from vibrissa.trial.cameras import Camera, load_cameras, orthogonal_views, save_cameras, triangulate
+from vibrissa.trial.camera_files import load_cameras, save_cameras
+from vibrissa.trial.cameras import Camera, orthogonal_views
 from vibrissa.trial.dynamics import Dynamics, resonances
 from vibrissa.trial.film import Look, film, views_of
 from vibrissa.trial.mesh import Mesh
@@ -18,6 +19,7 @@ from vibrissa.trial.recording import (
 )
 from vibrissa.trial.sensors import measure
 from vibrissa.trial.simulate import simulate
+from vibrissa.trial.triangulation import triangulate
 
 __all__ = [
     "Box",

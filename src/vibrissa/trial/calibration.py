@@ -144,7 +144,7 @@ def _error(
     cameras: Sequence[Camera], seen: Mapping[str, Sequence[Any]], board: Board, shared: list[int]
 ) -> float:
     """How far the corners are from where the cameras see the points that they see together."""
-    from vibrissa.trial.cameras import triangulate
+    from vibrissa.trial.triangulation import triangulate
 
     squares = []
     for i in shared:

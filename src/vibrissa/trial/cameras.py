@@ -1,4 +1,4 @@
-"""Cameras: from the laboratory to the pixels of a view, and back from two views.
+"""Cameras: from the laboratory to the pixels of a view.
 
     x_camera = R x_laboratory + t,    pixel = K d(x_camera)
 
@@ -9,16 +9,11 @@ of a pixel, (0, 0) the top left one. A mirror is a negative focal length in K.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from os import PathLike
 from typing import Literal
 
 import numpy as np
-import xarray as xr
 from numpy.typing import ArrayLike, NDArray
-
-from vibrissa.io.calibration import read_calibration, write_calibration
 
 Array = NDArray[np.float64]
 
@@ -210,77 +205,6 @@ def orthogonal_views(
     return views[0], views[1]
 
 
-def triangulate(
-    cameras: Sequence[Camera], pixels: ArrayLike, sigma: ArrayLike = 1.0
-) -> tuple[Array, Array]:
-    """Find the points that two or more cameras see.
-
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        At least two views.
-    pixels : array_like (camera, ..., 2)
-        Where each camera sees each point; NaN gives NaN.
-    sigma : array_like
-        Standard deviation of a pixel coordinate, broadcast to (camera, ...).
-
-    Returns
-    -------
-    points : array (..., 3)
-        Those that are seen nearest to the pixels, each weighted by its sigma, m.
-    covariance : array (..., 3, 3)
-        Of the points, m².
-
-    Raises
-    ------
-    ValueError
-        If there are fewer than two views, or shapes do not fit.
-    """
-    pixels = np.asarray(pixels, dtype=np.float64)
-    if len(cameras) < 2 or pixels.ndim < 2 or pixels.shape[0] != len(cameras):
-        raise ValueError(
-            f"{len(cameras)} cameras and pixels of shape {pixels.shape} do not fit; two or more "
-            "cameras and (camera, ..., 2) are needed"
-        )
-    weight = 1.0 / np.broadcast_to(np.asarray(sigma, np.float64), pixels.shape[:-1])
-    points = _nearest_to_rays(cameras, pixels)
-    hessian = np.zeros((*points.shape, 3))
-    for _ in range(8):
-        hessian = np.zeros((*points.shape, 3))
-        gradient = np.zeros(points.shape)
-        for camera, wanted, w in zip(cameras, pixels, weight, strict=True):
-            seen, slopes = camera.project_with_slopes(points)
-            scaled = slopes * w[..., None, None]
-            miss = (wanted - seen) * w[..., None]
-            hessian += np.swapaxes(scaled, -1, -2) @ scaled
-            gradient += (np.swapaxes(scaled, -1, -2) @ miss[..., None])[..., 0]
-        step = np.linalg.solve(_regular(hessian), gradient[..., None])[..., 0]
-        points = points + step
-        if not np.nanmax(np.abs(step), initial=0.0) > 1e-12:
-            break
-    return points, np.asarray(np.linalg.inv(_regular(hessian)), dtype=np.float64)
-
-
-def _regular(hessian: Array) -> Array:
-    """The same; NaN stays NaN, and rays that are parallel leave a finite, huge uncertainty."""
-    scale = np.trace(hessian, axis1=-2, axis2=-1)[..., None, None]
-    floored: Array = hessian + 1e-12 * scale * np.eye(3)
-    return floored
-
-
-def _nearest_to_rays(cameras: Sequence[Camera], pixels: Array) -> Array:
-    """Points (..., 3) that are nearest to all rays."""
-    matrix: Array = np.zeros((*pixels.shape[1:-1], 3, 3))
-    right: Array = np.zeros((*pixels.shape[1:-1], 3))
-    for camera, seen in zip(cameras, pixels, strict=True):
-        origin, direction = camera.rays(seen)
-        across: Array = np.eye(3) - direction[..., :, None] * direction[..., None, :]
-        matrix += across
-        right += (across @ origin[..., None])[..., 0]
-    solved = np.linalg.solve(_regular(matrix), right[..., None])[..., 0]
-    return np.asarray(solved, dtype=np.float64)
-
-
 def _distorted(flat: Array, k: Array) -> tuple[Array, Array]:
     """OpenCV's distortion of (..., 2) and its derivatives (..., 2, 2)."""
     x, y = flat[..., 0], flat[..., 1]
@@ -323,155 +247,3 @@ def _undistorted(bent: Array, k: Array) -> Array:
         if not np.nanmax(np.abs(step), initial=0.0) > 1e-14:
             break
     return flat
-
-
-def load_cameras(path: str | PathLike[str], unit: float = 1e-3) -> tuple[Camera, ...]:
-    """Read calibrated cameras.
-
-    Parameters
-    ----------
-    path : str or path
-        TOML of Anipose (`vibrissa.io.calibration`).
-    unit : float
-        Of the file's lengths, m; that of the board that calibrated the cameras, usually mm.
-
-    Returns
-    -------
-    tuple of Camera
-        In the file's order.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is no calibration, or one with faults.
-    """
-    from scipy.spatial.transform import Rotation
-
-    cameras = []
-    for table in read_calibration(path):
-        kind = table.get("projection", "perspective")
-        scale = np.diag([1.0 / unit, 1.0 / unit, 1.0]) if kind == "orthographic" else np.eye(3)
-        try:
-            turn = Rotation.from_rotvec(np.asarray(table["rotation"], np.float64)).as_matrix()
-            camera = Camera(
-                matrix=np.asarray(table["matrix"], np.float64) @ scale,
-                rotation=turn,
-                translation=np.asarray(table["translation"], np.float64) * unit,
-                distortion=np.asarray(table.get("distortions", ()), np.float64),
-                size=tuple(table["size"]),
-                projection=kind,
-                name=str(table["name"]),
-            )
-        except (TypeError, ValueError, IndexError) as error:
-            raise ValueError(f"{path}: camera {table['name']!r}: {error}") from error
-        cameras.append(camera)
-    return tuple(cameras)
-
-
-def save_cameras(path: str | PathLike[str], cameras: Sequence[Camera], unit: float = 1e-3) -> None:
-    """Write cameras so that `load_cameras`, and for perspective ones Anipose, can read them.
-
-    Parameters
-    ----------
-    path : str or path
-        Where to write, usually with the ending ``.toml``.
-    cameras : sequence of Camera
-        The views.
-    unit : float
-        Of the file's lengths, m.
-
-    Raises
-    ------
-    FileNotFoundError
-        If the folder does not exist.
-    """
-    from scipy.spatial.transform import Rotation
-
-    tables = []
-    for camera in cameras:
-        flat = camera.projection == "orthographic"
-        scale = np.diag([unit, unit, 1.0]) if flat else np.eye(3)
-        table = {
-            "name": camera.name,
-            "size": camera.size,
-            "matrix": (camera.matrix @ scale).tolist(),
-            "distortions": camera.distortion.tolist(),
-            "rotation": Rotation.from_matrix(camera.rotation).as_rotvec().tolist(),
-            "translation": (camera.translation / unit).tolist(),
-        }
-        tables.append(table | ({"projection": camera.projection} if flat else {}))
-    write_calibration(path, tables)
-
-
-def cameras_dataset(cameras: Sequence[Camera]) -> xr.Dataset:
-    """Write cameras as a dataset, the group ``cameras`` of a recording.
-
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        In the order of the views.
-
-    Returns
-    -------
-    xarray.Dataset
-        Dim view: camera_matrix, camera_rotation, camera_translation, camera_distortion,
-        image_size, projection.
-    """
-    about = {
-        "camera_matrix": "K: pixels per m if orthographic, else focal lengths in pixels",
-        "camera_rotation": "from the laboratory's to the camera's axes (right, down, forward)",
-        "camera_translation": "x_camera = rotation x_laboratory + translation",
-        "camera_distortion": "OpenCV's k1, k2, p1, p2, k3, k4, k5, k6",
-        "image_size": "width and height",
-        "projection": "orthographic or perspective",
-    }
-    units = {"camera_translation": "m", "image_size": "pixel"}
-    rows: dict[str, tuple[tuple[str, ...], list[object]]] = {
-        "camera_matrix": (("view", "row", "column"), [c.matrix for c in cameras]),
-        "camera_rotation": (("view", "row", "column"), [c.rotation for c in cameras]),
-        "camera_translation": (("view", "row"), [c.translation for c in cameras]),
-        "camera_distortion": (("view", "coefficient"), [c.distortion for c in cameras]),
-        "image_size": (("view", "side"), [c.size for c in cameras]),
-        "projection": (("view",), [c.projection for c in cameras]),
-    }
-    return xr.Dataset(
-        {
-            name: (
-                dims,
-                np.array(values),
-                {"units": units.get(name, "1"), "long_name": about[name]},
-            )
-            for name, (dims, values) in rows.items()
-        },
-        {"view": [c.name for c in cameras]},
-        {"reference_frame": "laboratory"},
-    )
-
-
-def cameras_from_dataset(dataset: xr.Dataset) -> tuple[Camera, ...]:
-    """Read the cameras that `cameras_dataset` wrote.
-
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        Dim view.
-
-    Returns
-    -------
-    tuple of Camera
-        View by view.
-    """
-    return tuple(
-        Camera(
-            matrix=row["camera_matrix"].values,
-            rotation=row["camera_rotation"].values,
-            translation=row["camera_translation"].values,
-            distortion=row["camera_distortion"].values,
-            size=(int(row["image_size"][0]), int(row["image_size"][1])),
-            projection=str(row["projection"].values),  # type: ignore[arg-type]
-            name=str(row["view"].values),
-        )
-        for row in (dataset.isel(view=i) for i in range(dataset.sizes["view"]))
-    )

@@ -23,7 +23,8 @@ from scipy.interpolate import CubicSpline
 from vibrissa.io.video import Frame, write_video
 from vibrissa.quantities import attributes
 from vibrissa.rod.surface import Surface
-from vibrissa.trial.cameras import PIXEL_SIZE, Camera, cameras_dataset, orthogonal_views
+from vibrissa.trial.camera_files import cameras_dataset
+from vibrissa.trial.cameras import PIXEL_SIZE, Camera, orthogonal_views
 from vibrissa.trial.recording import recorded_objects, recorded_whisker
 from vibrissa.trial.shadows import hidden, silhouette
 

@@ -26,7 +26,8 @@ from vibrissa.io.recording import KIND
 from vibrissa.quantities import attributes
 from vibrissa.rod.surface import Surface
 from vibrissa.status import flag_attributes
-from vibrissa.trial.cameras import Camera, cameras_from_dataset
+from vibrissa.trial.camera_files import cameras_from_dataset
+from vibrissa.trial.cameras import Camera
 from vibrissa.trial.motion import Motion
 from vibrissa.trial.object_files import object_from_dataset, objects_datasets
 from vibrissa.trial.objects import Peg

@@ -193,15 +193,6 @@ def test_demo_writes_and_reports(folder):
     assert "/truth" in text
 
 
-def test_demo_from_video_reports_every_stage(folder):
-    out = folder / "filmed"
-    text = run("demo", "-o", out, "--duration", 0.4, "--rate", 200, "--seed", 2)
-    for words in ("0 of 80 frames lost", "contact point", "px", "Signals, median", "paper's way"):
-        assert words in text
-    assert {"top.mp4", "front.mp4", "tracked.nc"} <= {file.name for file in out.iterdir()}
-    assert "cylinder" in run("reconstruct", out / "tracked.nc")
-
-
 def test_info(folder, table, chart):
     text = run("info")
     assert vb.__version__ in text

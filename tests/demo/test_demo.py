@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 import xarray as xr
+from typer.testing import CliRunner
 
 import vibrissa as vb
 from vibrissa import samples
+from vibrissa.cli.app import app
 from vibrissa.demo import filming, run_demo
 from vibrissa.demo.stages import from_curves, refined
 from vibrissa.io import load_contacts, load_recording
@@ -163,6 +165,21 @@ def test_signals_are_better_known_the_more_the_whisker_is_bent(from_video):
             medians = [getattr(row, name)[0] for row in one.signals if row.contacts >= 5]
             assert medians[-1] < 0.05
             assert medians[-1] < medians[0]
+
+
+def test_the_command_reports_every_stage_from_video(from_video, folder, tmp_path):
+    """Of the trial that lies there, which it takes up."""
+
+    def run(*words):
+        done = CliRunner().invoke(app, [str(word) for word in words])
+        assert done.exit_code == 0, done.exception
+        return done.output
+
+    text = run("demo", "-o", folder, "--duration", 0.4, "--rate", 250, "--seed", 2)
+    for words in ("0 of 100 frames lost", "contact point", "px", "Signals, median", "paper's way"):
+        assert words in text
+    assert {"top.mp4", "front.mp4", "tracked.nc"} <= {file.name for file in folder.iterdir()}
+    assert "cylinder" in run("reconstruct", folder / "tracked.nc", "-o", tmp_path / "contour.nc")
 
 
 def test_what_was_done_is_not_done_again(from_video, folder, monkeypatch):

@@ -30,7 +30,7 @@ def sweep_summary(found: xr.Dataset) -> str:
 
 def _lines(found: xr.Dataset) -> Iterator[str]:
     yield f"study {found.attrs.get('study', '')!r}: {found.sizes['whisker']} whiskers"
-    for number, origin in enumerate(found.attrs["origins"]):
+    for number, origin in enumerate(np.atleast_1d(found.attrs["origins"])):
         yield f"  {int((found['origin'] == number).sum())} cells by {origin}"
     for task in found["task"].values:
         status = found["status"].sel(task=task).values

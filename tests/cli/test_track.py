@@ -132,7 +132,9 @@ def test_what_is_known_besides_the_videos_is_used(videos, tmp_path):
     [
         (("--base", "20,30"), "each needs as many"),
         (("--offset", "some"), "a number of frames or auto"),
-        (("--pixel-size", "0"), "pixel_size"),
+        (("--pixel-size", "0"), "--pixel-size is 0 m"),
+        (("--width", "nan"), "--width is nan"),
+        (("--jump", "-1"), "--jump is -1"),
         (("--pixel-size", "0.058"), "11.136 m wide; it is in metres"),
         (("--fps", "0"), "--fps is 0"),
         (("--fps", "170"), "below half of 170 frames/s"),

@@ -226,7 +226,7 @@ def _compared(path: Path) -> Iterator[tuple[str, str]]:
     import h5netcdf
     import xarray as xr
 
-    from vibrissa.cli.tracking import compared_contacts
+    from vibrissa.cli.track_report import compared_contacts
 
     with h5netcdf.File(path, "r") as file:
         measured = file.groups.get("measured")

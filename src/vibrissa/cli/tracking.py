@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from vibrissa.cli.sources import whisker_from
-from vibrissa.cli.terminal import numbers, output, progress_bars, refuse, shown
+from vibrissa.cli.terminal import numbers, progress_bars, refuse
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     import xarray as xr
 
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from vibrissa.trial import Camera
 
 _MICRO = 1e-6
-_POOR = 2.0
 _WIDEST = 1.0
 """What views of a whisker may be wide at most, m."""
 
@@ -127,7 +126,7 @@ def track(
     Example: `vibrissa track top.mp4 front.mp4 --pixel-size 58e-6 --fps 1000 -o trial.nc`
     """
     from vibrissa.io import load_corrections
-    from vibrissa.io.paths import NETCDF, check_readable, check_writable
+    from vibrissa.io.paths import check_readable
     from vibrissa.tracking import TraceOptions, TrackOptions
 
     for path in videos:
@@ -136,24 +135,10 @@ def track(
         raise ValueError(f"--offset is {offset!r}; a number of frames or auto is needed")
     views = _cameras(videos, cameras, pixel_size)
     count = len(views)
-    trials = [videos[i : i + count] for i in range(0, len(videos), count)]
-    files = [recording]
-    if len(trials) > 1:
-        for name, given in (("corrections", corrections), ("head", head), ("contact", contact)):
-            if given is not None:
-                raise ValueError(f"--{name} is for one trial; track it by itself")
-        if not recording.is_dir():
-            raise ValueError(f"--output is {recording}; for several trials a folder is needed")
-        files = [recording / f"{trial[0].stem}.nc" for trial in trials]
-        if len(set(files)) < len(files):
-            raise ValueError("two trials would have one file: their first videos share a name")
-    for file in files:
-        check_writable(file, NETCDF)
+    alone = {"--corrections": corrections, "--head": head, "--contact": contact}
+    trials = _trials(videos, count, recording, alone)
     _check_numbers(fps, cutoff, base_radius)
-    for name, pixels in (("width", width), ("jump", jump)):
-        if not 0.0 < pixels < float("inf"):
-            raise ValueError(f"--{name} is {pixels:g}; pixels, more than 0, are needed")
-    _check_twice(trials)
+    _check_pixels(width=width, jump=jump)
     places = _bases(base or [], views)
     fixed = {} if corrections is None else load_corrections(corrections)
     unknown = sorted(view for view in fixed if view >= count)
@@ -173,7 +158,7 @@ def track(
     if "head" in beside:
         _check_head(beside["head"], videos[0], fps)
     trace = TraceOptions(scale=max(width / 3.0, 1.0), jump=jump)
-    for trial, file in zip(trials, files, strict=True):
+    for file, trial in trials.items():
         _tracked(trial, file, views, fps, places, fixed, trace, how, beside)
 
 
@@ -189,6 +174,7 @@ def _tracked(
     beside: Mapping[str, Any],
 ) -> None:
     """Track one trial and say what was found."""
+    from vibrissa.cli.track_report import tell_lengths, tell_recording
     from vibrissa.io import save_recording
     from vibrissa.tracking import partial_traces, trace_file
     from vibrissa.tracking import track as tracked
@@ -207,11 +193,11 @@ def _tracked(
             for view, path in enumerate(videos)
         ]
         result = tracked(cameras, traces, fps, how, progress=tell, **beside)
-    _tell_lengths(videos, traces, result.sizes["time"])
+    tell_lengths(videos, traces, result.sizes["time"])
     save_recording(recording, result)
     for file in kept:
         file.unlink(missing_ok=True)
-    _report(result, recording)
+    tell_recording(result, recording)
 
 
 def _cameras(
@@ -246,6 +232,33 @@ def _cameras(
             "metres, such as 58e-6"
         )
     return orthogonal_views(pixel_size, sizes[0])
+
+
+def _trials(
+    videos: Sequence[Path], count: int, recording: Path, alone: Mapping[str, Path | None]
+) -> dict[Path, Sequence[Path]]:
+    """Videos of each trial, by the recording that they give."""
+    from vibrissa.io.paths import NETCDF, check_writable
+
+    trials = [videos[i : i + count] for i in range(0, len(videos), count)]
+    files = [recording]
+    if len(trials) > 1:
+        refuse(alone, "it is for one trial; track that by itself")
+        if not recording.is_dir():
+            raise ValueError(f"--output is {recording}; for several trials a folder is needed")
+        files = [recording / f"{trial[0].stem}.nc" for trial in trials]
+        if len(set(files)) < len(files):
+            raise ValueError("two trials would have one file: their first videos share a name")
+    for file in files:
+        check_writable(file, NETCDF)
+    _check_twice(trials)
+    return dict(zip(files, trials, strict=True))
+
+
+def _check_pixels(**options: float) -> None:
+    for name, pixels in options.items():
+        if not 0.0 < pixels < float("inf"):
+            raise ValueError(f"--{name} is {pixels:g}; pixels, more than 0, are needed")
 
 
 def _check_numbers(fps: float, cutoff: float, base_radius: float | None) -> None:
@@ -324,85 +337,3 @@ def _bases(texts: Sequence[str], cameras: Sequence[Camera]) -> list[list[list[fl
                 f"--base {texts[i]} lies outside of view {i // each}, {width} × {height} pixels"
             )
     return [places[v * each : (v + 1) * each] for v in range(views)]
-
-
-def _tell_lengths(videos: Sequence[Path], traces: Sequence[Sequence[Any]], used: int) -> None:
-    """Say so where videos differ in length."""
-    frames = [len(view[0]) for view in traces]
-    if len(set(frames)) > 1:
-        listed = ", ".join(f"{path} {n}" for path, n in zip(videos, frames, strict=True))
-        output.print(
-            f"the videos differ in frames ({listed}); {used} of each are used: if the cameras did "
-            "not start together or dropped frames, track with --offset auto",
-            highlight=False,
-            soft_wrap=True,
-        )
-
-
-def _report(result: xr.DataTree, path: Path) -> None:
-    import numpy as np
-
-    from vibrissa.trial import recorded_whisker
-
-    data = result.to_dataset()
-    for k, name in enumerate(data["whisker"].values):
-        one = data.isel(whisker=k)
-        lost = int((one["confidence"] == 0.0).sum())
-        length = recorded_whisker(result, k).length
-        touching = int(np.nansum(one["in_contact"].values))
-        line = (
-            f"{name}: {shown('length', length)} long, in contact in {touching} of "
-            f"{one.sizes['time']} frames, lost in {lost}, misfit of the traces "
-            f"{float(one['trace_misfit'].median()):.2f} of their standard deviation"
-        )
-        output.print(line, highlight=False, soft_wrap=True)
-        if float(one["trace_misfit"].median()) > _POOR:
-            output.print(
-                "  The bent rod does not explain the traces: perhaps too few frames are free of "
-                "contact, or the traces are wrong; see trace_misfit and deviation.",
-                highlight=False,
-                soft_wrap=True,
-            )
-        for line in compared_contacts(result, k):
-            output.print(f"  {line}", highlight=False, soft_wrap=True)
-    output.print(f"wrote {path}", highlight=False, soft_wrap=True)
-
-
-def compared_contacts(recording: xr.DataTree, whisker: int) -> Iterator[str]:
-    """Say how contact points found otherwise compare with those of the rod.
-
-    Parameters
-    ----------
-    recording : xarray.DataTree
-        Tracked.
-    whisker : int
-        Which.
-
-    Yields
-    ------
-    str
-        A sentence, if there is anything to compare.
-    """
-    import numpy as np
-
-    measured = recording.children.get("measured")
-    if measured is None or "contact_difference" not in measured:
-        return
-    one = measured.to_dataset().isel(whisker=whisker)
-    away = one["contact_difference"].values
-    of_rod = recording.to_dataset()["arc_length"].isel(whisker=whisker)
-    along = one["arc_length"].values - of_rod.values
-    both = np.isfinite(away) & np.isfinite(along)
-    found = int(np.isfinite(one["contact_point"].values).all(axis=-1).sum())
-    source = one["contact_point"].attrs["source"]
-    if not both.any():
-        yield f"contact point ({source}): in {found} frames, in none of them has the rod one"
-        return
-    half, most = np.percentile(away[both], [50.0, 95.0])
-    yield (
-        f"contact point ({source}): in {found} frames; in {int(both.sum())} the rod has one too, "
-        f"{shown('contact_difference', half, 3)} away (median; 95 % within "
-        f"{shown('contact_difference', most, 3)}), "
-        f"{shown('contact_difference', float(np.median(along[both])), 3)} farther out along the "
-        "whisker"
-    )

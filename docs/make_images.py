@@ -39,7 +39,7 @@ from vibrissa.trial.film import film_frames, with_true_traces
 from vibrissa.trial.recording import recorded_objects
 
 WIDTH = 1200
-WIDER = {"title": 1400}
+WIDER = {"title": 1360}
 LEVELS = {"title": 48, "trial": 32, "movie_signals": 64, "movie_contour": 64}
 """Of red, green and blue in figures for which 256 colours are too few."""
 

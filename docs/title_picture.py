@@ -26,7 +26,7 @@ from vibrissa.signals import SIGNALS
 from vibrissa.trial import Peg
 from vibrissa.trial.recording import recorded_objects
 
-WIDTH, HEIGHT = 182.0, 108.0
+WIDTH, HEIGHT = 182.0, 119.0
 HEADS = (
     (2.0, "A whisker is bent,"),
     (66.0, "three signals tell where it is touched,"),
@@ -100,7 +100,7 @@ def bent(
     now = to_display("centerline", course.at_base(course.centerline))[moment]
     rest = to_display("centerline", line)
     limits = bounds(np.concatenate([places.reshape(-1, 3), rest, now]))
-    axes = space_axes(figure, (-7.0, 31.0, 71.0, 71.0), limits, (38.0, -66.0), zoom=0.9)
+    axes = space_axes(figure, (-7.0, 40.0, 71.0, 71.0), limits, (38.0, -66.0), zoom=0.9)
     name_axes(axes, (-8.0, -9.0, -10.5))
     paint(axes, places, SKIN, opacity=0.13)
     paint(axes, peg_triangles(course, peg, moment), PEG)
@@ -143,12 +143,12 @@ def peg_triangles(course: Course, peg: Peg, moment: int) -> Array:
 
 def readings(figure: Figure, now: xr.Dataset) -> None:
     """What the sensor reads at that moment; the three that are used stand out."""
-    write(figure, 4.0, 26.0, "felt at its base:", fontsize=7.0)
+    write(figure, 4.0, 31.0, "felt at its base:", fontsize=7.0)
     for i, name in enumerate(SIGNALS):
         value, unit = float(to_display(name, now[name].values)), quantity(name).display_unit
         used = name in TRIPLET
         look = {"fontsize": 7.5 if used else 7.0, "color": ORANGE if used else MUTED}
-        x, y = 4.0 + 26.0 * (i // 3), 19.5 - 5.8 * (i % 3)
+        x, y = 4.0 + 26.0 * (i // 3), 23.5 - 6.5 * (i % 3)
         write(figure, x, y, f"${quantity(name).symbol}$", **look)
         gap = "" if unit == "°" else " "
         digits = 0 if abs(value) >= 10.0 else 2
@@ -171,11 +171,11 @@ def solids(figure: Figure, course: Course, samples: xr.Dataset, line: Array, mom
     limits = signal_limits(felt(body))
     course_way = signal_places(*way.T)
     for i, name in enumerate(("r", "theta", "phi")):
-        axes = signal_axes(figure, (65.5, 69.0 - 32.5 * i, 51.0, 30.0), limits)
+        axes = signal_axes(figure, (65.5, 80.0 - 37.5 * i, 51.0, 30.0), limits)
         norm, marks = levels(name, body)
         values = to_display(name, values_of(name, body))
         paint(axes, felt(body), painted(values, norm, sequential()), flat=0.8)
-        coordinate_bar(figure, (118.0, 75.5 - 32.5 * i, 1.6, 15.0), name, norm, marks)
+        coordinate_bar(figure, (118.0, 86.5 - 37.5 * i, 1.6, 15.0), name, norm, marks)
         axes.plot(*course_way.T, color=ORANGE, linewidth=0.7, zorder=12)
         axes.scatter(*course_way[moment], s=14.0, color=ORANGE, zorder=14, depthshade=False)
 
@@ -190,7 +190,7 @@ def contour(figure: Figure, trial: xr.DataTree, peg: Peg, fit: CylinderFit, mome
     sharp = np.nanquantile(points[sigma < 10.0 * SHARP, 2], [0.0, 1.0])
     both = np.array([-1.0, 1.0])
     limits = np.stack([*(middle[:2, None] + half * both), sharp + 0.7 * both])
-    for view, box in (((0, 1), (139.0, 58.0, 41.0, 41.0)), ((0, 2), (139.0, 9.0, 41.0, 38.0))):
+    for view, box in (((0, 1), (139.0, 68.5, 41.0, 41.0)), ((0, 2), (139.0, 9.0, 41.0, 47.0))):
         axes = box_axes(figure, box, xlim=limits[view[0]], ylim=limits[view[1]])
         axes.set(xlabel=axis_label("xyz"[view[0]]), ylabel=axis_label("xyz"[view[1]]))
         axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))

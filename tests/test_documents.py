@@ -1,5 +1,7 @@
 """What the first pages tell to type can be typed, and pictures stay small."""
 
+import ast
+import importlib
 import re
 import shlex
 from functools import cache
@@ -63,6 +65,18 @@ def test_what_cannot_be_typed_is_noticed():
     ):
         with pytest.raises(Exception, match=message):
             parse(words)
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_names_that_pages_use_exist(name):
+    for node in (
+        node for code in blocks(PAGES[name], "python") for node in ast.walk(ast.parse(code))
+    ):
+        if isinstance(node, ast.ImportFrom):
+            module = importlib.import_module(node.module)
+            assert [one.name for one in node.names if not hasattr(module, one.name)] == []
+        elif isinstance(node, ast.Attribute) and ast.unparse(node.value) == "vb":
+            assert hasattr(vb, node.attr), node.attr
 
 
 @pytest.mark.parametrize("name", ["README.md", "tutorial.md"])

@@ -54,7 +54,7 @@ class TrialMode:
     def _controls(self, server: viser.ViserServer) -> None:
         gui, trial = server.gui, self.trial
         self._folder = gui.add_folder("Trial", visible=False)
-        end = _MS * float(trial.time[-1] - trial.time[0])
+        end = round(_MS * float(trial.time[-1] - trial.time[0]), 3)
         step = max(round(end / max(trial.frames - 1, 1), 3), 1e-3)
         with self._folder:
             self._time = gui.add_slider("Time (ms)", 0.0, max(end, step), step, 0.0)
@@ -188,4 +188,5 @@ class TrialMode:
         touching = "in contact" if trial.felt[frame, i] else "free"
         passed = f"{_MS * float(trial.time[frame] - trial.time[0]):.1f} ms"
         count = int(trial.felt[: frame + 1].sum())
-        return table(rows, f"{passed}: {touching}, {count} contacts so far")
+        so_far = f"{count} contact{'' if count == 1 else 's'} so far"
+        return table(rows, f"{passed}: {touching}, {so_far}")

@@ -5,9 +5,9 @@
 Simulated whiskers sweep past pegs at four distances: each touch begins, slides along the whisker
 and slips off. Under the noise of a sensor each sample is located alone, with the candidate of least
 force taken for the contact, and by the filter. Printed are, for three whiskers and four triplets:
-how often the candidate nearest to the truth is chosen where there are several, errors (over the
-length), how many errors lie beyond the 95 % ellipsoid that is stated, and how often the filter is
-right where it states some probability.
+how often the candidate nearest to the truth is chosen where there are several (or one that noise
+cannot tell from it), errors over the length, how many errors lie beyond the 95 % ellipsoid that is
+stated, and how often the filter is right where it states some probability.
 """
 
 import sys
@@ -31,6 +31,7 @@ WHISKERS = {
     ),
 }
 DISTANCES = (0.45, 0.6, 0.7, 0.85)
+ONE = 9.0  # candidates nearer to each other (χ²) cannot be told apart
 BEYOND = 7.81  # χ² of three degrees of freedom that one in twenty exceeds
 
 
@@ -69,12 +70,15 @@ def followed(contacts, trial, names, sigma, seed):
         if len(candidates):
             far = np.linalg.norm(candidates - point[i], axis=1)
             alone = far[0] / length
-            covariance = turn[i] @ known.located.covariance @ turn[i].T
-            own = chi_squared(candidates[0] - point[i], covariance)
+            spreads = turn[i] @ known.located.covariances @ turn[i].T
+            own = chi_squared(candidates[0] - point[i], spreads[0])
             if len(candidates) > 1:
-                first = far.argmin() == 0
+                best = far.argmin()
                 nearest = np.linalg.norm(candidates - known.point, axis=1).argmin()
-                ours = far.argmin() == nearest
+                first, ours = (
+                    chi_squared(candidates[k] - candidates[best], spreads[k] + spreads[best]) < ONE
+                    for k in (0, nearest)
+                )
         error = np.linalg.norm(away) / length
         out.append((first, ours, alone, error, own, chi, known.probability))
     return np.array(out, dtype=np.float64).reshape(-1, 7)

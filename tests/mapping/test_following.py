@@ -142,6 +142,9 @@ def test_a_filter_forgets_a_contact_that_is_lost_and_waits_for_what_is_missing(w
     np.testing.assert_allclose(
         turn[0] @ good.point_whisker + base[0], good.point, rtol=1e-12, atol=1e-15
     )
+    nowhere = good.located._replace(covariances=np.full((1, 3, 3), np.nan))
+    there = np.r_[np.zeros(3), good.located.point / 0.3][None]
+    assert follow._unaccounted(there, nowhere, turn[0], base[0] / 0.3).tolist() == [False]
     missing = follow(time[1], np.full(6, np.nan), turn[1], base[1])
     assert missing.status == vb.Status.MISSING
     assert np.linalg.norm(missing.point - good.point) < 1e-3

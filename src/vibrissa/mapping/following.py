@@ -235,6 +235,9 @@ class ContactFilter:
     def _unaccounted(self, values: Array, located: Located, turn: Array, base: Array) -> AnyArray:
         """Which candidates (n,) no hypothesis accounts for."""
         own = turn @ (located.covariances / self._length**2) @ turn.T
+        if not np.isfinite(own).all():  # a place that the signals do not determine
+            unknown = ~np.isfinite(own).all(axis=(1, 2))
+            own[unknown] = _FORGOTTEN**2 * np.eye(3)
         out = np.empty(len(values), np.bool_)
         points = values[:, 3:] @ turn.T + base
         unaccounted(self._mixture, self._stiffness, points, own, _NEW, out)

@@ -114,15 +114,15 @@ def estimate(
     from vibrissa.cli.recordings import is_recording, noise_from
     from vibrissa.io.paths import CSV, NETCDF, check_readable, check_writable
 
-    recorded = is_recording(check_readable(signals))
-    if path is None:
-        path = signals if recorded else Path("contacts.csv")
-    check_writable(path, (*NETCDF, *CSV) if recorded else CSV)
     how = how_to(triplet, method, all_six, charts, whisker)
     if noise is not None:
         options = {"--force-noise": force_noise, "--moment-noise": moment_noise}
         refuse(options, "--noise tells it all")
     sigma = noise_from(noise, force_noise, moment_noise)
+    recorded = is_recording(check_readable(signals))
+    if path is None:
+        path = signals if recorded else Path("contacts.csv")
+    check_writable(path, (*NETCDF, *CSV) if recorded else CSV)
     if recorded:
         _from_recording(signals, path, how, sigma)
     else:

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from vibrissa.io.video import Frame
 from vibrissa.tracking import ridge
 from vibrissa.tracking.ends import FEWEST, OUTSIDE, traced
+from vibrissa.tracking.likeness import usual_look
 from vibrissa.tracking.middle import smooth
 from vibrissa.tracking.trace import STEP, Trace, TraceOptions
 
@@ -36,6 +37,9 @@ _CLICK = 20.0
 
 _BRIGHT = 0.35
 """How bright it is beside a whisker at least, relative to the bright parts of the image."""
+
+_LOOKS = 200
+"""Frames over which is remembered how it looks."""
 
 _TURNS = np.radians([-6.0, 6.0, -12.0, 12.0, -18.0, 18.0])
 
@@ -69,6 +73,8 @@ class Follower:
     _missing: int = 0
     _supports: list[float] = field(default_factory=list)
     _unsearched: int = 0
+    _looks: list[Array] = field(default_factory=list)
+    _usual_look: tuple[Array, Array] = field(default_factory=lambda: usual_look(()))
 
     def restart(self, trace: Trace) -> None:
         """Go on from a trace that is known to be right.
@@ -194,6 +200,22 @@ class Follower:
         self._supports = [*self._supports[-self.options.memory :], trace.support]
         confidence = min(1.0, trace.confidence * min(1.0, trace.support / max(usual, 1.0)))
         return trace._replace(confidence=confidence)
+
+    @property
+    def usual_look(self) -> tuple[Array, Array]:
+        """How it usually looks, and by how much that differs (`vibrissa.tracking.likeness`)."""
+        return self._usual_look
+
+    def remember(self, look: Array) -> None:
+        """Learn how it looks.
+
+        Parameters
+        ----------
+        look : array
+            In a frame in which it was found.
+        """
+        self._looks = [*self._looks[-_LOOKS + 1 :], look]
+        self._usual_look = usual_look(self._looks)
 
     def lose(self) -> Trace:
         """Go on without the whisker in the next frame.

@@ -18,18 +18,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.io.video import Frame
 from vibrissa.tracking import ridge
-from vibrissa.tracking.find import overlap
+from vibrissa.tracking.find import find_whiskers, overlap
 from vibrissa.tracking.follow import Follower
+from vibrissa.tracking.identity import PLACES, SAME, Seen, sideways
+from vibrissa.tracking.likeness import look_of, unlikeness
 from vibrissa.tracking.trace import STEP, Trace, given
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-
-_PLACES = np.arange(0, 31, 5)
-"""Points at the beginning of a line by which it is told from others."""
-
-_SAME = 0.5
-"""Share of a line that lies on another one if both are one whisker."""
 
 _LOST = 1.0
 _SHORT = 0.5
@@ -42,6 +38,12 @@ _TURN = 0.1
 _SHIFT = 5.0
 """Turn, rad, and shift, pixels, of the whole row that cost as much as a lost whisker."""
 
+_UNLIKE = 6.0
+"""Unlikeness (`vibrissa.tracking.likeness`) that costs as much as a lost whisker."""
+
+_NEAR = 40.0
+"""How far from a base lines begin that are looked at without expectations, pixels."""
+
 _LARGEST_TURN = 0.35
 _ALIGNED = 0.7
 """Cosine of the largest angle between where a line begins to go and where it is expected to."""
@@ -52,7 +54,10 @@ half of the way to the next."""
 
 
 def follow_row(
-    followers: Sequence[Follower], frame: Frame, known: Mapping[int, ArrayLike]
+    followers: Sequence[Follower],
+    frame: Frame,
+    known: Mapping[int, ArrayLike],
+    record: list[Seen] | None = None,
 ) -> list[Trace]:
     """Find every whisker in the next frame; no two are the same.
 
@@ -64,6 +69,8 @@ def follow_row(
         Grey values.
     known : mapping of int to array_like (n, 2)
         Traces that are given.
+    record : list of Seen, optional
+        Gets what was seen, from which `vibrissa.tracking.identity.decided` tells who is who.
 
     Returns
     -------
@@ -75,11 +82,13 @@ def follow_row(
     free = [k for k in range(len(followers)) if k not in fixed]
     own = {k: list(followers[k].along_expected(frame, noise)) for k in free}
     before = [follower.last for follower in followers]
-    chosen = _clearly(followers, own, fixed)
+    chosen = _clearly(followers, own, fixed, frame)
+    pool: list[Trace] = []
     if chosen is None:
         apart = _apart(followers)
         pool = _pool(followers, own, fixed, frame, noise, apart)
-        chosen = _assigned([followers[k] for k in free], free, pool, apart[free])
+        looks = [look_of(frame, trace) for trace in pool]
+        chosen = _assigned([followers[k] for k in free], free, pool, looks, apart[free])
     found = []
     for k, follower in enumerate(followers):
         if k in fixed:
@@ -89,11 +98,31 @@ def follow_row(
             trace = chosen.get(k)
             found.append(follower.lose() if trace is None else follower.accept(trace))
     _carry(followers, before, found)
+    seen = _seen(frame, pool, found, set(fixed))
+    for follower, c in zip(followers, seen.chosen, strict=True):
+        if c >= 0:
+            follower.remember(seen.looks[c])
+    if record is not None:
+        record.append(seen)
     return found
 
 
+def _seen(frame: Frame, pool: Sequence[Trace], found: Sequence[Trace], fixed: set[int]) -> Seen:
+    """What a frame shows: lines that were looked at, and who was found where."""
+    lines = [trace for trace in found if len(trace.line)]
+    lines += [trace for trace in pool if not any(trace.line is other.line for other in lines)]
+    chosen = [
+        next((c for c, trace in enumerate(lines) if trace.line is each.line), -1) for each in found
+    ]
+    looks = [look_of(frame, trace) for trace in lines]
+    return Seen(lines, looks, chosen, fixed, clear=not pool)
+
+
 def _clearly(
-    followers: Sequence[Follower], own: Mapping[int, list[Trace]], fixed: Mapping[int, Trace]
+    followers: Sequence[Follower],
+    own: Mapping[int, list[Trace]],
+    fixed: Mapping[int, Trace],
+    frame: Frame,
 ) -> dict[int, Trace] | None:
     """The whiskers' own lines if there is no doubt about any."""
     chosen: dict[int, Trace] = {}
@@ -102,15 +131,17 @@ def _clearly(
         if not traces or traces[-1].support < follower.wanted:
             return None
         expected = follower.expected
-        if expected is None or np.abs(_offsets(expected, traces[-1].line)).mean() > (
+        if expected is None or np.abs(sideways(expected, traces[-1].line)).mean() > (
             0.5 * follower.reach
         ):
+            return None
+        if unlikeness(look_of(frame, traces[-1]), *follower.usual_look) > 0.5 * _UNLIKE:
             return None
         chosen[k] = traces[-1]
     lines = [trace.line for trace in (*chosen.values(), *fixed.values())]
     for a in range(len(lines)):
         for b in range(a):
-            if overlap(lines[a], lines[b]) >= _SAME or overlap(lines[b], lines[a]) >= _SAME:
+            if overlap(lines[a], lines[b]) >= SAME or overlap(lines[b], lines[a]) >= SAME:
                 return None
     return chosen
 
@@ -130,12 +161,17 @@ def _pool(
         proposed += traces
         if not any(trace.support >= follower.wanted for trace in traces):
             proposed += follower.along_turned(frame, noise)
-            proposed += follower.from_base(frame, noise, apart[k])
+            if follower.expected is None:
+                proposed += follower.from_base(frame, noise, apart[k])
+    bases = np.array([follower.base for follower in followers])
+    for found in find_whiskers(frame, followers[0].options):
+        if np.linalg.norm(bases - found.trace.line[0], axis=1).min() < _NEAR:
+            proposed.append(found.trace)
     kept: list[Trace] = []
     for trace in sorted(proposed, key=lambda t: -t.support):
         if not len(trace.line):
             continue
-        if any(overlap(trace.line, other.line) >= _SAME for other in fixed.values()):
+        if any(overlap(trace.line, other.line) >= SAME for other in fixed.values()):
             continue
         if not any(_equal(trace.line, other.line) for other in kept):
             kept.append(trace)
@@ -151,26 +187,21 @@ def _apart(followers: Sequence[Follower]) -> Array:
 
 
 def _equal(line: Array, other: Array) -> bool:
-    n = min(len(line), len(other), 3 * int(_PLACES[-1]))
+    n = min(len(line), len(other), 3 * int(PLACES[-1]))
     if overlap(line[:n], other[:n], 1.5) < 0.8:
         return False
     return float(np.linalg.norm(line[0] - other[0])) < 4.0
 
 
-def _offsets(expected: Array, line: Array) -> Array:
-    """How far a line is to the left (−dy, dx) of an expected one, at `_PLACES`, pixels."""
-    places = np.minimum(_PLACES, min(len(expected), len(line)) - 1)
-    tangent = np.gradient(expected[: _PLACES[-1] + 2], axis=0)
-    tangent = tangent[places] / np.linalg.norm(tangent[places], axis=1, keepdims=True)
-    away = line[places] - expected[places]
-    return np.asarray(away[:, 1] * tangent[:, 0] - away[:, 0] * tangent[:, 1])
-
-
 def _assigned(
-    followers: Sequence[Follower], names: Sequence[int], pool: Sequence[Trace], apart: Array
+    followers: Sequence[Follower],
+    names: Sequence[int],
+    pool: Sequence[Trace],
+    looks: Sequence[Array],
+    apart: Array,
 ) -> dict[int, Trace]:
     """The cheapest way to give lines to whiskers, without those in doubt."""
-    costs = _Costs.of(followers, pool, 0.5 * apart)
+    costs = _Costs.of(followers, pool, looks, 0.5 * apart)
     problem = _Row(followers, pool, costs.price)
     best: list[int] = []
     least, motion = np.inf, (0.0, 0.0)
@@ -193,7 +224,7 @@ def _assigned(
 
 def _aligned(expected: Array, line: Array) -> float:
     """Cosine between the directions in which two lines begin."""
-    i = min(int(_PLACES[-1]), len(expected) - 1, len(line) - 1)
+    i = min(int(PLACES[-1]), len(expected) - 1, len(line) - 1)
     a, b = expected[i] - expected[0], line[i] - line[0]
     return float(a @ b / max(np.linalg.norm(a) * np.linalg.norm(b), 1e-9))
 
@@ -208,9 +239,15 @@ class _Costs(NamedTuple):
     seen: Mask  # (whisker,), before
 
     @classmethod
-    def of(cls, followers: Sequence[Follower], pool: Sequence[Trace], half: Array) -> _Costs:
+    def of(
+        cls,
+        followers: Sequence[Follower],
+        pool: Sequence[Trace],
+        looks: Sequence[Array],
+        half: Array,
+    ) -> _Costs:
         shape = len(followers), len(pool)
-        price, offsets = np.full(shape, np.inf), np.zeros((*shape, len(_PLACES)))
+        price, offsets = np.full(shape, np.inf), np.zeros((*shape, len(PLACES)))
         longest = max((trace.support for trace in pool), default=1.0)
         for k, follower in enumerate(followers):
             expected = follower.expected
@@ -219,11 +256,12 @@ class _Costs(NamedTuple):
                     continue
                 share = trace.support / (follower.usual or longest)
                 price[k, c] = _SHORT * (1.0 - min(1.0, share))
+                price[k, c] += unlikeness(looks[c], *follower.usual_look) / _UNLIKE
                 if expected is None:
                     away = float(np.linalg.norm(trace.line[0] - follower.base))
                     price[k, c] += (away / min(_CLICK, half[k])) ** 2
                 elif _aligned(expected, trace.line) > _ALIGNED:
-                    offsets[k, c] = _offsets(expected, trace.line)
+                    offsets[k, c] = sideways(expected, trace.line)
                 else:
                     price[k, c] = np.inf
         reach = np.array([[follower.reach] for follower in followers])
@@ -235,7 +273,7 @@ class _Costs(NamedTuple):
 
         They are beside what is expected; the cheapest comes first.
         """
-        arms = STEP * _PLACES
+        arms = STEP * PLACES
         design = np.linalg.pinv(np.stack([np.ones(len(arms)), arms], axis=1))
         fits = self.offsets[np.isfinite(self.price) & self.seen[:, None]] @ design.T
         rounded = np.round(fits / [1.0, 0.02]) * [1.0, 0.02]
@@ -249,7 +287,7 @@ class _Costs(NamedTuple):
 
     def after(self, shift: float, turn: float) -> Array:
         """Cost of each line for each whisker if the row has moved; infinite beyond its reach."""
-        moved = (shift + turn * STEP * _PLACES) * self.seen[:, None, None]
+        moved = (shift + turn * STEP * PLACES) * self.seen[:, None, None]
         away = np.abs(self.offsets - moved)
         mean = away.mean(axis=2) / self.reach
         near = (mean <= 1.0) & (away[:, :, 0] <= self.apart)
@@ -266,7 +304,7 @@ class _Row:
         self.conflict = np.zeros((len(pool), len(pool)), dtype=bool)
         for a in used:
             for b in used:
-                if a != b and overlap(pool[a].line, pool[b].line) >= _SAME:
+                if a != b and overlap(pool[a].line, pool[b].line) >= SAME:
                     self.conflict[a, b] = self.conflict[b, a] = True
 
     def cheapest(self, costs: Array, limit: float) -> tuple[float, list[int]]:
@@ -320,8 +358,8 @@ def _carry(
     turns, shifts = [], []
     for line, trace in zip(before, found, strict=True):
         if line is not None and len(trace.line):
-            arms = STEP * _PLACES
-            offset = _offsets(line, trace.line)
+            arms = STEP * PLACES
+            offset = sideways(line, trace.line)
             shifts.append(trace.line[0] - line[0])
             turns.append(float((offset - offset[0]) @ arms / (arms @ arms)))
     if turns:

@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from vibrissa.io.video import Frame
 from vibrissa.tracking.find import find_whiskers, overlap
 from vibrissa.tracking.follow import Follower, start_at
+from vibrissa.tracking.identity import Seen, decided
+from vibrissa.tracking.likeness import look_of
 from vibrissa.tracking.row import follow_row
 from vibrissa.tracking.trace import Trace, TraceOptions, given
 
@@ -75,30 +77,58 @@ def trace_video(
     traces: list[list[Trace]] = [] if kept is None else kept
     done = len(begun[0]) if begun else 0
     recent: deque[Frame] = deque(maxlen=KEPT)
+    seen: list[Seen] = []
+    starts = np.empty((0, 2))
     for i, frame in enumerate(frames):
         if i == 0:
             if done:
-                starts = bases if bases is not None else [None] * len(begun)
+                places = bases if bases is not None else [None] * len(begun)
                 followers = [
-                    _resumed(row, base, options) for row, base in zip(begun, starts, strict=True)
+                    _resumed(row, base, options) for row, base in zip(begun, places, strict=True)
                 ]
             else:
                 followers = [start_at(base, options) for base in _bases(frame, bases, options)]
+            begins = [follower.base for follower in followers] if bases is None else bases
+            starts = np.array(begins, dtype=np.float64)
             traces[:] = [list(row) for row in begun] or [[] for _ in followers]
             _check(corrections, len(followers))
         if i < done:
             recent.append(frame)
+            if len(followers) > 1:
+                seen.append(_seen_before(frame, [row[i] for row in traces], followers))
             continue
-        found = follow_all(followers, frame, {k: p for (j, k), p in corrections.items() if j == i})
+        known = {k: p for (j, k), p in corrections.items() if j == i}
+        found = follow_all(followers, frame, known, seen)
         for trace, row in zip(found, traces, strict=True):
             row.append(trace)
         for k in range(len(followers)):
             if (i, k) in corrections:
-                _backward(traces[k], recent, k, corrections, options)
+                _backward(traces[k], recent, k, corrections, options, seen)
         recent.append(frame)
         if progress is not None:
             progress(i + 1)
+    if len(followers) > 1 and done < len(traces[0]):
+        _settle(traces, seen, starts)
     return traces
+
+
+def _seen_before(frame: Frame, found: Sequence[Trace], followers: Sequence[Follower]) -> Seen:
+    """What a frame showed that is not traced again."""
+    lines = [trace for trace in found if len(trace.line)]
+    looks = [look_of(frame, trace) for trace in lines]
+    chosen, rest = [], iter(range(len(lines)))
+    for follower, trace in zip(followers, found, strict=True):
+        chosen.append(next(rest) if len(trace.line) else -1)
+        if chosen[-1] >= 0:
+            follower.remember(looks[chosen[-1]])
+    return Seen(lines, looks, chosen, clear=min(chosen) >= 0)
+
+
+def _settle(traces: list[list[Trace]], seen: Sequence[Seen], starts: Array) -> None:
+    """Tell from all frames together who is who."""
+    for i, way in enumerate(decided(seen, starts)):
+        for row, c in zip(traces, way, strict=True):
+            row[i] = seen[i].lines[c] if c >= 0 else Trace.lost()
 
 
 def _bases(
@@ -134,7 +164,10 @@ def _check(corrections: Corrections, count: int) -> None:
 
 
 def follow_all(
-    followers: Sequence[Follower], frame: Frame, known: Mapping[int, ArrayLike]
+    followers: Sequence[Follower],
+    frame: Frame,
+    known: Mapping[int, ArrayLike],
+    record: list[Seen] | None = None,
 ) -> list[Trace]:
     """Find every whisker in the next frame.
 
@@ -146,6 +179,8 @@ def follow_all(
         Grey values.
     known : mapping of int to array_like (n, 2)
         Traces that are given.
+    record : list of Seen, optional
+        Of several whiskers gets what was seen of them.
 
     Returns
     -------
@@ -153,7 +188,7 @@ def follow_all(
         One a whisker; several are told apart by `vibrissa.tracking.row.follow_row`.
     """
     if len(followers) > 1:
-        return follow_row(followers, frame, known)
+        return follow_row(followers, frame, known, record)
     (follower,) = followers
     if not known:
         return [follower.follow(frame)]
@@ -168,6 +203,7 @@ def _backward(
     whisker: int,
     corrections: Corrections,
     options: TraceOptions,
+    seen: Sequence[Seen],
 ) -> None:
     """Trace back from a corrected frame, the last of the row, until nothing changes."""
     follower = Follower(row[-1].line[0], options)
@@ -182,3 +218,5 @@ def _backward(
         # The way that sees more is right; what was lost before is found now.
         if trace.support > 0.9 * row[i].support:
             row[i] = trace
+            if seen:
+                seen[i].settle(whisker, trace)

@@ -1,0 +1,103 @@
+"""Who is who, from all frames together: lines are drawn, so that seeing them costs nothing."""
+
+import numpy as np
+import pytest
+
+from vibrissa.tracking.identity import Seen, decided, sideways
+from vibrissa.tracking.likeness import FEATURES, look_of, unlikeness, usual_look
+from vibrissa.tracking.trace import Trace
+
+BASES = np.array([[20.0, 60.0], [20.0, 72.0]])
+FRAMES = 24
+
+
+def straight(base, angle, length):
+    along = np.arange(0.0, length, 2.0)[:, None] * [np.cos(angle), np.sin(angle)]
+    return Trace(base + along, np.full(len(along), 0.1), np.ones(len(along), dtype=bool), 1.0)
+
+
+def look(length, darkness):
+    return np.array([np.log(length), *[np.log(darkness)] * 3, 0.0, 0.0, 0.0])
+
+
+def row(length=(100.0, 160.0), darkness=(0.3, 0.5)):
+    """Two whiskers that sweep to and fro together, and what was seen of them."""
+    seen = []
+    for i in range(FRAMES):
+        angle = 0.8 * np.sin(0.6 * i)
+        lines = [straight(base, angle, long) for base, long in zip(BASES, length, strict=True)]
+        looks = [look(long, dark) for long, dark in zip(length, darkness, strict=True)]
+        seen.append(Seen(lines, looks, [0, 1], clear=i < 8))
+    return seen
+
+
+def test_a_mix_up_that_was_followed_is_put_right():
+    """From frame 12 on each was taken for the other."""
+    seen = row()
+    for frame in seen[12:]:
+        frame.chosen = [1, 0]
+    assert decided(seen, BASES) == [[0, 1]] * FRAMES
+
+
+def test_a_stranger_is_not_taken_for_a_whisker_that_is_hidden():
+    """Whisker 1 is not seen for five frames; a fainter line a little beside it is."""
+    seen = row()
+    for frame in seen[12:17]:
+        other = straight(BASES[1] + [0.0, 4.0], 0.0, 60.0)
+        frame.lines, frame.looks = [frame.lines[0], other], [frame.looks[0], look(60.0, 0.1)]
+    found = decided(seen, BASES)
+    assert [way[1] for way in found[12:17]] == [-1] * 5
+    assert all(way[0] == 0 for way in found)
+    assert all(way[1] == 1 for way in found[17:])
+
+
+def test_what_a_person_says_holds():
+    """Frame 15 is corrected: both on the line of the other, and there alone."""
+    seen = row()
+    swapped = list(seen[15].lines[::-1])
+    for k in range(2):
+        seen[15].settle(k, swapped[k])
+    found = decided(seen, BASES)
+    assert found[15] == [2, 3]
+    assert found[:15] + found[16:] == [[0, 1]] * (FRAMES - 1)
+
+
+def test_who_cannot_be_told_is_lost_rather_than_guessed():
+    """Alike, and at one place from frame 12 on: nothing tells who is who."""
+    seen = row((100.0, 100.0), (0.3, 0.3))
+    for i in range(12, FRAMES):
+        angles = 0.8 * np.sin(0.6 * i) + np.array([-0.05, 0.05])
+        seen[i].lines = [straight(BASES.mean(axis=0), angle, 100.0) for angle in angles]
+    found = decided(seen, BASES)
+    assert found[:12] == [[0, 1]] * 12
+    assert found[-1] == [-1, -1]
+
+
+def test_looks():
+    """Length, contrast and turns of a bent line of a known grey value."""
+    y, x = np.mgrid[:120, :200]
+    place = 30.0 + 0.002 * (x - 10.0) ** 2
+    frame = (200.0 - 100.0 * np.exp(-0.5 * ((y - place) / 1.4) ** 2)).astype(np.uint8)
+    column = np.arange(10.0, 170.0, 1.9)
+    line = np.stack([column, 30.0 + 0.002 * (column - 10.0) ** 2], axis=1)
+    seen = look_of(frame, Trace(line, np.ones(len(line)), np.ones(len(line), dtype=bool), 1.0))
+    assert seen[0] == pytest.approx(np.log(2.0 * len(line)))
+    np.testing.assert_allclose(seen[1:3], np.log(0.5), atol=0.2)
+    slopes = [np.arctan(0.004 * 1.9 * at) for at in (7.0, 24.0, 44.0, 64.0)]
+    np.testing.assert_allclose(seen[4:], np.diff(slopes), atol=0.01)
+    assert np.isnan(look_of(frame, Trace.lost())).all()
+    middle, spread = usual_look([seen] * 5)
+    assert unlikeness(seen, middle, spread) == 0.0
+    shorter, longer = seen.copy(), seen.copy()
+    shorter[0] -= 0.3
+    longer[0] += 0.3
+    assert 0.0 < unlikeness(shorter, middle, spread) < unlikeness(longer, middle, spread)
+    assert unlikeness(seen, *usual_look([])) == 0.0
+    assert middle.shape == (FEATURES,)
+
+
+def test_sideways_of_lines_that_stand_still():
+    line = straight(BASES[0], 0.3, 80.0).line
+    normal = np.array([-np.sin(0.3), np.cos(0.3)])
+    np.testing.assert_allclose(sideways(line, line + 2.0 * normal), 2.0, atol=1e-9)
+    assert np.isfinite(sideways(np.zeros((40, 2)), line)).all()

@@ -251,25 +251,34 @@ def nearest_nodes(chart: Reach, channels: Channels, measured: Array) -> IntArray
     (n, parts) int array
         Flat numbers of nodes; -1 for none.
     """
-    which = [CHANNELS.index(name) for name in channels.names]
-    known = np.ascontiguousarray(channels_of(chart.values.reshape(-1, 6))[:, which])
+    known = _seen(chart, channels.names)
     targets = channels.targets(measured)
+    which = [CHANNELS.index(name) for name in channels.names]
     # Forces are compared relative to the force, moments to the moment, and directions in rad.
     scale = np.ones_like(targets)
     for kind in ("F", "M"):
         same = [k for k, w in enumerate(which) if CHANNELS[w][0] == kind and not CIRCULAR[w]]
         size = np.linalg.norm(targets[:, same], axis=1, keepdims=True)
         scale[:, same] = 1.0 / np.where(size > 0.0, size, 1.0)
+    out = np.full((len(targets), _PARTS), -1)
+    share_out(len(targets), lambda first, last: _nearest(*known, targets, scale, out, first, last))
+    return out
+
+
+@lru_cache(maxsize=64)
+def _seen(chart: Reach, names: tuple[str, ...]) -> tuple[Array, Array, IntArray]:
+    """Channels (k, nodes) at the chart's nodes, 1/2π for those that are angles, and each's part."""
+    which = [CHANNELS.index(name) for name in names]
+    known = np.ascontiguousarray(channels_of(chart.values.reshape(-1, 6))[:, which].T)
     turns = np.array([0.5 / np.pi if CIRCULAR[w] else 0.0 for w in which])
+    return known, turns, parts(chart)
+
+
+def parts(chart: Reach) -> IntArray:
+    """To which of sixteen parts of the chart each of its nodes belongs, flat."""
     n, m, k = chart.values.shape[:3]
     i, j, _ = np.meshgrid(np.arange(n), np.arange(m), np.arange(k), indexing="ij")
-    part = (4 * (4 * i // n) + (4 * j // m) % 4).reshape(-1)
-    out = np.full((len(targets), _PARTS), -1)
-    share_out(
-        len(targets),
-        lambda first, last: _nearest(known, turns, part, targets, scale, out, first, last),
-    )
-    return out
+    return np.asarray((4 * (4 * i // n) + (4 * j // m) % 4).reshape(-1))
 
 
 @kernel
@@ -283,16 +292,19 @@ def _nearest(
     first: int,
     last: int,
 ) -> None:
-    least = np.empty(out.shape[1])
+    nodes = known.shape[1]
+    least, total = np.empty(out.shape[1]), np.empty(nodes)
     for row in range(first, last):
-        least[:] = np.inf
-        for node in range(known.shape[0]):
-            total = 0.0
-            for k in range(known.shape[1]):
-                away = known[node, k] - targets[row, k]
-                away -= np.rint(away * turns[k]) * 2.0 * np.pi
-                total += (away * scale[row, k]) ** 2
+        least[:], total[:] = np.inf, 0.0
+        for k in range(known.shape[0]):
+            target, size, turn = targets[row, k], scale[row, k], turns[k]
+            seen = known[k]
+            for node in range(nodes):
+                away = seen[node] - target
+                away -= np.rint(away * turn) * 2.0 * np.pi
+                total[node] += (away * size) ** 2
+        for node in range(nodes):
             p = part[node]
-            if total < least[p]:
-                least[p] = total
+            if total[node] < least[p]:
+                least[p] = total[node]
                 out[row, p] = node

@@ -16,7 +16,12 @@ from vibrissa.mapping.channels import CHANNELS, FITTED, WRENCH, Channels
 from vibrissa.mapping.estimate import check_signals
 from vibrissa.mapping.explanation import Bounds
 from vibrissa.mapping.inversion import MOST_CANDIDATES, _invert
-from vibrissa.mapping.least_squares import constant_weights, nearest_nodes, seeding_triplet
+from vibrissa.mapping.least_squares import (
+    constant_weights,
+    nearest_nodes,
+    parts,
+    seeding_triplet,
+)
 from vibrissa.mapping.noise import SensorNoise
 from vibrissa.mapping.weighing import Weighing, tree_seeds
 from vibrissa.mapping.whitening import TRUSTED, rank
@@ -199,10 +204,9 @@ class Mixed:
         self._back = np.linalg.pinv(h)
         self._chart, self._seen = chart, wrenches @ h.T
         self._largest = 10.0 * np.abs(self._seen).max(axis=0)
-        n, m, k = chart.values.shape[:3]
-        i, j, _ = np.meshgrid(np.arange(n), np.arange(m), np.arange(k), indexing="ij")
-        self._part = (4 * (4 * i // n) + (4 * j // m) % 4).reshape(-1)
+        self._part = parts(chart)
         if self.told >= 3:
+            n, m, k = chart.values.shape[:3]
             three = h[:3]
             values = self._seen[:, :3].reshape(n, m, k, 3)
             force, point = chart.tangents[..., :3, :], chart.tangents[..., 3:, :]

@@ -28,6 +28,8 @@ from vibrissa.rod.kernels import (
     integrate,
     lane_tangents,
     lane_value,
+    lanes_tangents,
+    set_all_lanes,
     set_lane,
 )
 from vibrissa.rod.newton import point_determinant, stable
@@ -261,26 +263,37 @@ def _fit(
             damping[i], size[i], active[i] = 0.0, 1.0, True
             misfits[row + i], converged[row + i] = np.inf, False
         for _ in range(_ROUNDS):
-            busy = False
+            number, only = 0, 0
             for i in range(n):
-                busy = busy or active[i]
-            if not busy:
+                if active[i]:
+                    number, only = number + 1, i
+            if number == 0:
                 break
-            for i in range(LANES):
-                c = to[min(i // lanes, n - 1)]
-                set_lane(b, i, c[0], c[1], c[2], c[3], i % lanes == 1)
-            integrate(rod, b, True)
+            alone = number == 1  # its tangents side by side
+            if alone:
+                set_all_lanes(b, to[only, 0], to[only, 1], to[only, 2], to[only, 3])
+            else:
+                for i in range(LANES):
+                    c = to[min(i // lanes, n - 1)]
+                    set_lane(b, i, c[0], c[1], c[2], c[3], i % lanes == 1)
+            integrate(rod, b, 1 if alone else 3)
             for i in range(n):
                 if not active[i]:
                     continue
                 lane_value(b, lanes * i, value)
-                lane_tangents(b, lanes * i, third)
-                for a in range(6):
-                    t[a, 0], t[a, 2], t[a, 3] = third[a, 0], third[a, 1], third[a, 2]
-                if free:
-                    lane_tangents(b, lanes * i + 1, third)
+                if alone:
+                    lanes_tangents(b, t)
+                else:
+                    lane_tangents(b, lanes * i, third)
                     for a in range(6):
-                        t[a, 1] = third[a, 0]
+                        t[a, 0], t[a, 2], t[a, 3] = third[a, 0], third[a, 1], third[a, 2]
+                    if free:
+                        lane_tangents(b, lanes * i + 1, third)
+                        for a in range(6):
+                            t[a, 1] = third[a, 0]
+                if not free:
+                    for a in range(6):
+                        t[a, 1] = 0.0
                 at = row + i
                 channel_equations(to[i], value, t, codes, targets[at], residual, jacobian)
                 misfit = _whiten(weights[at], residual, jacobian, k, trial_r, trial_j)

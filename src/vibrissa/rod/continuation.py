@@ -218,7 +218,7 @@ def follow(
                 set_lane(b, i, LEAST_ARC, 0.0, 0.0, 0.0, False)
         if running == 0:
             return
-        integrate(rod, b, True)
+        integrate(rod, b, 3)
         for i in range(LANES):
             m = row[i]
             if m < 0:

@@ -42,7 +42,8 @@ _Q = _N + 3 * LANES
 _TANGENT = _Q + 3 * LANES  # three tangents of (n, q)
 _H = _TANGENT + 18 * LANES  # the step, negative: from the contact to the base
 _TIP = _H + LANES  # 1 where the first unknown is f_x instead of s_c
-BUFFER_SIZE = _TIP + LANES
+_MOVING = _TIP + LANES  # the tangent that takes a step
+BUFFER_SIZE = _MOVING + 6 * LANES
 
 
 @inlined
@@ -245,9 +246,11 @@ def _value_step(rod: Rod, b: Array, k: int, tangents: bool) -> None:
 @inlined
 def _tangent_step(b: Array, row: int) -> None:
     """Take the same step with the tangent at ``row``, on the stages that the values left."""
+    for i in range(6 * LANES):
+        b[_MOVING + i] = b[row + i]
     for i in range(LANES):
         h = b[_H + i]
-        n, q = _get(b, row, i), _get(b, row + 3 * LANES, i)
+        n, q = _get(b, _MOVING, i), _get(b, _MOVING + 3 * LANES, i)
         n1, q1 = _tangent_rate(b, 0, i, n, q)
         n2, q2 = _tangent_rate(b, 1, i, _y2(n, h, n1), _y2(q, h, q1))
         n3, q3 = _tangent_rate(b, 2, i, _y3(n, h, n2), _y3(q, h, q2))
@@ -257,8 +260,10 @@ def _tangent_step(b: Array, row: int) -> None:
         n7, q7 = _tangent_rate(
             b, 6, i, _y7(n, h, n1, n2, n3, n4, n6), _y7(q, h, q1, q2, q3, q4, q6)
         )
-        _put(b, row, i, _advance(n, h, n1, n3, n4, n5, n6, n7))
-        _put(b, row + 3 * LANES, i, _advance(q, h, q1, q3, q4, q5, q6, q7))
+        _put(b, _MOVING, i, _advance(n, h, n1, n3, n4, n5, n6, n7))
+        _put(b, _MOVING + 3 * LANES, i, _advance(q, h, q1, q3, q4, q5, q6, q7))
+    for i in range(6 * LANES):
+        b[row + i] = b[_MOVING + i]
 
 
 @inlined
@@ -274,6 +279,23 @@ def set_lane(b: Array, i: int, s: float, fx: float, fy: float, fz: float, tip: b
         b[_TANGENT + i] = 1.0
     b[_TANGENT + (6 + 1) * LANES + i] = 1.0
     b[_TANGENT + (12 + 2) * LANES + i] = 1.0
+
+
+@inlined
+def set_all_lanes(b: Array, s: float, fx: float, fy: float, fz: float) -> None:
+    """Load every lane with one contact; their first tangents are those of s, f_x, f_y, f_z."""
+    for i in range(LANES):
+        set_lane(b, i, s, fx, fy, fz, i > 0)
+        for row in range(3):
+            b[_TANGENT + row * LANES + i] = 1.0 if i == row + 1 else 0.0
+
+
+@inlined
+def lanes_tangents(b: Array, tangents: Array) -> None:
+    """Copy ∂(F, p)/∂(s, f_x, f_y, f_z) of the one contact in all lanes into ``tangents`` (6, 4)."""
+    for row in range(6):
+        for i in range(LANES):
+            tangents[row, i] = b[_TANGENT + row * LANES + i]
 
 
 @inlined
@@ -308,19 +330,18 @@ def _carry_step(b: Array, row: int) -> None:
 
 
 @kernel
-def integrate(rod: Rod, b: Array, tangents: bool) -> None:
-    """Integrate every lane from its contact to the base, with its three tangents if asked."""
+def integrate(rod: Rod, b: Array, tangents: int) -> None:
+    """Integrate every lane from its contact to the base, with its first so many tangents."""
     start = rod[0]
     farthest = b[_ARC]
     for i in range(1, LANES):
         farthest = max(farthest, b[_ARC + i])
     for k in range(start.shape[0] - 1, -1, -1):
         if start[k] < farthest:
-            if tangents:
+            if tangents > 0:
                 _value_step(rod, b, k, True)
-                _tangent_step(b, _TANGENT)
-                _tangent_step(b, _TANGENT + 6 * LANES)
-                _tangent_step(b, _TANGENT + 12 * LANES)
+                for j in range(tangents):
+                    _tangent_step(b, _TANGENT + 6 * LANES * j)
             else:
                 _value_step(rod, b, k, False)
 
@@ -344,13 +365,23 @@ def evaluate(
     first, last : int
         The rows to do.
     """
-    b = np.zeros(BUFFER_SIZE)
+    b, four = np.zeros(BUFFER_SIZE), np.empty((6, 4))
     wanted = tangents.shape[0] > 0
+    if wanted and last == first + 1:  # a contact by itself: its tangents side by side
+        c = contacts[first]
+        set_all_lanes(b, c[0], c[1], c[2], c[3])
+        integrate(rod, b, 1)
+        lane_value(b, 0, values[first])
+        lanes_tangents(b, four)
+        for a in range(6):
+            t = tangents[first, a]
+            t[0], t[1], t[2] = four[a, 0], four[a, 2], four[a, 3]
+        return
     for row in range(first, last, LANES):
         for i in range(LANES):
             j = min(row + i, last - 1)
             set_lane(b, i, contacts[j, 0], contacts[j, 1], contacts[j, 2], contacts[j, 3], False)
-        integrate(rod, b, wanted)
+        integrate(rod, b, 3 if wanted else 0)
         for i in range(min(LANES, last - row)):
             lane_value(b, i, values[row + i])
             if wanted:

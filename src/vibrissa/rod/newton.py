@@ -23,7 +23,15 @@ import numpy as np
 
 from vibrissa.rod.arrays import Array, Rod
 from vibrissa.rod.compiled import copy, inlined
-from vibrissa.rod.kernels import LANES, integrate, lane_tangents, lane_value, set_lane
+from vibrissa.rod.kernels import (
+    LANES,
+    integrate,
+    lane_tangents,
+    lane_value,
+    lanes_tangents,
+    set_all_lanes,
+    set_lane,
+)
 from vibrissa.rod.preimage import solve3
 from vibrissa.rod.reach import LEAST_ARC, Fold, chart_to_contact, fold_force
 
@@ -85,7 +93,7 @@ def _chord_rounds(
         for i in range(LANES):
             j = i if i < count else 0
             set_lane(b, i, xi[j, 0], 0.0, xi[j, 1], xi[j, 2], False)
-        integrate(rod, b, False)
+        integrate(rod, b, 0)
         busy = False
         for i in range(count):
             if not active[i]:
@@ -151,7 +159,7 @@ def newton_group(
         Filled with det ∂p/∂ξ at the last Jacobian's place, within the last step of the solution;
         1 where the chart alone led to a solution well short of the fold.
     """
-    value, tangents = np.empty(6), np.empty((6, 3))
+    value, tangents, four = np.empty(6), np.empty((6, 3)), np.empty((6, 4))
     residual, step = np.empty(3), np.empty(3)
     jacobians = np.empty((LANES, 3, 3))
     active, stale = np.zeros(LANES, np.bool_), np.ones(LANES, np.bool_)
@@ -170,19 +178,35 @@ def newton_group(
     if not busy:
         return
     for _ in range(_ROUNDS):
-        wanted = False
-        for i in range(LANES):
-            j = i if i < count else 0
-            set_lane(b, i, xi[j, 0], 0.0, xi[j, 1], xi[j, 2], False)
-            wanted = wanted or (active[i] and stale[i])
-        integrate(rod, b, wanted)
+        wanted, number, only = False, 0, 0
+        for i in range(count):
+            if active[i]:
+                wanted = wanted or stale[i]
+                number, only = number + 1, i
+        alone = wanted and number == 1  # its tangents side by side
+        if alone:
+            set_all_lanes(b, xi[only, 0], 0.0, xi[only, 1], xi[only, 2])
+        else:
+            for i in range(LANES):
+                j = i if i < count else 0
+                set_lane(b, i, xi[j, 0], 0.0, xi[j, 1], xi[j, 2], False)
+        integrate(rod, b, 1 if alone else (3 if wanted else 0))
         busy = False
         for i in range(count):
             if not active[i]:
                 continue
             lane_value(b, i, value)
-            if wanted:
+            if alone:
+                lanes_tangents(b, four)
+                for a in range(6):
+                    tangents[a, 0], tangents[a, 1], tangents[a, 2] = (
+                        four[a, 0],
+                        four[a, 2],
+                        four[a, 3],
+                    )
+            elif wanted:
                 lane_tangents(b, i, tangents)
+            if wanted:
                 signs[i] = point_determinant(tangents)
             misfit = equation(value, tangents, wanted, targets[i], residual, jacobians[i])
             stale[i] = not misfit < 0.1 * misfits[i]

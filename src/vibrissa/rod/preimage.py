@@ -30,9 +30,9 @@ from vibrissa.rod.reach import Reach
 # 2 offsets (levels + 1,): first row of each level in 3; a node's eight children are row
 # offsets[level] + node 3 boxes (rows, 6, 8): middle and half width of the three quantities, for
 # eight sibling nodes 4 place (cells, 3): (i, j, k) of a cell 5 frame (cells, 6, 3): aligned
-# coordinates y = A (T - base): A (3 rows), base, least y, largest y 6 edges (cells, 3, 40): the
-# interpolant, T - base 7 folded (cells,): whether the map may fold inside, so that a cell may hold
-# several solutions
+# coordinates y = A (T - base): A (3 rows), base, least y, largest y 6 edges (cells, 160): the
+# interpolant, T - base, the three quantities side by side 7 care (cells,): how many starts a cell
+# needs, see _care
 Tree = tuple[Array, Array, IntArray, Array, IntArray, Array, Array, IntArray]
 
 #: At most so many contacts are found for one target.
@@ -106,7 +106,7 @@ class Preimages:
         base = values[tuple(place.T)]
         points = _bezier_points(corner, slope)
         aligned = _aligned(corner, points, base)
-        offsets, boxes = _boxes(points + base[:, None], circular, place)
+        offsets, boxes = _boxes(points + base[:, None], circular)
         return cls(
             (
                 grid,
@@ -115,7 +115,7 @@ class Preimages:
                 boxes,
                 place,
                 aligned,
-                _edges(corner, slope),
+                _side_by_side(_edges(corner, slope)),
                 _care(slope, aligned),
             )
         )
@@ -158,7 +158,7 @@ def _bezier_points(corner: Array, slope: Array) -> Array:
     return np.asarray(moved.reshape(len(corner), 64, 3))
 
 
-def _boxes(points: Array, circular: AnyArray, place: IntArray) -> tuple[IntArray, Array]:
+def _boxes(points: Array, circular: AnyArray) -> tuple[IntArray, Array]:
     """Middle and half width of the values in each cell and in larger blocks, 8 siblings a row."""
     low, high = points.min(axis=1), points.max(axis=1)
     grow = _MARGIN * (high - low) + 1e-12
@@ -219,6 +219,13 @@ def _edges(corner: Array, slope: Array) -> Array:
     return np.ascontiguousarray(np.concatenate(parts, axis=-1))
 
 
+def _side_by_side(edges: Array) -> Array:
+    """Coefficients (cells, 3, 40) as (cells, 160): quantities and padding side by side."""
+    out = np.zeros((len(edges), edges.shape[2], 4))
+    out[..., :3] = edges.transpose(0, 2, 1)
+    return out.reshape(len(edges), -1)
+
+
 def _care(slope: Array, aligned: Array) -> IntArray:
     """How many starts a cell needs: 0 one, 1 several until one is solved, 2 all of them."""
     det = np.linalg.det(slope)
@@ -237,41 +244,71 @@ def wrapped(angle: float) -> float:
     return float(angle - 2.0 * np.pi * np.rint(angle / (2.0 * np.pi)))
 
 
+# The interpolant's four lanes, three quantities and padding, lie in one flat buffer, without which
+# the compiler does not put them side by side: coefficients, T - target and ∂T/∂x there, T of the
+# target relative to the cell's base.
+_MISFIT = 160
+_SLOPES = _MISFIT + 4
+_RELATIVE = _SLOPES + 12
+_BUFFER = _RELATIVE + 4
+
+
 @inlined
-def _interpolate(edges: Array, x: Array, target: Array, misfit: Array, gradient: Array) -> None:
-    """T - target (both relative to the cell's base) and ∂T/∂x at the place x of a cell."""
+def _cubic(b: Array, n: int, q: int, t: float) -> tuple[float, float]:
+    """Quantity q along an edge whose four coefficients start at n, and its slope."""
+    c1, c2, c3 = b[4 * n + 4 + q], b[4 * n + 8 + q], b[4 * n + 12 + q]
+    return b[4 * n + q] + t * (c1 + t * (c2 + t * c3)), c1 + t * (2.0 * c2 + t * 3.0 * c3)
+
+
+@inlined
+def _bulge(b: Array, n: int, q: int, t: float) -> tuple[float, float]:
+    """What a cubic along an edge adds to the straight line between its ends, and its slope."""
+    c1, c2, c3 = b[4 * n + q], b[4 * n + 4 + q], b[4 * n + 8 + q]
+    return t * (c1 + t * (c2 + t * c3)), c1 + t * (2.0 * c2 + t * 3.0 * c3)
+
+
+@inlined
+def _interpolate(b: Array, x: Array) -> None:
+    """Leave T - target and ∂T/∂x at the place x of a cell in the buffer."""
     x1, y1, z1 = x[0], x[1], x[2]
     x0, y0, z0 = 1.0 - x1, 1.0 - y1, 1.0 - z1
-    for q in range(3):
-        c = edges[q]
-        total, gx, gy, gz = -target[q], 0.0, 0.0, 0.0
-        for e in range(4):
-            u = y1 if e >> 1 else y0
-            v = z1 if e & 1 else z0
-            du = 1.0 if e >> 1 else -1.0
-            dv = 1.0 if e & 1 else -1.0
-            n = 4 * e
-            h = c[n] + x1 * (c[n + 1] + x1 * (c[n + 2] + x1 * c[n + 3]))
-            total += u * v * h
-            gx += u * v * (c[n + 1] + x1 * (2.0 * c[n + 2] + x1 * 3.0 * c[n + 3]))
-            gy += du * v * h
-            gz += u * dv * h
-            u = x1 if e >> 1 else x0
-            n = 16 + 3 * e
-            h = y1 * (c[n] + y1 * (c[n + 1] + y1 * c[n + 2]))
-            total += u * v * h
-            gy += u * v * (c[n] + y1 * (2.0 * c[n + 1] + y1 * 3.0 * c[n + 2]))
-            gx += du * v * h
-            gz += u * dv * h
-            v = y1 if e & 1 else y0
-            n = 28 + 3 * e
-            h = z1 * (c[n] + z1 * (c[n + 1] + z1 * c[n + 2]))
-            total += u * v * h
-            gz += u * v * (c[n] + z1 * (2.0 * c[n + 1] + z1 * 3.0 * c[n + 2]))
-            gx += du * v * h
-            gy += u * dv * h
-        misfit[q] = total
-        gradient[q, 0], gradient[q, 1], gradient[q, 2] = gx, gy, gz
+    for q in range(4):
+        a0, s0 = _cubic(b, 0, q, x1)
+        a1, s1 = _cubic(b, 4, q, x1)
+        a2, s2 = _cubic(b, 8, q, x1)
+        a3, s3 = _cubic(b, 12, q, x1)
+        total = y0 * (z0 * a0 + z1 * a1) + y1 * (z0 * a2 + z1 * a3) - b[_RELATIVE + q]
+        gx = y0 * (z0 * s0 + z1 * s1) + y1 * (z0 * s2 + z1 * s3)
+        gy = z0 * (a2 - a0) + z1 * (a3 - a1)
+        gz = y0 * (a1 - a0) + y1 * (a3 - a2)
+        a0, s0 = _bulge(b, 16, q, y1)
+        a1, s1 = _bulge(b, 19, q, y1)
+        a2, s2 = _bulge(b, 22, q, y1)
+        a3, s3 = _bulge(b, 25, q, y1)
+        total += x0 * (z0 * a0 + z1 * a1) + x1 * (z0 * a2 + z1 * a3)
+        gx += z0 * (a2 - a0) + z1 * (a3 - a1)
+        gy += x0 * (z0 * s0 + z1 * s1) + x1 * (z0 * s2 + z1 * s3)
+        gz += x0 * (a1 - a0) + x1 * (a3 - a2)
+        a0, s0 = _bulge(b, 28, q, z1)
+        a1, s1 = _bulge(b, 31, q, z1)
+        a2, s2 = _bulge(b, 34, q, z1)
+        a3, s3 = _bulge(b, 37, q, z1)
+        b[_MISFIT + q] = total + x0 * (y0 * a0 + y1 * a1) + x1 * (y0 * a2 + y1 * a3)
+        b[_SLOPES + q] = gx + y0 * (a2 - a0) + y1 * (a3 - a1)
+        b[_SLOPES + 4 + q] = gy + x0 * (a1 - a0) + x1 * (a3 - a2)
+        b[_SLOPES + 8 + q] = gz + x0 * (y0 * s0 + y1 * s1) + x1 * (y0 * s2 + y1 * s3)
+
+
+@inlined
+def _adjugate(b: Array, rows: Array) -> float:
+    """Fill rows (3, 3) with det ∂T/∂x times its inverse; return det."""
+    for a in range(3):
+        u, v = _SLOPES + 4 * ((a + 1) % 3), _SLOPES + 4 * ((a + 2) % 3)
+        rows[a, 0] = b[u + 1] * b[v + 2] - b[u + 2] * b[v + 1]
+        rows[a, 1] = b[u + 2] * b[v] - b[u] * b[v + 2]
+        rows[a, 2] = b[u] * b[v + 1] - b[u + 1] * b[v]
+    d = _SLOPES
+    return float(b[d] * rows[0, 0] + b[d + 1] * rows[0, 1] + b[d + 2] * rows[0, 2])
 
 
 @inlined
@@ -323,24 +360,31 @@ def _locate(tree: Tree, cell: int, target: Array, relative: Array, x: Array) -> 
 
 
 @inlined
-def _invert(
-    edges: Array, relative: Array, half: Array, work: Array, careful: bool, x: Array
-) -> int:
+def _invert(b: Array, half: Array, work: Array, careful: bool, x: Array) -> int:
     """Solve a cell's interpolant: 2 solved, 1 nearly so (a fold of the map), 0 not in the cell.
 
-    If not solved, x is left where it missed least, by work[6, 0] of the cell's extent.
+    If not solved, x is left where it missed least, by work[5, 0] of the cell's extent.
     """
-    misfit, step, best, gradient = work[0], work[1], work[2], work[3:6]
-    least = np.inf
-    work[6, 0] = np.inf
-    for n in range(8):
-        _interpolate(edges, x, relative, misfit, gradient)
-        away = max(abs(misfit[0]) / half[0], abs(misfit[1]) / half[1], abs(misfit[2]) / half[2])
+    rows, step, best = work[:3], work[3], work[4]
+    least, done = np.inf, False
+    work[5, 0] = np.inf
+    for n in range(9):
+        _interpolate(b, x)
+        if done:
+            return 2
+        if n == 8:
+            break
+        m0, m1, m2 = b[_MISFIT], b[_MISFIT + 1], b[_MISFIT + 2]
+        away = max(abs(m0) / half[0], abs(m1) / half[1], abs(m2) / half[2])
         if away < least:
             least = away
-            copy(x, best)
-        if solve3(gradient, misfit, step) == 0.0:
+            for a in range(3):
+                best[a] = x[a]
+        det = _adjugate(b, rows)
+        if det == 0.0:
             break
+        for a in range(3):
+            step[a] = (rows[a, 0] * m0 + rows[a, 1] * m1 + rows[a, 2] * m2) / det
         size = max(abs(step[0]), abs(step[1]), abs(step[2]))
         if n == 0 and not careful:  # nearly linear: the first step tells which cell it is in
             reach = max(
@@ -354,37 +398,44 @@ def _invert(
         if size < 2e-2:  # the next step would be of its square
             if _outside(x) > _OVERLAP:
                 return 0
-            _interpolate(edges, x, relative, misfit, gradient)
-            return 2
-    copy(best, x)
-    work[6, 0] = least if _outside(x) <= 0.25 else np.inf
+            done = True
+    for a in range(3):
+        x[a] = best[a]
+    work[5, 0] = least if _outside(x) <= 0.25 else np.inf
     return 1 if least <= _NEARLY and _outside(x) <= 0.25 else 0
 
 
 @inlined
-def _sides(edges: Array, relative: Array, half: Array, x: Array, work: Array, sides: Array) -> bool:
+def _sides(b: Array, half: Array, x: Array, work: Array, sides: Array) -> bool:
     """Go _SIDE from x both ways, as the interpolant changes least; whether a fold is between."""
-    misfit, step, gradient = work[0], work[1], work[3:6]
-    _interpolate(edges, x, relative, misfit, gradient)
-    most = 0.0
-    for q in range(3):
-        b, c = (q + 1) % 3, (q + 2) % 3
-        scale = 1.0 / (half[b] * half[c])
-        d0 = scale * (gradient[b, 1] * gradient[c, 2] - gradient[b, 2] * gradient[c, 1])
-        d1 = scale * (gradient[b, 2] * gradient[c, 0] - gradient[b, 0] * gradient[c, 2])
-        d2 = scale * (gradient[b, 0] * gradient[c, 1] - gradient[b, 1] * gradient[c, 0])
-        size = max(abs(d0), abs(d1), abs(d2))
-        if size > most:
-            most = size
-            step[0], step[1], step[2] = d0 / size, d1 / size, d2 / size
-    if most == 0.0:
-        return False
-    for a in range(3):
-        sides[0, a], sides[1, a] = x[a] - _SIDE * step[a], x[a] + _SIDE * step[a]
-    _interpolate(edges, sides[0], relative, misfit, gradient)
-    det = solve3(gradient, misfit, step)
-    _interpolate(edges, sides[1], relative, misfit, gradient)
-    return bool(det * solve3(gradient, misfit, step) < 0.0)
+    rows, step = work[:3], work[3]
+    sign = 1.0
+    for at in range(3):
+        if at == 0:
+            copy(x, sides[2])
+        else:
+            for a in range(3):
+                sides[2, a] = sides[at - 1, a]
+        _interpolate(b, sides[2])
+        if at > 0:
+            sign *= _adjugate(b, rows)
+            continue
+        most = 0.0
+        for q in range(3):
+            u, v = _SLOPES + (q + 1) % 3, _SLOPES + (q + 2) % 3
+            scale = 1.0 / (half[(q + 1) % 3] * half[(q + 2) % 3])
+            d0 = scale * (b[u + 4] * b[v + 8] - b[u + 8] * b[v + 4])
+            d1 = scale * (b[u + 8] * b[v] - b[u] * b[v + 8])
+            d2 = scale * (b[u] * b[v + 4] - b[u + 4] * b[v])
+            size = max(abs(d0), abs(d1), abs(d2))
+            if size > most:
+                most = size
+                step[0], step[1], step[2] = d0 / size, d1 / size, d2 / size
+        if most == 0.0:
+            return False
+        for a in range(3):
+            sides[0, a], sides[1, a] = x[a] - _SIDE * step[a], x[a] + _SIDE * step[a]
+    return bool(sign < 0.0)
 
 
 @inlined
@@ -392,7 +443,8 @@ def _keep(
     grid: Array,
     place: IntArray,
     x: Array,
-    gradient: Array,
+    b: Array,
+    work: Array,
     solved: int,
     found: Array,
     inverses: Array,
@@ -420,20 +472,11 @@ def _keep(
         return count
     found[row, 0], found[row, 1], found[row, 2] = eta, psi, rho
     quality[row] = solved
-    _inverse(gradient, grid[1], inverses[row])
+    det = _adjugate(b, work)
+    for a in range(3):
+        for c in range(3):  # ∂(η, ψ, ρ)/∂T from ∂T/∂x in cell widths
+            inverses[row, a, c] = np.nan if det == 0.0 else work[a, c] * grid[1, a] / det
     return max(count, row + 1)
-
-
-@inlined
-def _inverse(gradient: Array, size: Array, inverse: Array) -> None:
-    """∂(η, ψ, ρ)/∂T from ∂T/∂x in cell widths; NaN where there is none."""
-    unit, column = np.zeros(3), np.empty(3)
-    for c in range(3):
-        unit[c] = 1.0
-        singular = solve3(gradient, unit, column) == 0.0
-        unit[c] = 0.0
-        for a in range(3):
-            inverse[a, c] = np.nan if singular else column[a] * size[a]
 
 
 @kernel
@@ -464,8 +507,9 @@ def seeds(tree: Tree, target: Array, found: Array, inverses: Array, quality: Int
     levels = offsets.shape[0] - 1
     stack = np.empty((_STACK, 2), np.int64)
     inside = np.empty(8, np.bool_)
-    work, relative, x = np.empty((7, 3)), np.empty(3), np.empty(3)
-    nearest, sides = np.empty(3), np.empty((2, 3))
+    work, relative, x = np.empty((6, 3)), np.empty(3), np.empty(3)
+    b = np.zeros(_BUFFER)
+    nearest, sides, half = np.empty(3), np.empty((3, 3)), np.empty(3)
     count, top = 0, 1
     stack[0, 0], stack[0, 1] = 0, 0
     t0, t1, t2 = target[0], target[1], target[2]
@@ -490,32 +534,38 @@ def seeds(tree: Tree, target: Array, found: Array, inverses: Array, quality: Int
                 continue
             if not _locate(tree, child, target, relative, x):
                 continue
+            careful, edge = care[child], edges[child]
+            for k in range(_MISFIT):
+                b[k] = edge[k]
+            for a in range(3):
+                half[a], b[_RELATIVE + a] = box[3 + a, c], relative[a]
             least = np.inf
-            missed = care[child] == 2 and place[child, 2] >= _RESTING
-            for start in range(9 if care[child] > 0 else 1):  # the place itself, then the corners
+            missed = careful == 2 and place[child, 2] >= _RESTING
+            for start in range(9 if careful > 0 else 1):  # the place itself, then the corners
                 if start > 0:
                     for a in range(3):
                         x[a] = (start - 1) >> a & 1
-                solved = _invert(edges[child], relative, box[3:, c], work, care[child] > 0, x)
+                solved = _invert(b, half, work, careful > 0, x)
                 missed = missed and solved < 2
-                if missed and work[6, 0] < least:
-                    least = work[6, 0]
+                if missed and work[5, 0] < least:
+                    least = work[5, 0]
                     copy(x, nearest)
                 if solved > 0:
                     count = _keep(
-                        grid, place[child], x, work[3:6], solved, found, inverses, quality, count
+                        grid, place[child], x, b, work, solved, found, inverses, quality, count
                     )
-                if solved == 2 and care[child] < 2:
+                if solved == 2 and careful < 2:
                     break
             if not missed or least > _MISSED:
                 continue
-            if _sides(edges[child], relative, box[3:, c], nearest, work, sides):
+            if _sides(b, half, nearest, work, sides):
                 for side in range(2):
                     count = _keep(
                         grid,
                         place[child],
                         sides[side],
-                        work[3:6],
+                        b,
+                        work,
                         0,
                         found,
                         inverses,

@@ -259,3 +259,13 @@ def test_loads_broadcast(gamma):
     assert bent.force.shape == (2, 3, 3)
     one = vb.deflect(gamma, vb.PointForce(s[1, 0], 1e-6, angle[2]))
     np.testing.assert_array_equal(bent.force[1, 2], one.force)
+
+
+def test_a_contact_by_itself_has_the_tangents_that_it_has_among_others(gamma):
+    d, rng = discretize(gamma), np.random.default_rng(11)
+    x = np.column_stack([rng.uniform(0.3, 1.0, 9), rng.normal(size=(9, 3)) * [0.0, 0.3, 0.3]])
+    values, tangents = solve_forces(d, x, tangents=True)
+    for row in range(9):
+        one, by_itself = solve_forces(d, x[row : row + 1], tangents=True)
+        np.testing.assert_array_equal(one[0], values[row])
+        np.testing.assert_array_equal(by_itself[0], tangents[row])

@@ -174,7 +174,7 @@ def _advice(running: ContactStream) -> str:
             "Nearly all signals are larger than any that this whisker can give: are they in N and "
             "N·m, is the offset taken away, and is the whisker's stiffness right?"
         )
-    if counts["no_contact"] == all_of_them:
+    if counts["not_felt"] == all_of_them:
         return (
             "No signal was so far from zero that a contact is felt: are they in N and N·m, and is "
             "the noise as it was said to be?"

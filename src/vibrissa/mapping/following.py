@@ -166,7 +166,7 @@ class ContactFilter:
             return self._known(*self._learned(measurement, turn, base), turn, base)
         if nothing != Status.MISSING:
             self._mixture = room(0)
-            felt = nothing != Status.NO_CONTACT or not np.isfinite(turn).all()
+            felt = nothing != Status.NOT_FELT or not np.isfinite(turn).all()
             self._free = None if felt else (time, turn, base)
         return self._known(nothing, None, turn, base)
 

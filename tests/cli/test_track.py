@@ -82,11 +82,11 @@ def test_what_is_traced_is_not_traced_again(videos, tmp_path, monkeypatch):
     out = tmp_path / "trial.nc"
     follow, calls = view.follow_all, []
 
-    def stopping(followers, frame, known):
+    def stopping(*what):
         calls.append(1)
         if len(calls) == 20:
             raise KeyboardInterrupt
-        return follow(followers, frame, known)
+        return follow(*what)
 
     monkeypatch.setattr(view, "follow_all", stopping)
     words = arguments(videos, "--cameras", videos / "cameras.toml", "-o", out)

@@ -25,6 +25,13 @@ def test_round_trip(tmp_path, ending):
     assert recognise(path) == (Kind.ARRAY if ending == "nc" else Kind.ARRAY_TABLE)
 
 
+def test_files_with_a_group_a_whisker(tmp_path):
+    path = tmp_path / "before.nc"
+    few = vb.WhiskerArray(list(SOME.values())[:2])
+    few.to_tree().to_netcdf(path, engine="h5netcdf")
+    np.testing.assert_array_equal(load_array(path).centerlines(), few.centerlines())
+
+
 def test_a_folder_of_centrelines(tmp_path):
     lines = SOME.centerlines(201)
     for name, line in zip(["Lgamma", "left_C1", "C3"], lines[:3], strict=True):

@@ -183,13 +183,20 @@ def _groups(path: Path) -> Iterator[tuple[str, str]]:
 
     yield "kind", kind_of(path) or "unknown"
     with h5netcdf.File(path, "r") as file:
-        whiskers = file.groups["whiskers"].groups if "whiskers" in file.groups else {}
+        names = [_text(one) for one in file.variables["whisker"][...]] if _many(file) else []
         for name, group in _within(file, "/"):
-            if not (len(whiskers) > 1 and name.startswith("/whiskers/")):
+            if not (names and f"{name}/".startswith("/whiskers/")):
                 yield from _variables(name, group)
-        if len(whiskers) > 1:
-            names = [_text(one) for one in file.variables["whisker"][...]]
-            yield "/whiskers", f"{len(whiskers)}: {', '.join(names)}"
+        if names:
+            yield "/whiskers", f"{len(names)}: {', '.join(names)}"
+
+
+def _many(file: Any) -> bool:
+    """Whether whiskers are so many that their names tell more than their variables."""
+    if "whiskers" not in file.groups or "whisker" not in file.variables:
+        return False
+    group = file.groups["whiskers"]
+    return len(group.groups) > 1 or len(group.variables) > 0
 
 
 def _within(group: Any, name: str) -> Iterator[tuple[str, Any]]:
@@ -232,7 +239,7 @@ def _compared(path: Path) -> Iterator[tuple[str, str]]:
         measured = file.groups.get("measured")
         if measured is None or "contact_difference" not in measured.variables:
             return
-    # A recording of many whiskers takes seconds to read whole.
+    # A long recording takes a while to read whole.
     names = {
         None: ["arc_length"],
         "measured": ["contact_difference", "contact_point", "arc_length"],

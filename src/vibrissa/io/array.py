@@ -36,6 +36,7 @@ from vibrissa.io.array_table import few, table_lines, whiskers_from_table
 from vibrissa.io.centerline import load_whisker
 from vibrissa.io.netcdf import is_netcdf, kind_of, reading
 from vibrissa.io.replace import replacing
+from vibrissa.io.whisker_stack import separate_whiskers, stacked_whiskers
 from vibrissa.whisker import Whisker
 from vibrissa.whisker.array import WhiskerArray
 from vibrissa.whisker.array_dataset import KIND
@@ -108,7 +109,7 @@ def save_array(path: str | PathLike[str], array: WhiskerArray) -> None:
         if path.suffix.lower() == ".csv":
             part.write_text("\n".join(table_lines(array)) + "\n", encoding="utf-8")
         else:
-            array.to_tree().to_netcdf(part, engine="h5netcdf")
+            stacked_whiskers(array.to_tree()).to_netcdf(part, engine="h5netcdf")
 
 
 def _netcdf(path: Path) -> WhiskerArray:
@@ -116,7 +117,7 @@ def _netcdf(path: Path) -> WhiskerArray:
     if kind != KIND:
         raise ValueError(f"{path} holds {kind or 'data of another kind'}, not an array of whiskers")
     with reading(path), xr.open_datatree(path, engine="h5netcdf") as tree:
-        return WhiskerArray.from_tree(tree.load())
+        return WhiskerArray.from_tree(separate_whiskers(tree.load()))
 
 
 def _folder(path: Path, base: Any, noise: float | None) -> WhiskerArray:

@@ -2,7 +2,8 @@
 
 Every float is kept to the last bit; arrays are compressed. Any reader of NetCDF or HDF5 can open
 the file; what the groups and variables mean is told by their own attributes and in
-:mod:`vibrissa.trial.recording`.
+:mod:`vibrissa.trial.recording`. In the file several whiskers stand side by side in one group
+(:mod:`vibrissa.io.whisker_stack`).
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import xarray as xr
 
 from vibrissa.io.netcdf import kind_of, reading
 from vibrissa.io.replace import replacing
+from vibrissa.io.whisker_stack import separate_whiskers, stacked_whiskers
 
 KIND = "vibrissa recording"
 """What the attribute ``kind`` of a recording says."""
@@ -43,16 +45,17 @@ def save_recording(path: str | PathLike[str], recording: xr.DataTree) -> None:
     if recording.attrs.get("kind") != KIND:
         kind = recording.attrs.get("kind", "nothing")
         raise ValueError(f"this is no recording: its attribute kind says {kind!r}, not {KIND!r}")
+    written = stacked_whiskers(recording)
     encoding = {
         group.path: {
             str(name): _COMPRESSED
             for name, variable in group.to_dataset(inherit=False).data_vars.items()
             if variable.dtype.kind in "fiub" and variable.size >= _SMALLEST
         }
-        for group in recording.subtree
+        for group in written.subtree
     }
     with replacing(path) as part:
-        recording.to_netcdf(part, engine="h5netcdf", encoding=encoding)
+        written.to_netcdf(part, engine="h5netcdf", encoding=encoding)
 
 
 def load_recording(path: str | PathLike[str]) -> xr.DataTree:
@@ -80,5 +83,4 @@ def load_recording(path: str | PathLike[str]) -> xr.DataTree:
     if kind != KIND:
         raise ValueError(f"{path} holds {kind or 'data of another kind'}, not a recording")
     with reading(path), xr.open_datatree(path, engine="h5netcdf") as tree:
-        loaded: xr.DataTree = tree.load()
-        return loaded.copy()
+        return separate_whiskers(tree.load().copy())

@@ -145,6 +145,9 @@ def test_a_filter_forgets_a_contact_that_is_lost_and_waits_for_what_is_missing(w
     nowhere = good.located._replace(covariances=np.full((1, 3, 3), np.nan))
     there = np.r_[np.zeros(3), good.located.point / 0.3][None]
     assert follow._unaccounted(there, nowhere, turn[0], base[0] / 0.3).tolist() == [False]
+    wrong = vb.ContactFilter(estimator, speed=0.01)  # a reaction: all signs are the others
+    strange = [wrong(time[i], -wrench[i], turn[i], base[i]).status for i in range(3)]
+    assert set(strange) <= {vb.Status.NOT_FRICTIONLESS, vb.Status.OUTSIDE_MAP}
     missing = follow(time[1], np.full(6, np.nan), turn[1], base[1])
     assert missing.status == vb.Status.MISSING
     assert np.linalg.norm(missing.point - good.point) < 1e-3

@@ -1,5 +1,7 @@
 """A sensor described once serves both ways, and known loads give back what it is."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -17,6 +19,7 @@ from vibrissa.sensing import (
     fit_stiffness,
     load_sensor,
     save_sensor,
+    tare,
 )
 
 
@@ -252,6 +255,12 @@ def test_offset_and_weight_are_found_from_free_poses(rng):
     assert np.abs(found.sensor.felt(readings, turn)).max() < 5e-3
     tared = calibrate_weight(Sensor(noise=true.noise), readings[:1])
     assert np.abs(tared.sensor.felt(readings[:1])).max() < 1e-12
+    drifted = Sensor(noise=true.noise, bias=true.bias + 0.1, mass=0.03, mass_moment=(1e-4, 0, 0))
+    later = drifted.read(np.arange(400.0), np.zeros((400, 6)), rotation=[turn[3]] * 400)
+    again = tare(Sensor(noise=true.noise, mass=0.03, mass_moment=(1e-4, 0, 0)), later, turn[3])
+    np.testing.assert_allclose(again.bias, drifted.bias, atol=5 * 1e-3 / 20)
+    with pytest.raises(ValueError, match="no reading without NaN"):
+        tare(Sensor(), np.full((2, 6), np.nan))
     still = np.broadcast_to(turn[0], (25, 3, 3))
     with pytest.raises(ValueError, match="hold the whisker free in more orientations"):
         calibrate_weight(Sensor(), readings, still)
@@ -324,7 +333,7 @@ def test_two_moments_tell_stiffness_too(wire, touched):
     found = fit_stiffness(wire, touched.contact_point, readings, sensor)
     away = np.log(found.stiffness / wire.base_bending_stiffness) / found.stiffness_sigma
     assert abs(away) < 4.0
-    with pytest.raises(ValueError, match="nothing is felt, or its sign"):
+    with pytest.raises(ValueError, match="do not grow with the loads: check"):
         fit_stiffness(wire, touched.contact_point, -readings, sensor)
 
 
@@ -406,3 +415,38 @@ def test_a_saturated_reading_tells_nothing(tmp_path):
     np.testing.assert_array_equal(load_sensor(tmp_path / "sensor.toml").largest, sensor.largest)
     with pytest.raises(ValueError, match=r"largest is 0\.0; it must be positive"):
         Sensor(largest=0.0)
+
+
+def test_components_in_other_units_need_one_number(rng):
+    wrench = rng.normal(size=(3, 6))
+    sensor = Sensor(mixing=1e3, noise=1e-9)  # mN and mN·m
+    np.testing.assert_allclose(sensor.read(np.arange(3.0), wrench), 1e3 * wrench, rtol=1e-6)
+    two = Sensor(("Fx", "Mz"), mixing=[1e3, 1e6])
+    assert (two.mixing[0, 0], two.mixing[1, 5], np.count_nonzero(two.mixing)) == (1e3, 1e6, 2)
+    with pytest.raises(ValueError, match="one number a channel"):
+        Sensor(("Fx", "Mz"), mixing=[1e3, 1e3, 1e3])
+
+
+def test_usual_mistakes_of_calibrations_are_said(wire, touched, rng):
+    """Another unit, rotations the wrong way, a base taken for the tip, a diameter for a radius."""
+    noise = np.repeat([1e-3, 1e-5], 3)
+    loads = rng.normal(size=(12, 6))
+    with pytest.raises(ValueError, match=r"1e\+03 times the loads"):
+        calibrate_frame(1e3 * loads, loads, force_noise=1e-3, moment_noise=1e-5)
+    turn = Rotation.random(25, random_state=3).as_matrix()
+    heavy = Sensor(noise=noise, mass=0.03, mass_moment=(3e-4, 0, 0), largest=[9.0, *5 * [8.0]])
+    readings = heavy.read(np.arange(25.0), np.zeros((25, 6)), rotation=turn)
+    with pytest.warns(UserWarning, match="turn the whisker's into the laboratory frame"):
+        calibrate_weight(Sensor(noise=noise), readings, turn.transpose(0, 2, 1))
+    with pytest.warns(UserWarning, match="carry 30 kg"):
+        calibrate_weight(Sensor(noise=1e3 * noise), 1e3 * readings, turn)
+    readings[0, 0] = 9.0  # saturated
+    assert calibrate_weight(replace(heavy, mass=0.0), readings, turn).misfit < 2.0
+    points, wrench = touched.contact_point, wrench_of(touched)
+    thin = wire.with_properties(base_radius=0.25e-3, tip_radius=0.5e-3)
+    assert "thicker than the base" in repr(thin)
+    with pytest.warns(UserWarning, match="which end is the base"):
+        fit_stiffness(thin, points, wrench, Sensor(noise=noise))
+    thick = wire.scaled(radius_factor=2.0)
+    with pytest.warns(UserWarning, match=r"E r⁴ 0\.0625 times .* whether the radius is a diameter"):
+        fit_stiffness(thick, points, wrench, Sensor(noise=noise), modulus_sigma=0.1)

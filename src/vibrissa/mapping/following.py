@@ -199,7 +199,9 @@ class ContactFilter:
             found = self._beginning.samples(measurement, located, reach)
             self._add(found, turn, base, prior)
         self._free = None
-        return Status.AMBIGUOUS if located is None else located.status, located
+        if explains or located is None:
+            return Status.AMBIGUOUS, located
+        return located.status, located
 
     def _update(
         self, measurement: Measurement, x: Array, values: Array, turn: Array, base: Array

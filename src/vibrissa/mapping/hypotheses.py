@@ -16,6 +16,7 @@ _SURE = 0.99
 # Hypotheses nearer to each other (Mahalanobis distance squared, by the sum of both covariances) run
 # together: there is no gap between them.
 _TOGETHER = 4.0
+_EXPLAINED = (Status.UNIQUE, Status.AMBIGUOUS, Status.UNDERDETERMINED)
 
 
 class Followed(NamedTuple):
@@ -34,7 +35,9 @@ class Followed(NamedTuple):
         That the contact is there, within the spread of the hypotheses that run together; 0 if there
         is none.
     status : Status
-        ``UNIQUE`` where that is above 0.99, else ``AMBIGUOUS``; or why there is no contact.
+        ``UNIQUE`` where that is above 0.99, else ``AMBIGUOUS``. ``MISSING``, ``NOT_FRICTIONLESS``
+        and other reasons are of this sample, which neither a hypothesis nor any contact explains:
+        the point then is what was known before.
     points : (k, 3) array
         Contact points of all hypotheses, the most probable first, laboratory frame, m.
     probabilities : (k,) array
@@ -84,7 +87,7 @@ def told(
     stiffness : float
         Relative standard deviation of the whisker's stiffness.
     status : Status
-        Of the sample: ``MISSING`` stays.
+        Of the sample: why nothing explains it stays.
     located : Located or None
         What the sample alone tells.
     turn, base : (3, 3), (3,) arrays
@@ -115,7 +118,7 @@ def told(
         probability = float(min(shares.max(), 1.0))
         away = points - mean[:3]
         covariance = np.tensordot(weights, spreads, axes=1) + (away.T * weights) @ away
-    if status != Status.MISSING:
+    if status in _EXPLAINED:
         status = Status.UNIQUE if probability > _SURE else Status.AMBIGUOUS
     return Followed(
         mean[:3] * length,

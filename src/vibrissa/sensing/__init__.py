@@ -7,7 +7,7 @@ from vibrissa.sensing.mixing import MixingCalibration, calibrate_mixing
 from vibrissa.sensing.mounting import FrameCalibration, calibrate_frame
 from vibrissa.sensing.sensor import COMPONENTS, FORCE_NOISE, MOMENT_NOISE, Sensor
 from vibrissa.sensing.stiffness import StiffnessFit, fit_stiffness
-from vibrissa.sensing.weight import WeightCalibration, calibrate_weight
+from vibrissa.sensing.weight import WeightCalibration, calibrate_weight, tare
 
 __all__ = [
     "COMPONENTS",
@@ -26,4 +26,5 @@ __all__ = [
     "fit_stiffness",
     "load_sensor",
     "save_sensor",
+    "tare",
 ]

@@ -14,7 +14,9 @@
     mass = 0.002                       # kg
     moment = [0, 0, 0]                 # kg·m
 
-Everything but the channels may be left out.
+Everything but channels and noise may be left out. Channels that are components in other units
+need one number only: ``mixing = 1e3`` for mN and mN·m (= N·mm). Noise, bias and the largest reading
+are in the channels' units.
 """
 
 from __future__ import annotations
@@ -74,7 +76,7 @@ def load_sensor(path: str | PathLike[str]) -> Sensor:
                 )
         given = {name: said[name] for name in (*_NUMBERS, *_SHARES) if name in said}
         how: dict[str, Any] = {"channels": said["channels"]} if "channels" in said else {}
-        return Sensor(
+        sensor = Sensor(
             **how,
             mixing=said.get("mixing"),
             **given,
@@ -82,6 +84,12 @@ def load_sensor(path: str | PathLike[str]) -> Sensor:
             mass=weight.get("mass", 0.0),
             mass_moment=weight.get("moment", (0.0, 0.0, 0.0)),
         )
+        if "noise" not in said:
+            raise ValueError(
+                "noise is needed: the standard deviation of each channel, in its unit, or one "
+                "number for all; what is felt and how surely depends on it"
+            )
+        return sensor
     except (tomllib.TOMLDecodeError, TypeError, ValueError) as error:
         raise ValueError(f"{path} describes no sensor: {error}") from error
 

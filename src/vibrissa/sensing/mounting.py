@@ -16,12 +16,15 @@ from scipy.spatial.transform import Rotation
 
 from vibrissa.sensing.frame import SensorFrame, cross_matrix
 from vibrissa.sensing.linear import solve
+from vibrissa.sensing.misfit import warn_of_misfit
 
 Array = NDArray[np.float64]
 
 _ADVICE = "apply forces in at least two directions, at two places or more"
 # Of two readings of the moments' sign the better must be this much better.
 _CLEARLY = 2.0
+# Forces so many times the loads are in another unit, or have an offset.
+_GAIN = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,12 +40,15 @@ class FrameCalibration:
         origin (m).
     force_residual, moment_residual : float
         RMS of what is left of a component, N and N·m.
+    misfit : float
+        χ² over its degrees of freedom: near 1, unless noise, loads or gain are not as stated.
     """
 
     frame: SensorFrame
     covariance: Array
     force_residual: float
     moment_residual: float
+    misfit: float
 
 
 def calibrate_frame(
@@ -71,7 +77,12 @@ def calibrate_frame(
     Raises
     ------
     ValueError
-        If shapes do not fit, or the loads do not determine the frame.
+        If shapes do not fit, readings are in other units, or the loads do not determine the frame.
+
+    Warns
+    -----
+    UserWarning
+        If residuals are more than five times the noise.
     """
     seen, true = np.asarray(readings, dtype=np.float64), np.asarray(wrenches, dtype=np.float64)
     if seen.ndim != 2 or seen.shape[1:] != (6,) or seen.shape != true.shape:
@@ -80,6 +91,7 @@ def calibrate_frame(
         raise ValueError(f"noises are positive; got {force_noise} N and {moment_noise} N·m")
     known = np.isfinite(seen).all(axis=1) & np.isfinite(true).all(axis=1)
     seen, true = seen[known], true[known]
+    _check_units(seen, true)
     force = _matched(seen[:, :3], true[:, :3])
     options = [_placed(seen, true, force, hand) for hand in (1, -1)]
     left = [option[1] for option in options]
@@ -107,7 +119,9 @@ def calibrate_frame(
         x_scale=[1.0] * 3 + [scale] * 3,
         method="lm",
     )
-    rows = residuals(found.x).reshape(-1, 6) * noise
+    misfit = float((found.fun**2).sum() / max(found.fun.size - 6, 1))
+    warn_of_misfit(misfit, "the loads and where they pull, their signs, offset and units")
+    rows = found.fun.reshape(-1, 6) * noise
     jacobian = np.asarray(found.jac, dtype=np.float64)
     spread = np.asarray(np.linalg.inv(jacobian.T @ jacobian), dtype=np.float64)
     return FrameCalibration(
@@ -115,7 +129,19 @@ def calibrate_frame(
         spread,
         float(np.sqrt((rows[:, :3] ** 2).mean())),
         float(np.sqrt((rows[:, 3:] ** 2).mean())),
+        misfit,
     )
+
+
+def _check_units(seen: Array, true: Array) -> None:
+    """Refuse forces of another size than the loads: a frame turns, and does not stretch."""
+    loads = float(np.linalg.norm(true[:, :3]))
+    gain = float(np.linalg.norm(seen[:, :3])) / loads if loads > 0.0 else 1.0
+    if not 1.0 / _GAIN < gain < _GAIN:
+        raise ValueError(
+            f"the forces read are {gain:.3g} times the loads: readings are needed in N and N·m, "
+            "with the offset taken away"
+        )
 
 
 def _matched(seen: Array, true: Array) -> Array:

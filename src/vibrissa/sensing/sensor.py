@@ -58,7 +58,8 @@ class Sensor:
     channels : sequence of str
         Their names. Without a mixing, which components are read.
     mixing : array_like (k, 6), optional
-        What each of the k channels reads of (Fx, Fy, Fz, Mx, My, Mz).
+        What each of the k channels reads of (Fx, Fy, Fz, Mx, My, Mz). Of channels that are
+        components, numbers for all or one each are enough: 1e3 for mN and mN·m (= N·mm).
     noise : array_like, optional
         Standard deviation of white noise; by default that of `FORCE_NOISE` and `MOMENT_NOISE` in
         every component.
@@ -91,6 +92,8 @@ class Sensor:
     --------
     >>> Sensor(channels=("Fx", "My", "Mz"), resolution=[1e-6, 1e-8, 1e-8]).mixing.shape
     (3, 6)
+    >>> Sensor(mixing=1e3, noise=[3, 3, 3, 0.1, 0.1, 0.1]).mixing[5, 5]  # in mN and N·mm
+    np.float64(1000.0)
     """
 
     channels: Sequence[str] = COMPONENTS
@@ -112,19 +115,20 @@ class Sensor:
         names = tuple(self.channels)
         if not names or len(set(names)) != len(names):
             faults.append(f"channels are {names}; different names, at least one, are needed")
-        if self.mixing is None:
+        given = np.array(1.0 if self.mixing is None else self.mixing, dtype=np.float64)
+        if given.ndim < 2:
             unknown = [name for name in names if name not in COMPONENTS]
             if unknown:
                 known = ", ".join(COMPONENTS)
-                faults.append(f"channels {unknown} are none of {known}, and there is no mixing")
+                faults.append(f"channels {unknown} are none of {known}, so mixing (k, 6) is needed")
             rows = [[float(name == component) for component in COMPONENTS] for name in names]
-            mixing = np.array(rows).reshape(-1, 6)
-        else:
-            mixing = np.array(self.mixing, dtype=np.float64)
-            if mixing.shape != (len(names), 6) or not np.isfinite(mixing).all():
-                faults.append(
-                    f"mixing has shape {mixing.shape}; finite ({len(names)}, 6) is needed"
-                )
+            if given.shape not in ((), (len(names),)):
+                faults.append(f"mixing has shape {given.shape}; one number a channel is needed")
+                given = np.ones(())
+            given = given[..., None] * np.array(rows).reshape(-1, 6)
+        mixing = given
+        if mixing.shape != (len(names), 6) or not np.isfinite(mixing).all():
+            faults.append(f"mixing has shape {mixing.shape}; finite ({len(names)}, 6) is needed")
         usual = np.repeat([FORCE_NOISE, MOMENT_NOISE], 3)
         numbers = {"mixing": mixing, "channels": names}
         for name in ("noise", "bias", "drift", "resolution", "largest"):

@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
 
 from vibrissa.sensing.contacts import wrenches_of_contacts
+from vibrissa.sensing.misfit import warn_of_misfit, warn_of_surprise
 from vibrissa.sensing.sensor import Sensor
 
 if TYPE_CHECKING:
@@ -111,6 +112,12 @@ def fit_stiffness(
     ------
     ValueError
         If shapes do not fit, nothing is felt, or what is asked for is not determined.
+
+    Warns
+    -----
+    UserWarning
+        If residuals are more than five times the noise, or E r⁴ is more than five standard
+        deviations from what was known before.
     """
     sensor = sensor or Sensor()
     y = np.asarray(readings, dtype=np.float64)
@@ -134,10 +141,18 @@ def fit_stiffness(
     ratio = whisker.tip_radius / whisker.base_radius
     scaled = y / noise
     if not len(y) or not (modelled(ratio) * scaled).sum() > 0.0:
-        raise ValueError("the readings do not grow with the loads: nothing is felt, or its sign")
+        raise ValueError(
+            "the readings do not grow with the loads: check the sensor's axes, sign (`reaction`) "
+            "and offset, or nothing is felt"
+        )
     ratio, factor, spread, left = _fitted(modelled, scaled, ratio, taper)
     degrees = y.size - (2 if taper else 1)
     misfit = float((left**2).sum() / max(degrees, 1))
+    warn_of_misfit(
+        misfit,
+        "contact points, shape and taper (which end is the base?), the sensor's frame, "
+        "offset and weight",
+    )
     spread = spread * max(1.0, misfit)
     if taper and np.sqrt(spread[1, 1]) > _OPEN:
         raise ValueError(
@@ -218,6 +233,7 @@ def _told_apart(
         return shift, covariance
     prior = np.diag([modulus_sigma**2, radius_sigma**2])
     total = by @ prior @ by + sigma**2
+    warn_of_surprise(log_factor, float(np.sqrt(total)))
     if total == 0.0:
         return np.zeros(2), prior
     gain = prior @ by / total

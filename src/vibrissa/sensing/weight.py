@@ -7,6 +7,7 @@ linear in the offset b, the mass m and its moment μ = m c, with g turning as th
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,11 +15,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.sensing.frame import cross_matrix
 from vibrissa.sensing.linear import Solution, solve
+from vibrissa.sensing.misfit import warn_of_misfit
 from vibrissa.sensing.sensor import GRAVITY, Sensor
 
 Array = NDArray[np.float64]
 AnyArray = NDArray[np.bool_]
 
+# No sensor of a whisker carries as much, kg.
+_HEAVY = 5.0
 # A mass so many standard deviations below zero is no noise.
 _SURELY = 4.0
 
@@ -41,11 +45,14 @@ class WeightCalibration:
         effect on these channels.
     residual : (k,) array
         RMS of what is left in each channel.
+    misfit : float
+        χ² over its degrees of freedom: near 1, unless the noise or something else is not as stated.
     """
 
     sensor: Sensor
     covariance: Array
     residual: Array
+    misfit: float
 
 
 def calibrate_weight(
@@ -61,7 +68,7 @@ def calibrate_weight(
     sensor : Sensor
         Whose mixing and frame are known; its noise weighs the channels.
     readings : array_like (n, k)
-        While nothing is touched.
+        While nothing is touched; rows with NaN or a saturated channel are left out.
     rotations : array_like (n, 3, 3), optional
         From the whisker's to the laboratory frame. Without them only the offset is found, for this
         one orientation: the weight is part of it.
@@ -78,15 +85,20 @@ def calibrate_weight(
     ValueError
         If shapes do not fit, the orientations do not tell weight from offset, or the weight comes
         out negative.
+
+    Warns
+    -----
+    UserWarning
+        If residuals are more than five times the noise, or the mass is more than 5 kg.
     """
     y = np.asarray(readings, dtype=np.float64)
     k = len(sensor.channels)
     if y.ndim != 2 or y.shape[1] != k:
         raise ValueError(f"readings are (n, {k}): {', '.join(sensor.channels)}; got {y.shape}")
-    known = np.flatnonzero(np.isfinite(y).all(axis=1))
+    known = np.flatnonzero((np.abs(y) < sensor.largest).all(axis=1))  # False for NaN
     n, y = len(y), y[known]
     if not len(y):
-        raise ValueError("there is no reading without NaN")
+        raise ValueError("there is no reading without NaN or a saturated channel")
     noise = np.sqrt(np.diag(sensor.covariance()))
     noise = np.where(noise > 0.0, noise, np.median(noise[noise > 0.0]) if noise.any() else 1.0)
     if rotations is None:
@@ -115,8 +127,56 @@ def calibrate_weight(
     calibrated = replace(
         sensor, bias=unknowns[:k], mass=float(unknowns[k]), mass_moment=unknowns[k + 1 :]
     )
+    if unknowns[k] > _HEAVY:
+        warnings.warn(
+            f"the sensor seems to carry {unknowns[k]:.3g} kg: are its channels in N and N·m, or "
+            "does its mixing say what they are in?",
+            stacklevel=2,
+        )
     left = found.residuals.reshape(-1, k) * noise
-    return WeightCalibration(calibrated, covariance, np.sqrt((left**2).mean(axis=0)))
+    misfit = float((found.residuals**2).sum() / max(found.residuals.size - felt.sum(), 1))
+    warn_of_misfit(
+        misfit,
+        "that the rotations are of the whisker's base (not of a flange), that they turn the "
+        "whisker's into the laboratory frame, and the sensor's axes and hand",
+    )
+    return WeightCalibration(calibrated, covariance, np.sqrt((left**2).mean(axis=0)), misfit)
+
+
+def tare(
+    sensor: Sensor,
+    readings: ArrayLike,
+    rotations: ArrayLike | None = None,
+    gravity: ArrayLike = GRAVITY,
+) -> Sensor:
+    """Find the offset anew, as after it has drifted; mass and its moment stay as they are known.
+
+    Parameters
+    ----------
+    sensor : Sensor
+        As calibrated.
+    readings : array_like (n, k)
+        While nothing is touched; those with NaN or a saturated channel are left out.
+    rotations : array_like (3, 3) or (n, 3, 3), optional
+        From the whisker's to the laboratory frame; needed where the sensor carries a mass.
+    gravity : array_like (3,)
+        In the laboratory frame, m/s².
+
+    Returns
+    -------
+    Sensor
+        With the new offset.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit, the rotation is needed but not given, or no reading is complete.
+    """
+    felt = np.atleast_2d(sensor.felt(readings, rotations, gravity))
+    felt = felt[np.isfinite(felt).all(axis=1)]
+    if not len(felt):
+        raise ValueError("there is no reading without NaN or a saturated channel")
+    return replace(sensor, bias=sensor.bias + felt.mean(axis=0))
 
 
 def _solved(
@@ -145,7 +205,9 @@ def _tared(sensor: Sensor, y: Array, noise: Array) -> WeightCalibration:
     covariance[:k, :k] = np.diag(noise**2 / len(y))
     left = np.sqrt(((y - bias) ** 2).mean(axis=0))
     tared = replace(sensor, bias=bias, mass=0.0, mass_moment=np.zeros(3))
-    return WeightCalibration(tared, covariance, left)
+    misfit = float((left**2 / noise**2).sum() * len(y) / max(len(y) - 1, 1) / k)
+    warn_of_misfit(misfit, "that nothing was touched, and that the orientation stayed the same")
+    return WeightCalibration(tared, covariance, left, misfit)
 
 
 def _design(sensor: Sensor, rotations: Array, gravity: Array) -> Array:

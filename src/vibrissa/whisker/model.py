@@ -540,6 +540,7 @@ class Whisker:
     def __repr__(self) -> str:
         """Say what it is in one line, in mm and µm."""
         base = "" if self.base_stiffness is None else ", on a compliant base"
+        thicker = " (thicker than the base)" if self.tip_radius > self.base_radius else ""
         bend = "straight"
         if not self.is_straight:
             tangent = self.frame(self.length)[:, 0]
@@ -548,7 +549,7 @@ class Whisker:
         return (
             f"Whisker {self.name!r}: {self.length * 1e3:.2f} mm long, radius "
             f"{self.base_radius * 1e6:.1f} µm at the base and {self.tip_radius * 1e6:.1f} µm at "
-            f"the tip, {bend}{base}"
+            f"the tip{thicker}, {bend}{base}"
         )
 
     def _repr_html_(self) -> str:

@@ -24,6 +24,11 @@ TAPER = 15.0
 YOUNGS_MODULUS = 3e9
 POISSON_RATIO = 0.38
 
+# From a soft gel to diamond, Pa; what lies outside is in another unit.
+_SOFTEST, _HARDEST = 1e3, 1e13
+# A rod's radius is at most this share of its length.
+_STOUT = 0.1
+
 COVERAGE = 0.01
 """Share of the length by which radius samples may fall short of base or tip."""
 
@@ -97,6 +102,12 @@ def settled(
         section = radius_profile(length, breaks=breaks, **stated)
     except ValueError as fault:
         raise ValueError("no whisker: " + "; ".join([*faults, str(fault)])) from None
+    thickest = float(section(np.linspace(0.0, length, 101)).max())
+    if thickest > _STOUT * length:
+        faults.append(
+            f"the radius is up to {thickest:.4g} m at a length of {length:.4g} m, more than a "
+            "tenth of it: these look like millimetres given as metres; multiply by 1e-3"
+        )
     if faults:
         raise ValueError("no whisker: " + "; ".join(faults))
     notes: tuple[str, ...] = ()
@@ -117,6 +128,11 @@ def material_faults(
     faults = []
     if not (np.isfinite(youngs_modulus) and youngs_modulus > 0.0):
         faults.append(f"youngs_modulus is {youngs_modulus!r} Pa; it must be positive")
+    elif not _SOFTEST <= youngs_modulus <= _HARDEST:
+        faults.append(
+            f"youngs_modulus is {youngs_modulus:.4g} Pa, and from a gel to diamond it is between "
+            f"{_SOFTEST:.0e} and {_HARDEST:.0e}: is it in Pa? 1 GPa is 1e9"
+        )
     if not -1.0 < poisson_ratio <= 0.5:
         faults.append(f"poisson_ratio is {poisson_ratio!r}; it must lie in (-1, 0.5]")
     if base_stiffness is not None:

@@ -65,8 +65,9 @@ def test_the_arrow_ends_at_the_contact_and_points_along_the_force(bend):
     drawn = bend_drawing(moved(bend, [24e-3, 11e-3, 3e-3]), 5.0)
     bent = vb.deflect(bend.whisker, vb.PointContact([24e-3, 11e-3, 3e-3]))
     arrow = drawn["force"]
-    np.testing.assert_allclose(arrow.end, bent.contact_point * MM, atol=1e-9)
-    along = (arrow.end - arrow.start) / np.linalg.norm(arrow.end - arrow.start)
+    start, end = arrow.start[0], arrow.end[0]
+    np.testing.assert_allclose(end, bent.contact_point * MM, atol=1e-9)
+    along = (end - start) / np.linalg.norm(end - start)
     np.testing.assert_allclose(along, bent.force / np.linalg.norm(bent.force), atol=1e-9)
 
 
@@ -138,7 +139,7 @@ def _rest(shape):
 
 def test_the_envelope_encloses_the_cloud():
     chart = charted(vb.samples.curved())
-    cloud, skin = places(chart), envelope(chart).vertices
+    cloud, skin = places(chart), envelope(chart).triangles.reshape(-1, 3)
     centre = np.array([20.0, 5.0, 0.0])
     assert np.linalg.norm(cloud - centre, axis=1).max() < np.linalg.norm(
         skin - centre, axis=1

@@ -1,5 +1,6 @@
 """Only the page itself, and programs that are no browser, may talk to its server."""
 
+import gzip
 import http.client
 
 import pytest
@@ -9,6 +10,7 @@ pytest.importorskip("viser", reason="viser is not installed", exc_type=ImportErr
 import vibrissa as vb
 from vibrissa.viewer import view
 from vibrissa.viewer.guard import from_own_page
+from vibrissa.viewer.page_script import SCRIPT, with_script
 from vibrissa.viewer.server import free_port
 
 
@@ -63,6 +65,23 @@ def test_pages_from_elsewhere_are_refused(capsys):
         port = viewer.page.server.get_port()
         with pytest.raises(ValueError, match=f"port {port} of 127.0.0.1 is taken"):
             view(vb.samples.gamma(), port=port)
+
+
+def test_the_page_comes_with_our_script_and_name():
+    with view(vb.samples.gamma()) as viewer:
+        page = viewer.page.server
+        connection = http.client.HTTPConnection(page.get_host(), page.get_port(), timeout=30)
+        plain, zipped = [], []
+        for pages, headers in ((plain, {}), (zipped, {"Accept-Encoding": "gzip"})):
+            connection.request("GET", "/", headers=headers)
+            answer = connection.getresponse()
+            pages.append(answer.read())
+            assert answer.status == 200
+            connection.close()
+    assert gzip.decompress(zipped[0]) == plain[0]
+    assert b"<title>vibrissa</title>" in plain[0][:20_000]
+    assert SCRIPT.encode() in plain[0]
+    assert with_script(b"no page") == b"no page"
 
 
 @pytest.mark.parametrize(("host", "port"), [("192.0.2.1", 8080), ("127.0.0.1", 70_000)])

@@ -96,6 +96,20 @@ def looking(browser):
 def test_the_page_loads_in_silence_and_asks_nobody_else(looking):
     looking.page.wait_for_timeout(500)
     assert looking.complaints == looking.faults == []
+    assert looking.page.title() == "vibrissa"
+    # What is put into the page relies on how viser made it: without a graphics card edges are not
+    # smoothed, and the pane for background images is not drawn.
+    canvas = "document.querySelector('canvas[data-engine]').getContext('webgl2')"
+    assert looking.page.evaluate(f"{canvas}.getContextAttributes().antialias") is False
+    looking.page.wait_for_function(
+        """() => {
+          let hidden = false;
+          __viserMutable.scene.traverse((thing) => {
+            if (thing.material === __viserMutable.backgroundMaterial) hidden = !thing.visible;
+          });
+          return hidden;
+        }"""
+    )
     assert all(url.startswith((looking.viewer.url, "blob:")) for url in looking.requests)
 
 

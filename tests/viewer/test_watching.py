@@ -86,7 +86,7 @@ def test_a_moment_shows_whisker_contact_and_force(trial):
     frame = int(np.argmax(np.nan_to_num(trial.signals["MB"][:, 0]) * trial.felt[:, 0]))
     drawn = moment_drawing(trial, frame, 5.0)
     assert {"whisker 0", "contact 0", "force 0"} <= drawn.keys()
-    np.testing.assert_allclose(drawn["force 0"].end, trial.contacts[frame, 0] * MM)
+    np.testing.assert_allclose(drawn["force 0"].end[0], trial.contacts[frame, 0] * MM)
     free = int(np.flatnonzero(~trial.felt[:, 0])[0])
     assert drawn.keys() - moment_drawing(trial, free, 5.0).keys() == {"contact 0", "force 0"}
 

@@ -17,7 +17,7 @@ from vibrissa.viewer.drawing import (
     REST,
     WHISKER,
     Array,
-    Arrow,
+    Arrows,
     Body,
     Colour,
     Drawing,
@@ -29,7 +29,8 @@ from vibrissa.viewer.meshes import cylinder, ellipsoid, tube
 from vibrissa.viewer.readout import number
 from vibrissa.whisker import Whisker
 
-NODES = 72
+NODES = 48
+_AXES = np.array([(190, 60, 60), (70, 140, 70), (70, 90, 190)], dtype=np.uint8)
 _ARROW = 0.3
 """Length of the arrow of a force of EI/L², over L; others go with the square root."""
 
@@ -59,13 +60,14 @@ def follicle(whisker: Whisker, exaggeration: float) -> Body:
 def axes(whisker: Whisker) -> dict[str, Thing]:
     """The whisker frame at the base: x red, y green, z blue."""
     size = _size(0.14 * whisker.length)
-    out: dict[str, Thing] = {}
-    for name, direction, colour in zip(
-        "xyz", np.eye(3), ((190, 60, 60), (70, 140, 70), (70, 90, 190)), strict=True
-    ):
-        out[f"axis {name}"] = Arrow(np.zeros(3), size * direction, colour, 0.05 * size)
-        out[f"axis {name} name"] = Label(1.12 * size * direction, name)
-    return out
+    ends = size * np.eye(3)
+    out: dict[str, Thing] = {"axes": Arrows(np.zeros((3, 3)), ends, _AXES, 0.05 * size)}
+    return out | {f"axis {name}": Label(1.12 * ends[i], name) for i, name in enumerate("xyz")}
+
+
+def arrow(start: Array, end: Array, thickness: float) -> Arrows:
+    """The arrow of a force between two places (3,), m; so many mm thick."""
+    return Arrows(_mm(start)[None], _mm(end)[None], np.array([FORCE], dtype=np.uint8), thickness)
 
 
 def force_arrow(whisker: Whisker, force: Array, at: Array) -> dict[str, Thing]:
@@ -77,7 +79,7 @@ def force_arrow(whisker: Whisker, force: Array, at: Array) -> dict[str, Thing]:
     start = at - reach * force / size
     thickness = _size(0.006 * whisker.length)
     return {
-        "force": Arrow(_mm(start), _mm(at), FORCE, thickness),
+        "force": arrow(start, at, thickness),
         "force size": Label(_mm(start), number("force", size, 3)),
     }
 
@@ -137,7 +139,7 @@ def _ball(whisker: Whisker, exaggeration: float) -> Body:
     """What marks the contact: it sticks out of the whisker where this can touch."""
     own = float(whisker.radius(0.5 * whisker.length))
     radius = max(1.7 * exaggeration * own, 0.006 * whisker.length)
-    vertices, faces = ellipsoid(np.zeros(3), _size(radius) * np.eye(3))
+    vertices, faces = ellipsoid(np.zeros(3), _size(radius) * np.eye(3), 12)
     return Body(vertices, faces, CONTACT)
 
 

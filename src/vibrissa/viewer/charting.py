@@ -11,11 +11,11 @@ from vibrissa.mapping import ContactMap
 from vibrissa.plots.chart import fine_chart
 from vibrissa.quantities import to_display
 from vibrissa.signals import SIGNALS
-from vibrissa.viewer.drawing import CLOUD, Array, Body, Bytes, Cloud
+from vibrissa.viewer.drawing import CLOUD, Array, Bytes, Cloud, Painted
 from vibrissa.viewer.meshes import sheet
 from vibrissa.whisker import Whisker
 
-_SKIN = (36, 72, 12)
+_SKIN = (12, 36, 6)
 _POINT = 0.008
 """Width of a point of the cloud, over L."""
 
@@ -66,13 +66,15 @@ def places(chart: Chart) -> Array:
     return to_display("contact_point", chart.points)
 
 
-def envelope(chart: Chart) -> Body:
+def envelope(chart: Chart) -> Painted:
     """The surface at which the whisker slips off, seen from inside, so that it hides nothing."""
     nodes = fine_chart(chart.samples, chart.line, shape=_SKIN)[..., :3]
     # The end near the base stays open.
     skin = np.concatenate([nodes[:, :, -1], nodes[-1, :, -2::-1].swapaxes(0, 1)])
     vertices, faces = sheet(to_display("contact_point", skin))
-    return Body(vertices, faces, CLOUD, 0.35, "back")
+    triangles = vertices[faces]
+    colours = np.broadcast_to(np.array(CLOUD, dtype=np.uint8), triangles.shape)
+    return Painted(triangles, colours, 0.45, "back")
 
 
 def coloured_cloud(chart: Chart, points: Array, colours: Bytes) -> Cloud:

@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 Colour = tuple[int, int, int]
+Side = Literal["front", "back", "double"]
 
 INK: Colour = (45, 50, 58)
 WHISKER: Colour = (62, 52, 44)
@@ -42,8 +43,8 @@ class Body:
         Red, green, blue, 0 to 255.
     opacity : float, optional
         From 0 to 1; without it nothing shines through.
-    side : {"double", "front", "back"}
-        From which it is seen.
+    side : {"front", "back", "double"}
+        From which it is seen; a closed surface has nothing to show on its back.
     place : tuple of float
         Where the origin of the vertices is, mm: what only moves need not be sent again.
     """
@@ -52,16 +53,30 @@ class Body:
     faces: Ints
     colour: Colour
     opacity: float | None = None
-    side: Literal["front", "back", "double"] = "double"
+    side: Side = "front"
     place: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Painted:
-    """Triangles (n, 3, 3), mm, with the colours (n, 3, 3) of their corners."""
+    """A surface of many colours, or one that is large: it costs little to draw.
+
+    Parameters
+    ----------
+    triangles : array (n, 3, 3)
+        Places of their corners, mm.
+    colours : array (n, 3, 3)
+        Of their corners.
+    opacity : float, optional
+        From 0 to 1; without it nothing shines through.
+    side : {"double", "front", "back"}
+        From which it is seen.
+    """
 
     triangles: Array
     colours: Bytes
+    opacity: float | None = None
+    side: Side = "double"
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,12 +89,12 @@ class Cloud:
 
 
 @dataclass(frozen=True, eq=False)
-class Arrow:
-    """From a start to an end (3,), mm."""
+class Arrows:
+    """From starts (n, 3) to ends (n, 3), mm, with colours (n, 3); all are drawn as one."""
 
     start: Array
     end: Array
-    colour: Colour
+    colours: Bytes
     thickness: float
 
 
@@ -100,7 +115,7 @@ class Label:
     text: str
 
 
-Thing = Body | Painted | Cloud | Arrow | Line | Label
+Thing = Body | Painted | Cloud | Arrows | Line | Label
 Drawing = Mapping[str, Thing]
 """Things by name; what is missing from the next drawing goes."""
 

@@ -44,7 +44,15 @@ class Grip:
             visible=False,
         )
         self._ball = server.scene.add_icosphere(
-            "/grip ball", radius=0.12 * size, color=(213, 94, 0), opacity=0.35, visible=False
+            "/grip ball",
+            radius=0.12 * size,
+            color=(213, 94, 0),
+            subdivisions=2,
+            opacity=0.35,
+            side="front",
+            cast_shadow=False,
+            receive_shadow=False,
+            visible=False,
         )
         self._turning = False
         self._by_ball = False

@@ -16,6 +16,8 @@ from http import HTTPStatus
 from typing import Any
 from urllib.parse import urlsplit
 
+from vibrissa.viewer.page_script import amended
+
 _ONE_AT_A_TIME = threading.Lock()
 
 
@@ -93,7 +95,9 @@ def guarded(host: str) -> Iterator[None]:
             headers = request.headers
             if not from_own_page(headers.get("Origin"), headers.get("Host"), host):
                 return connection.respond(HTTPStatus.FORBIDDEN, "This is for its own page only.\n")
-            return None if process_request is None else process_request(connection, request)
+            if process_request is None:
+                return None
+            return amended(process_request(connection, request))
 
         return plain(*args, process_request=checked, **options)
 

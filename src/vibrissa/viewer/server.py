@@ -11,12 +11,11 @@ import time
 from collections.abc import Sequence
 from os import PathLike
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import viser
 import xarray as xr
 from numpy.typing import ArrayLike
-from viser import _messages
 
 from vibrissa.io.footage import Footage
 from vibrissa.mapping import ContactMap
@@ -27,6 +26,7 @@ from vibrissa.viewer.locate_panel import LocateMode
 from vibrissa.viewer.map_panel import MapMode
 from vibrissa.viewer.page import Mode, Page
 from vibrissa.viewer.save_panel import SaveControls
+from vibrissa.viewer.stage import lit
 from vibrissa.viewer.trial_panel import TrialMode
 from vibrissa.viewer.watching import Watched, watched
 from vibrissa.viewer.whisker_panel import WhiskerControls
@@ -34,14 +34,6 @@ from vibrissa.whisker import Whisker
 
 HOST = "127.0.0.1"
 PORT = 8080
-
-# The page sends the mouse every 50 ms, which is 20 positions a second; a whisker follows faster.
-_OFTEN = """
-(() => {
-  const later = window.setTimeout.bind(window);
-  window.setTimeout = (job, delay, ...rest) => later(job, delay === 50 ? 16 : delay, ...rest);
-})();
-"""
 
 
 class Viewer:
@@ -191,9 +183,7 @@ def _served(host: str, port: int | None, opened: contextlib.ExitStack) -> viser.
     )
     server.scene.set_up_direction("+z")
     server.scene.world_axes.visible = False
-    server.scene.configure_default_lights(cast_shadow=False)
-    connection: Any = server.gui._websock_interface
-    connection.queue_message(_messages.RunJavascriptMessage(_OFTEN))
+    lit(server.scene)
     return server
 
 

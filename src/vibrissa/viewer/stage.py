@@ -5,10 +5,32 @@ from __future__ import annotations
 from typing import Any, cast
 
 import numpy as np
-import trimesh
 import viser
 
-from vibrissa.viewer.drawing import Arrow, Body, Bytes, Cloud, Drawing, Label, Line, Painted, Thing
+from vibrissa.viewer.drawing import Arrows, Body, Cloud, Drawing, Label, Line, Painted, Thing
+from vibrissa.viewer.glb import glb
+
+
+def lit(scene: viser.SceneApi) -> None:
+    """Light a scene from above and a little from everywhere.
+
+    Reflections of a surrounding, which viser lights with, take most of the time of a frame where
+    there is no graphics card, and nothing here is shiny; so do shadows.
+
+    Parameters
+    ----------
+    scene : viser.SceneApi
+        Of a server.
+    """
+    scene.configure_environment_map(None)
+    scene.configure_default_lights(cast_shadow=False)
+    scene.add_light_hemisphere(
+        "/light",
+        sky_color=(255, 255, 255),
+        ground_color=(200, 205, 215),
+        intensity=2.0,
+        position=(0.0, 0.0, 1.0),
+    )
 
 
 class Stage:
@@ -56,13 +78,12 @@ class Stage:
                     opacity=thing.opacity,
                     side=thing.side,
                     position=thing.place,
-                    cast_shadow=thing.opacity is None,
+                    cast_shadow=False,
                     receive_shadow=False,
                 )
             case Painted():
-                return scene.add_mesh_trimesh(
-                    path, _coloured(thing), cast_shadow=False, receive_shadow=False
-                )
+                content = glb(thing.triangles, thing.colours, thing.opacity, thing.side)
+                return scene.add_glb(path, content, cast_shadow=False, receive_shadow=False)
             case Cloud():
                 return scene.add_point_cloud(
                     path,
@@ -72,11 +93,11 @@ class Stage:
                     point_shape="circle",
                     precision="float32",
                 )
-            case Arrow():
+            case Arrows():
                 return scene.add_arrows(
                     path,
-                    np.stack([thing.start, thing.end])[None],
-                    thing.colour,
+                    np.stack([thing.start, thing.end], axis=1),
+                    thing.colours,
                     shaft_radius=thing.thickness,
                     head_radius=2.4 * thing.thickness,
                     head_length=6.0 * thing.thickness,
@@ -95,29 +116,6 @@ class Stage:
                 )
 
 
-def _coloured(thing: Painted) -> trimesh.Trimesh:
-    """A mesh that is dull, seen from both sides, and has the colours of its corners."""
-    count = 3 * len(thing.triangles)
-    mesh = trimesh.Trimesh(
-        thing.triangles.reshape(-1, 3), np.arange(count).reshape(-1, 3), process=False
-    )
-    dull = trimesh.visual.material.PBRMaterial(
-        metallicFactor=0.0, roughnessFactor=0.9, doubleSided=True
-    )
-    mesh.visual = trimesh.visual.TextureVisuals(material=dull)
-    opaque = np.full((count, 1), 255, dtype=np.uint8)
-    colours = _linear(thing.colours.reshape(-1, 3))
-    mesh.visual.vertex_attributes["color"] = np.concatenate([colours, opaque], axis=1)
-    return mesh
-
-
-def _linear(colours: Bytes) -> Bytes:
-    """Colours as light, which meshes with colours of their own are given in."""
-    share = colours / 255.0
-    light = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
-    return np.asarray(np.round(255.0 * light), dtype=np.uint8)
-
-
 def _changed(handle: viser.SceneNodeHandle, old: Thing, new: Thing) -> bool:
     """Change what is on the page into a new thing, if it is near enough to the old one."""
     node = cast(Any, handle)  # every kind has attributes of its own
@@ -130,8 +128,8 @@ def _changed(handle: viser.SceneNodeHandle, old: Thing, new: Thing) -> bool:
                 node.position = new.place
         case Cloud(), Cloud() if old.size == new.size:
             node.points, node.colors = new.points.astype(np.float32), new.colours
-        case Arrow(), Arrow() if (old.colour, old.thickness) == (new.colour, new.thickness):
-            node.points = np.stack([new.start, new.end])[None].astype(np.float32)
+        case Arrows(), Arrows() if _like(old, new):
+            node.points = np.stack([new.start, new.end], axis=1).astype(np.float32)
         case Line(), Line() if _alike(old, new):
             node.points = new.pieces.astype(np.float32)
         case Label(), Label():
@@ -143,6 +141,10 @@ def _changed(handle: viser.SceneNodeHandle, old: Thing, new: Thing) -> bool:
 
 def _same_faces(old: Body, new: Body) -> bool:
     return old.faces is new.faces or np.array_equal(old.faces, new.faces)
+
+
+def _like(old: Arrows, new: Arrows) -> bool:
+    return old.thickness == new.thickness and np.array_equal(old.colours, new.colours)
 
 
 def _alike(old: Line, new: Line) -> bool:

@@ -10,15 +10,13 @@ from vibrissa.plots.things import object_surface
 from vibrissa.quantities import to_display
 from vibrissa.rod.surface import Surface
 from vibrissa.trial.object_files import objects_datasets
-from vibrissa.viewer.bend_drawing import whisker_body
+from vibrissa.viewer.bend_drawing import arrow, whisker_body
 from vibrissa.viewer.bending import force_scale
 from vibrissa.viewer.drawing import (
     CONTACT,
     FIT,
-    FORCE,
     OBJECT,
     Array,
-    Arrow,
     Body,
     Bytes,
     Cloud,
@@ -77,7 +75,7 @@ def moment_drawing(trial: Watched, frame: int, exaggeration: float) -> Drawing:
         if np.isfinite(size) and size > 0.0:
             reach = 0.3 * whisker.length * np.sqrt(size / force_scale(whisker))
             start, thickness = at - reach * force / size, float(_mm(0.006 * whisker.length))
-            out[f"force {i}"] = Arrow(_mm(start), _mm(at), FORCE, thickness)
+            out[f"force {i}"] = arrow(start, at, thickness)
     return out
 
 
@@ -111,7 +109,7 @@ def surroundings(trial: Watched, objects: bool = True, fit: bool = True) -> Draw
     if fit and trial.contour is not None:
         body = fitted_body(trial.contour, near)
         if body is not None:
-            out["fit"] = Body(_mm(body[0]), body[1], FIT, 0.4)
+            out["fit"] = Body(_mm(body[0]), body[1], FIT, 0.4, "double")
     return out
 
 
@@ -120,7 +118,7 @@ def object_body(thing: Surface, extent: float, near: Array) -> Body:
     half = 0.5 * extent
     (held,) = objects_datasets([thing]).values()
     vertices, faces = object_surface(held, np.stack([near - half, near + half], axis=1))
-    return Body(vertices, faces, OBJECT, 0.55)
+    return Body(vertices, faces, OBJECT, 0.55, "double")
 
 
 def _known(trial: Watched) -> Array:

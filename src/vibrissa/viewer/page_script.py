@@ -1,0 +1,131 @@
+"""What is put into the page before it starts: a name, an icon, and less work for weak graphics.
+
+viser serves a page that is ready made and has no place for such things, so they are written into
+its head on the way to the browser. Without them the page works as well, but not as fast.
+"""
+
+from __future__ import annotations
+
+import gzip
+from functools import lru_cache
+from typing import Any
+
+SCRIPT = """
+(() => {
+  document.title = "vibrissa";
+
+  // The page sends the mouse every 50 ms; a whisker follows faster.
+  const later = window.setTimeout.bind(window);
+  window.setTimeout = (job, delay, ...rest) => later(job, delay === 50 ? 16 : delay, ...rest);
+
+  // Smooth edges take four times the work: no more than what a graphics card does in passing, but
+  // most of a frame where there is none.
+  const plain = HTMLCanvasElement.prototype.getContext;
+  let slow = null;
+  const inSoftware = () => {
+    const gl = plain.call(document.createElement("canvas"), "webgl2");
+    const info = gl && gl.getExtension("WEBGL_debug_renderer_info");
+    const name = info ? String(gl.getParameter(info.UNMASKED_RENDERER_WEBGL)) : "";
+    if (gl) gl.getExtension("WEBGL_lose_context")?.loseContext();
+    return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
+  };
+  HTMLCanvasElement.prototype.getContext = function (kind, options, ...rest) {
+    if (options && options.antialias && kind.startsWith("webgl")) {
+      slow ??= inSoftware();
+      if (slow) options = { ...options, antialias: false };
+    }
+    return plain.call(this, kind, options, ...rest);
+  };
+
+  // Changes of what is there are taken in at once, not at the next frame, which would draw them
+  // only a frame later.
+  const changes = new Set([
+    "SceneNodeUpdateMessage", "SetPositionMessage", "SetOrientationMessage", "GuiUpdateMessage",
+    "SetSceneNodeVisibilityMessage",
+  ]);
+  const take = ({ type, messages }) => {
+    const page = window.__viserMutable;
+    if (type !== "message_batch" || !page || page.firstMessageBatch) return;
+    if (page.getRenderRequestState !== "ready" || !page.drainMessageQueue) return;
+    if (page.messageQueue.length !== messages.length) return;
+    if (messages.every((message) => changes.has(message.type))) page.drainMessageQueue();
+  };
+  window.Worker = class extends Worker {
+    set onmessage(heard) {
+      super.onmessage = (event) => { heard(event); take(event.data); };
+    }
+    get onmessage() { return super.onmessage; }
+  };
+
+  const furnish = () => {
+    const page = window.__viserMutable, root = page?.scene?.__r3f?.root?.getState?.();
+    if (!page?.backgroundMaterial || !root) return later(furnish, 100);
+    // A pane for background images is drawn over the whole window although there is no image.
+    page.scene.traverse((thing) => {
+      if (thing.material === page.backgroundMaterial) thing.visible = false;
+    });
+    // A mouse that drags, and whatever changes, asks for frames for a quarter of a second. Where
+    // each takes its time they would keep that from being drawn which they wait for.
+    if (!slow) return;
+    let ask = page.requestRender, last;
+    const thrifty = () => {
+      const held = page.cameraControl?.enabled === false;  // something, not the view
+      if (!held || window.event?.type !== "pointermove") root.invalidate();
+      clearTimeout(last);
+      last = later(() => ask(), 150);
+    };
+    Object.defineProperty(page, "requestRender", { get: () => thrifty, set: (f) => { ask = f; } });
+  };
+  furnish();
+})();
+"""
+
+_ICON = (
+    "data:image/svg+xml,%3Csvg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 32 32'%3E"
+    "%3Cpath d='M3 25C13 25 22 20 28 6' fill='none' stroke='%233e342c' stroke-width='3.5' "
+    "stroke-linecap='round'/%3E%3Ccircle cx='21' cy='17.5' r='4.5' fill='%23d55e00'/%3E%3C/svg%3E"
+)
+
+
+def amended(response: Any) -> Any:
+    """Put the script into a response that is a page; leave every other as it is.
+
+    Parameters
+    ----------
+    response : websockets.http11.Response or None
+        Of viser's server.
+
+    Returns
+    -------
+    websockets.http11.Response or None
+        The same.
+    """
+    if response is None or not response.headers.get("Content-Type", "").startswith("text/html"):
+        return response
+    zipped = response.headers.get("Content-Encoding") == "gzip"
+    response.body = _zipped(response.body) if zipped else with_script(response.body)
+    del response.headers["Content-Length"]
+    response.headers["Content-Length"] = str(len(response.body))
+    return response
+
+
+@lru_cache(maxsize=2)
+def _zipped(page: bytes) -> bytes:
+    return gzip.compress(with_script(gzip.decompress(page)))
+
+
+def with_script(page: bytes) -> bytes:
+    """Put the script, an icon and a title first of all that a page loads.
+
+    Parameters
+    ----------
+    page : bytes
+        HTML.
+
+    Returns
+    -------
+    bytes
+        The same page where it has no head to put them.
+    """
+    ours = f'<link rel="icon" href="{_ICON}"/><title>vibrissa</title><script>{SCRIPT}</script>'
+    return page.replace(b"<head>", b"<head>" + ours.encode(), 1)

@@ -103,17 +103,20 @@ def some(gamma_map):
 @pytest.mark.parametrize("triplet", [t for t in TRIPLETS if t != CANONICAL], ids=" ".join)
 def test_every_triplet_finds_the_contact_again(gamma_map, some, triplet):
     hit, cone, *_ = found_again(gamma_map, triplet, some)
-    assert hit[~cone].mean() >= 0.97
+    assert hit[~cone].mean() >= 0.997
 
 
 @pytest.mark.parametrize(
     ("sample", "triplet", "least"),
     [
-        ("straight", ("Fx", "FT", "MD"), 0.997),
+        ("straight", ("Fx", "FT", "MD"), 0.999),
         ("gamma", ("Fx", "FT", "MD"), 0.999),
         ("gamma", ("Mx", "MB", "MD"), 0.9995),
         ("gamma", ("Fx", "FT", "MB"), 0.997),
-        ("gamma", ("FT", "FD", "MB"), 0.9945),
+        ("gamma", ("FT", "FD", "MB"), 0.999),
+        # Here the transverse force vanishes inside Ω, where its direction leaps.
+        ("gamma", ("Fx", "FD", "MB"), 0.999),
+        ("straight", ("FT", "FD", "MB"), 0.999),
     ],
     ids=lambda x: " ".join(x) if isinstance(x, tuple) else str(x),
 )

@@ -33,8 +33,8 @@ from vibrissa.rod.kernels import (
     set_lane,
 )
 from vibrissa.rod.newton import point_determinant, stable
-from vibrissa.rod.preimage import wrapped
 from vibrissa.rod.reach import Fold, Reach
+from vibrissa.rod.seeds import wrapped
 
 # Some valleys of χ² are narrow and bent: most fits take 5 rounds, but a few a hundred. What is not
 # at rest after so many goes on only if it may still count.

@@ -16,8 +16,9 @@ from vibrissa.rod.batch import share_out
 from vibrissa.rod.compiled import copy, inlined, kernel
 from vibrissa.rod.kernels import BUFFER_SIZE, LANES
 from vibrissa.rod.newton import TOLERANCE, newton_group, stable, start_from
-from vibrissa.rod.preimage import MOST_SEEDS, Preimages, Tree, seeds, wrapped
+from vibrissa.rod.preimage import Plane, Preimages, Tree
 from vibrissa.rod.reach import Fold, Reach, chart_to_contact
+from vibrissa.rod.seeds import MOST_SEEDS, seeds, wrapped
 from vibrissa.signals.base import (
     CIRCULAR,
     SIGNALS,
@@ -53,7 +54,25 @@ def triplet_tree(chart: Reach, triplet: tuple[str, ...]) -> Preimages:
     values = signals_of(force, np.cross(point, force))[..., which]
     derivatives = signal_derivatives(chart.values, chart.tangents)[..., which, :]
     angles = tuple(CIRCULAR[w] for w in which)
-    return Preimages.of(chart, np.ascontiguousarray(values), derivatives, angles)
+    plane = _plane(chart, triplet)
+    return Preimages.of(chart, np.ascontiguousarray(values), derivatives, angles, plane)
+
+
+def _plane(chart: Reach, triplet: tuple[str, ...]) -> Plane | None:
+    """The transverse force or the bending moment, if its size or direction is in the triplet."""
+    force, point = chart.values[..., :3], chart.values[..., 3:]
+    d_force, d_point = chart.tangents[..., :3, :], chart.tangents[..., 3:, :]
+    for size, direction in (("FT", "FD"), ("MB", "MD")):
+        if size not in triplet and direction not in triplet:
+            continue
+        vector, slopes = force, d_force
+        if size == "MB":
+            vector = np.cross(point, force)
+            slopes = np.cross(d_point, force[..., None], axis=-2)
+            slopes = slopes + np.cross(point[..., None], d_force, axis=-2)
+        places = [triplet.index(name) if name in triplet else -1 for name in (size, direction)]
+        return Plane(vector[..., 1:], slopes[..., 1:, :], *places)
+    return None
 
 
 def invert(chart: Reach, tree: Preimages, triplet: tuple[str, ...], targets: Array) -> Contacts:

@@ -26,7 +26,8 @@ from vibrissa.mapping.noise import SensorNoise
 from vibrissa.mapping.weighing import Weighing, tree_seeds
 from vibrissa.mapping.whitening import TRUSTED, rank
 from vibrissa.rod.arrays import Array, IntArray
-from vibrissa.rod.preimage import MOST_SEEDS, Preimages
+from vibrissa.rod.preimage import Preimages
+from vibrissa.rod.seeds import MOST_SEEDS
 from vibrissa.signals import CIRCULAR, SIGNALS, signal_scales
 
 if TYPE_CHECKING:

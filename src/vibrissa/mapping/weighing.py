@@ -15,8 +15,9 @@ from vibrissa.mapping.fitting import _fit, channel_equations
 from vibrissa.rod.arrays import AnyArray, Array, IntArray, Rod
 from vibrissa.rod.compiled import copy, inlined, kernel
 from vibrissa.rod.newton import point_determinant, stable
-from vibrissa.rod.preimage import MOST_SEEDS, Tree, seeds
+from vibrissa.rod.preimage import Tree
 from vibrissa.rod.reach import LEAST_ARC, Fold, chart_to_contact
+from vibrissa.rod.seeds import MOST_SEEDS, seeds
 
 # Of a channel's variance, what others do not explain; below this the covariance is singular.
 _SINGULAR = 1e-10

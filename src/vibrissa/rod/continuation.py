@@ -27,8 +27,8 @@ from vibrissa.rod.equations import (
 )
 from vibrissa.rod.kernels import BUFFER_SIZE, LANES, integrate, lane_tangents, lane_value, set_lane
 from vibrissa.rod.newton import ROUNDING, TOLERANCE, norm3
-from vibrissa.rod.preimage import solve3
 from vibrissa.rod.reach import LEAST_ARC, Fold
+from vibrissa.rod.seeds import solve3
 from vibrissa.status import Status
 
 #: A force this small (EI/L²) only says where an object touches.

@@ -32,8 +32,8 @@ from vibrissa.rod.kernels import (
     set_all_lanes,
     set_lane,
 )
-from vibrissa.rod.preimage import solve3
 from vibrissa.rod.reach import LEAST_ARC, Fold, chart_to_contact, fold_force
+from vibrissa.rod.seeds import solve3
 
 #: Residual at which an equation is solved.
 TOLERANCE = 1e-11

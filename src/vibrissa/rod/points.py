@@ -15,7 +15,7 @@ from vibrissa.rod.continuation import follow
 from vibrissa.rod.equations import POINT
 from vibrissa.rod.kernels import BUFFER_SIZE, LANES
 from vibrissa.rod.newton import TOLERANCE, newton_group, norm3, stable, start_from
-from vibrissa.rod.preimage import MOST_SEEDS, Preimages, Tree, seeds
+from vibrissa.rod.preimage import Preimages, Tree
 from vibrissa.rod.reach import (
     Fold,
     Reach,
@@ -24,6 +24,7 @@ from vibrissa.rod.reach import (
     reach,
     with_normal_force,
 )
+from vibrissa.rod.seeds import MOST_SEEDS, seeds
 from vibrissa.status import Status
 
 if TYPE_CHECKING:

@@ -1,0 +1,548 @@
+"""Seeds: where in the chart three quantities have given values, by the cells' interpolants.
+
+The tree (:mod:`vibrissa.rod.preimage`) tells which cells may hold a target. In each the interpolant
+is inverted by Newton's method, which gives seeds so near the exact solution that it converges at
+once.
+
+In a cell where a vector of the plane may vanish (:class:`~vibrissa.rod.preimage.Tree`), its length
+ℓ and direction β are not smooth, but its components v are: there the equations are
+
+    both known: v - ℓ (cos β, sin β) = 0;   β alone: v × (cos β, sin β) = 0, v · (cos β, sin β) > 0;
+    ℓ alone: (v · v - ℓ²) / 2R = 0, with R the largest |v| in the cell.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vibrissa.rod.arrays import Array, IntArray
+from vibrissa.rod.compiled import copy, inlined, kernel
+from vibrissa.rod.preimage import EVEN, FOLDED, Tree
+
+#: At most so many contacts are found for one target.
+MOST_SEEDS = 32
+# A solution may lie this far outside a cell (in cell widths) and still be its own: neighbours
+# overlap.
+_OVERLAP = 0.05
+# What the interpolant misses by this share of a cell's extent at most, the map itself may reach.
+_NEARLY = 0.02
+# Where a cell that may hold a fold has no solution but misses one by this share of its extent at
+# most, the map may have two, one to either side of the fold; starts this far from it (in cell
+# widths) lead to them.
+_MISSED = 0.3
+_SIDE = 0.2
+# In the first cells from rest, where signals vanish, misses are common and tell of no fold.
+_RESTING = 3
+# Linear equations whose determinant is below this share of the product of their rows are singular.
+_SINGULAR = 1e-3
+_STACK = 256
+
+
+@inlined
+def wrapped(angle: float) -> float:
+    """Angle in [-π, π]."""
+    return float(angle - 2.0 * np.pi * np.rint(angle / (2.0 * np.pi)))
+
+
+# The interpolant's four lanes, three quantities and padding, lie in one flat buffer, without which
+# the compiler does not put them side by side: coefficients, T - target and ∂T/∂x there, T of the
+# target relative to the cell's base.
+_MISFIT = 160
+_SLOPES = _MISFIT + 4
+_RELATIVE = _SLOPES + 12
+# For a polar cell: cos β and sin β (both 0 if β is unknown), ℓ (negative if unknown), the largest ℓ
+# in the cell (0 in all other cells), and v · (cos β, sin β) where it was last interpolated.
+_TARGET = _RELATIVE + 4
+_ALONG = _TARGET + 4
+_BUFFER = _ALONG + 1
+
+
+@inlined
+def _cubic(b: Array, n: int, q: int, t: float) -> tuple[float, float]:
+    """Quantity q along an edge whose four coefficients start at n, and its slope."""
+    c1, c2, c3 = b[4 * n + 4 + q], b[4 * n + 8 + q], b[4 * n + 12 + q]
+    return b[4 * n + q] + t * (c1 + t * (c2 + t * c3)), c1 + t * (2.0 * c2 + t * 3.0 * c3)
+
+
+@inlined
+def _bulge(b: Array, n: int, q: int, t: float) -> tuple[float, float]:
+    """What a cubic along an edge adds to the straight line between its ends, and its slope."""
+    c1, c2, c3 = b[4 * n + q], b[4 * n + 4 + q], b[4 * n + 8 + q]
+    return t * (c1 + t * (c2 + t * c3)), c1 + t * (2.0 * c2 + t * 3.0 * c3)
+
+
+@inlined
+def _interpolate(b: Array, x: Array) -> None:
+    """Leave T - target and ∂T/∂x at the place x of a cell in the buffer."""
+    x1, y1, z1 = x[0], x[1], x[2]
+    x0, y0, z0 = 1.0 - x1, 1.0 - y1, 1.0 - z1
+    for q in range(4):
+        a0, s0 = _cubic(b, 0, q, x1)
+        a1, s1 = _cubic(b, 4, q, x1)
+        a2, s2 = _cubic(b, 8, q, x1)
+        a3, s3 = _cubic(b, 12, q, x1)
+        total = y0 * (z0 * a0 + z1 * a1) + y1 * (z0 * a2 + z1 * a3) - b[_RELATIVE + q]
+        gx = y0 * (z0 * s0 + z1 * s1) + y1 * (z0 * s2 + z1 * s3)
+        gy = z0 * (a2 - a0) + z1 * (a3 - a1)
+        gz = y0 * (a1 - a0) + y1 * (a3 - a2)
+        a0, s0 = _bulge(b, 16, q, y1)
+        a1, s1 = _bulge(b, 19, q, y1)
+        a2, s2 = _bulge(b, 22, q, y1)
+        a3, s3 = _bulge(b, 25, q, y1)
+        total += x0 * (z0 * a0 + z1 * a1) + x1 * (z0 * a2 + z1 * a3)
+        gx += z0 * (a2 - a0) + z1 * (a3 - a1)
+        gy += x0 * (z0 * s0 + z1 * s1) + x1 * (z0 * s2 + z1 * s3)
+        gz += x0 * (a1 - a0) + x1 * (a3 - a2)
+        a0, s0 = _bulge(b, 28, q, z1)
+        a1, s1 = _bulge(b, 31, q, z1)
+        a2, s2 = _bulge(b, 34, q, z1)
+        a3, s3 = _bulge(b, 37, q, z1)
+        b[_MISFIT + q] = total + x0 * (y0 * a0 + y1 * a1) + x1 * (y0 * a2 + y1 * a3)
+        b[_SLOPES + q] = gx + y0 * (a2 - a0) + y1 * (a3 - a1)
+        b[_SLOPES + 4 + q] = gy + x0 * (a1 - a0) + x1 * (a3 - a2)
+        b[_SLOPES + 8 + q] = gz + x0 * (y0 * s0 + y1 * s1) + x1 * (y0 * s2 + y1 * s3)
+
+
+@inlined
+def _evaluate(b: Array, x: Array) -> None:
+    """Leave the cell's equations and their derivatives by x in the buffer; see the module."""
+    _interpolate(b, x)
+    largest = b[_TARGET + 3]
+    if largest == 0.0:
+        return
+    cos, sin, length = b[_TARGET], b[_TARGET + 1], b[_TARGET + 2]
+    directed = cos != 0.0 or sin != 0.0
+    if directed and length >= 0.0:
+        b[_MISFIT] -= length * cos
+        b[_MISFIT + 1] -= length * sin
+        return
+    v, w = b[_MISFIT], b[_MISFIT + 1]
+    if directed:
+        by_v, by_w = -sin, cos
+        b[_MISFIT] = w * cos - v * sin
+        b[_ALONG] = v * cos + w * sin
+    else:
+        by_v, by_w = v / largest, w / largest
+        b[_MISFIT] = 0.5 * (v * v + w * w - length * length) / largest
+    b[_MISFIT + 1], b[_MISFIT + 2] = b[_MISFIT + 2], b[_MISFIT + 3]
+    for c in range(3):
+        at = _SLOPES + 4 * c
+        b[at] = by_v * b[at] + by_w * b[at + 1]
+        b[at + 1], b[at + 2] = b[at + 2], b[at + 3]
+
+
+@inlined
+def _adjugate(b: Array, rows: Array) -> float:
+    """Fill rows (3, 3) with det ∂T/∂x times its inverse; return det."""
+    for a in range(3):
+        u, v = _SLOPES + 4 * ((a + 1) % 3), _SLOPES + 4 * ((a + 2) % 3)
+        rows[a, 0] = b[u + 1] * b[v + 2] - b[u + 2] * b[v + 1]
+        rows[a, 1] = b[u + 2] * b[v] - b[u] * b[v + 2]
+        rows[a, 2] = b[u] * b[v + 1] - b[u + 1] * b[v]
+    d = _SLOPES
+    return float(b[d] * rows[0, 0] + b[d + 1] * rows[0, 1] + b[d + 2] * rows[0, 2])
+
+
+@inlined
+def solve3(a: Array, r: Array, x: Array) -> float:
+    """Solve a x = r by Cramer's rule; return det a (x is not set if that is 0)."""
+    c0 = a[1, 1] * a[2, 2] - a[1, 2] * a[2, 1]
+    c1 = a[1, 2] * a[2, 0] - a[1, 0] * a[2, 2]
+    c2 = a[1, 0] * a[2, 1] - a[1, 1] * a[2, 0]
+    det = a[0, 0] * c0 + a[0, 1] * c1 + a[0, 2] * c2
+    if det != 0.0:
+        inverse = 1.0 / det
+        x[0] = inverse * (
+            c0 * r[0]
+            + (a[0, 2] * a[2, 1] - a[0, 1] * a[2, 2]) * r[1]
+            + (a[0, 1] * a[1, 2] - a[0, 2] * a[1, 1]) * r[2]
+        )
+        x[1] = inverse * (
+            c1 * r[0]
+            + (a[0, 0] * a[2, 2] - a[0, 2] * a[2, 0]) * r[1]
+            + (a[0, 2] * a[1, 0] - a[0, 0] * a[1, 2]) * r[2]
+        )
+        x[2] = inverse * (
+            c2 * r[0]
+            + (a[0, 1] * a[2, 0] - a[0, 0] * a[2, 1]) * r[1]
+            + (a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]) * r[2]
+        )
+    return float(det)
+
+
+@inlined
+def _outside(x: Array) -> float:
+    """How far a place lies outside its cell, in cell widths."""
+    return float(max(abs(x[0] - 0.5), abs(x[1] - 0.5), abs(x[2] - 0.5)) - 0.5)
+
+
+@inlined
+def _less(tree: Tree, q: int, target: float, base: float) -> float:
+    """By how much a target is larger than a base; an angle by at most half a turn."""
+    d = target - base
+    return float(d - 2.0 * np.pi * np.rint(d * tree.turns[q]))
+
+
+@inlined
+def _aim(tree: Tree, target: Array, b: Array) -> None:
+    """Bring direction and length of the target, where polar cells need them, into the buffer."""
+    length, direction = tree.roles[0], tree.roles[1]
+    b[_TARGET] = b[_TARGET + 1] = b[_TARGET + 3] = 0.0
+    if direction >= 0:
+        b[_TARGET], b[_TARGET + 1] = np.cos(target[direction]), np.sin(target[direction])
+    b[_TARGET + 2] = target[length] if length >= 0 else -1.0
+
+
+@inlined
+def _begin_polar(tree: Tree, row: int, target: Array, b: Array) -> None:
+    """Bring the target as a polar cell sees it into the buffer."""
+    frame = tree.polar_frame[row]
+    b[_RELATIVE], b[_RELATIVE + 1] = -frame[0], -frame[1]
+    for n in range(2):
+        q = tree.roles[2 + n]
+        b[_RELATIVE + 2 + n] = _less(tree, q, target[q], frame[2 + n]) if q >= 0 else 0.0
+
+
+@inlined
+def _locate_polar(tree: Tree, row: int, b: Array, work: Array, x: Array) -> bool:
+    """Whether a polar cell in the buffer may contain its target; if so, about where.
+
+    Its equations are linear in the components and the other quantities if the direction is known:
+    E T = E target. T is a linear function of x and a rest within bounds, so a solution lies within
+    bounds of that of the linear part.
+    """
+    linear = tree.polar_linear[row]
+    cos, sin, length = b[_TARGET], b[_TARGET + 1], b[_TARGET + 2]
+    x[0] = x[1] = x[2] = 0.5
+    if cos == 0.0 and sin == 0.0:
+        return True
+    matrix, right, slack = work[:3], work[3], work[4]
+    for a in range(3):
+        n = a + 1
+        if length >= 0.0:
+            n = a
+        first = length < 0.0 and a == 0
+        for c in range(3):
+            matrix[a, c] = linear[n, c]
+            if first:
+                matrix[a, c] = cos * linear[1, c] - sin * linear[0, c]
+        right[a] = b[_RELATIVE + n] - linear[n, 3]
+        slack[a] = linear[n, 4]
+        if first:
+            right[a] = cos * (b[_RELATIVE + 1] - linear[1, 3]) - sin * (b[_RELATIVE] - linear[0, 3])
+            slack[a] = abs(cos) * linear[1, 4] + abs(sin) * linear[0, 4]
+    if length >= 0.0:
+        right[0] += length * cos
+        right[1] += length * sin
+    else:
+        along = cos * (linear[0, 3] - b[_RELATIVE]) + sin * (linear[1, 3] - b[_RELATIVE + 1])
+        along += abs(cos) * linear[0, 4] + abs(sin) * linear[1, 4]
+        for c in range(3):
+            along += max(cos * linear[0, c] + sin * linear[1, c], 0.0)
+        if along < 0.0:
+            return False
+    return _within(matrix, right, slack, x)
+
+
+@inlined
+def _polar_care(tree: Tree, row: int, b: Array) -> int:
+    """How many starts a polar cell in the buffer needs; see `Tree.care`."""
+    cos, sin, length = b[_TARGET], b[_TARGET + 1], b[_TARGET + 2]
+    if cos == 0.0 and sin == 0.0:
+        return 2
+    least, most = np.inf, 0.0
+    volumes = tree.polar_volumes[row]
+    for k in range(8):
+        volume = volumes[k, 0]
+        if length < 0.0:
+            volume = cos * volumes[k, 1] - sin * volume
+        if k == 0:
+            sign = np.sign(volume)
+        least, most = min(least, sign * volume), max(most, abs(volume))
+    if least <= FOLDED * most:
+        return 2
+    return 1 if least <= EVEN * most else 0
+
+
+@inlined
+def _within(matrix: Array, right: Array, slack: Array, x: Array) -> bool:
+    """Whether matrix x = right, known to within slack, may have a solution in the unit cube.
+
+    If so, x is left there, as near as can be; if matrix is singular, it is not changed.
+    """
+    y, size = np.empty(3), 1.0
+    for a in range(3):
+        size *= max(abs(matrix[a, 0]), abs(matrix[a, 1]), abs(matrix[a, 2]))
+    det = solve3(matrix, right, y)
+    if not abs(det) > _SINGULAR * size:
+        return True
+    inverse = 1.0 / abs(det)
+    for a in range(3):
+        u, v = (a + 1) % 3, (a + 2) % 3
+        off = 0.0
+        for r in range(3):
+            p, q = (r + 1) % 3, (r + 2) % 3
+            cofactor = matrix[p, u] * matrix[q, v] - matrix[p, v] * matrix[q, u]
+            off += abs(cofactor) * slack[r]
+        off = _OVERLAP + off * inverse
+        if y[a] < -off or y[a] > 1.0 + off:
+            return False
+        y[a] = min(max(y[a], 0.0), 1.0)
+    copy(y, x)
+    return True
+
+
+@inlined
+def _locate(tree: Tree, cell: int, target: Array, relative: Array, x: Array) -> bool:
+    """Whether a cell may contain the target; if so, about where."""
+    frame = tree.frame[cell]
+    for q in range(3):
+        relative[q] = _less(tree, q, target[q], frame[3, q])
+    for a in range(3):
+        y = frame[a, 0] * relative[0] + frame[a, 1] * relative[1] + frame[a, 2] * relative[2]
+        if y < frame[4, a] or y > frame[5, a]:
+            return False
+        x[a] = min(max(y, 0.0), 1.0)
+    return True
+
+
+@inlined
+def _invert(b: Array, half: Array, work: Array, careful: bool, x: Array) -> int:
+    """Solve a cell's interpolant: 2 solved, 1 nearly so (a fold of the map), 0 not in the cell.
+
+    If not solved, x is left where it missed least, by work[5, 0] of the cell's extent.
+    """
+    rows, step, best = work[:3], work[3], work[4]
+    least, done = np.inf, False
+    work[5, 0] = np.inf
+    for n in range(9):
+        _evaluate(b, x)
+        if done:
+            return 2
+        if n == 8:
+            break
+        m0, m1, m2 = b[_MISFIT], b[_MISFIT + 1], b[_MISFIT + 2]
+        away = max(abs(m0) / half[0], abs(m1) / half[1], abs(m2) / half[2])
+        if away < least:
+            least = away
+            for a in range(3):
+                best[a] = x[a]
+        det = _adjugate(b, rows)
+        if det == 0.0:
+            break
+        for a in range(3):
+            step[a] = (rows[a, 0] * m0 + rows[a, 1] * m1 + rows[a, 2] * m2) / det
+        size = max(abs(step[0]), abs(step[1]), abs(step[2]))
+        if n == 0 and not careful:  # nearly linear: the first step tells which cell it is in
+            reach = max(
+                abs(x[0] - step[0] - 0.5), abs(x[1] - step[1] - 0.5), abs(x[2] - step[2] - 0.5)
+            )
+            if reach > 1.3:
+                return 0
+        shorten = min(1.0, 0.6 / max(size, 1e-300))
+        for a in range(3):
+            x[a] = min(max(x[a] - shorten * step[a], -0.5), 1.5)
+        if size < 2e-2:  # the next step would be of its square
+            if _outside(x) > _OVERLAP:
+                return 0
+            done = True
+    for a in range(3):
+        x[a] = best[a]
+    work[5, 0] = least if _outside(x) <= 0.25 else np.inf
+    return 1 if least <= _NEARLY and _outside(x) <= 0.25 else 0
+
+
+@inlined
+def _opposite(b: Array) -> bool:
+    """Whether a polar cell's vector, where last interpolated, points the other way."""
+    directed = b[_TARGET] != 0.0 or b[_TARGET + 1] != 0.0
+    polar = b[_TARGET + 3] > 0.0 and directed and b[_TARGET + 2] < 0.0
+    return bool(polar and b[_ALONG] < -_NEARLY * b[_TARGET + 3])
+
+
+@inlined
+def _sides(b: Array, half: Array, x: Array, work: Array, sides: Array) -> bool:
+    """Go _SIDE from x both ways, as the interpolant changes least; whether a fold is between."""
+    rows, step = work[:3], work[3]
+    sign = 1.0
+    for at in range(3):
+        if at == 0:
+            copy(x, sides[2])
+        else:
+            for a in range(3):
+                sides[2, a] = sides[at - 1, a]
+        _evaluate(b, sides[2])
+        if at > 0:
+            sign *= _adjugate(b, rows)
+            continue
+        most = 0.0
+        for q in range(3):
+            u, v = _SLOPES + (q + 1) % 3, _SLOPES + (q + 2) % 3
+            scale = 1.0 / (half[(q + 1) % 3] * half[(q + 2) % 3])
+            d0 = scale * (b[u + 4] * b[v + 8] - b[u + 8] * b[v + 4])
+            d1 = scale * (b[u + 8] * b[v] - b[u] * b[v + 8])
+            d2 = scale * (b[u] * b[v + 4] - b[u + 4] * b[v])
+            size = max(abs(d0), abs(d1), abs(d2))
+            if size > most:
+                most = size
+                step[0], step[1], step[2] = d0 / size, d1 / size, d2 / size
+        if most == 0.0:
+            return False
+        for a in range(3):
+            sides[0, a], sides[1, a] = x[a] - _SIDE * step[a], x[a] + _SIDE * step[a]
+    return bool(sign < 0.0)
+
+
+@inlined
+def _keep(
+    grid: Array,
+    place: IntArray,
+    x: Array,
+    b: Array,
+    work: Array,
+    solved: int,
+    found: Array,
+    inverses: Array,
+    quality: IntArray,
+    count: int,
+) -> int:
+    """Add a seed unless neighbours found it; what is solved replaces what is not."""
+    eta = grid[0, 0] + grid[1, 0] * (place[0] + x[0])
+    psi = grid[0, 1] + grid[1, 1] * (place[1] + x[1])
+    rho = grid[0, 2] + grid[1, 2] * (place[2] + x[2])
+    row = count
+    for n in range(count):
+        apart = max(
+            abs(eta - found[n, 0]) / grid[1, 0],
+            abs(wrapped(psi - found[n, 1])) / grid[1, 1],
+            abs(rho - found[n, 2]) / grid[1, 2],
+        )
+        both = solved + quality[n]
+        if apart < 0.02 or (both < 4 and apart < (0.5 if both > 1 else 0.15)):
+            if solved <= quality[n]:
+                return count
+            row = n
+            break
+    if row == MOST_SEEDS:
+        return count
+    found[row, 0], found[row, 1], found[row, 2] = eta, psi, rho
+    quality[row] = solved
+    det = _adjugate(b, work) if b[_TARGET + 3] == 0.0 else 0.0
+    for a in range(3):
+        for c in range(3):  # ∂(η, ψ, ρ)/∂T from ∂T/∂x in cell widths
+            inverses[row, a, c] = np.nan if det == 0.0 else work[a, c] * grid[1, a] / det
+    return max(count, row + 1)
+
+
+@kernel
+def seeds(tree: Tree, target: Array, found: Array, inverses: Array, quality: IntArray) -> int:
+    """All contacts that may have the target's values, as chart coordinates.
+
+    Parameters
+    ----------
+    tree : Tree
+        See :class:`~vibrissa.rod.preimage.Preimages`.
+    target : (3,) array
+        The values.
+    found : (MOST_SEEDS, 3) array
+        Filled with (η, ψ, ρ).
+    inverses : (MOST_SEEDS, 3, 3) array
+        Filled with the interpolant's ∂(η, ψ, ρ)/∂T there; NaN where it has none.
+    quality : (MOST_SEEDS,) int array
+        Filled with 2 (the interpolant is solved), 1 (nearly so: near a fold of the map) or 0 (it
+        is missed: to one side of a fold).
+
+    Returns
+    -------
+    int
+        How many.
+    """
+    grid, turns, offsets, boxes, place = (
+        tree.grid,
+        tree.turns,
+        tree.offsets,
+        tree.boxes,
+        tree.place,
+    )
+    edges, care, polar = tree.edges, tree.care, tree.polar
+    levels = offsets.shape[0] - 1
+    stack = np.empty((_STACK, 2), np.int64)
+    inside = np.empty(8, np.bool_)
+    work, relative, x = np.empty((6, 3)), np.empty(3), np.empty(3)
+    b = np.zeros(_BUFFER)
+    nearest, sides, half = np.empty(3), np.empty((3, 3)), np.empty(3)
+    count, top = 0, 1
+    stack[0, 0], stack[0, 1] = 0, 0
+    t0, t1, t2 = target[0], target[1], target[2]
+    _aim(tree, target, b)
+    while top > 0:
+        top -= 1
+        level, node = stack[top, 0], stack[top, 1]
+        box = boxes[offsets[level] + node]
+        for c in range(8):
+            d0, d1, d2 = t0 - box[0, c], t1 - box[1, c], t2 - box[2, c]
+            d0 -= 2.0 * np.pi * np.rint(d0 * turns[0])
+            d1 -= 2.0 * np.pi * np.rint(d1 * turns[1])
+            d2 -= 2.0 * np.pi * np.rint(d2 * turns[2])
+            inside[c] = (abs(d0) <= box[3, c]) & (abs(d1) <= box[4, c]) & (abs(d2) <= box[5, c])
+        for c in range(8):
+            if not inside[c]:
+                continue
+            child = 8 * node + c
+            if level < levels - 1:
+                if top < _STACK:
+                    stack[top, 0], stack[top, 1] = level + 1, child
+                    top += 1
+                continue
+            row = polar[child]
+            if row >= 0:
+                _begin_polar(tree, row, target, b)
+                if not _locate_polar(tree, row, b, work, x):
+                    continue
+                careful, edge = _polar_care(tree, row, b), tree.polar_edges[row]
+                b[_TARGET + 3] = tree.polar_frame[row, 7]
+                for a in range(3):
+                    half[a] = tree.polar_frame[row, 4 + a]
+            else:
+                if not _locate(tree, child, target, relative, x):
+                    continue
+                careful, edge = care[child], edges[child]
+                b[_TARGET + 3] = b[_RELATIVE + 3] = 0.0
+                for a in range(3):
+                    half[a], b[_RELATIVE + a] = box[3 + a, c], relative[a]
+            for k in range(_MISFIT):
+                b[k] = edge[k]
+            least = np.inf
+            missed = careful == 2 and place[child, 2] >= _RESTING
+            for start in range(9 if careful > 0 else 1):  # the place itself, then the corners
+                if start > 0:
+                    for a in range(3):
+                        x[a] = (start - 1) >> a & 1
+                solved = _invert(b, half, work, careful > 0, x)
+                missed = missed and solved < 2
+                if missed and work[5, 0] < least:
+                    least = work[5, 0]
+                    copy(x, nearest)
+                if solved > 0 and not _opposite(b):
+                    count = _keep(
+                        grid, place[child], x, b, work, solved, found, inverses, quality, count
+                    )
+                if solved == 2 and careful < 2:
+                    break
+            if not missed or least > _MISSED:
+                continue
+            if _sides(b, half, nearest, work, sides):
+                for side in range(2):
+                    count = _keep(
+                        grid,
+                        place[child],
+                        sides[side],
+                        b,
+                        work,
+                        0,
+                        found,
+                        inverses,
+                        quality,
+                        count,
+                    )
+    return count

@@ -55,6 +55,8 @@ def folder(tmp_path_factory):
         ("stream --sensor sensor.toml --signals Fx,MB,MD", "--signals cannot be used"),
         ("stream --sensor sensor.toml --moment-noise 0", "--moment-noise cannot be used"),
         ("stream noise.csv --topic wrench", "--topic cannot be used"),
+        ("stream noise.csv --pose-topic tool", "--pose-topic cannot be used"),
+        ("stream noise.csv --tare 10", "--tare cannot be used"),
         ("movie t.nc --kind contour --map map.nc", "--map cannot be used"),
         ("movie t.nc --kind signals --video top.mkv", "--video cannot be used"),
         ("figures map.nc --whisker 0", "--whisker cannot be used"),

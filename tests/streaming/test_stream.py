@@ -8,18 +8,21 @@ import subprocess
 import sys
 import time
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import vibrissa as vb
-from vibrissa.cli.streaming import _advice, stream
+from vibrissa.cli.streaming import stream
 from vibrissa.io.rosbag import bag_wrenches
 from vibrissa.mapping import ContactFilter, Estimator
 from vibrissa.sensing import Sensor, SensorFrame, save_sensor
-from vibrissa.streaming import ContactStream
+from vibrissa.streaming import ContactStream, Poses, advice
 from vibrissa.streaming.contacts import COMPONENTS, as_json
+from vibrissa.streaming.lines import POSITION, QUATERNION
 
 START = "from vibrissa.cli import main; main()"
 NOISE = np.repeat([1e-6, 2e-8], 3)
@@ -166,14 +169,14 @@ def test_a_sender_of_json_may_begin_anew_as_well(gamma_map, wrench):
 
 
 @pytest.mark.parametrize(
-    ("factor", "advice"), [(1000.0, "larger than any"), (1e-3, "far from zero"), (1.0, "")]
+    ("factor", "suspicion"), [(1000.0, "larger than any"), (1e-3, "far from zero"), (1.0, "")]
 )
-def test_wrong_units_are_suspected(gamma_map, wrench, factor, advice):
+def test_wrong_units_are_suspected(gamma_map, wrench, factor, suspicion):
     running = ContactStream(estimator(gamma_map, "Fx FT MB MD", felt_above=5.0))
     list(running.records(csv_lines(factor * wrench)))
-    said = _advice(running)
-    assert advice in said
-    assert bool(advice) == bool(said)
+    said = " ".join(advice(running))
+    assert suspicion in said
+    assert bool(suspicion) == bool(said)
 
 
 def test_a_sender_that_begins_anew_may_begin_time_anew(gamma_map, bent, wrench):
@@ -302,8 +305,75 @@ def test_the_verb_listens_to_udp_with_a_sensor(map_file, bent, wrench, tmp_path)
         np.testing.assert_allclose([record[n] for n in "xyz"], point, atol=1e-7)
 
 
-def write_wrenches(path, topics, sec=7):
-    """A bag with WrenchStamped messages a millisecond apart."""
+def test_poses_may_come_at_another_rate_and_of_what_carries_the_base(gamma_map, bent, wrench):
+    """The base turns and travels evenly; every sixth sample a pose of the flange comes before."""
+    contacts = estimator(gamma_map)
+    turn = Rotation.from_rotvec([0.1, 0.2, 0.3])
+    place = np.array([1e-2, 0.0, 2e-2])
+    poses = Poses(turn.as_matrix(), place)
+    running = ContactStream(contacts, follow=ContactFilter(contacts), poses=poses)
+
+    def flange(time):
+        return Rotation.from_rotvec([0.0, 0.0, 40.0 * time]), np.array([0.1 * time, 0.0, 0.5])
+
+    lines, expected = [], []
+    for i, row in enumerate(wrench.tolist()):
+        time = 0.001 * i
+        rotation, position = flange(time)
+        if i in (0, 1, 6):
+            q = rotation.as_quat()[[3, 0, 1, 2]]
+            pose = dict(zip((*POSITION, *QUATERNION), [*position, *q], strict=True))
+            lines.append(json.dumps({"time": time} | pose))
+        lines.append(json.dumps({"time": time} | dict(zip(COMPONENTS, row, strict=True))))
+        expected.append((rotation * turn, position + rotation.apply(place)))
+    records = list(running.records(lines))
+    assert len(records) == len(wrench) == running.samples
+    for i, record in enumerate(records):
+        rotation, base = expected[i]
+        own = [record[name] for name in "xyz"]
+        lab = [record[name] for name in ("lab_x", "lab_y", "lab_z")]
+        np.testing.assert_allclose(lab, rotation.apply(own) + base, atol=1e-12)
+    assert poses.number == 3
+    assert np.isnan(poses.at(1.0).position).all()  # long after the last
+    assert not advice(running)
+    far = Poses()
+    for i in range(3):
+        far.put(0.001 * i, np.eye(3), np.array([0.2 * i, 0.0, 0.0]))  # mm that are taken for m
+    running.poses = far
+    assert "is its position in m" in " ".join(advice(running))
+
+
+def test_the_offset_is_found_anew_from_the_first_samples(gamma_map, bent, wrench):
+    sensor = Sensor(noise=NOISE, mass=1e-3, mass_moment=(1e-6, 0.0, 0.0), bias=7e-4)
+    drifted = replace(sensor, bias=9e-4)
+    turned = Rotation.from_euler("x", 30, degrees=True)
+    rotation = [turned.as_matrix()] * 12
+    free = drifted.read(np.arange(12.0), np.zeros((12, 6)), 1, rotation)
+    touch = replace(drifted, noise=0.0).read(np.arange(12.0), wrench, 2, rotation)
+    running = ContactStream(Estimator.of_sensor(gamma_map, sensor), COMPONENTS, tare=12)
+    pose = dict(zip(QUATERNION, turned.as_quat()[[3, 0, 1, 2]], strict=True))
+    pose |= dict.fromkeys(POSITION, 0.0)
+    rows = np.concatenate([free, touch[8:9]]).tolist()
+    lines = [json.dumps(pose | dict(zip(COMPONENTS, row, strict=True))) for row in rows]
+    *before, last = running.records(lines)
+    assert {record["status"] for record in before} == {"tare"}
+    away = np.array([last[name] for name in "xyz"]) - bent.contact_point[8]
+    assert np.linalg.norm(away) < 1e-3
+    with pytest.raises(ValueError, match="there is no sensor"):
+        ContactStream(estimator(gamma_map), tare=3)
+
+
+def test_times_in_a_smaller_unit_are_noticed(gamma_map, wrench):
+    row = dict(zip(COMPONENTS, wrench[8].tolist(), strict=True))
+    running = ContactStream(estimator(gamma_map))
+    (record,) = running.records([json.dumps({"time": 1.7e18} | row)])
+    assert "in ms, µs or ns" in record["error"]
+    list(running.records(json.dumps({"time": 1e6 * i} | row) for i in range(5)))
+    assert "is their time in s?" in " ".join(advice(running))
+
+
+def write_wrenches(path, topics, sec=7, position=None):
+    """A bag with WrenchStamped messages a millisecond apart, and a pose at their beginning."""
     from rosbags.rosbag2 import Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -321,6 +391,17 @@ def write_wrenches(path, topics, sec=7):
                 both = t["geometry_msgs/msg/Wrench"](force=force, torque=torque)
                 raw = store.serialize_cdr(t[kind](header=header, wrench=both), kind)
                 writer.write(topic, 7_000_000_000 + 1_000_000 * i, raw)
+        if position is None:
+            return
+        kind = "geometry_msgs/msg/TransformStamped"
+        topic = writer.add_connection("/flange", kind, typestore=store)
+        vector = t["geometry_msgs/msg/Vector3"](*position)
+        half = t["geometry_msgs/msg/Quaternion"](0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))
+        stamp = t["builtin_interfaces/msg/Time"](sec=sec, nanosec=0)
+        header = t["std_msgs/msg/Header"](stamp=stamp, frame_id="world")
+        pose = t["geometry_msgs/msg/Transform"](translation=vector, rotation=half)
+        message = t[kind](header=header, child_frame_id="flange", transform=pose)
+        writer.write(topic, 7_100_000_000, store.serialize_cdr(message, kind))
 
 
 def test_bags_that_hold_something_else(wrench, tmp_path):
@@ -328,7 +409,7 @@ def test_bags_that_hold_something_else(wrench, tmp_path):
     write_wrenches(tmp_path / "two", {"/left": wrench[:2], "/right": wrench[2:3]})
     with pytest.raises(ValueError, match=r"name one of those .*: /left, /right"):
         list(bag_wrenches(tmp_path / "two"))
-    with pytest.raises(ValueError, match="no '/up' with wrenches; name one of those"):
+    with pytest.raises(ValueError, match="no '/up' with WrenchStamped; name one of those"):
         list(bag_wrenches(tmp_path / "two", "/up"))
     assert len(list(bag_wrenches(tmp_path / "two", "/right"))) == 1
     write_wrenches(tmp_path / "empty", {"/wrench": wrench[:0]})
@@ -370,9 +451,23 @@ def test_a_bag_goes_in_and_a_bag_comes_out(map_file, bent, wrench, tmp_path, cap
         assert cloud.row_step == cloud.data.size == 32 * cloud.width
 
 
+def test_a_bag_may_hold_the_pose_of_what_carries_the_base(map_file, wrench, tmp_path, capsys):
+    """A quarter turn about z, and the base 10 mm along the flange's x."""
+    pytest.importorskip("rosbags")
+    write_wrenches(tmp_path / "in", {"/wrench": wrench[5:9]}, position=[0.1, 0.2, 0.3])
+    mount = "10,0,0,1,0,0,0"
+    stream(tmp_path / "in", chart=map_file, follow=True, pose_topic="/flange", mount=mount)
+    for line in capsys.readouterr().out.splitlines():
+        record = json.loads(line)
+        x, y, z = (record[name] for name in "xyz")
+        lab = [record[name] for name in ("lab_x", "lab_y", "lab_z")]
+        np.testing.assert_allclose(lab, [0.1 - y, 0.21 + x, 0.3 + z], atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        ({"mount": "1,2,3"}, "seven numbers"),
         ({"source": Path("nothing.csv")}, "there is no file"),
         ({"udp": "here"}, "HOST:PORT"),
         ({"source": Path("x"), "udp": "127.0.0.1:0"}, "either a source or --udp"),

@@ -19,11 +19,10 @@ if TYPE_CHECKING:
     from vibrissa.io.rosbag import ContactBag
     from vibrissa.mapping import ContactMap, Estimator
     from vibrissa.sensing import Sensor
-    from vibrissa.streaming import ContactStream
+    from vibrissa.streaming import ContactStream, Poses
 
-
-# A share of samples from which on something is wrong in general.
-_NEARLY_ALL = 0.9
+# Advice is given once after so many samples, and at the end.
+_SOON = 500
 
 
 def stream(
@@ -89,8 +88,8 @@ def stream(
         bool,
         typer.Option(
             "--filter",
-            help="Follow contacts over time, with the pose of the base if lines carry base_x, "
-            "base_y, base_z (m) and base_qw, base_qx, base_qy, base_qz.",
+            help="Follow contacts over time, with the pose of the base: base_x, base_y, base_z (m) "
+            "and base_qw, base_qx, base_qy, base_qz, in each line or in lines of their own.",
         ),
     ] = False,
     speed: Annotated[
@@ -100,9 +99,32 @@ def stream(
             "quarter of the whisker's length a second.",
         ),
     ] = None,
+    mount: Annotated[
+        str | None,
+        typer.Option(
+            help="Poses are of a robot's flange; where the whisker's base is on it: mm, and a "
+            "quaternion from the whisker's to the flange's frame.",
+            metavar="X,Y,Z,QW,QX,QY,QZ",
+        ),
+    ] = None,
+    tare: Annotated[
+        int | None,
+        typer.Option(
+            help="The first N samples are of a free whisker, and give the sensor's offset anew.",
+            min=1,
+            metavar="N",
+        ),
+    ] = None,
     topic: Annotated[
         str | None,
         typer.Option(help="Of WrenchStamped in a bag, where there are several.", metavar="NAME"),
+    ] = None,
+    pose_topic: Annotated[
+        str | None,
+        typer.Option(
+            help="Of PoseStamped or TransformStamped in a bag: poses of the base, or the flange.",
+            metavar="NAME",
+        ),
     ] = None,
     bag: Annotated[
         Path | None,
@@ -133,14 +155,22 @@ def stream(
         options = {"--signals": signals, "--force-noise": force_noise}
         reason = "channels and noise are those of the --sensor"
         refuse(options | {"--moment-noise": moment_noise}, reason)
+    else:
+        refuse({"--tare": tare}, "the offset is that of a sensor's channels: give the --sensor")
+    if not follow:
+        refuse({"--speed": speed}, "it is of the filter: add --filter")
     described = None if sensor is None else load_sensor(sensor)
     from_bag = source is not None and is_bag(source)
     if not from_bag:
-        refuse({"--topic": topic}, "it is of a ROS bag, and the source is none")
+        refuse(
+            {"--topic": topic, "--pose-topic": pose_topic},
+            "it is of a ROS bag, and the source is none",
+        )
+    poses = _poses(mount)
     with ExitStack() as opened:
         writer = None if bag is None else opened.enter_context(_bag(bag, follow))
         lines = (
-            _bag_lines(source, topic)
+            _bag_lines(source, topic, pose_topic)
             if source is not None and from_bag
             else _lines(source, udp, opened)
         )
@@ -153,33 +183,41 @@ def stream(
             stiffness_sigma,
             felt,
         )
-        running = _stream(estimator, described, from_bag, follow, speed)
+        running = _stream(estimator, described, from_bag, follow, speed, poses, tare or 0)
+        if udp is not None:
+            errors.print("ready", highlight=False)
         with suppress(KeyboardInterrupt):  # the usual end
             _write(running, islice(lines, count), writer)
+    if follow and not running.poses.number:
+        errors.print("no pose came: the base was taken to stand still", highlight=False)
     errors.print(
         f"{running.samples} samples, {running.faults} lines that could not be read",
         highlight=False,
     )
-    if advice := _advice(running):
-        errors.print(advice, highlight=False, soft_wrap=True)
+    _advise(running)
 
 
-def _advice(running: ContactStream) -> str:
-    """What may be wrong where hardly any sample gave a contact."""
-    counts, all_of_them = running.statuses, running.samples
-    if not all_of_them:
-        return ""
-    if counts["outside_map"] > _NEARLY_ALL * all_of_them:
-        return (
-            "Nearly all signals are larger than any that this whisker can give: are they in N and "
-            "N·m, is the offset taken away, and is the whisker's stiffness right?"
-        )
-    if counts["not_felt"] == all_of_them:
-        return (
-            "No signal was so far from zero that a contact is felt: are they in N and N·m, and is "
-            "the noise as it was said to be?"
-        )
-    return ""
+def _advise(running: ContactStream) -> None:
+    from vibrissa.streaming import advice
+
+    for sentence in advice(running):
+        errors.print(sentence, highlight=False, soft_wrap=True)
+
+
+def _poses(mount: str | None) -> Poses:
+    """Poses of what the whisker is mounted on."""
+    from vibrissa.streaming import Poses
+    from vibrissa.streaming.lines import rotation_of
+
+    if mount is None:
+        return Poses()
+    try:
+        numbers = [float(part) for part in mount.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 7:
+        raise ValueError(f"--mount is X,Y,Z,QW,QX,QY,QZ, seven numbers; got {mount!r}")
+    return Poses(rotation_of(numbers[3:]), [1e-3 * x for x in numbers[:3]])
 
 
 def _lines(source: Path | None, udp: str | None, opened: ExitStack) -> Iterator[str]:
@@ -201,14 +239,26 @@ def _lines(source: Path | None, udp: str | None, opened: ExitStack) -> Iterator[
     return file_lines(source)
 
 
-def _bag_lines(source: Path, topic: str | None) -> Iterator[str]:
+def _bag_lines(source: Path, topic: str | None, pose_topic: str | None) -> Iterator[str]:
+    """Lines as they would have come, poses and wrenches in the order of their times."""
     import json
+    from heapq import merge
 
-    from vibrissa.io.rosbag import bag_wrenches
+    from vibrissa.io.rosbag import bag_poses, bag_wrenches
     from vibrissa.streaming.contacts import COMPONENTS
+    from vibrissa.streaming.lines import POSITION, QUATERNION
 
-    for time, wrench, _ in bag_wrenches(source, topic):
-        values = dict(zip(COMPONENTS, wrench.tolist(), strict=True))
+    wrenches: Iterator[tuple[float, dict[str, float]]] = (
+        (time, dict(zip(COMPONENTS, wrench.tolist(), strict=True)))
+        for time, wrench, _ in bag_wrenches(source, topic)
+    )
+    poses: Iterator[tuple[float, dict[str, float]]] = iter(())
+    if pose_topic is not None:
+        poses = (
+            (time, dict(zip((*POSITION, *QUATERNION), [*place, *turn], strict=True)))
+            for time, place, turn in bag_poses(source, pose_topic)
+        )
+    for time, values in merge(poses, wrenches, key=lambda timed: timed[0]):
         yield json.dumps({"time": time} | values)
 
 
@@ -250,6 +300,8 @@ def _stream(
     from_bag: bool,
     follow: bool,
     speed: float | None,
+    poses: Poses,
+    tare: int,
 ) -> ContactStream:
     from vibrissa.mapping import ContactFilter
     from vibrissa.streaming import ContactStream
@@ -257,15 +309,13 @@ def _stream(
     filtered = None
     if follow:
         filtered = ContactFilter(estimator, speed=None if speed is None else 1e-3 * speed)
-    elif speed is not None:
-        raise ValueError("--speed is of the filter: add --filter")
     names = None if sensor is None else tuple(sensor.channels)
     if from_bag and sensor is not None and not set(names or ()) <= set(_wrench_names()):
         raise ValueError(
             f"a bag of wrenches carries {', '.join(_wrench_names())}; the sensor has "
             f"{', '.join(sensor.channels)}"
         )
-    return ContactStream(estimator, names, filtered)
+    return ContactStream(estimator, names, filtered, poses, tare)
 
 
 def _wrench_names() -> tuple[str, ...]:
@@ -290,6 +340,8 @@ def _write(running: ContactStream, lines: Iterator[str], writer: ContactBag | No
             sys.stdout.flush()
             if writer is not None and "error" not in record:
                 _put(writer, record)
+            if running.samples == _SOON:
+                _advise(running)
     except BrokenPipeError:
         # What is flushed at the end must not fail again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

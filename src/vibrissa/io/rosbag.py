@@ -1,7 +1,8 @@
 """ROS 2 bags: wrenches in, contact points out (extra ``ros``: rosbags, which needs no ROS).
 
-`geometry_msgs/WrenchStamped` is read, from ROS 1 bags as well; `geometry_msgs/PointStamped` is
-written for contact points, and `sensor_msgs/PointCloud2` for all candidates of a sample.
+`geometry_msgs/WrenchStamped` is read, and `PoseStamped` or `TransformStamped` for the pose of the
+base, from ROS 1 bags as well; `geometry_msgs/PointStamped` is written for contact points, and
+`sensor_msgs/PointCloud2` for all candidates of a sample.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ Array = NDArray[np.float64]
 _WRENCH = "geometry_msgs/msg/WrenchStamped"
 _POINT = "geometry_msgs/msg/PointStamped"
 _CLOUD = "sensor_msgs/msg/PointCloud2"
+_POSE = "geometry_msgs/msg/PoseStamped"
+_TRANSFORM = "geometry_msgs/msg/TransformStamped"
 _SUFFIXES = {".bag", ".db3", ".mcap"}
 # Of sensor_msgs/PointField: 64-bit floats.
 _FLOAT64 = 8
@@ -72,6 +75,54 @@ def bag_wrenches(
     ValueError
         If it is no bag, or the topic is not there or not the only one.
     """
+    for time, message in _messages(path, topic, (_WRENCH,), "WrenchStamped"):
+        f, t = message.wrench.force, message.wrench.torque
+        yield time, np.array([f.x, f.y, f.z, t.x, t.y, t.z]), message.header.frame_id
+
+
+def bag_poses(
+    path: str | PathLike[str], topic: str | None = None
+) -> Iterator[tuple[float, list[float], list[float]]]:
+    """Read poses from a bag, in the order of recording.
+
+    Parameters
+    ----------
+    path : str or path
+        Of the bag.
+    topic : str, optional
+        With PoseStamped or TransformStamped messages; by default the only one that has them.
+
+    Yields
+    ------
+    time : float
+        Of the message's header, s; where that is zero, when it was recorded.
+    position : list of 3 floats
+        Where it is in its parent's frame, m.
+    quaternion : list of 4 floats
+        W, x, y, z; from its own to the parent's frame.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such bag.
+    ModuleNotFoundError
+        If rosbags is not installed.
+    ValueError
+        If it is no bag, or the topic is not there or not the only one.
+    """
+    kinds = (_POSE, _TRANSFORM)
+    for time, message in _messages(path, topic, kinds, "PoseStamped or TransformStamped"):
+        if hasattr(message, "pose"):
+            p, q = message.pose.position, message.pose.orientation
+        else:
+            p, q = message.transform.translation, message.transform.rotation
+        yield time, [p.x, p.y, p.z], [q.w, q.x, q.y, q.z]
+
+
+def _messages(
+    path: str | PathLike[str], topic: str | None, kinds: tuple[str, ...], named: str
+) -> Iterator[tuple[float, Any]]:
+    """Times and messages of some kinds on one topic."""
     rosbags = _library()
     path = Path(path)
     if not path.exists():
@@ -82,30 +133,28 @@ def bag_wrenches(
     except rosbags.fault as error:
         raise ValueError(f"{path} is no bag that can be read: {error}") from error
     try:
-        there = sorted({c.topic for c in reader.connections if c.msgtype == _WRENCH})
+        fitting = [c for c in reader.connections if c.msgtype in kinds]
+        there = sorted({c.topic for c in fitting})
         if topic is None and len(there) == 1:
             topic = there[0]
         if topic not in there:
-            raise ValueError(f"{path}: {_which_topic(reader.connections, there, topic)}")
-        chosen = [c for c in reader.connections if c.topic == topic and c.msgtype == _WRENCH]
+            raise ValueError(f"{path}: {_which_topic(reader.connections, there, topic, named)}")
+        chosen = [c for c in fitting if c.topic == topic]
         for connection, recorded, raw in reader.messages(connections=chosen):
             message: Any = reader.deserialize(raw, connection.msgtype)
             stamp = message.header.stamp
-            f, t = message.wrench.force, message.wrench.torque
-            wrench = np.array([f.x, f.y, f.z, t.x, t.y, t.z])
-            time = stamp.sec + 1e-9 * stamp.nanosec or 1e-9 * recorded
-            yield time, wrench, message.header.frame_id
+            yield stamp.sec + 1e-9 * stamp.nanosec or 1e-9 * recorded, message
     finally:
         reader.close()
 
 
-def _which_topic(connections: Any, there: list[str], topic: str | None) -> str:
-    """Say why it is open from which topic wrenches are read."""
+def _which_topic(connections: Any, there: list[str], topic: str | None, named: str) -> str:
+    """Say why it is open from which topic messages are read."""
     if there:
-        lacks = "" if topic is None else f"there is no {topic!r} with wrenches; "
-        return f"{lacks}name one of those with WrenchStamped messages: {', '.join(there)}"
+        lacks = "" if topic is None else f"there is no {topic!r} with {named}; "
+        return f"{lacks}name one of those with {named} messages: {', '.join(there)}"
     others = sorted({f"{c.topic} ({c.msgtype})" for c in connections})
-    return f"it has no topic with WrenchStamped messages, only {', '.join(others) or 'none at all'}"
+    return f"it has no topic with {named} messages, only {', '.join(others) or 'none at all'}"
 
 
 class ContactBag:

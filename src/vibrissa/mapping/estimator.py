@@ -168,6 +168,11 @@ class Estimator:
         order = np.argsort(self._order or range(len(self.names))).tolist()
         return tuple(self.names[i] for i in order)
 
+    @property
+    def sensor(self) -> Sensor | None:
+        """The sensor whose readings it takes, if it is of one."""
+        return self._sensor
+
     def reset(self) -> None:
         """Forget the measurement before, as when the whisker has lost touch."""
         self._trail.forget()

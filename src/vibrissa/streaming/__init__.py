@@ -1,7 +1,18 @@
 """Signals as they come in, line by line, to contacts as they go out."""
 
+from vibrissa.streaming.advice import advice
 from vibrissa.streaming.contacts import ContactStream
 from vibrissa.streaming.lines import Lines, Sample
+from vibrissa.streaming.poses import Pose, Poses
 from vibrissa.streaming.sources import file_lines, udp_lines
 
-__all__ = ["ContactStream", "Lines", "Sample", "file_lines", "udp_lines"]
+__all__ = [
+    "ContactStream",
+    "Lines",
+    "Pose",
+    "Poses",
+    "Sample",
+    "advice",
+    "file_lines",
+    "udp_lines",
+]

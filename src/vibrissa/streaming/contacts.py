@@ -17,11 +17,14 @@ from vibrissa.mapping.contact_map import spherical
 from vibrissa.signals import SIGNALS
 from vibrissa.signals.base import signals_of
 from vibrissa.streaming.lines import Lines, Sample
+from vibrissa.streaming.poses import Poses
 
 Array = NDArray[np.float64]
 
 # Time that falls by more than this comes from a sender that has begun anew, s.
 _ANEW = 1.0
+# Samples farther apart than this seem to have times in a smaller unit, s.
+_SLOW = 100.0
 
 COMPONENTS = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 """What signals are computed from, where a stream carries these."""
@@ -39,8 +42,22 @@ class ContactStream:
         signals, or components of force and moment from which these are computed, whichever the
         first line has.
     follow : ContactFilter, optional
-        Follows contacts over time with the base's pose, if a line has one; made of the same
+        Follows contacts over time with the base's pose, if there is one; made of the same
         estimator.
+    poses : Poses, optional
+        What is known of the base's pose, and where it is on what the lines' poses are of.
+    tare : int
+        How many complete samples at the beginning are of a free whisker: they give the offset of
+        the sensor anew. It needs an estimator of a sensor.
+
+    Attributes
+    ----------
+    samples, faults : int
+        Samples so far, and lines that could not be read.
+    statuses : Counter
+        How often each status came.
+    poses : Poses
+        Of the base.
     """
 
     def __init__(
@@ -48,7 +65,11 @@ class ContactStream:
         estimator: Estimator,
         names: tuple[str, ...] | None = None,
         follow: ContactFilter | None = None,
+        poses: Poses | None = None,
+        tare: int = 0,
     ) -> None:
+        if tare and estimator.sensor is None:
+            raise ValueError("the offset is that of a sensor's channels, and there is no sensor")
         by_name = estimator.announced
         self.lines = Lines(names or by_name, *(() if names else (_components(by_name),)))
         self.samples, self.faults = 0, 0
@@ -57,6 +78,11 @@ class ContactStream:
         self._begun, self._time = clock.monotonic(), -math.inf
         self.statuses: Counter[str] = Counter()
         self._headers = 0
+        self.poses = poses or Poses()
+        self.slow = 0
+        self._tare = tare
+        self._free: list[Array] = []
+        self._offset: Array | float = 0.0
 
     def records(self, lines: Iterable[str]) -> Iterator[dict[str, Any]]:
         """Turn lines into records, one for each sample, and one for each line that is none.
@@ -76,7 +102,9 @@ class ContactStream:
             try:
                 sample = self.lines(line)
                 if sample is None:
-                    self._begin_anew()
+                    continue
+                if not sample.names:
+                    self._put(sample)
                     continue
                 record = self.record(sample)
             except ValueError as fault:
@@ -87,15 +115,9 @@ class ContactStream:
             self.statuses[record["status"]] += 1
             yield record
 
-    def _begin_anew(self) -> None:
-        """After a new header time may begin anew, and nothing goes on from what was before."""
-        if self.lines.headers == self._headers:
-            return
-        self._headers = self.lines.headers
-        self._forget()
-
     def _forget(self) -> None:
         self._time = -math.inf
+        self.poses.forget()
         (self._follow or self._estimator).reset()
 
     def record(self, sample: Sample) -> dict[str, Any]:
@@ -117,19 +139,52 @@ class ContactStream:
             If the estimator or the filter refuses it.
         """
         time = clock.monotonic() - self._begun if sample.time is None else sample.time
-        if time < self._time - _ANEW:
+        # After a header time may begin anew by less; senders also repeat it, as nothing is sure to
+        # arrive by UDP.
+        if time < self._time - (_ANEW if self.lines.headers == self._headers else 0.0):
             self._forget()
+        self._headers = self.lines.headers
+        self.slow += time > self._time + _SLOW > -math.inf
         self._time = max(self._time, time)
-        values = sample.values
+        rotation, position = self._pose(sample, time)
+        if len(self._free) < self._tare:
+            return {"time": time, "status": self._tared(sample.values, rotation)}
+        values = sample.values - self._offset
         if self._which and sample.names != self._estimator.announced:
             wrench = np.zeros(6)
             wrench[[COMPONENTS.index(name) for name in sample.names]] = values
             values = signals_of(wrench[:3], wrench[3:])[self._which]
         if self._follow is None:
-            found = self._estimator(values, sample.rotation)
+            found = self._estimator(values, rotation)
             return {"time": time} | located_record(found)
-        known = self._follow(time, values, sample.rotation, sample.position)
-        return {"time": time} | followed_record(known, sample.rotation)
+        known = self._follow(time, values, rotation, position)
+        return {"time": time} | followed_record(known, rotation)
+
+    def _put(self, sample: Sample) -> None:
+        """Remember a pose that came alone."""
+        assert sample.time is not None
+        assert sample.rotation is not None
+        assert sample.position is not None
+        self.poses.put(sample.time, sample.rotation, sample.position)
+
+    def _pose(self, sample: Sample, time: float) -> tuple[Array | None, Array | None]:
+        """Pose of the base: the line's own, or what the poses before tell."""
+        rotation, position = sample.rotation, sample.position
+        if rotation is not None and position is not None and np.isfinite(rotation).all():
+            return self.poses.put(time, rotation, position)
+        return self.poses.at(time) or (rotation, position)
+
+    def _tared(self, values: Array, rotation: Array | None) -> str:
+        """Take one sample of a free whisker."""
+        sensor = self._estimator.sensor
+        assert sensor is not None
+        felt = sensor.felt(values, rotation)
+        if not np.isfinite(felt).all():
+            return "missing"
+        self._free.append(felt)
+        if len(self._free) == self._tare:
+            self._offset = np.mean(self._free, axis=0)
+        return "tare"
 
 
 def _components(signals: tuple[str, ...]) -> tuple[str, ...]:

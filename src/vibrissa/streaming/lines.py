@@ -2,7 +2,8 @@
 
 Both carry numbers by name, in SI units. The pose of the base may ride along: ``base_x``, ``base_y``
 and ``base_z`` (m, laboratory), and a unit quaternion ``base_qw``, ``base_qx``, ``base_qy``,
-``base_qz`` that turns the whisker's into the laboratory frame.
+``base_qz`` that turns the whisker's into the laboratory frame. A JSON object may hold a pose and
+its time alone.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +27,8 @@ QUATERNION = ("base_qw", "base_qx", "base_qy", "base_qz")
 
 # A quaternion that was rounded is no longer of unit length by this much.
 _UNIT = 0.01
+# Seconds since any epoch are fewer; what is more is in a smaller unit.
+_LATEST = 1e11
 
 
 class Sample(NamedTuple):
@@ -37,7 +41,7 @@ class Sample(NamedTuple):
     time : float or None
         Of the sample, s; None where the line has none.
     names : tuple of str
-        Which of the choices asked for it has.
+        Which of the choices asked for it has; none where the line has a pose alone.
     values : (k,) array
         In that order.
     rotation : (3, 3) array or None
@@ -132,16 +136,24 @@ class Lines:
         return dict(zip(self._header, cells, strict=True))
 
     def _sample(self, known: dict[str, object]) -> Sample:
-        names = self._chosen("it", list(known))
+        alone = {"time", *POSITION, *QUATERNION} <= set(known) and not any(
+            name in known for names in self.names for name in names
+        )
+        names = () if alone else self._chosen("it", list(known))
         time = _number("time", known["time"]) if "time" in known else None
         if time is not None and not math.isfinite(time):
             raise ValueError(f"time is {known['time']!r}; a finite number is needed, s")
+        if time is not None and abs(time) > _LATEST:
+            raise ValueError(
+                f"time is {known['time']}, more than any date in seconds: it seems to be in ms, µs "
+                "or ns"
+            )
         values = np.array([_number(name, known[name]) for name in names])
         rotation = position = None
         if set(POSITION) <= set(known):
             position = np.array([_number(name, known[name]) for name in POSITION])
         if set(QUATERNION) <= set(known):
-            rotation = _rotation(np.array([_number(name, known[name]) for name in QUATERNION]))
+            rotation = rotation_of([_number(name, known[name]) for name in QUATERNION])
         return Sample(self.number, time, names, values, rotation, position)
 
 
@@ -159,8 +171,25 @@ def _number(name: str, value: object) -> float:
         raise ValueError(f"{name} is {value!r}, which is no number") from None
 
 
-def _rotation(q: Array) -> Array:
-    """The matrix of a quaternion (w, x, y, z); NaN for NaN."""
+def rotation_of(quaternion: Sequence[float]) -> Array:
+    """Return the matrix of a quaternion.
+
+    Parameters
+    ----------
+    quaternion : sequence of float
+        W, x, y, z, of unit length.
+
+    Returns
+    -------
+    array (3, 3)
+        NaN for NaN.
+
+    Raises
+    ------
+    ValueError
+        If it is not of unit length.
+    """
+    q = np.array(quaternion)
     size = float(np.linalg.norm(q))
     if not math.isfinite(size):
         return np.full((3, 3), np.nan)

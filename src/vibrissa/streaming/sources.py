@@ -8,6 +8,8 @@ from pathlib import Path
 
 # A datagram holds no more.
 _LARGEST = 65535
+# Bytes that may wait to be read.
+_WAITING = 1 << 22
 
 
 def file_lines(path: Path) -> Iterator[str]:
@@ -83,6 +85,7 @@ def udp_socket(host: str, port: int) -> socket.socket:
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     opened = socket.socket(family, socket.SOCK_DGRAM)
+    opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _WAITING)  # or what the system allows
     try:
         opened.bind((host, port))
     except OSError as error:

@@ -1,0 +1,57 @@
+"""What may be wrong with a stream as a whole."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from vibrissa.streaming.contacts import ContactStream
+
+# A share of samples from which on something is wrong in general.
+_NEARLY_ALL = 0.9
+
+
+def advice(stream: ContactStream) -> list[str]:
+    """Say what users get wrong most often, where it looks like it.
+
+    Parameters
+    ----------
+    stream : ContactStream
+        After some samples.
+
+    Returns
+    -------
+    list of str
+        Sentences; none where nothing is suspected.
+    """
+    counts, total = stream.statuses, stream.samples
+    told = total - counts["missing"] - counts["tare"]
+    felt = told - counts["not_felt"]
+    unexplained = counts["outside_map"] + counts["not_frictionless"]
+    out = []
+    if felt > 0 and unexplained > _NEARLY_ALL * felt:
+        larger = (
+            "are larger than any that this whisker can give"
+            if counts["outside_map"] > unexplained / 2
+            else "are of no contact that this whisker can have"
+        )
+        out.append(
+            f"Nearly all signals {larger}: are they in N and N·m (or does the sensor's mixing say "
+            "what they are in), is the offset taken away, are the sensor's axes, sign and weight "
+            "and the base's rotation right, and the whisker's stiffness?"
+        )
+    if told > 0 and not felt:
+        out.append(
+            "No signal was so far from zero that a contact is felt: are they in N and N·m, and is "
+            "the noise as it was said to be?"
+        )
+    if total and counts["missing"] == total:
+        out.append(
+            "All samples are missing something: a number, the pose at that time, or readings are "
+            "as large as the largest that the sensor can say."
+        )
+    if stream.slow > _NEARLY_ALL * max(total - 1, 1):
+        out.append("Samples lie minutes apart: is their time in s?")
+    if stream.poses.too_fast > 0.5 * stream.poses.number > 0:
+        out.append("The base moves at more than 50 m/s: is its position in m, its time in s?")
+    return out

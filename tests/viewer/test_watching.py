@@ -1,6 +1,7 @@
 """A trial as it is shown: what is known of it, in space, in images, over time."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -198,6 +199,11 @@ def test_several_whiskers_are_drawn_each_in_its_colour(recording):
         groups[f"/whiskers/{k}"] = recording["whiskers/0"].to_dataset(inherit=False)
     trial = watched(xr.DataTree.from_dict(groups))
     assert trial.names == ("left", "right")
+    assert trial.busiest == 0
+    late = trial.felt & (
+        [False, True] | (trial.time > np.median(trial.time[trial.felt[:, 0]]))[:, None]
+    )
+    assert replace(trial, felt=late).busiest == 1
     frame = trial.next_contact(0) + 3
     drawn = moment_drawing(trial, frame, 5.0)
     assert {"whisker 0", "whisker 1", "contact 0", "contact 1"} <= drawn.keys()

@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from vibrissa.cli.terminal import output
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from vibrissa.mapping import ContactMap
+    from vibrissa.whisker import Whisker
 
 
 def view(
@@ -46,22 +52,16 @@ def view(
     from vibrissa.io import is_netcdf, kind_of, load_recording
     from vibrissa.viewer import view as serve
 
-    whisker, contacts, recording = whisker_from(path), None, None
     kind = kind_of(path) if path is not None and is_netcdf(path) else ""
+    shown: Whisker | ContactMap | xr.DataTree
     if kind == "vibrissa contact map" and path is not None:
-        contacts = map_from(path)
-        whisker = contacts.whisker
+        shown = map_from(path)
     elif kind == "vibrissa recording" and path is not None:
-        recording = load_recording(path)
+        shown = load_recording(path)
+    else:
+        shown = whisker_from(path)
     try:
-        with serve(
-            whisker,
-            contacts=contacts,
-            recording=recording,
-            videos=videos or (),
-            host=host,
-            port=port,
-        ) as viewer:
+        with serve(shown, videos=videos or (), host=host, port=port) as viewer:
             output.print(f"{viewer.url}   Ctrl-C ends it", highlight=False, soft_wrap=True)
             if browser:
                 import webbrowser

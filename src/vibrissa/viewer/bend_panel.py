@@ -16,8 +16,8 @@ from vibrissa.viewer.bending import (
     with_radius,
 )
 from vibrissa.viewer.charting import Chart, envelope
-from vibrissa.viewer.page import Page, asked, put
-from vibrissa.viewer.readout import of_deflection
+from vibrissa.viewer.page import Page, asked, put, show
+from vibrissa.viewer.readout import numbers, sentence
 
 _MM = quantity("length").display_factor
 _UN = quantity("force").display_factor
@@ -37,6 +37,7 @@ class BendMode:
     def __init__(self, page: Page) -> None:
         self._page = page
         self._clouded: Chart | None = None
+        self._told: Kind | None = None
         gui = page.server.gui
         bend = page.bend
         length = page.original.length
@@ -62,7 +63,8 @@ class BendMode:
                 visible=False,
             )
             self._way = gui.add_slider("Direction (°)", -180.0, 180.0, 1.0, 0.0, visible=False)
-            self._numbers = gui.add_html(of_deflection(bend.deflection))
+            self._state = gui.add_html("")
+            self._numbers = gui.add_html("")
         asked(self._kind, self._chosen)
         asked(self._target, self._typed)
         asked(self._radius, self._widened)
@@ -90,22 +92,26 @@ class BendMode:
             cloud = {} if page.chart is None else {"envelope": envelope(page.chart)}
             page.stage.show("reachable", cloud)
 
-    def write(self) -> None:
+    def write(self, brief: bool = False) -> None:
         """Write signals and contact, and where the load is."""
         bend = self._page.bend
-        self._numbers.content = of_deflection(bend.deflection)
+        show(self._state, sentence(bend.status))
+        show(self._numbers, numbers(bend.deflection))
+        if brief:
+            return
         self._target.visible = bend.kind != "force"
         self._radius.visible = bend.kind == "peg"
         self._place.visible = self._size.visible = self._way.visible = bend.kind == "force"
-        put(self._kind, bend.kind)
-        if bend.kind == "force":
+        if bend.kind != "force":
+            x, y, z = np.round(_MM * bend.target, 3).tolist()
+            put(self._target, (x, y, z))
+        if bend.kind != self._told:  # not while someone moves the sliders
+            self._told = bend.kind
+            put(self._kind, bend.kind)
+            put(self._radius, round(_MM * bend.radius, 2))
             put(self._place, round(bend.place, 3))
             put(self._size, round(_UN * bend.magnitude, 1))
             put(self._way, round(np.rad2deg(bend.direction)))
-        else:
-            put(self._radius, round(_MM * bend.radius, 2))
-            x, y, z = np.round(_MM * bend.target, 3).tolist()
-            put(self._target, (x, y, z))
 
     def _chosen(self, kind: Kind) -> None:
         self._page.change("kind", lambda bend: loaded(bend, kind))

@@ -88,7 +88,7 @@ class LocateMode:
         page.stage.show("candidates", drawing)
         self._paint(chart)
 
-    def write(self) -> None:
+    def write(self, brief: bool = False) -> None:
         """Write what the three signals tell."""
         bend = self._page.bend
         if self._page.chart is None:

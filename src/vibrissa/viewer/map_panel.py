@@ -81,7 +81,7 @@ class MapMode:
         self._paint(self._solids)
         self._mark()
 
-    def write(self) -> None:
+    def write(self, brief: bool = False) -> None:
         """Nothing: all is written as it is drawn."""
 
     def _paint(self, found: Solids) -> None:

@@ -27,9 +27,12 @@ from vibrissa.whisker import Whisker
 
 EXAGGERATION = 8.0
 
-_READ = 0.1
-"""How often numbers change while something is dragged, s: the browser takes as long for a line of
-text as for a whisker, and nobody reads faster."""
+_READ = 0.05
+"""How often numbers change while something is dragged, s: the browser takes half as long for them
+as for a whisker, and nobody reads faster."""
+
+_REST = 0.15
+"""How long the mouse rests before everything is written, s."""
 
 Transition = Callable[[Bend], Bend]
 
@@ -48,8 +51,8 @@ class Mode(Protocol):
     def redraw(self) -> None:
         """Follow a change of the whisker or of its load with what is in the scene."""
 
-    def write(self) -> None:
-        """Follow it with what is written in the panel."""
+    def write(self, brief: bool = False) -> None:
+        """Follow it with what is written in the panel; briefly: with what one reads meanwhile."""
 
 
 class Page:
@@ -176,7 +179,7 @@ class Page:
             if self.mode is not None:
                 self.mode.redraw()
                 if words:
-                    self.mode.write()
+                    self.mode.write(brief=dragging)
             if dragging:
                 self.grip.follow(self.bend.target)
             else:
@@ -184,9 +187,10 @@ class Page:
         self.server.flush()
         if words:
             self._written = now
-            self.work.drop("words")
+        if dragging:
+            self.work.put("words", self._write, now + _REST)
         else:
-            self.work.put("words", self._write, self._written + _READ)
+            self.work.drop("words")
 
     def _write(self) -> None:
         """Write what has waited."""
@@ -239,6 +243,12 @@ def put(handle: viser.GuiInputHandle[Any], value: Any) -> None:
     """Show a value in a control."""
     control: Any = handle  # type checkers take its value for read-only
     control.value = value
+
+
+def show(handle: viser.GuiHtmlHandle, content: str) -> None:
+    """Write something in the panel, unless it is there already."""
+    if handle.content != content:
+        handle.content = content
 
 
 def look_at(

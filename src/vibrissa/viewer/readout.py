@@ -87,7 +87,12 @@ def _framed(body: str) -> str:
 
 
 def of_deflection(bent: Deflection) -> str:
-    """What the base feels, where the contact is, and what became of the load."""
+    """What became of the load, what the base feels, and where the contact is."""
+    return sentence(Status(int(bent.status))) + numbers(bent)
+
+
+def numbers(bent: Deflection) -> str:
+    """What the base feels, and where the contact is."""
     signals = signals_of(np.asarray(bent.force), np.asarray(bent.moment))
     felt = dict(zip(SIGNALS, signals.tolist(), strict=True))
     x, y, z = np.asarray(bent.contact_point)
@@ -97,4 +102,4 @@ def of_deflection(bent: Deflection) -> str:
         "theta": float(np.arctan2(y, x)),
         "phi": float(np.arctan2(z, np.hypot(x, y))),
     }
-    return sentence(Status(int(bent.status))) + table(felt, "At the base") + table(where, "Contact")
+    return table(felt, "At the base") + table(where, "Contact")

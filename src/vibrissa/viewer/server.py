@@ -11,8 +11,9 @@ import time
 from collections.abc import Sequence
 from os import PathLike
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
+import numpy as np
 import viser
 import xarray as xr
 from numpy.typing import ArrayLike
@@ -25,15 +26,22 @@ from vibrissa.viewer.guard import guarded
 from vibrissa.viewer.locate_panel import LocateMode
 from vibrissa.viewer.map_panel import MapMode
 from vibrissa.viewer.page import Mode, Page
+from vibrissa.viewer.readout import note
 from vibrissa.viewer.save_panel import SaveControls
 from vibrissa.viewer.stage import lit
 from vibrissa.viewer.trial_panel import TrialMode
+from vibrissa.viewer.warming import Warming, rehearsal
 from vibrissa.viewer.watching import Watched, watched
 from vibrissa.viewer.whisker_panel import WhiskerControls
 from vibrissa.whisker import Whisker
 
 HOST = "127.0.0.1"
 PORT = 8080
+
+_COMPILING = (
+    "Compiling, once for this installation, for about a minute. What needs a part that is not "
+    "ready waits for it: pegs, candidates and their errors."
+)
 
 
 class Viewer:
@@ -64,7 +72,7 @@ class Viewer:
             Whisker frame, m.
         """
         self.page.change("drag", lambda bend: moved(loaded(bend, "point"), point))
-        self.page.settle()
+        self.page.work.wait()
 
     def wait(self) -> None:
         """Serve until interrupted."""
@@ -89,7 +97,7 @@ class Viewer:
 
 
 def view(
-    whisker: Whisker,
+    shown: Whisker | ContactMap | xr.DataTree,
     *,
     contacts: ContactMap | None = None,
     recording: xr.DataTree | None = None,
@@ -101,12 +109,13 @@ def view(
 
     Parameters
     ----------
-    whisker : Whisker
-        To look at.
+    shown : Whisker, ContactMap or DataTree
+        To look at: a whisker, its map, or a recording, whose whisker is the one that touches most
+        of the time.
     contacts : ContactMap, optional
-        Its map, if there is one already.
+        The map of the whisker, if there is one already.
     recording : DataTree, optional
-        A trial to watch.
+        A trial to watch beside another whisker or a map.
     videos : sequence of path
         Of the recording, one for each of its cameras, in their order.
     host : str
@@ -122,10 +131,30 @@ def view(
     Raises
     ------
     ValueError
-        If the recording has nothing to look at, there are not as many videos as cameras, or the
-        port is taken or not on this machine.
+        If it is none of these, the same is given twice, the map is that of another whisker, the
+        recording has nothing to look at, there are not as many videos as cameras, or the port is
+        taken or not on this machine.
     """
+    if isinstance(shown, xr.DataTree):
+        recording = _once(recording, shown, "recording")
+    elif isinstance(shown, ContactMap):
+        contacts = _once(contacts, shown, "map")
+    elif not isinstance(shown, Whisker):
+        raise ValueError(
+            "what is shown is a Whisker, a ContactMap or a recording (DataTree); got "
+            f"{type(shown).__name__}. Files are opened by load_whisker, ContactMap.load and "
+            "load_recording, or by `vibrissa view FILE`"
+        )
     trial = None if recording is None else watched(recording)
+    if isinstance(shown, Whisker):
+        whisker = shown
+    elif contacts is not None:
+        whisker = contacts.whisker
+    else:
+        assert trial is not None  # there is nothing else
+        whisker = trial.whiskers[trial.busiest]
+    if contacts is not None and contacts.whisker is not whisker:
+        whisker = _of_one(contacts, whisker)
     with contextlib.ExitStack() as opened:  # closed again if a later step fails
         footage = _footage(trial, videos, opened)
         page = Page(_served(host, port, opened), whisker, contacts)
@@ -138,6 +167,26 @@ def view(
     return viewer
 
 
+def _once(given: Any, shown: Any, name: str) -> Any:
+    """What is shown, where it is not given a second time."""
+    if given is not None:
+        raise ValueError(f"got two {name}s; give one")
+    return shown
+
+
+def _of_one(contacts: ContactMap, whisker: Whisker) -> Whisker:
+    """The whisker of a map, where it is the one that is asked for."""
+    own = contacts.whisker
+    names = ("length", "base_radius", "tip_radius", "youngs_modulus")
+    same = all(np.isclose(getattr(own, name), getattr(whisker, name)) for name in names)
+    if not (same and np.allclose(own.centerline(20), whisker.centerline(20), atol=1e-9)):
+        raise ValueError(
+            f"the map is that of another whisker ({1e3 * own.length:.3f} mm long, this one "
+            f"{1e3 * whisker.length:.3f} mm); leave it out to have one made"
+        )
+    return own
+
+
 def _furnished(
     page: Page, recording: xr.DataTree | None, trial: Watched | None, footage: Sequence[Footage]
 ) -> None:
@@ -145,6 +194,7 @@ def _furnished(
     names = ("Bend", "Locate", "Map") if trial is None else ("Bend", "Locate", "Map", "Trial")
     choice = page.server.gui.add_button_group("Look at", names)
     choice.on_click(lambda event: page.choose(event.target.value))
+    notice = page.server.gui.add_html(note(_COMPILING), visible=False)
     modes: list[Mode] = [BendMode(page), LocateMode(page), MapMode(page)]
     if trial is not None:
         modes.append(TrialMode(page, trial, footage))
@@ -153,7 +203,14 @@ def _furnished(
     SaveControls(page, recording)
     page.choose("Trial" if trial is not None else "Map" if page.has_map else "Bend")
     page.prepare()
-    page.settle()
+    page.work.wait()
+
+    def told(busy: bool) -> None:
+        notice.visible = busy
+
+    warming = Warming(told)
+    page.closing.append(warming.close)
+    warming.start(rehearsal(page))
 
 
 def _footage(

@@ -43,7 +43,7 @@ class TrialMode:
         self._videos = tuple(videos)
         self._now = float(trial.time[0])
         self._speed = SPEEDS[_USUAL]
-        self._whisker = 0
+        self._whisker = trial.busiest
         self._still: tuple[bool, bool] | None = None
         self._objects = self._fit = True
         self._views = views(trial)
@@ -62,7 +62,9 @@ class TrialMode:
             jump = gui.add_button("Next contact", color="blue")
             speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value=_USUAL)
             if len(trial.names) > 1:
-                which = gui.add_dropdown("Signals of", trial.names)
+                which = gui.add_dropdown(
+                    "Signals of", trial.names, initial_value=trial.names[self._whisker]
+                )
                 asked(which, self._choose)
             objects = gui.add_checkbox("Objects", True, visible=bool(trial.objects))
             fit = gui.add_checkbox("Fitted shape", True, visible=trial.contour is not None)
@@ -116,7 +118,7 @@ class TrialMode:
             image = self._videos[view.number].frame(frame) if self._videos else None
             shown.image = picture(view, trial, frame, image)
 
-    def write(self) -> None:
+    def write(self, brief: bool = False) -> None:
         """Write the signals of now, and where now is."""
         trial, frame = self.trial, self.frame
         passed = float(trial.time[frame] - trial.time[0])

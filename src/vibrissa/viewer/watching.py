@@ -77,6 +77,11 @@ class Watched:
         """The frame at a time, s."""
         return int(np.clip(np.searchsorted(self.time, time + 1e-9) - 1, 0, self.frames - 1))
 
+    @property
+    def busiest(self) -> int:
+        """The whisker that touches most of the time; the first of equals."""
+        return int(np.argmax(self.felt.sum(axis=0)))
+
     def onsets(self) -> NDArray[np.int64]:
         """Frames in which a whisker begins to touch."""
         before = np.concatenate([np.zeros((1, self.felt.shape[1]), bool), self.felt[:-1]])

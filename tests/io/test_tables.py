@@ -71,9 +71,15 @@ def test_signals_from_netcdf(tmp_path):
         ("", "is empty"),
         ("# nothing\n", "is empty"),
         (HEADER + "\n", "no rows"),
-        ("time,Fx,Fy,Mx,My\n0,0,0,0,0\n", "lacks Fz, Mz .it has time, Fx"),
-        ("time,Fx_uN,Fy_uN,Fz,Mx,My,Mz\n", "Fx_uN, Fy_uN are in other units"),
-        (HEADER + "\n0,0,0,0,0,0,0\n1,0,zero,0,0,0,0\n2,0\n", "line 3 reads '1,0,zero.*line 4"),
+        ("time,Fx,Fy,Mx,My\n0,0,0,0,0\n", "lacks Fz, Mz. It has the columns time, Fx"),
+        (
+            "time,Fx_g,Fy_raw,Fz,Mx,My,Mz\n",
+            "Fx_g, Fy_raw are in no units that are known, such as N, mN",
+        ),
+        ("0,0,0,0,0,0,0\n", "first line is numbers"),
+        (HEADER + "\n0,0,0,5,0,0,0,0,0,0\n", "line 2 reads.*decimal commas need semicolons"),
+        (HEADER.replace(",", ";") + "\n0.5;1,5;0;0;0;0;0\n", "line 2 reads.*no points elsewhere"),
+        (HEADER + "\n0,0,0,0,0,0,0\n1,0,zero,0,0,0,0\n2,0\n", "line 3 reads '1, 0, zero.*line 4"),
         (HEADER + "\n0,12000,0,0,0,0,0\n", r"Fx reaches 1\.2e\+04 N.*must be"),
         (HEADER + "\n0,0,0,0,0,0,-7000\n", r"Mz reaches 7e\+03 N·m"),
         (HEADER + "\n0,0,inf,0,0,0,0\n", "Fy has infinite"),
@@ -82,6 +88,56 @@ def test_signals_from_netcdf(tmp_path):
 def test_bad_signals(tmp_path, text, message):
     with pytest.raises(ValueError, match=message):
         load_signals(written(tmp_path, text))
+
+
+NUMBERS = [[0.0, 1e-6, 2e-6, 3e-6, 4e-9, 5e-9, 6e-9], [1.5, 1.25e-6, 0.0, -3e-6, 4e-9, 0.0, 6e-9]]
+
+
+def as_text(delimiter=",", header=HEADER, decimal=".", end="\n"):
+    rows = [delimiter.join(repr(x).replace(".", decimal) for x in row) for row in NUMBERS]
+    return end.join([header.replace(",", delimiter), *rows]) + end
+
+
+MICRO = "Time (ms),fx [µN],Force Y (µN),Fz/uN,Mx (mN·mm),ty_µN_m,Torque Z [mN mm]"
+
+
+@pytest.mark.parametrize(
+    ("content", "factors"),
+    [
+        (as_text().encode("utf-8-sig"), 1),
+        (as_text(end="\r\n").encode(), 1),
+        (as_text("\t").encode("utf-16"), 1),
+        (as_text("  ").encode(), 1),
+        (as_text(";", decimal=",").encode(), 1),
+        (("sep=;\n" + as_text(";")).encode(), 1),
+        (as_text().replace("\n1.5", ",\n1.5").encode(), 1),
+        (as_text(";", MICRO, ",").encode("cp1252"), [1e-3, *[1e-6] * 3, *[1e-6] * 3]),
+    ],
+)
+def test_tables_as_spreadsheets_and_loggers_write_them(tmp_path, content, factors):
+    path = tmp_path / "signals.csv"
+    path.write_bytes(content)
+    expected = np.array(NUMBERS) * factors
+    signals = load_signals(path)
+    np.testing.assert_allclose(signals["time"], expected[:, 0], rtol=1e-15)
+    np.testing.assert_allclose(signals["force"], expected[:, 1:4], rtol=1e-15)
+    np.testing.assert_allclose(signals["moment"], expected[:, 4:], rtol=1e-15)
+    assert signals.attrs["notes"] == []
+
+
+def test_missing_cells_and_columns_that_are_something_else(tmp_path):
+    text = "T,max,Fx_raw," + HEADER + "\n20,1,x,0,NA,2e-6,null,,1e-8,#N/A\n"
+    signals = load_signals(written(tmp_path, text))
+    np.testing.assert_array_equal(signals["force"], [[np.nan, 2e-6, np.nan]])
+    np.testing.assert_array_equal(signals["moment"], [[np.nan, 1e-8, np.nan]])
+
+
+def test_time_that_does_not_rise_is_told(tmp_path):
+    rows = "".join(f"{time},1e-6,0,0,1e-8,0,0\n" for time in (0, 1, 1, "", 2, 0))
+    signals = load_signals(written(tmp_path, HEADER + "\n" + rows))
+    back, still = signals.attrs["notes"]
+    assert "goes back in 1 of 6 rows, first in row 6, from 2 to 0 s" in back
+    assert "stands still in 1 of 6 rows, first in row 3" in still
 
 
 def bent_signals(whisker):

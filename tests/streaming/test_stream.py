@@ -63,7 +63,7 @@ def estimator(contacts, names="Fx MB MD", **options):
 
 
 @pytest.mark.parametrize("names", ["Fx MB MD", "MD Fx MB", "Fx FT FD Mx MB MD"])
-@pytest.mark.parametrize("kind", ["components", "signals", "json"])
+@pytest.mark.parametrize("kind", ["components", "signals", "json", "spreadsheet"])
 def test_lines_give_the_contacts(gamma_map, bent, wrench, names, kind):
     lines = list(csv_lines(wrench))
     known = vb.base_signals(bent.force, bent.moment)
@@ -73,6 +73,13 @@ def test_lines_give_the_contacts(gamma_map, bent, wrench, names, kind):
         lines += [f"{0.001 * i}," + ",".join(map(repr, row.tolist())) for i, row in enumerate(rows)]
     if kind == "json":
         lines = [json.dumps(dict(zip(names.split(), row.tolist(), strict=True))) for row in rows]
+    if kind == "spreadsheet":
+        lines = ["Time (ms);Fx [mN];fy_mN;Fz/mN;Mx (mN·mm);Ty_uNm;Torque Z (µN·m)"]
+        size = np.repeat([1e-3, 1e-6], 3)
+        lines += [
+            ";".join(map(repr, [1.0 * i, *(w / size).tolist()])) for i, w in enumerate(wrench)
+        ]
+        lines = [lines[0], *(line.replace(".", ",") for line in lines[1:])]
     running = ContactStream(estimator(gamma_map, names))
     records = list(running.records(lines))
     assert len(records) == len(wrench) == running.samples
@@ -82,7 +89,7 @@ def test_lines_give_the_contacts(gamma_map, bent, wrench, names, kind):
         assert away.min() < 1e-8
         assert record["sigma_x"] > 0.0
         if kind != "json":
-            assert record["time"] == 0.001 * i
+            assert record["time"] == pytest.approx(0.001 * i, rel=1e-15)
 
 
 def test_bad_lines_are_said_and_passed_over(gamma_map, wrench):

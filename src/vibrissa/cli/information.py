@@ -11,12 +11,22 @@ import typer
 from vibrissa.cli.terminal import output
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from xarray import Dataset
 
     from vibrissa.io.tracks import RawTracks
 
+_SHOWN = 12
+_TABLES = """\
+  signals         time, Fx, Fy, Fz, Mx, My, Mz
+  a centreline    x_mm, y_mm, z_mm, from base to tip
+  contacts        time, x, y, z, r, theta, phi, sigma_x, sigma_y, sigma_z, status
+  the head        time or frame; x, y, z; qw, qx, qy, qz, or r11 … r33, or angles
+  contact points  time or frame, x, y, z; or view, frame, x, y
+  tracked points  time or frame; x, y, z or column, row
+  corrections     view, frame, whisker, x, y
+  whiskers        name, x_mm, y_mm, z_mm, azimuth_deg, …, length_mm, coefficient_per_mm"""
 _PACKAGES = ("numpy", "scipy", "numba", "xarray", "h5netcdf", "matplotlib")
 
 
@@ -256,37 +266,48 @@ def _compared(path: Path) -> Iterator[tuple[str, str]]:
 
 def _table(path: Path) -> Iterator[tuple[str, str]]:
     """What a CSV file is."""
-    from collections.abc import Callable
-
     from vibrissa.io import (
+        Kind,
         load_contact_points,
         load_contacts,
         load_corrections,
         load_head,
         load_signals,
         load_whisker,
+        recognise,
     )
 
     # A centreline comes last: other tables have columns x, y and z too.
-    readers: tuple[tuple[str, Callable[[Path], Any]], ...] = (
-        ("contacts", load_contacts),
-        ("signals", load_signals),
-        ("the head's pose", load_head),
-        ("contact points", load_contact_points),
-        ("corrections", load_corrections),
-        ("whisker", load_whisker),
+    readers: tuple[tuple[str, Kind | None, Callable[[Path], Any]], ...] = (
+        ("contacts", Kind.CONTACTS, load_contacts),
+        ("signals", Kind.SIGNALS, load_signals),
+        ("the head's pose", Kind.HEAD, load_head),
+        ("contact points", None, load_contact_points),
+        ("corrections", Kind.CORRECTIONS, load_corrections),
+        ("whisker", Kind.CENTERLINE, load_whisker),
     )
-    faults = []
-    for kind, reader in readers:
+    looks = recognise(path)
+    for kind, known, reader in readers:
         try:
             data = reader(path)
-        except ValueError as fault:
-            faults.append(f"as {kind}: {fault}")
+        except ValueError:
+            # What it looks like tells best what is wrong with it.
+            if known == looks:
+                raise
             continue
         yield "kind", f"table of {kind}" if kind != "whisker" else "centreline of a whisker"
         yield from _rows(kind, data)
         return
-    raise ValueError(f"{path} is no table that is known. " + " ".join(faults))
+    raise ValueError(f"{path} is no table that is known: {_header(path)}. Known are\n{_TABLES}")
+
+
+def _header(path: Path) -> str:
+    """What a table begins with."""
+    from vibrissa.io.table import read_text, table_rows
+
+    cells = next(table_rows(read_text(path)), (0, []))[1]
+    shown = ", ".join(cells[:_SHOWN]) + (", …" if len(cells) > _SHOWN else "")
+    return f"its first line is {shown}" if cells else "it has no lines"
 
 
 def _rows(kind: str, data: Any) -> Iterator[tuple[str, str]]:
@@ -295,6 +316,9 @@ def _rows(kind: str, data: Any) -> Iterator[tuple[str, str]]:
 
     if kind == "whisker":
         yield "whisker", repr(data)
+        base, tip = (data.pose.to_source(data.position(s)) * 1e3 for s in (0.0, data.length))
+        for name, (x, y, z) in (("base", base), ("tip", tip)):
+            yield name, f"at ({x:.2f}, {y:.2f}, {z:.2f}) mm in the file"
         yield from (("note", note) for note in data.notes)
     elif kind == "corrections":
         for view, each in data.items():
@@ -307,6 +331,7 @@ def _rows(kind: str, data: Any) -> Iterator[tuple[str, str]]:
         told = time[np.isfinite(time)]
         span = f"from {told.min():g} to {told.max():g} s" if told.size else "at times not told"
         yield "rows", f"{time.size}, {span}"
+        yield from (("note", note) for note in data.attrs.get("notes", ()))
         if kind == "contacts":
             for sentence, count in describe(data["status"].values).most_common():
                 yield str(count), sentence

@@ -231,6 +231,8 @@ def _from_table(signals: Path, path: Path, how: How, noise: tuple[Array, str] | 
 
     covariance, said = noise or noise_from(None, FORCE_NOISE * 1e6, None) or (None, "")
     wrench, _ = wrench_from(signals)
+    for note in wrench.attrs.get("notes", ()):
+        say(f"{signals}: {note}")
     maps = maps_from(how.charts, 1, how.grid) if how.charts else []
     known = maps[0].whisker if maps else whisker_from(how.whisker)
     _check_scale(signals, wrench, known)

@@ -33,7 +33,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from vibrissa.io.array_table import few, table_lines, whiskers_from_table
-from vibrissa.io.centerline import load_whisker
+from vibrissa.io.centerline import load_whisker, tells_radius
 from vibrissa.io.netcdf import is_netcdf, kind_of, reading
 from vibrissa.io.replace import replacing
 from vibrissa.io.whisker_stack import separate_whiskers, stacked_whiskers
@@ -133,8 +133,10 @@ def _folder(path: Path, base: Any, noise: float | None) -> WhiskerArray:
         except ValueError as fault:
             faults.append(f"{file.name}: {fault}")
             continue
-        radii: Any = published_radii(identity, whisker.length)
-        whiskers.append(whisker.with_properties(**radii))
+        if not tells_radius(file):
+            radii: Any = published_radii(identity, whisker.length)
+            whisker = whisker.with_properties(**radii)
+        whiskers.append(whisker)
     if faults:
         raise ValueError(f"{path}: {few(faults)}")
     return _array(path, whiskers)

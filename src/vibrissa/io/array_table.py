@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.io.centerline import UNITS
+from vibrissa.io.centerline import UNITS, check_slender
 from vibrissa.io.table import read_text, table_rows
 from vibrissa.whisker import Whisker
 from vibrissa.whisker.array import WhiskerArray
@@ -80,6 +80,8 @@ def _whisker(
     """One line's whisker."""
     stated: Any = published_radii(Identity.of(name), length) | radii
     whisker = Whisker.parabola(length, coefficient, name=name, **stated)
+    for radius in radii.values():
+        check_slender(radius, length)
     bound = float(curvature_bound(length))
     if abs(coefficient) > bound:
         warnings.warn(

@@ -1,10 +1,15 @@
 """Digitised centrelines as CSV.
 
 The first line that is neither empty nor a comment (#) is the header. It names the coordinates and
-with them the unit: `x_mm,y_mm,z_mm` (also `_um`, `_m`), or `x,y,z` in metres. Without z the points
-lie in the plane z = 0. Other columns are left alone.
+with them the unit: `x_mm,y_mm,z_mm` (also `_um`, `_cm`, `_m`; `x (mm)`), or `x,y,z` in metres.
+Without z the points lie in the plane z = 0. A column `radius_um` or `diameter_um`, in any of these
+units or that of the coordinates, tells how thick the whisker is there; where its cells are empty,
+the radius goes on evenly between its neighbours, and at the ends as it was. Other columns are left
+alone, and so are rows without any coordinate.
 """
 
+import re
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Unpack
@@ -12,8 +17,9 @@ from typing import Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vibrissa.io.columns import LENGTHS, unit_factor
 from vibrissa.io.replace import replacing
-from vibrissa.io.table import read_text, table_rows
+from vibrissa.io.table import is_number, read_rows, read_text, table_rows
 from vibrissa.whisker import Whisker
 from vibrissa.whisker.section import Properties
 
@@ -22,7 +28,13 @@ Array = NDArray[np.float64]
 UNITS = {"": 1.0, "_m": 1.0, "_mm": 1e-3, "_um": 1e-6, "_µm": 1e-6}
 """Suffix of a column's name and the length it stands for, m."""
 
-ALLOWED = "x_mm,y_mm,z_mm (also _um, _m) or x,y,z in metres; z may be left out"
+ALLOWED = "x_mm,y_mm,z_mm (also _um, _cm, _m) or x,y,z in metres; z may be left out"
+
+_COORDINATE = re.compile(r"([xyz])(?![a-z0-9])(.*)", re.IGNORECASE)
+_THICKNESS = re.compile(r"(radius|diameter)(?![a-z0-9])(.*)", re.IGNORECASE)
+_THINNEST, _THICKEST = 1e-5, 0.1
+_TAPERED = 1.5
+"""How much thicker an end is, at least, that is known by it as the base."""
 
 
 def load_centerline(path: str | PathLike[str]) -> Array:
@@ -46,44 +58,99 @@ def load_centerline(path: str | PathLike[str]) -> Array:
         If the file is empty, has no header, lacks columns or has cells that are no numbers; all
         bad cells are named with their lines.
     """
-    path = Path(path)
+    return _table(Path(path))[0]
+
+
+def _table(path: Path) -> tuple[Array, Array | None, str]:
+    """Points (n, 3) and, if they are told, radii (n,), m; and the unit of the coordinates."""
     rows = table_rows(read_text(path))
     header = next(rows, None)
     if header is None:
         raise ValueError(f"{path} is empty; a header {ALLOWED} and at least 4 points are needed")
     columns, factor = _columns(path, header[1])
-    points, faults = [], []
-    for line, cells in rows:
-        try:
-            points.append([float(cells[column]) for column in columns])
-        except (ValueError, IndexError):
-            faults.append(f"line {line} reads {','.join(cells)!r}")
-    if faults:
-        more = "" if len(faults) <= 5 else f"; and {len(faults) - 5} more lines"
-        raise ValueError(
-            f"{path} has cells that are no numbers, or too few: {'; '.join(faults[:5])}{more}"
-        )
-    array = np.array(points, dtype=np.float64).reshape(-1, len(columns)) * factor
-    return array if len(columns) == 3 else np.column_stack([array, np.zeros(len(array))])
+    thickness = _thickness(path, header[1], factor)
+    places = [*columns, *(place for place, _ in thickness)]
+    array = read_rows(path, rows, len(header[1]), places)
+    array = array[np.isfinite(array[:, : len(columns)]).any(axis=1)]
+    points = array[:, : len(columns)] * factor
+    if len(columns) == 2:
+        points = np.column_stack([points, np.zeros(len(points))])
+    unit = next(name for name, length in LENGTHS.items() if length == factor)
+    return points, array[:, -1] * thickness[0][1] if thickness else None, unit
 
 
 def _columns(path: Path, header: list[str]) -> tuple[list[int], float]:
     """Where the coordinates stand, and the length of their unit, m."""
-    names = [name.lower() for name in header]
-    for suffix, factor in UNITS.items():
-        found = [f"{axis}{suffix}" for axis in "xyz" if f"{axis}{suffix}" in names]
-        if found[:2] == [f"x{suffix}", f"y{suffix}"]:
-            mixed = len(found) == 2 and any(f"z{other}" in names for other in UNITS)
-            if mixed:
-                break
-            return [names.index(name) for name in found], factor
-    try:
-        [float(name) for name in header]
-    except ValueError:
+    found: dict[float, dict[str, int]] = {}
+    for place, name in enumerate(header):
+        match = _COORDINATE.fullmatch(name)
+        if match and (factor := unit_factor(match[2], "length")) is not None:
+            found.setdefault(factor, {}).setdefault(match[1].lower(), place)
+    elsewhere = sum("z" in axes for axes in found.values())
+    for factor, axes in found.items():
+        if {"x", "y"} <= set(axes) and ("z" in axes or not elsewhere):
+            return [axes[axis] for axis in "xyz" if axis in axes], factor
+    if not all(is_number(name) for name in header):
         raise ValueError(
             f"{path} has the columns {', '.join(header)}; {ALLOWED}, all in one unit, is needed"
-        ) from None
+        )
     raise ValueError(f"{path} has no header: its first line is numbers; {ALLOWED} is needed")
+
+
+def _thickness(path: Path, header: list[str], coordinates: float) -> list[tuple[int, float]]:
+    """Where radius or diameter stands, and what makes it a radius in m; at most one."""
+    found = []
+    for place, name in enumerate(header):
+        match = _THICKNESS.fullmatch(name)
+        if match is None:
+            continue
+        factor = unit_factor(match[2], "length")
+        if factor is None:
+            continue
+        unit = factor if match[2].strip() else coordinates
+        found.append((place, unit if match[1].lower() == "radius" else 0.5 * unit))
+    if len(found) > 1:
+        names = " and ".join(header[place] for place, _ in found)
+        raise ValueError(f"{path} has {names}; one of them is needed, or none")
+    return found
+
+
+def check_slender(radius: float, length: float) -> None:
+    """Refuse a radius in another unit than it is said to be in.
+
+    Parameters
+    ----------
+    radius : float
+        The largest, m.
+    length : float
+        Of the whisker, m.
+
+    Raises
+    ------
+    ValueError
+        If no whisker, hair or wire is as thick or as thin.
+    """
+    if not _THINNEST < radius / length < _THICKEST:
+        raise ValueError(
+            f"the radius is {radius * 1e6:.4g} µm on a whisker of {length * 1e3:.4g} mm; its "
+            "column must be called by its unit, such as radius_um"
+        )
+
+
+def tells_radius(path: str | PathLike[str]) -> bool:
+    """Tell whether a table of a centreline has a column of radii.
+
+    Parameters
+    ----------
+    path : str or path
+        CSV.
+
+    Returns
+    -------
+    bool
+        Whether `load_whisker` takes the radius from it.
+    """
+    return _table(Path(path))[1] is not None
 
 
 def save_centerline(path: str | PathLike[str], points: ArrayLike) -> None:
@@ -120,9 +187,10 @@ def load_whisker(
     noise : float, optional
         Standard deviation of a coordinate, m; 0 asks for interpolation. By default it is estimated.
     base : {"first", "last"} or array (3,), optional
-        Which end is the base: by name, or a point near it, m. By default the first.
+        Which end is the base: by name, or a point near it, m. By default the thicker one where the
+        file tells radii that differ, and otherwise the first.
     **properties
-        Radius and material; see `Whisker`.
+        Radius and material; see `Whisker`. A radius that is given counts more than the file's.
 
     Returns
     -------
@@ -136,9 +204,47 @@ def load_whisker(
     ValueError
         If it cannot be read or holds no centreline.
     """
-    points = load_centerline(path)
+    points, radii, unit = _table(Path(path))
     properties.setdefault("name", Path(path).stem)
+    stated = {"radius", "base_radius", "tip_radius"} & set(properties)
     try:
-        return Whisker.from_points(points, noise=noise, base=base, **properties)
+        if radii is None or stated:
+            return Whisker.from_points(points, noise=noise, base=base, **properties)
+        return _tapered(points, radii, noise, base, properties)
     except ValueError as fault:
-        raise ValueError(f"{path}: {fault}") from None
+        raise ValueError(f"{path}: {fault} (by the header coordinates are in {unit})") from None
+
+
+def _tapered(
+    points: Array,
+    radii: Array,
+    noise: float | None,
+    base: str | ArrayLike | None,
+    properties: Properties,
+) -> Whisker:
+    """A whisker with the radius that was measured along it; its thicker end is the base."""
+    known = np.isfinite(radii)
+    if not known.any():
+        return Whisker.from_points(points, noise=noise, base=base, **properties)
+    faults = [f"{radii[i] * 1e6:g} µm at point {i + 1}" for i in np.flatnonzero(radii <= 0.0)]
+    if faults:
+        raise ValueError(
+            f"the radius must be positive; it is {'; '.join(faults[:5])} (leave the cell empty "
+            "where it was too thin to be measured)"
+        )
+    notes: tuple[str, ...] = ()
+    if base is None:
+        halves = [part[np.isfinite(part)] for part in np.array_split(radii, 2)]
+        if all(map(len, halves)) and halves[1].mean() > _TAPERED * halves[0].mean():
+            base = "last"
+            notes = ("its thicker end, the last point of the file, was taken as the base",)
+    whisker = Whisker.from_points(points, noise=noise, base=base, **properties)
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    s = np.append(0.0, np.cumsum(steps)) / steps.sum() * whisker.length
+    first, last = (np.linalg.norm(points[end] - whisker.pose.origin) for end in (0, -1))
+    if last < first:
+        s, radii, known = (whisker.length - s)[::-1], radii[::-1], known[::-1]
+    check_slender(float(radii[known].max()), whisker.length)
+    everywhere = np.interp(s, s[known], radii[known])
+    whisker = whisker.with_properties(radius=np.column_stack([s, everywhere]))
+    return replace(whisker, notes=(*whisker.notes, *notes))

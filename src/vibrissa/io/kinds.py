@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from enum import StrEnum
 from os import PathLike
 from pathlib import Path
 
 import h5py
 
+from vibrissa.io.columns import signal_column
 from vibrissa.io.corrections import COLUMNS as CORRECTIONS
 from vibrissa.io.hdf5 import opened
 from vibrissa.io.head import ANGLES, MATRIX, QUATERNION
@@ -118,12 +120,12 @@ def _of_text(path: Path) -> Kind:
     names = [name.lower() for name in first[1]]
     if names[0].startswith("["):
         return Kind.CALIBRATION
-    plain = {name.split("_")[0] for name in names}
+    plain = {re.split(r"[ _/(\[]", name)[0] for name in names}
     if names[0] == "scorer":
         return Kind.DEEPLABCUT
     if any(name.endswith("_ncams") for name in names):
         return Kind.ANIPOSE
-    if {"fx", "mx"} <= plain:
+    if {"Fx", "Mx"} <= {signal_column(name)[0] for name in first[1]}:
         return Kind.SIGNALS
     if {"theta", "phi", "status"} <= set(names):
         return Kind.CONTACTS

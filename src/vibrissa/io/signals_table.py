@@ -2,9 +2,9 @@
 
 CSV, or a NetCDF file with variables of these names along one dimension. Lines that are empty or
 begin with # are passed over, other columns are left alone, and an empty cell or ``nan`` is missing.
-A name may carry its SI unit, ``Fx_N`` or ``Mx_Nm``; other units are refused by name, and so are
-numbers that cannot be what they say: too large, or with a moment too large or small for the force,
-as |M| / |F| is at most the distance of the contact.
+A name may carry a unit (:mod:`vibrissa.io.columns`), ``Fx_mN`` or ``Mx (µN·m)``; what is no unit is
+refused by name, and so are numbers that cannot be what they say: too large, or with a moment too
+large or small for the force, as |M| / |F| is at most the distance of the contact.
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from vibrissa.io.columns import signal_columns, unit_factor, units_of
 from vibrissa.io.netcdf import is_netcdf, kind_of
 from vibrissa.io.replace import replacing
-from vibrissa.io.table import read_text, table_rows
+from vibrissa.io.table import is_number, read_rows, read_text, table_rows
 from vibrissa.quantities import attributes
 from vibrissa.whisker import Whisker
 
@@ -27,7 +28,7 @@ Array = NDArray[np.float64]
 COLUMNS = ("time", "Fx", "Fy", "Fz", "Mx", "My", "Mz")
 """Names of the columns, in the order in which they are written."""
 
-_UNITS = {"time": "s", "F": "N", "M": "Nm"}
+_KINDS = {"t": "time", "F": "force", "M": "moment"}
 # What a wire of steel as thick as a finger holds.
 _LARGEST = {"F": (1e4, "N"), "M": (1e3, "N·m")}
 _LEVER_ARMS = (1e-4, 1.0)
@@ -47,6 +48,7 @@ def load_signals(path: str | PathLike[str]) -> xr.Dataset:
     -------
     xarray.Dataset
         Dims time, space: ``force``, N, and ``moment``, N·m, in the whisker's frame at its base.
+        The attribute ``notes`` says where time does not rise, if there.
 
     Raises
     ------
@@ -54,13 +56,30 @@ def load_signals(path: str | PathLike[str]) -> xr.Dataset:
         If there is no such file.
     ValueError
         If it is empty, lacks columns, or has cells that are no numbers; or if the numbers cannot be
-        in SI units.
+        in the units that they are said to be.
     """
     path = Path(path)
     table = _netcdf(path) if is_netcdf(path) else _csv(path)
     _check_magnitudes(path, table)
     _check_lever_arm(path, table)
-    return _dataset(table)
+    return _dataset(table).assign_attrs(notes=_notes(table[:, 0]))
+
+
+def _notes(time: Array) -> list[str]:
+    """Where time does not rise, as when trials stand one below the other."""
+    known = np.flatnonzero(np.isfinite(time))
+    step = np.diff(time[known])
+    notes = []
+    for wrong, said in ((step < 0.0, "goes back"), (step == 0.0, "stands still")):
+        if wrong.any():
+            first = int(np.flatnonzero(wrong)[0])
+            before, after = known[first], known[first + 1]
+            notes.append(
+                f"time {said} in {int(wrong.sum())} of {time.size} rows, first in row {after + 1}, "
+                f"from {time[before]:g} to {time[after]:g} s; rows are taken each on its own, in "
+                "the order of the file"
+            )
+    return notes
 
 
 def check_scale(wrench: xr.Dataset, whisker: Whisker) -> None:
@@ -133,43 +152,33 @@ def _csv(path: Path) -> Array:
     header = next(rows, None)
     if header is None:
         raise ValueError(f"{path} is empty; a header {','.join(COLUMNS)} and rows are needed")
-    columns = _columns(path, header[1])
-    values, faults = [], []
-    for line, cells in rows:
-        try:
-            values.append([float(cells[column] or "nan") for column in columns])
-        except (ValueError, IndexError):
-            faults.append(f"line {line} reads {','.join(cells)!r}")
-    if faults:
-        more = "" if len(faults) <= 5 else f"; and {len(faults) - 5} more lines"
-        raise ValueError(
-            f"{path} has cells that are no numbers, or too few: {'; '.join(faults[:5])}{more}"
-        )
-    if not values:
+    columns, factors = _columns(path, header[1])
+    values = read_rows(path, rows, len(header[1]), columns)
+    if not len(values):
         raise ValueError(f"{path} has a header but no rows")
-    return np.array(values, dtype=np.float64)
+    return values * factors
 
 
-def _columns(path: Path, header: list[str]) -> list[int]:
-    """Where each column stands; all that is wrong with the header in one error."""
-    columns, missing, units = [], [], []
-    for name in COLUMNS:
-        allowed = {name, f"{name}_{_UNITS[name if name == 'time' else name[0]]}"}
-        found = [i for i, cell in enumerate(header) if cell in allowed]
-        other = [cell for cell in header if cell.startswith(f"{name}_") and cell not in allowed]
-        if found:
-            columns.append(found[0])
-        elif other:
-            units += other
-        else:
-            missing.append(name)
+def _columns(path: Path, header: list[str]) -> tuple[list[int], Array]:
+    """Where each column stands and its unit; all that is wrong with the header in one error."""
+    found, strange = signal_columns(header, COLUMNS)
+    missing = [name for name in COLUMNS if name not in found and name not in strange]
     faults = [f"it lacks {', '.join(missing)}"] if missing else []
-    if units:
-        faults.append(f"{', '.join(units)} are in other units: convert to s, N and N·m")
+    if strange:
+        cells = [cell for columns in strange.values() for cell in columns]
+        kinds = dict.fromkeys(_KINDS[name[0]] for name in strange)
+        units = ", ".join(units_of(kind) for kind in kinds)
+        faults.append(f"{', '.join(cells)} are in no units that are known, such as {units}")
     if faults:
         got = ", ".join(header)
-        raise ValueError(f"{path} is no table of signals: {'; '.join(faults)} (it has {got})")
-    return columns
+        if all(is_number(cell) for cell in header):
+            faults = ["its first line is numbers, not names (lines with # are comments)"]
+        raise ValueError(
+            f"{path} is no table of signals: {'; '.join(faults)}. It has the columns {got}; "
+            f"{', '.join(COLUMNS)} are needed, in SI units or with one as in Fx_mN"
+        )
+    places = [found[name] for name in COLUMNS]
+    return [place for place, _ in places], np.array([factor for _, factor in places])
 
 
 def _netcdf(path: Path) -> Array:
@@ -182,11 +191,21 @@ def _netcdf(path: Path) -> Array:
             raise ValueError(
                 f"{path} is no table of signals: it lacks {', '.join(missing)} (it has {got})"
             )
-        columns = [np.asarray(data[name].values, dtype=np.float64) for name in COLUMNS]
+        columns = [_in_si(path, data[name]) for name in COLUMNS]
     if any(column.ndim != 1 for column in columns) or len({c.size for c in columns}) != 1:
         shapes = {name: c.shape for name, c in zip(COLUMNS, columns, strict=True)}
         raise ValueError(f"{path}: all columns must run along time; got shapes {shapes}")
     return np.column_stack(columns)
+
+
+def _in_si(path: Path, variable: xr.DataArray) -> Array:
+    """Values of a variable by its attribute ``units``, if it has one."""
+    kind = _KINDS[str(variable.name)[0]]
+    unit = str(variable.attrs.get("units", ""))
+    factor = unit_factor(unit, kind)
+    if factor is None:
+        raise ValueError(f"{path}: {variable.name} is in {unit}; {units_of(kind)} are known")
+    return np.asarray(variable.values, dtype=np.float64) * factor
 
 
 def _check_magnitudes(path: Path, table: Array) -> None:

@@ -1,15 +1,27 @@
-"""Tables as text: lines of cells."""
+"""Tables as text: lines of cells.
+
+As spreadsheets and loggers write them: cells are parted by commas, semicolons, tabs or blanks,
+whichever the first line has most of; where it is not commas, a number may have a decimal comma.
+"""
 
 from __future__ import annotations
 
+import codecs
 import csv
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Sequence
 from os import PathLike
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vibrissa.io.paths import check_readable
+
+_MISSING = frozenset({"", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--"})
+_COMMA = re.compile(r"[+-]?(?:\d+,\d*|,\d+)(?:[eE][+-]?\d+)?")
+_SAID = re.compile(r"sep=([,;\t])", re.IGNORECASE)
+# Spreadsheets in Western Europe write µ, ° and umlauts so; anything else is no text of theirs.
+_SPREADSHEET = re.compile(rb"[\t\n\r\x20-\x7e\xa0-\xff]*")
 
 
 def read_text(path: str | PathLike[str]) -> str:
@@ -18,7 +30,8 @@ def read_text(path: str | PathLike[str]) -> str:
     Parameters
     ----------
     path : str or path
-        In UTF-8, with or without the byte order mark that spreadsheets put first.
+        In UTF-8 or UTF-16, with or without the byte order mark that spreadsheets put first, or in
+        the Western European encoding of older ones.
 
     Returns
     -------
@@ -34,13 +47,16 @@ def read_text(path: str | PathLike[str]) -> str:
     """
     path = check_readable(path)
     content = path.read_bytes()
+    utf16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     try:
-        text = content.decode("utf-8-sig")
+        text = content.decode("utf-16" if utf16 else "utf-8-sig")
     except UnicodeDecodeError as error:
-        at = error.start
-        raise ValueError(
-            f"{path} is no table as text in UTF-8: byte {at} is {content[at]:#04x}"
-        ) from None
+        if not _SPREADSHEET.fullmatch(content):
+            at = error.start
+            raise ValueError(
+                f"{path} is no table as text in UTF-8: byte {at} is {content[at]:#04x}"
+            ) from None
+        text = content.decode("cp1252")
     if "\0" in text:
         raise ValueError(f"{path} is no table as text: byte {content.find(0)} is zero")
     return text
@@ -58,11 +74,165 @@ def table_rows(text: str) -> Iterator[tuple[int, list[str]]]:
     ------
     tuple of int and list of str
         Number and cells, without blanks around them, of every line that is neither empty nor a
-        comment (#).
+        comment (#). Decimal commas are points.
     """
-    for number, line in enumerate(text.splitlines(), start=1):
-        if line.strip() and not line.lstrip().startswith("#"):
-            yield number, [cell.strip() for cell in next(csv.reader([line]))]
+    lines = [
+        (number, line)
+        for number, line in enumerate(text.splitlines(), start=1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    if lines and (said := _SAID.fullmatch(lines[0][1].strip())):
+        delimiter = said[1]
+        del lines[0]
+    else:
+        delimiter = delimiter_of(lines[0][1]) if lines else ","
+    rows = [cells_of(line, delimiter) for _, line in lines]
+    if delimiter != "," and not any("." in cell and is_number(cell) for r in rows for cell in r):
+        rows = [[with_point(cell) for cell in row] for row in rows]
+    yield from zip((number for number, _ in lines), rows, strict=True)
+
+
+def delimiter_of(header: str) -> str:
+    """Tell what parts the cells of a table.
+
+    Parameters
+    ----------
+    header : str
+        Its first line.
+
+    Returns
+    -------
+    str
+        A comma, a semicolon, a tab, or a blank for any number of them.
+    """
+    most = max(",;\t", key=header.count)
+    return most if header.count(most) or len(header.split()) < 2 else " "
+
+
+def cells_of(line: str, delimiter: str) -> list[str]:
+    """Take a line of a table apart.
+
+    Parameters
+    ----------
+    line : str
+        With or without its end.
+    delimiter : str
+        As `delimiter_of` tells it.
+
+    Returns
+    -------
+    list of str
+        Cells, without blanks around them.
+    """
+    if delimiter == " ":
+        return line.split()
+    return [cell.strip() for cell in next(csv.reader([line.rstrip("\r\n")], delimiter=delimiter))]
+
+
+def with_point(cell: str) -> str:
+    """Write a number that has a decimal comma with a point; leave other text alone.
+
+    Parameters
+    ----------
+    cell : str
+        Of a table that is not parted by commas.
+
+    Returns
+    -------
+    str
+        Such as ``1.5e-3`` of ``1,5e-3``.
+    """
+    return cell.replace(",", ".") if _COMMA.fullmatch(cell) else cell
+
+
+def is_number(cell: str) -> bool:
+    """Tell whether a cell is a number.
+
+    Parameters
+    ----------
+    cell : str
+        Of a table.
+
+    Returns
+    -------
+    bool
+        Missing ones are numbers as well.
+    """
+    try:
+        number(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def number(cell: str) -> float:
+    """Read a cell.
+
+    Parameters
+    ----------
+    cell : str
+        Of a table.
+
+    Returns
+    -------
+    float
+        NaN where it is empty or says that it is missing, as ``NA`` or ``null`` do.
+
+    Raises
+    ------
+    ValueError
+        If it is neither.
+    """
+    return float("nan") if cell.lower() in _MISSING else float(cell)
+
+
+def read_rows(
+    path: str | PathLike[str],
+    rows: Iterator[tuple[int, list[str]]],
+    width: int,
+    columns: Sequence[int],
+) -> NDArray[np.float64]:
+    """Read some columns of numbers.
+
+    Parameters
+    ----------
+    path : str or path
+        Of the table, for messages.
+    rows : iterator
+        Those of `table_rows` that follow the header.
+    width : int
+        How many columns the header names.
+    columns : sequence of int
+        Which to read, from 0.
+
+    Returns
+    -------
+    array (rows, columns)
+        Missing is NaN.
+
+    Raises
+    ------
+    ValueError
+        If a cell is no number, or a line has too few cells, or too many that are not empty; the
+        first such lines are named.
+    """
+    values, faults, commas = [], [], False
+    for line, cells in rows:
+        try:
+            values.append([number(cells[column]) for column in columns])
+            wrong = any(cells[width:])
+        except (ValueError, IndexError):
+            wrong = True
+        if wrong:
+            faults.append(f"line {line} reads {', '.join(cells)!r}")
+            commas |= len(cells) > width or any(_COMMA.fullmatch(cell) for cell in cells)
+    if faults:
+        advice = "; decimal commas need semicolons or tabs between cells, and no points elsewhere"
+        raise ValueError(
+            f"{path} has cells that are no numbers, or not one for each of the {width} columns: "
+            f"{_few(faults)}{advice if commas else ''}"
+        )
+    return np.array(values, dtype=np.float64).reshape(-1, len(columns))
 
 
 def read_numbers(path: str | PathLike[str]) -> tuple[list[str], NDArray[np.float64]]:
@@ -117,7 +287,7 @@ def _numbers(
     values, faults = np.full(len(cells), np.nan), []
     for i, (line, cell) in enumerate(cells):
         try:
-            values[i] = float(cell) if cell else np.nan
+            values[i] = number(cell)
         except ValueError:
             faults.append(f"line {line} reads {cell!r}")
     if faults and np.isfinite(values).any():

@@ -71,7 +71,7 @@ class ContactStream:
         if tare and estimator.sensor is None:
             raise ValueError("the offset is that of a sensor's channels, and there is no sensor")
         by_name = estimator.announced
-        self.lines = Lines(names or by_name, *(() if names else (_components(by_name),)))
+        self.lines = Lines(names, raw=True) if names else Lines(by_name, _components(by_name))
         self.samples, self.faults = 0, 0
         self._estimator, self._follow = estimator, follow
         self._which = [SIGNALS.index(name) for name in by_name] if names is None else []

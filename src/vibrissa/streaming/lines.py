@@ -1,9 +1,10 @@
 """Lines of signals: CSV with a header, or one JSON object a line.
 
-Both carry numbers by name, in SI units. The pose of the base may ride along: ``base_x``, ``base_y``
-and ``base_z`` (m, laboratory), and a unit quaternion ``base_qw``, ``base_qx``, ``base_qy``,
-``base_qz`` that turns the whisker's into the laboratory frame. A JSON object may hold a pose and
-its time alone.
+Both carry numbers by name, in SI units; signals of a table may be in others if its header says so
+(:mod:`vibrissa.io.columns`), and its cells may be parted by semicolons, tabs or blanks. The pose of
+the base may ride along: ``base_x``, ``base_y`` and ``base_z`` (m, laboratory), and a unit
+quaternion ``base_qw``, ``base_qx``, ``base_qy``, ``base_qz`` that turns the whisker's into the
+laboratory frame. A JSON object may hold a pose and its time alone.
 """
 
 from __future__ import annotations
@@ -17,6 +18,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from vibrissa.io.columns import signal_columns
+from vibrissa.io.table import cells_of, delimiter_of, is_number, number, with_point
+from vibrissa.signals import SIGNALS
+
 Array = NDArray[np.float64]
 
 POSITION = ("base_x", "base_y", "base_z")
@@ -25,6 +30,8 @@ POSITION = ("base_x", "base_y", "base_z")
 QUATERNION = ("base_qw", "base_qx", "base_qy", "base_qz")
 """Columns with its orientation."""
 
+# What a header may call otherwise, or give in other units.
+_SIGNALS = ("time", "Fx", "Fy", "Fz", "Mx", "My", "Mz", *SIGNALS)
 # A quaternion that was rounded is no longer of unit length by this much.
 _UNIT = 0.01
 # Seconds since any epoch are fewer; what is more is in a smaller unit.
@@ -65,6 +72,8 @@ class Lines:
     ----------
     *names : sequence of str
         The values wanted, or several choices of them: the first that a line has counts.
+    raw : bool
+        Whether they are a sensor's channels, which are called as they are and have no units.
 
     Attributes
     ----------
@@ -74,10 +83,12 @@ class Lines:
         Headers so far: another one comes from a sender that has begun anew.
     """
 
-    def __init__(self, *names: tuple[str, ...]) -> None:
-        self.names = names
+    def __init__(self, *names: tuple[str, ...], raw: bool = False) -> None:
+        self.names, self.raw = names, raw
         self.number, self.headers = 0, 0
         self._header: list[str] | None = None
+        self._delimiter = ","
+        self._factors: dict[str, float] = {}
 
     def __call__(self, line: str) -> Sample | None:
         """Read one line.
@@ -122,18 +133,41 @@ class Lines:
 
     def _row(self, text: str) -> dict[str, object] | None:
         try:
-            cells = [cell.strip() for cell in next(csv.reader([text]))]
+            cells = cells_of(text, delimiter_of(text) if self._header is None else self._delimiter)
         except csv.Error as error:
             raise ValueError(f"no CSV: {error}") from None
-        if self._header is None:
-            self._chosen("the header", cells)
-        if self._header is None or any(set(names) <= set(cells) for names in self.names):
-            self._header = cells
-            self.headers += 1
-            return None
+        if self._header is None or not is_number(cells[0]):
+            names, factors = self._named(cells)
+            if self._header is None:
+                self._chosen("the header", names)
+            if self._header is None or any(set(choice) <= set(names) for choice in self.names):
+                self._header, self._factors = names, factors
+                self._delimiter = delimiter_of(text)
+                self.headers += 1
+                return None
+        if len(cells) > len(self._header) and not any(cells[len(self._header) :]):
+            cells = cells[: len(self._header)]
         if len(cells) != len(self._header):
             raise ValueError(f"{len(cells)} cells; the header has {len(self._header)}")
-        return dict(zip(self._header, cells, strict=True))
+        if self._delimiter != "," and not any("." in cell for cell in cells):
+            cells = [with_point(cell) for cell in cells]
+        known: dict[str, object] = dict(zip(self._header, cells, strict=True))
+        for name, factor in self._factors.items():
+            known[name] = factor * _number(name, known[name])
+        return known
+
+    def _named(self, cells: list[str]) -> tuple[list[str], dict[str, float]]:
+        """Names of columns as they are used here, and what makes their numbers SI."""
+        names = list(cells)
+        if self.raw:
+            return names, {}
+        found, _ = signal_columns(cells, _SIGNALS)
+        factors = {}
+        for name, (place, factor) in found.items():
+            names[place] = name
+            if factor != 1.0:
+                factors[name] = factor
+        return names, factors
 
     def _sample(self, known: dict[str, object]) -> Sample:
         alone = {"time", *POSITION, *QUATERNION} <= set(known) and not any(
@@ -164,7 +198,7 @@ def _number(name: str, value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float | str):
         raise ValueError(f"{name} is {value!r}, which is no number")
     try:
-        return float(value)
+        return number(value) if isinstance(value, str) else float(value)
     except OverflowError:
         raise ValueError(f"{name} is larger than any number that can be used") from None
     except ValueError:

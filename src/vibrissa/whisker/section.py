@@ -152,12 +152,12 @@ def length_faults(length: float) -> list[str]:
     if length > 0.5:
         return [
             f"length is {length:.4g} m, longer than the 0.5 m allowed: these look like millimetres "
-            "given as metres; multiply by 1e-3"
+            "given as metres, or micrometres as millimetres; multiply by 1e-3"
         ]
     if length < 0.5e-3:
         return [
             f"length is {length:.4g} m, shorter than the 0.5 mm allowed: these look like metres "
-            "converted once too often; lengths are given in m"
+            "given as millimetres, or converted once too often; lengths are given in m"
         ]
     return []
 

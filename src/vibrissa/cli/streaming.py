@@ -184,6 +184,7 @@ def stream(
             felt,
         )
         running = _stream(estimator, described, from_bag, follow, speed, poses, tare or 0)
+        running.warm_up()
         if udp is not None:
             errors.print("ready", highlight=False)
         with suppress(KeyboardInterrupt):  # the usual end

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from vibrissa.mapping import ContactFilter, Estimator, Followed, Located
 from vibrissa.mapping.contact_map import spherical
+from vibrissa.rod import PointForce, deflect
 from vibrissa.signals import SIGNALS
 from vibrissa.signals.base import signals_of
 from vibrissa.streaming.lines import Lines, Sample
@@ -118,6 +119,25 @@ class ContactStream:
     def _forget(self) -> None:
         self._time = -math.inf
         self.poses.forget()
+        (self._follow or self._estimator).reset()
+
+    def warm_up(self) -> None:
+        """Locate a contact of the whisker once, so that no sample waits for code to be compiled."""
+        whisker, sensor = self._estimator.contacts.whisker, self._estimator.sensor
+        size = 0.5 * whisker.base_bending_stiffness / whisker.length**2
+        bent = deflect(whisker, PointForce(0.7 * whisker.length, size, 0.5))
+        turn = np.eye(3)
+        if sensor is None:
+            names = self._estimator.announced
+            signals = signals_of(bent.force, bent.moment)
+            values = signals[[SIGNALS.index(name) for name in names]]
+        else:
+            wrench = np.concatenate([bent.force, bent.moment])
+            values = sensor.read([0.0], wrench[None], rotation=turn[None])[0]
+        self._estimator(values, turn)
+        if self._follow is not None:
+            for time in (0.0, 1e-3):
+                self._follow(time, values, turn)
         (self._follow or self._estimator).reset()
 
     def record(self, sample: Sample) -> dict[str, Any]:

@@ -27,7 +27,7 @@ def blocks(page, *kinds):
 
 def commands(text):
     """Words of each call of the command line, of its own or in a pipe."""
-    calls = re.split(r"[\n|]|&&", text)
+    calls = re.split(r"[\n|]|&&", text.replace("\\\n", " "))
     calls = [call.split(" #")[0].strip() for call in calls]
     return [shlex.split(call)[1:] for call in calls if call.startswith("vibrissa ")]
 

@@ -11,21 +11,18 @@ Fewer than three signals leave a curve or a surface of contacts: see
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.mapping.answers import Answers
-from vibrissa.mapping.located import Explanations, Located
+from vibrissa.mapping.located import Located, nowhere
 from vibrissa.mapping.noise import sensor_noise
-from vibrissa.mapping.readout import Measurement, Mixed, Named, independent
+from vibrissa.mapping.readout import Measurement, Mixed, Named
 from vibrissa.mapping.sensor_readout import ByName, readout_of
-from vibrissa.mapping.single_fits import SingleFits
 from vibrissa.mapping.single_search import ExactSearch, LeastSquaresSearch, SetSearch
-from vibrissa.mapping.trail import Trail
-from vibrissa.mapping.whitening import explained
 from vibrissa.sensing import Sensor
 from vibrissa.sensing.sensor import GRAVITY
 from vibrissa.signals import selection
@@ -138,22 +135,21 @@ class Estimator:
         self.contacts = contacts
         told, named = self.readout.told, isinstance(self.readout, Named)
         self._determining = told < _UNKNOWNS or not named or contacts.determines(self.names)
-        sensor = self.readout.sensor if isinstance(self.readout, Named) else None
-        self.noisy = sensor is not None or not named
-        self._trail = Trail()
-        limit = explained(independent(contacts, self.readout) - _UNKNOWNS)
-        self._fits = SingleFits(contacts.chart, self.readout, limit)
-        self._answers = Answers(contacts, self.readout, self.noisy, self._trail)
         self._search = self._chosen_search()
 
     def _chosen_search(self) -> ExactSearch | LeastSquaresSearch | SetSearch:
         """How contacts are looked for, by how many independent numbers a measurement tells."""
-        contacts, readout, answers = self.contacts, self.readout, self._answers
+        contacts, readout = self.contacts, self.readout
         if readout.told < _UNKNOWNS:
-            return SetSearch(contacts, readout, answers)
+            return SetSearch(contacts, readout)
         if isinstance(readout, Named) and len(readout.names) == _UNKNOWNS:
-            return ExactSearch(contacts, readout, answers, self._trail)
-        return LeastSquaresSearch(contacts, readout, self._fits, answers, self._trail)
+            return ExactSearch(contacts, readout)
+        return LeastSquaresSearch(contacts, readout)
+
+    @property
+    def noisy(self) -> bool:
+        """Whether noise is known, so that there are covariances."""
+        return self.readout.noisy
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -175,7 +171,7 @@ class Estimator:
 
     def reset(self) -> None:
         """Forget the measurement before, as when the whisker has lost touch."""
-        self._trail.forget()
+        self._search.forget()
 
     def __call__(
         self,
@@ -259,7 +255,10 @@ class Estimator:
             The contact, all candidates, and the status.
         """
         nothing = self.nothing_in(measurement)
-        return self._search(measurement) if nothing is None else self._answers.nowhere(nothing)
+        if nothing is None:
+            return self._search(measurement)
+        self._search.forget()
+        return nowhere(nothing)
 
     def nothing_in(self, measurement: Measurement) -> Status | None:
         """Why a measurement is not worth a search: ``MISSING``, ``NOT_FELT``, ``DEGENERATE``.
@@ -274,23 +273,8 @@ class Estimator:
         Status or None
             None where it is worth one.
         """
-        if not np.isfinite(measurement.measured).all():
+        if not all(map(math.isfinite, measurement.measured.tolist())):
             return Status.MISSING
         if self.felt_above > 0.0 and not self.readout.felt(measurement, self.felt_above):
             return Status.NOT_FELT
         return None if self._determining else Status.DEGENERATE
-
-    def explanations(self, measurement: Measurement) -> Explanations:
-        """All minima of χ² that noise may explain: also those that miss the measurement a little.
-
-        Parameters
-        ----------
-        measurement : Measurement
-            Of three signals or more.
-
-        Returns
-        -------
-        Explanations
-            Found from all parts of the map; a millisecond.
-        """
-        return self._fits.explanations(measurement)

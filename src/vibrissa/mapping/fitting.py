@@ -40,10 +40,12 @@ from vibrissa.rod.seeds import wrapped
 # at rest after so many goes on only if it may still count.
 _ROUNDS = 15
 _TIMES = 8
-# A step this small, relative to the length and to the force, is the last.
-_SMALL = 1e-7
+# A step this small, relative to the length and to the force, is the last, and taken to first order;
+# a damped one only if it is smaller still.
+_LAST = 1e-6
+_SMALL = 1e-9
 # So is one that promises to lower χ² by no more than this share of it.
-_IDLE = 1e-7
+_IDLE = 1e-8
 _LONGEST = 0.1
 _MOST_DAMPING = 1e8
 
@@ -228,6 +230,26 @@ def _next(
     return 0.0 if gain <= _IDLE * total else float(size)
 
 
+@inlined
+def _finish(
+    x: Array, value: Array, t: Array, r: Array, j: Array, k: int, step: Array, to: Array
+) -> float:
+    """Take a step to first order: x becomes ``to``; return χ² there."""
+    for p in range(4):
+        step[p] = to[p] - x[p]
+        x[p] = to[p]
+    for a in range(6):
+        for p in range(4):
+            value[a] += t[a, p] * step[p]
+    total = 0.0
+    for i in range(k):
+        away = r[i]
+        for p in range(4):
+            away += j[i, p] * step[p]
+        total += away * away
+    return float(total)
+
+
 @kernel
 def _fit(
     rod: Rod,
@@ -251,7 +273,7 @@ def _fit(
     trial_r, trial_j = np.empty(k), np.empty((k, 4))
     r, j = np.empty((LANES, k)), np.empty((LANES, k, 4))
     x, to, work = np.empty((LANES, 4)), np.empty((LANES, 4)), np.empty((7, 4))
-    damping, size = np.empty(LANES), np.empty(LANES)
+    damping = np.empty(LANES)
     active = np.zeros(LANES, np.bool_)
     # With friction a contact takes two lanes: their tangents differ in the first unknown.
     lanes = 2 if free else 1
@@ -260,7 +282,7 @@ def _fit(
         n = min(together, last - row)
         for i in range(n):
             copy(contacts[row + i], to[i])
-            damping[i], size[i], active[i] = 0.0, 1.0, True
+            damping[i], active[i] = 0.0, True
             misfits[row + i], converged[row + i] = np.inf, False
         for _ in range(_ROUNDS):
             number, only = 0, 0
@@ -313,17 +335,18 @@ def _fit(
                     continue
                 else:
                     damping[i] = max(10.0 * damping[i], 1e-2)
-                if size[i] <= _SMALL or damping[i] > _MOST_DAMPING:
-                    # Smaller steps than rounding allows are neither better nor worse.
-                    converged[at] = True
-                    active[i] = False
-                    continue
-                size[i] = _next(x[i], r[i], j[i], k, damping[i], least, free, work)
-                while size[i] < 0.0 and damping[i] <= _MOST_DAMPING:
+                size = _next(x[i], r[i], j[i], k, damping[i], least, free, work)
+                while size < 0.0 and damping[i] <= _MOST_DAMPING:
                     damping[i] = max(10.0 * damping[i], 1e-8)
-                    size[i] = _next(x[i], r[i], j[i], k, damping[i], least, free, work)
-                active[i] = size[i] >= 0.0
-                copy(work[6], to[i])
+                    size = _next(x[i], r[i], j[i], k, damping[i], least, free, work)
+                active[i] = size >= 0.0
+                if size > (_LAST if damping[i] == 0.0 else _SMALL):
+                    copy(work[6], to[i])
+                elif active[i]:
+                    misfits[at] = _finish(
+                        contacts[at], values[at], tangents[at], r[i], j[i], k, work[5], work[6]
+                    )
+                    converged[at], active[i] = True, False
 
 
 @kernel

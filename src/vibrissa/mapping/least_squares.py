@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 #: At most so many candidates are kept.
 MOST = 8
 _UNKNOWNS = 3
-_PARTS = 16
+PARTS = 16
 # Of candidates that explain signals equally well the one with less force comes first.
 _FORCE = 1e-6
 
@@ -112,7 +112,7 @@ def least_squares(
     if again.size:
         nodes = nearest_nodes(chart, channels, measured[again])
         there = nodes >= 0
-        more = np.repeat(again, _PARTS).reshape(-1, _PARTS)[there]
+        more = np.repeat(again, PARTS).reshape(-1, PARTS)[there]
         seeds = chart.contacts.reshape(-1, 3)[nodes[there]]
         others = nearby(chart, channels, sensor, measured[more], seeds, limit)
         row = np.concatenate([row, more])
@@ -251,7 +251,7 @@ def nearest_nodes(chart: Reach, channels: Channels, measured: Array) -> IntArray
     (n, parts) int array
         Flat numbers of nodes; -1 for none.
     """
-    known = _seen(chart, channels.names)
+    known = at_nodes(chart, channels.names)
     targets = channels.targets(measured)
     which = [CHANNELS.index(name) for name in channels.names]
     # Forces are compared relative to the force, moments to the moment, and directions in rad.
@@ -260,13 +260,13 @@ def nearest_nodes(chart: Reach, channels: Channels, measured: Array) -> IntArray
         same = [k for k, w in enumerate(which) if CHANNELS[w][0] == kind and not CIRCULAR[w]]
         size = np.linalg.norm(targets[:, same], axis=1, keepdims=True)
         scale[:, same] = 1.0 / np.where(size > 0.0, size, 1.0)
-    out = np.full((len(targets), _PARTS), -1)
+    out = np.full((len(targets), PARTS), -1)
     share_out(len(targets), lambda first, last: _nearest(*known, targets, scale, out, first, last))
     return out
 
 
 @lru_cache(maxsize=64)
-def _seen(chart: Reach, names: tuple[str, ...]) -> tuple[Array, Array, IntArray]:
+def at_nodes(chart: Reach, names: tuple[str, ...]) -> tuple[Array, Array, IntArray]:
     """Channels (k, nodes) at the chart's nodes, 1/2π for those that are angles, and each's part."""
     which = [CHANNELS.index(name) for name in names]
     known = np.ascontiguousarray(channels_of(chart.values.reshape(-1, 6))[:, which].T)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from vibrissa.rod.arrays import Array
 from vibrissa.status import Status
 
@@ -52,13 +54,31 @@ class Located(NamedTuple):
     contact_forces: Array
 
 
-class Explanations(NamedTuple):
-    """Contacts that explain one measurement about as well as noise allows, non-dimensional.
+def nowhere(status: Status, misfit: float = np.nan) -> Located:
+    """Say why there is no contact.
 
-    Contacts x (n, 4), (F, p) (n, 6), covariances (n, 3, 3), NaN where not determined, and χ² (n,).
+    Parameters
+    ----------
+    status : Status
+        The reason.
+    misfit : float
+        As in :class:`Estimate`.
+
+    Returns
+    -------
+    Located
+        Of NaN, without candidates.
     """
-
-    contacts: Array
-    values: Array
-    covariances: Array
-    misfits: Array
+    none = np.full(3, np.nan)
+    return Located(
+        none,
+        status,
+        np.empty((0, 3)),
+        np.empty(0),
+        np.full((3, 3), np.nan),
+        misfit,
+        0,
+        np.empty((0, 3)),
+        np.empty((0, 3, 3)),
+        np.empty((0, 3)),
+    )

@@ -7,6 +7,7 @@ knows where contacts that explain it may lie: from a search tree of three quanti
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -15,19 +16,14 @@ import numpy as np
 from vibrissa.mapping.channels import CHANNELS, FITTED, WRENCH, Channels
 from vibrissa.mapping.estimate import check_signals
 from vibrissa.mapping.explanation import Bounds
-from vibrissa.mapping.inversion import MOST_CANDIDATES, _invert
-from vibrissa.mapping.least_squares import (
-    constant_weights,
-    nearest_nodes,
-    parts,
-    seeding_triplet,
-)
+from vibrissa.mapping.least_squares import at_nodes, constant_weights, parts, seeding_triplet
+from vibrissa.mapping.locating import Searched
 from vibrissa.mapping.noise import SensorNoise
-from vibrissa.mapping.weighing import Weighing, tree_seeds
+from vibrissa.mapping.weighing import Weighing
 from vibrissa.mapping.whitening import TRUSTED, rank
-from vibrissa.rod.arrays import Array, IntArray
-from vibrissa.rod.preimage import Preimages
-from vibrissa.rod.seeds import MOST_SEEDS
+from vibrissa.rod.arrays import Array
+from vibrissa.rod.preimage import Preimages, Tree
+from vibrissa.rod.reach import Reach
 from vibrissa.signals import CIRCULAR, SIGNALS, signal_scales
 
 if TYPE_CHECKING:
@@ -64,8 +60,8 @@ class Named:
     ) -> None:
         chart = contacts.chart
         d = chart.discretization
-        self._chart = chart
         self.names, self.sensor, self.channels = names, sensor, Channels.of(names)
+        self.noisy = sensor is not None
         self.scale = signal_scales(names, d.force, d.moment)
         self._pairs = self.channels.pairs()
         self._circular = [CIRCULAR[SIGNALS.index(name)] for name in names]
@@ -78,13 +74,19 @@ class Named:
         self._noise = [] if sensor is None else self._deviations(sensor)
         if len(names) >= 3:
             three = names if len(names) == 3 else seeding_triplet(chart, names)
-            self._tree = contacts.tree(three).tree
-            self._where = [names.index(name) for name in three]
-            self._row = np.zeros((1, 6))
-            self._row[0, 3:] = [SIGNALS.index(name) for name in three]
-            self._number = np.zeros(1, np.int64)
-            self._found = np.full((1, MOST_CANDIDATES, 3), np.nan)
-            self._values = np.full((1, MOST_CANDIDATES, 6), np.nan)
+            known, turns, _ = at_nodes(chart, self.channels.names)
+            self.searched = _searched(
+                chart,
+                contacts.tree(three).tree,
+                [names.index(name) for name in three],
+                [SIGNALS.index(name) for name in three],
+                known,
+                turns,
+                [
+                    2 if turn else "FM".index(name[0])
+                    for name, turn in zip(self.channels.names, turns, strict=True)
+                ],
+            )
 
     def _deviations(self, sensor: SensorNoise) -> list[tuple[int, float]]:
         """Standard deviations of signals that are no directions, where nothing is felt."""
@@ -119,7 +121,8 @@ class Named:
 
     def nothing(self, measurement: Measurement) -> bool:
         """Whether the whisker touches nothing."""
-        return bool(self._straight) and not measurement.measured[self._straight].any()
+        values = measurement.measured.tolist()
+        return bool(self._straight) and not any(values[i] for i in self._straight)
 
     def felt(self, measurement: Measurement, above: float) -> bool:
         """Whether a signal other than a direction is so many standard deviations from zero."""
@@ -130,31 +133,6 @@ class Named:
         """Whether the signals are far larger than any on the map."""
         values = measurement.measured.tolist()
         return any(abs(values[i]) > most for i, most in self._most)
-
-    def seeds(self, measurement: Measurement) -> tuple[Array, Array]:
-        """Contacts ξ (n, 3) that give three of the signals exactly, with (F, p) (n, 6)."""
-        chart = self._chart
-        self._row[0, :3] = measurement.measured[self._where]
-        self._number[0] = 0
-        _invert(
-            chart.discretization.rod,
-            chart.fold,
-            self._tree,
-            chart.proximal,
-            self._row,
-            self._number,
-            self._found,
-            self._values,
-            0,
-            1,
-        )
-        n = int(self._number[0])
-        return self._found[0, :n].copy(), self._values[0, :n].copy()
-
-    def nearest(self, measurement: Measurement) -> IntArray:
-        """Nodes of the chart that come nearest, one in each of sixteen parts."""
-        nodes = nearest_nodes(self._chart, self.channels, measurement.measured[None])[0]
-        return np.asarray(nodes[nodes >= 0])
 
 
 class Mixed:
@@ -189,6 +167,7 @@ class Mixed:
         typical = np.sqrt((wrenches**2).mean(axis=0))
         # Singular directions of what contacts make of whitened readings, the strongest first.
         u, strength, _ = np.linalg.svd(whiten @ (mixing * sizes) * typical)
+        self.noisy = True
         self.told = int((strength > _UNTOLD * strength[0]).sum())
         self._reduce = (u.T @ whiten)[: self.told]
         h = self._reduce @ (mixing * sizes)
@@ -203,20 +182,27 @@ class Mixed:
         )
         self.passes = 2 if stiffness > 0.0 else 1
         self._back = np.linalg.pinv(h)
-        self._chart, self._seen = chart, wrenches @ h.T
-        self._largest = 10.0 * np.abs(self._seen).max(axis=0)
-        self._part = parts(chart)
+        seen = wrenches @ h.T
+        self._largest = 10.0 * np.abs(seen).max(axis=0)
         if self.told >= 3:
             n, m, k = chart.values.shape[:3]
             three = h[:3]
-            values = self._seen[:, :3].reshape(n, m, k, 3)
+            values = seen[:, :3].reshape(n, m, k, 3)
             force, point = chart.tangents[..., :3, :], chart.tangents[..., 3:, :]
             moment = np.cross(point, chart.values[..., :3, None], axis=-2)
             moment = moment + np.cross(chart.values[..., 3:, None], force, axis=-2)
             slopes = three @ np.concatenate([force, moment], axis=-2)
             straight = (False, False, False)
-            self._tree = Preimages.of(chart, np.ascontiguousarray(values), slopes, straight).tree
-            self._found = np.empty((MOST_SEEDS, 3))
+            tree = Preimages.of(chart, np.ascontiguousarray(values), slopes, straight).tree
+            self.searched = _searched(
+                chart,
+                tree,
+                range(3),
+                range(3),
+                np.ascontiguousarray(seen.T),
+                np.zeros(self.told),
+                [2] * self.told,
+            )
             size = np.linalg.norm(slopes, axis=-1, keepdims=True)
             with np.errstate(invalid="ignore", divide="ignore"):
                 volume = np.abs(np.linalg.det(slopes / size))
@@ -241,20 +227,34 @@ class Mixed:
         """Whether the readings are far larger than any on the map."""
         return bool((np.abs(measurement.measured) > self._largest).any())
 
-    def seeds(self, measurement: Measurement) -> tuple[Array, Array | None]:
-        """Contacts ξ (n, 3) that about give three combinations of the readings."""
-        fold = self._chart.fold
-        n = tree_seeds(
-            fold, self._tree, np.ascontiguousarray(measurement.measured[:3]), self._found
-        )
-        return self._found[:n].copy(), None
 
-    def nearest(self, measurement: Measurement) -> IntArray:
-        """Nodes of the chart that come nearest, one in each of sixteen parts."""
-        away = ((self._seen - measurement.measured) ** 2).sum(axis=1)
-        order = np.argsort(away)
-        _, first = np.unique(self._part[order], return_index=True)
-        return np.asarray(order[first])
+def _searched(
+    chart: Reach,
+    tree: Tree,
+    where: Sequence[int],
+    codes: Sequence[int],
+    seen: Array,
+    turns: Array,
+    kinds: Sequence[int],
+) -> Searched:
+    """What is searched; see there."""
+    d = chart.discretization
+    return Searched(
+        d.rod,
+        chart.fold,
+        chart.proximal,
+        tree,
+        np.array(where),
+        np.array(codes, dtype=np.float64),
+        chart.contacts.reshape(-1, 3),
+        chart.values.reshape(-1, 6),
+        seen,
+        turns,
+        np.array(kinds),
+        parts(chart),
+        d.length,
+        d.force,
+    )
 
 
 def _weighing(

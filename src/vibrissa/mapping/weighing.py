@@ -1,4 +1,4 @@
-"""One measurement through compiled code: its weights, its fits, and the covariance of each contact.
+"""What one measurement weighs, and the covariances of contacts that explain it; compiled.
 
 What batches do with arrays (:mod:`~vibrissa.mapping.whitening`, :mod:`~vibrissa.mapping.channels`),
 here for one row at a time, where NumPy's overhead would be ten times the work. A measurement is
@@ -11,17 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.mapping.fitting import _fit, channel_equations
-from vibrissa.rod.arrays import AnyArray, Array, IntArray, Rod
+from vibrissa.mapping.fitting import channel_equations
+from vibrissa.rod.arrays import Array, IntArray
 from vibrissa.rod.compiled import copy, inlined, kernel
-from vibrissa.rod.newton import point_determinant, stable
-from vibrissa.rod.preimage import Tree
-from vibrissa.rod.reach import LEAST_ARC, Fold, chart_to_contact
-from vibrissa.rod.seeds import MOST_SEEDS, seeds
 
 # Of a channel's variance, what others do not explain; below this the covariance is singular.
 _SINGULAR = 1e-10
-_TIMES = 8
 # Unknowns that a measurement tells this much worse than others (as a share) it does not tell.
 _OPEN = 1e-14
 
@@ -175,107 +170,6 @@ def weigh(how: Weighing, value: Array, measured: Array, out: Array) -> bool:
 
 
 @kernel
-def explain(
-    rod: Rod,
-    fold: Fold,
-    proximal: float,
-    how: Weighing,
-    target: Array,
-    measured: Array,
-    passes: int,
-    worth: float,
-    contacts: Array,
-    values: Array,
-    tangents: Array,
-    misfits: Array,
-    inside: AnyArray,
-) -> bool:
-    """Fit one measurement from several starts; see :func:`~vibrissa.mapping.fitting.fit`.
-
-    Parameters
-    ----------
-    rod : tuple of arrays
-        Of the whisker.
-    fold : tuple of arrays
-        Of the chart.
-    proximal : float
-        Smallest arc length on the map, over L.
-    how : Weighing
-        Of the measurement.
-    target : (k,) array
-        What the channels should be.
-    measured : (k,) array
-        Signals by name, where these have deviations.
-    passes : int
-        How often weights are taken anew at where the last fit ended.
-    worth : float
-        Fits that are slow to come to rest are given up while χ² is above this.
-    contacts, values, tangents, misfits : (n, 4), (n, 6), (n, 6, 4), (n,) arrays
-        Where to start, with (F, p) there; filled with the fits.
-    inside : (n,) bool array
-        Filled: whether a fit is a stable contact on the map.
-
-    Returns
-    -------
-    bool
-        False where there are no weights.
-    """
-    n, k = contacts.shape[0], how.codes.shape[0]
-    targets, weights = np.empty((n, k)), np.empty((n, k, k))
-    converged = np.zeros(n, np.bool_)
-    for row in range(n):
-        copy(target, targets[row])
-    codes = how.codes
-    for _ in range(passes):
-        for row in range(n):
-            if not weigh(how, values[row], measured, weights[row]):
-                return False
-        _fit(
-            rod,
-            False,
-            LEAST_ARC,
-            codes,
-            targets,
-            weights,
-            contacts,
-            values,
-            tangents,
-            misfits,
-            converged,
-            0,
-            n,
-        )
-        for row in range(n):
-            for _ in range(_TIMES):
-                if converged[row] or not misfits[row] <= worth:
-                    break
-                _fit(
-                    rod,
-                    False,
-                    LEAST_ARC,
-                    codes,
-                    targets,
-                    weights,
-                    contacts,
-                    values,
-                    tangents,
-                    misfits,
-                    converged,
-                    row,
-                    row + 1,
-                )
-    xi, by_xi = np.empty(3), np.empty((6, 3))
-    for row in range(n):
-        xi[0], xi[1], xi[2] = contacts[row, 0], contacts[row, 2], contacts[row, 3]
-        for a in range(6):
-            t = tangents[row, a]
-            by_xi[a, 0], by_xi[a, 1], by_xi[a, 2] = t[0], t[2], t[3]
-        finite = misfits[row] < np.inf
-        inside[row] = finite and stable(fold, proximal, xi, point_determinant(by_xi))
-    return True
-
-
-@kernel
 def spread(
     how: Weighing,
     measured: Array,
@@ -349,14 +243,3 @@ def spread(
                 total = root[0, a] * root[0, c] + root[1, a] * root[1, c] + root[2, a] * root[2, c]
                 covariances[row, a, c] = total if known else np.nan
     return True
-
-
-@kernel
-def tree_seeds(fold: Fold, tree: Tree, target: Array, contacts: Array) -> int:
-    """Fill contacts ξ (MOST_SEEDS, 3) that about give three quantities; return how many."""
-    found, quality = np.empty((MOST_SEEDS, 3)), np.empty(MOST_SEEDS, np.int64)
-    slopes = np.empty((MOST_SEEDS, 3, 3))
-    n = seeds(tree, target, found, slopes, quality)
-    for i in range(n):
-        chart_to_contact(fold, found[i], contacts[i])
-    return int(n)

@@ -1,0 +1,289 @@
+"""The contacts that explain more than three signals, or a mix, best: one measurement at a time.
+
+The search tree tells about where three quantities have their values; χ² of all that is measured is
+minimised from there. Where no such contact explains the measurement, the search starts again from
+the nodes of the chart that come nearest, one for each of sixteen parts of it. What batches do with
+arrays is in :mod:`~vibrissa.mapping.least_squares`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vibrissa.mapping.fitting import _fit
+from vibrissa.mapping.inversion import MOST_CANDIDATES
+from vibrissa.mapping.least_squares import PARTS, _nearest
+from vibrissa.mapping.locating import Searched, Trail, go_on, near, tell
+from vibrissa.mapping.weighing import Weighing, weigh
+from vibrissa.mapping.whitening import INDISTINCT
+from vibrissa.rod.arrays import Array, IntArray
+from vibrissa.rod.compiled import copy, inlined, kernel
+from vibrissa.rod.kernels import evaluate
+from vibrissa.rod.newton import ROUNDING, point_determinant, stable
+from vibrissa.rod.reach import LEAST_ARC, chart_to_contact
+from vibrissa.rod.seeds import MOST_SEEDS, seeds
+from vibrissa.status import Status
+
+_UNIQUE, _AMBIGUOUS = int(Status.UNIQUE), int(Status.AMBIGUOUS)
+_OUTSIDE, _FRICTION = int(Status.OUTSIDE_MAP), int(Status.NOT_FRICTIONLESS)
+_MOST_STARTS = MOST_SEEDS + 1 + PARTS
+_TIMES = 8
+# Contacts within this (over L, and ten times that relative to the force) are one.
+_SAME = 1e-3
+# Of candidates that explain signals equally well the one with less force comes first.
+_FORCE = 1e-6
+
+# Row by row: x (n, 4), (F, p) (n, 6), ∂(F, p)/∂x (n, 6, 4), χ² (n,), and where a fit ended (n,):
+# 2 on the map, 1 nearer to the base, 0 nowhere.
+State = tuple[Array, Array, Array, Array, IntArray]
+
+
+@kernel
+def explain(
+    of: Searched,
+    how: Weighing,
+    noisy: bool,
+    passes: int,
+    limit: float,
+    target: Array,
+    measured: Array,
+    trail: Trail,
+    found: Array,
+) -> tuple[int, int, int, float]:
+    """Find the contacts that explain more than three signals, or a mix, best.
+
+    Parameters
+    ----------
+    of : Searched
+        The map.
+    how : Weighing
+        Of the measurement.
+    noisy : bool
+        Whether covariances are wanted.
+    passes : int
+        How often weights are taken anew at where the last fit ended.
+    limit : float
+        Largest χ² of what counts as explained.
+    target : (k,) array
+        What the channels should be.
+    measured : (k,) array
+        What was measured.
+    trail : Trail
+        The contact followed so far: one more place to start from.
+    found : (MOST_CANDIDATES, COLUMNS) array
+        Filled with the candidates, the best first.
+
+    Returns
+    -------
+    number : int
+        How many there are; one that explains nothing, but comes nearest, counts.
+    status : int
+        What is to be said.
+    continuing : int
+        Which of them goes on from the one before.
+    misfit : float
+        χ² of the first.
+    """
+    x, values = np.zeros((_MOST_STARTS, 4)), np.zeros((_MOST_STARTS, 6))
+    tangents, misfits = np.zeros((_MOST_STARTS, 6, 4)), np.full(_MOST_STARTS, np.inf)
+    inside = np.zeros(_MOST_STARTS, np.int64)
+    n = _starts(of, measured, trail, x, values)
+    state = (x, values, tangents, misfits, inside)
+    _fitted(of, how, passes, limit + INDISTINCT, target, measured, state, 0, n)
+    if not _explained(misfits, inside, limit, n):
+        n = _everywhere(of, how, passes, limit, target, measured, state, n)
+    kept, number, status = np.empty(MOST_CANDIDATES, np.int64), 0, _UNIQUE
+    if _explained(misfits, inside, limit, n):
+        number = _chosen(x, misfits, inside, limit, n, kept)
+        status = _UNIQUE if number == 1 else _AMBIGUOUS
+    else:
+        status, best = _FRICTION, np.inf
+        for row in range(n):
+            if inside[row] == 1 and misfits[row] <= limit:
+                status = _OUTSIDE
+            if inside[row] == 2 and misfits[row] < best:
+                kept[0], number, best = row, 1, misfits[row]
+    if number == 0:
+        trail.number[0] = 0
+        return 0, status, 0, np.nan
+    contacts, solved = np.empty((number, 3)), np.empty((number, 6))
+    slopes = np.empty((number, 6, 3))
+    for i in range(number):
+        row = kept[i]
+        contacts[i, 0], contacts[i, 1], contacts[i, 2] = x[row, 0], x[row, 2], x[row, 3]
+        copy(values[row], solved[i])
+        for a in range(6):
+            t = tangents[row, a]
+            slopes[i, a, 0], slopes[i, a, 1], slopes[i, a, 2] = t[0], t[2], t[3]
+    tell(of, how, noisy, measured, contacts, solved, slopes, found)
+    return number, status, go_on(trail, contacts, solved, number), misfits[kept[0]]
+
+
+@kernel
+def _starts(of: Searched, measured: Array, trail: Trail, x: Array, values: Array) -> int:
+    """Fill contacts that about give three quantities, and the one followed so far; how many."""
+    found, quality = np.empty((MOST_SEEDS, 3)), np.empty(MOST_SEEDS, np.int64)
+    slopes, xi, three = np.empty((MOST_SEEDS, 3, 3)), np.empty(3), np.empty(3)
+    for k in range(3):
+        three[k] = measured[of.where[k]]
+    n = int(seeds(of.tree, three, found, slopes, quality))
+    for row in range(n):
+        chart_to_contact(of.fold, found[row], xi)
+        x[row, 0], x[row, 2], x[row, 3] = xi[0], xi[1], xi[2]
+    evaluate(of.rod, x, values, np.empty((0, 6, 3)), 0, n)
+    if trail.number[0] > 0 and not near(trail, values, n):
+        last = trail.contact[0]
+        x[n, 0], x[n, 2], x[n, 3] = last[0], last[1], last[2]
+        copy(trail.value[0], values[n])
+        n += 1
+    return n
+
+
+@kernel
+def _fitted(
+    of: Searched,
+    how: Weighing,
+    passes: int,
+    worth: float,
+    target: Array,
+    measured: Array,
+    state: State,
+    first: int,
+    last: int,
+) -> None:
+    """Fit from some rows; fill whether a fit is on the map (2), or nearer to the base (1)."""
+    x, values, tangents, misfits, inside = state
+    k, n = how.codes.shape[0], x.shape[0]
+    targets, weights = np.empty((n, k)), np.empty((n, k, k))
+    converged = np.zeros(n, np.bool_)
+    for _ in range(passes):
+        for row in range(first, last):
+            copy(target, targets[row])
+            if not weigh(how, values[row], measured, weights[row]):
+                return
+        _fit(
+            of.rod,
+            False,
+            LEAST_ARC,
+            how.codes,
+            targets,
+            weights,
+            x,
+            values,
+            tangents,
+            misfits,
+            converged,
+            first,
+            last,
+        )
+        for row in range(first, last):
+            for _again in range(_TIMES):
+                if converged[row] or not misfits[row] <= worth:
+                    break
+                _fit(
+                    of.rod,
+                    False,
+                    LEAST_ARC,
+                    how.codes,
+                    targets,
+                    weights,
+                    x,
+                    values,
+                    tangents,
+                    misfits,
+                    converged,
+                    row,
+                    row + 1,
+                )
+    xi, by_xi = np.empty(3), np.empty((6, 3))
+    for row in range(first, last):
+        xi[0], xi[1], xi[2] = x[row, 0], x[row, 2], x[row, 3]
+        for a in range(6):
+            t = tangents[row, a]
+            by_xi[a, 0], by_xi[a, 1], by_xi[a, 2] = t[0], t[2], t[3]
+        sign = point_determinant(by_xi)
+        if not misfits[row] < np.inf:
+            inside[row] = 0
+        elif stable(of.fold, of.proximal, xi, sign):
+            inside[row] = 2
+        else:
+            inside[row] = 1 if stable(of.fold, LEAST_ARC + ROUNDING, xi, sign) else 0
+
+
+@inlined
+def _explained(misfits: Array, inside: IntArray, limit: float, n: int) -> bool:
+    found = False
+    for row in range(n):
+        found = found or (inside[row] == 2 and misfits[row] <= limit)
+    return found
+
+
+@kernel
+def _everywhere(
+    of: Searched,
+    how: Weighing,
+    passes: int,
+    limit: float,
+    target: Array,
+    measured: Array,
+    state: State,
+    n: int,
+) -> int:
+    """Fit from the nodes of all parts of the map that come nearest; how many rows there are."""
+    x, values = state[0], state[1]
+    q, k = of.seen.shape[0], how.codes.shape[0]
+    wanted, scale = np.empty((1, q)), np.ones((1, q))
+    sizes = np.zeros(2)
+    for i in range(q):
+        wanted[0, i] = 0.0
+        for c in range(k):
+            wanted[0, i] += how.mixing[i, c] * target[c]
+        if of.kinds[i] < 2:
+            sizes[of.kinds[i]] += wanted[0, i] ** 2
+    for i in range(q):
+        if of.kinds[i] < 2 and sizes[of.kinds[i]] > 0.0:
+            scale[0, i] = 1.0 / np.sqrt(sizes[of.kinds[i]])
+    nearest = np.full((1, PARTS), -1)
+    _nearest(of.seen, of.turns, of.part, wanted, scale, nearest, 0, 1)
+    rows = n
+    for part in range(PARTS):
+        node = nearest[0, part]
+        if node < 0:
+            continue
+        c = of.contacts[node]
+        x[rows, 0], x[rows, 1], x[rows, 2], x[rows, 3] = c[0], 0.0, c[1], c[2]
+        copy(of.values[node], values[rows])
+        rows += 1
+    _fitted(of, how, passes, limit + INDISTINCT, target, measured, state, n, rows)
+    return rows
+
+
+@inlined
+def _chosen(
+    x: Array, misfits: Array, inside: IntArray, limit: float, n: int, kept: IntArray
+) -> int:
+    """Fill which fits explain the measurement and cannot be told apart, the best first."""
+    doubt, least = np.full(n, np.inf), np.inf
+    for row in range(n):
+        if inside[row] == 2:
+            force = np.hypot(x[row, 2], x[row, 3])
+            doubt[row] = misfits[row] + _FORCE * (1.0 + misfits[row]) * force / (1.0 + force)
+            least = min(least, misfits[row])
+    most, number = min(least + INDISTINCT, limit), 0
+    for _ in range(n):
+        row = int(np.argmin(doubt))
+        if not doubt[row] < np.inf or number == MOST_CANDIDATES:
+            break
+        doubt[row] = np.inf
+        if misfits[row] > most:
+            continue
+        new = True
+        for i in range(number):
+            other = x[kept[i]]
+            size = 10.0 * _SAME * np.hypot(x[row, 2], x[row, 3])
+            apart = np.hypot(other[2] - x[row, 2], other[3] - x[row, 3])
+            new = new and not (abs(other[0] - x[row, 0]) < _SAME and apart < size)
+        if new:
+            kept[number] = row
+            number += 1
+    return number

@@ -1,0 +1,219 @@
+"""One measurement through compiled code: what is searched, and contacts that give three signals.
+
+What batches do with arrays (:mod:`~vibrissa.mapping.inversion`), here for one measurement at a
+time, where NumPy's overhead would be ten times the work: the contacts with their covariances, in SI
+units. More than three signals, or a mix, are for :mod:`~vibrissa.mapping.explaining`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from vibrissa.mapping.inversion import MOST_CANDIDATES, _invert, _polish
+from vibrissa.mapping.weighing import Weighing, spread
+from vibrissa.rod.arrays import Array, IntArray, Rod
+from vibrissa.rod.compiled import copy, inlined, kernel
+from vibrissa.rod.kernels import evaluate
+from vibrissa.rod.newton import TOLERANCE
+from vibrissa.rod.preimage import Tree
+from vibrissa.rod.reach import Fold
+
+# Columns of a candidate: contact point, arc length, force in the material frame, base force, and
+# the covariance of the point.
+POINT, ARC, CONTACT_FORCE, FORCE, COVARIANCE, COLUMNS = 0, 3, 4, 7, 10, 19
+# A contact moves no farther than this (over L) from one measurement to the next.
+_NEAR = 0.02
+
+
+class Searched(NamedTuple):
+    """What is searched, non-dimensional but for the units.
+
+    Parameters
+    ----------
+    rod, fold, proximal : tuples of arrays, float
+        The whisker and its chart.
+    tree : tuple of arrays
+        Search tree of three quantities.
+    where : (3,) int array
+        Which numbers of a measurement those are.
+    codes : (3,) array
+        Which signals they are, where they are met exactly.
+    contacts, values : (n, 3), (n, 6) arrays
+        ξ and (F, p) at the chart's nodes.
+    seen, turns : (q, n), (q,) arrays
+        Of the nodes, what is compared with a measurement, and 1/2π where that is an angle.
+    kinds : (q,) int array
+        0 for forces, compared relative to the force, 1 for moments, 2 for what is compared as it
+        is.
+    part : (n,) int array
+        In which part of the chart a node is.
+    length, force : float
+        Units, m and N.
+    """
+
+    rod: Rod
+    fold: Fold
+    proximal: float
+    tree: Tree
+    where: IntArray
+    codes: Array
+    contacts: Array
+    values: Array
+    seen: Array
+    turns: Array
+    kinds: IntArray
+    part: IntArray
+    length: float
+    force: float
+
+
+class Trail(NamedTuple):
+    """The contact that a stream has followed so far: which candidate of the next sample goes on.
+
+    Parameters
+    ----------
+    number : (1,) int array
+        How many candidates the last measurement had; 0 where there is no contact to go on from.
+    contact, value : (1, 3), (1, 6) arrays
+        ξ and (F, p) of the contact followed, non-dimensional.
+    """
+
+    number: IntArray
+    contact: Array
+    value: Array
+
+    @classmethod
+    def new(cls) -> Trail:
+        """Begin without a contact."""
+        return cls(np.zeros(1, np.int64), np.zeros((1, 3)), np.zeros((1, 6)))
+
+
+@inlined
+def near(trail: Trail, values: Array, n: int) -> bool:
+    """Whether one of the first n of (F, p) is near the contact followed so far."""
+    for row in range(n):
+        away = 0.0
+        for a in range(3, 6):
+            away = max(away, abs(values[row, a] - trail.value[0, a]))
+        if away < _NEAR:
+            return True
+    return False
+
+
+@inlined
+def go_on(trail: Trail, contacts: Array, values: Array, n: int) -> int:
+    """Choose which of n candidates goes on from the contact before, and remember it."""
+    chosen, least = 0, np.inf
+    if trail.number[0] > 0 and n > 1:
+        for row in range(n):
+            away = 0.0
+            for a in range(3, 6):
+                away += (values[row, a] - trail.value[0, a]) ** 2
+            if away < least:
+                chosen, least = row, away
+    trail.number[0] = n
+    copy(contacts[chosen], trail.contact[0])
+    copy(values[chosen], trail.value[0])
+    return chosen
+
+
+@kernel
+def tell(
+    of: Searched,
+    how: Weighing,
+    noisy: bool,
+    measured: Array,
+    contacts: Array,
+    values: Array,
+    tangents: Array,
+    found: Array,
+) -> bool:
+    """Fill candidates in SI units; False where they have no covariance though there is noise."""
+    n = contacts.shape[0]
+    covariances = np.full((n, 3, 3), np.nan)
+    good = not noisy or spread(how, measured, contacts, values, tangents, covariances)
+    for row in range(n):
+        out = found[row]
+        for a in range(3):
+            out[POINT + a] = values[row, 3 + a] * of.length
+            out[FORCE + a] = values[row, a] * of.force
+            for c in range(3):
+                out[COVARIANCE + 3 * a + c] = covariances[row, a, c] * of.length**2
+        out[ARC] = contacts[row, 0] * of.length
+        out[CONTACT_FORCE] = 0.0
+        out[CONTACT_FORCE + 1] = contacts[row, 1] * of.force
+        out[CONTACT_FORCE + 2] = contacts[row, 2] * of.force
+    return bool(good)
+
+
+@kernel
+def meet(
+    of: Searched, how: Weighing, noisy: bool, measured: Array, trail: Trail, found: Array
+) -> tuple[int, int, bool]:
+    """Find all contacts that give three signals exactly.
+
+    Parameters
+    ----------
+    of : Searched
+        The map.
+    how : Weighing
+        Of the measurement.
+    noisy : bool
+        Whether covariances are wanted.
+    measured : (3,) array
+        The signals.
+    trail : Trail
+        The contact followed so far: one more place to start from.
+    found : (MOST_CANDIDATES, COLUMNS) array
+        Filled with the candidates, by force.
+
+    Returns
+    -------
+    number : int
+        How many there are.
+    continuing : int
+        Which of them goes on from the one before.
+    good : bool
+        False where covariances are wanted, but the noise is singular.
+    """
+    target, number = np.empty((1, 6)), np.zeros(1, np.int64)
+    xi, values = np.empty((1, MOST_CANDIDATES + 1, 3)), np.empty((1, MOST_CANDIDATES + 1, 6))
+    for k in range(3):
+        target[0, k], target[0, 3 + k] = measured[of.where[k]], of.codes[k]
+    _invert(of.rod, of.fold, of.tree, of.proximal, target, number, xi, values, 0, 1)
+    n = int(number[0])
+    if n < trail.number[0] and not near(trail, values[0], n):
+        n = _followed(of, target, trail, xi[0], values[0], n)
+    if n == 0:
+        trail.number[0] = 0
+        return 0, 0, True
+    contacts, solved = xi[0, :n], values[0, :n]
+    tangents = np.empty((n, 6, 3))
+    if noisy:
+        x = np.zeros((n, 4))
+        for row in range(n):
+            x[row, 0], x[row, 2], x[row, 3] = contacts[row, 0], contacts[row, 1], contacts[row, 2]
+        evaluate(of.rod, x, np.empty((n, 6)), tangents, 0, n)
+    good = tell(of, how, noisy, measured, contacts, solved, tangents, found)
+    return n, go_on(trail, contacts, solved, n), good
+
+
+@kernel
+def _followed(of: Searched, target: Array, trail: Trail, xi: Array, values: Array, n: int) -> int:
+    """Add the contact that goes on from the last one, should the search have missed it."""
+    at, value = trail.contact.copy(), np.empty((1, 6))
+    residual, sign = np.full(1, np.inf), np.zeros(1)
+    _polish(of.rod, of.fold, target, at, value, residual, sign, 0, 1)
+    new = residual[0] <= TOLERANCE and sign[0] > 0.0 and at[0, 0] >= of.proximal
+    if not new or not near(trail, value, 1):
+        return n
+    place = n  # by force
+    while place > 0 and np.hypot(xi[place - 1, 1], xi[place - 1, 2]) > np.hypot(at[0, 1], at[0, 2]):
+        copy(xi[place - 1], xi[place])
+        copy(values[place - 1], values[place])
+        place -= 1
+    copy(at[0], xi[place])
+    copy(value[0], values[place])
+    return min(n + 1, MOST_CANDIDATES)

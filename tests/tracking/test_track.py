@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 
 from vibrissa.status import Status
-from vibrissa.tracking import TrackOptions, rest_shape, trace_video, track, whisker_at_rest
+from vibrissa.tracking import (
+    RefineOptions,
+    TrackOptions,
+    rest_shape,
+    trace_video,
+    track,
+    whisker_at_rest,
+)
 from vibrissa.tracking.banded import Smoother
 from vibrissa.trial import recorded_whisker
 from vibrissa.whisker.emergence import angles_of, base_rotation
@@ -138,10 +145,10 @@ def test_a_step_to_a_contact_that_no_rod_withstands_is_not_taken():
     problem = _Problem(
         discretize(whisker), pair, sight, touching, frames, state, 1000.0, RefineOptions(), still
     )
-    smoother, cost, _, wild = problem._linear(state)
-    assert wild.tolist() == [False, True]
-    assert cost == np.inf
-    assert np.isfinite(smoother.solved(1.0)).all()
+    fit = problem._linear(state)
+    assert fit.wild.tolist() == [False, True]
+    assert fit.cost == np.inf
+    assert np.isfinite(fit.smoother.solved(1.0)).all()
 
 
 def test_the_covariance_of_the_contact_is_of_the_size_of_its_errors(filmed, found, both):
@@ -181,6 +188,39 @@ def test_lost_frames_are_missing(filmed, traces):
     assert data["confidence"].values[12] == 0.0
     assert np.isnan(data["force"].values[12]).all()
     assert np.isfinite(data["base_position"].values[13]).all()
+
+
+def test_views_of_different_whiskers_are_refused(filmed, traces):
+    aside = np.array([30.0, 0.0])
+    moved = [trace._replace(line=trace.line + aside) for trace in traces[1][0]]
+    with pytest.raises(ValueError, match=r"the views do not show one whisker.* by 1[0-9] pixels"):
+        track(filmed.cameras, [traces[0], [moved]], 1000.0)
+
+
+def test_a_tip_that_is_not_seen_is_found_by_how_the_whisker_bends(filmed, traces):
+    """Without the last 6 % of every trace, said to go on; of every other frame."""
+    cut = []
+    for (whole,) in traces:
+        row = whole[::2]
+        ends = [int(0.94 * len(trace.line)) for trace in row]
+        cut.append(
+            [
+                t._replace(line=t.line[:n], sigma=t.sigma[:n], seen=t.seen[:n], tip_seen=False)
+                for t, n in zip(row, ends, strict=True)
+            ]
+        )
+    how = TrackOptions(refine=RefineOptions(rounds=6))
+    recording = track(filmed.cameras, [[row] for row in cut], 500.0, how)
+    true = recorded_whisker(filmed.recording).length
+    assert recorded_whisker(recording).length == pytest.approx(true, rel=0.03)
+    assert "its tip is too faint" in recording.attrs["remarks"]
+    found = recording.to_dataset().isel(whisker=0)
+    truth = filmed.truth.isel(time=slice(None, None, 2))
+    both = (truth["in_contact"].values > 0) & (found["in_contact"].values > 0)
+    away = (found["contact_point"].values - truth["contact_point"].values)[both]
+    spread = found["contact_covariance"].values[both]
+    squares = np.einsum("ti,tij,tj->t", away, np.linalg.inv(spread), away)
+    assert np.median(squares) < 2.366 * 2.0**2
 
 
 def test_the_smoother_solves_its_equations():

@@ -73,6 +73,8 @@ def tell_recording(result: xr.DataTree, path: Path) -> None:
             )
         for line in compared_contacts(result, k):
             output.print(f"  {line}", highlight=False, soft_wrap=True)
+    for line in result.attrs.get("remarks", "").splitlines():
+        output.print(f"note: {line}", highlight=False, soft_wrap=True)
     output.print(f"wrote {path}", highlight=False, soft_wrap=True)
 
 

@@ -60,7 +60,8 @@ def track(
         list[str] | None,
         typer.Option(
             help="Column and row where a whisker leaves the face in the first frame, view by view "
-            "and then whisker by whisker; by default the best seen whisker is traced.",
+            "and then whisker by whisker; by default the whisker is traced that all views show, or "
+            "else the best seen one.",
             metavar="X,Y",
         ),
     ] = None,
@@ -119,6 +120,13 @@ def track(
             "pixels; what is farther away is another whisker."
         ),
     ] = 5.0,
+    bright: Annotated[
+        bool | None,
+        typer.Option(
+            "--bright/--dark",
+            help="Whether whiskers are bright on dark; by default the first frame tells.",
+        ),
+    ] = None,
 ) -> None:
     """Track a whisker in two videos: its shape, how it is held, its contact, what its base feels.
 
@@ -157,7 +165,7 @@ def track(
     beside = _beside(head, contact, thing)
     if "head" in beside:
         _check_head(beside["head"], videos[0], fps)
-    trace = TraceOptions(scale=max(width / 3.0, 1.0), jump=jump)
+    trace = TraceOptions(scale=max(width / 3.0, 1.0), jump=jump, bright=bright)
     for file, trial in trials.items():
         _tracked(trial, file, views, fps, places, fixed, trace, how, beside)
 
@@ -179,6 +187,8 @@ def _tracked(
     from vibrissa.tracking import partial_traces, trace_file
     from vibrissa.tracking import track as tracked
 
+    if places[0] is None:
+        places = _found_bases(videos, cameras, options, how.offset)
     kept = [partial_traces(recording, view) for view in range(len(videos))]
     with progress_bars() as tell:
         traces = [
@@ -198,6 +208,23 @@ def _tracked(
     for file in kept:
         file.unlink(missing_ok=True)
     tell_recording(result, recording)
+
+
+def _found_bases(
+    videos: Sequence[Path],
+    cameras: tuple[Camera, ...],
+    options: TraceOptions,
+    offset: int | None,
+) -> list[Any]:
+    """Bases of the whisker that all views show; None where no line is the same in all."""
+    from vibrissa.io import read_video
+    from vibrissa.tracking import find_bases
+
+    frames = [next(read_video(video), None) for video in videos]
+    if any(frame is None for frame in frames) or offset != 0:
+        return [None] * len(videos)
+    found = find_bases(cameras, [frame for frame in frames if frame is not None], options)
+    return [None] * len(videos) if found is None else [[base.tolist()] for base in found]
 
 
 def _cameras(

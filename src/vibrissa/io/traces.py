@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from vibrissa.io.replace import replacing
 
 Array = NDArray[np.float64]
-Row = tuple[Array, Array, NDArray[np.bool_], float]
-"""Points (n, 2), standard deviations (n,), seen (n,) and confidence."""
+Row = tuple[Array, Array, NDArray[np.bool_], float, bool, bool]
+"""Points (n, 2), standard deviations (n,), seen (n,), confidence, whether base and tip are."""
 
 
 def save_traces(path: str | PathLike[str], key: str, traces: Sequence[Sequence[Row]]) -> None:
@@ -31,7 +31,7 @@ def save_traces(path: str | PathLike[str], key: str, traces: Sequence[Sequence[R
     key : str
         Of what they are.
     traces : sequence of sequence of tuple
-        Whisker by whisker, frame by frame: line, sigma, seen, confidence.
+        Whisker by whisker, frame by frame: line, sigma, seen, confidence, base and tip seen.
     """
     rows = [row for whisker in traces for row in whisker]
     columns = [np.concatenate([row[k] for row in rows]) if rows else np.empty(0) for k in range(3)]
@@ -42,6 +42,7 @@ def save_traces(path: str | PathLike[str], key: str, traces: Sequence[Sequence[R
             whiskers=np.array(len(traces)),
             count=np.array([len(row[0]) for row in rows], dtype=np.int64),
             confidence=np.array([row[3] for row in rows]),
+            ends=np.array([row[4:6] for row in rows], dtype=bool).reshape(-1, 2),
             line=columns[0].reshape(-1, 2),
             sigma=columns[1],
             seen=columns[2].astype(bool),
@@ -71,12 +72,12 @@ def load_traces(path: str | PathLike[str], key: str) -> list[list[Row]] | None:
                 return None
             count, whiskers = file["count"], int(file["whiskers"])
             parts = [np.split(file[name], np.cumsum(count)[:-1]) for name in _COLUMNS]
-            confidence = file["confidence"]
+            confidence, ends = file["confidence"], file["ends"]
     except (OSError, ValueError, KeyError, BadZipFile):
         return None
     rows = [
-        (line, sigma, seen, float(sure))
-        for line, sigma, seen, sure in zip(*parts, confidence, strict=True)
+        (line, sigma, seen, float(sure), bool(base), bool(tip))
+        for line, sigma, seen, sure, (base, tip) in zip(*parts, confidence, ends, strict=True)
     ]
     each = len(rows) // max(whiskers, 1)
     return [rows[k * each : (k + 1) * each] for k in range(whiskers)]

@@ -1,5 +1,6 @@
 """From two videos to a whisker in space: trace, merge, pose, contact, wrench."""
 
+from vibrissa.tracking.begin import find_bases, is_bright
 from vibrissa.tracking.filtering import low_pass
 from vibrissa.tracking.find import Found, find_whiskers
 from vibrissa.tracking.follow import Follower, start_at
@@ -30,7 +31,9 @@ __all__ = [
     "TrackOptions",
     "Tracked",
     "base_pose",
+    "find_bases",
     "find_whiskers",
+    "is_bright",
     "low_pass",
     "merge",
     "paired_frames",

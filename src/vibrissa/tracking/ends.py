@@ -22,6 +22,16 @@ _FUR = 3
 _BEYOND = 12
 """How many points beyond the last that is seen are looked at to find the tip."""
 
+_BORDER = 8.0
+"""How near the border of the image a line may end because the image does, pixels."""
+
+_CLEAR = 3.0
+"""By how many standard deviations, in each of its last points, a line must be darker than what is
+beyond for it to be seen to end there: then its end is known to a point."""
+
+_LAST = 10
+"""Points, and half as many beyond, from which that is told."""
+
 _BESIDE = (4.0, 7.0)
 """How far beside the whisker the face's edge is looked for, pixels."""
 
@@ -63,13 +73,18 @@ def traced(
         line = even(smoothed(frame, line, 3, noise, options, _FUR if from_face else 0)[0])
     if len(line) < FEWEST:
         return Trace.lost(), False
+    if not from_face:
+        # Without a face it begins as it ends: where the line does.
+        line = _lengthened(line[::-1])[::-1]
     line, fit = smoothed(frame, line, 1, noise, options, _FUR if from_face else 0)
-    count = tip(fit, noise)
-    if count < FEWEST:
+    first = 0 if from_face else len(line) - tip(fit.part(slice(None, None, -1)))
+    last = tip(fit)
+    if last - first < FEWEST:
         return Trace.lost(), False
-    seen = fit.seen[:count]
-    trusted = min(1.0, float(seen.sum() / max(fit.open[:count].sum(), 1)))
-    return Trace(line[:count], fit.sigma[:count], seen, trusted), from_face
+    tip_seen = _inside(frame, line[last - 1]) and _stops(frame, line, fit, last)
+    line, fit = line[first:last], fit.part(slice(first, last))
+    trusted = min(1.0, float(fit.seen.sum() / max(fit.open.sum(), 1)))
+    return Trace(line, fit.sigma, fit.seen, trusted, _inside(frame, line[0]), tip_seen), from_face
 
 
 def with_base(frame: Frame, line: Array, before: float) -> tuple[Array, bool]:
@@ -118,7 +133,7 @@ def _edge(frame: Frame, line: Array, distance: float) -> float | None:
     return float(np.mean(places))
 
 
-def tip(fit: Fit, noise: float) -> int:
+def tip(fit: Fit) -> int:
     """Say how many points of a line belong to the whisker.
 
     Beyond the tip the line is as light as its surroundings; before it, it goes on being about as
@@ -128,15 +143,13 @@ def tip(fit: Fit, noise: float) -> int:
     ----------
     fit : Fit
         Measured along the line and beyond the tip.
-    noise : float
-        Of the image.
 
     Returns
     -------
     int
         Points up to the tip.
     """
-    sigma = noise * np.sqrt(ridge.DEPTH_VARIANCE)
+    sigma = fit.noise * np.sqrt(ridge.DEPTH_VARIANCE)
     amplitude = np.where(fit.open, fit.amplitude, 0.0)
     count = np.convolve(fit.open.astype(float), np.ones(20))[: len(amplitude)]
     recent = np.convolve(np.maximum(amplitude, 0.0), np.ones(20))[: len(amplitude)]
@@ -144,6 +157,26 @@ def tip(fit: Fit, noise: float) -> int:
     usual = 0.6 * np.concatenate([[0.0], (recent / np.maximum(count, 1.0))[:-1]])
     gain = np.where(fit.open, (amplitude * usual - 0.5 * usual**2) / sigma**2, 0.0)
     return int(np.argmax(np.cumsum(np.clip(gain, -8.0, 8.0)))) + 1
+
+
+def _stops(frame: Frame, line: Array, fit: Fit, count: int) -> bool:
+    """Whether a line of so many points is seen to end, not to fade or to run behind something."""
+    before, after = slice(max(count - _LAST, 0), count), slice(count, count + _LAST // 2)
+    if not fit.open[after].any() or fit.open[before].mean() < 0.5 or fit.open[after].mean() < 0.5:
+        return False
+    levels = np.empty((len(line[before]), 2))
+    ridge.beside(frame, np.ascontiguousarray(line[before]), _BESIDE[0], levels)
+    if np.median(levels) >= np.iinfo(frame.dtype).max:
+        # Where the light is more than the image holds, what is faint does not show.
+        return False
+    sigma = fit.noise * np.sqrt(ridge.DEPTH_VARIANCE)
+    return bool(fit.amplitude[before][fit.open[before]].mean() > _CLEAR * sigma)
+
+
+def _inside(frame: Frame, place: Array) -> bool:
+    """Whether a place is not at the border of the image."""
+    far = np.array(frame.shape[::-1]) - 1.0 - _BORDER
+    return bool((place > _BORDER).all() and (place < far).all())
 
 
 def _lengthened(line: Array) -> Array:

@@ -106,21 +106,39 @@ def _whisker(frame: Frame, noise: float, line: Array, o: TraceOptions) -> list[F
         if trace.support < o.shortest:
             continue
         found = Found(trace, from_face)
-        if not best or (from_face, _thinner(frame, noise, trace, o)) > (
+        if not best or (from_face, darker_inward(frame, noise, trace, o)) > (
             best[0].from_face,
-            _thinner(frame, noise, best[0].trace, o),
+            darker_inward(frame, noise, best[0].trace, o),
         ):
             best = [found]
     return best
 
 
-def _thinner(frame: Frame, noise: float, trace: Trace, o: TraceOptions) -> float:
-    """How much darker the first third is than the last."""
-    n = len(trace.line)
-    columns = [np.empty(n) for _ in range(4)]
-    ridge.measure(frame, np.ascontiguousarray(trace.line), 0, noise, o.scale, *columns)
-    amplitude = columns[1]
-    return float(np.median(amplitude[: n // 3]) - np.median(amplitude[-n // 3 :]))
+def darker_inward(frame: Frame, noise: float, trace: Trace, options: TraceOptions) -> float:
+    """Say how much darker the first third of a whisker is than the last.
+
+    Parameters
+    ----------
+    frame : array (height, width)
+        Grey values.
+    noise : float
+        Of the image.
+    trace : Trace
+        Of the whisker.
+    options : TraceOptions
+        How it is traced.
+
+    Returns
+    -------
+    float
+        Grey values; below zero if it is fainter there.
+    """
+    line = np.ascontiguousarray(trace.line)
+    columns = [np.empty(len(line)) for _ in range(4)]
+    # Twice as wide as else, so that a thick base is measured too.
+    ridge.measure(frame, line, 0, noise, 2.0 * options.scale, *columns)
+    third = len(line) // 3
+    return float(np.median(columns[1][:third]) - np.median(columns[1][-third:]))
 
 
 def _distinct(found: list[Found]) -> list[Found]:

@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _SUPPORTED = 2.5
+_MEDIAN = 0.455
+"""Of the square of a standard normal number."""
 
 
 class Fit(NamedTuple):
@@ -34,12 +36,32 @@ class Fit(NamedTuple):
         Whether each point is seen.
     open : array (n,)
         Whether it is neither beside nor behind something dark.
+    noise : float
+        Of the image along the line, grey values: as much as was said, or more.
     """
 
     amplitude: Array
     sigma: Array
     seen: Mask
     open: Mask
+    noise: float
+
+    def part(self, rows: slice) -> Fit:
+        """Give some of the points.
+
+        Parameters
+        ----------
+        rows : slice
+            Which.
+
+        Returns
+        -------
+        Fit
+            Of these.
+        """
+        return Fit(
+            self.amplitude[rows], self.sigma[rows], self.seen[rows], self.open[rows], self.noise
+        )
 
 
 def smoothed(
@@ -83,6 +105,9 @@ def smoothed(
     better = smooth(measured, weight, options.stiffness)
     # What lies far from its neighbours counts less, the second time.
     miss = ((measured - better) ** 2).sum(axis=1) * weight
+    # Compression takes noise away where nothing is, and adds it where something is.
+    excess = max(1.0, float(np.median(miss[seen])) / _MEDIAN) if seen.any() else 1.0
+    weight, miss = weight / excess, miss / excess
     weight = np.where(miss > 9.0, weight * 9.0 / np.maximum(miss, 9.0), weight)
     better = smooth(measured, weight, options.stiffness)
     information = np.convolve(weight, np.ones(min(9, n)), mode="same")
@@ -91,7 +116,7 @@ def smoothed(
     away = np.full(n, 1e3) if not known.size else _distance_to(places, known)
     sigma = 1.0 / np.sqrt(np.maximum(information, 1.0)) + 0.05 * (0.1 * STEP * away) ** 1.5
     open_ = flank > 0.6 * np.median(flank)
-    return better, Fit(amplitude, sigma, seen, open_)
+    return better, Fit(amplitude, sigma, seen, open_, noise * float(np.sqrt(excess)))
 
 
 def smooth(line: Array, weight: Array, stiffness: float) -> Array:

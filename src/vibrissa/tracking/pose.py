@@ -90,7 +90,7 @@ def base_pose(curves: Array, shape: RestShape, whisker: Whisker) -> BasePose:
     n = len(curves)
     rotation, position = np.full((n, 3, 3), np.nan), np.full((n, 3), np.nan)
     seen = np.isfinite(curves).all(axis=(1, 2))
-    spacing, shapes = aligned_lengths(curves[seen])
+    spacing, shapes = aligned_lengths(curves[seen], shape.spacing)
     most = int(_WHOLE * min(curves.shape[1], len(shape.points)))
     known = np.minimum(np.isfinite(shapes[:, :, 0]).sum(axis=1), most)
     free = shape.free[seen]

@@ -11,8 +11,9 @@ moment at the base; the covariance says how well.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,7 @@ from vibrissa.tracking.head import HeadPose
 from vibrissa.tracking.pose import BasePose
 from vibrissa.tracking.rods import UNKNOWNS, State, bent, first_contacts, rods, tangents
 from vibrissa.tracking.sight import Sight
+from vibrissa.tracking.trust import trace_variance
 from vibrissa.trial.cameras import Camera
 from vibrissa.whisker import Whisker
 
@@ -155,7 +157,74 @@ def refine(
     Refined
         NaN in frames that show nothing.
     """
-    options = options or RefineOptions()
+    problem, frames = _problem(
+        cameras, sight, whisker, pose, touching, curves, rate, options or RefineOptions(), head
+    )
+    _, state, fit = problem.trusted()
+    found = _answer(problem.d, state, fit, problem.touching, nodes)
+    return _whole(_in_laboratory(found, problem.head), frames, len(curves))
+
+
+def cost_of(
+    cameras: Sequence[Camera],
+    sight: Sight,
+    touching: NDArray[np.bool_],
+    curves: Array,
+    rate: float,
+    options: RefineOptions,
+    head: HeadPose,
+) -> Callable[[Whisker, BasePose], float]:
+    """Say how whiskers are compared: by how well they explain the same traces.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        The views.
+    sight : Sight
+        The traces of one whisker.
+    touching : array (time,)
+        Frames in contact.
+    curves : array (time, node, 3)
+        The whisker, about, relative to the head, m; NaN in frames that do not count.
+    rate : float
+        Frames per second.
+    options : RefineOptions
+        How smooth.
+    head : HeadPose
+        The head in these frames.
+
+    Returns
+    -------
+    callable
+        Gives the sum of squares, in standard deviations, of a whisker with its pose.
+    """
+    variance: Array | None = None
+
+    def cost(whisker: Whisker, pose: BasePose) -> float:
+        nonlocal variance
+        problem, _ = _problem(cameras, sight, whisker, pose, touching, curves, rate, options, head)
+        if variance is None:
+            # The first says how far the traces are to be trusted.
+            trusted, _, fit = problem.trusted()
+            variance = trusted.variance
+            return fit.cost
+        return replace(problem, variance=variance).solved()[1].cost
+
+    return cost
+
+
+def _problem(
+    cameras: Sequence[Camera],
+    sight: Sight,
+    whisker: Whisker,
+    pose: BasePose,
+    touching: Mask,
+    curves: Array,
+    rate: float,
+    options: RefineOptions,
+    head: HeadPose | None,
+) -> tuple[_Problem, NDArray[np.intp]]:
+    """Equations of the frames that show something, and which these are."""
     d = discretize(whisker)
     known = np.isfinite(pose.rotation).all(axis=(1, 2)) & np.isfinite(curves).all(axis=(1, 2))
     frames = np.flatnonzero(known)
@@ -166,10 +235,18 @@ def refine(
     )
     start.contact[:, 0] = 0.5
     start.contact[touching] = first_contacts(d, start, curves[frames], touching)[0]
-    problem = _Problem(d, cameras, sight, touching, frames, start, rate, options, head)
-    state, smoother, misfit = problem.solved()
-    found = _answer(d, state, smoother.covariances(), touching, misfit, nodes)
-    return _whole(_in_laboratory(found, head), frames, len(curves))
+    return _Problem(d, cameras, sight, touching, frames, start, rate, options, head), frames
+
+
+class _Linear(NamedTuple):
+    """Normal equations at a state, and what they were made of."""
+
+    smoother: Smoother
+    cost: float
+    misfit: Array
+    wild: Mask
+    data: Array
+    misses: list[Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,23 +260,33 @@ class _Problem:
     rate: float
     options: RefineOptions
     head: HeadPose
+    begun: State | None = None
+    variance: Array | None = None
 
-    def solved(self) -> tuple[State, Smoother, Array]:
+    def trusted(self) -> tuple[_Problem, State, _Linear]:
+        """The problem with traces that are trusted as far as they deserve, and its solution."""
+        state, fit = self.solved()
+        fitted = np.einsum("tij,tji->t", fit.smoother.covariances(), fit.data)
+        variance = trace_variance(fit.misses, fitted)
+        problem = replace(self, begun=state, variance=variance)
+        return (problem, *((state, fit) if (variance == 1.0).all() else problem.solved()))
+
+    def solved(self) -> tuple[State, _Linear]:
         """Gauss–Newton with Levenberg's damping."""
-        state, damping = self.start, 1e-3
-        smoother, cost, misfit, _ = self._linear(state)
+        state, damping = self.begun or self.start, 1e-3
+        fit = self._linear(state)
         for _ in range(self.options.rounds):
-            step = smoother.solved(damping)
+            step = fit.smoother.solved(damping)
             trial = state.moved(step)
-            tried, lower, spread, wild = self._linear(trial)
-            if wild.any():
+            tried = self._linear(trial)
+            if tried.wild.any():
                 # A contact near the thin tip soon has a force under which no rod is in balance.
-                contact = np.where(wild[:, None], state.contact, trial.contact)
+                contact = np.where(tried.wild[:, None], state.contact, trial.contact)
                 trial = replace(trial, contact=contact)
-                tried, lower, spread, _ = self._linear(trial)
-            if lower < cost:
-                small = cost - lower < 1e-4 * cost
-                state, smoother, cost, misfit = trial, tried, lower, spread
+                tried = self._linear(trial)
+            if tried.cost < fit.cost:
+                small = fit.cost - tried.cost < 1e-4 * fit.cost
+                state, fit = trial, tried
                 damping = max(damping / 5.0, 1e-8)
                 if small:
                     break
@@ -207,10 +294,10 @@ class _Problem:
                 damping *= 10.0
                 if damping > 1e6:
                     break
-        return state, smoother, misfit
+        return state, fit
 
-    def _linear(self, state: State) -> tuple[Smoother, float, Array, Mask]:
-        """Normal equations at a state, the cost, each frame's misfit, and rods that blow up."""
+    def _linear(self, state: State) -> _Linear:
+        """Linearise at a state; rods that blow up count as infinitely far away."""
         points, slopes = bent(self.d, state, self.touching)
         wild = ~(np.abs(slopes).max(axis=(1, 2, 3)) < _WILD)
         points[wild], slopes[wild] = state.position[wild, None], 0.0
@@ -220,6 +307,8 @@ class _Problem:
         hessian = np.zeros((len(points), UNKNOWNS, UNKNOWNS))
         gradient = np.zeros((len(points), UNKNOWNS))
         total, count = np.zeros(len(points)), np.zeros(len(points))
+        weight = np.ones(len(points)) if self.variance is None else 1.0 / self.variance
+        along = []
         for view, camera in enumerate(self.cameras):
             pixels, by_point = camera.project_with_slopes(points)
             rows, misses = self.sight.equations(view, pixels, by_point * self.d.length)
@@ -228,11 +317,14 @@ class _Problem:
             gradient += np.einsum("tni,tn->ti", design, misses)
             total += (misses**2).sum(axis=1)
             count += (misses != 0.0).sum(axis=1)
+            # The last two are how far the ends are off along the trace.
+            along.append(np.where(wild[:, None], 0.0, misses[:, :-2]))
         misfit = np.sqrt(total / np.maximum(count, 1.0))
         total[wild] = np.inf
-        smoother = Smoother(hessian, gradient)
-        cost = float(total.sum()) + self._priors(smoother, state)
-        return smoother, cost, misfit, wild
+        data = hessian * weight[:, None, None]
+        smoother = Smoother(data, gradient * weight[:, None])
+        cost = float((weight * total).sum()) + self._priors(smoother, state)
+        return _Linear(smoother, cost, misfit, wild, data, along)
 
     def _priors(self, smoother: Smoother, state: State) -> float:
         o = self.options
@@ -280,15 +372,9 @@ def _turning(rotation: Array) -> Array:
     return np.asarray(Rotation.from_matrix(step).as_rotvec())
 
 
-def _answer(
-    d: Discretization,
-    state: State,
-    covariance: Array,
-    touching: Mask,
-    misfit: Array,
-    nodes: int,
-) -> Refined:
+def _answer(d: Discretization, state: State, fit: _Linear, touching: Mask, nodes: int) -> Refined:
     """Results in SI units, relative to the head."""
+    covariance, misfit = fit.smoother.covariances(), fit.misfit
     values, _ = solve_forces(d, state.contact)
     slope = tangents(d, state.contact)
     n = len(touching)

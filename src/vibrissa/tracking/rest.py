@@ -16,6 +16,7 @@ from vibrissa.whisker import Whisker
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Counts = NDArray[np.intp]
 
 _COMMON = 0.85
 """Share of the usual length over which shapes are compared: tips are uncertain."""
@@ -26,6 +27,9 @@ _LEAST = 0.4
 _NEAR = 4.0
 _LONGER = 1.1
 _STILL = 0.01
+_ENDS = 3
+"""Frames at rest that show the tip, from which the length is taken."""
+
 _SMOOTH = 4.0
 _ROUNDS = 4
 
@@ -45,15 +49,28 @@ class RestShape:
         whisker is missing.
     noise : float
         Usual deviation of the free frames, m.
+    whole : bool
+        Whether it ends at the whisker's tip; if not, its tip is not seen.
     """
 
     points: Array
     free: Mask
     deviation: Array
     noise: float
+    whole: bool = True
+
+    @property
+    def spacing(self) -> float:
+        """Of the points, m."""
+        return float(np.median(np.linalg.norm(np.diff(self.points, axis=0), axis=1)))
+
+    @property
+    def length(self) -> float:
+        """Along the points, m."""
+        return float(np.linalg.norm(np.diff(self.points, axis=0), axis=1).sum())
 
 
-def rest_shape(curves: Array, least: float = 0.1) -> RestShape:
+def rest_shape(curves: Array, least: float = 0.1, tips: Mask | None = None) -> RestShape:
     """Find the rest shape among the shapes of a trial.
 
     Parameters
@@ -62,6 +79,8 @@ def rest_shape(curves: Array, least: float = 0.1) -> RestShape:
         The whisker in every frame, equally spaced from base to tip, m; NaN where it is missing.
     least : float
         Share of the frames that are free of contact, at least.
+    tips : array (time,), optional
+        Frames in which the curve ends at the whisker's tip; by default all.
 
     Returns
     -------
@@ -78,16 +97,18 @@ def rest_shape(curves: Array, least: float = 0.1) -> RestShape:
         raise ValueError(
             f"the whisker is seen in {int(seen.sum())} frames; at least 3 are needed for its shape"
         )
-    _, shapes = aligned_lengths(curves[seen])
-    known = np.isfinite(shapes[:, :, 0]).sum(axis=1)
-    compared = int(_COMMON * (curves.shape[1] - 1)) + 1
-    whole = known >= compared
-    if whole.sum() < 3:
-        raise ValueError("hardly any two frames show the whisker over the same length")
+    shapes, known, compared, whole = _compared(curves[seen])
     part = shapes[whole, :compared]
     chords = np.linalg.norm(part[:, ::4, None, :] - part[:, None, ::4, :], axis=-1)
     best, near = _largest_group(chords.reshape(len(part), -1), least)
-    mean = part[best]
+    group = np.flatnonzero(seen)[whole][near]
+    length, ends = _length(curves[group], None if tips is None else tips[group])
+    # The same once more, at places that divide this length evenly.
+    first = np.flatnonzero(whole)[best]
+    shapes, known, compared, whole = _compared(curves[seen], length / (curves.shape[1] - 1))
+    near = np.isin(np.flatnonzero(seen)[whole], group)
+    part = shapes[whole, :compared]
+    mean = shapes[first, :compared]
     deviation = np.full(len(shapes), np.inf)
     for _ in range(_ROUNDS):
         mean = np.median(_onto(part[near], mean), axis=0)
@@ -96,9 +117,7 @@ def rest_shape(curves: Array, least: float = 0.1) -> RestShape:
         near = deviation[whole] < max(_NEAR * usual, 1e-9)
     rotation, shift = motions(part[near], mean)
     moved = np.einsum("tij,tnj->tni", rotation, shapes[whole][near]) + shift[:, None]
-    # A tip that is seen in a quarter of the free frames is part of the whisker.
-    counted = np.isfinite(moved[:, :, 0]).mean(axis=0) >= 0.25
-    points = np.nanmedian(moved[:, counted], axis=0)
+    points = np.nanmedian(moved[:, : curves.shape[1]], axis=0)
     # Where less of the whisker is seen, what is seen says whether it is bent.
     for i in np.flatnonzero(~whole & (known >= _LEAST * compared)):
         n = min(int(known[i]), len(points))
@@ -108,7 +127,27 @@ def rest_shape(curves: Array, least: float = 0.1) -> RestShape:
     out[seen] = np.where(np.isfinite(deviation), deviation, np.nan)
     with np.errstate(invalid="ignore"):
         free = out < max(_NEAR * noise, 1e-9)
-    return RestShape(points, free, out, noise)
+    return RestShape(points, free, out, noise, ends)
+
+
+def _compared(curves: Array, spacing: float | None = None) -> tuple[Array, Counts, int, Mask]:
+    """Shapes at equal lengths, how far each goes, how much is compared, and which show that."""
+    _, shapes = aligned_lengths(curves, spacing)
+    known = np.isfinite(shapes[:, :, 0]).sum(axis=1)
+    compared = int(_COMMON * (curves.shape[1] - 1)) + 1
+    whole = known >= compared
+    if whole.sum() < 3:
+        raise ValueError("hardly any two frames show the whisker over the same length")
+    return shapes, known, compared, whole
+
+
+def _length(curves: Array, tips: Mask | None) -> tuple[float, bool]:
+    """Length of the whisker, m, and whether its tip is seen."""
+    lengths = np.linalg.norm(np.diff(curves, axis=1), axis=2).sum(axis=1)
+    ends = np.ones(len(curves), dtype=bool) if tips is None else tips
+    whole = bool(ends.sum() >= _ENDS)
+    # A part of a tip may be missed, but hardly is more seen than there is.
+    return float(np.percentile(lengths[ends] if whole else lengths, 75.0)), whole
 
 
 def known_rest(curves: Array, whisker: Whisker, least: float = 0.1) -> RestShape:
@@ -189,13 +228,15 @@ def whisker_at_rest(shape: RestShape, name: str = "tracked", **properties: float
     return Whisker.from_points(shape.points, noise=noise, name=name, **properties)  # type: ignore[arg-type]
 
 
-def aligned_lengths(curves: Array) -> tuple[float, Array]:
+def aligned_lengths(curves: Array, spacing: float | None = None) -> tuple[float, Array]:
     """Cut curves at the same arc lengths.
 
     Parameters
     ----------
     curves : array (time, node, 3)
         Each equally spaced from base to tip, m.
+    spacing : float, optional
+        Of the arc lengths, m; by default such that the curves have about as many points.
 
     Returns
     -------
@@ -208,11 +249,13 @@ def aligned_lengths(curves: Array) -> tuple[float, Array]:
     lengths = steps.sum(axis=1)
     count = curves.shape[1]
     # Some frames may show less of the whisker, hardly any more.
-    spacing = float(np.percentile(lengths, 75.0)) / (count - 1)
+    if spacing is None:
+        spacing = float(np.percentile(lengths, 75.0)) / (count - 1)
     s = np.arange(int(1.05 * count)) * spacing
     shapes = np.full((len(curves), len(s), 3), np.nan)
     for i, (curve, step) in enumerate(zip(curves, steps, strict=True)):
         at = np.concatenate([[0.0], np.cumsum(step)])
+        at[-1] *= 1.0 + 1e-9
         for k in range(3):
             shapes[i, :, k] = np.interp(s, at, curve[:, k], right=np.nan)
     return spacing, shapes

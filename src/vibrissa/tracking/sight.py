@@ -36,12 +36,15 @@ class Sight:
         1 where the whisker is seen, 0 where it is bridged.
     confidence : array (time, view)
         Between 0 and 1.
+    ends : array (time, view, 2)
+        1 where the whisker is seen to begin and to end there, else 0.
     """
 
     line: Array
     sigma: Array
     seen: Array
     confidence: Array
+    ends: Array
 
     @classmethod
     def of(cls, traces: Sequence[Sequence[Trace]]) -> Sight:
@@ -58,7 +61,7 @@ class Sight:
         """
         shape = (len(traces[0]), len(traces), NODES)
         line, sigma, seen = np.full((*shape, 2), np.nan), np.full(shape, np.nan), np.zeros(shape)
-        confidence = np.zeros(shape[:2])
+        confidence, ends = np.zeros(shape[:2]), np.zeros((*shape[:2], 2))
         for view, row in enumerate(traces):
             for i, trace in enumerate(row):
                 n = len(trace.line)
@@ -70,7 +73,8 @@ class Sight:
                 sigma[i, view] = np.interp(place, np.arange(n), trace.sigma)
                 seen[i, view] = np.interp(place, np.arange(n), trace.seen) > 0.5
                 confidence[i, view] = trace.confidence
-        return cls(line, sigma, seen, confidence)
+                ends[i, view] = trace.base_seen, trace.tip_seen
+        return cls(line, sigma, seen, confidence, ends)
 
     def traces(self, frame: int) -> list[Trace]:
         """Give one frame's traces.
@@ -86,14 +90,15 @@ class Sight:
             View by view.
         """
         return [
-            Trace(line, sigma, seen > 0.5, float(confidence))
+            Trace(line, sigma, seen > 0.5, float(confidence), *(ends > 0.5).tolist())
             if np.isfinite(line).all()
             else Trace.lost()
-            for line, sigma, seen, confidence in zip(
+            for line, sigma, seen, confidence, ends in zip(
                 self.line[frame],
                 self.sigma[frame],
                 self.seen[frame],
                 self.confidence[frame],
+                self.ends[frame],
                 strict=True,
             )
         ]
@@ -164,7 +169,8 @@ class Sight:
         ends, gaps = [], []
         for end in (0, -1):
             gap = ((line[:, end] - pixels[:, end]) * tangent[:, end]).sum(axis=1)
-            counts = np.isfinite(gap) & ((end == 0) | (np.abs(gap) < _FAR))
+            counts = np.isfinite(gap) & (self.ends[:, view, end] > 0.5)
+            counts &= (end == 0) | (np.abs(gap) < _FAR)
             pull = np.einsum("ti,tij->tj", tangent[:, end], slopes[:, end]) / _END
             ends.append(np.where(counts[:, None], pull, 0.0))
             gaps.append(np.where(counts, gap / _END, 0.0))

@@ -91,7 +91,7 @@ def merge(cameras: Sequence[Camera], traces: Sequence[Trace]) -> SpaceCurve:
     Returns
     -------
     SpaceCurve
-        NaN if a trace is missing.
+        NaN if a trace is missing, or does not show the whisker's base.
 
     Raises
     ------
@@ -100,7 +100,7 @@ def merge(cameras: Sequence[Camera], traces: Sequence[Trace]) -> SpaceCurve:
     """
     if len(cameras) < 2 or len(cameras) != len(traces):
         raise ValueError(f"{len(cameras)} cameras and {len(traces)} traces: two each are needed")
-    if any(len(trace.line) < 8 for trace in traces):
+    if any(len(trace.line) < 8 or not trace.base_seen for trace in traces):
         return SpaceCurve.none()
     start = _matched(cameras, traces)
     if len(start) < 8 or not np.isfinite(start).all():
@@ -279,7 +279,7 @@ def _equations(
         for node, end in ((0, 0), (_SAMPLES - 1, -1)):
             gap = float((line[end] - pixels[node]) @ tangent[end])
             # The whisker may go on in another view where this one no longer shows it.
-            if node == 0 or abs(gap) < 6.0:
+            if node == 0 or (trace.tip_seen and abs(gap) < 6.0):
                 nodes.append(np.array([node]))
                 rows.append(tangent[end][None, :] @ slopes[node] / _END)
                 misses.append(np.array([gap / _END]))

@@ -24,6 +24,11 @@ LARGEST = 30
 
 _SWITCH = 40.0
 _WORST = 6.0
+_CLEARLY = 20.0
+"""By how much another shift must fit better than what is said."""
+
+_KNOWN = 10
+"""Frames that show an end, from which something can be told."""
 
 
 def paired_frames(
@@ -71,6 +76,59 @@ def paired_frames(
     return pairs[usable]
 
 
+def better_offset(
+    first: Camera, second: Camera, a: Sequence[Trace], b: Sequence[Trace], offset: int
+) -> Pairs:
+    """Say whether two videos fit clearly better with another shift between them.
+
+    What a calibration is off by all shifts share, and it does not count.
+
+    Parameters
+    ----------
+    first, second : Camera
+        The views.
+    a, b : sequence of Trace
+        Of one whisker, frame by frame.
+    offset : int
+        By how many frames the second began earlier, as it is said.
+
+    Returns
+    -------
+    array (n,)
+        Shifts that fit better, in the order of time; none if this one is as good.
+    """
+    cost = np.zeros((len(a), 2 * LARGEST + 1))
+    for end in (0, -1):
+        rows, other = (_shown(row, end) for row in (a, b))
+        if min(len(rows), len(other)) < _KNOWN or abs(offset) > LARGEST:
+            continue
+        gap = np.full(cost.shape, np.nan)
+        here, there = _rays(first, a, end), _rays(second, b, end)
+        for k in range(cost.shape[1]):
+            mine = rows[np.isin(rows + k - LARGEST, other)]
+            partner = mine + k - LARGEST
+            gap[mine, k] = _passing(
+                (here[0][mine], here[1][mine]), (there[0][partner], there[1][partner])
+            )
+        told = gap[:, offset + LARGEST]
+        if np.isfinite(told).sum() < _KNOWN:
+            continue
+        away = (gap - np.nanmedian(told)) * _pixels_per_m(first, second, a, b, end)
+        cost += np.where(np.isfinite(away), np.minimum(away**2, _WORST), 0.5 * _WORST)
+    way = _cheapest(cost)
+    changed = _SWITCH * int((np.diff(way) != 0).sum()) + _CLEARLY
+    frames = np.arange(len(a))
+    if cost[frames, way].sum() + changed >= cost[:, offset + LARGEST].sum():
+        return np.empty(0, dtype=np.int64)
+    return np.asarray(way[np.concatenate([[True], np.diff(way) != 0])] - LARGEST, dtype=np.int64)
+
+
+def _shown(traces: Sequence[Trace], end: int) -> NDArray[np.intp]:
+    """Frames in which an end of the whisker is seen."""
+    seen = [len(t.line) > 0 and (t.base_seen, t.tip_seen)[end] for t in traces]
+    return np.flatnonzero(seen)
+
+
 def _shifts(first: Camera, second: Camera, a: Sequence[Trace], b: Sequence[Trace]) -> Pairs:
     """Shift of each frame of the first view, by the cheapest way through all shifts."""
     count = len(a)
@@ -112,10 +170,16 @@ def _rays(camera: Camera, traces: Sequence[Trace], end: int) -> tuple[Array, Arr
 
 def _distance(one: tuple[Array, Array], other: tuple[Array, Array]) -> Array:
     """Between lines, m."""
+    distance: Array = np.abs(_passing(one, other))
+    return distance
+
+
+def _passing(one: tuple[Array, Array], other: tuple[Array, Array]) -> Array:
+    """Distance between lines, m; its sign says on which side they pass."""
     normal = np.cross(one[1], other[1])
     size = np.linalg.norm(normal, axis=1)
     away = ((other[0] - one[0]) * normal).sum(axis=1)
-    distance: Array = np.abs(away) / np.maximum(size, 1e-12)
+    distance: Array = away / np.maximum(size, 1e-12)
     return distance
 
 

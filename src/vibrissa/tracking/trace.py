@@ -36,6 +36,8 @@ class TraceOptions:
         farther away is another whisker. Each frame in which it is lost adds a pixel.
     memory : int
         Frames over which the usual length is remembered.
+    bright : bool, optional
+        Whether whiskers are bright on dark; by default the first frame tells.
     """
 
     bridge: float = 90.0
@@ -44,6 +46,7 @@ class TraceOptions:
     shortest: float = 40.0
     jump: float = 5.0
     memory: int = 25
+    bright: bool | None = None
 
 
 class Trace(NamedTuple):
@@ -59,12 +62,17 @@ class Trace(NamedTuple):
         Whether each point is seen, not bridged.
     confidence : float
         Between 0 and 1.
+    base_seen, tip_seen : bool
+        Whether the whisker is seen to begin and to end there. If not it goes on outside of the
+        image, or fades into the noise.
     """
 
     line: Array
     sigma: Array
     seen: Mask
     confidence: float
+    base_seen: bool = True
+    tip_seen: bool = True
 
     @classmethod
     def lost(cls) -> Trace:

@@ -16,8 +16,15 @@ from vibrissa.tracking.contact import Contacts, contacts_at, given_contacts
 from vibrissa.tracking.dataset import tracked_recording
 from vibrissa.tracking.filtering import CUTOFF
 from vibrissa.tracking.head import HeadPose
+from vibrissa.tracking.length import (
+    Length,
+    lengthened,
+    likeliest_length,
+    with_length_unsure,
+)
 from vibrissa.tracking.pose import BasePose, base_pose
-from vibrissa.tracking.refine import Refined, RefineOptions, refine
+from vibrissa.tracking.refine import Refined, RefineOptions, cost_of, refine
+from vibrissa.tracking.remarks import check_views, remarks_on, remarks_on_time
 from vibrissa.tracking.rest import RestShape, known_rest, rest_shape, whisker_at_rest
 from vibrissa.tracking.roll import rolled
 from vibrissa.tracking.sight import Sight
@@ -34,6 +41,12 @@ Progress = Callable[[str, int, int], None]
 """Called with what is being done, and how much of how much is."""
 
 _ANY_ROLL = np.radians(10.0)
+
+_FEWEST, _FRAMES = 8, 24
+"""Frames in contact from which a length is taken: at least, at most."""
+
+_LONGER = 2.0
+"""By how many standard deviations another length differs, to see what hangs on it."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +104,8 @@ class Tracked:
         The rod that fits the traces.
     head : HeadPose
         The head in these frames.
+    length : Length
+        Of the whisker; its standard deviation is 0 where its tip is seen or it is given.
     contacts : Contacts, optional
         Contact points that do not come from the rod.
     """
@@ -105,6 +120,7 @@ class Tracked:
     touching: Mask
     refined: Refined
     head: HeadPose
+    length: Length
     contacts: Contacts | None = None
 
 
@@ -151,12 +167,14 @@ def track(
         A recording. Its base pose, contact and wrench are those of the rod that fits the traces;
         the group ``measured`` holds what was measured before: the whisker merged from the views
         with its uncertainty, the pose the paper's way, and the contact points of ``contacts`` or
-        ``objects`` beside those of the rod.
+        ``objects`` beside those of the rod. The attribute ``remarks``, if there is one, says what
+        is to be known before it is believed, a sentence a line.
 
     Raises
     ------
     ValueError
-        If views and whiskers do not fit together, or a whisker is seen in too few frames.
+        If views and whiskers do not fit together, a whisker is seen in too few frames, or the
+        views show different ones.
     """
     options = options or TrackOptions()
     counts = {len(view) for view in traces}
@@ -169,7 +187,7 @@ def track(
         raise ValueError(f"rate is {rate!r}; it must be positive, in frames per second")
     pairs = paired_frames(cameras, [view[0] for view in traces], options.offset)
     moving = None if head is None else HeadPose.of(head, pairs[:, 0], rate)
-    found = []
+    found, remarks = [], remarks_on_time(cameras, [view[0] for view in traces], options.offset)
     for k in range(counts.pop()):
         rows = [[view[k][i] for i in pairs[:, v]] for v, view in enumerate(traces)]
         name = names[k] if names is not None else f"whisker {k}"
@@ -180,7 +198,11 @@ def track(
         elif objects:
             other = contacts_at(objects, one.curves, one.touching, one.refined)
         found.append(replace(one, contacts=other))
-    return tracked_recording(cameras, found, pairs, rate, moving, objects, options.cutoff)
+        remarks += remarks_on(cameras, one.sight, one.length, name)
+    recording = tracked_recording(cameras, found, pairs, rate, moving, objects, options.cutoff)
+    if remarks:
+        recording.attrs["remarks"] = "\n".join(remarks)
+    return recording
 
 
 def track_whisker(
@@ -218,10 +240,12 @@ def track_whisker(
     Raises
     ------
     ValueError
-        If it is seen in too few frames.
+        If it is seen in too few frames, or the views show different whiskers.
     """
     tell = progress or _silent
     count = len(traces[0])
+    sight = Sight.of(traces)
+    check_views(cameras, sight, name)
     curves = []
     for i, views in enumerate(zip(*traces, strict=True)):
         curves.append(merge(cameras, views))
@@ -230,34 +254,96 @@ def track_whisker(
     tell(f"contact of {name}", 0, 2)
     head = head or HeadPose.still(count)
     on_head = head.seen_from(points)
-    shape, whisker = _at_rest(on_head, options, name)
-    unfiltered = base_pose(on_head, shape, whisker)
-    pose = unfiltered.filtered(rate, options.cutoff)
+    tips: Mask = np.all(sight.ends[:, :, 1] > 0.5, axis=1)
+    shape, whisker = _at_rest(on_head, options, name, tips)
     tell(f"contact of {name}", 1, 2)
     known = np.isfinite(points).all(axis=(1, 2))
     touching = known & ~shape.free
-    sight = Sight.of(traces)
     how = options.refine
     if not shape.free.any():
         # Nothing but the bent shapes shows how the whisker is rolled.
-        pose = rolled(pose, on_head, whisker)
         how = replace(how, roll=max(how.roll, _ANY_ROLL))
-    refined = refine(
-        cameras, sight, whisker, pose, touching, on_head, rate, how, points.shape[1], head
-    )
+    fit = _Fit(cameras, sight, on_head, touching, rate, options, how, head)
+    length = Length(whisker.length, 0.0)
+    if options.whisker is None and not shape.whole:
+        length = fit.length(shape)
+        shape = lengthened(shape, length.value)
+        whisker = whisker_at_rest(shape, name, **options.properties)
+    unfiltered, pose = fit.pose(shape, whisker)
+    refined = fit.refined(whisker, pose)
+    if length.sigma > 0.0:
+        longer = lengthened(shape, length.value + _LONGER * length.sigma)
+        other = whisker_at_rest(longer, name, **options.properties)
+        further = fit.refined(other, fit.pose(longer, other)[1])
+        refined = with_length_unsure(refined, further, 1.0 / _LONGER)
     tell(f"contact of {name}", 2, 2)
     covariance = np.array([curve.covariance for curve in curves])
     return Tracked(
-        whisker, sight, points, covariance, shape, pose, unfiltered, touching, refined, head
+        whisker, sight, points, covariance, shape, pose, unfiltered, touching, refined, head, length
     )
 
 
-def _at_rest(curves: Array, options: TrackOptions, name: str) -> tuple[RestShape, Whisker]:
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Rods that are fitted to the same traces."""
+
+    cameras: Sequence[Camera]
+    sight: Sight
+    curves: Array
+    touching: Mask
+    rate: float
+    options: TrackOptions
+    how: RefineOptions
+    head: HeadPose
+
+    def pose(self, shape: RestShape, whisker: Whisker) -> tuple[BasePose, BasePose]:
+        """How it is held, unfiltered and filtered."""
+        unfiltered = base_pose(self.curves, shape, whisker)
+        pose = unfiltered.filtered(self.rate, self.options.cutoff)
+        return unfiltered, pose if shape.free.any() else rolled(pose, self.curves, whisker)
+
+    def refined(self, whisker: Whisker, pose: BasePose) -> Refined:
+        return refine(
+            self.cameras,
+            self.sight,
+            whisker,
+            pose,
+            self.touching,
+            self.curves,
+            self.rate,
+            self.how,
+            self.curves.shape[1],
+            self.head,
+        )
+
+    def length(self, shape: RestShape) -> Length:
+        """Of a whisker whose tip is not seen, from some of the frames in contact."""
+        rows = np.flatnonzero(self.touching)
+        if len(rows) < _FEWEST:
+            return Length(shape.length, np.nan)
+        rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _FRAMES)).astype(int)]
+        curves = np.full_like(self.curves, np.nan)
+        curves[rows] = self.curves[rows]
+        cost = cost_of(
+            self.cameras, self.sight, self.touching, curves, self.rate, self.how, self.head
+        )
+
+        def of(length: float) -> float:
+            longer = lengthened(shape, length)
+            whisker = whisker_at_rest(longer, **self.options.properties)
+            return cost(whisker, self.pose(longer, whisker)[1])
+
+        return likeliest_length(shape.length, of)
+
+
+def _at_rest(
+    curves: Array, options: TrackOptions, name: str, tips: Mask
+) -> tuple[RestShape, Whisker]:
     """Take the rest shape from the frames, or as it is known."""
     if options.whisker is not None:
         whisker = options.whisker.with_properties(name=name)
         return known_rest(curves, whisker, options.free), whisker
-    shape = rest_shape(curves, options.free)
+    shape = rest_shape(curves, options.free, tips)
     return shape, whisker_at_rest(shape, name, **options.properties)
 
 

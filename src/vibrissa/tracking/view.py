@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.io.video import Frame
+from vibrissa.tracking.begin import is_bright, negative
 from vibrissa.tracking.find import find_whiskers, overlap
 from vibrissa.tracking.follow import Follower, start_at
 from vibrissa.tracking.identity import Seen, decided
@@ -79,7 +80,17 @@ def trace_video(
     recent: deque[Frame] = deque(maxlen=KEPT)
     seen: list[Seen] = []
     starts = np.empty((0, 2))
+    bright, shape = False, (0, 0)
     for i, frame in enumerate(frames):
+        if i == 0:
+            bright = is_bright(frame, bases, options)
+            shape = frame.shape
+        if frame.shape != shape:
+            raise ValueError(
+                f"frame {i} has {frame.shape[1]} × {frame.shape[0]} pixels and those before it "
+                f"{shape[1]} × {shape[0]}: a video is needed whose frames are of one size"
+            )
+        frame = negative(frame) if bright else frame
         if i == 0:
             if done:
                 places = bases if bases is not None else [None] * len(begun)

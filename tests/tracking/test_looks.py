@@ -1,0 +1,110 @@
+"""Videos that look otherwise: bright whiskers, no face, tips not seen, views that differ."""
+
+import numpy as np
+import pytest
+
+from vibrissa.tracking import TraceOptions, find_bases, is_bright, trace_video
+from vibrissa.tracking.length import lengthened, likeliest_length
+from vibrissa.tracking.rest import RestShape
+from vibrissa.tracking.timing import better_offset
+from vibrissa.tracking.trust import trace_variance
+
+
+def image(begin, end, fade=False, noise=2.0, seed=0, size=(120, 200)):
+    """One dark line from column to column, on light ground, without a face."""
+    x, y = np.arange(size[1], dtype=float), np.arange(size[0])[:, None]
+    share = np.clip((end - x) / (end - begin), 0.0, 1.0) if fade else 1.0
+    dark = 120.0 * share * np.exp(-0.5 * ((y - 50.0 - 0.1 * x) / 1.1) ** 2)
+    picture = 190.0 - dark * ((x >= begin) & (x < end))
+    picture += np.random.default_rng(seed).normal(0.0, noise, size)
+    return np.clip(picture, 0, 255).astype(np.uint8)
+
+
+def test_without_a_face_a_whisker_begins_where_its_line_does():
+    frames = [image(30 + i, 170, seed=i) for i in range(4)]
+    (row,) = trace_video(frames, [(30.0, 53.0)], TraceOptions(shortest=30.0))
+    for i, trace in enumerate(row):
+        assert trace.line[0, 0] == pytest.approx(30.0 + i, abs=2.0)
+        assert trace.line[-1, 0] == pytest.approx(170.0, abs=2.5)
+        assert trace.base_seen
+        assert trace.tip_seen
+
+
+@pytest.mark.parametrize(
+    ("picture", "base", "tip"),
+    [
+        (image(30, 170), True, True),
+        (image(30, 200), True, False),
+        (image(-5, 170), False, True),
+        (image(30, 170, fade=True, noise=9.0), True, False),
+    ],
+    ids=["whole", "out at the tip", "out at the base", "fading"],
+)
+def test_an_end_that_is_not_seen_is_told(picture, base, tip):
+    ((trace,),) = trace_video([picture], [(30.0 if base else 3.0, 53.0)])
+    assert (trace.base_seen, trace.tip_seen) == (base, tip)
+
+
+def test_bright_whiskers_are_traced_as_dark_ones(filmed):
+    frames = filmed.frames[0][:2]
+    negative = [np.asarray(255 - frame) for frame in frames]
+    assert is_bright(negative[0])
+    assert not is_bright(frames[0])
+    for one, other in zip(trace_video(frames)[0], trace_video(negative)[0], strict=True):
+        np.testing.assert_array_equal(one.line, other.line)
+
+
+def test_views_together_say_where_the_whisker_begins(filmed):
+    frames = [view[0] for view in filmed.frames]
+    bases = find_bases(filmed.cameras, frames)
+    for view, base in enumerate(bases):
+        assert np.linalg.norm(base - filmed.truth["trace"].values[0, view, 0]) < 2.0
+    # The same columns are the same x: moved sideways nothing fits.
+    assert find_bases(filmed.cameras, [frames[0], np.roll(frames[1], 40, axis=1)]) is None
+
+
+def test_frames_of_another_size_are_refused():
+    with pytest.raises(ValueError, match="frame 1 has 100 × 120 pixels"):
+        trace_video([image(30, 170), image(30, 170)[:, :100]], [(30.0, 53.0)])
+
+
+def test_a_length_is_found_where_it_costs_least():
+    def cost(length):
+        return 7.0 + ((length - 33e-3) / 0.4e-3) ** 2
+
+    found = likeliest_length(30e-3, cost)
+    assert found.value == pytest.approx(33e-3, rel=1e-6)
+    assert found.sigma == pytest.approx(np.hypot(0.4e-3, 0.005 * 30e-3), rel=1e-4)
+    # What is cheapest if shorter than what is seen is as long as what is seen.
+    assert likeliest_length(34e-3, cost).value == pytest.approx(34e-3)
+    assert np.isnan(likeliest_length(30e-3, lambda length: -length).sigma)
+
+
+def test_a_shape_goes_on_as_it_bends():
+    s = np.linspace(0.0, 20e-3, 101)
+    curve = 0.05 * np.stack([np.sin(s / 0.05), 1.0 - np.cos(s / 0.05), 0.0 * s], axis=1)
+    shape = RestShape(curve[:81], np.ones(3, bool), np.zeros(3), 0.0)
+    longer = lengthened(shape, 20e-3)
+    assert longer.length == pytest.approx(20e-3, rel=2e-3)
+    assert np.abs(longer.points - curve).max() < 20e-6
+
+
+def test_traces_are_trusted_as_far_as_their_residuals_allow():
+    """Residuals of known variance and correlation, and a frame that fits badly."""
+    generator = np.random.default_rng(0)
+    noise, share = generator.normal(size=(200, 48)), 0.6
+    for k in range(1, 48):
+        noise[:, k] = share * noise[:, k - 1] + np.sqrt(1.0 - share**2) * noise[:, k]
+    together = (1.0 + share) / (1.0 - share)
+    found = trace_variance([2.0 * noise], np.zeros(200))
+    assert np.median(found) == pytest.approx(4.0 * together, rel=0.25)
+    noise[7] *= 10.0
+    assert trace_variance([2.0 * noise], np.zeros(200))[7] > 10.0 * np.median(found)
+    assert (trace_variance([0.1 * noise[:5]], np.zeros(5)) == 1.0).all()
+
+
+def test_cameras_out_of_step_are_noticed(filmed):
+    rows = [trace_video(frames)[0] for frames in filmed.frames]
+    in_step = better_offset(*filmed.cameras, rows[0], rows[1], 0)
+    assert not in_step.size
+    assert better_offset(*filmed.cameras, rows[0], rows[1][3:], 0).tolist() == [-3]

@@ -21,8 +21,6 @@ WINDOW = {"width": 1280, "height": 800}
 SHOWN = (270, 0, 1280, 770)  # without the empty wall
 DRAWN = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
-SILENCE = "document.querySelectorAll('.mantine-Notification-root').forEach(x => x.remove())"
-
 
 def picture() -> bytes:
     """What is seen of a contact that three signals do not locate, as PNG."""

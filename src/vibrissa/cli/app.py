@@ -33,7 +33,8 @@ from vibrissa.cli.terminal import errors, output
 
 HELP = """From what a whisker feels at its base to what it touched.
 
-Numbers typed and printed are in mm, µN, µN·m and degrees; files hold SI units.
+Numbers typed and printed are in mm, µN, µN·m and degrees unless an option says otherwise; files
+hold SI units.
 """
 
 app = typer.Typer(

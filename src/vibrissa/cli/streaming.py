@@ -143,7 +143,7 @@ def stream(
     Lines are CSV with a header, or JSON objects, in SI units; a column time is passed on. A line
     that cannot be read gives a line with its number and the error. Points are in the whisker's
     frame, m; with --filter also in the laboratory's (lab_x, ...). Stop with Ctrl-C.
-    Example: `vibrissa stream --udp 127.0.0.1:5005 --sensor sensor.toml --whisker wire.csv`
+    Example: `vibrissa stream --udp 127.0.0.1:5005 --map wire.nc --sensor sensor.toml`
     """
     from vibrissa.cli.recordings import usual_noise
     from vibrissa.io.rosbag import is_bag

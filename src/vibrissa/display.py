@@ -106,15 +106,15 @@ def _picture(recording: xr.DataTree) -> str:
     sources = [recording.to_dataset()]
     if "truth" in recording.children:
         sources.append(recording["truth"].to_dataset())
-    for name, colour, dots in (
-        ("centerline", BENT, False),
-        ("base_position", REST, True),
-        ("contact_point", CONTACT, True),
+    for name, colour, dots, label in (
+        ("centerline", BENT, False, "whisker"),
+        ("base_position", REST, True, "its base"),
+        ("contact_point", CONTACT, True, "contacts"),
     ):
         found = next((data[name] for data in sources if name in data), None)
         if found is None:
             continue
         values = found.transpose("time", ..., "space").values
         values = values if dots else thinned(values, MOST_CURVES)
-        marks.append(Mark(values, colour, dots, 3.0 if dots else 0.7))
+        marks.append(Mark(values, colour, dots, 3.0 if dots else 0.7, label))
     return views(marks) if marks else ""

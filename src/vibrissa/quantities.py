@@ -729,6 +729,40 @@ def axis_label(name: str) -> str:
     return f"${q.symbol}$ ({q.display_unit})" if q.display_unit else f"${q.symbol}$"
 
 
+_LARGER = {"µN": "mN", "mN": "N", "µN·m": "mN·m", "mN·m": "N·m"}
+
+
+def shown_unit(name: str, values: ArrayLike) -> tuple[float, str]:
+    """Choose the unit in which values are read most easily.
+
+    Parameters
+    ----------
+    name : str
+        A name of :data:`QUANTITIES`.
+    values : array_like, any shape
+        In the quantity's SI unit; NaN is left out.
+
+    Returns
+    -------
+    factor : float
+        What they are multiplied with to be in that unit.
+    unit : str
+        The display unit or, of forces and moments far larger than a rat's, one that is larger.
+
+    Examples
+    --------
+    >>> shown_unit("Fx", [-4.3, 0.2])
+    (1000.0, 'mN')
+    """
+    known = quantity(name)
+    factor, unit = known.display_factor, known.display_unit
+    size = np.abs(np.asarray(values, dtype=np.float64))
+    largest = float(np.max(size, initial=0.0, where=np.isfinite(size)))
+    while unit in _LARGER and largest * factor >= 1e4:
+        factor, unit = factor * 1e-3, _LARGER[unit]
+    return float(f"{factor:.6g}"), unit
+
+
 def to_display(name: str, values: ArrayLike) -> NDArray[np.float64]:
     """Convert SI values to the unit they are shown in.
 

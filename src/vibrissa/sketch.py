@@ -15,7 +15,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.quantities import quantity, to_display
+from vibrissa.quantities import quantity, shown_unit
 
 Array = NDArray[np.float64]
 _Kind = TypeVar("_Kind", bound=np.generic)
@@ -49,12 +49,15 @@ class Mark:
         Points rather than curves.
     width : float
         Of a line, or diameter of a dot, pixels.
+    label : str
+        What it is, for the legend; none by default.
     """
 
     places: ArrayLike
     colour: str
     dots: bool = False
     width: float = 1.5
+    label: str = ""
 
 
 def views(marks: Sequence[Mark]) -> str:
@@ -68,7 +71,8 @@ def views(marks: Sequence[Mark]) -> str:
     Returns
     -------
     str
-        An SVG element; empty if nothing is known of any place.
+        An SVG element, and a legend below if marks have labels; empty if nothing is known of any
+        place.
     """
     every = np.concatenate([np.asarray(mark.places, dtype=float).reshape(-1, 3) for mark in marks])
     every = every[np.isfinite(every).all(axis=1)]
@@ -93,8 +97,20 @@ def views(marks: Sequence[Mark]) -> str:
     width = 2.0 * _PANEL + _GAP
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.0f}" height="{height + 16:.0f}" '
-        f'viewBox="0 0 {width:.0f} {height + 16:.0f}" role="img">{"".join(parts)}</svg>'
+        f'viewBox="0 0 {width:.0f} {height + 16:.0f}" role="img" '
+        f'style="max-width:100%;height:auto">'
+        f"{''.join(parts)}</svg>{_legend(marks)}"
     )
+
+
+def _legend(marks: Sequence[Mark]) -> str:
+    """What is drawn in which colour, as far as it is told and there is any."""
+    told = [
+        f'<span style="color:{mark.colour}">{"●" if mark.dots else "━"}</span> {escape(mark.label)}'
+        for mark in marks
+        if mark.label and np.isfinite(np.asarray(mark.places, dtype=float)).any()
+    ]
+    return f"<br><small>{' &emsp; '.join(told)}</small>" if told else ""
 
 
 def _drawn(mark: Mark, pixels: Array) -> str:
@@ -217,11 +233,12 @@ def shown(name: str, values: ArrayLike) -> str:
         In the display unit, such as ``12.3 mm`` or ``12.3 mm (4.5 to 20.1)``; a dash if nothing is
         known.
     """
-    known = to_display(name, values).reshape(-1)
+    known = np.asarray(values, dtype=np.float64).reshape(-1)
     known = known[np.isfinite(known)]
     if not known.size:
         return "–"
-    unit = quantity(name).display_unit
+    factor, unit = shown_unit(name, known)
+    known = known * factor
     middle = f"{np.median(known):.4g}{'' if unit in ('', '°') else ' '}{unit}"
     if known.size > 1 and np.ptp(known) > 0.0:
         middle += f" ({known.min():.4g} to {known.max():.4g})"

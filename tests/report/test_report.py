@@ -299,7 +299,7 @@ def test_what_is_missing_is_named_with_the_verb_that_makes_it(folder):
     assert "no signals" in text
     page = (folder / "bare.html").read_text(encoding="utf-8")
     for verb in ("signals", "estimate", "reconstruct"):
-        assert f"`vibrissa {verb}` makes it" in page
+        assert f"<code>vibrissa {verb}</code> makes it" in page
     assert "contour" not in Page(page).sections
     recording = load_recording(folder / "trial.nc")
     groups = {g.path: g.to_dataset(inherit=False) for g in recording.subtree}

@@ -12,6 +12,8 @@ import typer
 from vibrissa.cli.terminal import Tell, output, progress_bars, refuse
 
 if TYPE_CHECKING:
+    from xarray import DataTree
+
     from vibrissa.report import Section
 
 _LARGEST = 15_000_000
@@ -41,7 +43,8 @@ def report(
         typer.Option("--map", help="Of a trial's whisker; simulated by default.", metavar="MAP"),
     ] = None,
     whisker: Annotated[
-        int | None, typer.Option(help="Of a trial: which whisker, from 0 (the default).")
+        int | None,
+        typer.Option(help="Of a trial: which whisker, from 0; by default the one most in contact."),
     ] = None,
     films: Annotated[
         list[Path] | None,
@@ -67,8 +70,18 @@ def report(
     With SOURCE_DATE_EPOCH set, the same command gives the same page. Example: `vibrissa report
     trial.nc --video top.mp4 --video front.mp4 -o report.html`
     """
+    import numpy as np
+
+    from vibrissa.io import load_recording
     from vibrissa.io.paths import check_readable, check_writable
-    from vibrissa.report import document, figure_sections, provenance, provenance_section
+    from vibrissa.report import (
+        contacts_by_whisker,
+        document,
+        figure_sections,
+        provenance,
+        provenance_section,
+    )
+    from vibrissa.trial import recorded_whisker
 
     check_writable(target, (".html", ".htm"))
     given = [path, *(file for file in (uniqueness, chart) if file), *(videos or []), *(films or [])]
@@ -78,12 +91,17 @@ def report(
         if film.suffix.lower() != ".mp4":
             raise ValueError(f"--movie is {film}; a movie that ends in .mp4 is needed")
     kind = _kind(path)
+    title = f"{'Trial' if kind == 'trial' else 'Map of contacts'}: {path.name}"
     with progress_bars() as tell:
         if kind == "trial":
             refuse({"--uniqueness": uniqueness}, f"{path} is a recording")
+            trial = load_recording(path)
+            whisker = int(np.argmax(contacts_by_whisker(trial))) if whisker is None else whisker
             sections, script, drawings = _of_trial(
-                path, videos or [], chart, whisker or 0, seed or 0, tell
+                path, trial, videos or [], chart, whisker, seed or 0, tell
             )
+            if trial.sizes["whisker"] > 1:
+                title += f", whisker {recorded_whisker(trial, whisker).name}"
         else:
             options = {"--video": videos, "--map": chart, "--movies": make_movies}
             refuse(options | {"--whisker": whisker, "--seed": seed}, f"{path} is a map")
@@ -93,8 +111,8 @@ def report(
     if make_movies:
         movies += _made(path, target, videos, chart, whisker or 0)
     command = ["vibrissa", *sys.argv[1:]]
-    origin = provenance_section(provenance(command, given, seed or 0))
-    title = f"{'Trial' if kind == 'trial' else 'Map of contacts'}: {path.name}"
+    drawn = (seed or 0) if kind == "trial" else None
+    origin = provenance_section(provenance(command, given, drawn))
     about = "From what a whisker feels at its base to what it touched, by vibrissa."
     if movies:
         sections.append(_movies(movies, target.parent, (title, about, sections, origin, script)))
@@ -118,7 +136,13 @@ def _kind(path: Path) -> str:
 
 
 def _of_trial(
-    path: Path, videos: list[Path], chart: Path | None, whisker: int, seed: int, tell: Tell
+    path: Path,
+    trial: DataTree,
+    videos: list[Path],
+    chart: Path | None,
+    whisker: int,
+    seed: int,
+    tell: Tell,
 ) -> tuple[list[Section], str, Mapping[str, Callable[[], Any]]]:
     """Sections, script and figures."""
     import numpy as np
@@ -126,11 +150,9 @@ def _of_trial(
     from vibrissa.cli.array_figures import array_drawings
     from vibrissa.cli.trial_figures import trial_drawings
     from vibrissa.cli.trial_views import fits_of
-    from vibrissa.io import load_recording
     from vibrissa.plots import course_of
     from vibrissa.report import contacts_in_space, space_section, trial_sections
 
-    trial = load_recording(path)
     course = course_of(trial, whisker)
     sections = trial_sections(trial, whisker, seed)
     drawings = array_drawings(path, "double")
@@ -141,7 +163,10 @@ def _of_trial(
         return sections, "", drawings
     things = trial["objects"].children.values() if "objects" in trial.children else ()
     picture = contacts_in_space(course, [thing.to_dataset() for thing in things], fits_of(trial))
-    about = "Contact points in the laboratory, the object as known and as fitted, and the whisker."
+    shown = ["Contact points in the laboratory"]
+    shown += ["the object as known"] if things else []
+    shown += ["as fitted"] if "contour" in trial.children else []
+    about = f"{', '.join(shown)}, and the whisker."
     section, script = space_section(picture, about)
     return [*sections, section], script, drawings
 

@@ -66,7 +66,7 @@ def trial_drawings(
 
     trial = load_recording(path)
     course = course_of(trial, whisker)
-    _say_what_is_lacking(course, path)
+    _say_what_is_lacking(course, trial, path)
     bent = recorded_whisker(trial, whisker)
     drawings = dict(_of_contacts(trial, course, bent, (width, colour)))
     if course.signals is not None:
@@ -74,11 +74,13 @@ def trial_drawings(
     return drawings
 
 
-def _say_what_is_lacking(course: Course, path: Path) -> None:
+def _say_what_is_lacking(course: Course, trial: xr.DataTree, path: Path) -> None:
     lacking = []
     if course.signals is None:
         lacking.append(f"no signals: `vibrissa signals {path}` makes them")
-    if course.estimated is None:
+    if course.estimated is None and "estimates" in trial.children:
+        lacking.append("no estimated contacts of this whisker")
+    elif course.estimated is None:
         lacking.append(f"no estimated contacts: `vibrissa estimate {path}` makes them")
     if course.places is None:
         lacking.append(f"no contact points: `vibrissa reconstruct {path}` makes them")

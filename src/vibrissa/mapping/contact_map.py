@@ -271,6 +271,7 @@ class ContactMap:
         if self.grid is not None:
             reached = int((self.grid.status == Status.OK).sum())
             rows.append(("paper's grid", f"{reached} of {self.grid.status.size} points reached"))
+        rows.append(("signals", "median (least to largest)"))
         rows += [(symbol(name), shown(name, data[name])) for name in (*SIGNALS, "r")]
         return card("ContactMap", rows, picture)
 

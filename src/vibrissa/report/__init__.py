@@ -9,12 +9,14 @@ from vibrissa.report.media import figure_sections, movies_section
 from vibrissa.report.page import Section, document, table
 from vibrissa.report.provenance import Provenance, provenance, provenance_section
 from vibrissa.report.space import contacts_in_space, reachable_space, space_section
+from vibrissa.report.tracked import contacts_by_whisker
 from vibrissa.report.trial import trial_sections
 
 __all__ = [
     "Provenance",
     "Section",
     "chart_sections",
+    "contacts_by_whisker",
     "contacts_in_space",
     "document",
     "figure_sections",

@@ -7,7 +7,7 @@ import xarray as xr
 
 from vibrissa.mapping import ContactMap
 from vibrissa.mapping.summary import verdict_rows
-from vibrissa.quantities import quantity, to_display
+from vibrissa.quantities import quantity, shown_unit, to_display
 from vibrissa.report.page import Section, paragraph, table
 from vibrissa.signals import SIGNALS
 from vibrissa.status import describe
@@ -43,10 +43,10 @@ def _ranges(samples: xr.Dataset) -> str:
     """Ranges of signals over all contacts, and how these ended."""
     rows = []
     for name in (*SIGNALS, "r", "theta", "phi"):
-        known = quantity(name)
-        values = to_display(name, samples[name].values)
+        factor, unit = shown_unit(name, samples[name].values)
+        values = factor * samples[name].values
         ends = (f"{end:.4g}".replace("-", "−") for end in (np.nanmin(values), np.nanmax(values)))
-        rows.append((f"{known.long_name} ({known.display_unit})", *ends))
+        rows.append((f"{quantity(name).long_name} ({unit})", *ends))
     ranges = table(rows, ("quantity", "least", "largest"), "Over all contacts of the map")
     counts = describe(samples["status"].values).most_common()
     ended = [(sentence, str(count)) for sentence, count in counts]

@@ -17,8 +17,8 @@ CAPTIONS = {
     "estimated against known coordinates.",
     "signals": "All six signals over time.",
     "estimates": "Estimated against known coordinates of the contact in the whisker's frame.",
-    "contact_places": "Contacts about the resting whisker and in the laboratory, with the object "
-    "(grey) and what was fitted (dashed).",
+    "contact_places": "Contacts about the resting whisker and in the laboratory; grey: the object, "
+    "where it is known; dashed: what was fitted.",
     "contour": "Contact points in the laboratory from three sides.",
     "whisker": "The resting whisker in its own frame, and how thick it is.",
     "signal_space": "All contacts that the whisker can hold, coloured by what they feel like.",

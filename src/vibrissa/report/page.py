@@ -5,6 +5,7 @@ Plain text becomes HTML here and nowhere else; whoever makes a body by hand esca
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from html import escape
 from typing import NamedTuple
@@ -35,13 +36,20 @@ th, td { padding: 0.15rem 1.1rem 0.15rem 0.3rem; text-align: left; vertical-alig
 thead th { border-bottom: 2px solid var(--line); }
 tbody th { font-weight: 500; }
 .data tbody tr:nth-child(even) { background: var(--band); }
+.facts td { overflow-wrap: anywhere; }
 .number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
 code { overflow-wrap: anywhere; font-size: 0.92em; }
 figure { margin: 1.2rem 0; }
 figure img, video { display: block; max-width: 100%; height: auto; }
+svg { max-width: 100%; height: auto; }
 .space { height: 34rem; overflow: hidden; }
+@media (max-width: 44rem) { figure { overflow-x: auto; } figure img { max-width: none;
+  width: 44rem; } caption { white-space: normal; } }
 @media print { nav, .space { display: none; } }
 """
+
+
+_CODE = re.compile(r"`([^`]+)`")
 
 
 class Section(NamedTuple):
@@ -109,7 +117,7 @@ def paragraph(text: str, kind: str = "") -> str:
     Parameters
     ----------
     text : str
-        Plain text.
+        Plain text; what stands between backticks is set as code.
     kind : str
         Its class in the style sheet.
 
@@ -119,7 +127,8 @@ def paragraph(text: str, kind: str = "") -> str:
         HTML.
     """
     named = f' class="{kind}"' if kind else ""
-    return f"<p{named}>{escape(text)}</p>"
+    told = _CODE.sub(r"<code>\1</code>", escape(text))
+    return f"<p{named}>{told}</p>"
 
 
 def document(title: str, about: str, sections: Sequence[Section], script: str = "") -> str:

@@ -32,8 +32,8 @@ class Provenance:
         Name of each file that was read, its size in bytes, and its SHA-256 in hexadecimal.
     versions : tuple of (str, str)
         Of the package, of Python and of libraries.
-    seed : int
-        Of the draws behind what is predicted.
+    seed : int or None
+        Of the draws behind what is predicted; None where nothing is drawn.
     date : datetime
         With a time zone.
     """
@@ -41,11 +41,11 @@ class Provenance:
     command: str
     inputs: tuple[tuple[str, int, str], ...]
     versions: tuple[tuple[str, str], ...]
-    seed: int
+    seed: int | None
     date: datetime
 
 
-def provenance(command: Sequence[str], inputs: Sequence[Path], seed: int) -> Provenance:
+def provenance(command: Sequence[str], inputs: Sequence[Path], seed: int | None) -> Provenance:
     """Gather it now.
 
     The date is that of the environment variable ``SOURCE_DATE_EPOCH``, seconds since 1970 in UTC,
@@ -57,8 +57,8 @@ def provenance(command: Sequence[str], inputs: Sequence[Path], seed: int) -> Pro
         Program and arguments.
     inputs : sequence of Path
         Files that are read.
-    seed : int
-        Of the draws.
+    seed : int or None
+        Of the draws; None where there are none.
 
     Returns
     -------
@@ -137,7 +137,12 @@ def provenance_section(known: Provenance) -> Section:
     rows = [
         ("command", known.command),
         ("made", known.date.strftime("%Y-%m-%d %H:%M:%S UTC")),
-        ("seed", f"{known.seed}: of the draws behind what is predicted"),
+        (
+            "seed",
+            "none: nothing is drawn by chance"
+            if known.seed is None
+            else f"{known.seed}: of the draws behind what is predicted",
+        ),
     ]
     files = [
         (name, f"{size / 1e6:.3f} MB", f"SHA-256 {digest}") for name, size, digest in known.inputs

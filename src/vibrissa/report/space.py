@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from vibrissa.contour import FittedShape
 from vibrissa.contour.mesh import surface_grid
 from vibrissa.plots import Course, object_triangles
-from vibrissa.quantities import quantity, to_display
+from vibrissa.quantities import quantity, shown_unit
 from vibrissa.report.page import Section, paragraph
 from vibrissa.sketch import BENT, REST, thinned
 
@@ -32,7 +32,7 @@ _SHAPES = 7
 """How many bent whiskers are drawn."""
 _ROOM = 0.15
 """Left about the contacts, as a share of their extent."""
-_CAMERA = {"eye": {"x": 1.4, "y": -1.5, "z": 0.9}}
+_CAMERA = {"eye": {"x": 1.65, "y": -1.8, "z": 1.05}, "center": {"x": 0.0, "y": 0.0, "z": -0.12}}
 
 
 def can_draw() -> bool:
@@ -168,13 +168,13 @@ def _points(points: Array, name: str, values: Array, label: str) -> Any:
     import plotly.graph_objects as go
 
     known = quantity(name)
-    unit = f" ({known.display_unit})" if known.display_unit else ""
+    factor, unit = shown_unit(name, values)
     bar = {
-        "title": {"text": f"{known.long_name}{unit}", "side": "right"},
+        "title": {"text": f"{known.long_name} ({unit})", "side": "right"},
         "thickness": 12,
         "len": 0.6,
     }
-    look = {"size": 2.5, "color": to_display(name, values), "colorscale": "Viridis"}
+    look = {"size": 2.5, "color": factor * values, "colorscale": "Viridis"}
     x, y, z = points.T
     return go.Scatter3d(x=x, y=y, z=z, mode="markers", marker={**look, "colorbar": bar}, name=label)
 

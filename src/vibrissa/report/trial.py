@@ -18,8 +18,10 @@ from vibrissa.demo.scores import ANGLES, ErrorRow, angle_label, contact_errors, 
 from vibrissa.demo.stages import from_curves, spread
 from vibrissa.display import show
 from vibrissa.pipeline import compare_contacts, distances_by_class
-from vibrissa.quantities import QUANTITIES, quantity, to_display
+from vibrissa.quantities import QUANTITIES, quantity
 from vibrissa.report.page import Section, paragraph, table
+from vibrissa.report.tracked import tracked_table, whiskers_table
+from vibrissa.report.values import shown_value
 from vibrissa.signals import CIRCULAR, SIGNALS, base_signals, nearest_on_rest, within_turn
 from vibrissa.status import describe
 from vibrissa.trial import recorded_objects, recorded_whisker
@@ -37,6 +39,11 @@ _FOUND = ("contact_point", "contact_point_whisker", "in_contact")
 _SPREADS = ("covariance", "contact_covariance", "candidates")
 
 _SPREAD = ("median", "95 %")
+
+_NOTHING = "No contact of this whisker was felt that there truly was: there is nothing to compare."
+
+_SUSPECT = 1.5
+"""Misfit from which another shape may go better."""
 
 
 def trial_sections(recording: xr.DataTree, whisker: int = 0, seed: int = 0) -> list[Section]:
@@ -69,6 +76,11 @@ def trial_sections(recording: xr.DataTree, whisker: int = 0, seed: int = 0) -> l
         Section("recording", "What was recorded", show(recording).html + bent._repr_html_()),
         Section("settings", "What was done, with which settings", _settings(recording)),
     ]
+    if recording.sizes["whisker"] > 1:
+        parts.append(Section("whiskers", "Whiskers", whiskers_table(recording, whisker)))
+    root = groups[""]
+    if "measured" in recording.children and root is not None and "in_contact" in root:
+        parts.append(Section("tracked", "What was tracked", tracked_table(root)))
     if truth is not None:
         parts += _against_truth(recording, groups, truth, bent, seed)
     if "contour" in recording.children:
@@ -92,6 +104,7 @@ def _settings(recording: xr.DataTree) -> str:
         for group in recording.subtree
         if not group.path.startswith(("/whiskers", "/objects"))
         for name, value in group.attrs.items()
+        if name != "kind"
     ]
     facts = table(
         [(f"{where}: {name}", value) for where, name, value in rows], caption="Settings by stage"
@@ -107,7 +120,11 @@ def _settings(recording: xr.DataTree) -> str:
 def _said(name: object, value: object) -> str:
     """Write an attribute; what is known to be a signal's size in its unit."""
     if name == "felt_above":
-        return f"M_B over {_shown('MB', float(str(value)))}"
+        return f"M_B over {shown_value('MB', float(str(value)))}"
+    if name == "noise" and isinstance(value, np.ndarray | list | tuple) and len(value) == 6:
+        force, moment = np.split(np.asarray(value, dtype=np.float64), 2)
+        sizes = (("force", force), ("moment", moment))
+        return "; ".join(f"{each} {_one_or_all(each, sigma)}" for each, sigma in sizes)
     if name == "cutoff":
         return f"{float(str(value)):g} Hz"
     if isinstance(value, np.ndarray | list | tuple):
@@ -115,14 +132,10 @@ def _said(name: object, value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float | np.floating) else str(value)
 
 
-def _shown(name: str, value: float, digits: int = 4) -> str:
-    """An SI value with its display unit; a dash for NaN."""
-    if not np.isfinite(value):
-        return "–"
-    unit = quantity(name).display_unit
-    number = float(to_display(name, value))
-    text = f"{number:.0f}" if abs(number) >= 10.0**digits else f"{number:.{digits}g}"
-    return f"{text.replace('-', '−')}{'' if unit in ('', '°') else ' '}{unit}"
+def _one_or_all(name: str, sigma: Array) -> str:
+    """Standard deviations of three components."""
+    told = [shown_value(name, float(each), 3) for each in sigma]
+    return f"{told[0]} each" if len(set(told)) == 1 else ", ".join(told)
 
 
 def _against_truth(
@@ -139,22 +152,35 @@ def _against_truth(
         yield Section("tracking", "Tracking", tracking_tables(root, truth))
     if _has(_FELT, signals, truth) and "contact_point_whisker" in truth:
         assert signals is not None
-        rows = signal_rows(signals, truth, whisker)
-        heading = ("deflection angle", "contacts", "force", "moment", "force, 95 %", "moment, 95 %")
-        note = "Size of the error over that of the true vector, each in its own whisker frame."
-        told = table(rows, heading, "Error of force and moment, median", note)
-        heading = ("signal", "contacts", *_SPREAD, "largest", "true, median size")
-        note = (
-            "Felt less true, each in its own whisker frame, where the whisker touches and was felt "
-            "to; directions on the circle."
-        )
-        told += table(six_rows(signals, truth), heading, "Error of the six signals", note)
-        yield Section("signals", "Signals", told)
+        yield Section("signals", "Signals", _signal_errors(signals, truth, whisker))
     if _has(_FOUND, estimates, truth) and _has(_SPREADS, estimates):
         assert estimates is not None
-        errors = contact_errors(estimates, truth, whisker, seed)
-        told = _felt(estimates, truth) + _errors(*error_rows(errors))
+        told = _felt(estimates, truth)
+        if np.isfinite(estimates["contact_point"].values).any():
+            told += _errors(*error_rows(contact_errors(estimates, truth, whisker, seed)))
+        else:
+            told += paragraph(_NOTHING)
         yield Section("estimates", "Estimated contacts", told)
+
+
+def _signal_errors(signals: xr.Dataset, truth: xr.Dataset, whisker: Whisker) -> str:
+    """Tables of the errors of force and moment, and of the six signals."""
+    rows, six = signal_rows(signals, truth, whisker), six_rows(signals, truth)
+    if not rows or not six:
+        return paragraph(_NOTHING)
+    told = table(
+        rows,
+        ("deflection angle", "contacts", "force", "moment", "force, 95 %", "moment, 95 %"),
+        "Error of force and moment, median",
+        "Size of the error over that of the true vector, each in its own whisker frame.",
+    )
+    return told + table(
+        six,
+        ("signal", "contacts", *_SPREAD, "largest", "true, median size"),
+        "Error of the six signals",
+        "Felt less true, each in its own whisker frame, where the whisker touches and was felt "
+        "to; directions on the circle.",
+    )
 
 
 def _has(names: Sequence[str], *data: xr.Dataset | None) -> bool:
@@ -185,7 +211,7 @@ def tracking_tables(root: xr.Dataset, truth: xr.Dataset) -> str:
             continue
         away = root[name].values[both] - truth[name].values[both]
         size = np.linalg.norm(away, axis=-1) if away.ndim > 1 else np.abs(away)
-        rows.append((quantity(name).long_name, *(_shown(name, v) for v in spread(size))))
+        rows.append((quantity(name).long_name, *(shown_value(name, v) for v in spread(size))))
     drawn = table(
         lines,
         ("distance from the true line", "points", *_SPREAD),
@@ -222,7 +248,7 @@ def _away(distances: Array, name: str) -> tuple[str, str, str]:
     """How many distances are known, their median and 95 %."""
     known = distances[np.isfinite(distances)]
     middle, most = spread(known)
-    return str(known.size), _shown(name, float(middle), 3), _shown(name, float(most), 3)
+    return str(known.size), shown_value(name, float(middle), 3), shown_value(name, float(most), 3)
 
 
 def six_rows(signals: xr.Dataset, truth: xr.Dataset) -> list[tuple[str, ...]]:
@@ -250,7 +276,7 @@ def six_rows(signals: xr.Dataset, truth: xr.Dataset) -> list[tuple[str, ...]]:
             continue
         values = (*spread(size), size.max())
         usual = np.nan if direction else float(np.nanmedian(np.abs(true[name].values[both])))
-        cells = (_shown(name, float(value), 3) for value in (*values, usual))
+        cells = (shown_value(name, float(value), 3) for value in (*values, usual))
         rows.append((quantity(name).long_name, str(size.size), *cells))
     return rows
 
@@ -326,7 +352,7 @@ def _errors(of_all: Sequence[ErrorRow], by_angle: Sequence[ErrorRow]) -> str:
 
 def _cells(row: ErrorRow) -> list[str]:
     values = (*row.measured, *row.predicted[:2])
-    return [str(row.contacts), *(_shown(row.quantity, float(value)) for value in values)]
+    return [str(row.contacts), *(shown_value(row.quantity, float(value)) for value in values)]
 
 
 def _contour(recording: xr.DataTree, seed: int) -> str:
@@ -340,14 +366,27 @@ def _contour(recording: xr.DataTree, seed: int) -> str:
         own = [p for p in fit.parameters if p.startswith(name)]
         for parameter, value in zip(own, values, strict=True):
             label = parameter.replace("_", ", ")
-            rows.append((label, _shown(meant, float(value), 6), _shown(meant, sigma[parameter], 3)))
+            rows.append(
+                (
+                    label,
+                    shown_value(meant, float(value), 6),
+                    shown_value(meant, sigma[parameter], 3),
+                )
+            )
     told = table(
         rows,
         ("parameter", "fitted", "standard deviation"),
         f"The fitted {fit.kind}",
         f"{int(fit.inliers.sum())} contacts fit; root mean square of their distances: "
-        f"{_shown('surface_distance', fit.rms)}.",
+        f"{shown_value('surface_distance', fit.rms)}. Misfit {fit.misfit:.3g}: χ² per degree of "
+        "freedom, about 1 where the shape and what is said of the errors are right.",
     )
+    if fit.kind != "free" and fit.misfit > _SUSPECT:
+        told += paragraph(
+            "Contacts lie farther from it than their covariance allows: it may be of another shape "
+            "(`vibrissa reconstruct --shape`), or the noise larger than it is said to be.",
+            "note",
+        )
     compared = [
         (quantity(name).long_name, _component_text(name, data[name].values))
         for name in ("axis_offset", "axis_tilt", "diameter_error", "radius_error", "center_offset")
@@ -361,9 +400,9 @@ def _contour(recording: xr.DataTree, seed: int) -> str:
 def _component_text(name: str, values: Array) -> str:
     """A number, or a vector in parentheses with its size."""
     if values.ndim == 0:
-        return _shown(name, float(values))
-    each = ", ".join(_shown(name, float(value)) for value in values)
-    return f"({each}); size {_shown(name, float(np.linalg.norm(values)))}"
+        return shown_value(name, float(values))
+    each = ", ".join(shown_value(name, float(value)) for value in values)
+    return f"({each}); size {shown_value(name, float(np.linalg.norm(values)))}"
 
 
 def _distances(recording: xr.DataTree, seed: int) -> str:
@@ -385,7 +424,7 @@ def _distances(recording: xr.DataTree, seed: int) -> str:
                 str(sums["label"].values[i]),
                 str(int(sums["contacts"].values[i])),
                 *(
-                    _shown("surface_distance", float(sums[column].values[i]))
+                    shown_value("surface_distance", float(sums[column].values[i]))
                     for column in (
                         "median",
                         "largest_95",

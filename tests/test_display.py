@@ -63,7 +63,7 @@ def test_a_deflection_shows_every_shape_and_what_became_of_the_loads(bent):
 def test_without_an_answer_nothing_is_drawn_but_the_reason_is_told():
     lost = vb.deflect(WHISKER, vb.PointContact([[1.0, 0.0, 0.0]]))
     html = lost._repr_html_()
-    assert "beyond tip 1" in html
+    assert "beyond the tip: the whisker is too short" in html
     assert "nan" not in html.lower()
 
 
@@ -135,3 +135,19 @@ def test_numbers_and_symbols():
 
 def test_nothing_known_gives_no_picture():
     assert views([Mark(np.full((3, 3), np.nan), BENT)]) == ""
+
+
+def test_what_is_printed_fits_a_terminal_and_tells_numbers(bent):
+    text = str(bent)
+    assert "ok 5" in text
+    assert "µN·m" in text
+    one = vb.deflect(WHISKER, vb.PointContact([60e-3, 0.0, 0.0]))
+    assert "slipped off" in str(one)
+    found = vb.estimate_from_wrench(WHISKER, bent.force, bent.moment)
+    assert "friction angle" in str(found)
+    for printed in (text, str(one), str(found)):
+        assert max(map(len, printed.splitlines())) <= 80
+    # A value that is the same but for rounding has no range.
+    assert shown("force", [1e-4, 1.0000000001e-4]) == "100 µN"
+    # A wire's forces are not told in a million micronewtons.
+    assert shown("force", [2.0, 4.0]) == "3000 mN (2000 to 4000)"

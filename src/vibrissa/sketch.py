@@ -7,6 +7,7 @@ whisker's x–y and x–z planes at one scale, with a bar of round length. Figur
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
@@ -193,6 +194,29 @@ def card(title: str, rows: Sequence[tuple[str, str]], picture: str = "") -> str:
     return f"<div><strong>{escape(title)}</strong><br>{picture}{table(rows)}</div>"
 
 
+def lines(title: str, rows: Sequence[tuple[str, str]]) -> str:
+    """Lay out a title and a table of names and values for a terminal of 80 columns.
+
+    Parameters
+    ----------
+    title : str
+        The first line.
+    rows : sequence of (str, str)
+        Names and values with their units.
+
+    Returns
+    -------
+    str
+        A line each, and more where a value is long.
+    """
+    width = max(len(name) for name, _ in rows) + 4
+    told = [
+        textwrap.fill(f"  {name:{width - 4}}  {value}", 80, subsequent_indent=" " * width)
+        for name, value in rows
+    ]
+    return "\n".join([title, *told])
+
+
 def table(rows: Sequence[Sequence[str]], heading: Sequence[str] = ()) -> str:
     """Lay out a table.
 
@@ -240,8 +264,9 @@ def shown(name: str, values: ArrayLike) -> str:
     factor, unit = shown_unit(name, known)
     known = known * factor
     middle = f"{np.median(known):.4g}{'' if unit in ('', '°') else ' '}{unit}"
-    if known.size > 1 and np.ptp(known) > 0.0:
-        middle += f" ({known.min():.4g} to {known.max():.4g})"
+    least, largest = f"{known.min():.4g}", f"{known.max():.4g}"
+    if least != largest:
+        middle += f" ({least} to {largest})"
     return middle.replace("-", "−")
 
 

@@ -21,7 +21,9 @@ from vibrissa.mapping import ContactMap
 from vibrissa.quantities import quantity
 from vibrissa.report import document, figure_sections, movies_section, table, trial_sections
 from vibrissa.report.page import Section
-from vibrissa.report.trial import tracking_tables
+from vibrissa.report.tracked import contacts_by_whisker, tracked_table, whiskers_table
+from vibrissa.report.trial import _settings, tracking_tables
+from vibrissa.report.values import shown_value
 from vibrissa.signals import SIGNALS
 from vibrissa.status import describe
 from vibrissa.trial import recorded_whisker
@@ -245,6 +247,59 @@ def test_errors_of_lines_are_distances_from_the_true_ones():
     rows = {row[0]: row[1:] for row in Page(tracking_tables(tracked, truth)).tables[LINES]}
     assert rows["centreline"] == ["33", "2 mm", "3 mm"]
     assert rows["trace, top view"] == ["33", "2 px", "3 px"]
+
+
+def two_whiskers(**groups):
+    """Force on two whiskers; the second touches in two of three frames."""
+    force = np.zeros((3, 2, 3))
+    force[1:, 1, 0] = [3e-6, -4e-6]
+    root = xr.Dataset(
+        {"force": (("time", "whisker", "space"), force)},
+        {"whisker": ["C1", "C2"], "time": [0, 1, 2]},
+    )
+    return xr.DataTree.from_dict({"/": root} | groups)
+
+
+def test_whiskers_that_touch_are_listed():
+    touching = xr.Dataset({"in_contact": (("whisker", "time"), [[False] * 3, [False, True, True]])})
+    trial = two_whiskers(truth=touching)
+    np.testing.assert_array_equal(contacts_by_whisker(trial), [0, 2])
+    told = whiskers_table(trial, 0)
+    assert "of whisker C1, number 0" in told
+    assert Page(told).tables["Whiskers that touch"][1:] == [["C2", "1", "2", "4 µN"]]
+    bare = two_whiskers()
+    np.testing.assert_array_equal(contacts_by_whisker(bare), [0, 0])
+    assert "None of the 2 whiskers" in whiskers_table(bare, 0)
+
+
+def test_what_was_tracked_is_told_without_the_truth():
+    root = xr.Dataset(
+        {
+            "in_contact": ("time", [False, True, True]),
+            "base_position": (("time", "space"), [[0.0] * 3, [0.0] * 3, [np.nan] * 3]),
+            "force": (("time", "space"), [[1.0, 0, 0], [1e-6, 0, 0], [0, 3e-6, 0]]),
+            "contact_covariance": (
+                ("time", "space", "space_2"),
+                np.eye(3) * np.array([[[9.0]], [[1e-10]], [[1e-10]]]),
+            ),
+        }
+    )
+    rows = dict(Page(tracked_table(root)).tables["By the rod that fits the images"])
+    assert rows["of these in contact"] == "2"
+    assert rows["lost"] == "1"
+    assert rows["force, in contact"] == "2 µN, up to 3 µN"
+    assert rows["standard deviation of the contact point"].startswith("0.0173 mm")
+
+
+def test_numbers_are_in_units_that_can_be_read():
+    assert shown_value("force", 2e-6) == "2 µN"
+    assert shown_value("force", 4.0) == "4000 mN"
+    assert shown_value("force", 40.0) == "40 N"
+    assert shown_value("moment", -3e-15) == "below 1e-05 µN·m"
+    assert shown_value("r", np.nan) == "–"
+    noise = {"noise": [1e-6, 1e-6, 1e-6, 1e-8, 2e-8, 2e-8]}
+    said = _settings(two_whiskers(signals=xr.Dataset(attrs=noise)))
+    assert "force 1 µN each; moment 0.01 µN·m, 0.02 µN·m, 0.02 µN·m" in said
 
 
 def test_where_it_comes_from(written, folder):

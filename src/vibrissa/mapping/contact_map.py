@@ -28,7 +28,7 @@ from vibrissa.rod.loads import PointContact
 from vibrissa.rod.preimage import Preimages
 from vibrissa.rod.reach import CELLS, PROXIMAL, Reach, reach, with_normal_force
 from vibrissa.signals import SIGNALS, base_signals, concave_backward, selection, within_cone
-from vibrissa.sketch import CONTACT, REST, Mark, card, shown, symbol, views
+from vibrissa.sketch import CONTACT, REST, Mark, card, lines, shown, symbol, views
 from vibrissa.status import Status, flag_attributes
 from vibrissa.whisker import Whisker
 
@@ -263,17 +263,25 @@ class ContactMap:
         points = data.contact_point.transpose(..., "space").to_numpy()
         picture = views(
             [
-                Mark(points, CONTACT, dots=True, width=1.5),
-                Mark(self.whisker.centerline(41), REST, width=2.5),
+                Mark(points, CONTACT, dots=True, width=1.5, label="contacts"),
+                Mark(self.whisker.centerline(41), REST, width=2.5, label="at rest"),
             ]
         )
+        return card("ContactMap", self._rows(), picture)
+
+    def __str__(self) -> str:
+        """Tell the range of each signal as well."""
+        return lines("ContactMap", self._rows())
+
+    def _rows(self) -> list[tuple[str, str]]:
+        """Whose contacts they are, how many, and how large the signals."""
+        data = self._samples
         rows = [("whisker", repr(self.whisker)), ("contacts at nodes", str(data.status.size))]
         if self.grid is not None:
             reached = int((self.grid.status == Status.OK).sum())
             rows.append(("paper's grid", f"{reached} of {self.grid.status.size} points reached"))
         rows.append(("signals", "median (least to largest)"))
-        rows += [(symbol(name), shown(name, data[name])) for name in (*SIGNALS, "r")]
-        return card("ContactMap", rows, picture)
+        return rows + [(symbol(name), shown(name, data[name])) for name in (*SIGNALS, "r")]
 
 
 def within_paper_bounds(whisker: Whisker, points: Array) -> AnyArray:

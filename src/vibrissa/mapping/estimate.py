@@ -22,10 +22,11 @@ from vibrissa.mapping.approximation import APPROXIMATE, by_approximation
 from vibrissa.mapping.contact_map import spherical
 from vibrissa.mapping.explanation import Explanation, by_least_squares, by_triplet, undetermined
 from vibrissa.mapping.noise import SensorNoise, sensor_noise
-from vibrissa.mapping.showing import estimate_card
+from vibrissa.mapping.showing import estimate_card, estimate_rows
 from vibrissa.quantities import attributes
 from vibrissa.rod.arrays import AnyArray, Array, IntArray
 from vibrissa.signals import CIRCULAR, SIGNALS, Coordinates, measured, selection, signal_scales
+from vibrissa.sketch import lines
 from vibrissa.status import counted, flag_attributes
 
 if TYPE_CHECKING:
@@ -176,6 +177,10 @@ class Estimate:
     def _repr_html_(self) -> str:
         """Show the contact points about the base, with the numbers."""
         return estimate_card(self._title(), self)
+
+    def __str__(self) -> str:
+        """Tell the numbers as well."""
+        return lines(self._title(), estimate_rows(self))
 
     def _title(self) -> str:
         return f"Estimate of {self.status.shape or 'one'} from ({', '.join(self.triplet)})"

@@ -9,7 +9,7 @@ import numpy as np
 
 from vibrissa.rod.arrays import Array, IntArray
 from vibrissa.sketch import CONTACT, REST, Mark, card, shown, views
-from vibrissa.status import counted
+from vibrissa.status import counted, describe
 
 
 class _Found(Protocol):
@@ -58,18 +58,37 @@ def estimate_card(title: str, found: _Found, rows: Sequence[tuple[str, str]] = (
         HTML.
     """
     marks = [
-        Mark(np.zeros((1, 3)), REST, dots=True, width=7.0),
+        Mark(np.zeros((1, 3)), REST, dots=True, width=7.0, label="base"),
         Mark(found.candidates, REST, dots=True, width=3.0),
-        Mark(found.point, CONTACT, dots=True, width=4.0),
+        Mark(found.point, CONTACT, dots=True, width=4.0, label="contact (candidates: grey)"),
     ]
+    return card(title, estimate_rows(found, rows), views(marks))
+
+
+def estimate_rows(found: _Found, rows: Sequence[tuple[str, str]] = ()) -> list[tuple[str, str]]:
+    """Tell contact points in numbers.
+
+    Parameters
+    ----------
+    found : Estimate or WrenchEstimate
+        What was found.
+    rows : sequence of (str, str)
+        What is to be said besides.
+
+    Returns
+    -------
+    list of (str, str)
+        Names and values with their units; of a single contact the status in words.
+    """
     r, theta, phi = np.moveaxis(found.spherical, -1, 0)
     sigma = np.sqrt(np.einsum("...ii->...i", found.covariance).max(axis=-1))
-    numbers = [
-        ("status", counted(found.status)),
+    one = np.size(found.status) == 1
+    return [
+        ("status", next(iter(describe(found.status))) if one else counted(found.status)),
         ("r", shown("r", r)),
         ("θ", shown("theta", theta)),
         ("φ", shown("phi", phi)),
         ("largest standard deviation of x, y, z", shown("r", sigma)),
         ("candidates", shown("candidates", found.n_candidates)),
+        *rows,
     ]
-    return card(title, [*numbers, *rows], views(marks))

@@ -26,7 +26,7 @@ from vibrissa.mapping.contact_map import spherical
 from vibrissa.mapping.fitting import Fits, fit
 from vibrissa.mapping.minima import Candidates, candidates, reliable, unknowns_covariance
 from vibrissa.mapping.noise import SensorNoise
-from vibrissa.mapping.showing import estimate_card
+from vibrissa.mapping.showing import estimate_card, estimate_rows
 from vibrissa.mapping.whitening import INDISTINCT, explained, rank, trusted, whitening
 from vibrissa.quantities import attributes
 from vibrissa.rod.arrays import AnyArray, Array, IntArray
@@ -34,7 +34,7 @@ from vibrissa.rod.batch import solve_forces
 from vibrissa.rod.discretize import Discretization, discretize
 from vibrissa.rod.wrench import vanishing_moments
 from vibrissa.signals import Coordinates, labelled_wrench
-from vibrissa.sketch import shown
+from vibrissa.sketch import lines, shown
 from vibrissa.status import Status, counted, flag_attributes
 
 if TYPE_CHECKING:
@@ -180,8 +180,14 @@ class WrenchEstimate:
 
     def _repr_html_(self) -> str:
         """Show the contact points about the base, with the numbers."""
-        extra = [("friction angle", shown("friction_angle", self.friction_angle))]
-        return estimate_card(self._title(), self, extra)
+        return estimate_card(self._title(), self, self._friction())
+
+    def __str__(self) -> str:
+        """Tell the numbers as well."""
+        return lines(self._title(), estimate_rows(self, self._friction()))
+
+    def _friction(self) -> list[tuple[str, str]]:
+        return [("friction angle", shown("friction_angle", self.friction_angle))]
 
     def _title(self) -> str:
         return f"WrenchEstimate of {self.status.shape or 'one'}"

@@ -15,8 +15,19 @@ from vibrissa.rod.pegs import Pegs, Rest, nearest_side, solve_from_contact, solv
 from vibrissa.rod.points import Solutions, point_solver
 from vibrissa.rod.reach import PROXIMAL
 from vibrissa.rod.shape import shapes
-from vibrissa.sketch import BENT, CONTACT, MOST_CURVES, REST, Mark, card, shown, thinned, views
-from vibrissa.status import Status, counted
+from vibrissa.sketch import (
+    BENT,
+    CONTACT,
+    MOST_CURVES,
+    REST,
+    Mark,
+    card,
+    lines,
+    shown,
+    thinned,
+    views,
+)
+from vibrissa.status import Status, counted, describe
 
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
@@ -96,28 +107,41 @@ class Deflection:
 
     def __repr__(self) -> str:
         """Say how many loads there are and what became of them."""
-        return (
-            f"<Deflection of {self.status.shape or 'one'} by {type(self.load).__name__}: "
-            f"{counted(self.status)}>"
-        )
+        return f"<{self._title()}: {counted(self.status)}>"
 
     def _repr_html_(self) -> str:
         """Show the bent whiskers, the resting one and the contacts, with the numbers."""
-        rest = Mark(self.whisker.centerline(41), REST)
+        rest = Mark(self.whisker.centerline(41), REST, label="at rest")
         bent = self._centerlines(thinned(np.arange(self.status.size), MOST_CURVES), 41)
         picture = views(
-            [rest, Mark(bent, BENT), Mark(self.contact_point, CONTACT, dots=True, width=4.0)]
+            [
+                rest,
+                Mark(bent, BENT, label="bent"),
+                Mark(self.contact_point, CONTACT, dots=True, width=4.0, label="contact"),
+            ]
         )
+        return card(self._title(), self._rows(), picture)
+
+    def __str__(self) -> str:
+        """Tell the numbers as well."""
+        return lines(self._title(), self._rows())
+
+    def _title(self) -> str:
+        return f"Deflection of {self.status.shape or 'one'} by {type(self.load).__name__}"
+
+    def _rows(self) -> list[tuple[str, str]]:
+        """Status, contact, force and moment; of a single load the status in words."""
         size = np.linalg.norm
-        rows = [
-            ("status", counted(self.status)),
+        status = counted(self.status)
+        if self.status.size == 1:
+            status = next(iter(describe(self.status)))
+        return [
+            ("status", status),
             ("contact, distance from base", shown("r", size(self.contact_point, axis=-1))),
             ("contact, arc length", shown("arc_length", self.arc_length)),
             ("force", shown("force", size(self.force, axis=-1))),
             ("moment", shown("moment", size(self.moment, axis=-1))),
         ]
-        title = f"Deflection of {self.status.shape or 'one'} by {type(self.load).__name__}"
-        return card(title, rows, picture)
 
 
 def deflect(

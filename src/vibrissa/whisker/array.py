@@ -203,9 +203,10 @@ class WhiskerArray(Mapping[str, Whisker]):
             for side in ("left", "right")
             if (count := sum(i.side == side for i in self._identities.values()))
         ]
+        names = list(self)
         return (
             f"WhiskerArray: {len(self)} whiskers ({', '.join(sides)}), {min(lengths):.1f} to "
-            f"{max(lengths):.1f} mm long: {', '.join(self)}"
+            f"{max(lengths):.1f} mm long: {', '.join(names[:6])}{', …' if len(names) > 6 else ''}"
         )
 
     def _repr_html_(self) -> str:

@@ -149,7 +149,9 @@ def test_from_video_contacts_are_as_good_as_noise_and_tracking_allow(from_video)
     # Of all contacts: single classes of deflection hold too few of this short trial.
     row, allowed = from_video.sensed.scores.errors[-1], from_video.tracking.contact[0]
     assert row.contacts >= 25
-    assert row.measured[0] < 1.3 * row.predicted[0] + allowed
+    # The median of n draws is off by about 1.25 / √n of itself; twice that may be.
+    drawn = 1.0 + 2.0 * 1.25 / np.sqrt(row.contacts)
+    assert row.measured[0] < drawn * row.predicted[0] + allowed
     assert from_video.seen.scores.errors[-1].measured[0] < 2.0 * allowed
 
 

@@ -10,6 +10,7 @@ from vibrissa.viewer.saving import (
     deflection_dataset,
     map_netcdf,
     netcdf,
+    on_paper,
     png,
     recording_netcdf,
     whisker_csv,
@@ -51,6 +52,16 @@ def test_a_trial_comes_back(tmp_path, recording):
     back = load_recording(tmp_path / "trial.nc")
     assert set(back.children) == set(recording.children)
     np.testing.assert_array_equal(back["force"], recording["force"])
+
+
+def test_a_picture_on_paper_has_a_margin_and_no_more():
+    image = np.zeros((200, 300, 4), dtype=np.uint8)
+    assert on_paper(image).shape == (200, 300, 3)
+    image[90:100, 120:160] = (255, 0, 0, 128)
+    paper = on_paper(image)
+    assert paper.shape == (10 + 2 * 24, 40 + 2 * 24, 3)
+    np.testing.assert_array_equal(paper[24, 24], [255, 127, 127])
+    assert (paper[:24] == 255).all()
 
 
 def test_a_picture_is_a_png():

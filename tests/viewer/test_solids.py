@@ -7,6 +7,7 @@ import vibrissa as vb
 from vibrissa.plots.chart import values_of
 from vibrissa.viewer.charting import charted
 from vibrissa.viewer.map_drawing import frame_drawing, picked_drawing, solids_drawing
+from vibrissa.viewer.readout import number
 from vibrissa.viewer.solids import COORDINATES, SLICES, TURN, picked, solids
 
 
@@ -39,7 +40,9 @@ def test_a_slice_holds_one_value(whole, name):
     low, high = whole.range(name)
     assert len(triangles)
     values = values_of(name, triangles)
-    np.testing.assert_allclose(values, low + 0.4 * (high - low), atol=1e-6 * (high - low))
+    np.testing.assert_allclose(values, whole.value(name, 0.4), atol=1e-6 * (high - low))
+    ends = [whole.value(name, share) for share in (0.0, 1.0)]
+    np.testing.assert_allclose(ends, [low, high], rtol=1e-12, atol=1e-18)
 
 
 def test_what_is_cut_open_lacks_a_quarter(whole):
@@ -70,8 +73,8 @@ def test_a_ray_picks_the_contact_that_it_meets_first(whole, space):
     edges = np.linalg.norm(np.roll(places, 1, axis=1) - places, axis=-1)
     bound = 1e-9 if space is None else 0.5 * edges.max()
     met = 0
-    for number in rng.integers(0, len(triangles), 12):
-        aim = places[number].mean(axis=0)
+    for chosen in rng.integers(0, len(triangles), 12):
+        aim = places[chosen].mean(axis=0)
         direction = (aim - origin) / np.linalg.norm(aim - origin)
         row = picked(triangles, places, origin, direction)
         if row is None:  # an edge
@@ -99,3 +102,13 @@ def test_what_is_picked_is_bent_exactly(whole):
     signals = vb.base_signals(bent.force, bent.moment)
     assert float(signals.MB) == pytest.approx(values_of("MB", row), rel=1e-3)
     assert 'data-quantity="MB"' in words
+
+
+def test_on_the_edge_the_chart_tells_what_is_felt(whole):
+    row = whole.nodes[12, 20, -1].copy()
+    row[:3] += 1e-3 * (row[:3] - whole.chart.whisker.position(values_of("arc_length", row)))
+    drawn, words = picked_drawing(whole, row, 5.0)
+    assert "bent" in drawn
+    assert "about to slip off" in words
+    for name in ("MB", "arc_length"):
+        assert number(name, float(values_of(name, row))) in words

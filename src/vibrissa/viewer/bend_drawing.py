@@ -129,7 +129,7 @@ def _resting(whisker: Whisker, exaggeration: float) -> dict[str, Thing]:
 def _peg(bend: Bend) -> Body:
     """The peg; a line is drawn a little thick, so that it is seen."""
     length = bend.whisker.length
-    radius = max(bend.radius, 0.002 * length)
+    radius = max(bend.radius, 0.004 * length)
     vertices, faces = cylinder(_mm(bend.origin), bend.axis, _size(radius), _size(0.8 * length))
     return Body(vertices, faces, OBJECT, 0.8)
 

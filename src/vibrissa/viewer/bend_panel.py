@@ -21,6 +21,7 @@ from vibrissa.viewer.readout import numbers, sentence
 
 _MM = quantity("length").display_factor
 _UN = quantity("force").display_factor
+_HELD = "The whisker holds this force."
 
 
 class BendMode:
@@ -51,9 +52,11 @@ class BendMode:
                 "Place (mm)", (x, y, z), step=0.05, hint="Drag the ball, or type"
             )
             self._radius = gui.add_slider(
-                "Peg radius (mm)", 0.0, _MM * 0.08 * length, 0.01, bend.radius, visible=False
+                "Radius (mm)", 0.0, _MM * 0.08 * length, 0.01, bend.radius, visible=False
             )
-            self._place = gui.add_slider("At s / L", 0.05, 1.0, 0.005, bend.place, visible=False)
+            self._place = gui.add_slider(
+                "At s / L", 0.05, 1.0, 0.005, bend.place, visible=False, hint="Along the whisker"
+            )
             self._size = gui.add_slider(
                 "Force (µN)",
                 0.0,
@@ -62,7 +65,15 @@ class BendMode:
                 round(_UN * bend.magnitude, 1),
                 visible=False,
             )
-            self._way = gui.add_slider("Direction (°)", -180.0, 180.0, 1.0, 0.0, visible=False)
+            self._way = gui.add_slider(
+                "Direction (°)",
+                -180.0,
+                180.0,
+                1.0,
+                0.0,
+                visible=False,
+                hint="Round the whisker: 0° along what is y at its base, 90° along z",
+            )
             self._state = gui.add_html("")
             self._numbers = gui.add_html("")
         asked(self._kind, self._chosen)
@@ -95,7 +106,7 @@ class BendMode:
     def write(self, brief: bool = False) -> None:
         """Write signals and contact, and where the load is."""
         bend = self._page.bend
-        show(self._state, sentence(bend.status))
+        show(self._state, sentence(bend.status, _HELD if bend.kind == "force" else None))
         show(self._numbers, numbers(bend.deflection))
         if brief:
             return

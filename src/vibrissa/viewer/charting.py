@@ -15,7 +15,7 @@ from vibrissa.viewer.drawing import CLOUD, Array, Bytes, Cloud, Painted
 from vibrissa.viewer.meshes import sheet
 from vibrissa.whisker import Whisker
 
-_SKIN = (12, 36, 6)
+_SKIN = (12, 48, 6)
 _POINT = 0.008
 """Width of a point of the cloud, over L."""
 

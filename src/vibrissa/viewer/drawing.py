@@ -19,7 +19,7 @@ Colour = tuple[int, int, int]
 Side = Literal["front", "back", "double"]
 
 INK: Colour = (45, 50, 58)
-WHISKER: Colour = (62, 52, 44)
+WHISKER: Colour = (84, 68, 56)
 REST: Colour = (150, 158, 168)
 GHOST: Colour = (213, 94, 0)
 CONTACT: Colour = (213, 94, 0)

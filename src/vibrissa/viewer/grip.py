@@ -45,7 +45,7 @@ class Grip:
         )
         self._ball = server.scene.add_icosphere(
             "/grip ball",
-            radius=0.12 * size,
+            radius=0.096 * size,
             color=(213, 94, 0),
             subdivisions=2,
             opacity=0.35,

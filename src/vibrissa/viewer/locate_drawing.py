@@ -17,6 +17,9 @@ from vibrissa.whisker import Whisker
 SIGMAS = 2.0
 """Standard deviations of the ellipsoids."""
 
+MOST = 0.3
+"""Longest semi-axis that is drawn, over the length: what is longer is as good as unknown."""
+
 
 def locate_drawing(whisker: Whisker, found: Located, exaggeration: float) -> Drawing:
     """Draw the whisker in every other contact that feels the same, and the errors of all.
@@ -47,7 +50,8 @@ def locate_drawing(whisker: Whisker, found: Located, exaggeration: float) -> Dra
             apart = number("separation", float(found.distances[i]), 3)
             out[f"apart {i}"] = Label(_mm(point), f"feels the same, {apart} away")
         if np.isfinite(covariances[i]).all():
-            vertices, faces = error_ellipsoid(point, covariances[i], SIGMAS)
+            most = MOST * whisker.length
+            vertices, faces = error_ellipsoid(point, covariances[i], SIGMAS, most)
             out[f"error {i}"] = Body(_mm(vertices), faces, FIT, 0.45)
     return out
 
@@ -69,6 +73,8 @@ def of_located(whisker: Whisker, found: Located | None, status: Status) -> str:
         spread = np.sqrt(np.diagonal(found.estimate.candidate_covariances[own]))
         errors = dict(zip(("sigma_x", "sigma_y", "sigma_z"), spread.tolist(), strict=True))
         parts.append(table(errors, f"Error of the contact point ({SIGMAS:.0f}σ drawn)"))
+        if SIGMAS * spread.max() > MOST * whisker.length:
+            parts.append(note("The ellipsoid is cut short: along it the place is unknown."))
     rest = {name: value for name, value in felt.items() if name not in names}
     parts.append(table(rest, "Not used"))
     return "".join(parts)

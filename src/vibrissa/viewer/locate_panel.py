@@ -45,10 +45,10 @@ class LocateMode:
                 initial_value=" ".join(self._sensor.triplet),
             )
             noise, turning = _UN * self._sensor.force_noise, _UNM * self._sensor.moment_noise
-            force = gui.add_slider("Noise (µN)", 0.0, 10.0 * noise, 0.1 * noise, noise)
-            moment = gui.add_slider("Noise (µN·m)", 0.0, 10.0 * turning, 0.1 * turning, turning)
+            force = gui.add_slider("F noise (µN)", 0.0, 10.0 * noise, 0.1 * noise, noise)
+            moment = gui.add_slider("M noise (µN·m)", 0.0, 10.0 * turning, 0.1 * turning, turning)
             colour = gui.add_dropdown("Colours", COLOURS, initial_value=self._what)
-            cut = gui.add_checkbox("Only z < 0", self._cut, hint="Cut the cloud open")
+            cut = gui.add_checkbox("Cut open", self._cut, hint="Only contacts with z < 0")
             self._legend = gui.add_html("")
             self._words = gui.add_html("")
         asked(triplet, lambda value: self._sense(triplet=tuple(value.split())))

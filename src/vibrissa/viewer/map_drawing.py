@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from vibrissa.plots.chart import values_of
-from vibrissa.quantities import to_display
 from vibrissa.rod import PointContact, deflect
+from vibrissa.signals import SIGNALS
 from vibrissa.status import Status
 from vibrissa.viewer.bend_drawing import NODES, follicle, whisker_body
 from vibrissa.viewer.drawing import (
@@ -25,7 +25,7 @@ from vibrissa.viewer.drawing import (
     pieces,
 )
 from vibrissa.viewer.meshes import ellipsoid
-from vibrissa.viewer.readout import note, of_deflection
+from vibrissa.viewer.readout import note, of_deflection, table
 from vibrissa.viewer.shading import Legend, shaded
 from vibrissa.viewer.solids import COORDINATES, TURN, Solids
 
@@ -125,16 +125,23 @@ def picked_drawing(solids: Solids, row: Array, exaggeration: float) -> tuple[Dra
         HTML.
     """
     whisker = solids.chart.whisker
-    bent = deflect(whisker, PointContact(row[:3]))
     radius = 0.016 * solids.length
     out: dict[str, Thing] = {}
     for number in (None, 0, 1, 2):
         vertices, faces = ellipsoid(solids.seen(row, number), radius * np.eye(3))
         out[f"mark {number}"] = Body(vertices, faces, CONTACT)
-    if Status(int(bent.status)).ok:
-        line = np.asarray(bent.centerline(NODES))
-        body = whisker_body(whisker, line, exaggeration, WHISKER)
-        out["bent"] = _moved(body, solids.place(None))
-        return out, of_deflection(bent)
-    place = ", ".join(f"{x:.2f}" for x in to_display("length", row[:3]))
-    return out, note(f"At ({place}) mm, on the edge of what the whisker can reach.")
+    # On the surface a whisker is about to slip off; a little inside it holds.
+    inside = np.asarray(whisker.position(values_of("arc_length", row))) - row[:3]
+    for share in (0.0, 0.01, 0.05):
+        bent = deflect(whisker, PointContact(row[:3] + share * inside))
+        if Status(int(bent.status)).ok:
+            line = np.asarray(bent.centerline(NODES))
+            body = whisker_body(whisker, line, exaggeration, WHISKER)
+            out["bent"] = _moved(body, solids.place(None))
+            if share == 0.0:
+                return out, of_deflection(bent)
+            break
+    felt = {name: float(values_of(name, row)) for name in SIGNALS}
+    where = {name: float(values_of(name, row)) for name in ("arc_length", *COORDINATES)}
+    edge = note("On the edge of what the whisker can reach: it is about to slip off.")
+    return out, edge + table(felt, "At the base") + table(where, "Contact")

@@ -10,12 +10,12 @@ import viser
 from vibrissa.quantities import to_display
 from vibrissa.viewer.drawing import Array
 from vibrissa.viewer.map_drawing import frame_drawing, picked_drawing, solids_drawing
-from vibrissa.viewer.page import Page, asked, look_at
+from vibrissa.viewer.page import Page, asked
 from vibrissa.viewer.readout import note, number
 from vibrissa.viewer.solids import COORDINATES, SLICES, Solids, picked, solids
 
 _WHOLE = "none"
-_SPACES: dict[str, int | None] = {"contacts": None, "r": 0, "theta": 1, "phi": 2}
+_SPACES = (None, 0, 1, 2)
 _HINT = "Click on a solid: the same contact is marked in all four spaces."
 
 
@@ -48,6 +48,8 @@ class MapMode:
             self._value = gui.add_html("")
             self._legends = gui.add_html("")
             self._words = gui.add_html(note(_HINT))
+        scene: Any = page.server.scene  # coroutines may be given, and run one after the other
+        scene.on_click()(self._clicked)
         for control in (self._by, self._cut, self._slice, self._share):
             asked(control, lambda _: page.work.put("map", self.redraw))
 
@@ -57,7 +59,7 @@ class MapMode:
         self._drawn = None
         length = float(to_display("length", self._page.bend.whisker.length))
         middle = np.array([1.0, 0.0, 0.0]) * length
-        look_at(self._page.server, middle, 2.5 * length, (0.0, -0.95, 0.33))
+        self._page.look_at(middle, 2.2 * length, (0.0, -0.95, 0.33))
 
     def leave(self) -> None:
         """Hide controls and things."""
@@ -96,34 +98,28 @@ class MapMode:
             self._value.content = ""
         else:
             self._triangles = found.slice(what, share)
-            low, high = found.range(what)
-            value = number(what, low + share * (high - low))
+            value = number(what, found.value(what, share))
             self._value.content = note(f"Contacts with {what} = {value}")
         painted, legends = solids_drawing(found, self._triangles, by)
         if not len(self._triangles):
             painted = {}
         self._page.stage.show("solids", painted)
         self._legends.content = "".join(legends[name].html() for name in COORDINATES)
-        for name in painted:
-            self._listen(name)
 
-    def _listen(self, name: str) -> None:
+    async def _clicked(self, event: viser.SceneClickEvent) -> None:
         """Pick where a solid is clicked."""
-        node: Any = self._page.stage.node("solids", name)
+        origin = np.asarray(event.ray_origin, dtype=np.float64)
+        direction = np.asarray(event.ray_direction, dtype=np.float64)
+        self._page.work.put("pick", lambda: self.pick(origin, direction))
 
-        async def clicked(event: viser.SceneNodePointerEvent[Any]) -> None:
-            origin = np.asarray(event.ray_origin, dtype=np.float64)
-            direction = np.asarray(event.ray_direction, dtype=np.float64)
-            self._page.work.put("pick", lambda: self.pick(name, origin, direction))
-
-        node.on_click(clicked)
-
-    def pick(self, space: str, origin: Array, direction: Array) -> None:
-        """Mark the contact that a ray, mm, meets first in a space."""
-        if self._solids is None:
+    def pick(self, origin: Array, direction: Array) -> None:
+        """Mark the contact that a ray, mm, meets first in any space."""
+        found = self._solids
+        if found is None:
             return
-        places = self._solids.seen(self._triangles, _SPACES[space])
-        row = picked(self._triangles, places, origin, direction)
+        places = np.concatenate([found.seen(self._triangles, space) for space in _SPACES])
+        rows = np.tile(self._triangles, (len(_SPACES), 1, 1))
+        row = picked(rows, places, origin, direction)
         if row is not None:
             self.row = row
             self._mark()

@@ -87,10 +87,16 @@ def ellipsoid(centre: Array, axes: Array, around: int = 24) -> tuple[Array, Ints
     return centre + ball.reshape(-1, 3) @ axes.T, faces
 
 
-def error_ellipsoid(centre: Array, covariance: Array, sigmas: float) -> tuple[Array, Ints]:
-    """Vertices and triangles of the ellipsoid of so many standard deviations."""
+def error_ellipsoid(
+    centre: Array, covariance: Array, sigmas: float, most: float = np.inf
+) -> tuple[Array, Ints]:
+    """Vertices and triangles of the ellipsoid of so many standard deviations.
+
+    Semi-axes are cut to the longest that is to be drawn.
+    """
     values, directions = np.linalg.eigh(covariance)
-    return ellipsoid(centre, directions * (sigmas * np.sqrt(np.clip(values, 0.0, None))))
+    sizes = np.minimum(sigmas * np.sqrt(np.clip(values, 0.0, None)), most)
+    return ellipsoid(centre, directions * sizes)
 
 
 def sheet(grid: Array) -> tuple[Array, Ints]:

@@ -19,6 +19,7 @@ from vibrissa.quantities import to_display
 from vibrissa.viewer.bending import Bend, begin, loaded, moved, with_whisker
 from vibrissa.viewer.charting import Chart, charted
 from vibrissa.viewer.drawing import Array
+from vibrissa.viewer.framing import Framing, Shot
 from vibrissa.viewer.grip import Grip
 from vibrissa.viewer.latest import Latest
 from vibrissa.viewer.shaping import shape_of, shaped
@@ -73,6 +74,7 @@ class Page:
     ) -> None:
         self.server = server
         self.stage = Stage(server)
+        self._framing = Framing(server)
         self.work = Latest(self._fault)
         self.slow_work = Latest(self._fault)
         self.original = whisker
@@ -84,9 +86,10 @@ class Page:
         self.mode: Mode | None = None
         self.modes: dict[str, Mode] = {}
         self.whisker_controls: viser.GuiFolderHandle | None = None
+        self.chosen: Callable[[str], None] = lambda name: None
         self.closing: list[Callable[[], None]] = []
         self._written = 0.0
-        self.grip = Grip(server, float(to_display("length", 0.16 * whisker.length)), self._dragged)
+        self.grip = Grip(server, float(to_display("length", 0.2 * whisker.length)), self._dragged)
 
     # What happens
 
@@ -163,6 +166,7 @@ class Page:
             self.mode = self.modes[name]
             if self.whisker_controls is not None:
                 self.whisker_controls.visible = name != "Trial"
+            self.chosen(name)
             self.mode.enter()
             self.redraw()
 
@@ -210,7 +214,11 @@ class Page:
     def face_whisker(self) -> None:
         """Let everyone look at the whisker."""
         length = float(to_display("length", self.bend.whisker.length))
-        look_at(self.server, np.array([0.4, 0.1, 0.0]) * length, 1.1 * length, (0.15, -0.8, 0.6))
+        self.look_at(np.array([0.45, 0.1, 0.0]) * length, 0.95 * length, (0.15, -0.8, 0.6))
+
+    def look_at(self, centre: Array, distance: float, way: Sequence[float]) -> None:
+        """Let everyone look at a place, mm, from a distance, mm, and a direction."""
+        self._framing.show(Shot(centre, distance, np.asarray(way, dtype=np.float64)))
 
     def _fault(self, error: Exception) -> None:
         traceback.print_exception(error)
@@ -249,22 +257,3 @@ def show(handle: viser.GuiHtmlHandle, content: str) -> None:
     """Write something in the panel, unless it is there already."""
     if handle.content != content:
         handle.content = content
-
-
-def look_at(
-    server: viser.ViserServer, centre: Array, distance: float, way: Sequence[float]
-) -> None:
-    """Let everyone look at a place, mm, from a direction, now and when they come.
-
-    The panel hides the right of the scene, so the place is put a little to the left.
-    """
-    direction = np.asarray(way, dtype=np.float64)
-    direction = direction / np.linalg.norm(direction)
-    right = np.cross([0.0, 0.0, 1.0], direction)
-    middle = centre + 0.17 * distance * right / np.linalg.norm(right)
-    position = middle + distance * direction
-    cameras: list[Any] = [server.initial_camera]
-    cameras += [client.camera for client in server.get_clients().values()]
-    for camera in cameras:
-        camera.position = tuple(position.tolist())
-        camera.look_at = tuple(middle.tolist())

@@ -13,6 +13,11 @@ from typing import Any
 SCRIPT = """
 (() => {
   document.title = "vibrissa";
+  const asked = new URLSearchParams(location.search);
+  if (matchMedia("(prefers-color-scheme: dark)").matches && !asked.has("darkMode")) {
+    asked.set("darkMode", "");
+    history.replaceState(null, "", "?" + asked);
+  }
 
   // The page sends the mouse every 50 ms; a whisker follows faster.
   const later = window.setTimeout.bind(window);
@@ -67,7 +72,7 @@ SCRIPT = """
     // A mouse that drags, and whatever changes, asks for frames for a quarter of a second. Where
     // each takes its time they would keep that from being drawn which they wait for.
     if (!slow) return;
-    let ask = page.requestRender, last;
+    let ask = page.requestRender, last = 0;
     const thrifty = () => {
       const held = page.cameraControl?.enabled === false;  // something, not the view
       if (!held || window.event?.type !== "pointermove") root.invalidate();

@@ -63,14 +63,18 @@ def table(rows: Mapping[str, float], heading: str = "") -> str:
     )
 
 
-def sentence(status: Status) -> str:
-    """Say what became of a load or an estimate, in the colour of good or bad news."""
+def sentence(status: Status, good: str | None = None) -> str:
+    """Say what became of a load or an estimate, in the colour of good or bad news.
+
+    Good news may be told in other words than those of the status.
+    """
+    words = good if good and status.ok else status.explanation
     colour = ("#e6f4ee", "#00614a") if status.ok else ("#fdece3", "#9c3d00")
     advice = f'<div style="margin-top:3px;opacity:.85">{plain(status.advice)}</div>'
     return (
         f'<div data-status="{status.name}" style="margin:0 12px 8px;padding:6px 9px;'
         f"border-radius:6px;font-size:13px;line-height:1.35;background:{colour[0]};"
-        f'color:{colour[1]}">{plain(status.explanation)}{advice if status.advice else ""}</div>'
+        f'color:{colour[1]}">{plain(words)}{advice if status.advice else ""}</div>'
     )
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import viser
 import xarray as xr
 
@@ -14,6 +13,7 @@ from vibrissa.viewer.saving import (
     deflection_dataset,
     map_netcdf,
     netcdf,
+    on_paper,
     png,
     recording_netcdf,
     whisker_csv,
@@ -75,15 +75,18 @@ class SaveControls:
         camera = client.camera
 
         def drawn() -> bytes:
-            image = client.get_render(
-                camera.image_height,
-                camera.image_width,
-                transport_format="png",
-                timeout=_TIMEOUT,
-            )
-            # What is empty is transparent; on paper it is white.
-            share = image[..., 3:] / 255.0
-            return png(np.round(image[..., :3] * share + 255.0 * (1.0 - share)).astype(np.uint8))
+            grip = self._page.grip
+            grip.show(None)  # nobody takes hold of a picture
+            try:
+                image = client.get_render(
+                    camera.image_height,
+                    camera.image_width,
+                    transport_format="png",
+                    timeout=_TIMEOUT,
+                )
+            finally:
+                self._page.place_grip()
+            return png(on_paper(image))
 
         self._send(event, "vibrissa.png", drawn)
 

@@ -19,6 +19,8 @@ from vibrissa.status import flag_attributes
 from vibrissa.whisker import Whisker
 
 NODES = 200
+_MARGIN = 24
+"""White around a picture, pixels."""
 
 
 def whisker_csv(whisker: Whisker) -> bytes:
@@ -82,6 +84,17 @@ def png(image: np.ndarray[Any, np.dtype[np.uint8]]) -> bytes:
 
     encoded: bytes = imageio.imwrite("<bytes>", image, extension=".png")
     return encoded
+
+
+def on_paper(image: np.ndarray[Any, np.dtype[np.uint8]]) -> np.ndarray[Any, np.dtype[np.uint8]]:
+    """A picture (height, width, 4) on white (height, width, 3), without its empty margins."""
+    share = image[..., 3:] / 255.0
+    out = np.round(image[..., :3] * share + 255.0 * (1.0 - share)).astype(np.uint8)
+    rows, columns = np.nonzero((out != 255).any(axis=-1))
+    if not rows.size:
+        return out
+    top, left = (max(int(at.min()) - _MARGIN, 0) for at in (rows, columns))
+    return out[top : rows.max() + _MARGIN + 1, left : columns.max() + _MARGIN + 1]
 
 
 def _written(name: str, write: Callable[[Path], object]) -> bytes:

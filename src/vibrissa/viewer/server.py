@@ -38,6 +38,9 @@ from vibrissa.whisker import Whisker
 HOST = "127.0.0.1"
 PORT = 8080
 
+_HERE = "● "
+"""Before the way to look that is chosen."""
+
 _COMPILING = (
     "Compiling, once for this installation, for about a minute. What needs a part that is not "
     "ready waits for it: pegs, candidates and their errors."
@@ -193,7 +196,12 @@ def _furnished(
     """Give a page its controls and its modes, and begin with the one that shows most."""
     names = ("Bend", "Locate", "Map") if trial is None else ("Bend", "Locate", "Map", "Trial")
     choice = page.server.gui.add_button_group("Look at", names)
-    choice.on_click(lambda event: page.choose(event.target.value))
+    choice.on_click(lambda event: page.choose(event.target.value.removeprefix(_HERE)))
+
+    def chosen(name: str) -> None:
+        choice.options = tuple(_HERE + each if each == name else each for each in names)
+
+    page.chosen = chosen
     notice = page.server.gui.add_html(note(_COMPILING), visible=False)
     modes: list[Mode] = [BendMode(page), LocateMode(page), MapMode(page)]
     if trial is not None:

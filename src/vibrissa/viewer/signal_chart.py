@@ -51,7 +51,7 @@ def cursor(share: float) -> str:
     """A line at a share of the time, to be laid over the chart."""
     x = LEFT + (WIDTH - LEFT) * share
     line = (
-        f'<line x1="{x:.2f}" x2="{x:.2f}" y1="0" y2="{len(ROWS) * ROW:.0f}" stroke="#111" '
+        f'<line x1="{x:.2f}" x2="{x:.2f}" y1="0" y2="{len(ROWS) * ROW:.0f}" stroke="currentColor" '
         f'stroke-width="1.2" data-cursor="{share:.4f}"/>'
     )
     return f'<div style="margin-top:{-100.0 * height() / WIDTH:.3f}%">{_svg(line)}</div>'
@@ -79,7 +79,7 @@ def _shade(time: Array, felt: NDArray[np.bool_]) -> str:
         x, end = _x(time, time[[first, beyond - 1]])
         out.append(
             f'<rect x="{x:.1f}" width="{max(end - x, 0.4):.1f}" y="0" '
-            f'height="{len(ROWS) * ROW:.0f}" fill="#e9eef3"/>'
+            f'height="{len(ROWS) * ROW:.0f}" fill="#7895b2" fill-opacity="0.17"/>'
         )
     return "".join(out)
 
@@ -91,7 +91,7 @@ def _row(time: Array, signals: dict[str, Array], names: tuple[str, str], top: fl
     inside, bottom = ROW - 12.0, top + ROW - 4.0
     unit = quantity(names[0]).display_unit
     out = [
-        f'<line x1="{LEFT}" x2="{WIDTH}" y1="{bottom:.1f}" y2="{bottom:.1f}" stroke="#ccc"/>',
+        f'<line x1="{LEFT}" x2="{WIDTH}" y1="{bottom:.1f}" y2="{bottom:.1f}" stroke="#8888"/>',
         _text(LEFT - 3.0, top + 11.0, _brief(high), "end"),
         _text(LEFT - 3.0, bottom, _brief(low), "end"),
         _text(LEFT - 3.0, top + 0.5 * ROW + 3.0, unit, "end"),

@@ -16,6 +16,7 @@ from vibrissa.plots.chart import column, fine_chart, values_of
 from vibrissa.plots.solids import clipped, level, solid
 from vibrissa.plots.style import root
 from vibrissa.quantities import to_display
+from vibrissa.signals import SIGNALS
 from vibrissa.viewer.charting import Chart
 from vibrissa.viewer.drawing import Array
 
@@ -66,9 +67,17 @@ class Solids:
 
     def slice(self, name: str, share: float) -> Array:
         """Triangles (n, 3, columns) of contacts with one value, at a share of its range."""
+        height = self.value(name, share)
+        return clipped(level(self.nodes, column(name), height), column("deflection"))
+
+    def value(self, name: str, share: float) -> float:
+        """The value at a share of a range, SI units; of signals by square roots, as in space."""
         low, high = self.range(name)
-        value = low + share * (high - low)
-        return clipped(level(self.nodes, column(name), value), column("deflection"))
+        if name not in SIGNALS:
+            return low + share * (high - low)
+        start, end = root(np.array([low, high]))
+        middle = start + share * (end - start)
+        return float(np.sign(middle) * middle**2)
 
     def range(self, name: str) -> tuple[float, float]:
         """Least and largest value of what a slice can hold fixed, SI units."""

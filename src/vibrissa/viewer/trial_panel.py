@@ -8,7 +8,7 @@ import numpy as np
 import viser
 
 from vibrissa.io.footage import Footage
-from vibrissa.viewer.page import Page, asked, look_at, put
+from vibrissa.viewer.page import Page, asked, put
 from vibrissa.viewer.player import Player
 from vibrissa.viewer.readout import table
 from vibrissa.viewer.signal_chart import chart, cursor
@@ -93,7 +93,7 @@ class TrialMode:
         if self._window is not None:
             self._window.visible = True
         middle, size = extent(self.trial)
-        look_at(self._page.server, middle, 1.0 * size, (0.25, -0.75, 0.65))
+        self._page.look_at(middle, 0.9 * size, (0.25, -0.75, 0.65))
         self._draw_chart()
 
     def leave(self) -> None:

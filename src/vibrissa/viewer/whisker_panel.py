@@ -54,7 +54,7 @@ class WhiskerControls:
             self._thick = gui.add_slider(
                 "Drawn × thick", 1.0, 20.0, 0.5, EXAGGERATION, hint="Only in the picture"
             )
-            self._reset = gui.add_button("As it was", color="blue")
+            self._reset = gui.add_button("Reset", hint="The whisker as it was", color="blue")
         asked(self._length, lambda value: page.reshape(length=value / _MM))
         asked(self._turn, lambda value: page.reshape(turn=float(np.deg2rad(value))))
         asked(self._taper, lambda value: page.reshape(taper=value))

@@ -1,0 +1,39 @@
+"""What is shown stands in the middle of what the panel leaves free, as large as fits."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("viser", reason="viser is not installed", exc_type=ImportError)
+
+from vibrissa.viewer.framing import PANEL, Shot, framed
+
+FOV = np.deg2rad(75.0)
+
+
+def on_screen(place, position, look_at, width, height):
+    """Pixels from the left and from the top."""
+    ahead = (look_at - position) / np.linalg.norm(look_at - position)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    away = place - position
+    focal = 0.5 * height / np.tan(0.5 * FOV)
+    seen = np.array([away @ right, -away @ np.cross(right, ahead)]) / (away @ ahead)
+    return 0.5 * np.array([width, height]) + focal * seen
+
+
+@pytest.mark.parametrize(
+    ("width", "height"), [(1280, 720), (1920, 1080), (900, 480), (480, 800), (3000, 500)]
+)
+def test_the_centre_is_in_the_middle_of_what_is_free(width, height):
+    shot = Shot(np.array([16.0, 4.0, -2.0]), 38.0, np.array([0.15, -0.8, 0.6]))
+    position, look_at = framed(shot, width, height, FOV)
+    free = max(width - PANEL, 0.5 * width)
+    seen = on_screen(shot.centre, position, look_at, width, height)
+    np.testing.assert_allclose(seen, [0.5 * free, 0.5 * height], atol=1e-6)
+    assert np.linalg.norm(position - look_at) >= shot.distance * (1.0 - 1e-12)
+    # 1.25 times the distance fits beside the panel.
+    aside = np.cross(look_at - position, [0.0, 0.0, 1.0])
+    aside *= 0.5 * 1.25 * shot.distance / np.linalg.norm(aside)
+    ends = [on_screen(shot.centre + s * aside, position, look_at, width, height) for s in (-1, 1)]
+    assert ends[0][0] >= -1e-6
+    assert ends[1][0] <= free + 1e-6

@@ -34,6 +34,7 @@ _LEAST = 0.25
 
 _STYLE = "border-collapse:collapse;font-size:90%"
 _CELL = "text-align:left;padding:1px 10px 1px 0;vertical-align:top"
+_NAME = ";white-space:nowrap"
 
 
 @dataclass(frozen=True)
@@ -234,7 +235,12 @@ def table(rows: Sequence[Sequence[str]], heading: Sequence[str] = ()) -> str:
     """
     head = "".join(f'<th style="{_CELL}">{escape(cell)}</th>' for cell in heading)
     body = "".join(
-        "<tr>" + "".join(f'<td style="{_CELL}">{escape(cell)}</td>' for cell in row) + "</tr>"
+        "<tr>"
+        + "".join(
+            f'<td style="{_CELL}{_NAME if i == 0 else ""}">{escape(cell)}</td>'
+            for i, cell in enumerate(row)
+        )
+        + "</tr>"
         for row in rows
     )
     head = f"<tr>{head}</tr>" if head else ""

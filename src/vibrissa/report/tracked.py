@@ -37,7 +37,8 @@ def whiskers_table(recording: xr.DataTree, chosen: int) -> str:
             largest = float(np.max(size, initial=0.0, where=np.isfinite(size)))
         rows.append((names[k], str(k), str(touching[k]), shown_value("force", largest)))
     told = paragraph(
-        f"What follows is of whisker {names[chosen]}, number {chosen}; `--whisker` chooses another."
+        f"Signals and estimated contacts below are of whisker {names[chosen]}, number {chosen}; "
+        "`--whisker` chooses another. The contour is of all."
     )
     if not rows:
         return told + paragraph(f"None of the {len(names)} whiskers is known to touch anything.")

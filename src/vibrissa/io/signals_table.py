@@ -9,6 +9,7 @@ large or small for the force, as |M| / |F| is at most the distance of the contac
 
 from __future__ import annotations
 
+from itertools import zip_longest
 from os import PathLike
 from pathlib import Path
 
@@ -31,6 +32,8 @@ COLUMNS = ("time", "Fx", "Fy", "Fz", "Mx", "My", "Mz")
 _KINDS = {"t": "time", "F": "force", "M": "moment"}
 # What a wire of steel as thick as a finger holds.
 _LARGEST = {"F": (1e4, "N"), "M": (1e3, "N·m")}
+# Seconds since any epoch are fewer.
+_LATEST = 1e11
 _LEVER_ARMS = (1e-4, 1.0)
 # Of whiskers bent to their fold 0.3 L from the base, forces and moments stay below 40 times these.
 _LARGEST_SCALES = 100.0
@@ -60,6 +63,7 @@ def load_signals(path: str | PathLike[str]) -> xr.Dataset:
     """
     path = Path(path)
     table = _netcdf(path) if is_netcdf(path) else _csv(path)
+    _check_time(path, table[:, 0])
     _check_magnitudes(path, table)
     _check_lever_arm(path, table)
     return _dataset(table).assign_attrs(notes=_notes(table[:, 0]))
@@ -152,8 +156,13 @@ def _csv(path: Path) -> Array:
     header = next(rows, None)
     if header is None:
         raise ValueError(f"{path} is empty; a header {','.join(COLUMNS)} and rows are needed")
-    columns, factors = _columns(path, header[1])
-    values = read_rows(path, rows, len(header[1]), columns)
+    names, later = header[1], list(rows)
+    # Some programs write units in a line of their own.
+    if later and not any(is_number(cell) for cell in later[0][1]):
+        names = [f"{name} ({unit})" for name, unit in zip_longest(names, later[0][1], fillvalue="")]
+        del later[0]
+    columns, factors = _columns(path, names)
+    values = read_rows(path, iter(later), len(names), columns)
     if not len(values):
         raise ValueError(f"{path} has a header but no rows")
     return values * factors
@@ -206,6 +215,15 @@ def _in_si(path: Path, variable: xr.DataArray) -> Array:
     if factor is None:
         raise ValueError(f"{path}: {variable.name} is in {unit}; {units_of(kind)} are known")
     return np.asarray(variable.values, dtype=np.float64) * factor
+
+
+def _check_time(path: Path, time: Array) -> None:
+    late = np.flatnonzero(np.abs(time) > _LATEST)
+    if late.size:
+        raise ValueError(
+            f"{path}: time is {time[late[0]]:.6g} s in row {late[0] + 1}, more than any date in "
+            "seconds: if it is in ms, µs or ns, call the column time_ms, time_us or time_ns"
+        )
 
 
 def _check_magnitudes(path: Path, table: Array) -> None:

@@ -73,8 +73,8 @@ def table_rows(text: str) -> Iterator[tuple[int, list[str]]]:
     Yields
     ------
     tuple of int and list of str
-        Number and cells, without blanks around them, of every line that is neither empty nor a
-        comment (#). Decimal commas are points.
+        Number and cells, without blanks around them, of every line that is neither empty, be it
+        of empty cells, nor a comment (#). Decimal commas are points.
     """
     lines = [
         (number, line)
@@ -89,7 +89,9 @@ def table_rows(text: str) -> Iterator[tuple[int, list[str]]]:
     rows = [cells_of(line, delimiter) for _, line in lines]
     if delimiter != "," and not any("." in cell and is_number(cell) for r in rows for cell in r):
         rows = [[with_point(cell) for cell in row] for row in rows]
-    yield from zip((number for number, _ in lines), rows, strict=True)
+    for (line, _), row in zip(lines, rows, strict=True):
+        if any(row):
+            yield line, row
 
 
 def delimiter_of(header: str) -> str:

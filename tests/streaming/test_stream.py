@@ -366,6 +366,11 @@ def test_the_offset_is_found_anew_from_the_first_samples(gamma_map, bent, wrench
     assert {record["status"] for record in before} == {"tare"}
     away = np.array([last[name] for name in "xyz"]) - bent.contact_point[8]
     assert np.linalg.norm(away) < 1e-3
+    (unposed,) = running.records([json.dumps(dict(zip(COMPONENTS, rows[0], strict=True)))])
+    assert "base_qw" not in unposed.get("error", "")  # the pose before still counts
+    running = ContactStream(Estimator.of_sensor(gamma_map, sensor), COMPONENTS)
+    (unposed,) = running.records([json.dumps(dict(zip(COMPONENTS, rows[0], strict=True)))])
+    assert "base's rotation is needed: base_qw" in unposed["error"]
     with pytest.raises(ValueError, match="there is no sensor"):
         ContactStream(estimator(gamma_map), tare=3)
 

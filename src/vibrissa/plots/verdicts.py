@@ -67,7 +67,9 @@ def verdict_table(verdicts: xr.Dataset, *, width: Width = "double") -> Figure:
         figure = new_figure(width, height, None)
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(0.0, page), ylim=(height, 0.0))
         axes.set_axis_off()
-        _heads(axes, regions, width, page)
+        shares = verdicts.get("ambiguous_share")
+        told = shares is not None and bool(np.isfinite(shares.values).any())
+        _heads(axes, regions, width, page, told)
         chosen = str(verdicts.attrs.get("chosen_triplet", ""))
         for i, triplet in enumerate(triplets):
             _row(axes, verdicts.sel(triplet=triplet), i, triplet == chosen, width, page)
@@ -106,7 +108,7 @@ def _line(axes: Axes, y: float, page: float, weight: float) -> None:
     axes.plot([1.5, page - 1.5], [y, y], color=INK, linewidth=weight)
 
 
-def _heads(axes: Axes, regions: list[str], width: Width, page: float) -> None:
+def _heads(axes: Axes, regions: list[str], width: Width, page: float, shares: bool) -> None:
     names, column, notation = _EDGES[width]
     base = _HEAD - 2.0
     look: dict[str, Any] = {"fontsize": 6.5, "va": "bottom"}
@@ -120,6 +122,7 @@ def _heads(axes: Axes, regions: list[str], width: Width, page: float) -> None:
     axes.text(left, base, "unique for", **look)
     if width == "double" and "all" in regions:
         axes.text(left + notation + 1.0, base, "critical\ncone", linespacing=1.1, **look)
+    if width == "double" and "all" in regions and shares:
         axes.text(left + notation + 14.0, base, "ambiguous\nat 0.1 %", linespacing=1.1, **look)
 
 

@@ -167,6 +167,12 @@ class ContactStream:
         self.slow += time > self._time + _SLOW > -math.inf
         self._time = max(self._time, time)
         rotation, position = self._pose(sample, time)
+        sensor = self._estimator.sensor
+        if rotation is None and sensor is not None and sensor.mass > 0.0:
+            raise ValueError(
+                "the sensor carries a mass, so the base's rotation is needed: base_qw, base_qx, "
+                "base_qy and base_qz in the line, or a pose before it"
+            )
         if len(self._free) < self._tare:
             return {"time": time, "status": self._tared(sample.values, rotation)}
         values = sample.values - self._offset

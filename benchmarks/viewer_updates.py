@@ -209,12 +209,17 @@ def measured(browser, pipe, start, drawing, seconds):
     page.wait_for_timeout(500)
     pipe.send("tell")
     server, log = pipe.recv(), page.evaluate("vibrissaLog")
+    shown = page.evaluate(
+        "(({width, height}) => `${width} × ${height}`)"
+        "(document.querySelector('canvas[data-engine]'))"
+    )
     page.mouse.up()
     page.close()
     times = {name: np.array(log[name]) for name in ("sent", "arrived", "drawn")}
     times |= {name: np.array(server[name]) for name in ("heard", "bent")}
     report(followed(times), times, server, lasted)
     count = len(times["drawn"])
+    print(f"  in the end {shown} pixels are drawn (the page takes fewer where it is slow)")
     print(f"  {log['batches'] / count:.2f} batches of messages, {log['frames'] / count:.2f} frames")
     for name in after:
         print(f"  {name:26} {1e3 * (after[name] - before.get(name, 0.0)) / count:6.1f} ms")

@@ -18,7 +18,7 @@ from vibrissa.viewer import view
 CONTACT = (24e-3, 3e-3, 4e-3)
 TRIPLET = "Fx FT MB"
 WINDOW = {"width": 1280, "height": 800}
-SHOWN = (270, 0, 1280, 770)  # without the empty wall
+FINE = 2  # pixels of the screen a pixel of the picture, which makes edges smooth
 DRAWN = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 
@@ -27,7 +27,7 @@ def picture() -> bytes:
     chromium = shutil.which("chromium") or shutil.which("chromium-browser")
     with view(vb.samples.gamma()) as viewer, sync_playwright() as play:
         browser = play.chromium.launch(executable_path=chromium, args=DRAWN)
-        page = browser.new_page(viewport=WINDOW)
+        page = browser.new_page(viewport=WINDOW, device_scale_factor=FINE)
         page.set_default_timeout(120e3)  # what is drawn by software is slow
         page.goto(viewer.url)
         page.get_by_role("button", name="Locate").click()
@@ -49,7 +49,7 @@ def main() -> None:
     target = Path(__file__).parent / "images" / "viewer.png"
     if len(sys.argv) > 1:
         target = Path(sys.argv[1])
-    image = Image.open(io.BytesIO(picture())).convert("RGB").crop(SHOWN)
+    image = Image.open(io.BytesIO(picture())).convert("RGB").reduce(FINE)
     # 256 colours are enough for what is drawn and written.
     image.quantize(256, dither=Image.Dither.NONE).save(target, optimize=True)
 

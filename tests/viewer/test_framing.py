@@ -27,7 +27,7 @@ def on_screen(place, position, look_at, width, height):
 def test_the_centre_is_in_the_middle_of_what_is_free(width, height):
     shot = Shot(np.array([16.0, 4.0, -2.0]), 38.0, np.array([0.15, -0.8, 0.6]))
     position, look_at = framed(shot, width, height, FOV)
-    free = max(width - PANEL, 0.5 * width)
+    free = max(width - PANEL * height, 0.5 * width)
     seen = on_screen(shot.centre, position, look_at, width, height)
     np.testing.assert_allclose(seen, [0.5 * free, 0.5 * height], atol=1e-6)
     assert np.linalg.norm(position - look_at) >= shot.distance * (1.0 - 1e-12)

@@ -9,8 +9,10 @@ import viser
 
 from vibrissa.viewer.drawing import Array
 
-PANEL = 400.0
-"""Width of the panel and its margin, pixels; in a narrow window at most half of it counts."""
+PANEL = 0.52
+"""Width of the panel and its margin, over the height of a usual window; in a narrow one at most
+half of the width counts. How many pixels it has is not known: screens have one or more to each of
+the page's."""
 
 _WIDTH = 1.25
 """How wide what is shown is, over the distance from which it is looked at."""
@@ -52,7 +54,7 @@ def framed(shot: Shot, width: float, height: float, fov: float) -> tuple[Array, 
     position, look_at : array (3,)
         mm.
     """
-    free = max(width - PANEL, 0.5 * width)
+    free = max(width - PANEL * height, 0.5 * width)
     across = 2.0 * np.tan(0.5 * fov) / height  # of a pixel, over the distance
     distance = shot.distance * max(1.0, _WIDTH / (free * across))
     direction = shot.way / np.linalg.norm(shot.way)

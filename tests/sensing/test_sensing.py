@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import vibrissa as vb
+from vibrissa.cli.information import info
 from vibrissa.sensing import (
     Sensor,
     SensorFrame,
@@ -450,3 +451,12 @@ def test_usual_mistakes_of_calibrations_are_said(wire, touched, rng):
     thick = wire.scaled(radius_factor=2.0)
     with pytest.warns(UserWarning, match=r"E r⁴ 0\.0625 times .* whether the radius is a diameter"):
         fit_stiffness(thick, points, wrench, Sensor(noise=noise), modulus_sigma=0.1)
+
+
+def test_a_sensor_file_can_be_looked_into(tmp_path, capsys):
+    frame = SensorFrame(("x", "-z", "-y"), (-0.03, 0.0, 0.0))
+    save_sensor(tmp_path / "s.toml", Sensor(("My",), mixing=1e3, noise=0.1, frame=frame, mass=0.01))
+    info(tmp_path / "s.toml")
+    said = capsys.readouterr().out
+    for part in ("1000 My + 0, noise 0.1", "left-handed, origin at (-30.00", "10 g"):
+        assert part in said

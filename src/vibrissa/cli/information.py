@@ -74,6 +74,9 @@ def _file(path: Path) -> Iterator[tuple[str, str]]:
         return
     check_readable(path)
     yield "file", f"{path}, {path.stat().st_size / 1e6:.3g} MB"
+    if _is_sensor(path):
+        yield from _sensor(path)
+        return
     kind = recognise(path)
     if kind in (Kind.ARRAY, Kind.ARRAY_TABLE):
         yield from _array(path, kind)
@@ -92,6 +95,38 @@ def _file(path: Path) -> Iterator[tuple[str, str]]:
         raise ValueError(f"{path} is of no kind that is known. Known are: {known}")
     else:
         yield from _table(path)
+
+
+def _is_sensor(path: Path) -> bool:
+    import tomllib
+
+    if path.suffix != ".toml":
+        return False
+    try:
+        said = tomllib.loads(path.read_text(encoding="utf-8"))
+    except ValueError:
+        return False
+    return "noise" in said and not isinstance(said["noise"], dict)
+
+
+def _sensor(path: Path) -> Iterator[tuple[str, str]]:
+    """A sensor, a line for each channel."""
+    from vibrissa.sensing import COMPONENTS, load_sensor
+
+    sensor = load_sensor(path)
+    yield "kind", "sensor"
+    numbers = zip(
+        sensor.channels, sensor.mixing, sensor.noise, sensor.bias, sensor.largest, strict=True
+    )
+    for name, mixing, noise, bias, largest in numbers:
+        parts = [f"{a:g} {c}" for a, c in zip(mixing, COMPONENTS, strict=True) if a]
+        ends = f", saturates at ±{largest:g}" if np.isfinite(largest) else ""
+        yield name, f"{' + '.join(parts)} + {bias:.4g}, noise {noise:.3g}{ends}"
+    x, y, z = 1e3 * sensor.frame.position
+    hand = "right" if sensor.frame.handedness > 0 else "left"
+    counts = ", tells the reaction" if sensor.frame.reaction else ""
+    yield "frame", f"{hand}-handed, origin at ({x:.2f}, {y:.2f}, {z:.2f}) mm{counts}"
+    yield "carries", f"{1e3 * sensor.mass:.3g} g"
 
 
 def _array(path: Path, kind: str) -> Iterator[tuple[str, str]]:

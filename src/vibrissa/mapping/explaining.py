@@ -10,15 +10,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibrissa.mapping.fitting import _fit
+from vibrissa.mapping.fitting import _fit, channel_equations
 from vibrissa.mapping.inversion import MOST_CANDIDATES
 from vibrissa.mapping.least_squares import PARTS, _nearest
 from vibrissa.mapping.locating import Searched, Trail, go_on, near, tell
-from vibrissa.mapping.weighing import Weighing, weigh
+from vibrissa.mapping.weighing import Weighing, spread, weigh
 from vibrissa.mapping.whitening import INDISTINCT
-from vibrissa.rod.arrays import Array, IntArray
+from vibrissa.rod.arrays import Array, IntArray, Rod
 from vibrissa.rod.compiled import copy, inlined, kernel
-from vibrissa.rod.kernels import evaluate
+from vibrissa.rod.kernels import (
+    BUFFER_SIZE,
+    LANES,
+    evaluate,
+    integrate,
+    lane_value,
+    set_lane,
+)
 from vibrissa.rod.newton import ROUNDING, point_determinant, stable
 from vibrissa.rod.reach import LEAST_ARC, chart_to_contact
 from vibrissa.rod.seeds import MOST_SEEDS, seeds
@@ -28,6 +35,9 @@ _UNIQUE, _AMBIGUOUS = int(Status.UNIQUE), int(Status.AMBIGUOUS)
 _OUTSIDE, _FRICTION = int(Status.OUTSIDE_MAP), int(Status.NOT_FRICTIONLESS)
 _MOST_STARTS = MOST_SEEDS + 1 + PARTS
 _TIMES = 8
+# At the foot of a valley fits are slow, and most go the same way: one that is this near in χ² to a
+# better one is given up if on the way there χ² does not rise by more than this.
+_CLOSE, _SILL = 0.3, 0.01
 # Contacts within this (over L, and ten times that relative to the force) are one.
 _SAME = 1e-3
 # Of candidates that explain signals equally well the one with less force comes first.
@@ -115,7 +125,10 @@ def explain(
         for a in range(6):
             t = tangents[row, a]
             slopes[i, a, 0], slopes[i, a, 1], slopes[i, a, 2] = t[0], t[2], t[3]
-    tell(of, how, noisy, measured, contacts, solved, slopes, found)
+    covariances = np.full((number, 3, 3), np.nan)
+    if noisy:
+        spread(how, measured, contacts, solved, slopes, covariances)
+    tell(of.length, of.force, contacts, solved, covariances, found)
     return number, status, go_on(trail, contacts, solved, number), misfits[kept[0]]
 
 
@@ -155,17 +168,17 @@ def _fitted(
     x, values, tangents, misfits, inside = state
     k, n = how.codes.shape[0], x.shape[0]
     targets, weights = np.empty((n, k)), np.empty((n, k, k))
-    converged = np.zeros(n, np.bool_)
+    converged, rod, codes = np.zeros(n, np.bool_), of.rod, how.codes
     for _ in range(passes):
         for row in range(first, last):
             copy(target, targets[row])
             if not weigh(how, values[row], measured, weights[row]):
                 return
         _fit(
-            of.rod,
+            rod,
             False,
             LEAST_ARC,
-            how.codes,
+            codes,
             targets,
             weights,
             x,
@@ -176,15 +189,20 @@ def _fitted(
             first,
             last,
         )
-        for row in range(first, last):
+        order = first + np.argsort(misfits[first:last])
+        for i in range(last - first):
+            row = order[i]
             for _again in range(_TIMES):
                 if converged[row] or not misfits[row] <= worth:
                     break
+                if _known(rod, codes, target, weights[row], x, misfits, inside, order[:i], row):
+                    misfits[row] = np.inf
+                    break
                 _fit(
-                    of.rod,
+                    rod,
                     False,
                     LEAST_ARC,
-                    how.codes,
+                    codes,
                     targets,
                     weights,
                     x,
@@ -195,19 +213,78 @@ def _fitted(
                     row,
                     row + 1,
                 )
+            inside[row] = _where(of, x[row], tangents[row], misfits[row])
+
+
+@inlined
+def _where(of: Searched, x: Array, tangents: Array, misfit: float) -> int:
+    """Whether a fit is on the map, 2, nearer to the base, 1, or neither, 0."""
     xi, by_xi = np.empty(3), np.empty((6, 3))
-    for row in range(first, last):
-        xi[0], xi[1], xi[2] = x[row, 0], x[row, 2], x[row, 3]
-        for a in range(6):
-            t = tangents[row, a]
-            by_xi[a, 0], by_xi[a, 1], by_xi[a, 2] = t[0], t[2], t[3]
-        sign = point_determinant(by_xi)
-        if not misfits[row] < np.inf:
-            inside[row] = 0
-        elif stable(of.fold, of.proximal, xi, sign):
-            inside[row] = 2
-        else:
-            inside[row] = 1 if stable(of.fold, LEAST_ARC + ROUNDING, xi, sign) else 0
+    xi[0], xi[1], xi[2] = x[0], x[2], x[3]
+    for a in range(6):
+        t = tangents[a]
+        by_xi[a, 0], by_xi[a, 1], by_xi[a, 2] = t[0], t[2], t[3]
+    sign = point_determinant(by_xi)
+    if not misfit < np.inf:
+        return 0
+    if stable(of.fold, of.proximal, xi, sign):
+        return 2
+    return 1 if stable(of.fold, LEAST_ARC + ROUNDING, xi, sign) else 0
+
+
+@kernel
+def _known(
+    rod: Rod,
+    codes: IntArray,
+    target: Array,
+    weights: Array,
+    x: Array,
+    misfits: Array,
+    inside: IntArray,
+    others: IntArray,
+    row: int,
+) -> bool:
+    """Whether from a contact the way to one on the map that fits a little better goes down.
+
+    It goes where s and s f, about the moment, change evenly: valleys of χ² lie along those.
+    """
+    b, k = np.zeros(BUFFER_SIZE), codes.shape[0]
+    value, at, t = np.empty(6), np.zeros(4), np.zeros((6, 4))
+    residual, jacobian, mine = np.empty(k), np.empty((k, 4)), x[row]
+    for other in others:
+        near = misfits[other] <= misfits[row] <= misfits[other] + _CLOSE
+        if not (near and inside[other] == 2):
+            continue
+        there = x[other]
+        for i in range(LANES):
+            share = (i + 1.0) / (LANES + 1.0)
+            s = (1.0 - share) * mine[0] + share * there[0]
+            near, far = (1.0 - share) * mine[0] / s, share * there[0] / s
+            set_lane(
+                b,
+                i,
+                s,
+                0.0,
+                near * mine[2] + far * there[2],
+                near * mine[3] + far * there[3],
+                False,
+            )
+        integrate(rod, b, 0)
+        down, before = True, misfits[row]
+        for i in range(LANES):
+            lane_value(b, i, value)
+            channel_equations(at, value, t, codes, target, residual, jacobian)
+            misfit = 0.0
+            for a in range(k):
+                r = 0.0
+                for c in range(k):
+                    r += weights[a, c] * residual[c]
+                misfit += r * r
+            down = down and misfit <= before + _SILL
+            before = misfit
+        if down:
+            return True
+    return False
 
 
 @inlined

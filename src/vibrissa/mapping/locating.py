@@ -121,31 +121,30 @@ def go_on(trail: Trail, contacts: Array, values: Array, n: int) -> int:
 
 @kernel
 def tell(
-    of: Searched,
-    how: Weighing,
-    noisy: bool,
-    measured: Array,
-    contacts: Array,
-    values: Array,
-    tangents: Array,
-    found: Array,
-) -> bool:
-    """Fill candidates in SI units; False where they have no covariance though there is noise."""
-    n = contacts.shape[0]
-    covariances = np.full((n, 3, 3), np.nan)
-    good = not noisy or spread(how, measured, contacts, values, tangents, covariances)
-    for row in range(n):
+    length: float, force: float, contacts: Array, values: Array, covariances: Array, found: Array
+) -> None:
+    """Fill candidates in SI units.
+
+    Parameters
+    ----------
+    length, force : float
+        Units, m and N.
+    contacts, values, covariances : (n, 3), (n, 6), (n, 3, 3) arrays
+        ξ, (F, p) and the covariances of p, non-dimensional.
+    found : (≥ n, COLUMNS) array
+        Filled.
+    """
+    for row in range(contacts.shape[0]):
         out = found[row]
         for a in range(3):
-            out[POINT + a] = values[row, 3 + a] * of.length
-            out[FORCE + a] = values[row, a] * of.force
+            out[POINT + a] = values[row, 3 + a] * length
+            out[FORCE + a] = values[row, a] * force
             for c in range(3):
-                out[COVARIANCE + 3 * a + c] = covariances[row, a, c] * of.length**2
-        out[ARC] = contacts[row, 0] * of.length
+                out[COVARIANCE + 3 * a + c] = covariances[row, a, c] * length**2
+        out[ARC] = contacts[row, 0] * length
         out[CONTACT_FORCE] = 0.0
-        out[CONTACT_FORCE + 1] = contacts[row, 1] * of.force
-        out[CONTACT_FORCE + 2] = contacts[row, 2] * of.force
-    return bool(good)
+        out[CONTACT_FORCE + 1] = contacts[row, 1] * force
+        out[CONTACT_FORCE + 2] = contacts[row, 2] * force
 
 
 @kernel
@@ -190,13 +189,15 @@ def meet(
         trail.number[0] = 0
         return 0, 0, True
     contacts, solved = xi[0, :n], values[0, :n]
-    tangents = np.empty((n, 6, 3))
+    covariances, good = np.full((n, 3, 3), np.nan), True
     if noisy:
         x = np.zeros((n, 4))
         for row in range(n):
             x[row, 0], x[row, 2], x[row, 3] = contacts[row, 0], contacts[row, 1], contacts[row, 2]
+        tangents = np.empty((n, 6, 3))
         evaluate(of.rod, x, np.empty((n, 6)), tangents, 0, n)
-    good = tell(of, how, noisy, measured, contacts, solved, tangents, found)
+        good = spread(how, measured, contacts, solved, tangents, covariances)
+    tell(of.length, of.force, contacts, solved, covariances, found)
     return n, go_on(trail, contacts, solved, n), good
 
 

@@ -127,38 +127,24 @@ class SetSearch:
 
     def __init__(self, contacts: ContactMap, readout: Named | Mixed) -> None:
         self._ambiguity = Ambiguity(contacts.chart, readout)
-        self._d, self._readout = contacts.chart.discretization, readout
+        self._readout = readout
 
     def forget(self) -> None:
         """Nothing goes on from a whole set."""
 
     def __call__(self, measurement: Measurement) -> Located:
         """Search in the whole map."""
-        if self._readout.nothing(measurement):
+        readout = self._readout
+        if readout.nothing(measurement):
             return nowhere(Status.DEGENERATE)
-        found = self._ambiguity.samples(measurement)
-        if not len(found.contacts):
-            beyond = self._readout.beyond(measurement)
+        found, middle, covariance = self._ambiguity.samples(measurement)
+        if not len(found):
+            beyond = readout.beyond(measurement)
             return nowhere(Status.OUTSIDE_MAP if beyond else Status.NOT_FRICTIONLESS)
-        d = self._d
-        points = found.values[:, 3:] * d.length
-        middle = int(np.argmin(((points - points.mean(axis=0)) ** 2).sum(axis=1)))
-        away = points - points[middle]
-        local = found.covariances * d.length**2
-        covariance = away.T @ away / len(points) + local.mean(axis=0)
-        noisy = self._readout.noisy
-        return Located(
-            points[middle],
-            Status.UNDERDETERMINED,
-            points,
-            found.contacts[:, 0] * d.length,
-            covariance if noisy else np.full((3, 3), np.nan),
-            0.0,
-            middle,
-            found.values[:, :3] * d.force,
-            local if noisy else np.full_like(local, np.nan),
-            found.contacts[:, 1:] * d.force,
-        )
+        if not readout.noisy:
+            covariance[:], found[:, locating.COVARIANCE :] = np.nan, np.nan
+        located = _located(found, Status.UNDERDETERMINED, 0.0, middle)
+        return located._replace(point=located.candidates[middle], covariance=covariance)
 
 
 def _located(found: Array, status: Status, misfit: float, continuing: int) -> Located:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import av
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from vibrissa import Whisker
+from vibrissa.samples import gamma
 from vibrissa.trial import Camera, facing_peg, orthogonal_views, simulate, sweep_past
 from vibrissa.trial.film import Look, film_frames, with_true_traces
 
@@ -296,7 +297,6 @@ CASES = (
     Case("contrast a quarter", "light", look=Look(contrast=0.85 / 4.0)),
     Case("a third of the light", "light", look=Look(light=65.0, dark=6.0)),
     Case("light falls by half", "light", change=drift(0.5)),
-    Case("lamp at 50 Hz, 30 %", "light", change=flicker(50.0, 0.3)),
     Case("lamp at 60 Hz, 60 %", "light", change=flicker(60.0, 0.6)),
     Case("overexposed, background white", "light", change=each(lambda f: 1.6 * f)),
     Case(
@@ -309,15 +309,12 @@ CASES = (
     Case("noise of 6 grey values", "noise", change=noisy(6.0)),
     Case("noise of 12 grey values", "noise", change=noisy(12.0)),
     Case("cloth, 8 grey values over 3 pixels", "background", change=textured(3.0, 8.0)),
-    Case("cloth, 15 grey values over 12 pixels", "background", change=textured(12.0, 15.0)),
     Case("six dark lines in the background", "background", change=lines(6, 60.0)),
     Case("a bar hides 15 % of one view", "hidden", change=bar(0.62, 0.15)),
     Case("H.264, rate factor 28", "compression", change=coded("libx264", crf="28")),
     Case("H.264, rate factor 36", "compression", change=coded("libx264", crf="36")),
-    Case("MJPEG, quality 5", "compression", change=coded("mjpeg", qmin="5", qmax="5")),
-    Case("MJPEG, quality 15", "compression", change=coded("mjpeg", qmin="15", qmax="15")),
+    Case("MJPEG, quantiser 15", "compression", change=coded("mjpeg", qmin="15", qmax="15")),
     Case("250 frames/s", "rate", rate=250.0, duration=0.3),
-    Case("500 frames/s", "rate", rate=500.0),
     Case("2,000 frames/s", "rate", rate=2000.0, duration=0.1),
     Case("320 × 240, 110 µm a pixel", "size", size=(320, 240), pixel=110e-6),
     Case("1280 × 1024, 25 µm a pixel", "size", size=(1280, 1024), pixel=25e-6),
@@ -340,7 +337,7 @@ CASES = (
         "base leaves the image",
         "frame",
         motion={"position_drift": 2e-3},
-        shift=(1.9e-3, 0.0, 0.0),
+        shift=(2.6e-3, 0.0, 0.0),
     ),
     Case("thick peg", "hidden", peg=2.5),
     Case("one frame dropped, not told", "frames", shown=without(1, 70)),
@@ -348,9 +345,5 @@ CASES = (
     Case("one view 30 frames shorter", "frames", shown=shorter(1, 30)),
     Case("one frame out of step, not told", "frames", shown=late(1, 1)),
     Case("one frame out of step, offset auto", "frames", shown=late(1, 1), offset=None),
-    Case("0.3 s, γ whisker", "ordinary"),
+    Case("γ whisker, 0.3 s", "ordinary", whisker=gamma(), duration=0.3, pixel=95e-6),
 )
-
-
-def ordinary(**changes: Any) -> Case:
-    return replace(CASES[0], **changes)

@@ -119,6 +119,7 @@ def rod_scores(film: Filmed, found: Any) -> dict[str, Any]:
     claimed = np.sqrt(np.einsum("tii->t", spread[fine]))
     force = np.linalg.norm(data["moment"].values - truth["moment"].values, axis=1)
     strong = np.linalg.norm(truth["moment"].values, axis=1)
+    bent = both & (strong > 0.1 * strong.max())
 
     def two(values: Array) -> list[float]:
         return [float(q) for q in np.percentile(values, [50.0, 95.0])] if values.size else []
@@ -132,7 +133,7 @@ def rod_scores(film: Filmed, found: Any) -> dict[str, Any]:
         "claimed": two(claimed),
         # 2.37 is the median of the square of three standard normal numbers.
         "over": float(np.sqrt(np.median(squares) / 2.366)) if squares.size else np.nan,
-        "moment": two((force / strong)[both & (strong > 0.1 * strong.max())]),
+        "moment": two(force[bent] / strong[bent]),
         "length": float(whisker.length / true.length - 1.0),
         "misfit": float(np.nanmedian(data["trace_misfit"].values)),
     }

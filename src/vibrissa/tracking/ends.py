@@ -29,6 +29,9 @@ _CLEAR = 3.0
 """By how many standard deviations, in each of its last points, a line must be darker than what is
 beyond for it to be seen to end there: then its end is known to a point."""
 
+_SMOOTHED = 0.6
+"""Noise below which an image is none as a sensor gives it, grey values: twice that of rounding."""
+
 _LAST = 10
 """Points, and half as many beyond, from which that is told."""
 
@@ -81,7 +84,9 @@ def traced(
     last = tip(fit)
     if last - first < FEWEST:
         return Trace.lost(), False
-    tip_seen = _inside(frame, line[last - 1]) and _stops(frame, line, fit, last)
+    # An image without noise was smoothed, as by compression, and what is faint went with it.
+    tip_seen = noise > _SMOOTHED and _inside(frame, line[last - 1])
+    tip_seen = tip_seen and _stops(frame, line, fit, last)
     line, fit = line[first:last], fit.part(slice(first, last))
     trusted = min(1.0, float(fit.seen.sum() / max(fit.open.sum(), 1)))
     return Trace(line, fit.sigma, fit.seen, trusted, _inside(frame, line[0]), tip_seen), from_face

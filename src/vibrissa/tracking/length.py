@@ -103,7 +103,9 @@ def likeliest_length(seen: float, cost: Callable[[float], float]) -> Length:
     # A parabola about the lowest of three.
     a, b, _ = np.polyfit(lengths[first : first + 3], costs[first : first + 3], 2)
     if not a > 0.0:
-        return Length(lengths[k], np.nan)
+        # It rises, though not as a parabola: one from here to the next.
+        a = (costs[k + 1] - costs[k]) / (lengths[k + 1] - lengths[k]) ** 2
+        return Length(lengths[k], float(np.hypot(a**-0.5, _SURE * seen)))
     value = float(np.clip(-0.5 * b / a, seen, lengths[-1]))
     return Length(value, float(np.hypot(a**-0.5, _SURE * seen)))
 

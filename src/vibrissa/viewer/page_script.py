@@ -19,6 +19,11 @@ SCRIPT = """
     history.replaceState(null, "", "?" + asked);
   }
 
+  // Arrow keys that move a slider are not for the view as well.
+  addEventListener("DOMContentLoaded", () => document.body.addEventListener("keydown", (event) => {
+    if (event.target.getAttribute?.("role") === "slider") event.stopPropagation();
+  }));
+
   // The page sends the mouse every 50 ms; a whisker follows faster.
   const later = window.setTimeout.bind(window);
   window.setTimeout = (job, delay, ...rest) => later(job, delay === 50 ? 16 : delay, ...rest);

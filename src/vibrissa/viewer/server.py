@@ -210,8 +210,8 @@ def _furnished(
     page.whisker_controls = WhiskerControls(page).folder
     SaveControls(page, recording)
     page.choose("Trial" if trial is not None else "Map" if page.has_map else "Bend")
+    page.work.wait()  # one thing is compiled at a time; this is what the page needs to be there
     page.prepare()
-    page.work.wait()
 
     def told(busy: bool) -> None:
         notice.visible = busy

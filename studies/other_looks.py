@@ -81,6 +81,7 @@ def short(remark: str) -> str:
     """What a remark is about."""
     for words, about in (
         ("out of step", "noted: out of step"),
+        ("does not explain", "noted: misfit"),
         ("too faint", "noted: tip not seen"),
         ("nor is it bent", "noted: tip not seen"),
         ("does not show its base", "noted: base not seen"),

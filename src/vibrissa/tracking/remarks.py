@@ -24,6 +24,9 @@ _NEAR = 2.0
 _FAR = 10.0
 """Pixels by which bases seen by several views miss each other: more than usual; not the same."""
 
+_STRANGE, _OFTEN = 2.0, 0.05
+"""Misfit that is not usual, and the share of the frames with it that is worth a sentence."""
+
 _SHARE = 0.03
 """The same as a share of the whisker's length in the images."""
 
@@ -56,7 +59,9 @@ def check_views(cameras: Sequence[Camera], sight: Sight, name: str) -> None:
         )
 
 
-def remarks_on(cameras: Sequence[Camera], sight: Sight, length: Length, name: str) -> list[str]:
+def remarks_on(
+    cameras: Sequence[Camera], sight: Sight, length: Length, misfit: Array, name: str
+) -> list[str]:
     """Say what is unusual about a tracked whisker.
 
     Parameters
@@ -67,6 +72,8 @@ def remarks_on(cameras: Sequence[Camera], sight: Sight, length: Length, name: st
         Its traces.
     length : Length
         Of it.
+    misfit : array (time,)
+        Of the rod from the traces, in their standard deviations; NaN where it is lost.
     name : str
         Of it.
 
@@ -87,6 +94,13 @@ def remarks_on(cameras: Sequence[Camera], sight: Sight, length: Length, name: st
     if outside:
         found.append(
             f"{name}: in {outside} frames a view does not show its base; they are left out."
+        )
+    strange = int((np.nan_to_num(misfit) > _STRANGE).sum())
+    if strange > _OFTEN * len(misfit):
+        found.append(
+            f"{name}: in {strange} frames the bent rod does not explain the traces (trace_misfit "
+            f"above {_STRANGE:g}): they are on something else, or its own inertia or a second "
+            "contact bends it. What is said of these frames is not to be believed."
         )
     if np.isnan(length.sigma):
         found.append(

@@ -198,7 +198,7 @@ def track(
         elif objects:
             other = contacts_at(objects, one.curves, one.touching, one.refined)
         found.append(replace(one, contacts=other))
-        remarks += remarks_on(cameras, one.sight, one.length, name)
+        remarks += remarks_on(cameras, one.sight, one.length, one.refined.misfit, name)
     recording = tracked_recording(cameras, found, pairs, rate, moving, objects, options.cutoff)
     if remarks:
         recording.attrs["remarks"] = "\n".join(remarks)

@@ -33,6 +33,8 @@ from vibrissa.sensing.sensor import GRAVITY
 from vibrissa.status import Status
 
 _UNKNOWNS = 3
+# The pose of a base that rests in the laboratory's frame.
+_LEVEL, _ORIGIN = np.eye(3), np.zeros(3)
 # Hypotheses less probable than this next to the best are dropped.
 _LEAST = 1e-6
 # At most so many are kept.
@@ -146,8 +148,8 @@ class ContactFilter:
             If time does not go on or is not finite, the estimator refuses the signals, or its
             sensor carries a mass and the rotation is not given.
         """
-        turn = np.ascontiguousarray(np.eye(3) if rotation is None else rotation, dtype=np.float64)
-        base = np.asarray(np.zeros(3) if position is None else position, dtype=np.float64)
+        turn = np.ascontiguousarray(_LEVEL if rotation is None else rotation, dtype=np.float64)
+        base = np.asarray(_ORIGIN if position is None else position, dtype=np.float64)
         if turn.shape != (3, 3) or base.shape != (3,):
             raise ValueError(f"a pose is (3, 3) and (3,); got {turn.shape} and {base.shape}")
         if not math.isfinite(time):
@@ -160,7 +162,7 @@ class ContactFilter:
             self._predict(time - self._time)
         self._time = time
         nothing = self.estimator.nothing_in(measurement)
-        if nothing is None and not (np.isfinite(turn).all() and np.isfinite(base).all()):
+        if nothing is None and not math.isfinite(float(turn.sum() + base.sum())):
             nothing = Status.MISSING
         if nothing is None:
             return self._known(*self._learned(measurement, turn, base), turn, base)
@@ -237,7 +239,7 @@ class ContactFilter:
     def _unaccounted(self, values: Array, located: Located, turn: Array, base: Array) -> AnyArray:
         """Which candidates (n,) no hypothesis accounts for."""
         own = turn @ (located.covariances / self._length**2) @ turn.T
-        if not np.isfinite(own).all():  # a place that the signals do not determine
+        if not math.isfinite(float(own.sum())):  # a place that the signals do not determine
             unknown = ~np.isfinite(own).all(axis=(1, 2))
             own[unknown] = _FORGOTTEN**2 * np.eye(3)
         out = np.empty(len(values), np.bool_)

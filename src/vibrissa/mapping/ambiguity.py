@@ -43,8 +43,10 @@ _ROUNDS = 15
 _FAR, _SOON = 0.1, 5
 # Signals that are bilinear meet in a face or no farther (in cell widths) from its middle.
 _BESIDE = 1.5
-# No force is no place to start from; share of a cell.
-_REST = 0.05
+# Where neighbouring faces say that they meet within this (in cell widths) is one place.
+_ONE = 0.1
+# Hardly any force is no place to start from; share of a cell, for one signal and for two.
+_REST = (0.05, 0.5)
 # Two samples of a station within this, relative to the force, are one.
 _SAME = 1e-4
 # Directions that signals tell this much worse than others (as a share of variance) they do not
@@ -215,8 +217,9 @@ def _starts(of: Sections, how: Weighing, target: Array, starts: Array) -> int:
             wanted[i] += how.mixing[i, a] * target[a]
     away = np.empty((of.bearings.shape[0], of.loads.shape[0], q))
     sign = np.empty(away.shape[:2], np.int8)
-    place, n = np.empty(3), 0
+    at, crossings, place, n = np.empty((_MOST, 2)), np.empty((2, 2)), np.empty(3), 0
     for station in range(of.stations.shape[0]):
+        first = n
         for j in range(away.shape[0]):
             for k in range(away.shape[1]):
                 bits = 0
@@ -227,7 +230,7 @@ def _starts(of: Sections, how: Weighing, target: Array, starts: Array) -> int:
                     away[j, k, i] = d
                     bits |= (1 << i) if d > 0.0 else 0
                 sign[j, k] = bits
-        step = 1 if q > 1 else _BEARINGS
+            step, rest = (1, _REST[1]) if q > 1 else (_BEARINGS, _REST[0])
         for j in range(0, away.shape[0] - 1, step):
             for k in range(away.shape[1] - 1):
                 met = sign[j, k] ^ sign[j, k + 1]
@@ -235,18 +238,28 @@ def _starts(of: Sections, how: Weighing, target: Array, starts: Array) -> int:
                     met |= (sign[j, k] ^ sign[j + 1, k]) | (sign[j, k] ^ sign[j + 1, k + 1])
                 if met != (1 << q) - 1:
                     continue
-                if _turned(away, of.turns, j, k, q) or (q > 1 and not _crossed(away, j, k)):
+                if _turned(away, of.turns, j, k, q):
                     continue
-                if n == _MOST:
-                    return n
-                near, far = 0.5, 0.5  # the middle of the face
                 if q == 1:
-                    near, far = 0.0, away[j, k, 0] / (away[j, k, 0] - away[j, k + 1, 0])
-                place[0] = of.stations[station]
-                place[1] = of.bearings[j] + near * (of.bearings[1] - of.bearings[0])
-                place[2] = max(k + far, _REST) * (of.loads[1] - of.loads[0])
-                chart_to_contact(of.fold, place, starts[n])
-                n += 1
+                    crossings[0, 0] = 0.0
+                    crossings[0, 1] = away[j, k, 0] / (away[j, k, 0] - away[j, k + 1, 0])
+                count = 1 if q == 1 else _crossings(away, j, k, crossings)
+                for crossing in range(count):
+                    u, v = j + crossings[crossing, 0], max(k + crossings[crossing, 1], rest)
+                    new = True
+                    for other in range(first, n):
+                        beside = max(abs(u - at[other, 0]), abs(v - at[other, 1]))
+                        new = new and (q == 1 or beside > _ONE)
+                    if not new:
+                        continue
+                    if n == _MOST:
+                        return n
+                    at[n, 0], at[n, 1] = u, v
+                    place[0] = of.stations[station]
+                    place[1] = of.bearings[0] + u * (of.bearings[1] - of.bearings[0])
+                    place[2] = min(v * (of.loads[1] - of.loads[0]), 1.0)
+                    chart_to_contact(of.fold, place, starts[n])
+                    n += 1
     return n
 
 
@@ -265,8 +278,12 @@ def _turned(away: Array, turns: AnyArray, j: int, k: int, q: int) -> bool:
 
 
 @inlined
-def _crossed(away: Array, j: int, k: int) -> bool:
-    """Whether two signals, if they are bilinear, are both met in a face or next to it."""
+def _crossings(away: Array, j: int, k: int, crossings: Array) -> int:
+    """Fill where two signals, if they are bilinear, are both met in a face or next to it; how many.
+
+    In cell widths from its corner (j, k); the middle where their curves miss each other, for then
+    they about touch.
+    """
     c = np.empty((2, 4))
     for i in range(2):
         a00, a01 = away[j, k, i], away[j, k + 1, i]
@@ -278,17 +295,20 @@ def _crossed(away: Array, j: int, k: int) -> bool:
     a = c[1, 1] * c[0, 3] - c[0, 1] * c[1, 3]
     b = c[1, 0] * c[0, 3] + c[1, 1] * c[0, 2] - c[0, 0] * c[1, 3] - c[0, 1] * c[1, 2]
     d = c[1, 0] * c[0, 2] - c[0, 0] * c[1, 2]
-    if b * b < 4.0 * a * d:  # their curves about touch
-        return True
+    if b * b < 4.0 * a * d:
+        crossings[0, 0] = crossings[0, 1] = 0.5
+        return 1
     q = -0.5 * (b + np.sqrt(b * b - 4.0 * a * d) * (1.0 if b > 0.0 else -1.0))
-    near = False
+    count = 0
     for root in range(2):
         u = d / q if root == 0 else q / a
         first, second = c[0, 2] + c[0, 3] * u, c[1, 2] + c[1, 3] * u
         row, slope = (0, first) if abs(first) > abs(second) else (1, second)
         v = -(c[row, 0] + c[row, 1] * u) / slope
-        near = near or max(abs(u - 0.5), abs(v - 0.5)) <= _BESIDE
-    return near
+        if max(abs(u - 0.5), abs(v - 0.5)) <= _BESIDE:
+            crossings[count, 0], crossings[count, 1] = u, v
+            count += 1
+    return count
 
 
 @kernel

@@ -24,9 +24,6 @@ Array = NDArray[np.float64]
 HALF = 4
 """The fit takes samples from −HALF to HALF."""
 
-FLANK = 5
-"""The sides are sampled up to here."""
-
 WIDTH = 1.4
 """Standard deviation of g, in steps."""
 

@@ -11,7 +11,7 @@ from vibrissa.viewer.bend_drawing import whisker_body
 from vibrissa.viewer.drawing import FIT, GHOST, Array, Body, Drawing, Label, Thing
 from vibrissa.viewer.locating import Located
 from vibrissa.viewer.meshes import ellipsoid, error_ellipsoid
-from vibrissa.viewer.readout import note, number, sentence, symbol, table
+from vibrissa.viewer.readout import note, number, sentence, table
 from vibrissa.whisker import Whisker
 
 SIGMAS = 2.0
@@ -78,11 +78,6 @@ def of_located(whisker: Whisker, found: Located | None, status: Status) -> str:
     rest = {name: value for name, value in felt.items() if name not in names}
     parts.append(table(rest, "Not used"))
     return "".join(parts)
-
-
-def triplet_words(triplet: tuple[str, ...]) -> str:
-    """Three signals as HTML."""
-    return ", ".join(f"<i>{symbol(name)}</i>" for name in triplet)
 
 
 def _mm(values: Array) -> Array:

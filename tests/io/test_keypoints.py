@@ -4,6 +4,8 @@ They are made with the programs' own libraries where these are installed, else b
 """
 
 import itertools
+import pickle
+import warnings
 
 import h5py
 import numpy as np
@@ -123,13 +125,57 @@ def test_bad_deeplabcut(tmp_path, rng):
         assert "video.csv" in str(caught.value)
 
 
-def test_a_column_name_runs_no_code(tmp_path, rng):
+_DTYPE = b"cnumpy\ndtype\n(V%s\nI00\nI01\ntR(I3\nV|\nN%sI%d\nI1\nI%d\ntb"
+_OBJECT = _DTYPE % (b"O8", b"NN", -1, 63)
+_POINTER = _DTYPE % (b"V8", b"(Va\nt(dVa\n(" + _OBJECT + b"I0\nts", 8, 0)
+PICKLES = {
+    "code": b"cos\nsystem\n(S'true'\ntR.",
+    # A record with an object, of which the file chooses the pointer.
+    "pointer": b"(lp0\n(Vs\nVa\ncnumpy._core.multiarray\nscalar\n("
+    + _POINTER
+    + b"c_codecs\nencode\n(VAAAAAAAA\nVlatin1\ntRtRta.",
+    "persistent": b"(lp0\nPx\na.",
+    "circle": b"(lp0\ng0\na.",
+    "no list": b"Vx\n.",
+    "cut": b"(lp0\n(Vs\n",
+    "empty": b".",
+}
+
+
+@pytest.mark.parametrize("pickled", PICKLES.values(), ids=PICKLES)
+def test_a_column_name_runs_no_code(tmp_path, rng, pickled):
+    """The bytes of the second take the interpreter down where they are unpickled."""
     pytest.importorskip("tables")
     path = tmp_path / "video.h5"
     deeplabcut(rng)[0].to_hdf(path, key="df", format="table", mode="w")
     with h5py.File(path, "r+") as file:
-        file["df/table"].attrs["values_block_0_kind"] = np.bytes_(b"cos\nsystem\n(S'true'\ntR.")
-    with pytest.raises(ValueError, match=r"video.h5.*pickled os.system, which is not read"):
+        file["df/table"].attrs["values_block_0_kind"] = np.bytes_(pickled)
+    with pytest.raises(ValueError, match=r"video\.h5"):
+        load_tracks(path)
+
+
+@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
+def test_names_are_read_of_every_protocol(tmp_path, rng, protocol):
+    pytest.importorskip("tables")
+    path = tmp_path / "video.h5"
+    table, points, sure = deeplabcut(rng)
+    table.to_hdf(path, key="df", format="table", mode="w")
+    pickled = pickle.dumps(list(table.columns), protocol)
+    with h5py.File(path, "r+") as file:
+        file["df/table"].attrs["values_block_0_kind"] = np.bytes_(pickled)
+    check_image(load_tracks(path), points, sure, ["whisker"])
+
+
+def test_blocks_are_numbers(tmp_path, rng):
+    """What pandas cannot store as numbers it pickles."""
+    pytest.importorskip("tables")
+    path = tmp_path / "video.h5"
+    table = deeplabcut(rng)[0].astype(object)
+    table.iloc[0, 0] = "one"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        table.to_hdf(path, key="df", format="fixed", mode="w")
+    with pytest.raises(ValueError, match=r"video\.h5.*numbers are needed"):
         load_tracks(path)
 
 

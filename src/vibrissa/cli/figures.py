@@ -147,15 +147,14 @@ def dataset_with(path: Path, needed: str) -> xr.Dataset:
     ValueError
         If it is a table, or does not hold the variable.
     """
-    import xarray as xr
-
     from vibrissa.io import kind_of
+    from vibrissa.io.netcdf import read_dataset
     from vibrissa.io.paths import CSV
 
     if path.suffix.lower() in CSV:
         raise ValueError(f"{path} is a table; the same saved as NetCDF (-o FILE.nc) is needed")
     kind = kind_of(path)
-    data = xr.load_dataset(path, engine="h5netcdf")
+    data = read_dataset(path)
     if needed not in data:
         raise ValueError(
             f"{path} holds {kind or 'data of another kind'}, and no variable {needed!r}"

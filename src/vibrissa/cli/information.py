@@ -225,9 +225,10 @@ def _groups(path: Path) -> Iterator[tuple[str, str]]:
     import h5netcdf
 
     from vibrissa.io import kind_of
+    from vibrissa.io.hdf5 import opened
 
     yield "kind", kind_of(path) or "unknown"
-    with h5netcdf.File(path, "r") as file:
+    with opened(path, "a NetCDF-4 file", soft_links=False), h5netcdf.File(path, "r") as file:
         names = [_text(one) for one in file.variables["whisker"][...]] if _many(file) else []
         for name, group in _within(file, "/"):
             if not (names and f"{name}/".startswith("/whiskers/")):
@@ -275,24 +276,21 @@ def _text(value: Any) -> str:
 
 def _compared(path: Path) -> Iterator[tuple[str, str]]:
     """How contact points that do not come from the rod compare with those that do."""
-    import h5netcdf
     import xarray as xr
 
     from vibrissa.cli.track_report import compared_contacts
+    from vibrissa.io.hdf5 import opened
+    from vibrissa.io.netcdf import read_dataset
 
-    with h5netcdf.File(path, "r") as file:
-        measured = file.groups.get("measured")
-        if measured is None or "contact_difference" not in measured.variables:
+    with opened(path, "a recording") as file:
+        if "measured/contact_difference" not in file:
             return
     # A long recording takes a while to read whole.
     names = {
         None: ["arc_length"],
         "measured": ["contact_difference", "contact_point", "arc_length"],
     }
-    parts = {}
-    for group, wanted in names.items():
-        with xr.open_dataset(path, engine="h5netcdf", group=group) as data:
-            parts[f"/{group or ''}"] = data[wanted].load()
+    parts = {f"/{group or ''}": read_dataset(path, group, of) for group, of in names.items()}
     recording = xr.DataTree.from_dict(parts)
     for k, name in enumerate(recording.coords["whisker"].values):
         for sentence in compared_contacts(recording, k):

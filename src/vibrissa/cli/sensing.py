@@ -176,11 +176,8 @@ def _error(value: float) -> str:
 
 
 def _save(path: Path, found: Dataset) -> None:
-    from vibrissa.io.replace import replacing
+    from vibrissa.io.netcdf import COMPRESSED, write_netcdf
 
-    squeezed = {"zlib": True, "complevel": 1, "shuffle": True}
-    floats = [name for name, v in found.data_vars.items() if v.dtype.kind == "f"]
-    with replacing(path) as part:
-        found.assign_attrs(kind="vibrissa sensitivity").to_netcdf(
-            part, engine="h5netcdf", encoding=dict.fromkeys(floats, squeezed)
-        )
+    floats = [str(name) for name, v in found.data_vars.items() if v.dtype.kind == "f"]
+    about = found.assign_attrs(kind="vibrissa sensitivity")
+    write_netcdf(path, about, {"/": dict.fromkeys(floats, COMPRESSED)})

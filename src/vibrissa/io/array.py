@@ -29,12 +29,12 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-import xarray as xr
 from numpy.typing import ArrayLike
 
 from vibrissa.io.array_table import few, table_lines, whiskers_from_table
 from vibrissa.io.centerline import load_whisker, tells_radius
-from vibrissa.io.netcdf import is_netcdf, kind_of, reading
+from vibrissa.io.hdf5 import naming
+from vibrissa.io.netcdf import is_netcdf, kind_of, read_tree, write_netcdf
 from vibrissa.io.replace import replacing
 from vibrissa.io.whisker_stack import separate_whiskers, stacked_whiskers
 from vibrissa.whisker import Whisker
@@ -105,19 +105,20 @@ def save_array(path: str | PathLike[str], array: WhiskerArray) -> None:
         If a table was asked for and a whisker is of another shape.
     """
     path = Path(path)
+    if path.suffix.lower() != ".csv":
+        write_netcdf(path, stacked_whiskers(array.to_tree()))
+        return
     with replacing(path) as part:
-        if path.suffix.lower() == ".csv":
-            part.write_text("\n".join(table_lines(array)) + "\n", encoding="utf-8")
-        else:
-            stacked_whiskers(array.to_tree()).to_netcdf(part, engine="h5netcdf")
+        part.write_text("\n".join(table_lines(array)) + "\n", encoding="utf-8")
 
 
 def _netcdf(path: Path) -> WhiskerArray:
     kind = kind_of(path)
     if kind != KIND:
         raise ValueError(f"{path} holds {kind or 'data of another kind'}, not an array of whiskers")
-    with reading(path), xr.open_datatree(path, engine="h5netcdf") as tree:
-        return WhiskerArray.from_tree(separate_whiskers(tree.load()))
+    tree = read_tree(path)
+    with naming(path, "an array of whiskers"):
+        return WhiskerArray.from_tree(separate_whiskers(tree))
 
 
 def _folder(path: Path, base: Any, noise: float | None) -> WhiskerArray:

@@ -14,7 +14,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from vibrissa.io.netcdf import kind_of, reading
+from vibrissa.io.netcdf import read_dataset
 from vibrissa.io.tracks import Labels, RawTracks, labelled
 
 Array = NDArray[np.float64]
@@ -53,9 +53,7 @@ def load_movement(path: str | PathLike[str], **labels: Unpack[Labels]) -> xr.Dat
 def read_movement(path: str | PathLike[str]) -> RawTracks:
     """Read a poses dataset as raw tracks; see `load_movement`."""
     path = Path(path)
-    kind_of(path)
-    with reading(path), xr.open_dataset(path, engine="h5netcdf") as file:
-        poses = file.load()
+    poses = read_dataset(path)
     poses = poses.rename({old: new for old, new in _NAMES.items() if old in poses.dims})
     if "position" not in poses or not {"time", "keypoint", "space"} <= set(poses["position"].dims):
         got = ", ".join(str(name) for name in poses.variables) or "nothing"

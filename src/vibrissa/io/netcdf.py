@@ -1,15 +1,28 @@
-"""What a NetCDF-4 file holds."""
+"""Datasets and trees of datasets as NetCDF-4 files.
+
+They are written in memory and then to the disk with ordinary calls, because HDF5 takes the whole
+interpreter down when a disk that is full lets it not close a file. So writing takes as much memory
+as the file is large, compressed, beside the data.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+import io
+from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
-from vibrissa.io.paths import NETCDF, check_readable
+import xarray as xr
+
+from vibrissa.io.hdf5 import opened
+from vibrissa.io.paths import NETCDF
+from vibrissa.io.replace import replacing
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
+
+COMPRESSED: Mapping[str, Any] = {"zlib": True, "complevel": 1, "shuffle": True}
+"""How large variables are encoded, without loss."""
 
 
 def is_netcdf(path: str | PathLike[str]) -> bool:
@@ -34,31 +47,6 @@ def is_netcdf(path: str | PathLike[str]) -> bool:
         return file.read(len(_SIGNATURE)) == _SIGNATURE
 
 
-@contextmanager
-def reading(path: str | PathLike[str]) -> Iterator[None]:
-    """Name the file where it turns out to be damaged while it is read.
-
-    Parameters
-    ----------
-    path : str or path
-        That is being read.
-
-    Yields
-    ------
-    None
-        To read in.
-
-    Raises
-    ------
-    ValueError
-        Instead of what the libraries below raise.
-    """
-    try:
-        yield
-    except (OSError, KeyError, RuntimeError) as error:
-        raise ValueError(f"{path} cannot be read: it is cut off or damaged ({error})") from error
-
-
 def kind_of(path: str | PathLike[str]) -> str:
     """Read what a NetCDF-4 file says it holds.
 
@@ -79,15 +67,93 @@ def kind_of(path: str | PathLike[str]) -> str:
     ValueError
         If it is a folder, empty, cut off, or no NetCDF-4 file.
     """
-    import h5netcdf
+    with opened(path, "a NetCDF-4 file") as file:
+        kind = file.attrs.get("kind", "")
+    return kind.decode("utf-8", "replace") if isinstance(kind, bytes) else str(kind)
 
-    path = check_readable(path)
-    try:
-        with h5netcdf.File(path, "r") as file:
-            kind = file.attrs.get("kind", "")
-    except (OSError, KeyError, RuntimeError) as error:
-        raise ValueError(
-            f"{path} cannot be read as NetCDF-4: it is of another format, cut off or damaged "
-            f"({error})"
-        ) from error
-    return kind.decode() if isinstance(kind, bytes) else str(kind)
+
+def read_dataset(
+    path: str | PathLike[str], group: str | None = None, names: Sequence[str] | None = None
+) -> xr.Dataset:
+    """Read the dataset of one group.
+
+    Parameters
+    ----------
+    path : str or path
+        NetCDF-4 file.
+    group : str, optional
+        Its name; by default the root.
+    names : sequence of str, optional
+        Variables to read, as far as there are such; by default all.
+
+    Returns
+    -------
+    xarray.Dataset
+        All of it, in memory.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If it is cut off, damaged or no NetCDF-4 file.
+    """
+    with (
+        opened(path, "a NetCDF-4 file", soft_links=False),
+        xr.open_dataset(path, engine="h5netcdf", group=group) as data,
+    ):
+        return (data if names is None else data[[n for n in names if n in data]]).load()
+
+
+def read_tree(path: str | PathLike[str]) -> xr.DataTree:
+    """Read the datasets of all groups; see `read_dataset`."""
+    with (
+        opened(path, "a NetCDF-4 file", soft_links=False),
+        xr.open_datatree(path, engine="h5netcdf") as tree,
+    ):
+        return tree.load()
+
+
+def write_netcdf(
+    path: str | PathLike[str],
+    data: xr.Dataset | xr.DataTree,
+    encoding: Mapping[str, Mapping[str, Any]] | None = None,
+) -> None:
+    """Write a dataset, or a tree with a group for each dataset.
+
+    Parameters
+    ----------
+    path : str or path
+        Where to; an existing file is replaced once the new one is complete.
+    data : xarray.Dataset or xarray.DataTree
+        What is written.
+    encoding : mapping, optional
+        By path of the group, such as ``/``: by variable, how it is stored.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the folder does not exist.
+    OSError
+        If the disk is full; an older file is then as it was.
+    """
+    with replacing(path) as part:
+        part.write_bytes(netcdf_image(data, encoding))
+
+
+def netcdf_image(
+    data: xr.Dataset | xr.DataTree, encoding: Mapping[str, Mapping[str, Any]] | None = None
+) -> memoryview:
+    """Give the bytes of the file that `write_netcdf` writes."""
+    import h5netcdf
+    from xarray.backends import H5NetCDFStore
+
+    tree = xr.DataTree(data) if isinstance(data, xr.Dataset) else data
+    image = io.BytesIO()
+    with h5netcdf.File(image, "w") as file:
+        for node in tree.subtree:
+            store = H5NetCDFStore(file, group=node.path, mode="a")
+            # A coordinate that a group inherits is written only where it is.
+            dataset = node.to_dataset(inherit=node is tree)
+            dataset.dump_to_store(store, encoding=(encoding or {}).get(node.path))
+    return image.getbuffer()

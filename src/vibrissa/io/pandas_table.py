@@ -1,14 +1,14 @@
 """Tables that pandas wrote to HDF5, read without pandas.
 
 Its two formats: "table", one compound dataset whose column names are pickled in attributes, and
-"fixed", plain arrays of values, levels and labels. The pickles are opened with a reader that knows
-lists, tuples, text and numbers only, so that no file can run code.
+"fixed", plain arrays of values, levels and labels. Nothing is unpickled, since a pickle can run
+code and build objects of chosen bytes: names are read off its text, and blocks that are no numbers
+are refused.
 """
 
 from __future__ import annotations
 
-import io
-import pickle
+import pickletools
 from collections.abc import Iterator
 from typing import Any
 
@@ -18,13 +18,6 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Names = list[tuple[str, ...]]
-
-_HARMLESS = {
-    ("numpy", "dtype"),
-    ("numpy.core.multiarray", "scalar"),
-    ("numpy._core.multiarray", "scalar"),
-    ("_codecs", "encode"),
-}
 
 
 def pandas_tables(file: h5py.File) -> Iterator[tuple[str, h5py.Group]]:
@@ -83,9 +76,8 @@ def _appendable(group: h5py.Group) -> tuple[Names, list[Array], list[str]]:
     blocks = [name for name in table.dtype.names if name.startswith("values_block_")]
     names: Names = []
     for block in blocks:
-        columns = _unpickled(table.attrs[f"{block}_kind"])
-        names += [column if isinstance(column, tuple) else (column,) for column in columns]
-    values = [np.asarray(rows[block], dtype=np.float64).reshape(len(rows), -1) for block in blocks]
+        names += _column_names(table.attrs[f"{block}_kind"])
+    values = [_numbers(block, rows[block]).reshape(len(rows), -1) for block in blocks]
     return _as_text(names), values, _index(rows["index"]) if "index" in rows.dtype.names else []
 
 
@@ -107,7 +99,7 @@ def _fixed(group: h5py.Group) -> tuple[Names, list[Array], list[str]]:
                 )
             )
         names += columns
-        block = np.asarray(group[f"block{i}_values"][:], dtype=np.float64)
+        block = _numbers(f"block{i}_values", group[f"block{i}_values"][:])
         values.append(block.reshape(-1, len(columns)))
     return _as_text(names), values, _index(group["axis1"][:]) if "axis1" in group else []
 
@@ -130,21 +122,65 @@ def _text(value: Any) -> str:
     return value.decode("utf-8") if isinstance(value, bytes) else str(value)
 
 
-class _Reader(pickle.Unpickler):
-    """Unpickle text and numbers in lists and tuples, and nothing that runs."""
+def _column_names(value: Any) -> Names:
+    """Names of columns from a pickle, of which nothing is run.
 
-    def find_class(self, module: str, name: str) -> Any:
-        if (module, name) in _HARMLESS:
-            return super().find_class(module, name)
-        raise ValueError(f"a column's name is a pickled {module}.{name}, which is not read")
-
-
-def _unpickled(value: Any) -> list[Any]:
+    A pickle is a program, so it is not unpickled: its instructions are listed, and those that lay
+    text, numbers, tuples and lists upon each other are followed. No other has a meaning here.
+    """
     content = value.encode("latin-1") if isinstance(value, str) else bytes(value)
-    try:
-        names = _Reader(io.BytesIO(content)).load()
-    except (pickle.UnpicklingError, EOFError, AttributeError, IndexError, KeyError) as error:
-        raise ValueError(f"the names of its columns cannot be read ({error})") from error
-    if not isinstance(names, list):
-        raise ValueError(f"the names of its columns are a {type(names).__name__}, not a list")
+    stack: list[Any] = []
+    memo: dict[int, Any] = {}
+    for operation, argument, _ in pickletools.genops(content):
+        name = operation.name
+        if name.endswith(_PLAIN):
+            stack.append(argument)
+        elif name in ("MARK", "EMPTY_LIST", "EMPTY_TUPLE"):
+            stack.append({"MARK": _MARK, "EMPTY_LIST": [], "EMPTY_TUPLE": ()}[name])
+        elif name in ("LIST", "TUPLE"):
+            stack.append({"LIST": list, "TUPLE": tuple}[name](_above_mark(stack)))
+        elif name in ("TUPLE1", "TUPLE2", "TUPLE3"):
+            count = int(name[-1])
+            stack[-count:] = [tuple(stack[-count:])]
+        elif name in ("APPEND", "APPENDS"):
+            more = [stack.pop()] if name == "APPEND" else _above_mark(stack)
+            stack[-1].extend(more)
+        elif name.endswith("GET"):
+            stack.append(memo[argument])
+        elif name.endswith("PUT") or name == "MEMOIZE":
+            memo[len(memo) if argument is None else argument] = stack[-1]
+        elif name not in ("PROTO", "FRAME", "STOP"):
+            raise ValueError(
+                f"the names of its columns are a pickle with {name} {argument or ''}, which is not "
+                "read: text in lists and tuples is; save the table as CSV"
+            )
+    return _checked_names(stack)
+
+
+_PLAIN = ("INT", "INT1", "INT2", "LONG", "LONG1", "FLOAT", "STRING", "UNICODE")
+_MARK = object()
+
+
+def _above_mark(stack: list[Any]) -> list[Any]:
+    """Take what lies above the last mark off a stack, and the mark."""
+    at = max(i for i, one in enumerate(stack) if one is _MARK)
+    taken = stack[at + 1 :]
+    del stack[at:]
+    return taken
+
+
+def _checked_names(stack: list[Any]) -> Names:
+    """What is left of a pickle, if it is a list of text or of tuples of text."""
+    if len(stack) != 1 or not isinstance(stack[0], list):
+        raise ValueError("the names of its columns are no list")
+    names: Names = [name if isinstance(name, tuple) else (name,) for name in stack[0]]
+    if not all(isinstance(part, str | int | float) for name in names for part in name):
+        raise ValueError("the names of its columns are more than text and numbers")
     return names
+
+
+def _numbers(name: str, data: Any) -> Array:
+    """Values as they are, if they are numbers: those of other types may be pickles."""
+    if data.dtype.kind not in "fiub":
+        raise ValueError(f"{name} is of type {data.dtype}; numbers are needed")
+    return np.asarray(data, dtype=np.float64)

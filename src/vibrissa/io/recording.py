@@ -13,14 +13,13 @@ from pathlib import Path
 
 import xarray as xr
 
-from vibrissa.io.netcdf import kind_of, reading
-from vibrissa.io.replace import replacing
+from vibrissa.io.hdf5 import naming
+from vibrissa.io.netcdf import COMPRESSED, kind_of, read_tree, write_netcdf
 from vibrissa.io.whisker_stack import separate_whiskers, stacked_whiskers
 
 KIND = "vibrissa recording"
 """What the attribute ``kind`` of a recording says."""
 
-_COMPRESSED = {"zlib": True, "complevel": 1, "shuffle": True}
 _SMALLEST = 1000
 
 
@@ -48,14 +47,13 @@ def save_recording(path: str | PathLike[str], recording: xr.DataTree) -> None:
     written = stacked_whiskers(recording)
     encoding = {
         group.path: {
-            str(name): _COMPRESSED
+            str(name): COMPRESSED
             for name, variable in group.to_dataset(inherit=False).data_vars.items()
             if variable.dtype.kind in "fiub" and variable.size >= _SMALLEST
         }
         for group in written.subtree
     }
-    with replacing(path) as part:
-        written.to_netcdf(part, engine="h5netcdf", encoding=encoding)
+    write_netcdf(path, written, encoding)
 
 
 def load_recording(path: str | PathLike[str]) -> xr.DataTree:
@@ -82,5 +80,6 @@ def load_recording(path: str | PathLike[str]) -> xr.DataTree:
     kind = kind_of(path)
     if kind != KIND:
         raise ValueError(f"{path} holds {kind or 'data of another kind'}, not a recording")
-    with reading(path), xr.open_datatree(path, engine="h5netcdf") as tree:
-        return separate_whiskers(tree.load().copy())
+    tree = read_tree(path)
+    with naming(path, "a recording"):
+        return separate_whiskers(tree)

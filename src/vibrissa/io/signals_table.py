@@ -18,7 +18,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa.io.columns import signal_columns, unit_factor, units_of
-from vibrissa.io.netcdf import is_netcdf, kind_of
+from vibrissa.io.netcdf import is_netcdf, read_dataset
 from vibrissa.io.replace import replacing
 from vibrissa.io.table import is_number, read_rows, read_text, table_rows
 from vibrissa.quantities import attributes
@@ -192,15 +192,14 @@ def _columns(path: Path, header: list[str]) -> tuple[list[int], Array]:
 
 def _netcdf(path: Path) -> Array:
     """Columns (n, 7) of a NetCDF file."""
-    kind_of(path)
-    with xr.open_dataset(path, engine="h5netcdf") as data:
-        missing = [name for name in COLUMNS if name not in data.variables]
-        if missing:
-            got = ", ".join(str(name) for name in data.variables)
-            raise ValueError(
-                f"{path} is no table of signals: it lacks {', '.join(missing)} (it has {got})"
-            )
-        columns = [_in_si(path, data[name]) for name in COLUMNS]
+    data = read_dataset(path)
+    missing = [name for name in COLUMNS if name not in data.variables]
+    if missing:
+        got = ", ".join(str(name) for name in data.variables)
+        raise ValueError(
+            f"{path} is no table of signals: it lacks {', '.join(missing)} (it has {got})"
+        )
+    columns = [_in_si(path, data[name]) for name in COLUMNS]
     if any(column.ndim != 1 for column in columns) or len({c.size for c in columns}) != 1:
         shapes = {name: c.shape for name, c in zip(COLUMNS, columns, strict=True)}
         raise ValueError(f"{path}: all columns must run along time; got shapes {shapes}")

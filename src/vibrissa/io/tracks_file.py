@@ -21,7 +21,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from vibrissa.io.netcdf import kind_of, reading
+from vibrissa.io.netcdf import COMPRESSED, kind_of, read_dataset, write_netcdf
 from vibrissa.io.paths import CSV, NETCDF, check_writable
 from vibrissa.io.replace import replacing
 from vibrissa.io.table import read_text, table_rows
@@ -60,10 +60,8 @@ def save_tracks(path: str | PathLike[str], tracks: xr.Dataset) -> None:
         with replacing(path) as part:
             part.write_text(text, encoding="utf-8")
         return
-    squeezed = {"zlib": True, "complevel": 1, "shuffle": True}
-    encoding = {name: squeezed for name, one in tracks.data_vars.items() if one.size > 1000}
-    with replacing(path) as part:
-        tracks.to_netcdf(part, engine="h5netcdf", encoding=encoding)
+    large = [str(name) for name, one in tracks.data_vars.items() if one.size > 1000]
+    write_netcdf(path, tracks, {"/": dict.fromkeys(large, COMPRESSED)})
 
 
 def load_own_tracks(path: str | PathLike[str]) -> xr.Dataset:
@@ -90,13 +88,11 @@ def load_own_tracks(path: str | PathLike[str]) -> xr.Dataset:
     kind = kind_of(path)
     if kind not in (KIND, _RECORDING):
         raise ValueError(f"{path} holds {kind or 'data of another kind'}, not tracks")
-    with reading(path), xr.open_dataset(path, engine="h5netcdf") as file:
-        if kind == KIND:
-            return file.load()
-        names = [name for name in _VARIABLES if name in file]
-        if not {"trace", "centerline"} & set(names):
-            raise ValueError(f"{path} is a recording without a trace or a centreline")
-        tracks = file[names].load()
+    if kind == KIND:
+        return read_dataset(path)
+    tracks = read_dataset(path, names=_VARIABLES)
+    if not {"trace", "centerline"} & set(tracks.data_vars):
+        raise ValueError(f"{path} is a recording without a trace or a centreline")
     tracks.attrs |= {"kind": KIND, "source": path.name, "source_software": "vibrissa"}
     return tracks
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
-from vibrissa.io.netcdf import kind_of, reading
-from vibrissa.io.replace import replacing
+from vibrissa.io.hdf5 import naming
+from vibrissa.io.netcdf import COMPRESSED, kind_of, read_tree, write_netcdf
 from vibrissa.rod.discretize import discretize
 from vibrissa.rod.reach import Reach
 from vibrissa.whisker import Whisker
@@ -47,23 +47,23 @@ def save_map(contacts: ContactMap, path: Path) -> None:
     if contacts.grid is not None:
         groups["grid"] = contacts.grid
     tree = xr.DataTree.from_dict(groups)
-    squeezed = {"zlib": True, "complevel": 1, "shuffle": True}
-    encoding = (
-        {"/grid": dict.fromkeys(contacts.grid.data_vars, squeezed)} if contacts.grid else None
-    )
-    with replacing(path) as part:
-        tree.to_netcdf(part, engine="h5netcdf", encoding=encoding)
+    grid = [] if contacts.grid is None else list(map(str, contacts.grid.data_vars))
+    write_netcdf(path, tree, {"/grid": dict.fromkeys(grid, COMPRESSED)})
 
 
 def load_map(path: Path) -> ContactMap:
     """Read a map; raise a ValueError if the file is not one."""
-    from vibrissa.mapping.contact_map import ContactMap
-
     kind = kind_of(path)
     if kind != _KIND:
         raise ValueError(f"{path} holds {kind or 'data of another kind'}, not a contact map")
-    with reading(path), xr.open_datatree(path, engine="h5netcdf") as opened:
-        tree = opened.load()
+    tree = read_tree(path)
+    with naming(path, "a contact map"):
+        return _from_tree(tree)
+
+
+def _from_tree(tree: xr.DataTree) -> ContactMap:
+    from vibrissa.mapping.contact_map import ContactMap
+
     whisker = Whisker.from_dataset(tree["whisker"].to_dataset())
     steps = int(tree.attrs["steps"])
     raw = {str(name): np.asarray(v) for name, v in tree["chart"].to_dataset().variables.items()}

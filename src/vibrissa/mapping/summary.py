@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from vibrissa.io.netcdf import write_netcdf
 from vibrissa.io.paths import check_writable
 from vibrissa.io.replace import replacing
 from vibrissa.mapping.evidence import NOT_UNIQUE, OFF_SURFACE, UNIQUE
@@ -174,8 +175,7 @@ def save_uniqueness(found: xr.Dataset, path: str | PathLike[str]) -> None:
     path = Path(path)
     check_writable(path, ENDINGS)
     if path.suffix == ".nc":
-        with replacing(path) as part:
-            found.to_netcdf(part, engine="h5netcdf")
+        write_netcdf(path, found)
     else:
         with replacing(path) as part:
             part.write_text(_rows(found), encoding="utf-8")

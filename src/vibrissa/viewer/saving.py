@@ -11,6 +11,7 @@ import numpy as np
 import xarray as xr
 
 from vibrissa.io import save_centerline, save_recording
+from vibrissa.io.netcdf import netcdf_image
 from vibrissa.mapping import ContactMap
 from vibrissa.quantities import attributes
 from vibrissa.rod import Deflection
@@ -45,7 +46,7 @@ def recording_netcdf(recording: xr.DataTree) -> bytes:
 
 def netcdf(data: xr.Dataset) -> bytes:
     """A dataset as a file."""
-    return _written("data.nc", lambda path: data.to_netcdf(path, engine="h5netcdf"))
+    return bytes(netcdf_image(data))
 
 
 def deflection_dataset(bent: Deflection) -> xr.Dataset:

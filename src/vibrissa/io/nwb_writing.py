@@ -14,6 +14,7 @@ Missing is NaN. The truth of a simulated trial is left out.
 from __future__ import annotations
 
 import importlib
+import io
 import uuid
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -21,6 +22,7 @@ from datetime import datetime
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
+import h5py
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
@@ -122,8 +124,12 @@ def save_nwb(
         cameras = recording.children["cameras"].to_dataset()
     file = _file(session)
     _fill(file, data, cameras)
-    with replacing(path) as part, NWBHDF5IO(str(part), "w") as out:
-        out.write(file)
+    with replacing(path) as part:
+        # In memory first, as :mod:`vibrissa.io.netcdf` says why.
+        image = io.BytesIO()
+        with h5py.File(image, "w") as content, NWBHDF5IO(mode="w", file=content) as out:
+            out.write(file)
+        part.write_bytes(image.getbuffer())
 
 
 def _check(data: xr.Dataset) -> None:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from vibrissa.cli.terminal import output, refuse
+from vibrissa.cli.terminal import Force, free, output, refuse
 
 _POOR = 1.0
 """Reprojection error above which something is wrong, pixels."""
@@ -34,6 +34,7 @@ def calibrate(
     frames: Annotated[
         int | None, typer.Option(help="Frames to take of a video, evenly spread; 40 by default.")
     ] = None,
+    force: Force = False,
 ) -> None:
     """Calibrate cameras by a checkerboard that they see at the same moments (extra cameras).
 
@@ -52,6 +53,7 @@ def calibrate(
     if frames is not None and frames < 2:
         raise ValueError(f"--frames is {frames}; a few dozen are needed")
     check_writable(cameras, (".toml",))
+    free([cameras], force)
     if not any(recognise(check_readable(image)) == Kind.VIDEO for image in images):
         refuse({"--frames": frames}, "it is of videos, and these are images")
     series = load_series(images, frames or 40)

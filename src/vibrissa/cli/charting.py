@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vibrissa.cli.terminal import output, progress_bars
+from vibrissa.cli.terminal import Force, free, output, progress_bars
 
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
@@ -39,6 +39,7 @@ def chart(
     grid: Annotated[
         bool, typer.Option(help="Whether the paper's grid of 237,765 points is solved too.")
     ] = True,
+    force: Force = False,
 ) -> None:
     """Chart all stable contacts of a whisker, and the paper's grid.
 
@@ -52,6 +53,7 @@ def chart(
     from vibrissa.whisker import Whisker
 
     check_writable(path, NETCDF)
+    free([path], force)
     if length is not None and whisker is not None:
         raise ValueError("give either --whisker or the --length of a straight one")
     chosen = whisker_from(whisker) if length is None else Whisker.straight(1e-3 * length)

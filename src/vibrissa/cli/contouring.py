@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
-from vibrissa.cli.terminal import Tell, numbers, output, progress_bars
+from vibrissa.cli.terminal import Force, Tell, numbers, output, progress_bars
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -107,6 +107,7 @@ def reconstruct(
             metavar="FILE",
         ),
     ] = None,
+    force: Force = False,
 ) -> None:
     """Find the object that was touched from a recording alone.
 
@@ -116,7 +117,7 @@ def reconstruct(
     points go to a table as well. Example: `vibrissa reconstruct trial.nc --shape cylinder`
     """
     from vibrissa.cli.locating import how_to
-    from vibrissa.cli.recordings import noise_from, recording_from, tell_written
+    from vibrissa.cli.recordings import free_beside, noise_from, recording_from, tell_written
     from vibrissa.io import save_contour, save_recording
     from vibrissa.io.paths import CSV, NETCDF, check_writable
     from vibrissa.pipeline import contour_points
@@ -126,6 +127,7 @@ def reconstruct(
     points = target.with_name(f"{target.stem}_contour.csv") if csv is None else csv
     check_writable(target, NETCDF)
     check_writable(points, CSV)
+    free_beside(recording, [target, points], force)
     direction = None if axis is None else numbers(axis, ("X", "Y", "Z"), "--axis")
     _check_shape(shape, direction is not None)
     if lean is not None and not 0.0 <= lean < 90.0:
@@ -156,7 +158,7 @@ def reconstruct(
     _tell(tree, known, whiskers, wanted)
     save_recording(target, tree)
     save_contour(points, contour_points(tree, whiskers))
-    tell_written(target)
+    tell_written(target, recording, "contour")
     tell_written(points)
 
 

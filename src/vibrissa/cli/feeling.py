@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vibrissa.cli.terminal import output, progress_bars, refuse, shown
+from vibrissa.cli.terminal import Force, output, progress_bars, refuse, shown
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -46,19 +46,27 @@ def signals(
         Path | None,
         typer.Option(help="Centreline as CSV, if the recording has no whisker.", metavar="FILE"),
     ] = None,
+    force: Force = False,
 ) -> None:
     """Find force, moment and the six signals at the base in every frame.
 
     They are added to the recording as a group `signals`; what it already holds stays, but estimates
     and a contour that were made of other signals are left out. Example: `vibrissa signals trial.nc`
     """
-    from vibrissa.cli.recordings import recording_from, say, tell_statuses, tell_written
+    from vibrissa.cli.recordings import (
+        free_beside,
+        recording_from,
+        say,
+        tell_statuses,
+        tell_written,
+    )
     from vibrissa.io import save_recording, save_signals
     from vibrissa.io.paths import CSV, NETCDF, check_writable
     from vibrissa.pipeline import with_signals
 
     target = recording if path is None else path
     check_writable(target, (*NETCDF, *CSV))
+    free_beside(recording, [target], force)
     tree = recording_from(recording)
     table = target.suffix.lower() in CSV
     if table and tree.sizes["whisker"] != 1:
@@ -81,7 +89,7 @@ def signals(
         save_signals(target, found.isel(whisker=0)[["force", "moment"]])
     else:
         save_recording(target, done)
-    tell_written(target)
+    tell_written(target, recording, "signals")
 
 
 def signal_options(

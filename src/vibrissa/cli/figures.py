@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from vibrissa.cli.terminal import output, progress_bars, refuse
+from vibrissa.cli.terminal import Force, free, output, progress_bars, refuse
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -72,6 +72,7 @@ def figures(
         str | None,
         typer.Option(help="Of a trial's contacts in both frames: time (by default) or deflection."),
     ] = None,
+    force: Force = False,
 ) -> None:
     """Draw the figures that a map or a trial allows.
 
@@ -106,6 +107,7 @@ def figures(
             refuse(options, f"{path} is no recording")
         if not drawings:
             drawings = dict(map_drawings(map_from(path), width, verdicts, sweep))
+        free([folder / f"{name}.{ending}" for name in drawings for ending in endings], force)
         folder.mkdir(parents=True, exist_ok=True)
         files = []
         for i, (name, draw) in enumerate(drawings.items()):

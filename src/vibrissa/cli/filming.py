@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from vibrissa.cli.terminal import Tell, output, progress_bars, refuse, stoppable
+from vibrissa.cli.terminal import Force, Tell, free, output, progress_bars, refuse, stoppable
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -54,6 +54,7 @@ def movie(
     ),
     stop: Annotated[float | None, typer.Option("--to", help="Time of the last frame, s.")] = None,
     whisker: Annotated[int, typer.Option(help="Which whisker, from 0.")] = 0,
+    force: Force = False,
 ) -> None:
     """Make movies of a trial: its signals in the solids of all contacts; the contour as it comes.
 
@@ -69,6 +70,7 @@ def movie(
     if "contour" not in kinds:
         refuse({"--video": videos}, "the movie of the signals shows no video")
     files = _files(target, path, kinds)
+    free(files.values(), force)
     trial = load_recording(path)
     course = course_of(trial, whisker)
     rows = movie_rows(course.time, fps, step, start, stop)

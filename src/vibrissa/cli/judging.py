@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vibrissa.cli.terminal import output, progress_bars
+from vibrissa.cli.terminal import Force, free, output, progress_bars
 
 if TYPE_CHECKING:
     from xarray import Dataset
@@ -57,6 +57,7 @@ def uniqueness(
         Path | None,
         typer.Option("--output", "-o", help="All evidence, .nc or .csv.", metavar="FILE"),
     ] = None,
+    force: Force = False,
 ) -> None:
     """Tell which triplets of signals locate the contact uniquely, with witnesses where not.
 
@@ -72,6 +73,7 @@ def uniqueness(
 
     if path is not None:
         check_writable(path, ENDINGS)
+        free([path], force)
     contacts = map_from(chart)
     with progress_bars() as tell:
         tell("verdicts", 0, 1)

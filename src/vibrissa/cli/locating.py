@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from vibrissa.cli.terminal import Tell, progress_bars, refuse, shown
+from vibrissa.cli.terminal import Force, Tell, progress_bars, refuse, shown
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -100,6 +100,7 @@ def estimate(
             metavar="FILE",
         ),
     ] = None,
+    force: Force = False,
 ) -> None:
     """Find the contact point in each frame or row of signals, with its uncertainty.
 
@@ -111,7 +112,7 @@ def estimate(
     made of other contacts is left out. A table goes to a table.
     Example: `vibrissa estimate signals.csv --map map.nc --signals Fx,FT,MB,MD -o contacts.csv`
     """
-    from vibrissa.cli.recordings import is_recording, noise_from
+    from vibrissa.cli.recordings import free_beside, is_recording, noise_from
     from vibrissa.io.paths import CSV, NETCDF, check_readable, check_writable
 
     how = how_to(triplet, method, all_six, charts, whisker)
@@ -123,6 +124,7 @@ def estimate(
     if path is None:
         path = signals if recorded else Path("contacts.csv")
     check_writable(path, (*NETCDF, *CSV) if recorded else CSV)
+    free_beside(signals, [path], force)
     if recorded:
         _from_recording(signals, path, how, sigma)
     else:
@@ -279,7 +281,7 @@ def _from_recording(signals: Path, path: Path, how: How, noise: tuple[Array, str
         save_contacts(path, contact_columns(found.isel(whisker=0)))
     else:
         save_recording(path, done)
-    tell_written(path)
+    tell_written(path, signals, "estimates")
 
 
 def estimated(

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vibrissa.cli.terminal import Tell, errors, output
+from vibrissa.cli.terminal import Tell, errors, free, output
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     import xarray as xr
 
@@ -256,12 +256,42 @@ def tell_statuses(codes: object) -> None:
         output.print(f"{count:6d}  {sentence}", highlight=False, soft_wrap=True)
 
 
-def tell_written(path: Path) -> None:
-    """Print that a file is there.
+def free_beside(recording: Path, files: Iterable[Path], force: bool) -> None:
+    """Raise if files are there that nobody said to replace; a recording is added to.
+
+    Parameters
+    ----------
+    recording : Path
+        To which a stage may be added where it is.
+    files : iterable of Path
+        To be written.
+    force : bool
+        Whether others may be replaced.
+
+    Raises
+    ------
+    FileExistsError
+        If there is one.
+    """
+    free([file for file in files if not _same(file, recording)], force)
+
+
+def _same(path: Path, other: Path) -> bool:
+    return path.resolve() == other.resolve()
+
+
+def tell_written(path: Path, recording: Path | None = None, stage: str = "") -> None:
+    """Print that a file is there, or that a recording has a stage more.
 
     Parameters
     ----------
     path : Path
         Which.
+    recording : Path, optional
+        What was read.
+    stage : str
+        What was added to it.
     """
-    output.print(f"wrote {path}", highlight=False, soft_wrap=True)
+    added = recording is not None and _same(path, recording)
+    said = f"added {stage} to {path}" if added else f"wrote {path}"
+    output.print(said, highlight=False, soft_wrap=True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vibrissa.cli.terminal import Tell, output, progress_bars, refuse
+from vibrissa.cli.terminal import Force, Tell, free, output, progress_bars, refuse
 
 if TYPE_CHECKING:
     from xarray import DataTree
@@ -64,6 +64,7 @@ def report(
             help="Of a trial: of the draws behind what is predicted; 0 by default.", min=0
         ),
     ] = None,
+    force: Force = False,
 ) -> None:
     """Write a page that opens offline: what was done, how well, figures, a contour to turn.
 
@@ -74,6 +75,7 @@ def report(
 
     from vibrissa.io import load_recording
     from vibrissa.io.paths import check_readable, check_writable
+    from vibrissa.io.replace import replacing
     from vibrissa.report import (
         contacts_by_whisker,
         document,
@@ -84,6 +86,7 @@ def report(
     from vibrissa.trial import recorded_whisker
 
     check_writable(target, (".html", ".htm"))
+    free([target], force)
     given = [path, *(file for file in (uniqueness, chart) if file), *(videos or []), *(films or [])]
     for file in given:
         check_readable(file)
@@ -109,7 +112,7 @@ def report(
         sections.append(figure_sections(_drawn(drawings, tell)))
     movies = list(films or [])
     if make_movies:
-        movies += _made(path, target, videos, chart, whisker or 0)
+        movies += _made(path, target, videos, chart, whisker or 0, force)
     command = ["vibrissa", *sys.argv[1:]]
     drawn = (seed or 0) if kind == "trial" else None
     origin = provenance_section(provenance(command, given, drawn))
@@ -117,7 +120,8 @@ def report(
     if movies:
         sections.append(_movies(movies, target.parent, (title, about, sections, origin, script)))
     page = document(title, about, [*sections, origin], script)
-    target.write_text(page, encoding="utf-8")
+    with replacing(target) as part:
+        part.write_text(page, encoding="utf-8")
     size = target.stat().st_size / 1e6
     output.print(f"wrote {target}, {size:.1f} MB", highlight=False, soft_wrap=True)
 
@@ -211,14 +215,19 @@ def _drawn(drawings: Mapping[str, Callable[[], Any]], tell: Tell) -> dict[str, b
 
 
 def _made(
-    path: Path, target: Path, videos: list[Path] | None, chart: Path | None, whisker: int
+    path: Path,
+    target: Path,
+    videos: list[Path] | None,
+    chart: Path | None,
+    whisker: int,
+    force: bool,
 ) -> list[Path]:
     """Make the movies that the trial allows, beside the page."""
     from vibrissa.cli.filming import movie
 
     folder = target.parent
     before = {file: file.stat().st_mtime_ns for file in folder.glob(f"{path.stem}-*.mp4")}
-    movie(path, folder, videos=videos, chart=chart, whisker=whisker)
+    movie(path, folder, videos=videos, chart=chart, whisker=whisker, force=force)
     after = sorted(folder.glob(f"{path.stem}-*.mp4"))
     return [file for file in after if before.get(file) != file.stat().st_mtime_ns]
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vibrissa.cli.terminal import output, progress_bars, shown
+from vibrissa.cli.terminal import Force, free, output, progress_bars, shown
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -36,6 +36,7 @@ def sensitivity(
         Path | None,
         typer.Option("--output", "-o", help="Everything, NetCDF; SI units.", metavar="FILE"),
     ] = None,
+    force: Force = False,
 ) -> None:
     """Say how the contact point depends on three signals, and which three would be the best.
 
@@ -53,6 +54,7 @@ def sensitivity(
 
     if path is not None:
         check_writable(path, NETCDF)
+        free([path], force)
     names = selection([name.strip() for name in triplet.split(",")], exactly=3)
     contacts = map_from(chart)
     noise = np.diag(np.repeat([(force_noise * 1e-6) ** 2, (moment_noise * 1e-6) ** 2], 3))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vibrissa.cli.terminal import output, progress_bars, shown
+from vibrissa.cli.terminal import Force, free, output, progress_bars, shown
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -80,6 +80,7 @@ def simulate(
     example: Annotated[
         bool, typer.Option("--example", help="Print a trial with all that one can say, and stop.")
     ] = False,
+    force: Force = False,
 ) -> None:
     """Simulate a whisking trial among objects, with its truth.
 
@@ -99,6 +100,7 @@ def simulate(
         output.out(EXAMPLE, highlight=False, end="")
         return
     check_writable(path, NETCDF)
+    free([path, *(() if film is None else _films(film))], force)
     with progress_bars() as tell:
         tell("how far to whisk", 0, 1)
         plan = read_script(
@@ -175,6 +177,11 @@ def _tell(trial: xr.DataTree) -> None:
         )
 
 
+def _films(folder: Path) -> list[Path]:
+    """Where the videos of the two views go."""
+    return [folder / f"{view}.mkv" for view in ("top", "front")]
+
+
 def _film(trial: xr.DataTree, path: Path, folder: Path, seed: int) -> None:
     """Film the trial, and add cameras and true traces to the recording."""
     from vibrissa.io import save_recording
@@ -182,7 +189,7 @@ def _film(trial: xr.DataTree, path: Path, folder: Path, seed: int) -> None:
 
     folder.mkdir(parents=True, exist_ok=True)
     cameras = views_of(trial)
-    files = {camera.name: folder / f"{camera.name}.mkv" for camera in cameras}
+    files = dict(zip([camera.name for camera in cameras], _films(folder), strict=True))
     with progress_bars() as tell:
         filmed = film(
             trial,

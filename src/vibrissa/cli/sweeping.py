@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vibrissa.cli.terminal import errors, output, progress_bars, refuse
+from vibrissa.cli.terminal import Force, errors, free, output, progress_bars, refuse
 
 if TYPE_CHECKING:
     from vibrissa.sweeps import Study
@@ -57,6 +57,7 @@ def sweep(
     example: Annotated[
         bool, typer.Option("--example", help="Print a study with all that one can say, and stop.")
     ] = False,
+    force: Force = False,
 ) -> None:
     """Ask the same of many whiskers, here or on a cluster; stopped, it goes on where it was.
 
@@ -79,9 +80,11 @@ def sweep(
     elif study == _SHOW:
         options = {"--workers": workers, "--scheduler": scheduler, "--again": again}
         refuse(options | {"--dry-run": dry_run}, "results are only shown")
-        _show(store, path)
+        _show(store, path, force)
     elif store is not None:
         raise ValueError(f"{store} is one word too many; the store is said with -o")
+    elif force:
+        raise ValueError("--force is for the figures of `show`; a study goes on with its results")
     else:
         if scheduler not in (None, "local"):
             refuse({"--workers": workers}, f"the workers are those of {scheduler}")
@@ -141,7 +144,7 @@ def _cost(plan: Study, workers: int) -> None:
     )
 
 
-def _show(store: Path | None, folder: Path | None) -> None:
+def _show(store: Path | None, folder: Path | None, force: bool) -> None:
     if store is None:
         raise ValueError("say what to show: vibrissa sweep show STORE")
     from vibrissa import plots
@@ -152,9 +155,10 @@ def _show(store: Path | None, folder: Path | None) -> None:
     _print_failures(failures(store))
     folder = folder or Path()
     folder.mkdir(parents=True, exist_ok=True)
-    for task in plots.drawable(found):
+    names = {task: folder / f"{store.resolve().stem}-{task}" for task in plots.drawable(found)}
+    free([name.with_name(f"{name.name}.png") for name in names.values()], force)
+    for task, name in names.items():
         figure = plots.sweep_overview(found, task=task)
-        name = folder / (f"{store.resolve().stem}-{task}")
         for file in plots.save(figure, name, ("png",)):
             output.print(f"wrote {file}", highlight=False, soft_wrap=True)
 

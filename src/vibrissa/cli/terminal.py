@@ -5,19 +5,26 @@ from __future__ import annotations
 import math
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
 
+import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
 
 from vibrissa.quantities import quantity
 
+_NAMED = 3
 output = Console()
 """Where results go."""
 
 errors = Console(stderr=True)
 """Where progress and messages go, so that results can be piped."""
+
+Force = Annotated[bool, typer.Option("--force", help="Replace files that are there already.")]
+"""The option of every verb that writes files of its own."""
 
 Tell = Callable[[str, int, int], None]
 """Called with what is being done, and how much of how much is."""
@@ -153,6 +160,31 @@ def numbers(text: str, names: Sequence[str], option: str) -> list[float]:
     if len(values) != len(names) or not all(map(math.isfinite, values)):
         raise ValueError(f"{option} is {text!r}; {','.join(names)} are needed")
     return values
+
+
+def free(files: Iterable[Path], force: bool) -> None:
+    """Raise if files are there that nobody said to replace.
+
+    Parameters
+    ----------
+    files : iterable of Path
+        To be written.
+    force : bool
+        Whether they may be replaced.
+
+    Raises
+    ------
+    FileExistsError
+        If there is one; says which.
+    """
+    there = [str(file) for file in files if not force and file.exists()]
+    if there:
+        more = f" and {len(there) - _NAMED} more" if len(there) > _NAMED else ""
+        are = "is" if len(there) == 1 else "are"
+        raise FileExistsError(
+            f"{', '.join(there[:_NAMED])}{more} {are} there already: write elsewhere with "
+            "--output, or replace with --force"
+        )
 
 
 def refuse(options: Mapping[str, object], reason: str) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from vibrissa.cli.sources import whisker_from
-from vibrissa.cli.terminal import numbers, progress_bars, refuse
+from vibrissa.cli.terminal import Force, free, numbers, progress_bars, refuse
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -127,6 +127,7 @@ def track(
             help="Whether whiskers are bright on dark; by default the first frame tells.",
         ),
     ] = None,
+    force: Force = False,
 ) -> None:
     """Track a whisker in two videos: its shape, how it is held, its contact, what its base feels.
 
@@ -145,6 +146,7 @@ def track(
     count = len(views)
     alone = {"--corrections": corrections, "--head": head, "--contact": contact}
     trials = _trials(videos, count, recording, alone)
+    free(trials, force)
     _check_numbers(fps, cutoff, base_radius)
     _check_pixels(width=width, jump=jump)
     places = _bases(base or [], views)

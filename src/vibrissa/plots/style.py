@@ -23,6 +23,8 @@ from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
+from vibrissa.io.replace import replacing
+
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Width = Literal["single", "double"]
@@ -372,7 +374,8 @@ def save(
     dated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
     with looking():
         for file, ending in zip(files, formats, strict=True):
-            figure.savefig(file, format=ending, metadata=dated.get(ending))
+            with replacing(file) as part:
+                figure.savefig(part, format=ending, metadata=dated.get(ending))
     return files
 
 

@@ -11,6 +11,7 @@ import xarray as xr
 
 import vibrissa
 from vibrissa.io import load_recording, save_recording
+from vibrissa.io.replace import replacing
 from vibrissa.pipeline.estimates import Progress
 from vibrissa.tracking import TrackOptions, partial_traces, trace_file, track
 from vibrissa.trial import film, recorded_cameras, recorded_whisker, views_of
@@ -62,7 +63,8 @@ def begin(folder: Path, whisker: Whisker, **settings: object) -> None:
         )
     for file in made:
         file.unlink(missing_ok=True)
-    path.write_text(text, encoding="utf-8")
+    with replacing(path) as part:
+        part.write_text(text, encoding="utf-8")
 
 
 def video_files(folder: Path) -> list[Path]:

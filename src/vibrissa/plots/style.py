@@ -372,10 +372,9 @@ def save(
     files = [stem.with_name(f"{stem.name}.{ending}") for ending in formats]
     # Without a date the same figure gives the same file.
     dated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
-    with looking():
-        for file, ending in zip(files, formats, strict=True):
-            with replacing(file) as part:
-                figure.savefig(part, format=ending, metadata=dated.get(ending))
+    for file, ending in zip(files, formats, strict=True):
+        with replacing(file) as part:
+            part.write_bytes(_drawn(figure, format=ending, metadata=dated.get(ending)))
     return files
 
 
@@ -394,7 +393,12 @@ def png(figure: Figure, dots: float = 200.0) -> bytes:
     bytes
         A PNG file.
     """
+    return _drawn(figure, format="png", dpi=dots)
+
+
+def _drawn(figure: Figure, **how: Any) -> bytes:
+    # In memory, because some writers break where a disk is full.
     file = BytesIO()
     with looking():
-        figure.savefig(file, format="png", dpi=dots)
+        figure.savefig(file, **how)
     return file.getvalue()

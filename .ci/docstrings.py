@@ -4,9 +4,9 @@ Public is a name without a leading underscore in a module without one, and the m
 properties of such a class. What a package exports by name in its ``__init__``, and what a module
 directly under ``vibrissa`` defines, is its face and describes every parameter and what it
 returns. Elsewhere a summary will do, but sections that are there must be whole. The objects
-themselves are looked at rather than their source, so that the parameters of a dataclass are its
-fields, which it may describe under Attributes too. An enumeration has no parameters to describe,
-and a compiled kernel is called by our own code only.
+themselves are looked at rather than their source, so that the parameters of a dataclass and of a
+named tuple are its fields, which it may describe under Attributes too. An enumeration has no
+parameters to describe, and a compiled kernel is called by our own code only.
 """
 
 import dataclasses
@@ -84,12 +84,19 @@ def public(module_name: str) -> Iterator[tuple[str, object, object]]:
                 yield f"{module_name}.{name}.{member_name}", member, value
 
 
+def field_names(cls: type) -> set[str]:
+    """Fields of a dataclass or of a named tuple; none of another class."""
+    if dataclasses.is_dataclass(cls):
+        return {f.name for f in dataclasses.fields(cls) if f.init and not f.name.startswith("_")}
+    return set(getattr(cls, "_fields", ()))
+
+
 def field_faults(cls: type, doc: Mapping[str, list[Parameter]]) -> Iterator[tuple[str, str]]:
-    """Fields of a dataclass that it does not describe, and parameters that are no fields.
+    """Fields of a class that it does not describe, and parameters that are no fields.
 
     Other Parameters are left out: they are those that its constructors share.
     """
-    fields = {f.name for f in dataclasses.fields(cls) if f.init and not f.name.startswith("_")}
+    fields = field_names(cls)
     parameters, attributes = (
         {name.strip() for row in doc[section] for name in row.name.split(",")}
         for section in ("Parameters", "Attributes")
@@ -110,7 +117,7 @@ def faults(value: object, on_face: bool) -> Iterator[tuple[str, str]]:
         checks = SUMMARY
     elif inspect.isclass(value) and issubclass(value, enum.Enum | BaseException):
         checks = CHECKS - PARAMETERS
-    elif dataclasses.is_dataclass(value):
+    elif inspect.isclass(value) and field_names(value):
         checks = CHECKS - PARAMETERS
         yield from field_faults(value, doc)
     for code, message in validate(doc)["errors"]:

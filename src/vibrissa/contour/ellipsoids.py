@@ -14,7 +14,7 @@ from vibrissa.contour.touches import Array
 class Ellipsoids(NamedTuple):
     """Ellipsoids about points.
 
-    Parameters
+    Attributes
     ----------
     semiaxes : array (..., 3)
         Their lengths, m, the longest first; NaN where the covariance is.

@@ -22,7 +22,7 @@ _EXPLAINED = (Status.UNIQUE, Status.AMBIGUOUS, Status.UNDERDETERMINED)
 class Followed(NamedTuple):
     """What a filter knows after a sample.
 
-    Parameters
+    Attributes
     ----------
     point : (3,) array
         Most probable contact point, laboratory frame, m; NaN if there is none. Where hypotheses run

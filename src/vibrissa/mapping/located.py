@@ -13,7 +13,7 @@ from vibrissa.status import Status
 class Located(NamedTuple):
     """What one measurement tells.
 
-    Parameters
+    Attributes
     ----------
     point : (3,) array
         Contact point of the most plausible candidate, whisker frame, m; NaN if there is none.

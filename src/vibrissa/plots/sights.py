@@ -39,7 +39,7 @@ class _View(Protocol):
 class Sight(NamedTuple):
     """One view of a trial.
 
-    Parameters
+    Attributes
     ----------
     view : _View
         The camera.

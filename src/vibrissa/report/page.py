@@ -55,7 +55,7 @@ _CODE = re.compile(r"`([^`]+)`")
 class Section(NamedTuple):
     """A part of the page.
 
-    Parameters
+    Attributes
     ----------
     name : str
         Within the page's address; letters, digits and hyphens.

@@ -41,7 +41,7 @@ _LATEST = 1e11
 class Sample(NamedTuple):
     """One line: its number, the named values, and the pose of the base, where it is there.
 
-    Parameters
+    Attributes
     ----------
     line : int
         Number of the line, from 1.

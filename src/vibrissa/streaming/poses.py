@@ -20,7 +20,7 @@ _TOO_FAST = 50.0
 class Pose(NamedTuple):
     """Of the whisker's base.
 
-    Parameters
+    Attributes
     ----------
     rotation : (3, 3) array
         From the whisker's to the laboratory frame.

@@ -27,7 +27,7 @@ _SEEDS = 4000
 class Found(NamedTuple):
     """A whisker in one frame.
 
-    Parameters
+    Attributes
     ----------
     trace : Trace
         From base to tip.

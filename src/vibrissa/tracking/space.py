@@ -47,7 +47,7 @@ _END = 1.0
 class SpaceCurve(NamedTuple):
     """A whisker in space.
 
-    Parameters
+    Attributes
     ----------
     points : array (NODES, 3)
         From base to where the first of the views ends, laboratory frame, m; NaN if there is none.

@@ -52,7 +52,7 @@ class TraceOptions:
 class Trace(NamedTuple):
     """A whisker in one frame of one view.
 
-    Parameters
+    Attributes
     ----------
     line : array (n, 2)
         Column and row from base to tip, `STEP` pixels apart.

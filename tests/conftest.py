@@ -3,6 +3,7 @@ deadline, one browser, and on several cores in an order that keeps them all busy
 
 import os
 import shutil
+import signal
 from pathlib import Path
 
 os.environ.setdefault("MPLBACKEND", "Agg")
@@ -61,6 +62,17 @@ def pytest_configure(config):
 def pytest_collection_modifyitems(config, items):
     if hasattr(config, "workerinput"):
         items.sort(key=lambda item: _turn(item.path))
+
+
+@pytest.fixture
+def interruptible():
+    """Children start with the default action of SIGINT, also where the tests run with it ignored.
+
+    A shell without job control starts what runs in its background so, and children inherit it.
+    """
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 _BROWSER = [

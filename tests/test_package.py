@@ -1,4 +1,5 @@
 import importlib.metadata
+import signal
 import subprocess
 import sys
 
@@ -33,3 +34,13 @@ def test_import_loads_nothing_heavy():
         [sys.executable, "-c", code], check=True, capture_output=True, text=True
     ).stdout
     assert loaded.strip() == "[]"
+
+
+def test_children_can_be_interrupted_where_the_tests_cannot(request):
+    """As where a shell starts the tests in its background."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    request.addfinalizer(lambda: signal.signal(signal.SIGINT, before))
+    request.getfixturevalue("interruptible")
+    code = "import signal; print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)"
+    child = [sys.executable, "-c", code]
+    assert subprocess.run(child, capture_output=True, text=True).stdout.strip() == "True"

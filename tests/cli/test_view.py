@@ -15,6 +15,7 @@ pytest.importorskip("viser", reason="viser is not installed", exc_type=ImportErr
 COMMAND = [sys.executable, "-c", "from vibrissa.cli import main; main()", "view", "--no-browser"]
 
 
+@pytest.mark.usefixtures("interruptible")
 def test_the_page_is_served_until_interrupted():
     serving = subprocess.Popen(COMMAND, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:

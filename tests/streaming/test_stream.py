@@ -256,6 +256,7 @@ def run(*options):
             process.kill()
 
 
+@pytest.mark.usefixtures("interruptible")
 def test_the_verb_answers_each_line_at_once_and_ends_cleanly(map_file, bent, wrench):
     lines = list(csv_lines(wrench))
     with run("--map", map_file) as process:

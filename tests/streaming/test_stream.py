@@ -6,8 +6,9 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,9 +21,10 @@ from vibrissa.cli.streaming import stream
 from vibrissa.io.rosbag import bag_wrenches
 from vibrissa.mapping import ContactFilter, Estimator
 from vibrissa.sensing import Sensor, SensorFrame, save_sensor
-from vibrissa.streaming import ContactStream, Poses, advice
+from vibrissa.streaming import ContactStream, Lines, NewestLines, Poses, advice, file_lines
 from vibrissa.streaming.contacts import COMPONENTS, as_json
 from vibrissa.streaming.lines import POSITION, QUATERNION
+from vibrissa.streaming.sources import udp_lost, udp_socket
 
 START = "from vibrissa.cli import main; main()"
 NOISE = np.repeat([1e-6, 2e-8], 3)
@@ -132,7 +134,12 @@ def test_bad_lines_are_said_and_passed_over(gamma_map, wrench):
     [
         ("0.0,1e-5\r2,0,0,0,0,0", "no CSV"),
         ('{"Fx": 1' + 400 * "0" + ', "MB": 1e-6, "MD": 0.5}', "larger than any number"),
-        ('{"Fx": ' + 100_000 * "[", "no JSON"),
+        ('{"Fx": ' + 60_000 * "[", "no JSON"),
+        ('{"Fx": ' + 100_000 * "[", "a line of more than 65536 characters"),
+        (",".join(30_000 * ["0"]), "30000 cells; the header has 7"),
+        (",".join(f"c{i}" for i in range(9_000)), "9000 cells; the header has 7"),
+        ("0.1,1e-5\0,0,0,0,0,0", "no number"),
+        (b"0.1,1e-5,\xe2\x82".decode(errors="replace"), "3 cells; the header has 7"),
         ("nan,0,0,0,0,0,0", "time is 'nan'; a finite number"),
         (",0,0,0,0,0,0", "time is ''"),
         ('{"time": Infinity, "Fx": 1e-5, "MB": 1e-6, "MD": 0.5}', "time is inf"),
@@ -160,6 +167,52 @@ def test_garbage_gives_faults_only(gamma_map, wrench):
     assert records[-1]["status"] == "unique"
     for record in records:
         assert json.loads(as_json(record))
+
+
+@pytest.mark.parametrize("names", ["Fx MB MD", "Fx FT MB MD"])
+def test_numbers_of_which_squares_are_none_give_a_status(gamma_map, names):
+    """Also in the batch, which looks for the nearest signals in the same way."""
+    contacts = estimator(gamma_map, names, felt_above=5.0)
+    row = dict.fromkeys(names.split(), 1e-6)
+    strange = (1e99, 1e154, 1e155, -1e155, 1e200, 1e308, -1e308, 5e-324, -0.0)
+    rows = [row | {"Fx": value} for value in strange]
+    running = ContactStream(contacts)
+    records = list(running.records(map(json.dumps, rows)))
+    assert running.faults == 0
+    assert {record["status"] for record in records[:-2]} == {"outside_map"}
+    table = {key: np.array([1e200 if key == "Fx" else 1e-6, 1e-6]) for key in row}
+    found = gamma_map.estimate(table, tuple(row))
+    assert found.status[0] == vb.Status.OUTSIDE_MAP
+
+
+def test_rows_are_not_read_under_a_header_that_was_refused(gamma_map, wrench):
+    """A sensor's channels have no units: a header that gives some cannot be used."""
+    sensor = Sensor(noise=NOISE)
+    good = list(csv_lines(wrench))
+    running = ContactStream(Estimator.of_sensor(gamma_map, sensor), COMPONENTS)
+    units = "time," + ",".join(f"{name} (mN)" for name in COMPONENTS)
+    *before, header, row, other, again = running.records(
+        [*good[:2], units, good[2], "Fx;Fy;Fz", good[0], good[2]]
+    )
+    assert [record["status"] for record in before] == ["unique"]
+    assert "without units) lacks Fx, Fy" in header["error"]
+    assert row == {
+        "line": 4,
+        "error": "a row, and no header says what its columns are: that of line 3 was refused",
+    }
+    assert "lacks" in other["error"]
+    assert again["status"] == "unique"
+    # Without a sensor its units count, also where its cells are parted otherwise.
+    running = ContactStream(estimator(gamma_map))
+    milli = "time;" + ";".join(f"{name} [mN]" for name in COMPONENTS[:3]) + ";Mx;My;Mz"
+    size = np.repeat([1e3, 1.0], 3)
+    rows = [";".join(map(repr, [0.1, *(size * w).tolist()])) for w in wrench[:1]]
+    first, second = running.records([*good[:2], milli, *rows])
+    np.testing.assert_allclose([second[n] for n in "xyz"], [first[n] for n in "xyz"], rtol=1e-9)
+    # Noise and strangers' lines are no headers.
+    running = ContactStream(estimator(gamma_map))
+    lines = [*good[:2], "hello, world", "\ufffd\ufffd nonsense", good[2]]
+    assert ["error" in one for one in running.records(lines)] == [False, True, True, False]
 
 
 def test_a_sender_of_json_may_begin_anew_as_well(gamma_map, wrench):
@@ -296,6 +349,7 @@ def test_the_verb_listens_to_udp_with_a_sensor(map_file, bent, wrench, tmp_path)
         map_file,
         "--sensor",
         tmp_path / "sensor.toml",
+        "--every",
         "--count",
         3,
     ) as process:
@@ -311,6 +365,83 @@ def test_the_verb_listens_to_udp_with_a_sensor(map_file, bent, wrench, tmp_path)
     assert len(records) == 3
     for record, point in zip(records, bent.contact_point[:3], strict=True):
         np.testing.assert_allclose([record[n] for n in "xyz"], point, atol=1e-7)
+
+
+def test_of_what_waits_at_a_socket_only_the_newest_sample_is_read():
+    """Headers, and poses that a motion is continued from, are not dropped with samples."""
+    wanted = Lines(("Fx", "MB", "MD"))
+    pose = {"time": 0.0} | dict.fromkeys((*POSITION, *QUATERNION), 0.5)
+    poses = [json.dumps(pose | {"time": i}) for i in range(5)]
+    sample = json.dumps({"Fx": 1.0, "MB": 1.0, "MD": 1.0})
+    with udp_socket("127.0.0.1", 0) as heard, socket.socket(type=socket.SOCK_DGRAM) as out:
+
+        def send(*lines):
+            out.sendto("\n".join(lines).encode(), heard.getsockname())
+
+        newest = NewestLines(heard, wanted.kind)
+        read = iter(newest)
+        for each in ("1,2,3\n.5,6,7", poses[0], "Fx,MB,MD", sample, *poses[1:], "-8,9,1", "7,8,9"):
+            send(each)
+        send("1,1,1", "2,2,2")
+        assert [next(read) for _ in range(5)] == ["Fx,MB,MD", *poses[3:], "1,1,1", "2,2,2"]
+        assert newest.dropped == 5
+        send("3,3,3")
+        assert next(read) == "3,3,3"
+        assert newest.dropped == 5
+
+
+def test_what_the_system_throws_away_is_counted():
+    with udp_socket("127.0.0.1", 0) as heard, socket.socket(type=socket.SOCK_DGRAM) as out:
+        heard.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1)  # the least that it allows
+        for _ in range(1000):
+            out.sendto(bytes(100), heard.getsockname())
+        heard.setblocking(False)
+        came = 0
+        with suppress(BlockingIOError):
+            while heard.recv(200):
+                came += 1
+        assert 0 < came < 1000
+        if sys.platform == "linux":
+            assert came + udp_lost(heard) == 1000
+
+
+def test_over_udp_stale_samples_are_dropped_and_counted(map_file, wrench):
+    """More come than can be answered: the last is answered, and the others are accounted for."""
+    lines = list(csv_lines(wrench))
+    count = 3000
+    with run("--udp", "127.0.0.1:0", "--map", map_file) as process:
+        port = int(process.stderr.readline().rsplit(":", 1)[1])
+        assert process.stderr.readline() == "ready\n"
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+            for line in (lines[0], *(f"{i},{lines[1].split(',', 1)[1]}" for i in range(count))):
+                out.sendto(line.encode(), ("127.0.0.1", port))
+        while True:
+            record = json.loads(process.stdout.readline())
+            if record["time"] == count - 1:
+                break
+        process.send_signal(signal.SIGTERM)
+        rest, said = process.communicate(timeout=60)
+    assert rest == ""
+    answered = int(said.split(" samples, 0 lines")[0].rsplit("\n", 1)[-1])
+    dropped = int(said.rsplit(" samples dropped because newer", 1)[0].rsplit(" ", 1)[-1])
+    assert answered + dropped == count
+    assert said.count("so far ") >= 1
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
+def test_a_pipe_that_closes_is_waited_for(tmp_path):
+    path, said = tmp_path / "pipe", []
+    os.mkfifo(path)
+    read = file_lines(path, reconnect=True, tell=said.append)
+    for text in ("1\n2\n3.1", "4\n"):  # the third number was to have more digits
+        writer = threading.Thread(target=path.write_text, args=(text,))
+        writer.start()
+        assert [next(read) for _ in range(text.count("\n"))] == text.splitlines(keepends=True)[:2]
+        writer.join()
+    assert said == [f"{path} closed; waiting until it opens again", f"{path} is open again"]
+    (tmp_path / "file").write_text("1\n")
+    with pytest.raises(ValueError, match="a file, which ends"):
+        next(file_lines(tmp_path / "file", reconnect=True))
 
 
 def test_poses_may_come_at_another_rate_and_of_what_carries_the_base(gamma_map, bent, wrench):
@@ -385,8 +516,11 @@ def test_times_in_a_smaller_unit_are_noticed(gamma_map, wrench):
     assert "is their time in s?" in " ".join(advice(running))
 
 
-def write_wrenches(path, topics, sec=7, position=None):
-    """A bag with WrenchStamped messages a millisecond apart, and a pose at their beginning."""
+def write_wrenches(path, topics, sec=7, position=None, stamps=None):
+    """A bag with WrenchStamped messages a millisecond apart, and a pose at their beginning.
+
+    Time stamps that are given are recorded 40 ns later.
+    """
     from rosbags.rosbag2 import Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -397,13 +531,16 @@ def write_wrenches(path, topics, sec=7, position=None):
             topic = writer.add_connection(name, kind, typestore=store)
             for i, row in enumerate(wrenches):
                 nanosec = 1_000_000 * i if sec else 0
+                if stamps is not None:
+                    sec, nanosec = divmod(stamps[i], 10**9)
                 stamp = t["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec)
                 header = t["std_msgs/msg/Header"](stamp=stamp, frame_id="sensor")
                 force = t["geometry_msgs/msg/Vector3"](*row[:3].tolist())
                 torque = t["geometry_msgs/msg/Vector3"](*row[3:].tolist())
                 both = t["geometry_msgs/msg/Wrench"](force=force, torque=torque)
                 raw = store.serialize_cdr(t[kind](header=header, wrench=both), kind)
-                writer.write(topic, 7_000_000_000 + 1_000_000 * i, raw)
+                recorded = 7_000_000_000 + 1_000_000 * i if stamps is None else stamps[i] + 40
+                writer.write(topic, recorded, raw)
         if position is None:
             return
         kind = "geometry_msgs/msg/TransformStamped"
@@ -415,6 +552,100 @@ def write_wrenches(path, topics, sec=7, position=None):
         pose = t["geometry_msgs/msg/Transform"](translation=vector, rotation=half)
         message = t[kind](header=header, child_frame_id="flange", transform=pose)
         writer.write(topic, 7_100_000_000, store.serialize_cdr(message, kind))
+
+
+def test_time_stamps_and_frames_go_through_unchanged(gamma_map, wrench, tmp_path, monkeypatch):
+    """Nanoseconds since 1970 have more digits than a 64-bit float."""
+    pytest.importorskip("rosbags")
+    stamps = 1_700_000_000_123_456_789 + 1_000_003 * np.arange(12)
+    write_wrenches(tmp_path / "in", {"/wrench": wrench}, stamps=stamps.tolist())
+    gamma_map.save(tmp_path / "map.nc")
+    stream(tmp_path / "in", chart=tmp_path / "map.nc", bag=tmp_path / "out")
+    assert [each.stamp for each in bag_wrenches(tmp_path / "in")] == stamps.tolist()
+    messages = bag_messages(tmp_path / "out")
+    for name in ("/contact_point", "/contact_candidates"):
+        headers = [message.header for _, message in messages[name]]
+        said = [10**9 * header.stamp.sec + header.stamp.nanosec for header in headers]
+        assert said == stamps.tolist()
+        assert [recorded for recorded, _ in messages[name]] == (stamps + 40).tolist()
+        assert {header.frame_id for header in headers} == {"sensor"}
+
+
+def bag_messages(path):
+    """Recording times and messages of a bag by their topic."""
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with AnyReader([path], default_typestore=store) as reader:
+        found = {c.topic: [] for c in reader.connections}
+        for connection, recorded, raw in reader.messages():
+            found[connection.topic].append((recorded, reader.deserialize(raw, connection.msgtype)))
+        assert reader.message_count == sum(map(len, found.values()))
+    return found
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGALRM", "SIGKILL"])
+def test_a_bag_is_whole_however_the_stream_ends(map_file, wrench, tmp_path, name):
+    """All samples after a signal that can be taken; after SIGKILL those of a second before it."""
+    pytest.importorskip("rosbags")
+    lines = list(csv_lines(wrench))
+    with run("--map", map_file, "--bag-out", tmp_path / "out") as process:
+        process.stdin.write("\n".join(lines[:8]) + "\n")
+        process.stdin.flush()
+        for _ in range(7):
+            assert json.loads(process.stdout.readline())["status"] == "unique"
+        if name == "SIGKILL":
+            time.sleep(1.0)
+        process.send_signal(getattr(signal, name))
+        process.wait(timeout=60)
+        said = process.stderr.read()
+    assert "Traceback" not in said
+    if name != "SIGKILL":
+        assert process.returncode == 0
+        assert "7 samples" in said
+    messages = bag_messages(tmp_path / "out")
+    assert [recorded for recorded, _ in messages["/contact_point"]] == [
+        1_000_000 * i for i in range(7)
+    ]
+    assert len(messages["/contact_candidates"]) == 7
+    metadata = json.loads((tmp_path / "out" / "metadata.yaml").read_text())  # JSON is YAML
+    assert metadata["rosbag2_bagfile_information"]["message_count"] == 14
+
+
+def test_a_bag_that_was_killed_while_it_was_written_is_finished_by_the_reader(wrench, tmp_path):
+    """A journal of SQLite is left beside the database; what it undoes must not be read."""
+    pytest.importorskip("rosbags")
+    import shutil
+    import sqlite3
+
+    write_wrenches(tmp_path / "bag", {"/wrench": wrench})
+    (file,) = (tmp_path / "bag").glob("*.db3")
+    database = sqlite3.connect(file)
+    database.execute("PRAGMA cache_size = 0")  # what is changed goes to the file at once
+    database.execute("UPDATE messages SET data = zeroblob(40000)")
+    shutil.copytree(tmp_path / "bag", tmp_path / "killed")
+    database.close()
+    assert Path(f"{tmp_path / 'killed' / file.name}-journal").stat().st_size
+    values = [message.values for message in bag_wrenches(tmp_path / "killed")]
+    np.testing.assert_array_equal(values, wrench)
+
+
+def test_a_bag_that_cannot_be_written_is_said_and_the_stream_goes_on(
+    map_file, wrench, tmp_path, capsys, monkeypatch
+):
+    pytest.importorskip("rosbags")
+
+    def full(self):
+        raise OSError("no space")
+
+    lines = list(csv_lines(wrench))
+    (tmp_path / "lines.csv").write_text("\n".join(lines))
+    monkeypatch.setattr("vibrissa.io.rosbag.ContactBag.write", lambda *_: full(None))
+    stream(tmp_path / "lines.csv", chart=map_file, bag=tmp_path / "out")
+    out, said = capsys.readouterr()
+    assert len(out.splitlines()) == len(wrench)
+    assert said.count("no space; the stream goes on without it") == 1
 
 
 def test_bags_that_hold_something_else(wrench, tmp_path):
@@ -431,8 +662,8 @@ def test_bags_that_hold_something_else(wrench, tmp_path):
     with pytest.raises(ValueError, match="no topic with WrenchStamped messages, only none at all"):
         list(bag_wrenches(tmp_path / "nothing"))
     write_wrenches(tmp_path / "unstamped", {"/wrench": wrench[:3]}, sec=0)
-    times = [time for time, _, _ in bag_wrenches(tmp_path / "unstamped")]
-    assert times == pytest.approx([7.0, 7.001, 7.002])
+    stamps = [message.stamp for message in bag_wrenches(tmp_path / "unstamped")]
+    assert stamps == [7_000_000_000, 7_001_000_000, 7_002_000_000]
 
 
 def test_a_bag_goes_in_and_a_bag_comes_out(map_file, bent, wrench, tmp_path, capsys):
@@ -456,7 +687,7 @@ def test_a_bag_goes_in_and_a_bag_comes_out(map_file, bent, wrench, tmp_path, cap
     stamp, first = found["/contact_point"][3]
     assert stamp == 7_003_000_000
     assert (first.header.stamp.sec, first.header.stamp.nanosec) == (7, 3_000_000)
-    assert first.header.frame_id == "whisker"
+    assert first.header.frame_id == "sensor"
     for record, (_, cloud) in zip(records, found["/contact_candidates"], strict=True):
         table = np.frombuffer(cloud.data.tobytes(), "<f8").reshape(cloud.width, 4)
         np.testing.assert_array_equal(table[:, :3], record["candidates"])
@@ -486,6 +717,9 @@ def test_a_bag_may_hold_the_pose_of_what_carries_the_base(map_file, wrench, tmp_
         ({"source": Path("x"), "udp": "127.0.0.1:0"}, "either a source or --udp"),
         ({"sensor": Path("none.toml")}, r"none\.toml"),
         ({"udp": "127.0.0.1:0", "speed": 1.0}, "add --filter"),
+        ({"every": True}, "only of what comes by --udp"),
+        ({"reconnect": True}, "neither a named pipe nor a device"),
+        ({"source": Path(__file__), "reconnect": True}, "for pipes and devices"),
     ],
 )
 def test_what_cannot_be_is_said(options, message, map_file):

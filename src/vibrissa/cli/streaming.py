@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
-from contextlib import ExitStack, suppress
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack
 from io import TextIOWrapper
 from itertools import islice
 from pathlib import Path
@@ -13,16 +14,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vibrissa.cli.terminal import errors, refuse
+from vibrissa.cli.terminal import Ended, ending_in_order, errors, refuse
 
 if TYPE_CHECKING:
+    import socket
+
     from vibrissa.io.rosbag import ContactBag
     from vibrissa.mapping import ContactMap, Estimator
     from vibrissa.sensing import Sensor
-    from vibrissa.streaming import ContactStream, Poses
+    from vibrissa.streaming import ContactStream, NewestLines, Poses
 
 # Advice is given once after so many samples, and at the end.
 _SOON = 500
+# Seconds between two reports of samples that are dropped.
+_REPORTED = 1.0
 
 
 def stream(
@@ -38,6 +43,21 @@ def stream(
         str | None,
         typer.Option(help="Receive lines as UDP datagrams here instead.", metavar="HOST:PORT"),
     ] = None,
+    every: Annotated[
+        bool,
+        typer.Option(
+            "--every",
+            help="Answer every sample that comes by UDP, however late; by default the newest, and "
+            "those before it that wait are dropped and counted.",
+        ),
+    ] = False,
+    reconnect: Annotated[
+        bool,
+        typer.Option(
+            "--reconnect",
+            help="Wait for a named pipe or serial device that closes to open again.",
+        ),
+    ] = False,
     chart: Annotated[
         Path | None,
         typer.Option("--map", help="Of the whisker; simulated if not given.", metavar="FILE"),
@@ -141,8 +161,9 @@ def stream(
     """Find contacts while signals come in, one line of JSON each.
 
     Lines are CSV with a header, or JSON objects, in SI units; a column time is passed on. A line
-    that cannot be read gives a line with its number and the error. Points are in the whisker's
-    frame, m; with --filter also in the laboratory's (lab_x, ...). Stop with Ctrl-C.
+    that cannot be read gives a line with its number and the error; after a header that cannot be
+    used, rows wait for another one. Points are in the whisker's frame, m; with --filter also in the
+    laboratory's (lab_x, ...). Stop with Ctrl-C or any signal.
     Example: `vibrissa stream --udp 127.0.0.1:5005 --map wire.nc --sensor sensor.toml`
     """
     from vibrissa.cli.recordings import usual_noise
@@ -166,13 +187,18 @@ def stream(
             {"--topic": topic, "--pose-topic": pose_topic},
             "it is of a ROS bag, and the source is none",
         )
+    if udp is None:
+        refuse({"--every": every}, "only of what comes by --udp are samples dropped")
+    if source is None or from_bag:
+        refuse({"--reconnect": reconnect}, "the source is neither a named pipe nor a device")
     poses = _poses(mount)
-    with ExitStack() as opened:
+    with ending_in_order(), ExitStack() as opened:
         writer = None if bag is None else opened.enter_context(_bag(bag, follow))
-        lines = (
+        heard = None if udp is None else _socket(udp, opened)
+        lines: Iterable[str] = (
             _bag_lines(source, topic, pose_topic)
             if source is not None and from_bag
-            else _lines(source, udp, opened)
+            else _lines(source, reconnect, heard)
         )
         contacts = _map(chart, whisker)
         estimator = _estimator(
@@ -185,15 +211,23 @@ def stream(
         )
         running = _stream(estimator, described, from_bag, follow, speed, poses, tare or 0)
         running.warm_up()
-        if udp is not None:
+        losses = None if heard is None else _Losses(heard)
+        if heard is not None and losses is not None:
             errors.print("ready", highlight=False)
-        with suppress(KeyboardInterrupt):  # the usual end
-            _write(running, islice(lines, count), writer)
+            if not every:
+                lines = losses.newest(running)
+        keep = None if writer is None else _keeper(writer, running, described, follow)
+        try:
+            _write(running, islice(lines, count), keep, losses)
+        except Ended as signalled:  # the usual end
+            errors.print(f"stopped: {signalled}", highlight=False)
+        lost = "" if losses is None else losses.told()
     if follow and not running.poses.number:
         errors.print("no pose came: the base was taken to stand still", highlight=False)
     errors.print(
-        f"{running.samples} samples, {running.faults} lines that could not be read",
+        f"{running.samples} samples, {running.faults} lines that could not be read{lost}",
         highlight=False,
+        soft_wrap=True,
     )
     _advise(running)
 
@@ -221,23 +255,69 @@ def _poses(mount: str | None) -> Poses:
     return Poses(rotation_of(numbers[3:]), [1e-3 * x for x in numbers[:3]])
 
 
-def _lines(source: Path | None, udp: str | None, opened: ExitStack) -> Iterator[str]:
-    """Lines as they come; a socket is open before the map is made, so that none are lost."""
-    from vibrissa.io.paths import check_readable
-    from vibrissa.streaming.sources import file_lines, udp_address, udp_lines, udp_socket
+def _socket(udp: str, opened: ExitStack) -> socket.socket:
+    """Listen before the map is made, so that nothing is lost."""
+    from vibrissa.streaming.sources import udp_address, udp_socket
 
-    if udp is not None:
-        heard = opened.enter_context(udp_socket(*udp_address(udp)))
-        host, port = heard.getsockname()[:2]
-        errors.print(f"listening at {host}:{port}", highlight=False)
+    heard = opened.enter_context(udp_socket(*udp_address(udp)))
+    host, port = heard.getsockname()[:2]
+    errors.print(f"listening at {host}:{port}", highlight=False)
+    return heard
+
+
+def _lines(source: Path | None, reconnect: bool, heard: socket.socket | None) -> Iterator[str]:
+    """Lines as they come."""
+    from vibrissa.io.paths import check_readable
+    from vibrissa.streaming.sources import bounded_lines, file_lines, udp_lines
+
+    if heard is not None:
         return udp_lines(heard)
     if source is None or str(source) == "-":
+        refuse({"--reconnect": reconnect}, "standard input does not open again")
         if isinstance(sys.stdin, TextIOWrapper):  # noise on a serial line must not end a stream
             sys.stdin.reconfigure(errors="replace")
-        return iter(sys.stdin.readline, "")
+        return bounded_lines(sys.stdin)
     if source.is_dir() or not source.exists():
         check_readable(source)
-    return file_lines(source)
+    if reconnect and source.is_file():
+        raise ValueError(f"{source} is a file, which ends; --reconnect is for pipes and devices")
+    return file_lines(source, reconnect, lambda said: errors.print(said, highlight=False))
+
+
+class _Losses:
+    """Samples that came by UDP and are not answered, told once a second while there are more."""
+
+    def __init__(self, heard: socket.socket) -> None:
+        self._heard = heard
+        self._lines: NewestLines | None = None
+        self._before, self._next = (0, 0), 0.0
+
+    def newest(self, running: ContactStream) -> NewestLines:
+        """Lines of which only the newest are passed on."""
+        from vibrissa.streaming import NewestLines
+
+        self._lines = NewestLines(self._heard, running.lines.kind)
+        return self._lines
+
+    def report(self) -> None:
+        """Say how many there are so far, if it is time to, and there are more."""
+        if (now := time.monotonic()) < self._next:
+            return
+        self._next = now + _REPORTED
+        if (counts := self._counts()) != self._before:
+            self._before = counts
+            errors.print(f"so far{self.told()[1:]}", highlight=False, soft_wrap=True)
+
+    def told(self) -> str:
+        """All of them, as the end of a sentence; nothing where there are none."""
+        dropped, lost = self._counts()
+        said = f", {dropped} samples dropped because newer ones had come" if dropped else ""
+        return said + (f", {lost} datagrams lost because too many waited" if lost else "")
+
+    def _counts(self) -> tuple[int, int]:
+        from vibrissa.streaming.sources import udp_lost
+
+        return 0 if self._lines is None else self._lines.dropped, udp_lost(self._heard)
 
 
 def _bag_lines(source: Path, topic: str | None, pose_topic: str | None) -> Iterator[str]:
@@ -245,22 +325,21 @@ def _bag_lines(source: Path, topic: str | None, pose_topic: str | None) -> Itera
     import json
     from heapq import merge
 
-    from vibrissa.io.rosbag import bag_poses, bag_wrenches
+    from vibrissa.io.rosbag import BagMessage, bag_poses, bag_wrenches
     from vibrissa.streaming.contacts import COMPONENTS
-    from vibrissa.streaming.lines import POSITION, QUATERNION
+    from vibrissa.streaming.lines import FRAME, POSITION, QUATERNION, RECORDED, STAMP
 
-    wrenches: Iterator[tuple[float, dict[str, float]]] = (
-        (time, dict(zip(COMPONENTS, wrench.tolist(), strict=True)))
-        for time, wrench, _ in bag_wrenches(source, topic)
-    )
-    poses: Iterator[tuple[float, dict[str, float]]] = iter(())
+    def named(messages: Iterator[BagMessage], names: tuple[str, ...]) -> Iterator[dict[str, Any]]:
+        for stamp, recorded, frame, values in messages:
+            said = {STAMP: stamp, RECORDED: recorded, FRAME: frame}
+            yield said | dict(zip(names, values, strict=True))
+
+    poses: Iterator[dict[str, Any]] = iter(())
     if pose_topic is not None:
-        poses = (
-            (time, dict(zip((*POSITION, *QUATERNION), [*place, *turn], strict=True)))
-            for time, place, turn in bag_poses(source, pose_topic)
-        )
-    for time, values in merge(poses, wrenches, key=lambda timed: timed[0]):
-        yield json.dumps({"time": time} | values)
+        poses = named(bag_poses(source, pose_topic), (*POSITION, *QUATERNION))
+    wrenches = named(bag_wrenches(source, topic), COMPONENTS)
+    for message in merge(poses, wrenches, key=lambda one: one[STAMP]):
+        yield json.dumps(message)
 
 
 def _map(chart: Path | None, whisker: Path | None) -> ContactMap:
@@ -331,16 +410,24 @@ def _bag(path: Path, follow: bool) -> ContactBag:
     return ContactBag(path, frame="laboratory" if follow else "whisker")
 
 
-def _write(running: ContactStream, lines: Iterator[str], writer: ContactBag | None) -> None:
+def _write(
+    running: ContactStream,
+    lines: Iterator[str],
+    keep: Callable[[dict[str, Any]], None] | None,
+    losses: _Losses | None,
+) -> None:
     """Print records as they come, each at once; stop quietly when nobody reads any more."""
     from vibrissa.streaming.contacts import as_json
 
     try:
         for record in running.records(lines):
+            # First, so that all that was answered is in the bag, wherever a signal comes.
+            if keep is not None and "error" not in record:
+                keep(record)
             sys.stdout.write(as_json(record) + "\n")
             sys.stdout.flush()
-            if writer is not None and "error" not in record:
-                _put(writer, record)
+            if losses is not None:
+                losses.report()
             if running.samples == _SOON:
                 _advise(running)
     except BrokenPipeError:
@@ -348,12 +435,38 @@ def _write(running: ContactStream, lines: Iterator[str], writer: ContactBag | No
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _put(writer: ContactBag, record: dict[str, Any]) -> None:
+def _keeper(
+    bag: ContactBag, running: ContactStream, sensor: Sensor | None, follow: bool
+) -> Callable[[dict[str, Any]], None]:
+    """What puts records into the bag, as long as it can be written; the stream goes on without."""
     import numpy as np
 
-    followed = "hypotheses" in record
-    points = np.reshape(record.get("hypotheses", record.get("candidates", [])), (-1, 3))
-    likely = record.get("probabilities", [1.0 / len(points)] * len(points) if len(points) else [])
-    names = ("lab_x", "lab_y", "lab_z") if followed else ("x", "y", "z")
-    point = np.array([record[name] for name in names]) if "x" in record else None
-    writer.write(record["time"], point, points, np.array(likely))
+    from vibrissa.streaming.lines import FRAME, RECORDED, STAMP
+
+    # Points are in the whisker's frame, which is the sensor's unless that is mounted otherwise.
+    same = sensor is None or np.array_equal(sensor.frame.to_base(), np.eye(6))
+    names = ("lab_x", "lab_y", "lab_z") if follow else ("x", "y", "z")
+    broken = False
+
+    def keep(record: dict[str, Any]) -> None:
+        nonlocal broken
+        points = np.reshape(record.get("hypotheses", record.get("candidates", [])), (-1, 3))
+        likely = record.get("probabilities", np.full(len(points), 1.0 / max(len(points), 1)))
+        point = np.array([record[name] for name in names]) if "x" in record else None
+        stamp = record.get(STAMP)
+        if stamp is None:
+            stamp = round(record["time"] * 1e9)
+        moved = follow and running.poses.number
+        frame = running.laboratory if moved else record.get(FRAME, "") if same else ""
+        try:
+            if not broken:
+                bag.write(
+                    stamp, point, points, np.array(likely), frame or None, record.get(RECORDED)
+                )
+        except ValueError as fault:
+            errors.print(f"not in the bag: {fault}", highlight=False, soft_wrap=True)
+        except OSError as fault:
+            broken = True
+            errors.print(f"{fault}; the stream goes on without it", highlight=False, soft_wrap=True)
+
+    return keep

@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -82,6 +82,44 @@ def stoppable() -> Iterator[Callable[[], bool]]:
     finally:
         if before is not None:
             signal.signal(signal.SIGINT, before)
+
+
+# What does not end a process by itself, cannot be taken, or is a fault of the process.
+_LEFT_ALONE = (
+    *("SIGKILL", "SIGSTOP", "SIGCHLD", "SIGURG", "SIGWINCH", "SIGCONT", "SIGTSTP", "SIGTTIN"),
+    *("SIGTTOU", "SIGINFO", "SIGSEGV", "SIGBUS", "SIGFPE", "SIGILL", "SIGTRAP", "SIGSYS"),
+)
+
+
+class Ended(KeyboardInterrupt):
+    """A signal asked the process to end."""
+
+
+@contextmanager
+def ending_in_order() -> Iterator[None]:
+    """Raise `Ended` at a signal that would end the process; while that is done others wait.
+
+    Signals that are ignored (``nohup``) or handled otherwise are left as they are.
+    """
+    taken: dict[int, Any] = {}
+
+    def end(number: int, frame: object) -> None:
+        for each in taken:
+            signal.signal(each, signal.SIG_IGN)
+        raise Ended(signal.strsignal(number) or f"signal {number}")
+
+    # Elsewhere than in the main thread no signal can be taken.
+    if threading.current_thread() is threading.main_thread():
+        ending = (signal.SIG_DFL, signal.default_int_handler)
+        left = {getattr(signal, name, None) for name in _LEFT_ALONE}
+        for number in signal.valid_signals() - left:
+            if signal.getsignal(number) in ending:
+                taken[number] = signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number, before in taken.items():
+            signal.signal(number, before)
 
 
 def shown(name: str, value: float, digits: int = 4) -> str:

@@ -2,16 +2,25 @@
 
 `geometry_msgs/WrenchStamped` is read, and `PoseStamped` or `TransformStamped` for the pose of the
 base, from ROS 1 bags as well; `geometry_msgs/PointStamped` is written for contact points, and
-`sensor_msgs/PointCloud2` for all candidates of a sample.
+`sensor_msgs/PointCloud2` for all candidates of a sample. Time stamps are whole nanoseconds
+throughout: seconds since 1970 as a 64-bit float are rounded to a quarter of a microsecond.
+
+The writer of rosbags leaves a bag that can be read only when it is closed. A stream may be stopped
+by anything, so a bag is written here as the format prescribes (SQLite, schema 4, and
+``metadata.yaml`` of version 9), and both are brought up to date every half second.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import json
+import sqlite3
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, suppress
 from os import PathLike
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +35,11 @@ _TRANSFORM = "geometry_msgs/msg/TransformStamped"
 _SUFFIXES = {".bag", ".db3", ".mcap"}
 # Of sensor_msgs/PointField: 64-bit floats.
 _FLOAT64 = 8
+_SECOND = 1_000_000_000
+# Seconds of a ROS time stamp are 32-bit numbers.
+_LARGEST_SECOND = 2**31 - 1
+# Seconds between two moments at which a bag is whole.
+_KEPT_EVERY = 0.5
 
 
 def is_bag(path: str | PathLike[str]) -> bool:
@@ -45,9 +59,28 @@ def is_bag(path: str | PathLike[str]) -> bool:
     return (path / "metadata.yaml").is_file() or (path.is_file() and path.suffix in _SUFFIXES)
 
 
-def bag_wrenches(
-    path: str | PathLike[str], topic: str | None = None
-) -> Iterator[tuple[float, Array, str]]:
+class BagMessage(NamedTuple):
+    """One message of a bag.
+
+    Parameters
+    ----------
+    stamp : int
+        Time stamp of the message's header, ns; where that is zero, when it was recorded.
+    recorded : int
+        Time at which it was recorded, ns.
+    frame : str
+        Name of the frame of its header.
+    values : list of float
+        Its numbers.
+    """
+
+    stamp: int
+    recorded: int
+    frame: str
+    values: list[float]
+
+
+def bag_wrenches(path: str | PathLike[str], topic: str | None = None) -> Iterator[BagMessage]:
     """Read wrenches from a bag, in the order of recording.
 
     Parameters
@@ -59,12 +92,8 @@ def bag_wrenches(
 
     Yields
     ------
-    time : float
-        Of the message's header, s; where that is zero, when it was recorded.
-    wrench : array (6,)
-        Force, N, and torque, N·m.
-    frame : str
-        Name of the frame they are in.
+    BagMessage
+        With six values: force, N, and torque, N·m.
 
     Raises
     ------
@@ -73,16 +102,17 @@ def bag_wrenches(
     ModuleNotFoundError
         If rosbags is not installed.
     ValueError
-        If it is no bag, or the topic is not there or not the only one.
+        If it is no bag or damaged, or the topic is not there or not the only one.
     """
-    for time, message in _messages(path, topic, (_WRENCH,), "WrenchStamped"):
+
+    def values(message: Any) -> list[float]:
         f, t = message.wrench.force, message.wrench.torque
-        yield time, np.array([f.x, f.y, f.z, t.x, t.y, t.z]), message.header.frame_id
+        return [f.x, f.y, f.z, t.x, t.y, t.z]
+
+    return _messages(path, topic, (_WRENCH,), "WrenchStamped", values)
 
 
-def bag_poses(
-    path: str | PathLike[str], topic: str | None = None
-) -> Iterator[tuple[float, list[float], list[float]]]:
+def bag_poses(path: str | PathLike[str], topic: str | None = None) -> Iterator[BagMessage]:
     """Read poses from a bag, in the order of recording.
 
     Parameters
@@ -94,12 +124,9 @@ def bag_poses(
 
     Yields
     ------
-    time : float
-        Of the message's header, s; where that is zero, when it was recorded.
-    position : list of 3 floats
-        Where it is in its parent's frame, m.
-    quaternion : list of 4 floats
-        W, x, y, z; from its own to the parent's frame.
+    BagMessage
+        With seven values: position in its parent's frame, m, and the quaternion w, x, y, z from
+        its own to the parent's frame. The frame is the parent's.
 
     Raises
     ------
@@ -108,30 +135,36 @@ def bag_poses(
     ModuleNotFoundError
         If rosbags is not installed.
     ValueError
-        If it is no bag, or the topic is not there or not the only one.
+        If it is no bag or damaged, or the topic is not there or not the only one.
     """
-    kinds = (_POSE, _TRANSFORM)
-    for time, message in _messages(path, topic, kinds, "PoseStamped or TransformStamped"):
+
+    def values(message: Any) -> list[float]:
         if hasattr(message, "pose"):
             p, q = message.pose.position, message.pose.orientation
         else:
             p, q = message.transform.translation, message.transform.rotation
-        yield time, [p.x, p.y, p.z], [q.w, q.x, q.y, q.z]
+        return [p.x, p.y, p.z, q.w, q.x, q.y, q.z]
+
+    kinds = (_POSE, _TRANSFORM)
+    return _messages(path, topic, kinds, "PoseStamped or TransformStamped", values)
 
 
 def _messages(
-    path: str | PathLike[str], topic: str | None, kinds: tuple[str, ...], named: str
-) -> Iterator[tuple[float, Any]]:
-    """Times and messages of some kinds on one topic."""
+    path: str | PathLike[str],
+    topic: str | None,
+    kinds: tuple[str, ...],
+    named: str,
+    values: Callable[[Any], list[float]],
+) -> Iterator[BagMessage]:
+    """Messages of some kinds on one topic."""
     rosbags = _library()
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"there is no bag {path}")
-    try:
+    with _readable(path):
+        _finish(path)
         reader = rosbags.reader([path], default_typestore=rosbags.types)
         reader.open()
-    except rosbags.fault as error:
-        raise ValueError(f"{path} is no bag that can be read: {error}") from error
     try:
         fitting = [c for c in reader.connections if c.msgtype in kinds]
         there = sorted({c.topic for c in fitting})
@@ -139,13 +172,44 @@ def _messages(
             topic = there[0]
         if topic not in there:
             raise ValueError(f"{path}: {_which_topic(reader.connections, there, topic, named)}")
-        chosen = [c for c in fitting if c.topic == topic]
-        for connection, recorded, raw in reader.messages(connections=chosen):
-            message: Any = reader.deserialize(raw, connection.msgtype)
-            stamp = message.header.stamp
-            yield stamp.sec + 1e-9 * stamp.nanosec or 1e-9 * recorded, message
+        messages = iter(reader.messages(connections=[c for c in fitting if c.topic == topic]))
+        while True:
+            with _readable(path):
+                following = next(messages, None)
+                if following is None:
+                    return
+                connection, recorded, raw = following
+                message: Any = reader.deserialize(raw, connection.msgtype)
+                stamp = _SECOND * message.header.stamp.sec + message.header.stamp.nanosec
+                read = BagMessage(
+                    stamp or recorded, recorded, message.header.frame_id, values(message)
+                )
+            yield read
     finally:
-        reader.close()
+        with suppress(Exception):  # of a bag that is damaged, not all has been opened
+            reader.close()
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """Turn whatever the library stumbles over in a damaged bag into one message."""
+    try:
+        yield
+    except Exception as error:
+        reason = f"{error}" or type(error).__name__
+        raise ValueError(f"{path} is no bag that can be read: {reason[:300]}") from error
+
+
+def _finish(path: Path) -> None:
+    """Let SQLite take back what a process that was killed had half written.
+
+    The library opens databases as files that do not change, and would not do so.
+    """
+    files = [path] if path.is_file() else path.glob("*.db3")
+    for file in files:
+        if Path(f"{file}-journal").exists():
+            with closing(sqlite3.connect(file)) as database:
+                database.execute("SELECT count(*) FROM sqlite_master").fetchone()
 
 
 def _which_topic(connections: Any, there: list[str], topic: str | None, named: str) -> str:
@@ -157,15 +221,41 @@ def _which_topic(connections: Any, there: list[str], topic: str | None, named: s
     return f"it has no topic with {named} messages, only {', '.join(others) or 'none at all'}"
 
 
+_SCHEMA = """
+CREATE TABLE schema(schema_version INTEGER PRIMARY KEY, ros_distro TEXT NOT NULL);
+CREATE TABLE metadata(
+    id INTEGER PRIMARY KEY, metadata_version INTEGER NOT NULL, metadata TEXT NOT NULL
+);
+CREATE TABLE topics(
+    id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL,
+    serialization_format TEXT NOT NULL, offered_qos_profiles TEXT NOT NULL,
+    type_description_hash TEXT NOT NULL
+);
+CREATE TABLE message_definitions(
+    id INTEGER PRIMARY KEY, topic_type TEXT NOT NULL, encoding TEXT NOT NULL,
+    encoded_message_definition TEXT NOT NULL, type_description_hash TEXT NOT NULL
+);
+CREATE TABLE messages(
+    id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL, timestamp INTEGER NOT NULL,
+    data BLOB NOT NULL
+);
+CREATE INDEX timestamp_idx ON messages (timestamp ASC);
+INSERT INTO schema(schema_version, ros_distro) VALUES (4, 'rosbags');
+"""
+_METADATA_VERSION = 9
+
+
 class ContactBag:
     """Writes contact points and clouds of candidates into a ROS 2 bag; a context manager.
+
+    The bag is whole every half second, however the process ends; a power cut may spoil it.
 
     Parameters
     ----------
     path : str or path
         Of the bag, a folder that must not exist.
     frame : str
-        Name of the frame that points are in.
+        Name of the frame that points are in, where a sample does not say another.
     point_topic, cloud_topic : str
         Where to write them.
 
@@ -184,24 +274,40 @@ class ContactBag:
         point_topic: str = "/contact_point",
         cloud_topic: str = "/contact_candidates",
     ) -> None:
-        self._rosbags = _library()
-        path = Path(path)
-        if path.exists():
+        self._types = _library().types
+        self._path = Path(path)
+        if self._path.exists():
             raise FileExistsError(f"{path} exists; a bag is written to a new folder")
-        if not path.parent.is_dir():
-            raise FileNotFoundError(f"there is no folder {path.parent}")
+        if not self._path.parent.is_dir():
+            raise FileNotFoundError(f"there is no folder {self._path.parent}")
         self.frame = frame
-        self._writer = self._rosbags.writer(path, version=self._rosbags.version)
         self._topics = {_POINT: point_topic, _CLOUD: cloud_topic}
-        self._connections: dict[str, Any] = {}
+        self._numbers = {kind: k for k, kind in enumerate(self._topics, start=1)}
+        self._counts = dict.fromkeys(self._numbers.values(), 0)
+        self._begin, self._end, self._counted = 2**63 - 1, 0, 0
+        self._lock, self._closed = threading.Lock(), threading.Event()
+        self._fault: OSError | None = None
 
     def __enter__(self) -> ContactBag:
         """Open the bag."""
-        self._writer.open()
-        for kind, topic in self._topics.items():
-            self._connections[kind] = self._writer.add_connection(
-                topic, kind, typestore=self._rosbags.types
-            )
+        self._path.mkdir()
+        file = self._path / f"{self._path.name}.db3"
+        self._database = sqlite3.connect(file, check_same_thread=False)
+        # Waiting for the disk would hold up samples. What is not kept yet stays in memory, so that
+        # between two moments the file is as readers that know no journal expect it.
+        self._database.executescript(
+            f"PRAGMA synchronous = OFF; PRAGMA cache_spill = OFF; {_SCHEMA}"
+        )
+        for kind, number in self._numbers.items():
+            definition, _ = self._types.generate_msgdef(kind, ros_version=2)
+            digest = self._types.hash_rihs01(kind)
+            topic = number, self._topics[kind], kind, "cdr", "[]", digest
+            self._database.execute("INSERT INTO topics VALUES (?, ?, ?, ?, ?, ?)", topic)
+            row = number, kind, "ros2msg", definition, digest
+            self._database.execute("INSERT INTO message_definitions VALUES (?, ?, ?, ?, ?)", row)
+        self._keep()
+        self._keeper = threading.Thread(target=self._keep_on, daemon=True)
+        self._keeper.start()
         return self
 
     def __exit__(
@@ -211,36 +317,78 @@ class ContactBag:
         trace: TracebackType | None,
     ) -> None:
         """Close it."""
-        self._writer.close()
+        self._closed.set()
+        self._keeper.join()
+        with closing(self._database):
+            if self._fault is None:
+                self._keep()
 
-    def write(self, time: float, point: Array | None, candidates: Array, values: Array) -> None:
+    def write(
+        self,
+        stamp: int,
+        point: Array | None,
+        candidates: Array,
+        values: Array,
+        frame: str | None = None,
+        recorded: int | None = None,
+    ) -> None:
         """Write one sample.
 
         Parameters
         ----------
-        time : float
-            Of it, s.
+        stamp : int
+            Time stamp of it, ns.
         point : (3,) array or None
             The contact, m; None for none.
         candidates : (k, 3) array
             Points of the cloud, m.
         values : (k,) array
             Their probabilities, field ``probability`` of the cloud.
+        frame : str, optional
+            Name of the frame that its points are in; by default the bag's.
+        recorded : int, optional
+            Time at which it is recorded, ns; by default its time stamp.
+
+        Raises
+        ------
+        OSError
+            If the bag cannot be written any more; all up to half a second ago is in it.
+        ValueError
+            If the time stamp is none of ROS.
         """
-        types = self._rosbags.types.types
-        sec, nanosec = divmod(round(time * 1e9), 1_000_000_000)
-        stamp = types["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec)
-        header = types["std_msgs/msg/Header"](stamp=stamp, frame_id=self.frame)
+        if self._fault is not None:
+            raise self._fault
+        types = self._types.types
+        sec, nanosec = divmod(stamp, _SECOND)
+        if not -_LARGEST_SECOND <= sec <= _LARGEST_SECOND:
+            raise ValueError(f"a ROS time stamp holds 32 bits of seconds; {sec} s are too many")
+        ros_time = types["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec)
+        header = types["std_msgs/msg/Header"](
+            stamp=ros_time, frame_id=self.frame if frame is None else frame
+        )
+        at = stamp if recorded is None else recorded
+        messages = {_CLOUD: self._cloud(header, candidates, values)}
         if point is not None:
             place = types["geometry_msgs/msg/Point"](*(float(x) for x in point))
-            self._put(_POINT, sec, nanosec, types[_POINT](header=header, point=place))
+            messages = {_POINT: types[_POINT](header=header, point=place), **messages}
+        rows = [
+            (self._numbers[kind], at, bytes(self._types.serialize_cdr(message, kind)))
+            for kind, message in messages.items()
+        ]
+        with self._lock, _kept(self._path):
+            self._database.executemany(
+                "INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)", rows
+            )
+
+    def _cloud(self, header: Any, candidates: Array, values: Array) -> Any:
+        types = self._types.types
         table = np.column_stack([candidates, values]).astype("<f8")
         names = ("x", "y", "z", "probability")
         fields = [
             types["sensor_msgs/msg/PointField"](name, 8 * i, _FLOAT64, 1)
             for i, name in enumerate(names)
         ]
-        cloud = types[_CLOUD](
+        return types[_CLOUD](
             header=header,
             height=1,
             width=len(table),
@@ -251,23 +399,92 @@ class ContactBag:
             data=np.frombuffer(table.tobytes(), dtype=np.uint8),
             is_dense=True,
         )
-        self._put(_CLOUD, sec, nanosec, cloud)
 
-    def _put(self, kind: str, sec: int, nanosec: int, message: Any) -> None:
-        raw = self._rosbags.types.serialize_cdr(message, kind)
-        self._writer.write(self._connections[kind], 1_000_000_000 * sec + nanosec, raw)
+    def _keep_on(self) -> None:
+        """Keep the bag whole, also while no samples come."""
+        while not self._closed.wait(_KEPT_EVERY):
+            try:
+                self._keep()
+            except OSError as fault:
+                self._fault = fault
+                return
+
+    def _keep(self) -> None:
+        """Write what came since the last time, and what the metadata say of it."""
+        with self._lock, _kept(self._path):
+            # Counted here and not by `write`, which an exception may leave at any line.
+            new = self._database.execute(
+                "SELECT topic_id, count(*), min(timestamp), max(timestamp), max(id) FROM messages "
+                "WHERE id > ? GROUP BY topic_id",
+                [self._counted],
+            ).fetchall()
+            if self._counted and not new:
+                return
+            for number, count, begin, end, last in new:
+                self._counts[number] += count
+                self._begin, self._end = min(self._begin, begin), max(self._end, end)
+                self._counted = max(self._counted, last)
+            # JSON is YAML.
+            text = json.dumps({"rosbag2_bagfile_information": self._metadata()}, indent=1)
+            self._database.execute(
+                "INSERT OR REPLACE INTO metadata VALUES (1, ?, ?)", [_METADATA_VERSION, text]
+            )
+            self._database.commit()
+            part = self._path / "metadata.yaml.part"
+            part.write_text(text, encoding="utf-8")
+            part.replace(self._path / "metadata.yaml")
+
+    def _metadata(self) -> dict[str, Any]:
+        file = f"{self._path.name}.db3"
+        spans = {
+            "starting_time": {"nanoseconds_since_epoch": self._begin},
+            "duration": {"nanoseconds": max(self._end - self._begin, 0)},
+            "message_count": sum(self._counts.values()),
+        }
+        topics = [
+            {
+                "topic_metadata": {
+                    "name": self._topics[kind],
+                    "type": kind,
+                    "serialization_format": "cdr",
+                    "offered_qos_profiles": [],
+                    "type_description_hash": self._types.hash_rihs01(kind),
+                },
+                "message_count": self._counts[number],
+            }
+            for kind, number in self._numbers.items()
+        ]
+        return {
+            "version": _METADATA_VERSION,
+            "storage_identifier": "sqlite3",
+            "relative_file_paths": [file],
+            **spans,
+            "topics_with_message_count": topics,
+            "compression_format": "",
+            "compression_mode": "",
+            "files": [{"path": file, **spans}],
+            "custom_data": None,
+            "ros_distro": "rosbags",
+        }
+
+
+@contextmanager
+def _kept(path: Path) -> Iterator[None]:
+    """Say of which bag it is what the database says."""
+    try:
+        yield
+    except (sqlite3.Error, OSError) as fault:
+        raise OSError(f"the bag {path} cannot be written: {fault}") from fault
 
 
 class _Rosbags:
     """The parts of the library that are used."""
 
     def __init__(self) -> None:
-        from rosbags.highlevel import AnyReader, AnyReaderError
-        from rosbags.rosbag2 import Writer
+        from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
 
-        self.reader, self.writer, self.fault = AnyReader, Writer, AnyReaderError
-        self.version = Writer.VERSION_LATEST
+        self.reader = AnyReader
         self.types: Any = get_typestore(Stores.ROS2_HUMBLE)
 
 

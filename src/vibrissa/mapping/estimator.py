@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from vibrissa.mapping.contact_map import ContactMap
 
 _UNKNOWNS = 3
+# What is larger is brought to this: no less absurd, in any unit, and its square is still a number.
+_LARGEST = 1e100
 
 
 class Estimator:
@@ -233,6 +235,8 @@ class Estimator:
             ) from error
         if values.shape != (self._width,):
             raise ValueError(f"one measurement has {self._width} signals; got shape {values.shape}")
+        if not max(map(abs, values.tolist())) < _LARGEST:
+            values = np.where(np.isinf(values), np.nan, np.clip(values, -_LARGEST, _LARGEST))
         if self._sensor is not None:
             values = self._sensor.felt(values, rotation, gravity)
             if self._components is not None:

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 # Signals this many times larger than any on the map are in another unit.
 _FAR_BEYOND = 10.0
+# What is nearest to signals farther away is the same, and squares of distances are still numbers.
+_FARTHEST = 1e100
 
 
 class Bounds(NamedTuple):
@@ -238,7 +240,7 @@ def _on_circle(values: Array, turned: AnyArray, size: Array) -> Array:
     parts = []
     for k, turns in enumerate(turned.tolist()):
         v = values[:, k]
-        parts += [np.cos(v), np.sin(v)] if turns else [v / size[k]]
+        parts += [np.cos(v), np.sin(v)] if turns else [np.clip(v / size[k], -_FARTHEST, _FARTHEST)]
     return np.stack(parts, axis=1)
 
 

@@ -17,7 +17,7 @@ from vibrissa.mapping.contact_map import spherical
 from vibrissa.rod import PointForce, deflect
 from vibrissa.signals import SIGNALS
 from vibrissa.signals.base import signals_of
-from vibrissa.streaming.lines import Lines, Sample
+from vibrissa.streaming.lines import FRAME, Lines, Sample
 from vibrissa.streaming.poses import Poses
 
 Array = NDArray[np.float64]
@@ -26,6 +26,8 @@ Array = NDArray[np.float64]
 _ANEW = 1.0
 # Samples farther apart than this seem to have times in a smaller unit, s.
 _SLOW = 100.0
+# Characters of what is said of a line that cannot be read; it may quote the line.
+_SAID = 400
 
 COMPONENTS = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 """What signals are computed from, where a stream carries these."""
@@ -59,6 +61,8 @@ class ContactStream:
         How often each status came.
     poses : Poses
         Of the base.
+    laboratory : str
+        Name of the frame that poses are in, where they say it; empty where they do not.
     """
 
     def __init__(
@@ -80,6 +84,7 @@ class ContactStream:
         self.statuses: Counter[str] = Counter()
         self._headers = 0
         self.poses = poses or Poses()
+        self.laboratory = ""
         self.slow = 0
         self._tare = tare
         self._free: list[Array] = []
@@ -96,8 +101,8 @@ class ContactStream:
         Yields
         ------
         dict
-            Ready for JSON: ``time``, ``status`` and what is known of the contact; or ``line`` and
-            ``error``.
+            Ready for JSON: ``time``, ``status`` and what is known of the contact, with the line's
+            ``stamp_ns``, ``recorded_ns`` and ``frame_id`` as they are; or ``line`` and ``error``.
         """
         for line in lines:
             try:
@@ -110,7 +115,10 @@ class ContactStream:
                 record = self.record(sample)
             except ValueError as fault:
                 self.faults += 1
-                yield {"line": self.lines.number, "error": str(fault)}
+                said = str(fault)
+                if len(said) > _SAID:
+                    said = f"{said[:_SAID]} …"
+                yield {"line": self.lines.number, "error": said}
                 continue
             self.samples += 1
             self.statuses[record["status"]] += 1
@@ -173,24 +181,24 @@ class ContactStream:
                 "the sensor carries a mass, so the base's rotation is needed: base_qw, base_qx, "
                 "base_qy and base_qz in the line, or a pose before it"
             )
+        known = {"time": time, **sample.passed}
         if len(self._free) < self._tare:
-            return {"time": time, "status": self._tared(sample.values, rotation)}
+            return known | {"status": self._tared(sample.values, rotation)}
         values = sample.values - self._offset
         if self._which and sample.names != self._estimator.announced:
             wrench = np.zeros(6)
             wrench[[COMPONENTS.index(name) for name in sample.names]] = values
             values = signals_of(wrench[:3], wrench[3:])[self._which]
         if self._follow is None:
-            found = self._estimator(values, rotation)
-            return {"time": time} | located_record(found)
-        known = self._follow(time, values, rotation, position)
-        return {"time": time} | followed_record(known, rotation)
+            return known | located_record(self._estimator(values, rotation))
+        return known | followed_record(self._follow(time, values, rotation, position), rotation)
 
     def _put(self, sample: Sample) -> None:
         """Remember a pose that came alone."""
         assert sample.time is not None
         assert sample.rotation is not None
         assert sample.position is not None
+        self.laboratory = sample.passed.get(FRAME, self.laboratory)
         self.poses.put(sample.time, sample.rotation, sample.position)
 
     def _pose(self, sample: Sample, time: float) -> tuple[Array | None, Array | None]:

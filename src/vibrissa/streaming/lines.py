@@ -4,7 +4,11 @@ Both carry numbers by name, in SI units; signals of a table may be in others if 
 (:mod:`vibrissa.io.columns`), and its cells may be parted by semicolons, tabs or blanks. The pose of
 the base may ride along: ``base_x``, ``base_y`` and ``base_z`` (m, laboratory), and a unit
 quaternion ``base_qw``, ``base_qx``, ``base_qy``, ``base_qz`` that turns the whisker's into the
-laboratory frame. A JSON object may hold a pose and its time alone.
+laboratory frame. A JSON object may hold a pose and its time alone. What ROS says of a message is
+passed on as it is: ``stamp_ns`` and ``recorded_ns`` (whole numbers) and ``frame_id``.
+
+Rows mean what the last header says. So after a header that is refused no row is read until there is
+another one.
 """
 
 from __future__ import annotations
@@ -12,13 +16,15 @@ from __future__ import annotations
 import csv
 import json
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from enum import Enum, auto
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.io.columns import signal_columns
+from vibrissa.io.columns import signal_column, signal_columns
 from vibrissa.io.table import cells_of, delimiter_of, is_number, number, with_point
 from vibrissa.signals import SIGNALS
 
@@ -30,12 +36,34 @@ POSITION = ("base_x", "base_y", "base_z")
 QUATERNION = ("base_qw", "base_qx", "base_qy", "base_qz")
 """Columns with its orientation."""
 
+STAMP = "stamp_ns"
+"""Column with the time stamp of ROS, ns."""
+
+RECORDED = "recorded_ns"
+"""Column with the time at which ROS recorded it, ns."""
+
+FRAME = "frame_id"
+"""Column with the name of the frame that ROS gives it."""
+
+LONGEST = 65536
+"""Characters that a line may have; a datagram holds no more."""
+
 # What a header may call otherwise, or give in other units.
 _SIGNALS = ("time", "Fx", "Fy", "Fz", "Mx", "My", "Mz", *SIGNALS)
 # A quaternion that was rounded is no longer of unit length by this much.
 _UNIT = 0.01
 # Seconds since any epoch are fewer; what is more is in a smaller unit.
 _LATEST = 1e11
+# Characters that a number in a table may begin with.
+_DIGITS = frozenset("0123456789+-.")
+
+
+class LineKind(Enum):
+    """What a line is, as far as can be told at a glance."""
+
+    SAMPLE = auto()
+    POSE = auto()
+    OTHER = auto()
 
 
 class Sample(NamedTuple):
@@ -55,6 +83,9 @@ class Sample(NamedTuple):
         From the whisker's to the laboratory frame; NaN where the line leaves it empty.
     position : (3,) array or None
         Of the base in the laboratory, m; NaN where the line leaves it empty.
+    passed : mapping
+        What is passed on as it is: ``stamp_ns``, ``recorded_ns`` and ``frame_id``, where the line
+        has them.
     """
 
     line: int
@@ -63,6 +94,7 @@ class Sample(NamedTuple):
     values: Array
     rotation: Array | None
     position: Array | None
+    passed: Mapping[str, Any] = MappingProxyType({})
 
 
 class Lines:
@@ -80,7 +112,7 @@ class Lines:
     number : int
         Lines so far.
     headers : int
-        Headers so far: another one comes from a sender that has begun anew.
+        Headers so far that were taken: another one comes from a sender that has begun anew.
     """
 
     def __init__(self, *names: tuple[str, ...], raw: bool = False) -> None:
@@ -89,6 +121,7 @@ class Lines:
         self._header: list[str] | None = None
         self._delimiter = ","
         self._factors: dict[str, float] = {}
+        self._refused = 0
 
     def __call__(self, line: str) -> Sample | None:
         """Read one line.
@@ -109,11 +142,33 @@ class Lines:
             If it is neither, or lacks a value; what is wrong with it.
         """
         self.number += 1
+        if len(line) > LONGEST:
+            raise ValueError(f"a line of more than {LONGEST} characters")
         text = line.strip().lstrip("\ufeff")
         if not text or text.startswith("#"):
             return None
         known = self._object(text) if text.startswith("{") else self._row(text)
         return None if known is None else self._sample(known)
+
+    def kind(self, line: str) -> LineKind:
+        """Tell what a line is without taking it apart.
+
+        Parameters
+        ----------
+        line : str
+            With or without its end.
+
+        Returns
+        -------
+        LineKind
+            A sample, if there is nothing else in it that later lines rely on.
+        """
+        text = line.lstrip()
+        if not text.startswith("{"):
+            return LineKind.SAMPLE if text[:1] in _DIGITS else LineKind.OTHER
+        if any(f'"{name}"' in text for names in self.names for name in names):
+            return LineKind.SAMPLE
+        return LineKind.POSE if f'"{QUATERNION[0]}"' in text else LineKind.OTHER
 
     def _chosen(self, what: str, there: list[str]) -> tuple[str, ...]:
         for names in self.names:
@@ -136,15 +191,13 @@ class Lines:
             cells = cells_of(text, delimiter_of(text) if self._header is None else self._delimiter)
         except csv.Error as error:
             raise ValueError(f"no CSV: {error}") from None
-        if self._header is None or not is_number(cells[0]):
-            names, factors = self._named(cells)
-            if self._header is None:
-                self._chosen("the header", names)
-            if self._header is None or any(set(choice) <= set(names) for choice in self.names):
-                self._header, self._factors = names, factors
-                self._delimiter = delimiter_of(text)
-                self.headers += 1
-                return None
+        # A first cell that is empty is an index without a name, or a number that is missing.
+        named = self._header is None if cells[0] == "" else not is_number(cells[0])
+        if named and self._heads(text):
+            return None
+        if self._header is None:
+            refused = f": that of line {self._refused} was refused" if self._refused else ""
+            raise ValueError(f"a row, and no header says what its columns are{refused}")
         if len(cells) > len(self._header) and not any(cells[len(self._header) :]):
             cells = cells[: len(self._header)]
         if len(cells) != len(self._header):
@@ -155,6 +208,36 @@ class Lines:
         for name, factor in self._factors.items():
             known[name] = factor * _number(name, known[name])
         return known
+
+    def _heads(self, text: str) -> bool:
+        """Take a line as the header if it is one.
+
+        A ValueError says that it is one, but cannot be used; rows are then not read.
+        """
+        delimiter = delimiter_of(text)
+        cells = cells_of(text, delimiter)
+        names, factors = self._named(cells)
+        fits = any(set(choice) <= set(names) for choice in self.names)
+        if not fits and self._header is not None and not self._like_header(cells):
+            return False
+        self._header, self._refused = None, self.number
+        lacks = "the header"
+        if self.raw:
+            lacks = "the header (channels are called as the sensor's are, without units)"
+        self._chosen(lacks, names)
+        self._header, self._factors, self._delimiter = names, factors, delimiter
+        self._refused = 0
+        self.headers += 1
+        return True
+
+    def _like_header(self, cells: list[str]) -> bool:
+        """Whether a line that cannot be used as a header is one, and not noise on a serial line."""
+        if len(cells) < 2 or not all(cell[:1].isalpha() and not is_number(cell) for cell in cells):
+            return False
+        wanted = {"time", *POSITION, *QUATERNION, *(name for names in self.names for name in names)}
+        return len(cells) == len(self._header or ()) or any(
+            cell in wanted or signal_column(cell)[0] for cell in cells
+        )
 
     def _named(self, cells: list[str]) -> tuple[list[str], dict[str, float]]:
         """Names of columns as they are used here, and what makes their numbers SI."""
@@ -170,11 +253,15 @@ class Lines:
         return names, factors
 
     def _sample(self, known: dict[str, object]) -> Sample:
-        alone = {"time", *POSITION, *QUATERNION} <= set(known) and not any(
+        timed = "time" in known or STAMP in known
+        alone = (timed and {*POSITION, *QUATERNION} <= set(known)) and not any(
             name in known for names in self.names for name in names
         )
         names = () if alone else self._chosen("it", list(known))
-        time = _number("time", known["time"]) if "time" in known else None
+        passed = _passed(known)
+        time = passed[STAMP] / 1e9 if STAMP in passed else None
+        if "time" in known:
+            time = _number("time", known["time"])
         if time is not None and not math.isfinite(time):
             raise ValueError(f"time is {known['time']!r}; a finite number is needed, s")
         if time is not None and abs(time) > _LATEST:
@@ -188,7 +275,25 @@ class Lines:
             position = np.array([_number(name, known[name]) for name in POSITION])
         if set(QUATERNION) <= set(known):
             rotation = rotation_of([_number(name, known[name]) for name in QUATERNION])
-        return Sample(self.number, time, names, values, rotation, position)
+        return Sample(self.number, time, names, values, rotation, position, passed)
+
+
+def _passed(known: Mapping[str, object]) -> dict[str, Any]:
+    """What is passed on as it is."""
+    out: dict[str, Any] = {}
+    for name in (STAMP, RECORDED):
+        if known.get(name) in (None, ""):
+            continue
+        try:
+            # Never by way of a float, which has not as many digits.
+            out[name] = int(str(known[name]))
+        except ValueError:
+            out[name] = None
+        if out[name] is None or abs(out[name]) >= 2**63:
+            raise ValueError(f"{name} is {known[name]!r}; a whole number of ns is needed")
+    if isinstance(frame := known.get(FRAME), str):
+        out[FRAME] = frame
+    return out
 
 
 def _number(name: str, value: object) -> float:

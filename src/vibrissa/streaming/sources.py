@@ -1,40 +1,109 @@
-"""Where lines come from: a file, pipe or serial device, or UDP datagrams."""
+"""Where lines come from: a file, pipe or serial device, or UDP datagrams.
+
+A pipe holds its sender up until what it sent is read. Datagrams wait instead, and where more come
+than can be answered, answers fall behind by as many as the system keeps, and what comes then is
+lost. So of those that wait only the newest is answered (`NewestLines`).
+"""
 
 from __future__ import annotations
 
 import socket
-from collections.abc import Iterator
+import stat
+import struct
+import sys
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TextIO
+
+from vibrissa.streaming.lines import LONGEST, LineKind
 
 # A datagram holds no more.
 _LARGEST = 65535
 # Bytes that may wait to be read.
 _WAITING = 1 << 22
+# Seconds after which the newest datagram so far is answered, though others go on coming.
+_DRAINED = 0.02
+# Poses that a motion is continued from.
+_POSES = 2
+# Of Linux: the option of a socket that gives its counters, and which of them counts what is lost.
+_COUNTERS, _LOST = 55, 8
+# Seconds after which a line that has closed is opened anew.
+_BACK = 0.2
 
 
-def file_lines(path: Path) -> Iterator[str]:
+def file_lines(
+    path: Path, reconnect: bool = False, tell: Callable[[str], None] | None = None
+) -> Iterator[str]:
     """Read lines as they come, from a file, named pipe or device, until it ends.
 
     Parameters
     ----------
     path : Path
         A serial device is read as it is set up (``stty``); bytes that are no UTF-8 are replaced.
+    reconnect : bool
+        Whether a named pipe or device that closes is waited for and opened anew, without end. A
+        line that it was in the middle of is left out.
+    tell : callable, optional
+        Called with a sentence when it closes and when it is open again.
 
     Yields
     ------
     str
-        A line.
+        A line; of one that is too long, the beginning.
 
     Raises
     ------
     FileNotFoundError
         If there is no such file.
+    ValueError
+        If a file is to be opened anew that is neither a pipe nor a device.
     """
     if not path.exists():
         raise FileNotFoundError(f"there is no file {path}")
-    with path.open("rb") as file:
-        for line in file:
-            yield line.decode("utf-8", errors="replace")
+    if not reconnect:
+        with path.open(encoding="utf-8", errors="replace") as file:
+            yield from bounded_lines(file)
+        return
+    if stat.S_ISREG(path.stat().st_mode):
+        raise ValueError(f"{path} is a file, which ends; a named pipe or device opens anew")
+    said = tell or (lambda sentence: None)
+    closed = False
+    while True:
+        reason = ""
+        try:
+            with path.open(encoding="utf-8", errors="replace") as file:
+                for line in bounded_lines(file):
+                    if closed:
+                        said(f"{path} is open again")
+                        closed = False
+                    if line.endswith("\n") or len(line) > LONGEST:
+                        yield line
+        except OSError as fault:  # a device that was unplugged
+            reason = f" ({fault.strerror})"
+        if not closed:
+            said(f"{path} closed{reason}; waiting until it opens again")
+        closed = True
+        time.sleep(_BACK)
+
+
+def bounded_lines(file: TextIO) -> Iterator[str]:
+    """Read lines, each at once, of which none fills the memory.
+
+    Parameters
+    ----------
+    file : text file
+        Open for reading.
+
+    Yields
+    ------
+    str
+        A line with its end; of one that is longer than `LONGEST`, one character more than that.
+    """
+    while line := file.readline(LONGEST + 1):
+        yield line
+        while len(line) > LONGEST and not line.endswith("\n"):
+            line = file.readline(LONGEST + 1)
 
 
 def udp_address(text: str) -> tuple[str, int]:
@@ -108,5 +177,86 @@ def udp_lines(opened: socket.socket) -> Iterator[str]:
         A line.
     """
     while True:
-        data = opened.recv(_LARGEST)
-        yield from data.decode("utf-8", errors="replace").splitlines()
+        yield from _text(opened.recv(_LARGEST))
+
+
+def udp_lost(opened: socket.socket) -> int:
+    """Count datagrams that the system threw away because too many waited.
+
+    Parameters
+    ----------
+    opened : socket
+        Of `udp_socket`.
+
+    Returns
+    -------
+    int
+        Since it was opened; 0 where the system does not count them (other than Linux).
+    """
+    if sys.platform != "linux":
+        return 0
+    try:
+        counters = opened.getsockopt(socket.SOL_SOCKET, _COUNTERS, 4 * (_LOST + 1))
+    except OSError:
+        return 0
+    return int(struct.unpack_from("=I", counters, 4 * _LOST)[0])
+
+
+class NewestLines:
+    """Lines of the newest datagram that has come; iterates without end.
+
+    Samples of datagrams before it are dropped and counted. Headers are not, nor poses that the
+    motion of the base is continued from.
+
+    Parameters
+    ----------
+    opened : socket
+        Of `udp_socket`.
+    kind : callable
+        Tells what a line is, as `Lines.kind` does.
+
+    Attributes
+    ----------
+    dropped : int
+        Samples so far that were not passed on because a newer one had come.
+    """
+
+    def __init__(self, opened: socket.socket, kind: Callable[[str], LineKind]) -> None:
+        self.dropped = 0
+        self._opened, self._kind = opened, kind
+
+    def __iter__(self) -> Iterator[str]:
+        """Receive."""
+        while True:
+            *before, newest = self._waiting(self._opened.recv(_LARGEST))
+            yield from self._latest_poses([line for data in before for line in self._needed(data)])
+            yield from _text(newest)
+
+    def _waiting(self, first: bytes) -> list[bytes]:
+        """All datagrams that wait, after one that does not any more."""
+        datagrams, end = [first], time.monotonic() + _DRAINED
+        self._opened.setblocking(False)
+        try:
+            while time.monotonic() < end:
+                datagrams.append(self._opened.recv(_LARGEST))
+        except BlockingIOError:
+            pass
+        finally:
+            self._opened.setblocking(True)
+        return datagrams
+
+    def _needed(self, data: bytes) -> list[str]:
+        """Lines of a datagram that is not the newest which later ones rely on."""
+        lines = _text(data)
+        kept = [line for line in lines if self._kind(line) is not LineKind.SAMPLE]
+        self.dropped += len(lines) - len(kept)
+        return kept
+
+    def _latest_poses(self, lines: list[str]) -> list[str]:
+        poses = [i for i, line in enumerate(lines) if self._kind(line) is LineKind.POSE]
+        stale = set(poses[:-_POSES])
+        return [line for i, line in enumerate(lines) if i not in stale]
+
+
+def _text(data: bytes) -> list[str]:
+    return data.decode("utf-8", errors="replace").splitlines()

@@ -38,6 +38,7 @@ from vibrissa.mapping.fitting import charted, fit
 from vibrissa.mapping.learning import log_weights
 from vibrissa.mapping.located import Located
 from vibrissa.mapping.minima import reliable, unknowns_covariance
+from vibrissa.mapping.noise import common_channels
 from vibrissa.mapping.readout import Measurement, Named
 from vibrissa.mapping.weighing import Weighing, weigh
 from vibrissa.rod.arrays import Array, IntArray
@@ -64,13 +65,14 @@ _FREE = [0, 2, 3]
 class Gaussians(NamedTuple):
     """Of contact points in the whisker's frame, in L: one for each of some contacts.
 
-    x (n, 4), (F, p) (n, 6), covariances (n, 3, 3), ∂p/∂log(EI) (n, 3), log weights (n,).
+    x (n, 4), (F, p) (n, 6), covariances (n, 3, 3), what errors that all samples
+    share change in p (n, 3, e), log weights (n,).
     """
 
     contacts: Array
     values: Array
     covariances: Array
-    by_stiffness: Array
+    by_errors: Array
     weights: Array
 
 
@@ -88,7 +90,7 @@ class Beginning:
         how = self._readout.how
         self._names = tuple(CHANNELS[code] for code in how.codes)
         # Noise alone, which differs from sample to sample.
-        self._quiet = how._replace(stiffness=0.0)
+        self._quiet = how._replace(errors=np.zeros((0, 6, 7)))
         chart = self._chart
         n = len(chart.stations)
         some = np.unique(np.linspace(0, n - 1, _WINDOWS).round().astype(int))
@@ -186,25 +188,27 @@ class Beginning:
         some = np.linspace(0, number - 1, min(number, _MOST)).astype(int)
         x, values = (part[some] for part in self.exact(located))
         _, slope = solve_forces(self._chart.discretization, x, tangents=True)
-        across, by_stiffness = self._across(measurement, values, slope)
+        across, by_errors = self._across(measurement, values, slope)
         covariance = across + _gaps_between(values[:, 3:]) + _FINEST**2 * np.eye(3)
         weights = 0.5 * np.linalg.slogdet(covariance)[1] - 0.5 * located.misfit
         return Gaussians(
-            x, values, covariance, by_stiffness, weights + self._log_prior(x, values, reach)
+            x, values, covariance, by_errors, weights + self._log_prior(x, values, reach)
         )
 
     def _across(self, measurement: Measurement, values: Array, slope: Array) -> tuple[Array, Array]:
-        """Covariances across a curve or surface, and ∂p/∂log(EI)."""
+        """Covariances across a curve or surface, and what errors that all samples share change."""
         w = self._weights(self._quiet, measurement, values)
         force = np.linalg.norm(values[:, :3], axis=1)
         unit = slope * np.stack([np.ones_like(force), force, force], axis=1)[:, None]
         back = np.linalg.pinv(w @ channel_derivatives(values, unit, self._names), rcond=1e-9)
         root = unit[:, 3:] @ back
+        return root @ np.swapaxes(root, 1, 2), root @ w @ self._wrong(values)
+
+    def _wrong(self, values: Array) -> Array:
+        """What errors that all samples share change in channels, (n, k, e)."""
         wrench = np.concatenate([values[:, :3], np.cross(values[:, 3:], values[:, :3])], axis=1)
-        grown = (
-            w @ np.einsum("nka,na->nk", channel_gradients(values, self._names), wrench)[..., None]
-        )
-        return root @ np.swapaxes(root, 1, 2), (root @ grown)[..., 0]
+        g = channel_gradients(values, self._names)
+        return common_channels(self._readout.how.errors, g, wrench)
 
     def exact(self, located: Located) -> tuple[Array, Array]:
         """The candidates of one sample as x (n, 4) and (F, p) (n, 6), non-dimensional."""
@@ -292,15 +296,11 @@ class Beginning:
             row = by_point[:, 0] / self._width
             information = information + row[:, :, None] * row[:, None, :]
         covariance = np.linalg.inv(information) + _FINEST**2 * np.eye(3)
-        wrench = np.concatenate([values[:, :3], np.cross(values[:, 3:], values[:, :3])], axis=1)
-        grown = (
-            w @ np.einsum("nka,na->nk", channel_gradients(values, self._names), wrench)[..., None]
-        )
-        by_stiffness = (covariance @ np.swapaxes(seen, 1, 2) @ grown)[..., 0]
+        by_errors = covariance @ np.swapaxes(seen, 1, 2) @ w @ self._wrong(values)
         total = weights + 0.5 * np.linalg.slogdet(covariance)[1] + 1.5 * math.log(2.0 * math.pi)
         total = total + np.array([log_weights(one, q) for one in w])
         return Gaussians(
-            x, values, covariance, by_stiffness, total + self._log_prior(x, values, reach)
+            x, values, covariance, by_errors, total + self._log_prior(x, values, reach)
         )
 
     def _log_prior(self, x: Array, values: Array, reach: float) -> Array:

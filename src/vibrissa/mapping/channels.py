@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vibrissa.mapping.noise import SensorNoise
+from vibrissa.mapping.noise import SensorNoise, common_covariance, scaled_errors
 from vibrissa.mapping.whitening import trusted
 from vibrissa.rod.arrays import Array
 from vibrissa.rod.discretize import Discretization
@@ -94,7 +94,7 @@ class Channels:
         """
         if sensor is not None and sensor.deviations is not None:
             own = self._by_deviations(sensor.deviations, measured, discretization)
-            if sensor.stiffness == 0.0:
+            if not len(sensor.errors):
                 return own
         wrench = np.concatenate([values[:, :3], np.cross(values[:, 3:], values[:, :3])], axis=1)
         g = channel_gradients(values, self.names)
@@ -105,7 +105,8 @@ class Channels:
                 sizes = np.repeat([discretization.force, discretization.moment], 3)
                 components = sensor.wrench / np.outer(sizes, sizes)
                 own = np.asarray(g @ components @ np.swapaxes(g, -1, -2))
-            return own + sensor.common(g, wrench)
+            errors = scaled_errors(sensor.errors, discretization.force, discretization.moment)
+            return own + common_covariance(errors, g, wrench)
 
     def _by_deviations(
         self, deviations: dict[str, float], measured: Array, discretization: Discretization

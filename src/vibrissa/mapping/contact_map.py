@@ -120,6 +120,8 @@ class ContactMap:
         noise: Mapping[str, float] | ArrayLike | None = None,
         method: str = "exact",
         stiffness_sigma: float = 0.0,
+        gain_sigma: float | ArrayLike = 0.0,
+        mixing_sigma: float | ArrayLike = 0.0,
     ) -> Estimate:
         """Find the contacts that explain measured signals.
 
@@ -140,6 +142,12 @@ class ContactMap:
             Relative standard deviation of the whisker's bending stiffness E r⁴, such as
             ``fit_stiffness`` tells or √(σ_E² + 16 σ_r²) of those of modulus and radius; it adds to
             the covariances, and needs noise.
+        gain_sigma : float or (6,) array_like
+            Relative standard deviation of the sensor's gains, of all or each of Fx, Fy, Fz, Mx, My
+            and Mz; likewise.
+        mixing_sigma : float or (6, 6) array_like
+            Standard deviations of what each of these reads of all six; or one number, relative: of
+            the cross-talk among forces, and among moments. Likewise.
 
         Returns
         -------
@@ -148,7 +156,9 @@ class ContactMap:
         """
         from vibrissa.mapping.estimate import estimate  # it knows this class
 
-        return estimate(self, signals, triplet, noise, method, stiffness_sigma)
+        return estimate(
+            self, signals, triplet, noise, method, stiffness_sigma, gain_sigma, mixing_sigma
+        )
 
     def tree(self, triplet: tuple[str, ...]) -> Preimages:
         """Return the search tree of three signals, made on first use.

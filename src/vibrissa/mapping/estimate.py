@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from vibrissa.mapping.approximation import APPROXIMATE, by_approximation
 from vibrissa.mapping.contact_map import spherical
 from vibrissa.mapping.explanation import Explanation, by_least_squares, by_triplet, undetermined
-from vibrissa.mapping.noise import SensorNoise, sensor_noise
+from vibrissa.mapping.noise import SensorNoise, common_errors, sensor_noise
 from vibrissa.mapping.showing import estimate_card, estimate_rows
 from vibrissa.quantities import attributes
 from vibrissa.rod.arrays import AnyArray, Array, IntArray
@@ -193,6 +193,8 @@ def estimate(
     noise: Mapping[str, float] | ArrayLike | None = None,
     method: str = "exact",
     stiffness_sigma: float = 0.0,
+    gain_sigma: float | ArrayLike = 0.0,
+    mixing_sigma: float | ArrayLike = 0.0,
 ) -> Estimate:
     """Find all frictionless contacts of a whisker that explain measured signals.
 
@@ -213,6 +215,11 @@ def estimate(
         signals: its look-up table, by natural neighbours or linear, or a network.
     stiffness_sigma : float
         Relative standard deviation of the whisker's bending stiffness E r⁴, in the covariances.
+    gain_sigma : float or (6,) array_like
+        Relative standard deviation of the sensor's gains, of all or each of Fx, Fy, Fz, Mx, My, Mz.
+    mixing_sigma : float or (6, 6) array_like
+        Standard deviations of what each of these reads of all six; or one number, relative: of the
+        cross-talk among forces, and among moments.
 
     Returns
     -------
@@ -226,7 +233,8 @@ def estimate(
     """
     explain = _method(method)
     names = selection(triplet)
-    sensor = sensor_noise(noise, names, stiffness_sigma)
+    errors = common_errors(stiffness_sigma, gain_sigma, mixing_sigma)
+    sensor = sensor_noise(noise, names, errors)
     values, dims, coords = measured(signals, names)
     check_signals(values, names)
     shape = values.shape[:-1]

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.mapping.located import Located, nowhere
-from vibrissa.mapping.noise import sensor_noise
+from vibrissa.mapping.noise import by_stiffness, common_errors, sensor_noise
 from vibrissa.mapping.readout import Measurement, Mixed, Named
 from vibrissa.mapping.sensor_readout import ByName, readout_of
 from vibrissa.mapping.single_search import ExactSearch, LeastSquaresSearch, SetSearch
@@ -55,6 +55,11 @@ class Estimator:
     felt_above : float
         Signals within so many standard deviations of zero are ``NOT_FELT``; 0, the default,
         locates all. It needs noise.
+    gain_sigma : float or (6,) array_like
+        Relative standard deviation of the sensor's gains, of all or each of Fx, Fy, Fz, Mx, My, Mz.
+    mixing_sigma : float or (6, 6) array_like
+        Standard deviations of what each of these reads of all six; or one number, relative: of the
+        cross-talk among forces, and among moments.
 
     See Also
     --------
@@ -68,10 +73,13 @@ class Estimator:
         noise: Mapping[str, float] | ArrayLike | None = None,
         stiffness_sigma: float = 0.0,
         felt_above: float = 0.0,
+        gain_sigma: float | ArrayLike = 0.0,
+        mixing_sigma: float | ArrayLike = 0.0,
     ) -> None:
         names = selection(triplet, least=1)
         order = triplet.replace(",", " ").split() if isinstance(triplet, str) else list(triplet)
-        sensor = sensor_noise(noise, names, stiffness_sigma)
+        errors = common_errors(stiffness_sigma, gain_sigma, mixing_sigma)
+        sensor = sensor_noise(noise, names, errors)
         self._order: list[int] | None = [order.index(name) for name in names]
         if felt_above > 0.0 and sensor is None:
             raise ValueError("what is felt is judged by the noise, and there is none")
@@ -92,7 +100,8 @@ class Estimator:
         contacts : ContactMap
             The whisker's map.
         sensor : Sensor
-            What it reads, how it is mounted and its noise; offset and weight are taken away.
+            What it reads, how it is mounted, its noise and the errors of its gain, mixing and
+            calibration, all in the covariances; offset and weight are taken away.
         stiffness_sigma : float
             Relative standard deviation of the whisker's bending stiffness.
         felt_above : float
@@ -116,7 +125,8 @@ class Estimator:
             raise ValueError(f"readings are weighed by their noise; {', '.join(silent)} has none")
         if not h.any():
             raise ValueError("the sensor's channels read nothing of force and moment")
-        readout = readout_of(contacts, h, covariance, stiffness_sigma)
+        errors = np.concatenate([by_stiffness(h, stiffness_sigma), sensor.common_errors])
+        readout = readout_of(contacts, h, covariance, errors)
         out._order = None
         out._start(contacts, readout, len(sensor.channels), felt_above)
         out._sensor = sensor

@@ -102,13 +102,13 @@ class ContactFilter:
         self._birth = math.log(birth)
         self._beginning = Beginning(estimator)
         how = estimator.readout.how
-        self._stiffness = how.stiffness
+        self._errors = len(how.errors)
         self._limit = explained(len(how.own))
         self.reset()
 
     def reset(self) -> None:
         """Forget everything, as when the whisker has lost touch."""
-        self._mixture = room(0)
+        self._mixture = room(0, self._errors)
         self._time: float | None = None
         self._free: tuple[float, Array, Array] | None = None  # when and where last nothing was felt
         self.estimator.reset()
@@ -167,7 +167,7 @@ class ContactFilter:
         if nothing is None:
             return self._known(*self._learned(measurement, turn, base), turn, base)
         if nothing != Status.MISSING:
-            self._mixture = room(0)
+            self._mixture = room(0, self._errors)
             felt = nothing != Status.NOT_FELT or not np.isfinite(turn).all()
             self._free = None if felt else (time, turn, base)
         return self._known(nothing, None, turn, base)
@@ -211,7 +211,7 @@ class ContactFilter:
         """Let all hypotheses learn; whether any of them explains the measurement."""
         chart, readout = self.estimator.contacts.chart, self.estimator.readout
         most = len(self._mixture.weight) * (1 + len(x))
-        out, misfits = room(most), np.empty(most)
+        out, misfits = room(most, self._errors), np.empty(most)
         try:
             n = learn(
                 chart.discretization.rod,
@@ -244,7 +244,7 @@ class ContactFilter:
             own[unknown] = _FORGOTTEN**2 * np.eye(3)
         out = np.empty(len(values), np.bool_)
         points = values[:, 3:] @ turn.T + base
-        unaccounted(self._mixture, self._stiffness, points, own, _NEW, out)
+        unaccounted(self._mixture, points, own, _NEW, out)
         return out
 
     def _reach(self, turn: Array, base: Array) -> float:
@@ -259,13 +259,13 @@ class ContactFilter:
     def _add(self, found: Gaussians, turn: Array, base: Array, log_prior: float) -> None:
         """Put Gaussians of the whisker's frame to the hypotheses."""
         n, old = len(found.weights), len(self._mixture.weight)
-        out = room(old + n)
+        out = room(old + n, self._errors)
         for mine, before in zip(out, self._mixture, strict=True):
             mine[:old] = before
         out.mean[old:, :3] = found.values[:, 3:] @ turn.T + base
         out.spread[old:, :3, :3] = turn @ found.covariances @ turn.T + self._pose * np.eye(3)
         out.spread[old:, 3:, 3:] = self._drift.speed**2 * np.eye(3)
-        out.by_stiffness[old:, :3] = found.by_stiffness @ turn.T
+        out.by_errors[old:, :3] = turn @ found.by_errors
         out.contact[old:], out.value[old:] = found.contacts, found.values
         out.weight[old:] = found.weights + log_prior
         self._mixture = _tidied(out, old + n)
@@ -278,10 +278,10 @@ class ContactFilter:
             return
         variance = np.trace(self._mixture.spread[:, :3, :3], axis1=1, axis2=2)
         if (variance > _FORGOTTEN**2).all():
-            self._mixture = room(0)
+            self._mixture = room(0, self._errors)
 
     def _known(self, status: Status, located: Located | None, turn: Array, base: Array) -> Followed:
-        return told(self._mixture, self._stiffness, status, located, turn, base, self._length)
+        return told(self._mixture, status, located, turn, base, self._length)
 
 
 def _tidied(mixture: Mixture, number: int) -> Mixture:

@@ -71,7 +71,6 @@ def nothing_known(status: Status, located: Located | None) -> Followed:
 
 def told(
     mixture: Mixture,
-    stiffness: float,
     status: Status,
     located: Located | None,
     turn: Array,
@@ -84,8 +83,6 @@ def told(
     ----------
     mixture : Mixture
         The hypotheses, the most probable first.
-    stiffness : float
-        Relative standard deviation of the whisker's stiffness.
     status : Status
         Of the sample: why nothing explains it stays.
     located : Located or None
@@ -105,9 +102,8 @@ def told(
         return nothing_known(status, located)
     weights = np.exp(mixture.weight)
     points, spreads = mixture.mean[:, :3], mixture.spread[:, :3, :3]
-    if stiffness > 0.0:
-        b = stiffness * mixture.by_stiffness[:, :3]
-        spreads = spreads + b[:, :, None] * b[:, None, :]
+    b = mixture.by_errors[:, :3]
+    spreads = spreads + b @ np.swapaxes(b, 1, 2)
     if n == 1:
         mean, probability, covariance = mixture.mean[0], 1.0, spreads[0]
     else:

@@ -11,9 +11,10 @@ signals exactly and is not far from the prediction. Each is weighed by Laplace's
 with the weights W of the signals, which differ from contact to contact where noise of force and
 moment makes that of a direction.
 
-An uncertain stiffness is the same error in all samples, which no averaging removes: how the state
-depends on it, b = ∂(p, v)/∂log(EI), is carried along, and σ²bbᵀ is part of the covariance (a
-"consider" parameter, as Schmidt had it).
+An uncertain stiffness, and errors of a sensor's gain and mixing, are the same in all samples, and
+no averaging removes them: how the state depends on each, b = ∂(p, v)/∂ε for an error ε of standard
+deviation one, is carried along, and Σ bbᵀ is part of the covariance ("consider" parameters, as
+Schmidt had it).
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import numpy as np
 
 from vibrissa.mapping.fitting import _fit, channel_equations
 from vibrissa.mapping.mixture import Mixture
-from vibrissa.mapping.weighing import Weighing, gradients, weigh
+from vibrissa.mapping.weighing import Weighing, gradients, weigh, wrong_by
 from vibrissa.rod.arrays import Array, IntArray, Rod
 from vibrissa.rod.compiled import copy, inlined, kernel
 from vibrissa.rod.newton import point_determinant, stable
@@ -243,22 +244,21 @@ def _moved(
     keep = np.eye(6)
     keep[:, :3] -= through
     noise = after - after @ inverse @ after
-    b = mixture.by_stiffness[i].copy()
-    if how.stiffness > 0.0:
-        g, wrench = np.empty((k, 6)), np.empty(6)
-        wrench[:3], wrench[3:] = v[:3], _moment(v)
-        gradients(how.codes, wrench[:3], wrench[3:], g)
-        pushed = after @ (turn @ (seen.T @ (own @ (g @ wrench))))
+    b, g, wrong = mixture.by_errors[i].copy(), np.empty((k, 6)), np.empty(6)
+    gradients(how.codes, v[:3], _moment(v), g)
+    for e in range(b.shape[1]):
+        wrong_by(how.errors[e], v[:3], _moment(v), wrong)
+        pushed = after @ (turn @ (seen.T @ (own @ (g @ wrong))))
         for a in range(3):
-            for e in range(3):
-                noise[a, e] -= how.stiffness**2 * pushed[a] * pushed[e]
-        b = keep @ b + gain @ pushed
+            for c in range(3):
+                noise[a, c] -= pushed[a] * pushed[c]
+        b[:, e] = keep @ np.ascontiguousarray(b[:, e]) + gain @ pushed
     # What the base's own error adds passes through the same gain.
     whole = keep @ spread @ keep.T + gain @ noise @ gain.T + pose * (through @ through.T)
     step = gain @ (turn @ (v[3:] - prior))
     for a in range(6):
         out.mean[row, a] = mixture.mean[i, a] + step[a]
-        out.by_stiffness[row, a] = b[a]
+        copy(b[a], out.by_errors[row, a])
         out.value[row, a] = v[a]
         for e in range(6):
             out.spread[row, a, e] = 0.5 * (whole[a, e] + whole[e, a])

@@ -167,7 +167,7 @@ def largest_misfit(channels: Channels, sensor: SensorNoise | None, contacts: Con
 
 def constant_weights(channels: Channels, sensor: SensorNoise | None) -> bool:
     """Whether the weights of channels are the same for all contacts."""
-    if sensor is None or sensor.stiffness > 0.0:
+    if sensor is None or sensor.errors[..., :6].any():
         return False
     return sensor.deviations is not None or not set(channels.names) & {"FT", "FD", "MB", "MD"}
 

@@ -16,9 +16,9 @@ class Mixture(NamedTuple):
     Parameters
     ----------
     mean, spread : (n, 6), (n, 6, 6) arrays
-        Of (p, v); the covariance without that of the stiffness.
-    by_stiffness : (n, 6) array
-        ∂(p, v)/∂log(EI).
+        Of (p, v); the covariance without that of errors that all samples share.
+    by_errors : (n, 6, e) array
+        What such errors of one standard deviation change in (p, v).
     contact, value : (n, 4), (n, 6) arrays
         ξ as x and (F, p) in the whisker's frame, where it was last.
     weight : (n,) array
@@ -27,7 +27,7 @@ class Mixture(NamedTuple):
 
     mean: Array
     spread: Array
-    by_stiffness: Array
+    by_errors: Array
     contact: Array
     value: Array
     weight: Array
@@ -37,12 +37,13 @@ class Mixture(NamedTuple):
 def predict(mixture: Mixture, moved: float, kept: float, grown: Array) -> None:
     """Let time pass: p goes by `moved` v, v keeps a share; `grown` (pp, pv, vv) is added."""
     for i in range(mixture.mean.shape[0]):
-        m, s, b = mixture.mean[i], mixture.spread[i], mixture.by_stiffness[i]
+        m, s, b = mixture.mean[i], mixture.spread[i], mixture.by_errors[i]
         for a in range(3):
             m[a] += moved * m[3 + a]
-            b[a] += moved * b[3 + a]
             m[3 + a] *= kept
-            b[3 + a] *= kept
+            for e in range(b.shape[1]):
+                b[a, e] += moved * b[3 + a, e]
+                b[3 + a, e] *= kept
         for a in range(3):
             for c in range(3):
                 pv, vp, vv = s[a, 3 + c], s[3 + a, c], s[3 + a, 3 + c]
@@ -57,12 +58,12 @@ def predict(mixture: Mixture, moved: float, kept: float, grown: Array) -> None:
             s[3 + a, 3 + a] += grown[2]
 
 
-def room(n: int) -> Mixture:
-    """Make room for n hypotheses."""
+def room(n: int, errors: int) -> Mixture:
+    """Make room for n hypotheses, and so many errors."""
     return Mixture(
         np.zeros((n, 6)),
         np.zeros((n, 6, 6)),
-        np.zeros((n, 6)),
+        np.zeros((n, 6, errors)),
         np.zeros((n, 4)),
         np.zeros((n, 6)),
         np.zeros(n),
@@ -93,7 +94,7 @@ def tidy(mixture: Mixture, number: int, least: float, most: int, near: float) ->
     """
     order = np.argsort(-mixture.weight[:number])
     mean, spread = mixture.mean[order], mixture.spread[order]
-    by, contact = mixture.by_stiffness[order], mixture.contact[order]
+    by, contact = mixture.by_errors[order], mixture.contact[order]
     value, weight = mixture.value[order], mixture.weight[order]
     kept = 0
     for i in range(number):
@@ -116,7 +117,9 @@ def tidy(mixture: Mixture, number: int, least: float, most: int, near: float) ->
             away = mean[i] - mixture.mean[twin]
             for a in range(6):
                 mixture.mean[twin, a] += share * away[a]
-                mixture.by_stiffness[twin, a] += share * (by[i, a] - mixture.by_stiffness[twin, a])
+                for e in range(by.shape[2]):
+                    old = mixture.by_errors[twin, a, e]
+                    mixture.by_errors[twin, a, e] = old + share * (by[i, a, e] - old)
                 for b in range(6):
                     old = mixture.spread[twin, a, b]
                     mixture.spread[twin, a, b] = (
@@ -131,7 +134,7 @@ def tidy(mixture: Mixture, number: int, least: float, most: int, near: float) ->
         copy(mean[i], mixture.mean[kept])
         for a in range(6):
             copy(spread[i, a], mixture.spread[kept, a])
-        copy(by[i], mixture.by_stiffness[kept])
+            copy(by[i, a], mixture.by_errors[kept, a])
         copy(contact[i], mixture.contact[kept])
         copy(value[i], mixture.value[kept])
         mixture.weight[kept] = weight[i]
@@ -147,7 +150,6 @@ def tidy(mixture: Mixture, number: int, least: float, most: int, near: float) ->
 @kernel
 def unaccounted(
     mixture: Mixture,
-    stiffness: float,
     points: Array,
     covariances: Array,
     far: float,
@@ -158,12 +160,13 @@ def unaccounted(
     for i in range(len(points)):
         out[i] = True
         for j in range(len(mixture.weight)):
-            b = mixture.by_stiffness[j]
+            b = mixture.by_errors[j]
             for a in range(3):
                 away[a] = points[i, a] - mixture.mean[j, a]
                 for e in range(3):
-                    both[a, e] = mixture.spread[j, a, e] + stiffness**2 * b[a] * b[e]
-                    both[a, e] += covariances[i, a, e]
+                    both[a, e] = mixture.spread[j, a, e] + covariances[i, a, e]
+                    for k in range(b.shape[1]):
+                        both[a, e] += b[a, k] * b[e, k]
             if not away @ np.linalg.solve(both, away) > far:
                 out[i] = False
                 break

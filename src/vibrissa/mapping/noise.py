@@ -3,12 +3,17 @@
 Noise is told as one standard deviation a signal, the same everywhere, or as a covariance of force
 and moment, as a force/torque sensor has it: then a direction is the noisier the smaller the force
 or moment that it belongs to.
+
+Errors that all measurements share, of the whisker's stiffness and of the sensor's gain and mixing,
+add to that: a measured wrench is (F, M) + Σ ε E (F, M, 1), with matrices E (6, 7) and ε of standard
+deviation 1, drawn once (:mod:`vibrissa.sensing.errors`). So Σ E (F, M, 1) (F, M, 1)ᵀ Eᵀ is part of
+the covariance of each measurement, but averaging many does not make it smaller.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
@@ -17,11 +22,15 @@ from numpy.typing import ArrayLike
 
 from vibrissa.quantities import attributes
 from vibrissa.rod.arrays import Array
+from vibrissa.sensing import Sensor
 from vibrissa.signals import SIGNALS
 from vibrissa.signals.base import wrench_derivatives
 
 #: Standard deviation of each signal, or covariance (6, 6) of (F, M), SI units.
 Noise: TypeAlias = Mapping[str, float] | ArrayLike
+
+
+_NONE = np.zeros((0, 6, 7))
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,18 +43,16 @@ class SensorNoise:
         Standard deviation of each signal.
     wrench : (6, 6) array or None
         Covariance of (F, M).
-    stiffness : float
-        Relative standard deviation of the whisker's bending stiffness, to which all forces and
-        moments are proportional: of E r⁴, so √(σ_E² + 16 σ_r²) of those of modulus and radius. It
-        is the same error in every measurement.
+    errors : (n, 6, 7) array
+        Errors that all measurements share, in SI units; see the module and :func:`common_errors`.
     """
 
     deviations: dict[str, float] | None
     wrench: Array | None
-    stiffness: float = 0.0
+    errors: Array = field(default_factory=_NONE.copy)
 
     @classmethod
-    def of(cls, noise: Noise, names: tuple[str, ...], stiffness: float = 0.0) -> SensorNoise:
+    def of(cls, noise: Noise, names: tuple[str, ...], errors: Array = _NONE) -> SensorNoise:
         """Read noise and check it.
 
         Parameters
@@ -54,8 +61,8 @@ class SensorNoise:
             Standard deviation of each signal, or covariance of (F, M), SI units.
         names : tuple of str
             The signals, or components of force and moment, that a mapping must have.
-        stiffness : float
-            Relative standard deviation of the whisker's bending stiffness.
+        errors : (n, 6, 7) array
+            Those that all measurements share.
 
         Returns
         -------
@@ -67,10 +74,6 @@ class SensorNoise:
         ValueError
             If it lacks a signal, or is no covariance.
         """
-        if not 0.0 <= stiffness < np.inf:
-            raise ValueError(
-                f"the stiffness's relative standard deviation is not negative; got {stiffness}"
-            )
         if isinstance(noise, Mapping):
             missing = [name for name in names if name not in noise]
             if missing:
@@ -84,7 +87,7 @@ class SensorNoise:
                 raise ValueError(f"noise must be standard deviations ≥ 0; got {given}") from error
             if not all(0.0 <= value < np.inf for value in sigma.values()):
                 raise ValueError(f"noise must be standard deviations ≥ 0; got {sigma}")
-            return cls(sigma, None, float(stiffness))
+            return cls(sigma, None, errors)
         try:
             wrench = np.asarray(noise, dtype=np.float64)
         except (TypeError, ValueError) as error:
@@ -106,7 +109,7 @@ class SensorNoise:
             raise ValueError(
                 f"a covariance has no negative eigenvalue; that of its correlations is {least:.3g}"
             )
-        return cls(None, wrench, float(stiffness))
+        return cls(None, wrench, errors)
 
     def covariance(self, names: tuple[str, ...], force: Array, moment: Array) -> Array:
         """Covariance of signals.
@@ -127,37 +130,120 @@ class SensorNoise:
             assert self.deviations is not None
             sigma = np.array([self.deviations[name] for name in names])
             own = np.broadcast_to(np.diag(sigma**2), (len(force), len(names), len(names)))
-            if self.stiffness == 0.0:
+            if not len(self.errors):
                 return own
         g = wrench_derivatives(force, moment)[:, [SIGNALS.index(name) for name in names]]
         with np.errstate(invalid="ignore"):
             if self.wrench is not None:
                 own = np.asarray(g @ self.wrench @ np.swapaxes(g, -1, -2))
-            out = own + self.common(g, np.concatenate([force, moment], axis=-1))
+            wrenches = np.concatenate([force, moment], axis=-1)
+            out = own + common_covariance(self.errors, g, wrenches)
         out[~np.isfinite(out)] = np.nan
         return out
 
-    def common(self, gradients: Array, wrenches: Array) -> Array:
-        """Covariance that the uncertainty of the stiffness adds to channels.
 
-        Parameters
-        ----------
-        gradients : (n, k, 6) array
-            ∂(channels)/∂(F, M).
-        wrenches : (n, 6) array
-            (F, M), in the same units.
+def common_errors(
+    stiffness_sigma: float = 0.0,
+    gain_sigma: float | ArrayLike = 0.0,
+    mixing_sigma: float | ArrayLike = 0.0,
+) -> Array:
+    """Errors that all measurements of force and moment share.
 
-        Returns
-        -------
-        (n, k, k) array
-            Of rank one: all channels grow together.
-        """
-        grown = self.stiffness * np.einsum("nki,ni->nk", gradients, wrenches)
-        return np.asarray(grown[:, :, None] * grown[:, None, :])
+    Parameters
+    ----------
+    stiffness_sigma : float
+        Relative standard deviation of the whisker's bending stiffness, to which all forces and
+        moments are proportional: of E r⁴, so √(σ_E² + 16 σ_r²) of those of modulus and radius.
+    gain_sigma : float or (6,) array_like
+        Relative standard deviations of the gains of F_x, F_y, F_z, M_x, M_y and M_z.
+    mixing_sigma : float or (6, 6) array_like
+        Standard deviations of what each component reads of all six; see
+        :class:`~vibrissa.sensing.Sensor`.
+
+    Returns
+    -------
+    (n, 6, 7) array
+        In SI units.
+
+    Raises
+    ------
+    ValueError
+        If a standard deviation is negative or not finite, or there are not as many as needed.
+    """
+    for name, sigma, shape in (("gain", gain_sigma, (6,)), ("mixing", mixing_sigma, (6, 6))):
+        given = np.asarray(sigma, dtype=np.float64)
+        if given.shape not in ((), shape) or not (np.isfinite(given) & (given >= 0.0)).all():
+            raise ValueError(
+                f"{name}_sigma is one standard deviation ≥ 0, or has shape {shape}; got {sigma!r}"
+            )
+    sensor = Sensor(gain_error=gain_sigma, mixing_error=mixing_sigma)
+    return np.concatenate([by_stiffness(np.eye(6), stiffness_sigma), sensor.common_errors])
+
+
+def by_stiffness(mixing: Array, sigma: float) -> Array:
+    """Error that the stiffness of the whisker makes in channels of force and moment.
+
+    Parameters
+    ----------
+    mixing : (k, 6) array
+        What the channels read.
+    sigma : float
+        Relative standard deviation of the whisker's bending stiffness.
+
+    Returns
+    -------
+    (n, k, 7) array
+        One, or none where the stiffness is exact.
+
+    Raises
+    ------
+    ValueError
+        If the standard deviation is negative or not finite.
+    """
+    if not 0.0 <= sigma < np.inf:
+        raise ValueError(
+            f"the stiffness's relative standard deviation is not negative; got {sigma}"
+        )
+    out = np.zeros((1 if sigma > 0.0 else 0, len(mixing), 7))
+    out[..., :6] = sigma * mixing
+    return out
+
+
+def scaled_errors(errors: Array, force: float, moment: float) -> Array:
+    """Make errors (n, 6, 7) of wrenches non-dimensional, for these units of force and moment."""
+    sizes = np.repeat([force, moment], 3)
+    return np.ascontiguousarray(errors * np.append(sizes, 1.0) / sizes[:, None])
+
+
+def common_channels(errors: Array, gradients: Array, wrenches: Array) -> Array:
+    """What errors of one standard deviation change in channels.
+
+    Parameters
+    ----------
+    errors : (n, 6, 7) array
+        That all measurements share.
+    gradients : (m, k, 6) array
+        ∂(channels)/∂(F, M).
+    wrenches : (m, 6) array
+        (F, M), in the same units.
+
+    Returns
+    -------
+    (m, k, n) array
+        In the units of the channels.
+    """
+    wrong = np.einsum("nac,mc->man", errors[..., :6], wrenches) + errors[..., 6].T
+    return np.asarray(gradients @ wrong)
+
+
+def common_covariance(errors: Array, gradients: Array, wrenches: Array) -> Array:
+    """Covariance (m, k, k) that errors add to channels; as for :func:`common_channels`."""
+    changed = common_channels(errors, gradients, wrenches)
+    return np.asarray(changed @ np.swapaxes(changed, -1, -2))
 
 
 def sensor_noise(
-    noise: Noise | None, names: tuple[str, ...], stiffness: float = 0.0
+    noise: Noise | None, names: tuple[str, ...], errors: Array = _NONE
 ) -> SensorNoise | None:
     """Read noise if there is any.
 
@@ -167,8 +253,8 @@ def sensor_noise(
         As for :meth:`SensorNoise.of`.
     names : tuple of str
         The signals.
-    stiffness : float
-        Relative standard deviation of the whisker's bending stiffness.
+    errors : (n, 6, 7) array
+        Those that all measurements share; see :func:`common_errors`.
 
     Returns
     -------
@@ -178,13 +264,13 @@ def sensor_noise(
     Raises
     ------
     ValueError
-        If the noise does not fit, or the stiffness is uncertain but no noise is known.
+        If the noise does not fit, or there are errors but no noise is known.
     """
     if noise is not None:
-        return SensorNoise.of(noise, names, stiffness)
-    if stiffness != 0.0:
+        return SensorNoise.of(noise, names, errors)
+    if len(errors):
         raise ValueError(
-            "the uncertainty of the stiffness adds to that of a sensor: give its noise"
+            "the uncertainty of stiffness, gain and mixing adds to that of a sensor: give its noise"
         )
     return None
 

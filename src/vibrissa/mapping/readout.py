@@ -18,7 +18,7 @@ from vibrissa.mapping.estimate import check_signals
 from vibrissa.mapping.explanation import Bounds
 from vibrissa.mapping.least_squares import at_nodes, constant_weights, parts, seeding_triplet
 from vibrissa.mapping.locating import Searched
-from vibrissa.mapping.noise import SensorNoise
+from vibrissa.mapping.noise import SensorNoise, scaled_errors
 from vibrissa.mapping.weighing import Weighing
 from vibrissa.mapping.whitening import TRUSTED, rank
 from vibrissa.rod.arrays import Array
@@ -146,12 +146,12 @@ class Mixed:
         H, at the whisker's base, SI units.
     covariance : (k, k) array
         Of the noise.
-    stiffness : float
-        Relative standard deviation of the whisker's bending stiffness.
+    errors : (n, k, 7) array
+        Errors that all readings share, SI units; see :mod:`~vibrissa.mapping.noise`.
     """
 
     def __init__(
-        self, contacts: ContactMap, mixing: Array, covariance: Array, stiffness: float = 0.0
+        self, contacts: ContactMap, mixing: Array, covariance: Array, errors: Array
     ) -> None:
         chart = contacts.chart
         d = chart.discretization
@@ -171,6 +171,7 @@ class Mixed:
         self.told = int((strength > _UNTOLD * strength[0]).sum())
         self._reduce = (u.T @ whiten)[: self.told]
         h = self._reduce @ (mixing * sizes)
+        self._back = np.linalg.pinv(h)
         self.how = Weighing(
             np.array([FITTED.index(name) for name in WRENCH]),
             np.ascontiguousarray(h),
@@ -178,10 +179,10 @@ class Mixed:
             np.zeros((6, 6)),
             0.0,
             np.full(6, np.nan),
-            float(stiffness),
+            # What is told has full rank, so that wrong readings are those of wrong wrenches.
+            np.ascontiguousarray(self._back @ (self._reduce @ errors) * np.append(sizes, 1.0)),
         )
-        self.passes = 2 if stiffness > 0.0 else 1
-        self._back = np.linalg.pinv(h)
+        self.passes = 2 if errors[..., :6].any() else 1
         seen = wrenches @ h.T
         self._largest = 10.0 * np.abs(seen).max(axis=0)
         if self.told >= 3:
@@ -274,7 +275,7 @@ def _weighing(
         np.ascontiguousarray(components, dtype=np.float64),
         TRUSTED if sensor is None else 0.0,
         deviations,
-        0.0 if sensor is None else sensor.stiffness,
+        np.zeros((0, 6, 7)) if sensor is None else scaled_errors(sensor.errors, force, moment),
     )
 
 

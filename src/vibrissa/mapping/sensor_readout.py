@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vibrissa.mapping.noise import sensor_noise
+from vibrissa.mapping.noise import SensorNoise
 from vibrissa.mapping.readout import Mixed, Named
 from vibrissa.rod.arrays import Array
 from vibrissa.sensing import COMPONENTS
@@ -43,17 +43,32 @@ class ByName:
         return np.array([known[name] for name in self.named.names])
 
 
-def readout_of(
-    contacts: ContactMap, h: Array, covariance: Array, stiffness: float
-) -> ByName | Mixed:
-    """Signals by name if the channels tell these and nothing else, or a mix."""
+def readout_of(contacts: ContactMap, h: Array, covariance: Array, errors: Array) -> ByName | Mixed:
+    """Signals by name if the channels tell these and nothing else, or a mix.
+
+    Parameters
+    ----------
+    contacts : ContactMap
+        The map.
+    h : (k, 6) array
+        What the channels read of (F, M) at the whisker's base, SI units.
+    covariance : (k, k) array
+        Covariance of their noise.
+    errors : (n, k, 7) array
+        Errors that all readings share; see :mod:`~vibrissa.mapping.noise`.
+
+    Returns
+    -------
+    ByName or Mixed
+        Ready for readings.
+    """
     read = [name for name, column in zip(COMPONENTS, h.T, strict=True) if column.any()]
     whole = [group for group in _BY_NAME if set(group) <= set(read)]
     places = [COMPONENTS.index(name) for name in read]
     own = h[:, places]
     complete = sum(map(len, whole)) == len(read) and len(read) >= _UNKNOWNS
     if not complete or np.linalg.matrix_rank(own / np.linalg.norm(own, axis=0)) < len(read):
-        return Mixed(contacts, h, covariance, stiffness)
+        return Mixed(contacts, h, covariance, errors)
     root = np.linalg.inv(np.linalg.cholesky(covariance))
     back = np.linalg.pinv(root @ own) @ root
     wrench = np.zeros((6, 6))
@@ -66,5 +81,7 @@ def readout_of(
     }
     chosen = [name for group in whole for name in names[group]]
     signals = tuple(name for name in SIGNALS if name in chosen)
-    noise = sensor_noise(0.5 * (wrench + wrench.T), signals, stiffness)
+    wrong = np.zeros((len(errors), 6, 7))
+    wrong[:, places] = back @ errors
+    noise = SensorNoise.of(0.5 * (wrench + wrench.T), signals, wrong)
     return ByName(Named(contacts, signals, noise), np.asarray(back, dtype=np.float64), places)

@@ -38,8 +38,8 @@ class Weighing(NamedTuple):
         Standard deviation of components of F and M relative to |F| and |M|.
     deviations : (k,) array
         Standard deviations of signals by name; NaN for none.
-    stiffness : float
-        Relative standard deviation of the stiffness.
+    errors : (n, 6, 7) array
+        Errors that all measurements share: E, of ε E (F, M, 1).
     """
 
     codes: IntArray
@@ -48,7 +48,7 @@ class Weighing(NamedTuple):
     components: Array
     share: float
     deviations: Array
-    stiffness: float
+    errors: Array
 
 
 @inlined
@@ -75,9 +75,18 @@ def gradients(codes: IntArray, force: Array, moment: Array, out: Array) -> None:
 
 
 @inlined
+def wrong_by(error: Array, force: Array, moment: Array, out: Array) -> None:
+    """E (F, M, 1), (6,), for an error E (6, 7)."""
+    for a in range(6):
+        out[a] = error[a, 6]
+        for c in range(3):
+            out[a] += error[a, c] * force[c] + error[a, 3 + c] * moment[c]
+
+
+@inlined
 def _covariance(how: Weighing, value: Array, measured: Array, sigma: Array) -> None:
     """Covariance (k, k) of the channels at a contact with (F, p)."""
-    codes, components, deviations = how.codes, how.components, how.deviations
+    codes, deviations = how.codes, how.deviations
     k = codes.shape[0]
     force, moment, g = np.empty(3), np.empty(3), np.empty((k, 6))
     copy(value[:3], force)
@@ -88,18 +97,20 @@ def _covariance(how: Weighing, value: Array, measured: Array, sigma: Array) -> N
     gradients(codes, force, moment, g)
     f2 = force[0] ** 2 + force[1] ** 2 + force[2] ** 2
     m2 = moment[0] ** 2 + moment[1] ** 2 + moment[2] ** 2
-    grown = np.zeros(k)
-    for i in range(k):
-        for a in range(3):
-            grown[i] += how.stiffness * (g[i, a] * force[a] + g[i, 3 + a] * moment[a])
+    common, wrong = how.components.copy(), np.empty(6)
+    for error in how.errors:
+        wrong_by(error, force, moment, wrong)
+        for a in range(6):
+            for c in range(6):
+                common[a, c] += wrong[a] * wrong[c]
     for i in range(k):
         for j in range(k):
-            total = grown[i] * grown[j]
+            total = 0.0
             for a in range(6):
                 size = f2 if a < 3 else m2
                 total += how.share**2 * size * g[i, a] * g[j, a]
                 for c in range(6):
-                    total += g[i, a] * components[a, c] * g[j, c]
+                    total += g[i, a] * common[a, c] * g[j, c]
             sigma[i, j] = total
     if not deviations[0] >= 0.0:
         return

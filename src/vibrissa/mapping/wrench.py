@@ -25,7 +25,13 @@ from vibrissa.mapping.channels import WRENCH
 from vibrissa.mapping.contact_map import spherical
 from vibrissa.mapping.fitting import Fits, fit
 from vibrissa.mapping.minima import Candidates, candidates, reliable, unknowns_covariance
-from vibrissa.mapping.noise import SensorNoise
+from vibrissa.mapping.noise import (
+    SensorNoise,
+    common_covariance,
+    common_errors,
+    scaled_errors,
+    sensor_noise,
+)
 from vibrissa.mapping.showing import estimate_card, estimate_rows
 from vibrissa.mapping.whitening import INDISTINCT, explained, rank, trusted, whitening
 from vibrissa.quantities import attributes
@@ -199,6 +205,9 @@ def estimate_from_wrench(
     moment: ArrayLike | xr.DataArray,
     *,
     noise: Mapping[str, float] | ArrayLike | None = None,
+    stiffness_sigma: float = 0.0,
+    gain_sigma: float | ArrayLike = 0.0,
+    mixing_sigma: float | ArrayLike = 0.0,
     steps: int = STEPS,
 ) -> WrenchEstimate:
     """Locate contacts from force and moment at the base, with or without friction.
@@ -214,6 +223,14 @@ def estimate_from_wrench(
     noise : mapping or (6, 6) array_like, optional
         Standard deviations of ``Fx``, ``Fy``, ``Fz``, ``Mx``, ``My`` and ``Mz``, or the covariance
         of (F, M), SI units.
+    stiffness_sigma : float
+        Relative standard deviation of the whisker's bending stiffness E r⁴, in the covariances; it
+        needs noise, as the next two do.
+    gain_sigma : float or (6,) array_like
+        Relative standard deviation of the sensor's gains, of all or each of the six.
+    mixing_sigma : float or (6, 6) array_like
+        Standard deviations of what each component reads of all six; or one number, relative: of
+        the cross-talk among forces, and among moments.
     steps : int
         Integration steps along the whisker. The default is good to 1e-8 of the length.
 
@@ -236,7 +253,7 @@ def estimate_from_wrench(
     >>> float(found.arc_length.round(6))
     0.025
     """
-    sensor = None if noise is None else SensorNoise.of(noise, WRENCH)
+    sensor = sensor_noise(noise, WRENCH, common_errors(stiffness_sigma, gain_sigma, mixing_sigma))
     f, m, dims, coords = labelled_wrench(force, moment)
     d = discretize(whisker, steps)
     scale = np.repeat([d.force, d.moment], 3)
@@ -249,7 +266,8 @@ def estimate_from_wrench(
         weights = whitening(trusted(wrenches[rows]))
     else:
         covariance = _covariance(sensor) / np.outer(scale, scale)
-        weights = np.tile(whitening(covariance), (rows.size, 1, 1))
+        errors = scaled_errors(sensor.errors, d.force, d.moment)
+        weights = whitening(covariance + common_covariance(errors, np.eye(6), wrenches[rows]))
         degrees = rank(covariance) - _UNKNOWNS
     solved = _solve(discretize(whisker, _COARSE), d, wrenches[rows], weights, explained(degrees))
     status = np.where(known, int(Status.DEGENERATE), int(Status.MISSING))

@@ -4,6 +4,9 @@
     mixing = [[1, 0, 0, 0, 0, 0], …]   # a line a channel: of Fx, Fy, Fz, Mx, My, Mz
     noise = [1e-6, 2e-8, 2e-8]         # standard deviations; or one number for all
     bias = 0.0
+    gain_error = 0.01                  # relative standard deviation, the same error in all readings
+    mixing_error = 0.01                # or a matrix of standard deviations, as mixing
+    mixing_covariance = [[[1e-6, …], …], …]   # a channel: 7 × 7, of its mixing and offset
 
     [frame]
     axes = ["x", "-z", "y"]            # or a 3 × 3 matrix, the sensor's axes in its columns
@@ -33,9 +36,9 @@ from vibrissa.io.table import read_text
 from vibrissa.sensing.frame import SensorFrame
 from vibrissa.sensing.sensor import Sensor
 
-_NUMBERS = ("noise", "bias", "drift", "resolution", "largest")
-_SHARES = ("relative_noise", "gain_error")
-_TOP = {"channels", "mixing", *_NUMBERS, *_SHARES, "frame", "weight"}
+_NUMBERS = ("noise", "bias", "drift", "resolution", "largest", "gain_error")
+_OTHERS = ("relative_noise", "mixing_error", "mixing_covariance")
+_TOP = {"channels", "mixing", *_NUMBERS, *_OTHERS, "frame", "weight"}
 _FRAME = {"axes", "position", "reaction"}
 _WEIGHT = {"mass", "moment"}
 
@@ -74,7 +77,7 @@ def load_sensor(path: str | PathLike[str]) -> Sensor:
                 raise ValueError(
                     f"{what} has {', '.join(unknown)}; it may have {', '.join(sorted(known))}"
                 )
-        given = {name: said[name] for name in (*_NUMBERS, *_SHARES) if name in said}
+        given = {name: said[name] for name in (*_NUMBERS, *_OTHERS) if name in said}
         how: dict[str, Any] = {"channels": said["channels"]} if "channels" in said else {}
         sensor = Sensor(
             **how,
@@ -107,7 +110,12 @@ def save_sensor(path: str | PathLike[str], sensor: Sensor) -> None:
     lines = [f"channels = [{', '.join(_text(name) for name in sensor.channels)}]"]
     lines.append(f"mixing = {_array(sensor.mixing)}")
     lines += [f"{name} = {_array(getattr(sensor, name))}" for name in _NUMBERS]
-    lines += [f"{name} = {float(getattr(sensor, name))!r}" for name in _SHARES]
+    lines.append(f"relative_noise = {float(sensor.relative_noise)!r}")
+    lines += [
+        f"{name} = {_array(getattr(sensor, name))}"
+        for name in ("mixing_error", "mixing_covariance")
+        if getattr(sensor, name).any()
+    ]
     lines += ["", "[frame]", f"axes = {_array(sensor.frame.axes)}"]
     lines.append(f"position = {_array(sensor.frame.position)}")
     lines.append(f"reaction = {'true' if sensor.frame.reaction else 'false'}")
@@ -123,6 +131,8 @@ def _text(name: str) -> str:
 
 def _array(values: Any) -> str:
     array = np.asarray(values, dtype=np.float64)
+    if array.ndim == 0:
+        return repr(float(array))
     if array.ndim == 1:
         return "[" + ", ".join(repr(float(value)) for value in array) + "]"
     return "[" + ", ".join(_array(row) for row in array) + "]"

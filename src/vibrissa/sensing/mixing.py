@@ -29,7 +29,8 @@ class MixingCalibration:
     Attributes
     ----------
     sensor : Sensor
-        With the mixing (in the whisker's frame), offset and noise that were found.
+        With the mixing (in the whisker's frame), offset and noise that were found, and their
+        covariance.
     components : tuple of str
         Which components the channels may read.
     covariance : (k, p + 1, p + 1) array
@@ -104,13 +105,19 @@ def calibrate_mixing(
     variance = (found.residuals**2).sum(axis=0) / free
     mixing = np.zeros((y.shape[1], 6))
     mixing[:, which] = found.unknowns[:-1].T
-    sensor = Sensor(names, mixing, np.sqrt(variance), found.unknowns[-1], frame=SensorFrame())
-    return MixingCalibration(
-        sensor,
-        tuple(components),
-        variance[:, None, None] * found.spread,
-        np.sqrt((found.residuals**2).mean(axis=0)),
+    covariance = variance[:, None, None] * found.spread
+    whole = np.zeros((y.shape[1], 7, 7))
+    whole[np.ix_(range(y.shape[1]), [*which, 6], [*which, 6])] = covariance
+    sensor = Sensor(
+        names,
+        mixing,
+        np.sqrt(variance),
+        found.unknowns[-1],
+        frame=SensorFrame(),
+        mixing_covariance=whole,
     )
+    residual = np.sqrt((found.residuals**2).mean(axis=0))
+    return MixingCalibration(sensor, tuple(components), covariance, residual)
 
 
 def _loaded(wrenches: Array) -> Array:

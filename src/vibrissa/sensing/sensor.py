@@ -14,6 +14,9 @@ carries: (m g, m c × g) for its mass m with its centre at c, g as seen from the
 
 The same description serves both ways: :meth:`Sensor.read` simulates, :meth:`Sensor.felt` takes
 offset and weight away, and :meth:`Sensor.to_wrench` returns to force and moment at the base.
+
+Noise differs from reading to reading. Errors of gain, of the mixing and of what a calibration has
+found are the same in all of them (:mod:`~vibrissa.sensing.errors`), and averaging leaves them.
 """
 
 from __future__ import annotations
@@ -26,6 +29,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vibrissa.sensing.errors import by_calibration, by_gain, by_mixing, checked_covariance
 from vibrissa.sensing.frame import SensorFrame
 
 Array = NDArray[np.float64]
@@ -74,8 +78,16 @@ class Sensor:
         Infinite, the default, for none.
     relative_noise : float
         Standard deviation of white noise relative to the signal.
-    gain_error : float
-        Standard deviation of the channels' errors of gain, which are drawn once.
+    gain_error : array_like
+        Standard deviation of the channels' errors of gain, relative: the same in all readings, one
+        channel's independent of another's.
+    mixing_error : float or array_like (k, 6)
+        Standard deviation of the errors of the mixing, the same in all readings: of each number of
+        it, in its unit; or, as one number, relative to the channel's largest mixing of a force, or
+        of a moment, so that cross-talk among forces and among moments is part of it.
+    mixing_covariance : array_like (k, 7, 7), optional
+        Covariance of each channel's mixing of the six components and, last, its offset, as a
+        calibration leaves it; besides the two stated errors.
     frame : SensorFrame
         How it sits at the whisker; by default its frame is the whisker's.
     mass : float
@@ -104,7 +116,9 @@ class Sensor:
     resolution: Any = 0.0
     largest: Any = np.inf
     relative_noise: float = 0.0
-    gain_error: float = 0.0
+    gain_error: Any = 0.0
+    mixing_error: Any = 0.0
+    mixing_covariance: Any = None
     frame: SensorFrame = field(default_factory=SensorFrame)
     mass: float = 0.0
     mass_moment: Any = (0.0, 0.0, 0.0)
@@ -131,7 +145,7 @@ class Sensor:
             faults.append(f"mixing has shape {mixing.shape}; finite ({len(names)}, 6) is needed")
         usual = np.repeat([FORCE_NOISE, MOMENT_NOISE], 3)
         numbers = {"mixing": mixing, "channels": names}
-        for name in ("noise", "bias", "drift", "resolution", "largest"):
+        for name in ("noise", "bias", "drift", "resolution", "largest", "gain_error"):
             value = getattr(self, name)
             if value is None and mixing.shape == (len(names), 6):
                 value = np.sqrt(mixing**2 @ usual**2)
@@ -147,10 +161,19 @@ class Sensor:
                 faults.append(f"{name} is {array.tolist()}; it must not be negative")
             else:
                 numbers[name] = np.broadcast_to(array, (len(names),))
-        for name in ("relative_noise", "gain_error"):
-            share = float(getattr(self, name))
-            if not (np.isfinite(share) and share >= 0.0):
-                faults.append(f"{name} is {share!r}; it must not be negative")
+        share = float(self.relative_noise)
+        if not (np.isfinite(share) and share >= 0.0):
+            faults.append(f"relative_noise is {share!r}; it must not be negative")
+        error = np.asarray(self.mixing_error, dtype=np.float64)
+        if error.shape not in ((), (len(names), 6)):
+            faults.append(
+                f"mixing_error has shape {error.shape}; () or ({len(names)}, 6) is needed"
+            )
+        elif not (np.isfinite(error) & (error >= 0.0)).all():
+            faults.append(f"mixing_error is {error.tolist()}; it must be finite and not negative")
+        numbers["mixing_error"] = error
+        numbers["mixing_covariance"], fault = checked_covariance(self.mixing_covariance, len(names))
+        faults += fault
         moment = np.asarray(self.mass_moment, dtype=np.float64)
         if moment.shape != (3,) or not np.isfinite(moment).all():
             faults.append(f"mass_moment is {self.mass_moment!r}; three numbers, kg·m, are needed")
@@ -186,11 +209,29 @@ class Sensor:
         Returns
         -------
         array (k, k)
-            Diagonal; drift and errors of gain are not in it.
+            Diagonal; drift is not in it, nor are the `common_errors`.
         """
         relative = self.relative_noise * np.asarray(reading, dtype=np.float64)
         variance = self.noise**2 + self.resolution**2 / 12.0 + relative**2
         return np.diag(variance)
+
+    @cached_property
+    def common_errors(self) -> Array:
+        """Errors of gain, mixing and offset that all readings share, E (n, k, 7).
+
+        Each is independent of the others: readings of (F, M) at the whisker's base are wrong by
+        ε E (F, M, 1), where ε is drawn once, with standard deviation 1.
+        """
+        own = np.concatenate(
+            [
+                by_gain(self.mixing, self.gain_error),
+                by_mixing(self.mixing, self.mixing_error),
+                by_calibration(self.mixing_covariance),
+            ]
+        )
+        if len(own):
+            own[..., :6] = own[..., :6] @ self.frame.from_base()
+        return own
 
     def weight(self, rotation: ArrayLike, gravity: ArrayLike = GRAVITY) -> Array:
         """Wrench at the base of the weight that the sensor carries.
@@ -276,7 +317,7 @@ class Sensor:
         wrench : array (..., 6)
             (F, M), whisker's frame, N and N·m.
         covariance : array (6, 6)
-            Of it.
+            Of its noise; the `common_errors` are not in it.
 
         Raises
         ------
@@ -343,8 +384,9 @@ class Sensor:
         noise = generator.normal(size=size) * self.noise
         if self.relative_noise > 0.0:
             reading = reading * (1.0 + generator.normal(scale=self.relative_noise, size=size))
-        if self.gain_error > 0.0:
-            reading = reading * (1.0 + generator.normal(scale=self.gain_error, size=size[1]))
+        errors = self.common_errors
+        wrong = np.tensordot(generator.normal(size=len(errors)), errors, axes=1)
+        reading = reading + true @ wrong[:, :6].T + wrong[:, 6]
         reading = reading + self.bias + noise
         if (self.drift > 0.0).any():
             steps = np.sqrt(np.diff(at, prepend=at[:1]))

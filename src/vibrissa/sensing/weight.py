@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vibrissa.sensing.errors import with_offset
 from vibrissa.sensing.frame import cross_matrix
 from vibrissa.sensing.linear import Solution, solve
 from vibrissa.sensing.misfit import warn_of_misfit
@@ -125,7 +126,11 @@ def calibrate_weight(
         felt[k] = False  # nothing that can be weighed
         found, unknowns, covariance = _solved(sensor, design, y, noise, felt)
     calibrated = replace(
-        sensor, bias=unknowns[:k], mass=float(unknowns[k]), mass_moment=unknowns[k + 1 :]
+        sensor,
+        bias=unknowns[:k],
+        mass=float(unknowns[k]),
+        mass_moment=unknowns[k + 1 :],
+        mixing_covariance=with_offset(sensor.mixing_covariance, np.diag(covariance)[:k]),
     )
     if unknowns[k] > _HEAVY:
         warnings.warn(
@@ -176,7 +181,12 @@ def tare(
     felt = felt[np.isfinite(felt).all(axis=1)]
     if not len(felt):
         raise ValueError("there is no reading without NaN or a saturated channel")
-    return replace(sensor, bias=sensor.bias + felt.mean(axis=0))
+    variance = np.diag(sensor.covariance()) / len(felt)
+    return replace(
+        sensor,
+        bias=sensor.bias + felt.mean(axis=0),
+        mixing_covariance=with_offset(sensor.mixing_covariance, variance),
+    )
 
 
 def _solved(
@@ -204,7 +214,13 @@ def _tared(sensor: Sensor, y: Array, noise: Array) -> WeightCalibration:
     covariance = np.zeros((k + 4, k + 4))
     covariance[:k, :k] = np.diag(noise**2 / len(y))
     left = np.sqrt(((y - bias) ** 2).mean(axis=0))
-    tared = replace(sensor, bias=bias, mass=0.0, mass_moment=np.zeros(3))
+    tared = replace(
+        sensor,
+        bias=bias,
+        mass=0.0,
+        mass_moment=np.zeros(3),
+        mixing_covariance=with_offset(sensor.mixing_covariance, np.diag(covariance)[:k]),
+    )
     misfit = float((left**2 / noise**2).sum() * len(y) / max(len(y) - 1, 1) / k)
     warn_of_misfit(misfit, "that nothing was touched, and that the orientation stayed the same")
     return WeightCalibration(tared, covariance, left, misfit)

@@ -125,7 +125,7 @@ def _folder(path: Path, base: Any, noise: float | None) -> WhiskerArray:
     """A digitised centreline each."""
     files = sorted(file for file in path.iterdir() if file.suffix.lower() == ".csv")
     if not files:
-        raise ValueError(f"{path} has no CSV files; a centreline each, such as C2.csv, is needed")
+        raise ValueError(f"{path} {_of_folder(path)}")
     whiskers, faults = [], []
     for file in files:
         try:
@@ -141,6 +141,15 @@ def _folder(path: Path, base: Any, noise: float | None) -> WhiskerArray:
     if faults:
         raise ValueError(f"{path}: {few(faults)}")
     return _array(path, whiskers)
+
+
+def _of_folder(path: Path) -> str:
+    """Why a folder is no folder of centrelines."""
+    names = sorted(file.name for file in path.iterdir())
+    if {".zgroup", ".zarray", "zarr.json"}.intersection(names):
+        return "is a Zarr folder, as NWB can be kept in; save it as HDF5, in one file .nwb"
+    held = few(names) if names else "nothing"
+    return f"is a folder of {held}; one of centrelines, such as C2.csv, or a file is needed"
 
 
 def _array(path: Path, whiskers: Sequence[Whisker]) -> WhiskerArray:

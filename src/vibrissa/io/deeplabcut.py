@@ -8,6 +8,7 @@ ensemble, are left alone. An individual is a whisker, its body parts the whisker
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from os import PathLike
 from pathlib import Path
 from typing import Unpack
@@ -27,7 +28,7 @@ Array = NDArray[np.float64]
 Names = list[tuple[str, ...]]
 
 _LEVELS = ("scorer", "individuals", "bodyparts", "coords")
-_NEEDED = "columns headed by scorer, bodyparts (after individuals, if any) and coords are needed"
+_NEEDED = "Columns headed by scorer, bodyparts (after individuals, if any) and coords are needed"
 _LIGHTNING = re.compile("heatmap|regression|lightning|ensemble|eks", re.IGNORECASE)
 
 
@@ -91,23 +92,13 @@ def read_deeplabcut(path: str | PathLike[str]) -> RawTracks:
 def _four_levels(path: Path, name: tuple[str, ...]) -> tuple[str, ...]:
     """Scorer, individual (empty if there are none), body part, coordinate."""
     if len(name) not in (3, 4):
-        raise ValueError(f"{path} has columns such as {'/'.join(name)}; {_NEEDED}")
+        raise ValueError(f"{path} has columns such as {'/'.join(name)}. {_NEEDED}")
     return name if len(name) == 4 else (name[0], "", *name[1:])
 
 
 def _csv(path: Path) -> tuple[Names, Array, list[str]]:
     rows = table_rows(read_text(path))
-    header: dict[str, list[str]] = {}
-    for _, cells in rows:
-        if cells[0] not in _LEVELS:
-            raise ValueError(
-                f"{path} is no table of DeepLabCut: a line begins with {cells[0]!r}; {_NEEDED}"
-            )
-        header[cells[0]] = cells
-        if cells[0] == "coords":
-            break
-    if not {"scorer", "bodyparts", "coords"} <= set(header):
-        raise ValueError(f"{path} is no table of DeepLabCut, or cut short; {_NEEDED}")
+    header = _header(path, rows)
     levels = [header[level] for level in _LEVELS if level in header]
     if len({len(level) for level in levels}) != 1:
         raise ValueError(f"{path} has lines of different length in its header")
@@ -116,6 +107,11 @@ def _csv(path: Path) -> tuple[Names, Array, list[str]]:
     names = [_four_levels(path, name) for name in list(zip(*levels, strict=True))[first:]]
     values, index = [], []
     for line, cells in rows:
+        if cells[0] in _LEVELS:
+            raise ValueError(
+                f"{path}: line {line} is a header row once more, {cells[0]}; tables one below the "
+                "other are to be read each on its own"
+            )
         try:
             numbers = [float(cell) if cell else np.nan for cell in cells[first:]]
         except ValueError:
@@ -132,13 +128,35 @@ def _csv(path: Path) -> tuple[Names, Array, list[str]]:
     return names, np.array(values), index
 
 
+def _header(path: Path, rows: Iterator[tuple[int, list[str]]]) -> dict[str, list[str]]:
+    """Header rows by the words that they begin with, up to the coordinates."""
+    header: dict[str, list[str]] = {}
+    other = ""
+    for line, cells in rows:
+        if cells[0] in header:
+            raise ValueError(f"{path}: line {line} is the header row {cells[0]} a second time")
+        if cells[0] not in _LEVELS:
+            other = f"; then a line begins with {cells[0]!r}"
+            break
+        header[cells[0]] = cells
+        if cells[0] == "coords":
+            break
+    missing = [name for name in ("scorer", "bodyparts", "coords") if name not in header]
+    if missing:
+        raise ValueError(
+            f"{path} is no table of DeepLabCut, or cut short: its header rows are "
+            f"{', '.join(header) or 'none'}{other}; it lacks {', '.join(missing)}. {_NEEDED}"
+        )
+    return header
+
+
 def _hdf5(path: Path) -> tuple[Names, Array, list[str]]:
     with opened(path, "a table of DeepLabCut") as file:
         for _, group in pandas_tables(file):
             names, values, index = read_table(group)
             if names and names[0][-1] in "xyz":
                 return [_four_levels(path, name) for name in names], values, index
-    raise ValueError(f"{path} is no table of DeepLabCut; {_NEEDED}")
+    raise ValueError(f"{path} is no table of DeepLabCut. {_NEEDED}")
 
 
 def _frames(path: Path, index: list[str], count: int) -> NDArray[np.int64]:

@@ -121,7 +121,7 @@ def _of_text(path: Path) -> Kind:
     if names[0].startswith("["):
         return Kind.CALIBRATION
     plain = {re.split(r"[ _/(\[]", name)[0] for name in names}
-    if names[0] == "scorer":
+    if names[0] in ("scorer", "individuals", "bodyparts"):
         return Kind.DEEPLABCUT
     if any(name.endswith("_ncams") for name in names):
         return Kind.ANIPOSE

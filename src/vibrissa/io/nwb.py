@@ -181,13 +181,20 @@ def _series(group: h5py.Group) -> _Series | None:
     time = series_time(first)
     points, sure = [], []
     for name in nodes:
-        data = children[name]["data"]
-        values = data[:] * data.attrs.get("conversion", 1.0) + data.attrs.get("offset", 0.0)
+        values = _points(children[name])
         if len(values) != time.size:
             raise ValueError(f"{group.name} has nodes at different times")
-        points.append(np.asarray(values, dtype=np.float64))
-        known = children[name].get("confidence")
-        sure.append(np.full(time.size, np.nan) if known is None else np.asarray(known[:], float))
+        points.append(values)
+        known = "confidence" in children[name]
+        sure.append(
+            series_values(children[name], "confidence") if known else np.full(time.size, np.nan)
+        )
+        if sure[-1].shape != time.shape:
+            raise ValueError(
+                f"{children[name].name} has a confidence of another size than its data"
+            )
+    if len({one.shape[1] for one in points}) != 1:
+        raise ValueError(f"{group.name} has nodes in the plane and others in space")
     said = str(first["data"].attrs.get("unit", "")).lower()
     flat = points[0].shape[1] == 2
     if said and said not in (_PIXELS if flat else _LENGTHS):
@@ -201,6 +208,26 @@ def _series(group: h5py.Group) -> _Series | None:
         "" if flat else _LENGTHS.get(said, ""),
         _frame(frame),
     )
+
+
+def _points(series: h5py.Group) -> Array:
+    """Positions (time, 2 or 3) in the unit that they are said to be in."""
+    values = series_values(series, "data")
+    if values.ndim != 2 or values.shape[1] not in (2, 3):
+        raise ValueError(
+            f"{series.name} has data of shape {values.shape}; (times, 2) or (times, 3) is needed"
+        )
+    about = series["data"].attrs
+    return values * _number(series, about, "conversion", 1.0) + _number(
+        series, about, "offset", 0.0
+    )
+
+
+def _number(item: h5py.HLObject, attributes: Mapping[str, Any], name: str, usual: float) -> float:
+    try:
+        return float(attributes.get(name, usual))
+    except (TypeError, ValueError):
+        raise ValueError(f"{item.name} has the {name} {attributes[name]!r}, no number") from None
 
 
 def _frame(item: Any) -> str:
@@ -222,10 +249,44 @@ def series_time(series: h5py.Group) -> Array:
         s.
     """
     if "timestamps" in series:
-        return np.asarray(series["timestamps"][:], dtype=np.float64)
-    start = series["starting_time"]
-    count = series["data"].shape[0]
-    return np.asarray(start[()] + np.arange(count) / start.attrs["rate"], dtype=np.float64)
+        return series_values(series, "timestamps")
+    if "starting_time" not in series:
+        raise ValueError(f"{series.name} has neither timestamps nor a starting_time")
+    start = series_values(series, "starting_time")
+    rate = _number(series, series["starting_time"].attrs, "rate", np.nan)
+    if not (start.shape == () and 0.0 < rate < np.inf):
+        raise ValueError(
+            f"{series.name} has a starting_time of rate {rate}, by which nobody can count"
+        )
+    return np.asarray(start + np.arange(len(series_values(series, "data"))) / rate)
+
+
+def series_values(series: h5py.Group, name: str) -> Array:
+    """Give the numbers of one dataset of a series.
+
+    Parameters
+    ----------
+    series : h5py.Group
+        Of an NWB file.
+    name : str
+        The dataset, such as ``data``.
+
+    Returns
+    -------
+    array
+        All of them.
+
+    Raises
+    ------
+    ValueError
+        If there is none, or it holds no numbers.
+    """
+    data = series.get(name)
+    if not isinstance(data, h5py.Dataset):
+        raise ValueError(f"{series.name} has no {name}")
+    if data.dtype.kind not in "fiub":
+        raise ValueError(f"{data.name} is of type {data.dtype}; numbers are needed")
+    return np.asarray(data[()], dtype=np.float64)
 
 
 def _table(

@@ -16,7 +16,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa.io.hdf5 import opened
-from vibrissa.io.nwb import series_time
+from vibrissa.io.nwb import series_time, series_values
 from vibrissa.quantities import attributes
 
 Array = NDArray[np.float64]
@@ -72,7 +72,15 @@ def load_nwb_series(path: str | PathLike[str]) -> xr.Dataset:
         time = series_time(next(iter(found.values())))
         if any(not np.array_equal(series_time(series), time) for series in found.values()):
             raise ValueError(f"{path} has series at different times; one clock is needed")
-        values = {key: np.asarray(series["data"][:], float) for key, series in found.items()}
+        values = {key: series_values(series, "data") for key, series in found.items()}
+    for (name, who), array in values.items():
+        shape = (time.size, *(3,) * len((_EACH | _OF_HEAD)[name]))
+        if array.shape != shape:
+            raise ValueError(
+                f"{path} has {name} {who} of shape {array.shape}; {shape} is needed".replace(
+                    "  ", " "
+                )
+            )
     whiskers = list(dict.fromkeys(who for _, who in values if who))
     data = {}
     for name, axes in (_EACH | _OF_HEAD).items():

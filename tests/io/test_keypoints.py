@@ -289,7 +289,9 @@ def test_sleap_analysis(tmp_path, rng, dims):
     check_image(load_tracks(path), points, sure, ["C1", "C2"])
     content = path.read_bytes()
     path.write_bytes(content[: len(content) // 2])
-    with pytest.raises(ValueError, match=r"a.analysis.h5 cannot be read as HDF5.*cut off"):
+    with pytest.raises(
+        ValueError, match=r"a.analysis.h5 cannot be read as an analysis file of SLEAP.*cut off"
+    ):
         load_sleap(path)
     with h5py.File(path, "w") as file:
         file["tracks"] = points

@@ -67,7 +67,7 @@ def test_nothing_there(tmp_path):
     with pytest.raises(ValueError, match="is empty"):
         load_tracks(path)
     path.write_bytes(b"\x89HDF\r\n\x1a\n and then nothing")
-    with pytest.raises(ValueError, match=r"a.h5 cannot be read as HDF5"):
+    with pytest.raises(ValueError, match=r"a.h5 cannot be read as a file of a known kind"):
         load_tracks(path)
 
 

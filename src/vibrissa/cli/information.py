@@ -228,7 +228,7 @@ def _groups(path: Path) -> Iterator[tuple[str, str]]:
     from vibrissa.io.hdf5 import opened
 
     yield "kind", kind_of(path) or "unknown"
-    with opened(path, "a NetCDF-4 file", soft_links=False), h5netcdf.File(path, "r") as file:
+    with opened(path, "NetCDF-4", soft_links=False), h5netcdf.File(path, "r") as file:
         names = [_text(one) for one in file.variables["whisker"][...]] if _many(file) else []
         for name, group in _within(file, "/"):
             if not (names and f"{name}/".startswith("/whiskers/")):

@@ -9,8 +9,10 @@ damaged; whatever the libraries raise then becomes one error that names the file
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
+from mmap import ACCESS_READ, mmap
 from os import PathLike
 from pathlib import Path
 
@@ -22,6 +24,7 @@ from vibrissa.io.paths import check_readable
 # Deflate, the densest of the filters that are read, makes at most 1032 bytes of one.
 _DENSEST = 1100
 _ALWAYS_ALLOWED = 1 << 28
+_HEAP = b"GCOL\1\0\0\0"
 
 
 @contextmanager
@@ -52,6 +55,8 @@ def opened(path: str | PathLike[str], what: str, *, soft_links: bool = True) -> 
         read something is not there or of another kind.
     """
     path = check_readable(path)
+    with naming(path, what):
+        _check_heaps(path)
     with naming(path, what), h5py.File(path, "r") as file:
         _check(file, path.stat().st_size, soft_links)
         yield file
@@ -82,7 +87,7 @@ def naming(path: Path, what: str) -> Iterator[None]:
         yield
     except (OSError, RuntimeError) as error:
         raise ValueError(
-            f"{path} cannot be read as HDF5: it is of another format, cut off or damaged "
+            f"{path} cannot be read as {what}: it is of another format, cut off or damaged "
             f"({_line(error)})"
         ) from error
     except ValueError as error:
@@ -96,6 +101,23 @@ def naming(path: Path, what: str) -> Iterator[None]:
 
 def _line(error: Exception) -> str:
     return " ".join(str(error).split()) or repr(error)
+
+
+def _check_heaps(path: Path) -> None:
+    """Refuse heaps with an entry of no size, through which the library would go for ever."""
+    with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as content:
+        start = content.find(_HEAP)
+        while start >= 0:
+            (size,) = struct.unpack_from("<Q", content, start + 8)
+            end = min(start + size, len(content))
+            entry = start + 16
+            while entry + 16 <= end:
+                number, length = struct.unpack_from("<H6xQ", content, entry)
+                if number == 0 and length == 0:
+                    raise ValueError("a heap of text is damaged")
+                # That of free space counts its own head.
+                entry += length if number == 0 else 16 + -(-length // 8) * 8
+            start = content.find(_HEAP, start + 4)
 
 
 def _items(file: h5py.File, soft_links: bool) -> Iterator[tuple[str, h5py.HLObject]]:

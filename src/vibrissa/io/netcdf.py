@@ -67,7 +67,7 @@ def kind_of(path: str | PathLike[str]) -> str:
     ValueError
         If it is a folder, empty, cut off, or no NetCDF-4 file.
     """
-    with opened(path, "a NetCDF-4 file") as file:
+    with opened(path, "NetCDF-4") as file:
         kind = file.attrs.get("kind", "")
     return kind.decode("utf-8", "replace") if isinstance(kind, bytes) else str(kind)
 
@@ -99,7 +99,7 @@ def read_dataset(
         If it is cut off, damaged or no NetCDF-4 file.
     """
     with (
-        opened(path, "a NetCDF-4 file", soft_links=False),
+        opened(path, "NetCDF-4", soft_links=False),
         xr.open_dataset(path, engine="h5netcdf", group=group) as data,
     ):
         return (data if names is None else data[[n for n in names if n in data]]).load()
@@ -108,7 +108,7 @@ def read_dataset(
 def read_tree(path: str | PathLike[str]) -> xr.DataTree:
     """Read the datasets of all groups; see `read_dataset`."""
     with (
-        opened(path, "a NetCDF-4 file", soft_links=False),
+        opened(path, "NetCDF-4", soft_links=False),
         xr.open_datatree(path, engine="h5netcdf") as tree,
     ):
         return tree.load()

@@ -1,0 +1,214 @@
+"""Files that are damaged, or made to do harm, end in one line that names them."""
+
+import random
+import warnings
+
+import h5py
+import numpy as np
+import pytest
+import xarray as xr
+from h5py import h5d, h5s, h5t
+
+from vibrissa import samples
+from vibrissa.io import kind_of, load_recording, load_tracks, recognise, save_recording
+from vibrissa.io.netcdf import netcdf_image, read_dataset, read_tree, write_netcdf
+from vibrissa.trial import facing_peg, measure, simulate, whisking
+
+WHISKER = samples.gamma()
+
+
+@pytest.fixture(scope="module")
+def trial():
+    return measure(simulate(WHISKER, whisking(duration=0.12, rate=100.0), facing_peg(WHISKER)))
+
+
+@pytest.fixture(scope="module")
+def content(trial, tmp_path_factory):
+    """Bytes of files as they should be, by name."""
+    path = tmp_path_factory.mktemp("good") / "trial.nc"
+    save_recording(path, trial)
+    rng = np.random.default_rng(0)
+    names = ("time", "space", "keypoint", "individual")
+    poses = xr.Dataset(
+        {"position": (names, rng.uniform(1, 30, (5, 2, 4, 1)))},
+        {"time": np.arange(5) / 50.0, "space": ["x", "y"], "keypoint": list("abcd")},
+        {"fps": 50.0, "time_unit": "seconds", "ds_type": "poses"},
+    ).assign_coords(individual=["C1"])
+    return {"trial.nc": path.read_bytes(), "poses.nc": bytes(netcdf_image(poses))}
+
+
+def external_link(file):
+    file["there"] = h5py.ExternalLink("/etc/other.h5", "/data")
+
+
+def external_group(file):
+    del file["truth"]
+    file["truth"] = h5py.ExternalLink("other.h5", "/truth")
+
+
+def external_storage(file):
+    file.create_dataset("bytes", (8,), "u1", external=[("/etc/hostname", 0, 8)])
+
+
+def virtual(file):
+    layout = h5py.VirtualLayout((4,), "f8")
+    layout[:] = h5py.VirtualSource("other.h5", "data", (4,))
+    file.create_virtual_dataset("joined", layout)
+
+
+def terabytes(file):
+    file.create_dataset("huge", (10**6, 10**6), "f8", chunks=(100, 100), compression="gzip")
+
+
+def many_gigabytes(file):
+    for i in range(20):
+        file.create_dataset(f"huge{i}", (10**4, 10**4), "f8", chunks=(100, 100))
+
+
+def wide_text(file):
+    file.create_dataset("text", (10,), "S500000000")
+
+
+def one_chunk(file):
+    file.create_dataset("chunk", (1,), "f8", maxshape=(None,), chunks=(10**8,))
+
+
+def in_a_circle(file):
+    file["truth/again"] = file["/"]
+
+
+def twice(file):
+    file["whiskers/again"] = file["truth"]
+
+
+def by_name(file):
+    file["truth/again"] = h5py.SoftLink("/")
+
+
+def opaque(file):
+    kind = h5t.create(h5t.OPAQUE, 8)
+    kind.set_tag(b"NUMPY:|O8")
+    h5d.create(file.id, b"chosen", kind, h5s.create_simple((3,)))
+
+
+HARMFUL = (
+    (external_link, "out of the file"),
+    (external_group, "out of the file"),
+    (external_storage, "other files"),
+    (virtual, "other files"),
+    (terabytes, "8e.03 GB, more than"),
+    (many_gigabytes, "GB, more than"),
+    (wide_text, "GB, more than"),
+    (one_chunk, "GB, more than"),
+    (in_a_circle, "several places"),
+    (twice, "several places"),
+    (by_name, "soft link"),
+    (opaque, "opaque"),
+)
+
+
+@pytest.mark.parametrize(("spoil", "said"), HARMFUL, ids=lambda one: getattr(one, "__name__", ""))
+def test_what_could_do_harm_is_refused(tmp_path, content, spoil, said):
+    path = tmp_path / "trial.nc"
+    path.write_bytes(content["trial.nc"])
+    with h5py.File(path, "r+") as file:
+        spoil(file)
+    with pytest.raises(ValueError, match=said) as caught:
+        load_recording(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_compresses_well_is_read(tmp_path):
+    """Nothing but zeros is a thousandth of its size, and no harm is meant."""
+    path = tmp_path / "zeros.nc"
+    data = xr.Dataset({"zeros": (("time", "node"), np.zeros((40_000, 1000)))})
+    encoding = {"zeros": {"zlib": True, "complevel": 9, "shuffle": True}}
+    write_netcdf(path, data, {"/": encoding})
+    assert data.nbytes > 1 << 28 > 400 * path.stat().st_size
+    assert read_dataset(path).identical(data)
+
+
+def test_groups_and_names_go_through_unchanged(tmp_path, trial):
+    """As xarray's own files: a coordinate of a group above is written once."""
+    ours, theirs = tmp_path / "ours.nc", tmp_path / "theirs.nc"
+    write_netcdf(ours, trial)
+    trial.to_netcdf(theirs, engine="h5netcdf")
+    assert read_tree(ours).identical(read_tree(theirs))
+    with h5py.File(ours) as one, h5py.File(theirs) as other:
+        names = [[], []]
+        one.visit(names[0].append)
+        other.visit(names[1].append)
+    assert sorted(names[0]) == sorted(names[1])
+
+
+def removed(file, chosen):
+    """Delete a variable, a group, or an attribute of one."""
+    held = []
+    file.visit(held.append)
+    name = chosen.choice(held)
+    attributes = file[name].attrs
+    if len(attributes) and chosen.random() < 0.5:
+        del attributes[chosen.choice(sorted(attributes))]
+    else:
+        del file[name]
+
+
+def exchanged(file, chosen):
+    """Give a variable other values, of another type or shape."""
+    held = []
+    file.visititems(lambda name, item: held.append(name) if hasattr(item, "shape") else None)
+    name = chosen.choice(held)
+    attributes = dict(file[name].attrs)
+    del file[name]
+    values = chosen.choice([np.zeros(3), np.array(1.0), np.array([b"ab"] * 3), np.full((2, 2), 7)])
+    file[name] = values
+    for key, value in attributes.items():
+        if key not in ("DIMENSION_LIST", "REFERENCE_LIST", "CLASS", "NAME"):
+            file[name].attrs[key] = value
+
+
+def spoilt_attribute(file, chosen):
+    held = []
+    file.visititems(lambda name, item: held.append(name) if len(item.attrs) else None)
+    attributes = file[chosen.choice(held)].attrs
+    wrong = [b"\xff\xfe", -1, np.nan, "x", np.arange(3), h5py.Empty("f"), ""]
+    attributes[chosen.choice(sorted(attributes))] = chosen.choice(wrong)
+
+
+def damaged(content, path, chosen):
+    """Write a file after some accident."""
+    spoilt = bytearray(content)
+    size = len(spoilt)
+    accident = chosen.choice(["cut", "zeros", removed, exchanged, spoilt_attribute])
+    if accident == "cut":
+        del spoilt[chosen.randrange(1, size) :]
+    elif accident == "zeros":
+        at = chosen.randrange(size - 512)
+        spoilt[at : at + 512] = bytes(512)
+    path.write_bytes(spoilt)
+    if callable(accident):
+        with h5py.File(path, "r+") as file:
+            accident(file, chosen)
+
+
+def fault(read, path):
+    try:
+        read(path)
+    except ValueError as error:
+        return str(error)
+    return None
+
+
+@pytest.mark.parametrize("seed", range(24))
+@pytest.mark.parametrize("name", ["trial.nc", "poses.nc"])
+def test_damage_ends_in_one_line(tmp_path, content, name, seed):
+    """Or the file can be read all the same; thousands more are tried by hand."""
+    path = tmp_path / name
+    damaged(content[name], path, random.Random(f"{name} {seed}"))
+    readers = (recognise, kind_of, load_tracks, *([load_recording] if name == "trial.nc" else ()))
+    for read in readers:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            said = fault(read, path)
+        assert said is None or (str(path) in said and "\n" not in said), (read, said)

@@ -1,6 +1,8 @@
 """The store of a study: whole whenever a run ends, and nobody else's."""
 
 import errno
+import json
+import shutil
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,6 +12,8 @@ import pytest
 import xarray as xr
 
 pytest.importorskip("zarr", reason="zarr (extra sweeps) is not installed")
+
+import zarr
 
 from vibrissa.sweeps import Busy, Store, failures, open_sweep, read_study, run_sweep
 from vibrissa.sweeps import sweep_summary as summary
@@ -131,7 +135,7 @@ def test_a_run_that_is_killed_at_any_write_loses_and_spoils_nothing(
             raise Killed
         write(self, values, index, column)
 
-    writes = 2 + 6 + 4
+    writes = 2 + 6 + 5
     monkeypatch.setattr(Rows, "write", killed_while_it_writes)
     for last in range(writes):
         left = last
@@ -172,6 +176,62 @@ def test_a_run_that_is_killed_while_it_lays_out_is_begun_anew(
     run_sweep(study, tmp_path / "s", workers=0)
     xr.testing.assert_identical(open_sweep(tmp_path / "s").load(), whole)
     assert not list((tmp_path / "s").glob(".new*"))
+
+
+def cut(file):
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+
+
+def overwrite(file):
+    content = bytearray(file.read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 4] = bytes(byte ^ 0x55 for byte in content[middle : middle + 4])
+    file.write_bytes(content)
+
+
+@pytest.mark.parametrize("damage", [cut, overwrite, Path.unlink])
+def test_whatever_is_damaged_is_noticed_and_done_again(study, path, whole, tmp_path, damage):
+    """Files of every kind in turn; those at the root, for other libraries, are renewed."""
+    files = [one.relative_to(path) for one in path.rglob("*") if one.is_file()]
+    for others in (".zmetadata", ".zgroup", ".zattrs", ".sweep.lock"):
+        files.remove(Path(others))
+    assert len(files) > 30
+    coordinates = {"whisker", "group", "task", "station"}
+    kind = (cut, overwrite, Path.unlink).index(damage)
+    for number, file in enumerate(sorted(files)[kind::3]):  # one after the other of an array
+        store = tmp_path / f"{number}"
+        shutil.copytree(path, store)
+        damage(store / file)
+        if not (store / file).exists() and file.name == ".study.json":
+            assert run_sweep(study, store, workers=0).done == 3
+            continue
+        if file.name == ".study.json":
+            with pytest.raises(ValueError, match=r"study\.json is damaged"):
+                run_sweep(study, store, workers=0)
+            continue
+        if len(file.parts) < 3 or file.name.startswith(".") or file.parts[1] in coordinates:
+            with pytest.raises(ValueError, match=f"{file.parts[0]} is damaged"):
+                open_sweep(store)
+        else:
+            shown = open_sweep(store).load()
+            damaged = shown["status"].values[:, 0] == 3
+            assert damaged.any(), file
+            assert np.isnan(shown["map_slip_force"].values[damaged]).all()
+            assert "damaged (`vibrissa sweep` does them again)" in summary(shown)
+        outcome = run_sweep(study, store, workers=0)
+        assert outcome.done >= 1, file
+        assert outcome.damaged or outcome.faults, file
+        assert not list(store.glob(".new-*"))
+        xr.testing.assert_identical(open_sweep(store).load(), whole)
+
+
+def test_a_store_without_checksums_is_shown(path, whole):
+    kept = json.loads((path / ".study.json").read_text())
+    (path / ".study.json").write_text(json.dumps(kept | {"layout": 2}))
+    group = zarr.open_group(path / "cells", mode="a", zarr_format=2)
+    del group["checksum"]
+    zarr.consolidate_metadata(path / "cells", zarr_format=2)
+    xr.testing.assert_identical(open_sweep(path).load(), whole)
 
 
 FULL = Path("/dev/full")

@@ -126,6 +126,10 @@ def _run(plan: Study, path: Path, **how: Any) -> None:
         said += f"; {outcome.skipped} were there before and skipped"
     if outcome.failed_before:
         said += f", {outcome.failed_before} of which had failed (--again tries them again)"
+    if outcome.damaged:
+        said += f"; {outcome.damaged} were damaged since they were written, and were done again"
+    for fault in outcome.faults:
+        errors.print(fault, highlight=False, soft_wrap=True, markup=False)
     output.print(said, highlight=False, soft_wrap=True)
     output.print(sweep_summary(open_sweep(path)), highlight=False, soft_wrap=True, markup=False)
     _print_failures(failures(path))

@@ -165,9 +165,9 @@ def _messages(
         _finish(path)
         reader = rosbags.reader([path], default_typestore=rosbags.types)
         reader.open()
-    try:
         fitting = [c for c in reader.connections if c.msgtype in kinds]
         there = sorted({c.topic for c in fitting})
+    try:
         if topic is None and len(there) == 1:
             topic = there[0]
         if topic not in there:
@@ -196,8 +196,8 @@ def _readable(path: Path) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        reason = f"{error}" or type(error).__name__
-        raise ValueError(f"{path} is no bag that can be read: {reason[:300]}") from error
+        reason = " ".join(str(error).split())[:300] or type(error).__name__
+        raise ValueError(f"{path} is no bag that can be read: {reason}") from error
 
 
 def _finish(path: Path) -> None:

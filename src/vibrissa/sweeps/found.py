@@ -2,34 +2,64 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 import xarray as xr
 import zarr
 from numpy.typing import NDArray
 
-from vibrissa.sweeps.rows import Rows, make_rows
+from vibrissa.sweeps.rows import Rows, is_rows, make_rows
+
+_ALL, _SUM = ".zmetadata", "checksum"
 
 
 class Found:
-    """The arrays of a task, open for writing.
+    """The arrays of a task, open for writing and reading.
 
     Parameters
     ----------
     path : Path
         Of the group, made by `lay_out`.
+
+    Raises
+    ------
+    ValueError
+        If what describes its arrays, or a coordinate, is damaged.
     """
 
     def __init__(self, path: Path) -> None:
-        self._rows: dict[str, Rows] = {}
-        self._coordinates: dict[str, NDArray[Any]] = {}
-        for name, array in zarr.open_group(path, mode="r", zarr_format=2).arrays():
-            if array.attrs["_ARRAY_DIMENSIONS"][:1] == ["whisker"]:
-                self._rows[name] = Rows(path / name)
-            else:
-                self._coordinates[name] = np.asarray(array[...])
+        self.rows: dict[str, Rows] = {}
+        self.coordinates: dict[str, NDArray[Any]] = {}
+        try:
+            known = json.loads((path / _ALL).read_text(encoding="utf-8"))["metadata"]
+            # All that the group was made of must be there, as it was.
+            if any(
+                json.loads((path / key).read_text(encoding="utf-8")) != known[key] for key in known
+            ):
+                raise ValueError("its description has changed")
+            for name, array in zarr.open_group(path, mode="r", zarr_format=2).arrays():
+                if is_rows(array):
+                    self.rows[name] = Rows(path / name)
+                else:
+                    self.coordinates[name] = np.asarray(array[...])
+            told = known[".zattrs"].get(_SUM)
+            if told is not None and told != _sum_of(self.coordinates):
+                raise ValueError("its coordinates have changed")
+        except Exception as fault:  # of a damaged file, libraries raise whatever they stumble over
+            reason = " ".join(str(fault).split())[:200] or type(fault).__name__
+            raise ValueError(
+                f"{path} is damaged ({reason}): `vibrissa sweep` with the same study does it again"
+            ) from fault
+
+    @property
+    def ordered(self) -> list[Rows]:
+        """Arrays of numbers, in the order of their names."""
+        return [self.rows[name] for name in sorted(self.rows)]
 
     def misfit(self, result: xr.Dataset) -> str:
         """Say what keeps a result from standing beside those of other whiskers.
@@ -46,8 +76,8 @@ class Found:
         """
         # Variables, not data arrays, which take longer to make than to write.
         for name, variable in result.variables.items():
-            others = self._coordinates.get(str(name))
-            rows = self._rows.get(str(name))
+            others = self.coordinates.get(str(name))
+            rows = self.rows.get(str(name))
             if others is not None and not _same(others, variable.values):
                 return f"{name} is {variable.values}, that of other whiskers {others}\n"
             if others is None and rows is None:
@@ -58,7 +88,7 @@ class Found:
                 )
         return ""
 
-    def write(self, result: xr.Dataset, index: int) -> None:
+    def write(self, result: xr.Dataset, index: int) -> bytes:
         """Write a whisker's result.
 
         Parameters
@@ -68,14 +98,21 @@ class Found:
         index : int
             Number of the whisker.
 
+        Returns
+        -------
+        bytes
+            All that was written, array by array in the order of their names.
+
         Raises
         ------
         OSError
             If it cannot be written.
         """
-        for name, variable in result.variables.items():
-            if name in self._rows:
-                self._rows[str(name)].write(variable.values, index)
+        content = []
+        for name, rows in sorted(self.rows.items()):
+            content.append(rows.encoded(result.variables[name].values if name in result else None))
+            rows.write(np.frombuffer(content[-1], rows.dtype).reshape(rows.shape), index)
+        return b"".join(content)
 
 
 def lay_out(group: zarr.Group, result: xr.Dataset, count: int) -> None:
@@ -109,6 +146,23 @@ def lay_out(group: zarr.Group, result: xr.Dataset, count: int) -> None:
             chunks=values.shape,
             attributes={**_plain(coordinate.attrs), "_ARRAY_DIMENSIONS": [str(name)]},
         )
+
+
+def seal(group: zarr.Group) -> None:
+    """Note the checksum of all arrays of a group that are not written to any more.
+
+    Parameters
+    ----------
+    group : zarr.Group
+        A new one, with all its arrays.
+    """
+    fixed = {name: np.asarray(one[...]) for name, one in group.arrays() if not is_rows(one)}
+    group.attrs[_SUM] = _sum_of(fixed)
+
+
+def _sum_of(arrays: Mapping[str, NDArray[Any]]) -> int:
+    """Checksum of arrays by name."""
+    return crc32(json.dumps({name: arrays[name].tolist() for name in sorted(arrays)}).encode())
 
 
 def _plain(attributes: dict[Any, Any]) -> dict[str, Any]:

@@ -10,13 +10,14 @@ it. So a disk that is full is mostly noticed before anything of a whisker is wri
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import zarr
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 WHISKERS = 4096
 """Whiskers to a chunk."""
@@ -62,8 +63,24 @@ def make_rows(
     )
 
 
+def is_rows(array: zarr.Array[Any]) -> bool:
+    """Tell whether an array is one of `make_rows`.
+
+    Parameters
+    ----------
+    array : zarr.Array
+        Of a store.
+
+    Returns
+    -------
+    bool
+        Whether its chunks hold plain numbers.
+    """
+    return not array.compressors
+
+
 class Rows:
-    """An array made by `make_rows`, to be written to.
+    """An array made by `make_rows`, to be written to and read from.
 
     Parameters
     ----------
@@ -76,11 +93,11 @@ class Rows:
         self._path = path
         self._chunk = array.chunks
         self._fill = array.fill_value
-        self._dtype = array.dtype
+        self.dtype = array.dtype
         self._rest = ".0" * (array.ndim - 1)
         sizes = [*array.chunks[1:], array.dtype.itemsize]
         self._steps = [int(np.prod(sizes[k:])) for k in range(array.ndim)]
-        self.shape = array.shape[1:]
+        self.count, self.shape, self.block = array.shape[0], array.shape[1:], array.chunks[0]
 
     def write(self, values: ArrayLike, index: int, column: int = 0) -> None:
         """Write a whisker's numbers, or those from a column on.
@@ -108,9 +125,67 @@ class Rows:
             file = open(path, "r+b")  # noqa: SIM115
         with file:
             file.seek(row * self._steps[0] + (column * self._steps[1] if column else 0))
-            file.write(np.asarray(values, dtype=self._dtype).tobytes())
+            file.write(self.encoded(values))
+
+    def encoded(self, values: ArrayLike | None) -> bytes:
+        """Numbers as they are written.
+
+        Parameters
+        ----------
+        values : array_like or None
+            As many as there are of a whisker, or one of a column; None for what means that nothing
+            is known of a whisker.
+
+        Returns
+        -------
+        bytes
+            Of the file.
+        """
+        if values is None:
+            values = np.full(self.shape, self._fill)
+        return np.asarray(values, dtype=self.dtype).tobytes()
+
+    def blocks(self) -> Iterator[NDArray[Any]]:
+        """Read all numbers, chunk by chunk.
+
+        Yields
+        ------
+        array (whiskers of the chunk, ...)
+            What a file lacks, because it was cut or is not there, means that nothing is known.
+        """
+        for first in range(0, self.count, self._chunk[0]):
+            block = np.full(self._chunk, self._fill, dtype=self.dtype)
+            with contextlib.suppress(FileNotFoundError):
+                content = self._file(first // self._chunk[0]).read_bytes()[: block.nbytes]
+                block.reshape(-1).view(np.uint8)[: len(content)] = np.frombuffer(content, np.uint8)
+            yield block[: self.count - first]
+
+    def read(self) -> NDArray[Any]:
+        """Read all numbers.
+
+        Returns
+        -------
+        array (whisker, ...)
+            As `blocks` gives them.
+        """
+        return np.concatenate(list(self.blocks()))
+
+    def whole(self) -> bool:
+        """Tell whether Zarr can read it.
+
+        Returns
+        -------
+        bool
+            Whether all files that are there have the size of a chunk.
+        """
+        size = int(np.prod(self._chunk)) * self.dtype.itemsize
+        files = map(self._file, range(-(-self.count // self._chunk[0])))
+        return all(file.stat().st_size == size for file in files if file.exists())
+
+    def _file(self, block: int) -> Path:
+        return self._path / f"{block}{self._rest}"
 
     def _make(self, path: Path) -> None:
         part = path.with_name(f"{path.name}.part")
-        part.write_bytes(np.full(self._chunk, self._fill, dtype=self._dtype).tobytes())
+        part.write_bytes(np.full(self._chunk, self._fill, dtype=self.dtype).tobytes())
         part.replace(path)

@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from vibrissa.sweeps.store import DONE, FAILED, Store
+from vibrissa.sweeps.checksums import DONE, FAILED
+from vibrissa.sweeps.store import DAMAGED, Store
 from vibrissa.sweeps.study import Cell, Study, answer
 
 Progress = Callable[[int, int], None]
@@ -32,12 +33,18 @@ class Outcome:
         Cells done now, those of them that failed, and those that were there before.
     failed_before : int
         Of those that were there before, the ones that had failed.
+    damaged : int
+        Cells that were there before, but not as they had been written; they were done again.
+    faults : tuple of str
+        What of the store was so damaged that it was made anew.
     """
 
     done: int
     failed: int
     skipped: int
     failed_before: int
+    damaged: int = 0
+    faults: tuple[str, ...] = ()
 
 
 def run_sweep(
@@ -50,7 +57,7 @@ def run_sweep(
     any_version: bool = False,
     progress: Progress | None = None,
 ) -> Outcome:
-    """Do what is not done yet of a study.
+    """Do what is not done yet of a study, and again what was damaged since.
 
     Parameters
     ----------
@@ -101,7 +108,9 @@ def run_sweep(
                 failed += not store.write(cell, found)
                 done += 1
                 tell(skipped + done, study.size)
-    return Outcome(done, failed, skipped, before)
+    return Outcome(
+        done, failed, skipped, before, int((status == DAMAGED).sum()), tuple(store.faults)
+    )
 
 
 def _silent(done: int, total: int) -> None:

@@ -1,17 +1,19 @@
 """Where a study's results are kept: Zarr, in which each cell's numbers have their place.
 
     /whiskers   what each whisker is
-    /cells      per whisker and task: status, seconds of CPU, which code found it, and the hash of
-                what was asked
+    /cells      per whisker and task: status, seconds of CPU, which code found it, the hash of what
+                was asked, and a checksum of all that is kept of it
     /TASK       the task's result for every whisker
 
 A cell's numbers are written once, in place (`vibrissa.sweeps.rows`), and its status, one byte,
 after everything else: a cell that is done is whole, whenever the run was killed, and of others
-nothing counts. Groups and files are made aside and renamed.
+nothing counts. Groups and files are made aside and renamed. What was damaged since is found by
+checksums (`vibrissa.sweeps.checksums`) when the store is opened, and done again.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 from collections.abc import Callable
@@ -24,13 +26,14 @@ import xarray as xr
 import zarr
 from numpy.typing import NDArray
 
-from vibrissa.sweeps.found import Found, lay_out
+from vibrissa.sweeps.checksums import DONE, FAILED, TOLD, checksum, damaged
+from vibrissa.sweeps.found import Found, lay_out, seal
 from vibrissa.sweeps.lock import hold
 from vibrissa.sweeps.origin import origin, own
-from vibrissa.sweeps.rows import Rows, make_rows
+from vibrissa.sweeps.rows import make_rows
 from vibrissa.sweeps.study import TAKEN, Cell, Study
 
-NOT_ASKED, DONE, FAILED = -1, 1, 2
+NOT_ASKED, DAMAGED = -1, 3
 DESCRIBED = {
     "length": "m",
     "base_radius": "m",
@@ -43,19 +46,24 @@ DESCRIBED = {
 
 FAILURES = ".failures"
 _STUDY, _LOCK, _ALL = ".study.json", ".sweep.lock", ".zmetadata"
-_LAYOUT = 2
-_HASH = 16
+_LAYOUT, _UNCHECKED = 3, 2
+_HASH, _SUM = 16, "checksum"
 _CELLS: dict[str, tuple[str, Any]] = {
     "status": ("int8", 0),
     "seconds": ("float64", np.nan),
     "origin": ("int16", -1),
     "identity": (f"S{_HASH}", b""),
+    "checksum": ("uint32", 0),
 }
 """What is told of every cell: type, and what means that nothing is known."""
 
 
 class Busy(ValueError):
     """Another run writes to the store."""
+
+
+class _Damaged(Exception):
+    """A group of the store cannot be read."""
 
 
 class Store:
@@ -76,6 +84,11 @@ class Store:
         If another run has it open.
     ValueError
         If it holds the results of another study or of another version, or is no store.
+
+    Attributes
+    ----------
+    faults : list of str
+        What of the store was so damaged that it was made anew.
     """
 
     def __init__(
@@ -86,6 +99,7 @@ class Store:
         self._any_version = any_version
         self._lock: IO[str] | None = None
         self._found: dict[str, Found] = {}
+        self.faults: list[str] = []
         self._columns = {name: k for k, name in enumerate(study.tasks)}
 
     def __enter__(self) -> Store:
@@ -123,18 +137,37 @@ class Store:
                 shutil.rmtree(self.path / begun, ignore_errors=True)
             self._make("whiskers", self._lay_out_whiskers)
             self._make("cells", self._lay_out_cells)
-            root = zarr.open_group(self.path, mode="a", zarr_format=2)
-            root.attrs.update({"kind": "vibrissa sweep", "study": self.study.name})
             self._note(_STUDY, {**_described(self.study), "origins": []})
         self._origin = self._admitted(noted(self.path))
-        self._consolidate()
-        self._cells = {name: Rows(self.path / "cells" / name) for name in _CELLS}
-        self._whiskers = {name: Rows(self.path / "whiskers" / name) for name in DESCRIBED}
+        self._note(".zgroup", {"zarr_format": 2})
+        self._note(".zattrs", {"kind": "vibrissa sweep", "study": self.study.name})
+        self._whiskers = self._opened("whiskers", self._lay_out_whiskers)
+        self._cells = self._opened("cells", self._lay_out_cells).rows
         for task in self.study.tasks:
             if self._known(task):
-                self._found[task] = Found(self.path / task)
+                with contextlib.suppress(_Damaged):
+                    self._found[task] = self._checked(task)
+        self._consolidate()
+
+    def _opened(self, name: str, fill: Callable[[zarr.Group], None]) -> Found:
+        """Open a group, or make it anew."""
+        with contextlib.suppress(_Damaged):
+            return self._checked(name)
+        self._make(name, fill)
+        return Found(self.path / name)
+
+    def _checked(self, name: str) -> Found:
+        """Open a group; one that cannot be read is removed, and what was in it is done again."""
+        try:
+            return Found(self.path / name)
+        except ValueError as fault:
+            self.faults.append(str(fault))
+            shutil.rmtree(self.path / name, ignore_errors=True)
+            raise _Damaged from fault
 
     def _note(self, name: str, content: dict[str, Any]) -> None:
+        if name == _STUDY:
+            content = {**content, _SUM: _sum(content)}
         part = self.path / f"{name}.part"
         part.write_text(json.dumps(content), encoding="utf-8")
         part.replace(self.path / name)
@@ -176,7 +209,9 @@ class Store:
         if self._known(name):
             return
         aside = self.path / f".new-{name}"
-        fill(zarr.open_group(aside, mode="w", zarr_format=2))
+        group = zarr.open_group(aside, mode="w", zarr_format=2)
+        fill(group)
+        seal(group)
         zarr.consolidate_metadata(aside, zarr_format=2)
         aside.rename(self.path / name)
 
@@ -208,14 +243,18 @@ class Store:
         Returns
         -------
         array (whisker, task) of int8
-            0 where nothing is, 1 where a cell is done, 2 where it failed.
+            0 where nothing is, 1 where a cell is done, 2 where it failed, 3 where what is there is
+            not what was written.
         """
-        cells = zarr.open_group(self.path / "cells", mode="r", zarr_format=2)
+        told = {name: rows.read() for name, rows in self._cells.items()}
         identity = np.zeros((len(self.study.specimens), len(self._columns)), dtype=f"S{_HASH}")
         for cell in self.study.cells():
             identity[cell.index, self._columns[cell.task]] = cell.identity.encode()
-        known = (cells["identity"][...] == identity) & (identity != b"")
-        return np.where(known, cells["status"][...], np.int8(0))
+        known = (told["identity"] == identity) & (identity != b"")
+        found = [self._found.get(task) for task in self._columns]
+        results = [[] if one is None else one.ordered for one in found]
+        bad = damaged(told, self._whiskers.ordered, results)
+        return np.where(bad, np.int8(DAMAGED), np.where(known, told["status"], np.int8(0)))
 
     def write(self, cell: Cell, answer: dict[str, Any]) -> bool:
         """Keep what became of a cell.
@@ -240,7 +279,9 @@ class Store:
             before is whole.
         """
         try:
-            failure = answer.get("failure") or self._write_result(cell, answer)
+            failure, numbers = answer.get("failure") or "", b""
+            if not failure:
+                failure, numbers = self._write_result(cell, answer)
             said = self.path / FAILURES / f"{cell.task}-{cell.index}.txt"
             if failure:
                 said.parent.mkdir(exist_ok=True)
@@ -248,11 +289,17 @@ class Store:
                 part.write_text(f"{cell.specimen.name}\n{failure}", encoding="utf-8")
                 part.replace(said)
             at = cell.index, self._columns[cell.task]
-            self._cells["seconds"].write(answer["seconds"], *at)
-            self._cells["origin"].write(self._origin, *at)
-            self._cells["identity"].write(cell.identity.encode(), *at)
-            # One byte, of which no half can be written: with it all of the above counts.
-            self._cells["status"].write(FAILED if failure else DONE, *at)
+            told = {
+                "seconds": answer["seconds"],
+                "origin": self._origin,
+                "identity": cell.identity.encode(),
+                "status": FAILED if failure else DONE,
+            }
+            own = b"".join(self._cells[name].encoded(told[name]) for name in TOLD)
+            told = {"checksum": checksum(own, numbers), **told}
+            # The status last: one byte, of which no half can be written. With it all counts.
+            for name, value in told.items():
+                self._cells[name].write(value, *at)
             if not failure:
                 said.unlink(missing_ok=True)
         except OSError as fault:
@@ -263,8 +310,8 @@ class Store:
             ) from fault
         return not failure
 
-    def _write_result(self, cell: Cell, answer: dict[str, Any]) -> str:
-        """Write a result, or say why it cannot be kept beside those of other whiskers."""
+    def _write_result(self, cell: Cell, answer: dict[str, Any]) -> tuple[str, bytes]:
+        """Write a result: its numbers as bytes, or why it cannot be kept beside others."""
         result: xr.Dataset = answer["result"]
         if cell.task not in self._found:
             count = len(self.study.specimens)
@@ -273,11 +320,13 @@ class Store:
             self._found[cell.task] = Found(self.path / cell.task)
         found = self._found[cell.task]
         if misfit := found.misfit(result):
-            return misfit
-        found.write(result, cell.index)
-        for name, value in answer["whisker"].items():
-            self._whiskers[name].write(value, cell.index)
-        return ""
+            return misfit, b""
+        numbers = found.write(result, cell.index)
+        described = b""
+        for name, rows in sorted(self._whiskers.rows.items()):
+            described += rows.encoded(answer["whisker"][name])
+            rows.write(answer["whisker"][name], cell.index)
+        return "", described + numbers
 
 
 def noted(path: Path) -> dict[str, Any]:
@@ -300,13 +349,27 @@ def noted(path: Path) -> dict[str, Any]:
     """
     if not (path / _STUDY).exists():
         raise ValueError(f"{path} is no store of a sweep")
-    kept: dict[str, Any] = json.loads((path / _STUDY).read_text(encoding="utf-8"))
-    if kept.get("layout") != _LAYOUT:
+    try:
+        kept = json.loads((path / _STUDY).read_bytes())
+    except ValueError:
+        kept = None
+    if isinstance(kept, dict) and kept.get("layout") not in (_LAYOUT, _UNCHECKED):
         raise ValueError(
             f"{path} is laid out as another version of vibrissa does: open it with that one, or "
             "give another store"
         )
+    if not isinstance(kept, dict) or (kept["layout"] == _LAYOUT and kept.get(_SUM) != _sum(kept)):
+        raise ValueError(
+            f"{path / _STUDY} is damaged, which says what the store holds: put back a copy of it, "
+            "or remove it, and the study is begun anew"
+        )
     return kept
+
+
+def _sum(kept: dict[str, Any]) -> int:
+    """Checksum of what a store says of itself."""
+    own = {name: value for name, value in kept.items() if name != _SUM}
+    return checksum(json.dumps(own, sort_keys=True).encode())
 
 
 def _described(study: Study) -> dict[str, Any]:

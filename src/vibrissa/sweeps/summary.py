@@ -36,7 +36,11 @@ def _lines(found: xr.Dataset) -> Iterator[str]:
         status = found["status"].sel(task=task).values
         counts = [int((status == code).sum()) for code in (1, 2, 0)]
         seconds = float(np.nansum(found["seconds"].sel(task=task).values))
-        yield "  {}: {} done, {} failed, {} to do; {:.0f} s of CPU".format(task, *counts, seconds)
+        spoilt = int((status == 3).sum())
+        again = f", {spoilt} damaged (`vibrissa sweep` does them again)" if spoilt else ""
+        yield "  {}: {} done, {} failed, {} to do{}; {:.0f} s of CPU".format(
+            task, *counts, again, seconds
+        )
     groups = list(dict.fromkeys(map(str, found["group"].values)))
     for task in map(str, found["task"].values):
         for group in groups:

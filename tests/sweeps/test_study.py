@@ -137,6 +137,18 @@ def test_a_cell_is_the_same_in_any_study_that_has_it():
         (WHISKERS + '[[tasks]]\nkind = "uniqueness"\nresolution = "no"\n', "true or false"),
         (WHISKERS + '[[tasks]]\nkind = "estimation"\nsignals = ["Q"]\n', r"\[\[tasks\]\] 1: "),
         (WHISKERS + '[[tasks]]\nkind = "friction"\nfriction = [-1]\n', "coefficients from 0"),
+        (WHISKERS + '[[tasks]]\nkind = "friction"\nfriction = [inf]\n', "coefficients from 0"),
+        (WHISKERS + '[[tasks]]\nkind = "friction"\ncontacts = 1e12\n', "from 1 to 1e"),
+        (WHISKERS + '[[tasks]]\nkind = "sensitivity"\nforce_noise = nan\n', "a number from 0"),
+        (WHISKERS + "kind = []\n" + TASKS, r"kind is \[\]; one of grid"),
+        (WHISKERS + "kind = {a = 1}\n" + TASKS, "kind is .*; one of grid"),
+        (WHISKERS + 'kind = "array"\nrows = [true]\n' + TASKS, "a list of words"),
+        (WHISKERS + 'kind = "array"\nside = []\n' + TASKS, "right or left"),
+        (WHISKERS + 'kind = "array"\ncolumns = ["1"]\n' + TASKS, "whole numbers"),
+        (WHISKERS + 'kind = "random"\ncount = 1000000000000\n' + TASKS, "1e.12 whiskers"),
+        (WHISKERS + 'kind = "random"\ncount = 1\nlogarithmic = [[]]\n' + TASKS, "list of words"),
+        (WHISKERS + f"length = {'9' * 400}\n" + TASKS, "a number or a list of numbers"),
+        ("a = " + 5000 * "[", "no TOML"),
     ],
 )
 def test_what_is_wrong_is_told_with_what_is_allowed(text, message):

@@ -89,7 +89,11 @@ def sweep(
         if scheduler not in (None, "local"):
             refuse({"--workers": workers}, f"the workers are those of {scheduler}")
         workers = 1 if workers is None else workers
-        plan = read_study(read_text(check_readable(study)), Path(study).parent)
+        text = read_text(check_readable(study))
+        try:
+            plan = read_study(text, Path(study).parent)
+        except ValueError as fault:
+            raise ValueError(f"{study}: {fault}") from None
         if dry_run:
             _cost(plan, max(workers, 1))
         else:

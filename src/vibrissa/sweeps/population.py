@@ -9,6 +9,8 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
+import math
+import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -36,6 +38,10 @@ PARAMETERS: Mapping[str, tuple[float, float, float]] = {
 rate by so many degrees from base to tip, and ``corkscrew`` turns the plane of bending by so many.
 ``trim`` is the share of the length that is left, the radius being what it was.
 """
+
+
+_MOST = 10_000_000
+"""Whiskers of a study: the calling process holds them all, 2.5 kB each."""
 
 
 @dataclass(frozen=True)
@@ -92,14 +98,14 @@ def population(tables: Sequence[Any], folder: Path, seed: int) -> list[Specimen]
         if not isinstance(table, Mapping):
             raise ValueError(f"{where} is {table!r}; a table is needed")
         kind = table.get("kind", "grid")
-        if kind not in _KINDS:
+        if not isinstance(kind, str) or kind not in _KINDS:
             raise ValueError(f"{where}: kind is {kind!r}; one of {', '.join(_KINDS)} is needed")
         said = {key: value for key, value in table.items() if key not in ("kind", "group")}
         group = str(table.get("group", kind))
         try:
             some = _KINDS[kind](said, folder, [seed, number])
             found += [replace(specimen, group=group) for specimen in some]
-        except (TypeError, ValueError, OSError) as fault:
+        except (TypeError, ValueError, OverflowError, OSError) as fault:
             raise ValueError(f"{where}: {fault}") from None
     counts = Counter(specimen.name for specimen in found)
     if twice := sorted(name for name, count in counts.items() if count > 1):
@@ -114,6 +120,7 @@ def _grid(said: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iterato
     only(said, {"prefix", *PARAMETERS}, "a grid")
     names = [name for name in PARAMETERS if name in said]
     values = [_numbers(name, said[name]) for name in names]
+    _check_count(math.prod(map(len, values)))
     for row in itertools.product(*values):
         yield _formula(dict(zip(names, row, strict=True)), str(said.get("prefix", "")))
 
@@ -124,7 +131,8 @@ def _random(said: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Itera
     count = said.get("count")
     if not isinstance(count, int) or isinstance(count, bool) or count < 1:
         raise ValueError(f"count is {count!r}; a whole number from 1 is needed")
-    logarithmic = said.get("logarithmic", [])
+    _check_count(count)
+    logarithmic = _words("logarithmic", said.get("logarithmic", []))
     if unknown := sorted(set(logarithmic) - set(PARAMETERS)):
         raise ValueError(f"logarithmic names {', '.join(unknown)}; known: {', '.join(PARAMETERS)}")
     generator = np.random.default_rng(list(seed))
@@ -178,6 +186,14 @@ def _array(said: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iterat
     only(said, {"prefix", "side", "rows", "columns", "names"}, "an array")
     choice = {key: value for key, value in said.items() if key != "prefix"}
     choice.setdefault("side", "right")
+    for name in ("rows", "names"):
+        if not isinstance(choice.get(name, ""), str):
+            _words(name, choice[name])
+    if not isinstance(choice["side"], str):
+        raise ValueError(f"side is {choice['side']!r}; right or left is needed")
+    columns = choice.get("columns", [])
+    if not isinstance(columns, list) or not all(type(one) is int for one in columns):
+        raise ValueError(f"columns is {columns!r}; a list of whole numbers is needed")
     prefix = str(said.get("prefix", ""))
     for name, whisker in whisker_array(**choice).items():
         identity = _hash(["array", choice["side"], name])
@@ -258,12 +274,27 @@ class _Made:
         return self.whisker
 
 
+def _check_count(count: int) -> None:
+    if count > _MOST:
+        raise ValueError(f"these are {count:.3g} whiskers; a study can have {_MOST:g}")
+
+
+def _words(name: str, value: Any) -> list[str]:
+    if not isinstance(value, list) or not all(isinstance(one, str) for one in value):
+        raise ValueError(f"{name} is {value!r}; a list of words is needed")
+    return value
+
+
 def _numbers(name: str, value: Any) -> list[float]:
     """One number or several of a parameter, within its bounds."""
     values = value if isinstance(value, list) else [value]
     least = PARAMETERS[name][2]
     for one in values:
-        if isinstance(one, bool) or not isinstance(one, int | float) or not np.isfinite(one):
+        if (
+            isinstance(one, bool)
+            or not isinstance(one, int | float)
+            or not abs(one) <= sys.float_info.max
+        ):
             raise ValueError(f"{name} is {value!r}; a number or a list of numbers is needed")
         if one <= least:
             raise ValueError(f"{name} is {one!r}; it must be above {least:g}")

@@ -237,7 +237,7 @@ def read_study(text: str, folder: Path) -> Study:
     """
     try:
         said = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as fault:
+    except (tomllib.TOMLDecodeError, RecursionError) as fault:
         raise ValueError(f"this is no TOML: {fault}") from None
     known = {"name", "seed", "whiskers", "tasks"}
     if unknown := sorted(set(said) - known):

@@ -36,6 +36,8 @@ PAPERS = ("Fx MB MD", "Mx MB MD", "Fx FD MD")
 
 VERDICTS = ("unique", "unique off a surface", "not unique")
 _MICRO = 1e-6
+_MOST = 10_000_000
+"""Samples of a whisker; more would not fit into memory."""
 _STATIONS = np.linspace(0.3, 1.0, 15)
 
 
@@ -97,7 +99,7 @@ def settings_of(said: Mapping[str, Any], where: str) -> tuple[str, Settings]:
     settings = {**task.defaults, **given}
     try:
         task.check(settings)
-    except (TypeError, ValueError) as fault:
+    except (TypeError, ValueError, AttributeError, OverflowError) as fault:
         raise ValueError(f"{where}: {fault}") from None
     return kind, settings
 
@@ -279,7 +281,7 @@ def _check_uniqueness(settings: Settings) -> None:
         raise ValueError(f"regions has {unknown[0]!r}; known are {', '.join(REGIONS)}")
     if not isinstance(settings["resolution"], bool):
         raise ValueError(f"resolution is {settings['resolution']!r}; true or false is needed")
-    _check_number(settings, "samples", 16)
+    _check_number(settings, "samples", 16, _MOST)
     _check_number(settings, "cone", 0.0)
 
 
@@ -296,21 +298,23 @@ def _check_sensitivity(settings: Settings) -> None:
 def _check_estimation(settings: Settings) -> None:
     _sets(settings)
     _check_noise(settings)
-    _check_number(settings, "contacts", 1)
+    _check_number(settings, "contacts", 1, _MOST)
 
 
 def _check_friction(settings: Settings) -> None:
     selection(settings["triplet"], exactly=3)
-    _check_number(settings, "contacts", 1)
+    _check_number(settings, "contacts", 1, _MOST)
     values = _several(settings, "friction")
-    if not all(isinstance(mu, int | float) and mu >= 0.0 for mu in values):
+    if not all(isinstance(mu, int | float) and 0.0 <= mu < np.inf for mu in values):
         raise ValueError(f"friction is {values!r}; a list of coefficients from 0 is needed")
 
 
-def _check_number(settings: Settings, name: str, least: float) -> None:
+def _check_number(settings: Settings, name: str, least: float, most: float = np.inf) -> None:
     value = settings[name]
-    if isinstance(value, bool) or not isinstance(value, int | float) or value < least:
-        raise ValueError(f"{name} is {value!r}; a number from {least:g} is needed")
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not number or not (least <= value <= most and value < np.inf):
+        upto = f" to {most:g}" if most < np.inf else ""
+        raise ValueError(f"{name} is {value!r}; a number from {least:g}{upto} is needed")
 
 
 def _nothing(settings: Settings) -> None:

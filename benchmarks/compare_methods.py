@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import vibrissa as vb
-from vibrissa.demo.scores import ANGLES
+from vibrissa.evaluation import ANGLES
 from vibrissa.mapping import LookupTable
 from vibrissa.mapping.contact_map import within_paper_bounds
 from vibrissa.mapping.network import DrawnContacts, draw_contacts

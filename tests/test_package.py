@@ -43,4 +43,5 @@ def test_children_can_be_interrupted_where_the_tests_cannot(request):
     request.getfixturevalue("interruptible")
     code = "import signal; print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)"
     child = [sys.executable, "-c", code]
-    assert subprocess.run(child, capture_output=True, text=True).stdout.strip() == "True"
+    done = subprocess.run(child, check=True, capture_output=True, text=True)
+    assert done.stdout.strip() == "True"

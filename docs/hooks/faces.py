@@ -36,7 +36,7 @@ class Faces(griffe.Extension):
                 if module is None or path != f"{package.path}.{name}.{name}":
                     continue
                 value = module.members[name]
-                # What else is in the module is still found, by its path and by going through the package.
+                # What else is in the module is found by its path, and by going through the package.
                 value.members |= module.members
                 package.members[f"{name}.py"] = module
                 package.set_member(name, griffe.Alias(name, value, parent=package))

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from vibrissa.demo.scores import ANGLES
+from vibrissa.evaluation import ANGLES
 from vibrissa.status import Status
 
 TARGET = 1.3

@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline
 
 import vibrissa as vb
 from vibrissa.contour import axis_offset, fit_cylinder
-from vibrissa.demo.scores import REPLICATES
+from vibrissa.evaluation import REPLICATES
 from vibrissa.mapping import ContactMap
 from vibrissa.pipeline import (
     SOLVED_TO,

@@ -9,9 +9,12 @@ import vibrissa as vb
 from vibrissa import samples
 from vibrissa.cli.app import app
 from vibrissa.demo import filming, run_demo
-from vibrissa.demo.stages import from_curves, refined
+from vibrissa.evaluation import caution, tracking_scores, truth_of
+from vibrissa.evaluation.stages import from_curves, refined
 from vibrissa.io import load_contacts, load_recording
 from vibrissa.pipeline import fit_contacts
+from vibrissa.report import trial_sections
+from vibrissa.report.values import shown_value
 from vibrissa.trial import recorded_whisker
 
 SHORT = {"duration": 0.6, "rate": 300.0, "video": False}
@@ -159,6 +162,44 @@ def test_from_video_the_peg_is_found(from_video):
     for one in (from_video.sensed, from_video.seen):
         assert np.linalg.norm(one.scores.offset) < 0.2e-3
         assert abs(one.scores.diameter_error) < 0.2e-3
+
+
+def test_a_report_of_the_trial_has_the_same_errors(from_video, folder):
+    """Its whisker is the one that was tracked, not quite of the shape of the one that whisked."""
+    for name, one in (("trial.nc", from_video.sensed), ("seen.nc", from_video.seen)):
+        recording = load_recording(folder / name)
+        truth, whisker = truth_of(recording)
+        np.testing.assert_array_equal(
+            whisker.centerline(9), recorded_whisker(from_video.simulated).centerline(9)
+        )
+        scores = tracking_scores(recording.to_dataset().isel(whisker=0), truth)
+        for field in ("trace", "centerline", "base", "contact", "told"):
+            np.testing.assert_array_equal(
+                getattr(scores, field), getattr(from_video.tracking, field)
+            )
+        text = " ".join(part.body for part in trial_sections(recording))
+        for row in (*one.scores.errors, *one.scores.by_angle):
+            for value in row.measured:
+                assert f">{shown_value(row.quantity, value)}</td>" in text
+        for row in one.scores.by_angle:
+            assert f'{row.label}</th><td class="number">{row.contacts}</td>' in text
+        for row in one.signals:
+            assert f">{100 * row.force[0]:.3g} %</td>" in text
+        for length in (from_video.tracking.base[0], from_video.tracking.centerline[0]):
+            assert f">{shown_value('centerline', length, 3)}</td>" in text
+
+
+def test_what_tests_no_whisker_says_so_wherever_it_is_shown(from_video, folder, tmp_path):
+    """Signals that the model made agree with the model: in the report, and when reconstructed."""
+    said = caution("contact point")
+    for name, warned in (("trial.nc", False), ("seen.nc", True)):
+        done = CliRunner().invoke(
+            app, ["reconstruct", str(folder / name), "-o", str(tmp_path / name)]
+        )
+        assert done.exit_code == 0, done.exception
+        assert (said in done.output) is warned
+        sections = trial_sections(load_recording(folder / name))
+        assert any(said in part.body for part in sections) is warned
 
 
 def test_signals_are_better_known_the_more_the_whisker_is_bent(from_video):

@@ -245,8 +245,33 @@ def test_errors_of_lines_are_distances_from_the_true_ones():
         for dim, aside in (("node", away), ("true_node", 0.0 * away))
     )
     rows = {row[0]: row[1:] for row in Page(tracking_tables(tracked, truth)).tables[LINES]}
-    assert rows["centreline"] == ["33", "2 mm", "3 mm"]
-    assert rows["trace, top view"] == ["33", "2 px", "3 px"]
+    assert rows["centreline"] == ["2 mm", "3 mm"]
+    assert rows["trace, top view"] == ["2 px", "3 px"]
+
+
+def test_points_that_lie_on_a_bent_whisker_are_on_it():
+    """Its nodes are farther apart than what was traced, and chords between them cut its bend."""
+
+    def arc(nodes, dim):
+        turn = np.linspace(0.0, 2.0, nodes)
+        curve = 0.02 * np.stack([np.sin(turn), 1.0 - np.cos(turn)], axis=-1)
+        data = {
+            "centerline": (("time", dim, "space"), np.insert(curve, 2, 0.0, axis=-1)[None]),
+            "trace": (("view", "time", dim, "image_axis"), 2e4 * curve[None, None]),
+            "in_contact": ("time", [True]),
+            "contact_point": (("time", "space"), np.zeros((1, 3))),
+        }
+        return xr.Dataset(data, {"view": ["top"], "time": [0.0]})
+
+    tracked, truth = arc(101, "node"), arc(33, "true_node")
+    # What hides the end of the whisker is traced, and is not seen.
+    tracked["trace"][..., 90:, :] += 50.0
+    tracked["trace_visible"] = ("view", "time", "node"), (np.arange(101) < 90)[None, None]
+    _, *rows = Page(tracking_tables(tracked, truth)).tables[LINES]
+    assert [row[0] for row in rows] == ["trace, top view", "centreline"]
+    for row, radius in zip(rows, (400.0, 20.0), strict=True):  # pixels, mm
+        sagitta = radius * (1.0 - np.cos(1.0 / 32))
+        assert all(number(cell) < 0.05 * sagitta for cell in row[1:])
 
 
 def two_whiskers(**groups):

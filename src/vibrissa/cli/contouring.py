@@ -232,6 +232,7 @@ def _tell(
     from vibrissa.cli.contour_tables import distance_table, object_table, summary
     from vibrissa.cli.recordings import tell_statuses
     from vibrissa.contour import shape_from_dataset
+    from vibrissa.evaluation import caution
     from vibrissa.pipeline import compare_contacts, compare_shapes, distances_by_class
 
     contour, estimates = (tree[name].to_dataset() for name in ("contour", "estimates"))
@@ -245,6 +246,8 @@ def _tell(
     if known:
         compared = compare_contacts(tree, known, whiskers)
         output.print(distance_table(distances_by_class(compared)["deflection_angle"]))
+    if said := caution(contour.attrs.get("source")):
+        output.print(said, highlight=False, soft_wrap=True)
 
 
 def _check_shape(shape: str, axis: bool) -> None:

@@ -104,6 +104,8 @@ def _pictures(result: DemoResult, folder: Path, tell: Tell) -> list[Path]:
 
 
 def _report(result: DemoResult, noise: bool) -> None:
+    from vibrissa.evaluation import caution
+
     sensed = result.sensed
     scores = sensed.scores
     none, one, several = scores.candidates
@@ -131,15 +133,10 @@ def _report(result: DemoResult, noise: bool) -> None:
         rows = result.seen.scores.by_angle
         title = f"The same {_SEEN}*, signals and map being of one model"
         output.print(_table(title, "angle", rows, False, lambda r: r.label))
-        output.print("* " + _CIRCULAR, highlight=False, soft_wrap=True)
+        said = caution(result.seen.contacts.attrs["source"])
+        output.print(f"* {said}", highlight=False, soft_wrap=True)
         output.print()
     output.print(_peg_table(result))
-
-
-_CIRCULAR = (
-    "The model gives signals for the contact point that was tracked, and is asked where they come "
-    "from: this tests tracking and inversion, not what a whisker feels."
-)
 
 
 def _tracking_table(scores: TrackingScores) -> Table:

@@ -1,8 +1,7 @@
 """The main job from end to end: from a whisker's signals to the contour of what it touched."""
 
 from vibrissa.demo.run import DemoResult, Located, run_demo
-from vibrissa.demo.scores import ErrorRow, Scores
-from vibrissa.demo.stages import SignalRow, TrackingScores
+from vibrissa.evaluation import ErrorRow, Scores, SignalRow, TrackingScores
 
 __all__ = [
     "DemoResult",

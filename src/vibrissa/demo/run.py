@@ -15,8 +15,17 @@ import xarray as xr
 from vibrissa import samples
 from vibrissa.contour import CylinderFit, shape_from_dataset
 from vibrissa.demo.filming import SIMULATED, TRACKED, begin, filmed, tracked, video_files
-from vibrissa.demo.scores import Scores, contact_errors, score
-from vibrissa.demo.stages import SignalRow, TrackingScores, signal_errors, tracking_scores
+from vibrissa.evaluation import (
+    Scores,
+    SignalRow,
+    TrackingScores,
+    contact_errors,
+    score,
+    signal_errors,
+    tracking_scores,
+    truth_of,
+    with_truth,
+)
 from vibrissa.io import save_contacts, save_recording
 from vibrissa.mapping import ContactMap
 from vibrissa.pipeline import (
@@ -166,18 +175,17 @@ def run_demo(
         held, scores, seen = trial, None, None
         if video:
             trial = filmed(trial, folder, seed, tell)
-            held = tracked(trial, folder, tell)
-            scores = tracking_scores(held.to_dataset().isel(DIM), trial)
-            held = _with_truth(held, trial)
+            held = with_truth(tracked(trial, folder, tell), trial)
+            scores = tracking_scores(held.to_dataset().isel(DIM), truth_of(held)[0])
         tell("map of all contacts", 0, 1)
         chart = ContactMap.simulate(recorded_whisker(held), grid=False)
         tell("map of all contacts", 1, 1)
         read = placed_by(signals_of(trial, "sensor"), held) if video else signals_of(trial)
-        sensed = _located(with_group(held, "signals", read), trial, chart, seed)
+        sensed = _located(with_group(held, "signals", read), chart, seed)
         tell("contact points", 1, 2 if video else 1)
         if video:
             read = signals_of(held, "contact point")
-            seen = _located(with_group(held, "signals", read), trial, chart, seed)
+            seen = _located(with_group(held, "signals", read), chart, seed)
             tell("contact points", 2, 2)
         (peg,) = recorded_objects(trial)
         assert isinstance(peg, Peg)
@@ -212,36 +220,23 @@ def _simulated(
     return measure(trial, force_noise, moment_noise, seed)
 
 
-def _with_truth(held: xr.DataTree, trial: xr.DataTree) -> xr.DataTree:
-    """Put what is known of the trial beside what was tracked of it."""
-    groups = {group.path: group.to_dataset(inherit=False) for group in held.subtree}
-    for group in trial.subtree:
-        if group.path.split("/")[1] in ("truth", "objects"):
-            # The curves of the truth have nodes of their own.
-            data = group.to_dataset(inherit=False)
-            groups[group.path] = data.rename(node="true_node") if "node" in data.dims else data
-    return xr.DataTree.from_dict(groups)
-
-
-def _located(recording: xr.DataTree, trial: xr.DataTree, chart: ContactMap, seed: int) -> Located:
+def _located(recording: xr.DataTree, chart: ContactMap, seed: int) -> Located:
     """Estimate contacts from a recording's signals, fit the peg, and compare with the truth."""
     recording = with_contour(with_estimates(recording, contact_maps=[chart]))
-    estimates = recording["estimates"].to_dataset()
-    contacts = estimates.isel(DIM)
+    contacts = recording["estimates"].to_dataset().isel(DIM)
     fit = shape_from_dataset(recording["contour"].to_dataset())
     assert isinstance(fit, CylinderFit)
-    whisker = recorded_whisker(trial)
-    truth = trial["truth"].to_dataset()
-    (peg,) = recorded_objects(trial)
+    truth, whisker = truth_of(recording)
+    (peg,) = recorded_objects(recording)
     assert isinstance(peg, Peg)
-    known = truth.isel(DIM).assign(
-        radius=("time", whisker_radii(truth, [whisker])[:, 0]),
+    radii = whisker_radii(recording["truth"].to_dataset(), [whisker])[:, 0]
+    known = truth.assign(
+        radius=("time", radii),
         peg_position=("space", peg.origin),
         peg_axis=("space", peg.axis),
         peg_radius=((), peg.radius),
     )
-    errors = contact_errors(contacts, known, whisker, seed)
-    angle = errors["deflection_angle"].values
+    errors = contact_errors(contacts, truth, whisker, seed)
     signals = recording["signals"].to_dataset().isel(DIM)
     return Located(
         recording=recording,
@@ -249,7 +244,7 @@ def _located(recording: xr.DataTree, trial: xr.DataTree, chart: ContactMap, seed
         errors=errors,
         fit=fit,
         scores=score(contacts, known, errors, fit),
-        signals=signal_errors(signals, trial, angle),
+        signals=signal_errors(signals, truth, errors["deflection_angle"].values),
     )
 
 

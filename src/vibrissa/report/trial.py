@@ -6,7 +6,6 @@ themselves. What a recording lacks is named with the verb that makes it.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -14,15 +13,24 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa.contour import shape_from_dataset
-from vibrissa.demo.scores import ANGLES, ErrorRow, angle_label, contact_errors, error_rows
-from vibrissa.demo.stages import from_curves, spread
 from vibrissa.display import show
+from vibrissa.evaluation import (
+    ErrorRow,
+    caution,
+    contact_errors,
+    deflection_angle,
+    error_rows,
+    signal_errors,
+    spread,
+    tracking_scores,
+    truth_of,
+)
 from vibrissa.pipeline import compare_contacts, distances_by_class
 from vibrissa.quantities import QUANTITIES, quantity
 from vibrissa.report.page import Section, paragraph, table
 from vibrissa.report.tracked import tracked_table, whiskers_table
 from vibrissa.report.values import shown_value
-from vibrissa.signals import CIRCULAR, SIGNALS, base_signals, nearest_on_rest, within_turn
+from vibrissa.signals import CIRCULAR, SIGNALS, base_signals, within_turn
 from vibrissa.status import describe
 from vibrissa.trial import recorded_objects, recorded_whisker
 from vibrissa.whisker import Whisker
@@ -34,7 +42,7 @@ STAGES = {"signals": "signals", "estimates": "estimate", "contour": "reconstruct
 
 # What can be compared.
 _TRACKED = ("contact_point", "in_contact")
-_FELT = ("force", "moment", "in_contact")
+_FELT = ("force", "moment", "in_contact", "base_rotation")
 _FOUND = ("contact_point", "contact_point_whisker", "in_contact")
 _SPREADS = ("covariance", "contact_covariance", "candidates")
 
@@ -71,7 +79,9 @@ def trial_sections(recording: xr.DataTree, whisker: int = 0, seed: int = 0) -> l
     """
     bent = recorded_whisker(recording, whisker)
     groups = {name: _one(recording, name, whisker) for name in ("", "signals", "estimates")}
-    truth = _one(recording, "truth", whisker)
+    truth, true_whisker = None, bent
+    if "truth" in recording.children:
+        truth, true_whisker = truth_of(recording, whisker)
     parts = [
         Section("recording", "What was recorded", show(recording).html + bent._repr_html_()),
         Section("settings", "What was done, with which settings", _settings(recording)),
@@ -82,7 +92,7 @@ def trial_sections(recording: xr.DataTree, whisker: int = 0, seed: int = 0) -> l
     if "measured" in recording.children and root is not None and "in_contact" in root:
         parts.append(Section("tracked", "What was tracked", tracked_table(root)))
     if truth is not None:
-        parts += _against_truth(recording, groups, truth, bent, seed)
+        parts += _against_truth(recording, groups, truth, true_whisker, seed)
     if "contour" in recording.children:
         parts.append(Section("contour", "The contour", _contour(recording, seed)))
     counted = _statuses(groups)
@@ -160,6 +170,8 @@ def _against_truth(
             told += _errors(*error_rows(contact_errors(estimates, truth, whisker, seed)))
         else:
             told += paragraph(_NOTHING)
+        warned = caution(estimates.attrs.get("source"))
+        told += paragraph(warned, "note") if warned else ""
         yield Section("estimates", "Estimated contacts", told)
 
 
@@ -172,7 +184,7 @@ def _signal_errors(signals: xr.Dataset, truth: xr.Dataset, whisker: Whisker) -> 
         rows,
         ("deflection angle", "contacts", "force", "moment", "force, 95 %", "moment, 95 %"),
         "Error of force and moment, median",
-        "Size of the error over that of the true vector, each in its own whisker frame.",
+        "Size of the error over that of the true vector, in the laboratory frame.",
     )
     return told + table(
         six,
@@ -201,54 +213,48 @@ def tracking_tables(root: xr.Dataset, truth: xr.Dataset) -> str:
     str
         HTML: tables of lines, and of contacts.
     """
-    lines = _line_rows(root, truth)
+    scores = tracking_scores(root, truth)
     touching = [data["in_contact"].values.astype(bool) for data in (root, truth)]
     both = touching[0] & touching[1]
-    told = float((touching[0] == touching[1]).mean())
-    rows = []
-    for name in ("contact_point", "arc_length", "force", "moment"):
+    views = root["view"].values if len(scores.trace) else ()
+    named = [
+        (f"trace, {view} view", "trace", each)
+        for view, each in zip(views, scores.trace, strict=True)
+    ]
+    named += [
+        ("centreline", "centerline", scores.centerline),
+        ("base", "base_position", scores.base),
+    ]
+    lines = [
+        (label, *_spread_cells(name, each))
+        for label, name, each in named
+        if np.isfinite(each).any()
+    ]
+    rows = [(quantity("contact_point").long_name, *_spread_cells("contact_point", scores.contact))]
+    for name in ("arc_length", "force", "moment"):
         if name not in root or name not in truth:
             continue
         away = root[name].values[both] - truth[name].values[both]
         size = np.linalg.norm(away, axis=-1) if away.ndim > 1 else np.abs(away)
-        rows.append((quantity(name).long_name, *(shown_value(name, v) for v in spread(size))))
+        rows.append((quantity(name).long_name, *_spread_cells(name, spread(size))))
     drawn = table(
         lines,
-        ("distance from the true line", "points", *_SPREAD),
+        ("distance from the true line", *_SPREAD),
         "Tracked and true lines",
-        "Of every point that was tracked.",
+        "Of points of the trace that were seen, of all of the centreline, and of the base from the "
+        "true one.",
     )
     return (drawn if lines else "") + table(
         rows,
         ("error of", *_SPREAD),
         "Tracked against true",
         f"Of {int(both.sum())} frames that are in contact and were found to be. Contact is told "
-        f"from none in {100 * told:.1f} % of {both.size} frames.",
+        f"from none in {100 * scores.told:.1f} % of {both.size} frames.",
     )
 
 
-def _line_rows(root: xr.Dataset, truth: xr.Dataset) -> list[tuple[str, str, str, str]]:
-    """Distances of traces, by view, and of centrelines from the true ones."""
-    rows = []
-    if "trace" in root and "trace" in truth:
-        pair = [
-            data["trace"].transpose("view", "time", ..., "image_axis") for data in (root, truth)
-        ]
-        names = [str(name) for name in np.atleast_1d(root["view"].values)]
-        for name, found, true in zip(names, *(each.values for each in pair), strict=True):
-            rows.append((f"trace, {name} view", *_away(from_curves(found, true), "trace")))
-    if "centerline" in root and "centerline" in truth:
-        pair = [data["centerline"].transpose("time", ..., "space") for data in (root, truth)]
-        away = from_curves(*(each.values for each in pair))
-        rows.append(("centreline", *_away(away, "centerline")))
-    return rows
-
-
-def _away(distances: Array, name: str) -> tuple[str, str, str]:
-    """How many distances are known, their median and 95 %."""
-    known = distances[np.isfinite(distances)]
-    middle, most = spread(known)
-    return str(known.size), shown_value(name, float(middle), 3), shown_value(name, float(most), 3)
+def _spread_cells(name: str, values: Array) -> list[str]:
+    return [shown_value(name, float(value), 3) for value in values]
 
 
 def six_rows(signals: xr.Dataset, truth: xr.Dataset) -> list[tuple[str, ...]]:
@@ -281,42 +287,29 @@ def six_rows(signals: xr.Dataset, truth: xr.Dataset) -> list[tuple[str, ...]]:
     return rows
 
 
-def signal_rows(
-    signals: xr.Dataset, truth: xr.Dataset, whisker: Whisker
-) -> list[tuple[str, str, str, str, str, str]]:
+def signal_rows(signals: xr.Dataset, truth: xr.Dataset, whisker: Whisker) -> list[tuple[str, ...]]:
     """Sum up errors of force and moment by deflection angle.
 
     Parameters
     ----------
     signals, truth : Dataset
-        Of one whisker, dim time: ``force``, ``moment``, ``in_contact``, and the true
-        ``contact_point_whisker``.
+        Of one whisker, dim time: ``force``, ``moment``, ``in_contact``, ``base_rotation``, and the
+        true ``contact_point_whisker``.
     whisker : Whisker
-        That touched.
+        The whisker as it truly is.
 
     Returns
     -------
     list of tuple of str
         Class, contacts, medians of both errors and 95 % of both, as shares of the true size.
     """
-    distance, arc_length = nearest_on_rest(whisker, truth["contact_point_whisker"].values)
-    angle = np.degrees(np.arctan2(distance, arc_length))
-    known = truth["in_contact"].values.astype(bool) & signals["in_contact"].values.astype(bool)
-    errors = []
-    for name in ("force", "moment"):
-        true = truth[name].values
-        with np.errstate(invalid="ignore", divide="ignore"):
-            away = np.linalg.norm(signals[name].values - true, axis=-1)
-            errors.append(away / np.linalg.norm(true, axis=-1))
-        known &= np.isfinite(errors[-1])
+    angle = deflection_angle(truth, whisker)
     rows = []
-    for low, high in itertools.pairwise(ANGLES):
-        some = known & (angle >= low) & (angle < high)
-        if some.any():
-            (force, force_most), (moment, moment_most) = (spread(e[some]) for e in errors)
-            shares = (f"{100 * v:.3g} %" for v in (force, moment, force_most, moment_most))
-            rows.append((angle_label(low, high), str(int(some.sum())), *shares))
-    return rows  # type: ignore[return-value]
+    for row in signal_errors(signals, truth, angle):
+        shares = [*row.force, *row.moment]
+        cells = (f"{100 * shares[i]:.3g} %" for i in (0, 2, 1, 3))
+        rows.append((row.label, str(row.contacts), *cells))
+    return rows
 
 
 def _felt(estimates: xr.Dataset, truth: xr.Dataset) -> str:

@@ -112,9 +112,9 @@ def contact_errors(
     truth : xarray.Dataset
         Of the recording, dim time: ``contact_point``, ``contact_point_whisker``.
     whisker : Whisker
-        That touched.
+        The whisker as it truly is, not as it was tracked.
     seed : int
-        Of the draws.
+        Seed of the draws.
 
     Returns
     -------
@@ -130,14 +130,31 @@ def contact_errors(
     away = contacts["contact_point"].values - truth["contact_point"].values
     errors = _with_size(_errors(point, true), away)
     drawn = _with_size(_errors(point + deviation, point), placed)
-    distance, arc_length = nearest_on_rest(whisker, true)
-    angle = np.arctan2(distance, arc_length)
     data = {name: ("time", errors[..., i]) for i, name in enumerate(ERRORS)}
     predicted = {
         f"{name}_predicted": (("replicate", "time"), drawn[..., i]) for i, name in enumerate(ERRORS)
     }
-    angles = {"deflection_angle": ("time", angle)}
+    angles = {"deflection_angle": ("time", deflection_angle(truth, whisker))}
     return xr.Dataset({**data, **predicted, **angles}, {"time": contacts["time"]})
+
+
+def deflection_angle(truth: xr.Dataset, whisker: Whisker) -> Array:
+    """Angle by which the true contact has moved from the whisker at rest, seen from the base.
+
+    Parameters
+    ----------
+    truth : xarray.Dataset
+        Truth of one whisker, dim time: ``contact_point_whisker``.
+    whisker : Whisker
+        The whisker as it truly is: the shape that was tracked has other angles.
+
+    Returns
+    -------
+    array (time,)
+        Angles, rad; NaN without contact.
+    """
+    distance, arc_length = nearest_on_rest(whisker, truth["contact_point_whisker"].values)
+    return np.asarray(np.arctan2(distance, arc_length))
 
 
 def _errors(estimated: Array, true: Array) -> Array:

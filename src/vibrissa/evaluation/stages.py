@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
-from vibrissa.demo.scores import ANGLES, angle_label
+from vibrissa.evaluation.contacts import ANGLES, angle_label
 
 Array = NDArray[np.float64]
 
@@ -24,9 +24,10 @@ class TrackingScores:
     Parameters
     ----------
     frames, lost : int
-        Of the videos, and those in which the whisker was not found.
+        Numbers of frames, and of those in which the whisker was not found.
     trace : array (view, 2)
-        Distance of traced points from the whisker in the image, pixels.
+        Distance of traced points from the whisker in the image, pixels; without views where no
+        traces are known.
     centerline : array (2,)
         Of points in space from the whisker's centreline, m.
     base : array (2,)
@@ -66,56 +67,71 @@ class SignalRow:
     moment: Array
 
 
-def tracking_scores(tracked: xr.Dataset, simulated: xr.DataTree) -> TrackingScores:
+def tracking_scores(tracked: xr.Dataset, truth: xr.Dataset) -> TrackingScores:
     """Compare what was tracked with the truth.
 
     Parameters
     ----------
     tracked : xarray.Dataset
-        Of a tracked recording, one whisker.
-    simulated : xarray.DataTree
-        The same trial, filmed, in the same frames.
+        Tracked recording of one whisker: ``in_contact``, ``contact_point``, and as far as they are
+        known ``trace``, ``trace_visible``, ``centerline``, ``base_position``, ``confidence``.
+    truth : xarray.Dataset
+        Truth of the same whisker in the same frames, see `truth_of`.
 
     Returns
     -------
     TrackingScores
-        The numbers.
+        The numbers; NaN for what is not known of both.
     """
-    truth = simulated["truth"].to_dataset().isel(whisker=0)
-    true_base = simulated.to_dataset()["base_position"].isel(whisker=0).values
-    traced = tracked["trace"].transpose("view", "time", "node", "image_axis").values
-    seen = tracked["trace_visible"].transpose("view", "time", "node").values.astype(bool)
-    drawn = [refined(one) for one in truth["trace"].transpose("view", "time", ...).values]
-    inside = [
-        distances[visible]
-        for distances, visible in zip(map(from_curves, traced, drawn), seen, strict=True)
-    ]
-    order = ("time", "node", "space")
-    lines = [data["centerline"].transpose(*order).values for data in (tracked, truth)]
-    away = np.linalg.norm(tracked["contact_point"].values - truth["contact_point"].values, axis=-1)
+    unknown = np.full(2, np.nan)
     touching = [data["in_contact"].values.astype(bool) for data in (tracked, truth)]
+    away = _distances(tracked, truth, "contact_point")[touching[0] & touching[1]]
+    base = centerline = unknown
+    if "base_position" in tracked and "base_position" in truth:
+        base = spread(_distances(tracked, truth, "base_position"))
+    if "centerline" in tracked and "centerline" in truth:
+        lines = [data["centerline"].transpose("time", ..., "space") for data in (tracked, truth)]
+        centerline = spread(from_curves(lines[0].values, refined(lines[1].values)))
+    lost = int((tracked["confidence"].values == 0.0).sum()) if "confidence" in tracked else 0
     return TrackingScores(
         frames=tracked.sizes["time"],
-        lost=int((tracked["confidence"].values == 0.0).sum()),
-        trace=np.array([spread(pixels) for pixels in inside]),
-        centerline=spread(from_curves(lines[0], refined(lines[1]))),
-        base=spread(np.linalg.norm(tracked["base_position"].values - true_base, axis=-1)),
-        contact=spread(away[touching[0] & touching[1]]),
+        lost=lost,
+        trace=_trace_errors(tracked, truth),
+        centerline=centerline,
+        base=base,
+        contact=spread(away),
         told=float((touching[0] == touching[1]).mean()),
     )
 
 
-def signal_errors(
-    signals: xr.Dataset, simulated: xr.DataTree, angle: Array
-) -> tuple[SignalRow, ...]:
+def _distances(tracked: xr.Dataset, truth: xr.Dataset, name: str) -> Array:
+    """How far a point (time, space) is from the true one."""
+    pair = [data[name].transpose("time", "space").values for data in (tracked, truth)]
+    return np.asarray(np.linalg.norm(pair[0] - pair[1], axis=-1))
+
+
+def _trace_errors(tracked: xr.Dataset, truth: xr.Dataset) -> Array:
+    """Median and 95 % distance of traced points that were seen, view by view."""
+    if "trace" not in tracked or "trace" not in truth:
+        return np.empty((0, 2))
+    order = ("view", "time", ..., "image_axis")
+    traced, true = (data["trace"].transpose(*order).values for data in (tracked, truth))
+    seen = np.ones(traced.shape[:3], dtype=bool)
+    if "trace_visible" in tracked:
+        seen = tracked["trace_visible"].transpose("view", "time", "node").values.astype(bool)
+    views = zip(traced, map(refined, true), seen, strict=True)
+    return np.array([spread(from_curves(a, b)[visible]) for a, b, visible in views])
+
+
+def signal_errors(signals: xr.Dataset, truth: xr.Dataset, angle: Array) -> tuple[SignalRow, ...]:
     """Compare force and moment with the truth, by deflection angle.
 
     Parameters
     ----------
     signals : xarray.Dataset
         The group ``signals``, one whisker.
-    simulated : xarray.DataTree
-        The same trial in the same frames.
+    truth : xarray.Dataset
+        Truth of the same whisker in the same frames, see `truth_of`.
     angle : array (time,)
         Deflection angle, rad.
 
@@ -124,12 +140,9 @@ def signal_errors(
     tuple of SignalRow
         One for each class that there is.
     """
-    truth = simulated["truth"].to_dataset().isel(whisker=0)
-    turned = simulated.to_dataset()["base_rotation"].isel(whisker=0).values
     errors = {}
     for name in ("force", "moment"):
-        true = np.einsum("tij,tj->ti", turned, truth[name].values)
-        found = np.einsum("tij,tj->ti", signals["base_rotation"].values, signals[name].values)
+        found, true = (_in_laboratory(data, name) for data in (signals, truth))
         with np.errstate(invalid="ignore", divide="ignore"):
             errors[name] = np.linalg.norm(found - true, axis=1) / np.linalg.norm(true, axis=1)
     known = truth["in_contact"].values.astype(bool) & signals["in_contact"].values.astype(bool)
@@ -141,6 +154,12 @@ def signal_errors(
             both = (spread(errors[name][some]) for name in ("force", "moment"))
             rows.append(SignalRow(angle_label(low, high), int(some.sum()), *both))
     return tuple(rows)
+
+
+def _in_laboratory(data: xr.Dataset, name: str) -> Array:
+    """Turn vectors (time, 3) from the whisker's frame into the laboratory's."""
+    turned = data["base_rotation"].transpose("time", "space", "whisker_axis").values
+    return np.asarray(np.einsum("tij,tj->ti", turned, data[name].transpose("time", "space").values))
 
 
 def refined(curves: Array, times: int = 8) -> Array:

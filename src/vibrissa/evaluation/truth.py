@@ -1,0 +1,87 @@
+"""The truth of a trial beside what was tracked of it, and what its numbers do not test."""
+
+from __future__ import annotations
+
+import xarray as xr
+
+from vibrissa.trial import recorded_whisker
+from vibrissa.whisker import Whisker
+
+_POSE = ("base_position", "base_rotation")
+
+_CIRCULAR = (
+    "The model gives signals for the contact that was tracked, and is asked where they come from: "
+    "this tests tracking and inversion, not what a whisker measures."
+)
+
+
+def with_truth(tracked: xr.DataTree, simulated: xr.DataTree) -> xr.DataTree:
+    """Put what is known of a trial beside what was tracked of it.
+
+    Parameters
+    ----------
+    tracked : xarray.DataTree
+        Tracked recording.
+    simulated : xarray.DataTree
+        The same trial in the same frames, as it was simulated.
+
+    Returns
+    -------
+    xarray.DataTree
+        The tracked recording with the objects and the group ``truth``, which has the base's true
+        pose and the whiskers as they truly are.
+    """
+    groups = {group.path: group.to_dataset(inherit=False) for group in tracked.subtree}
+    for group in simulated.subtree:
+        if group.path.startswith(("/truth", "/objects")):
+            # The curves of the truth have nodes of their own.
+            data = group.to_dataset(inherit=False)
+            groups[group.path] = data.rename(node="true_node") if "node" in data.dims else data
+        elif group.path.startswith("/whiskers"):
+            groups[f"/truth{group.path}"] = group.to_dataset(inherit=False)
+    root = simulated.to_dataset()
+    groups["/truth"] = groups["/truth"].assign({name: root[name].variable for name in _POSE})
+    return xr.DataTree.from_dict(groups)
+
+
+def truth_of(recording: xr.DataTree, whisker: int = 0) -> tuple[xr.Dataset, Whisker]:
+    """Give what is truly known of one whisker.
+
+    Parameters
+    ----------
+    recording : xarray.DataTree
+        Recording with a group ``truth``, simulated or of `with_truth`.
+    whisker : int
+        Number of the whisker along the dimension ``whisker``.
+
+    Returns
+    -------
+    truth : xarray.Dataset
+        Its truth, dim time, with the base's true ``base_position`` and ``base_rotation`` unless
+        they are not known.
+    whisker : Whisker
+        The whisker as it truly is; as it was tracked where nothing else is known.
+    """
+    group = recording.children["truth"]
+    truth = group.to_dataset()
+    if "measured" not in recording.children:
+        root = recording.to_dataset()
+        truth = truth.assign({n: root[n] for n in _POSE if n in root and n not in truth})
+    known = group if "whiskers" in group.children else recording
+    return truth.isel(whisker=whisker), recorded_whisker(known, whisker)
+
+
+def caution(source: object) -> str | None:
+    """Say what errors of contacts do not test, by where their signals come from.
+
+    Parameters
+    ----------
+    source : object
+        Attribute ``source`` of the group ``signals``.
+
+    Returns
+    -------
+    str or None
+        A sentence where the model itself computed the signals, from what was tracked.
+    """
+    return _CIRCULAR if source in ("contact point", "rod") else None

@@ -84,6 +84,12 @@ class Status(enum.IntEnum):
         "The input of this row is missing or not finite.",
         "Check the row for NaN, for example frames in which the whisker was not tracked.",
     )
+    TOO_STRONG = (
+        15,
+        False,
+        "The force is so strong that it winds the whisker up in waves too short to compute.",
+        "Check the force's unit (N), and the whisker's radius: forces scale with its fourth power.",
+    )
     UNIQUE = (
         20,
         True,

@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 
 import vibrissa as vb
 from vibrissa.rod.batch import solve_forces
 from vibrissa.rod.discretize import discretize
+from vibrissa.rod.reach import fold_forces, reach
 
 few = settings(max_examples=15)
 
@@ -110,6 +112,99 @@ def test_a_point_on_the_resting_whisker_needs_no_force(whisker, s, off):
     assert abs(bent.arc_length / d.length - s) <= 2.0 * off + 1e-7
     # At the tip 1 N bends thousands of times as far as at 0.3 L.
     assert sizes(bent.force) / d.force <= 150.0 * off + 1e-7
+
+
+# A curved and nearly cylindrical whisker, bent far enough, passes again through points that it
+# touches at rest: there the answer is the contact that grows from rest.
+
+
+def along_the_path_from_rest(d, s, ends, steps):
+    """Contacts (n, 4) at points ``ends``, followed from rest at s by Newton's method."""
+    contacts = np.stack([s, 0.0 * s, 0.0 * s, 0.0 * s], axis=-1)
+    begins = solve_forces(d, contacts)[0][:, 3:]
+    for part in np.arange(1, steps + 1) / steps:
+        for _ in range(8):
+            values, tangents = solve_forces(d, contacts, tangents=True)
+            left = values[:, 3:] - (begins + part * (ends - begins))
+            contacts[:, [0, 2, 3]] -= np.linalg.solve(tangents[:, 3:], left[..., None])[..., 0]
+        assert (np.linalg.det(tangents[:, 3:]) > 0.0).all()
+        assert (sizes(left) <= 1e-12).all()
+    return contacts
+
+
+def arched(bend, ratio):
+    """A whisker of constant curvature that turns by ``bend`` (rad)."""
+    curvature = np.array([0.0, 0.0, bend]) / 69.4e-3
+    return vb.Whisker.from_curvature(
+        69.4e-3,
+        lambda s: curvature + 0.0 * np.asarray(s)[..., None],
+        base_radius=97e-6,
+        tip_radius=97e-6 / ratio,
+    )
+
+
+@pytest.fixture(scope="module", params=[(0.9, 1.062), (1.0, 1.0)])
+def cylinder(request):
+    return arched(*request.param)
+
+
+@pytest.mark.parametrize("off", [0.0, 3e-9, 3e-6, 1e-3, 6e-3])
+def test_a_light_contact_is_light_on_a_cylinder_too(cylinder, off):
+    d = discretize(cylinder)
+    s = np.linspace(0.31, 0.99, 69)
+    bearing = np.arange(69) * 2.4
+    frame = cylinder.frame(s * d.length)
+    aside = frame[:, :, 1] * np.cos(bearing)[:, None] + frame[:, :, 2] * np.sin(bearing)[:, None]
+    points = cylinder.position(s * d.length) + off * d.length * aside
+    expected = along_the_path_from_rest(d, s, points / d.length, 1)
+    bent = vb.deflect(cylinder, vb.PointContact(points))
+    np.testing.assert_array_equal(bent.status, vb.Status.OK)
+    np.testing.assert_allclose(bent.arc_length / d.length, expected[:, 0], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(bent.contact_force / d.force, expected[:, 1:], rtol=0, atol=1e-7)
+
+
+def test_where_two_contacts_are_at_one_point_the_lighter_one_is_the_answer(cylinder):
+    """Heavy contacts that pass the resting whisker, where a light one holds it as well."""
+    d, fold = discretize(cylinder), reach(cylinder).fold
+    rng = np.random.default_rng(6)
+    heavy = np.zeros((300_000, 4))
+    s, bearing = rng.uniform(0.4, 0.98, len(heavy)), rng.normal(np.pi, 0.2, len(heavy))
+    heavy[:, 0], heavy[:, 2], heavy[:, 3] = s, np.cos(bearing), np.sin(bearing)
+    share = rng.uniform(0.5, 0.9, len(heavy))
+    heavy[:, 2:] *= (share * fold_forces(fold, heavy[:, [0, 2, 3]]))[:, None]
+    points = solve_forces(d, heavy)[0][:, 3:]
+    s = np.linspace(0.32, 0.98, 1001)
+    away, nearest = cKDTree(cylinder.position(s * d.length) / d.length).query(points)
+    crossing = np.flatnonzero(away < 8e-3)
+    assert crossing.size > 10
+    expected = along_the_path_from_rest(d, s[nearest[crossing]], points[crossing], 5)
+    bent = vb.deflect(cylinder, vb.PointContact(points[crossing] * d.length))
+    np.testing.assert_array_equal(bent.status, vb.Status.OK)
+    np.testing.assert_allclose(bent.arc_length / d.length, expected[:, 0], rtol=0, atol=1e-9)
+    assert (sizes(bent.contact_force) / d.force < 0.1 * sizes(heavy[crossing, 1:])).all()
+
+
+def test_just_before_the_proximal_limit_a_cylinder_is_not_touched_elsewhere(cylinder):
+    points = cylinder.position(np.linspace(0.2, 0.2999, 40) * cylinder.length)
+    status = vb.deflect(cylinder, vb.PointContact(points)).status
+    np.testing.assert_array_equal(status, vb.Status.TOO_PROXIMAL)
+
+
+@few
+@given(data=st.data())
+def test_the_answer_is_connected_to_rest(cylinder, loads, data):
+    """Half way to the fold: followed from rest in small steps, by the test's own code."""
+    load = data.draw(loads).on(cylinder, most=0.5)
+    points = vb.deflect(cylinder, load).contact_point
+    bent = vb.deflect(cylinder, vb.PointContact(points))
+    d = discretize(cylinder)
+    s = bent.arc_length / d.length
+    force = bent.contact_force / d.force
+    contacts = np.concatenate([s[:, None], force], axis=1)
+    for share in np.linspace(0.0, 1.0, 21):
+        values, tangents = solve_forces(d, contacts * [1.0, share, share, share], tangents=True)
+        assert (np.linalg.det(tangents[:, 3:]) > 0.0).all()
+    assert (sizes(values[:, 3:] * d.length - points) <= 1e-10 * d.length).all()
 
 
 # Points out of reach, and why.

@@ -95,7 +95,8 @@ def discretize(whisker: Whisker, steps: int = STEPS) -> Discretization:
     rod = (nodes[:-1].copy(), width, ones, ones * (1.0 + whisker.poisson_ratio), ones, shape)
     stiffness = whisker.base_bending_stiffness
     if whisker.base_stiffness is not None:
-        rod = _with_joint(rod, stiffness / length, *whisker.base_stiffness)
+        pieces = _JOINT_STEPS * max(1, steps // STEPS)
+        rod = _with_joint(rod, pieces, stiffness / length, *whisker.base_stiffness)
     return Discretization(
         rod=tuple(np.ascontiguousarray(a, dtype=np.float64) for a in rod),  # type: ignore[arg-type]
         length=length,
@@ -126,13 +127,12 @@ def _nodes(whisker: Whisker, steps: int) -> Array:
     return np.concatenate([*pieces, [1.0]])
 
 
-def _with_joint(rod: Rod, moment_scale: float, bending: float, twist: float) -> Rod:
+def _with_joint(rod: Rod, n: int, moment_scale: float, bending: float, twist: float) -> Rod:
     """Put a compliant base before the rod: one unit of rod without length, as soft as the joint.
 
     Such a piece turns by the rotation that its moment asks for and moves nothing, so it is a
-    torsion spring; being rod, it needs no equations of its own.
+    torsion spring; being rod, it needs no equations of its own. It is cut into n steps.
     """
-    n = _JOINT_STEPS
     start, width, extent, twists, bends, shape = rod
     unit = np.zeros((n, 4, 4))
     unit[:, 3, 0] = 1.0

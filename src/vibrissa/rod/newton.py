@@ -46,6 +46,9 @@ _MOST_FAILURES = 4
 _CHORD_ROUNDS = 6
 # Beyond this share of the fold force a solution's determinant is computed at the solution.
 _NEAR_FOLD = 0.97
+#: The interpolated fold force is good to a few parts in 10⁴; up to this much above it the
+#: determinant's sign decides.
+ABOVE_FOLD = 1.01
 
 
 @inlined
@@ -267,6 +270,4 @@ def stable(fold: Fold, proximal: float, xi: Array, sign: float) -> bool:
     if not (sign > 0.0 and xi[0] >= proximal - ROUNDING):
         return False
     strength = fold_force(fold, xi[0], float(np.arctan2(xi[2], xi[1])))
-    # The interpolated fold force is good to a few parts in 10⁴; the determinant's sign decides near
-    # it.
-    return bool(np.hypot(xi[1], xi[2]) <= 1.01 * strength)
+    return bool(np.hypot(xi[1], xi[2]) <= ABOVE_FOLD * strength)

@@ -2,8 +2,9 @@
 
 A peg met from rest is moved, in thought, from far on its side along the direction in which it
 pushes until it touches the resting whisker, and from there to where it is, the contact followed all
-the way (:mod:`vibrissa.rod.continuation`). A peg met from an earlier deflection moves straight from
-its place then to its place now.
+the way (:mod:`vibrissa.rod.continuation`). A line that so passes by the tip may still hold the
+whisker, which leans over when it is bent; it is moved from a touch near the tip straight to its
+place. A peg met from an earlier deflection moves straight from its place then to its place now.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 _SAMPLES = 513
 # The first touch, as deep as the least force needs.
 _DEPTH = 1e-6
+# Arc length (over L) of the touch from which a line that passes by the tip is moved.
+_NEAR_TIP = 0.95
 # An axis this near (over L) goes through the whisker.
 _TOUCHING = 1e-9
 _ROWS = 4096
@@ -156,13 +159,46 @@ def _solve_from_rest(
     near_base = np.flatnonzero(out.statuses == int(Status.TOO_PROXIMAL))
     out.values[near_base], out.contacts[near_base] = np.nan, np.nan
     out.misfits[near_base] = np.nan
+    if rows.size:
+        ends = pegs.parameters()[rows]
+        begins = ends.copy()
+        begins[:, :3] += (depth[rows] + _DEPTH)[:, None] * push[rows]
+        kinds, unknowns = _start(rest, s[rows], direction[rows])
+        _follow(whisker, begins, ends, kinds, unknowns, out, rows, proximal, steps)
+    missed = there & (pegs.radius < 0.0) & (depth == np.inf)
+    _from_near_tip(whisker, rest, pegs, push, out, np.flatnonzero(missed), proximal, steps)
+    return out
+
+
+def _from_near_tip(
+    whisker: Whisker,
+    rest: Rest,
+    pegs: Pegs,
+    push: Array,
+    out: Solutions,
+    rows: IntArray,
+    proximal: float,
+    steps: int,
+) -> None:
+    """Solve lines that pass by the tip of the resting whisker, if they hold the bent one."""
+    ends, axis = pegs.parameters()[rows], pegs.axis[rows]
+    i = int(np.searchsorted(rest.s, _NEAR_TIP))
+    normal = np.cross(axis, rest.frame[i][:, 0])
+    normal *= np.sign(np.einsum("ni,ni->n", normal, push[rows]))[:, None]
+    size = np.linalg.norm(normal, axis=1, keepdims=True)
+    normal /= np.where(size > 0.0, size, 1.0)
+    touch = _normal_part(rest.position[i] - ends[:, :3], axis)
+    pushing = np.flatnonzero(np.einsum("ni,ni->n", touch, normal) < 0.0)
+    rows, ends, normal, touch = rows[pushing], ends[pushing], normal[pushing], touch[pushing]
     if not rows.size:
-        return out
-    ends = pegs.parameters()[rows]
+        return
     begins = ends.copy()
-    begins[:, :3] += (depth[rows] + _DEPTH)[:, None] * push[rows]
-    kinds, unknowns = _start(rest, s[rows], direction[rows])
-    return _follow(whisker, begins, ends, kinds, unknowns, out, rows, proximal, steps)
+    begins[:, :3] += touch + _DEPTH * normal
+    kinds, unknowns = _start(rest, np.full(rows.size, rest.s[i]), normal)
+    found = Solutions.empty(len(out.statuses))
+    _follow(whisker, begins, ends, kinds, unknowns, found, rows, proximal, steps)
+    held = rows[found.statuses[rows] == Status.OK]
+    out.put(held, Solutions(*(part[held] for part in found)))
 
 
 def solve_from_contact(
@@ -183,9 +219,10 @@ def solve_from_contact(
     out = Solutions.empty(len(ends))
     rows = np.flatnonzero(np.isfinite(ends).all(axis=1))
     kinds = np.where(tip, TIP, SIDE)
-    return _follow(
+    _follow(
         whisker, begins[rows], ends[rows], kinds[rows], unknowns[rows], out, rows, proximal, steps
     )
+    return out
 
 
 def _follow(
@@ -198,7 +235,7 @@ def _follow(
     rows: IntArray,
     proximal: float,
     steps: int,
-) -> Solutions:
+) -> None:
     chart = reach(whisker, proximal=proximal, steps=steps)
     solved = follow_all(
         chart, np.ascontiguousarray(begins), np.ascontiguousarray(ends), kinds.copy(), unknowns
@@ -208,7 +245,6 @@ def _follow(
     out.contacts[rows[good]], out.values[rows[good]] = solved.contacts[good], solved.values[good]
     out.contacts[rows[~good]], out.values[rows[~good]] = np.nan, np.nan
     _rest_values(out, rows[solved.statuses == Status.NO_CONTACT])
-    return out
 
 
 def _rest_values(out: Solutions, rows: IntArray) -> None:

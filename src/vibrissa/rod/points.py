@@ -1,4 +1,12 @@
-"""The contact at a given point: seeds from the chart, Newton, and a reason where there is none."""
+"""The contact at a given point: seeds from the chart, Newton, and a reason where there is none.
+
+The contact point is not injective on Ω for every whisker: pushed far enough, a curved and nearly
+cylindrical one passes again through points that it touches at rest. The answer is the equilibrium
+of least force. A solution is therefore in doubt where another seed has less force, or where the
+point is so near the resting whisker that a light contact may hold it. There, and where no seed
+leads to a solution, the path is followed from all starts, and the contact of least force that is
+reached is the answer.
+"""
 
 from __future__ import annotations
 
@@ -14,13 +22,17 @@ from vibrissa.rod.compiled import copy, inlined, kernel
 from vibrissa.rod.continuation import follow
 from vibrissa.rod.equations import POINT
 from vibrissa.rod.kernels import BUFFER_SIZE, LANES
-from vibrissa.rod.newton import TOLERANCE, newton_group, norm3, stable, start_from
+from vibrissa.rod.newton import ABOVE_FOLD, TOLERANCE, newton_group, norm3, stable, start_from
 from vibrissa.rod.preimage import Preimages, Tree
 from vibrissa.rod.reach import (
+    LEAST_ARC,
     Fold,
     Reach,
+    arc_length,
     chart_to_contact,
     contacts_at,
+    fold_force,
+    fold_forces,
     reach,
     with_normal_force,
 )
@@ -32,10 +44,23 @@ if TYPE_CHECKING:
 
 # A point without a seed is unreachable, and the nearest face of the chart tells why. This near to
 # a face (over L) it is approached from inside instead, in case the interpolant misjudges; and this
-# near to the resting whisker, where bearings have no meaning and there may be no seed.
+# near to the resting whisker, where bearings have no meaning and there may be no seed, from there.
 _NEAR = 0.01
 # Points along each edge of the chart's faces.
 _FACE = 65
+# Points along the resting whisker, as a polygon.
+_RESTING = 33
+# A contact up to here, in the chart's ρ, is light.
+_LIGHT = 0.25
+# Seeds nearer than this to each other, in η and ρ, lead to the same solution.
+_APART = 0.05
+# Starts that are followed for one point, and how near to the fold they are at most, in ρ.
+_STARTS = 8
+_SHORT_OF_FOLD = 0.95
+# Residual of a point that was reached, if only at a fold.
+_REACHED = 1e-9
+# Coordinates beyond this (over L) are as far out of reach as this; their squares might overflow.
+_FAR = 1e3
 
 
 class Solutions(NamedTuple):
@@ -70,11 +95,103 @@ def _at_point(
     return norm3(residual)
 
 
+@inlined
+def _force(fold: Fold, chart: Array) -> float:
+    """Force of a seed."""
+    strength = fold_force(fold, arc_length(fold[0], chart[0]), chart[1])
+    return float(chart[2] * chart[2] * strength)
+
+
+@inlined
+def _apart(a: Array, b: Array) -> bool:
+    """Whether two seeds lead to different solutions."""
+    return bool(max(abs(a[0] - b[0]), abs(a[2] - b[2])) > _APART)
+
+
+@inlined
+def _near_rest(resting: Array, point: Array) -> bool:
+    """Whether a point may be within ``_NEAR`` of the resting whisker."""
+    x, y, z = point[0], point[1], point[2]
+    reached = (_NEAR + 0.5 / (_RESTING - 1)) ** 2
+    near = 0
+    for i in range(resting.shape[1]):  # without branches, so that it vectorises
+        u, v, w = resting[0, i] - x, resting[1, i] - y, resting[2, i] - z
+        near |= 1 if u * u + v * v + w * w < reached else 0
+    return near == 1
+
+
+@inlined
+def _touch(resting: Array, point: Array) -> tuple[float, float]:
+    """Where the resting whisker is nearest to a point: arc length, and the distance squared."""
+    last = resting.shape[1] - 1
+    least, where = np.inf, 0.0
+    for i in range(last):
+        along = length = here = 0.0
+        for a in range(3):
+            side, away = resting[a, i + 1] - resting[a, i], point[a] - resting[a, i]
+            along, length, here = along + side * away, length + side * side, here + away * away
+        part = min(max(along / length, 0.0), 1.0)
+        distance = here + part * (part * length - 2.0 * along)
+        if distance < least:
+            least, where = distance, (i + part) / last
+    return LEAST_ARC + (1.0 - LEAST_ARC) * where, least
+
+
+@inlined
+def _in_doubt(fold: Fold, resting: Array, point: Array, found: Array, n: int, best: int) -> bool:
+    """Whether a contact of less force than that of the best seed may be at the point."""
+    for i in range(n):
+        other = i != best and _apart(found[i], found[best])
+        if other and _force(fold, found[i]) < _force(fold, found[best]):
+            return True
+    if found[best, 2] < _LIGHT or not _near_rest(resting, point):
+        return False
+    return bool(_touch(resting, point)[1] < _NEAR * _NEAR)
+
+
+@kernel
+def _find_starts(
+    fold: Fold, tree: Tree, resting: Array, points: Array, starts: Array, first: int, last: int
+) -> None:
+    """Fill contacts (n, _STARTS, 3) from which points may be reached, by increasing force.
+
+    Near the resting whisker the first of them is the touch without force; the others are seeds.
+    Rows end with NaN.
+    """
+    found, quality = np.empty((MOST_SEEDS, 3)), np.empty(MOST_SEEDS, np.int64)
+    slopes, forces = np.empty((MOST_SEEDS, 3, 3)), np.empty(MOST_SEEDS)
+    for row in range(first, last):
+        count = 0
+        arc, distance = _touch(resting, points[row])
+        if distance < _NEAR * _NEAR:
+            starts[row, 0, 0], starts[row, 0, 1], starts[row, 0, 2] = arc, 0.0, 0.0
+            count = 1
+        n = seeds(tree, points[row], found, slopes, quality)
+        for i in range(n):
+            forces[i] = _force(fold, found[i])
+        while count < _STARTS and n > 0:
+            least = best = np.argmin(forces[:n])
+            if forces[least] == np.inf:
+                break
+            for i in range(n):
+                if not _apart(found[i], found[least]):
+                    forces[i] = np.inf
+                    best = i if quality[i] > quality[best] else best
+            found[best, 0] = min(max(found[best, 0], 0.0), 1.0)
+            found[best, 2] = min(found[best, 2], _SHORT_OF_FOLD)
+            chart_to_contact(fold, found[best], starts[row, count])
+            count += 1
+        for i in range(count, _STARTS):
+            for a in range(3):
+                starts[row, i, a] = np.nan
+
+
 @kernel
 def _solve_points(
     rod: Rod,
     fold: Fold,
     tree: Tree,
+    resting: Array,
     proximal: float,
     points: Array,
     xi: Array,
@@ -84,18 +201,22 @@ def _solve_points(
     first: int,
     last: int,
 ) -> None:
-    """Solve contact points (n, 3) where the chart has a seed that leads to a stable solution."""
+    """Solve contact points (n, 3) where the chart has a seed that leads to a stable solution.
+
+    ``solved`` is 1 there, 2 where the solution is in doubt; -1 where the point may be reached by
+    another path, as there are seeds or the resting whisker is near; 0 elsewhere.
+    """
     b = np.zeros(BUFFER_SIZE)
     found, quality = np.empty((MOST_SEEDS, 3)), np.empty(MOST_SEEDS, np.int64)
     slopes = np.empty((MOST_SEEDS, 3, 3))
     charts, inverses = np.empty((LANES, 3)), np.empty((LANES, 3, 3))
     rows, targets, group = np.empty(LANES, np.int64), np.empty((LANES, 3)), np.empty((LANES, 3))
     group_values, group_misfits = np.empty((LANES, 6)), np.empty(LANES)
-    signs = np.empty(LANES)
+    signs, doubt = np.empty(LANES), np.zeros(LANES, np.bool_)
     count = 0
     for row in range(first, last):
-        solved[row] = 0
         n = seeds(tree, points[row], found, slopes, quality)
+        solved[row] = -1 if n == 0 and _near_rest(resting, points[row]) else 0
         if n > 0:
             solved[row] = -1
             best = 0
@@ -105,6 +226,7 @@ def _solve_points(
                 if better or (quality[i] == quality[best] and found[i, 2] < found[best, 2]):
                     best = i
             rows[count] = row
+            doubt[count] = _in_doubt(fold, resting, points[row], found, n, best)
             copy(points[row], targets[count])
             chart_to_contact(fold, found[best], group[count])
             start_from(found[best], slopes[best], quality[best], charts[count], inverses[count])
@@ -126,7 +248,7 @@ def _solve_points(
             )
             for i in range(count):
                 if group_misfits[i] <= TOLERANCE and stable(fold, proximal, group[i], signs[i]):
-                    solved[rows[i]] = 1
+                    solved[rows[i]] = 2 if doubt[i] else 1
                     copy(group[i], xi[rows[i]])
                     copy(group_values[i], values[rows[i]])
                     misfits[rows[i]] = group_misfits[i]
@@ -154,7 +276,7 @@ class PointSolver:
         self._nearest = cKDTree(inner)
         places, reasons = zip(*_faces(chart), strict=True)
         self._faces = cKDTree(np.concatenate(places))
-        self._rest = cKDTree(_at_rest(chart))
+        self._resting = _at_rest(chart)
         self._reasons = np.concatenate(
             [np.full(len(p), int(r)) for p, r in zip(places, reasons, strict=True)]
         )
@@ -176,7 +298,7 @@ class PointSolver:
         out = Solutions.empty(n)
         contacts, values, misfits, statuses = out
         there = np.flatnonzero(np.isfinite(points).all(axis=1))
-        wanted = np.ascontiguousarray(points[there])
+        wanted = np.clip(points[there], -_FAR, _FAR)
         xi, found = np.empty((there.size, 3)), np.empty((there.size, 6))
         residuals, solved = np.empty(there.size), np.zeros(there.size, np.int64)
         chart = self.chart
@@ -187,6 +309,7 @@ class PointSolver:
                 rod,
                 fold,
                 self._tree,
+                self._resting,
                 chart.proximal,
                 wanted,
                 xi,
@@ -197,34 +320,67 @@ class PointSolver:
                 last,
             ),
         )
-        good = solved == 1
+        good = solved > 0
         rows = there[good]
         contacts[rows, 0], contacts[rows, 1], contacts[rows, 2:] = xi[good, 0], 0.0, xi[good, 1:]
         values[rows], misfits[rows], statuses[rows] = found[good], residuals[good], int(Status.OK)
-        self._approach(wanted[~good], solved[~good] < 0, there[~good], out)
+        open_rows = np.flatnonzero((solved < 0) | (solved == 2))
+        self._from_starts(wanted[open_rows], there[open_rows], out)
+        lost = np.flatnonzero(statuses[there] == Status.MISSING)
+        self._approach(wanted[lost], solved[lost] < 0, there[lost], out)
         return out
 
-    def _approach(self, points: Array, seeded: AnyArray, rows: IntArray, out: Solutions) -> None:
-        """Follow points without a ready seed from the nearest known contact; say why it fails."""
+    def _from_starts(self, points: Array, rows: IntArray, out: Solutions) -> None:
+        """Follow points from their starts; replace what is known by contacts of less force."""
+        least = np.hypot(out.contacts[rows, 2], out.contacts[rows, 3])
+        least[np.isnan(least)] = np.inf
+        starts = np.empty((rows.size, _STARTS, 3))
+        fold, tree, resting = self.chart.fold, self._tree, self._resting
+        share_out(
+            rows.size,
+            lambda first, last: _find_starts(fold, tree, resting, points, starts, first, last),
+        )
+        for start in np.moveaxis(starts, 1, 0):
+            which = np.flatnonzero(np.hypot(start[:, 1], start[:, 2]) < least)
+            solved = self._follow(start[which], points[which])
+            force = np.hypot(solved.contacts[:, 2], solved.contacts[:, 3])
+            # Before the proximal limit, too, a contact of less force is what holds the point.
+            reached = np.isin(solved.statuses, (Status.OK, Status.TOO_PROXIMAL))
+            reached &= solved.misfits < _REACHED
+            better = np.flatnonzero(reached & (force < least[which]))
+            out.put(rows[which[better]], Solutions(*(part[better] for part in solved)))
+            least[which[better]] = force[better]
+        _drop_unanswered(out, rows)
+
+    def _approach(self, points: Array, hopeful: AnyArray, rows: IntArray, out: Solutions) -> None:
+        """Follow points from the nearest known contact where that may help; say why it fails."""
         if not rows.size:
             return
         away, face = self._faces.query(points)
         out.statuses[rows] = self._reasons[face]
-        near = np.flatnonzero((away < _NEAR) | seeded | (self._rest.query(points)[0] < _NEAR))
-        points, rows = points[near], rows[near]
-        _, start = self._nearest.query(points)
-        begins, ends = np.zeros((rows.size, 7)), np.zeros((rows.size, 7))
-        begins[:, :3], ends[:, :3] = self._nearest.data[start], points
-        solved = follow_all(
-            self.chart, begins, ends, np.full(rows.size, POINT), self._contacts[start].copy()
-        )
-        out.statuses[rows] = solved.statuses
-        out.misfits[rows] = solved.misfits
-        good = solved.statuses == Status.OK
-        out.contacts[rows[good]], out.values[rows[good]] = (
-            solved.contacts[good],
-            solved.values[good],
-        )
+        near = np.flatnonzero((away < _NEAR) | hopeful)
+        _, start = self._nearest.query(points[near])
+        out.put(rows[near], self._follow(self._contacts[start], points[near]))
+        _drop_unanswered(out, rows)
+
+    def _follow(self, starts: Array, points: Array) -> Solutions:
+        """Follow contacts ξ (n, 3) to points."""
+        begins, ends = np.zeros((len(points), 7)), np.zeros((len(points), 7))
+        at_start = solve_forces(self.chart.discretization, with_normal_force(starts))[0]
+        begins[:, :3], ends[:, :3] = at_start[:, 3:], points
+        solved = follow_all(self.chart, begins, ends, np.full(len(points), POINT), starts.copy())
+        # A step may lead across the fold and beyond, where the determinant has its sign again.
+        ends = solved.contacts[:, [0, 2, 3]]
+        strength = fold_forces(self.chart.fold, ends)
+        beyond = np.hypot(ends[:, 1], ends[:, 2]) > ABOVE_FOLD * strength
+        solved.statuses[beyond & (solved.statuses == Status.OK)] = int(Status.BEYOND_FOLD)
+        return solved
+
+
+def _drop_unanswered(out: Solutions, rows: IntArray) -> None:
+    """Leave no contact where the status says that there is none."""
+    lost = rows[out.statuses[rows] != Status.OK]
+    out.contacts[lost], out.values[lost] = np.nan, np.nan
 
 
 def _faces(chart: Reach) -> list[tuple[Array, Status]]:
@@ -244,10 +400,10 @@ def _faces(chart: Reach) -> list[tuple[Array, Status]]:
 
 
 def _at_rest(chart: Reach) -> Array:
-    """Places along the resting whisker, (n, 3)."""
-    contacts = np.zeros((_FACE, 4))
-    contacts[:, 0] = np.linspace(chart.proximal, 1.0, _FACE)
-    return solve_forces(chart.discretization, contacts)[0][:, 3:]
+    """Points along the resting whisker from ``LEAST_ARC`` to the tip, (3, n)."""
+    contacts = np.zeros((_RESTING, 4))
+    contacts[:, 0] = np.linspace(LEAST_ARC, 1.0, _RESTING)
+    return np.ascontiguousarray(solve_forces(chart.discretization, contacts)[0][:, 3:].T)
 
 
 def follow_all(

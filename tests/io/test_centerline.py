@@ -5,6 +5,7 @@ import pytest
 
 from vibrissa import samples
 from vibrissa.io import load_centerline, load_whisker, save_centerline
+from vibrissa.whisker import Whisker, morphology
 
 POINTS = samples.gamma().centerline(12)
 
@@ -107,8 +108,67 @@ def test_the_thicker_end_is_the_base(tmp_path):
     said = load_whisker(around, noise=0.0, base="first")
     np.testing.assert_allclose(said.pose.origin, POINTS[-1], rtol=0, atol=1e-9)
     assert "last point" not in " ".join(said.notes)
-    rod = table(tmp_path, header, POINTS[::-1] * 1e3, np.linspace(95, 100, len(POINTS)))
-    np.testing.assert_allclose(load_whisker(rod, noise=0.0).pose.origin, POINTS[-1], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("radii", "turned"),
+    [
+        (np.linspace(95.0, 100.0, len(POINTS)), True),
+        (np.where(np.arange(len(POINTS)) < 7, 80.0, 96.0), True),
+        (97.0 + 3.0 * np.sin(2.5 * np.arange(len(POINTS))), False),
+        (np.linspace(100.0, 95.0, len(POINTS)), False),
+    ],
+)
+def test_radii_tell_the_base_of_rods_with_little_taper(tmp_path, radii, turned):
+    rod = table(tmp_path, "x_mm,y_mm,z_mm,radius_um", POINTS * 1e3, radii)
+    whisker = load_whisker(rod, noise=0.0)
+    np.testing.assert_allclose(whisker.pose.origin, POINTS[-1 if turned else 0], atol=1e-9)
+    assert ("last point of the file" in " ".join(whisker.notes)) == turned
+
+
+def test_a_point_in_two_rows_states_a_jump(tmp_path):
+    """Jumps of a stepped rod, exactly where the file has them, and base and tip the other way."""
+    line = np.column_stack([np.linspace(0.0, 30.0, 11), np.zeros((11, 2))])
+    rows = np.sort(np.append(np.arange(11), [3, 7]))
+    radii = np.repeat([20.0, 50.0, 80.0], [4, 5, 4])
+    whisker = load_whisker(table(tmp_path, "x_mm,y_mm,z_mm,radius_um", line[rows], radii))
+    np.testing.assert_allclose(whisker.breaks, [9e-3, 21e-3], rtol=1e-9)
+    np.testing.assert_allclose(whisker.radius([1e-3, 12e-3, 25e-3]), [80e-6, 50e-6, 20e-6])
+    assert "jumps at 2 arc lengths" in " ".join(whisker.notes)
+
+
+def test_what_a_file_does_not_state_is_noted(tmp_path):
+    path = table(tmp_path, "x_mm,y_mm,z_mm", POINTS * 1e3)
+    about = ("radius assumed", "Young's modulus assumed", "Poisson's ratio assumed")
+    notes = load_whisker(path).notes
+    for begin in about:
+        assert sum(note.startswith(begin) for note in notes) == 1, begin
+    stated = load_whisker(path, base_radius=9e-5, tip_radius=5e-6, youngs_modulus=2e9)
+    assert [begin for begin in about if begin in " ".join(stated.notes)] == [about[2]]
+    measured = table(tmp_path, "x_mm,y_mm,z_mm,radius_um", POINTS * 1e3, RADII * 1e6)
+    assert "radius assumed" not in " ".join(load_whisker(measured).notes)
+
+
+def test_published_radii_where_the_caller_asks(tmp_path):
+    path = table(tmp_path, "x_mm,y_mm,z_mm", POINTS * 1e3)
+    whisker = load_whisker(path, rat="left C2")
+    length = whisker.length
+    assert whisker.base_radius == pytest.approx(float(morphology.base_radius(3, 2, length)))
+    assert whisker.tip_radius == pytest.approx(float(morphology.tip_radius(3, 2, length)))
+    assert "published regressions" in " ".join(whisker.notes)
+    assert "radius assumed" not in " ".join(whisker.notes)
+    again = Whisker.from_dataset(whisker.to_dataset())
+    assert again.notes == whisker.notes
+    # Of a whisker known by its length only, radii are among those of whiskers of that length.
+    short = Whisker.straight(6.5e-3, rat="any")
+    every = [
+        morphology.base_radius(row, column, 6.5e-3) for row in range(1, 6) for column in (5, 6)
+    ]
+    assert min(every) < short.base_radius < max(every)
+    with pytest.raises(ValueError, match="rat and a radius"):
+        load_whisker(path, rat="C2", base_radius=1e-4)
+    with pytest.raises(ValueError, match="F9"):
+        load_whisker(path, rat="F9")
 
 
 def test_radii_and_points_that_are_missing(tmp_path):

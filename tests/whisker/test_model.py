@@ -146,7 +146,13 @@ def test_jump_in_curvature_is_seen_from_both_sides():
     assert whisker.curvature(0.0123)[2] == pytest.approx(9.0, abs=1e-12)
     assert not whisker.notes
     unstated = Whisker.from_curvature(LENGTH, lambda s: (0.0, 0.0, 5.0 if s < 0.0123 else 9.0))
-    assert "stated as breaks" in unstated.notes[0]
+    np.testing.assert_allclose(unstated.breaks, [0.0123], rtol=1e-12)
+    assert not unstated.notes
+
+
+def test_more_jumps_than_can_be_found_are_noted():
+    whisker = Whisker.from_curvature(LENGTH, lambda s: (0.0, 0.0, 5.0 + (s * 1e5 % 1.0)))
+    assert "stated as breaks" in whisker.notes[0]
 
 
 def test_curvature_functions_of_every_kind_agree():
@@ -204,6 +210,8 @@ def test_curvature_keeps_the_frame_it_was_stated_in_until_aligned():
         ({"radius": np.ones((3, 3))}, r"shape \(3, 3\)"),
         ({"radius": [[0.0, 1e-4], [0.02, 1e-5]]}, "cover the whisker"),
         ({"radius": [1e-4, 1e-5], "tip_radius": 1e-5}, "give one of them"),
+        ({"radius": [[0, 1e-4], [0.01, 1e-4], [0, 1e-5]]}, "increasing"),
+        ({"radius": [[0, 1e-4], [0.02, 9e-5], [0.02, 8e-5], [0.04, 1e-5], [0.04, 1e-6]]}, "tip"),
         ({"base_stiffness": (1e-3, 0.0)}, "two positive"),
         ({"base_stiffness": 1e-3}, "two positive"),
     ],
@@ -240,6 +248,43 @@ def test_radius_profiles():
     default = Whisker.straight(LENGTH)
     assert default.base_radius / default.tip_radius == pytest.approx(15.0)
     assert default.base_bending_stiffness == pytest.approx(3e9 * np.pi * 1e-16 / 4)
+
+
+@settings(max_examples=40)
+@given(st.integers(8, 300), st.floats(0.5, 1.3), st.sampled_from([0.0, 1e-3, 0.02]), st.data())
+def test_a_tapered_radius_with_noise_has_no_breaks(count, power, noise, data):
+    random = np.random.default_rng(data.draw(st.integers(0, 2**32)))
+    s = np.linspace(0.0, LENGTH, count)
+    radius = 1e-4 * (1.0 - 0.95 * s / LENGTH) ** power
+    radius *= 1.0 + noise * random.standard_normal(count)
+    whisker = Whisker.straight(LENGTH, radius=np.column_stack([s, radius]))
+    assert whisker.breaks == ()
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.005])
+@pytest.mark.parametrize("count", [61, 400])
+def test_steps_among_samples_are_found(count, noise):
+    edges = LENGTH * np.array([0.21, 0.517, 0.83])
+    s = np.linspace(0.0, LENGTH, count)
+    radius = np.array([1e-4, 8e-5, 9e-5, 4e-5])[np.searchsorted(edges, s)]
+    radius *= 1.0 + noise * np.random.default_rng(count).standard_normal(count)
+    whisker = Whisker.straight(LENGTH, radius=np.column_stack([s, radius]))
+    np.testing.assert_allclose(whisker.breaks, edges, rtol=0, atol=0.5 * LENGTH / (count - 1))
+    assert "jumps at 3 arc lengths" in whisker.notes[0]
+    again = whisker.with_properties(base_radius=1e-4)
+    assert again.breaks == ()
+    assert Whisker.from_dataset(whisker.to_dataset()).breaks == whisker.breaks
+
+
+def test_breaks_can_be_stated_for_every_shape():
+    for whisker in (
+        Whisker.straight(LENGTH, breaks=(0.01,)),
+        Whisker.parabola(LENGTH, 10.0, breaks=(0.01,)),
+        Whisker.from_points(samples.gamma().centerline(20), breaks=(0.01,)),
+    ):
+        assert whisker.breaks == (0.01,)
+    with pytest.raises(ValueError, match=r"breaks \[0.05\]"):
+        Whisker.straight(LENGTH, breaks=(0.05,))
 
 
 def test_tip_thicker_than_base_is_noted():

@@ -4,8 +4,9 @@ The first line that is neither empty nor a comment (#) is the header. It names t
 with them the unit: `x_mm,y_mm,z_mm` (also `_um`, `_cm`, `_m`; `x (mm)`), or `x,y,z` in metres.
 Without z the points lie in the plane z = 0. A column `radius_um` or `diameter_um`, in any of these
 units or that of the coordinates, tells how thick the whisker is there; where its cells are empty,
-the radius goes on evenly between its neighbours, and at the ends as it was. Other columns are left
-alone, and so are rows without any coordinate.
+the radius goes on smoothly between its neighbours, and at the ends as it was. Where it jumps, one
+point may stand in two rows with two radii. Other columns are left alone, and so are rows without
+any coordinate.
 """
 
 import re
@@ -33,8 +34,11 @@ ALLOWED = "x_mm,y_mm,z_mm (also _um, _cm, _m) or x,y,z in metres; z may be left 
 _COORDINATE = re.compile(r"([xyz])(?![a-z0-9])(.*)", re.IGNORECASE)
 _THICKNESS = re.compile(r"(radius|diameter)(?![a-z0-9])(.*)", re.IGNORECASE)
 _THINNEST, _THICKEST = 1e-5, 0.1
-_TAPERED = 1.5
-"""How much thicker an end is, at least, that is known by it as the base."""
+_TAPERED = 0.01
+"""Share of the mean radius by which an end is thicker, at least, that counts as the base."""
+
+_SURE = 4.0
+"""Standard errors by which it is thicker, at least."""
 
 
 def load_centerline(path: str | PathLike[str]) -> Array:
@@ -206,7 +210,7 @@ def load_whisker(
     """
     points, radii, unit = _table(Path(path))
     properties.setdefault("name", Path(path).stem)
-    stated = {"radius", "base_radius", "tip_radius"} & set(properties)
+    stated = {"radius", "base_radius", "tip_radius", "rat"} & set(properties)
     try:
         if radii is None or stated:
             return Whisker.from_points(points, noise=noise, base=base, **properties)
@@ -233,18 +237,35 @@ def _tapered(
             "where it was too thin to be measured)"
         )
     notes: tuple[str, ...] = ()
-    if base is None:
-        halves = [part[np.isfinite(part)] for part in np.array_split(radii, 2)]
-        if all(map(len, halves)) and halves[1].mean() > _TAPERED * halves[0].mean():
-            base = "last"
-            notes = ("its thicker end, the last point of the file, was taken as the base",)
-    whisker = Whisker.from_points(points, noise=noise, base=base, **properties)
+    if base is None and _thickens(radii[known]):
+        base = "last"
+        notes = ("its thicker end, the last point of the file, was taken as the base",)
+    # A point in two rows states two radii; rows that repeat their radius too are kept, and refused.
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    jump = (steps == 0.0) & (np.diff(radii) != 0.0)
+    whisker = Whisker.from_points(
+        points[np.append(True, ~jump)], noise=noise, base=base, **properties
+    )
     s = np.append(0.0, np.cumsum(steps)) / steps.sum() * whisker.length
     first, last = (np.linalg.norm(points[end] - whisker.pose.origin) for end in (0, -1))
     if last < first:
         s, radii, known = (whisker.length - s)[::-1], radii[::-1], known[::-1]
     check_slender(float(radii[known].max()), whisker.length)
-    everywhere = np.interp(s, s[known], radii[known])
-    whisker = whisker.with_properties(radius=np.column_stack([s, everywhere]))
+    samples = np.column_stack([s, radii])[known]
+    if samples[0, 0] > 0.0:
+        samples = np.vstack([[0.0, samples[0, 1]], samples])
+    if samples[-1, 0] < whisker.length:
+        samples = np.vstack([samples, [whisker.length, samples[-1, 1]]])
+    whisker = whisker.with_properties(radius=samples)
     return replace(whisker, notes=(*whisker.notes, *notes))
+
+
+def _thickens(radii: Array) -> bool:
+    """Whether the last of some radii belong to the thicker end, beyond their scatter."""
+    if radii.size < 2:
+        return False
+    x = np.linspace(-0.5, 0.5, radii.size)
+    slope = x @ radii / (x @ x)
+    rest = radii - radii.mean() - slope * x
+    error = np.sqrt(rest @ rest / max(radii.size - 2, 1) / (x @ x))
+    return bool(slope > max(_TAPERED * radii.mean(), _SURE * error))

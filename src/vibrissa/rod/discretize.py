@@ -3,6 +3,9 @@
 Lengths are divided by L, forces by EI/L² and moments by EI/L, with EI the bending stiffness at the
 base. On each step the intrinsic curvature and the radius are the cubics through their values at the
 step's four Gauss points: a cubic error orthogonal to all cubics costs only O(h⁸) at the step's end.
+Where curvature or radius are rough inside a step, as measured radii with noise are, that would be
+as good as four samples of them; there the cubics have the moments of order 0 to 3 of the curvature
+and of the compliance ∝ r⁻⁴ over the step, so that the noise averages out as it does in the rod.
 
 Steps are shorter where the whisker is thin (width ∝ radius^0.4, found best for the reference loads
 between 0.2 and 1), follow the intrinsic curvature's total turning, and never straddle a kink.
@@ -30,6 +33,8 @@ _TURN_PER_STEP = 0.08
 _TAPER_EXPONENT = 0.4
 _JOINT_STEPS = 4
 _ORDER = 4
+# Misfit of a step's cubics, relative to the largest value, from which their moments are matched.
+_ROUGH = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,16 +85,10 @@ def discretize(whisker: Whisker, steps: int = STEPS) -> Discretization:
     nodes = _nodes(whisker, steps)
     width = np.diff(nodes)
     fractions = (np.polynomial.legendre.leggauss(_ORDER)[0] + 1.0) / 2.0
-    arc_length = length * (nodes[:-1, None] + width[:, None] * fractions)
+    samples = _scaled(whisker, nodes[:-1, None] + width[:, None] * fractions)
     to_cubic = np.linalg.inv(np.vander(fractions, _ORDER, increasing=True))
-    samples = np.concatenate(
-        [
-            whisker.curvature(arc_length) * length,
-            whisker.radius(arc_length)[..., None] / whisker.base_radius,
-        ],
-        axis=-1,
-    )
     shape = np.einsum("ij,njc->nci", to_cubic, samples)
+    _match_moments(whisker, nodes, shape)
     n = width.size
     ones = np.ones(n)
     rod = (nodes[:-1].copy(), width, ones, ones * (1.0 + whisker.poisson_ratio), ones, shape)
@@ -125,6 +124,69 @@ def _nodes(whisker: Whisker, steps: int) -> Array:
     for piece, kink in zip(pieces[1:], whisker.breaks, strict=True):
         piece[0] = kink / whisker.length
     return np.concatenate([*pieces, [1.0]])
+
+
+def _scaled(whisker: Whisker, s: Array) -> Array:
+    """Curvatures times L, and radius relative to the base's, at arc lengths in units of L."""
+    arc_length = s * whisker.length
+    curvature = whisker.curvature(arc_length) * whisker.length
+    radius = whisker.radius(arc_length) / whisker.base_radius
+    return np.concatenate([curvature, radius[..., None]], axis=-1)
+
+
+def _match_moments(whisker: Whisker, nodes: Array, shape: Array) -> None:
+    """Replace the cubics (n, 4, 4) of steps in which curvature or radius are rough."""
+    knots = [
+        p.knots / whisker.length for p in (whisker.intrinsic_curvature, whisker.section_radius)
+    ]
+    joints = np.unique(np.clip(np.concatenate([nodes, *knots]), 0.0, 1.0))
+    joints = joints[np.append(True, np.diff(joints) > 1e-12)]
+    abscissae, weights = np.polynomial.legendre.leggauss(2 * _ORDER)
+    half = np.diff(joints)[:, None] / 2.0
+    s = joints[:-1, None] + half * (1.0 + abscissae)
+    step = np.searchsorted(nodes, s[:, 0], side="right") - 1
+    width = np.diff(nodes)[step, None]
+    t, weight = (s - nodes[step, None]) / width, half * weights / width
+    values = _scaled(whisker, s)
+    cubics = np.einsum(
+        "mci,mji->mjc", shape[step], np.vander(t.ravel(), 4, True).reshape(*t.shape, 4)
+    )
+    misfit = np.abs(cubics - values).max(axis=1)
+    largest = np.append(np.full(3, np.abs(values[..., :3]).max()), 0.0)
+    largest = np.where(np.arange(4) < 3, largest, values[..., 3].min(axis=1)[:, None])
+    rough = misfit > _ROUGH * largest
+    for k in np.unique(step[rough.any(axis=1)]):
+        rows = step == k
+        at, w = t[rows].ravel(), weight[rows].ravel()
+        for component in np.flatnonzero(rough[rows].any(axis=0)):
+            known = values[rows, :, component].ravel()
+            match = _radius_cubic if component == 3 else _curvature_cubic
+            shape[k, component] = match(at, w, known, shape[k, component])
+
+
+def _curvature_cubic(t: Array, weight: Array, values: Array, _: Array) -> Array:
+    """The cubic that has the moments of values at t."""
+    legendre = np.polynomial.legendre.legvander(2.0 * t - 1.0, 3)
+    matrix = (weight[:, None] * legendre).T @ np.vander(t, 4, increasing=True)
+    return np.asarray(np.linalg.solve(matrix, (weight * values) @ legendre), dtype=np.float64)
+
+
+def _radius_cubic(t: Array, weight: Array, radius: Array, cubic: Array) -> Array:
+    """The cubic whose inverse fourth power has the moments of that of the radius, by Newton."""
+    legendre = weight[:, None] * np.polynomial.legendre.legvander(2.0 * t - 1.0, 3)
+    powers = np.vander(t, 4, increasing=True)
+    moments = radius**-4.0 @ legendre
+    found: Array = cubic
+    for _ in range(30):
+        r = powers @ found
+        if not (0.5 * radius.min() < r.min() and r.max() < 2.0 * radius.max()):
+            return cubic
+        misfit = r**-4.0 @ legendre - moments
+        if np.abs(misfit).max() < 1e-12 * moments[0]:
+            return found
+        slope = legendre.T @ (-4.0 * r[:, None] ** -5.0 * powers)
+        found = found - np.asarray(np.linalg.solve(slope, misfit), dtype=np.float64)
+    return cubic
 
 
 def _with_joint(rod: Rod, n: int, moment_scale: float, bending: float, twist: float) -> Rod:

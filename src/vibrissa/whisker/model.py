@@ -10,7 +10,7 @@ The whisker frame has its origin at the base and x along the base tangent; the p
 whisker lies as close as possible to the x–y plane and bends toward +y.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Unpack
@@ -38,9 +38,13 @@ from vibrissa.whisker.section import (
     POISSON_RATIO,
     YOUNGS_MODULUS,
     Properties,
+    assumptions,
+    kept_notes,
     length_faults,
     material_faults,
+    radius_notes,
     radius_profile,
+    renewed_notes,
     settled,
     split,
 )
@@ -99,7 +103,13 @@ class Whisker:
         between.
     radius : callable or array
         Any other radius: r(s), radii (n,) equally spaced from base to tip, or pairs (n, 2) of arc
-        length and radius, m. It replaces base_radius.
+        length and radius, m; two pairs at one arc length state a jump. It replaces base_radius.
+    rat : str
+        Row and column of a rat's whisker, such as ``"C2"``, or ``"any"`` where only its length is
+        known: radii by published regressions (Belli et al. 2017), instead of all other radii.
+    breaks : sequence of float
+        Arc lengths, m, at which curvature or radius has a kink or a jump. Those of sampled radii
+        and, as far as they can be told from noise, of functions are found without.
 
     Examples
     --------
@@ -184,8 +194,9 @@ class Whisker:
                 f"the noise of its points was estimated at {shape.noise * 1e3:.2g} mm (standard "
                 "deviation per coordinate) by cross-validation",
             )
-        whisker = _assembled(shape.length, shape.curvature, shape.pose, properties, (), notes)
-        return whisker.aligned()
+        whisker = _assembled(shape.length, shape.curvature, shape.pose, properties, notes)
+        assumed = assumptions(whisker.length, whisker.section_radius, properties)
+        return replace(whisker, notes=whisker.notes + assumed).aligned()
 
     @classmethod
     def parabola(
@@ -243,8 +254,6 @@ class Whisker:
         cls,
         length: float,
         curvature: Callable[..., object],
-        *,
-        breaks: Sequence[float] = (),
         **properties: Unpack[Properties],
     ) -> "Whisker":
         """Make a whisker from its intrinsic curvature.
@@ -256,10 +265,8 @@ class Whisker:
         curvature : callable
             Takes arc lengths, m (an array, or one at a time), and returns (..., 3): twist,
             curvature about d1, curvature about d2, 1/m.
-        breaks : sequence of float
-            Arc lengths, m, where curvature or radius has a kink or a jump.
         **properties
-            Radius and material; see `Whisker`.
+            Radius, material and breaks; see `Whisker`.
 
         Returns
         -------
@@ -271,6 +278,7 @@ class Whisker:
         if not callable(curvature):
             got = type(curvature).__name__
             faults.append(f"curvature is of type {got}; a function of arc length is needed")
+        breaks = properties.get("breaks", ())
         faults = faults or _break_faults(breaks, length)
         if faults:
             raise ValueError("no whisker from curvature: " + "; ".join(faults))
@@ -282,7 +290,7 @@ class Whisker:
                 f"the curvature is met to {profile.error:.1e} of its largest value only; it has "
                 "kinks or jumps that should be stated as breaks",
             )
-        whisker = _assembled(length, profile, Pose(), properties, breaks, notes)
+        whisker = _assembled(length, profile, Pose(), properties, notes)
         if not whisker.is_straight and abs(whisker._proximal_roll()) > np.pi / 2:
             note = "its proximal part bends toward −y in the frame its curvature was stated in"
             whisker = replace(whisker, notes=(*whisker.notes, note))
@@ -454,11 +462,16 @@ class Whisker:
         stated, holding = split(properties)
         whisker = self
         if stated:
-            if stated.get("radius") is None:
+            if stated.get("radius") is None and stated.get("rat") is None:
                 stated.setdefault("base_radius", self.base_radius)
-            section = radius_profile(self.length, breaks=self.breaks, **stated)
-            whisker = replace(whisker, section_radius=section)
-        return replace(whisker, **holding)
+            own = set(self.section_radius.breaks()) - set(self.intrinsic_curvature.breaks())
+            kept = {s for s in self.breaks if s not in own} | {*stated.get("breaks", ())}
+            stated["breaks"] = sorted(kept)
+            section = radius_profile(self.length, **stated)
+            breaks = _merged(kept, section.breaks(), self.length)
+            notes = kept_notes(self.notes, stated) + radius_notes(self.length, section, stated)
+            whisker = replace(whisker, section_radius=section, breaks=breaks, notes=notes)
+        return replace(whisker, notes=kept_notes(whisker.notes, holding), **holding)
 
     def trimmed(self, length: float) -> "Whisker":
         """Cut the tip off; shape and radius of what stays do not change.
@@ -476,11 +489,13 @@ class Whisker:
             raise ValueError(
                 f"length to keep is {length!r} m; it must be positive and at most {self.length!r} m"
             )
+        section = self.section_radius.trimmed(length)
         return replace(
             self,
             length=length,
             intrinsic_curvature=self.intrinsic_curvature.trimmed(length),
-            section_radius=self.section_radius.trimmed(length),
+            section_radius=section,
+            notes=renewed_notes(self.notes, length, section),
             breaks=tuple(s for s in self.breaks if s < length),
         )
 
@@ -502,11 +517,13 @@ class Whisker:
         for what, value in (("length_factor", length_factor), ("radius_factor", radius_factor)):
             if not (np.isfinite(value) and value > 0.0):
                 raise ValueError(f"{what} is {value!r}; it must be positive")
+        section = self.section_radius.scaled(length_factor, radius_factor)
         return replace(
             self,
             length=self.length * length_factor,
             intrinsic_curvature=self.intrinsic_curvature.scaled(length_factor, 1 / length_factor),
-            section_radius=self.section_radius.scaled(length_factor, radius_factor),
+            section_radius=section,
+            notes=renewed_notes(self.notes, self.length * length_factor, section),
             breaks=tuple(s * length_factor for s in self.breaks),
         )
 
@@ -568,17 +585,29 @@ def _break_faults(breaks: Sequence[float], length: float) -> list[str]:
     return [f"breaks {outside} m; they must lie inside the whisker, between 0 and {length!r} m"]
 
 
+def _merged(stated: Iterable[float], found: Iterable[float], length: float) -> tuple[float, ...]:
+    """Breaks that were stated, and those found that are not among them."""
+    breaks = [float(s) for s in stated]
+    for s in found:
+        if all(abs(s - other) > ROUNDING * length for other in breaks):
+            breaks.append(float(s))
+    return tuple(sorted(breaks))
+
+
 def _assembled(
     length: float,
     curvature: Profile,
     pose: Pose,
     properties: Properties,
-    breaks: Sequence[float] = (),
     notes: tuple[str, ...] = (),
 ) -> Whisker:
     """Add radius and material to a shape."""
-    section, holding, remarks = settled(length, breaks, properties)
-    notes += remarks
+    stated = properties.get("breaks", ())
+    faults = _break_faults(stated, length)
+    if faults:
+        raise ValueError("no whisker: " + "; ".join(faults))
+    section, holding, remarks = settled(length, properties)
+    breaks = _merged(stated, [*curvature.breaks(), *section.breaks()], length)
     return Whisker(
-        length, curvature, section, pose=pose, breaks=tuple(breaks), notes=notes, **holding
+        length, curvature, section, pose=pose, breaks=breaks, notes=notes + remarks, **holding
     )

@@ -6,8 +6,10 @@ On the interval [s_j, s_{j+1}] a profile is
 
 so that all coefficients have the unit of f. Any function is brought into this form once, by
 interpolation at Chebyshev points (interior ones: a jump at a declared break is seen from the
-proper side) on intervals that are halved until points in between agree. Constants and straight
-ramps come out exactly, smooth functions to 1e-12 of their largest value.
+proper side) on intervals that are halved until points in between agree. Where halving ends without
+that, a jump or kink is searched for by bisection and becomes an interval's end, unless there are so
+many that the function is noise. Constants and straight ramps come out exactly, smooth functions to
+1e-12 of their largest value.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,6 +35,14 @@ FINEST = 512
 
 UNRESOLVED = 1e-7
 """Relative error above which a function counts as not resolved."""
+
+
+MOST_SEARCHED = 64
+"""Intervals not resolved, at most, in which jumps and kinks are searched for."""
+
+JUMP, KINK = 1e-9, 1e-3
+"""Smallest changes of value and of slope times length, relative to the largest value, that count as
+a jump and as a kink."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +102,26 @@ class Profile:
             value = value * tau + coefficient[interval]
         # A constant is NaN at NaN too.
         return value + 0.0 * tau
+
+    def breaks(self) -> Array:
+        """Find the knots at which the function jumps or has a kink.
+
+        Returns
+        -------
+        array (n,)
+            Arc lengths, m, rising; neither start nor end is among them.
+        """
+        power = np.arange(len(self.coefficients)).reshape(-1, *(1,) * (1 + len(self.shape)))
+        half = (np.diff(self.knots) / 2.0).reshape(-1, *(1,) * len(self.shape))
+        signed = self.coefficients * (-1.0) ** power
+        largest = float(np.abs(self.coefficients).sum(axis=0).max())
+        value = signed.sum(axis=0)[1:] - self.coefficients.sum(axis=0)[:-1]
+        start = -(power * signed).sum(axis=0) / half
+        end = (power * self.coefficients).sum(axis=0) / half
+        slope = (start[1:] - end[:-1]) * (self.knots[-1] - self.knots[0])
+        rough = (np.abs(value) > JUMP * largest) | (np.abs(slope) > KINK * largest)
+        found: Array = self.knots[1:-1][rough.any(axis=tuple(range(1, rough.ndim)))]
+        return found
 
     def trimmed(self, length: float) -> "Profile":
         """Drop the intervals that begin at or beyond a length.
@@ -171,11 +201,24 @@ def approximate(
         Its `error` tells how well the function was met between the interpolation points.
     """
     joints = np.asarray(joints, dtype=np.float64)
+    profile, unresolved = _halved(function, joints, tolerance)
+    if 0 < len(unresolved) <= MOST_SEARCHED:
+        singular = [_singular(function, *interval) for interval in unresolved]
+        near = 1e-12 * (joints[-1] - joints[0])
+        new = [s for s in singular if np.abs(joints - s).min() > near]
+        profile, _ = _halved(function, np.unique([*joints, *new]), tolerance)
+    return profile
+
+
+def _halved(
+    function: Function, joints: Array, tolerance: float
+) -> tuple[Profile, list[tuple[float, float]]]:
+    """Polynomials on intervals halved as far as allowed, and the intervals not resolved."""
     middles = 0.5 * (joints[1:] + joints[:-1])
     scale = float(np.abs(function(np.concatenate([joints, middles]))).max())
     shortest = (joints[-1] - joints[0]) / FINEST
     todo = [(float(a), float(b)) for a, b in pairwise(joints)][::-1]
-    knots, pieces, worst = [float(joints[0])], [], 0.0
+    knots, pieces, worst, rough = [float(joints[0])], [], 0.0, []
     while todo:
         start, end = todo.pop()
         coefficients, error, largest = _best_polynomial(function, start, end, scale)
@@ -184,10 +227,27 @@ def approximate(
             middle = 0.5 * (start + end)
             todo += [(middle, end), (start, middle)]
             continue
+        if error > UNRESOLVED * scale:
+            rough.append((start, end))
         knots.append(end)
         pieces.append(coefficients)
         worst = max(worst, error)
-    return Profile(np.array(knots), _padded(pieces), worst / scale if scale > 0.0 else 0.0)
+    profile = Profile(np.array(knots), _padded(pieces), worst / scale if scale > 0.0 else 0.0)
+    return profile, rough
+
+
+def _singular(function: Function, start: float, end: float) -> float:
+    """Bisect to the worst jump or kink in an interval."""
+    finest = 4.0 * np.finfo(np.float64).eps * max(abs(start), abs(end))
+    while end - start > finest:
+        middle = 0.5 * (start + end)
+        halves = ((start, middle), (middle, end))
+        errors = [_best_polynomial(function, a, b, 0.0)[1] for a, b in halves]
+        if not any(errors):
+            # What is left is exactly straight on both sides of the middle.
+            return middle
+        start, end = halves[int(errors[1] > errors[0])]
+    return 0.5 * (start + end)
 
 
 _CHECKS = np.cos(np.pi * (np.arange(33) + 0.5) / 33.0)

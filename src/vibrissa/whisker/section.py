@@ -4,8 +4,8 @@ A circular section of radius r(s), of one isotropic material:
 
     B(s) = diag(GJ, EI, EI),    I = π r⁴ / 4,    J = 2 I,    G = E / (2 (1 + ν))
 
-By default r falls linearly from base to tip. Sampled radii are joined by a monotone cubic (PCHIP),
-which has no kinks and cannot overshoot below zero.
+By default r falls linearly from base to tip. Sampled radii are joined by monotone cubics between
+the jumps and kinks found in them (`vibrissa.whisker.sampled`).
 """
 
 from collections.abc import Callable, Sequence
@@ -13,9 +13,17 @@ from typing import TypedDict, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import PchipInterpolator
 
-from vibrissa.whisker.profile import UNRESOLVED, Profile, approximate, array_function, linear
+from vibrissa.whisker.profile import (
+    JUMP,
+    UNRESOLVED,
+    Profile,
+    approximate,
+    array_function,
+    linear,
+)
+from vibrissa.whisker.published import published_note, published_radii
+from vibrissa.whisker.sampled import sampled_radius, scatter
 
 Array = NDArray[np.float64]
 
@@ -29,16 +37,22 @@ _SOFTEST, _HARDEST = 1e3, 1e13
 # A rod's radius is at most this share of its length.
 _STOUT = 0.1
 
+# Share of the radius by which samples scatter before it is worth a note, and how well the base
+# signals follow samples that scatter, in units of it.
+_SCATTERED, _FOLLOWED = 2e-3, 0.04
+
 COVERAGE = 0.01
 """Share of the length by which radius samples may fall short of base or tip."""
 
 
 class Section(TypedDict, total=False):
-    """Keywords that state the radius."""
+    """Keywords that state the radius, and where it or the curvature has a kink or a jump."""
 
     base_radius: float
     tip_radius: float | None
     radius: Callable[..., object] | ArrayLike | None
+    breaks: Sequence[float]
+    rat: str | None
 
 
 class Holding(TypedDict, total=False):
@@ -62,19 +76,17 @@ def split(properties: Properties) -> tuple[Section, Holding]:
 
 
 _SECTION_KEYS = Section.__optional_keys__
+_RADIUS_ASSUMED = "radius assumed, not measured"
+_NOTED = {"youngs_modulus": "Young's modulus", "poisson_ratio": "Poisson's ratio"}
 
 
-def settled(
-    length: float, breaks: Sequence[float], properties: Properties
-) -> tuple[Profile, Holding, tuple[str, ...]]:
+def settled(length: float, properties: Properties) -> tuple[Profile, Holding, tuple[str, ...]]:
     """Turn the keywords of a constructor into a radius profile and checked material.
 
     Parameters
     ----------
     length : float
         Arc length of the whisker, m.
-    breaks : sequence of float
-        Arc lengths, m, where the radius may have a kink or a jump.
     properties : Properties
         What the caller stated.
 
@@ -99,7 +111,7 @@ def settled(
         holding.get("base_stiffness"),
     )
     try:
-        section = radius_profile(length, breaks=breaks, **stated)
+        section = radius_profile(length, **stated)
     except ValueError as fault:
         raise ValueError("no whisker: " + "; ".join([*faults, str(fault)])) from None
     thickest = float(section(np.linspace(0.0, length, 101)).max())
@@ -110,15 +122,111 @@ def settled(
         )
     if faults:
         raise ValueError("no whisker: " + "; ".join(faults))
-    notes: tuple[str, ...] = ()
-    if section(length, "left") > section(0.0) * (1.0 + 1e-9):
-        notes += ("the tip is thicker than the base",)
-    if section.error > UNRESOLVED:
-        notes += (
-            f"the radius is met to {section.error:.1e} of its largest value only; it has kinks or "
-            "jumps that should be stated as breaks",
+    return section, holding, radius_notes(length, section, stated)
+
+
+def assumptions(length: float, section: Profile, properties: Properties) -> tuple[str, ...]:
+    """Say what of a measured whisker was not stated and is assumed.
+
+    Parameters
+    ----------
+    length : float
+        Arc length of the whisker, m.
+    section : Profile
+        Its radius, m.
+    properties : Properties
+        What was stated.
+
+    Returns
+    -------
+    tuple of str
+        Sentences that begin with what they are about.
+    """
+    notes = []
+    stated = {name for name, value in properties.items() if value is not None}
+    if not stated & {"radius", "base_radius", "rat"}:
+        notes.append(_assumed_radius(length, section))
+    elif not stated & {"radius", "tip_radius", "rat"}:
+        notes.append(f"radius of the tip assumed, not measured: the base's over {TAPER:g}")
+    if "youngs_modulus" not in stated:
+        notes.append(
+            f"Young's modulus assumed, not measured: {YOUNGS_MODULUS * 1e-9:g} GPa; forces are "
+            "proportional to it"
         )
-    return section, holding, notes
+    if "poisson_ratio" not in stated:
+        notes.append(f"Poisson's ratio assumed, not measured: {POISSON_RATIO:g}")
+    return tuple(notes)
+
+
+def _assumed_radius(length: float, section: Profile) -> str:
+    base, tip = float(section(0.0)) * 1e6, float(section(length, "left")) * 1e6
+    return (
+        f"{_RADIUS_ASSUMED}: {base:.4g} µm at the base, {tip:.3g} µm at the tip; forces go with "
+        "its fourth power. Of a rat's whisker the row and column (C2), or the length, tell it by "
+        "published regressions: rat (Python), --rat (command line)"
+    )
+
+
+def kept_notes(notes: Sequence[str], properties: Section | Holding) -> tuple[str, ...]:
+    """Leave out the notes on what is stated anew.
+
+    Parameters
+    ----------
+    notes : sequence of str
+        Those of a whisker.
+    properties : Section or Holding
+        What is stated now.
+
+    Returns
+    -------
+    tuple of str
+    """
+    about = []
+    if properties.keys() & _SECTION_KEYS - {"breaks"}:
+        about += ["radius", "the radius", "the tip"]
+    about += [begin for name, begin in _NOTED.items() if name in properties]
+    return tuple(note for note in notes if not note.startswith(tuple(about)))
+
+
+def renewed_notes(notes: Sequence[str], length: float, section: Profile) -> tuple[str, ...]:
+    """Bring the assumed radius in notes up to date after the radius or the length was changed."""
+    return tuple(
+        _assumed_radius(length, section) if note.startswith(_RADIUS_ASSUMED) else note
+        for note in notes
+    )
+
+
+def radius_notes(length: float, section: Profile, stated: Section) -> tuple[str, ...]:
+    """Say what the user should know about a radius."""
+    notes = []
+    rat = stated.get("rat")
+    if rat is not None:
+        notes.append(published_note(rat))
+    if section(length, "left") > section(0.0) * (1.0 + 1e-9):
+        notes.append("the tip is thicker than the base")
+    if section.error > UNRESOLVED:
+        notes.append(
+            f"the radius is met to {section.error:.1e} of its largest value only; it has kinks or "
+            "jumps that should be stated as breaks"
+        )
+    radius = stated.get("radius")
+    if radius is None or callable(radius):
+        return tuple(notes)
+    breaks = section.breaks()
+    change = np.abs(section(breaks) / section(breaks, "left") - 1.0)
+    steps = change[change > JUMP]
+    if steps.size:
+        notes.append(
+            f"the radius jumps at {steps.size} arc lengths, by up to {steps.max():.1%}: these are "
+            "taken as steps of the rod, not smoothed"
+        )
+    noise = scatter(*_samples(length, np.asarray(radius, dtype=np.float64)))
+    if noise > _SCATTERED:
+        notes.append(
+            f"the radius samples scatter by {noise:.2g} of the radius, and forces go with its "
+            f"fourth power; signals follow the samples to about {_FOLLOWED * noise:.0e}"
+        )
+    return tuple(notes)
 
 
 def material_faults(
@@ -164,10 +272,11 @@ def length_faults(length: float) -> list[str]:
 
 def radius_profile(
     length: float,
-    base_radius: float = BASE_RADIUS,
+    base_radius: float | None = None,
     tip_radius: float | None = None,
     radius: Callable[..., object] | ArrayLike | None = None,
     breaks: Sequence[float] = (),
+    rat: str | None = None,
 ) -> Profile:
     """Radius over arc length from any of the ways to state it.
 
@@ -175,15 +284,18 @@ def radius_profile(
     ----------
     length : float
         Arc length of the whisker, m.
-    base_radius : float
-        Radius at the base, m; not used where `radius` is given.
+    base_radius : float, optional
+        Radius at the base, m, 100 µm by default; not used where `radius` is given.
     tip_radius : float, optional
         Radius at the tip, m; by default a fifteenth of the base's.
     radius : callable or array, optional
         Radius r(s), m, of arc length s, m; or radii (n,) equally spaced from base to tip; or pairs
-        (n, 2) of arc length and radius.
+        (n, 2) of arc length and radius; two pairs at one arc length state a jump.
     breaks : sequence of float
         Arc lengths, m, where a callable radius has a kink or a jump.
+    rat : str, optional
+        Row and column of a rat's whisker, such as ``"C2"``, or ``"any"``: its radii by published
+        regressions, instead of all others.
 
     Returns
     -------
@@ -194,6 +306,10 @@ def radius_profile(
     ValueError
         If radii are not positive or do not cover the whisker.
     """
+    if rat is not None:
+        if not all(other is None for other in (radius, tip_radius, base_radius)):
+            raise ValueError("rat and a radius were both given; give one of them")
+        return linear(*published_radii(rat, length), length)
     if radius is None:
         bad = [
             f"{what} is {value!r} m; it must be positive"
@@ -202,8 +318,10 @@ def radius_profile(
         ]
         if bad:
             raise ValueError("; ".join(bad))
-        tip = base_radius / TAPER if tip_radius is None else tip_radius
-        return linear(float(base_radius), float(tip), length)
+        base = BASE_RADIUS if base_radius is None else base_radius
+        return linear(
+            float(base), float(base / TAPER if tip_radius is None else tip_radius), length
+        )
     if tip_radius is not None:
         raise ValueError("tip_radius and radius were both given; give one of them")
     if callable(radius):
@@ -215,20 +333,31 @@ def radius_profile(
     return profile
 
 
-def _joined(length: float, samples: Array) -> Profile:
-    """PCHIP through radius samples, (n,) or (n, 2)."""
+def _samples(length: float, samples: Array) -> tuple[Array, Array]:
+    """Arc lengths and radii of samples, (n,) or (n, 2)."""
     if samples.ndim == 1 and samples.size >= 2:
-        s, r = np.linspace(0.0, length, samples.size), samples
-    elif samples.ndim == 2 and samples.shape[1] == 2 and len(samples) >= 2:
-        s, r = samples.T
-    else:
-        raise ValueError(
-            f"radius has shape {samples.shape}; a function of arc length, at least 2 radii (n,) "
-            "equally spaced from base to tip, or at least 2 pairs (n, 2) of arc length and radius "
-            "are allowed"
-        )
-    if not (np.isfinite(samples).all() and (np.diff(s) > 0.0).all()):
+        return np.linspace(0.0, length, samples.size), samples
+    if samples.ndim == 2 and samples.shape[1] == 2 and len(samples) >= 2:
+        return samples[:, 0], samples[:, 1]
+    raise ValueError(
+        f"radius has shape {samples.shape}; a function of arc length, at least 2 radii (n,) "
+        "equally spaced from base to tip, or at least 2 pairs (n, 2) of arc length and radius "
+        "are allowed"
+    )
+
+
+def _joined(length: float, samples: Array) -> Profile:
+    """Join radius samples, (n,) or (n, 2)."""
+    s, r = _samples(length, samples)
+    steps = np.diff(s)
+    twice = np.flatnonzero(steps == 0.0)
+    if not (np.isfinite(samples).all() and (steps >= 0.0).all()):
         raise ValueError("radius samples must be finite, at increasing arc lengths")
+    if (np.diff(twice) == 1).any() or np.isin(twice, (0, steps.size - 1)).any():
+        raise ValueError(
+            "radius samples may state two radii at an arc length where the radius jumps, but not "
+            "three, nor at base or tip"
+        )
     if s[0] > COVERAGE * length or s[-1] < (1.0 - COVERAGE) * length:
         raise ValueError(
             f"radius samples reach from {s[0]:.4g} to {s[-1]:.4g} m; they must cover the whisker "
@@ -236,9 +365,7 @@ def _joined(length: float, samples: Array) -> Profile:
         )
     if not (r > 0.0).all():
         raise ValueError(f"radius is {r.min():.4g} m at sample {r.argmin()}; it must be positive")
-    cubic = PchipInterpolator(s, r)
-    joints = np.concatenate([[0.0], s[(s > 1e-9 * length) & (s < (1 - 1e-9) * length)], [length]])
-    return approximate(lambda x: np.asarray(cubic(np.clip(x, s[0], s[-1]))), joints)
+    return sampled_radius(length, s, r)
 
 
 def _require_positive(profile: Profile, length: float) -> None:

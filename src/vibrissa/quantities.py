@@ -335,6 +335,13 @@ _ROWS: tuple[tuple[str, str, _Unit, str, str], ...] = (
         "whether the covariance can be relied on",
         "1 where the contact scatters as the derivatives say, 0 where it does not.",
     ),
+    (
+        "probability",
+        "P",
+        _NUMBER,
+        "posterior probability",
+        "Of a contact among all that explain the signals as noise has them.",
+    ),
     ("candidates", "n", _NUMBER, "number of candidates", "Contacts that explain the signals."),
     ("share", r"\mathrm{share}", _PERCENT, "share", "Of all rows."),
     ("confidence", "c", _NUMBER, "confidence", "From 0 (none) to 1."),

@@ -125,6 +125,7 @@ def by_approximation(
         misfit=_misfit(signals, bent.force, bent.moment, names, _ranges(contacts, names)),
         status=status,
         linear=np.zeros(len(targets), dtype=bool),
+        probability=np.full((len(targets), 1), np.nan),
     )
 
 

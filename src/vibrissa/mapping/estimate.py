@@ -1,10 +1,11 @@
 """Measured signals in, contacts out: all that explain them, each with its covariance.
 
-Three signals T have as many unknowns ξ: every contact with T(ξ) = T is a candidate, and for noise
-of covariance Σ its point's covariance is A Σ Aᵀ with the exact A = ∂p/∂ξ (∂T/∂ξ)⁻¹. More signals
-are explained by weighted least squares, χ² = |T(ξ) - T|² in standard deviations; the covariance is
-∂p/∂ξ (JᵀΣ⁻¹J)⁻¹ ∂p/∂ξᵀ with J = ∂T/∂ξ. For a covariance of force and moment, Σ is carried over to
-the signals by their derivatives.
+Three signals T have as many unknowns ξ: every contact with T(ξ) = T is a candidate. More signals
+are explained by weighted least squares, χ² = |T(ξ) - T|² in standard deviations. With noise three
+are treated so too: contacts on the boundary of T(Ω) explain what noise has carried out of it. For
+noise of covariance Σ the covariance is ∂p/∂ξ (JᵀΣ⁻¹J)⁻¹ ∂p/∂ξᵀ with J = ∂T/∂ξ to first order, see
+:mod:`~vibrissa.mapping.posterior`. For a covariance of force and moment, Σ is carried over to the
+signals by their derivatives.
 """
 
 from __future__ import annotations
@@ -20,12 +21,19 @@ from numpy.typing import ArrayLike
 
 from vibrissa.mapping.approximation import APPROXIMATE, by_approximation
 from vibrissa.mapping.contact_map import spherical
-from vibrissa.mapping.explanation import Explanation, by_least_squares, by_triplet, undetermined
+from vibrissa.mapping.explanation import (
+    Explanation,
+    by_least_squares,
+    by_triplet,
+    check_signals,
+    undetermined,
+)
 from vibrissa.mapping.noise import SensorNoise, common_errors, sensor_noise
+from vibrissa.mapping.noisy import under_noise
 from vibrissa.mapping.showing import estimate_card, estimate_rows
 from vibrissa.quantities import attributes
 from vibrissa.rod.arrays import AnyArray, Array, IntArray
-from vibrissa.signals import CIRCULAR, SIGNALS, Coordinates, measured, selection, signal_scales
+from vibrissa.signals import Coordinates, measured, selection, signal_scales
 from vibrissa.sketch import lines
 from vibrissa.status import counted, flag_attributes
 
@@ -42,24 +50,27 @@ class Estimate:
     point : (..., 3) array
         Contact point of the most plausible candidate, m; NaN where there is none.
     covariance : (..., 3, 3) array
-        Its covariance, m²; NaN without ``noise``.
+        Its covariance, m², of the posterior probability about the point: to first order where the
+        contact moves with the signals as the derivatives say, and widened where it does not, as
+        near slip-off and where the deflection is small; NaN without ``noise``.
     linear : (...) bool array
-        Whether the covariance can be relied on: within two standard deviations the contact moves
-        with the signals as the derivatives say, and stays on the whisker. False without ``noise``,
-        and mostly where the deflection is small.
+        Whether the covariance can be relied on: regions stated from it hold what they state. False
+        without ``noise``, and mostly where the noise is as large as the signals.
     status : (...) int array
-        :class:`~vibrissa.Status`: ``UNIQUE``; ``AMBIGUOUS``; ``NOT_FRICTIONLESS`` where no contact
-        on the map explains the signals (of more than three signals: where χ² is larger than one
-        measurement in a thousand would have it; then the contact that comes nearest is given);
+        :class:`~vibrissa.Status`: ``UNIQUE`` (with ``noise``: all other candidates together are
+        less than 5 % probable); ``AMBIGUOUS``; ``NOT_FRICTIONLESS`` where no contact on the map
+        explains the signals (with ``noise``, and of more than three signals: where χ² is larger
+        than one measurement in a thousand would have it; then the contact nearest is given);
         ``OUTSIDE_MAP`` where one nearer to the base would, or where signals are ten times larger
         than any on the map; ``DEGENERATE`` where all forces and moments are zero, and everywhere if
         the signals do not determine contacts (:meth:`ContactMap.determines`); ``MISSING``.
         Of a look-up table or network, which cannot see whether contacts are ambiguous:
         ``APPROXIMATE``, ``OUTSIDE_MAP`` (outside the table) or ``MISSING``.
     misfit : (...) array
-        Of three signals, 0 where they are explained; else how far, in shares of each signal's
-        range, they are from the nearest ones that are. Of k > 3 signals, χ² of k - 3 degrees of
-        freedom: the sum of squares of what is left unexplained, in standard deviations. Of a table
+        χ² of k - 3 degrees of freedom: the sum of squares of what is left unexplained of k signals,
+        in standard deviations; of three, more than 0 only where noise has carried them out of what
+        contacts give. Of three signals without ``noise``, 0 where they are explained; else how far,
+        in shares of each signal's range, they are from the nearest ones that are. Of a table
         or network, how far the signals of the contact given are from those measured, likewise in
         shares of ranges; NaN where the whisker cannot reach the point.
     arc_length : (...) array
@@ -67,9 +78,10 @@ class Estimate:
     force, moment : (..., 3) arrays
         Base force and moment of the candidate, N and N·m.
     candidates : (..., k, 3) array
-        Contact points of all candidates, padded with NaN, m: by rising force, or for more than
-        three signals by rising χ² and then force. Candidates have χ² within 10.8 of the least (the
-        likelihood ratio that one pair in a thousand exceeds by chance).
+        Contact points of all candidates, padded with NaN, m: with ``noise`` by falling probability;
+        without, by rising force, or for more than three signals by rising χ² and then force.
+        Candidates have χ² within 10.8 of the least (the likelihood ratio that one pair in a
+        thousand exceeds by chance).
     candidate_covariances : (..., k, 3, 3) array
         Their covariances, m²; NaN without ``noise``.
     candidate_arc_lengths : (..., k) array
@@ -78,6 +90,9 @@ class Estimate:
         Their base forces, N.
     candidate_contact_forces : (..., k, 3) array
         Their forces in the material frame at the contact (tangent, d1, d2), N.
+    candidate_probabilities : (..., k) array
+        Their posterior probabilities, where any contact point of Ω is as probable beforehand; NaN
+        without ``noise``.
     n_candidates : (...) int array
         How many.
     triplet : tuple of str
@@ -101,6 +116,7 @@ class Estimate:
     candidate_arc_lengths: Array
     candidate_forces: Array
     candidate_contact_forces: Array
+    candidate_probabilities: Array
     n_candidates: IntArray
     triplet: tuple[str, ...]
     dims: tuple[str, ...]
@@ -110,6 +126,11 @@ class Estimate:
     def spherical(self) -> Array:
         """(r, θ, φ) of the contact point: m and rad, shape (..., 3)."""
         return spherical(self.point)
+
+    @property
+    def probability(self) -> Array:
+        """Posterior probability of the contact given, shape (...); NaN without ``noise``."""
+        return self.candidate_probabilities[..., 0]
 
     @property
     def candidate_moments(self) -> Array:
@@ -162,7 +183,13 @@ class Estimate:
                     self.candidate_moments,
                     attributes("moment"),
                 ),
+                "candidate_probabilities": (
+                    (*dims, "candidate"),
+                    self.candidate_probabilities,
+                    attributes("probability"),
+                ),
                 "n_candidates": (dims, self.n_candidates, attributes("candidates")),
+                "probability": (dims, self.probability, attributes("probability")),
                 "linear": (dims, self.linear, attributes("linear")),
                 "status": (dims, self.status, {**attributes("status"), **flag_attributes()}),
             },
@@ -261,6 +288,7 @@ def estimate(
         candidate_arc_lengths=whole(found.contacts[:, :most, 0] * d.length),
         candidate_forces=whole(forces[:, :most]),
         candidate_contact_forces=whole(found.contacts[:, :most, 1:] * d.force),
+        candidate_probabilities=whole(found.probability[:, :most]),
         n_candidates=whole(found.number),
         triplet=names,
         dims=dims,
@@ -273,8 +301,11 @@ def _exact(
 ) -> Explanation:
     if not contacts.determines(names):
         return undetermined(targets)
-    explain = by_triplet if len(names) == 3 else by_least_squares
-    return explain(contacts, names, targets, sensor)
+    if len(names) == 3:
+        found = by_triplet(contacts, names, targets)
+    else:
+        found = by_least_squares(contacts, names, targets, sensor)
+    return found if sensor is None else under_noise(contacts, names, targets, sensor, found)
 
 
 def _method(
@@ -286,30 +317,3 @@ def _method(
         return partial(by_approximation, method)
     known = ", ".join(repr(name) for name in ("exact", *APPROXIMATE))
     raise ValueError(f"method is one of {known}; got {method!r}")
-
-
-def check_signals(values: Array, names: tuple[str, ...]) -> None:
-    """Refuse what no sensor in SI units can say.
-
-    Parameters
-    ----------
-    values : (..., k) array
-        Signals, SI units.
-    names : tuple of str
-        Which.
-
-    Raises
-    ------
-    ValueError
-        If a size is negative, or an angle is more than a full turn.
-    """
-    for k, name in enumerate(names):
-        if name in ("FT", "MB") and (values[..., k] < 0.0).any():
-            raise ValueError(
-                f"{name} is a size and cannot be negative; got {np.nanmin(values[..., k])}"
-            )
-        if CIRCULAR[SIGNALS.index(name)] and (np.abs(values[..., k]) > 2.0 * np.pi).any():
-            largest = np.nanmax(np.abs(values[..., k]))
-            raise ValueError(
-                f"{name} is an angle in rad; got {largest:g}, which looks like degrees"
-            )

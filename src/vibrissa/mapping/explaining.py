@@ -12,9 +12,10 @@ import numpy as np
 
 from vibrissa.mapping.fitting import _fit, channel_equations
 from vibrissa.mapping.inversion import MOST_CANDIDATES
-from vibrissa.mapping.least_squares import PARTS, _nearest
-from vibrissa.mapping.locating import Searched, Trail, go_on, near, tell
-from vibrissa.mapping.weighing import Weighing, spread, weigh
+from vibrissa.mapping.least_squares import PARTS, nearest_of
+from vibrissa.mapping.locating import Searched, Trail, conclude, near
+from vibrissa.mapping.posterior import CERTAIN
+from vibrissa.mapping.weighing import Weighing, weigh
 from vibrissa.mapping.whitening import INDISTINCT
 from vibrissa.rod.arrays import Array, IntArray, Rod
 from vibrissa.rod.compiled import copy, inlined, kernel
@@ -59,7 +60,8 @@ def explain(
     measured: Array,
     trail: Trail,
     found: Array,
-) -> tuple[int, int, int, float]:
+    probability: Array,
+) -> tuple[int, int, int, float, bool]:
     """Find the contacts that explain more than three signals, or a mix, best.
 
     Parameters
@@ -69,7 +71,7 @@ def explain(
     how : Weighing
         Of the measurement.
     noisy : bool
-        Whether covariances are wanted.
+        Whether noise is known.
     passes : int
         How often weights are taken anew at where the last fit ended.
     limit : float
@@ -82,6 +84,8 @@ def explain(
         The contact followed so far: one more place to start from.
     found : (MOST_CANDIDATES, COLUMNS) array
         Filled with the candidates, the best first.
+    probability : (1, MOST_CANDIDATES) array
+        Filled with their posterior probabilities; NaN without noise.
 
     Returns
     -------
@@ -93,6 +97,8 @@ def explain(
         Which of them goes on from the one before.
     misfit : float
         χ² of the first.
+    valid : bool
+        Whether the covariance of the first can be relied on.
     """
     x, values = np.zeros((_MOST_STARTS, 4)), np.zeros((_MOST_STARTS, 6))
     tangents, misfits = np.zeros((_MOST_STARTS, 6, 4)), np.full(_MOST_STARTS, np.inf)
@@ -100,36 +106,57 @@ def explain(
     n = _starts(of, measured, trail, x, values)
     state = (x, values, tangents, misfits, inside)
     _fitted(of, how, passes, limit + INDISTINCT, target, measured, state, 0, n)
-    if not _explained(misfits, inside, limit, n):
+    kept, good = np.empty(MOST_CANDIDATES, np.int64), _explained(misfits, inside, limit, n)
+    if not (good or noisy):
         n = _everywhere(of, how, passes, limit, target, measured, state, n)
-    kept, number, status = np.empty(MOST_CANDIDATES, np.int64), 0, _UNIQUE
-    if _explained(misfits, inside, limit, n):
-        number = _chosen(x, misfits, inside, limit, n, kept)
-        status = _UNIQUE if number == 1 else _AMBIGUOUS
-    else:
-        status, best = _FRICTION, np.inf
+        good = _explained(misfits, inside, limit, n)
+    number = _chosen(x, misfits, inside, limit, n, kept) if good else 0
+    if not (good or noisy):
+        number = _nearest_fit(misfits, inside, n, kept)
+    contacts, solved = np.zeros((1, MOST_CANDIDATES, 4)), np.empty((1, MOST_CANDIDATES, 6))
+    for i in range(number):
+        copy(x[kept[i]], contacts[0, i])
+        copy(values[kept[i]], solved[0, i])
+    least = misfits[kept[0]] if number > 0 else np.nan
+    number, continuing, misfit, valid = conclude(
+        of,
+        how,
+        noisy,
+        passes,
+        limit,
+        target,
+        measured,
+        trail,
+        number,
+        contacts,
+        solved,
+        found,
+        probability,
+    )
+    if not noisy:
+        misfit = least
+    elif misfit <= limit:
+        good = True
+    else:  # perhaps a contact nearer to the base than the map goes explains it
+        n = _everywhere(of, how, passes, limit, target, measured, state, n)
+    sure = probability[0, 0] > CERTAIN if noisy else number == 1
+    status = _UNIQUE if sure else _AMBIGUOUS
+    if not good:
+        status = _FRICTION
         for row in range(n):
             if inside[row] == 1 and misfits[row] <= limit:
                 status = _OUTSIDE
-            if inside[row] == 2 and misfits[row] < best:
-                kept[0], number, best = row, 1, misfits[row]
-    if number == 0:
-        trail.number[0] = 0
-        return 0, status, 0, np.nan
-    contacts, solved = np.empty((number, 3)), np.empty((number, 6))
-    slopes = np.empty((number, 6, 3))
-    for i in range(number):
-        row = kept[i]
-        contacts[i, 0], contacts[i, 1], contacts[i, 2] = x[row, 0], x[row, 2], x[row, 3]
-        copy(values[row], solved[i])
-        for a in range(6):
-            t = tangents[row, a]
-            slopes[i, a, 0], slopes[i, a, 1], slopes[i, a, 2] = t[0], t[2], t[3]
-    covariances = np.full((number, 3, 3), np.nan)
-    if noisy:
-        spread(how, measured, contacts, solved, slopes, covariances)
-    tell(of.length, of.force, contacts, solved, covariances, found)
-    return number, status, go_on(trail, contacts, solved, number), misfits[kept[0]]
+    return number, status, continuing, misfit, valid
+
+
+@inlined
+def _nearest_fit(misfits: Array, inside: IntArray, n: int, kept: IntArray) -> int:
+    """Fill which fit on the map comes nearest; 1, or 0 if there is none."""
+    number, best = 0, np.inf
+    for row in range(n):
+        if inside[row] == 2 and misfits[row] < best:
+            kept[0], number, best = row, 1, misfits[row]
+    return number
 
 
 @kernel
@@ -308,20 +335,8 @@ def _everywhere(
 ) -> int:
     """Fit from the nodes of all parts of the map that come nearest; how many rows there are."""
     x, values = state[0], state[1]
-    q, k = of.seen.shape[0], how.codes.shape[0]
-    wanted, scale = np.empty((1, q)), np.ones((1, q))
-    sizes = np.zeros(2)
-    for i in range(q):
-        wanted[0, i] = 0.0
-        for c in range(k):
-            wanted[0, i] += how.mixing[i, c] * target[c]
-        if of.kinds[i] < 2:
-            sizes[of.kinds[i]] += wanted[0, i] ** 2
-    for i in range(q):
-        if of.kinds[i] < 2 and sizes[of.kinds[i]] > 0.0:
-            scale[0, i] = 1.0 / np.sqrt(sizes[of.kinds[i]])
     nearest = np.full((1, PARTS), -1)
-    _nearest(of.seen, of.turns, of.part, wanted, scale, nearest, 0, 1)
+    nearest_of(of.seen, of.turns, of.part, of.kinds, how.mixing, target, nearest)
     rows = n
     for part in range(PARTS):
         node = nearest[0, part]

@@ -11,7 +11,6 @@ from scipy.spatial import cKDTree
 from vibrissa.mapping.inversion import invert, polish
 from vibrissa.mapping.least_squares import least_squares
 from vibrissa.mapping.noise import SensorNoise
-from vibrissa.mapping.uncertainty import point_covariances
 from vibrissa.rod.arrays import AnyArray, Array, IntArray
 from vibrissa.rod.newton import TOLERANCE
 from vibrissa.rod.reach import with_normal_force
@@ -71,7 +70,7 @@ class Explanation(NamedTuple):
 
     Their number (n,), arc length and force in the material frame (n, k, 4), (F, p) (n, k, 6),
     covariances of p (n, k, 3, 3); of each row misfit, status and whether the covariance of the
-    first can be relied on (n,).
+    first can be relied on (n,); posterior probabilities (n, k).
     """
 
     number: IntArray
@@ -81,11 +80,27 @@ class Explanation(NamedTuple):
     misfit: Array
     status: IntArray
     linear: AnyArray
+    probability: Array
+
+    @classmethod
+    def without_noise(
+        cls, number: IntArray, contacts: Array, values: Array, misfit: Array, status: IntArray
+    ) -> Explanation:
+        """Leave out what only noise tells."""
+        n, k = contacts.shape[:2]
+        return cls(
+            number,
+            contacts,
+            values,
+            np.full((n, k, 3, 3), np.nan),
+            misfit,
+            status,
+            np.zeros(n, np.bool_),
+            np.full((n, k), np.nan),
+        )
 
 
-def by_triplet(
-    contacts: ContactMap, names: tuple[str, ...], targets: Array, sensor: SensorNoise | None
-) -> Explanation:
+def by_triplet(contacts: ContactMap, names: tuple[str, ...], targets: Array) -> Explanation:
     """Find the contacts that give three signals exactly.
 
     Parameters
@@ -96,8 +111,6 @@ def by_triplet(
         The signals.
     targets : (n, 3) array
         Their values, non-dimensional.
-    sensor : SensorNoise or None
-        Noise.
 
     Returns
     -------
@@ -112,9 +125,8 @@ def by_triplet(
     rows = np.flatnonzero((found.number == 0) & ~missing)
     if rows.size:
         status[rows], misfit[rows] = why_none(contacts, names, targets[rows])
-    covariances, linear = _uncertain(contacts, names, found.number, found.contacts, sensor)
     xi = with_normal_force(found.contacts.reshape(-1, 3)).reshape(*found.contacts.shape[:2], 4)
-    return Explanation(found.number, xi, found.values, covariances, misfit, status, linear)
+    return Explanation.without_noise(found.number, xi, found.values, misfit, status)
 
 
 def by_least_squares(
@@ -155,9 +167,8 @@ def by_least_squares(
         found.contacts[..., [0, 2, 3]],
         found.values,
     )
-    covariances, linear = _uncertain(contacts, names, number, xi, sensor)
     whole = with_normal_force(xi.reshape(-1, 3)).reshape(n, most, 4)
-    return Explanation(number, whole, values, covariances, misfit, status, linear)
+    return Explanation.without_noise(number, whole, values, misfit, status)
 
 
 def undetermined(targets: Array) -> Explanation:
@@ -175,14 +186,12 @@ def undetermined(targets: Array) -> Explanation:
     """
     n = len(targets)
     known = np.isfinite(targets).all(axis=1)
-    return Explanation(
+    return Explanation.without_noise(
         number=np.zeros(n, np.int64),
         contacts=np.full((n, 1, 4), np.nan),
         values=np.full((n, 1, 6), np.nan),
-        covariances=np.full((n, 1, 3, 3), np.nan),
         misfit=np.full(n, np.nan),
         status=np.where(known, int(Status.DEGENERATE), int(Status.MISSING)),
-        linear=np.zeros(n, np.bool_),
     )
 
 
@@ -244,20 +253,28 @@ def _on_circle(values: Array, turned: AnyArray, size: Array) -> Array:
     return np.stack(parts, axis=1)
 
 
-def _uncertain(
-    contacts: ContactMap,
-    names: tuple[str, ...],
-    number: IntArray,
-    xi: Array,
-    sensor: SensorNoise | None,
-) -> tuple[Array, AnyArray]:
-    """Covariances (n, k, 3, 3) of candidates ξ (n, k, 3), and whether the first's is reliable."""
-    covariances = np.full((*xi.shape[:2], 3, 3), np.nan)
-    linear = np.zeros(len(xi), np.bool_)
-    row, place = np.nonzero(np.arange(xi.shape[1]) < number[:, None])
-    if sensor is None or not row.size:
-        return covariances, linear
-    d, first = contacts.chart.discretization, place == 0
-    covariances[row, place], good = point_covariances(d, names, xi[row, place], sensor, first)
-    linear[row[first]] = good[first]
-    return covariances, linear
+def check_signals(values: Array, names: tuple[str, ...]) -> None:
+    """Refuse what no sensor in SI units can say.
+
+    Parameters
+    ----------
+    values : (..., k) array
+        Signals, SI units.
+    names : tuple of str
+        Which.
+
+    Raises
+    ------
+    ValueError
+        If a size is negative, or an angle is more than a full turn.
+    """
+    for k, name in enumerate(names):
+        if name in ("FT", "MB") and (values[..., k] < 0.0).any():
+            raise ValueError(
+                f"{name} is a size and cannot be negative; got {np.nanmin(values[..., k])}"
+            )
+        if CIRCULAR[SIGNALS.index(name)] and (np.abs(values[..., k]) > 2.0 * np.pi).any():
+            largest = np.nanmax(np.abs(values[..., k]))
+            raise ValueError(
+                f"{name} is an angle in rad; got {largest:g}, which looks like degrees"
+            )

@@ -140,7 +140,7 @@ def channel_equations(
 
 
 @inlined
-def _whiten(w: Array, residual: Array, jacobian: Array, k: int, r: Array, j: Array) -> float:
+def whiten(w: Array, residual: Array, jacobian: Array, k: int, r: Array, j: Array) -> float:
     """Fill r = W residual, j = W jacobian; return |r|²."""
     total = 0.0
     for a in range(k):
@@ -318,7 +318,7 @@ def _fit(
                         t[a, 1] = 0.0
                 at = row + i
                 channel_equations(to[i], value, t, codes, targets[at], residual, jacobian)
-                misfit = _whiten(weights[at], residual, jacobian, k, trial_r, trial_j)
+                misfit = whiten(weights[at], residual, jacobian, k, trial_r, trial_j)
                 if misfit < misfits[at]:
                     damping[i] = 0.0 if damping[i] < 1e-5 else 0.1 * damping[i]
                     misfits[at] = misfit

@@ -308,3 +308,40 @@ def _nearest(
             if total[node] < least[p]:
                 least[p] = total[node]
                 out[row, p] = node
+
+
+@kernel
+def nearest_of(
+    known: Array,
+    turns: Array,
+    part: IntArray,
+    kinds: IntArray,
+    mixing: Array,
+    target: Array,
+    out: IntArray,
+) -> None:
+    """Fill the nodes of all parts of the chart that come nearest to one measurement.
+
+    Parameters
+    ----------
+    known, turns, part, kinds : arrays
+        As in :class:`~vibrissa.mapping.locating.Searched`.
+    mixing : (q, k) array
+        A of the measurement.
+    target : (k,) array
+        What the channels should be.
+    out : (1, PARTS) int array
+        Filled with numbers of nodes; -1 for none.
+    """
+    q, k = known.shape[0], target.shape[0]
+    wanted, scale = np.zeros((1, q)), np.ones((1, q))
+    sizes = np.zeros(2)
+    for i in range(q):
+        for c in range(k):
+            wanted[0, i] += mixing[i, c] * target[c]
+        if kinds[i] < 2:
+            sizes[kinds[i]] += wanted[0, i] ** 2
+    for i in range(q):
+        if kinds[i] < 2 and sizes[kinds[i]] > 0.0:
+            scale[0, i] = 1.0 / np.sqrt(sizes[kinds[i]])
+    _nearest(known, turns, part, wanted, scale, out, 0, 1)

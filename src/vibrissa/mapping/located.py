@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -40,6 +41,11 @@ class Located(NamedTuple):
         Covariances of all candidates, m²; NaN without noise.
     contact_forces : (k, 3) array
         Forces in the material frame at the contacts (tangent, d1, d2), N; the first is 0.
+    probabilities : (k,) array
+        Posterior probabilities of the candidates; NaN without noise, and of fewer than three
+        signals.
+    linear : bool
+        Whether ``covariance`` can be relied on, as in :class:`Estimate`.
     """
 
     point: Array
@@ -52,6 +58,13 @@ class Located(NamedTuple):
     forces: Array
     covariances: Array
     contact_forces: Array
+    probabilities: Array
+    linear: bool
+
+    @property
+    def probability(self) -> float:
+        """Posterior probability of ``point``; NaN without noise."""
+        return float(self.probabilities[0]) if len(self.probabilities) else math.nan
 
 
 def nowhere(status: Status, misfit: float = np.nan) -> Located:
@@ -81,4 +94,6 @@ def nowhere(status: Status, misfit: float = np.nan) -> Located:
         np.empty((0, 3)),
         np.empty((0, 3, 3)),
         np.empty((0, 3)),
+        np.empty(0),
+        False,
     )

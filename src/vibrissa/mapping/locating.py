@@ -12,10 +12,10 @@ from typing import NamedTuple
 import numpy as np
 
 from vibrissa.mapping.inversion import MOST_CANDIDATES, _invert, _polish
-from vibrissa.mapping.weighing import Weighing, spread
+from vibrissa.mapping.modes import settle
+from vibrissa.mapping.weighing import Weighing
 from vibrissa.rod.arrays import Array, IntArray, Rod
 from vibrissa.rod.compiled import copy, inlined, kernel
-from vibrissa.rod.kernels import evaluate
 from vibrissa.rod.newton import TOLERANCE
 from vibrissa.rod.preimage import Tree
 from vibrissa.rod.reach import Fold
@@ -148,25 +148,41 @@ def tell(
 
 
 @kernel
-def meet(
-    of: Searched, how: Weighing, noisy: bool, measured: Array, trail: Trail, found: Array
-) -> tuple[int, int, bool]:
-    """Find all contacts that give three signals exactly.
+def conclude(
+    of: Searched,
+    how: Weighing,
+    noisy: bool,
+    passes: int,
+    limit: float,
+    target: Array,
+    measured: Array,
+    trail: Trail,
+    number: int,
+    x: Array,
+    values: Array,
+    found: Array,
+    probability: Array,
+) -> tuple[int, int, float, bool]:
+    """Complete and judge candidates of one measurement where it is noisy, and tell them.
 
     Parameters
     ----------
-    of : Searched
-        The map.
-    how : Weighing
-        Of the measurement.
+    of, how, passes, limit : Searched, Weighing, int, float
+        As for :func:`~vibrissa.mapping.modes.settle`.
     noisy : bool
-        Whether covariances are wanted.
-    measured : (3,) array
-        The signals.
+        Whether noise is known.
+    target, measured : (k,) arrays
+        What the channels should be, and what was measured.
     trail : Trail
-        The contact followed so far: one more place to start from.
+        The contact followed so far.
+    number : int
+        How many candidates there are.
+    x, values : (1, MOST_CANDIDATES, 4), (1, MOST_CANDIDATES, 6) arrays
+        Those, and (F, p); changed.
     found : (MOST_CANDIDATES, COLUMNS) array
-        Filled with the candidates, by force.
+        Filled with them.
+    probability : (1, MOST_CANDIDATES) array
+        Filled with their posterior probabilities; NaN without noise.
 
     Returns
     -------
@@ -174,31 +190,77 @@ def meet(
         How many there are.
     continuing : int
         Which of them goes on from the one before.
-    good : bool
-        False where covariances are wanted, but the noise is singular.
+    misfit : float
+        χ² of the first; 0 without noise.
+    valid : bool
+        Whether the covariance of the first can be relied on.
     """
-    target, number = np.empty((1, 6)), np.zeros(1, np.int64)
-    xi, values = np.empty((1, MOST_CANDIDATES + 1, 3)), np.empty((1, MOST_CANDIDATES + 1, 6))
-    for k in range(3):
-        target[0, k], target[0, 3 + k] = measured[of.where[k]], of.codes[k]
-    _invert(of.rod, of.fold, of.tree, of.proximal, target, number, xi, values, 0, 1)
-    n = int(number[0])
-    if n < trail.number[0] and not near(trail, values[0], n):
-        n = _followed(of, target, trail, xi[0], values[0], n)
+    most, k = MOST_CANDIDATES, target.shape[0]
+    misfits, covariances = np.zeros((1, most)), np.full((1, most, 3, 3), np.nan)
+    count, valid = np.full(1, number), np.zeros(1, np.bool_)
+    if noisy:
+        settle(
+            of,
+            how,
+            passes,
+            limit,
+            target.reshape(1, k),
+            measured.reshape(1, measured.shape[0]),
+            count,
+            x,
+            values,
+            misfits,
+            covariances,
+            probability,
+            valid,
+            0,
+            1,
+        )
+    n = count[0]
     if n == 0:
         trail.number[0] = 0
-        return 0, 0, True
-    contacts, solved = xi[0, :n], values[0, :n]
-    covariances, good = np.full((n, 3, 3), np.nan), True
-    if noisy:
-        x = np.zeros((n, 4))
-        for row in range(n):
-            x[row, 0], x[row, 2], x[row, 3] = contacts[row, 0], contacts[row, 1], contacts[row, 2]
-        tangents = np.empty((n, 6, 3))
-        evaluate(of.rod, x, np.empty((n, 6)), tangents, 0, n)
-        good = spread(how, measured, contacts, solved, tangents, covariances)
-    tell(of.length, of.force, contacts, solved, covariances, found)
-    return n, go_on(trail, contacts, solved, n), good
+        return 0, 0, np.nan, False
+    contacts = np.empty((n, 3))
+    for row in range(n):
+        for a in range(3):
+            contacts[row, a] = x[0, row, a if a == 0 else a + 1]
+    tell(of.length, of.force, contacts, values[0], covariances[0], found)
+    return n, go_on(trail, contacts, values[0], n), misfits[0, 0], valid[0]
+
+
+@kernel
+def meet(
+    of: Searched,
+    how: Weighing,
+    noisy: bool,
+    passes: int,
+    limit: float,
+    target: Array,
+    measured: Array,
+    trail: Trail,
+    found: Array,
+    probability: Array,
+) -> tuple[int, int, float, bool]:
+    """Find all contacts that give three signals exactly, or as noise has them.
+
+    The arguments and what is returned are those of :func:`conclude`.
+    """
+    aim, number = np.empty((1, 6)), np.zeros(1, np.int64)
+    xi, solved = np.empty((1, MOST_CANDIDATES + 1, 3)), np.empty((1, MOST_CANDIDATES + 1, 6))
+    for k in range(3):
+        aim[0, k], aim[0, 3 + k] = measured[of.where[k]], of.codes[k]
+    _invert(of.rod, of.fold, of.tree, of.proximal, aim, number, xi, solved, 0, 1)
+    n = int(number[0])
+    if n < trail.number[0] and not near(trail, solved[0], n):
+        n = _followed(of, aim, trail, xi[0], solved[0], n)
+    x, values = np.zeros((1, MOST_CANDIDATES, 4)), np.empty((1, MOST_CANDIDATES, 6))
+    for row in range(n):
+        for a in range(3):
+            x[0, row, a if a == 0 else a + 1] = xi[0, row, a]
+        copy(solved[0, row], values[0, row])
+    return conclude(
+        of, how, noisy, passes, limit, target, measured, trail, n, x, values, found, probability
+    )
 
 
 @kernel

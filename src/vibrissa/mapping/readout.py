@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vibrissa.mapping.channels import CHANNELS, FITTED, WRENCH, Channels
-from vibrissa.mapping.estimate import check_signals
-from vibrissa.mapping.explanation import Bounds
+from vibrissa.mapping.explanation import Bounds, check_signals
 from vibrissa.mapping.least_squares import at_nodes, constant_weights, parts, seeding_triplet
 from vibrissa.mapping.locating import Searched
 from vibrissa.mapping.noise import SensorNoise, scaled_errors
@@ -66,7 +65,8 @@ class Named:
         self._pairs = self.channels.pairs()
         self._circular = [CIRCULAR[SIGNALS.index(name)] for name in names]
         self._sizes = [i for i, name in enumerate(names) if name in ("FT", "MB")]
-        self._most = Bounds.of(contacts, names).most()
+        self.bounds = Bounds.of(contacts, names)
+        self._most = self.bounds.most()
         self._straight = [i for i, turns in enumerate(self._circular) if not turns]
         self.how = _weighing(self.channels, sensor, d.force, d.moment, self.scale)
         self.passes = 1 if constant_weights(self.channels, sensor) else 2

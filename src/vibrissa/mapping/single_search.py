@@ -13,8 +13,8 @@ from vibrissa.mapping.explanation import why_none
 from vibrissa.mapping.inversion import MOST_CANDIDATES
 from vibrissa.mapping.located import Located, nowhere
 from vibrissa.mapping.locating import COLUMNS, Trail, meet
+from vibrissa.mapping.posterior import CERTAIN
 from vibrissa.mapping.readout import Measurement, Mixed, Named, independent
-from vibrissa.mapping.uncertainty import point_covariances
 from vibrissa.mapping.whitening import explained
 from vibrissa.rod.arrays import Array
 from vibrissa.status import Status
@@ -39,6 +39,7 @@ class ExactSearch:
 
     def __init__(self, contacts: ContactMap, readout: Named) -> None:
         self._contacts, self._readout, self._trail = contacts, readout, Trail.new()
+        self._limit = explained(independent(contacts, readout) - _UNKNOWNS)
 
     def forget(self) -> None:
         """Begin anew, as when the whisker has lost touch."""
@@ -47,26 +48,35 @@ class ExactSearch:
     def __call__(self, measurement: Measurement) -> Located:
         """Search in the whole map."""
         readout, found = self._readout, np.empty((MOST_CANDIDATES, COLUMNS))
-        noisy, measured = readout.sensor is not None, measurement.measured
-        number, continuing, good = meet(
-            readout.searched, readout.how, noisy, measured, self._trail, found
+        probability = np.full((1, MOST_CANDIDATES), np.nan)
+        if readout.nothing(measurement) or readout.beyond(measurement):
+            self.forget()
+            return self._none(measurement)
+        number, continuing, misfit, valid = meet(
+            readout.searched,
+            readout.how,
+            readout.noisy,
+            readout.passes,
+            self._limit,
+            measurement.target,
+            measurement.measured,
+            self._trail,
+            found,
+            probability,
         )
         if not number:
-            why, misfit = why_none(self._contacts, readout.names, measured[None])
-            return nowhere(_STATUSES[int(why[0])], float(misfit[0]))
-        if not good:
-            self._weigh_singly(found[:number])
-        status = Status.UNIQUE if number == 1 else Status.AMBIGUOUS
-        return _located(found[:number], status, 0.0, continuing)
+            return self._none(measurement)
+        sure = probability[0, 0] > CERTAIN if readout.noisy else number == 1
+        status = Status.UNIQUE if sure else Status.AMBIGUOUS
+        if not misfit <= self._limit:
+            status = self._none(measurement).status
+        return _located(found[:number], probability[0], status, misfit, continuing, valid)
 
-    def _weigh_singly(self, found: Array) -> None:
-        """Fill covariances where the noise is singular."""
-        d, readout = self._contacts.chart.discretization, self._readout
-        assert readout.sensor is not None
-        xi = found[:, [locating.ARC, locating.CONTACT_FORCE + 1, locating.CONTACT_FORCE + 2]]
-        xi = xi / [d.length, d.force, d.force]
-        covariances = point_covariances(d, readout.names, xi, readout.sensor)[0]
-        found[:, locating.COVARIANCE :] = covariances.reshape(-1, 9) * d.length**2
+    def _none(self, measurement: Measurement) -> Located:
+        """Say why there is no contact."""
+        measured = measurement.measured[None]
+        why, misfit = why_none(self._contacts, self._readout.names, measured)
+        return nowhere(_STATUSES[int(why[0])], float(misfit[0]))
 
 
 class LeastSquaresSearch:
@@ -98,7 +108,8 @@ class LeastSquaresSearch:
             self.forget()
             return nowhere(Status.OUTSIDE_MAP)
         found = np.empty((MOST_CANDIDATES, COLUMNS))
-        number, status, continuing, misfit = explain(
+        probability = np.full((1, MOST_CANDIDATES), np.nan)
+        number, status, continuing, misfit, valid = explain(
             readout.searched,
             readout.how,
             readout.noisy,
@@ -108,10 +119,13 @@ class LeastSquaresSearch:
             measurement.measured,
             self._trail,
             found,
+            probability,
         )
         if not number:
             return nowhere(_STATUSES[status])
-        return _located(found[:number], _STATUSES[status], misfit, continuing)
+        return _located(
+            found[:number], probability[0], _STATUSES[status], misfit, continuing, valid
+        )
 
 
 class SetSearch:
@@ -143,11 +157,19 @@ class SetSearch:
             return nowhere(Status.OUTSIDE_MAP if beyond else Status.NOT_FRICTIONLESS)
         if not readout.noisy:
             covariance[:], found[:, locating.COVARIANCE :] = np.nan, np.nan
-        located = _located(found, Status.UNDERDETERMINED, 0.0, middle)
+        unknown = np.full(len(found), np.nan)
+        located = _located(found, unknown, Status.UNDERDETERMINED, 0.0, middle, False)
         return located._replace(point=located.candidates[middle], covariance=covariance)
 
 
-def _located(found: Array, status: Status, misfit: float, continuing: int) -> Located:
+def _located(
+    found: Array,
+    probability: Array,
+    status: Status,
+    misfit: float,
+    continuing: int,
+    valid: bool,
+) -> Located:
     """Tell candidates, see :mod:`~vibrissa.mapping.locating`, in their order."""
     points = found[:, : locating.ARC]
     covariances = found[:, locating.COVARIANCE :].reshape(-1, 3, 3)
@@ -162,4 +184,6 @@ def _located(found: Array, status: Status, misfit: float, continuing: int) -> Lo
         found[:, locating.FORCE : locating.COVARIANCE],
         covariances,
         found[:, locating.CONTACT_FORCE : locating.FORCE],
+        probability[: len(found)],
+        valid,
     )

@@ -1,4 +1,4 @@
-"""What one measurement weighs, and the covariances of contacts that explain it; compiled.
+"""What one measurement weighs; compiled.
 
 What batches do with arrays (:mod:`~vibrissa.mapping.whitening`, :mod:`~vibrissa.mapping.channels`),
 here for one row at a time, where NumPy's overhead would be ten times the work. A measurement is
@@ -11,14 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.mapping.fitting import channel_equations
 from vibrissa.rod.arrays import Array, IntArray
 from vibrissa.rod.compiled import copy, inlined, kernel
 
 # Of a channel's variance, what others do not explain; below this the covariance is singular.
 _SINGULAR = 1e-10
-# Unknowns that a measurement tells this much worse than others (as a share) it does not tell.
-_OPEN = 1e-14
 
 
 class Weighing(NamedTuple):
@@ -177,80 +174,4 @@ def weigh(how: Weighing, value: Array, measured: Array, out: Array) -> bool:
                     total -= low[i, a] * out[a, j]
                 total /= low[i, i]
             out[i, j] = total
-    return True
-
-
-@kernel
-def spread(
-    how: Weighing,
-    measured: Array,
-    contacts: Array,
-    values: Array,
-    tangents: Array,
-    covariances: Array,
-) -> bool:
-    """Covariances of contact points.
-
-    Parameters
-    ----------
-    how : Weighing
-        Of the measurement.
-    measured : (k,) array
-        Signals by name, where these have deviations.
-    contacts, values, tangents : (n, 3), (n, 6), (n, 6, 3) arrays
-        ξ, (F, p) and ∂(F, p)/∂ξ of the contacts found.
-    covariances : (n, 3, 3) array
-        Filled, non-dimensional; NaN where the measurement does not determine the contact.
-
-    Returns
-    -------
-    bool
-        False where a measurement cannot be weighed.
-    """
-    n, k = values.shape[0], how.codes.shape[0]
-    x, t, low, root = np.zeros(4), np.zeros((6, 4)), np.zeros((3, 3)), np.empty((3, 3))
-    residual, jacobian, target = np.empty(k), np.empty((k, 4)), np.zeros(k)
-    weights, j, size = np.empty((k, k)), np.empty((k, 3)), np.empty(3)
-    for row in range(n):
-        if not weigh(how, values[row], measured, weights):
-            return False
-        x[0] = contacts[row, 0]
-        for a in range(6):
-            d = tangents[row, a]
-            t[a, 0], t[a, 2], t[a, 3] = d[0], d[1], d[2]
-        channel_equations(x, values[row], t, how.codes, target, residual, jacobian)
-        for c in range(3):
-            size[c] = 0.0
-            for i in range(k):
-                total = 0.0
-                for a in range(k):
-                    total += weights[i, a] * jacobian[a, 0 if c == 0 else c + 1]
-                j[i, c] = total
-                size[c] += total * total
-            size[c] = np.sqrt(size[c])
-        known = True
-        for p in range(3):  # Cholesky of JᵀJ, columns scaled to one
-            for q in range(p + 1):
-                total = 0.0
-                for i in range(k):
-                    total += j[i, p] * j[i, q] / (size[p] * size[q])
-                for i in range(q):
-                    total -= low[p, i] * low[q, i]
-                if p > q:
-                    low[p, q] = total / low[q, q]
-                elif total > _OPEN:
-                    low[p, p] = np.sqrt(total)
-                else:
-                    known = False
-                    low[p, p] = 1.0
-        for a in range(3):  # rows: L⁻¹ (∂p/∂ξ)ᵀ
-            for p in range(3):
-                total = tangents[row, 3 + a, p] / size[p]
-                for i in range(p):
-                    total -= low[p, i] * root[i, a]
-                root[p, a] = total / low[p, p]
-        for a in range(3):
-            for c in range(3):
-                total = root[0, a] * root[0, c] + root[1, a] * root[1, c] + root[2, a] * root[2, c]
-                covariances[row, a, c] = total if known else np.nan
     return True

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from vibrissa.mapping.channels import WRENCH
 from vibrissa.mapping.contact_map import spherical
 from vibrissa.mapping.fitting import Fits, fit
-from vibrissa.mapping.minima import Candidates, candidates, reliable, unknowns_covariance
+from vibrissa.mapping.minima import Candidates, candidates, unknowns_covariance
 from vibrissa.mapping.noise import (
     SensorNoise,
     common_covariance,
@@ -32,6 +32,7 @@ from vibrissa.mapping.noise import (
     scaled_errors,
     sensor_noise,
 )
+from vibrissa.mapping.posterior import CERTAIN, judged, ranked
 from vibrissa.mapping.showing import estimate_card, estimate_rows
 from vibrissa.mapping.whitening import INDISTINCT, explained, rank, trusted, whitening
 from vibrissa.quantities import attributes
@@ -74,7 +75,8 @@ class WrenchEstimate:
     point : (..., 3) array
         Contact point, m; NaN where there is none.
     covariance : (..., 3, 3) array
-        Its covariance, m²; NaN without ``noise``.
+        Its covariance, m², widened where the contact does not move with the wrench as derivatives
+        say; NaN without ``noise``.
     arc_length : (...) array
         Arc length of the contact, m.
     contact_force : (..., 3) array
@@ -91,23 +93,28 @@ class WrenchEstimate:
         standard deviations. Without ``noise`` components of F count as known to 1 % of |F|, and
         those of M to 1 % of |M|.
     linear : (...) bool array
-        Whether the covariance can be relied on: within two standard deviations the contact stays on
-        the whisker and moves with the wrench as the derivatives say. False without ``noise``.
+        Whether the covariance can be relied on: contacts scatter as it says. False without
+        ``noise``.
     status : (...) int array
-        :class:`~vibrissa.Status`: ``UNIQUE``; ``AMBIGUOUS``; ``NOT_ONE_CONTACT`` where χ² is
+        :class:`~vibrissa.Status`: ``UNIQUE`` (with ``noise``: all other candidates together are
+        less than 5 % probable); ``AMBIGUOUS``; ``NOT_ONE_CONTACT`` where χ² is
         larger than one measurement in a thousand would have it, ``BEYOND_TIP`` where moreover the
         nearest contact is the tip, ``TOO_PROXIMAL`` where it is at 0.05 L (the nearest contact is
         given in all three); ``DEGENERATE`` for a force or a moment of zero, and where with this
         noise the contact may be anywhere; ``MISSING``.
     candidates : (..., k, 3) array
-        Contact points of all contacts that cannot be told apart (χ² within 10.8 of the least), by
-        rising χ² + (friction angle / 20°)²; m, padded with NaN.
+        Contact points of all contacts that cannot be told apart (χ² within 10.8 of the least), m,
+        padded with NaN: by falling probability, or without ``noise`` by rising χ² + (friction
+        angle / 20°)².
     candidate_arc_lengths : (..., k) array
         Their arc lengths, m.
     candidate_forces : (..., k, 3) array
         Their base forces, N.
     candidate_contact_forces : (..., k, 3) array
         Their forces in the material frame at the contact, N.
+    candidate_probabilities : (..., k) array
+        Their posterior probabilities, where contact points are as probable beforehand, and friction
+        angles scatter by 20°; NaN without ``noise``.
     n_candidates : (...) int array
         How many.
     dims : tuple of str
@@ -131,6 +138,7 @@ class WrenchEstimate:
     candidate_arc_lengths: Array
     candidate_forces: Array
     candidate_contact_forces: Array
+    candidate_probabilities: Array
     n_candidates: IntArray
     dims: tuple[str, ...]
     coords: Coordinates
@@ -139,6 +147,11 @@ class WrenchEstimate:
     def spherical(self) -> Array:
         """(r, θ, φ) of the contact point: m and rad, shape (..., 3)."""
         return spherical(self.point)
+
+    @property
+    def probability(self) -> Array:
+        """Posterior probability of the contact given, shape (...); NaN without ``noise``."""
+        return self.candidate_probabilities[..., 0]
 
     def to_dataset(self) -> xr.Dataset:
         """Return everything as a labelled dataset.
@@ -173,6 +186,12 @@ class WrenchEstimate:
                 (*dims, "candidate", "space"),
                 self.candidates,
                 attributes("contact_point_whisker"),
+            ),
+            "probability": (dims, self.probability, attributes("probability")),
+            "candidate_probabilities": (
+                (*dims, "candidate"),
+                self.candidate_probabilities,
+                attributes("probability"),
             ),
             "n_candidates": (dims, self.n_candidates, attributes("candidates")),
             "status": (dims, self.status, {**attributes("status"), **flag_attributes()}),
@@ -271,8 +290,10 @@ def estimate_from_wrench(
         degrees = rank(covariance) - _UNKNOWNS
     solved = _solve(discretize(whisker, _COARSE), d, wrenches[rows], weights, explained(degrees))
     status = np.where(known, int(Status.DEGENERATE), int(Status.MISSING))
-    status[rows] = _statuses(solved, explained(degrees))
-    found = _uncertain(d, solved, weights, known=sensor is not None)
+    found = _without_noise(solved)
+    if sensor is not None:
+        solved, found = _uncertain(d, solved, wrenches[rows], weights)
+    status[rows] = _statuses(solved, found.probability, explained(degrees))
     status[rows[found.lost]] = int(Status.DEGENERATE)
     return _estimate(d, solved, found, felt, status, f.shape[:-1], dims, coords)
 
@@ -351,8 +372,10 @@ def _friction_angle(contacts: Array) -> Array:
     return np.arctan2(contacts[..., 1], np.hypot(contacts[..., 2], contacts[..., 3]))
 
 
-def _statuses(solved: Candidates, limit: float) -> IntArray:
-    status = np.where(solved.number > 1, int(Status.AMBIGUOUS), int(Status.UNIQUE))
+def _statuses(solved: Candidates, probability: Array, limit: float) -> IntArray:
+    first = probability[:, 0]
+    sure = np.where(np.isfinite(first), first > CERTAIN, solved.number == 1)
+    status = np.where(sure, int(Status.UNIQUE), int(Status.AMBIGUOUS))
     s, misfit = solved.contacts[:, 0, 0], solved.misfits[:, 0]
     explains = misfit <= limit
     status[~explains] = int(Status.NOT_ONE_CONTACT)
@@ -364,36 +387,74 @@ def _statuses(solved: Candidates, limit: float) -> IntArray:
 class _Uncertain(NamedTuple):
     """Of the first candidates: the point's covariance, m², and the friction angle's deviation, rad.
 
-    And whether they can be relied on, and whether the contact is not known at all.
+    And whether they can be relied on, and whether the contact is not known at all; and the
+    posterior probabilities of all candidates.
     """
 
     covariance: Array
     angle: Array
     linear: AnyArray
     lost: AnyArray
+    probability: Array
 
 
-def _uncertain(d: Discretization, solved: Candidates, weights: Array, known: bool) -> _Uncertain:
+def _without_noise(solved: Candidates) -> _Uncertain:
     n = len(solved.number)
-    if not known:
-        nothing = np.zeros(n, np.bool_)
-        return _Uncertain(np.full((n, 3, 3), np.nan), np.full(n, np.nan), nothing, nothing)
+    nothing = np.zeros(n, np.bool_)
+    unknown = np.full(solved.misfits.shape, np.nan)
+    return _Uncertain(np.full((n, 3, 3), np.nan), np.full(n, np.nan), nothing, nothing, unknown)
+
+
+def _uncertain(
+    d: Discretization, solved: Candidates, wrenches: Array, weights: Array
+) -> tuple[Candidates, _Uncertain]:
+    """Put the most probable candidate first, and tell what noise leaves open."""
+    n, most = solved.misfits.shape
+    row, place = np.nonzero(np.arange(most) < solved.number[:, None])
+    x, values, tangents = (a[row, place] for a in solved[1:4])
+    judgement = judged(
+        d,
+        WRENCH,
+        wrenches[row],
+        weights[row],
+        x,
+        values,
+        tangents,
+        friction=True,
+        least=PROXIMAL,
+        proximal=PROXIMAL,
+    )
+    weight, covariance = np.full((n, most), -np.inf), np.full((n, most, 3, 3), np.nan)
+    linear = np.zeros((n, most), np.bool_)
+    weight[row, place] = judgement.weight - 0.5 * (_friction_angle(x) / _LIKELY) ** 2
+    covariance[row, place], linear[row, place] = judgement.covariances, judgement.valid
+    probability, order = ranked(weight, solved.number)
+    line = np.arange(n)[:, None]
+    solved = Candidates(solved.number, *(a[line, order] for a in solved[1:]))
+    first = np.arange(n), order[:, 0]
     x, values, tangents = solved.contacts[:, 0], solved.values[:, 0], solved.tangents[:, 0]
     spread = unknowns_covariance(WRENCH, values, tangents, weights, friction=True)
-    by_x = tangents[:, 3:]
-    covariance = d.length**2 * by_x @ spread @ np.swapaxes(by_x, -1, -2)
+    size = np.einsum("nai,nij,naj->n", tangents[:, 3:], spread, tangents[:, 3:])
+    with np.errstate(invalid="ignore"):
+        lost = np.isfinite(x[:, 0]) & ~(size <= _UNKNOWN**2)
+    return solved, _Uncertain(
+        d.length**2 * covariance[first],
+        _angle_deviation(x, spread),
+        linear[first],
+        lost,
+        probability,
+    )
+
+
+def _angle_deviation(x: Array, spread: Array) -> Array:
+    """Standard deviations of friction angles (n,), rad, from covariances (n, 4, 4) of x (n, 4)."""
     normal = np.hypot(x[:, 2], x[:, 3])
     slope = np.zeros_like(x)
     with np.errstate(invalid="ignore", divide="ignore"):
         slope[:, 1] = normal
         slope[:, 2:] = -x[:, 1:2] * x[:, 2:] / normal[:, None]
         slope /= (normal**2 + x[:, 1] ** 2)[:, None]
-    angle = np.sqrt(np.einsum("na,nab,nb->n", slope, spread, slope))
-    linear = reliable(d, WRENCH, weights, x, values, tangents, spread, PROXIMAL)
-    size = np.trace(covariance, axis1=1, axis2=2)
-    with np.errstate(invalid="ignore"):
-        lost = np.isfinite(x[:, 0]) & ~(size <= (_UNKNOWN * d.length) ** 2)
-    return _Uncertain(covariance, angle, linear, lost)
+    return np.asarray(np.sqrt(np.einsum("na,nab,nb->n", slope, spread, slope)))
 
 
 def _estimate(
@@ -432,6 +493,7 @@ def _estimate(
         candidate_arc_lengths=whole(solved.contacts[:, :most, 0] * d.length),
         candidate_forces=whole(solved.values[:, :most, :3] * d.force),
         candidate_contact_forces=whole(solved.contacts[:, :most, 1:] * d.force),
+        candidate_probabilities=whole(found.probability[:, :most]),
         n_candidates=whole(solved.number, missing=0),
         dims=dims,
         coords=coords,

@@ -28,6 +28,7 @@ def test_numbers_stored_in_files_keep_their_meaning():
         "APPROXIMATE": 26,
         "UNDERDETERMINED": 27,
         "NOT_FELT": 28,
+        "OUTSIDE_PRIOR": 29,
     }
     assert enum.verify(enum.UNIQUE)(Status)
     assert all(int(member) < 127 for member in Status)  # stored as int8

@@ -152,6 +152,13 @@ class Status(enum.IntEnum):
         "whisker, or too lightly to be told from nothing.",
         "",
     )
+    OUTSIDE_PRIOR = (
+        29,
+        False,
+        "Contacts of this whisker explain the signals, but none of those that are possible "
+        "according to the prior.",
+        "Widen the prior's region or limits of force, or check the sensor's axes and offset.",
+    )
 
     def __new__(
         cls, code: int, ok: bool = False, explanation: str = "", advice: str = ""

@@ -12,6 +12,7 @@ from vibrissa.mapping.located import Located
 from vibrissa.mapping.lookup import LookupTable
 from vibrissa.mapping.natural import NaturalNeighbour
 from vibrissa.mapping.network import NetworkSolver, train_network
+from vibrissa.mapping.prior import Prior
 from vibrissa.mapping.sensitivity import sensitivity
 from vibrissa.mapping.slices import error_solid, signal_slice
 from vibrissa.mapping.summary import save_uniqueness, verdict_table
@@ -28,6 +29,7 @@ __all__ = [
     "LookupTable",
     "NaturalNeighbour",
     "NetworkSolver",
+    "Prior",
     "WrenchEstimate",
     "best_triplet",
     "critical_cones",

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from vibrissa.mapping.estimate import Estimate
     from vibrissa.mapping.lookup import LookupTable
     from vibrissa.mapping.network import NetworkSolver
+    from vibrissa.mapping.prior import Prior
 
 #: The paper's grid: radii over L, azimuth and elevation in rad.
 GRID_RADII = np.linspace(0.3, 1.0, 15)
@@ -122,6 +123,7 @@ class ContactMap:
         stiffness_sigma: float = 0.0,
         gain_sigma: float | ArrayLike = 0.0,
         mixing_sigma: float | ArrayLike = 0.0,
+        prior: Prior | None = None,
     ) -> Estimate:
         """Find the contacts that explain measured signals.
 
@@ -148,6 +150,8 @@ class ContactMap:
         mixing_sigma : float or (6, 6) array_like
             Standard deviations of what each of these reads of all six; or one number, relative: of
             the cross-talk among forces, and among moments. Likewise.
+        prior : Prior, optional
+            Which contacts are possible; others are left out of the candidates.
 
         Returns
         -------
@@ -157,7 +161,15 @@ class ContactMap:
         from vibrissa.mapping.estimate import estimate  # it knows this class
 
         return estimate(
-            self, signals, triplet, noise, method, stiffness_sigma, gain_sigma, mixing_sigma
+            self,
+            signals,
+            triplet,
+            noise,
+            method,
+            stiffness_sigma,
+            gain_sigma,
+            mixing_sigma,
+            prior,
         )
 
     def tree(self, triplet: tuple[str, ...]) -> Preimages:

@@ -30,6 +30,8 @@ from vibrissa.mapping.explanation import (
 )
 from vibrissa.mapping.noise import SensorNoise, common_errors, sensor_noise
 from vibrissa.mapping.noisy import under_noise
+from vibrissa.mapping.prior import Prior, among_allowed
+from vibrissa.mapping.readout import Named
 from vibrissa.mapping.showing import estimate_card, estimate_rows
 from vibrissa.quantities import attributes
 from vibrissa.rod.arrays import AnyArray, Array, IntArray
@@ -62,7 +64,8 @@ class Estimate:
         explains the signals (with ``noise``, and of more than three signals: where χ² is larger
         than one measurement in a thousand would have it; then the contact nearest is given);
         ``OUTSIDE_MAP`` where one nearer to the base would, or where signals are ten times larger
-        than any on the map; ``DEGENERATE`` where all forces and moments are zero, and everywhere if
+        than any on the map; ``OUTSIDE_PRIOR`` where the prior allows none of those that explain
+        them; ``DEGENERATE`` where all forces and moments are zero, and everywhere if
         the signals do not determine contacts (:meth:`ContactMap.determines`); ``MISSING``.
         Of a look-up table or network, which cannot see whether contacts are ambiguous:
         ``APPROXIMATE``, ``OUTSIDE_MAP`` (outside the table) or ``MISSING``.
@@ -222,6 +225,7 @@ def estimate(
     stiffness_sigma: float = 0.0,
     gain_sigma: float | ArrayLike = 0.0,
     mixing_sigma: float | ArrayLike = 0.0,
+    prior: Prior | None = None,
 ) -> Estimate:
     """Find all frictionless contacts of a whisker that explain measured signals.
 
@@ -247,6 +251,8 @@ def estimate(
     mixing_sigma : float or (6, 6) array_like
         Standard deviations of what each of these reads of all six; or one number, relative: of the
         cross-talk among forces, and among moments.
+    prior : Prior, optional
+        Which contacts are possible; others are left out of the candidates.
 
     Returns
     -------
@@ -268,6 +274,9 @@ def estimate(
     d = contacts.chart.discretization
     targets = values.reshape(-1, len(names)) / signal_scales(names, d.force, d.moment)
     found = explain(contacts, names, targets, sensor)
+    if prior is not None:
+        readout = Named(contacts, names, sensor)
+        found = among_allowed(prior, contacts, readout, targets, found)
     most = max(1, int(found.number.max(initial=0)))
 
     def whole(array: AnyArray) -> AnyArray:

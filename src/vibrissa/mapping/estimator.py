@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from vibrissa.mapping.located import Located, nowhere
 from vibrissa.mapping.noise import by_stiffness, common_errors, sensor_noise
+from vibrissa.mapping.prior import Prior, located_where_allowed
 from vibrissa.mapping.readout import Measurement, Mixed, Named
 from vibrissa.mapping.sensor_readout import ByName, readout_of
 from vibrissa.mapping.single_search import ExactSearch, LeastSquaresSearch, SetSearch
@@ -60,6 +61,8 @@ class Estimator:
     mixing_sigma : float or (6, 6) array_like
         Standard deviations of what each of these reads of all six; or one number, relative: of the
         cross-talk among forces, and among moments.
+    prior : Prior, optional
+        Which contacts are possible; others are left out of the candidates.
 
     See Also
     --------
@@ -75,6 +78,7 @@ class Estimator:
         felt_above: float = 0.0,
         gain_sigma: float | ArrayLike = 0.0,
         mixing_sigma: float | ArrayLike = 0.0,
+        prior: Prior | None = None,
     ) -> None:
         names = selection(triplet, least=1)
         order = triplet.replace(",", " ").split() if isinstance(triplet, str) else list(triplet)
@@ -83,7 +87,7 @@ class Estimator:
         self._order: list[int] | None = [order.index(name) for name in names]
         if felt_above > 0.0 and sensor is None:
             raise ValueError("what is felt is judged by the noise, and there is none")
-        self._start(contacts, Named(contacts, names, sensor), len(names), felt_above)
+        self._start(contacts, Named(contacts, names, sensor), len(names), felt_above, prior)
 
     @classmethod
     def of_sensor(
@@ -92,6 +96,7 @@ class Estimator:
         sensor: Sensor,
         stiffness_sigma: float = 0.0,
         felt_above: float = 0.0,
+        prior: Prior | None = None,
     ) -> Estimator:
         """Locate contacts from a sensor's raw readings.
 
@@ -106,6 +111,8 @@ class Estimator:
             Relative standard deviation of the whisker's bending stiffness.
         felt_above : float
             Readings within so many standard deviations of zero are ``NOT_FELT``; 0 locates all.
+        prior : Prior, optional
+            Which contacts are possible.
 
         Returns
         -------
@@ -128,7 +135,7 @@ class Estimator:
         errors = np.concatenate([by_stiffness(h, stiffness_sigma), sensor.common_errors])
         readout = readout_of(contacts, h, covariance, errors)
         out._order = None
-        out._start(contacts, readout, len(sensor.channels), felt_above)
+        out._start(contacts, readout, len(sensor.channels), felt_above, prior)
         out._sensor = sensor
         return out
 
@@ -138,7 +145,9 @@ class Estimator:
         readout: ByName | Named | Mixed,
         width: int,
         felt_above: float,
+        prior: Prior | None,
     ) -> None:
+        self.prior = prior
         self.felt_above = float(felt_above)
         self._sensor: Sensor | None = None
         self._components = readout if isinstance(readout, ByName) else None
@@ -270,7 +279,12 @@ class Estimator:
         """
         nothing = self.nothing_in(measurement)
         if nothing is None:
-            return self._search(measurement)
+            found = self._search(measurement)
+            if self.prior is None:
+                return found
+            return located_where_allowed(
+                self.prior, self.contacts, self.readout, measurement, found
+            )
         self._search.forget()
         return nowhere(nothing)
 

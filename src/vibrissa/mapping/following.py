@@ -26,6 +26,7 @@ from vibrissa.mapping.hypotheses import Followed, told
 from vibrissa.mapping.learning import learn
 from vibrissa.mapping.located import Located
 from vibrissa.mapping.mixture import Mixture, predict, room, tidy, unaccounted
+from vibrissa.mapping.prior import Prior
 from vibrissa.mapping.readout import Measurement
 from vibrissa.mapping.whitening import explained
 from vibrissa.rod.arrays import AnyArray, Array
@@ -257,7 +258,9 @@ class ContactFilter:
         return min(max(moved, _LEAST_REACH), _ANYWHERE)
 
     def _add(self, found: Gaussians, turn: Array, base: Array, log_prior: float) -> None:
-        """Put Gaussians of the whisker's frame to the hypotheses."""
+        """Put Gaussians of the whisker's frame to the hypotheses, those that are possible."""
+        if self.estimator.prior is not None:
+            found = self._possible(self.estimator.prior, found)
         n, old = len(found.weights), len(self._mixture.weight)
         out = room(old + n, self._errors)
         for mine, before in zip(out, self._mixture, strict=True):
@@ -269,6 +272,12 @@ class ContactFilter:
         out.contact[old:], out.value[old:] = found.contacts, found.values
         out.weight[old:] = found.weights + log_prior
         self._mixture = _tidied(out, old + n)
+
+    def _possible(self, prior: Prior, found: Gaussians) -> Gaussians:
+        d, whisker = self.estimator.contacts.chart.discretization, self.estimator.contacts.whisker
+        x, points = found.contacts, found.values[:, 3:] * d.length
+        kept = prior.allows(whisker, points, x[:, 0] * d.length, x[:, 1:] * d.force)
+        return Gaussians(*(part[kept] for part in found))
 
     def _predict(self, step: float) -> None:
         if not len(self._mixture.weight):

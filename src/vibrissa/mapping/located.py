@@ -21,9 +21,9 @@ class Located(NamedTuple):
     status : Status
         ``UNIQUE``, ``AMBIGUOUS``, ``NOT_FRICTIONLESS`` (no contact on the map explains it; of more
         than three signals ``point`` is the one that comes nearest), ``OUTSIDE_MAP``,
-        ``DEGENERATE`` or ``MISSING``, as in :class:`Estimate`. Of fewer than three signals
-        ``UNDERDETERMINED``: the candidates are samples of the curve or surface of contacts that
-        explain them, ``point`` the one in their middle.
+        ``OUTSIDE_PRIOR``, ``DEGENERATE`` or ``MISSING``, as in :class:`Estimate`. Of fewer than
+        three signals ``UNDERDETERMINED``: the candidates are samples of the curve or surface of
+        contacts that explain them, ``point`` the one in their middle.
     candidates : (k, 3) array
         All contact points, in the order of :class:`Estimate`, m.
     arc_lengths : (k,) array

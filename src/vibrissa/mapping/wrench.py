@@ -33,6 +33,7 @@ from vibrissa.mapping.noise import (
     sensor_noise,
 )
 from vibrissa.mapping.posterior import CERTAIN, judged, ranked
+from vibrissa.mapping.prior import Prior, allowed_first
 from vibrissa.mapping.showing import estimate_card, estimate_rows
 from vibrissa.mapping.whitening import INDISTINCT, explained, rank, trusted, whitening
 from vibrissa.quantities import attributes
@@ -100,7 +101,8 @@ class WrenchEstimate:
         less than 5 % probable); ``AMBIGUOUS``; ``NOT_ONE_CONTACT`` where χ² is
         larger than one measurement in a thousand would have it, ``BEYOND_TIP`` where moreover the
         nearest contact is the tip, ``TOO_PROXIMAL`` where it is at 0.05 L (the nearest contact is
-        given in all three); ``DEGENERATE`` for a force or a moment of zero, and where with this
+        given in all three); ``OUTSIDE_PRIOR`` where the prior allows none of the candidates;
+        ``DEGENERATE`` for a force or a moment of zero, and where with this
         noise the contact may be anywhere; ``MISSING``.
     candidates : (..., k, 3) array
         Contact points of all contacts that cannot be told apart (χ² within 10.8 of the least), m,
@@ -227,6 +229,7 @@ def estimate_from_wrench(
     stiffness_sigma: float = 0.0,
     gain_sigma: float | ArrayLike = 0.0,
     mixing_sigma: float | ArrayLike = 0.0,
+    prior: Prior | None = None,
     steps: int = STEPS,
 ) -> WrenchEstimate:
     """Locate contacts from force and moment at the base, with or without friction.
@@ -250,6 +253,8 @@ def estimate_from_wrench(
     mixing_sigma : float or (6, 6) array_like
         Standard deviations of what each component reads of all six; or one number, relative: of
         the cross-talk among forces, and among moments.
+    prior : Prior, optional
+        Which contacts are possible; others are left out of the candidates.
     steps : int
         Integration steps along the whisker. The default is good to 1e-8 of the length.
 
@@ -289,6 +294,8 @@ def estimate_from_wrench(
         weights = whitening(covariance + common_covariance(errors, np.eye(6), wrenches[rows]))
         degrees = rank(covariance) - _UNKNOWNS
     solved = _solve(discretize(whisker, _COARSE), d, wrenches[rows], weights, explained(degrees))
+    if prior is not None:
+        solved = _possible(prior, whisker, d, solved)
     status = np.where(known, int(Status.DEGENERATE), int(Status.MISSING))
     found = _without_noise(solved)
     if sensor is not None:
@@ -337,6 +344,15 @@ def _solve(
     return kept.replaced(row, place, final)
 
 
+def _possible(prior: Prior, whisker: Whisker, d: Discretization, solved: Candidates) -> Candidates:
+    """Candidates that a prior allows."""
+    there = np.arange(solved.contacts.shape[1]) < solved.number[:, None]
+    x, points = solved.contacts[there], solved.values[there][:, 3:] * d.length
+    allowed = np.zeros_like(there)
+    allowed[there] = prior.allows(whisker, points, x[:, 0] * d.length, x[:, 1:] * d.force)
+    return Candidates(allowed.sum(axis=1), *(allowed_first(allowed, a) for a in solved[1:]))
+
+
 def _fit(
     d: Discretization, wrenches: Array, weights: Array, row: IntArray, seeds: Array, limit: float
 ) -> Fits:
@@ -381,6 +397,7 @@ def _statuses(solved: Candidates, probability: Array, limit: float) -> IntArray:
     status[~explains] = int(Status.NOT_ONE_CONTACT)
     status[~explains & (s >= 1.0)] = int(Status.BEYOND_TIP)
     status[s <= PROXIMAL] = int(Status.TOO_PROXIMAL)
+    status[solved.number == 0] = int(Status.OUTSIDE_PRIOR)
     return status
 
 

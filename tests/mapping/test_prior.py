@@ -1,0 +1,177 @@
+"""A prior leaves out candidates, and the status says what is left."""
+
+import numpy as np
+import pytest
+
+import vibrissa as vb
+from vibrissa.signals.regions import REGIONS, concave_backward
+from vibrissa.status import Status
+
+NOISE = np.diag(np.repeat([1e-6, 2e-8], 3) ** 2)
+
+
+@pytest.fixture(scope="module")
+def bent(gamma_map):
+    rng = np.random.default_rng(11)
+    n, whisker = 300, gamma_map.whisker
+    at = rng.uniform(0.35, 0.95, n) * whisker.length
+    load = vb.PointForce(at, rng.uniform(5e-6, 8e-5, n), rng.uniform(-np.pi, np.pi, n))
+    bent = vb.deflect(whisker, load)
+    kept = np.flatnonzero(bent.status == vb.Status.OK)
+    return bent.force[kept], bent.moment[kept], bent.contact_point[kept]
+
+
+PRIORS = [
+    vb.Prior("CB"),
+    vb.Prior("ELD CF"),
+    vb.Prior(least_force=1e-5, greatest_force=5e-5),
+    vb.Prior({"r": (0.02, 0.035), "phi": (-0.2, 0.4)}),
+    vb.Prior({"theta": (0.2, -0.1)}),
+]
+
+
+def reference(prior, whisker, points, forces):
+    """The prior again, from contact point and base force."""
+    size = np.linalg.norm(forces, axis=-1)
+    good = (size >= prior.least_force) & (size <= prior.greatest_force)
+    if prior.region == "CB":
+        good &= concave_backward(whisker, points)
+    elif prior.region == "ELD CF":
+        turned = vb.deflect(whisker, vb.PointContact(points)).centerline(401)
+        ahead = turned[..., 1:, 0] - turned[..., :-1, 0]
+        away = np.linalg.norm(turned[..., 1:, :] - points[..., None, :], axis=-1).argmin(axis=-1)
+        good &= np.take_along_axis(ahead, away[..., None], axis=-1)[..., 0] >= 0.0
+        good &= ~concave_backward(whisker, points)
+    elif prior.region != "all":
+        x, y, z = np.moveaxis(points, -1, 0)
+        r, theta = np.linalg.norm(points, axis=-1), np.arctan2(y, x)
+        if "r" in prior.region:
+            good &= (r >= 0.02) & (r <= 0.035)
+            good &= (np.arcsin(z / r) >= -0.2) & (np.arcsin(z / r) <= 0.4)
+        else:
+            good &= (theta >= 0.2) | (theta <= -0.1)
+    return good
+
+
+@pytest.mark.parametrize("prior", PRIORS, ids=str)
+@pytest.mark.parametrize("noise", [None, NOISE], ids=["exact", "noise"])
+@pytest.mark.parametrize("names", ["FT FD MB", "Fx FT MB"])
+def test_candidates_are_those_that_are_possible(gamma_map, bent, names, noise, prior):
+    """The same as without a prior, but for those that it excludes; and one at a time alike."""
+    signals = vb.base_signals(*bent[:2])
+    whole = gamma_map.estimate(signals, names, noise)
+    some = gamma_map.estimate(signals, names, noise, prior=prior)
+    locate = vb.Estimator(gamma_map, names, noise, prior=prior)
+    rows = np.stack([signals[name] for name in names.split()], axis=-1)
+    fewer = 0
+    for i in range(len(rows)):
+        n = whole.n_candidates[i]
+        points, forces = whole.candidates[i, :n], whole.candidate_forces[i, :n]
+        good = reference(prior, gamma_map.whisker, points, forces)
+        fewer += good.sum() < n
+        assert some.n_candidates[i] == good.sum()
+        np.testing.assert_array_equal(some.candidates[i, : good.sum()], points[good])
+        assert np.isnan(some.candidates[i, good.sum() :]).all()
+        expected = {0: Status.OUTSIDE_PRIOR, 1: Status.UNIQUE}.get(good.sum(), Status.AMBIGUOUS)
+        assert some.status[i] == (expected if n else whole.status[i])
+        if i % 20 == 0:
+            locate.reset()
+            one = locate(rows[i])
+            assert one.status == some.status[i]
+            np.testing.assert_allclose(one.candidates, points[good], atol=1e-8)
+    assert 0 < fewer < len(rows)
+    kept = some.n_candidates > 0
+    np.testing.assert_array_equal(some.point[kept], some.candidates[kept, 0])
+    same = kept & (some.point == whole.point).all(axis=-1)
+    np.testing.assert_array_equal(some.linear[same], whole.linear[same])
+    assert not some.linear[~same].any()
+
+
+def test_misfits_are_those_of_the_contact_that_is_left(gamma_map, bent):
+    """Where noisy signals have several contacts, and the first is excluded by its force."""
+    rng = np.random.default_rng(3)
+    noise = {"Fx": 1e-6, "FT": 1e-6, "Mx": 2e-8, "MB": 2e-8}
+    true = vb.base_signals(*bent[:2])
+    signals = {
+        name: np.abs(true[name].values + sigma * rng.normal(size=len(bent[0])))
+        if name in ("FT", "MB")
+        else true[name].values + sigma * rng.normal(size=len(bent[0]))
+        for name, sigma in noise.items()
+    }
+    whole = gamma_map.estimate(signals, tuple(noise), noise)
+    several = np.flatnonzero(whole.n_candidates > 1)
+    assert several.size > 10
+    for i in several[:20]:
+        first, second = np.linalg.norm(whole.candidate_forces[i, :2], axis=-1)
+        limits = {"greatest_force" if first > second else "least_force": 0.5 * (first + second)}
+        one, prior = {name: values[i] for name, values in signals.items()}, vb.Prior(**limits)
+        some = gamma_map.estimate(one, tuple(noise), noise, prior=prior)
+        at_contact = vb.base_signals(some.force, some.moment)
+        misfit = sum(((float(at_contact[n]) - one[n]) / noise[n]) ** 2 for n in noise)
+        assert some.misfit == pytest.approx(misfit, rel=1e-6, abs=1e-9)
+        located = vb.Estimator(gamma_map, tuple(noise), noise, prior=prior)(list(one.values()))
+        assert located.misfit == pytest.approx(misfit, rel=1e-3, abs=1e-6)
+
+
+def test_samples_of_a_curve_are_those_that_are_possible(gamma_map, bent):
+    """Two signals leave a curve of contacts; of it the part on one side is left."""
+    signals = vb.base_signals(*bent[:2])
+    prior = vb.Prior("CB")
+    some = vb.Estimator(gamma_map, "FT MB", NOISE, prior=prior)
+    whole = vb.Estimator(gamma_map, "FT MB", NOISE)
+    partly = 0
+    for i in range(0, len(bent[0]), 10):
+        row = [float(signals[name][i]) for name in ("FT", "MB")]
+        known, free = some(row), whole(row)
+        good = concave_backward(gamma_map.whisker, free.candidates)
+        if not good.any():
+            assert known.status in (Status.OUTSIDE_PRIOR, free.status)
+            continue
+        partly += not good.all()
+        np.testing.assert_array_equal(known.candidates, free.candidates[good])
+        assert (known.point == known.candidates).all(axis=1).any()
+        away = known.candidates - known.point
+        scatter = away.T @ away / len(away)
+        assert np.linalg.eigvalsh(known.covariance - scatter).min() > -1e-12
+    assert partly > 5
+
+
+def test_a_filter_begins_where_contacts_are_possible(gamma_map, bent):
+    i = int(np.flatnonzero(concave_backward(gamma_map.whisker, bent[2]))[0])
+    signals = vb.base_signals(bent[0][i], bent[1][i])
+    row = [float(signals[name]) for name in ("FT", "MB")]
+    for region, holds in (("CB", True), ("CF", False)):
+        locate = vb.Estimator(gamma_map, "FT MB", NOISE, prior=vb.Prior(region))
+        found = vb.ContactFilter(locate)(0.0, row)
+        assert len(found.points)
+        assert (concave_backward(gamma_map.whisker, found.points) == holds).all()
+
+
+def test_a_whole_wrench_knows_a_prior_too(gamma_map, bent):
+    force, moment, points = bent
+    back = concave_backward(gamma_map.whisker, points)
+    some = vb.estimate_from_wrench(gamma_map.whisker, force, moment, prior=vb.Prior("CB"))
+    whole = vb.estimate_from_wrench(gamma_map.whisker, force, moment)
+    alone = whole.n_candidates == 1
+    np.testing.assert_array_equal(some.status[alone & back], whole.status[alone & back])
+    assert (some.status[alone & ~back] == Status.OUTSIDE_PRIOR).all()
+    assert np.isnan(some.point[alone & ~back]).all()
+    np.testing.assert_allclose(some.point[back & alone], points[back & alone], atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"region": "left"}, "one of " + ", ".join(REGIONS)),
+        ({"region": {"x": (0.0, 1.0)}}, "limits of r, theta, phi"),
+        ({"region": {}}, "limits of r, theta, phi"),
+        ({"region": {"r": (2.0, 1.0)}}, "least value first"),
+        ({"region": {"r": 1.0}}, "between two numbers"),
+        ({"least_force": 2.0, "greatest_force": 1.0}, "0 ≤ least < greatest"),
+        ({"least_force": -1.0}, "0 ≤ least < greatest"),
+        ({"greatest_force": np.nan}, "0 ≤ least < greatest"),
+    ],
+)
+def test_what_is_no_prior_is_refused(given, message):
+    with pytest.raises(ValueError, match=message):
+        vb.Prior(**given)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from vibrissa.cli.assumptions import Proximal, smallest_arc
 from vibrissa.cli.terminal import Force, free, output, progress_bars
 
 if TYPE_CHECKING:
@@ -33,6 +34,7 @@ def chart(
         float | None, typer.Option(help="Young's modulus, GPa.", min=0.0, metavar="GPA")
     ] = None,
     poisson: Annotated[float | None, typer.Option(help="Poisson's ratio.", metavar="RATIO")] = None,
+    proximal: Proximal = None,
     path: Annotated[
         Path, typer.Option("--output", "-o", help="The map, NetCDF.", metavar="FILE")
     ] = Path("map.nc"),
@@ -61,7 +63,10 @@ def chart(
     with progress_bars() as tell:
         tell("map of all contacts", 0, 1)
         contacts = ContactMap.simulate(
-            chosen, grid=grid, progress=lambda done, total: tell("map of all contacts", done, total)
+            chosen,
+            grid=grid,
+            progress=lambda done, total: tell("map of all contacts", done, total),
+            proximal=smallest_arc(proximal),
         )
         tell("map of all contacts", 1, 1)
         contacts.save(path)

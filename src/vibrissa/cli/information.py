@@ -127,6 +127,17 @@ def _sensor(path: Path) -> Iterator[tuple[str, str]]:
     counts = ", tells the reaction" if sensor.frame.reaction else ""
     yield "frame", f"{hand}-handed, origin at ({x:.2f}, {y:.2f}, {z:.2f}) mm{counts}"
     yield "carries", f"{1e3 * sensor.mass:.3g} g"
+    known = []
+    if sensor.gain_error.any():
+        known.append(f"gain known to {100.0 * sensor.gain_error.max():g} %")
+    if sensor.mixing_error.any():
+        share = (
+            f"{100.0 * sensor.mixing_error:g} %" if sensor.mixing_error.ndim == 0 else "a matrix"
+        )
+        known.append(f"mixing to {share}")
+    if sensor.mixing_covariance.any():
+        known.append("mixing and offset as a calibration left them")
+    yield "errors", ", ".join(known) or "none stated: gain and mixing count as exact"
 
 
 def _array(path: Path, kind: str) -> Iterator[tuple[str, str]]:

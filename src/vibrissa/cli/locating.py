@@ -7,6 +7,18 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
+from vibrissa.cli.assumptions import (
+    Assumed,
+    GainSigma,
+    GreatestForce,
+    LeastForce,
+    MixingSigma,
+    Proximal,
+    Region,
+    StiffnessSigma,
+    assumed,
+    smallest_arc,
+)
 from vibrissa.cli.terminal import Force, Tell, progress_bars, refuse, shown
 
 if TYPE_CHECKING:
@@ -90,6 +102,13 @@ def estimate(
             metavar="FILE",
         ),
     ] = None,
+    stiffness_sigma: StiffnessSigma = 0.0,
+    gain_sigma: GainSigma = 0.0,
+    mixing_sigma: MixingSigma = 0.0,
+    region: Region = None,
+    least_force: LeastForce = None,
+    greatest_force: GreatestForce = None,
+    proximal: Proximal = None,
     path: Annotated[
         Path | None,
         typer.Option(
@@ -116,6 +135,14 @@ def estimate(
     from vibrissa.io.paths import CSV, NETCDF, check_readable, check_writable
 
     how = how_to(triplet, method, all_six, charts, whisker)
+    beforehand = assumed(
+        stiffness_sigma, gain_sigma, mixing_sigma, region, least_force, greatest_force
+    )
+    if charts:
+        refuse({"--proximal": proximal}, "it is of maps that are simulated, and --map is given")
+    if all_six:
+        refuse({"--proximal": proximal}, "it is of a map, and --wrench needs none")
+    how = how._replace(assumed=beforehand, proximal=proximal)
     if noise is not None:
         options = {"--force-noise": force_noise, "--moment-noise": moment_noise}
         refuse(options, "--noise tells it all")
@@ -146,6 +173,10 @@ class How(NamedTuple):
         Maps; none: to be simulated.
     whisker : Path or None
         Where it is not that of the recording.
+    assumed : Assumed
+        What is known beforehand.
+    proximal : float or None
+        Smallest arc length of a contact of maps that are simulated, share of the length.
     """
 
     names: tuple[str, ...] | None
@@ -153,6 +184,8 @@ class How(NamedTuple):
     all_six: bool
     charts: tuple[Path, ...]
     whisker: Path | None
+    assumed: Assumed = Assumed({}, None)
+    proximal: float | None = None
 
     @property
     def known(self) -> Path | None:
@@ -165,11 +198,10 @@ class How(NamedTuple):
         return self.method.startswith("lookup")
 
     def used(self, names: str) -> str:
-        """Say by which signals."""
+        """Say by which signals, and what is known beforehand."""
         by = "" if self.method == "exact" else f" by {self.method}"
-        if names == "wrench":
-            return "force and moment whole"
-        return f"signals ({', '.join(names.split())}){by}"
+        used = f"signals ({', '.join(names.split())}){by}"
+        return ("force and moment whole" if names == "wrench" else used) + self.assumed.said()
 
 
 def how_to(
@@ -240,13 +272,18 @@ def _from_table(signals: Path, path: Path, how: How, noise: tuple[Array, str] | 
     _check_scale(signals, wrench, known)
     with progress_bars() as tell:
         if not maps and not how.all_six:
-            maps = maps_of([known], tell, how.grid)
+            maps = maps_of([known], tell, how.grid, smallest_arc(how.proximal))
         tell("contact points", 0, 1)
         if how.all_six:
-            found = locate_from_wrench(known, wrench, covariance)
+            found = locate_from_wrench(known, wrench, covariance, *how.assumed)
         else:
             found = locate(
-                maps[0], wrench, how.names or TRIPLET, noise=covariance, method=how.method
+                maps[0],
+                wrench,
+                how.names or TRIPLET,
+                noise=covariance,
+                method=how.method,
+                **how.assumed._asdict(),
             )
         tell("contact points", 1, 1)
     save_contacts(path, contact_columns(found))
@@ -335,7 +372,9 @@ def estimated(
         "wrench" if all_six else how.names,
         noise=None if noise is None else noise[0],
         method=how.method,
+        proximal=smallest_arc(how.proximal),
         progress=tell,
+        **how.assumed._asdict(),
         **options,
     )
     said = "noise as the recording says" if noise is None else noise[1]

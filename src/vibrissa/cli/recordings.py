@@ -138,7 +138,9 @@ def maps_from(charts: Sequence[Path], count: int, grid: bool = False) -> list[Co
     return found
 
 
-def maps_of(whiskers: Sequence[Whisker], tell: Tell, grid: bool = False) -> list[ContactMap]:
+def maps_of(
+    whiskers: Sequence[Whisker], tell: Tell, grid: bool, proximal: float
+) -> list[ContactMap]:
     """Simulate the map of each whisker, and say so.
 
     Parameters
@@ -149,6 +151,8 @@ def maps_of(whiskers: Sequence[Whisker], tell: Tell, grid: bool = False) -> list
         Of progress.
     grid : bool
         Whether the paper's grid is needed.
+    proximal : float
+        Smallest arc length of a contact, share of the length.
 
     Returns
     -------
@@ -161,7 +165,7 @@ def maps_of(whiskers: Sequence[Whisker], tell: Tell, grid: bool = False) -> list
     for k, whisker in enumerate(whiskers):
         say(f"no map given; simulating that of {whisker!r}")
         tell("map of all contacts", k, len(whiskers))
-        maps.append(ContactMap.simulate(whisker, grid=grid))
+        maps.append(ContactMap.simulate(whisker, grid=grid, proximal=proximal))
         tell("map of all contacts", k + 1, len(whiskers))
     return maps
 

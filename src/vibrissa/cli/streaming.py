@@ -14,6 +14,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from vibrissa.cli.assumptions import (
+    Assumed,
+    GainSigma,
+    GreatestForce,
+    LeastForce,
+    MixingSigma,
+    Proximal,
+    Region,
+    StiffnessSigma,
+    assumed,
+    smallest_arc,
+)
 from vibrissa.cli.terminal import Ended, ending_in_order, errors, refuse
 
 if TYPE_CHECKING:
@@ -96,10 +108,13 @@ def stream(
             min=0.0,
         ),
     ] = None,
-    stiffness_sigma: Annotated[
-        float,
-        typer.Option(help="Standard deviation of the whisker's bending stiffness, %.", min=0.0),
-    ] = 0.0,
+    stiffness_sigma: StiffnessSigma = 0.0,
+    gain_sigma: GainSigma = 0.0,
+    mixing_sigma: MixingSigma = 0.0,
+    region: Region = None,
+    least_force: LeastForce = None,
+    greatest_force: GreatestForce = None,
+    proximal: Proximal = None,
     felt: Annotated[
         float,
         typer.Option(help="Standard deviations from zero at which a contact is felt.", min=0.0),
@@ -176,6 +191,8 @@ def stream(
         options = {"--signals": signals, "--force-noise": force_noise}
         reason = "channels and noise are those of the --sensor"
         refuse(options | {"--moment-noise": moment_noise}, reason)
+        stated = {"--gain-sigma": gain_sigma or None, "--mixing-sigma": mixing_sigma or None}
+        refuse(stated, "the --sensor's file states gain_error and mixing_error")
     else:
         refuse({"--tare": tare}, "the offset is that of a sensor's channels: give the --sensor")
     if not follow:
@@ -200,14 +217,15 @@ def stream(
             if source is not None and from_bag
             else _lines(source, reconnect, heard)
         )
-        contacts = _map(chart, whisker)
+        contacts = _map(chart, whisker, proximal)
         estimator = _estimator(
             contacts,
             described,
             signals or "Fx,MB,MD",
             usual_noise(force_noise, moment_noise),
-            stiffness_sigma,
+            assumed(stiffness_sigma, gain_sigma, mixing_sigma, region, least_force, greatest_force),
             felt,
+            tare or 0,
         )
         running = _stream(estimator, described, from_bag, follow, speed, poses, tare or 0)
         running.warm_up()
@@ -342,17 +360,18 @@ def _bag_lines(source: Path, topic: str | None, pose_topic: str | None) -> Itera
         yield json.dumps(message)
 
 
-def _map(chart: Path | None, whisker: Path | None) -> ContactMap:
+def _map(chart: Path | None, whisker: Path | None, proximal: float | None) -> ContactMap:
     from vibrissa.cli.sources import map_from, whisker_from
     from vibrissa.mapping import ContactMap
 
     if chart is not None and whisker is not None:
         raise ValueError("give either --map or --whisker: a map already has its whisker")
     if chart is not None:
+        refuse({"--proximal": proximal}, "it is of a map that is simulated, and --map is given")
         return map_from(chart)
     chosen = whisker_from(whisker)
     errors.print(f"no map given; simulating that of {chosen!r}", highlight=False, soft_wrap=True)
-    return ContactMap.simulate(chosen, grid=False)
+    return ContactMap.simulate(chosen, grid=False, proximal=smallest_arc(proximal))
 
 
 def _estimator(
@@ -360,18 +379,24 @@ def _estimator(
     sensor: Sensor | None,
     signals: str,
     noise: tuple[float, float],
-    stiffness_sigma: float,
+    beforehand: Assumed,
     felt: float,
+    tare: int,
 ) -> Estimator:
     import numpy as np
 
     from vibrissa.mapping import Estimator
 
-    share = 0.01 * stiffness_sigma
+    prior = beforehand.prior
     if sensor is not None:
-        return Estimator.of_sensor(contacts, sensor, share, felt)
+        stiffness = beforehand.errors.get("stiffness_sigma", 0.0)
+        if tare:
+            sensor = sensor.with_new_offset(tare)
+        return Estimator.of_sensor(contacts, sensor, stiffness, felt, prior)
     covariance = np.diag(np.repeat([1e-6 * noise[0], 1e-6 * noise[1]], 3) ** 2)
-    return Estimator(contacts, signals, covariance, share, felt)
+    return Estimator(
+        contacts, signals, covariance, felt_above=felt, prior=prior, **beforehand.errors
+    )
 
 
 def _stream(

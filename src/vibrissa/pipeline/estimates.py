@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.mapping import ContactMap
+from vibrissa.mapping import ContactMap, Prior
 from vibrissa.pipeline.frames import signals_in, whiskers_in
 from vibrissa.pipeline.laboratory import in_laboratory
 from vibrissa.pipeline.locate import TRIPLET, locate, locate_from_wrench, unfelt
 from vibrissa.pipeline.signals import sensor_noise
+from vibrissa.rod.reach import PROXIMAL
 from vibrissa.signals import selection
 from vibrissa.status import is_ok
 from vibrissa.whisker import Whisker
@@ -50,6 +52,9 @@ def estimates_of(
     contact_maps: Sequence[ContactMap] | None = None,
     whiskers: Sequence[Whisker] | None = None,
     method: str = "exact",
+    errors: Mapping[str, Any] | None = None,
+    prior: Prior | None = None,
+    proximal: float = PROXIMAL,
     progress: Progress | None = None,
 ) -> xr.Dataset:
     """Estimate the contact point in every frame in which a contact is felt.
@@ -70,6 +75,13 @@ def estimates_of(
         One for each, where there are no maps; by default those of the recording.
     method : {"exact", "lookup", "lookup-linear", "network"}
         As of ``ContactMap.estimate``.
+    errors : mapping of str to float, optional
+        ``stiffness_sigma``, ``gain_sigma`` and ``mixing_sigma``, as of ``ContactMap.estimate``:
+        the same errors in all frames. They need noise.
+    prior : Prior, optional
+        Which contacts are possible; others are left out of the candidates.
+    proximal : float
+        Smallest arc length of a contact of maps that are simulated, share of the length.
     progress : callable, optional
         Called as ``progress(stage, done, total)``.
 
@@ -124,25 +136,31 @@ def estimates_of(
             wrench = wrench.assign(in_contact=one["in_contact"])
         found = None if whole else unfelt(whisker, wrench, names, noise=sigma)
         if whole:
-            found = locate_from_wrench(whisker, wrench, sigma)
+            found = locate_from_wrench(whisker, wrench, sigma, errors, prior)
         elif found is None:
             if contact_maps is not None:
                 chart = contact_maps[k]
             else:
                 tell("map of all contacts", k, count)
-                chart = ContactMap.simulate(whisker, grid=method.startswith("lookup"))
+                grid = method.startswith("lookup")
+                chart = ContactMap.simulate(whisker, grid=grid, proximal=proximal)
                 tell("map of all contacts", k + 1, count)
-            found = locate(chart, wrench, names, noise=sigma, method=method)
+            found = locate(
+                chart, wrench, names, noise=sigma, method=method, errors=errors, prior=prior
+            )
         parts.append(_placed(one, found, given=noise is not None))
         tell("contact points", k + 1, count)
     out = xr.concat(parts, "whisker").transpose("time", "whisker", ...)
-    about = {
+    about: dict[str, Any] = {
         "signals": WHOLE if whole else " ".join(names),
         "source": str(data.attrs.get("source", "not known")),
         "felt_above": float(np.median([part.attrs["felt_above"] for part in parts])),
     }
     if method != "exact":
         about["method"] = method
+    about |= errors or {}
+    if prior is not None:
+        about["prior"] = repr(prior)
     out.attrs = about
     return out.assign_coords({n: data[n].variable for n in ("time", "whisker", "space")})
 

@@ -7,14 +7,16 @@ the laboratory tell which goes on from the frames around (`vibrissa.pipeline.lab
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.mapping import ContactMap, estimate_from_wrench
+from vibrissa.mapping import ContactMap, Prior, estimate_from_wrench
 from vibrissa.mapping.channels import WRENCH
+from vibrissa.mapping.noise import common_covariance, common_errors
 from vibrissa.pipeline.slopes import contact_normals, gains
 from vibrissa.quantities import attributes
 from vibrissa.signals import base_signals, selection
@@ -66,6 +68,8 @@ def locate(
     *,
     noise: ArrayLike | None,
     method: str = "exact",
+    errors: Mapping[str, Any] | None = None,
+    prior: Prior | None = None,
 ) -> xr.Dataset:
     """Estimate the contact point in every frame in which a contact is felt.
 
@@ -83,6 +87,11 @@ def locate(
         known; then there are no covariances, and a contact is felt wherever M_B is not zero.
     method : {"exact", "lookup", "lookup-linear", "network"}
         As of ``ContactMap.estimate``.
+    errors : mapping of str to float, optional
+        ``stiffness_sigma``, ``gain_sigma`` and ``mixing_sigma``, as of ``ContactMap.estimate``:
+        the same errors in all frames. They need noise.
+    prior : Prior, optional
+        Which contacts are possible; others are left out of the candidates.
 
     Returns
     -------
@@ -91,10 +100,10 @@ def locate(
         ``arc_length``, ``force`` at the base as the contact found would make it, the same of all
         candidates (``candidate_points``, ``candidate_covariance``, ...), their number
         ``candidates``, ``in_contact`` (felt) and ``status``; and of the candidates what leads from
-        an error of the wrench to one of the contact, ``candidate_gain``, with the noise of the
-        wrench, ``wrench_covariance``. Covariances are those of the exact way in every method.
-        Where nothing is felt all is NaN, and the status ``NOT_FELT``, or ``NO_CONTACT`` where force
-        and moment are zero or ``in_contact`` says so.
+        an error of the wrench to one of the contact, ``candidate_gain``, with the covariance of the
+        wrench by noise and errors, ``wrench_covariance``. Covariances are those of the exact way in
+        every method. Where nothing is felt all is NaN, and the status ``NOT_FELT``, or
+        ``NO_CONTACT`` where force and moment are zero or ``in_contact`` says so.
 
     Raises
     ------
@@ -102,9 +111,11 @@ def locate(
         If the noise does not fit.
     """
     names = selection(triplet)
-    felt = _Felt.of(wrench, noise)
+    felt = _Felt.of(wrench, noise, errors)
     signals = base_signals(felt.force[felt.rows], felt.moment[felt.rows])
-    found = contact_map.estimate(signals, names, felt.typical, method)
+    found = contact_map.estimate(
+        signals, names, felt.typical, method, prior=prior, **(errors or {})
+    )
     candidates = _Candidates(
         found.candidates,
         found.candidate_arc_lengths,
@@ -149,7 +160,13 @@ def unfelt(
     return _located(whisker, selection(triplet), felt, none)
 
 
-def locate_from_wrench(whisker: Whisker, wrench: xr.Dataset, noise: ArrayLike | None) -> xr.Dataset:
+def locate_from_wrench(
+    whisker: Whisker,
+    wrench: xr.Dataset,
+    noise: ArrayLike | None,
+    errors: Mapping[str, Any] | None = None,
+    prior: Prior | None = None,
+) -> xr.Dataset:
     """Locate contacts from all six components, with friction or without.
 
     Parameters
@@ -160,15 +177,24 @@ def locate_from_wrench(whisker: Whisker, wrench: xr.Dataset, noise: ArrayLike | 
         As for `locate`.
     noise : array_like (6, 6) or (time, 6, 6), optional
         As for `locate`.
+    errors : mapping of str to float, optional
+        As for `locate`.
+    prior : Prior, optional
+        As for `locate`.
 
     Returns
     -------
     xarray.Dataset
         As of `locate`, with ``friction_angle``.
     """
-    felt = _Felt.of(wrench, noise)
+    felt = _Felt.of(wrench, noise, errors)
     found = estimate_from_wrench(
-        whisker, felt.force[felt.rows], felt.moment[felt.rows], noise=felt.typical
+        whisker,
+        felt.force[felt.rows],
+        felt.moment[felt.rows],
+        noise=felt.typical,
+        prior=prior,
+        **(errors or {}),
     )
     candidates = _Candidates(
         found.candidates,
@@ -185,8 +211,8 @@ class _Felt(NamedTuple):
     """What is measured: force, moment (n, 3), their covariance (n, 6, 6), NaN if not known.
 
     And in which frames they are known, in which a contact is felt and in which there is none, (n,);
-    the noise of all frames together, (6, 6), if there is any; and M_B from which contacts are
-    felt, N·m.
+    the noise of all frames together, (6, 6), if there is any; errors that all frames share
+    (k, 6, 7); and M_B from which contacts are felt, N·m.
     """
 
     time: xr.Variable
@@ -197,10 +223,13 @@ class _Felt(NamedTuple):
     rows: NDArray[np.bool_]
     free: NDArray[np.bool_]
     typical: Array | None
+    errors: Array
     above: float
 
     @classmethod
-    def of(cls, wrench: xr.Dataset, noise: ArrayLike | None) -> _Felt:
+    def of(
+        cls, wrench: xr.Dataset, noise: ArrayLike | None, errors: Mapping[str, Any] | None = None
+    ) -> _Felt:
         """Look at a measured wrench."""
         force, moment = (
             np.asarray(wrench[name].transpose("time", "space").values, dtype=np.float64)
@@ -226,9 +255,12 @@ class _Felt(NamedTuple):
         if noise is not None:
             same = bool((covariance == covariance[:1]).all())
             typical = covariance[0] if same else _typical(covariance[rows])
-        return cls(
-            wrench["time"].variable, force, moment, covariance, known, rows, free, typical, above
-        )
+        shared = common_errors(**(errors or {}))
+        if len(shared):
+            whole = np.concatenate([force, moment], axis=1)
+            covariance = covariance + common_covariance(shared, np.eye(6), whole)
+        time = wrench["time"].variable
+        return cls(time, force, moment, covariance, known, rows, free, typical, shared, above)
 
 
 def _noise_of_frames(noise: ArrayLike | None, n: int) -> Array:
@@ -258,7 +290,7 @@ def _located(
     rows = felt.rows
     shape = found.arc_lengths.shape
     flat = (found.arc_lengths.reshape(-1), found.contact_forces.reshape(-1, 3))
-    gain = gains(whisker, names, *flat, felt.typical).reshape(*shape, 6, 6)
+    gain = gains(whisker, names, *flat, felt.typical, felt.errors).reshape(*shape, 6, 6)
     normals = contact_normals(whisker, *flat).reshape(*shape, 3)
     point_gain = gain[..., :3, :]
     spread = point_gain @ felt.covariance[rows][:, None] @ np.swapaxes(point_gain, -1, -2)

@@ -60,6 +60,7 @@ def gains(
     arc_length: Array,
     contact_force: Array,
     weighing: Array | None = None,
+    errors: Array | None = None,
 ) -> Array:
     """Tell how contact points and normals move with the measured wrench.
 
@@ -76,6 +77,8 @@ def gains(
         Their force in the material frame at the contact (tangent, d1, d2), N.
     weighing : array (6, 6), optional
         Covariance of (F, M) by which more than three signals were weighed; by default 1 % of each.
+    errors : array (k, 6, 7), optional
+        Errors that all frames share, by which they were weighed as well.
 
     Returns
     -------
@@ -97,7 +100,7 @@ def gains(
     slopes = channel_derivatives(touch.values, touch.value_slopes[..., free], channels.names)
     by_wrench = channel_gradients(touch.values, channels.names)
     if not three:
-        weights = _weights(d, channels, touch.values, weighing)
+        weights = _weights(d, channels, touch.values, weighing, errors)
         slopes, by_wrench = weights @ slopes, weights @ by_wrench
     moved = np.concatenate([touch.value_slopes[:, 3:], touch.normal_slopes], axis=1)[..., free]
     inner = np.repeat([d.length, 1.0], 3)[:, None] / np.repeat([d.force, d.moment], 3)
@@ -197,8 +200,16 @@ def contact_normals(whisker: Whisker, arc_length: Array, contact_force: Array) -
     return out
 
 
-def _weights(d: Discretization, channels: Channels, values: Array, weighing: Array | None) -> Array:
-    sensor = None if weighing is None else SensorNoise(None, weighing)
+def _weights(
+    d: Discretization,
+    channels: Channels,
+    values: Array,
+    weighing: Array | None,
+    errors: Array | None,
+) -> Array:
+    sensor = None
+    if weighing is not None:
+        sensor = SensorNoise(None, weighing, np.zeros((0, 6, 7)) if errors is None else errors)
     measured = signals_of(values[:, :3], np.cross(values[:, 3:], values[:, :3]))
     return whitening(channels.covariance(sensor, measured, values, d))
 

@@ -22,14 +22,20 @@ found are the same in all of them (:mod:`~vibrissa.sensing.errors`), and averagi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.sensing.errors import by_calibration, by_gain, by_mixing, checked_covariance
+from vibrissa.sensing.errors import (
+    by_calibration,
+    by_gain,
+    by_mixing,
+    checked_covariance,
+    with_offset,
+)
 from vibrissa.sensing.frame import SensorFrame
 
 Array = NDArray[np.float64]
@@ -232,6 +238,28 @@ class Sensor:
         if len(own):
             own[..., :6] = own[..., :6] @ self.frame.from_base()
         return own
+
+    def with_new_offset(self, readings: int, bias: ArrayLike | None = None) -> Sensor:
+        """Give the same sensor with an offset that was found as the mean of so many readings.
+
+        Parameters
+        ----------
+        readings : int
+            How many.
+        bias : array_like (k,), optional
+            The offset; by default as it is.
+
+        Returns
+        -------
+        Sensor
+            Whose `mixing_covariance` has the offset's new variance, by the noise.
+        """
+        variance = np.diag(self.covariance()) / readings
+        return replace(
+            self,
+            bias=self.bias if bias is None else bias,
+            mixing_covariance=with_offset(self.mixing_covariance, variance),
+        )
 
     def weight(self, rotation: ArrayLike, gravity: ArrayLike = GRAVITY) -> Array:
         """Wrench at the base of the weight that the sensor carries.

@@ -181,12 +181,7 @@ def tare(
     felt = felt[np.isfinite(felt).all(axis=1)]
     if not len(felt):
         raise ValueError("there is no reading without NaN or a saturated channel")
-    variance = np.diag(sensor.covariance()) / len(felt)
-    return replace(
-        sensor,
-        bias=sensor.bias + felt.mean(axis=0),
-        mixing_covariance=with_offset(sensor.mixing_covariance, variance),
-    )
+    return sensor.with_new_offset(len(felt), sensor.bias + felt.mean(axis=0))
 
 
 def _solved(
@@ -214,13 +209,8 @@ def _tared(sensor: Sensor, y: Array, noise: Array) -> WeightCalibration:
     covariance = np.zeros((k + 4, k + 4))
     covariance[:k, :k] = np.diag(noise**2 / len(y))
     left = np.sqrt(((y - bias) ** 2).mean(axis=0))
-    tared = replace(
-        sensor,
-        bias=bias,
-        mass=0.0,
-        mass_moment=np.zeros(3),
-        mixing_covariance=with_offset(sensor.mixing_covariance, np.diag(covariance)[:k]),
-    )
+    light = replace(sensor, mass=0.0, mass_moment=np.zeros(3))
+    tared = light.with_new_offset(len(y), bias)
     misfit = float((left**2 / noise**2).sum() * len(y) / max(len(y) - 1, 1) / k)
     warn_of_misfit(misfit, "that nothing was touched, and that the orientation stayed the same")
     return WeightCalibration(tared, covariance, left, misfit)

@@ -105,10 +105,10 @@ def test_what_is_asked_for_is_made_anew(folder, tmp_path):
     work = tmp_path / "t.nc"
     done("reconstruct", folder / "sim.nc", "--map", folder / "map.nc", "-o", work)
     first = load_recording(work)
-    done("reconstruct", work, "--axis", "0,0,1")
+    done("reconstruct", work, "--axis", "0,0,1", "--force")
     assert load_recording(work)["contour"]["object_axis"].values.tolist() == [0, 0, 1]
     xr.testing.assert_identical(load_recording(work)["estimates"], first["estimates"])
-    done("reconstruct", work, "--wrench", "--force-noise", "2")
+    done("reconstruct", work, "--wrench", "--force-noise", "2", "--force")
     other = load_recording(work)
     assert other["estimates"].attrs["signals"] == "wrench"
     xr.testing.assert_identical(other["signals"], first["signals"])
@@ -123,7 +123,7 @@ def test_a_shape_that_does_not_fit_is_said(folder, tmp_path):
     assert "agree with it" in text
     assert "another shape" not in text
     assert "goes better" not in text
-    text = " ".join(done("reconstruct", work, "--shape", "plane").split())
+    text = " ".join(done("reconstruct", work, "--shape", "plane", "--force").split())
     assert "do not go with a plane" in text
     assert "another shape (--shape)" in text
     assert "A cylinder goes better with them" in text
@@ -136,7 +136,7 @@ def test_another_whisker_makes_signals_and_contacts_anew(folder, tmp_path):
     first = load_recording(work)
     soft = recorded_whisker(first).with_properties(youngs_modulus=1.5e9)
     ContactMap.simulate(soft, grid=False).save(tmp_path / "soft.nc")
-    done("reconstruct", work, "--whisker", tmp_path / "soft.nc")
+    done("reconstruct", work, "--whisker", tmp_path / "soft.nc", "--force")
     other = load_recording(work)
     assert other["signals"].attrs == first["signals"].attrs
     for group in ("signals", "estimates"):
@@ -204,7 +204,7 @@ def test_a_whisker_that_is_missing_can_be_given(folder, tmp_path):
     done("estimate", out, "--map", folder / "map.nc")
     done("reconstruct", out, "--whisker", folder / "map.nc")
     assert "contour" in load_recording(out).children
-    done("reconstruct", folder / "bare.nc", "--map", folder / "map.nc", "-o", out)
+    done("reconstruct", folder / "bare.nc", "--map", folder / "map.nc", "-o", out, "--force")
     assert "contour" in load_recording(out).children
 
 

@@ -121,9 +121,9 @@ def test_what_is_known_besides_the_videos_is_used(videos, tmp_path):
     for table, kind in ((head, "the head's pose"), (whisker, "centreline of a whisker")):
         assert kind in run("info", table).stdout
     head.write_text(head.read_text().rsplit("\n", 3)[0])
-    done = run(*words, "--head", head)
+    done = run(*words, "--head", head, "--force")
     assert "missing for 3 frames of the video, the first of which is 13" in str(done.exception)
-    done = run(*words, "--contact", head, "--object", objects)
+    done = run(*words, "--contact", head, "--object", objects, "--force")
     assert "give one of them" in str(done.exception)
 
 

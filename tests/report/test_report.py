@@ -344,7 +344,8 @@ def test_where_it_comes_from(written, folder):
 def test_the_same_command_gives_the_same_page(map_page, folder, monkeypatch):
     path, words = map_page
     before = path.read_bytes()
-    run("report", *words, "-o", path)
+    assert "is there already" in fault("report", *words, "-o", path)
+    run("report", *words, "-o", path, "--force")
     assert path.read_bytes() == before
     monkeypatch.setattr(reporting, "_drawn", lambda drawings, tell: {})
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "yesterday")

@@ -113,7 +113,8 @@ def report(
     movies = list(films or [])
     if make_movies:
         movies += _made(path, target, videos, chart, whisker or 0, force)
-    command = ["vibrissa", *sys.argv[1:]]
+    # The page is the same, whether there was one before or not.
+    command = ["vibrissa", *(word for word in sys.argv[1:] if word != "--force")]
     drawn = (seed or 0) if kind == "trial" else None
     origin = provenance_section(provenance(command, given, drawn))
     about = "From what a whisker feels at its base to what it touched, by vibrissa."

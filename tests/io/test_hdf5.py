@@ -91,6 +91,13 @@ def opaque(file):
     h5d.create(file.id, b"chosen", kind, h5s.create_simple((3,)))
 
 
+def too_many_scales(file):
+    scales = file["truth/force"].attrs["DIMENSION_LIST"]
+    del file["truth/force"]
+    file["truth/force"] = np.zeros(5)
+    file["truth/force"].attrs.create("DIMENSION_LIST", scales)
+
+
 HARMFUL = (
     (external_link, "out of the file"),
     (external_group, "out of the file"),
@@ -104,6 +111,7 @@ HARMFUL = (
     (twice, "several places"),
     (by_name, "soft link"),
     (opaque, "opaque"),
+    (too_many_scales, "scales of others"),
 )
 
 
@@ -117,6 +125,17 @@ def test_what_could_do_harm_is_refused(tmp_path, content, spoil, said):
         load_recording(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_heap_through_which_there_is_no_end(tmp_path, content):
+    """Zeros over text of any length, of which the library would take nothing again and again."""
+    spoilt = bytearray(content["trial.nc"])
+    start = spoilt.index(b"GCOL")
+    spoilt[start + 16 : start + 512] = bytes(496)
+    path = tmp_path / "trial.nc"
+    path.write_bytes(spoilt)
+    with pytest.raises(ValueError, match=r"trial\.nc: a heap of text is damaged"):
+        load_recording(path)
 
 
 def test_what_compresses_well_is_read(tmp_path):

@@ -34,8 +34,8 @@ from vibrissa.cli.terminal import errors, output
 HELP = """From what a whisker feels at its base to what it touched.
 
 Numbers typed and printed are in mm, µN, µN·m and degrees unless an option says otherwise; files
-hold SI units. No file that is there is replaced without --force; stages are added to a recording where
-it is.
+hold SI units. No file that is there is replaced without --force; stages are added to a recording
+where it is.
 """
 
 app = typer.Typer(

@@ -151,6 +151,9 @@ def _check(file: h5py.File, size: int, soft_links: bool) -> None:
             attribute = item.attrs.get_id(key)
             _check_type(f"the attribute {key} of {name}", attribute.get_type())
             claimed += _bytes(attribute.shape, attribute.get_type())
+            # The library would read past the end of a list that is too long or too short.
+            if key == "DIMENSION_LIST" and attribute.shape != (item.ndim,):
+                raise ValueError(f"{name} has {item.ndim} dimensions, and scales of others")
         if isinstance(item, h5py.Dataset):
             claimed += _checked_size(name, item)
         if claimed > max(_ALWAYS_ALLOWED, _DENSEST * size):

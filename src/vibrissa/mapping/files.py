@@ -57,6 +57,9 @@ def load_map(path: Path) -> ContactMap:
     if kind != _KIND:
         raise ValueError(f"{path} holds {kind or 'data of another kind'}, not a contact map")
     tree = read_tree(path)
+    missing = [name for name in ("whisker", "chart") if name not in tree.children]
+    if missing:
+        raise ValueError(f"{path} lacks the group {' and '.join(missing)} of a contact map")
     with naming(path, "a contact map"):
         return _from_tree(tree)
 

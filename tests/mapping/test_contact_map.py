@@ -1,5 +1,6 @@
 """The map: its samples are equilibria, its domains are told apart, and files keep it whole."""
 
+import h5py
 import numpy as np
 import pytest
 import xarray as xr
@@ -73,6 +74,17 @@ def test_a_file_of_another_kind_is_refused(tmp_path):
     xr.Dataset({"a": 1.0}).to_netcdf(other, engine="h5netcdf")
     with pytest.raises(ValueError, match="not a contact map"):
         vb.ContactMap.load(other)
+
+
+@pytest.mark.parametrize("lost", ["chart", "whisker", "chart/fold", "whisker/radius"])
+def test_a_map_without_a_part_of_it_is_refused(tmp_path, gamma_map, lost):
+    path = tmp_path / "map.nc"
+    gamma_map.save(path)
+    with h5py.File(path, "r+") as file:
+        del file[lost]
+    with pytest.raises(ValueError, match=lost.rpartition("/")[2]) as caught:
+        vb.ContactMap.load(path)
+    assert str(path) in str(caught.value)
 
 
 def test_the_papers_grid(tmp_path):

@@ -146,9 +146,9 @@ def _column_names(value: Any) -> Names:
             more = [stack.pop()] if name == "APPEND" else _above_mark(stack)
             stack[-1].extend(more)
         elif name.endswith("GET"):
-            stack.append(memo[argument])
+            stack.append(memo[int(argument or 0)])
         elif name.endswith("PUT") or name == "MEMOIZE":
-            memo[len(memo) if argument is None else argument] = stack[-1]
+            memo[len(memo) if argument is None else int(argument)] = stack[-1]
         elif name not in ("PROTO", "FRAME", "STOP"):
             raise ValueError(
                 f"the names of its columns are a pickle with {name} {argument or ''}, which is not "

@@ -20,6 +20,7 @@ from pathlib import Path
 from vibrissa.io.paths import check_writable
 
 _MARK = ".vibrissa-part-"
+_LOCKS = sys.platform != "win32"
 _PART = re.compile(rf"\..+{re.escape(_MARK)}[a-z0-9_]{{8}}(\.[^.]*)?")
 
 
@@ -56,14 +57,17 @@ def replacing(path: str | PathLike[str]) -> Iterator[Path]:
             prefix=f".{path.stem}{_MARK}", suffix=path.suffix, dir=path.parent
         )
     part = Path(name)
+    _held(handle)
+    if not _LOCKS:  # and what is open cannot be renamed
+        os.close(handle)
     try:
-        _held(handle)
         with _failing(path):
             yield part
             _finish(part)
             part.replace(path)
     finally:
-        os.close(handle)
+        if _LOCKS:
+            os.close(handle)
         part.unlink(missing_ok=True)
 
 
@@ -92,7 +96,7 @@ def _finish(part: Path) -> None:
 
 def _held(handle: int) -> bool:
     """Take the lock of a part; False if somebody has it, or there are no locks here."""
-    if sys.platform == "win32":
+    if not _LOCKS:
         return False
     import fcntl
 

@@ -1,5 +1,6 @@
 """Compiling: said once, cached where possible, done without a cache where not."""
 
+import os
 import subprocess
 import sys
 import textwrap
@@ -39,6 +40,94 @@ def test_the_first_compilation_says_what_it_is_doing_once():
     )
     assert said.stderr.count("vibrissa: compiling kernels") == 1
     assert said.stdout == ""
+
+
+def test_what_is_compiled_is_said_with_the_verb():
+    said = run(
+        """
+        import sys
+        import vibrissa.cli.app
+        from vibrissa.rod.compiled import kernel
+
+        sys.argv[1:] = ["--help", "estimate", "signals.csv"]
+
+        def twice(x):
+            return 2.0 * x
+
+        for module in ("vibrissa.made_up", "vibrissa.other"):
+            twice.__module__ = module
+            assert kernel(twice)(2.0) == 4.0
+        """
+    )
+    (line,) = said.stderr.splitlines()
+    assert line.startswith("vibrissa: compiling kernels for `estimate` (once for this installation")
+
+
+SQUARE = """
+import resource, sys
+
+import numpy as np
+
+from vibrissa.rod.compiled import kernel
+
+if len(sys.argv) > 1:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), -1))
+
+@kernel
+def square(x):
+    return x * x
+
+assert square(3.0) == 9.0
+assert (square(np.arange(3.0)) == [0.0, 1.0, 4.0]).all()
+print(sum(square.stats.cache_hits.values()))
+"""
+
+
+@pytest.fixture
+def square(tmp_path):
+    """Runs a script with a kernel of two signatures; its cache is in a folder of its own."""
+    script, folder = tmp_path / "script.py", tmp_path / "kept"
+    script.write_text(SQUARE)
+    folder.mkdir()
+
+    def call(*limit):
+        return subprocess.run(
+            [sys.executable, "-W", "error", script, *map(str, limit)],
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=300,
+            env=os.environ | {"NUMBA_CACHE_DIR": str(folder)},
+        )
+
+    return call, folder
+
+
+def test_a_damaged_cache_counts_as_none(square):
+    call, folder = square
+    assert call().stdout == "0\n"
+    assert call().stdout == "2\n"
+    files = sorted(folder.rglob("*.nb?"), reverse=True)
+    assert [file.suffix for file in files] == [".nbi", ".nbc", ".nbc"]
+    for file, kept in zip(files, (0, 1, 1), strict=True):
+        content = file.read_bytes()
+        middle = len(content) // 2
+        flipped = content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
+        file.write_bytes({".nbi": content[:middle], ".nbc": flipped}[file.suffix])
+        again = call()
+        assert (again.stdout, again.stderr) == (f"{kept}\n", "")
+    assert call().stdout == "2\n"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="this system cannot limit the size of files")
+def test_what_cannot_be_kept_is_said_once_and_the_result_is_there(square):
+    """As on a full disk."""
+    call, _ = square
+    result = call(100)
+    assert result.stdout == "0\n"
+    (said,) = result.stderr.splitlines()
+    assert "compiled kernels cannot be kept and are compiled in each run" in said
+    assert call().stdout == "0\n"
 
 
 def test_other_people_s_compilations_are_none_of_our_business():

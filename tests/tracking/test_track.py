@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from vibrissa.status import Status
 from vibrissa.tracking import (
@@ -195,6 +196,28 @@ def test_views_of_different_whiskers_are_refused(filmed, traces):
     moved = [trace._replace(line=trace.line + aside) for trace in traces[1][0]]
     with pytest.raises(ValueError, match=r"the views do not show one whisker.* by 1[0-9] pixels"):
         track(filmed.cameras, [traces[0], [moved]], 1000.0)
+
+
+@pytest.mark.parametrize("spoilt", ["views", "lost"])
+def test_a_whisker_that_cannot_be_tracked_does_not_cost_the_others(
+    filmed, traces, recording, spoilt
+):
+    from vibrissa.tracking import Trace
+
+    first, second = (view[0] for view in traces)
+    moved = [trace._replace(line=trace.line + np.array([60.0, 0.0])) for trace in second]
+    lost = [Trace.lost()] * len(first)
+    bad = [first, moved] if spoilt == "views" else [lost, lost]
+    both = [[worse, good] for worse, good in zip(bad, (first, second), strict=True)]
+    found = track(filmed.cameras, both, 1000.0, names=["bad", "good"])
+    assert list(found["whisker"].values) == ["good"]
+    one = found.to_dataset().drop_vars("whisker")
+    xr.testing.assert_identical(
+        one.drop_attrs(), recording.to_dataset().drop_vars("whisker").drop_attrs()
+    )
+    assert "bad could not be tracked and is left out: " in found.attrs["remarks"]
+    with pytest.raises(ValueError, match=r"no whisker could be tracked: .*bad could.*worse could"):
+        track(filmed.cameras, [[row, row] for row in bad], 1000.0, names=["bad", "worse"])
 
 
 def test_a_tip_that_is_not_seen_is_found_by_how_the_whisker_bends(filmed, traces):

@@ -90,9 +90,9 @@ def bag_wrenches(path: str | PathLike[str], topic: str | None = None) -> Iterato
     topic : str, optional
         With WrenchStamped messages; by default the only one that has them.
 
-    Yields
-    ------
-    BagMessage
+    Returns
+    -------
+    iterator of BagMessage
         With six values: force, N, and torque, N·m.
 
     Raises
@@ -122,9 +122,9 @@ def bag_poses(path: str | PathLike[str], topic: str | None = None) -> Iterator[B
     topic : str, optional
         With PoseStamped or TransformStamped messages; by default the only one that has them.
 
-    Yields
-    ------
-    BagMessage
+    Returns
+    -------
+    iterator of BagMessage
         With seven values: position in its parent's frame, m, and the quaternion w, x, y, z from
         its own to the parent's frame. The frame is the parent's.
 

@@ -66,7 +66,13 @@ def _whole(content: bytes) -> Any:
 
 
 class PackageCache(FunctionCache):
-    """Keeps a compiled function on disk, as long as the kernels of its package are the same."""
+    """Keeps a compiled function on disk, as long as the kernels of its package are the same.
+
+    Parameters
+    ----------
+    function : callable
+        What is compiled.
+    """
 
     _told = False
 

@@ -78,17 +78,17 @@ class Store:
     any_version : bool
         Whether it is gone on with though another version of vibrissa began it.
 
+    Attributes
+    ----------
+    faults : list of str
+        What of the store was so damaged that it was made anew.
+
     Raises
     ------
     Busy
         If another run has it open.
     ValueError
         If it holds the results of another study or of another version, or is no store.
-
-    Attributes
-    ----------
-    faults : list of str
-        What of the store was so damaged that it was made anew.
     """
 
     def __init__(

@@ -168,13 +168,14 @@ def track(
         the group ``measured`` holds what was measured before: the whisker merged from the views
         with its uncertainty, the pose the paper's way, and the contact points of ``contacts`` or
         ``objects`` beside those of the rod. The attribute ``remarks``, if there is one, says what
-        is to be known before it is believed, a sentence a line.
+        is to be known before it is believed, a sentence a line. Of several whiskers, one that
+        cannot be tracked (it is seen in too few frames, or the views show different ones) is left
+        out, and a remark says why.
 
     Raises
     ------
     ValueError
-        If views and whiskers do not fit together, a whisker is seen in too few frames, or the
-        views show different ones.
+        If views and whiskers do not fit together, or no whisker can be tracked.
     """
     options = options or TrackOptions()
     counts = {len(view) for view in traces}
@@ -185,24 +186,41 @@ def track(
         )
     if not (np.isfinite(rate) and rate > 0.0):
         raise ValueError(f"rate is {rate!r}; it must be positive, in frames per second")
-    pairs = paired_frames(cameras, [view[0] for view in traces], options.offset)
+    timed = _best_seen(traces)
+    pairs = paired_frames(cameras, timed, options.offset)
     moving = None if head is None else HeadPose.of(head, pairs[:, 0], rate)
-    found, remarks = [], remarks_on_time(cameras, [view[0] for view in traces], options.offset)
-    for k in range(counts.pop()):
+    found, remarks = [], remarks_on_time(cameras, timed, options.offset)
+    count = counts.pop()
+    for k in range(count):
         rows = [[view[k][i] for i in pairs[:, v]] for v, view in enumerate(traces)]
         name = names[k] if names is not None else f"whisker {k}"
-        one = track_whisker(cameras, rows, rate, options, name, progress, moving)
-        other = None
-        if contacts is not None:
-            other = given_contacts(contacts, cameras, pairs, rate, k, one.refined)
-        elif objects:
-            other = contacts_at(objects, one.curves, one.touching, one.refined)
-        found.append(replace(one, contacts=other))
-        remarks += remarks_on(cameras, one.sight, one.length, one.refined.misfit, name)
+        try:
+            one = track_whisker(cameras, rows, rate, options, name, progress, moving)
+            other = None
+            if contacts is not None:
+                other = given_contacts(contacts, cameras, pairs, rate, k, one.refined)
+            elif objects:
+                other = contacts_at(objects, one.curves, one.touching, one.refined)
+            found.append(replace(one, contacts=other))
+            remarks += remarks_on(cameras, one.sight, one.length, one.refined.misfit, name)
+        except Exception as fault:  # whatever it is, it must not cost the others
+            if count == 1:
+                raise
+            reason = " ".join(str(fault).split()) or type(fault).__name__
+            remarks.append(f"{name} could not be tracked and is left out: {reason}")
+    if not found:
+        raise ValueError(f"no whisker could be tracked: {'; '.join(remarks)}")
     recording = tracked_recording(cameras, found, pairs, rate, moving, objects, options.cutoff)
     if remarks:
         recording.attrs["remarks"] = "\n".join(remarks)
     return recording
+
+
+def _best_seen(traces: Sequence[Sequence[Sequence[Trace]]]) -> list[Sequence[Trace]]:
+    """Traces, view by view, of the whisker that is least often lost."""
+    seen = [[sum(len(trace.line) > 0 for trace in row) for row in view] for view in traces]
+    best = int(np.argmax(np.min(seen, axis=0)))
+    return [view[best] for view in traces]
 
 
 def track_whisker(

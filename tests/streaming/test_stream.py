@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 from scipy.spatial.transform import Rotation
 
 import vibrissa as vb
@@ -28,6 +29,9 @@ from vibrissa.streaming.sources import udp_lost, udp_socket
 
 START = "from vibrissa.cli import main; main()"
 NOISE = np.repeat([1e-6, 2e-8], 3)
+
+HELD = {"time": 0.0, "Fx": 0.0, "MB": 0.0, "MD": 0.0, "base_qw": 1.0}
+HELD |= dict.fromkeys((*POSITION, *QUATERNION[1:]), 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -139,6 +143,10 @@ def test_bad_lines_are_said_and_passed_over(gamma_map, wrench):
         (",".join(30_000 * ["0"]), "30000 cells; the header has 7"),
         (",".join(f"c{i}" for i in range(9_000)), "9000 cells; the header has 7"),
         ("0.1,1e-5\0,0,0,0,0,0", "no number"),
+        (json.dumps(HELD | {"base_qw": 1e155}), "of length 1e+155, not 1"),
+        (json.dumps(HELD | {"base_x": 1e308}), "its position is in m"),
+        (json.dumps(HELD | {"base_x": float("inf")}), "its position is in m"),
+        (json.dumps(HELD | {"stamp_ns": 1.5}), "a whole number of ns"),
         (b"0.1,1e-5,\xe2\x82".decode(errors="replace"), "3 cells; the header has 7"),
         ("nan,0,0,0,0,0,0", "time is 'nan'; a finite number"),
         (",0,0,0,0,0,0", "time is ''"),
@@ -642,7 +650,9 @@ def test_a_bag_that_cannot_be_written_is_said_and_the_stream_goes_on(
     lines = list(csv_lines(wrench))
     (tmp_path / "lines.csv").write_text("\n".join(lines))
     monkeypatch.setattr("vibrissa.io.rosbag.ContactBag.write", lambda *_: full(None))
-    stream(tmp_path / "lines.csv", chart=map_file, bag=tmp_path / "out")
+    with pytest.raises(typer.Exit) as ended:
+        stream(tmp_path / "lines.csv", chart=map_file, bag=tmp_path / "out")
+    assert ended.value.exit_code == 1
     out, said = capsys.readouterr()
     assert len(out.splitlines()) == len(wrench)
     assert said.count("no space; the stream goes on without it") == 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from io import TextIOWrapper
 from itertools import islice
@@ -234,7 +234,7 @@ def stream(
             errors.print("ready", highlight=False)
             if not every:
                 lines = losses.newest(running)
-        keep = None if writer is None else _keeper(writer, running, described, follow)
+        keep = None if writer is None else _Keeper(writer, running, described, follow)
         try:
             _write(running, islice(lines, count), keep, losses)
         except Ended as signalled:  # the usual end
@@ -248,6 +248,8 @@ def stream(
         soft_wrap=True,
     )
     _advise(running)
+    if keep is not None and keep.broken:
+        raise typer.Exit(1)
 
 
 def _advise(running: ContactStream) -> None:
@@ -438,7 +440,7 @@ def _bag(path: Path, follow: bool) -> ContactBag:
 def _write(
     running: ContactStream,
     lines: Iterator[str],
-    keep: Callable[[dict[str, Any]], None] | None,
+    keep: _Keeper | None,
     losses: _Losses | None,
 ) -> None:
     """Print records as they come, each at once; stop quietly when nobody reads any more."""
@@ -460,38 +462,47 @@ def _write(
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _keeper(
-    bag: ContactBag, running: ContactStream, sensor: Sensor | None, follow: bool
-) -> Callable[[dict[str, Any]], None]:
-    """What puts records into the bag, as long as it can be written; the stream goes on without."""
-    import numpy as np
+class _Keeper:
+    """Puts records into the bag as long as it can be written; the stream goes on without."""
 
-    from vibrissa.streaming.lines import FRAME, RECORDED, STAMP
+    def __init__(
+        self, bag: ContactBag, running: ContactStream, sensor: Sensor | None, follow: bool
+    ) -> None:
+        import numpy as np
 
-    # Points are in the whisker's frame, which is the sensor's unless that is mounted otherwise.
-    same = sensor is None or np.array_equal(sensor.frame.to_base(), np.eye(6))
-    names = ("lab_x", "lab_y", "lab_z") if follow else ("x", "y", "z")
-    broken = False
+        self._bag, self._running, self._follow = bag, running, follow
+        # Points are in the whisker's frame, which is the sensor's unless that is mounted otherwise.
+        self._same = sensor is None or np.array_equal(sensor.frame.to_base(), np.eye(6))
+        self.broken = False
 
-    def keep(record: dict[str, Any]) -> None:
-        nonlocal broken
+    def __call__(self, record: dict[str, Any]) -> None:
+        """Put a record of a sample."""
+        import numpy as np
+
+        from vibrissa.streaming.lines import RECORDED, STAMP
+
+        if self.broken:
+            return
         points = np.reshape(record.get("hypotheses", record.get("candidates", [])), (-1, 3))
         likely = record.get("probabilities", np.full(len(points), 1.0 / max(len(points), 1)))
+        names = ("lab_x", "lab_y", "lab_z") if self._follow else ("x", "y", "z")
         point = np.array([record[name] for name in names]) if "x" in record else None
         stamp = record.get(STAMP)
         if stamp is None:
             stamp = round(record["time"] * 1e9)
-        moved = follow and running.poses.number
-        frame = running.laboratory if moved else record.get(FRAME, "") if same else ""
+        frame, recorded = self._frame(record), record.get(RECORDED)
         try:
-            if not broken:
-                bag.write(
-                    stamp, point, points, np.array(likely), frame or None, record.get(RECORDED)
-                )
+            self._bag.write(stamp, point, points, np.array(likely), frame, recorded)
         except ValueError as fault:
             errors.print(f"not in the bag: {fault}", highlight=False, soft_wrap=True)
         except OSError as fault:
-            broken = True
+            self.broken = True
             errors.print(f"{fault}; the stream goes on without it", highlight=False, soft_wrap=True)
 
-    return keep
+    def _frame(self, record: dict[str, Any]) -> str | None:
+        """Name of the frame that points are in, where the input says it."""
+        from vibrissa.streaming.lines import FRAME
+
+        if self._follow and self._running.poses.number:
+            return self._running.laboratory or None
+        return record.get(FRAME) if self._same else None

@@ -54,6 +54,8 @@ _SIGNALS = ("time", "Fx", "Fy", "Fz", "Mx", "My", "Mz", *SIGNALS)
 _UNIT = 0.01
 # Seconds since any epoch are fewer; what is more is in a smaller unit.
 _LATEST = 1e11
+# Farther away than this no base is, m; infinite ones are no numbers either.
+_FARTHEST = 1e9
 # Characters that a number in a table may begin with.
 _DIGITS = frozenset("0123456789+-.")
 
@@ -273,6 +275,8 @@ class Lines:
         rotation = position = None
         if set(POSITION) <= set(known):
             position = np.array([_number(name, known[name]) for name in POSITION])
+            if (np.abs(position) > _FARTHEST).any():
+                raise ValueError(f"the base is at {position.tolist()}; its position is in m")
         if set(QUATERNION) <= set(known):
             rotation = rotation_of([_number(name, known[name]) for name in QUATERNION])
         return Sample(self.number, time, names, values, rotation, position, passed)
@@ -329,7 +333,7 @@ def rotation_of(quaternion: Sequence[float]) -> Array:
         If it is not of unit length.
     """
     q = np.array(quaternion)
-    size = float(np.linalg.norm(q))
+    size = math.hypot(*quaternion)
     if not math.isfinite(size):
         return np.full((3, 3), np.nan)
     if abs(size - 1.0) > _UNIT:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -92,6 +93,7 @@ def simulate(
     from vibrissa.io import save_recording
     from vibrissa.io.paths import NETCDF, check_writable
     from vibrissa.io.table import read_text
+    from vibrissa.io.toml import in_file
     from vibrissa.trial import measure
     from vibrissa.trial import simulate as simulated
     from vibrissa.trial.script import EXAMPLE, read_script
@@ -103,25 +105,26 @@ def simulate(
     free([path, *(() if film is None else _films(film))], force)
     with progress_bars() as tell:
         tell("how far to whisk", 0, 1)
-        plan = read_script(
-            "" if script is None else read_text(script),
-            Path() if script is None else script.parent,
-            whisker_from,
-            whisker=whisker,
-            array=array,
-            side=side,
-            whiskers=None if whiskers is None else whiskers.replace(",", " ").split(),
-            object=thing,
-            duration=duration,
-            rate=rate,
-            frequency=frequency,
-            protraction=protraction,
-            row=row,
-            friction=friction,
-            dynamic=dynamic,
-            noise=noise,
-            seed=seed,
-        )
+        with nullcontext() if script is None else in_file(script):
+            plan = read_script(
+                "" if script is None else read_text(script),
+                Path() if script is None else script.parent,
+                whisker_from,
+                whisker=whisker,
+                array=array,
+                side=side,
+                whiskers=None if whiskers is None else whiskers.replace(",", " ").split(),
+                object=thing,
+                duration=duration,
+                rate=rate,
+                frequency=frequency,
+                protraction=protraction,
+                row=row,
+                friction=friction,
+                dynamic=dynamic,
+                noise=noise,
+                seed=seed,
+            )
         tell("how far to whisk", 1, 1)
         trial = simulated(
             plan.whisker,

@@ -243,10 +243,16 @@ def _cameras(
             cameras = recorded_cameras(load_recording(path))
         else:
             cameras = load_cameras(path)
+        if len(cameras) < 2:
+            raise ValueError(
+                f"{path} tells of one camera, {cameras[0].name!r}; a whisker in space is seen by "
+                "two or more: calibrate them together, or leave --cameras out"
+            )
         if len(videos) % len(cameras):
             raise ValueError(
                 f"{path} tells of {len(cameras)} cameras; there are {len(videos)} videos"
             )
+        _check_sizes(videos, path, cameras)
         return cameras
     if len(videos) % 2:
         raise ValueError(f"{len(videos)} videos: give two a trial, or their cameras with --cameras")
@@ -261,6 +267,20 @@ def _cameras(
             "metres, such as 58e-6"
         )
     return orthogonal_views(pixel_size, sizes[0])
+
+
+def _check_sizes(videos: Sequence[Path], path: Path, cameras: tuple[Camera, ...]) -> None:
+    """Make sure that each camera was calibrated with images of its video's size."""
+    from vibrissa.io import video_info
+
+    for i, video in enumerate(videos):
+        camera, info = cameras[i % len(cameras)], video_info(video)
+        if (info.width, info.height) != tuple(camera.size):
+            raise ValueError(
+                f"{video} is {info.width} × {info.height} pixels; {path} calibrates camera "
+                f"{camera.name!r} for {camera.size[0]} × {camera.size[1]}: calibrate with images "
+                "of the video's size, or give the videos in the cameras' order"
+            )
 
 
 def _trials(
@@ -315,6 +335,7 @@ def _beside(head: Path | None, contact: Path | None, thing: Path | None) -> dict
     from vibrissa.io import load_contact_points, load_head, load_recording
     from vibrissa.io.paths import NETCDF
     from vibrissa.io.table import read_text
+    from vibrissa.io.toml import in_file
     from vibrissa.trial import recorded_objects
     from vibrissa.trial.script import read_objects
 
@@ -334,7 +355,8 @@ def _beside(head: Path | None, contact: Path | None, thing: Path | None) -> dict
         if not beside["objects"]:
             raise ValueError(f"{thing} is a recording without objects")
     elif thing is not None:
-        beside["objects"] = read_objects(read_text(thing), thing.parent)
+        with in_file(thing):
+            beside["objects"] = read_objects(read_text(thing), thing.parent)
     return beside
 
 

@@ -15,15 +15,25 @@ know, has ``projection = "orthographic"`` besides, and pixels per unit on its ma
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from vibrissa.io.replace import replacing
+from vibrissa.io.toml import in_file, number_array, quoted, read_toml
 
 _NEEDED = ("size", "matrix", "rotation", "translation")
+_SHAPES = {"size": (2,), "matrix": (3, 3), "rotation": (3,), "translation": (3,), "distortions": ()}
+_NUMBERS = {
+    "size": "width and height",
+    "matrix": "three rows of three numbers",
+    "rotation": "three numbers",
+    "translation": "three numbers",
+    "distortions": "a list of numbers",
+}
 
 
 def read_calibration(path: str | PathLike[str]) -> list[dict[str, Any]]:
@@ -48,23 +58,38 @@ def read_calibration(path: str | PathLike[str]) -> list[dict[str, Any]]:
         If it is no TOML, tells of no cameras, or something of a camera is missing.
     """
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no file {path}")
-    try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is no TOML: {error}") from error
     cameras = []
-    for name, table in tables.items():
+    for name, table in read_toml(path).items():
         if not isinstance(table, dict) or name == "metadata":
             continue
         missing = [key for key in _NEEDED if key not in table]
         if missing:
             raise ValueError(f"{path}: [{name}] has no {', '.join(missing)}")
-        cameras.append({"name": name} | table)
+        with in_file(f"{path}: [{name}]"):
+            cameras.append({"name": name} | table | _checked(table))
     if not cameras:
         raise ValueError(f"{path} tells of no camera")
     return cameras
+
+
+def _checked(table: Mapping[str, Any]) -> dict[str, Any]:
+    """What is said of a camera in numbers, each of the shape that it needs."""
+    out: dict[str, Any] = {}
+    for key, shape in _SHAPES.items():
+        values = number_array(table.get(key, []), key)
+        if values.shape != shape and not (key == "distortions" and values.ndim == 1):
+            raise ValueError(f"{key} is {quoted(table[key])}; {_NUMBERS[key]} are needed")
+        if not np.isfinite(values).all():
+            raise ValueError(f"{key} is {quoted(table[key])}; its numbers must be finite")
+        out[key] = values.tolist()
+    kind = table.get("projection", "perspective")
+    if kind not in ("perspective", "orthographic"):
+        raise ValueError(f"projection is {quoted(kind)}; perspective or orthographic is needed")
+    width, height = out["size"]
+    if not (width % 1.0 == height % 1.0 == 0.0 and min(width, height) >= 1.0):
+        raise ValueError(f"size is {quoted(table['size'])}; whole numbers of pixels are needed")
+    out["size"] = [int(width), int(height)]
+    return out
 
 
 def write_calibration(path: str | PathLike[str], cameras: Sequence[Mapping[str, Any]]) -> None:

@@ -24,15 +24,15 @@ are in the channels' units.
 
 from __future__ import annotations
 
-import tomllib
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vibrissa.io.replace import replacing
-from vibrissa.io.table import read_text
+from vibrissa.io.toml import number_array, quoted, read_toml
 from vibrissa.sensing.frame import SensorFrame
 from vibrissa.sensing.sensor import Sensor
 
@@ -64,37 +64,88 @@ def load_sensor(path: str | PathLike[str]) -> Sensor:
         If it is no TOML, has unknown keys, or describes no sensor.
     """
     path = Path(path)
+    said = read_toml(path)
     try:
-        said = tomllib.loads(read_text(path))
-        frame, weight = said.get("frame", {}), said.get("weight", {})
-        for what, table, known in (
-            ("the file", said, _TOP),
-            ("[frame]", frame, _FRAME),
-            ("[weight]", weight, _WEIGHT),
-        ):
-            unknown = sorted(set(table) - known)
-            if unknown:
-                raise ValueError(
-                    f"{what} has {', '.join(unknown)}; it may have {', '.join(sorted(known))}"
-                )
-        given = {name: said[name] for name in (*_NUMBERS, *_OTHERS) if name in said}
-        how: dict[str, Any] = {"channels": said["channels"]} if "channels" in said else {}
-        sensor = Sensor(
-            **how,
-            mixing=said.get("mixing"),
-            **given,
-            frame=SensorFrame(**frame),
-            mass=weight.get("mass", 0.0),
-            mass_moment=weight.get("moment", (0.0, 0.0, 0.0)),
-        )
-        if "noise" not in said:
-            raise ValueError(
-                "noise is needed: the standard deviation of each channel, in its unit, or one "
-                "number for all; what is felt and how surely depends on it"
-            )
-        return sensor
-    except (tomllib.TOMLDecodeError, TypeError, ValueError) as error:
+        return _described(said)
+    except ValueError as error:
         raise ValueError(f"{path} describes no sensor: {error}") from error
+
+
+def _described(said: dict[str, Any]) -> Sensor:
+    """The sensor that a file describes."""
+    frame, weight = _table(said, "frame"), _table(said, "weight")
+    _only(said, _TOP, "the file")
+    _only(frame, _FRAME, "[frame]")
+    _only(weight, _WEIGHT, "[weight]")
+    how: dict[str, Any] = {}
+    if "channels" in said:
+        names = said["channels"]
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise ValueError(f"channels is {quoted(names)}; a list of names is needed")
+        how["channels"] = names
+    for name in ("mixing", *_NUMBERS, *_OTHERS):
+        if name in said:
+            how[name] = number_array(said[name], name)
+    if "relative_noise" in said:
+        how["relative_noise"] = _one(said["relative_noise"], "relative_noise")
+    reaction = frame.get("reaction", False)
+    if not isinstance(reaction, bool):
+        raise ValueError(f"reaction is {quoted(reaction)}; true or false is needed")
+    if "noise" not in said:
+        raise ValueError(
+            "noise is needed: the standard deviation of each channel, in its unit, or one "
+            "number for all; what is felt and how surely depends on it"
+        )
+    return Sensor(
+        **how,
+        frame=SensorFrame(
+            axes=_axes(frame.get("axes", ["x", "y", "z"])),
+            position=_three(frame.get("position", [0.0, 0.0, 0.0]), "position"),
+            reaction=reaction,
+        ),
+        mass=_one(weight.get("mass", 0.0), "mass"),
+        mass_moment=_three(weight.get("moment", [0.0, 0.0, 0.0]), "moment"),
+    )
+
+
+def _table(said: dict[str, Any], name: str) -> dict[str, Any]:
+    table = said.get(name, {})
+    if not isinstance(table, dict):
+        raise ValueError(f"{name} is {quoted(table)}; it is written as a table, [{name}]")
+    return table
+
+
+def _only(table: dict[str, Any], known: set[str], where: str) -> None:
+    unknown = sorted(set(table) - known)
+    if unknown:
+        raise ValueError(
+            f"{where} has {', '.join(unknown)}; it may have {', '.join(sorted(known))}"
+        )
+
+
+def _one(value: Any, name: str) -> float:
+    array = number_array(value, name)
+    if array.ndim:
+        raise ValueError(f"{name} is {quoted(value)}; one number is needed")
+    return float(array)
+
+
+def _three(value: Any, name: str) -> NDArray[np.float64]:
+    array = number_array(value, name)
+    if array.shape != (3,):
+        raise ValueError(f"{name} is {quoted(value)}; three numbers are needed")
+    return array
+
+
+def _axes(value: Any) -> Any:
+    """Axes by name as they are, or the numbers of a matrix."""
+    named = isinstance(value, list) and all(isinstance(name, str) for name in value)
+    if named or isinstance(value, str):
+        return value
+    axes = number_array(value, "axes")
+    if axes.shape != (3, 3):
+        raise ValueError(f"axes is {quoted(value)}; three names, or three rows of three numbers")
+    return axes
 
 
 def save_sensor(path: str | PathLike[str], sensor: Sensor) -> None:

@@ -10,6 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa.io.calibration import read_calibration, write_calibration
+from vibrissa.io.toml import in_file
 from vibrissa.trial.cameras import Camera
 
 Array = NDArray[np.float64]
@@ -43,19 +44,16 @@ def load_cameras(path: str | PathLike[str], unit: float = 1e-3) -> tuple[Camera,
     for table in read_calibration(path):
         kind = table.get("projection", "perspective")
         scale = np.diag([1.0 / unit, 1.0 / unit, 1.0]) if kind == "orthographic" else np.eye(3)
-        try:
-            turn = Rotation.from_rotvec(np.asarray(table["rotation"], np.float64)).as_matrix()
+        with in_file(path):
             camera = Camera(
-                matrix=np.asarray(table["matrix"], np.float64) @ scale,
-                rotation=turn,
-                translation=np.asarray(table["translation"], np.float64) * unit,
-                distortion=np.asarray(table.get("distortions", ()), np.float64),
-                size=tuple(table["size"]),
+                matrix=np.asarray(table["matrix"]) @ scale,
+                rotation=Rotation.from_rotvec(table["rotation"]).as_matrix(),
+                translation=np.asarray(table["translation"]) * unit,
+                distortion=np.asarray(table["distortions"]),
+                size=(table["size"][0], table["size"][1]),
                 projection=kind,
                 name=str(table["name"]),
             )
-        except (TypeError, ValueError, IndexError) as error:
-            raise ValueError(f"{path}: camera {table['name']!r}: {error}") from error
         cameras.append(camera)
     return tuple(cameras)
 

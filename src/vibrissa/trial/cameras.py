@@ -25,6 +25,7 @@ SIZE = (1024, 1024)
 
 _COEFFICIENTS = 8
 _ROUNDS = 20
+_SINGULAR = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +52,8 @@ class Camera:
     Raises
     ------
     ValueError
-        If a shape is wrong, a number is not finite, or R is no rotation.
+        If a shape is wrong, a number is not finite, a focal length is zero, the last row of K is
+        not (0, 0, 1), or R is no rotation.
     """
 
     matrix: Array
@@ -83,6 +85,7 @@ class Camera:
         if self.projection == "orthographic" and bent.any():
             faults.append("an orthographic camera has no distortion")
         if not faults:
+            faults += _faults_of_matrix(self.matrix)
             turn = self.rotation
             if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-5 or np.linalg.det(turn) < 0.0:
                 faults.append("rotation is no rotation; a mirror is a negative focal length")
@@ -158,6 +161,18 @@ class Camera:
         ahead = np.concatenate([flat, np.ones_like(flat[..., :1])], axis=-1) @ self.rotation
         center = np.broadcast_to(-self.translation @ self.rotation, ahead.shape).copy()
         return center, ahead / np.linalg.norm(ahead, axis=-1, keepdims=True)
+
+
+def _faults_of_matrix(matrix: Array) -> list[str]:
+    """What makes that a matrix has no rays."""
+    if not np.array_equal(matrix[2], (0.0, 0.0, 1.0)):
+        row = ", ".join(f"{value:g}" for value in matrix[2])
+        return [f"the last row of matrix is ({row}), not (0, 0, 1): is it transposed?"]
+    focal = matrix[:2, :2]
+    size = np.linalg.norm(focal, axis=1)
+    if not size.all() or abs(np.linalg.det(focal / size[:, None])) < _SINGULAR:
+        return [f"focal lengths are {focal[0, 0]:g} and {focal[1, 1]:g}; neither may be zero"]
+    return []
 
 
 def orthogonal_views(

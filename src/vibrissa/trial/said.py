@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vibrissa.io.table import read_text, table_rows
+from vibrissa.io.toml import number_array, quoted
 from vibrissa.whisker.emergence import base_rotation
 
 Array = NDArray[np.float64]
@@ -32,27 +33,25 @@ def subtable(said: Mapping[str, Any], name: str) -> Mapping[str, Any]:
     """Give what is said in a table, [name]."""
     table = said.get(name, {})
     if not isinstance(table, Mapping):
-        raise ValueError(f"{name} is {table!r}; it is written as a table, [{name}]")
+        raise ValueError(f"{name} is {quoted(table)}; it is written as a table, [{name}]")
     return table
 
 
 def number(said: Mapping[str, Any], name: str, default: float) -> float:
-    """Give a number."""
+    """Give a number, finite if it is said."""
     value = said.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f"{name} is {value!r}; a number is needed")
-    return float(value)
+    array = number_array(value, name)
+    if array.ndim or (name in said and not np.isfinite(array)):
+        raise ValueError(f"{name} is {quoted(value)}; a number is needed")
+    return float(array)
 
 
 def three(said: Mapping[str, Any], name: str, default: Any = None) -> Array:
     """Give three numbers."""
-    value = said.get(name, default)
-    try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        array = np.empty(0)
-    if array.shape != (3,):
-        raise ValueError(f"{name} is {value!r}; three numbers are needed")
+    value = said.get(name, [] if default is None else list(default))
+    array = number_array(value, name)
+    if array.shape != (3,) or not np.isfinite(array).all():
+        raise ValueError(f"{name} is {quoted(value)}; three numbers are needed")
     return array
 
 

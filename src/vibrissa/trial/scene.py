@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vibrissa.io.toml import quoted
 from vibrissa.rod.surface import Surface
 from vibrissa.trial.array_motion import head_path, shared_whisking
 from vibrissa.trial.mesh import Mesh
@@ -43,7 +44,7 @@ def object_of(said: Any, folder: Path) -> Surface:
         If it is of no known kind, has unknown keys, or says what cannot be.
     """
     if not isinstance(said, Mapping):
-        raise ValueError(f"an object is {said!r}; it is written as [[object]]")
+        raise ValueError(f"an object is {quoted(said)}; it is written as [[object]]")
     kind = said.get("kind", "peg")
     keys = {
         "peg": {"position", "axis", "diameter"},
@@ -52,8 +53,8 @@ def object_of(said: Any, folder: Path) -> Surface:
         "box": {"position", "size", "angles", "edge_radius"},
         "mesh": {"file", "unit", "resolution"},
     }
-    if kind not in keys:
-        raise ValueError(f"an object's kind is {kind!r}; one of {', '.join(keys)} is needed")
+    if not isinstance(kind, str) or kind not in keys:
+        raise ValueError(f"an object's kind is {quoted(kind)}; one of {', '.join(keys)} is needed")
     only(said, keys[kind] | {"kind", "stiffness"}, f"an object of kind {kind}")
     stiffness = number(said, "stiffness", np.inf)
     if kind == "mesh":
@@ -130,7 +131,7 @@ def motion_of(
     if kind == "past" and isinstance(first, Peg | Sphere | Box):
         return sweep_past(whisker, first, duration, rate, row=row, seed=seed, **how)
     if kind not in ("past", "whisking"):
-        raise ValueError(f"the motion's kind is {kind!r}; past, whisking or table is needed")
+        raise ValueError(f"the motion's kind is {quoted(kind)}; past, whisking or table is needed")
     return whisking(duration, rate, row=row, seed=seed, **how)
 
 
@@ -164,7 +165,9 @@ def array_motion_of(
     if kind == "table":
         return _tabulated(said, folder, rate)
     if kind != "whisking":
-        raise ValueError(f"the motion of an array is of kind {kind!r}; whisking or table is needed")
+        raise ValueError(
+            f"the motion of an array is of kind {quoted(kind)}; whisking or table is needed"
+        )
     only(said, {*_DEGREES, *_SHARES, "position_drift"}, "[motion] of an array")
     return shared_whisking(duration, rate, seed=seed, **_numbers(said, _DEGREES))
 

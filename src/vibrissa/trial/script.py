@@ -5,7 +5,6 @@ The text is TOML, and everything in it may be left out. `EXAMPLE` has all of it.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from vibrissa.io.array import load_array
+from vibrissa.io.toml import parsed_toml
 from vibrissa.rod.surface import Surface
 from vibrissa.sensing import COMPONENTS, Sensor
 from vibrissa.trial.array_motion import protracted
@@ -25,6 +25,7 @@ from vibrissa.trial.said import number, only, subtable
 from vibrissa.trial.scene import array_motion_of, head_of, motion_of, object_of
 from vibrissa.whisker import Whisker, WhiskerArray, whisker_array
 
+_MOST_FRAMES = 10_000_000
 EXAMPLE = """\
 # A trial for `vibrissa simulate`: lengths in mm, angles in degrees, forces in µN, moments in µN·m.
 # What is left out has the value shown here, unless something else is said.
@@ -166,7 +167,7 @@ def read_script(
     ValueError
         If it is no TOML, has unknown keys, or says what cannot be.
     """
-    said = _parsed(text)
+    said = parsed_toml(text)
     given = {name: value for name, value in changes.items() if value is not None}
     said |= {k: given[k] for k in ("duration", "rate", "friction", "seed") if k in given}
     only(said, _TOP, "the trial")
@@ -181,6 +182,11 @@ def read_script(
     seed = int(number(said, "seed", 0.0))
     usual = 3.5 if isinstance(whisker, Whisker) else 0.5
     duration, rate = number(said, "duration", usual), number(said, "rate", 1000.0)
+    if not 0.0 < duration * rate <= _MOST_FRAMES:
+        raise ValueError(
+            f"duration is {duration:g} s and rate {rate:g} frames/s; both are positive, and a "
+            f"trial has up to {_MOST_FRAMES:,} frames"
+        )
     head = subtable(said, "head")
     motion: Motion | Mapping[str, Motion]
     if isinstance(whisker, Whisker):
@@ -269,17 +275,10 @@ def read_objects(text: str, folder: Path) -> tuple[Surface, ...]:
     ValueError
         If it is no TOML, has no object, or an object says what cannot be.
     """
-    things = _parsed(text).get("object", [])
+    things = parsed_toml(text).get("object", [])
     if not isinstance(things, list) or not things:
         raise ValueError("there is no object; one is written as [[object]], in double brackets")
     return tuple(object_of(thing, folder) for thing in things)
-
-
-def _parsed(text: str) -> dict[str, Any]:
-    try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"the trial is no TOML: {error}") from None
 
 
 def _dynamics(said: Mapping[str, Any], wanted: bool) -> Dynamics | None:

@@ -9,6 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from vibrissa.cli.app import app
+from vibrissa.io import write_video
 from vibrissa.io.table import read_text
 from vibrissa.io.toml import in_file
 from vibrissa.sensing import Sensor, SensorFrame, load_sensor, save_sensor
@@ -166,3 +168,83 @@ def test_what_is_damaged_is_said_in_a_line_with_the_files_name(
     except (ValueError, FileNotFoundError) as fault:
         said = str(fault)
     assert said is None or (str(path) in said and "\n" not in said and len(said) < 600)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("[900.0, 0.0, 320.0]", "[0.0, 0.0, 320.0]", "focal lengths are 0 and 905; neither may be"),
+        ("[0.0, 905.0, 240.0]", "[900.0, 0.0, 240.0]", "neither may be zero"),
+        ("[0.0, 0.0, 1.0]]\ndistortions = [0.1", "[9.0, 0.0, 1.0]]\ndistortions = [0.1", "transp"),
+        ("size = [640, 480]", "size = [640.5, 480]", "size is [640.5, 480]; whole numbers"),
+        ("size = [640, 480]", "size = [640]", "size is [640]; width and height are needed"),
+        ("translation = [10.0, -20.0, 300.0]", "translation = 3", "three numbers are needed"),
+        ('projection = "orthographic"', 'projection = "flat"', "perspective or orthographic"),
+    ],
+)
+def test_what_is_wrong_with_a_camera_is_said(originals, tmp_path, old, new, said):
+    text = originals["cameras"].decode()
+    assert old in text
+    path = tmp_path / "cameras.toml"
+    path.write_text(text.replace(old, new))
+    with pytest.raises(ValueError, match=re.escape(said)) as raised:
+        load_cameras(path)
+    assert str(path) in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("noise = true", "noise is True; numbers"),
+        ("noise = [[1], [1, 2]]", "noise is [[1], [1, 2]]; numbers"),
+        ("noise = 1\n[frame]\nreaction = 'no'", "reaction is 'no'; true or false is needed"),
+        ("noise = 1\nframe = 3", "frame is 3; it is written as a table, [frame]"),
+        ("noise = 1\n[weight]\nmass = [1]", "mass is [1]; one number is needed"),
+        ("noise = 1\nchannels = [1, 2]", "channels is [1, 2]; a list of names is needed"),
+        ("noise = 1\nrelative_noise = 1" + 400 * "0", "relative_noise is 1000"),
+    ],
+)
+def test_what_is_wrong_with_a_sensor_is_said(tmp_path, text, said):
+    path = tmp_path / "sensor.toml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=re.escape(said)) as raised:
+        load_sensor(path)
+    assert str(raised.value).startswith(f"{path} describes no sensor")
+
+
+def test_cameras_that_do_not_fit_the_videos_are_refused(tmp_path):
+    """One camera for two videos, and cameras that were calibrated with larger images."""
+    for name in ("top", "front"):
+        write_video(tmp_path / f"{name}.mkv", np.zeros((3, 64, 64), np.uint8), rate=25.0)
+    videos = [tmp_path / "top.mkv", tmp_path / "front.mkv"]
+
+    def fault(views):
+        save_cameras(tmp_path / "cameras.toml", views)
+        words = ["track", *videos, "--cameras", tmp_path / "cameras.toml", "--fps", 500]
+        words += ["-o", tmp_path / "trial.nc"]
+        result = typer_testing.CliRunner().invoke(app, [str(word) for word in words])
+        assert isinstance(result.exception, ValueError), result.exception
+        return str(result.exception)
+
+    said = fault(orthogonal_views(size=(64, 64))[:1])
+    assert "cameras.toml tells of one camera, 'top'" in said
+    said = fault(orthogonal_views(size=(64, 48)))
+    assert f"{videos[0]} is 64 × 64 pixels" in said
+    assert "calibrates camera 'top' for 64 × 48" in said
+
+
+@pytest.mark.parametrize(("verb", "option"), [("simulate", "--script"), ("track", "--object")])
+def test_a_verb_names_the_file_that_is_wrong(tmp_path, verb, option):
+    path = tmp_path / "said.toml"
+    path.write_text("[[object]]\nkind = 'egg'\n")
+    words = [verb, option, path]
+    if verb == "track":
+        for name in ("top", "front"):
+            write_video(tmp_path / f"{name}.mkv", np.zeros((3, 64, 64), np.uint8), rate=25.0)
+            words.append(tmp_path / f"{name}.mkv")
+        words += ["--fps", 500]
+    else:
+        words = [verb, path]
+    words += ["-o", tmp_path / "trial.nc"]
+    result = typer_testing.CliRunner().invoke(app, [str(word) for word in words])
+    assert str(result.exception).startswith(f"{path}: an object's kind is 'egg'")

@@ -100,7 +100,8 @@ def test_info_of_videos_and_calibrations(tmp_path):
         assert part in said
     path = tmp_path / "calibration.toml"
     path.write_text(
-        '[cam_0]\nname = "top"\nsize = [1024, 768]\nmatrix = []\nrotation = []\ntranslation = []\n'
+        '[cam_0]\nname = "top"\nsize = [1024, 768]\nrotation = [0, 0, 0]\n'
+        "matrix = [[900, 0, 512], [0, 900, 384], [0, 0, 1]]\ntranslation = [0, 0, 300]\n"
     )
     assert "top 1024 × 768 pixels, perspective" in info(path)
 

@@ -95,7 +95,9 @@ def in_file(path: object) -> Iterator[None]:
         raise ValueError(f"{path}: {error}") from error
 
 
-def number_array(value: Any, name: str) -> NDArray[np.float64]:
+def number_array(
+    value: Any, name: str, needed: str = "numbers, or lists of as many each, are needed"
+) -> NDArray[np.float64]:
     """Take a number, or lists of them, from what TOML says.
 
     Parameters
@@ -104,6 +106,8 @@ def number_array(value: Any, name: str) -> NDArray[np.float64]:
         As it was read.
     name : str
         What it is, for the message.
+    needed : str
+        What is needed instead, for the message.
 
     Returns
     -------
@@ -120,7 +124,7 @@ def number_array(value: Any, name: str) -> NDArray[np.float64]:
             return np.array(value, dtype=np.float64)
     except (ValueError, OverflowError):  # lists of different lengths, or 1 with 400 zeros
         pass
-    raise ValueError(f"{name} is {quoted(value)}; numbers, or lists of as many each, are needed")
+    raise ValueError(f"{name} is {quoted(value)}; {needed}")
 
 
 def quoted(value: object) -> str:

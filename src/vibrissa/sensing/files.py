@@ -91,12 +91,7 @@ def _described(said: dict[str, Any]) -> Sensor:
     reaction = frame.get("reaction", False)
     if not isinstance(reaction, bool):
         raise ValueError(f"reaction is {quoted(reaction)}; true or false is needed")
-    if "noise" not in said:
-        raise ValueError(
-            "noise is needed: the standard deviation of each channel, in its unit, or one "
-            "number for all; what is felt and how surely depends on it"
-        )
-    return Sensor(
+    sensor = Sensor(
         **how,
         frame=SensorFrame(
             axes=_axes(frame.get("axes", ["x", "y", "z"])),
@@ -106,6 +101,12 @@ def _described(said: dict[str, Any]) -> Sensor:
         mass=_one(weight.get("mass", 0.0), "mass"),
         mass_moment=_three(weight.get("moment", [0.0, 0.0, 0.0]), "moment"),
     )
+    if "noise" not in said:
+        raise ValueError(
+            "noise is needed: the standard deviation of each channel, in its unit, or one "
+            "number for all; what is felt and how surely depends on it"
+        )
+    return sensor
 
 
 def _table(said: dict[str, Any], name: str) -> dict[str, Any]:

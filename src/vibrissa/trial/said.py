@@ -16,6 +16,7 @@ from vibrissa.whisker.emergence import base_rotation
 Array = NDArray[np.float64]
 
 MM = 1e-3
+_THREE = "three numbers are needed"
 COLUMNS = ("time", "azimuth", "elevation", "roll", "x", "y", "z")
 """Columns of a table of motion."""
 
@@ -40,7 +41,7 @@ def subtable(said: Mapping[str, Any], name: str) -> Mapping[str, Any]:
 def number(said: Mapping[str, Any], name: str, default: float) -> float:
     """Give a number, finite if it is said."""
     value = said.get(name, default)
-    array = number_array(value, name)
+    array = number_array(value, name, "a number is needed")
     if array.ndim or (name in said and not np.isfinite(array)):
         raise ValueError(f"{name} is {quoted(value)}; a number is needed")
     return float(array)
@@ -48,10 +49,10 @@ def number(said: Mapping[str, Any], name: str, default: float) -> float:
 
 def three(said: Mapping[str, Any], name: str, default: Any = None) -> Array:
     """Give three numbers."""
-    value = said.get(name, [] if default is None else list(default))
-    array = number_array(value, name)
+    value = said.get(name, default)
+    array = number_array(list(value) if isinstance(value, tuple) else value, name, _THREE)
     if array.shape != (3,) or not np.isfinite(array).all():
-        raise ValueError(f"{name} is {quoted(value)}; three numbers are needed")
+        raise ValueError(f"{name} is {quoted(value)}; {_THREE}")
     return array
 
 

@@ -19,6 +19,7 @@ def test_numbers_stored_in_files_keep_their_meaning():
         "TOO_PROXIMAL": 12,
         "NOT_CONVERGED": 13,
         "MISSING": 14,
+        "TOO_STRONG": 15,
         "UNIQUE": 20,
         "AMBIGUOUS": 21,
         "NOT_FRICTIONLESS": 22,

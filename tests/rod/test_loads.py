@@ -120,3 +120,72 @@ def test_loads_stay_as_they_were_given(parabola):
     before = vb.deflect(parabola, load).force
     point[:] = 0.0
     np.testing.assert_array_equal(vb.deflect(parabola, load).force, before)
+
+
+# Input that no measurement has, but that a file may.
+
+
+@pytest.mark.parametrize("far", [1e10, 1e155, 1e300, 1.7e308])
+def test_a_point_at_the_end_of_the_world_is_out_of_reach(gamma, far):
+    points = gamma.position(np.array([0.5, 0.5, 0.7]) * gamma.length)
+    points[1] = [far, -far, far]
+    status = vb.deflect(gamma, vb.PointContact(points)).status
+    assert status[0] == status[2] == vb.Status.OK
+    assert status[1] in (vb.Status.BEYOND_FOLD, vb.Status.BEYOND_TIP)
+
+
+@pytest.mark.parametrize("far", [1e155, 1e300])
+def test_pegs_of_any_size_have_a_status(gamma, far):
+    load = vb.PegContact([[far, 0, 0], [0.02, far, 0], [0.02, 0.005, far]], [0, 0, far])
+    reasons = (vb.Status.NO_CONTACT, vb.Status.BEYOND_FOLD, vb.Status.BEYOND_TIP)
+    assert np.isin(vb.deflect(gamma, load).status[:2], reasons).all()
+    short = vb.PegContact([0.02, 0.005, 0.0], [0, 0, 1 / far], side=[0, 1 / far, 0])
+    same = vb.PegContact([0.02, 0.005, 0.0], [0, 0, 1], side=[0, 1, 0])
+    np.testing.assert_array_equal(vb.deflect(gamma, short).force, vb.deflect(gamma, same).force)
+
+
+def test_what_is_masked_is_missing(gamma):
+    points = np.stack([gamma.position(0.6 * gamma.length)] * 3)
+    hidden = np.zeros((3, 3), dtype=bool)
+    hidden[1], hidden[2, 1] = True, True
+    ok, missing = vb.Status.OK, vb.Status.MISSING
+    bent = vb.deflect(gamma, vb.PointContact(np.ma.masked_array(points, hidden)))
+    np.testing.assert_array_equal(bent.status, [ok, missing, missing])
+    force = np.ma.masked_array([1e-6, 1e-6], [False, True])
+    bent = vb.deflect(gamma, vb.PointForce(0.5 * gamma.length, force, 0.0))
+    np.testing.assert_array_equal(bent.status, [ok, missing])
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        np.ones(3, dtype=complex),
+        np.array(["1", "2", "3"]),
+        np.array(["2026-01-01"] * 3, dtype="M8[s]"),
+        [True, False, True],
+        [10**400, 0, 0],
+    ],
+)
+def test_what_is_no_number_is_refused(points):
+    with pytest.raises(ValueError, match="points must be numbers; got"):
+        vb.PointContact(points)
+
+
+@pytest.mark.parametrize("steps", [3, -1, 36.5, 10**9, np.nan])
+def test_steps_are_a_whole_number_within_bounds(gamma, steps):
+    with pytest.raises(ValueError, match="whole number from 4 to"):
+        vb.deflect(gamma, vb.PointForce(0.02, 1e-6, 0.0), steps=steps)
+
+
+@pytest.mark.parametrize(("ratio", "bend"), [(262.0, 0.5), (976.0, 2.0), (1e4, 1.0)])
+def test_needles_are_touched_like_other_whiskers(ratio, bend):
+    """So thin at the tip that its fold is beyond what can be integrated."""
+    curvature = np.array([0.0, 0.0, bend]) / 0.04
+    whisker = vb.Whisker.from_curvature(
+        0.04, lambda s: curvature + 0.0 * np.asarray(s)[..., None], tip_radius=100e-6 / ratio
+    )
+    s = np.linspace(0.31, 0.99, 20) * whisker.length
+    points = whisker.position(s) + 1e-6 * whisker.frame(s)[:, :, 1]
+    bent = vb.deflect(whisker, vb.PointContact(points))
+    np.testing.assert_array_equal(bent.status, vb.Status.OK)
+    np.testing.assert_allclose(bent.arc_length, s, rtol=0, atol=2e-6)

@@ -6,8 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import vibrissa as vb
-from vibrissa.rod.batch import solve_forces
+from vibrissa.rod.batch import contact_tangents, solve_forces
 from vibrissa.rod.discretize import discretize
+from vibrissa.rod.reach import fold_forces, reach
 
 few = settings(max_examples=15)
 OK, TIP, FREE = vb.Status.OK, vb.Status.TIP_CONTACT, vb.Status.NO_CONTACT
@@ -62,6 +63,33 @@ def test_a_line_through_a_contact_holds_it_if_the_force_is_normal_to_it(gamma, l
     axis /= sizes(axis)[:, None]
     assert (np.abs(np.einsum("ni,ni->n", held.force, axis)) <= 1e-9 * sizes(held.force)).all()
     assert (sizes(across(held.contact_point - pushed.contact_point, axis)) <= 1e-10 * 0.04).all()
+
+
+def test_a_line_near_the_tip_holds_the_bent_whisker(whisker):
+    """Moved along its force it would pass by the tip of the resting whisker, without a touch."""
+    d, rng = discretize(whisker), np.random.default_rng(17)
+    n = 300
+    s, bearing = rng.uniform(0.97, 0.999, n), rng.uniform(-np.pi, np.pi, n)
+    contacts = np.stack([s, 0.0 * s, np.cos(bearing), np.sin(bearing)], axis=-1)
+    share = rng.uniform(0.02, 0.2, n) * fold_forces(reach(whisker).fold, contacts[:, [0, 2, 3]])
+    contacts[:, 2:] *= share[:, None]
+    pushed = vb.deflect(whisker, vb.PointForce(s * d.length, share * d.force, bearing))
+    along = contact_tangents(d, contacts)
+    axis = np.cross(pushed.force / sizes(pushed.force)[:, None], along)
+    axis += rng.uniform(-0.8, 0.8, (n, 1)) * along
+    held = vb.deflect(whisker, vb.PegContact(pushed.contact_point, axis, side=pushed.force))
+    np.testing.assert_array_equal(held.status, OK)
+    np.testing.assert_allclose(held.arc_length, pushed.arc_length, rtol=0, atol=1e-8 * d.length)
+    assert (sizes(held.force - pushed.force) <= 1e-6 * sizes(pushed.force)).all()
+
+
+def test_a_line_beyond_the_tip_holds_nothing(whisker):
+    frame, tip = whisker.frame(whisker.length), whisker.position(whisker.length)
+    beyond = tip + np.array([[1e-5], [1e-3], [1e-2]]) * frame[:, 0]
+    for axis, side in ((frame[:, 2], frame[:, 1]), (frame[:, 1], frame[:, 2])):
+        for push in (side, -side):
+            bent = vb.deflect(whisker, vb.PegContact(beyond, axis, side=push))
+            np.testing.assert_array_equal(bent.status, FREE)
 
 
 def test_a_line_folds_at_half_the_force_at_which_a_point_does(straight):

@@ -32,6 +32,9 @@ from vibrissa.status import Status, counted, describe
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
 
+# Lengths beyond this (over L) are as good as this: their squares would overflow.
+_FARTHEST = 1e100
+
 
 @dataclass(frozen=True, eq=False)
 class Deflection:
@@ -194,7 +197,9 @@ def deflect(
         return replace(dimensional(whisker, load, d, solved, steps), _needed=needed)
     if isinstance(load, PointContact):
         solver = point_solver(whisker, proximal, steps)
-        solved = solver.solve(np.asarray(load.points).reshape(-1, 3) / d.length)
+        with np.errstate(over="ignore"):
+            points = np.asarray(load.points).reshape(-1, 3) / d.length
+        solved = solver.solve(points)
     elif isinstance(load, PegContact):
         solved = _by_peg(whisker, d, load, proximal, steps)
     else:
@@ -226,9 +231,11 @@ def _by_force(
 
 
 def _rows(load: PegContact, length: float) -> Pegs:
-    radius = np.asarray(load.radius).reshape(-1) / length
+    with np.errstate(over="ignore"):
+        radius = np.minimum(np.asarray(load.radius).reshape(-1) / length, _FARTHEST)
+        origin = np.asarray(load.origin).reshape(-1, 3) / length
     return Pegs(
-        np.asarray(load.origin).reshape(-1, 3) / length,
+        np.clip(origin, -_FARTHEST, _FARTHEST),
         np.array(load.axis, dtype=np.float64).reshape(-1, 3),
         np.where(radius == 0.0, -1.0, radius),
     )

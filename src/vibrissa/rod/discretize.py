@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 #: Steps along a whisker: base force and contact point within 1e-6 (relative) of the exact solution
 #: while the tangent turns by less than about 65°, within 1e-4 up to slip-off.
 STEPS = 36
+#: More steps than this only add rounding.
+MOST_STEPS = 2**8 * STEPS
 # A corkscrew needs more: as many steps as keep the rest whisker's turning per step below this
 # (rad).
 _TURN_PER_STEP = 0.08
@@ -79,9 +81,9 @@ def discretize(whisker: Whisker, steps: int = STEPS) -> Discretization:
     Discretization
         Cached per whisker (whiskers are immutable and compared by identity).
     """
-    if steps < 4:
-        raise ValueError(f"steps is {steps}; at least 4 are needed")
-    length = whisker.length
+    if not 4 <= steps <= MOST_STEPS or int(steps) != steps:
+        raise ValueError(f"steps is {steps}; it must be a whole number from 4 to {MOST_STEPS}")
+    steps, length = int(steps), whisker.length
     nodes = _nodes(whisker, steps)
     width = np.diff(nodes)
     fractions = (np.polynomial.legendre.leggauss(_ORDER)[0] + 1.0) / 2.0

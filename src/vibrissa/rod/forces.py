@@ -15,7 +15,7 @@ import numpy as np
 
 from vibrissa.rod.arrays import AnyArray, Array, IntArray
 from vibrissa.rod.batch import solve_forces
-from vibrissa.rod.discretize import discretize
+from vibrissa.rod.discretize import MOST_STEPS, discretize
 
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 _KEPT = 1e-6
 # What shorter steps may change, relative to the force and to L.
 _SETTLED = 1e-4
-# Forces that so many halvings of the steps do not settle are too strong.
-_HALVINGS = 8
 
 
 def solve_known_forces(
@@ -59,14 +57,12 @@ def solve_known_forces(
         kept = np.abs(np.linalg.norm(values[:, :3], axis=1) - size) <= _KEPT * size
         scale = np.where(np.arange(6) < 3, size[:, None], 1.0)
         rows = np.flatnonzero(~kept)
-        for _ in range(_HALVINGS):
-            if not rows.size:
-                break
+        while rows.size and 2 * steps <= MOST_STEPS:
             steps *= 2
             finer = solve_forces(discretize(whisker, steps), contacts[rows])[0]
             settled = (np.abs(finer - values[rows]) <= _SETTLED * scale[rows]).all(axis=1)
             rows, finer = rows[~settled], finer[~settled]
-            values[rows], needed[rows] = finer, 2 * steps
+            values[rows], needed[rows] = finer, min(2 * steps, MOST_STEPS)
     good = np.ones(len(contacts), dtype=bool)
     good[rows] = False
     return values, needed, good

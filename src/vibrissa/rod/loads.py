@@ -15,11 +15,21 @@ if TYPE_CHECKING:
 
 
 def _numbers(name: str, value: ArrayLike, vector: bool) -> Array:
-    """Return float64, (..., 3) for vectors; raise a ValueError that says what is wrong."""
+    """Return float64, (..., 3) for vectors; raise a ValueError that says what is wrong.
+
+    What is masked becomes NaN: it is missing.
+    """
+    kind = type(value).__name__
+    if hasattr(value, "dtype"):
+        kind += f" of {value.dtype}"
     try:
+        if np.asarray(value).dtype.kind not in "iufO":
+            raise TypeError
+        if isinstance(value, np.ma.MaskedArray):
+            value = value.astype(np.float64).filled(np.nan)
         array = np.array(value, dtype=np.float64)  # a copy: the caller may go on using theirs
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be numbers; got {type(value).__name__}") from error
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"{name} must be numbers; got {kind}") from error
     if vector and (array.ndim == 0 or array.shape[-1] != 3):
         raise ValueError(f"{name} must have shape (..., 3); got {array.shape}")
     if np.isinf(array).any():
@@ -27,6 +37,14 @@ def _numbers(name: str, value: ArrayLike, vector: bool) -> Array:
             f"{name} has {int(np.isinf(array).sum())} infinite values; NaN means missing"
         )
     return array
+
+
+def _directions(vectors: Array) -> Array:
+    """Unit vectors; (0, 0, 0) stays as it is. No square overflows or vanishes."""
+    largest = np.abs(vectors).max(axis=-1, keepdims=True)
+    scaled = vectors / np.where(largest > 0.0, largest, 1.0)
+    length = np.linalg.norm(scaled, axis=-1, keepdims=True)
+    return np.asarray(scaled / np.where(length > 0.0, length, 1.0))
 
 
 def _broadcast(**shapes: tuple[int, ...]) -> tuple[int, ...]:
@@ -41,8 +59,9 @@ def _broadcast(**shapes: tuple[int, ...]) -> tuple[int, ...]:
 class PointForce:
     """A known force at a known place of the whisker.
 
-    Any such force has exactly one equilibrium, and that is what is given; whether an object there
-    could hold it, or the whisker would slip off, is not asked.
+    Any such force has exactly one equilibrium that grows from rest with the force, and that is what
+    is given; whether an object there could hold it, or the whisker would slip off, is not asked.
+    Only a force that winds the whisker up in waves too short to compute gets a status instead.
 
     Parameters
     ----------
@@ -82,12 +101,8 @@ class PointForce:
             size = _numbers("magnitude", self.magnitude, vector=False)
             angle = _numbers("direction", self.direction, vector=False)
             _broadcast(arc_length=s.shape, magnitude=size.shape, direction=angle.shape)
-            force = np.stack(
-                np.broadcast_arrays(
-                    0.0 * (size + angle), size * np.cos(angle), size * np.sin(angle)
-                ),
-                axis=-1,
-            )
+            across = size * np.cos(angle), size * np.sin(angle)
+            force = np.stack(np.broadcast_arrays(0.0 * across[0], *across), axis=-1)
         else:
             parts = self.components
             if isinstance(parts, tuple):
@@ -119,12 +134,12 @@ class PointContact:
     Parameters
     ----------
     points : array_like
-        Contact points in the whisker frame, m, shape (..., 3); NaN means missing.
+        Contact points in the whisker frame, m, shape (..., 3); NaN or masked means missing.
 
     Raises
     ------
     ValueError
-        If the shape is wrong or a coordinate is infinite.
+        If the shape is wrong, or a coordinate is infinite or not a number.
     """
 
     points: Any
@@ -187,18 +202,17 @@ class PegContact:
             )
         if (radius == 0.0).any() != (radius == 0.0).all():
             raise ValueError("lines (radius 0) and cylinders do not mix in one load: give two")
-        length = np.linalg.norm(axis, axis=-1, keepdims=True)
-        if (length == 0.0).any():
+        axis = _directions(axis)
+        if (axis == 0.0).all(axis=-1).any():
             raise ValueError("a peg's axis must not be (0, 0, 0)")
         if self.side is not None and self.start is not None:
             raise ValueError("give a PegContact either side or start: start already tells the side")
         if self.side is not None:
-            side = _numbers("side", self.side, vector=True)
+            side = _directions(_numbers("side", self.side, vector=True))
             shapes["side"] = side.shape[:-1]
             toward, along = np.broadcast_arrays(side, axis)
             across = np.cross(toward, along)
-            bound = 1e-9 * np.linalg.norm(side, axis=-1) * length[..., 0]
-            if (np.linalg.norm(across, axis=-1) <= bound).any():
+            if (np.linalg.norm(across, axis=-1) <= 1e-9).any():
                 raise ValueError("side must not be (0, 0, 0) or along the peg's axis")
         if self.start is not None:
             if not isinstance(getattr(self.start, "load", None), PegContact):
@@ -207,7 +221,7 @@ class PegContact:
             shapes["start"] = self.start.status.shape
         shape = _broadcast(**shapes)
         object.__setattr__(self, "origin", np.broadcast_to(origin, (*shape, 3)))
-        object.__setattr__(self, "axis", np.broadcast_to(axis / length, (*shape, 3)))
+        object.__setattr__(self, "axis", np.broadcast_to(axis, (*shape, 3)))
         object.__setattr__(self, "radius", np.broadcast_to(radius, shape))
         if self.side is not None:
             object.__setattr__(self, "side", np.broadcast_to(side, (*shape, 3)))

@@ -50,13 +50,15 @@ _NEAR = 0.01
 _FACE = 65
 # Points along the resting whisker, as a polygon.
 _RESTING = 33
-# A contact up to here, in the chart's ρ, is light.
-_LIGHT = 0.25
+# Points this near to the resting whisker (over L) are solved from there. Contacts with more than
+# this share of the fold's force, in ρ, are not light.
+_LIGHT = 1e-3
+_HEAVY = 0.25
 # Seeds nearer than this to each other, in η and ρ, lead to the same solution.
 _APART = 0.05
 # Starts that are followed for one point, and how near to the fold they are at most, in ρ.
 _STARTS = 8
-_SHORT_OF_FOLD = 0.95
+_SHORT_OF_FOLD = 0.99
 # Residual of a point that was reached, if only at a fold.
 _REACHED = 1e-9
 # Coordinates beyond this (over L) are as far out of reach as this; their squares might overflow.
@@ -138,13 +140,33 @@ def _touch(resting: Array, point: Array) -> tuple[float, float]:
 
 
 @inlined
+def _light_touch(resting: Array, point: Array) -> float:
+    """Arc length at which the resting whisker is nearest to a point very near to it; else 0."""
+    if not _near_rest(resting, point):
+        return 0.0
+    touch, distance = _touch(resting, point)
+    return touch if distance < _LIGHT * _LIGHT else 0.0
+
+
+@inlined
+def _best(found: Array, quality: IntArray, n: int) -> int:
+    """Which seed to begin with: of two near the fold that of less force is the stable one."""
+    best = 0
+    for i in range(1, n):
+        better = quality[i] > quality[best]
+        if better or (quality[i] == quality[best] and found[i, 2] < found[best, 2]):
+            best = i
+    return best
+
+
+@inlined
 def _in_doubt(fold: Fold, resting: Array, point: Array, found: Array, n: int, best: int) -> bool:
     """Whether a contact of less force than that of the best seed may be at the point."""
     for i in range(n):
         other = i != best and _apart(found[i], found[best])
         if other and _force(fold, found[i]) < _force(fold, found[best]):
             return True
-    if found[best, 2] < _LIGHT or not _near_rest(resting, point):
+    if found[best, 2] < _HEAVY or not _near_rest(resting, point):
         return False
     return bool(_touch(resting, point)[1] < _NEAR * _NEAR)
 
@@ -201,7 +223,7 @@ def _solve_points(
     first: int,
     last: int,
 ) -> None:
-    """Solve contact points (n, 3) where the chart has a seed that leads to a stable solution.
+    """Solve contact points (n, 3) from the chart's seeds; very near to rest, from there.
 
     ``solved`` is 1 there, 2 where the solution is in doubt; -1 where the point may be reached by
     another path, as there are seeds or the resting whisker is near; 0 elsewhere.
@@ -215,22 +237,23 @@ def _solve_points(
     signs, doubt = np.empty(LANES), np.zeros(LANES, np.bool_)
     count = 0
     for row in range(first, last):
-        n = seeds(tree, points[row], found, slopes, quality)
-        solved[row] = -1 if n == 0 and _near_rest(resting, points[row]) else 0
-        if n > 0:
-            solved[row] = -1
-            best = 0
-            for i in range(1, n):
-                # Of two solutions near the fold the one with less force is the stable one.
-                better = quality[i] > quality[best]
-                if better or (quality[i] == quality[best] and found[i, 2] < found[best, 2]):
-                    best = i
-            rows[count] = row
+        rows[count], doubt[count] = row, False
+        copy(points[row], targets[count])
+        touch = _light_touch(resting, points[row])
+        n = 0 if touch > 0.0 else seeds(tree, points[row], found, slopes, quality)
+        if touch > 0.0:
+            group[count, 0], group[count, 1], group[count, 2] = touch, 0.0, 0.0
+            charts[count, 2], inverses[count, 0, 0] = 0.0, np.nan
+        elif n > 0:
+            best = _best(found, quality, n)
             doubt[count] = _in_doubt(fold, resting, points[row], found, n, best)
-            copy(points[row], targets[count])
             chart_to_contact(fold, found[best], group[count])
             start_from(found[best], slopes[best], quality[best], charts[count], inverses[count])
+        if touch > 0.0 or n > 0:
+            solved[row] = -1
             count += 1
+        else:
+            solved[row] = -1 if _near_rest(resting, points[row]) else 0
         if count == LANES or (row == last - 1 and count > 0):
             newton_group(
                 _at_point,
@@ -272,8 +295,9 @@ class PointSolver:
         ).tree
         # Paths start short of the fold, where there is room to move.
         inner = points[:, :-1, :-1].reshape(-1, 3)
-        self._contacts = chart.contacts[:, :-1, :-1].reshape(-1, 3)
-        self._nearest = cKDTree(inner)
+        held = np.isfinite(inner).all(axis=1)
+        self._contacts = chart.contacts[:, :-1, :-1].reshape(-1, 3)[held]
+        self._nearest = cKDTree(inner[held])
         places, reasons = zip(*_faces(chart), strict=True)
         self._faces = cKDTree(np.concatenate(places))
         self._resting = _at_rest(chart)
@@ -297,7 +321,7 @@ class PointSolver:
         n = len(points)
         out = Solutions.empty(n)
         contacts, values, misfits, statuses = out
-        there = np.flatnonzero(np.isfinite(points).all(axis=1))
+        there = np.flatnonzero(~np.isnan(points).any(axis=1))
         wanted = np.clip(points[there], -_FAR, _FAR)
         xi, found = np.empty((there.size, 3)), np.empty((there.size, 6))
         residuals, solved = np.empty(there.size), np.zeros(there.size, np.int64)
@@ -326,7 +350,7 @@ class PointSolver:
         values[rows], misfits[rows], statuses[rows] = found[good], residuals[good], int(Status.OK)
         open_rows = np.flatnonzero((solved < 0) | (solved == 2))
         self._from_starts(wanted[open_rows], there[open_rows], out)
-        lost = np.flatnonzero(statuses[there] == Status.MISSING)
+        lost = np.flatnonzero(np.isin(statuses[there], (Status.MISSING, Status.NOT_CONVERGED)))
         self._approach(wanted[lost], solved[lost] < 0, there[lost], out)
         return out
 
@@ -347,9 +371,9 @@ class PointSolver:
             # Before the proximal limit, too, a contact of less force is what holds the point.
             reached = np.isin(solved.statuses, (Status.OK, Status.TOO_PROXIMAL))
             reached &= solved.misfits < _REACHED
-            better = np.flatnonzero(reached & (force < least[which]))
+            better = (reached & (force < least[which])) | (least[which] == np.inf)
             out.put(rows[which[better]], Solutions(*(part[better] for part in solved)))
-            least[which[better]] = force[better]
+            least[which] = np.where(reached, np.minimum(force, least[which]), least[which])
         _drop_unanswered(out, rows)
 
     def _approach(self, points: Array, hopeful: AnyArray, rows: IntArray, out: Solutions) -> None:
@@ -395,7 +419,9 @@ def _faces(chart: Reach) -> list[tuple[Array, Status]]:
     ):
         place = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         contacts = with_normal_force(contacts_at(chart.fold, place))
-        faces.append((solve_forces(chart.discretization, contacts)[0][:, 3:], reason))
+        points = solve_forces(chart.discretization, contacts)[0][:, 3:]
+        # At the tip of a needle the interpolated fold force may be more than can be integrated.
+        faces.append((points[np.isfinite(points).all(axis=1)], reason))
     return faces
 
 

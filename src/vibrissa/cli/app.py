@@ -29,6 +29,7 @@ from vibrissa.cli import (
     viewing,
     whole_job,
 )
+from vibrissa.cli.sources import about_whisker
 from vibrissa.cli.terminal import errors, output
 
 HELP = """From what a whisker feels at its base to what it touched.
@@ -46,21 +47,21 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.command("demo")(whole_job.demo)
-app.command("deflect")(bend.bend)
-app.command("map")(charting.chart)
+app.command("demo")(about_whisker(whole_job.demo))
+app.command("deflect")(about_whisker(bend.bend))
+app.command("map")(about_whisker(charting.chart))
 app.command("uniqueness")(judging.uniqueness)
-app.command("simulate")(simulating.simulate)
-app.command("track")(tracking.track)
+app.command("simulate")(about_whisker(simulating.simulate))
+app.command("track")(about_whisker(tracking.track))
 app.command("correct")(correcting.correct)
 app.command("calibrate")(calibrating.calibrate)
 app.command("sensitivity")(sensing.sensitivity)
-app.command("signals")(feeling.signals)
-app.command("estimate")(locating.estimate)
-app.command("reconstruct")(contouring.reconstruct)
-app.command("stream")(streaming.stream)
+app.command("signals")(about_whisker(feeling.signals))
+app.command("estimate")(about_whisker(locating.estimate))
+app.command("reconstruct")(about_whisker(contouring.reconstruct))
+app.command("stream")(about_whisker(streaming.stream))
 app.command("figures")(figures.figures)
-app.command("view")(viewing.view)
+app.command("view")(about_whisker(viewing.view))
 app.command("movie")(filming.movie)
 app.command("report")(reporting.report)
 app.command("sweep")(sweeping.sweep)

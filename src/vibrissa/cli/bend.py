@@ -13,9 +13,13 @@ from vibrissa.cli.terminal import fixed, numbers, output, refuse
 if TYPE_CHECKING:
     from vibrissa.rod import Deflection
     from vibrissa.rod.loads import Load
+    from vibrissa.status import Status
+    from vibrissa.whisker import Whisker
 
 _MM = 1e-3
 _MICRO = 1e-6
+# Share of the length below which a place looks like metres typed for mm.
+_NEXT_TO_BASE = 0.02
 
 
 def bend(
@@ -47,18 +51,71 @@ def bend(
             help="About where the peg pushes; by default the nearest side.", metavar="X,Y,Z"
         ),
     ] = None,
+    proximal: Annotated[
+        float | None,
+        typer.Option(
+            help="Share of the length nearer to the base than which no contact is considered; "
+            "0.3 by default.",
+            min=0.0,
+            max=1.0,
+            metavar="SHARE",
+        ),
+    ] = None,
 ) -> None:
     """Bend a whisker by a point, a force or a peg, and print what its base feels.
 
-    All in the whisker's frame. Give one of --point, --force, --peg. Example:
-    `vibrissa deflect --point 25,12,1`
+    All in the whisker's frame. Give one of --point, --force, --peg. Without an answer the status
+    says why, and the exit status is 1. Example: `vibrissa deflect --point 25,12,1`
     """
-    from vibrissa.cli.sources import whisker_from
+    from vibrissa.cli.sources import tell_notes, whisker_from
     from vibrissa.rod import deflect
+    from vibrissa.rod.reach import PROXIMAL
+    from vibrissa.status import Status
 
     load = _load(point, force, peg, axis, side)
+    if force is not None:
+        refuse({"--proximal": proximal}, "a --force acts where it is stated")
     chosen = whisker_from(whisker)
-    _print(repr(chosen), deflect(chosen, load))
+    output.print(repr(chosen), highlight=False, soft_wrap=True)
+    tell_notes(chosen)
+    bent = deflect(chosen, load, proximal=PROXIMAL if proximal is None else proximal)
+    status = Status(int(bent.status))
+    output.print(_told(status), highlight=False, soft_wrap=True)
+    _doubt_the_unit(load, chosen)
+    if not status.ok:
+        raise typer.Exit(1)
+    _print(bent)
+
+
+def _told(status: Status) -> str:
+    """A status with its advice, by the name that the advised option has here."""
+    from vibrissa.status import Status
+
+    option = " The option is --proximal." if status == Status.TOO_PROXIMAL else ""
+    return f"{status}{option}"
+
+
+def _doubt_the_unit(load: Load, whisker: Whisker) -> None:
+    """Say so where a place would be on the whisker if it had been typed in metres."""
+    import numpy as np
+
+    from vibrissa.cli.terminal import errors
+    from vibrissa.rod import PointContact, PointForce
+
+    if isinstance(load, PointForce):
+        place = float(load.arc_length)
+    elif isinstance(load, PointContact):
+        place = float(np.linalg.norm(load.points))
+    else:
+        place = float(np.linalg.norm(load.origin))
+    if 0.0 < place < _NEXT_TO_BASE * whisker.length:
+        errors.print(
+            f"lengths are typed in mm: the load is {place / _MM:.4g} mm from the base of a whisker "
+            f"of {whisker.length / _MM:.4g} mm. Were metres meant? {place / _MM:.4g} m is "
+            f"{place / _MM / _MM:.4g} mm",
+            highlight=False,
+            soft_wrap=True,
+        )
 
 
 def _load(
@@ -90,16 +147,13 @@ def _named(**values: str | None) -> list[tuple[str, str | None]]:
     return list(values.items())
 
 
-def _print(whisker: str, bent: Deflection) -> None:
+def _print(bent: Deflection) -> None:
     from rich.table import Table
 
     from vibrissa.mapping.contact_map import spherical
     from vibrissa.quantities import quantity
     from vibrissa.signals import SIGNALS, base_signals
-    from vibrissa.status import Status
 
-    output.print(whisker, highlight=False, soft_wrap=True)
-    output.print(str(Status(int(bent.status))), highlight=False, soft_wrap=True)
     table = Table(show_header=False)
     rows = list(zip("xyz", bent.contact_point, strict=True))
     rows += zip(("r", "theta", "phi"), spherical(bent.contact_point), strict=True)

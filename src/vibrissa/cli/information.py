@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -328,7 +329,7 @@ def _table(path: Path) -> Iterator[tuple[str, str]]:
         ("the head's pose", Kind.HEAD, load_head),
         ("contact points", None, load_contact_points),
         ("corrections", Kind.CORRECTIONS, load_corrections),
-        ("whisker", Kind.CENTERLINE, load_whisker),
+        ("whisker", Kind.CENTERLINE, partial(load_whisker, any_length=True)),
     )
     looks = recognise(path)
     for kind, known, reader in readers:
@@ -357,13 +358,14 @@ def _header(path: Path) -> str:
 def _rows(kind: str, data: Any) -> Iterator[tuple[str, str]]:
     """What a table holds."""
     from vibrissa.status import describe
+    from vibrissa.whisker.section import length_faults
 
     if kind == "whisker":
         yield "whisker", repr(data)
         base, tip = (data.pose.to_source(data.position(s)) * 1e3 for s in (0.0, data.length))
         for name, (x, y, z) in (("base", base), ("tip", tip)):
             yield name, f"at ({x:.2f}, {y:.2f}, {z:.2f}) mm in the file"
-        yield from (("note", note) for note in data.notes)
+        yield from (("note", note) for note in (*data.notes, *length_faults(data.length)))
     elif kind == "corrections":
         for view, each in data.items():
             yield f"view {view}", f"{len(each)} corrected traces"

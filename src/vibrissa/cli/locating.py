@@ -258,7 +258,7 @@ def _from_table(signals: Path, path: Path, how: How, noise: tuple[Array, str] | 
         tell_statuses,
         tell_written,
     )
-    from vibrissa.cli.sources import whisker_from, wrench_from
+    from vibrissa.cli.sources import tell_notes, whisker_from, wrench_from
     from vibrissa.io import save_contacts
     from vibrissa.pipeline import TRIPLET, contact_columns, locate, locate_from_wrench
     from vibrissa.sensing import FORCE_NOISE
@@ -269,6 +269,7 @@ def _from_table(signals: Path, path: Path, how: How, noise: tuple[Array, str] | 
         say(f"{signals}: {note}")
     maps = maps_from(how.charts, 1, how.grid) if how.charts else []
     known = maps[0].whisker if maps else whisker_from(how.whisker)
+    tell_notes(known)
     _check_scale(signals, wrench, known)
     with progress_bars() as tell:
         if not maps and not how.all_six:

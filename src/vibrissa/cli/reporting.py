@@ -129,7 +129,9 @@ def report(
 
 def _kind(path: Path) -> str:
     from vibrissa.io import is_netcdf, kind_of
+    from vibrissa.io.paths import refuse_whisk
 
+    refuse_whisk(path)
     kind = kind_of(path) if is_netcdf(path) else None
     kinds = {"vibrissa recording": "trial", "vibrissa contact map": "map"}
     if kind not in kinds:

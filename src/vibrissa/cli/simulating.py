@@ -89,7 +89,7 @@ def simulate(
     than the file. Examples: `vibrissa simulate --duration 0.5 --friction 0.3 -o trial.nc`;
     `vibrissa simulate --array average --object sphere -o face.nc`
     """
-    from vibrissa.cli.sources import whisker_from
+    from vibrissa.cli.sources import tell_notes, whisker_from
     from vibrissa.io import save_recording
     from vibrissa.io.paths import NETCDF, check_writable
     from vibrissa.io.table import read_text
@@ -97,6 +97,7 @@ def simulate(
     from vibrissa.trial import measure
     from vibrissa.trial import simulate as simulated
     from vibrissa.trial.script import EXAMPLE, read_script
+    from vibrissa.whisker import Whisker
 
     if example:
         output.out(EXAMPLE, highlight=False, end="")
@@ -137,6 +138,8 @@ def simulate(
         trial = measure(trial, seed=plan.seed, sensor=plan.sensor)
         save_recording(path, trial)
     output.print(f"{plan.whisker!r}", highlight=False, soft_wrap=True)
+    if isinstance(plan.whisker, Whisker):
+        tell_notes(plan.whisker)
     for solid in plan.objects:
         output.print(f"{solid!r}", highlight=False, soft_wrap=True)
     _tell(trial)

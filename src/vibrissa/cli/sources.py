@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable, Mapping
+from contextvars import ContextVar
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast, get_type_hints
+
+import typer
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -11,8 +18,84 @@ if TYPE_CHECKING:
     from vibrissa.mapping import ContactMap
     from vibrissa.whisker import Whisker
 
+_RAT = Annotated[
+    str | None,
+    typer.Option(
+        "--rat",
+        help="Radii of the whisker of a file by published regressions: row and column of a rat's "
+        "whisker, such as C2, or any, where only its length is known.",
+        metavar="NAME",
+    ),
+]
+_ANY_LENGTH = Annotated[
+    bool,
+    typer.Option(
+        "--any-length", help="A whisker shorter than 0.5 mm or longer than 0.5 m is meant."
+    ),
+]
+_NOTHING: Mapping[str, Any] = MappingProxyType({})
+_stated: ContextVar[Mapping[str, Any]] = ContextVar("stated of a whisker", default=_NOTHING)
+"""Keywords of `load_whisker` that the verb was called with."""
 
-def whisker_from(path: Path | None) -> Whisker:
+Verb = TypeVar("Verb", bound=Callable[..., None])
+
+
+def about_whisker(verb: Verb) -> Verb:
+    """Give a verb that reads a whisker the options on what its file does not state.
+
+    Parameters
+    ----------
+    verb : callable
+        Of the command line. Those of its parameters that are called ``whisker`` name the file.
+
+    Returns
+    -------
+    callable
+        The same with the options ``--rat`` and ``--any-length``, which `whisker_from` follows.
+    """
+
+    @wraps(verb)
+    def wrapped(*args: Any, rat: str | None, any_length: bool, **others: Any) -> None:
+        if (rat is not None or any_length) and others.get("whisker", "") is None:
+            raise ValueError("--rat and --any-length are about a --whisker, and none is given")
+        before = _stated.set({"rat": rat, "any_length": any_length})
+        try:
+            verb(*args, **others)
+        finally:
+            _stated.reset(before)
+
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    new = [
+        inspect.Parameter("rat", keyword, default=None, annotation=_RAT),
+        inspect.Parameter("any_length", keyword, default=False, annotation=_ANY_LENGTH),
+    ]
+    hints = get_type_hints(verb, include_extras=True)
+    own = inspect.signature(verb).parameters.values()
+    wrapped.__annotations__ = hints | {one.name: one.annotation for one in new}
+    wrapped.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+        [*(one.replace(annotation=hints[one.name]) for one in own), *new]
+    )
+    return cast(Verb, wrapped)
+
+
+def refuse_stated(path: Path | None) -> None:
+    """Raise where ``--rat`` or ``--any-length`` is given for what is not a file of a whisker.
+
+    Parameters
+    ----------
+    path : Path or None
+        The file.
+
+    Raises
+    ------
+    ValueError
+        If one of them is given.
+    """
+    if any(_stated.get().values()):
+        raise ValueError(f"--rat and --any-length are about a whisker, and {path} is not its file")
+
+
+def whisker_from(path: Path | None, rat: str | None = None, any_length: bool = False) -> Whisker:
     """Read a whisker: a centreline as CSV, or out of a map or recording; by default the γ whisker.
 
     Parameters
@@ -40,15 +123,25 @@ def whisker_from(path: Path | None) -> Whisker:
     if not path.exists():
         raise FileNotFoundError(f"there is no file {path}")
     if not is_netcdf(path):
-        return load_whisker(path)
-    kind = kind_of(path)
+        return load_whisker(path, **_stated.get())
+    kind, rat = kind_of(path), _stated.get().get("rat")
     if kind == "vibrissa recording":
         from vibrissa.trial import recorded_whisker
 
-        return recorded_whisker(load_recording(path))
+        whisker = recorded_whisker(load_recording(path))
+        return whisker if rat is None else whisker.with_properties(rat=rat)
     if kind == "vibrissa contact map":
-        return map_from(path).whisker
+        whisker = map_from(path).whisker
+        return whisker if rat is None else whisker.with_properties(rat=rat)
     raise ValueError(f"{path} holds {kind or 'data of another kind'}, and no whisker")
+
+
+def tell_notes(whisker: Whisker) -> None:
+    """Print what is assumed about a whisker, and all else that its user should know."""
+    from vibrissa.cli.terminal import errors
+
+    for note in whisker.notes:
+        errors.print(f"note: {note}", highlight=False, markup=False, soft_wrap=True)
 
 
 def map_from(path: Path) -> ContactMap:

@@ -182,6 +182,7 @@ def stream(
     Example: `vibrissa stream --udp 127.0.0.1:5005 --map wire.nc --sensor sensor.toml`
     """
     from vibrissa.cli.recordings import usual_noise
+    from vibrissa.io.paths import refuse_whisk
     from vibrissa.io.rosbag import is_bag
     from vibrissa.sensing import load_sensor
 
@@ -198,6 +199,8 @@ def stream(
     if not follow:
         refuse({"--speed": speed}, "it is of the filter: add --filter")
     described = None if sensor is None else load_sensor(sensor)
+    if source is not None:
+        refuse_whisk(source)
     from_bag = source is not None and is_bag(source)
     if not from_bag:
         refuse(
@@ -363,7 +366,7 @@ def _bag_lines(source: Path, topic: str | None, pose_topic: str | None) -> Itera
 
 
 def _map(chart: Path | None, whisker: Path | None, proximal: float | None) -> ContactMap:
-    from vibrissa.cli.sources import map_from, whisker_from
+    from vibrissa.cli.sources import map_from, tell_notes, whisker_from
     from vibrissa.mapping import ContactMap
 
     if chart is not None and whisker is not None:
@@ -372,6 +375,7 @@ def _map(chart: Path | None, whisker: Path | None, proximal: float | None) -> Co
         refuse({"--proximal": proximal}, "it is of a map that is simulated, and --map is given")
         return map_from(chart)
     chosen = whisker_from(whisker)
+    tell_notes(chosen)
     errors.print(f"no map given; simulating that of {chosen!r}", highlight=False, soft_wrap=True)
     return ContactMap.simulate(chosen, grid=False, proximal=smallest_arc(proximal))
 

@@ -48,18 +48,21 @@ def view(
     Serves a page on this machine until Ctrl-C. Example: `vibrissa view trial.nc --video top.mp4
     --video front.mp4`
     """
-    from vibrissa.cli.sources import map_from, whisker_from
+    from vibrissa.cli.sources import map_from, refuse_stated, tell_notes, whisker_from
     from vibrissa.io import is_netcdf, kind_of, load_recording
     from vibrissa.viewer import view as serve
 
     kind = kind_of(path) if path is not None and is_netcdf(path) else ""
     shown: Whisker | ContactMap | xr.DataTree
+    if kind in ("vibrissa contact map", "vibrissa recording"):
+        refuse_stated(path)
     if kind == "vibrissa contact map" and path is not None:
         shown = map_from(path)
     elif kind == "vibrissa recording" and path is not None:
         shown = load_recording(path)
     else:
         shown = whisker_from(path)
+        tell_notes(shown)
     try:
         with serve(shown, videos=videos or (), host=host, port=port) as viewer:
             output.print(f"{viewer.url}   Ctrl-C ends it", highlight=False, soft_wrap=True)

@@ -55,7 +55,7 @@ def demo(
     compared with the truth. Stopped with Ctrl-C it goes on from there when it is called again.
     Example: `vibrissa demo --output try --seed 1`
     """
-    from vibrissa.cli.sources import whisker_from
+    from vibrissa.cli.sources import tell_notes, whisker_from
     from vibrissa.demo import run_demo
     from vibrissa.demo.run import DURATION, FULL_DURATION
     from vibrissa.io.paths import check_folder
@@ -65,6 +65,7 @@ def demo(
     check_folder(folder)
     chosen = whisker_from(whisker)
     output.print(f"{chosen!r}", highlight=False, soft_wrap=True)
+    tell_notes(chosen)
     if duration is None:
         duration = FULL_DURATION if full else DURATION
     with progress_bars() as tell:

@@ -40,7 +40,6 @@ from vibrissa.io.whisker_stack import separate_whiskers, stacked_whiskers
 from vibrissa.whisker import Whisker
 from vibrissa.whisker.array import WhiskerArray
 from vibrissa.whisker.array_dataset import KIND
-from vibrissa.whisker.average import published_radii
 from vibrissa.whisker.identity import Identity
 
 
@@ -135,8 +134,7 @@ def _folder(path: Path, base: Any, noise: float | None) -> WhiskerArray:
             faults.append(f"{file.name}: {fault}")
             continue
         if not tells_radius(file):
-            radii: Any = published_radii(identity, whisker.length)
-            whisker = whisker.with_properties(**radii)
+            whisker = whisker.with_properties(rat=identity.name)
         whiskers.append(whisker)
     if faults:
         raise ValueError(f"{path}: {few(faults)}")

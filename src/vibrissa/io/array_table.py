@@ -15,12 +15,11 @@ from vibrissa.io.centerline import UNITS, check_slender
 from vibrissa.io.table import read_text, table_rows
 from vibrissa.whisker import Whisker
 from vibrissa.whisker.array import WhiskerArray
-from vibrissa.whisker.average import published_radii
 from vibrissa.whisker.emergence import angles_of, base_rotation
-from vibrissa.whisker.identity import Identity
 from vibrissa.whisker.morphology import curvature_bound
 from vibrissa.whisker.parabola import parabola_curvature
 from vibrissa.whisker.pose import Pose
+from vibrissa.whisker.published import published_note, published_radii
 
 Array = NDArray[np.float64]
 
@@ -78,8 +77,11 @@ def _whisker(
     name: str, pose: Pose, length: float, coefficient: float, radii: dict[str, float]
 ) -> Whisker:
     """One line's whisker."""
-    stated: Any = published_radii(Identity.of(name), length) | radii
+    published = dict(zip(_RADII, published_radii(name, length), strict=True))
+    stated: Any = published | radii
     whisker = Whisker.parabola(length, coefficient, name=name, **stated)
+    if len(radii) < len(published):
+        whisker = replace(whisker, notes=(*whisker.notes, published_note(name)))
     for radius in radii.values():
         check_slender(radius, length)
     bound = float(curvature_bound(length))

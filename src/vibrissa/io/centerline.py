@@ -210,7 +210,11 @@ def load_whisker(
     """
     points, radii, unit = _table(Path(path))
     properties.setdefault("name", Path(path).stem)
-    stated = {"radius", "base_radius", "tip_radius", "rat"} & set(properties)
+    stated = {
+        name
+        for name in ("radius", "base_radius", "tip_radius", "rat")
+        if properties.get(name) is not None
+    }
     try:
         if radii is None or stated:
             return Whisker.from_points(points, noise=noise, base=base, **properties)

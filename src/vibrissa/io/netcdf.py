@@ -16,7 +16,7 @@ from typing import Any
 import xarray as xr
 
 from vibrissa.io.hdf5 import opened
-from vibrissa.io.paths import NETCDF
+from vibrissa.io.paths import NETCDF, refuse_whisk
 from vibrissa.io.replace import replacing
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -67,8 +67,12 @@ def kind_of(path: str | PathLike[str]) -> str:
     ValueError
         If it is a folder, empty, cut off, or no NetCDF-4 file.
     """
-    with opened(path, "NetCDF-4") as file:
-        kind = file.attrs.get("kind", "")
+    try:
+        with opened(path, "NetCDF-4") as file:
+            kind = file.attrs.get("kind", "")
+    except ValueError:
+        refuse_whisk(path)
+        raise
     return kind.decode("utf-8", "replace") if isinstance(kind, bytes) else str(kind)
 
 

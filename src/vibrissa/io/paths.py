@@ -20,6 +20,37 @@ NWB = (".nwb",)
 """Endings of Neurodata Without Borders files."""
 
 
+_WHISK = {b"bwhiskbin": "traces of whisk (.whiskers)", b"measv": "measurements of whisk"}
+"""What whisk's binary files begin with, and what they are called."""
+
+
+def refuse_whisk(path: str | PathLike[str]) -> None:
+    """Raise where a file is whisk's and something else is needed.
+
+    Parameters
+    ----------
+    path : str or path
+        A file, which need not exist.
+
+    Raises
+    ------
+    ValueError
+        If it is one; the message says what takes it.
+    """
+    path = Path(path)
+    if not path.is_file():
+        return
+    with path.open("rb") as file:
+        head = file.read(16)
+    for begin, kind in _WHISK.items():
+        if head.startswith(begin):
+            raise ValueError(
+                f"{path} holds {kind}: whiskers traced in one film, in pixels. `vibrissa info` "
+                "shows what is in it and vibrissa.io.load_tracks (Python) reads it; no other verb "
+                "takes it"
+            )
+
+
 def check_readable(path: str | PathLike[str]) -> Path:
     """Make sure that there is a file with something in it.
 
@@ -78,6 +109,7 @@ def check_writable(path: str | PathLike[str], endings: Sequence[str] = ()) -> Pa
     if path.is_dir():
         raise ValueError(f"{path} is a folder; the name of a file is needed")
     if endings and path.suffix.lower() not in endings:
+        refuse_whisk(path)
         got = f"ends in {path.suffix}" if path.suffix else "has no ending"
         raise ValueError(f"{path} {got}; {' or '.join(endings)} is needed")
     _check_folder(path.parent)

@@ -15,7 +15,7 @@ from os import PathLike
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.io.paths import check_readable
+from vibrissa.io.paths import check_readable, refuse_whisk
 
 _MISSING = frozenset({"", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--"})
 _COMMA = re.compile(r"[+-]?(?:\d+,\d*|,\d+)(?:[eE][+-]?\d+)?")
@@ -46,6 +46,7 @@ def read_text(path: str | PathLike[str]) -> str:
         If it is a folder, empty, or no text.
     """
     path = check_readable(path)
+    refuse_whisk(path)
     content = path.read_bytes()
     utf16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     try:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vibrissa.io.paths import refuse_whisk
 from vibrissa.io.replace import replacing
 
 if TYPE_CHECKING:
@@ -273,6 +274,7 @@ def opened_video(path: str | PathLike[str]) -> InputContainer:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {path}")
+    refuse_whisk(path)
     try:
         container = av.open(str(path))
     except av.FFmpegError as error:

@@ -13,6 +13,7 @@ from vibrissa.whisker.emergence import base_rotation, mirrored
 from vibrissa.whisker.identity import ROWS, Identity
 from vibrissa.whisker.model import Whisker
 from vibrissa.whisker.pose import Pose
+from vibrissa.whisker.published import published_radii
 from vibrissa.whisker.section import Properties
 
 
@@ -112,8 +113,10 @@ def average_whisker(identity: Identity, **properties: Unpack[Properties]) -> Whi
     notes = _range_notes(identity, length, coefficient)
     for note in notes:
         warnings.warn(f"{identity.name}: {note}", UserWarning, stacklevel=3)
-    radii = published_radii(identity, length)
-    own = {"base_radius", "tip_radius", "radius"} & set(properties)
+    radii = dict(
+        zip(("base_radius", "tip_radius"), published_radii(identity.name, length), strict=True)
+    )
+    own = {"base_radius", "tip_radius", "radius", "rat"} & set(properties)
     if not own and radii["tip_radius"] == radii["base_radius"] / morphology.MOST_TAPER:
         notes.append(
             "the published radius slope leaves it no tip (or too thin a one); its base radius over "
@@ -127,28 +130,6 @@ def average_whisker(identity: Identity, **properties: Unpack[Properties]) -> Whi
         angles, place = mirrored(angles), place * [-1.0, 1.0, 1.0]
     pose = Pose(base_rotation(*angles), place)
     return replace(whisker, pose=pose, notes=(*whisker.notes, *notes))
-
-
-def published_radii(identity: Identity, length: float) -> dict[str, float]:
-    """Radii of a whisker by row, column and length (Belli et al. 2017).
-
-    Parameters
-    ----------
-    identity : Identity
-        Which whisker.
-    length : float
-        Arc length, m.
-
-    Returns
-    -------
-    dict
-        ``base_radius`` and ``tip_radius``, m.
-    """
-    row, column = identity.row_number, identity.column
-    return {
-        "base_radius": float(morphology.base_radius(row, column, length)),
-        "tip_radius": float(morphology.tip_radius(row, column, length)),
-    }
 
 
 def _range_notes(identity: Identity, length: float, coefficient: float) -> list[str]:

@@ -22,7 +22,7 @@ from vibrissa.whisker.curve import ArcLength, nearest_parameters
 from vibrissa.whisker.pose import Pose, least_turn
 from vibrissa.whisker.profile import Profile, approximate, constant
 from vibrissa.whisker.rest import Path
-from vibrissa.whisker.section import length_faults
+from vibrissa.whisker.section import LONGEST, length_faults
 from vibrissa.whisker.smoothing import Smoothed, natural_spline, smooth
 
 Array = NDArray[np.float64]
@@ -71,7 +71,12 @@ class Digitized:
     noise: float
 
 
-def digitize(points: ArrayLike, noise: float | None, base: str | ArrayLike | None) -> Digitized:
+def digitize(
+    points: ArrayLike,
+    noise: float | None,
+    base: str | ArrayLike | None,
+    any_length: bool = False,
+) -> Digitized:
     """Find length, intrinsic curvature and pose in digitised points.
 
     Parameters
@@ -82,6 +87,8 @@ def digitize(points: ArrayLike, noise: float | None, base: str | ArrayLike | Non
         Standard deviation of a coordinate, m; 0 asks for interpolation. By default it is estimated.
     base : {"first", "last"} or array (3,) or (2,), optional
         Which end is the base: by name, or a point near it. By default the first.
+    any_length : bool
+        Whether a length that no animal's whisker has is meant.
 
     Returns
     -------
@@ -92,11 +99,11 @@ def digitize(points: ArrayLike, noise: float | None, base: str | ArrayLike | Non
     ValueError
         If the points are no centreline, with all that is wrong with them.
     """
-    array = checked_points(points, noise)
+    array = checked_points(points, noise, any_length)
     array = array[::-1] if _starts_at_tip(array, base) else array
     line = _Line.fitted(array)
     if line.deviation <= 1e-9 * line.extent:
-        return line.digitized(noise or 0.0)
+        return line.digitized(noise or 0.0, any_length)
     # Lengths are counted in extents of the data from here on, about its middle.
     middle, unit = array.mean(axis=0), line.extent
     scaled = (array - middle) / unit
@@ -108,12 +115,17 @@ def digitize(points: ArrayLike, noise: float | None, base: str | ArrayLike | Non
     _require_order(parameters, found)
     sigma = found * unit if noise is None else noise
     if len(fit.residuals) and line.explains(array, fit, components, unit, noise):
-        return line.digitized(line.noise(components) if noise is None else noise)
+        sigma = line.noise(components) if noise is None else noise
+        return line.digitized(sigma, any_length)
     curve = BSpline(fit.curve.t, fit.curve.c * unit + middle, 5)
-    return _measured(curve, float(parameters[0]), float(parameters[-1]), sigma)
+    digitized = _measured(curve, float(parameters[0]), float(parameters[-1]), sigma)
+    _require_length(digitized.length, any_length)
+    return digitized
 
 
-def checked_points(points: ArrayLike, noise: float | None = None) -> Array:
+def checked_points(
+    points: ArrayLike, noise: float | None = None, any_length: bool = False
+) -> Array:
     """Return points as (n, 3), m, or raise a ValueError that names every fault."""
     array = np.asarray(points, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] not in (2, 3):
@@ -133,8 +145,10 @@ def checked_points(points: ArrayLike, noise: float | None = None) -> Array:
         if repeated.size:
             faults.append(f"rows {_rows(repeated)} repeat earlier points (counted from 0)")
         extent = float(np.linalg.norm(np.ptp(good, axis=0)))
-        faults += ["all points are one: " + fault for fault in length_faults(extent) if not extent]
-        faults += [fault for fault in length_faults(extent) if extent > 0.5]
+        if not extent:
+            faults += ["all points are one: " + fault for fault in length_faults(extent)]
+        elif extent > LONGEST:
+            faults += length_faults(extent, any_length)
     if faults:
         raise ValueError("no whisker in these points: " + "; ".join(faults))
     return array if array.shape[1] == 3 else np.column_stack([array, np.zeros(len(array))])
@@ -220,9 +234,9 @@ class _Line:
         """Standard deviation per coordinate of points about the line, m."""
         return float(np.sqrt(self.rss / (components * (len(self.along) - 2))))
 
-    def digitized(self, noise: float) -> Digitized:
+    def digitized(self, noise: float, any_length: bool) -> Digitized:
         _require_order(self.along / self.extent, noise / self.extent)
-        _require_length(self.length)
+        _require_length(self.length, any_length)
         pose = Pose(least_turn(self.direction), self.start)
         return Digitized(self.length, constant(np.zeros(3), self.length), pose, noise)
 
@@ -299,8 +313,8 @@ def _require_order(parameters: Array, noise: float) -> None:
         )
 
 
-def _require_length(length: float) -> None:
-    faults = length_faults(length)
+def _require_length(length: float, any_length: bool) -> None:
+    faults = length_faults(length, any_length)
     if faults:
         raise ValueError("no whisker in these points: " + "; ".join(faults))
 
@@ -313,7 +327,6 @@ def _measured(curve: BSpline, start: float, end: float, noise: float) -> Digitiz
             "all of them; they must be in order from base to tip"
         )
     arc = ArcLength(curve, start, end)
-    _require_length(arc.total)
     first, second = curve.derivative(1), curve.derivative(2)
 
     def rotation_rate(s: Array) -> Array:

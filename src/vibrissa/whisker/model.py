@@ -107,6 +107,9 @@ class Whisker:
     rat : str
         Row and column of a rat's whisker, such as ``"C2"``, or ``"any"`` where only its length is
         known: radii by published regressions (Belli et al. 2017), instead of all other radii.
+    any_length : bool
+        Whether a length below 0.5 mm or above 0.5 m, as rods of robots have, is meant; by default
+        such a length is refused as a likely error of units.
     breaks : sequence of float
         Arc lengths, m, at which curvature or radius has a kink or a jump. Those of sampled radii
         and, as far as they can be told from noise, of functions are found without.
@@ -130,7 +133,7 @@ class Whisker:
 
     def __post_init__(self) -> None:
         """Check every field and bring the numbers into plain Python types."""
-        faults = length_faults(self.length)
+        faults = length_faults(self.length, any_length=True)
         faults += material_faults(self.youngs_modulus, self.poisson_ratio, self.base_stiffness)
         faults += _break_faults(self.breaks, self.length)
         for what, profile, shape in (
@@ -187,7 +190,7 @@ class Whisker:
         ValueError
             If the points are no centreline, with all that is wrong with them.
         """
-        shape = digitize(points, noise, base)
+        shape = digitize(points, noise, base, properties.get("any_length", False))
         notes: tuple[str, ...] = ()
         if noise is None:
             notes += (
@@ -218,7 +221,7 @@ class Whisker:
         -------
         Whisker
         """
-        faults = length_faults(length)
+        faults = length_faults(length, properties.get("any_length"))
         if not np.isfinite(coefficient):
             faults.append(f"coefficient is {coefficient!r}; it must be a finite number, in 1/m")
         if faults:
@@ -243,7 +246,7 @@ class Whisker:
         -------
         Whisker
         """
-        faults = length_faults(length)
+        faults = length_faults(length, properties.get("any_length"))
         if faults:
             raise ValueError("no straight whisker: " + "; ".join(faults))
         properties.setdefault("name", "straight")
@@ -274,7 +277,7 @@ class Whisker:
             Its frame is the one the curvature is stated in, whichever way it bends; `aligned`
             rolls it so that it bends to +y.
         """
-        faults = length_faults(length)
+        faults = length_faults(length, properties.get("any_length"))
         if not callable(curvature):
             got = type(curvature).__name__
             faults.append(f"curvature is of type {got}; a function of arc length is needed")

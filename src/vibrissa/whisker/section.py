@@ -34,6 +34,12 @@ POISSON_RATIO = 0.38
 
 # From a soft gel to diamond, Pa; what lies outside is in another unit.
 _SOFTEST, _HARDEST = 1e3, 1e13
+SHORTEST, LONGEST = 0.5e-3, 0.5
+"""Lengths, m, between which the unit is not doubted."""
+
+CONFIRMATION = "any_length=True (Python) or --any-length (command line)"
+"""How a length outside them is confirmed."""
+
 # A rod's radius is at most this share of its length.
 _STOUT = 0.1
 
@@ -67,11 +73,17 @@ class Holding(TypedDict, total=False):
 class Properties(Section, Holding, total=False):
     """Keywords that every constructor of a whisker takes."""
 
+    any_length: bool
+
 
 def split(properties: Properties) -> tuple[Section, Holding]:
     """Take the keywords for the radius apart from the others."""
     section = {key: value for key, value in properties.items() if key in _SECTION_KEYS}
-    others = {key: value for key, value in properties.items() if key not in _SECTION_KEYS}
+    others = {
+        key: value
+        for key, value in properties.items()
+        if key not in _SECTION_KEYS and key != "any_length"
+    }
     return cast(Section, section), cast(Holding, others)
 
 
@@ -253,21 +265,36 @@ def material_faults(
     return faults
 
 
-def length_faults(length: float) -> list[str]:
-    """Say what is wrong with a length, m; empty if nothing is."""
+def length_faults(length: float, any_length: bool | None = False) -> list[str]:
+    """Say what is wrong with a length; empty if nothing is.
+
+    Parameters
+    ----------
+    length : float
+        Arc length, m.
+    any_length : bool, optional
+        Whether a length that no animal's whisker has is meant.
+
+    Returns
+    -------
+    list of str
+    """
     if not (np.isfinite(length) and length > 0.0):
         return [f"length is {length!r} m; it must be positive"]
-    if length > 0.5:
-        return [
-            f"length is {length:.4g} m, longer than the 0.5 m allowed: these look like millimetres "
-            "given as metres, or micrometres as millimetres; multiply by 1e-3"
-        ]
-    if length < 0.5e-3:
-        return [
-            f"length is {length:.4g} m, shorter than the 0.5 mm allowed: these look like metres "
-            "given as millimetres, or converted once too often; lengths are given in m"
-        ]
-    return []
+    if any_length or SHORTEST <= length <= LONGEST:
+        return []
+    if length > LONGEST:
+        fault = (
+            f"length is {length:.4g} m, longer than the {LONGEST:g} m of any whisker: these look "
+            "like millimetres given as metres, or micrometres as millimetres; multiply by 1e-3"
+        )
+    else:
+        fault = (
+            f"length is {length:.4g} m, shorter than the {SHORTEST * 1e3:g} mm of any whisker: "
+            "these look like metres given as millimetres, or converted once too often; lengths are "
+            "given in m"
+        )
+    return [f"{fault}. If a rod of this length is meant, say so: {CONFIRMATION}"]
 
 
 def radius_profile(

@@ -95,7 +95,7 @@ def refuse_stated(path: Path | None) -> None:
         raise ValueError(f"--rat and --any-length are about a whisker, and {path} is not its file")
 
 
-def whisker_from(path: Path | None, rat: str | None = None, any_length: bool = False) -> Whisker:
+def whisker_from(path: Path | None) -> Whisker:
     """Read a whisker: a centreline as CSV, or out of a map or recording; by default the γ whisker.
 
     Parameters

@@ -10,7 +10,8 @@ import pytest
 import vibrissa as vb
 from vibrissa import samples
 from vibrissa.cli.app import app
-from vibrissa.io import save_centerline
+from vibrissa.io import load_recording, save_centerline, save_recording
+from vibrissa.trial import Motion, Peg, measure, recorded_whisker, simulate
 from vibrissa.whisker import morphology
 
 typer_testing = pytest.importorskip("typer.testing")
@@ -55,6 +56,18 @@ def test_deflect_and_info_state_what_is_assumed(centerline):
         text = " ".join(ran(*words).output.split())
         for about in ("radius", "Young's modulus", "Poisson's ratio"):
             assert f"{about} assumed" in text, words
+
+
+def test_what_is_assumed_survives_a_recording(centerline, tmp_path):
+    whisker = vb.load_whisker(centerline)
+    assert whisker.assumed == ("radius", "Young's modulus", "Poisson's ratio")
+    still = Motion(np.arange(3) * 1e-3, *np.zeros((3, 3)), np.zeros((3, 3)))
+    far = Peg([0.02, 0.02, 0.0], [0.0, 0.0, 1.0], 1e-3)
+    save_recording(tmp_path / "t.nc", measure(simulate(whisker, still, far)))
+    assert recorded_whisker(load_recording(tmp_path / "t.nc")).notes == whisker.notes
+    text = " ".join(ran("info", tmp_path / "t.nc").output.split())
+    for name in whisker.assumed:
+        assert f"{name} assumed" in text
 
 
 def test_published_radii_on_the_command_line(centerline):

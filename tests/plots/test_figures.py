@@ -57,6 +57,8 @@ def test_whisker_is_drawn_in_mm_with_its_taper() -> None:
 
 
 def test_whisker_views_have_one_scale() -> None:
+    assumed = texts(whisker_views(LINE, RADIUS, assumed=("radius", "Young's modulus")))
+    assert any("assumed: radius\nassumed: Young's modulus" in text for text in assumed)
     figure = whisker_views(LINE, RADIUS)
     figure.draw_without_rendering()
     scales = [

@@ -196,7 +196,11 @@ def map_drawings(
     line = whisker.centerline(_NODES)
     radius = whisker.radius(np.linspace(0.0, whisker.length, _NODES))
     samples = contacts.to_dataset()
-    yield "whisker", lambda: plots.whisker_views(line, radius, name=whisker.name, width=width)
+    assumed = whisker.assumed
+    yield (
+        "whisker",
+        lambda: plots.whisker_views(line, radius, name=whisker.name, assumed=assumed, width=width),
+    )
     yield "signal_space", lambda: plots.signal_clouds(samples, line, width=width)
     yield "contact_surfaces", lambda: plots.contact_surfaces(samples, line, width=width)
     yield "sensitivity", lambda: plots.sensitivity_panels(_derivatives(contacts), width=width)

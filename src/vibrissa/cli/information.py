@@ -247,6 +247,7 @@ def _groups(path: Path) -> Iterator[tuple[str, str]]:
                 yield from _variables(name, group)
         if names:
             yield "/whiskers", f"{len(names)}: {', '.join(names)}"
+            yield from _notes(file.groups["whiskers"])
 
 
 def _many(file: Any) -> bool:
@@ -276,10 +277,27 @@ def _variables(name: str, group: Any) -> Iterator[tuple[str, str]]:
     if not shown:
         return
     listed = ", ".join(f"{dim} {size}" for dim, size in sizes.items())
+    yield from _notes(group)
     yield name, f"[dim]{listed or 'no dimensions'}[/]"
     for variable, data in shown.items():
         units = _text(data.attrs.get("units", ""))
         yield f"  {variable}", f"({', '.join(data.dimensions)}) {'' if units == '1' else units}"
+
+
+def _notes(group: Any) -> Iterator[tuple[str, str]]:
+    """What is assumed about the whisker of a group, or about all that are stacked in it."""
+    import json
+
+    if _text(group.attrs.get("kind", "")) != "vibrissa whisker":
+        return
+    told = [_text(group.attrs["notes"])] if "notes" in group.attrs else []
+    if "notes" in group.variables:
+        told += [_text(one) for one in group.variables["notes"][...]]
+    try:
+        notes = [str(note) for text in told for note in json.loads(text)]
+    except (ValueError, TypeError):
+        notes = told
+    yield from (("note", note) for note in dict.fromkeys(notes))
 
 
 def _text(value: Any) -> str:

@@ -102,7 +102,11 @@ def _of_contacts(
     by: Any = "time" if colour == "time" else "deflection_angle"
     line = whisker.centerline(_NODES)
     radius = whisker.radius(np.linspace(0.0, whisker.length, _NODES))
-    yield "whisker", lambda: plots.whisker_views(line, radius, name=whisker.name, width=width)
+    assumed = whisker.assumed
+    yield (
+        "whisker",
+        lambda: plots.whisker_views(line, radius, name=whisker.name, assumed=assumed, width=width),
+    )
     angles = plots.deflection_angles(course, line)
     bodies, fits = bodies_of(trial), fits_of(trial)
     places, known, estimated = course.places, course.known, course.estimated

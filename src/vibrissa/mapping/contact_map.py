@@ -298,7 +298,9 @@ class ContactMap:
     def _rows(self) -> list[tuple[str, str]]:
         """Whose contacts they are, how many, and how large the signals."""
         data = self._samples
-        rows = [("whisker", repr(self.whisker)), ("contacts at nodes", str(data.status.size))]
+        rows = [("whisker", repr(self.whisker))]
+        rows += [("note", note) for note in self.whisker.notes]
+        rows.append(("contacts at nodes", str(data.status.size)))
         if self.grid is not None:
             reached = int((self.grid.status == Status.OK).sum())
             rows.append(("paper's grid", f"{reached} of {self.grid.status.size} points reached"))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -31,6 +33,7 @@ def whisker_views(
     *,
     name: str | None = None,
     magnification: float | None = None,
+    assumed: Sequence[str] = (),
     width: Width = "single",
 ) -> Figure:
     """Draw a whisker from above (x–y), from the side (x–z) and along its base (z–y), to one scale.
@@ -46,6 +49,8 @@ def whisker_views(
     magnification : float, optional
         How many times too wide the whisker is drawn; chosen by default so that the base is easily
         seen, and always said in the figure.
+    assumed : sequence of str
+        Properties of the whisker that were not measured; written under the magnification.
     width : {"single", "double"}
         Columns of the page.
 
@@ -74,12 +79,14 @@ def whisker_views(
             figure = new_figure(width, 40.0, None)
             say(figure, "no whisker")
             return figure
-        return _views(points, radii, name, magnification, width)
+        figure, axes, magnification = _views(points, radii, magnification, width)
+        _caption(axes, name, magnification, assumed)
+        return figure
 
 
 def _views(
-    points: Array, radii: Array, name: str | None, magnification: float | None, width: Width
-) -> Figure:
+    points: Array, radii: Array, magnification: float | None, width: Width
+) -> tuple[Figure, Axes, float]:
     extent = float(np.ptp(points, axis=0).max())
     if magnification is None:
         aim = _WIDE * extent / (2.0 * max(radii.max(), 1e-9))
@@ -110,8 +117,7 @@ def _views(
     few = max(3, round(scale * span[1] / 12.0))
     for axis, ticks in ((top.yaxis, few), (end.yaxis, few), (side.yaxis, 3), (end.xaxis, 3)):
         axis.set_major_locator(MaxNLocator(ticks, integer=True))
-    _caption(top, name, magnification)
-    return figure
+    return figure, top, magnification
 
 
 def _limits(points: Array, margin: float, extent: float) -> Array:
@@ -146,13 +152,15 @@ def _tube(places: Array, radii: Array) -> Path:
     return Path.make_compound_path(*(Path(loop, closed=True) for loop in corners), *discs)
 
 
-def _caption(axes: Axes, name: str | None, magnification: float) -> None:
-    """Say whose views these are, and how much too wide."""
+def _caption(axes: Axes, name: str | None, magnification: float, assumed: Sequence[str]) -> None:
+    """Say whose views these are, how much too wide, and what is assumed."""
     axes.set_title(name or "whisker", loc="left", fontweight="bold")
+    lines = [f"width × {magnification:g}" if magnification != 1 else "true width"]
+    lines += [f"assumed: {one}" for one in assumed]
     axes.text(
         0.02,
         0.97,
-        f"width × {magnification:g}" if magnification != 1 else "true width",
+        "\n".join(lines),
         transform=axes.transAxes,
         va="top",
         color=MUTED,

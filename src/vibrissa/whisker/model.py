@@ -35,6 +35,7 @@ from vibrissa.whisker.profile import (
 )
 from vibrissa.whisker.rest import Path, proximal_roll
 from vibrissa.whisker.section import (
+    ASSUMED,
     POISSON_RATIO,
     YOUNGS_MODULUS,
     Properties,
@@ -315,6 +316,11 @@ class Whisker:
     def base_bending_stiffness(self) -> float:
         """E π r⁴ / 4 at the base, N·m²."""
         return self.youngs_modulus * np.pi * self.base_radius**4 / 4.0
+
+    @property
+    def assumed(self) -> tuple[str, ...]:
+        """Names of the properties that nobody stated, such as ``radius``; notes say more."""
+        return tuple(note.split(ASSUMED)[0] for note in self.notes if ASSUMED in note)
 
     @cached_property
     def is_straight(self) -> bool:

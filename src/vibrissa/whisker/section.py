@@ -88,7 +88,10 @@ def split(properties: Properties) -> tuple[Section, Holding]:
 
 
 _SECTION_KEYS = Section.__optional_keys__
-_RADIUS_ASSUMED = "radius assumed, not measured"
+ASSUMED = " assumed, not measured"
+"""What follows the name of a property in a note that it was not stated."""
+
+_RADIUS_ASSUMED = f"radius{ASSUMED}"
 _NOTED = {"youngs_modulus": "Young's modulus", "poisson_ratio": "Poisson's ratio"}
 
 
@@ -159,14 +162,14 @@ def assumptions(length: float, section: Profile, properties: Properties) -> tupl
     if not stated & {"radius", "base_radius", "rat"}:
         notes.append(_assumed_radius(length, section))
     elif not stated & {"radius", "tip_radius", "rat"}:
-        notes.append(f"radius of the tip assumed, not measured: the base's over {TAPER:g}")
+        notes.append(f"radius of the tip{ASSUMED}: the base's over {TAPER:g}")
     if "youngs_modulus" not in stated:
         notes.append(
-            f"Young's modulus assumed, not measured: {YOUNGS_MODULUS * 1e-9:g} GPa; forces are "
+            f"Young's modulus{ASSUMED}: {YOUNGS_MODULUS * 1e-9:g} GPa; forces are "
             "proportional to it"
         )
     if "poisson_ratio" not in stated:
-        notes.append(f"Poisson's ratio assumed, not measured: {POISSON_RATIO:g}")
+        notes.append(f"Poisson's ratio{ASSUMED}: {POISSON_RATIO:g}")
     return tuple(notes)
 
 

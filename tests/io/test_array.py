@@ -112,7 +112,7 @@ def test_what_is_more_curved_than_any_whisker_is_warned_of(tmp_path):
 def test_other_files_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError):
         load_array(tmp_path / "none.csv")
-    with pytest.raises(ValueError, match="no CSV files"):
+    with pytest.raises(ValueError, match="is a folder of nothing"):
         load_array(tmp_path)
     bent = vb.WhiskerArray([vb.samples.gamma().with_properties(name="Lgamma")])
     with pytest.raises(ValueError, match="no planar parabola"):

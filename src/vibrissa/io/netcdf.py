@@ -106,7 +106,9 @@ def read_dataset(
         opened(path, "NetCDF-4", soft_links=False),
         xr.open_dataset(path, engine="h5netcdf", group=group) as data,
     ):
-        return (data if names is None else data[[n for n in names if n in data]]).load()
+        wanted = data if names is None else data[[name for name in names if name in data]]
+        # How this file was encoded is nothing to the next one, and may be damaged.
+        return wanted.load().drop_encoding()
 
 
 def read_tree(path: str | PathLike[str]) -> xr.DataTree:
@@ -115,7 +117,8 @@ def read_tree(path: str | PathLike[str]) -> xr.DataTree:
         opened(path, "NetCDF-4", soft_links=False),
         xr.open_datatree(path, engine="h5netcdf") as tree,
     ):
-        return tree.load()
+        loaded = {one.path: one.to_dataset(inherit=False).load() for one in tree.subtree}
+        return xr.DataTree.from_dict({path: one.drop_encoding() for path, one in loaded.items()})
 
 
 def write_netcdf(

@@ -1,11 +1,15 @@
 """MATLAB files: the layouts that laboratories use, in both versions of the format."""
 
+import struct
+import zlib
+
 import h5py
 import numpy as np
 import pytest
 from scipy.io import savemat
 
 from vibrissa.io import load_matlab, load_tracks
+from vibrissa.io.matlab_values import matlab_values
 
 generator = np.random.default_rng(0)
 LENGTHS = (5, 7, 0, 6)
@@ -176,3 +180,21 @@ def test_bad_files(tmp_path, write):
     path.write_bytes(b"no MATLAB file at all, but long enough" * 9)
     with pytest.raises(ValueError, match="cannot be read as a MATLAB file"):
         load_matlab(path)
+
+
+@pytest.mark.parametrize("kind", [0, 8, 10, 11, 19, 255])
+@pytest.mark.parametrize("compressed", [False, True])
+def test_elements_of_no_kind_are_refused(tmp_path, kind, compressed):
+    """Of some of these kinds the library that reads them takes the interpreter down."""
+    path = tmp_path / "a.mat"
+    savemat(path, {"x": np.arange(8.0)})
+    content = bytearray(path.read_bytes())
+    tag = struct.pack("<II", 9, 8 * 8)
+    assert content.count(tag) == 1
+    content[content.index(tag)] = kind
+    if compressed:
+        packed = zlib.compress(content[128:])
+        content[128:] = struct.pack("<II", 15, len(packed)) + packed
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=rf"a\.mat.*of the kind {kind}"):
+        matlab_values(path)

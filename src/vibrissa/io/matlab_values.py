@@ -6,6 +6,9 @@ what is anything else (text, functions, objects of classes) is left out.
 
 from __future__ import annotations
 
+import io
+import struct
+import zlib
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
@@ -18,6 +21,9 @@ from vibrissa.io.hdf5 import opened
 from vibrissa.io.paths import check_readable
 
 _HEADER = 128
+_MATRIX, _COMPRESSED = 14, 15
+_ELEMENTS = {*range(1, 8), 9, 12, 13, _MATRIX, _COMPRESSED, 16, 17, 18}
+"""Kinds of elements of version 5: integers, floats, matrices, what is compressed, text."""
 
 
 def matlab_values(path: str | PathLike[str]) -> dict[str, Any]:
@@ -57,13 +63,33 @@ def _version_5(path: Path) -> dict[str, Any]:
     from scipy.io import loadmat
 
     try:
-        content = loadmat(path)
+        file = path.read_bytes()
+        _check_elements(file[_HEADER:], "<" if file[_HEADER - 2 : _HEADER] == b"IM" else ">")
+        content = loadmat(io.BytesIO(file))
     except Exception as error:  # SciPy's errors for damaged files are of many kinds.
         raise ValueError(
             f"{path} cannot be read as a MATLAB file: it is of another format, cut short or "
             f"damaged ({error})"
         ) from error
     return {name: _of_scipy(value) for name, value in content.items() if name[:2] != "__"}
+
+
+def _check_elements(content: bytes, order: str) -> None:
+    """Refuse elements of kinds that there are none of, at which the library crashes."""
+    at = 0
+    while at + 8 <= len(content):
+        kind, size = struct.unpack_from(f"{order}II", content, at)
+        start = at + 8
+        # All but what is compressed is filled up to a multiple of eight bytes.
+        after = start + (size if kind == _COMPRESSED else -(-size // 8) * 8)
+        if kind >> 16:  # of up to four bytes, which stand in the tag itself
+            kind, size, start, after = kind & 0xFFFF, kind >> 16, at + 4, at + 8
+        if kind not in _ELEMENTS:
+            raise ValueError(f"it has an element of the kind {kind}, which there is not")
+        part = content[start : start + size]
+        if kind in (_MATRIX, _COMPRESSED):
+            _check_elements(zlib.decompress(part) if kind == _COMPRESSED else part, order)
+        at = after
 
 
 def _of_scipy(value: Any) -> Any:

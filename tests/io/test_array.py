@@ -112,6 +112,16 @@ def test_what_is_more_curved_than_any_whisker_is_warned_of(tmp_path):
 def test_other_files_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError):
         load_array(tmp_path / "none.csv")
+    zarr = tmp_path / "trial.nwb.zarr"
+    zarr.mkdir()
+    (zarr / ".zgroup").write_text("{}")
+    with pytest.raises(ValueError, match="is a Zarr folder, as NWB can be kept in"):
+        load_array(zarr)
+    (zarr / ".zgroup").rename(zarr / "session.nwb")
+    with pytest.raises(ValueError, match=r"is a folder of session\.nwb"):
+        load_array(zarr)
+    (zarr / "session.nwb").unlink()
+    zarr.rmdir()
     with pytest.raises(ValueError, match="is a folder of nothing"):
         load_array(tmp_path)
     bent = vb.WhiskerArray([vb.samples.gamma().with_properties(name="Lgamma")])

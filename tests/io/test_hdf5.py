@@ -10,7 +10,14 @@ import xarray as xr
 from h5py import h5d, h5s, h5t
 
 from vibrissa import samples
-from vibrissa.io import kind_of, load_recording, load_tracks, recognise, save_recording
+from vibrissa.io import (
+    kind_of,
+    load_recording,
+    load_signals,
+    load_tracks,
+    recognise,
+    save_recording,
+)
 from vibrissa.io.netcdf import netcdf_image, read_dataset, read_tree, write_netcdf
 from vibrissa.trial import facing_peg, measure, simulate, whisking
 
@@ -231,3 +238,12 @@ def test_damage_ends_in_one_line(tmp_path, content, name, seed):
             warnings.simplefilter("ignore")
             said = fault(read, path)
         assert said is None or (str(path) in said and "\n" not in said), (read, said)
+
+
+def test_columns_that_are_no_numbers_are_said_with_the_file(tmp_path):
+    path = tmp_path / "signals.nc"
+    names = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
+    data = xr.Dataset({name: ("time", np.zeros(3)) for name in names}, {"time": np.arange(3.0)})
+    write_netcdf(path, data.assign(Fx=("time", ["a", "b", "c"])))
+    with pytest.raises(ValueError, match=r"signals\.nc: could not convert"):
+        load_signals(path)

@@ -118,6 +118,9 @@ def test_bad_deeplabcut(tmp_path, rng):
         (text.rstrip() + "abc\n", "line 8 has cells that are no numbers"),
         (text.replace("coords,x,y,", "coords,x,x,"), "same name"),
         ("a,b,c\n1,2,3\n", "no table of DeepLabCut"),
+        (text[text.index("bodyparts") :], "header rows are bodyparts, coords; it lacks scorer"),
+        (text.split("\n", 1)[0] + "\n" + text, "line 2 is the header row scorer a second time"),
+        (text + text, "line 9 is a header row once more"),
     ):
         path.write_text(spoilt)
         with pytest.raises(ValueError, match=message) as caught:

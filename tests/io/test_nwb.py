@@ -280,3 +280,63 @@ def test_bad_files(tmp_path, recording):
         file["a"] = 1
     with pytest.raises(ValueError, match="no NWB file"):
         load_nwb(path)
+
+
+def without(*names):
+    def change(series):
+        for name in names:
+            if name in series:
+                del series[name]
+
+    return change
+
+
+def instead(name, values):
+    def change(series):
+        if name in series:
+            del series[name]
+        series[name] = values
+
+    return change
+
+
+SPOILT = (
+    (without("data"), "has no data"),
+    (without("timestamps", "starting_time"), "neither timestamps nor a starting_time"),
+    (instead("timestamps", np.array([b"now"] * 40)), "numbers are needed"),
+    (instead("data", np.array([b"ab"] * 40)), "numbers are needed"),
+    (instead("data", np.zeros(40)), r"shape \(40,\)"),
+    (instead("confidence", np.array([b"ab"] * 40)), "numbers are needed"),
+    (instead("confidence", np.zeros(3)), "confidence of another size"),
+    (lambda series: series["data"].attrs.__setitem__("conversion", "mm"), "no number"),
+)
+
+
+@pytest.mark.parametrize(("spoil", "said"), SPOILT)
+def test_what_is_wrong_with_a_series_is_said(tmp_path, recording, spoil, said):
+    path = tmp_path / "bad.nwb"
+    save_nwb(path, recording, SESSION)
+    with h5py.File(path, "r+") as file:
+        found = []
+        file.visititems(
+            lambda name, item: (
+                found.append(name)
+                if item.attrs.get("neurodata_type") == "PoseEstimationSeries"
+                else None
+            )
+        )
+        spoil(file[found[0]])
+    with pytest.raises(ValueError, match=said) as caught:
+        load_tracks(path)
+    assert str(path) in str(caught.value)
+    assert "Error(" not in str(caught.value)
+
+
+def test_what_is_wrong_with_forces_is_said(tmp_path, recording):
+    path = tmp_path / "bad.nwb"
+    save_nwb(path, recording, SESSION)
+    for values, said in ((np.zeros((40, 2)), r"shape \(40, 2\)"), ([b"a"] * 40, "numbers are")):
+        with h5py.File(path, "r+") as file:
+            instead("data", values)(file["processing/behavior/force_C1"])
+        with pytest.raises(ValueError, match=said):
+            load_nwb_series(path)

@@ -6,7 +6,6 @@ what is anything else (text, functions, objects of classes) is left out.
 
 from __future__ import annotations
 
-import io
 import struct
 import zlib
 from collections.abc import Mapping
@@ -65,7 +64,7 @@ def _version_5(path: Path) -> dict[str, Any]:
     try:
         file = path.read_bytes()
         _check_elements(file[_HEADER:], "<" if file[_HEADER - 2 : _HEADER] == b"IM" else ">")
-        content = loadmat(io.BytesIO(file))
+        content = loadmat(path)
     except Exception as error:  # SciPy's errors for damaged files are of many kinds.
         raise ValueError(
             f"{path} cannot be read as a MATLAB file: it is of another format, cut short or "

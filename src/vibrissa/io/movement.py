@@ -14,6 +14,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from vibrissa.io.hdf5 import naming
 from vibrissa.io.netcdf import read_dataset
 from vibrissa.io.tracks import Labels, RawTracks, labelled
 
@@ -53,7 +54,11 @@ def load_movement(path: str | PathLike[str], **labels: Unpack[Labels]) -> xr.Dat
 def read_movement(path: str | PathLike[str]) -> RawTracks:
     """Read a poses dataset as raw tracks; see `load_movement`."""
     path = Path(path)
-    poses = read_dataset(path)
+    with naming(path, "a poses dataset of movement"):
+        return _raw(path, read_dataset(path))
+
+
+def _raw(path: Path, poses: xr.Dataset) -> RawTracks:
     poses = poses.rename({old: new for old, new in _NAMES.items() if old in poses.dims})
     if "position" not in poses or not {"time", "keypoint", "space"} <= set(poses["position"].dims):
         got = ", ".join(str(name) for name in poses.variables) or "nothing"

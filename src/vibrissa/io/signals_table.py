@@ -18,6 +18,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa.io.columns import signal_columns, unit_factor, units_of
+from vibrissa.io.hdf5 import naming
 from vibrissa.io.netcdf import is_netcdf, read_dataset
 from vibrissa.io.replace import replacing
 from vibrissa.io.table import is_number, read_rows, read_text, table_rows
@@ -199,7 +200,8 @@ def _netcdf(path: Path) -> Array:
         raise ValueError(
             f"{path} is no table of signals: it lacks {', '.join(missing)} (it has {got})"
         )
-    columns = [_in_si(path, data[name]) for name in COLUMNS]
+    with naming(path, "a table of signals"):
+        columns = [_in_si(path, data[name]) for name in COLUMNS]
     if any(column.ndim != 1 for column in columns) or len({c.size for c in columns}) != 1:
         shapes = {name: c.shape for name, c in zip(COLUMNS, columns, strict=True)}
         raise ValueError(f"{path}: all columns must run along time; got shapes {shapes}")

@@ -1,6 +1,9 @@
 """Where files may go and what can be read: said before anything is computed."""
 
 import os
+import tempfile
+from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 
@@ -34,16 +37,29 @@ def test_where_a_folder_can_be_made(tmp_path):
             check_folder(path)
 
 
-@pytest.mark.skipif(
-    not hasattr(os, "geteuid") or os.geteuid() == 0, reason="nothing is forbidden to root"
-)
-def test_a_folder_that_cannot_be_written_to(tmp_path):
-    locked = tmp_path / "locked"
-    locked.mkdir(mode=0o500)
-    with pytest.raises(PermissionError, match="locked"):
-        check_writable(locked / "a.csv")
-    with pytest.raises(PermissionError, match="locked"):
-        check_folder(locked / "a")
+@contextmanager
+def without_rights():
+    """Not as root, to whom nothing is forbidden."""
+    if os.geteuid() != 0:
+        yield
+        return
+    os.setresuid(65534, 65534, 0)
+    try:
+        yield
+    finally:
+        os.setresuid(0, 0, 0)
+
+
+@pytest.mark.skipif(not hasattr(os, "setresuid"), reason="this system has no such users")
+def test_a_folder_that_cannot_be_written_to():
+    # Folders of the other tests are closed to others than their owner.
+    with tempfile.TemporaryDirectory() as base:
+        Path(base).chmod(0o755)
+        locked = Path(base) / "locked"
+        locked.mkdir(mode=0o555)
+        for check, path in ((check_writable, locked / "a.csv"), (check_folder, locked / "a")):
+            with without_rights(), pytest.raises(PermissionError, match="locked"):
+                check(path)
 
 
 def test_what_can_be_read(tmp_path):

@@ -89,6 +89,8 @@ def test_a_rod_longer_than_any_whisker_is_confirmed(tmp_path):
     assert "--any-length" in fault
     assert "any_length=True" in fault
     assert ran(*words, "--any-length").exit_code == 0
+    long = ("map", "--length", "900", "-o", tmp_path / "no folder" / "map.nc")
+    assert "the folder" in str(ran(*long, "--any-length").exception)
     assert "If a rod of this length is meant" in " ".join(
         ran("info", tmp_path / "rod.csv").output.split()
     )

@@ -232,6 +232,25 @@ def test_bad_lengths(length):
         Whisker.straight(length)
 
 
+@pytest.mark.parametrize("length", [0.9, 3.0, 2e-4])
+def test_any_length_that_is_confirmed(length):
+    radius = {"base_radius": 0.01 * length}
+    for make in (
+        lambda **how: Whisker.straight(length, **how),
+        lambda **how: Whisker.parabola(length, 0.4 / length, **how),
+        lambda **how: Whisker.from_curvature(length, lambda s: (0.0, 0.0, 0.3 / length), **how),
+        lambda **how: Whisker.from_points(
+            samples.gamma().scaled(length / 40e-3).centerline(20), **how
+        ),
+    ):
+        with pytest.raises(ValueError, match=r"any_length=True \(Python\) or --any-length"):
+            make(**radius)
+        whisker = make(any_length=True, **radius)
+        assert whisker.length == pytest.approx(length, rel=1e-3)
+        assert Whisker.from_dataset(whisker.to_dataset()).length == whisker.length
+        assert whisker.with_properties(name="rod").length == whisker.length
+
+
 def test_metres_for_millimetres_are_named():
     with pytest.raises(ValueError, match="millimetres given as metres"):
         Whisker.parabola(39.4, 0.02)

@@ -49,7 +49,7 @@ def chart(
     Example: `vibrissa map --whisker C1.csv -o map.nc`; steel wire:
     `vibrissa map --length 300 --base-radius 500 --tip-radius 250 --modulus 200 --poisson 0.29`
     """
-    from vibrissa.cli.sources import tell_notes, whisker_from
+    from vibrissa.cli.sources import stated, tell_notes, whisker_from
     from vibrissa.io.paths import NETCDF, check_writable
     from vibrissa.mapping import ContactMap
     from vibrissa.whisker import Whisker
@@ -58,7 +58,10 @@ def chart(
     free([path], force)
     if length is not None and whisker is not None:
         raise ValueError("give either --whisker or the --length of a straight one")
-    chosen = whisker_from(whisker) if length is None else Whisker.straight(1e-3 * length)
+    if length is None:
+        chosen = whisker_from(whisker)
+    else:
+        chosen = Whisker.straight(1e-3 * length, **stated())
     chosen = _made(chosen, base_radius, tip_radius, modulus, poisson)
     tell_notes(chosen)
     with progress_bars() as tell:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from vibrissa.mapping import ContactMap
     from vibrissa.whisker import Whisker
+    from vibrissa.whisker.section import Properties
 
 _RAT = Annotated[
     str | None,
@@ -46,7 +47,8 @@ def about_whisker(verb: Verb) -> Verb:
     Parameters
     ----------
     verb : callable
-        Of the command line. Those of its parameters that are called ``whisker`` name the file.
+        Of the command line. Its parameter ``whisker``, if any, names the file; ``length`` is that
+        of a whisker without one.
 
     Returns
     -------
@@ -56,7 +58,8 @@ def about_whisker(verb: Verb) -> Verb:
 
     @wraps(verb)
     def wrapped(*args: Any, rat: str | None, any_length: bool, **others: Any) -> None:
-        if (rat is not None or any_length) and others.get("whisker", "") is None:
+        about = [others[name] for name in ("whisker", "length") if name in others]
+        if (rat is not None or any_length) and about and all(one is None for one in about):
             raise ValueError("--rat and --any-length are about a --whisker, and none is given")
         before = _stated.set({"rat": rat, "any_length": any_length})
         try:
@@ -76,6 +79,17 @@ def about_whisker(verb: Verb) -> Verb:
         [*(one.replace(annotation=hints[one.name]) for one in own), *new]
     )
     return cast(Verb, wrapped)
+
+
+def stated() -> Properties:
+    """Say what ``--rat`` and ``--any-length`` state.
+
+    Returns
+    -------
+    Properties
+        Keywords of a whisker.
+    """
+    return cast("Properties", dict(_stated.get()))
 
 
 def refuse_stated(path: Path | None) -> None:
@@ -123,7 +137,7 @@ def whisker_from(path: Path | None) -> Whisker:
     if not path.exists():
         raise FileNotFoundError(f"there is no file {path}")
     if not is_netcdf(path):
-        return load_whisker(path, **_stated.get())
+        return load_whisker(path, **stated())
     kind, rat = kind_of(path), _stated.get().get("rat")
     if kind == "vibrissa recording":
         from vibrissa.trial import recorded_whisker

@@ -68,6 +68,8 @@ def test_what_is_assumed_survives_a_recording(centerline, tmp_path):
     text = " ".join(ran("info", tmp_path / "t.nc").output.split())
     for name in whisker.assumed:
         assert f"{name} assumed" in text
+    text = ran("estimate", tmp_path / "t.nc", "--wrench", "-o", tmp_path / "found.nc").output
+    assert "radius assumed" in " ".join(text.split())
 
 
 def test_published_radii_on_the_command_line(centerline):

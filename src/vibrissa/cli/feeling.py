@@ -60,6 +60,7 @@ def signals(
         tell_statuses,
         tell_written,
     )
+    from vibrissa.cli.sources import tell_notes
     from vibrissa.io import save_recording, save_signals
     from vibrissa.io.paths import CSV, NETCDF, check_writable
     from vibrissa.pipeline import with_signals
@@ -81,6 +82,7 @@ def signals(
             refuse({"--whisker": whisker}, f"signals of the {options['source']} need none")
         done = with_signals(tree, **options)
         tell("signals", 1, 1)
+    tell_notes(*(options["whiskers"] or ()))
     say(described(done))
     found = done["signals"].to_dataset()
     tell_statuses(found["status"].values)

@@ -349,6 +349,7 @@ def estimated(
     """
     from vibrissa.cli.feeling import signal_options
     from vibrissa.cli.recordings import maps_from, noise_from, say, whiskers_for
+    from vibrissa.cli.sources import tell_notes
     from vibrissa.pipeline import sensor_noise, with_estimates, with_signals
     from vibrissa.sensing import FORCE_NOISE
 
@@ -359,6 +360,7 @@ def estimated(
         noise = noise_from(None, FORCE_NOISE * 1e6, None)
     maps = maps_from(how.charts, tree.sizes["whisker"], how.grid) if how.charts else []
     whiskers = [one.whisker for one in maps] if maps else whiskers_for(tree, how.whisker)
+    tell_notes(*whiskers)
     for k, whisker in enumerate(whiskers):
         _check_scale(name, signals.isel(whisker=k), whisker)
     by_default = how.names is None and how.method == "exact"

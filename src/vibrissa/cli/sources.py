@@ -150,11 +150,17 @@ def whisker_from(path: Path | None) -> Whisker:
     raise ValueError(f"{path} holds {kind or 'data of another kind'}, and no whisker")
 
 
-def tell_notes(whisker: Whisker) -> None:
-    """Print what is assumed about a whisker, and all else that its user should know."""
+def tell_notes(*whiskers: Whisker) -> None:
+    """Print what is assumed about whiskers, and all else that their user should know.
+
+    Parameters
+    ----------
+    *whiskers : Whisker
+        What several have in common is printed once.
+    """
     from vibrissa.cli.terminal import errors
 
-    for note in whisker.notes:
+    for note in dict.fromkeys(note for whisker in whiskers for note in whisker.notes):
         errors.print(f"note: {note}", highlight=False, markup=False, soft_wrap=True)
 
 

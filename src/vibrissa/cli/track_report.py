@@ -50,6 +50,7 @@ def tell_recording(result: xr.DataTree, path: Path) -> None:
     """
     import numpy as np
 
+    from vibrissa.cli.sources import tell_notes
     from vibrissa.trial import recorded_whisker
 
     data = result.to_dataset()
@@ -73,6 +74,7 @@ def tell_recording(result: xr.DataTree, path: Path) -> None:
             )
         for line in compared_contacts(result, k):
             output.print(f"  {line}", highlight=False, soft_wrap=True)
+    tell_notes(*(recorded_whisker(result, k) for k in range(data.sizes["whisker"])))
     for line in result.attrs.get("remarks", "").splitlines():
         output.print(f"note: {line}", highlight=False, soft_wrap=True)
     output.print(f"wrote {path}", highlight=False, soft_wrap=True)

@@ -26,7 +26,7 @@ def _numbers(name: str, value: ArrayLike, vector: bool) -> Array:
         if np.asarray(value).dtype.kind not in "iufO":
             raise TypeError
         if isinstance(value, np.ma.MaskedArray):
-            value = value.astype(np.float64).filled(np.nan)
+            value = np.ma.filled(value.astype(np.float64), np.nan)
         array = np.array(value, dtype=np.float64)  # a copy: the caller may go on using theirs
     except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{name} must be numbers; got {kind}") from error

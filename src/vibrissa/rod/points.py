@@ -192,7 +192,7 @@ def _find_starts(
         for i in range(n):
             forces[i] = _force(fold, found[i])
         while count < _STARTS and n > 0:
-            least = best = np.argmin(forces[:n])
+            least = best = int(np.argmin(forces[:n]))
             if forces[least] == np.inf:
                 break
             for i in range(n):

@@ -281,6 +281,17 @@ def parts(chart: Reach) -> IntArray:
     return np.asarray((4 * (4 * i // n) + (4 * j // m) % 4).reshape(-1))
 
 
+@lru_cache(maxsize=16)
+def volumes(chart: Reach) -> Array:
+    """Volumes of contact points that the chart's nodes stand for, flat."""
+    size = np.abs(np.linalg.det(chart.tangents[..., 3:, :] @ chart.frames))
+    for axis in range(3):  # nodes on its faces stand for half a cell
+        ends = np.ones(size.shape[axis])
+        ends[[0, -1]] = 0.5
+        size = size * np.expand_dims(ends, [i for i in range(3) if i != axis])
+    return np.asarray(np.maximum(size, np.finfo(float).tiny).reshape(-1))
+
+
 @kernel
 def _nearest(
     known: Array,

@@ -49,6 +49,8 @@ class Searched(NamedTuple):
         is.
     part : (n,) int array
         In which part of the chart a node is.
+    volume : (n,) array
+        Volume of contact points that a node stands for.
     length, force : float
         Units, m and N.
     """
@@ -65,6 +67,7 @@ class Searched(NamedTuple):
     turns: Array
     kinds: IntArray
     part: IntArray
+    volume: Array
     length: float
     force: float
 

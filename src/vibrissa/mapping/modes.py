@@ -21,7 +21,7 @@ from vibrissa.mapping.bounded import fit_within
 from vibrissa.mapping.fitting import channel_equations, whiten
 from vibrissa.mapping.inversion import MOST_CANDIDATES
 from vibrissa.mapping.least_squares import PARTS, nearest_of
-from vibrissa.mapping.posterior import judge, rank
+from vibrissa.mapping.posterior import CERTAIN, NORMAL_KURTOSIS, judge, rank, second_moment
 from vibrissa.mapping.weighing import Weighing, _covariance, weigh
 from vibrissa.mapping.whitening import INDISTINCT
 from vibrissa.rod.arrays import AnyArray, Array, IntArray
@@ -42,6 +42,8 @@ _NEAR, _ON_THE_WAY = 0.04, 0.5
 _MOST_STARTS = 6
 # Contacts within this (over L, and ten times that relative to the force) are one.
 _SAME = 1e-3
+# So many of the chart's nodes must count for their moments to replace those about one contact.
+_MANY = 30.0
 # Eigenvalues of a correlation matrix below this are rounding; what counts as exact, relative to the
 # other deviations.
 _SINGULAR, _EXACT = 1e-10, 1e-6
@@ -328,6 +330,42 @@ def _kept(limit: float, number: int, x: Array, values: Array, misfits: Array) ->
 
 
 @kernel
+def _over_the_map(
+    of: Searched, how: Weighing, weights: Array, target: Array, point: Array, covariance: Array
+) -> None:
+    """Replace a covariance by the second moment of the posterior over the chart's nodes.
+
+    That is where noise leaves more open than the second order about one contact can describe, so
+    that many nodes count; otherwise the covariance stays.
+    """
+    q, nodes = of.seen.shape
+    white, points, log = how.own[0, 0] > 0.0, np.empty((nodes, 3)), np.empty(nodes)
+    away, largest, total, squares = np.empty(q), -np.inf, 0.0, 0.0
+    for node in range(nodes):
+        for i in range(q):
+            away[i] = of.seen[i, node] - target[i]
+            away[i] -= np.rint(away[i] * of.turns[i]) * 2.0 * np.pi
+        misfit = 0.0
+        for i in range(q):
+            r = away[i]
+            if not white:
+                r = 0.0
+                for c in range(q):
+                    r += weights[i, c] * away[c]
+            misfit += r * r
+        log[node] = math.log(of.volume[node]) - 0.5 * misfit
+        largest = max(largest, log[node])
+    for node in range(nodes):
+        log[node] = math.exp(log[node] - largest)
+        total += log[node]
+        squares += log[node] * log[node]
+        for a in range(3):
+            points[node, a] = of.values[node, 3 + a] - point[a]
+    if total * total > _MANY * squares:
+        second_moment(points, log, total, NORMAL_KURTOSIS, covariance)
+
+
+@kernel
 def settle(
     of: Searched,
     how: Weighing,
@@ -437,3 +475,7 @@ def settle(
             for a in range(3):
                 copy(spread[old, a], covariances[row, c, a])
         valid[row] = fine[order[0, 0]]
+        if probability[row, 0] > CERTAIN and not valid[row]:
+            seen = measured[row] if how.own[0, 0] > 0.0 else targets[row]
+            best = weights[order[0, 0]]
+            _over_the_map(of, how, best, seen, values[row, 0, 3:], covariances[row, 0])

@@ -48,6 +48,9 @@ _REACH = 2.0
 # be relied on, the largest kurtosis relative to a normal distribution's, and the least share of the
 # nodes that counts.
 _MISSED, _TAILED, _COUNTING = 0.03, 1.8, 0.3
+# Where the second order misses so much, densities are not to be trusted: the first order tells what
+# a candidate weighs. A node's log density gains at most so much over the first order's.
+_BROKEN, _MOST_GAIN = 0.3, 3.0
 # With a smaller share than this moments mean nothing.
 _TOO_FEW = 0.1
 # Below this second order (relative to the first, at two standard deviations) the first will do.
@@ -77,6 +80,8 @@ def _kurtosis(nodes: Array) -> float:
     return float(((nodes**2).sum(axis=1) ** 2).mean())
 
 
+#: Fourth moment of three coordinates that are normally distributed.
+NORMAL_KURTOSIS = 15.0
 _NODES_3, _NODES_4 = _normal(3), _normal(4)
 # Fourth moment of the point's three coordinates: of the nodes, and with friction, where they are
 # three of four unknowns, that of a normal distribution.
@@ -368,7 +373,40 @@ def _density(
             total += slope * u[i]
         log -= 0.5 * (total * total - r0[a] * r0[a])
     det = _determinant(m, n)
-    return (abs(det) if friction else max(det, 0.0)) * math.exp(min(log, 8.0))
+    return (abs(det) if friction else max(det, 0.0)) * math.exp(min(log, _MOST_GAIN))
+
+
+@inlined
+def second_moment(
+    points: Array, density: Array, total: float, normal: float, covariance: Array
+) -> float:
+    """Fill the second moment (3, 3) of points (n, 3) of some density, widened for their tails.
+
+    Their kurtosis is returned, relative to what is normal; infinite where there is none.
+    """
+    root, back = np.zeros((3, 3)), np.empty(3)
+    for a in range(3):
+        for c in range(3):
+            covariance[a, c] = 0.0
+            for k in range(points.shape[0]):
+                covariance[a, c] += density[k] / total * points[k, a] * points[k, c]
+    if not _cholesky(covariance, root):
+        return np.inf
+    fourth = 0.0
+    for k in range(points.shape[0]):
+        size = 0.0
+        for a in range(3):
+            back[a] = points[k, a]
+            for c in range(a):
+                back[a] -= root[a, c] * back[c]
+            back[a] /= root[a, a]
+            size += back[a] * back[a]
+        fourth += density[k] / total * size * size
+    wider = max(fourth / normal, 1.0) ** 0.75
+    for a in range(3):
+        for c in range(3):
+            covariance[a, c] *= wider
+    return fourth / normal
 
 
 @inlined
@@ -378,8 +416,7 @@ def _moments(
     """Fill the second moment about the point, widened; mean density, and whether it can serve."""
     number = nodes.shape[0]
     points, density = np.empty((number, 3)), np.empty(number)
-    m, root, back = np.empty((4, 4)), np.zeros((3, 3)), np.empty(3)
-    total, squares = 0.0, 0.0
+    m, total, squares = np.empty((4, 4)), 0.0, 0.0
     for k in range(number):
         density[k] = _density(model, nodes[k], s, proximal, friction, points[k], m)
         total += density[k]
@@ -392,28 +429,11 @@ def _moments(
                     share = density[k] / total if total > 0.0 else 0.0
                     covariance[a, c] += share * points[k, a] * points[k, c]
         return total / number, False
+    normal = _KURTOSIS_4 if friction else _KURTOSIS_3
+    tailed = second_moment(points, density, total, normal, covariance)
     for a in range(3):
         for c in range(3):
-            covariance[a, c] = 0.0
-            for k in range(number):
-                covariance[a, c] += density[k] / total * points[k, a] * points[k, c]
-    if not _cholesky(covariance, root):
-        return total / number, False
-    fourth = 0.0
-    for k in range(number):
-        size = 0.0
-        for a in range(3):
-            back[a] = points[k, a]
-            for c in range(a):
-                back[a] -= root[a, c] * back[c]
-            back[a] /= root[a, a]
-            size += back[a] * back[a]
-        fourth += density[k] / total * size * size
-    tailed = fourth / (_KURTOSIS_4 if friction else _KURTOSIS_3)
-    wider = max(tailed, 1.0) ** 0.75 / counting
-    for a in range(3):
-        for c in range(3):
-            covariance[a, c] *= wider
+            covariance[a, c] /= counting
     return total / number, tailed < _TAILED and counting > _COUNTING
 
 
@@ -502,14 +522,16 @@ def judge(
             pulled = max(pulled, abs(pull))
         away = 4.0 * math.sqrt(away)
         inside = proximal + away < x[0] < 1.0 - away
-        if inside and bent < _STRAIGHT and pulled < _STRAIGHT:
-            for a in range(4):
-                copy(by_y[a], slopes[a])
-            density, fair = abs(_determinant(slopes, n)), True
-        else:
+        for a in range(4):
+            copy(by_y[a], slopes[a])
+        first_order, density, fair = abs(_determinant(slopes, n)), 0.0, True
+        straight = inside and bent < _STRAIGHT and pulled < _STRAIGHT
+        if not straight:
             density, fair = _moments(
                 model, _NODES_4 if friction else _NODES_3, x[0], proximal, friction, covariance
             )
+        if straight or (missed > _BROKEN and first_order > 0.0):
+            density = first_order
         weight[row] = math.log(density) - 0.5 * misfit if density > 0.0 else -np.inf
         valid[row] = missed < _MISSED and fair
 

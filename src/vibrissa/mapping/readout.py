@@ -15,7 +15,13 @@ import numpy as np
 
 from vibrissa.mapping.channels import CHANNELS, FITTED, WRENCH, Channels
 from vibrissa.mapping.explanation import Bounds, check_signals
-from vibrissa.mapping.least_squares import at_nodes, constant_weights, parts, seeding_triplet
+from vibrissa.mapping.least_squares import (
+    at_nodes,
+    constant_weights,
+    parts,
+    seeding_triplet,
+    volumes,
+)
 from vibrissa.mapping.locating import Searched
 from vibrissa.mapping.noise import SensorNoise, scaled_errors
 from vibrissa.mapping.weighing import Weighing
@@ -253,6 +259,7 @@ def _searched(
         turns,
         np.array(kinds),
         parts(chart),
+        volumes(chart),
         d.length,
         d.force,
     )

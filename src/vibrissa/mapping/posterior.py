@@ -157,8 +157,14 @@ def _principal(j: Array, k: int, unknowns: IntArray, axes: Array) -> bool:
             total += c[i, p] * c[i, p]
         length = math.sqrt(total)
         known = known and length > _OPEN
+        largest, best = -1.0, 0
+        for i in range(n):  # rounding must not choose an axis's sign: nodes are not symmetric
+            share = abs(axes[unknowns[i], p]) * size[i]
+            if share > 1.001 * largest:
+                largest, best = share, unknowns[i]
+        scale = math.copysign(1.0 / max(length, _OPEN), axes[best, p])
         for i in range(4):
-            axes[i, p] /= max(length, _OPEN)
+            axes[i, p] *= scale
     return known
 
 
@@ -341,11 +347,18 @@ def _determinant(m: Array, n: int) -> float:
 
 @inlined
 def _density(
-    model: Model, u: Array, s: float, proximal: float, friction: bool, y: Array, m: Array
+    model: Model,
+    u: Array,
+    s: float,
+    proximal: float,
+    friction: bool,
+    turn: float,
+    y: Array,
+    m: Array,
 ) -> float:
     """Posterior density at a node relative to the nodes' own, and the displacement y of the point.
 
-    ``m`` (4, 4) is working memory.
+    ``turn`` is 1 where the axes are right-handed, -1 otherwise; ``m`` (4, 4) is working memory.
     """
     r0, by_r, bent_r, by_y, bent_y, axes = model
     n, log = u.shape[0], 0.0
@@ -372,7 +385,7 @@ def _density(
                 slope += 0.5 * bent_r[a, i, q] * u[q]
             total += slope * u[i]
         log -= 0.5 * (total * total - r0[a] * r0[a])
-    det = _determinant(m, n)
+    det = turn * _determinant(m, n)
     return (abs(det) if friction else max(det, 0.0)) * math.exp(min(log, _MOST_GAIN))
 
 
@@ -411,14 +424,20 @@ def second_moment(
 
 @inlined
 def _moments(
-    model: Model, nodes: Array, s: float, proximal: float, friction: bool, covariance: Array
+    model: Model,
+    nodes: Array,
+    s: float,
+    proximal: float,
+    friction: bool,
+    turn: float,
+    covariance: Array,
 ) -> tuple[float, bool]:
     """Fill the second moment about the point, widened; mean density, and whether it can serve."""
     number = nodes.shape[0]
     points, density = np.empty((number, 3)), np.empty(number)
     m, total, squares = np.empty((4, 4)), 0.0, 0.0
     for k in range(number):
-        density[k] = _density(model, nodes[k], s, proximal, friction, points[k], m)
+        density[k] = _density(model, nodes[k], s, proximal, friction, turn, points[k], m)
         total += density[k]
         squares += density[k] * density[k]
     counting = total * total / (number * squares) if squares > 0.0 else 0.0
@@ -527,9 +546,15 @@ def judge(
         first_order, density, fair = abs(_determinant(slopes, n)), 0.0, True
         straight = inside and bent < _STRAIGHT and pulled < _STRAIGHT
         if not straight:
-            density, fair = _moments(
-                model, _NODES_4 if friction else _NODES_3, x[0], proximal, friction, covariance
-            )
+            for p in range(n):
+                for q in range(n):
+                    slopes[p, q] = axes[unknowns[p], q]
+            turn = math.copysign(1.0, _determinant(slopes, n))
+            nodes = _NODES_4 if friction else _NODES_3
+            density, fair = _moments(model, nodes, x[0], proximal, friction, turn, covariance)
+            for a in range(4):
+                for q in range(4):
+                    slopes[a, q] = 0.0
         if straight or (missed > _BROKEN and first_order > 0.0):
             density = first_order
         weight[row] = math.log(density) - 0.5 * misfit if density > 0.0 else -np.inf

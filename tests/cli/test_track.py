@@ -60,7 +60,29 @@ def test_two_videos_become_a_recording(videos, tmp_path):
     recording = load_recording(out)
     assert recording["trace"].shape[:3] == (16, 1, 2)
     np.testing.assert_allclose(recording["base_position"].values[0, 0], 0.0, atol=2e-4)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["trial.nc"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["start.png", "trial.nc"]
+
+
+def test_what_is_taken_for_the_whisker_is_said_and_shown(videos, tmp_path):
+    done = run(*arguments(videos, "--cameras", videos / "cameras.toml", "-o", tmp_path / "t.nc"))
+    (line,) = [line for line in done.stdout.splitlines() if "taken to begin at" in line]
+    base = CAMERAS[0].project(np.zeros(3))
+    said = np.array(line.split("begin at ")[1].split(" (top)")[0].split(","), dtype=float)
+    assert np.linalg.norm(said - base) < 5.0
+    assert "start.png" in line
+    assert (tmp_path / "start.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_views_that_contradict_each_other_are_refused_with_a_picture(videos, tmp_path):
+    """Moved sideways by a fifth, the front view shows no base in the column of the top view."""
+    frames = [np.roll(frame, 40, axis=1) for frame in read_video(videos / "front.mkv")]
+    write_video(tmp_path / "moved.mkv", frames)
+    words = ["track", videos / "top.mkv", tmp_path / "moved.mkv"]
+    done = run(*words, "--cameras", videos / "cameras.toml", "-o", tmp_path / "t.nc")
+    assert done.exit_code != 0
+    assert "--base X,Y --base X,Y" in str(done.exception)
+    assert (tmp_path / "start.png").exists()
+    assert not (tmp_path / "t.nc").exists()
 
 
 def test_several_trials_go_to_a_folder(videos, tmp_path):

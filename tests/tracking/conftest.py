@@ -1,5 +1,8 @@
 """A short whisk past a peg, filmed small: its truth is known to the last digit."""
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
@@ -8,6 +11,8 @@ from scipy.spatial import cKDTree
 from vibrissa import Whisker
 from vibrissa.trial import Motion, Peg, orthogonal_views, simulate
 from vibrissa.trial.film import film_frames, with_true_traces
+
+sys.path.append(str(Path(__file__).parent))  # tests and studies share the maker of films, furry.py
 
 FRAMES = 40
 CAMERAS = orthogonal_views(size=(256, 256), center=(5e-3, 0.0, 0.0))

@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 
     import xarray as xr
 
+    from vibrissa.tracking import Start
+
 _POOR = 2.0
 
 
@@ -33,6 +35,37 @@ def tell_lengths(videos: Sequence[Path], traces: Sequence[Sequence[Any]], used: 
         output.print(
             f"the videos differ in frames ({listed}); {used} of each are used: if the cameras did "
             "not start together or dropped frames, track with --offset auto",
+            highlight=False,
+            soft_wrap=True,
+        )
+
+
+def tell_start(start: Start, names: Sequence[str], picture: Path) -> None:
+    """Say what is taken for the whisker.
+
+    Parameters
+    ----------
+    start : Start
+        What was found.
+    names : sequence of str
+        Names of the views.
+    picture : Path
+        Where it is shown.
+    """
+    bases = start.bases or []
+    places = " and ".join(
+        f"{column:.0f},{row:.0f} ({name})" for name, (column, row) in zip(names, bases, strict=True)
+    )
+    output.print(
+        f"the whisker is taken to begin at {places}, as in {start.agreed[0]} of {start.agreed[1]} "
+        f"frames, with confidence {start.confidence:.2f}: see {picture}",
+        highlight=False,
+        soft_wrap=True,
+    )
+    if start.doubts:
+        output.print(
+            f"not sure: {'; '.join(start.doubts)}. If it is not the whisker, say where that leaves "
+            f"the face, once for each view: {' '.join('--base X,Y' for _ in names)}",
             highlight=False,
             soft_wrap=True,
         )

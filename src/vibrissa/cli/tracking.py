@@ -60,8 +60,8 @@ def track(
         list[str] | None,
         typer.Option(
             help="Column and row where a whisker leaves the face in the first frame, view by view "
-            "and then whisker by whisker; by default the whisker is traced that all views show, or "
-            "else the best seen one.",
+            "and then whisker by whisker; by default the whisker is traced that all views show: "
+            "start.png, beside the recording, shows which.",
             metavar="X,Y",
         ),
     ] = None,
@@ -169,12 +169,14 @@ def track(
         _check_head(beside["head"], videos[0], fps)
     trace = TraceOptions(scale=max(width / 3.0, 1.0), jump=jump, bright=bright)
     for file, trial in trials.items():
-        _tracked(trial, file, views, fps, places, fixed, trace, how, beside)
+        picture = file.with_name("start.png" if len(trials) == 1 else f"{file.stem}.start.png")
+        _tracked(trial, file, picture, views, fps, places, fixed, trace, how, beside)
 
 
 def _tracked(
     videos: Sequence[Path],
     recording: Path,
+    picture: Path,
     cameras: tuple[Camera, ...],
     fps: float,
     places: Sequence[Any],
@@ -190,7 +192,7 @@ def _tracked(
     from vibrissa.tracking import track as tracked
 
     if places[0] is None:
-        places = _found_bases(videos, cameras, options, how.offset)
+        places, options = _found(videos, picture, cameras, options, how.offset or 0)
     kept = [partial_traces(recording, view) for view in range(len(videos))]
     with progress_bars() as tell:
         traces = [
@@ -212,21 +214,35 @@ def _tracked(
     tell_recording(result, recording)
 
 
-def _found_bases(
+def _found(
     videos: Sequence[Path],
+    picture: Path,
     cameras: tuple[Camera, ...],
     options: TraceOptions,
-    offset: int | None,
-) -> list[Any]:
-    """Bases of the whisker that all views show; None where no line is the same in all."""
-    from vibrissa.io import read_video
-    from vibrissa.tracking import find_bases
+    offset: int,
+) -> tuple[list[Any], TraceOptions]:
+    """Find the whisker, and show what is taken for it before any time is spent on it."""
+    from dataclasses import replace
 
-    frames = [next(read_video(video), None) for video in videos]
-    if any(frame is None for frame in frames) or offset != 0:
-        return [None] * len(videos)
-    found = find_bases(cameras, [frame for frame in frames if frame is not None], options)
-    return [None] * len(videos) if found is None else [[base.tolist()] for base in found]
+    from vibrissa.cli.track_report import tell_start
+    from vibrissa.plots import save, start_views
+    from vibrissa.tracking import find_start, start_frames
+
+    numbers, frames = start_frames(videos, offset)
+    start = find_start(cameras, frames, options)
+    names = [camera.name for camera in cameras]
+    images = [view[start.frame] for view in frames]
+    remarks = [f"frame {numbers[start.frame]} of {videos[0].name}: {why}" for why in start.doubts]
+    figure = start_views(images, start.lines, names, start.confidence, remarks)
+    save(figure, picture.with_suffix(""), ("png",))
+    if start.bases is None:
+        raise ValueError(
+            f"where the whisker begins was not found: {start.doubts[0]}. See {picture}, and say "
+            "where it leaves the face, once for each view: "
+            + " ".join("--base X,Y" for _ in videos)
+        )
+    tell_start(start, names, picture)
+    return [[base.tolist()] for base in start.bases], replace(options, bright=start.bright)
 
 
 def _cameras(

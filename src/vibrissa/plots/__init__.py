@@ -16,6 +16,7 @@ from vibrissa.plots.sights import Sight
 from vibrissa.plots.signal_movie import signal_frames
 from vibrissa.plots.signals import signals_over_time
 from vibrissa.plots.slices import solid_slices
+from vibrissa.plots.start import start_views
 from vibrissa.plots.style import png, save
 from vibrissa.plots.surfaces import contact_surfaces
 from vibrissa.plots.sweep import drawable, sweep_overview
@@ -48,6 +49,7 @@ __all__ = [
     "signal_frames",
     "signals_over_time",
     "solid_slices",
+    "start_views",
     "sweep_overview",
     "telling_rows",
     "trial_overview",

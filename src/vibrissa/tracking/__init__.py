@@ -1,6 +1,6 @@
 """From two videos to a whisker in space: trace, merge, pose, contact, wrench."""
 
-from vibrissa.tracking.begin import find_bases, is_bright
+from vibrissa.tracking.begin import Start, find_bases, find_start, is_bright
 from vibrissa.tracking.filtering import low_pass
 from vibrissa.tracking.find import Found, find_whiskers
 from vibrissa.tracking.follow import Follower, start_at
@@ -13,7 +13,7 @@ from vibrissa.tracking.space import SpaceCurve, merge
 from vibrissa.tracking.timing import paired_frames
 from vibrissa.tracking.trace import Trace, TraceOptions
 from vibrissa.tracking.track import Tracked, TrackOptions, track, track_whisker
-from vibrissa.tracking.video_file import partial_traces, trace_file
+from vibrissa.tracking.video_file import partial_traces, start_frames, trace_file
 from vibrissa.tracking.view import trace_video
 
 __all__ = [
@@ -26,12 +26,14 @@ __all__ = [
     "RestShape",
     "Sight",
     "SpaceCurve",
+    "Start",
     "Trace",
     "TraceOptions",
     "TrackOptions",
     "Tracked",
     "base_pose",
     "find_bases",
+    "find_start",
     "find_whiskers",
     "is_bright",
     "low_pass",
@@ -41,6 +43,7 @@ __all__ = [
     "refine",
     "rest_shape",
     "start_at",
+    "start_frames",
     "trace_file",
     "trace_video",
     "track",

@@ -1,44 +1,126 @@
-"""Where to begin: what is seen in the first frames of all views together.
+"""Where to begin: what several frames of all views show together.
 
-A view alone may take an edge of an object for the face, or a seam of the background for a whisker.
-Of all lines, each one way or the other, those count that views see as one curve in space; of these
-one that begins at the face in all views comes first, then one that gets thinner outward, then the
-one that is seen over the longest way.
+In one view or one frame a hair may be more like a whisker than the whisker is, or the glint of a
+peg. In each of some frames, lines that may be whiskers are combined, one of each view. A
+combination counts the more, the more its lines are like whiskers and the better the views agree
+about its base and its tip. The bases that outweigh all others over all frames are taken.
+
+What does not move is left out unless nothing moves. Where a view shows the whisker before the
+animal itself, that view does not show where it begins; the other views do.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.io.video import Frame
 from vibrissa.tracking import ridge
-from vibrissa.tracking.find import Found, darker_inward, find_whiskers
+from vibrissa.tracking.curves import Curve, find_curves
 from vibrissa.tracking.follow import start_at
-from vibrissa.tracking.space import merge
-from vibrissa.tracking.trace import Trace, TraceOptions
+from vibrissa.tracking.scene import Scene
+from vibrissa.tracking.trace import TraceOptions
 from vibrissa.trial.cameras import Camera
 from vibrissa.trial.triangulation import triangulate
 
 Array = NDArray[np.float64]
 
-_LINES = 6
+FRAMES = 30
+"""How many frames a start is best found in."""
+
+_VOTES = 10
+"""In how many of them whiskers are looked for."""
+
+_LINES = 8
 """How many lines of a view are looked at."""
 
-_APART = 3.0
-"""How far bases may be from where the other views say, pixels."""
+_GAP = 6.0
+"""How far bases are from where the other views say: standard deviation, pixels."""
 
-_MISFIT = 40.0
-"""Misfit of a curve in space, in standard deviations, from which it is none: a few pixels."""
+_TIP = 0.15
+"""The same of tips, which are cut where they are faint or hidden: as a share of the length."""
+
+_TOGETHER, _SELDOM = 3.0, 0.2
+"""How near tips of one whisker are where both views show them, pixels, and in how many frames that
+is so at least: fewer than half where they are faint."""
+
+_SAME = 25.0
+"""How far the base of one whisker moves from frame to frame at most, pixels."""
+
+_LONGER = 30.0
+"""How much longer a line is if it goes on before a body than if it began there, pixels."""
+
+_BEFORE = 30.0
+"""How far a line may be followed into a body beyond where it begins, pixels."""
+
+_MOVED = 0.4
+"""Share of a whisker that moves, from which on more is no more."""
 
 _BETTER = 1.5
 """By how much more must be seen of a bright whisker than of a dark one."""
 
-_THINNER = 2.0
-"""By how much a whisker must get fainter to be told from its other end, in units of the noise."""
+_LONG = 80.0
+"""Score of what is a whisker rather than a hair."""
+
+_HALF_SEEN, _HALF = 0.6, 0.5
+"""How much the confidence is worth if one view alone shows where the whisker begins, and if what
+does not move begins at no face."""
+
+_POLARITY = 3
+"""Frames in which that is looked at."""
+
+_SURE, _GUESS = 0.5, 0.2
+"""Confidence below which there is doubt, and below which nothing is found."""
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Where a whisker begins, as several frames of all views show it together.
+
+    Parameters
+    ----------
+    bases : list of array (2,), or None
+        Column and row of its base in each view, in the first frame that shows it; None if views
+        show no line in common.
+    lines : list of array (n, 2)
+        View by view, what is taken for the whisker in the frame in which it is seen best; without
+        points where there is nothing.
+    frame : int
+        Which of the frames that is.
+    bright : bool
+        Whether whiskers are bright on a dark background.
+    confidence : float
+        Between 0 and 1: how much more frames say so than anything else.
+    agreed : tuple of int
+        In how many frames nothing else is likelier, and of how many frames.
+    doubts : tuple of str
+        Why it may be wrong, a sentence each.
+    """
+
+    bases: list[Array] | None
+    lines: list[Array]
+    frame: int
+    bright: bool
+    confidence: float
+    agreed: tuple[int, int]
+    doubts: tuple[str, ...]
+
+
+class _Combination(NamedTuple):
+    """A line of each view, in one frame."""
+
+    frame: int
+    worth: float
+    bases: Array  # (view, 2)
+    gap: float
+    tip_gap: float  # as a share of the length
+    share: float  # how good its lines are relative to the best of their views
+    curves: tuple[Curve, ...]
 
 
 def negative(frame: Frame) -> Frame:
@@ -84,10 +166,10 @@ def is_bright(
 
 
 def _seen(frame: Frame, bases: Sequence[ArrayLike] | None, options: TraceOptions) -> float:
-    """Length that is seen, pixels; twice that of what begins at a face."""
+    """Length that is seen, pixels, the less the less it is like a whisker."""
     if bases is None:
-        found = find_whiskers(frame, options)[:1]
-        return sum(f.trace.support * (2.0 if f.from_face else 1.0) for f in found)
+        curves = find_curves(frame, Scene.of([frame], options.scale), options)
+        return max((curve.score for curve in curves), default=0.0)
     noise = ridge.noise_level(frame)
     return sum(
         max((t.support for t in start_at(base, options).from_base(frame, noise)), default=0.0)
@@ -105,7 +187,7 @@ def find_bases(
     cameras : sequence of Camera
         The views.
     frames : sequence of array (height, width)
-        One of each view, of the same moment.
+        One of each view, of the same moment. Several moments say more: see `find_start`.
     options : TraceOptions, optional
         How whiskers are traced.
 
@@ -114,42 +196,256 @@ def find_bases(
     list of array (2,), or None
         Column and row of its base in each view; None if no line is the same in all.
     """
+    return find_start(cameras, [[frame] for frame in frames], options).bases
+
+
+def find_start(
+    cameras: Sequence[Camera],
+    frames: Sequence[Sequence[Frame]],
+    options: TraceOptions | None = None,
+) -> Start:
+    """Find the whisker that all views show.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        The views.
+    frames : sequence of sequence of array (height, width)
+        View by view, frames of the same moments, the first frame of the film first. Some `FRAMES`
+        that are spread over a whisk or more tell the whisker from what does not move.
+    options : TraceOptions, optional
+        How whiskers are traced; ``bright``, unless None, is not asked.
+
+    Returns
+    -------
+    Start
+        What was found, with its confidence and what there is to doubt.
+
+    Raises
+    ------
+    ValueError
+        If views and cameras do not fit, or there is no frame.
+    """
     options = options or TraceOptions()
-    frames = [negative(f) if is_bright(f, None, options) else f for f in frames]
-    lines = [_both_ways(find_whiskers(f, options)[:_LINES]) for f in frames]
-    best: tuple[tuple[bool, int, int, float], list[Array]] | None = None
-    for one in product(*lines):
-        traces = [found.trace for found in one]
-        if not _same(cameras, traces):
-            continue
-        faces = sum(found.from_face for found in one)
-        thinner = sum(
-            darker_inward(f, ridge.noise_level(f), t, options) / ridge.noise_level(f)
-            for f, t in zip(frames, traces, strict=True)
+    counts = {len(view) for view in frames}
+    if len(frames) != len(cameras) or len(counts) != 1 or 0 in counts:
+        raise ValueError(
+            f"{len(cameras)} cameras and {[len(view) for view in frames]} frames in the views do "
+            "not fit: every view needs as many, one at least"
         )
-        sure = int(np.sign(thinner)) if abs(thinner) > _THINNER else 0
-        worth = (faces == len(cameras), sure, faces, sum(t.support for t in traces))
-        if best is None or worth > best[0]:
-            best = worth, [trace.line[0] for trace in traces]
-    return None if best is None else best[1]
+    search, bright = _Search.of(cameras, frames, options), bool(options.bright)
+    if options.bright is not False:
+        other = _Search.of(cameras, [[negative(f) for f in view] for view in frames], options)
+        few = search.moments(_POLARITY)
+        bright = bright or other.worth(few) > _BETTER * search.worth(few)
+        search = other if bright else search
+    return _start(search, search.vote(), bright)
 
 
-def _both_ways(found: Sequence[Found]) -> list[Found]:
-    turned = [
-        Found(
-            Trace(t.line[::-1], t.sigma[::-1], t.seen[::-1], t.confidence),
-            from_face=False,
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """Views in which whiskers are dark."""
+
+    cameras: Sequence[Camera]
+    frames: Sequence[Sequence[Frame]]
+    scenes: Sequence[Scene]
+    options: TraceOptions
+    known: dict[tuple[int, int, bool], list[Curve]] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        cameras: Sequence[Camera],
+        frames: Sequence[Sequence[Frame]],
+        options: TraceOptions,
+    ) -> _Search:
+        return cls(cameras, frames, [Scene.of(view, options.scale) for view in frames], options)
+
+    def moments(self, count: int) -> list[int]:
+        """Frames that are spread over all of them, the first among them."""
+        whole = len(self.frames[0])
+        return sorted({int(i) for i in np.linspace(0, whole - 1, min(count, whole))})
+
+    def vote(self) -> _Vote:
+        """What most frames say: of what moves, or if nothing does, of all that is there."""
+        moments = self.moments(_VOTES)
+        vote = _voted([self._combined(m, self.curves(m, moving=True)) for m in moments])
+        if vote.confidence >= _SURE:
+            return vote
+        moving = [self._shown(view, moments) for view in range(len(self.cameras))]
+        if not any(moving):
+            found = [self._combined(m, self.curves(m, moving=False)) for m in moments]
+            return self._resting(_voted(found))
+        # A view that shows the whisker before the animal does not show where it begins.
+        for view in range(len(self.cameras)):
+            if any(shown for other, shown in enumerate(moving) if other != view):
+                other = _voted([self._combined(m, self._before(m, view)) for m in moments])
+                name, confidence = self.cameras[view].name, _HALF_SEEN * other.confidence
+                other = other._replace(hidden=name, confidence=confidence)
+                vote = max(vote, other, key=lambda one: one.confidence)
+        return vote
+
+    def _resting(self, vote: _Vote) -> _Vote:
+        """What is said of what does not move, though it could have been seen to."""
+        if all(scene.background is None for scene in self.scenes):
+            return vote
+        from_face = all(curve.from_face for one in vote.winners for curve in one.curves)
+        confidence = vote.confidence * (1.0 if from_face else _HALF)
+        return vote._replace(moves=False, confidence=confidence)
+
+    def curves(self, moment: int, moving: bool) -> list[list[Curve]]:
+        """What may be whiskers, view by view, the likeliest first."""
+        found = []
+        for view in range(len(self.cameras)):
+            curves = self._found(view, moment, inside=False)
+            if moving:
+                curves = [c._replace(score=c.score * min(1.0, c.moved / _MOVED)) for c in curves]
+            found.append(sorted(curves, key=lambda curve: -curve.score)[:_LINES])
+        return found
+
+    def _found(self, view: int, moment: int, inside: bool) -> list[Curve]:
+        key = view, moment, inside
+        if key not in self.known:
+            frame = self.frames[view][moment]
+            self.known[key] = find_curves(frame, self.scenes[view], self.options, inside)
+        return self.known[key]
+
+    def _shown(self, view: int, moments: Sequence[int]) -> bool:
+        """Whether a view by itself shows something long that moves, in half of the frames."""
+        best = [
+            max((c.score for c in self.curves(m, moving=True)[view]), default=0.0) for m in moments
+        ]
+        return self.scenes[view].background is not None and float(np.median(best)) > _LONG
+
+    def _before(self, moment: int, view: int) -> list[list[Curve]]:
+        """Curves of which those of one view may run before a body: they begin where others say."""
+        found = self.curves(moment, moving=True)
+        first = next(other for other in range(len(found)) if other != view)
+        # Where it is seen to begin at a body, hardly more is to be seen before that body.
+        begun = [c.length for c in found[view] if c.from_face and c.score > self.options.shortest]
+        least = _LONGER + max(begun, default=0.0)
+        loose = [c for c in self._found(view, moment, inside=True) if c.length > least]
+        cut = [
+            part
+            for known in found[first][:2]
+            for curve in loose
+            for part in self._cut(curve, view, known.line[0], first)
+            if part.length > least
+        ]
+        found[view] = sorted(cut, key=lambda curve: -curve.score)[:_LINES]
+        return found
+
+    def _cut(self, curve: Curve, view: int, base: Array, other: int) -> list[Curve]:
+        """Let a curve begin where it is seen in line with the base of another view."""
+        line = curve.line
+        cameras = [self.cameras[other], self.cameras[view]]
+        gaps = base_gap(cameras, np.stack([np.broadcast_to(base, line.shape), line]))
+        at = int(np.nanargmin(gaps))
+        share = 1.0 - at / len(line)
+        if gaps[at] > 2.0 * _GAP or curve.length * share < self.options.shortest:
+            return []
+        # A line that goes on before that base does not begin there.
+        before = np.exp(-curve.length * (1.0 - share) / _BEFORE)
+        worth = float(curve.score * share * before) * min(1.0, curve.moved / _MOVED)
+        return [curve._replace(line=line[at:], length=curve.length * share, score=worth)]
+
+    def _combined(self, moment: int, curves: list[list[Curve]]) -> list[_Combination]:
+        curves = [[curve for curve in view if curve.score > 0.0] for view in curves]
+        every = list(product(*curves))
+        if not every:
+            return []
+        ends = np.array([[[c.line[0], c.line[-1]] for c in one] for one in every])
+        gaps = base_gap(self.cameras, np.moveaxis(ends, 1, 0))
+        best = [view[0].score for view in curves]
+        found = []
+        for one, bases, (gap, tip_gap) in zip(every, ends[:, :, 0], gaps, strict=True):
+            tip = float(tip_gap) / min(curve.length for curve in one)
+            worth = float(np.exp(np.mean([np.log(max(c.score, 1e-9)) for c in one])))
+            worth *= np.exp(-0.5 * (gap / _GAP) ** 2) / (1.0 + (tip / _TIP) ** 2)
+            share = min(c.score / most for c, most in zip(one, best, strict=True))
+            if worth > 1.0:
+                found.append(_Combination(moment, worth, bases, float(gap), tip, share, one))
+        return sorted(found, key=lambda one: -one.worth)
+
+    def worth(self, moments: Sequence[int]) -> float:
+        """How much is seen of whiskers in some frames."""
+        found = [self._combined(m, self.curves(m, moving=True)) for m in moments]
+        return sum(row[0].worth for row in found if row)
+
+
+class _Vote(NamedTuple):
+    """What most frames say."""
+
+    winners: list[_Combination]  # of the frames that show it
+    confidence: float
+    agreed: tuple[int, int]  # in how many of how many frames nothing else is likelier
+    moves: bool = True
+    hidden: str = ""  # the view that does not show where it begins
+
+
+def _voted(found: Sequence[Sequence[_Combination]]) -> _Vote:
+    """Choose the bases that outweigh all others over all frames."""
+    every = [one for row in found for one in row[:3]]
+    if not every:
+        return _Vote([], 0.0, (0, len(found)))
+
+    def supporters(center: _Combination) -> list[_Combination]:
+        near = ([one for one in row if _near(one, center)][:1] for row in found)
+        return [one for first in near for one in first]
+
+    best = max(every, key=lambda one: sum(other.worth for other in supporters(one)))
+    winners = supporters(best)
+    total = sum(one.worth for one in winners)
+    rivals = (one for one in every if not _near(one, best))
+    rival = max((sum(one.worth for one in supporters(other)) for other in rivals), default=0.0)
+    firsts = [row[0] for row in found if row]
+    agreed = sum(any(one is first for first in firsts) for one in winners)
+    # A whisker that leaves out what a view shows best is in doubt, whatever the others show.
+    share = min(1.0, 2.0 * float(np.median([one.share for one in winners])))
+    gap = float(np.median([one.gap for one in winners]))
+    sure = share * float(np.exp(-0.5 * (gap / _GAP) ** 2))
+    confidence = sure * agreed / len(found) * total / (total + rival)
+    return _Vote(winners, confidence, (agreed, len(found)))
+
+
+def _near(one: _Combination, other: _Combination) -> bool:
+    return bool((np.hypot(*(one.bases - other.bases).T) < _SAME).all())
+
+
+def _start(search: _Search, vote: _Vote, bright: bool) -> Start:
+    """Say what was found, and what there is to doubt."""
+    if not vote.winners or vote.confidence < _GUESS:
+        moment = search.moments(_VOTES)[0]
+        alone = [
+            curves[0].line if curves else np.empty((0, 2)) for curves in search.curves(moment, True)
+        ]
+        missing = [c.name for c, line in zip(search.cameras, alone, strict=True) if not len(line)]
+        why = (
+            f"nothing in {' and '.join(missing)} is like a whisker"
+            if missing
+            else "the views show no line that could be one whisker in space"
         )
-        for t, _ in found
-    ]
-    return [*found, *turned]
-
-
-def _same(cameras: Sequence[Camera], traces: Sequence[Trace]) -> bool:
-    """Whether traces are images of one curve in space."""
-    if base_gap(cameras, np.array([trace.line[0] for trace in traces])) > _APART:
-        return False
-    return bool(merge(cameras, traces).misfit < _MISFIT)
+        return Start(None, alone, moment, bright, 0.0, vote.agreed, (why,))
+    best = max(vote.winners, key=lambda one: one.worth)
+    confidence, doubts = vote.confidence, []
+    if not vote.moves:
+        doubts.append("nothing that moves is like a whisker; this does not move")
+    if vote.hidden:
+        doubts.append(f"in {vote.hidden} it seems to begin on a dark body, at no edge of that")
+    if confidence < _SURE:
+        first, count = vote.agreed
+        doubts.append(f"it is the likeliest in {first} of {count} frames, or others are nearly so")
+    gap = float(np.median([one.gap for one in vote.winners]))
+    if gap > 0.5 * _GAP:
+        doubts.append(f"its base is {gap:.0f} pixels from where the other view shows it")
+    tips = [one.tip_gap * min(c.length for c in one.curves) for one in vote.winners]
+    together = float(np.mean(np.array(tips) < _TOGETHER))
+    if together < _SELDOM:
+        doubts.append(f"views show its tip at one place in {100.0 * together:.0f} % of frames only")
+    clear = [one for one in vote.winners if one.worth > 0.5 * best.worth]
+    bases = list(min(clear, key=lambda one: one.frame).bases)
+    lines = [curve.line for curve in best.curves]
+    return Start(bases, lines, best.frame, bright, confidence, vote.agreed, tuple(doubts))
 
 
 def base_gap(cameras: Sequence[Camera], pixels: Array) -> Array:

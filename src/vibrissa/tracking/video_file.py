@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import islice
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vibrissa.io import load_traces, read_video, save_traces, video_info
+from vibrissa.io import load_traces, read_video, save_traces, video_frames, video_info
+from vibrissa.io.video import Frame
+from vibrissa.tracking.begin import FRAMES
 from vibrissa.tracking.trace import Trace, TraceOptions
 from vibrissa.tracking.view import trace_video
 
@@ -34,6 +37,53 @@ def partial_traces(recording: str | PathLike[str], view: int) -> Path:
     """
     recording = Path(recording)
     return recording.with_name(f".{recording.name}.view{view}.npz")
+
+
+_SPAN = 400
+"""From how many frames at the beginning of a film those for its start are taken."""
+
+
+def start_frames(
+    videos: Sequence[str | PathLike[str]], offset: int = 0
+) -> tuple[list[int], list[list[Frame]]]:
+    """Read frames of the beginning of a film, from which its whisker can be found.
+
+    Parameters
+    ----------
+    videos : sequence of str or path
+        The video of each view.
+    offset : int
+        Frames by which the other cameras began before the first.
+
+    Returns
+    -------
+    numbers : list of int
+        Numbers of the frames in the first video.
+    frames : list of list of array (height, width)
+        View by view, frames of the same moments.
+
+    Raises
+    ------
+    ValueError
+        If a video has no frames of these moments.
+    """
+    firsts = [max(-offset, 0), *(max(offset, 0) for _ in videos[1:])]
+    infos = [video_info(video).frames for video in videos]
+    span = min(_SPAN, *(count - first for count, first in zip(infos, firsts, strict=True)))
+    rows = np.unique(np.linspace(0, max(span, 1) - 1, min(FRAMES, max(span, 1))).astype(int))
+    frames = [_some(video, first + rows) for video, first in zip(videos, firsts, strict=True)]
+    count = min(len(view) for view in frames)
+    if not count:
+        raise ValueError(f"{', '.join(map(str, videos))}: there is no frame of all views")
+    return (firsts[0] + rows[:count]).tolist(), [view[:count] for view in frames]
+
+
+def _some(video: str | PathLike[str], numbers: Any) -> list[Frame]:
+    try:
+        return list(video_frames(video, numbers))
+    except ValueError:
+        # Not every file says truly how many frames it has.
+        return list(islice(read_video(video), int(numbers[0]), int(numbers[0]) + FRAMES))
 
 
 def trace_file(

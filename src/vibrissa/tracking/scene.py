@@ -1,0 +1,378 @@
+"""What stands still in a view: its light, its background, and how dark a body is.
+
+A whisker is thin and moves. A grey closing (the largest values nearby, then the smallest of these)
+removes what is thin, so that light and bodies (the face, objects) stay; the value that a pixel
+exceeds in a sixth of the frames is its background, on which moving whiskers leave no mark, so that
+wires, glints and scale bars do not show in the difference from it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vibrissa.io.video import Frame
+from vibrissa.rod.compiled import kernel
+
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+Labels = NDArray[np.int32]
+
+_HALF = 2
+"""Bodies are looked for in images of half the size."""
+
+_THIN = 7
+"""Width of what a closing removes, pixels of half the size, for a whisker of usual width."""
+
+_SOFT = 4.0
+"""Smoothing of the light, pixels of half the size."""
+
+_SPARSE = 8
+
+_RANK = 0.15
+"""Share of the frames in which a pixel is brighter than its background."""
+
+_FEWEST = 6
+"""Frames from which a background can be taken."""
+
+_DARK, _LIT = 0.75, 0.85
+"""How dark bodies are in the mean at most, and at their edges, relative to the light."""
+
+_EVEN = 0.01
+"""How much it counts that light is even, compared with what is seen of it."""
+
+_SMALLEST = 40
+"""Smallest body, pixels of half the size."""
+
+_LARGE = 0.02
+"""Share of the image that a face covers at least."""
+
+_RANGE = (-20.0, 80.0)
+"""Differences that count, grey values."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bodies:
+    """Dark bodies in one frame, in an image of half its size.
+
+    Parameters
+    ----------
+    label : array (height / 2, width / 2)
+        Number of the body that covers a pixel, from 1; 0 where there is none.
+    face : array (n + 1,)
+        Whether each body is at the border of the image and large, as a face is.
+    """
+
+    label: Labels
+    face: NDArray[np.bool_]
+
+    def at(self, places: Array) -> Labels:
+        """Say which body covers pixels of the frame.
+
+        Parameters
+        ----------
+        places : array (n, 2)
+            Column and row.
+
+        Returns
+        -------
+        array (n,)
+            Its number; 0 where there is none.
+        """
+        at = np.asarray(places / _HALF, dtype=np.int64)
+        rows, columns = self.label.shape
+        row, column = at[:, 1].clip(0, rows - 1), at[:, 0].clip(0, columns - 1)
+        return np.asarray(self.label[row, column])
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """One view without its whiskers.
+
+    Parameters
+    ----------
+    light : array (height, width)
+        Grey values where nothing thin is.
+    level : array (height / 2, width / 2)
+        Grey values below which there is a body; 0 everywhere if nothing stands out as dark.
+    background : array (height, width), optional
+        Grey values of what does not move; None if too few frames are known.
+    sample : array (n, m)
+        The usual frame, at every eighth pixel, to which the light of others is compared.
+    thin : int
+        Width of what the closing removes, pixels of half the size.
+    """
+
+    light: Image
+    level: Image
+    background: Image | None
+    sample: Image
+    thin: int
+
+    @classmethod
+    def of(cls, frames: Sequence[Frame], scale: float = 1.0) -> Scene:
+        """Take the scene from frames of one view.
+
+        Parameters
+        ----------
+        frames : sequence of array (height, width)
+            Grey values, of moments that are as different as can be had; one will do.
+        scale : float
+            Width of a whisker, relative to a usual one.
+
+        Returns
+        -------
+        Scene
+        """
+        sparse = np.stack([f[::_SPARSE, ::_SPARSE] for f in frames]).astype(np.float32)
+        usual = np.median(sparse, axis=0)
+        thin = 2 * int(np.ceil(0.5 * _THIN * scale)) - 1
+        background = None
+        if len(frames) >= _FEWEST:
+            gains = np.array([_gain(one, usual) for one in sparse], dtype=np.float32)
+            background = np.empty(frames[0].shape, dtype=np.float32)
+            rank = max(1, int(_RANK * len(frames)))
+            nth_largest(np.stack(frames), gains, rank, background)
+            background -= np.median(background[::_SPARSE, ::_SPARSE] - usual)
+        still = halved(frames[0] if background is None else background)
+        light = smoothed(closed(still, thin + 2), _SOFT)
+        return cls(
+            doubled(light, frames[0].shape),
+            _level(closed(still, thin + 2)),
+            background,
+            np.asarray(usual, dtype=np.float32),
+            thin,
+        )
+
+    def gain(self, frame: Frame) -> float:
+        """Say how much brighter a frame is than the scene.
+
+        Parameters
+        ----------
+        frame : array (height, width)
+            Grey values.
+
+        Returns
+        -------
+        float
+            1 if it is as bright: lamps flicker.
+        """
+        return _gain(frame[::_SPARSE, ::_SPARSE], self.sample)
+
+    def bodies(self, frame: Frame) -> Bodies:
+        """Find what is dark and not thin in a frame.
+
+        Parameters
+        ----------
+        frame : array (height, width)
+            Grey values.
+
+        Returns
+        -------
+        Bodies
+        """
+        from scipy.ndimage import label
+
+        dark = smoothed(closed(halved(frame), self.thin), 0.75) < self.level * self.gain(frame)
+        labels, count = label(dark)
+        area = np.bincount(labels.ravel(), minlength=count + 1)
+        area[0] = 0
+        border = np.zeros(count + 1, dtype=bool)
+        for edge in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
+            border[edge] = True
+        number = np.where(area >= _SMALLEST, np.arange(count + 1), 0)
+        return Bodies(number[labels].astype(np.int32), border & (area > _LARGE * labels.size))
+
+    def difference(self, frame: Frame) -> Image:
+        """Say how much darker a frame is than the light.
+
+        Parameters
+        ----------
+        frame : array (height, width)
+            Grey values.
+
+        Returns
+        -------
+        array (height, width)
+            Grey values, clipped where they are large.
+        """
+        out = np.empty(frame.shape, dtype=np.float32)
+        darker(frame, self.light, self.gain(frame), *_RANGE, out)
+        return out
+
+    def moved(self, frame: Frame, places: Array) -> NDArray[np.bool_]:
+        """Say where what is dark in a frame is usually not.
+
+        Parameters
+        ----------
+        frame : array (height, width)
+            Grey values.
+        places : array (n, 2)
+            Column and row of pixels that are darker than the light.
+
+        Returns
+        -------
+        array (n,)
+            Whether at least half of the darkness is missing in the background; everywhere if that
+            is not known.
+        """
+        if self.background is None:
+            return np.ones(len(places), dtype=bool)
+        column, row = np.rint(places).astype(np.int64).T
+        gain, grey = self.gain(frame), frame[row, column].astype(np.float64)
+        whole = gain * self.light[row, column] - grey
+        return np.asarray(gain * self.background[row, column] - grey > 0.5 * whole)
+
+
+def _gain(sparse: Any, usual: Any) -> float:
+    # With one grey value more, so that what is black in both is as bright.
+    return float(np.median((sparse + np.float32(1.0)) / (usual + np.float32(1.0))))
+
+
+def halved(image: Any) -> Image:
+    """Bring an image to half its size; of four pixels the brightest stays."""
+    rows, columns = (n - n % _HALF for n in image.shape)
+    image = image[:rows, :columns]
+    rowwise = np.maximum(image[::2], image[1::2])
+    return np.asarray(np.maximum(rowwise[:, ::2], rowwise[:, 1::2]), dtype=np.float32)
+
+
+def doubled(image: Image, shape: tuple[int, ...]) -> Image:
+    """Bring an image back to a size twice as large."""
+    large = np.repeat(np.repeat(image, _HALF, axis=0), _HALF, axis=1)
+    return np.pad(large, [(0, n - m) for n, m in zip(shape, large.shape, strict=True)], mode="edge")
+
+
+def closed(image: Image, width: int) -> Image:
+    """Grey closing with a square: what is dark and thinner than it vanishes.
+
+    Parameters
+    ----------
+    image : array (height, width)
+        Grey values.
+    width : int
+        Of the square, pixels; odd.
+
+    Returns
+    -------
+    array (height, width)
+        Grey values.
+    """
+    from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
+    for extreme in (maximum_filter1d, minimum_filter1d):
+        for axis in (0, 1):
+            image = extreme(image, width, axis=axis, mode="nearest")
+    return image
+
+
+def smoothed(image: Image, sigma: float) -> Image:
+    """Smooth an image with a Gaussian."""
+    from scipy.ndimage import gaussian_filter
+
+    return np.asarray(gaussian_filter(image, sigma, truncate=3.0, mode="nearest"))
+
+
+def _level(still: Image) -> Image:
+    """Grey values below which there is a body: a share of the light, which may fall unevenly."""
+    part = still[::4, ::4].astype(np.float64)
+    rows, columns = (np.linspace(-1.0, 1.0, n) for n in still.shape)
+
+    def terms(y: Array, x: Array) -> Array:
+        return np.stack([0.0 * x + 1.0, x, y, x * x, x * y, y * y], axis=-1)
+
+    y, x = np.meshgrid(rows[::4], columns[::4], indexing="ij")
+    design, value = terms(y.ravel(), x.ravel()), np.log(np.maximum(part.ravel(), 1.0))
+    # Where all is dark the light is as it is elsewhere, rather than whatever a parabola becomes.
+    even = np.sqrt(_EVEN * len(value)) * np.eye(design.shape[1])[1:]
+    coefficients = np.zeros(design.shape[1])
+    coefficients[0] = np.quantile(value, 0.9)
+    for _ in range(30):
+        # What is darker than the rest counts ever less: the fit rises to the open ground.
+        low = np.minimum(value - design @ coefficients, 0.0)
+        weight = 1.0 / (1.0 + (low / 0.1) ** 2)
+        coefficients = np.linalg.lstsq(
+            np.concatenate([design * weight[:, None], even]),
+            np.concatenate([value * weight, np.zeros(len(even))]),
+        )[0]
+    whole = terms(*np.meshgrid(rows, columns, indexing="ij"))
+    share = _threshold(np.exp(value - design @ coefficients))
+    return np.asarray(share * np.exp(whole @ coefficients), dtype=np.float32)
+
+
+def _threshold(share: Array) -> float:
+    """Otsu's threshold between dark and bright; 0 if they do not differ enough."""
+    counts, edges = np.histogram(share, bins=128, range=(0.0, 1.5))
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    below = np.cumsum(counts).astype(np.float64)
+    above = below[-1] - below
+    total = np.cumsum(counts * middle)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        dark, bright = total / below, (total[-1] - total) / above
+        between = np.nan_to_num(below * above * (bright - dark) ** 2)
+    # Nearer to the light it is the light's own unevenness that is divided.
+    between[edges[1:] > _LIT] = 0.0
+    # Between empty bins every threshold is as good: the middle one is taken.
+    best = np.flatnonzero(between >= (1.0 - 1e-9) * between.max())
+    at = int(best[len(best) // 2])
+    return float(edges[at + 1]) if dark[at] < _DARK * bright[at] else 0.0
+
+
+@kernel
+def nth_largest(frames: Any, gains: Any, rank: int, out: Any) -> None:
+    """Per pixel the value that is the n-th largest of all frames.
+
+    Parameters
+    ----------
+    frames : array (n, height, width)
+        Grey values.
+    gains : array (n,)
+        How bright each frame is: its grey values are divided by it.
+    rank : int
+        Which, from 1.
+    out : array (height, width)
+        Result.
+    """
+    count, rows, columns = frames.shape
+    top = np.empty((rank, columns), np.float32)
+    for row in range(rows):
+        for k in range(rank):
+            for column in range(columns):
+                top[k, column] = -1.0
+        for i in range(count):
+            share = np.float32(1.0) / gains[i]
+            # Each value goes down the list until it meets a smaller one, which goes on instead.
+            for column in range(columns):
+                value = share * frames[i, row, column]
+                for k in range(rank):
+                    other = top[k, column]
+                    top[k, column] = max(value, other)
+                    value = min(value, other)
+        for column in range(columns):
+            out[row, column] = top[rank - 1, column]
+
+
+@kernel
+def darker(frame: Any, light: Any, gain: float, low: float, high: float, out: Any) -> None:
+    """How much darker a frame is than the light.
+
+    Parameters
+    ----------
+    frame, light : array (height, width)
+        Grey values.
+    gain : float
+        How bright the frame is: the light is multiplied by it.
+    low, high : float
+        To which differences are clipped.
+    out : array (height, width)
+        Result.
+    """
+    rows, columns = frame.shape
+    for row in range(rows):
+        for column in range(columns):
+            value = gain * light[row, column] - frame[row, column]
+            out[row, column] = min(max(value, low), high)

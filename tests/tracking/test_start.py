@@ -1,0 +1,181 @@
+"""Where a whisker begins, found without a click in films with all that looks like one."""
+
+import numpy as np
+import pytest
+from furry import Film, Setup
+
+from vibrissa.tracking import TraceOptions, find_bases, find_start, trace_video
+from vibrissa.tracking.begin import negative
+from vibrissa.tracking.curves import joined
+from vibrissa.tracking.lines import Segment, segments
+from vibrissa.tracking.scene import Scene, nth_largest
+
+SMALL = {"size": (320, 320), "frames": 16, "rate": 40.0}
+
+
+@pytest.fixture(scope="module")
+def films():
+    """Films whose frames are spread over some whisks, made once."""
+    made = {}
+
+    def film(seed, **setup):
+        key = seed, tuple(sorted(setup.items()))
+        if key not in made:
+            made[key] = Film(Setup(seed=seed, **{**SMALL, **setup}))
+        return made[key]
+
+    return film
+
+
+def misses(film, start):
+    """Distance of the bases from where the whisker leaves the fur, view by view, pixels."""
+    true = [view[0][0] for view in film.curves]
+    return [float(np.linalg.norm(b - t)) for b, t in zip(start.bases, true, strict=True)]
+
+
+@pytest.mark.parametrize(
+    ("seed", "setup"),
+    [
+        (200, {}),
+        (201, {}),
+        (202, {"crf": 28}),
+        (206, {"noise": 8.0}),
+        (203, {"bright": True}),
+        (207, {"still": True}),
+    ],
+    ids=["left", "another", "compressed", "noisy", "bright", "at rest"],
+)
+def test_the_whisker_is_found_among_fur_glint_and_wires(films, seed, setup):
+    film = films(seed, **setup)
+    start = find_start(film.cameras, film.frames)
+    assert max(misses(film, start)) < 5.0
+    assert start.confidence > 0.5
+    assert start.bright == setup.get("bright", False)
+    assert bool(start.doubts) == setup.get("still", False)
+    for view, line in enumerate(start.lines):
+        away = np.linalg.norm(line[:, None] - film.curves[view][start.frame][None], axis=2)
+        assert np.median(away.min(axis=1)) < 1.5
+
+
+def test_followed_from_there_no_frame_is_lost():
+    film = Film(Setup(seed=200, **{**SMALL, "frames": 24, "rate": 500.0}))
+    start = find_start(film.cameras, [view[::3] for view in film.frames])
+    for view, frames in enumerate(film.frames):
+        (row,) = trace_video(frames, [start.bases[view]], TraceOptions(bright=start.bright))
+        for i, trace in enumerate(row):
+            away = np.linalg.norm(trace.line[:, None] - film.curves[view][i][None], axis=2)
+            assert np.median(away.min(axis=1)) < 1.5
+
+
+def test_films_without_a_whisker_are_in_doubt(films):
+    film = films(205, whisker=False)
+    start = find_start(film.cameras, film.frames)
+    assert start.bases is None or start.confidence < 0.5
+    assert start.doubts
+
+
+def test_views_of_different_whiskers_are_in_doubt(films):
+    """Each view shows a whisker, at other columns and in other frames than the other one."""
+    one, other = films(200), films(201)
+    for first, second in ((one, other), (other, one)):
+        front = [np.roll(frame, 20, axis=1) for frame in second.frames[1]]
+        start = find_start(first.cameras, [first.frames[0], front])
+        assert start.bases is None or start.confidence < 0.5
+        assert start.doubts
+
+
+def test_bright_whiskers_begin_where_dark_ones_do(films):
+    film = films(200)
+    dark = find_start(film.cameras, film.frames)
+    bright = find_start(film.cameras, [[negative(f) for f in view] for view in film.frames])
+    assert (dark.bright, bright.bright) == (False, True)
+    for a, b in zip(dark.bases, bright.bases, strict=True):
+        # Grey values are rounded before and after the light is taken from them.
+        np.testing.assert_allclose(a, b, atol=1.0)
+
+
+def test_a_whisker_before_the_animal_is_never_taken_without_doubt(films):
+    """Grey fur behind it in one view hides where it begins: only the other view shows that."""
+    film = films(241, cheek=True)
+    start = find_start(film.cameras, film.frames)
+    assert start.doubts
+    assert start.confidence < 0.6
+    assert start.bases is None or max(misses(film, start)) < 8.0
+
+
+def test_one_frame_is_enough_on_even_ground(filmed):
+    """Mirrored left to right, the bases are mirrored, but for what a pixel is rounded to."""
+    frames = [view[0] for view in filmed.frames]
+    bases = find_bases(filmed.cameras, frames)
+    width = frames[0].shape[1]
+    for base, other in zip(
+        bases, find_bases(filmed.cameras, [f[:, ::-1] for f in frames]), strict=True
+    ):
+        np.testing.assert_allclose([width - 1.0 - other[0], other[1]], base, atol=2.0)
+
+
+def test_views_without_frames_are_refused(filmed):
+    with pytest.raises(ValueError, match="every view needs as many"):
+        find_start(filmed.cameras, [filmed.frames[0][:3], filmed.frames[1][:2]])
+    with pytest.raises(ValueError, match="every view needs as many"):
+        find_start(filmed.cameras, [[], []])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_background_is_an_order_statistic(seed):
+    generator = np.random.default_rng(seed)
+    frames = generator.integers(0, 256, (11, 6, 7)).astype(np.uint8)
+    out = np.empty((6, 7), np.float32)
+    for rank in (1, 3, 11):
+        nth_largest(frames, np.ones(11, np.float32), rank, out)
+        np.testing.assert_allclose(out, np.sort(frames, axis=0)[-rank], rtol=1e-6)
+
+
+def dark_line(angle, size=160, gap=0.0, noise=1.5):
+    """A dark line through the middle of an even image, and how far each pixel is along it."""
+    y, x = np.mgrid[:size, :size] - 0.5 * (size - 1)
+    along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
+    shown = (np.abs(along) < 60.0) & (np.abs(along) >= 0.5 * gap)
+    image = 180.0 - 70.0 * shown * np.exp(-0.5 * (across / 1.2) ** 2)
+    image += np.random.default_rng(0).normal(0.0, noise, image.shape)
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("angle", np.linspace(0.0, np.pi, 9)[:-1])
+def test_a_line_of_any_direction_is_one_segment_in_its_middle(angle):
+    frame = dark_line(angle)
+    scene = Scene.of([frame])
+    found = segments(scene.difference(frame), scene.bodies(frame))
+    (line,) = [one for one in found if len(one.places) > 60]
+    x, y = (line.places - 0.5 * (frame.shape[0] - 1)).T
+    across = y * np.cos(angle) - x * np.sin(angle)
+    assert np.abs(across[4:-4]).max() < 0.3  # ends are drawn aside by noise
+    assert np.hypot(np.ptp(x), np.ptp(y)) == pytest.approx(120.0, abs=6.0)
+
+
+@pytest.mark.parametrize("angle", [0.3, 1.4, 2.5])
+def test_parts_of_one_line_are_joined_and_parallel_lines_are_not(angle):
+    frame = dark_line(angle, gap=20.0)
+    scene = Scene.of([frame])
+    bodies = scene.bodies(frame)
+    found = segments(scene.difference(frame), bodies)
+    assert max(len(one.places) for one in found) < 60
+    assert max(np.ptp(one.places, axis=0).max() for one in joined(found, bodies)) > 80
+    x = np.arange(50.0)
+    beside = [
+        Segment(np.stack([x + 55.0 * k, 40.0 + 9.0 * k + 0.0 * x], axis=1), np.full(50, 20.0))
+        for k in range(2)
+    ]
+    assert len(joined(beside, bodies)) == 2
+
+
+def test_flickering_light_moves_nothing(films):
+    film = films(200)
+    lamp = 0.75 + 0.25 * np.cos(np.arange(SMALL["frames"]))
+    dim = [
+        [np.asarray(np.rint(f * s), dtype=np.uint8) for f, s in zip(view, lamp, strict=True)]
+        for view in film.frames
+    ]
+    start = find_start(film.cameras, dim)
+    assert max(misses(film, start)) < 5.0
+    assert not start.doubts

@@ -13,12 +13,15 @@ from scipy.spatial import cKDTree
 
 from looks.cases import Case, Filmed, filmed
 from vibrissa.tracking import (
+    Start,
     Trace,
+    TraceOptions,
     TrackOptions,
-    find_bases,
+    find_start,
     trace_video,
     track,
 )
+from vibrissa.tracking.begin import FRAMES
 from vibrissa.trial import recorded_whisker
 
 Array = NDArray[np.float64]
@@ -39,11 +42,10 @@ def tracked(case: Case, seed: int = 0) -> dict[str, Any]:
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         try:
-            first = [frames[0] for frames in film.frames]
-            bases = find_bases(film.cameras, first)
+            start = started(film)
             traces = [
-                trace_video(frames, None if bases is None else [bases[view]])
-                for view, frames in enumerate(film.frames)
+                trace_video(frames, [base], TraceOptions(bright=start.bright))
+                for frames, base in zip(film.frames, start.bases, strict=True)
             ]
             out |= trace_scores(film, traces)
             options = TrackOptions(properties=properties, offset=case.offset)
@@ -55,6 +57,16 @@ def tracked(case: Case, seed: int = 0) -> dict[str, Any]:
     out["said"] = sorted({str(one.message) for one in said})
     out["cpu"] = time.process_time() - begun
     return out
+
+
+def started(film: Filmed) -> Start:
+    """Where the whisker begins, from frames as `vibrissa track` reads them."""
+    count = min(len(frames) for frames in film.frames)
+    rows = np.unique(np.linspace(0, count - 1, min(FRAMES, count)).astype(int))
+    start = find_start(film.cameras, [[view[i] for i in rows] for view in film.frames])
+    if start.bases is None:
+        raise ValueError(f"where the whisker begins was not found: {start.doubts[0]}")
+    return start
 
 
 def trace_scores(film: Filmed, traces: list[list[list[Trace]]]) -> dict[str, Any]:

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from furry import Film, Setup
 
-from vibrissa.tracking import TraceOptions, find_bases, find_start, trace_video
+from vibrissa.io import VideoInfo, write_video
+from vibrissa.tracking import TraceOptions, find_bases, find_start, start_frames, trace_video
 from vibrissa.tracking.begin import negative
 from vibrissa.tracking.curves import joined
 from vibrissa.tracking.lines import Segment, segments
@@ -119,6 +120,22 @@ def test_views_without_frames_are_refused(filmed):
         find_start(filmed.cameras, [filmed.frames[0][:3], filmed.frames[1][:2]])
     with pytest.raises(ValueError, match="every view needs as many"):
         find_start(filmed.cameras, [[], []])
+
+
+@pytest.mark.parametrize("claimed", [None, 0, 90], ids=["right", "none", "too many"])
+@pytest.mark.parametrize("offset", [0, 2, -3])
+def test_frames_of_the_same_moments_are_read(tmp_path, monkeypatch, claimed, offset):
+    """Each frame is as grey as its number says, whatever the file says of how many there are."""
+    videos = [tmp_path / "top.mkv", tmp_path / "front.mkv"]
+    for video in videos:
+        write_video(video, [np.full((32, 32), 5 * i, np.uint8) for i in range(40)])
+    if claimed is not None:
+        info = VideoInfo(32, 32, claimed, 50.0, "ffv1")
+        monkeypatch.setattr("vibrissa.tracking.video_file.video_info", lambda video: info)
+    numbers, (first, second) = start_frames(videos, offset)
+    assert len(numbers) >= 25
+    assert [int(f[0, 0]) // 5 for f in first] == numbers
+    assert [int(f[0, 0]) // 5 for f in second] == [n + offset for n in numbers]
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -68,22 +68,20 @@ def start_frames(
         If a video has no frames of these moments.
     """
     firsts = [max(-offset, 0), *(max(offset, 0) for _ in videos[1:])]
-    infos = [video_info(video).frames for video in videos]
-    span = min(_SPAN, *(count - first for count, first in zip(infos, firsts, strict=True)))
-    rows = np.unique(np.linspace(0, max(span, 1) - 1, min(FRAMES, max(span, 1))).astype(int))
-    frames = [_some(video, first + rows) for video, first in zip(videos, firsts, strict=True)]
+    pairs = list(zip(videos, firsts, strict=True))
+    left = [(video_info(video).frames or _SPAN + first) - first for video, first in pairs]
+    span = max(1, min(_SPAN, *left))
+    rows = np.unique(np.linspace(0, span - 1, min(FRAMES, span)).astype(int))
+    try:
+        frames = [list(video_frames(video, first + rows)) for video, first in pairs]
+    except ValueError:
+        # Not every file says truly how many frames it has.
+        rows = np.arange(FRAMES)
+        frames = [list(islice(read_video(v), first, first + FRAMES)) for v, first in pairs]
     count = min(len(view) for view in frames)
     if not count:
         raise ValueError(f"{', '.join(map(str, videos))}: there is no frame of all views")
     return (firsts[0] + rows[:count]).tolist(), [view[:count] for view in frames]
-
-
-def _some(video: str | PathLike[str], numbers: Any) -> list[Frame]:
-    try:
-        return list(video_frames(video, numbers))
-    except ValueError:
-        # Not every file says truly how many frames it has.
-        return list(islice(read_video(video), int(numbers[0]), int(numbers[0]) + FRAMES))
 
 
 def trace_file(

@@ -118,8 +118,8 @@ def ending_in_order() -> Iterator[None]:
     try:
         yield
     finally:
-        for number, before in taken.items():
-            signal.signal(number, before)
+        for each, before in taken.items():
+            signal.signal(each, before)
 
 
 def shown(name: str, value: float, digits: int = 4) -> str:

@@ -116,8 +116,9 @@ def test_an_answer_beside_the_map_is_the_contact_of_least_misfit(gamma_map, besi
         return sum((a / one) ** 2 for a, one in zip(away, sigma.values(), strict=True))
 
     own = misfit(vb.base_signals(found.force[moved], found.moment[moved]))
-    np.testing.assert_allclose(own, found.misfit[moved], rtol=1e-4)
-    assert (own <= misfit(vb.base_signals(true.force, true.moment)) + 1e-3).all()
+    # Size and direction of M are fitted as components: the same to second order in the noise.
+    np.testing.assert_allclose(own, found.misfit[moved], rtol=1e-2)
+    assert (own <= 1.01 * misfit(vb.base_signals(true.force, true.moment)) + 1e-3).all()
 
 
 def test_probabilities_are_how_often_candidates_are_true(gamma_map, rng):

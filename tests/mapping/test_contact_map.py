@@ -76,7 +76,7 @@ def test_a_file_of_another_kind_is_refused(tmp_path):
         vb.ContactMap.load(other)
 
 
-@pytest.mark.parametrize("lost", ["chart", "whisker", "chart/fold", "whisker/radius"])
+@pytest.mark.parametrize("lost", ["chart", "whisker", "chart/fold", "chart/values"])
 def test_a_map_without_a_part_of_it_is_refused(tmp_path, gamma_map, lost):
     path = tmp_path / "map.nc"
     gamma_map.save(path)

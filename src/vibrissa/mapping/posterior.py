@@ -616,13 +616,7 @@ def judged(
     least: float,
     proximal: float,
 ) -> Judgement:
-    """Judge candidates of many measurements; the arguments are those of :func:`judge`.
-
-    Returns
-    -------
-    Judgement
-        Of each candidate.
-    """
+    """Judge candidates of many measurements; the arguments are those of :func:`judge`."""
     n, rod = len(contacts), discretization.rod
     out = Judgement(np.full((n, 3, 3), np.nan), np.full(n, -np.inf), np.zeros(n, np.bool_))
     codes = np.array([FITTED.index(name) for name in names])

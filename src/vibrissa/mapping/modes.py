@@ -42,8 +42,6 @@ _NEAR, _ON_THE_WAY = 0.04, 0.5
 _MOST_STARTS = 6
 # Contacts within this (over L, and ten times that relative to the force) are one.
 _SAME = 1e-3
-# A fit replaces the same contact, known already, if it lowers χ² by more than this.
-_BETTER = 0.01
 # So many of the chart's nodes must count for their moments to replace those about one contact.
 _MANY = 30.0
 # Eigenvalues of a correlation matrix below this are rounding; what counts as exact, relative to the
@@ -225,7 +223,7 @@ def _try(
         size = math.hypot(at[2], at[3])
         apart = math.hypot(x[c, 2] - at[2], x[c, 3] - at[3])
         if abs(x[c, 0] - at[0]) < _SAME and apart < 10.0 * _SAME * size:
-            if misfit < misfits[c] - _BETTER or not misfits[c] <= worth:
+            if not misfits[c] <= worth:
                 copy(at, x[c])
                 copy(value[0], values[c])
                 misfits[c] = misfit

@@ -151,7 +151,17 @@ def _principal(j: Array, k: int, unknowns: IntArray, axes: Array) -> bool:
         if largest < 1e-9:
             break
     known = True
-    for p in range(n):
+    for p in range(n):  # longest first: rounding must not choose the axes' order either
+        for q in range(p + 1, n):
+            pp, qq = 0.0, 0.0
+            for i in range(k):
+                pp += c[i, p] * c[i, p]
+                qq += c[i, q] * c[i, q]
+            if qq < pp:
+                for i in range(k):
+                    c[i, p], c[i, q] = c[i, q], c[i, p]
+                for i in range(4):
+                    axes[i, p], axes[i, q] = axes[i, q], axes[i, p]
         total = 0.0
         for i in range(k):
             total += c[i, p] * c[i, p]

@@ -85,7 +85,11 @@ def straight_map():
 @pytest.mark.parametrize("noise", ["deviations", "covariance", None])
 @pytest.mark.parametrize("names", ["FT FD MB MD", "Fx FT FD MB", "Fx FD MB MD"])
 def test_a_contact_that_turns_is_weighed_anew(straight_map, rng, names, noise):
-    """One size of force in any direction: weights depend on the direction."""
+    """One size of force in any direction: weights depend on the direction.
+
+    Noise that is larger than stated leaves much of the signals unexplained; the fits of a stream
+    and of a batch then end a small share of a standard deviation apart.
+    """
     whisker, n = straight_map.whisker, 12
     bent = vb.deflect(
         whisker, vb.PointForce(0.6 * whisker.length, 1e-4, rng.uniform(-np.pi, np.pi, n))
@@ -106,7 +110,11 @@ def test_a_contact_that_turns_is_weighed_anew(straight_map, rng, names, noise):
     found = [locate(row) for row in rows]
     assert [int(one.status) for one in found] == batch.status.tolist()
     stream = np.array([one.point for one in found])
-    np.testing.assert_allclose(stream, batch.point, atol=1e-6 * whisker.length)
+    apart = np.linalg.norm(stream - batch.point, axis=1)
+    spread = np.sqrt(np.trace(batch.covariance, axis1=1, axis2=2))
+    unexplained = (batch.status == vb.Status.NOT_FRICTIONLESS) & (given is not None)
+    allowed = np.where(unexplained, 1e-2 * spread, 1e-6 * whisker.length)
+    assert (apart <= allowed).all(), apart / allowed
 
 
 def test_a_stream_says_as_a_batch_why_nothing_explains_signals(gamma_map):

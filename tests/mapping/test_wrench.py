@@ -116,7 +116,11 @@ def test_covariance_predicts_the_scatter(place, force, rng):
 
 
 def test_small_deflections_are_flagged(rng):
-    """Where estimates are flagged linear, their scatter is as predicted; elsewhere it is not."""
+    """Where estimates are flagged linear, their scatter is as predicted; elsewhere it is not.
+
+    Covariances are widened for long tails, of which a few hundred samples show little: scatter
+    may be less than predicted now and then, but not more.
+    """
     whisker = WHISKERS["gamma"]
     covariance = np.diag(SIGMA**2)
     ratios, linear = [], []
@@ -130,7 +134,8 @@ def test_small_deflections_are_flagged(rng):
         ratios.append(scatter / np.sqrt(np.trace(one)))
     ratios, linear = np.array(ratios), exact.linear
     assert 8 <= linear.sum() <= 32
-    assert (np.abs(np.log(ratios[linear])) < np.log(1.25)).all(), ratios[linear]
+    assert (ratios[linear] < 1.25).all(), ratios[linear]
+    assert (np.abs(np.log(ratios[linear])) < np.log(1.25)).mean() > 0.9, ratios[linear]
     assert (np.abs(np.log(ratios[~linear])) > np.log(1.25)).mean() > 0.5, ratios[~linear]
 
 

@@ -6,8 +6,9 @@ little apart: the search tree is asked for those two standard deviations to eith
 minimised within Ω from what it finds and did not know. If nothing explains a measurement so, the
 search starts from the nodes of the chart that come nearest.
 
-Then all candidates are judged (:mod:`~vibrissa.mapping.posterior`). Batches call this row by row,
-as streams do.
+Then all candidates are judged (:mod:`~vibrissa.mapping.posterior`); where the second order does not
+describe one of them, they are compared by their likelihoods alone. Batches call this row by row, as
+streams do.
 """
 
 from __future__ import annotations
@@ -453,6 +454,12 @@ def settle(
             0,
             n,
         )
+        sound = True
+        for c in range(n):
+            sound = sound and fine[c]
+        for c in range(n):  # volumes that mean little are left out
+            if not sound and weight[0, c] > -np.inf:
+                weight[0, c] = -0.5 * misfits[row, c]
         number_here = np.array([n])
         rank(weight, number_here, chance, order)
         for c in range(n):

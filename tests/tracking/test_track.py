@@ -313,3 +313,15 @@ def test_the_rest_shape_ignores_how_it_is_held():
     whisker = whisker_at_rest(shape)
     expected = 2.0 * 8.0 / (1.0 + (2.0 * 8.0 * 10e-3) ** 2) ** 1.5
     assert whisker.curvature(10e-3)[2] == pytest.approx(expected, rel=0.05)
+
+
+def test_the_rest_shape_of_a_whisker_whose_tip_is_mostly_hidden():
+    """The frame that most others resemble may show less than the length that some show."""
+    s = np.linspace(0.0, 1.0, 101)
+    lengths = np.where(np.arange(60) % 10 == 0, 20e-3, 11e-3)
+    noise = np.random.default_rng(0).normal(0.0, 1e-6, (60, 101, 3))
+    along = lengths[:, None] * s
+    curves = np.stack([along, 8.0 * along**2, 0.0 * along], axis=-1) + noise
+    shape = rest_shape(curves, 0.9, lengths > 15e-3)
+    assert shape.length == pytest.approx(20e-3, rel=0.05)
+    assert shape.free.all()

@@ -107,8 +107,11 @@ def rest_shape(curves: Array, least: float = 0.1, tips: Mask | None = None) -> R
     first = np.flatnonzero(whole)[best]
     shapes, known, compared, whole = _compared(curves[seen], length / (curves.shape[1] - 1))
     near = np.isin(np.flatnonzero(seen)[whole], group)
+    if not near.any():
+        raise ValueError("no frame free of contact shows nearly the whole length of the whisker")
     part = shapes[whole, :compared]
-    mean = shapes[first, :compared]
+    # The first may show less of the length than is compared now.
+    mean = shapes[first, :compared] if whole[first] else part[near][0]
     deviation = np.full(len(shapes), np.inf)
     for _ in range(_ROUNDS):
         mean = np.median(_onto(part[near], mean), axis=0)

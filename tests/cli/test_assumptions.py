@@ -103,6 +103,15 @@ def test_a_prior_is_in_what_estimate_writes(folder, tmp_path, bent):
     assert (table["status"].values == Status.OUTSIDE_PRIOR).all()
 
 
+def test_a_prior_is_said_in_the_units_of_the_options(folder, tmp_path):
+    words = ("estimate", folder / "signals.csv", "--map", folder / "map.nc", "-o")
+    limits = ("--region", "r=20:35,theta=-30:30", "--least-force", 1, "--greatest-force", 900)
+    said = " ".join(done(*words, tmp_path / "a.csv", *limits).split())
+    where = "where r=20:35,theta=-30:30 (mm, degrees)"
+    assert f"contacts only {where} and of at least 1 µN and of at most 900 µN" in said
+    assert "contacts only in CB;" in done(*words, tmp_path / "b.csv", "--region", "CB")
+
+
 def lines(folder, tmp_path, *words):
     text = (folder / "signals.csv").read_text()
     out = done("stream", "--map", folder / "map.nc", *words, input=text)

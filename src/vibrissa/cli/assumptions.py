@@ -88,8 +88,26 @@ class Assumed(NamedTuple):
             for name, value in self.errors.items()
         ]
         if self.prior is not None:
-            parts.append(f"of contacts only {self.prior!r}")
+            parts.append(f"contacts only {_possible(self.prior)}")
         return "".join(f"; {part}" for part in parts)
+
+
+def _possible(prior: Prior) -> str:
+    """Say which contacts are possible, in the units of the options."""
+    parts = []
+    if not isinstance(prior.region, str):
+        limits = (
+            f"{name}={least / _UNITS[name]:g}:{greatest / _UNITS[name]:g}"
+            for name, (least, greatest) in prior.region.items()
+        )
+        parts.append(f"where {','.join(limits)} (mm, degrees)")
+    elif prior.region != "all":
+        parts.append(f"in {prior.region}")
+    if prior.least_force > 0.0:
+        parts.append(f"of at least {1e6 * prior.least_force:g} µN")
+    if prior.greatest_force < math.inf:
+        parts.append(f"of at most {1e6 * prior.greatest_force:g} µN")
+    return " and ".join(parts) or "of any place and force"
 
 
 def assumed(

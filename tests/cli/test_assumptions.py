@@ -59,7 +59,7 @@ def folder(tmp_path_factory, bent):
 
 def estimated(folder, tmp_path, *words):
     path = tmp_path / "contacts.csv"
-    done("estimate", folder / "signals.csv", *words, "-o", path)
+    done("estimate", folder / "signals.csv", *words, "-o", path, "--force")
     return load_contacts(path)
 
 
@@ -106,10 +106,10 @@ def test_a_prior_is_in_what_estimate_writes(folder, tmp_path, bent):
 def test_a_prior_is_said_in_the_units_of_the_options(folder, tmp_path):
     words = ("estimate", folder / "signals.csv", "--map", folder / "map.nc", "-o")
     limits = ("--region", "r=20:35,theta=-30:30", "--least-force", 1, "--greatest-force", 900)
-    said = " ".join(done(*words, tmp_path / "a.csv", *limits).split())
+    said = " ".join(run(*words, tmp_path / "a.csv", *limits).output.split())
     where = "where r=20:35,theta=-30:30 (mm, degrees)"
     assert f"contacts only {where} and of at least 1 µN and of at most 900 µN" in said
-    assert "contacts only in CB;" in done(*words, tmp_path / "b.csv", "--region", "CB")
+    assert "contacts only in CB;" in run(*words, tmp_path / "b.csv", "--region", "CB").output
 
 
 def lines(folder, tmp_path, *words):

@@ -124,7 +124,8 @@ def locate(
         found.n_candidates,
         found.status,
     )
-    return _located(contact_map.whisker, names, felt, candidates)
+    stated = found.candidate_covariances if method == "exact" else None
+    return _located(contact_map.whisker, names, felt, candidates, stated)
 
 
 def unfelt(
@@ -204,7 +205,7 @@ def locate_from_wrench(
         found.n_candidates,
         found.status,
     )
-    return _located(whisker, WRENCH, felt, candidates)
+    return _located(whisker, WRENCH, felt, candidates, found.covariance[:, None])
 
 
 class _Felt(NamedTuple):
@@ -212,7 +213,7 @@ class _Felt(NamedTuple):
 
     And in which frames they are known, in which a contact is felt and in which there is none, (n,);
     the noise of all frames together, (6, 6), if there is any; errors that all frames share
-    (k, 6, 7); and M_B from which contacts are felt, N·m.
+    (k, 6, 7); M_B from which contacts are felt, N·m; and whether all frames are as noisy.
     """
 
     time: xr.Variable
@@ -225,6 +226,7 @@ class _Felt(NamedTuple):
     typical: Array | None
     errors: Array
     above: float
+    steady: bool
 
     @classmethod
     def of(
@@ -251,16 +253,17 @@ class _Felt(NamedTuple):
             rows &= touching
             free |= known & ~touching
         above = float(np.median(least[rows])) if rows.any() else float(np.nanmax(least, initial=0))
-        typical = None
+        typical, steady = None, bool((covariance == covariance[:1]).all())
         if noise is not None:
-            same = bool((covariance == covariance[:1]).all())
-            typical = covariance[0] if same else _typical(covariance[rows])
+            typical = covariance[0] if steady else _typical(covariance[rows])
         shared = common_errors(**(errors or {}))
         if len(shared):
             whole = np.concatenate([force, moment], axis=1)
             covariance = covariance + common_covariance(shared, np.eye(6), whole)
         time = wrench["time"].variable
-        return cls(time, force, moment, covariance, known, rows, free, typical, shared, above)
+        return cls(
+            time, force, moment, covariance, known, rows, free, typical, shared, above, steady
+        )
 
 
 def _noise_of_frames(noise: ArrayLike | None, n: int) -> Array:
@@ -284,9 +287,17 @@ def _typical(covariance: Array) -> Array | None:
 
 
 def _located(
-    whisker: Whisker, names: tuple[str, ...], felt: _Felt, found: _Candidates
+    whisker: Whisker,
+    names: tuple[str, ...],
+    felt: _Felt,
+    found: _Candidates,
+    stated: Array | None = None,
 ) -> xr.Dataset:
-    """Write candidates of the felt frames as a dataset of all frames."""
+    """Write candidates of the felt frames as a dataset of all frames.
+
+    Covariances are those ``stated`` (n, some, 3, 3) by the estimate, which hold what they say up to
+    slip-off, where all frames are as noisy as it took them to be; otherwise of first order.
+    """
     rows = felt.rows
     shape = found.arc_lengths.shape
     flat = (found.arc_lengths.reshape(-1), found.contact_forces.reshape(-1, 3))
@@ -294,6 +305,9 @@ def _located(
     normals = contact_normals(whisker, *flat).reshape(*shape, 3)
     point_gain = gain[..., :3, :]
     spread = point_gain @ felt.covariance[rows][:, None] @ np.swapaxes(point_gain, -1, -2)
+    if stated is not None and felt.steady:
+        first = spread[:, : stated.shape[1]]
+        first[:] = np.where(np.isfinite(stated), stated, first)
     status = np.where(felt.known, int(Status.NOT_FELT), int(Status.MISSING)).astype(np.int8)
     status[felt.free] = int(Status.NO_CONTACT)
     status[rows] = found.status

@@ -76,7 +76,9 @@ def test_a_file_of_another_kind_is_refused(tmp_path):
         vb.ContactMap.load(other)
 
 
-@pytest.mark.parametrize("lost", ["chart", "whisker", "chart/fold", "chart/values"])
+@pytest.mark.parametrize(
+    "lost", ["chart", "whisker", "chart/fold", "chart/values", "whisker/radius"]
+)
 def test_a_map_without_a_part_of_it_is_refused(tmp_path, gamma_map, lost):
     path = tmp_path / "map.nc"
     gamma_map.save(path)

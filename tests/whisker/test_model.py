@@ -386,6 +386,17 @@ def test_another_dataset_is_refused():
         Whisker.from_dataset(samples.gamma().to_dataset().drop_vars("base_bending_stiffness"))
 
 
+@pytest.mark.parametrize("name", ["arc_length", "centerline", "radius"])
+def test_a_dataset_whose_drawing_was_lost_or_changed_is_refused(name):
+    """The polynomials count; who changed only the radius would be given the old one in silence."""
+    dataset = samples.gamma().to_dataset()
+    with pytest.raises(ValueError, match=f"lacks {name}"):
+        Whisker.from_dataset(dataset.drop_vars(name))
+    for factor in (1.01, np.nan):
+        with pytest.raises(ValueError, match="was changed: centerline and radius"):
+            Whisker.from_dataset(dataset.assign({name: dataset[name] * factor}))
+
+
 angles = st.floats(-np.pi, np.pi)
 
 

@@ -2,7 +2,8 @@
 
 Curvature and radius are stored as their polynomials, Σ c_k τ^k with τ ∈ [−1, 1] on each interval,
 so that what is read back equals what was written to the last bit. Centreline and radius at 101
-equally spaced points come along for whoever reads the file with other tools.
+equally spaced points come along for whoever reads the file with other tools; a file in which one
+of them is not there, or they are those of another whisker, was changed by somebody and is refused.
 """
 
 import json
@@ -106,6 +107,46 @@ def _profile_rows(name: str, profile: Profile, units: str, long_name: str) -> li
     ]
 
 
+def check_drawn(dataset: xr.Dataset, whisker: "Whisker") -> None:
+    """Raise if a file draws another whisker than its polynomials make.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        What `whisker_dataset` wrote, as far as nobody changed it.
+    whisker : Whisker
+        Made of it.
+
+    Raises
+    ------
+    ValueError
+        If centreline or radius at the points that come along are not those of the whisker, so
+        that it is open which of both is meant.
+    """
+    if dataset.variables.keys().isdisjoint(_DRAWN):
+        return
+    s, line, radius = (np.asarray(dataset[name].values, dtype=np.float64) for name in _DRAWN)
+    if s.ndim == 1 and line.shape == (*s.shape, 3) and radius.shape == s.shape:
+        inside = (s >= 0.0).all() and (s <= whisker.length * (1.0 + _SAME)).all()
+        s = np.minimum(s, whisker.length)
+        drawn = {"centerline": (line, whisker.position), "radius": (radius, whisker.radius)}
+        if inside and all(
+            np.abs(stored - own(s)).max() <= _SAME * np.abs(own(s)).max()
+            for stored, own in drawn.values()
+        ):
+            return
+    raise ValueError(
+        "this dataset of a whisker was changed: centerline and radius at arc_length are not those "
+        "of its curvature and section coefficients, which alone count; make it anew from points "
+        "(Whisker.from_points) instead of changing the file"
+    )
+
+
+_DRAWN = ("arc_length", "centerline", "radius")
+_SAME = 1e-6
+"""To which share of the largest value what a file draws agrees with what it says."""
+
+
 def whisker_fields(dataset: xr.Dataset) -> dict[str, Any]:
     """Read the fields of a `Whisker` from a dataset that `whisker_dataset` wrote.
 
@@ -128,6 +169,8 @@ def whisker_fields(dataset: xr.Dataset) -> dict[str, Any]:
     needed |= {"base_bending_stiffness", "base_twist_stiffness"}
     needed |= {"pose_rotation", "pose_origin", "curvature_knots", "curvature_coefficients"}
     needed |= {"section_knots", "section_coefficients", "curvature_error", "section_error"}
+    if not dataset.variables.keys().isdisjoint(_DRAWN):  # files of many whiskers do without
+        needed |= set(_DRAWN)
     missing = sorted(needed - set(dataset.variables))
     if missing:
         raise ValueError(f"this is no dataset of a whisker: it lacks {', '.join(missing)}")

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.quantities import quantity
 from vibrissa.sketch import BENT, Mark, card, shown, views
-from vibrissa.whisker.dataset import whisker_dataset, whisker_fields
+from vibrissa.whisker.dataset import check_drawn, whisker_dataset, whisker_fields
 from vibrissa.whisker.digitized import digitize
 from vibrissa.whisker.parabola import parabola_curvature
 from vibrissa.whisker.pose import Pose, least_turn, roll
@@ -560,8 +560,15 @@ class Whisker:
         Returns
         -------
         Whisker
+
+        Raises
+        ------
+        ValueError
+            If something of it is missing, or was changed so that its parts contradict each other.
         """
-        return cls(**whisker_fields(dataset))
+        whisker = cls(**whisker_fields(dataset))
+        check_drawn(dataset, whisker)
+        return whisker
 
     def __repr__(self) -> str:
         """Say what it is in one line, in mm and µm."""

@@ -200,6 +200,17 @@ def test_numbers_are_those_of_the_recording(written, folder):
         assert {r[0]: int(r[column]) for r in rows if int(r[column])} == dict(expected)
 
 
+@pytest.mark.parametrize("lost", ["force", "contact_point_whisker"])
+def test_errors_that_cannot_be_told_are_said_to_be(folder, lost):
+    """Of a film the truth may be known in part; sections are not left out in silence."""
+    trial = load_recording(folder / "trial.nc")
+    trial["truth"] = trial["truth"].to_dataset().drop_vars(lost)
+    parts = {part.name: part.body for part in trial_sections(trial)}
+    said = "Errors cannot be told: the truth in this recording has no"
+    assert f"{said} {lost}" in parts["signals"]
+    assert (f"{said} {lost}" in parts["estimates"]) == (lost == "contact_point_whisker")
+
+
 def test_errors_of_signals_are_shares_of_the_truth(folder):
     trial = load_recording(folder / "trial.nc")
     # All forces a tenth too large and moments exact.
@@ -386,8 +397,9 @@ def test_what_is_missing_is_named_with_the_verb_that_makes_it(folder):
     groups = {g.path: g.to_dataset(inherit=False) for g in recording.subtree}
     blind = {path: data for path, data in groups.items() if path != "/truth"}
     save_recording(folder / "blind.nc", xr.DataTree.from_dict(blind))
-    names = [part.name for part in trial_sections(load_recording(folder / "blind.nc"))]
-    assert names == ["recording", "settings", "contour", "statuses"]
+    sections = trial_sections(load_recording(folder / "blind.nc"))
+    assert [part.name for part in sections] == ["recording", "settings", "contour", "statuses"]
+    assert "no truth in this recording" in sections[1].body
 
 
 def test_without_the_drawing_library_the_picture_in_space_is_left_out(folder, monkeypatch):

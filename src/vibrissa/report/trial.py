@@ -124,6 +124,8 @@ def _settings(recording: xr.DataTree) -> str:
         for group, verb in STAGES.items()
         if group not in recording.children
     ]
+    if "truth" not in recording.children:
+        lacking.append("There is no truth in this recording, so errors cannot be told.")
     return facts + "".join(paragraph(each, "note") for each in lacking)
 
 
@@ -158,21 +160,27 @@ def _against_truth(
     """Sections on stages that can be compared with the truth."""
     root, signals, estimates = groups.values()
     assert root is not None
-    if "measured" in recording.children and _has(_TRACKED, root, truth):
-        yield Section("tracking", "Tracking", tracking_tables(root, truth))
-    if _has(_FELT, signals, truth) and "contact_point_whisker" in truth:
-        assert signals is not None
-        yield Section("signals", "Signals", _signal_errors(signals, truth, whisker))
-    if _has(_FOUND, estimates, truth) and _has(_SPREADS, estimates):
-        assert estimates is not None
-        told = _felt(estimates, truth)
-        if np.isfinite(estimates["contact_point"].values).any():
-            told += _errors(*error_rows(contact_errors(estimates, truth, whisker, seed)))
-        else:
-            told += paragraph(_NOTHING)
-        warned = caution(estimates.attrs.get("source"))
-        told += paragraph(warned, "note") if warned else ""
+    if "measured" in recording.children:
+        lacking = _lacking(_TRACKED, root, truth)
+        yield Section("tracking", "Tracking", lacking or tracking_tables(root, truth))
+    if signals is not None:
+        lacking = _lacking(_FELT, signals, truth, also_true=("contact_point_whisker",))
+        yield Section("signals", "Signals", lacking or _signal_errors(signals, truth, whisker))
+    if estimates is not None:
+        lacking = _lacking(_FOUND, estimates, truth, also_found=_SPREADS)
+        told = lacking or _contact_errors(estimates, truth, whisker, seed)
         yield Section("estimates", "Estimated contacts", told)
+
+
+def _contact_errors(estimates: xr.Dataset, truth: xr.Dataset, whisker: Whisker, seed: int) -> str:
+    """Tables of contacts felt, and of their errors."""
+    told = _felt(estimates, truth)
+    if np.isfinite(estimates["contact_point"].values).any():
+        told += _errors(*error_rows(contact_errors(estimates, truth, whisker, seed)))
+    else:
+        told += paragraph(_NOTHING)
+    warned = caution(estimates.attrs.get("source"))
+    return told + (paragraph(warned, "note") if warned else "")
 
 
 def _signal_errors(signals: xr.Dataset, truth: xr.Dataset, whisker: Whisker) -> str:
@@ -193,6 +201,25 @@ def _signal_errors(signals: xr.Dataset, truth: xr.Dataset, whisker: Whisker) -> 
         "Felt less true, each in its own whisker frame, where the whisker touches and was felt "
         "to; directions on the circle.",
     )
+
+
+def _lacking(
+    names: Sequence[str],
+    found: xr.Dataset,
+    truth: xr.Dataset,
+    also_found: Sequence[str] = (),
+    also_true: Sequence[str] = (),
+) -> str:
+    """A note on what is not there to be compared; nothing where all is."""
+    told = []
+    for where, data, also in (
+        ("what was found", found, also_found),
+        ("the truth in this recording", truth, also_true),
+    ):
+        absent = [name for name in (*names, *also) if name not in data.data_vars]
+        if absent:
+            told.append(f"{where} has no {', '.join(absent)}")
+    return paragraph(f"Errors cannot be told: {'; '.join(told)}.", "note") if told else ""
 
 
 def _has(names: Sequence[str], *data: xr.Dataset | None) -> bool:

@@ -101,11 +101,30 @@ def test_one_command_does_all_by_defaults_that_it_says(folder, tmp_path):
     assert set(load_recording(folder / "tracked.nc").children) == {"whiskers"}
 
 
+def test_the_table_of_a_contour_goes_along_with_it_and_nothing_else_does(folder, tmp_path):
+    """A second shape needs no --force, for what the table held is what the recording held."""
+    work, table = tmp_path / "t.nc", tmp_path / "t_contour.csv"
+    work.write_bytes((folder / "sim.nc").read_bytes())
+    done("reconstruct", work, "--map", folder / "map.nc")
+    first = table.read_text()
+    done("reconstruct", work, "--shape", "sphere")
+    second = table.read_text()
+    assert second != first
+    table.write_text(second + "# a note of mine\n")
+    result = run("reconstruct", work)
+    assert isinstance(result.exception, FileExistsError)
+    assert table.read_text().endswith("of mine\n")
+    other = tmp_path / "other.nc"
+    other.write_bytes((folder / "sim.nc").read_bytes())
+    assert isinstance(run("reconstruct", other, "--csv", table).exception, FileExistsError)
+    done("reconstruct", work, "--force")
+
+
 def test_what_is_asked_for_is_made_anew(folder, tmp_path):
     work = tmp_path / "t.nc"
     done("reconstruct", folder / "sim.nc", "--map", folder / "map.nc", "-o", work)
     first = load_recording(work)
-    done("reconstruct", work, "--axis", "0,0,1", "--force")
+    done("reconstruct", work, "--axis", "0,0,1")
     assert load_recording(work)["contour"]["object_axis"].values.tolist() == [0, 0, 1]
     xr.testing.assert_identical(load_recording(work)["estimates"], first["estimates"])
     done("reconstruct", work, "--wrench", "--force-noise", "2", "--force")

@@ -113,8 +113,9 @@ def reconstruct(
 
     Signals and estimates that the recording already has are used; what is missing is made first, by
     defaults that are printed, and what options ask for is made anew. All is added to the recording
-    as groups `signals`, `estimates` and `contour`; what it held before stays as it was. The contour
-    points go to a table as well. Example: `vibrissa reconstruct trial.nc --shape cylinder`
+    as groups `signals`, `estimates` and `contour`; what else it held stays as it was. The contour
+    points go to a table as well; one that holds just what the recording held goes along with it
+    when that is made anew. Example: `vibrissa reconstruct trial.nc --shape cylinder`
     """
     from vibrissa.cli.locating import how_to
     from vibrissa.cli.recordings import free_beside, noise_from, recording_from, tell_written
@@ -127,7 +128,8 @@ def reconstruct(
     points = target.with_name(f"{target.stem}_contour.csv") if csv is None else csv
     check_writable(target, NETCDF)
     check_writable(points, CSV)
-    free_beside(recording, [target, points], force)
+    own = not force and _of_contour(points, recording, whisker)
+    free_beside(recording, [target] if own else [target, points], force)
     direction = None if axis is None else numbers(axis, ("X", "Y", "Z"), "--axis")
     _check_shape(shape, direction is not None)
     if lean is not None and not 0.0 <= lean < 90.0:
@@ -248,6 +250,23 @@ def _tell(
         output.print(distance_table(distances_by_class(compared)["deflection_angle"]))
     if said := caution(contour.attrs.get("source")):
         output.print(said, highlight=False, soft_wrap=True)
+
+
+def _of_contour(points: Path, recording: Path, whisker: Path | None) -> bool:
+    """Whether a table holds what the recording does: replaced with it, nothing else is lost."""
+    from vibrissa.cli.recordings import is_recording, recording_from, whiskers_for
+    from vibrissa.io.contour_table import holds_contour
+    from vibrissa.pipeline import contour_points
+
+    if not points.is_file() or not is_recording(recording):
+        return False
+    tree = recording_from(recording)
+    if not {"estimates", "contour"} <= set(tree.children):
+        return False
+    try:
+        return holds_contour(points, contour_points(tree, whiskers_for(tree, whisker)))
+    except ValueError:
+        return False
 
 
 def _check_shape(shape: str, axis: bool) -> None:

@@ -9,6 +9,7 @@ whether the contact is no outlier.
 from __future__ import annotations
 
 from os import PathLike
+from pathlib import Path
 
 import numpy as np
 import xarray as xr
@@ -39,6 +40,30 @@ def save_contour(path: str | PathLike[str], contour: xr.Dataset) -> None:
     ValueError
         If a needed variable is not there, or one has another dim.
     """
+    text = _text(contour)
+    with replacing(path) as part:
+        part.write_bytes(text.encode("utf-8"))
+
+
+def holds_contour(path: str | PathLike[str], contour: xr.Dataset) -> bool:
+    """Tell whether a file is just what `save_contour` writes of contour points.
+
+    Parameters
+    ----------
+    path : str or path
+        Any file.
+    contour : xarray.Dataset
+        As of `save_contour`.
+
+    Returns
+    -------
+    bool
+        Whether it has the same text.
+    """
+    return Path(path).read_bytes() == _text(contour).encode("utf-8")
+
+
+def _text(contour: xr.Dataset) -> str:
     missing = [name for name in ("time", "x", "y", "z") if name not in contour.variables]
     if missing:
         raise ValueError(f"contour points lack {', '.join(missing)}")
@@ -52,8 +77,7 @@ def save_contour(path: str | PathLike[str], contour: xr.Dataset) -> None:
     ]
     lines = [",".join(COLUMNS)]
     lines += [",".join(map(_cell, row)) for row in zip(*columns, strict=True)]
-    with replacing(path) as part:
-        part.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return "\n".join(lines) + "\n"
 
 
 def _cell(value: object) -> str:

@@ -193,6 +193,13 @@ def test_signals_too_large_for_the_whisker(tmp_path):
     check_scale(signals * 1e3, Whisker.straight(length=0.15, base_radius=1e-3))
 
 
+def test_a_column_that_is_there_twice_is_refused(tmp_path):
+    """Else one of both would be taken in silence."""
+    path = written(tmp_path, "time,Fx,Fx,Fy,Fz,Mx,My,Mz\n0,1,2,3,4,5,6,7\n")
+    with pytest.raises(ValueError, match="column Fx more than once"):
+        load_signals(path)
+
+
 def test_no_file(tmp_path):
     for load in (load_signals, load_contacts):
         with pytest.raises(FileNotFoundError):

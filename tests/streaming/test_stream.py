@@ -193,6 +193,14 @@ def test_numbers_of_which_squares_are_none_give_a_status(gamma_map, names):
     assert found.status[0] == vb.Status.OUTSIDE_MAP
 
 
+def test_a_header_that_names_a_column_twice_is_refused():
+    lines = Lines(COMPONENTS)
+    with pytest.raises(ValueError, match="the header has Fx more than once"):
+        lines("time,Fx,Fx,Fy,Fz,Mx,My,Mz")
+    with pytest.raises(ValueError, match="that of line 1 was refused"):
+        lines("0,1,2,3,4,5,6,7")
+
+
 def test_rows_are_not_read_under_a_header_that_was_refused(gamma_map, wrench):
     """A sensor's channels have no units: a header that gives some cannot be used."""
     sensor = Sensor(noise=NOISE)

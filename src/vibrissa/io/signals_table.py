@@ -188,6 +188,9 @@ def _columns(path: Path, header: list[str]) -> tuple[list[int], Array]:
             f"{', '.join(COLUMNS)} are needed, in SI units or with one as in Fx_mN"
         )
     places = [found[name] for name in COLUMNS]
+    twice = [header[place] for place, _ in places if header.count(header[place]) > 1]
+    if twice:
+        raise ValueError(f"{path} has the column {', '.join(twice)} more than once")
     return [place for place, _ in places], np.array([factor for _, factor in places])
 
 

@@ -227,6 +227,10 @@ class Lines:
         if self.raw:
             lacks = "the header (channels are called as the sensor's are, without units)"
         self._chosen(lacks, names)
+        used = {name for choice in self.names for name in choice} | {"time", *POSITION, *QUATERNION}
+        twice = {cell for cell, name in zip(cells, names, strict=True) if name in used}
+        if twice := {cell for cell in twice if cells.count(cell) > 1}:
+            raise ValueError(f"{lacks} has {', '.join(sorted(twice))} more than once")
         self._header, self._factors, self._delimiter = names, factors, delimiter
         self._refused = 0
         self.headers += 1

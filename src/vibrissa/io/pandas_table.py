@@ -163,7 +163,9 @@ _MARK = object()
 
 def _above_mark(stack: list[Any]) -> list[Any]:
     """Take what lies above the last mark off a stack, and the mark."""
-    at = max(i for i, one in enumerate(stack) if one is _MARK)
+    at = len(stack) - 1
+    while stack[at] is not _MARK:  # from above: a pickle may be made of marks
+        at -= 1
     taken = stack[at + 1 :]
     del stack[at:]
     return taken

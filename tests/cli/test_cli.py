@@ -248,3 +248,28 @@ def test_numbers_and_units():
     assert numbers("1,-2.5", "AB", "--ab") == [1.0, -2.5]
     with pytest.raises(ValueError, match="A,B are needed"):
         numbers("1,x", "AB", "--ab")
+
+
+def test_names_with_brackets_are_printed_as_they_are(monkeypatch, capsys, tmp_path):
+    """Brackets are the marks of whoever draws tables; names of files and channels have them too."""
+    folder = tmp_path / "d["
+    folder.mkdir()
+    path = folder / "]sensor[bold].toml"
+    path.write_text(
+        'channels = ["[/] a"]\nmixing = [[0, 0, 0, 0, 21.0, 1.5]]\nnoise = 2e-3\n', encoding="utf-8"
+    )
+    assert "[/] a" in run("info", path)
+    none = folder / "[" / "]none.csv"
+    assert str(none) in fault(monkeypatch, capsys, "info", none)
+
+
+def test_info_says_what_settings_are_for_and_what_is_wrong_with_them(monkeypatch, capsys, tmp_path):
+    path = tmp_path / "study.toml"
+    path.write_text(run("sweep", "--example"), encoding="utf-8")
+    assert "a study, for vibrissa sweep" in run("info", path)
+    path.write_text(run("simulate", "--example"), encoding="utf-8")
+    assert "vibrissa simulate" in run("info", path)
+    path.write_text("channels = [", encoding="utf-8")
+    said = fault(monkeypatch, capsys, "info", path)
+    assert f"{path}: it is no TOML" in said
+    assert said.count("\n") == 1

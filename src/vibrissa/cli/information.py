@@ -42,10 +42,11 @@ def info(
     """
     rows = _installation() if path is None else _file(path)
     from rich.table import Table
+    from rich.text import Text
 
     table = Table(show_header=False, box=None)
     for name, value in rows:
-        table.add_row(f"[bold]{name}", value)
+        table.add_row(Text(name, style="bold"), value)
     output.print(table, highlight=False)
 
 
@@ -91,6 +92,8 @@ def _file(path: Path) -> Iterator[tuple[str, str]]:
         yield from _video(path)
     elif kind == Kind.CALIBRATION:
         yield from _calibration(path)
+    elif path.suffix == ".toml":
+        yield from _settings(path)
     elif kind == Kind.UNKNOWN and not _is_text(path):
         known = "; ".join([*READERS, Kind.TRACKS, Kind.RECORDING, "tables as text"])
         raise ValueError(f"{path} is of no kind that is known. Known are: {known}")
@@ -98,15 +101,22 @@ def _file(path: Path) -> Iterator[tuple[str, str]]:
         yield from _table(path)
 
 
+def _settings(path: Path) -> Iterator[tuple[str, str]]:
+    """What other settings are for; they are checked by the verb that takes them."""
+    from vibrissa.io.toml import read_toml
+
+    said = read_toml(path)
+    study = {"whiskers", "tasks"} & set(said)
+    yield "kind", "a study, for vibrissa sweep" if study else "settings, as of vibrissa simulate"
+    yield "says", ", ".join(said) or "nothing"
+
+
 def _is_sensor(path: Path) -> bool:
-    import tomllib
+    from vibrissa.io.toml import read_toml
 
     if path.suffix != ".toml":
         return False
-    try:
-        said = tomllib.loads(path.read_text(encoding="utf-8"))
-    except ValueError:
-        return False
+    said = read_toml(path)
     return "noise" in said and not isinstance(said["noise"], dict)
 
 
@@ -278,7 +288,7 @@ def _variables(name: str, group: Any) -> Iterator[tuple[str, str]]:
         return
     listed = ", ".join(f"{dim} {size}" for dim, size in sizes.items())
     yield from _notes(group)
-    yield name, f"[dim]{listed or 'no dimensions'}[/]"
+    yield name, listed or "no dimensions"
     for variable, data in shown.items():
         units = _text(data.attrs.get("units", ""))
         yield f"  {variable}", f"({', '.join(data.dimensions)}) {'' if units == '1' else units}"

@@ -147,6 +147,7 @@ def _rival_table(
     """The triplets that are best most often, and the one that was asked for."""
     import numpy as np
     from rich.table import Table
+    from rich.text import Text
 
     table = Table(
         title=f"Which triplet for a sensor with {force_noise:g} µN and {moment_noise:g} µN·m noise",
@@ -164,7 +165,7 @@ def _rival_table(
         row = rivals.isel(triplet=i)
         label = str(row["triplet"].values)
         table.add_row(
-            f"[bold]{label}" if i == asked else label,
+            Text(label, style="bold" if i == asked else ""),
             f"{100.0 * float(row['share']):.1f} %",
             _error(float(row["median_error"])),
             _error(float(row["median_error_where_best"])),

@@ -17,10 +17,10 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn
 from vibrissa.quantities import quantity
 
 _NAMED = 3
-output = Console()
-"""Where results go."""
+output = Console(markup=False, emoji=False)
+"""Where results go, as they are: names of files and whiskers may have brackets."""
 
-errors = Console(stderr=True)
+errors = Console(stderr=True, markup=False, emoji=False)
 """Where progress and messages go, so that results can be piped."""
 
 Force = Annotated[bool, typer.Option("--force", help="Replace files that are there already.")]
@@ -41,7 +41,7 @@ def progress_bars() -> Iterator[Tell]:
     """
     columns = (
         SpinnerColumn(finished_text="[green]✓"),
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=30),
         TimeElapsedColumn(),
     )

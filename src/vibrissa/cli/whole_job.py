@@ -207,6 +207,7 @@ def _table(title: str, first: str, rows: tuple[ErrorRow, ...], noise: bool, labe
 def _peg_table(result: DemoResult) -> Table:
     """The peg, fitted and true."""
     from rich.table import Table
+    from rich.text import Text
 
     found = {_SENSED: result.sensed}
     if result.seen is not None:
@@ -218,7 +219,7 @@ def _peg_table(result: DemoResult) -> Table:
         fit, scores = one.fit, one.scores
         true = fit.origin - scores.offset
         if len(found) > 1:
-            table.add_row(f"[bold]{name}")
+            table.add_row(Text(name, style="bold"))
         for i, axis in enumerate("xy"):
             values = (fit.origin[i], true[i], scores.offset[i], fit.origin_sigma[i])
             cells = (f"{1e3 * float(value):.4f} mm" for value in values)

@@ -280,9 +280,14 @@ def located_where_allowed(
 
 
 def _renormalised(probability: Array) -> Array:
-    """Probabilities (..., k) of what is left; NaN stays where there are none."""
+    """Probabilities (..., k) of what is left; NaN stays where there are none.
+
+    Equal ones where what is left had none worth a number.
+    """
+    total = np.nansum(probability, axis=-1, keepdims=True)
+    weight = np.where(total > 0.0, probability, probability + 1.0)
     with np.errstate(invalid="ignore"):
-        return np.asarray(probability / np.nansum(probability, axis=-1, keepdims=True))
+        return np.asarray(weight / np.nansum(weight, axis=-1, keepdims=True))
 
 
 def _left(status: Status, number: int, probability: float) -> Status:

@@ -3,7 +3,7 @@
 Public is a name without a leading underscore in a module without one, and the methods and
 properties of such a class. What a package exports by name in its ``__init__``, and what a module
 directly under ``vibrissa`` defines, is its face and describes every parameter and what it
-returns. Elsewhere a summary will do, but sections that are there must be whole. The objects
+returns. Elsewhere a summary will do. The objects
 themselves are looked at rather than their source, so that the parameters of a dataclass and of a
 named tuple are its fields, which it may describe under Attributes too. An enumeration has no
 parameters to describe, and a compiled kernel is called by our own code only.
@@ -41,7 +41,6 @@ CHECKS = {
 }
 PARAMETERS = {"PR01", "PR02", "PR03"}
 SUMMARY = {"GL08", "SS03", "SS06"}
-SECTIONS = ("Parameters", "Attributes", "Returns", "Yields")
 
 
 def modules() -> Iterator[str]:
@@ -67,8 +66,11 @@ def exported() -> Iterator[object]:
     """Everything on the face of a package or of a module directly under vibrissa."""
     for name in modules():
         module = importlib.import_module(name)
-        if name.count(".") == 1 or hasattr(module, "__path__"):
-            yield from (value for key, value in vars(module).items() if not key.startswith("_"))
+        if hasattr(module, "__path__"):
+            yield from (getattr(module, key) for key in getattr(module, "__all__", ()))
+        elif name.count(".") == 1:
+            own = (v for v in vars(module).values() if getattr(v, "__module__", None) == name)
+            yield from own
 
 
 def public(module_name: str) -> Iterator[tuple[str, object, object]]:
@@ -112,8 +114,7 @@ def faults(value: object, on_face: bool) -> Iterator[tuple[str, str]]:
     function = getattr(value, "py_func", value)  # a compiled kernel keeps what it was made from
     doc = get_doc_object(function)
     checks = CHECKS
-    whole = on_face or any(doc[section] for section in SECTIONS)
-    if function is not value or isinstance(value, property) or not whole:
+    if function is not value or isinstance(value, property) or not on_face:
         checks = SUMMARY
     elif inspect.isclass(value) and issubclass(value, enum.Enum | BaseException):
         checks = CHECKS - PARAMETERS

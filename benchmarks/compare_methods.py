@@ -22,10 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import vibrissa as vb
+from vibrissa.contacts.contact_map import within_paper_bounds
 from vibrissa.evaluation import ANGLES
-from vibrissa.mapping import LookupTable
-from vibrissa.mapping.contact_map import within_paper_bounds
-from vibrissa.mapping.network import DrawnContacts, draw_contacts
+from vibrissa.paper import LookupTable
+from vibrissa.paper.network import DrawnContacts, draw_contacts
 from vibrissa.signals import SIGNALS, nearest_on_rest, selection
 
 Array = NDArray[np.float64]

@@ -18,17 +18,12 @@ from pathlib import Path
 from typing import Any
 
 import vibrissa as vb
-from vibrissa.mapping.network import draw_contacts
+from vibrissa.cameras import orthogonal_views
+from vibrissa.paper.network import draw_contacts
 from vibrissa.signals import SIGNALS
+from vibrissa.simulation import array_whisking, facing_peg, simulate, sweep_past
+from vibrissa.simulation.film import film_frames
 from vibrissa.tracking import TrackOptions, trace_video, track
-from vibrissa.trial import (
-    array_whisking,
-    facing_peg,
-    orthogonal_views,
-    simulate,
-    sweep_past,
-)
-from vibrissa.trial.film import film_frames
 
 RATE = 500.0
 TRIPLET = ("Fx", "MB", "MD")

@@ -23,7 +23,7 @@ import numpy as np
 import vibrissa as vb
 from vibrissa.rod.discretize import discretize
 from vibrissa.rod.reach import fold_forces, reach
-from vibrissa.sensing import Sensor
+from vibrissa.sensors import Sensor
 from vibrissa.signals import SIGNALS
 
 NAMES = ("wall_median", "wall_high", "wall_worst", "own_median", "own_high")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import vibrissa as vb
-from vibrissa.mapping.inversion import invert
+from vibrissa.contacts.inversion import invert
 from vibrissa.rod.batch import solve_forces
 from vibrissa.rod.discretize import discretize
 from vibrissa.signals import SIGNALS

@@ -22,10 +22,11 @@ import vibrissa as vb
 from vibrissa import plots
 from vibrissa.cli.figures import witnesses
 from vibrissa.contour import compare_with, distances_by, shape_from_dataset
-from vibrissa.mapping import critical_cones, error_solid, signal_slice
+from vibrissa.identifiability import critical_cones, error_solid, signal_slice
 from vibrissa.pipeline import with_contour, with_estimates
+from vibrissa.recording.tree import recorded_objects
 from vibrissa.signals import nearest_on_rest
-from vibrissa.trial import (
+from vibrissa.simulation import (
     array_whisking,
     facing_peg,
     head_path,
@@ -35,8 +36,7 @@ from vibrissa.trial import (
     views_of,
     within_reach,
 )
-from vibrissa.trial.film import film_frames, with_true_traces
-from vibrissa.trial.recording import recorded_objects
+from vibrissa.simulation.film import film_frames, with_true_traces
 
 WIDTH = 1200
 WIDER = {"title": 1360}

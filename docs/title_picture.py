@@ -11,6 +11,7 @@ from matplotlib.ticker import MaxNLocator
 
 import vibrissa as vb
 from vibrissa.contour import CylinderFit, shape_from_dataset
+from vibrissa.objects import Peg
 from vibrissa.plots import Course, course_of, telling_rows
 from vibrissa.plots.chart import column, fine_chart, values_of
 from vibrissa.plots.colours import sequential
@@ -22,9 +23,8 @@ from vibrissa.plots.space import bounds, name_axes, paint, painted, space_axes
 from vibrissa.plots.style import BLUE, INK, MUTED, ORANGE, Array, box_axes, looking, sized_figure
 from vibrissa.plots.surfaces import coordinate_bar, levels
 from vibrissa.quantities import axis_label, quantity, to_display
+from vibrissa.recording.tree import recorded_objects
 from vibrissa.signals import SIGNALS
-from vibrissa.trial import Peg
-from vibrissa.trial.recording import recorded_objects
 
 WIDTH, HEIGHT = 182.0, 119.0
 HEADS = (

@@ -15,8 +15,9 @@ from scipy.spatial import ConvexHull
 import vibrissa as vb
 from vibrissa import plots
 from vibrissa.contour import shape_from_dataset
+from vibrissa.objects import Mesh
 from vibrissa.pipeline import contour_points, with_contour
-from vibrissa.trial import Mesh, measure, simulate, tabulated
+from vibrissa.simulation import measure, simulate, tabulated
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "output")
 folder.mkdir(parents=True, exist_ok=True)

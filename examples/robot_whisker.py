@@ -15,7 +15,7 @@ import numpy as np
 
 import vibrissa as vb
 from vibrissa import plots
-from vibrissa.sensing import Sensor, calibrate_on_contacts, fit_stiffness
+from vibrissa.sensors import Sensor, calibrate_on_contacts, fit_stiffness
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "output")
 folder.mkdir(parents=True, exist_ok=True)

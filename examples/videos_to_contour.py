@@ -13,18 +13,13 @@ import numpy as np
 
 import vibrissa as vb
 from vibrissa import plots
+from vibrissa.cameras import orthogonal_views
 from vibrissa.contour import shape_from_dataset
 from vibrissa.io import read_video
 from vibrissa.pipeline import with_contour
+from vibrissa.recording import recorded_objects
+from vibrissa.simulation import facing_peg, film, simulate, sweep_past
 from vibrissa.tracking import TrackOptions, trace_video, track
-from vibrissa.trial import (
-    facing_peg,
-    film,
-    orthogonal_views,
-    recorded_objects,
-    simulate,
-    sweep_past,
-)
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "output")
 folder.mkdir(parents=True, exist_ok=True)
@@ -37,7 +32,7 @@ files = {camera.name: folder / f"{camera.name}.mp4" for camera in cameras}
 film(trial, files, cameras, seed=1)
 
 # %% Trace the whisker in each view, merge them, fit the rod; radii no camera sees, so you give them
-# Your own cameras come from their calibration: vibrissa.trial.load_cameras("cameras.toml").
+# Your own cameras come from their calibration: vibrissa.cameras.load_cameras("cameras.toml").
 traces = [trace_video(read_video(files[camera.name])) for camera in cameras]
 known = {"base_radius": whisker.base_radius, "tip_radius": whisker.tip_radius}
 tracked = track(cameras, traces, rate, TrackOptions(properties=known))

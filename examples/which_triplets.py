@@ -10,7 +10,7 @@ from pathlib import Path
 
 import vibrissa as vb
 from vibrissa import plots
-from vibrissa.mapping import verdict_table
+from vibrissa.identifiability import verdict_table
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "output")
 folder.mkdir(parents=True, exist_ok=True)

@@ -15,7 +15,7 @@ import sys
 import numpy as np
 
 import vibrissa as vb
-from vibrissa.trial import facing_peg, simulate, sweep_past
+from vibrissa.simulation import facing_peg, simulate, sweep_past
 
 TRIPLETS = ("Fx MB MD", "Fx FT MD", "FT FD MB", "FT MB MD")
 RAT = np.repeat([1e-6, 2e-8], 3)

@@ -20,7 +20,7 @@ from honest.video import cutoffs, paper_test, tracked_scores
 from honest.ways import WAYS, chart, located, scored, truth_of
 from pages import save
 
-from vibrissa.trial import recorded_whisker
+from vibrissa.recording import recorded_whisker
 
 TRIALS = 3
 ROOT = Path(__file__).parent.parent

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from pages import save
 
 import vibrissa as vb
-from vibrissa.mapping.places import sample, spread
+from vibrissa.identifiability.regions import sample, spread
 from vibrissa.plots.style import BLUE, GREEN, INK, MUTED, ORANGE, head, looking, new_figure
 
 SETS = (

@@ -13,8 +13,11 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import numpy as np
 import pytest
 from hypothesis import settings
+
+import vibrissa as vb
 
 # Where all that the extra test names is installed, a test skipped for want of it hides a fault.
 if os.environ.get("REQUIRE_EXTRAS"):
@@ -29,7 +32,7 @@ settings.load_profile("vibrissa")
 # kernels; those after it need none, so that nobody compiles the same at the same time; then follow
 # those that take longest, so that no worker is left alone with one of them at the end.
 _FIRST = [
-    "mapping/test_uniqueness.py",
+    "identifiability/test_uniqueness.py",
     "whisker",
     "contour",
     "io",
@@ -39,11 +42,13 @@ _FIRST = [
     "viewer/test_page.py",
     "viewer/test_watching.py",
     "sweeps",
-    "mapping",
+    "contacts",
+    "identifiability",
+    "paper",
     "rod",
     "tracking",
     "plots",
-    "trial",
+    "simulation",
     "cli",
 ]
 _HERE = Path(__file__).parent
@@ -107,3 +112,14 @@ def browser():
         browser = play.chromium.launch(executable_path=found, args=_BROWSER)
         yield browser
         browser.close()
+
+
+@pytest.fixture(scope="session")
+def gamma_map() -> vb.ContactMap:
+    """The default whisker's map."""
+    return vb.ContactMap.simulate(vb.samples.gamma(), grid=False)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(20)

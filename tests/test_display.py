@@ -8,8 +8,8 @@ import pytest
 import xarray as xr
 
 import vibrissa as vb
+from vibrissa.simulation import facing_peg, measure, simulate, sweep_past
 from vibrissa.sketch import BENT, CONTACT, MOST_CURVES, MOST_POINTS, Mark, shown, symbol, views
-from vibrissa.trial import facing_peg, measure, simulate, sweep_past
 
 WHISKER = vb.samples.gamma()
 

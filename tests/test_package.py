@@ -1,4 +1,5 @@
 import importlib.metadata
+import pkgutil
 import signal
 import subprocess
 import sys
@@ -15,7 +16,16 @@ def test_every_public_name_resolves(name):
 
 
 def test_every_public_name_comes_from_its_home():
-    assert {*vibrissa._HOMES, *vibrissa._MODULES, "__version__"} == set(vibrissa.__all__)
+    homes = {name: home for home, names in vibrissa._HOMES.items() for name in names}
+    for name, home in homes.items():
+        module = importlib.import_module(f"vibrissa.{home}")
+        assert getattr(vibrissa, name) is getattr(module, name)
+
+
+def test_every_package_is_public():
+    packages = {module.name for module in pkgutil.iter_modules(vibrissa.__path__) if module.ispkg}
+    assert packages - set(vibrissa.__all__) <= {"cli", "demo"}
+    assert set(dir(vibrissa)) == set(vibrissa.__all__)
 
 
 def test_unknown_name_is_an_attribute_error():

@@ -11,23 +11,46 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from vibrissa import samples
-    from vibrissa.display import show
-    from vibrissa.io import load_array, load_whisker
-    from vibrissa.mapping import (
+    from vibrissa import (
+        cameras,
+        contacts,
+        contour,
+        evaluation,
+        identifiability,
+        io,
+        numerics,
+        objects,
+        paper,
+        pipeline,
+        plots,
+        quantities,
+        recording,
+        report,
+        rod,
+        samples,
+        sensors,
+        signals,
+        simulation,
+        status,
+        streaming,
+        sweeps,
+        tracking,
+        viewer,
+        whisker,
+    )
+    from vibrissa.contacts import (
         ContactFilter,
         ContactMap,
         Estimate,
         Estimator,
         Prior,
         WrenchEstimate,
-        best_triplet,
-        critical_cones,
         estimate_from_wrench,
-        sensitivity,
-        sensitivity_findings,
-        uniqueness,
     )
+    from vibrissa.display import show
+    from vibrissa.identifiability import best_triplet, critical_cones, sensitivity, uniqueness
+    from vibrissa.io import load_array, load_whisker
+    from vibrissa.paper import sensitivity_findings
     from vibrissa.rod import Deflection, PegContact, PointContact, PointForce, deflect
     from vibrissa.signals import base_signals
     from vibrissa.status import Status
@@ -52,58 +75,85 @@ __all__ = [
     "__version__",
     "base_signals",
     "best_triplet",
+    "cameras",
+    "contacts",
+    "contour",
     "critical_cones",
     "deflect",
     "estimate_from_wrench",
+    "evaluation",
+    "identifiability",
+    "io",
     "load_array",
     "load_whisker",
+    "numerics",
+    "objects",
+    "paper",
+    "pipeline",
+    "plots",
+    "quantities",
+    "recording",
+    "report",
+    "rod",
     "samples",
     "sensitivity",
     "sensitivity_findings",
+    "sensors",
     "show",
+    "signals",
+    "simulation",
+    "status",
+    "streaming",
+    "sweeps",
+    "tracking",
     "uniqueness",
+    "viewer",
+    "whisker",
     "whisker_array",
 ]
 
 _HOMES = {
-    "ContactFilter": "vibrissa.mapping",
-    "ContactMap": "vibrissa.mapping",
-    "Deflection": "vibrissa.rod",
-    "Estimate": "vibrissa.mapping",
-    "Estimator": "vibrissa.mapping",
-    "PegContact": "vibrissa.rod",
-    "PointContact": "vibrissa.rod",
-    "PointForce": "vibrissa.rod",
-    "Prior": "vibrissa.mapping",
-    "Status": "vibrissa.status",
-    "Whisker": "vibrissa.whisker",
-    "WhiskerArray": "vibrissa.whisker",
-    "WrenchEstimate": "vibrissa.mapping",
-    "base_signals": "vibrissa.signals",
-    "best_triplet": "vibrissa.mapping",
-    "critical_cones": "vibrissa.mapping",
-    "deflect": "vibrissa.rod",
-    "estimate_from_wrench": "vibrissa.mapping",
-    "load_array": "vibrissa.io",
-    "load_whisker": "vibrissa.io",
-    "sensitivity": "vibrissa.mapping",
-    "sensitivity_findings": "vibrissa.mapping",
-    "show": "vibrissa.display",
-    "uniqueness": "vibrissa.mapping",
-    "whisker_array": "vibrissa.whisker",
+    "contacts": (
+        "ContactFilter",
+        "ContactMap",
+        "Estimate",
+        "Estimator",
+        "Prior",
+        "WrenchEstimate",
+        "estimate_from_wrench",
+    ),
+    "display": ("show",),
+    "identifiability": (
+        "best_triplet",
+        "critical_cones",
+        "sensitivity",
+        "uniqueness",
+    ),
+    "io": ("load_array", "load_whisker"),
+    "paper": ("sensitivity_findings",),
+    "rod": (
+        "Deflection",
+        "PegContact",
+        "PointContact",
+        "PointForce",
+        "deflect",
+    ),
+    "signals": ("base_signals",),
+    "status": ("Status",),
+    "whisker": ("Whisker", "WhiskerArray", "whisker_array"),
 }
-_MODULES = {"samples"}
+_HOME = {name: home for home, names in _HOMES.items() for name in names}
 
 
 def __getattr__(name: str) -> object:
-    if name in _MODULES:
-        return importlib.import_module(f"vibrissa.{name}")
-    if name not in _HOMES:
+    if name not in __all__:
         raise AttributeError(f"module 'vibrissa' has no attribute {name!r}")
-    value = getattr(importlib.import_module(_HOMES[name]), name)
+    if name not in _HOME:
+        return importlib.import_module(f"vibrissa.{name}")
+    value = getattr(importlib.import_module(f"vibrissa.{_HOME[name]}"), name)
     globals()[name] = value
     return value
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted(__all__)

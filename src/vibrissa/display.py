@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from vibrissa.identifiability.summary import verdict_rows, verdict_table
 from vibrissa.io.recording import KIND
-from vibrissa.mapping.summary import verdict_rows, verdict_table
+from vibrissa.recording import recorded_objects
 from vibrissa.sketch import BENT, CONTACT, MOST_CURVES, REST, Mark, card, table, thinned, views
-from vibrissa.trial import recorded_objects
 
 
 class Shown:

@@ -8,16 +8,9 @@ import xarray as xr
 
 import vibrissa as vb
 from vibrissa.io import load_recording, read_video, save_recording
+from vibrissa.recording import recorded_cameras
+from vibrissa.simulation import Dynamics, facing_peg, film, measure, simulate, sweep_past
 from vibrissa.tracking import trace_video, track
-from vibrissa.trial import (
-    Dynamics,
-    facing_peg,
-    film,
-    measure,
-    recorded_cameras,
-    simulate,
-    sweep_past,
-)
 
 RATE = 1000.0
 NODES = 257

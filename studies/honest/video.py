@@ -9,9 +9,9 @@ import xarray as xr
 import vibrissa as vb
 from honest.conditions import RATE, Recorded
 from honest.ways import TRIPLET, Pose, Truth, chart, located, poses_of, scored, truth_of
+from vibrissa.recording import recorded_whisker
 from vibrissa.tracking.pose import base_pose
 from vibrissa.tracking.rest import rest_shape
-from vibrissa.trial import recorded_whisker
 from vibrissa.whisker import Whisker
 
 CUTOFFS = (30.0, 50.0, 85.0, 120.0, 200.0, None)

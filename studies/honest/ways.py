@@ -8,9 +8,9 @@ import xarray as xr
 from scipy.interpolate import CubicSpline
 
 import vibrissa as vb
+from vibrissa.contacts import ContactMap
 from vibrissa.contour import axis_offset, fit_cylinder
 from vibrissa.evaluation import REPLICATES
-from vibrissa.mapping import ContactMap
 from vibrissa.pipeline import (
     SOLVED_TO,
     component_noise,
@@ -20,9 +20,9 @@ from vibrissa.pipeline import (
     locate_from_wrench,
     whisker_radii,
 )
-from vibrissa.sensing import FORCE_NOISE, MOMENT_NOISE
+from vibrissa.recording import recorded_pegs, recorded_whisker
+from vibrissa.sensors import FORCE_NOISE, MOMENT_NOISE
 from vibrissa.signals import SIGNALS, nearest_on_rest
-from vibrissa.trial import recorded_pegs, recorded_whisker
 from vibrissa.whisker import Whisker
 
 NOISE = component_noise(FORCE_NOISE, MOMENT_NOISE)

@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from vibrissa import Whisker
+from vibrissa.cameras import Camera, orthogonal_views
 from vibrissa.samples import gamma
-from vibrissa.trial import Camera, facing_peg, orthogonal_views, simulate, sweep_past
-from vibrissa.trial.film import Look, film_frames, with_true_traces
+from vibrissa.simulation import facing_peg, simulate, sweep_past
+from vibrissa.simulation.film import Look, film_frames, with_true_traces
 
 Array = NDArray[np.float64]
 Frames = list[NDArray[np.uint8]]

@@ -12,6 +12,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
 from looks.cases import Case, Filmed, filmed
+from vibrissa.recording import recorded_whisker
 from vibrissa.tracking import (
     Start,
     Trace,
@@ -22,7 +23,6 @@ from vibrissa.tracking import (
     track,
 )
 from vibrissa.tracking.begin import FRAMES
-from vibrissa.trial import recorded_whisker
 
 Array = NDArray[np.float64]
 

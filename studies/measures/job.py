@@ -7,7 +7,8 @@ import vibrissa as vb
 from vibrissa.contour import CylinderFit, shape_from_dataset
 from vibrissa.demo import DemoResult, Located, run_demo
 from vibrissa.pipeline import with_contour, with_estimates
-from vibrissa.trial import facing_peg, measure, recorded_objects, simulate, sweep_past
+from vibrissa.recording import recorded_objects
+from vibrissa.simulation import facing_peg, measure, simulate, sweep_past
 
 WAYS = ("felt by a sensor", "the paper's way")
 

@@ -11,7 +11,9 @@ import vibrissa as vb
 from vibrissa import samples
 from vibrissa.cli.app import app
 from vibrissa.io import load_recording, save_centerline, save_recording
-from vibrissa.trial import Motion, Peg, measure, recorded_whisker, simulate
+from vibrissa.objects import Peg
+from vibrissa.recording import recorded_whisker
+from vibrissa.simulation import Motion, measure, simulate
 from vibrissa.whisker import morphology
 
 typer_testing = pytest.importorskip("typer.testing")

@@ -7,9 +7,9 @@ import pytest
 
 import vibrissa as vb
 from vibrissa.cli.app import app
+from vibrissa.contacts import ContactMap
 from vibrissa.io import load_contacts
-from vibrissa.mapping import ContactMap
-from vibrissa.sensing import Sensor, save_sensor
+from vibrissa.sensors import Sensor, save_sensor
 from vibrissa.signals.regions import concave_backward
 from vibrissa.status import Status
 

@@ -8,7 +8,7 @@ import vibrissa as vb
 from vibrissa import samples
 from vibrissa.cli.app import app
 from vibrissa.io import load_recording, save_recording, save_signals, write_video
-from vibrissa.trial import facing_peg, measure, simulate, whisking
+from vibrissa.simulation import facing_peg, measure, simulate, whisking
 
 
 @pytest.fixture(scope="module")

@@ -4,10 +4,11 @@ import pytest
 
 import vibrissa as vb
 from vibrissa.cli.app import app
+from vibrissa.contacts import ContactMap
 from vibrissa.io import save_recording
-from vibrissa.mapping import ContactMap
+from vibrissa.objects import Peg
 from vibrissa.pipeline import with_signals
-from vibrissa.trial import Motion, Peg, measure, simulate
+from vibrissa.simulation import Motion, measure, simulate
 
 typer_testing = pytest.importorskip("typer.testing")
 

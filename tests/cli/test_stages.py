@@ -7,9 +7,9 @@ import pytest
 import xarray as xr
 
 from vibrissa.cli.app import app
+from vibrissa.contacts import ContactMap
 from vibrissa.io import load_contacts, load_recording, load_signals, save_recording
-from vibrissa.mapping import ContactMap
-from vibrissa.trial import recorded_whisker
+from vibrissa.recording import recorded_whisker
 
 typer_testing = pytest.importorskip("typer.testing")
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from vibrissa import Whisker
+from vibrissa.cameras import orthogonal_views, save_cameras
 from vibrissa.cli.app import app
 from vibrissa.io import (
     load_recording,
@@ -15,16 +16,9 @@ from vibrissa.io import (
     save_traces,
     write_video,
 )
-from vibrissa.trial import (
-    Motion,
-    Peg,
-    film,
-    orthogonal_views,
-    recorded_objects,
-    recorded_whisker,
-    save_cameras,
-    simulate,
-)
+from vibrissa.objects import Peg
+from vibrissa.recording import recorded_objects, recorded_whisker
+from vibrissa.simulation import Motion, film, simulate
 
 typer_testing = pytest.importorskip("typer.testing")
 CAMERAS = orthogonal_views(size=(192, 192), center=(4e-3, 0.0, 0.0))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from vibrissa.contour import compare_with, distances_by, ellipsoids, fit_sphere
-from vibrissa.trial import Peg, Plane, Sphere
+from vibrissa.objects import Peg, Plane, Sphere
 
 
 def scattered(body, n=3000, sigma=(30e-6, 60e-6)):

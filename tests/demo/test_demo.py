@@ -13,9 +13,9 @@ from vibrissa.evaluation import caution, tracking_scores, truth_of
 from vibrissa.evaluation.stages import from_curves, refined
 from vibrissa.io import load_contacts, load_recording
 from vibrissa.pipeline import fit_contacts
+from vibrissa.recording import recorded_whisker
 from vibrissa.report import trial_sections
 from vibrissa.report.values import shown_value
-from vibrissa.trial import recorded_whisker
 
 SHORT = {"duration": 0.6, "rate": 300.0, "video": False}
 FILMED = {"duration": 0.4, "rate": 250.0, "seed": 2}

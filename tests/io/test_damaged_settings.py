@@ -9,13 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from vibrissa.cameras import Camera, load_cameras, orthogonal_views, save_cameras
 from vibrissa.cli.app import app
 from vibrissa.io import write_video
 from vibrissa.io.table import read_text
 from vibrissa.io.toml import in_file
-from vibrissa.sensing import Sensor, SensorFrame, load_sensor, save_sensor
-from vibrissa.trial import Camera, load_cameras, orthogonal_views, save_cameras
-from vibrissa.trial.script import EXAMPLE, read_objects, read_script
+from vibrissa.sensors import Sensor, SensorFrame, load_sensor, save_sensor
+from vibrissa.simulation.script import EXAMPLE, read_objects, read_script
 from vibrissa.whisker import Whisker
 
 typer_testing = pytest.importorskip("typer.testing")

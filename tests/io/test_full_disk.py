@@ -13,7 +13,7 @@ import pytest
 
 from vibrissa import samples
 from vibrissa.io import save_recording
-from vibrissa.trial import facing_peg, measure, simulate, whisking
+from vibrissa.simulation import facing_peg, measure, simulate, whisking
 
 pytest.importorskip("resource", reason="this system has no limits for files")
 

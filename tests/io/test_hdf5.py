@@ -19,7 +19,7 @@ from vibrissa.io import (
     save_recording,
 )
 from vibrissa.io.netcdf import netcdf_image, read_dataset, read_tree, write_netcdf
-from vibrissa.trial import facing_peg, measure, simulate, whisking
+from vibrissa.simulation import facing_peg, measure, simulate, whisking
 
 WHISKER = samples.gamma()
 

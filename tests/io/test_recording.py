@@ -9,7 +9,8 @@ import xarray as xr
 from vibrissa import samples
 from vibrissa.io.netcdf import kind_of
 from vibrissa.io.recording import load_recording, save_recording
-from vibrissa.trial import facing_peg, measure, recorded_whisker, simulate, whisking
+from vibrissa.recording import recorded_whisker
+from vibrissa.simulation import facing_peg, measure, simulate, whisking
 
 WHISKER = samples.gamma()
 PEG = facing_peg(WHISKER)

@@ -5,10 +5,10 @@ import pytest
 import xarray as xr
 
 from vibrissa import samples
-from vibrissa.mapping import ContactMap
+from vibrissa.contacts import ContactMap
 from vibrissa.quantities import attributes
-from vibrissa.trial import facing_peg, measure, simulate, sweep_past
-from vibrissa.trial.recording import recorded
+from vibrissa.recording.tree import recorded
+from vibrissa.simulation import facing_peg, measure, simulate, sweep_past
 
 WHISKER = samples.gamma()
 PEG = facing_peg(WHISKER)

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 import vibrissa as vb
+from vibrissa.objects import Mesh
 from vibrissa.pipeline import with_contour
-from vibrissa.trial import Mesh, array_whisking, head_path, measure, simulate, within_reach
+from vibrissa.simulation import array_whisking, head_path, measure, simulate, within_reach
 
 SOME = vb.whisker_array("right", names=["B3", "C3", "C4", "D4"])
 

@@ -7,6 +7,7 @@ import xarray as xr
 from vibrissa import samples
 from vibrissa.contour import shape_from_dataset
 from vibrissa.io import load_recording, save_recording
+from vibrissa.objects import Sphere
 from vibrissa.pipeline import (
     compare_contacts,
     compare_shapes,
@@ -27,16 +28,9 @@ from vibrissa.pipeline import (
 from vibrissa.pipeline.locate import unfelt
 from vibrissa.pipeline.reconstruct import frames_together
 from vibrissa.pipeline.shapes import GOES, STRONG
+from vibrissa.recording import recorded_pegs, recorded_whisker
+from vibrissa.simulation import facing_peg, measure, simulate, sweep_past
 from vibrissa.status import Status
-from vibrissa.trial import (
-    Sphere,
-    facing_peg,
-    measure,
-    recorded_pegs,
-    recorded_whisker,
-    simulate,
-    sweep_past,
-)
 
 ALL = "Fx FT FD Mx MB MD"
 

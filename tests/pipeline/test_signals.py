@@ -12,11 +12,11 @@ from vibrissa.pipeline import (
     signals_of,
     with_signals,
 )
-from vibrissa.sensing import Sensor
+from vibrissa.sensors import Sensor
 from vibrissa.signals import SIGNALS, base_signals
+from vibrissa.simulation import measure
 from vibrissa.status import Status
 from vibrissa.tracking.filtering import low_pass
-from vibrissa.trial import measure
 
 
 def exact(tracked, trial):

@@ -5,11 +5,12 @@ import pytest
 import xarray as xr
 
 import vibrissa as vb
+from vibrissa.cameras import orthogonal_views
+from vibrissa.cameras.files import cameras_dataset
 from vibrissa.io.recording import KIND
+from vibrissa.objects import Peg
+from vibrissa.objects.dataset import objects_datasets
 from vibrissa.quantities import attributes
-from vibrissa.trial import Peg, orthogonal_views
-from vibrissa.trial.camera_files import cameras_dataset
-from vibrissa.trial.object_files import objects_datasets
 
 COUNT, LENGTH, NODES = 12, 40e-3, 21
 AZIMUTH = np.linspace(-0.3, 0.3, COUNT)

@@ -5,11 +5,12 @@ import pytest
 import xarray as xr
 
 import vibrissa as vb
+from vibrissa.objects import Box, Mesh, Peg, Plane, Sphere
+from vibrissa.objects.dataset import objects_datasets
 from vibrissa.plots import array_views
 from vibrissa.plots.array import ROW_COLOURS
 from vibrissa.plots.things import head_triangles, object_triangles
-from vibrissa.trial import Box, Mesh, Peg, Plane, Sphere, array_whisking, simulate
-from vibrissa.trial.object_files import objects_datasets
+from vibrissa.simulation import array_whisking, simulate
 
 ARRAY = vb.whisker_array(rows="BC", columns=[1, 2])
 BALL = Sphere([24e-3, 6e-3, -8e-3], 8e-3)

@@ -5,9 +5,9 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from vibrissa.contour import compare_with, distances_by, fit_free, fit_plane, fit_sphere
+from vibrissa.objects import Plane, Sphere
 from vibrissa.plots import contour_views, distances_by_class
 from vibrissa.quantities import axis_label
-from vibrissa.trial import Plane, Sphere
 
 BALL = Sphere(origin=[25e-3, 1e-3, 0.0], radius=4e-3)
 

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 import vibrissa as vb
 from vibrissa.cli.app import app
 from vibrissa.io import save_recording
+from vibrissa.objects import Peg, Plane, Sphere
 from vibrissa.plots import (
     Sight,
     contact_places,
@@ -24,7 +25,6 @@ from vibrissa.plots import (
 from vibrissa.plots.head import draw_head, head_of
 from vibrissa.plots.outlines import draw_body, one_scale, room_for
 from vibrissa.plots.style import RED
-from vibrissa.trial import Peg, Plane, Sphere
 
 GREY = np.full((300, 300), 200, np.uint8)
 LINE = np.linspace([0.0, 0.0, 0.0], [40e-3, 0.0, 0.0], 20)

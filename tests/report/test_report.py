@@ -16,9 +16,10 @@ from vibrissa import __version__, plots
 from vibrissa.cli import reporting
 from vibrissa.cli.app import app
 from vibrissa.cli.figures import dataset_with
+from vibrissa.contacts import ContactMap
 from vibrissa.io import load_recording, save_recording, video_info
-from vibrissa.mapping import ContactMap
 from vibrissa.quantities import quantity
+from vibrissa.recording import recorded_whisker
 from vibrissa.report import document, figure_sections, movies_section, table, trial_sections
 from vibrissa.report.page import Section
 from vibrissa.report.tracked import contacts_by_whisker, tracked_table, whiskers_table
@@ -26,7 +27,6 @@ from vibrissa.report.trial import _settings, tracking_tables
 from vibrissa.report.values import shown_value
 from vibrissa.signals import SIGNALS
 from vibrissa.status import describe
-from vibrissa.trial import recorded_whisker
 
 LINES = "Tracked and true lines"
 VOID = {"meta", "br", "img", "path", "link", "input", "hr"}
@@ -125,7 +125,7 @@ def map_page(folder):
     verdicts = vb.uniqueness(
         contacts, [("Fx", "MB", "MD"), ("FT", "FD", "MD")], ["all", "ELD"], samples=256
     )
-    vb.mapping.save_uniqueness(verdicts, folder / "uniqueness.nc")
+    vb.identifiability.save_uniqueness(verdicts, folder / "uniqueness.nc")
     words = (folder / "map.nc", "--uniqueness", folder / "uniqueness.nc")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SOURCE_DATE_EPOCH", "1700000000")

@@ -7,7 +7,7 @@ import textwrap
 
 import pytest
 
-from vibrissa.rod.compiled import copy
+from vibrissa.numerics.compiled import copy
 
 
 def run(code, **environment):
@@ -25,7 +25,7 @@ def test_the_first_compilation_says_what_it_is_doing_once():
     """A kernel that is in nobody's cache, made in a module of the package's name."""
     said = run(
         """
-        from vibrissa.rod.compiled import kernel
+        from vibrissa.numerics.compiled import kernel
 
         def twice(x):
             return 2.0 * x
@@ -47,7 +47,7 @@ def test_what_is_compiled_is_said_with_the_verb():
         """
         import sys
         import vibrissa.cli.app
-        from vibrissa.rod.compiled import kernel
+        from vibrissa.numerics.compiled import kernel
 
         sys.argv[1:] = ["--help", "estimate", "signals.csv"]
 
@@ -68,7 +68,7 @@ import resource, sys
 
 import numpy as np
 
-from vibrissa.rod.compiled import kernel
+from vibrissa.numerics.compiled import kernel
 
 if len(sys.argv) > 1:
     resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), -1))
@@ -156,7 +156,7 @@ def test_where_nothing_can_be_written_kernels_are_compiled_without_a_cache():
         for locator in caching.CacheImpl._locator_classes:
             locator.from_function = classmethod(lambda cls, function, file: None)
 
-        from vibrissa.rod.compiled import inlined, kernel
+        from vibrissa.numerics.compiled import inlined, kernel
 
         @inlined
         def square(x):

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 import vibrissa as vb
+from vibrissa.objects import Box, Peg, Plane, Sphere
 from vibrissa.rod.contact_state import contact_state
 from vibrissa.rod.discretize import discretize
 from vibrissa.rod.surfaces import follow_surfaces
+from vibrissa.simulation import whisking
+from vibrissa.simulation.motion import base_rotation
 from vibrissa.status import Status
-from vibrissa.trial import Box, Peg, Plane, Sphere, whisking
-from vibrissa.trial.motion import base_rotation
 
 WHISKER = vb.samples.gamma()
 LENGTH = WHISKER.length

@@ -19,9 +19,9 @@ from scipy.spatial.transform import Rotation
 
 import vibrissa as vb
 from vibrissa.cli.streaming import stream
+from vibrissa.contacts import ContactFilter, Estimator
 from vibrissa.io.rosbag import bag_wrenches
-from vibrissa.mapping import ContactFilter, Estimator
-from vibrissa.sensing import Sensor, SensorFrame, save_sensor
+from vibrissa.sensors import Sensor, SensorFrame, save_sensor
 from vibrissa.streaming import ContactStream, Lines, NewestLines, Poses, advice, file_lines
 from vibrissa.streaming.contacts import COMPONENTS, as_json
 from vibrissa.streaming.lines import POSITION, QUATERNION

@@ -9,8 +9,10 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
 from vibrissa import Whisker
-from vibrissa.trial import Motion, Peg, orthogonal_views, simulate
-from vibrissa.trial.film import film_frames, with_true_traces
+from vibrissa.cameras import orthogonal_views
+from vibrissa.objects import Peg
+from vibrissa.simulation import Motion, simulate
+from vibrissa.simulation.film import film_frames, with_true_traces
 
 sys.path.append(str(Path(__file__).parent))  # tests and studies share the maker of films, furry.py
 

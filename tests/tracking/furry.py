@@ -17,8 +17,8 @@ import av
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates, shift
 
-from vibrissa.trial import orthogonal_views
-from vibrissa.trial.painting import cover
+from vibrissa.cameras import orthogonal_views
+from vibrissa.simulation.painting import cover
 
 PIXEL = 58e-6
 

@@ -6,8 +6,10 @@ import xarray as xr
 from scipy.spatial.transform import Rotation
 
 from vibrissa import Whisker
+from vibrissa.objects import Peg
+from vibrissa.recording import recorded_objects, recorded_whisker
+from vibrissa.simulation import Motion, simulate
 from vibrissa.tracking import HeadPose, TrackOptions, trace_video, track
-from vibrissa.trial import Motion, Peg, recorded_objects, recorded_whisker, simulate
 
 FRAMES = 30
 RATE = 1000.0

@@ -6,10 +6,11 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
 from vibrissa import Whisker
+from vibrissa.cameras import orthogonal_views
+from vibrissa.simulation import Look, Motion, simulate
+from vibrissa.simulation.film import film_frames, with_true_traces
 from vibrissa.tracking import Trace, ridge, start_at, trace_video
 from vibrissa.tracking.row import follow_row
-from vibrissa.trial import Look, Motion, orthogonal_views, simulate
-from vibrissa.trial.film import film_frames, with_true_traces
 
 COUNT = 6
 FRAMES = 50

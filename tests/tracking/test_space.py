@@ -6,9 +6,9 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from vibrissa.cameras import Camera, orthogonal_views
 from vibrissa.tracking import Trace, low_pass, merge, paired_frames
 from vibrissa.tracking.trace import even
-from vibrissa.trial import Camera, orthogonal_views
 
 LENGTH = 30e-3
 

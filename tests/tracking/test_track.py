@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from vibrissa.recording import recorded_whisker
 from vibrissa.status import Status
 from vibrissa.tracking import (
     RefineOptions,
@@ -14,7 +15,6 @@ from vibrissa.tracking import (
     whisker_at_rest,
 )
 from vibrissa.tracking.banded import Smoother
-from vibrissa.trial import recorded_whisker
 from vibrissa.whisker.emergence import angles_of, base_rotation
 
 
@@ -90,9 +90,9 @@ def test_force_and_moment_are_those_of_the_rod(filmed, found, both):
 def test_friction_is_found_in_the_shape(share):
     """A rod bent by a known force with friction, seen without noise: the force comes out."""
     from vibrissa import PointForce, Whisker, deflect
+    from vibrissa.cameras import orthogonal_views
     from vibrissa.tracking import BasePose, Sight, Trace, refine
     from vibrissa.tracking.trace import even
-    from vibrissa.trial import orthogonal_views
 
     whisker = Whisker.parabola(length=30e-3, coefficient=10.0)
     across = np.array([60e-6, 20e-6])
@@ -125,13 +125,13 @@ def test_friction_is_found_in_the_shape(share):
 
 def test_a_step_to_a_contact_that_no_rod_withstands_is_not_taken():
     from vibrissa import samples
+    from vibrissa.cameras import orthogonal_views
     from vibrissa.rod.discretize import discretize
     from vibrissa.tracking import RefineOptions, Sight, Trace
     from vibrissa.tracking.head import HeadPose
     from vibrissa.tracking.refine import _Problem
     from vibrissa.tracking.rods import State
     from vibrissa.tracking.trace import even
-    from vibrissa.trial import orthogonal_views
 
     whisker = samples.gamma()
     pair = orthogonal_views(center=(0.012, 0.005, 0.0))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vibrissa.trial import Box, Peg, Plane, Sphere
+from vibrissa.objects import Box, Peg, Plane, Sphere
 from vibrissa.viewer.meshes import cylinder, ellipsoid, error_ellipsoid, tube
 from vibrissa.viewer.trial_drawing import object_body
 

@@ -162,7 +162,7 @@ def test_a_click_on_a_solid_marks_the_contact_in_all_spaces(looking):
 
 
 def test_a_trial_plays(browser, recording):
-    from vibrissa.trial import recorded_whisker
+    from vibrissa.recording import recorded_whisker
     from vibrissa.viewer import view
 
     with view(recorded_whisker(recording), recording=recording) as viewer:

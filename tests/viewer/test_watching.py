@@ -11,7 +11,7 @@ import vibrissa as vb
 from vibrissa.contour import fit_cylinder, fit_free, fit_plane, fit_sphere
 from vibrissa.io import write_video
 from vibrissa.io.footage import Footage
-from vibrissa.trial import recorded_pegs
+from vibrissa.recording import recorded_pegs
 from vibrissa.viewer.signal_chart import chart, cursor
 from vibrissa.viewer.trial_drawing import fitted_body, moment_drawing, surroundings, touched
 from vibrissa.viewer.views import picture, views

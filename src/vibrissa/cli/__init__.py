@@ -5,4 +5,6 @@ What is typed and printed is in mm, µN, µN·m, degrees; files hold SI units.
 
 from vibrissa.cli.app import main
 
-__all__ = ["main"]
+__all__ = [
+    "main",
+]

@@ -12,29 +12,7 @@ _CONTACTS = ("estimates", "truth")
 
 
 def array_drawings(path: Path, width: Any) -> dict[str, Draw]:
-    """Say what can be drawn of a face.
-
-    Parameters
-    ----------
-    path : Path
-        A file.
-    width : {"single", "double"}
-        Columns of the page.
-
-    Returns
-    -------
-    dict of str to callable
-        Names of figures, and what draws them: none, unless it holds an array of whiskers, or is the
-        recording of several, whose contact points are drawn as they were estimated, or else as they
-        truly are or were tracked.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is damaged.
-    """
+    """Say what can be drawn of a face."""
     from vibrissa import plots
     from vibrissa.io import Kind, load_array, load_recording, recognise
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import typer
 
 if TYPE_CHECKING:
-    from vibrissa.mapping import Prior
+    from vibrissa.contacts import Prior
 
 StiffnessSigma = Annotated[
     float,
@@ -68,15 +68,7 @@ _UNITS = {"r": 1e-3, "theta": math.pi / 180.0, "phi": math.pi / 180.0}
 
 
 class Assumed(NamedTuple):
-    """What is known beforehand.
-
-    Parameters
-    ----------
-    errors : dict of str to float
-        Relative standard deviations, by the estimators' names; only those that are not zero.
-    prior : Prior or None
-        Which contacts are possible.
-    """
+    """What is known beforehand."""
 
     errors: dict[str, float]
     prior: Prior | None
@@ -118,27 +110,7 @@ def assumed(
     least_force: float | None = None,
     greatest_force: float | None = None,
 ) -> Assumed:
-    """Read what is known beforehand from options.
-
-    Parameters
-    ----------
-    stiffness_sigma, gain_sigma, mixing_sigma : float
-        Relative standard deviations, %.
-    region : str or None
-        Where contacts may be.
-    least_force, greatest_force : float or None
-        Limits of their force, µN.
-
-    Returns
-    -------
-    Assumed
-        In SI units.
-
-    Raises
-    ------
-    ValueError
-        If the region is none, or the limits are not in order.
-    """
+    """Read what is known beforehand from options."""
     given = {
         "stiffness_sigma": stiffness_sigma,
         "gain_sigma": gain_sigma,
@@ -147,7 +119,7 @@ def assumed(
     errors = {name: 0.01 * value for name, value in given.items() if value > 0.0}
     if region is None and least_force is None and greatest_force is None:
         return Assumed(errors, None)
-    from vibrissa.mapping import Prior
+    from vibrissa.contacts import Prior
 
     least = 0.0 if least_force is None else 1e-6 * least_force
     greatest = math.inf if greatest_force is None else 1e-6 * greatest_force

@@ -150,7 +150,7 @@ def _named(**values: str | None) -> list[tuple[str, str | None]]:
 def _print(bent: Deflection) -> None:
     from rich.table import Table
 
-    from vibrissa.mapping.contact_map import spherical
+    from vibrissa.contacts.contact_map import spherical
     from vibrissa.quantities import quantity
     from vibrissa.signals import SIGNALS, base_signals
 

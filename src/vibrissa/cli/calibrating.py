@@ -42,10 +42,10 @@ def calibrate(
     its laboratory frame is that of the board in the first moment in which all cameras see it.
     Example: `vibrissa calibrate --pattern 9x6 --square 5e-3 top_*.png front_*.png -o cameras.toml`
     """
+    from vibrissa.cameras import calibrate as calibrated
+    from vibrissa.cameras import save_cameras
     from vibrissa.io import Kind, load_series, recognise
     from vibrissa.io.paths import check_readable, check_writable
-    from vibrissa.trial import calibrate as calibrated
-    from vibrissa.trial import save_cameras
 
     corners = _corners(pattern)
     if not 0.0 < square < _LARGEST:

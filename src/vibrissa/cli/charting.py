@@ -50,8 +50,8 @@ def chart(
     `vibrissa map --length 300 --base-radius 500 --tip-radius 250 --modulus 200 --poisson 0.29`
     """
     from vibrissa.cli.sources import stated, tell_notes, whisker_from
+    from vibrissa.contacts import ContactMap
     from vibrissa.io.paths import NETCDF, check_writable
-    from vibrissa.mapping import ContactMap
     from vibrissa.whisker import Whisker
 
     check_writable(path, NETCDF)

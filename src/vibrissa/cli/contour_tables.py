@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from vibrissa.contour import FittedShape
-    from vibrissa.rod.surface import Surface
+    from vibrissa.objects.surface import Surface
 
 _TURNED = ("axis", "normal")
 
@@ -83,22 +83,7 @@ def _matching(
 
 
 def summary(fit: FittedShape, contour: xr.Dataset, shapes: xr.Dataset | None) -> list[str]:
-    """Say how well contacts agree with the fitted object, and whether it has another shape.
-
-    Parameters
-    ----------
-    fit : FittedShape
-        The object.
-    contour : Dataset
-        Its group.
-    shapes : Dataset or None
-        Of `vibrissa.pipeline.compare_shapes`.
-
-    Returns
-    -------
-    list of str
-        Lines.
-    """
+    """Say how well contacts agree with the fitted object, and whether it has another shape."""
     import numpy as np
 
     found, used = int(np.isfinite(fit.residuals).sum()), int(fit.used.sum())

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from vibrissa.cli.locating import How
-    from vibrissa.rod.arrays import Array
-    from vibrissa.rod.surface import Surface
+    from vibrissa.numerics.arrays import Array
+    from vibrissa.objects.surface import Surface
     from vibrissa.whisker import Whisker
 
 _SUSPECT = 1.5
@@ -122,7 +122,7 @@ def reconstruct(
     from vibrissa.io import save_contour, save_recording
     from vibrissa.io.paths import CSV, NETCDF, check_writable
     from vibrissa.pipeline import contour_points
-    from vibrissa.trial import recorded_objects
+    from vibrissa.recording import recorded_objects
 
     target = recording if path is None else path
     points = target.with_name(f"{target.stem}_contour.csv") if csv is None else csv

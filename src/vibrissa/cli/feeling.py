@@ -97,30 +97,7 @@ def signals(
 def signal_options(
     tree: xr.DataTree, source: str | None, cutoff: float | None, whisker: Path | None
 ) -> dict[str, Any]:
-    """Turn options of the command line into those of `signals_of`.
-
-    Parameters
-    ----------
-    tree : DataTree
-        The recording.
-    source : str or None
-        As given; a hyphen counts as a blank.
-    cutoff : float or None
-        Hz; 0 for none, None for the usual.
-    whisker : Path or None
-        As given.
-
-    Returns
-    -------
-    dict
-        Keyword arguments.
-
-    Raises
-    ------
-    ValueError
-        If the recording has no source of signals, or no whisker where one is needed, or a cut-off
-        is given for signals that do not come from the contact point.
-    """
+    """Turn options of the command line into those of `signals_of`."""
     from vibrissa.cli.recordings import whiskers_for
     from vibrissa.pipeline import default_source
     from vibrissa.tracking.filtering import CUTOFF
@@ -135,18 +112,7 @@ def signal_options(
 
 
 def described(tree: xr.DataTree) -> str:
-    """Say what signals come from.
-
-    Parameters
-    ----------
-    tree : DataTree
-        A recording with signals.
-
-    Returns
-    -------
-    str
-        A line.
-    """
+    """Say what signals come from."""
     about = tree["signals"].attrs
     source = str(about.get("source", "a source not known"))
     if source == "sensor":

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import NDArray
 
-    from vibrissa.mapping import ContactMap
+    from vibrissa.contacts import ContactMap
     from vibrissa.rod import Deflection
     from vibrissa.whisker import Whisker
 
@@ -130,25 +130,7 @@ def _chosen(formats: list[str] | None, width: str) -> list[str]:
 
 
 def dataset_with(path: Path, needed: str) -> xr.Dataset:
-    """Read a dataset that holds a variable.
-
-    Parameters
-    ----------
-    path : Path
-        NetCDF.
-    needed : str
-        The variable.
-
-    Returns
-    -------
-    Dataset
-        The data.
-
-    Raises
-    ------
-    ValueError
-        If it is a table, or does not hold the variable.
-    """
+    """Read a dataset that holds a variable."""
     from vibrissa.io import kind_of
     from vibrissa.io.netcdf import read_dataset
     from vibrissa.io.paths import CSV
@@ -167,29 +149,7 @@ def dataset_with(path: Path, needed: str) -> xr.Dataset:
 def map_drawings(
     contacts: ContactMap, width: Any, verdicts: xr.Dataset | None, cones: xr.Dataset | None
 ) -> Iterator[tuple[str, Draw]]:
-    """Say what can be drawn of a map.
-
-    Parameters
-    ----------
-    contacts : ContactMap
-        The map.
-    width : {"single", "double"}
-        Columns of the page.
-    verdicts : Dataset or None
-        Of :func:`vibrissa.uniqueness`.
-    cones : Dataset or None
-        Critical cones by curvature and taper.
-
-    Yields
-    ------
-    str, callable
-        Names of figures, and what draws them.
-
-    Raises
-    ------
-    ValueError
-        If the verdicts are those of another whisker.
-    """
+    """Say what can be drawn of a map."""
     from vibrissa import plots
 
     whisker = contacts.whisker
@@ -219,41 +179,20 @@ def map_drawings(
 
 def _derivatives(contacts: ContactMap) -> xr.Dataset:
     """Derivatives at the paper's contacts, which fill the panels best, or at the map's."""
-    from vibrissa.mapping import sensitivity
+    from vibrissa.identifiability import sensitivity
 
     return sensitivity(contacts, at=None if contacts.grid is None else "grid")
 
 
 def _solid(contacts: ContactMap) -> tuple[xr.Dataset, xr.Dataset | None]:
     """The slice at M_D = −π/2, and all contacts with the errors of a look-up in the grid."""
-    from vibrissa.mapping import error_solid, signal_slice
+    from vibrissa.identifiability import error_solid, signal_slice
 
     return signal_slice(contacts), None if contacts.grid is None else error_solid(contacts)
 
 
 def witnesses(whisker: Whisker, verdicts: xr.Dataset) -> Iterator[tuple[str, xr.Dataset]]:
-    """Bend a whisker into the farthest pair of contacts that feel the same, for chosen triplets.
-
-    Parameters
-    ----------
-    whisker : Whisker
-        Whose verdicts these are.
-    verdicts : Dataset
-        As of ``vibrissa.uniqueness``.
-
-    Yields
-    ------
-    triplet : str
-        One of the paper's three, or the one chosen, if it has a witness: among all contacts, or
-        if these were not judged, in the region where its contacts lie farthest apart.
-    witness : Dataset
-        As :func:`vibrissa.plots.witness_pair` takes it.
-
-    Raises
-    ------
-    ValueError
-        If the verdicts are those of another whisker.
-    """
+    """Bend a whisker into the farthest pair of contacts that feel the same, for chosen triplets."""
     from vibrissa.plots.evidence import HIGHLIGHTED
 
     needed = {"witness_arc_length", "witness_contact_force", "witness_separation"}

@@ -112,29 +112,7 @@ def movie_rows(
     start: float | None = None,
     stop: float | None = None,
 ) -> NDArray[np.intp]:
-    """Choose frames of a trial for a movie.
-
-    Parameters
-    ----------
-    time : array (n,)
-        Of the trial's frames, s, rising.
-    fps : float
-        At which the movie is shown.
-    step : int, optional
-        Every how many frames; by default as few as make a movie of 45 s at most.
-    start, stop : float, optional
-        Time of the first and the last, s.
-
-    Returns
-    -------
-    array (m,) of int
-        Their numbers.
-
-    Raises
-    ------
-    ValueError
-        If fps or step is not positive, or there are no frames at these times.
-    """
+    """Choose frames of a trial for a movie."""
     if not (np.isfinite(fps) and fps > 0.0):
         raise ValueError(f"--fps is {fps!r}; it must be positive")
     if step is not None and step < 1:
@@ -200,7 +178,7 @@ def _contour_frames(
 ) -> Iterator[Any]:
     from vibrissa.cli.trial_views import bodies_of, fits_of, sights_of
     from vibrissa.plots import contour_frames
-    from vibrissa.trial import recorded_whisker
+    from vibrissa.recording import recorded_whisker
 
     rest = recorded_whisker(trial, whisker).centerline(101)
     sights = sights_of(trial, course, videos, rows)

@@ -122,7 +122,7 @@ def _is_sensor(path: Path) -> bool:
 
 def _sensor(path: Path) -> Iterator[tuple[str, str]]:
     """A sensor, a line for each channel."""
-    from vibrissa.sensing import COMPONENTS, load_sensor
+    from vibrissa.sensors import COMPONENTS, load_sensor
 
     sensor = load_sensor(path)
     yield "kind", "sensor"

@@ -66,10 +66,10 @@ def uniqueness(
     import numpy as np
 
     from vibrissa.cli.sources import map_from
+    from vibrissa.identifiability import save_uniqueness, verdict_table
+    from vibrissa.identifiability import uniqueness as judge
+    from vibrissa.identifiability.summary import ENDINGS
     from vibrissa.io.paths import check_writable
-    from vibrissa.mapping import save_uniqueness, verdict_table
-    from vibrissa.mapping import uniqueness as judge
-    from vibrissa.mapping.summary import ENDINGS
 
     if path is not None:
         check_writable(path, ENDINGS)

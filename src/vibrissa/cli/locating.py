@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     import xarray as xr
 
-    from vibrissa.rod.arrays import Array
+    from vibrissa.numerics.arrays import Array
     from vibrissa.whisker import Whisker
 
 
@@ -159,25 +159,7 @@ def estimate(
 
 
 class How(NamedTuple):
-    """How contacts are estimated.
-
-    Parameters
-    ----------
-    names : tuple of str or None
-        The signals; None for the default.
-    method : str
-        As of ``ContactMap.estimate``.
-    all_six : bool
-        Whether force and moment are used whole.
-    charts : tuple of Path
-        Maps; none: to be simulated.
-    whisker : Path or None
-        Where it is not that of the recording.
-    assumed : Assumed
-        What is known beforehand.
-    proximal : float or None
-        Smallest arc length of a contact of maps that are simulated, share of the length.
-    """
+    """How contacts are estimated."""
 
     names: tuple[str, ...] | None
     method: str
@@ -211,31 +193,7 @@ def how_to(
     charts: Sequence[Path] | None,
     whisker: Path | None,
 ) -> How:
-    """Read how to estimate from options of the command line.
-
-    Parameters
-    ----------
-    triplet : str or None
-        Names of signals; None for the default.
-    method : str
-        As of ``ContactMap.estimate``.
-    all_six : bool
-        Whether force and moment are used whole.
-    charts : sequence of Path or None
-        Maps.
-    whisker : Path or None
-        A whisker.
-
-    Returns
-    -------
-    How
-        Checked.
-
-    Raises
-    ------
-    ValueError
-        If options do not go together.
-    """
+    """Read how to estimate from options of the command line."""
     from vibrissa.pipeline import TRIPLET
     from vibrissa.signals import selection
 
@@ -261,7 +219,7 @@ def _from_table(signals: Path, path: Path, how: How, noise: tuple[Array, str] | 
     from vibrissa.cli.sources import tell_notes, whisker_from, wrench_from
     from vibrissa.io import save_contacts
     from vibrissa.pipeline import TRIPLET, contact_columns, locate, locate_from_wrench
-    from vibrissa.sensing import FORCE_NOISE
+    from vibrissa.sensors import FORCE_NOISE
 
     covariance, said = noise or noise_from(None, FORCE_NOISE * 1e6, None) or (None, "")
     wrench, _ = wrench_from(signals)
@@ -325,33 +283,12 @@ def _from_recording(signals: Path, path: Path, how: How, noise: tuple[Array, str
 def estimated(
     tree: xr.DataTree, how: How, noise: tuple[Array, str] | None, tell: Tell, name: str
 ) -> tuple[xr.DataTree, str]:
-    """Add contacts to a recording, and signals where there are none.
-
-    Parameters
-    ----------
-    tree : DataTree
-        The recording.
-    how : How
-        By which signals and maps.
-    noise : tuple or None
-        Covariance of (F, M) and how it was given; by default what the recording says.
-    tell : callable
-        Of progress.
-    name : str
-        Of the file, for messages.
-
-    Returns
-    -------
-    tree : DataTree
-        With signals and contacts.
-    said : str
-        How they were estimated.
-    """
+    """Add contacts to a recording, and signals where there are none."""
     from vibrissa.cli.feeling import signal_options
     from vibrissa.cli.recordings import maps_from, noise_from, say, whiskers_for
     from vibrissa.cli.sources import tell_notes
     from vibrissa.pipeline import sensor_noise, with_estimates, with_signals
-    from vibrissa.sensing import FORCE_NOISE
+    from vibrissa.sensors import FORCE_NOISE
 
     if "signals" not in tree.children:
         tree = with_signals(tree, **signal_options(tree, None, None, how.known))
@@ -390,7 +327,7 @@ def estimated(
 
 
 def _check_method(method: str, names: tuple[str, ...], all_six: bool) -> None:
-    from vibrissa.mapping.approximation import APPROXIMATE
+    from vibrissa.paper.approximation import APPROXIMATE
 
     if method not in ("exact", *APPROXIMATE):
         allowed = ", ".join(("exact", *APPROXIMATE))

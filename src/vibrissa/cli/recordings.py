@@ -12,31 +12,13 @@ if TYPE_CHECKING:
 
     import xarray as xr
 
-    from vibrissa.mapping import ContactMap
-    from vibrissa.rod.arrays import Array
+    from vibrissa.contacts import ContactMap
+    from vibrissa.numerics.arrays import Array
     from vibrissa.whisker import Whisker
 
 
 def recording_from(path: Path) -> xr.DataTree:
-    """Read a recording.
-
-    Parameters
-    ----------
-    path : Path
-        NetCDF.
-
-    Returns
-    -------
-    DataTree
-        The recording.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is no recording, or has neither frames nor whiskers.
-    """
+    """Read a recording."""
     from vibrissa.io import load_recording
     from vibrissa.io.paths import check_readable
     from vibrissa.pipeline.frames import check_recording
@@ -50,18 +32,7 @@ def recording_from(path: Path) -> xr.DataTree:
 
 
 def is_recording(path: Path) -> bool:
-    """Tell whether a file holds a recording.
-
-    Parameters
-    ----------
-    path : Path
-        Any.
-
-    Returns
-    -------
-    bool
-        False too if there is no such file.
-    """
+    """Tell whether a file holds a recording."""
     from vibrissa.io import is_netcdf, kind_of
 
     if not path.is_file() or path.stat().st_size == 0:
@@ -70,27 +41,9 @@ def is_recording(path: Path) -> bool:
 
 
 def whiskers_for(recording: xr.DataTree, path: Path | None) -> list[Whisker]:
-    """Find the whisker of each that a recording has signals of.
-
-    Parameters
-    ----------
-    recording : DataTree
-        The recording.
-    path : Path or None
-        A file with the one whisker, where the recording does not carry it or another is wanted.
-
-    Returns
-    -------
-    list of Whisker
-        Along the dimension ``whisker``.
-
-    Raises
-    ------
-    ValueError
-        If the recording does not carry them, or one is given for several.
-    """
+    """Find the whisker of each that a recording has signals of."""
     from vibrissa.cli.sources import whisker_from
-    from vibrissa.trial import recorded_whisker
+    from vibrissa.recording import recorded_whisker
 
     count = recording.sizes["whisker"]
     if path is not None:
@@ -104,27 +57,7 @@ def whiskers_for(recording: xr.DataTree, path: Path | None) -> list[Whisker]:
 
 
 def maps_from(charts: Sequence[Path], count: int, grid: bool = False) -> list[ContactMap]:
-    """Read the map of each whisker.
-
-    Parameters
-    ----------
-    charts : sequence of Path
-        Their files.
-    count : int
-        How many whiskers there are.
-    grid : bool
-        Whether the paper's grid is needed.
-
-    Returns
-    -------
-    list of ContactMap
-        One for each.
-
-    Raises
-    ------
-    ValueError
-        If there are not as many, or the grid is missing.
-    """
+    """Read the map of each whisker."""
     from vibrissa.cli.sources import map_from
 
     if len(charts) != count:
@@ -141,25 +74,8 @@ def maps_from(charts: Sequence[Path], count: int, grid: bool = False) -> list[Co
 def maps_of(
     whiskers: Sequence[Whisker], tell: Tell, grid: bool, proximal: float
 ) -> list[ContactMap]:
-    """Simulate the map of each whisker, and say so.
-
-    Parameters
-    ----------
-    whiskers : sequence of Whisker
-        Whose.
-    tell : callable
-        Of progress.
-    grid : bool
-        Whether the paper's grid is needed.
-    proximal : float
-        Smallest arc length of a contact, share of the length.
-
-    Returns
-    -------
-    list of ContactMap
-        One for each.
-    """
-    from vibrissa.mapping import ContactMap
+    """Simulate the map of each whisker, and say so."""
+    from vibrissa.contacts import ContactMap
 
     maps = []
     for k, whisker in enumerate(whiskers):
@@ -173,26 +89,7 @@ def maps_of(
 def noise_from(
     path: Path | None, force_noise: float | None, moment_noise: float | None
 ) -> tuple[Array, str] | None:
-    """Read the noise that is given on the command line.
-
-    Parameters
-    ----------
-    path : Path or None
-        Covariance of force and moment, six lines of six numbers, SI units.
-    force_noise, moment_noise : float or None
-        Standard deviation of a component, µN and µN·m; that of the usual sensor where only the
-        other is given.
-
-    Returns
-    -------
-    tuple or None
-        Covariance of (F, M), SI units, and how it was given; None if it was not.
-
-    Raises
-    ------
-    ValueError
-        If the file is no covariance.
-    """
+    """Read the noise that is given on the command line."""
     import numpy as np
 
     from vibrissa.io.table import read_text, table_rows
@@ -215,19 +112,8 @@ def noise_from(
 
 
 def usual_noise(force_noise: float | None, moment_noise: float | None) -> tuple[float, float]:
-    """Fill in the usual sensor's noise.
-
-    Parameters
-    ----------
-    force_noise, moment_noise : float or None
-        As given, µN and µN·m.
-
-    Returns
-    -------
-    tuple of float
-        The same, with the usual where nothing is given.
-    """
-    from vibrissa.sensing import FORCE_NOISE, MOMENT_NOISE
+    """Fill in the usual sensor's noise."""
+    from vibrissa.sensors import FORCE_NOISE, MOMENT_NOISE
 
     return (
         FORCE_NOISE * 1e6 if force_noise is None else force_noise,
@@ -236,24 +122,12 @@ def usual_noise(force_noise: float | None, moment_noise: float | None) -> tuple[
 
 
 def say(line: str) -> None:
-    """Print what is done by default, beside the results.
-
-    Parameters
-    ----------
-    line : str
-        One line.
-    """
+    """Print what is done by default, beside the results."""
     errors.print(line, highlight=False, soft_wrap=True)
 
 
 def tell_statuses(codes: object) -> None:
-    """Print how many frames have which status.
-
-    Parameters
-    ----------
-    codes : array_like of int
-        Statuses.
-    """
+    """Print how many frames have which status."""
     from vibrissa.status import describe
 
     for sentence, count in describe(codes).most_common():  # type: ignore[arg-type]
@@ -261,22 +135,7 @@ def tell_statuses(codes: object) -> None:
 
 
 def free_beside(recording: Path, files: Iterable[Path], force: bool) -> None:
-    """Raise if files are there that nobody said to replace; a recording is added to.
-
-    Parameters
-    ----------
-    recording : Path
-        To which a stage may be added where it is.
-    files : iterable of Path
-        To be written.
-    force : bool
-        Whether others may be replaced.
-
-    Raises
-    ------
-    FileExistsError
-        If there is one.
-    """
+    """Raise if files are there that nobody said to replace; a recording is added to."""
     free([file for file in files if not _same(file, recording)], force)
 
 
@@ -285,17 +144,7 @@ def _same(path: Path, other: Path) -> bool:
 
 
 def tell_written(path: Path, recording: Path | None = None, stage: str = "") -> None:
-    """Print that a file is there, or that a recording has a stage more.
-
-    Parameters
-    ----------
-    path : Path
-        Which.
-    recording : Path, optional
-        What was read.
-    stage : str
-        What was added to it.
-    """
+    """Print that a file is there, or that a recording has a stage more."""
     added = recording is not None and _same(path, recording)
     said = f"added {stage} to {path}" if added else f"wrote {path}"
     output.print(said, highlight=False, soft_wrap=True)

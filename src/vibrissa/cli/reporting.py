@@ -76,6 +76,7 @@ def report(
     from vibrissa.io import load_recording
     from vibrissa.io.paths import check_readable, check_writable
     from vibrissa.io.replace import replacing
+    from vibrissa.recording import recorded_whisker
     from vibrissa.report import (
         contacts_by_whisker,
         document,
@@ -83,7 +84,6 @@ def report(
         provenance,
         provenance_section,
     )
-    from vibrissa.trial import recorded_whisker
 
     check_writable(target, (".html", ".htm"))
     free([target], force)

@@ -46,10 +46,11 @@ def sensitivity(
     import numpy as np
 
     from vibrissa.cli.sources import map_from
+    from vibrissa.identifiability import best_triplet
+    from vibrissa.identifiability import sensitivity as derivatives
     from vibrissa.io.paths import NETCDF, check_writable
-    from vibrissa.mapping import best_triplet, sensitivity_findings
-    from vibrissa.mapping import sensitivity as derivatives
-    from vibrissa.mapping.volume_shares import weights
+    from vibrissa.numerics.quantiles import weights
+    from vibrissa.paper import sensitivity_findings
     from vibrissa.signals import selection
 
     if path is not None:

@@ -94,9 +94,9 @@ def simulate(
     from vibrissa.io.paths import NETCDF, check_writable
     from vibrissa.io.table import read_text
     from vibrissa.io.toml import in_file
-    from vibrissa.trial import measure
-    from vibrissa.trial import simulate as simulated
-    from vibrissa.trial.script import EXAMPLE, read_script
+    from vibrissa.simulation import measure
+    from vibrissa.simulation import simulate as simulated
+    from vibrissa.simulation.script import EXAMPLE, read_script
     from vibrissa.whisker import Whisker
 
     if example:
@@ -191,7 +191,7 @@ def _films(folder: Path) -> list[Path]:
 def _film(trial: xr.DataTree, path: Path, folder: Path, seed: int) -> None:
     """Film the trial, and add cameras and true traces to the recording."""
     from vibrissa.io import save_recording
-    from vibrissa.trial import film, views_of
+    from vibrissa.simulation import film, views_of
 
     folder.mkdir(parents=True, exist_ok=True)
     cameras = views_of(trial)

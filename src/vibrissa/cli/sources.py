@@ -15,7 +15,7 @@ import typer
 if TYPE_CHECKING:
     import xarray as xr
 
-    from vibrissa.mapping import ContactMap
+    from vibrissa.contacts import ContactMap
     from vibrissa.whisker import Whisker
     from vibrissa.whisker.section import Properties
 
@@ -42,19 +42,7 @@ Verb = TypeVar("Verb", bound=Callable[..., None])
 
 
 def about_whisker(verb: Verb) -> Verb:
-    """Give a verb that reads a whisker the options on what its file does not state.
-
-    Parameters
-    ----------
-    verb : callable
-        Of the command line. Its parameter ``whisker``, if any, names the file; ``length`` is that
-        of a whisker without one.
-
-    Returns
-    -------
-    callable
-        The same with the options ``--rat`` and ``--any-length``, which `whisker_from` follows.
-    """
+    """Give a verb that reads a whisker the options on what its file does not state."""
 
     @wraps(verb)
     def wrapped(*args: Any, rat: str | None, any_length: bool, **others: Any) -> None:
@@ -82,53 +70,18 @@ def about_whisker(verb: Verb) -> Verb:
 
 
 def stated() -> Properties:
-    """Say what ``--rat`` and ``--any-length`` state.
-
-    Returns
-    -------
-    Properties
-        Keywords of a whisker.
-    """
+    """Say what ``--rat`` and ``--any-length`` state."""
     return cast("Properties", dict(_stated.get()))
 
 
 def refuse_stated(path: Path | None) -> None:
-    """Raise where ``--rat`` or ``--any-length`` is given for what is not a file of a whisker.
-
-    Parameters
-    ----------
-    path : Path or None
-        The file.
-
-    Raises
-    ------
-    ValueError
-        If one of them is given.
-    """
+    """Raise where ``--rat`` or ``--any-length`` is given for what is not a file of a whisker."""
     if any(_stated.get().values()):
         raise ValueError(f"--rat and --any-length are about a whisker, and {path} is not its file")
 
 
 def whisker_from(path: Path | None) -> Whisker:
-    """Read a whisker: a centreline as CSV, or out of a map or recording; by default the γ whisker.
-
-    Parameters
-    ----------
-    path : Path or None
-        The file.
-
-    Returns
-    -------
-    Whisker
-        That it holds.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it holds no whisker.
-    """
+    """Read a whisker from a CSV centreline, a map or a recording; the γ whisker by default."""
     from vibrissa import samples
     from vibrissa.io import is_netcdf, kind_of, load_recording, load_whisker
 
@@ -140,7 +93,7 @@ def whisker_from(path: Path | None) -> Whisker:
         return load_whisker(path, **stated())
     kind, rat = kind_of(path), _stated.get().get("rat")
     if kind == "vibrissa recording":
-        from vibrissa.trial import recorded_whisker
+        from vibrissa.recording import recorded_whisker
 
         whisker = recorded_whisker(load_recording(path))
         return whisker if rat is None else whisker.with_properties(rat=rat)
@@ -151,13 +104,7 @@ def whisker_from(path: Path | None) -> Whisker:
 
 
 def tell_notes(*whiskers: Whisker) -> None:
-    """Print what is assumed about whiskers, and all else that their user should know.
-
-    Parameters
-    ----------
-    *whiskers : Whisker
-        What several have in common is printed once.
-    """
+    """Print what is assumed about whiskers, and all else that their user should know."""
     from vibrissa.cli.terminal import errors
 
     for note in dict.fromkeys(note for whisker in whiskers for note in whisker.notes):
@@ -165,59 +112,21 @@ def tell_notes(*whiskers: Whisker) -> None:
 
 
 def map_from(path: Path) -> ContactMap:
-    """Read a map.
-
-    Parameters
-    ----------
-    path : Path
-        NetCDF.
-
-    Returns
-    -------
-    ContactMap
-        The map.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is no map.
-    """
-    from vibrissa.mapping import ContactMap
+    """Read a map."""
+    from vibrissa.contacts import ContactMap
 
     return ContactMap.load(path)
 
 
 def wrench_from(path: Path) -> tuple[xr.Dataset, Whisker | None]:
-    """Read force and moment over time from a table of signals or a recording.
-
-    Parameters
-    ----------
-    path : Path
-        CSV or NetCDF.
-
-    Returns
-    -------
-    wrench : Dataset
-        Dims time, space: ``force``, ``moment``.
-    whisker : Whisker or None
-        That rides along in a recording.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it holds no signals.
-    """
+    """Read force and moment over time from a table of signals or a recording."""
     from vibrissa.io import is_netcdf, kind_of, load_recording, load_signals
 
     if not path.exists():
         raise FileNotFoundError(f"there is no file {path}")
     if not (is_netcdf(path) and kind_of(path) == "vibrissa recording"):
         return load_signals(path), None
-    from vibrissa.trial import recorded_whisker
+    from vibrissa.recording import recorded_whisker
 
     recording = load_recording(path)
     if not {"force", "moment"} <= set(recording.data_vars):

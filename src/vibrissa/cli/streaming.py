@@ -31,9 +31,9 @@ from vibrissa.cli.terminal import Ended, ending_in_order, errors, refuse
 if TYPE_CHECKING:
     import socket
 
+    from vibrissa.contacts import ContactMap, Estimator
     from vibrissa.io.rosbag import ContactBag
-    from vibrissa.mapping import ContactMap, Estimator
-    from vibrissa.sensing import Sensor
+    from vibrissa.sensors import Sensor
     from vibrissa.streaming import ContactStream, NewestLines, Poses
 
 # Advice is given once after so many samples, and at the end.
@@ -184,7 +184,7 @@ def stream(
     from vibrissa.cli.recordings import usual_noise
     from vibrissa.io.paths import refuse_whisk
     from vibrissa.io.rosbag import is_bag
-    from vibrissa.sensing import load_sensor
+    from vibrissa.sensors import load_sensor
 
     if source is not None and udp is not None:
         raise ValueError("give either a source or --udp")
@@ -367,7 +367,7 @@ def _bag_lines(source: Path, topic: str | None, pose_topic: str | None) -> Itera
 
 def _map(chart: Path | None, whisker: Path | None, proximal: float | None) -> ContactMap:
     from vibrissa.cli.sources import map_from, tell_notes, whisker_from
-    from vibrissa.mapping import ContactMap
+    from vibrissa.contacts import ContactMap
 
     if chart is not None and whisker is not None:
         raise ValueError("give either --map or --whisker: a map already has its whisker")
@@ -391,7 +391,7 @@ def _estimator(
 ) -> Estimator:
     import numpy as np
 
-    from vibrissa.mapping import Estimator
+    from vibrissa.contacts import Estimator
 
     prior = beforehand.prior
     if sensor is not None:
@@ -414,7 +414,7 @@ def _stream(
     poses: Poses,
     tare: int,
 ) -> ContactStream:
-    from vibrissa.mapping import ContactFilter
+    from vibrissa.contacts import ContactFilter
     from vibrissa.streaming import ContactStream
 
     filtered = None

@@ -32,13 +32,7 @@ Tell = Callable[[str, int, int], None]
 
 @contextmanager
 def progress_bars() -> Iterator[Tell]:
-    """Show a bar for each stage that is told about.
-
-    Yields
-    ------
-    callable
-        To be called as ``tell(stage, done, total)``.
-    """
+    """Show a bar for each stage that is told about."""
     columns = (
         SpinnerColumn(finished_text="[green]✓"),
         TextColumn("{task.description}", markup=False),
@@ -58,13 +52,7 @@ def progress_bars() -> Iterator[Tell]:
 
 @contextmanager
 def stoppable() -> Iterator[Callable[[], bool]]:
-    """Take Ctrl-C as the wish to stop soon; a second one stops at once.
-
-    Yields
-    ------
-    callable
-        Tells whether to stop.
-    """
+    """Take Ctrl-C as the wish to stop soon; a second one stops at once."""
     asked = False
 
     def ask(number: int, frame: object) -> None:
@@ -123,42 +111,12 @@ def ending_in_order() -> Iterator[None]:
 
 
 def shown(name: str, value: float, digits: int = 4) -> str:
-    """Write an SI value with the unit in which it is shown.
-
-    Parameters
-    ----------
-    name : str
-        Of a quantity.
-    value : float
-        In its SI unit.
-    digits : int
-        Significant ones.
-
-    Returns
-    -------
-    str
-        Such as ``0.15 mm``.
-    """
+    """Write an SI value with the unit in which it is shown."""
     return _with_unit(f"{value * quantity(name).display_factor:.{digits}g}", name)
 
 
 def fixed(name: str, value: float, decimals: int = 4) -> str:
-    """Write an SI value with the unit in which it is shown, to so many decimals there.
-
-    Parameters
-    ----------
-    name : str
-        Of a quantity.
-    value : float
-        In its SI unit.
-    decimals : int
-        Behind the point.
-
-    Returns
-    -------
-    str
-        Such as ``0.1500 mm``.
-    """
+    """Write an SI value with the unit in which it is shown, to so many decimals there."""
     # Adding zero turns −0 into 0.
     number = round(value * quantity(name).display_factor, decimals) + 0.0
     return _with_unit(f"{number:.{decimals}f}", name)
@@ -170,27 +128,7 @@ def _with_unit(number: str, name: str) -> str:
 
 
 def numbers(text: str, names: Sequence[str], option: str) -> list[float]:
-    """Read numbers parted by commas.
-
-    Parameters
-    ----------
-    text : str
-        Such as ``25,12,1``.
-    names : sequence of str
-        What each number is.
-    option : str
-        Where they come from, for the message.
-
-    Returns
-    -------
-    list of float
-        As many as there are names.
-
-    Raises
-    ------
-    ValueError
-        If there are more or fewer, or one is no number or not finite.
-    """
+    """Read numbers parted by commas."""
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
@@ -201,20 +139,7 @@ def numbers(text: str, names: Sequence[str], option: str) -> list[float]:
 
 
 def free(files: Iterable[Path], force: bool) -> None:
-    """Raise if files are there that nobody said to replace.
-
-    Parameters
-    ----------
-    files : iterable of Path
-        To be written.
-    force : bool
-        Whether they may be replaced.
-
-    Raises
-    ------
-    FileExistsError
-        If there is one; says which.
-    """
+    """Raise if files are there that nobody said to replace."""
     there = [str(file) for file in files if not force and file.exists()]
     if there:
         more = f" and {len(there) - _NAMED} more" if len(there) > _NAMED else ""
@@ -226,20 +151,7 @@ def free(files: Iterable[Path], force: bool) -> None:
 
 
 def refuse(options: Mapping[str, object], reason: str) -> None:
-    """Raise if options are given that would have no effect.
-
-    Parameters
-    ----------
-    options : mapping
-        What was given, by the option's name; None, False or nothing if it was not.
-    reason : str
-        Why they have none.
-
-    Raises
-    ------
-    ValueError
-        If one is given.
-    """
+    """Raise if options are given that would have no effect."""
     given = [name for name, value in options.items() if not _nothing(value)]
     if given:
         raise ValueError(f"{', '.join(given)} cannot be used: {reason}")

@@ -18,17 +18,7 @@ _POOR = 2.0
 
 
 def tell_lengths(videos: Sequence[Path], traces: Sequence[Sequence[Any]], used: int) -> None:
-    """Say so where videos differ in length.
-
-    Parameters
-    ----------
-    videos : sequence of Path
-        One for each view.
-    traces : sequence
-        Of each view, of each whisker.
-    used : int
-        Frames of the recording.
-    """
+    """Say so where videos differ in length."""
     frames = [len(view[0]) for view in traces]
     if len(set(frames)) > 1:
         listed = ", ".join(f"{path} {n}" for path, n in zip(videos, frames, strict=True))
@@ -41,17 +31,7 @@ def tell_lengths(videos: Sequence[Path], traces: Sequence[Sequence[Any]], used: 
 
 
 def tell_start(start: Start, names: Sequence[str], picture: Path) -> None:
-    """Say what is taken for the whisker.
-
-    Parameters
-    ----------
-    start : Start
-        What was found.
-    names : sequence of str
-        Names of the views.
-    picture : Path
-        Where it is shown.
-    """
+    """Say what is taken for the whisker."""
     bases = start.bases or []
     places = " and ".join(
         f"{column:.0f},{row:.0f} ({name})" for name, (column, row) in zip(names, bases, strict=True)
@@ -72,19 +52,11 @@ def tell_start(start: Start, names: Sequence[str], picture: Path) -> None:
 
 
 def tell_recording(result: xr.DataTree, path: Path) -> None:
-    """Say what was tracked of each whisker.
-
-    Parameters
-    ----------
-    result : DataTree
-        The recording.
-    path : Path
-        Where it is.
-    """
+    """Say what was tracked of each whisker."""
     import numpy as np
 
     from vibrissa.cli.sources import tell_notes
-    from vibrissa.trial import recorded_whisker
+    from vibrissa.recording import recorded_whisker
 
     data = result.to_dataset()
     for k, name in enumerate(data["whisker"].values):
@@ -114,20 +86,7 @@ def tell_recording(result: xr.DataTree, path: Path) -> None:
 
 
 def compared_contacts(recording: xr.DataTree, whisker: int) -> Iterator[str]:
-    """Say how contact points found otherwise compare with those of the rod.
-
-    Parameters
-    ----------
-    recording : xarray.DataTree
-        Tracked.
-    whisker : int
-        Which.
-
-    Yields
-    ------
-    str
-        A sentence, if there is anything to compare.
-    """
+    """Say how contact points found otherwise compare with those of the rod."""
     import numpy as np
 
     measured = recording.children.get("measured")

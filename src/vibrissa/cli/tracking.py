@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
     import xarray as xr
 
+    from vibrissa.cameras import Camera
     from vibrissa.tracking import TraceOptions, TrackOptions
-    from vibrissa.trial import Camera
 
 _MICRO = 1e-6
 _WIDEST = 1.0
@@ -248,10 +248,11 @@ def _found(
 def _cameras(
     videos: Sequence[Path], path: Path | None, pixel_size: float | None
 ) -> tuple[Camera, ...]:
+    from vibrissa.cameras import load_cameras, orthogonal_views
+    from vibrissa.cameras.camera import PIXEL_SIZE
     from vibrissa.io import load_recording, video_info
     from vibrissa.io.paths import NETCDF
-    from vibrissa.trial import load_cameras, orthogonal_views, recorded_cameras
-    from vibrissa.trial.cameras import PIXEL_SIZE
+    from vibrissa.recording import recorded_cameras
 
     if path is not None:
         refuse({"--pixel-size": pixel_size}, "the --cameras tell it")
@@ -352,8 +353,8 @@ def _beside(head: Path | None, contact: Path | None, thing: Path | None) -> dict
     from vibrissa.io.paths import NETCDF
     from vibrissa.io.table import read_text
     from vibrissa.io.toml import in_file
-    from vibrissa.trial import recorded_objects
-    from vibrissa.trial.script import read_objects
+    from vibrissa.recording import recorded_objects
+    from vibrissa.simulation.script import read_objects
 
     if contact is not None and thing is not None:
         raise ValueError("--contact and --object both say where the contact is; give one of them")

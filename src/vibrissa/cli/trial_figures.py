@@ -29,40 +29,10 @@ def trial_drawings(
     tell: Tell,
     colour: str = "time",
 ) -> dict[str, Draw]:
-    """Say what can be drawn of a trial; what cannot is told, with the verb that makes it.
-
-    Parameters
-    ----------
-    path : Path
-        Of the recording.
-    width : {"single", "double"}
-        Columns of the page.
-    videos : sequence of Path
-        One for each view, or none.
-    chart : Path or None
-        Of the whisker's map; simulated if there is none and it is needed.
-    whisker : int
-        Which whisker.
-    tell : callable
-        Told of the progress: ``tell(stage, done, total)``.
-    colour : {"time", "deflection"}
-        What colours contacts in both frames.
-
-    Returns
-    -------
-    dict of str to callable
-        Names of figures, and what draws them.
-
-    Raises
-    ------
-    FileNotFoundError
-        If a file does not exist.
-    ValueError
-        If there is no such whisker, or videos or map do not belong to the recording.
-    """
+    """Say what can be drawn of a trial; what cannot is told, with the verb that makes it."""
     from vibrissa.io import load_recording
     from vibrissa.plots import course_of
-    from vibrissa.trial import recorded_whisker
+    from vibrissa.recording import recorded_whisker
 
     trial = load_recording(path)
     course = course_of(trial, whisker)
@@ -94,9 +64,9 @@ def _of_contacts(
     """Figures of the whisker and of contact points."""
     from vibrissa import plots
     from vibrissa.cli.trial_views import bodies_of, fits_of
+    from vibrissa.contacts.contact_map import spherical
     from vibrissa.contour import CylinderFit
-    from vibrissa.mapping.contact_map import spherical
-    from vibrissa.trial import Peg
+    from vibrissa.objects import Peg
 
     width, colour = look
     by: Any = "time" if colour == "time" else "deflection_angle"

@@ -13,11 +13,11 @@ if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import NDArray
 
+    from vibrissa.cameras import Camera
+    from vibrissa.contacts import ContactMap
     from vibrissa.contour import FittedShape
-    from vibrissa.mapping import ContactMap
+    from vibrissa.objects.surface import Surface
     from vibrissa.plots import Course, Sight
-    from vibrissa.rod.surface import Surface
-    from vibrissa.trial import Camera
 
 _LIGHT, _DARK = 235.0, 70.0
 _MOST = 2
@@ -26,32 +26,7 @@ _MOST = 2
 def sights_of(
     trial: xr.DataTree, course: Course, videos: Sequence[Path], rows: NDArray[np.intp]
 ) -> list[Sight]:
-    """Give what the cameras of a trial see in some frames.
-
-    Parameters
-    ----------
-    trial : DataTree
-        A recording.
-    course : Course
-        Of it.
-    videos : sequence of Path
-        One for each view, in their order; none: objects are drawn as the cameras would see them.
-    rows : array (m,) of int
-        Frames of the trial, rising.
-
-    Returns
-    -------
-    list of Sight
-        At most two; none if there are no cameras and no true whisker to point them at.
-
-    Raises
-    ------
-    FileNotFoundError
-        If a video does not exist.
-    ValueError
-        If there are not as many videos as views, or a video has another size than its camera or
-        fewer frames than the trial.
-    """
+    """Give what the cameras of a trial see in some frames."""
     from vibrissa.io import video_frames
     from vibrissa.plots import Sight
 
@@ -75,7 +50,8 @@ def sights_of(
 
 def _cameras(trial: xr.DataTree) -> tuple[Camera, ...]:
     """Cameras of a recording; for a simulated trial without, two that look at it."""
-    from vibrissa.trial import recorded_cameras, views_of
+    from vibrissa.recording import recorded_cameras
+    from vibrissa.simulation import views_of
 
     if "cameras" in trial.children:
         return recorded_cameras(trial)
@@ -106,7 +82,7 @@ def _check(video: Path, camera: Camera, frames: Sequence[int]) -> None:
 
 def _backdrop(trial: xr.DataTree, camera: Camera, course: Course) -> Any:
     """Objects as a camera sees them, on even light."""
-    from vibrissa.trial.shadows import silhouette
+    from vibrissa.simulation.shadows import silhouette
 
     middle = np.nanmean(course.position, axis=0)
     covered = silhouette(camera, bodies_of(trial), middle, 0.7)
@@ -114,41 +90,14 @@ def _backdrop(trial: xr.DataTree, camera: Camera, course: Course) -> Any:
 
 
 def bodies_of(trial: xr.DataTree) -> list[Surface]:
-    """List the objects of a trial, as far as they are known.
-
-    Parameters
-    ----------
-    trial : DataTree
-        A recording.
-
-    Returns
-    -------
-    list of Surface
-        Laboratory frame.
-    """
-    from vibrissa.trial import recorded_objects
+    """List the objects of a trial, as far as they are known."""
+    from vibrissa.recording import recorded_objects
 
     return list(recorded_objects(trial))
 
 
 def fits_of(trial: xr.DataTree) -> list[FittedShape]:
-    """List the shapes that were fitted to the contacts of a trial.
-
-    Parameters
-    ----------
-    trial : DataTree
-        A recording.
-
-    Returns
-    -------
-    list of FittedShape
-        That of the group ``contour``, or nothing.
-
-    Raises
-    ------
-    ValueError
-        If it is of an unknown kind.
-    """
+    """List the shapes that were fitted to the contacts of a trial."""
     from vibrissa.contour import shape_from_dataset
 
     if "contour" not in trial.children:
@@ -157,32 +106,10 @@ def fits_of(trial: xr.DataTree) -> list[FittedShape]:
 
 
 def map_of(trial: xr.DataTree, path: Path | None, whisker: int, tell: Any) -> ContactMap:
-    """Read the map of a trial's whisker, or simulate it.
-
-    Parameters
-    ----------
-    trial : DataTree
-        A recording.
-    path : Path or None
-        Of the map, if there is one.
-    whisker : int
-        Which whisker.
-    tell : callable
-        Told of the progress: ``tell(stage, done, total)``.
-
-    Returns
-    -------
-    ContactMap
-        The map, without the paper's grid if it is simulated.
-
-    Raises
-    ------
-    ValueError
-        If it is the map of a whisker of another length.
-    """
+    """Read the map of a trial's whisker, or simulate it."""
     from vibrissa.cli.sources import map_from
-    from vibrissa.mapping import ContactMap
-    from vibrissa.trial import recorded_whisker
+    from vibrissa.contacts import ContactMap
+    from vibrissa.recording import recorded_whisker
 
     own = recorded_whisker(trial, whisker)
     if path is None:

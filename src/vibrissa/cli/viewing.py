@@ -12,7 +12,7 @@ from vibrissa.cli.terminal import output
 if TYPE_CHECKING:
     import xarray as xr
 
-    from vibrissa.mapping import ContactMap
+    from vibrissa.contacts import ContactMap
     from vibrissa.whisker import Whisker
 
 

@@ -30,20 +30,7 @@ class Support(NamedTuple):
 
 
 def merged(support: Support, most: int) -> Support:
-    """Merge neighbours until no more are left than wanted.
-
-    Parameters
-    ----------
-    support : Support
-        Places, values, and variances, all positive.
-    most : int
-        How many may be left.
-
-    Returns
-    -------
-    Support
-        At most that many; unchanged where there are no more.
-    """
+    """Merge neighbours until no more are left than wanted."""
     if len(support.value) <= most:
         return support
     place = support.place - support.place.min(axis=0)

@@ -26,17 +26,7 @@ _FLOOR = 1e-9
 
 
 class Contacts(NamedTuple):
-    """Usable contacts, SI units: points of the surface, normals, covariances.
-
-    Parameters
-    ----------
-    surface : array (n, 3)
-        Where their points say that the surface is.
-    normal : array (n, 3) or None
-        Its outward unit normals there.
-    covariance : array (n, 6, 6) or (n, 3, 3)
-        Of both, or of the points.
-    """
+    """Usable contacts, SI units: points of the surface, normals, covariances."""
 
     surface: Array
     normal: Array | None
@@ -44,17 +34,7 @@ class Contacts(NamedTuple):
 
 
 class Placed(NamedTuple):
-    """Contacts on a simple shape.
-
-    Parameters
-    ----------
-    foot : array (n, 3)
-        Where they are on it, m.
-    height : array (n,)
-        Of the surface above it, m.
-    covariance : array (n, 3, 3)
-        Of places and heights, m², along the axes of the frame.
-    """
+    """Contacts on a simple shape."""
 
     foot: Array
     height: Array
@@ -62,22 +42,7 @@ class Placed(NamedTuple):
 
 
 def placed(base: FittedShape, contacts: Contacts, slope: float) -> Placed:
-    """Place contacts on a simple shape.
-
-    Parameters
-    ----------
-    base : CylinderFit, SphereFit or PlaneFit
-        The shape.
-    contacts : Contacts
-        What is known of them.
-    slope : float
-        Standard deviation of the surface's slope against it, in each direction.
-
-    Returns
-    -------
-    Placed
-        On it.
-    """
+    """Place contacts on a simple shape."""
     p = contacts.surface
     foot = p - base.signed_distance(p)[:, None] * base.outward_normals(p)
     for _ in range(1 if contacts.normal is None else _ROUNDS):

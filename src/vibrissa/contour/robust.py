@@ -63,15 +63,7 @@ _LARGEST = 1e3
 
 
 class Candidate(ABC):
-    """A shape that is being fitted, in units of the points' extent.
-
-    Attributes
-    ----------
-    count : int
-        How many numbers change it.
-    size : float
-        How large it is: its radius.
-    """
+    """A shape that is being fitted, in units of the points' extent."""
 
     count: int
     size: float
@@ -106,24 +98,7 @@ T = TypeVar("T", bound=Candidate)
 
 @dataclass(frozen=True, eq=False)
 class Found(Generic[T]):
-    """A fitted shape.
-
-    Attributes
-    ----------
-    shape : Candidate
-        It.
-    covariance : array (parameters, parameters)
-        Of its parameters, in units of the extent.
-    residuals : array (m,)
-        Distances of the whisker's surface from the shape's, m; NaN for contacts not usable.
-    inliers : array (m,) of bool
-        Contacts that were used and are no outliers.
-    chi_squared : array (m,)
-        By how much their equations are missed, squared, in standard deviations; NaN for contacts
-        that were not used.
-    equations : int
-        How many each has; 0 if their covariance is not known.
-    """
+    """A fitted shape."""
 
     shape: T
     covariance: Array
@@ -136,29 +111,7 @@ class Found(Generic[T]):
 def fitted(
     what: str, starts: Sequence[T], given: Checked, arranged: Callable[[T], T] | None = None
 ) -> Found[T]:
-    """Fit a shape to contacts.
-
-    Parameters
-    ----------
-    what : str
-        It is, for messages.
-    starts : sequence of Candidate
-        Rough ones.
-    given : Checked
-        The contacts.
-    arranged : callable, optional
-        Brings a shape to the parameters that it is to be known by.
-
-    Returns
-    -------
-    Found
-        The best.
-
-    Raises
-    ------
-    ValueError
-        If none fits, or the contacts determine none.
-    """
+    """Fit a shape to contacts."""
     touches = given.touches
     if touches.covariance is None:
         touches, starts = _scattered(what, starts, touches)

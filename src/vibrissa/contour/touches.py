@@ -22,19 +22,7 @@ _NEGATIVE = 1e-8
 
 
 class Touches(NamedTuple):
-    """Contacts in units of their extent, and what is known of them.
-
-    Parameters
-    ----------
-    position : array (n, 3)
-        On the whisker's centreline, about their mean.
-    whisker_radius : array (n,)
-        Of the whisker there.
-    normal : array (n, 3) or None
-        Outward unit normals of the surface.
-    covariance : array (n, 3, 3), (n, 6, 6) or None
-        Of the points, or of points and normals.
-    """
+    """Contacts in units of their extent, and what is known of them."""
 
     position: Array
     whisker_radius: Array
@@ -67,19 +55,7 @@ class Touches(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Checked:
-    """What of the given contacts can be used.
-
-    Attributes
-    ----------
-    usable : array (m,) of bool
-        Which of the m given ones.
-    touches : Touches
-        Those.
-    mean : array (3,)
-        Of their points, m.
-    extent : float
-        Root mean square distance of their points from the mean, m.
-    """
+    """What of the given contacts can be used."""
 
     usable: Mask
     touches: Touches
@@ -98,37 +74,7 @@ def checked(
     *,
     least: int,
 ) -> Checked:
-    """Check contacts and bring them into units of their extent.
-
-    Parameters
-    ----------
-    what : str
-        Is to be fitted, for messages.
-    points : array_like (n, 3)
-        Contact points on the whisker's centreline, m; rows with NaN in anything are left out.
-    covariance : array_like (n, 3, 3), optional
-        Of the points, m².
-    whisker_radius : array_like (n,) or float, optional
-        Of the whisker, m; 0 by default.
-    normals : array_like (n, 3), optional
-        Outward normals, of any length but zero.
-    normal_covariance : array_like (n, 3, 3), optional
-        Of the unit normals.
-    point_normal_covariance : array_like (n, 3, 3), optional
-        Of points (rows) with unit normals (columns), m; none by default.
-    least : int
-        How many contacts are needed.
-
-    Returns
-    -------
-    Checked
-        What can be used.
-
-    Raises
-    ------
-    ValueError
-        If shapes are wrong, a covariance is none, too few contacts are left, or all lie on a line.
-    """
+    """Check contacts and bring them into units of their extent."""
     n = _number(what, points)
     given: dict[str, tuple[ArrayLike | None, list[tuple[int, ...]]]] = {
         "points": (points, [(n, 3)]),
@@ -210,20 +156,7 @@ def _covariance(
 
 
 def whitened(misses: Array, covariance: Array) -> Array:
-    """Express misses in standard deviations.
-
-    Parameters
-    ----------
-    misses : array (n, m)
-        By how much equations are missed.
-    covariance : array (n, m, m)
-        Of them.
-
-    Returns
-    -------
-    array (n, m)
-        Uncorrelated, of unit variance.
-    """
+    """Express misses in standard deviations."""
     m = misses.shape[1]
     # Rounding must not make the least noisy combination look exact.
     floor = FLOOR**2 + _FINE * np.trace(covariance, axis1=1, axis2=2)

@@ -13,9 +13,10 @@ import vibrissa
 from vibrissa.io import load_recording, save_recording
 from vibrissa.io.replace import replacing
 from vibrissa.pipeline.estimates import Progress
+from vibrissa.recording import recorded_cameras, recorded_whisker
+from vibrissa.simulation import film, views_of
+from vibrissa.simulation.film import with_true_traces
 from vibrissa.tracking import TrackOptions, partial_traces, trace_file, track
-from vibrissa.trial import film, recorded_cameras, recorded_whisker, views_of
-from vibrissa.trial.film import with_true_traces
 from vibrissa.whisker import Whisker
 
 SIMULATED, TRACKED = "simulated.nc", "tracked.nc"
@@ -30,22 +31,7 @@ _PROPERTIES = ("base_radius", "tip_radius", "youngs_modulus", "poisson_ratio")
 
 
 def begin(folder: Path, whisker: Whisker, **settings: object) -> None:
-    """Make the folder, and clear away what was made there with other settings.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the demo.
-    whisker : Whisker
-        That whisks.
-    **settings
-        What else the trial hangs on, numbers.
-
-    Raises
-    ------
-    ValueError
-        If files are in the way that were not made here.
-    """
+    """Make the folder, and clear away what was made there with other settings."""
     folder.mkdir(parents=True, exist_ok=True)
     places = np.linspace(0.0, whisker.length, _PLACES)
     shape = np.column_stack([whisker.centerline(_PLACES), whisker.radius(places)])
@@ -68,40 +54,12 @@ def begin(folder: Path, whisker: Whisker, **settings: object) -> None:
 
 
 def video_files(folder: Path) -> list[Path]:
-    """Say where the videos of the demo are.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the demo.
-
-    Returns
-    -------
-    list of Path
-        View by view.
-    """
+    """Say where the videos of the demo are."""
     return [folder / f"{name}.mp4" for name in VIEWS]
 
 
 def filmed(trial: xr.DataTree, folder: Path, seed: int, tell: Progress) -> xr.DataTree:
-    """Film a trial, and keep it beside the videos.
-
-    Parameters
-    ----------
-    trial : xarray.DataTree
-        Simulated and measured.
-    folder : Path
-        Where to.
-    seed : int
-        Of the noise.
-    tell : callable
-        Called as ``tell(stage, done, total)``.
-
-    Returns
-    -------
-    xarray.DataTree
-        The trial with cameras and true traces; as it is in the folder, if it is there.
-    """
+    """Film a trial, and keep it beside the videos."""
     path = folder / SIMULATED
     if path.exists():
         return load_recording(path)
@@ -117,23 +75,7 @@ def filmed(trial: xr.DataTree, folder: Path, seed: int, tell: Progress) -> xr.Da
 
 
 def tracked(trial: xr.DataTree, folder: Path, tell: Progress) -> xr.DataTree:
-    """Track the whisker in the videos of a trial.
-
-    Parameters
-    ----------
-    trial : xarray.DataTree
-        Of `filmed`; of what is known only its cameras, and radius and material of its whisker, are
-        used.
-    folder : Path
-        Where the videos are.
-    tell : callable
-        Called as ``tell(stage, done, total)``.
-
-    Returns
-    -------
-    xarray.DataTree
-        Of `vibrissa.tracking.track`; as it is in the folder, if it is there.
-    """
+    """Track the whisker in the videos of a trial."""
     path = folder / TRACKED
     if path.exists():
         return load_recording(path)

@@ -13,6 +13,7 @@ from pathlib import Path
 import xarray as xr
 
 from vibrissa import samples
+from vibrissa.contacts import ContactMap
 from vibrissa.contour import CylinderFit, shape_from_dataset
 from vibrissa.demo.filming import SIMULATED, TRACKED, begin, filmed, tracked, video_files
 from vibrissa.evaluation import (
@@ -27,7 +28,7 @@ from vibrissa.evaluation import (
     with_truth,
 )
 from vibrissa.io import save_contacts, save_recording
-from vibrissa.mapping import ContactMap
+from vibrissa.objects import Peg
 from vibrissa.pipeline import (
     contact_columns,
     placed_by,
@@ -38,16 +39,9 @@ from vibrissa.pipeline import (
     with_group,
 )
 from vibrissa.pipeline.estimates import Progress
-from vibrissa.sensing import FORCE_NOISE, MOMENT_NOISE
-from vibrissa.trial import (
-    Peg,
-    facing_peg,
-    measure,
-    recorded_objects,
-    recorded_whisker,
-    simulate,
-    sweep_past,
-)
+from vibrissa.recording import recorded_objects, recorded_whisker
+from vibrissa.sensors import FORCE_NOISE, MOMENT_NOISE
+from vibrissa.simulation import facing_peg, measure, simulate, sweep_past
 from vibrissa.whisker import Whisker
 
 DURATION = 0.5

@@ -14,8 +14,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from vibrissa.contacts.contact_map import spherical
 from vibrissa.contour import CylinderFit, axis_offset, surface_distances
-from vibrissa.mapping.contact_map import spherical
 from vibrissa.pipeline.comparison import ANGLE_CLASSES
 from vibrissa.signals import nearest_on_rest, within_turn
 from vibrissa.whisker import Whisker

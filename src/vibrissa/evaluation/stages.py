@@ -163,20 +163,7 @@ def _in_laboratory(data: xr.Dataset, name: str) -> Array:
 
 
 def refined(curves: Array, times: int = 8) -> Array:
-    """Take more points of smooth curves, whose chords would cut their bends.
-
-    Parameters
-    ----------
-    curves : array (time, m, d)
-        Points at equal steps; a curve with NaN stays the polygon that it is.
-    times : int
-        How many steps for one.
-
-    Returns
-    -------
-    array (time, (m - 1) times + 1, d)
-        Cubics through the points.
-    """
+    """Take more points of smooth curves, whose chords would cut their bends."""
     steps = np.arange(curves.shape[1])
     at = np.linspace(0.0, steps[-1], times * int(steps[-1]) + 1)
     before = np.minimum(at.astype(int), steps[-1] - 1)
@@ -189,20 +176,7 @@ def refined(curves: Array, times: int = 8) -> Array:
 
 
 def from_curves(points: Array, curves: Array) -> Array:
-    """Distances of points from curves, frame by frame.
-
-    Parameters
-    ----------
-    points : array (time, n, d)
-        NaN stays NaN.
-    curves : array (time, m, d)
-        Corners of polygonal curves.
-
-    Returns
-    -------
-    array (time, n)
-        Of each point from the curve of its frame, in the unit of the points.
-    """
+    """Distances of points from curves, frame by frame."""
     out = np.full(points.shape[:2], np.nan)
     for i, (some, curve) in enumerate(zip(points, curves, strict=True)):
         start, step = curve[:-1], np.diff(curve, axis=0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import xarray as xr
 
-from vibrissa.trial import recorded_whisker
+from vibrissa.recording import recorded_whisker
 from vibrissa.whisker import Whisker
 
 _POSE = ("base_position", "base_rotation")

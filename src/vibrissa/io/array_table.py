@@ -37,23 +37,7 @@ _NEARLY = 1e-3
 
 
 def whiskers_from_table(path: Path) -> list[Whisker]:
-    """Read a table of whiskers.
-
-    Parameters
-    ----------
-    path : Path
-        CSV.
-
-    Returns
-    -------
-    list of Whisker
-        Parabolas, with poses in the table's frame.
-
-    Raises
-    ------
-    ValueError
-        With all that is wrong with it.
-    """
+    """Read a table of whiskers."""
     columns = _Columns(path)
     place = np.stack([columns.numbers(axis, UNITS) for axis in "xyz"], axis=-1)
     length = columns.numbers("length", UNITS)
@@ -174,23 +158,7 @@ def _rotations(columns: _Columns) -> Array:
 
 
 def table_lines(array: WhiskerArray) -> list[str]:
-    """Write whiskers as the lines of a table.
-
-    Parameters
-    ----------
-    array : WhiskerArray
-        Of parabolas with a linear taper.
-
-    Returns
-    -------
-    list of str
-        The header first.
-
-    Raises
-    ------
-    ValueError
-        If a whisker is of another shape.
-    """
+    """Write whiskers as the lines of a table."""
     header = ["name", "x_mm", "y_mm", "z_mm", *(f"{name}_deg" for name in _ANGLES)]
     header += ["length_mm", "coefficient_per_mm", "base_radius_um", "tip_radius_um"]
     lines = [",".join(header)]

@@ -37,26 +37,7 @@ _NUMBERS = {
 
 
 def read_calibration(path: str | PathLike[str]) -> list[dict[str, Any]]:
-    """Read what a calibration says of each camera.
-
-    Parameters
-    ----------
-    path : str or path
-        TOML file.
-
-    Returns
-    -------
-    list of dict
-        One a camera, in the file's order: name, size, matrix, rotation (vector), translation, and
-        where given distortions and projection. In the file's units.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is no TOML, tells of no cameras, or something of a camera is missing.
-    """
+    """Read what a calibration says of each camera."""
     path = Path(path)
     cameras = []
     for name, table in read_toml(path).items():
@@ -93,20 +74,7 @@ def _checked(table: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def write_calibration(path: str | PathLike[str], cameras: Sequence[Mapping[str, Any]]) -> None:
-    """Write a calibration that `read_calibration` reads.
-
-    Parameters
-    ----------
-    path : str or path
-        Where to write, usually with the ending ``.toml``.
-    cameras : sequence of mapping
-        What to say of each: strings, numbers and nested lists of numbers.
-
-    Raises
-    ------
-    FileNotFoundError
-        If the folder does not exist.
-    """
+    """Write a calibration that `read_calibration` reads."""
     lines = []
     for i, camera in enumerate(cameras):
         lines.append(f"[cam_{i}]")

@@ -120,20 +120,7 @@ def _thickness(path: Path, header: list[str], coordinates: float) -> list[tuple[
 
 
 def check_slender(radius: float, length: float) -> None:
-    """Refuse a radius in another unit than it is said to be in.
-
-    Parameters
-    ----------
-    radius : float
-        The largest, m.
-    length : float
-        Of the whisker, m.
-
-    Raises
-    ------
-    ValueError
-        If no whisker, hair or wire is as thick or as thin.
-    """
+    """Refuse a radius in another unit than it is said to be in."""
     if not _THINNEST < radius / length < _THICKEST:
         raise ValueError(
             f"the radius is {radius * 1e6:.4g} µm on a whisker of {length * 1e3:.4g} mm; its "
@@ -142,18 +129,7 @@ def check_slender(radius: float, length: float) -> None:
 
 
 def tells_radius(path: str | PathLike[str]) -> bool:
-    """Tell whether a table of a centreline has a column of radii.
-
-    Parameters
-    ----------
-    path : str or path
-        CSV.
-
-    Returns
-    -------
-    bool
-        Whether `load_whisker` takes the radius from it.
-    """
+    """Tell whether a table of a centreline has a column of radii."""
     return _table(Path(path))[1] is not None
 
 

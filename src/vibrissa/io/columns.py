@@ -39,20 +39,7 @@ _BETWEEN = re.compile(r"[\s·⋅×*.^_-]")
 
 
 def signal_column(header: str) -> tuple[str, float | None]:
-    """Tell which signal a column holds, and in which unit.
-
-    Parameters
-    ----------
-    header : str
-        As it stands in the file.
-
-    Returns
-    -------
-    name : str
-        ``time``, ``Fx``, … ``Mz``, ``FT``, ``FD``, ``MB`` or ``MD``; empty if it is none of these.
-    factor : float or None
-        What makes its numbers SI; None if what follows the name is no unit that is known.
-    """
+    """Tell which signal a column holds, and in which unit."""
     text = header.strip()
     if match := _COMPONENT.fullmatch(text):
         name = ("F" if match[1][0] in "Ff" else "M") + match[2].lower()
@@ -66,20 +53,7 @@ def signal_column(header: str) -> tuple[str, float | None]:
 
 
 def unit_factor(text: str, kind: str) -> float | None:
-    """Read a unit.
-
-    Parameters
-    ----------
-    text : str
-        Such as ``_mN``, ``(mN)``, ``[µN·m]``, ``/ N mm``; nothing stands for SI.
-    kind : str
-        time, length, force, moment or angle.
-
-    Returns
-    -------
-    float or None
-        How much of the SI unit it is; None if it is no unit of this kind.
-    """
+    """Read a unit."""
     bare = text.strip().lstrip("_/,: ").strip("()[] ")
     unit = _BETWEEN.sub("", bare).replace("µ", "u").replace("μ", "u")
     if kind in ("time", "length"):
@@ -88,41 +62,14 @@ def unit_factor(text: str, kind: str) -> float | None:
 
 
 def units_of(kind: str) -> str:
-    """List the units of a kind, for messages.
-
-    Parameters
-    ----------
-    kind : str
-        time, length, force, moment or angle.
-
-    Returns
-    -------
-    str
-        Such as ``N, mN, uN, nN``.
-    """
+    """List the units of a kind, for messages."""
     return ", ".join(_UNITS[kind])
 
 
 def signal_columns(
     header: Sequence[str], names: Sequence[str]
 ) -> tuple[dict[str, tuple[int, float]], dict[str, list[str]]]:
-    """Find signals among columns.
-
-    Parameters
-    ----------
-    header : sequence of str
-        Names of all columns.
-    names : sequence of str
-        Which signals are looked for.
-
-    Returns
-    -------
-    found : dict
-        Where each stands that is there, and what makes its numbers SI. A column that is called
-        exactly so comes before others.
-    strange : dict
-        By signals that are not there otherwise, columns of theirs in units that are not known.
-    """
+    """Find signals among columns."""
     known = [signal_column(cell) for cell in header]
     found: dict[str, tuple[int, float]] = {}
     strange: dict[str, list[str]] = {}

@@ -46,20 +46,7 @@ def save_contour(path: str | PathLike[str], contour: xr.Dataset) -> None:
 
 
 def holds_contour(path: str | PathLike[str], contour: xr.Dataset) -> bool:
-    """Tell whether a file is just what `save_contour` writes of contour points.
-
-    Parameters
-    ----------
-    path : str or path
-        Any file.
-    contour : xarray.Dataset
-        As of `save_contour`.
-
-    Returns
-    -------
-    bool
-        Whether it has the same text.
-    """
+    """Tell whether a file is just what `save_contour` writes of contour points."""
     return Path(path).read_bytes() == _text(contour).encode("utf-8")
 
 

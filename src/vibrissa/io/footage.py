@@ -17,20 +17,7 @@ AHEAD = 60
 
 
 class Footage:
-    """A video to look at frame by frame; keeps the file open until it is closed.
-
-    Parameters
-    ----------
-    path : str or path
-        Of the video.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is no video.
-    """
+    """A video to look at frame by frame; keeps the file open until it is closed."""
 
     def __init__(self, path: str | PathLike[str]) -> None:
         self.info = video_info(path)
@@ -44,23 +31,7 @@ class Footage:
         self._last: Frame | None = None
 
     def frame(self, number: int) -> Frame:
-        """Give one frame.
-
-        Parameters
-        ----------
-        number : int
-            From 0.
-
-        Returns
-        -------
-        array (height, width)
-            Grey values, 0 is black and 255 white.
-
-        Raises
-        ------
-        ValueError
-            If the video has no such frame, or cannot be read there.
-        """
+        """Give one frame."""
         import av
 
         if number < 0:

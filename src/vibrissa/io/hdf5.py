@@ -29,31 +29,7 @@ _HEAP = b"GCOL\1\0\0\0"
 
 @contextmanager
 def opened(path: str | PathLike[str], what: str, *, soft_links: bool = True) -> Iterator[h5py.File]:
-    """Open a file in HDF5 for reading, once it has been found harmless.
-
-    Parameters
-    ----------
-    path : str or path
-        The file.
-    what : str
-        It is read as, such as ``a table of DeepLabCut``.
-    soft_links : bool
-        Whether it may have soft links. Where all groups are gone through, they make a small file
-        endless.
-
-    Yields
-    ------
-    h5py.File
-        Open, and closed after.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it cannot be opened, leads out of itself, claims more than it can hold, or while it is
-        read something is not there or of another kind.
-    """
+    """Open a file in HDF5 for reading, once it has been found harmless."""
     path = check_readable(path)
     with naming(path, what):
         _check_heaps(path)
@@ -64,25 +40,7 @@ def opened(path: str | PathLike[str], what: str, *, soft_links: bool = True) -> 
 
 @contextmanager
 def naming(path: Path, what: str) -> Iterator[None]:
-    """Turn whatever is raised while a file is read into one error that names it.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    what : str
-        It is read as, such as ``a recording``.
-
-    Yields
-    ------
-    None
-        To read, and to take apart what was read.
-
-    Raises
-    ------
-    ValueError
-        Instead of what the libraries raise.
-    """
+    """Turn whatever is raised while a file is read into one error that names it."""
     try:
         yield
     except (OSError, RuntimeError) as error:

@@ -26,25 +26,7 @@ _ELEMENTS = {*range(1, 8), 9, 12, 13, _MATRIX, _COMPRESSED, 16, 17, 18}
 
 
 def matlab_values(path: str | PathLike[str]) -> dict[str, Any]:
-    """Read the variables of a MATLAB file.
-
-    Parameters
-    ----------
-    path : str or path
-        The ``.mat`` file.
-
-    Returns
-    -------
-    dict
-        By name: arrays; lists for cell arrays; lists of dicts for struct arrays.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is no MATLAB file, or cut short.
-    """
+    """Read the variables of a MATLAB file."""
     path = check_readable(path)
     with path.open("rb") as file:
         head = file.read(_HEADER)

@@ -79,29 +79,7 @@ def kind_of(path: str | PathLike[str]) -> str:
 def read_dataset(
     path: str | PathLike[str], group: str | None = None, names: Sequence[str] | None = None
 ) -> xr.Dataset:
-    """Read the dataset of one group.
-
-    Parameters
-    ----------
-    path : str or path
-        NetCDF-4 file.
-    group : str, optional
-        Its name; by default the root.
-    names : sequence of str, optional
-        Variables to read, as far as there are such; by default all.
-
-    Returns
-    -------
-    xarray.Dataset
-        All of it, in memory.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is cut off, damaged or no NetCDF-4 file.
-    """
+    """Read the dataset of one group."""
     with (
         opened(path, "NetCDF-4", soft_links=False),
         xr.open_dataset(path, engine="h5netcdf", group=group) as data,
@@ -126,24 +104,7 @@ def write_netcdf(
     data: xr.Dataset | xr.DataTree,
     encoding: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> None:
-    """Write a dataset, or a tree with a group for each dataset.
-
-    Parameters
-    ----------
-    path : str or path
-        Where to; an existing file is replaced once the new one is complete.
-    data : xarray.Dataset or xarray.DataTree
-        What is written.
-    encoding : mapping, optional
-        By path of the group, such as ``/``: by variable, how it is stored.
-
-    Raises
-    ------
-    FileNotFoundError
-        If the folder does not exist.
-    OSError
-        If the disk is full; an older file is then as it was.
-    """
+    """Write a dataset, or a tree with a group for each dataset."""
     with replacing(path) as part:
         part.write_bytes(netcdf_image(data, encoding))
 

@@ -236,18 +236,7 @@ def _frame(item: Any) -> str:
 
 
 def series_time(series: h5py.Group) -> Array:
-    """Give the times of a series.
-
-    Parameters
-    ----------
-    series : h5py.Group
-        Of an NWB file.
-
-    Returns
-    -------
-    array (n,)
-        s.
-    """
+    """Give the times of a series."""
     if "timestamps" in series:
         return series_values(series, "timestamps")
     if "starting_time" not in series:
@@ -262,25 +251,7 @@ def series_time(series: h5py.Group) -> Array:
 
 
 def series_values(series: h5py.Group, name: str) -> Array:
-    """Give the numbers of one dataset of a series.
-
-    Parameters
-    ----------
-    series : h5py.Group
-        Of an NWB file.
-    name : str
-        The dataset, such as ``data``.
-
-    Returns
-    -------
-    array
-        All of them.
-
-    Raises
-    ------
-    ValueError
-        If there is none, or it holds no numbers.
-    """
+    """Give the numbers of one dataset of a series."""
     data = series.get(name)
     if not isinstance(data, h5py.Dataset):
         raise ValueError(f"{series.name} has no {name}")

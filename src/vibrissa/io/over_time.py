@@ -17,28 +17,7 @@ _SHOWN = 5
 
 
 def read_over_time(path: str | PathLike[str]) -> tuple[str, dict[str, Array]]:
-    """Read a table whose rows are moments.
-
-    Parameters
-    ----------
-    path : str or path
-        CSV with a line of names; one column is ``time`` or ``frame``.
-
-    Returns
-    -------
-    key : {"time", "frame"}
-        Which of both.
-    columns : dict of str to array (rows,)
-        All, by name.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is no table, has neither or both of these columns, or frames that are no numbers from
-        0 on.
-    """
+    """Read a table whose rows are moments."""
     names, values = read_numbers(path)
     columns = dict(zip(names, values.T, strict=True))
     keys = [name for name in ("time", "frame") if name in columns]
@@ -57,22 +36,7 @@ def read_over_time(path: str | PathLike[str]) -> tuple[str, dict[str, Array]]:
 
 
 def check_rising(path: str | PathLike[str], key: str, moments: Array) -> None:
-    """Refuse moments that do not rise from row to row.
-
-    Parameters
-    ----------
-    path : str or path
-        Of the table, for the message.
-    key : str
-        ``time`` or ``frame``.
-    moments : array (rows,)
-        Its values.
-
-    Raises
-    ------
-    ValueError
-        If they do not rise; names the first rows where.
-    """
+    """Refuse moments that do not rise from row to row."""
     back = np.flatnonzero(np.diff(moments) <= 0.0)
     if back.size:
         i = int(back[0])
@@ -83,20 +47,7 @@ def check_rising(path: str | PathLike[str], key: str, moments: Array) -> None:
 
 
 def moments_coordinate(key: str, moments: Array) -> xr.Variable:
-    """Label moments.
-
-    Parameters
-    ----------
-    key : {"time", "frame"}
-        What they are.
-    moments : array (rows,)
-        Seconds, or numbers of frames.
-
-    Returns
-    -------
-    xarray.Variable
-        Along the dimension of that name.
-    """
+    """Label moments."""
     if key == "time":
         return xr.Variable("time", moments, attributes("time"))
     about = {"units": "1", "long_name": "frame of the first video"}
@@ -104,18 +55,7 @@ def moments_coordinate(key: str, moments: Array) -> xr.Variable:
 
 
 def few(numbers: NDArray[np.int64]) -> str:
-    """Write the first of some numbers.
-
-    Parameters
-    ----------
-    numbers : array (n,)
-        Of frames or rows.
-
-    Returns
-    -------
-    str
-        Such as ``3, 4, 5, 6, 7 and 12 more``.
-    """
+    """Write the first of some numbers."""
     text = ", ".join(str(int(n)) for n in numbers[:_SHOWN])
     return text + (f" and {len(numbers) - _SHOWN} more" if len(numbers) > _SHOWN else "")
 

@@ -21,18 +21,7 @@ Names = list[tuple[str, ...]]
 
 
 def pandas_tables(file: h5py.File) -> Iterator[tuple[str, h5py.Group]]:
-    """Find the tables of a file.
-
-    Parameters
-    ----------
-    file : h5py.File
-        Open for reading.
-
-    Yields
-    ------
-    tuple of str and h5py.Group
-        Name and group of every pandas table at the top.
-    """
+    """Find the tables of a file."""
     for name, group in file.items():
         if isinstance(group, h5py.Group) and _text(group.attrs.get("pandas_type", "")) in (
             "frame",
@@ -42,27 +31,7 @@ def pandas_tables(file: h5py.File) -> Iterator[tuple[str, h5py.Group]]:
 
 
 def read_table(group: h5py.Group) -> tuple[Names, Array, list[str]]:
-    """Read one table of numbers.
-
-    Parameters
-    ----------
-    group : h5py.Group
-        Of `pandas_tables`.
-
-    Returns
-    -------
-    names : list of tuple of str
-        Of the columns, level by level.
-    values : array (rows, columns)
-        NaN where missing.
-    index : list of str
-        Of the rows.
-
-    Raises
-    ------
-    ValueError
-        If its columns cannot be told.
-    """
+    """Read one table of numbers."""
     table = _text(group.attrs["pandas_type"]) == "frame_table"
     names, values, index = _appendable(group) if table else _fixed(group)
     if sum(block.shape[1] for block in values) != len(names):

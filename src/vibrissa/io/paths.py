@@ -25,18 +25,7 @@ _WHISK = {b"bwhiskbin": "traces of whisk (.whiskers)", b"measv": "measurements o
 
 
 def refuse_whisk(path: str | PathLike[str]) -> None:
-    """Raise where a file is whisk's and something else is needed.
-
-    Parameters
-    ----------
-    path : str or path
-        A file, which need not exist.
-
-    Raises
-    ------
-    ValueError
-        If it is one; the message says what takes it.
-    """
+    """Raise where a file is whisk's and something else is needed."""
     path = Path(path)
     if not path.is_file():
         return

@@ -26,29 +26,7 @@ _PART = re.compile(rf"\..+{re.escape(_MARK)}[a-z0-9_]{{8}}(\.[^.]*)?")
 
 @contextmanager
 def replacing(path: str | PathLike[str]) -> Iterator[Path]:
-    """Give a place to write to, and put what was written in place of the file at the end.
-
-    Parameters
-    ----------
-    path : str or path
-        What is to be written or replaced.
-
-    Yields
-    ------
-    Path
-        A file beside it. If writing raises, it is removed and the old file stays.
-
-    Raises
-    ------
-    FileNotFoundError
-        If the folder does not exist.
-    OSError
-        If writing fails, as when the disk is full; the message names the file.
-    PermissionError
-        If it cannot be written to.
-    ValueError
-        If the path is a folder.
-    """
+    """Give a place to write to, and put what was written in place of the file at the end."""
     path = check_writable(path)
     _remove_left(path.parent)
     with _failing(path):

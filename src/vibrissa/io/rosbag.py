@@ -43,36 +43,13 @@ _KEPT_EVERY = 0.5
 
 
 def is_bag(path: str | PathLike[str]) -> bool:
-    """Tell whether a path looks like a bag.
-
-    Parameters
-    ----------
-    path : str or path
-        A folder with ``metadata.yaml`` (ROS 2), or a file ending in .bag, .db3 or .mcap.
-
-    Returns
-    -------
-    bool
-        Whether it does.
-    """
+    """Tell whether a path looks like a bag."""
     path = Path(path)
     return (path / "metadata.yaml").is_file() or (path.is_file() and path.suffix in _SUFFIXES)
 
 
 class BagMessage(NamedTuple):
-    """One message of a bag.
-
-    Parameters
-    ----------
-    stamp : int
-        Time stamp of the message's header, ns; where that is zero, when it was recorded.
-    recorded : int
-        Time at which it was recorded, ns.
-    frame : str
-        Name of the frame of its header.
-    values : list of float
-        Its numbers.
-    """
+    """One message of a bag."""
 
     stamp: int
     recorded: int
@@ -81,29 +58,7 @@ class BagMessage(NamedTuple):
 
 
 def bag_wrenches(path: str | PathLike[str], topic: str | None = None) -> Iterator[BagMessage]:
-    """Read wrenches from a bag, in the order of recording.
-
-    Parameters
-    ----------
-    path : str or path
-        Of the bag.
-    topic : str, optional
-        With WrenchStamped messages; by default the only one that has them.
-
-    Returns
-    -------
-    iterator of BagMessage
-        With six values: force, N, and torque, N·m.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such bag.
-    ModuleNotFoundError
-        If rosbags is not installed.
-    ValueError
-        If it is no bag or damaged, or the topic is not there or not the only one.
-    """
+    """Read wrenches from a bag, in the order of recording."""
 
     def values(message: Any) -> list[float]:
         f, t = message.wrench.force, message.wrench.torque
@@ -113,30 +68,7 @@ def bag_wrenches(path: str | PathLike[str], topic: str | None = None) -> Iterato
 
 
 def bag_poses(path: str | PathLike[str], topic: str | None = None) -> Iterator[BagMessage]:
-    """Read poses from a bag, in the order of recording.
-
-    Parameters
-    ----------
-    path : str or path
-        Of the bag.
-    topic : str, optional
-        With PoseStamped or TransformStamped messages; by default the only one that has them.
-
-    Returns
-    -------
-    iterator of BagMessage
-        With seven values: position in its parent's frame, m, and the quaternion w, x, y, z from
-        its own to the parent's frame. The frame is the parent's.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such bag.
-    ModuleNotFoundError
-        If rosbags is not installed.
-    ValueError
-        If it is no bag or damaged, or the topic is not there or not the only one.
-    """
+    """Read poses from a bag, in the order of recording."""
 
     def values(message: Any) -> list[float]:
         if hasattr(message, "pose"):
@@ -249,22 +181,6 @@ class ContactBag:
     """Writes contact points and clouds of candidates into a ROS 2 bag; a context manager.
 
     The bag is whole every half second, however the process ends; a power cut may spoil it.
-
-    Parameters
-    ----------
-    path : str or path
-        Of the bag, a folder that must not exist.
-    frame : str
-        Name of the frame that points are in, where a sample does not say another.
-    point_topic, cloud_topic : str
-        Where to write them.
-
-    Raises
-    ------
-    FileExistsError
-        If there is something at the path.
-    ModuleNotFoundError
-        If rosbags is not installed.
     """
 
     def __init__(
@@ -332,30 +248,7 @@ class ContactBag:
         frame: str | None = None,
         recorded: int | None = None,
     ) -> None:
-        """Write one sample.
-
-        Parameters
-        ----------
-        stamp : int
-            Time stamp of it, ns.
-        point : (3,) array or None
-            The contact, m; None for none.
-        candidates : (k, 3) array
-            Points of the cloud, m.
-        values : (k,) array
-            Their probabilities, field ``probability`` of the cloud.
-        frame : str, optional
-            Name of the frame that its points are in; by default the bag's.
-        recorded : int, optional
-            Time at which it is recorded, ns; by default its time stamp.
-
-        Raises
-        ------
-        OSError
-            If the bag cannot be written any more; all up to half a second ago is in it.
-        ValueError
-            If the time stamp is none of ROS.
-        """
+        """Write one sample."""
         if self._fault is not None:
             raise self._fault
         types = self._types.types

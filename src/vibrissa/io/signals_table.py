@@ -88,21 +88,7 @@ def _notes(time: Array) -> list[str]:
 
 
 def check_scale(wrench: xr.Dataset, whisker: Whisker) -> None:
-    """Refuse forces and moments that are far too large to have bent this whisker.
-
-    Parameters
-    ----------
-    wrench : xarray.Dataset
-        Dims time, space: ``force``, N, and ``moment``, N·m.
-    whisker : Whisker
-        That felt them. Its bending stiffness at the base and its length, EI / L² and EI / L, say
-        how large forces and moments can be.
-
-    Raises
-    ------
-    ValueError
-        If they are a hundred times larger, as when millinewtons are taken for newtons.
-    """
+    """Refuse forces and moments that are far too large to have bent this whisker."""
     stiffness = whisker.base_bending_stiffness
     scales = {"force": stiffness / whisker.length**2, "moment": stiffness / whisker.length}
     faults = []

@@ -25,26 +25,7 @@ _SPREADSHEET = re.compile(rb"[\t\n\r\x20-\x7e\xa0-\xff]*")
 
 
 def read_text(path: str | PathLike[str]) -> str:
-    """Read a text file.
-
-    Parameters
-    ----------
-    path : str or path
-        In UTF-8 or UTF-16, with or without the byte order mark that spreadsheets put first, or in
-        the Western European encoding of older ones.
-
-    Returns
-    -------
-    str
-        All of it.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is a folder, empty, or no text.
-    """
+    """Read a text file."""
     path = check_readable(path)
     refuse_whisk(path)
     content = path.read_bytes()
@@ -64,19 +45,7 @@ def read_text(path: str | PathLike[str]) -> str:
 
 
 def table_rows(text: str) -> Iterator[tuple[int, list[str]]]:
-    """Take a table apart.
-
-    Parameters
-    ----------
-    text : str
-        All of a CSV file.
-
-    Yields
-    ------
-    tuple of int and list of str
-        Number and cells, without blanks around them, of every line that is neither empty, be it
-        of empty cells, nor a comment (#). Decimal commas are points.
-    """
+    """Take a table apart."""
     lines = [
         (number, line)
         for number, line in enumerate(text.splitlines(), start=1)
@@ -96,71 +65,25 @@ def table_rows(text: str) -> Iterator[tuple[int, list[str]]]:
 
 
 def delimiter_of(header: str) -> str:
-    """Tell what parts the cells of a table.
-
-    Parameters
-    ----------
-    header : str
-        Its first line.
-
-    Returns
-    -------
-    str
-        A comma, a semicolon, a tab, or a blank for any number of them.
-    """
+    """Tell what parts the cells of a table."""
     most = max(",;\t", key=header.count)
     return most if header.count(most) or len(header.split()) < 2 else " "
 
 
 def cells_of(line: str, delimiter: str) -> list[str]:
-    """Take a line of a table apart.
-
-    Parameters
-    ----------
-    line : str
-        With or without its end.
-    delimiter : str
-        As `delimiter_of` tells it.
-
-    Returns
-    -------
-    list of str
-        Cells, without blanks around them.
-    """
+    """Take a line of a table apart."""
     if delimiter == " ":
         return line.split()
     return [cell.strip() for cell in next(csv.reader([line.rstrip("\r\n")], delimiter=delimiter))]
 
 
 def with_point(cell: str) -> str:
-    """Write a number that has a decimal comma with a point; leave other text alone.
-
-    Parameters
-    ----------
-    cell : str
-        Of a table that is not parted by commas.
-
-    Returns
-    -------
-    str
-        Such as ``1.5e-3`` of ``1,5e-3``.
-    """
+    """Write a number that has a decimal comma with a point; leave other text alone."""
     return cell.replace(",", ".") if _COMMA.fullmatch(cell) else cell
 
 
 def is_number(cell: str) -> bool:
-    """Tell whether a cell is a number.
-
-    Parameters
-    ----------
-    cell : str
-        Of a table.
-
-    Returns
-    -------
-    bool
-        Missing ones are numbers as well.
-    """
+    """Tell whether a cell is a number."""
     try:
         number(cell)
     except ValueError:
@@ -169,23 +92,7 @@ def is_number(cell: str) -> bool:
 
 
 def number(cell: str) -> float:
-    """Read a cell.
-
-    Parameters
-    ----------
-    cell : str
-        Of a table.
-
-    Returns
-    -------
-    float
-        NaN where it is empty or says that it is missing, as ``NA`` or ``null`` do.
-
-    Raises
-    ------
-    ValueError
-        If it is neither.
-    """
+    """Read a cell."""
     return float("nan") if cell.lower() in _MISSING else float(cell)
 
 
@@ -195,30 +102,7 @@ def read_rows(
     width: int,
     columns: Sequence[int],
 ) -> NDArray[np.float64]:
-    """Read some columns of numbers.
-
-    Parameters
-    ----------
-    path : str or path
-        Of the table, for messages.
-    rows : iterator
-        Those of `table_rows` that follow the header.
-    width : int
-        How many columns the header names.
-    columns : sequence of int
-        Which to read, from 0.
-
-    Returns
-    -------
-    array (rows, columns)
-        Missing is NaN.
-
-    Raises
-    ------
-    ValueError
-        If a cell is no number, or a line has too few cells, or too many that are not empty; the
-        first such lines are named.
-    """
+    """Read some columns of numbers."""
     values, faults, commas = [], [], False
     for line, cells in rows:
         try:
@@ -239,28 +123,7 @@ def read_rows(
 
 
 def read_numbers(path: str | PathLike[str]) -> tuple[list[str], NDArray[np.float64]]:
-    """Read a table of numbers under one line of names.
-
-    Parameters
-    ----------
-    path : str or path
-        CSV; an empty cell, and one that says nan, is missing.
-
-    Returns
-    -------
-    names : list of str
-        Of the columns.
-    values : array (rows, columns)
-        Also cells that are no numbers are NaN, where their column has no number at all: labels.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is empty, has two columns of one name, or lines of another length or with a cell that
-        is no number in a column of numbers; all bad lines are named.
-    """
+    """Read a table of numbers under one line of names."""
     rows = table_rows(read_text(path))
     header = next(rows, None)
     if header is None:

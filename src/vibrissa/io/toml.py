@@ -18,25 +18,7 @@ _QUOTED = 60
 
 
 def read_toml(path: str | PathLike[str]) -> dict[str, Any]:
-    """Read a TOML file.
-
-    Parameters
-    ----------
-    path : str or path
-        Name of the file; UTF-8.
-
-    Returns
-    -------
-    dict
-        What is in it.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is a folder, empty or no TOML.
-    """
+    """Read a TOML file."""
     path = check_readable(path)
     try:
         text = path.read_bytes().decode("utf-8-sig")
@@ -48,23 +30,7 @@ def read_toml(path: str | PathLike[str]) -> dict[str, Any]:
 
 
 def parsed_toml(text: str) -> dict[str, Any]:
-    """Read TOML.
-
-    Parameters
-    ----------
-    text : str
-        All of it.
-
-    Returns
-    -------
-    dict
-        What it says.
-
-    Raises
-    ------
-    ValueError
-        If it is no TOML.
-    """
+    """Read TOML."""
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -75,18 +41,7 @@ def parsed_toml(text: str) -> dict[str, Any]:
 
 @contextmanager
 def in_file(path: object) -> Iterator[None]:
-    """Name the file in what is raised because of its content.
-
-    Parameters
-    ----------
-    path : path
-        Name of the file.
-
-    Yields
-    ------
-    None
-        Nothing.
-    """
+    """Name the file in what is raised because of its content."""
     try:
         yield
     except ValueError as error:
@@ -98,27 +53,7 @@ def in_file(path: object) -> Iterator[None]:
 def number_array(
     value: Any, name: str, needed: str = "numbers, or lists of as many each, are needed"
 ) -> NDArray[np.float64]:
-    """Take a number, or lists of them, from what TOML says.
-
-    Parameters
-    ----------
-    value : object
-        As it was read.
-    name : str
-        What it is, for the message.
-    needed : str
-        What is needed instead, for the message.
-
-    Returns
-    -------
-    array
-        Of the lists' shape.
-
-    Raises
-    ------
-    ValueError
-        If something is no number, or lists differ in length.
-    """
+    """Take a number, or lists of them, from what TOML says."""
     try:
         if _numeric(value):
             return np.array(value, dtype=np.float64)
@@ -128,18 +63,7 @@ def number_array(
 
 
 def quoted(value: object) -> str:
-    """Quote the beginning of a value.
-
-    Parameters
-    ----------
-    value : object
-        That is wrong.
-
-    Returns
-    -------
-    str
-        In one line.
-    """
+    """Quote the beginning of a value."""
     try:
         text = repr(value)
     except ValueError:  # a whole number of more digits than Python writes

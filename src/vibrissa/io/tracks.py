@@ -59,39 +59,7 @@ class Labels(TypedDict, total=False):
 
 @dataclass(frozen=True, eq=False)
 class RawTracks:
-    """What a reader found in a file.
-
-    Parameters
-    ----------
-    software : str
-        That wrote the file.
-    whiskers : sequence of str
-        Names along the dimension whisker.
-    image : array (n, whiskers, views, nodes, 2), optional
-        Column and row, pixels.
-    space : array (n, whiskers, nodes, 3), optional
-        In ``unit``.
-    image_confidence, space_confidence : arrays, optional
-        As ``image`` and ``space`` without the last dimension.
-    nodes : sequence of str, optional
-        Names along the dimension node.
-    views : sequence of str
-        Names of the cameras; empty if the file does not say.
-    frames : array (n,), optional
-        Numbers of the frames; by default from 0.
-    time : array (n,), optional
-        Of the frames, s.
-    fps : float, optional
-        Frames per second.
-    unit : str
-        Of points in space; empty if the file does not say.
-    reference_frame : str
-        Of points in space; empty if the file does not say.
-    extra : mapping
-        More variables, which must have their units.
-    about : mapping
-        More attributes.
-    """
+    """What a reader found in a file."""
 
     software: str
     whiskers: Sequence[str]
@@ -111,28 +79,7 @@ class RawTracks:
 
 
 def labelled(raw: RawTracks, path: str | PathLike[str], **labels: Unpack[Labels]) -> xr.Dataset:
-    """Check tracks, bring them to our units and name everything.
-
-    Parameters
-    ----------
-    raw : RawTracks
-        As read.
-    path : str or path
-        Where from, for messages and the attribute ``source``.
-    **labels
-        What the file does not say; see `Labels`.
-
-    Returns
-    -------
-    xarray.Dataset
-        Tracks, as the module describes.
-
-    Raises
-    ------
-    ValueError
-        If the unit of points in space is not known, or they cannot be in it; if what the file says
-        is contradicted; or if there is no frame, no whisker or no node.
-    """
+    """Check tracks, bring them to our units and name everything."""
     path = Path(path)
     _check_size(raw, path)
     data: dict[str, xr.Variable] = {}

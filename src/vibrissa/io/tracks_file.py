@@ -65,25 +65,7 @@ def save_tracks(path: str | PathLike[str], tracks: xr.Dataset) -> None:
 
 
 def load_own_tracks(path: str | PathLike[str]) -> xr.Dataset:
-    """Read tracks that `save_tracks` wrote as NetCDF, or those of a recording.
-
-    Parameters
-    ----------
-    path : str or path
-        NetCDF.
-
-    Returns
-    -------
-    xarray.Dataset
-        Tracks.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it holds something else, or is cut short.
-    """
+    """Read tracks that `save_tracks` wrote as NetCDF, or those of a recording."""
     path = Path(path)
     kind = kind_of(path)
     if kind not in (KIND, _RECORDING):

@@ -26,19 +26,7 @@ _SIZE = "size_of_"
 
 
 def stacked_whiskers(tree: xr.DataTree) -> xr.DataTree:
-    """Lay the whiskers of a tree side by side, if they fit.
-
-    Parameters
-    ----------
-    tree : xarray.DataTree
-        Any; with whiskers in groups ``/whiskers/0``, ``/whiskers/1``, …
-
-    Returns
-    -------
-    xarray.DataTree
-        With one group ``/whiskers`` instead, or as it was if there are fewer than two or if they
-        do not fit together. `separate_whiskers` undoes it.
-    """
+    """Lay the whiskers of a tree side by side, if they fit."""
     group = tree.children.get(GROUP)
     if group is None or len(group.children) < 2 or group.to_dataset(inherit=False).variables:
         return tree
@@ -55,18 +43,7 @@ def stacked_whiskers(tree: xr.DataTree) -> xr.DataTree:
 
 
 def separate_whiskers(tree: xr.DataTree) -> xr.DataTree:
-    """Give every whisker its own group again.
-
-    Parameters
-    ----------
-    tree : xarray.DataTree
-        As it was read from a file.
-
-    Returns
-    -------
-    xarray.DataTree
-        What `stacked_whiskers` was given.
-    """
+    """Give every whisker its own group again."""
     group = tree.children.get(GROUP)
     if group is None or _OWN not in group.attrs:
         return tree

@@ -8,11 +8,11 @@ import numpy as np
 import xarray as xr
 
 from vibrissa.contour import compare_with, distances_by
+from vibrissa.objects.surface import Surface
 from vibrissa.pipeline.frames import EACH, estimates_in, whisker_radii, whiskers_in
 from vibrissa.quantities import attributes
-from vibrissa.rod.surface import Surface
+from vibrissa.recording.tree import recorded_objects
 from vibrissa.signals import nearest_on_rest
-from vibrissa.trial.recording import recorded_objects
 from vibrissa.whisker import Whisker
 
 ANGLE_CLASSES = (0.0, 2.0, 5.0, 10.0, 15.0, 90.0)
@@ -25,27 +25,7 @@ ANGLES = np.deg2rad(ANGLE_CLASSES)
 def nearest_object(
     estimates: xr.Dataset, whiskers: Sequence[Whisker], objects: Sequence[Surface]
 ) -> int:
-    """Find the object that contacts are nearest to.
-
-    Parameters
-    ----------
-    estimates : xarray.Dataset
-        Of `vibrissa.pipeline.estimates_of`.
-    whiskers : sequence of Whisker
-        That touched.
-    objects : sequence of Surface
-        In the laboratory, at least one.
-
-    Returns
-    -------
-    int
-        Which, by the median distance.
-
-    Raises
-    ------
-    ValueError
-        If there is no object, or no contact.
-    """
+    """Find the object that contacts are nearest to."""
     if not objects:
         raise ValueError("no object is known to compare with")
     points = estimates["contact_point"].transpose(*EACH, "space").values

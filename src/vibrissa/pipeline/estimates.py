@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.mapping import ContactMap, Prior
+from vibrissa.contacts import ContactMap, Prior
 from vibrissa.pipeline.frames import signals_in, whiskers_in
 from vibrissa.pipeline.laboratory import in_laboratory
 from vibrissa.pipeline.locate import TRIPLET, locate, locate_from_wrench, unfelt

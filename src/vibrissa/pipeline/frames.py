@@ -9,8 +9,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from vibrissa.recording.tree import recorded, recorded_whisker, variable_faults
 from vibrissa.signals import base_signals
-from vibrissa.trial.recording import recorded, recorded_whisker, variable_faults
 from vibrissa.whisker import Whisker
 
 Array = NDArray[np.float64]
@@ -47,19 +47,7 @@ ESTIMATED = (
 
 
 def check_recording(recording: xr.DataTree) -> None:
-    """Make sure that a recording has frames and whiskers, and variables with their dimensions.
-
-    Parameters
-    ----------
-    recording : xarray.DataTree
-        Perhaps one.
-
-    Raises
-    ------
-    ValueError
-        If it has no time, or no dimension ``whisker``, if the time does not rise, or variables have
-        other dimensions than those of a recording, or are no numbers or no rotations.
-    """
+    """Make sure that a recording has frames and whiskers, and variables with their dimensions."""
     root = recording.to_dataset(inherit=False)
     missing = [name for name in ("time", "whisker") if name not in root.dims]
     if missing:
@@ -85,38 +73,12 @@ def check_recording(recording: xr.DataTree) -> None:
 
 
 def names_of(data: xr.Dataset) -> str:
-    """List the variables of a dataset, for a message.
-
-    Parameters
-    ----------
-    data : xarray.Dataset
-        Any.
-
-    Returns
-    -------
-    str
-        Their names.
-    """
+    """List the variables of a dataset, for a message."""
     return ", ".join(sorted(map(str, data.data_vars))) or "no variables"
 
 
 def needed(root: xr.Dataset, names: Sequence[str], source: str) -> None:
-    """Make sure that variables are there.
-
-    Parameters
-    ----------
-    root : xarray.Dataset
-        Of a recording.
-    names : sequence of str
-        The variables.
-    source : str
-        What they are needed for signals from.
-
-    Raises
-    ------
-    ValueError
-        If one is missing; says which there are.
-    """
+    """Make sure that variables are there."""
     missing = [name for name in names if name not in root]
     if not missing:
         return
@@ -126,20 +88,7 @@ def needed(root: xr.Dataset, names: Sequence[str], source: str) -> None:
 
 
 def one_whisker(values: Mapping[str, Any], status: NDArray[np.int64]) -> xr.Dataset:
-    """Give signals of one whisker as a dataset with a dimension ``whisker`` of length one.
-
-    Parameters
-    ----------
-    values : mapping
-        Variables of a recording by name, arrays (time, ...), force and moment among them.
-    status : array (time,)
-        What became of each frame.
-
-    Returns
-    -------
-    xarray.Dataset
-        With the six signals.
-    """
+    """Give signals of one whisker as a dataset with a dimension ``whisker`` of length one."""
     data = {name: recorded(name, array) for name, array in values.items()}
     data["status"] = recorded("status", np.asarray(status, dtype=np.int8))
     six = base_signals(values["force"], values["moment"])
@@ -149,87 +98,24 @@ def one_whisker(values: Mapping[str, Any], status: NDArray[np.int64]) -> xr.Data
 
 
 def with_coordinates(data: xr.Dataset, root: xr.Dataset, about: Mapping[str, Any]) -> xr.Dataset:
-    """Take coordinates from a recording.
-
-    Parameters
-    ----------
-    data : xarray.Dataset
-        Without them.
-    root : xarray.Dataset
-        Of the recording.
-    about : mapping
-        Attributes.
-
-    Returns
-    -------
-    xarray.Dataset
-        With coordinates and attributes.
-    """
+    """Take coordinates from a recording."""
     names = ("time", "whisker", "space", "whisker_axis")
     coordinates = {name: root[name].variable for name in names if name in root.coords}
     return data.assign_coords({"space": list("xyz"), **coordinates}).assign_attrs(about)
 
 
 def whiskers_in(recording: xr.DataTree) -> list[Whisker]:
-    """Make the whiskers of a recording again.
-
-    Parameters
-    ----------
-    recording : xarray.DataTree
-        The recording.
-
-    Returns
-    -------
-    list of Whisker
-        Along the dimension ``whisker``.
-
-    Raises
-    ------
-    ValueError
-        If it does not carry them all.
-    """
+    """Make the whiskers of a recording again."""
     return [recorded_whisker(recording, k) for k in range(recording.sizes["whisker"])]
 
 
 def estimates_in(recording: xr.DataTree) -> xr.Dataset:
-    """Find the estimates in a recording.
-
-    Parameters
-    ----------
-    recording : xarray.DataTree
-        The recording.
-
-    Returns
-    -------
-    xarray.Dataset
-        Its group ``estimates``.
-
-    Raises
-    ------
-    ValueError
-        If it has none, or some of it is missing.
-    """
+    """Find the estimates in a recording."""
     return _group_in(recording, "estimates", ESTIMATED)
 
 
 def signals_in(recording: xr.DataTree) -> xr.Dataset:
-    """Find the signals in a recording.
-
-    Parameters
-    ----------
-    recording : xarray.DataTree
-        The recording.
-
-    Returns
-    -------
-    xarray.Dataset
-        Its group ``signals``.
-
-    Raises
-    ------
-    ValueError
-        If it has none, or some of it is missing.
-    """
+    """Find the signals in a recording."""
     return _group_in(recording, "signals", FELT_BY)
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
+from vibrissa.contacts.contact_map import spherical
 from vibrissa.contour import continuing_candidates, to_laboratory
-from vibrissa.mapping.contact_map import spherical
 from vibrissa.quantities import attributes
 
 Array = NDArray[np.float64]
@@ -117,18 +117,7 @@ def _placed_covariance(
 
 
 def cross_matrices(vectors: Array) -> Array:
-    """Write cross products with vectors as matrices.
-
-    Parameters
-    ----------
-    vectors : array (n, 3)
-        The first factors.
-
-    Returns
-    -------
-    array (n, 3, 3)
-        What the second factors are multiplied by.
-    """
+    """Write cross products with vectors as matrices."""
     x, y, z = vectors.T
     zero = np.zeros_like(x)
     return np.stack([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)

@@ -14,9 +14,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.mapping import ContactMap, Prior, estimate_from_wrench
-from vibrissa.mapping.channels import WRENCH
-from vibrissa.mapping.noise import common_covariance, common_errors
+from vibrissa.contacts import ContactMap, Prior, estimate_from_wrench
+from vibrissa.contacts.channels import WRENCH
+from vibrissa.contacts.noise import common_covariance, common_errors
 from vibrissa.pipeline.slopes import contact_normals, gains
 from vibrissa.quantities import attributes
 from vibrissa.signals import base_signals, selection
@@ -135,24 +135,7 @@ def unfelt(
     *,
     noise: ArrayLike | None,
 ) -> xr.Dataset | None:
-    """Say what `locate` would, without a map, where no contact is felt in any frame.
-
-    Parameters
-    ----------
-    whisker : Whisker
-        Whose signals these are.
-    wrench : xarray.Dataset
-        As for `locate`.
-    triplet : tuple of str
-        As for `locate`.
-    noise : array_like (6, 6) or (time, 6, 6), optional
-        As for `locate`.
-
-    Returns
-    -------
-    xarray.Dataset or None
-        As of `locate`; None where a contact is felt.
-    """
+    """Say what `locate` would, without a map, where no contact is felt in any frame."""
     felt = _Felt.of(wrench, noise)
     if felt.rows.any():
         return None

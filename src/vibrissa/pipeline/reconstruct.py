@@ -25,13 +25,13 @@ from vibrissa.contour import (
     fit_plane,
     fit_sphere,
 )
+from vibrissa.objects import Peg, Sphere
+from vibrissa.objects.surface import Surface
 from vibrissa.pipeline.comparison import nearest_object
 from vibrissa.pipeline.estimates import WHOLE
 from vibrissa.pipeline.frames import EACH, estimates_in, whisker_radii, whiskers_in
 from vibrissa.quantities import attributes
-from vibrissa.rod.surface import Surface
-from vibrissa.trial import Peg, Sphere
-from vibrissa.trial.recording import recorded_objects
+from vibrissa.recording.tree import recorded_objects
 from vibrissa.whisker import Whisker
 
 Array = NDArray[np.float64]
@@ -123,20 +123,7 @@ def reconstruct(
 
 
 def scores_of(fit: FittedShape, estimates: xr.Dataset) -> Array:
-    """Give the distances of contacts from a fitted shape in standard deviations.
-
-    Parameters
-    ----------
-    fit : FittedShape
-        Of `fit_contacts`.
-    estimates : xarray.Dataset
-        That it was fitted to.
-
-    Returns
-    -------
-    array (time, whisker)
-        Residuals over their standard deviation; NaN but for inliers.
-    """
+    """Give the distances of contacts from a fitted shape in standard deviations."""
     normal, spread = (_rows(estimates[n]) for n in ("contact_normal", "contact_covariance"))
     variance = np.einsum("ni,nij,nj->n", normal, spread, normal) + SOLVED_TO**2
     scores = fit.residuals / np.sqrt(np.where(np.isfinite(variance), variance, 1.0))
@@ -159,24 +146,6 @@ def frames_together(scores: ArrayLike) -> float:
 
     Contacts that were tracked err alike from frame to frame, as the whisker's shape and the base's
     pose do, so that a hundred of them tell less than a hundred of a sensor.
-
-    Parameters
-    ----------
-    scores : array_like (time, whisker)
-        Errors, each over its standard deviation; NaN where there is none.
-
-    Returns
-    -------
-    float
-        The correlation time 1 + 2 Σ ρ_k, summed over the lags k until the correlation ρ_k is no
-        more than chance; 1 for errors that are independent.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> white = np.random.default_rng(0).normal(size=(900, 1))
-    >>> frames_together(white), frames_together(np.repeat(white, 3, axis=0)) > 2.0
-    (1.0, True)
     """
     z = np.asarray(scores, dtype=np.float64)
     known = np.isfinite(z)

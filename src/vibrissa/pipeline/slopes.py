@@ -23,14 +23,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.mapping.channels import (
+from vibrissa.contacts.channels import (
     WRENCH,
     Channels,
     channel_derivatives,
     channel_gradients,
 )
-from vibrissa.mapping.noise import SensorNoise
-from vibrissa.mapping.whitening import whitening
+from vibrissa.contacts.noise import SensorNoise
+from vibrissa.contacts.whitening import whitening
 from vibrissa.rod.batch import contact_tangents, solve_forces
 from vibrissa.rod.discretize import Discretization, discretize
 from vibrissa.signals.base import signals_of
@@ -62,30 +62,7 @@ def gains(
     weighing: Array | None = None,
     errors: Array | None = None,
 ) -> Array:
-    """Tell how contact points and normals move with the measured wrench.
-
-    Parameters
-    ----------
-    whisker : Whisker
-        That is touched.
-    signals : tuple of str
-        Three or more of the six, or the six components `vibrissa.mapping.channels.WRENCH`, which
-        allow for friction.
-    arc_length : array (n,)
-        Of the contacts that were found, m.
-    contact_force : array (n, 3)
-        Their force in the material frame at the contact (tangent, d1, d2), N.
-    weighing : array (6, 6), optional
-        Covariance of (F, M) by which more than three signals were weighed; by default 1 % of each.
-    errors : array (k, 6, 7), optional
-        Errors that all frames share, by which they were weighed as well.
-
-    Returns
-    -------
-    array (n, 6, 6)
-        Derivatives of (p, n) by (F, M), SI units, whisker's frame; NaN where the contact is, or
-        where the signals do not determine it.
-    """
+    """Tell how contact points and normals move with the measured wrench."""
     d = discretize(whisker)
     friction = signals == WRENCH
     x = np.concatenate([arc_length[:, None] / d.length, contact_force / d.force], axis=1)
@@ -109,22 +86,7 @@ def gains(
 
 
 def wrench_slopes(whisker: Whisker, arc_length: Array, contact_force: Array) -> Array:
-    """Tell how the wrench of frictionless contacts moves with their points.
-
-    Parameters
-    ----------
-    whisker : Whisker
-        That is touched.
-    arc_length : array (n,)
-        Of the contacts, m.
-    contact_force : array (n, 3)
-        Force in the material frame at the contact (tangent, d1, d2), N.
-
-    Returns
-    -------
-    array (n, 6, 3)
-        Derivatives of (F, M) by p, SI units, whisker's frame; NaN where the contact is.
-    """
+    """Tell how the wrench of frictionless contacts moves with their points."""
     d = discretize(whisker)
     x = np.concatenate([arc_length[:, None] / d.length, contact_force / d.force], axis=1)
     out = np.full((len(x), 6, 3), np.nan)
@@ -172,22 +134,7 @@ def _touch(d: Discretization, x: Array) -> _Touch:
 
 
 def contact_normals(whisker: Whisker, arc_length: Array, contact_force: Array) -> Array:
-    """Give the direction of contact forces across the whisker.
-
-    Parameters
-    ----------
-    whisker : Whisker
-        That is touched.
-    arc_length : array (n,)
-        Of the contacts, m.
-    contact_force : array (n, 3)
-        Force in the material frame at the contact (tangent, d1, d2), N.
-
-    Returns
-    -------
-    array (n, 3)
-        Unit vectors, whisker's frame; NaN where the contact is, or the force zero.
-    """
+    """Give the direction of contact forces across the whisker."""
     d = discretize(whisker)
     x = np.concatenate([arc_length[:, None] / d.length, contact_force / d.force], axis=1)
     out = np.full((len(x), 3), np.nan)

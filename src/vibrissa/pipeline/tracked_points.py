@@ -29,17 +29,7 @@ Array = NDArray[np.float64]
 
 
 class Pose(NamedTuple):
-    """How one whisker is held, frame by frame, laboratory frame.
-
-    Parameters
-    ----------
-    rotation : array (time, 3, 3)
-        From the whisker's frame.
-    position : array (time, 3)
-        Of the base, m.
-    covariance : array (time, 6, 6)
-        Of position and of a small turn about the laboratory's axes; zero where it is not known.
-    """
+    """How one whisker is held, frame by frame, laboratory frame."""
 
     rotation: Array
     position: Array
@@ -50,23 +40,6 @@ def paper_pose(recording: xr.DataTree, cutoff: float | None) -> list[Pose]:
     """How each whisker is held, filtered: from before the rod was fitted, or the recording's own.
 
     What is filtered is how it is held relative to the head.
-
-    Parameters
-    ----------
-    recording : xarray.DataTree
-        Tracked, or with the pose at its top.
-    cutoff : float, optional
-        Of the low pass, Hz; None filters nothing.
-
-    Returns
-    -------
-    list of Pose
-        Whisker by whisker.
-
-    Raises
-    ------
-    ValueError
-        If there is no pose, or only one that was filtered otherwise.
     """
     root = recording.to_dataset()
     head = HeadPose.still(root.sizes["time"])
@@ -142,26 +115,7 @@ def signals_by_point(
     whisker: Whisker,
     proximal: float,
 ) -> xr.Dataset:
-    """Give the signals of the rod that passes through the tracked contact point.
-
-    Parameters
-    ----------
-    one : xarray.Dataset
-        The recording's root, of one whisker.
-    given : xarray.DataArray or None
-        Contact points from a table, dims time, space, which count more where they are known.
-    pose : Pose
-        How the whisker is held.
-    whisker : Whisker
-        The whisker.
-    proximal : float
-        Smallest arc length of a contact, as a fraction of the length.
-
-    Returns
-    -------
-    xarray.Dataset
-        Dim whisker of length one.
-    """
+    """Give the signals of the rod that passes through the tracked contact point."""
     rotation, position = pose.rotation, pose.position
     point = one["contact_point"].transpose("time", "space").values
     told = np.zeros(len(point), dtype=bool)

@@ -32,36 +32,12 @@ _SHAPE = (36, 72, 24)
 
 
 def column(name: str) -> int:
-    """Tell where a quantity stands in a row.
-
-    Parameters
-    ----------
-    name : str
-        One of :data:`COLUMNS`.
-
-    Returns
-    -------
-    int
-        Its column.
-    """
+    """Tell where a quantity stands in a row."""
     return _COLUMN[name]
 
 
 def values_of(name: str, rows: Array) -> Array:
-    """Take a signal, a coordinate or another column out of rows.
-
-    Parameters
-    ----------
-    name : str
-        One of the six signals, or of :data:`COLUMNS`.
-    rows : array (..., columns)
-        Rows.
-
-    Returns
-    -------
-    array (...)
-        Its values, SI units; directions in (−π, π].
-    """
+    """Take a signal, a coordinate or another column out of rows."""
     if name in _COLUMN:
         return np.asarray(rows[..., _COLUMN[name]])
     kind = name[0]
@@ -76,30 +52,7 @@ def fine_chart(
     bearings: tuple[float, float] | None = None,
     shape: tuple[int, int, int] | None = None,
 ) -> Array:
-    """Sample the contacts of a map finely.
-
-    Parameters
-    ----------
-    samples : Dataset
-        ``ContactMap.to_dataset()``: contact points, arc lengths and the six signals over
-        ``station``, ``bearing`` and ``load``, complete.
-    centerline : array_like (k, 3)
-        Of the resting whisker, whisker frame, m.
-    bearings : tuple of float, optional
-        From where to where, rad; one turn by default.
-    shape : tuple of int, optional
-        Cells over stations, over one turn of bearings, and over loads.
-
-    Returns
-    -------
-    array (stations, bearings, loads, columns)
-        Rows of :data:`COLUMNS`.
-
-    Raises
-    ------
-    ValueError
-        If variables are missing, or if some of their values are.
-    """
+    """Sample the contacts of a map finely."""
     names = ("contact_point", "arc_length", *SIGNALS)
     missing = [name for name in names if name not in samples]
     if missing:
@@ -159,41 +112,13 @@ def _rows(nodes: Array, line: Array) -> Array:
 
 
 def outside_cone(points: Array, centerline: Array) -> Array:
-    """How far contacts lie outside the cone of small deflections.
-
-    Parameters
-    ----------
-    points : array (n, 3)
-        Contact points, m.
-    centerline : array (k, 3)
-        Of the resting whisker from its base, m.
-
-    Returns
-    -------
-    array (n,)
-        Distance from the resting whisker less tan 2° times the arc length there, m.
-    """
+    """How far contacts lie outside the cone of small deflections."""
     distance, arc_length = nearest_at_rest(points, centerline)
     return np.asarray(distance - arc_length * np.tan(_CONE))
 
 
 def nearest_at_rest(points: Array, centerline: Array) -> tuple[Array, Array]:
-    """How far contacts lie from the resting whisker.
-
-    Parameters
-    ----------
-    points : array (n, 3)
-        Contact points, whisker frame, m, finite.
-    centerline : array (k, 3)
-        Of the resting whisker from its base, m.
-
-    Returns
-    -------
-    distance : array (n,)
-        To the resting whisker, m.
-    arc_length : array (n,)
-        Of the point of it that is nearest, m.
-    """
+    """How far contacts lie from the resting whisker."""
     from scipy.spatial import cKDTree
 
     count = max(2000, len(centerline))

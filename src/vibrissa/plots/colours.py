@@ -45,13 +45,7 @@ def _srgb(lab: Array) -> Array:
 
 
 def cyclic() -> Colormap:
-    """Colormap for directions over one turn, from −π to π.
-
-    Returns
-    -------
-    Colormap
-        Light at 0, blue at −π/2, dark at ±π and ochre at π/2.
-    """
+    """Colormap for directions over one turn, from −π to π."""
     turn = np.linspace(-np.pi, np.pi, 512, endpoint=False)
     lab = np.stack(
         [
@@ -65,42 +59,19 @@ def cyclic() -> Colormap:
 
 
 def sequential() -> Colormap:
-    """Colormap for what grows from one end, without the pale end that is lost on white paper.
-
-    Returns
-    -------
-    Colormap
-        Viridis, up to 93 %.
-    """
+    """Colormap for what grows from one end, without the pale end that is lost on white paper."""
     return ListedColormap(
         mpl.colormaps["viridis"](np.linspace(0.0, 0.93, 256)), name="vibrissa_sequential"
     )
 
 
 def diverging() -> Colormap:
-    """Colormap for what has a sign.
-
-    Returns
-    -------
-    Colormap
-        Blue below zero, grey at zero, red above.
-    """
+    """Colormap for what has a sign."""
     return mpl.colormaps["coolwarm"]
 
 
 def shading(values: Array | None) -> dict[str, Any]:
-    """What tells a scatter plot how to colour its points.
-
-    Parameters
-    ----------
-    values : array (n,), optional
-        Of each point; without them all points are black.
-
-    Returns
-    -------
-    dict
-        Keyword arguments of ``Axes.scatter``, with limits that leave out the outermost 2 %.
-    """
+    """What tells a scatter plot how to colour its points."""
     if values is None:
         return {"color": INK, "linewidths": 0.0}
     low, high = robust_limits(values)

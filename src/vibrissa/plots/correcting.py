@@ -42,30 +42,7 @@ class Frames(Protocol):
 
 
 class Correcting:
-    """Corrected points of one view, and the figure in which they are made.
-
-    Parameters
-    ----------
-    frames : Frames
-        Of the video.
-    count : int
-        How many.
-    corrections : mapping, optional
-        What was corrected before: by frame and whisker points (n, 2), column and row.
-    traces : mapping, optional
-        Traces to look at: by frame and whisker points (n, 2); NaN or absent where they are lost.
-    save : callable, optional
-        Called with the corrections, those of at least two points.
-    figure : Figure, optional
-        To draw in.
-
-    Attributes
-    ----------
-    frame, whisker : int
-        What is shown.
-    changed : bool
-        Whether there is anything to save.
-    """
+    """Corrected points of one view, and the figure in which they are made."""
 
     def __init__(
         self,
@@ -106,13 +83,7 @@ class Correcting:
         return {key: np.array(p) for key, p in sorted(self._points.items()) if len(p) >= 2}
 
     def go(self, frame: int) -> None:
-        """Show another frame.
-
-        Parameters
-        ----------
-        frame : int
-            Which; beyond the ends the first or the last.
-        """
+        """Show another frame."""
         self.frame = min(max(frame, 0), self._count - 1)
         self._draw()
 
@@ -126,13 +97,7 @@ class Correcting:
         self._draw()
 
     def add(self, x: float, y: float) -> None:
-        """Add a point beyond the last.
-
-        Parameters
-        ----------
-        x, y : float
-            Column and row.
-        """
+        """Add a point beyond the last."""
         key = (self.frame, self.whisker)
         points = self._points.get(key, [])
         if any(np.hypot(x - a, y - b) < _SAME for a, b in points):
@@ -140,13 +105,7 @@ class Correcting:
         self._change(key, [*points, (x, y)])
 
     def remove(self, x: float, y: float) -> None:
-        """Remove the point that is nearest.
-
-        Parameters
-        ----------
-        x, y : float
-            Column and row.
-        """
+        """Remove the point that is nearest."""
         key = (self.frame, self.whisker)
         points = self._points.get(key, [])
         if points:
@@ -170,13 +129,7 @@ class Correcting:
         self._draw()
 
     def choose(self, whisker: int) -> None:
-        """Turn to another whisker.
-
-        Parameters
-        ----------
-        whisker : int
-            Its number.
-        """
+        """Turn to another whisker."""
         self.whisker = whisker
         self._draw()
 
@@ -256,13 +209,7 @@ class Correcting:
             getattr(self, _KEYS[key])()
 
     def close(self, event: Any = None) -> None:
-        """Save what is not saved; to be called when the window is closed.
-
-        Parameters
-        ----------
-        event : Event, optional
-            Of Matplotlib.
-        """
+        """Save what is not saved; to be called when the window is closed."""
         if self.changed:
             self.save()
 
@@ -294,31 +241,7 @@ def correct(
     traces: Mapping[Key, ArrayLike] | None = None,
     save: Save | None = None,
 ) -> dict[Key, Array]:
-    """Open a window to correct traces in, and wait until it is closed.
-
-    Parameters
-    ----------
-    frames : Frames
-        Of the video.
-    count : int
-        How many.
-    corrections : mapping, optional
-        What was corrected before: by frame and whisker points (n, 2), column and row.
-    traces : mapping, optional
-        Traces to look at: by frame and whisker points (n, 2).
-    save : callable, optional
-        Called with the corrections when they are saved.
-
-    Returns
-    -------
-    dict
-        The corrections, saved or not.
-
-    Raises
-    ------
-    ValueError
-        If there is no screen.
-    """
+    """Open a window to correct traces in, and wait until it is closed."""
     import matplotlib as mpl
     import matplotlib.pyplot as plt
 

@@ -221,18 +221,7 @@ def deflection_angles(course: Course, centerline: ArrayLike) -> Array:
 
 
 def spherical(points: Array) -> Array:
-    """Give the spherical coordinates of contact points.
-
-    Parameters
-    ----------
-    points : array (..., 3)
-        Whisker frame, m.
-
-    Returns
-    -------
-    array (..., 3)
-        r, θ and φ, m and rad; NaN where the points are.
-    """
+    """Give the spherical coordinates of contact points."""
     x, y, z = np.moveaxis(points, -1, 0)
     away = np.hypot(x, y)
     return np.stack([np.hypot(away, z), np.arctan2(y, x), np.arctan2(z, away)], axis=-1)

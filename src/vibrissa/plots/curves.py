@@ -29,27 +29,7 @@ class Curve(NamedTuple):
 def curves_over_time(
     figure: Figure, boxes: Sequence[Box], course: Course, signals: dict[str, Array], span: slice
 ) -> list[Curve]:
-    """Draw F_x, M_B, M_D, r, θ and φ over time.
-
-    Parameters
-    ----------
-    figure : Figure
-        Where to.
-    boxes : sequence of tuple of float
-        Six: left, bottom, width and height, mm. Boxes with the same left edge stand one below the
-        other, the lowest carries the time.
-    course : Course
-        Of the trial.
-    signals : dict of str to array (n,)
-        Its signals, SI units.
-    span : slice
-        Which frames.
-
-    Returns
-    -------
-    list of Curve
-        In the order of the boxes.
-    """
+    """Draw F_x, M_B, M_D, r, θ and φ over time."""
     time = to_display("time", course.time)
     first, last = time[span][0], time[span][-1]
     contacts = intervals(time[span], course.touching[span])
@@ -137,17 +117,7 @@ def _ends(values: Array, left_out: float) -> Array:
 
 
 def curve_legend(figure: Figure, course: Course, place: tuple[float, float]) -> None:
-    """Say what shades, lines and dots of :func:`curves_over_time` mean.
-
-    Parameters
-    ----------
-    figure : Figure
-        Where to.
-    course : Course
-        Of the trial.
-    place : tuple of float
-        Of the lower right corner, shares of the figure.
-    """
+    """Say what shades, lines and dots of :func:`curves_over_time` mean."""
     handles: list[Line2D | Patch] = [Patch(facecolor=SHADE, label="in contact")]
     if course.known is not None:
         handles.append(Line2D([], [], color=MUTED, linewidth=1.6, label=course.known_as))

@@ -29,18 +29,7 @@ _FLOOR: dict[str, Any] = {"color": "#c8c8c8", "linewidth": 0.4, "zorder": 0}
 
 
 def signal_places(axial: ArrayLike, bending: ArrayLike, direction: ArrayLike) -> Array:
-    """Say where signals lie in the cylinder.
-
-    Parameters
-    ----------
-    axial, bending, direction : array_like (...)
-        F_x, N; M_B, N·m; M_D, rad.
-
-    Returns
-    -------
-    array (..., 3)
-        Square roots of display units.
-    """
+    """Say where signals lie in the cylinder."""
     size = np.sqrt(to_display("MB", bending))
     turn = np.asarray(direction, dtype=np.float64)
     return np.stack(
@@ -49,34 +38,12 @@ def signal_places(axial: ArrayLike, bending: ArrayLike, direction: ArrayLike) ->
 
 
 def felt(rows: Array) -> Array:
-    """Say where rows of a chart lie in the cylinder.
-
-    Parameters
-    ----------
-    rows : array (..., columns)
-        Of :mod:`vibrissa.plots.chart`.
-
-    Returns
-    -------
-    array (..., 3)
-        Square roots of display units.
-    """
+    """Say where rows of a chart lie in the cylinder."""
     return signal_places(*(values_of(name, rows) for name in ("Fx", "MB", "MD")))
 
 
 def signal_limits(places: Array) -> Array:
-    """Limits of axes that hold places in the cylinder.
-
-    Parameters
-    ----------
-    places : array (..., 3)
-        Of :func:`felt`.
-
-    Returns
-    -------
-    array (3, 2)
-        Of x, y and the height.
-    """
+    """Limits of axes that hold places in the cylinder."""
     reach = float(np.hypot(places[..., 0], places[..., 1]).max()) * 1.02
     low, high = float(places[..., 2].min()), float(places[..., 2].max())
     room = 0.02 * (high - low)
@@ -84,40 +51,14 @@ def signal_limits(places: Array) -> Array:
 
 
 def square(box: Box) -> Box:
-    """Give axes in space, which are square, the room of a panel, and somewhat more.
-
-    Parameters
-    ----------
-    box : tuple of float
-        The panel, mm.
-
-    Returns
-    -------
-    tuple of float
-        Left, bottom, width and height, mm.
-    """
+    """Give axes in space, which are square, the room of a panel, and somewhat more."""
     left, bottom, width, height = box
     side = max(width, height)
     return left + 0.5 * (width - side), bottom - 1.0 + 0.5 * (height - side), side, side
 
 
 def signal_axes(figure: Figure, panel: Box, limits: Array) -> Any:
-    """Add axes for the cylinder: rings of equal M_B and rays of equal M_D on its floor.
-
-    Parameters
-    ----------
-    figure : Figure
-        Where to.
-    panel : tuple of float
-        Left, bottom, width and height, mm.
-    limits : array (3, 2)
-        Of :func:`signal_limits`.
-
-    Returns
-    -------
-    Axes3D
-        The axes.
-    """
+    """Add axes for the cylinder: rings of equal M_B and rays of equal M_D on its floor."""
     left, bottom, side, _ = square(panel)
     box = left + 3.5, bottom + 0.5, side, side
     zoom = 0.98 if side > 50.0 else 0.86  # lettering does not shrink with the panel

@@ -142,26 +142,7 @@ def _range(true: Array, estimated: Array) -> Array:
 def against(
     axes: Axes, name: str, pair: tuple[Array, Array], look: dict[str, Any], known_as: str = "true"
 ) -> PathCollection:
-    """Draw an estimated coordinate against the true one.
-
-    Parameters
-    ----------
-    axes : Axes
-        Where to.
-    name : {"r", "theta", "phi"}
-        Which coordinate.
-    pair : tuple of array (n,)
-        True and estimated values, display units, finite.
-    look : dict
-        As of ``Axes.scatter``.
-    known_as : str
-        What the first of the pair is called.
-
-    Returns
-    -------
-    PathCollection
-        The dots.
-    """
+    """Draw an estimated coordinate against the true one."""
     true, estimated = pair
     limits = _range(*pair)
     axes.plot(limits, limits, color=MUTED, linewidth=0.6, zorder=1)

@@ -22,15 +22,7 @@ _SKIN, _EDGE, _EYE = "#efe6dc", "#a89a8c", "#5a4f45"
 
 
 class Head(NamedTuple):
-    """Where a head is.
-
-    Parameters
-    ----------
-    snout : array (3,)
-        Its tip, laboratory frame, m.
-    axes : array (3, 3)
-        Columns: right, forward and up.
-    """
+    """Where a head is."""
 
     snout: Array
     axes: Array
@@ -41,16 +33,6 @@ def head_of(course: Course) -> Head:
 
     Where the recording does not tell, the head is level, the whisker points away from it sideways
     and curves forward, and its base is on the snout.
-
-    Parameters
-    ----------
-    course : Course
-        Of one of its whiskers.
-
-    Returns
-    -------
-    Head
-        In the laboratory.
     """
     base = np.nanmean(course.position, axis=0)
     if course.head is not None:
@@ -86,17 +68,7 @@ def _nearest_rotation(mean: Array) -> Array:
 
 
 def draw_head(axes: Axes, head: Head, view: tuple[int, int]) -> None:
-    """Draw the outline of a head, filled.
-
-    Parameters
-    ----------
-    axes : Axes
-        In mm; its limits stay.
-    head : Head
-        Where it is.
-    view : tuple of int
-        Which of x, y, z are to the right and up.
-    """
+    """Draw the outline of a head, filled."""
     skin = _outline(head_triangles(head.axes, head.snout), view)
     axes.add_patch(Polygon(skin, facecolor=_SKIN, edgecolor=_EDGE, linewidth=0.8, zorder=0.5))
     eyes = eye_triangles(head.axes, head.snout)

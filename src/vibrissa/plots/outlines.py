@@ -24,21 +24,7 @@ class Body(Protocol):
 
 
 def draw_body(axes: Axes, body: Body, view: tuple[int, int], limits: Array, look: str) -> None:
-    """Draw the outline of an object, or rather of what of it lies within limits.
-
-    Parameters
-    ----------
-    axes : Axes
-        In mm.
-    body : object
-        With ``signed_distance``, laboratory frame, m.
-    view : tuple of int
-        Which of x, y, z are to the right and up; one looks along the third.
-    limits : array (3, 2)
-        Of x, y and z, mm.
-    look : {"true", "fitted"}
-        Filled grey, or dashed.
-    """
+    """Draw the outline of an object, or rather of what of it lies within limits."""
     i, j = view
     right, up = (np.linspace(limits[n, 0], limits[n, 1], _CELLS) for n in view)
     points: Array = np.zeros((_CELLS, _CELLS, 3))
@@ -97,22 +83,7 @@ def _marched(body: Body, points: Array, limits: Array, depth: int, deep: float) 
 
 
 def room_for(places: Array, bodies: Sequence[Body], least: float = 1.0) -> Array:
-    """Limits that hold most places, and the objects there as far as they end nearby.
-
-    Parameters
-    ----------
-    places : array (n, 3)
-        Contact points, mm, finite, at least one.
-    bodies : sequence of object
-        With ``signed_distance``, laboratory frame, m.
-    least : float
-        By which the limits lie outside of the places, mm.
-
-    Returns
-    -------
-    array (3, 2)
-        Of x, y and z, mm.
-    """
+    """Limits that hold most places, and the objects there as far as they end nearby."""
     low, high = np.quantile(places, [0.04, 0.96], axis=0)
     half = 0.5 * (high - low)
     near = np.array([[-1.0], [1.0]]) * (2.0 * half.max() + 3.0 * least)
@@ -133,22 +104,7 @@ def room_for(places: Array, bodies: Sequence[Body], least: float = 1.0) -> Array
 
 
 def one_scale(limits: Array, views: Sequence[tuple[int, int]], sizes: Sequence[Any]) -> Array:
-    """Widen limits so that panels of given sizes show all of them to one scale.
-
-    Parameters
-    ----------
-    limits : array (3, 2)
-        Of x, y and z.
-    views : sequence of tuple of int
-        For each panel, which of x, y, z are to the right and up.
-    sizes : sequence of (float, float)
-        Width and height of each panel.
-
-    Returns
-    -------
-    array (panels, 2, 2)
-        For each panel the limits to the right and up.
-    """
+    """Widen limits so that panels of given sizes show all of them to one scale."""
     middle, span = limits.mean(axis=1), np.ptp(limits, axis=1)
     scale = max(
         max(span[i] / wide, span[j] / tall)

@@ -32,26 +32,14 @@ _DPI = 160.0
 
 
 def screen_figure() -> Figure:
-    """Make the empty figure of a movie.
-
-    Returns
-    -------
-    Figure
-        Of 1280 × 720 pixels.
-    """
+    """Make the empty figure of a movie."""
     figure = sized_figure(WIDTH, HEIGHT)
     figure.set_dpi(_DPI)
     return figure
 
 
 class Screen:
-    """A figure of which only some artists move.
-
-    Parameters
-    ----------
-    figure : Figure
-        Of :func:`screen_figure`, complete; moving artists are animated (``animated=True``).
-    """
+    """A figure of which only some artists move."""
 
     def __init__(self, figure: Figure) -> None:
         self._figure = figure
@@ -62,13 +50,7 @@ class Screen:
         self._background = self._agg.copy_from_bbox(figure.bbox)
 
     def keep(self, artists: Iterable[Artist]) -> None:
-        """Draw artists into all frames from now on.
-
-        Parameters
-        ----------
-        artists : iterable of Artist
-            Each as it is now.
-        """
+        """Draw artists into all frames from now on."""
         self._agg.restore_region(self._background)
         self._draw(artists)
         self._background = self._agg.copy_from_bbox(self._figure.bbox)
@@ -76,20 +58,7 @@ class Screen:
     def frame(
         self, artists: Iterable[Artist], images: Iterable[tuple[Axes, Picture]] = ()
     ) -> Picture:
-        """Draw one frame.
-
-        Parameters
-        ----------
-        artists : iterable of Artist
-            What moves, as it is now, the lowest first.
-        images : iterable of (Axes, array (height, width))
-            8 bit grey, of the size of :meth:`pixels`: fill panels, below the artists.
-
-        Returns
-        -------
-        array (height, width, 4)
-            Red, green, blue, opacity, 8 bit.
-        """
+        """Draw one frame."""
         self._agg.restore_region(self._background)
         buffer = np.asarray(self._agg.buffer_rgba())
         for axes, image in images:
@@ -99,18 +68,7 @@ class Screen:
         return buffer.copy()
 
     def pixels(self, axes: Axes) -> tuple[int, int]:
-        """Tell how large a panel is.
-
-        Parameters
-        ----------
-        axes : Axes
-            The panel.
-
-        Returns
-        -------
-        tuple of int
-            Width and height, pixels.
-        """
+        """Tell how large a panel is."""
         return self._place(axes)[2:]
 
     def _place(self, axes: Axes) -> tuple[int, int, int, int]:
@@ -125,40 +83,14 @@ class Screen:
 
 
 def moving_line(axes: Any, **look: Any) -> Line2D:
-    """Add a line that moves.
-
-    Parameters
-    ----------
-    axes : Axes
-        Where it is drawn, also beyond their edge if they are in space.
-    **look
-        As of Matplotlib's lines.
-
-    Returns
-    -------
-    Line2D
-        Without points yet.
-    """
+    """Add a line that moves."""
     (line,) = axes.plot([], [], animated=True, **look)
     assert isinstance(line, Line2D)
     return line
 
 
 def flat_line(axes: Any, **look: Any) -> Line2D:
-    """Add a line to axes in space that lies on the paper, see :func:`flattened`.
-
-    Parameters
-    ----------
-    axes : Axes3D
-        Where it is drawn.
-    **look
-        As of Matplotlib's lines.
-
-    Returns
-    -------
-    Line2D
-        Without points yet.
-    """
+    """Add a line to axes in space that lies on the paper, see :func:`flattened`."""
     line = Line2D([], [], transform=axes.transData, **look)
     line.set_clip_on(False)
     axes.figure.add_artist(line)
@@ -166,20 +98,7 @@ def flat_line(axes: Any, **look: Any) -> Line2D:
 
 
 def flattened(axes: Any, places: Array) -> Array:
-    """Say where places in space lie on the paper.
-
-    Parameters
-    ----------
-    axes : Axes3D
-        Complete: limits, view and size as they will be drawn.
-    places : array (..., 3)
-        In the unit of the axes.
-
-    Returns
-    -------
-    array (..., 2)
-        For :func:`flat_line`; NaN where places are.
-    """
+    """Say where places in space lie on the paper."""
     from mpl_toolkits.mplot3d import proj3d  # type: ignore[import-untyped]
 
     # Matplotlib sets the size of the box of space only while it draws.

@@ -22,54 +22,17 @@ _UNKNOWN = 0.05
 
 
 def is_cylinder(body: Body) -> bool:
-    """Tell whether a body is a cylinder.
-
-    Parameters
-    ----------
-    body : object
-        Any.
-
-    Returns
-    -------
-    bool
-        Whether it has an axis and a radius.
-    """
+    """Tell whether a body is a cylinder."""
     return hasattr(body, "axis") and hasattr(body, "radius")
 
 
 def has_band(body: Body) -> bool:
-    """Tell whether a body is drawn with a band.
-
-    Parameters
-    ----------
-    body : object
-        Any.
-
-    Returns
-    -------
-    bool
-        Whether it knows how uncertain it is, and is drawn by sections.
-    """
+    """Tell whether a body is drawn with a band."""
     return hasattr(body, "distance_sigma") and not is_cylinder(body)
 
 
 def lies_flat(body: Body, view: tuple[int, int], places: Array) -> bool:
-    """Tell whether one looks straight at a surface, so that a section would lie in it.
-
-    Parameters
-    ----------
-    body : object
-        With ``outward_normals``, or any.
-    view : tuple of int
-        Which of x, y, z are to the right and up.
-    places : array (n, 3)
-        Contact points, mm.
-
-    Returns
-    -------
-    bool
-        Whether most of its normals there point to the viewer or away; False if it has none.
-    """
+    """Tell whether one looks straight at a surface, so that a section would lie in it."""
     normals = getattr(body, "outward_normals", None)
     if normals is None:
         return False
@@ -78,24 +41,7 @@ def lies_flat(body: Body, view: tuple[int, int], places: Array) -> bool:
 
 
 def outline(cylinder: Any, view: tuple[int, int], height: float, limits: Array) -> Array:
-    """Give the outline of a cylinder: from above its section, from the side its silhouette.
-
-    Parameters
-    ----------
-    cylinder : object
-        With ``origin`` (3,), m, ``axis`` (3,) and ``radius``, m.
-    view : tuple of int
-        Which of x, y, z are to the right and up.
-    height : float
-        Where it is cut, mm.
-    limits : array (3, 2)
-        Of the picture, mm.
-
-    Returns
-    -------
-    array (k, 2)
-        Corners, mm.
-    """
+    """Give the outline of a cylinder: from above its section, from the side its silhouette."""
     origin = to_display("peg_position", cylinder.origin)
     radius = float(to_display("peg_radius", cylinder.radius))
     axis = np.asarray(cylinder.axis, dtype=np.float64)
@@ -124,23 +70,7 @@ def outline(cylinder: Any, view: tuple[int, int], height: float, limits: Array) 
 def draw_section(
     axes: Axes, body: Body, view: tuple[int, int], depth: float, limits: Array, look: str
 ) -> None:
-    """Draw a section through an object, with its 95 % band where it has one.
-
-    Parameters
-    ----------
-    axes : Axes
-        In mm.
-    body : object
-        With ``signed_distance``, and perhaps ``distance_sigma``, laboratory frame, m.
-    view : tuple of int
-        Which of x, y, z are to the right and up.
-    depth : float
-        Where along the third it is cut, mm.
-    limits : array (3, 2)
-        Of x, y and z, mm.
-    look : {"true", "fitted"}
-        Filled grey, or dashed with the band.
-    """
+    """Draw a section through an object, with its 95 % band where it has one."""
     i, j = view
     right, up = (np.linspace(limits[n, 0], limits[n, 1], _CELLS) for n in view)
     points: Array = np.empty((_CELLS, _CELLS, 3))

@@ -56,23 +56,7 @@ class _Contacts:
 
 
 def derivative_label(coordinate: str, signal: str) -> str:
-    r"""Label the axis of a derivative.
-
-    Parameters
-    ----------
-    coordinate, signal : str
-        Names of quantities.
-
-    Returns
-    -------
-    str
-        In mathtext, with the display units of both.
-
-    Examples
-    --------
-    >>> print(derivative_label("r", "MB"))
-    $\partial r/\partial M_B$ (mm per µN·m)
-    """
+    r"""Label the axis of a derivative."""
     above, below = quantity(coordinate), quantity(signal)
     unit = f"{above.display_unit} per {below.display_unit}"
     return rf"$\partial {above.symbol}/\partial {below.symbol}$ ({unit})"

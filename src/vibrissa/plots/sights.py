@@ -52,25 +52,7 @@ class Sight(NamedTuple):
 
 
 def seen(course: Course, views: Sequence[_View], number: int) -> tuple[Array, Array]:
-    """Tell where whisker and contact are in the images of a view.
-
-    Parameters
-    ----------
-    course : Course
-        Of the trial.
-    views : sequence of _View
-        All of its cameras.
-    number : int
-        Which of them.
-
-    Returns
-    -------
-    line : array (n, k, 2)
-        The traced whisker or else the whisker in space as the camera sees it, pixels; NaN where
-        neither is known.
-    contact : array (n, 2)
-        The contact point.
-    """
+    """Tell where whisker and contact are in the images of a view."""
     count = len(course.time)
     if number < len(course.traces):
         line = course.traces[number]
@@ -84,23 +66,7 @@ def seen(course: Course, views: Sequence[_View], number: int) -> tuple[Array, Ar
 
 
 def part_of(lines: Array, shape: tuple[float, float], size: tuple[int, int]) -> tuple[Array, Array]:
-    """Choose the part of images in which a whisker moves.
-
-    Parameters
-    ----------
-    lines : array (..., 2)
-        Where it is, column and row; NaN is left out.
-    shape : tuple of float
-        Width and height of the panel, in any unit.
-    size : tuple of int
-        Width and height of the images, pixels.
-
-    Returns
-    -------
-    low, high : array (2,)
-        Column and row of two corners, pixels; in the shape of the panel. It reaches beyond the
-        image only if it must.
-    """
+    """Choose the part of images in which a whisker moves."""
     places = lines.reshape(-1, 2)
     places = places[np.isfinite(places).all(axis=1)]
     whole = np.asarray(size, dtype=np.float64)
@@ -117,17 +83,7 @@ def part_of(lines: Array, shape: tuple[float, float], size: tuple[int, int]) -> 
 
 
 class Window:
-    """A part of images, brought to the size of a panel by averaging over areas.
-
-    Parameters
-    ----------
-    low, high : array (2,)
-        Of :func:`part_of`.
-    size : tuple of int
-        Width and height of the images, pixels.
-    panel : tuple of int
-        Width and height of the panel, pixels.
-    """
+    """A part of images, brought to the size of a panel by averaging over areas."""
 
     def __init__(
         self, low: Array, high: Array, size: tuple[int, int], panel: tuple[int, int]
@@ -139,23 +95,7 @@ class Window:
         self._beyond = np.float32(_LIGHT) * (1.0 - covered.astype(np.float32))
 
     def of(self, image: Grey) -> Grey:
-        """Show the part.
-
-        Parameters
-        ----------
-        image : array (height, width)
-            8 bit grey.
-
-        Returns
-        -------
-        array
-            8 bit grey of the panel's size; light grey lies beyond the image.
-
-        Raises
-        ------
-        ValueError
-            If the image has another size than the camera's.
-        """
+        """Show the part."""
         if image.shape != self._size[::-1]:
             raise ValueError(
                 f"an image has {image.shape[1]} × {image.shape[0]} pixels; the camera has "
@@ -177,41 +117,14 @@ def _averaging(low: float, high: float, size: int, count: int) -> Any:
 
 
 def sight_axes(figure: Figure, box: Box, low: Array, high: Array) -> Axes:
-    """Add a panel for a part of an image.
-
-    Parameters
-    ----------
-    figure : Figure
-        Where to.
-    box : tuple of float
-        Left, bottom, width and height, mm.
-    low, high : array (2,)
-        Of :func:`part_of`.
-
-    Returns
-    -------
-    Axes
-        In pixels of the whole image, without the image.
-    """
+    """Add a panel for a part of an image."""
     axes = box_axes(figure, box, xlim=(low[0], high[0]), ylim=(high[1], low[1]))
     axes.set_axis_off()
     return axes
 
 
 def scale_bar(axes: Axes, course: Course, view: _View, length: float = 5e-3) -> None:
-    """Draw a bar as long as some millimetres below the right end of an image.
-
-    Parameters
-    ----------
-    axes : Axes
-        Of :func:`sight_axes`.
-    course : Course
-        Of the trial: the scale is that at the base.
-    view : _View
-        The camera.
-    length : float
-        Of the bar, m.
-    """
+    """Draw a bar as long as some millimetres below the right end of an image."""
     base = np.nanmean(course.position, axis=0)
     ends = view.project(base + 0.5e-3 * np.concatenate([np.eye(3), -np.eye(3)]))
     pixels = 1e3 * length * float(np.linalg.norm(ends[:3] - ends[3:], axis=1).max())

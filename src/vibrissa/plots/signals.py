@@ -103,25 +103,7 @@ def _contact(signals: xr.Dataset) -> Mask | None:
 
 
 def intervals(time: Array, contact: Mask) -> Array:
-    """Find when contacts begin and end.
-
-    Parameters
-    ----------
-    time : array (n,)
-        Of the frames, rising.
-    contact : array (n,) of bool
-        Whether there is contact in each frame.
-
-    Returns
-    -------
-    array (k, 2)
-        Begin and end of each contact, halfway to the frames before and after.
-
-    Examples
-    --------
-    >>> intervals(np.arange(5.0), np.array([False, True, True, False, False]))
-    array([[0.5, 2.5]])
-    """
+    """Find when contacts begin and end."""
     if time.size < 2:
         return np.empty((0, 2))
     halfway = 0.5 * (time[1:] + time[:-1])

@@ -36,32 +36,7 @@ def solid_panels(
     rails: Sequence[Box],
     way: Array | None = None,
 ) -> list[Any]:
-    """Draw the signals of all contacts three times, coloured by r, θ and φ.
-
-    Parameters
-    ----------
-    figure : Figure
-        Where to.
-    samples : Dataset
-        ``ContactMap.to_dataset()``: all of the reachable space.
-    centerline : array_like (k, 3)
-        Of the resting whisker, whisker frame, m.
-    panels, rails : sequence of tuple of float
-        Three each, for solids and colour bars: left, bottom, width and height, mm.
-    way : array (n, 3), optional
-        F_x, M_B and M_D of a trial, SI units: solids end where contacts are half as strong again,
-        so that its way fills them.
-
-    Returns
-    -------
-    list of Axes3D
-        Three, in which places are those of :func:`vibrissa.plots.cylinder.signal_places`.
-
-    Raises
-    ------
-    ValueError
-        If the dataset lacks something.
-    """
+    """Draw the signals of all contacts three times, coloured by r, θ and φ."""
     nodes = fine_chart(samples, centerline)
     within: list[int] = []
     if way is not None and np.isfinite(way).all(axis=1).any():

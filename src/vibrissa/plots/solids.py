@@ -19,20 +19,7 @@ _QUAD = ((0, 1, 2), (0, 2, 3))
 
 
 def skin(nodes: Array, closed: bool) -> Array:
-    """Triangles on the outside of a chart.
-
-    Parameters
-    ----------
-    nodes : array (a, b, c, k)
-        Rows over stations, bearings and loads.
-    closed : bool
-        Whether the bearings go round once, so that their two ends are no outside.
-
-    Returns
-    -------
-    array (n, 3, k)
-        Triangles; without the side of no load, which is the resting whisker.
-    """
+    """Triangles on the outside of a chart."""
     faces = [nodes[:, :, -1], nodes[0], nodes[-1]]
     if not closed:
         faces += [nodes[:, 0], nodes[:, -1]]
@@ -47,22 +34,7 @@ def _triangulated(face: Array) -> Array:
 
 
 def level(nodes: Array, column: int, value: float) -> Array:
-    """Triangles on which a column has a given value.
-
-    Parameters
-    ----------
-    nodes : array (a, b, c, k)
-        Rows.
-    column : int
-        Which.
-    value : float
-        The value.
-
-    Returns
-    -------
-    array (n, 3, k)
-        Triangles.
-    """
+    """Triangles on which a column has a given value."""
     rows = nodes.reshape(-1, nodes.shape[-1])
     height = rows[:, column] - value
     corners = _tetrahedra(nodes.shape[:3])
@@ -112,20 +84,7 @@ def _crossing(rows: Array, height: Array, i: int, j: int) -> Array:
 
 
 def clipped(triangles: Array, column: int) -> Array:
-    """What remains of triangles where a column is positive.
-
-    Parameters
-    ----------
-    triangles : array (n, 3, k)
-        Triangles.
-    column : int
-        Which.
-
-    Returns
-    -------
-    array (m, 3, k)
-        Triangles.
-    """
+    """What remains of triangles where a column is positive."""
     height = triangles[..., column]
     inside: Mask = height > 0.0
     count = inside.sum(axis=1)
@@ -146,22 +105,7 @@ def clipped(triangles: Array, column: int) -> Array:
 
 
 def refined(triangles: Array, chosen: Mask, times: int = 3) -> Array:
-    """Halve the edges of some triangles, so that they can be coloured finely.
-
-    Parameters
-    ----------
-    triangles : array (n, 3, k)
-        Triangles.
-    chosen : array (n,) of bool
-        Which are parted, each in four.
-    times : int
-        How often.
-
-    Returns
-    -------
-    array (m, 3, k)
-        The same surface.
-    """
+    """Halve the edges of some triangles, so that they can be coloured finely."""
     pieces = triangles[chosen]
     for _ in range(times):
         middles = 0.5 * (pieces + np.roll(pieces, -1, axis=1))
@@ -173,22 +117,7 @@ def refined(triangles: Array, chosen: Mask, times: int = 3) -> Array:
 
 
 def solid(nodes: Array, closed: bool, *columns: int) -> Array:
-    """Triangles around the contacts where some columns are positive.
-
-    Parameters
-    ----------
-    nodes : array (a, b, c, k)
-        Rows.
-    closed : bool
-        Whether the bearings go round once.
-    *columns : int
-        Which must be positive.
-
-    Returns
-    -------
-    array (n, 3, k)
-        Triangles of a closed surface.
-    """
+    """Triangles around the contacts where some columns are positive."""
     around = []
     for cut in (None, *columns):
         part = skin(nodes, closed) if cut is None else level(nodes, cut, 0.0)

@@ -34,30 +34,7 @@ def space_axes(
     frame: bool = True,
     aspect: tuple[float, float, float] | None = None,
 ) -> Any:
-    """Add three-dimensional axes, by default to one scale.
-
-    Parameters
-    ----------
-    figure : Figure
-        Where to.
-    box : tuple of float
-        Left, bottom, width and height, mm; what is drawn fits the smaller of the two.
-    limits : array (3, 2)
-        Of x, y and z.
-    view : tuple of float
-        Elevation and azimuth, degrees.
-    zoom : float
-        1 fits the whole box of the axes with its lettering.
-    frame : bool
-        Whether the box of the axes, its ticks and labels are drawn.
-    aspect : tuple of float, optional
-        Lengths of the axes, where they are not to one scale.
-
-    Returns
-    -------
-    Axes3D
-        The axes.
-    """
+    """Add three-dimensional axes, by default to one scale."""
     wide, tall = 25.4 * figure.get_size_inches()
     left, bottom, width, height = box
     place = (left / wide, bottom / tall, width / wide, height / tall)
@@ -82,15 +59,7 @@ def space_axes(
 
 
 def name_axes(axes: Any, pads: Sequence[float] = (-9.0, -10.0, -11.0)) -> None:
-    """Write x, y and z at the axes.
-
-    Parameters
-    ----------
-    axes : Axes3D
-        In mm.
-    pads : sequence of float
-        Points between the ticks' labels and these.
-    """
+    """Write x, y and z at the axes."""
     for name, pad in zip("xyz", pads, strict=True):
         axis = getattr(axes, f"{name}axis")
         axis.set_label_text(axis_label(name), fontsize=6.0)
@@ -98,20 +67,7 @@ def name_axes(axes: Any, pads: Sequence[float] = (-9.0, -10.0, -11.0)) -> None:
 
 
 def bounds(points: ArrayLike, room: float = 0.02) -> Array:
-    """Limits that hold points and the origin.
-
-    Parameters
-    ----------
-    points : array_like (..., 3)
-        Points; those that are not finite are left out.
-    room : float
-        Around them, as a share of their largest extent.
-
-    Returns
-    -------
-    array (3, 2)
-        Limits.
-    """
+    """Limits that hold points and the origin."""
     places = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     places = np.concatenate([places, np.zeros((1, 3))])
     low, high = np.nanmin(places, axis=0), np.nanmax(places, axis=0)
@@ -120,43 +76,14 @@ def bounds(points: ArrayLike, room: float = 0.02) -> Array:
 
 
 def painted(values: Array, norm: Normalize, colours: Colormap) -> Array:
-    """Colours of triangles by the mean of the values at their corners.
-
-    Parameters
-    ----------
-    values : array (n, 3)
-        At the corners.
-    norm : Normalize
-        Limits.
-    colours : Colormap
-        Colours.
-
-    Returns
-    -------
-    array (n, 4)
-        Red, green, blue, opacity.
-    """
+    """Colours of triangles by the mean of the values at their corners."""
     return np.asarray(colours(norm(values.mean(axis=1))), dtype=np.float64)
 
 
 def paint(
     axes: Any, triangles: Array, colours: ArrayLike, *, opacity: float = 1.0, flat: float = _FLAT
 ) -> None:
-    """Draw lit triangles; those of one call hide each other rightly.
-
-    Parameters
-    ----------
-    axes : Axes3D
-        Where.
-    triangles : array (n, 3, 3)
-        Corners, in the unit of the axes.
-    colours : array_like (n, 4) or (4,)
-        Of each, or of all.
-    opacity : float
-        0 to 1.
-    flat : float
-        Brightness of a surface that the light only grazes; 1 leaves colours as they are.
-    """
+    """Draw lit triangles; those of one call hide each other rightly."""
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-untyped]
 
     limits = np.array([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()])

@@ -97,146 +97,50 @@ class _StyledFigure(Figure):
     """
 
     def draw(self, renderer: RendererBase) -> None:
-        """Draw.
-
-        Parameters
-        ----------
-        renderer : RendererBase
-            On which.
-        """
+        """Draw."""
         with looking():
             super().draw(renderer)
 
 
 def looking() -> AbstractContextManager[None]:
-    """Put :data:`LOOK` into force as long as a ``with`` block lasts.
-
-    Returns
-    -------
-    context manager
-        Which restores Matplotlib's settings in the end.
-    """
+    """Put :data:`LOOK` into force as long as a ``with`` block lasts."""
     settings: Any = dict(LOOK)
     return mpl.rc_context(settings)
 
 
 def new_figure(width: Width, height: float, layout: Literal["constrained"] | None) -> Figure:
-    """Make an empty figure.
-
-    Parameters
-    ----------
-    width : {"single", "double"}
-        How many columns wide.
-    height : float
-        In mm.
-    layout : {"constrained"} or None
-        Whether Matplotlib arranges the axes.
-
-    Returns
-    -------
-    Figure
-        In which :func:`looking` should be active while axes are added.
-
-    Raises
-    ------
-    ValueError
-        If there is no such width.
-    """
+    """Make an empty figure."""
     return sized_figure(page_width(width), height, layout)
 
 
 def sized_figure(
     width: float, height: float, layout: Literal["constrained"] | None = None
 ) -> Figure:
-    """Make an empty figure of any size.
-
-    Parameters
-    ----------
-    width, height : float
-        In mm.
-    layout : {"constrained"} or None
-        Whether Matplotlib arranges the axes.
-
-    Returns
-    -------
-    Figure
-        In which :func:`looking` should be active while axes are added.
-    """
+    """Make an empty figure of any size."""
     return _StyledFigure(figsize=(width / 25.4, height / 25.4), layout=layout)
 
 
 def box_axes(figure: Figure, box: tuple[float, float, float, float], **settings: Any) -> Axes:
-    """Add a panel at a place in mm.
-
-    Parameters
-    ----------
-    figure : Figure
-        Where to.
-    box : tuple of float
-        Left, bottom, width and height, mm.
-    **settings
-        What else axes take.
-
-    Returns
-    -------
-    Axes
-        The panel.
-    """
+    """Add a panel at a place in mm."""
     wide, tall = 25.4 * figure.get_size_inches()
     left, bottom, width, height = box
     return figure.add_axes((left / wide, bottom / tall, width / wide, height / tall), **settings)
 
 
 def page_width(width: Width) -> float:
-    """Tell how wide a figure is.
-
-    Parameters
-    ----------
-    width : {"single", "double"}
-        How many columns.
-
-    Returns
-    -------
-    float
-        In mm.
-
-    Raises
-    ------
-    ValueError
-        If there is no such width.
-    """
+    """Tell how wide a figure is."""
     if width not in WIDTHS:
         raise ValueError(f"width is {width!r}; one of {', '.join(WIDTHS)} is needed")
     return WIDTHS[width]
 
 
 def say(figure: Figure, message: str) -> None:
-    """Write one sentence where there is nothing to draw.
-
-    Parameters
-    ----------
-    figure : Figure
-        Without axes.
-    message : str
-        Such as "no contacts".
-    """
+    """Write one sentence where there is nothing to draw."""
     figure.text(0.5, 0.5, message, ha="center", va="center", color=MUTED, fontsize=8.0)
 
 
 def head(axes: Axes, letter: str, title: str, left: float = 0.0) -> None:
-    """Write a bold letter and a title above the upper left corner of a panel.
-
-    Parameters
-    ----------
-    axes : Axes
-        The panel.
-    letter : str
-        Usually a, b, c, ...
-    title : str
-        A few words.
-    left : float
-        How far to the left of the panel they begin, points.
-    """
+    """Write a bold letter and a title above the upper left corner of a panel."""
     for text, right, look in ((letter, 0.0, "bold"), (title, 11.0, "normal")):
         axes.annotate(
             text,
@@ -252,39 +156,13 @@ def head(axes: Axes, letter: str, title: str, left: float = 0.0) -> None:
 
 
 def plain(bar: Colorbar) -> None:
-    """Take the frame off a colour bar.
-
-    Parameters
-    ----------
-    bar : Colorbar
-        The colour bar.
-    """
+    """Take the frame off a colour bar."""
     outline: Any = bar.outline  # a spine, whatever Matplotlib's stubs say
     outline.set_visible(False)
 
 
 def robust_limits(values: ArrayLike, share: float = 0.98, symmetric: bool = False) -> Array:
-    """Limits between which most of the finite values lie.
-
-    Parameters
-    ----------
-    values : array_like
-        Any shape; what is not finite is left out.
-    share : float
-        Of the values that lie between the limits.
-    symmetric : bool
-        Whether the limits are to be as far below zero as above.
-
-    Returns
-    -------
-    array (2,)
-        Lower and upper limit, never equal; (0, 1) or (−1, 1) where there are no values.
-
-    Examples
-    --------
-    >>> robust_limits([1.0, 2.0, float("nan")], share=1.0)
-    array([1., 2.])
-    """
+    """Limits between which most of the finite values lie."""
     finite = np.asarray(values, dtype=np.float64)
     finite = finite[np.isfinite(finite)]
     if finite.size == 0:
@@ -300,41 +178,13 @@ def robust_limits(values: ArrayLike, share: float = 0.98, symmetric: bool = Fals
 
 
 def root(values: ArrayLike) -> Array:
-    """Take square roots of sizes and keep signs, for scales on which small values are seen.
-
-    Parameters
-    ----------
-    values : array_like
-        Any shape.
-
-    Returns
-    -------
-    array
-        sign(x) √|x|.
-
-    Examples
-    --------
-    >>> root([-4.0, 9.0])
-    array([-2.,  3.])
-    """
+    """Take square roots of sizes and keep signs, for scales on which small values are seen."""
     x = np.asarray(values, dtype=np.float64)
     return np.asarray(np.sign(x) * np.sqrt(np.abs(x)))
 
 
 def scale_near_zero(axes: Axes, axis: str, limits: Array, width: float | None) -> None:
-    """Make an axis linear near zero and logarithmic beyond, with ticks at zero and powers of ten.
-
-    Parameters
-    ----------
-    axes : Axes
-        The panel.
-    axis : {"x", "y"}
-        Which axis.
-    limits : array (2,)
-        Its limits.
-    width : float or None
-        Up to where it is linear; None leaves it linear throughout.
-    """
+    """Scale an axis linearly near zero and logarithmically beyond, ticks at powers of ten."""
     panel: Any = axes  # what is chosen by name has no type
     if width is not None:
         getattr(panel, f"set_{axis}scale")("asinh", linear_width=width)

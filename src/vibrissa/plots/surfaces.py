@@ -121,22 +121,7 @@ def _places(triangles: Array) -> Array:
 
 
 def levels(name: str, shell: Array) -> tuple[Normalize, list[float]]:
-    """Limits of the colours, and round values for surfaces.
-
-    Parameters
-    ----------
-    name : {"r", "theta", "phi"}
-        Which coordinate.
-    shell : array (..., columns)
-        Rows of a chart.
-
-    Returns
-    -------
-    norm : Normalize
-        Limits that leave out the outermost 2 %, display units.
-    marks : list of float
-        Round values about evenly between them, display units.
-    """
+    """Limits of the colours, and round values for surfaces."""
     values = to_display(name, values_of(name, shell))
     low, high = robust_limits(values)
     locator = MaxNLocator(12, steps=[1, 2, 2.5, 5, 10])
@@ -204,21 +189,7 @@ def _cylinder(figure: Figure, panel: _Panel, limits: Array) -> Any:
 def coordinate_bar(
     figure: Figure, place: Box, name: str, norm: Normalize, marks: list[float]
 ) -> None:
-    """Draw a colour bar for a coordinate.
-
-    Parameters
-    ----------
-    figure : Figure
-        Where to.
-    place : tuple of float
-        Left, bottom, width and height, mm; upright if it is higher than wide.
-    name : {"r", "theta", "phi"}
-        Which coordinate.
-    norm : Normalize
-        Limits, display units.
-    marks : list of float
-        Where ticks are, display units.
-    """
+    """Draw a colour bar for a coordinate."""
     wide, tall = 25.4 * figure.get_size_inches()
     left, bottom, width, height = place
     rail = figure.add_axes((left / wide, bottom / tall, width / wide, height / tall))

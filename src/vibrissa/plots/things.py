@@ -41,20 +41,7 @@ _EYE, _AROUND = 1.5, 40
 
 
 def head_triangles(rotation: Array, position: Array) -> Array:
-    """Sketch a rat's head.
-
-    Parameters
-    ----------
-    rotation : array (3, 3)
-        From the head's frame to that of the picture.
-    position : array (3,)
-        Tip of the snout, m.
-
-    Returns
-    -------
-    array (n, 3, 3)
-        Corners, mm.
-    """
+    """Sketch a rat's head."""
     turn = np.linspace(0.0, 2.0 * np.pi, _AROUND)
     # Smooth between the sections, which are closer together near the snout.
     number = np.arange(len(_SECTIONS))
@@ -67,20 +54,7 @@ def head_triangles(rotation: Array, position: Array) -> Array:
 
 
 def eye_triangles(rotation: Array, position: Array) -> Array:
-    """Give the head eyes.
-
-    Parameters
-    ----------
-    rotation : array (3, 3)
-        From the head's frame to that of the picture.
-    position : array (3,)
-        Tip of the snout, m.
-
-    Returns
-    -------
-    array (n, 3, 3)
-        Corners, mm.
-    """
+    """Give the head eyes."""
     balls = [place + _EYE * _ball(16) for place in _EYES]
     return _moved(np.concatenate(balls), rotation, position)
 
@@ -115,27 +89,7 @@ def object_triangles(thing: xr.Dataset, limits: Array) -> Array:
 
 
 def object_surface(thing: xr.Dataset, limits: Array) -> tuple[Array, Ints]:
-    """Give the surface of an object as vertices that triangles share where it is smooth.
-
-    Parameters
-    ----------
-    thing : Dataset
-        As for `object_triangles`.
-    limits : array (3, 2)
-        What is seen, mm.
-
-    Returns
-    -------
-    vertices : array (n, 3)
-        mm.
-    faces : array (m, 3) of int
-        Numbers of the corners of triangles.
-
-    Raises
-    ------
-    ValueError
-        If it is of an unknown kind.
-    """
+    """Give the surface of an object as vertices that triangles share where it is smooth."""
     kind = str(thing.attrs.get("kind"))
     if kind not in _KINDS:
         raise ValueError(f"an object is of kind {kind!r}; one of {', '.join(_KINDS)} is known")
@@ -143,18 +97,7 @@ def object_surface(thing: xr.Dataset, limits: Array) -> tuple[Array, Ints]:
 
 
 def ends_nearby(thing: xr.Dataset) -> bool:
-    """Tell whether an object is to be shown as a whole.
-
-    Parameters
-    ----------
-    thing : Dataset
-        As for `object_triangles`.
-
-    Returns
-    -------
-    bool
-        False for pegs and planes, which have no end.
-    """
+    """Tell whether an object is to be shown as a whole."""
     return thing.attrs.get("kind") in ("sphere", "box", "mesh")
 
 

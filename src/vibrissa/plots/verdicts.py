@@ -89,18 +89,7 @@ def _check(verdicts: xr.Dataset) -> None:
 
 
 def triplet_label(triplet: str) -> str:
-    """Write a triplet with its signals' symbols.
-
-    Parameters
-    ----------
-    triplet : str
-        Such as ``"Fx MB MD"``.
-
-    Returns
-    -------
-    str
-        In mathtext.
-    """
+    """Write a triplet with its signals' symbols."""
     return "  ".join(f"${quantity(name).symbol}$" for name in triplet.split())
 
 

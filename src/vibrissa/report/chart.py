@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from vibrissa.mapping import ContactMap
-from vibrissa.mapping.summary import verdict_rows
+from vibrissa.contacts import ContactMap
+from vibrissa.identifiability.summary import verdict_rows
 from vibrissa.quantities import quantity, shown_unit, to_display
 from vibrissa.report.page import Section, paragraph, table
 from vibrissa.signals import SIGNALS

@@ -112,20 +112,7 @@ def table(
 
 
 def paragraph(text: str, kind: str = "") -> str:
-    """Write a paragraph.
-
-    Parameters
-    ----------
-    text : str
-        Plain text; what stands between backticks is set as code.
-    kind : str
-        Its class in the style sheet.
-
-    Returns
-    -------
-    str
-        HTML.
-    """
+    """Write a paragraph."""
     named = f' class="{kind}"' if kind else ""
     told = _CODE.sub(r"<code>\1</code>", escape(text))
     return f"<p{named}>{told}</p>"

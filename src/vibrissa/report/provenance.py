@@ -77,18 +77,7 @@ def provenance(command: Sequence[str], inputs: Sequence[Path], seed: int | None)
 
 
 def sha256(path: Path) -> str:
-    """Tell a file by its content.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    str
-        64 hexadecimal digits.
-    """
+    """Tell a file by its content."""
     found = hashlib.sha256()
     with path.open("rb") as file:
         while block := file.read(_BLOCK):

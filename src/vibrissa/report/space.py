@@ -36,13 +36,7 @@ _CAMERA = {"eye": {"x": 1.65, "y": -1.8, "z": 1.05}, "center": {"x": 0.0, "y": 0
 
 
 def can_draw() -> bool:
-    """Tell whether the drawing library is installed.
-
-    Returns
-    -------
-    bool
-        False: pictures are left out.
-    """
+    """Tell whether the drawing library is installed."""
     return find_spec("plotly") is not None
 
 

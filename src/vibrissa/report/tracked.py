@@ -12,20 +12,7 @@ from vibrissa.report.values import shown_value
 
 
 def whiskers_table(recording: xr.DataTree, chosen: int) -> str:
-    """Tell which whiskers touched for how long, and how strongly.
-
-    Parameters
-    ----------
-    recording : DataTree
-        A trial.
-    chosen : int
-        The whisker that the page is about.
-
-    Returns
-    -------
-    str
-        HTML.
-    """
+    """Tell which whiskers touched for how long, and how strongly."""
     names = [str(name) for name in recording.coords["whisker"].values]
     touching = contacts_by_whisker(recording)
     force = recording.to_dataset().get("force")
@@ -71,19 +58,7 @@ def contacts_by_whisker(recording: xr.DataTree) -> NDArray[np.int64]:
 
 
 def tracked_table(root: xr.Dataset) -> str:
-    """Tell what tracking found, and how well by its own account.
-
-    Parameters
-    ----------
-    root : Dataset
-        Of one tracked whisker, dim time: ``in_contact``, ``base_position``, and what else there is
-        of ``force``, ``moment``, ``contact_covariance``.
-
-    Returns
-    -------
-    str
-        HTML.
-    """
+    """Tell what tracking found, and how well by its own account."""
     touching = root["in_contact"].values.astype(bool)
     rows = [
         ("frames", str(touching.size)),

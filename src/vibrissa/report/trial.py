@@ -27,12 +27,12 @@ from vibrissa.evaluation import (
 )
 from vibrissa.pipeline import compare_contacts, distances_by_class
 from vibrissa.quantities import QUANTITIES, quantity
+from vibrissa.recording import recorded_objects, recorded_whisker
 from vibrissa.report.page import Section, paragraph, table
 from vibrissa.report.tracked import tracked_table, whiskers_table
 from vibrissa.report.values import shown_value
 from vibrissa.signals import CIRCULAR, SIGNALS, base_signals, within_turn
 from vibrissa.status import describe
-from vibrissa.trial import recorded_objects, recorded_whisker
 from vibrissa.whisker import Whisker
 
 Array = NDArray[np.float64]
@@ -228,18 +228,7 @@ def _has(names: Sequence[str], *data: xr.Dataset | None) -> bool:
 
 
 def tracking_tables(root: xr.Dataset, truth: xr.Dataset) -> str:
-    """Tell the errors of what was tracked.
-
-    Parameters
-    ----------
-    root, truth : Dataset
-        Of one whisker in the same frames: ``in_contact``, and what else is to be compared.
-
-    Returns
-    -------
-    str
-        HTML: tables of lines, and of contacts.
-    """
+    """Tell the errors of what was tracked."""
     scores = tracking_scores(root, truth)
     touching = [data["in_contact"].values.astype(bool) for data in (root, truth)]
     both = touching[0] & touching[1]
@@ -285,19 +274,7 @@ def _spread_cells(name: str, values: Array) -> list[str]:
 
 
 def six_rows(signals: xr.Dataset, truth: xr.Dataset) -> list[tuple[str, ...]]:
-    """Sum up the errors of the six signals.
-
-    Parameters
-    ----------
-    signals, truth : Dataset
-        Of one whisker, dim time: ``force``, ``moment`` in the whisker's frame, ``in_contact``.
-
-    Returns
-    -------
-    list of tuple of str
-        Name, contacts, median, 95 % and largest error, and the median size of the true signal; a
-        dash for that of a direction.
-    """
+    """Sum up the errors of the six signals."""
     both = truth["in_contact"].values.astype(bool) & signals["in_contact"].values.astype(bool)
     felt, true = (base_signals(data["force"], data["moment"]) for data in (signals, truth))
     rows = []
@@ -315,21 +292,7 @@ def six_rows(signals: xr.Dataset, truth: xr.Dataset) -> list[tuple[str, ...]]:
 
 
 def signal_rows(signals: xr.Dataset, truth: xr.Dataset, whisker: Whisker) -> list[tuple[str, ...]]:
-    """Sum up errors of force and moment by deflection angle.
-
-    Parameters
-    ----------
-    signals, truth : Dataset
-        Of one whisker, dim time: ``force``, ``moment``, ``in_contact``, ``base_rotation``, and the
-        true ``contact_point_whisker``.
-    whisker : Whisker
-        The whisker as it truly is.
-
-    Returns
-    -------
-    list of tuple of str
-        Class, contacts, medians of both errors and 95 % of both, as shares of the true size.
-    """
+    """Sum up errors of force and moment by deflection angle."""
     angle = deflection_angle(truth, whisker)
     rows = []
     for row in signal_errors(signals, truth, angle):

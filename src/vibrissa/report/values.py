@@ -11,22 +11,7 @@ _LEAST = 1e-5
 
 
 def shown_value(name: str, value: float, digits: int = 4) -> str:
-    """Write an SI value with its unit.
-
-    Parameters
-    ----------
-    name : str
-        Of a quantity.
-    value : float
-        In its SI unit.
-    digits : int
-        Significant ones.
-
-    Returns
-    -------
-    str
-        Such as ``0.1428 mm``; a dash for NaN.
-    """
+    """Write an SI value with its unit."""
     if not np.isfinite(value):
         return "–"
     factor, unit = shown_unit(name, value)

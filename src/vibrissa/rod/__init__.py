@@ -3,4 +3,11 @@
 from vibrissa.rod.deflection import Deflection, deflect
 from vibrissa.rod.loads import Load, PegContact, PointContact, PointForce
 
-__all__ = ["Deflection", "Load", "PegContact", "PointContact", "PointForce", "deflect"]
+__all__ = [
+    "Deflection",
+    "Load",
+    "PegContact",
+    "PointContact",
+    "PointForce",
+    "deflect",
+]

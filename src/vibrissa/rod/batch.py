@@ -9,7 +9,7 @@ from functools import cache
 
 import numpy as np
 
-from vibrissa.rod.arrays import Array
+from vibrissa.numerics.arrays import Array
 from vibrissa.rod.discretize import Discretization
 from vibrissa.rod.kernels import carry_tangents, evaluate
 
@@ -33,15 +33,7 @@ def threads() -> int:
 
 
 def share_out(rows: int, work: Callable[[int, int], object]) -> None:
-    """Call ``work(first, last)`` for pieces that cover all rows, on all cores.
-
-    Parameters
-    ----------
-    rows : int
-        How many rows there are.
-    work : callable
-        Does the rows from ``first`` up to, not including, ``last``; must release the GIL to gain.
-    """
+    """Call ``work(first, last)`` for pieces that cover all rows, on all cores."""
     if rows <= _SERIAL or threads() == 1:
         if rows:
             work(0, rows)
@@ -54,24 +46,7 @@ def share_out(rows: int, work: Callable[[int, int], object]) -> None:
 def solve_forces(
     discretization: Discretization, contacts: Array, tangents: bool = False
 ) -> tuple[Array, Array]:
-    """Base force and contact point of contacts whose force is known, non-dimensional.
-
-    Parameters
-    ----------
-    discretization : Discretization
-        The whisker.
-    contacts : (n, 4) array
-        s_c and (f_x, f_y, f_z) in the material frame at the contact.
-    tangents : bool
-        Whether derivatives are wanted.
-
-    Returns
-    -------
-    values : (n, 6) array
-        Base force F and contact point p.
-    tangents : (n, 6, 3) array
-        ∂(F, p)/∂(s_c, f_y, f_z); (0, 6, 3) if not wanted.
-    """
+    """Base force and contact point of contacts whose force is known, non-dimensional."""
     contacts = np.ascontiguousarray(contacts, dtype=np.float64)
     n = contacts.shape[0]
     values = np.empty((n, 6))
@@ -82,20 +57,7 @@ def solve_forces(
 
 
 def contact_tangents(discretization: Discretization, contacts: Array) -> Array:
-    """Unit tangents of the deflected whisker at its contacts, base frame.
-
-    Parameters
-    ----------
-    discretization : Discretization
-        The whisker.
-    contacts : (n, 4) array
-        s_c and (f_x, f_y, f_z) in the material frame at the contact, non-dimensional.
-
-    Returns
-    -------
-    (n, 3) array
-        Tangents; NaN for rows with NaN.
-    """
+    """Unit tangents of the deflected whisker at its contacts, base frame."""
     contacts = np.ascontiguousarray(contacts, dtype=np.float64)
     tangents = np.empty((len(contacts), 3))
     rod = discretization.rod

@@ -17,8 +17,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibrissa.rod.arrays import Array, Rod
-from vibrissa.rod.compiled import inlined, kernel
+from vibrissa.numerics.arrays import Array, Rod
+from vibrissa.numerics.compiled import inlined, kernel
 from vibrissa.rod.equations import whisker_radius
 from vibrissa.rod.shape import NODES, STAGES, WEIGHTS
 
@@ -63,22 +63,7 @@ def _rates(rod: Rod, k: int, t: float, y: Array, dy: Array) -> None:
 
 @kernel
 def contact_state(rod: Rod, contact: Array, state: Array) -> tuple[float, float]:
-    """Integrate one contact to the base.
-
-    Parameters
-    ----------
-    rod : tuple of arrays
-        See :class:`vibrissa.rod.discretize.Discretization`.
-    contact : (4,) array
-        s_c and (f_x, f_y, f_z) in the material frame there.
-    state : (9, 5) array
-        Filled with (F, p, t) in column 0 and its derivatives with respect to the contact beside it.
-
-    Returns
-    -------
-    tuple of float
-        The whisker's radius at s_c over the base radius, and its slope.
-    """
+    """Integrate one contact to the base."""
     start, width = rod[0], rod[1]
     s = contact[0]
     slopes = np.zeros((7, STATES, _COLUMNS))

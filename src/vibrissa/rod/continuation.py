@@ -14,8 +14,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibrissa.rod.arrays import Array, IntArray, Rod
-from vibrissa.rod.compiled import copy, inlined, kernel
+from vibrissa.numerics.arrays import Array, IntArray, Rod
+from vibrissa.numerics.compiled import copy, inlined, kernel
 from vibrissa.rod.equations import (
     POINT,
     SIDE,
@@ -166,34 +166,7 @@ def follow(
     first: int,
     last: int,
 ) -> None:
-    """Follow problems from ``begins`` to ``ends``, four at a time; see the module.
-
-    Parameters
-    ----------
-    rod, fold : tuples of arrays
-        The whisker and its fold forces.
-    radius : float
-        Base radius over L.
-    proximal : float
-        Smallest s_c/L that counts.
-    begins, ends : (n, 7) arrays
-        Parameters where the solution is known and where it is wanted.
-    kinds : (n,) int array
-        Kind of each problem; replaced by the kind it ended as.
-    unknowns : (n, 3) array
-        Solutions at ``begins`` (approximately); replaced by those at ``ends``, or by the last on
-        the way.
-    contacts : (n, 4) array
-        Filled with (s, f_x, f_y, f_z).
-    values : (n, 6) array
-        Filled with (F, p).
-    misfits : (n,) array
-        Filled with the residual's norm.
-    statuses : (n,) int array
-        Filled with a :class:`Status`.
-    first, last : int
-        The rows to do.
-    """
+    """Follow problems from ``begins`` to ``ends``, four at a time; see the module."""
     b = np.zeros(BUFFER_SIZE)
     value, t, g, p = np.empty(6), np.empty((6, 3)), np.empty(3), np.empty(7)
     jacobian, step, contact = np.empty((3, 3)), np.empty(3), np.empty(4)

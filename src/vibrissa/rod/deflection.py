@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vibrissa.rod.arrays import AnyArray, Array, IntArray
+from vibrissa.numerics.arrays import AnyArray, Array, IntArray
 from vibrissa.rod.discretize import STEPS, Discretization, discretize
 from vibrissa.rod.forces import solve_known_forces
 from vibrissa.rod.loads import Load, PegContact, PointContact, PointForce

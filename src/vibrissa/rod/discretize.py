@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vibrissa.rod.arrays import Array, Rod
+from vibrissa.numerics.arrays import Array, Rod
 
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
@@ -41,22 +41,7 @@ _ROUGH = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Discretization:
-    """Arrays for the kernels and the scales that make their results dimensional.
-
-    Attributes
-    ----------
-    rod : tuple of arrays
-        For n steps from the base: ``start`` and ``width`` (n,) in units of L; ``extent`` (n,), 1
-        for rod and 0 for the compliant base; compliance in twist and in bending (n,) relative to
-        the base section; ``shape`` (n, 4, 4), cubics in the fraction of the step for the three
-        curvatures times L and for the radius relative to the base radius.
-    length : float
-        L, m.
-    force, moment : float
-        EI/L² in N and EI/L in N·m.
-    radius : float
-        Base radius over L.
-    """
+    """Arrays for the kernels and the scales that make their results dimensional."""
 
     rod: Rod
     length: float
@@ -67,20 +52,7 @@ class Discretization:
 
 @lru_cache(maxsize=64)
 def discretize(whisker: Whisker, steps: int = STEPS) -> Discretization:
-    """Cut a whisker into steps for the kernels.
-
-    Parameters
-    ----------
-    whisker : Whisker
-        What bends.
-    steps : int
-        Steps along its length; more where the whisker is a corkscrew.
-
-    Returns
-    -------
-    Discretization
-        Cached per whisker (whiskers are immutable and compared by identity).
-    """
+    """Cut a whisker into steps for the kernels."""
     if not 4 <= steps <= MOST_STEPS or int(steps) != steps:
         raise ValueError(f"steps is {steps}; it must be a whole number from 4 to {MOST_STEPS}")
     steps, length = int(steps), whisker.length

@@ -16,8 +16,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibrissa.rod.arrays import Array, Rod
-from vibrissa.rod.compiled import inlined
+from vibrissa.numerics.arrays import Array, Rod
+from vibrissa.numerics.compiled import inlined
 from vibrissa.rod.reach import Fold, fold_force
 
 POINT, SIDE, TIP = 0, 1, 2

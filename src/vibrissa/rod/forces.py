@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vibrissa.rod.arrays import AnyArray, Array, IntArray
+from vibrissa.numerics.arrays import AnyArray, Array, IntArray
 from vibrissa.rod.batch import solve_forces
 from vibrissa.rod.discretize import MOST_STEPS, discretize
 
@@ -30,26 +30,7 @@ _SETTLED = 1e-4
 def solve_known_forces(
     whisker: Whisker, contacts: Array, steps: int
 ) -> tuple[Array, IntArray, AnyArray]:
-    """Base force and contact point of known forces of any size, non-dimensional.
-
-    Parameters
-    ----------
-    whisker : Whisker
-        The whisker.
-    contacts : (n, 4) array
-        s_c and (f_x, f_y, f_z) in the material frame at the contact, finite.
-    steps : int
-        Integration steps to begin with.
-
-    Returns
-    -------
-    values : (n, 6) array
-        Base force F and contact point p.
-    steps : (n,) int array
-        Steps that each needs.
-    settled : (n,) bool array
-        Whether its values can be relied on.
-    """
+    """Base force and contact point of known forces of any size, non-dimensional."""
     values = solve_forces(discretize(whisker, steps), contacts)[0]
     needed = np.full(len(contacts), steps)
     with np.errstate(over="ignore", invalid="ignore"):

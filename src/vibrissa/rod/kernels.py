@@ -31,8 +31,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibrissa.rod.arrays import Array, Rod, Vector
-from vibrissa.rod.compiled import inlined, kernel
+from vibrissa.numerics.arrays import Array, Rod, Vector
+from vibrissa.numerics.compiled import inlined, kernel
 
 LANES = 4
 _STAGE = 11 * LANES  # a stage keeps n, q, u (3 each) and the two compliances, for the tangents
@@ -350,21 +350,7 @@ def integrate(rod: Rod, b: Array, tangents: int) -> None:
 def evaluate(
     rod: Rod, contacts: Array, values: Array, tangents: Array, first: int, last: int
 ) -> None:
-    """Base force and contact point of many contacts.
-
-    Parameters
-    ----------
-    rod : tuple of arrays
-        See :class:`vibrissa.rod.discretize.Discretization`.
-    contacts : (n, 4) array
-        s_c and the force (f_x, f_y, f_z) in the material frame at the contact.
-    values : (n, 6) array
-        Filled with (F, p).
-    tangents : (n, 6, 3) or (0, 6, 3) array
-        Filled with ∂(F, p)/∂(s_c, f_y, f_z); left out if it has no rows.
-    first, last : int
-        The rows to do.
-    """
+    """Base force and contact point of many contacts."""
     b, four = np.zeros(BUFFER_SIZE), np.empty((6, 4))
     wanted = tangents.shape[0] > 0
     if wanted and last == first + 1:  # a contact by itself: its tangents side by side
@@ -390,19 +376,7 @@ def evaluate(
 
 @kernel
 def carry_tangents(rod: Rod, contacts: Array, tangents: Array, first: int, last: int) -> None:
-    """Unit tangents of the deflected whisker at its contacts, in the base frame.
-
-    Parameters
-    ----------
-    rod : tuple of arrays
-        See :class:`vibrissa.rod.discretize.Discretization`.
-    contacts : (n, 4) array
-        s_c and the force (f_x, f_y, f_z) in the material frame at the contact.
-    tangents : (n, 3) array
-        Filled.
-    first, last : int
-        The rows to do.
-    """
+    """Unit tangents of the deflected whisker at its contacts, in the base frame."""
     b = np.zeros(BUFFER_SIZE)
     for row in range(first, last, LANES):
         for i in range(LANES):

@@ -21,8 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from vibrissa.rod.arrays import Array, Rod
-from vibrissa.rod.compiled import copy, inlined
+from vibrissa.numerics.arrays import Array, Rod
+from vibrissa.numerics.compiled import copy, inlined
 from vibrissa.rod.kernels import (
     LANES,
     integrate,
@@ -133,35 +133,7 @@ def newton_group(
     misfits: Array,
     signs: Array,
 ) -> None:
-    """Solve up to four problems side by side, in place.
-
-    Parameters
-    ----------
-    equation : function
-        See the module.
-    rod, fold : tuples of arrays
-        The whisker and its fold forces.
-    b : (BUFFER_SIZE,) array
-        Lanes.
-    count : int
-        How many of the four rows below are problems.
-    targets : (4, k) array
-        What the equation is to meet.
-    charts : (4, 3) array
-        Seeds in the chart's coordinates (η, ψ, ρ); overwritten.
-    inverses : (4, 3, 3) array
-        Inverse Jacobians there, ∂(η, ψ, ρ)/∂(equations); NaN for rows that take Newton steps at
-        once.
-    xi : (4, 3) array
-        The same seeds as contacts; replaced by solutions.
-    values : (4, 6) array
-        Filled with (F, p) at the solution.
-    misfits : (4,) array
-        Filled with the residual's norm; above ``TOLERANCE`` where there was no convergence.
-    signs : (4,) array
-        Filled with det ∂p/∂ξ at the last Jacobian's place, within the last step of the solution;
-        1 where the chart alone led to a solution well short of the fold.
-    """
+    """Solve up to four problems side by side, in place."""
     value, tangents, four = np.empty(6), np.empty((6, 3)), np.empty((6, 4))
     residual, step = np.empty(3), np.empty(3)
     jacobians = np.empty((LANES, 3, 3))

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from vibrissa.rod.arrays import AnyArray, Array, IntArray
+from vibrissa.numerics.arrays import AnyArray, Array, IntArray
 from vibrissa.rod.continuation import LEAST_FORCE
 from vibrissa.rod.equations import SIDE, TIP
 from vibrissa.rod.points import Solutions, follow_all
@@ -73,23 +73,7 @@ class Rest(NamedTuple):
 
 
 def nearest_side(rest: Rest, pegs: Pegs, outward: bool) -> Array:
-    """Unit vectors (n, 3) between axis and resting whisker where they are nearest.
-
-    Parameters
-    ----------
-    rest : Rest
-        The whisker.
-    pegs : Pegs
-        The pegs.
-    outward : bool
-        Whether they point from the axis to the whisker (the side of a solid peg on which the
-        whisker lies) or from the whisker to the axis (the way a line must push to be where it is).
-
-    Returns
-    -------
-    (n, 3) array
-        The directions.
-    """
+    """Unit vectors (n, 3) between axis and resting whisker where they are nearest."""
     rows = np.arange(len(pegs.axis))
     away = _normal_part(rest.position - pegs.origin[:, None], pegs.axis[:, None])
     nearest = np.linalg.norm(away, axis=-1).argmin(axis=1)
@@ -115,26 +99,7 @@ def nearest_side(rest: Rest, pegs: Pegs, outward: bool) -> Array:
 def solve_from_rest(
     whisker: Whisker, pegs: Pegs, side: Array, proximal: float, steps: int
 ) -> Solutions:
-    """Solve pegs met from rest.
-
-    Parameters
-    ----------
-    whisker : Whisker
-        The whisker.
-    pegs : Pegs
-        n pegs; rows with NaN are passed over.
-    side : (n, 3) array
-        Approximate direction of the force on the whisker.
-    proximal : float
-        Smallest s_c/L.
-    steps : int
-        Integration steps.
-
-    Returns
-    -------
-    Solutions
-        Row by row.
-    """
+    """Solve pegs met from rest."""
     parts = [Solutions.empty(0)]
     rest = Rest.of(whisker)
     for first in range(0, len(side), _ROWS):

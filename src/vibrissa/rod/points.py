@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from vibrissa.rod.arrays import AnyArray, Array, IntArray, Rod
+from vibrissa.numerics.arrays import AnyArray, Array, IntArray, Rod
+from vibrissa.numerics.compiled import copy, inlined, kernel
 from vibrissa.rod.batch import share_out, solve_forces
-from vibrissa.rod.compiled import copy, inlined, kernel
 from vibrissa.rod.continuation import follow
 from vibrissa.rod.equations import POINT
 from vibrissa.rod.kernels import BUFFER_SIZE, LANES
@@ -279,13 +279,7 @@ def _solve_points(
 
 
 class PointSolver:
-    """Contact at a point, for one whisker: tables made once, then microseconds a point.
-
-    Parameters
-    ----------
-    chart : Reach
-        The whisker's stable contacts.
-    """
+    """Contact at a point, for one whisker: tables made once, then microseconds a point."""
 
     def __init__(self, chart: Reach) -> None:
         self.chart = chart
@@ -306,18 +300,7 @@ class PointSolver:
         )
 
     def solve(self, points: Array) -> Solutions:
-        """Solve contact points.
-
-        Parameters
-        ----------
-        points : (n, 3) array
-            Contact points over L; rows with NaN are passed over.
-
-        Returns
-        -------
-        Solutions
-            Row by row; NaN where there is no solution.
-        """
+        """Solve contact points."""
         n = len(points)
         out = Solutions.empty(n)
         contacts, values, misfits, statuses = out

@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.rod.arrays import AnyArray, Array, IntArray
+from vibrissa.numerics.arrays import AnyArray, Array, IntArray
 from vibrissa.rod.reach import Reach
 
 # Boxes are widened by this share of their size for what the cubic misses.
@@ -44,40 +44,7 @@ _TURNED = 0.9
 
 
 class Tree(NamedTuple):
-    """The tree, for the kernels.
-
-    Parameters
-    ----------
-    grid : (2, 3) array
-        Origin and size of a cell in (η, ψ, ρ).
-    turns : (3,) array
-        1/2π for an angle, 0 otherwise.
-    offsets : (levels + 1,) array
-        First row of each level in ``boxes``; a node's eight children are row offsets[level] + node.
-    boxes : (rows, 6, 8) array
-        Middle and half width of the three quantities, for eight sibling nodes.
-    place : (cells, 3) array
-        (i, j, k) of a cell.
-    frame : (cells, 6, 3) array
-        Aligned coordinates y = A (T - base): A (3 rows), base, least y, largest y.
-    edges : (cells, 160) array
-        The interpolant, T - base, the three quantities side by side.
-    care : (cells,) array
-        How many starts a cell needs: 0 one, 1 several until one is solved, 2 all of them.
-    polar : (cells,) array
-        Row of a polar cell in the two below; -1 for all others.
-    polar_edges : (polar cells, 160) array
-        Their interpolant: two components and the other quantities side by side.
-    polar_frame : (polar cells, 8) array
-        What the interpolant is relative to (4), scales of the three equations, largest length.
-    polar_linear : (polar cells, 4, 5) array
-        The interpolant's linear part (3), and middle and half width of what is left.
-    polar_volumes : (polar cells, 8, 2) array
-        At each corner, what its slopes span together with those of the other quantities: those of
-        either component, or first those of both if length and direction are known.
-    roles : (4,) array
-        Which quantity is the length, which the direction, and which are the others; -1 for none.
-    """
+    """The tree, for the kernels."""
 
     grid: Array
     turns: Array
@@ -96,17 +63,7 @@ class Tree(NamedTuple):
 
 
 class Plane(NamedTuple):
-    """A vector of the plane, of which quantities are the length or the direction.
-
-    Parameters
-    ----------
-    values : (n, m, k, 2) array
-        Components at the chart's nodes.
-    derivatives : (n, m, k, 2, 3) array
-        Their derivatives with respect to ξ there.
-    length, direction : int
-        Which quantities are its length and its direction; -1 for none.
-    """
+    """A vector of the plane, of which quantities are the length or the direction."""
 
     values: Array
     derivatives: Array
@@ -116,13 +73,7 @@ class Plane(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Preimages:
-    """Subdivision tree of three quantities over a chart.
-
-    Attributes
-    ----------
-    tree : Tree
-        For the kernels.
-    """
+    """Subdivision tree of three quantities over a chart."""
 
     tree: Tree
 
@@ -135,26 +86,7 @@ class Preimages:
         angles: tuple[bool, ...],
         plane: Plane | None = None,
     ) -> Preimages:
-        """Build the tree.
-
-        Parameters
-        ----------
-        reach : Reach
-            The chart; its numbers of cells are powers of two, that along ψ the largest.
-        values : (n, m, k, 3) array
-            Quantities at the chart's nodes.
-        derivatives : (n, m, k, 3, 3) array
-            Their derivatives with respect to ξ there.
-        angles : tuple of bool
-            Which of them are angles, rad.
-        plane : Plane, optional
-            A vector of which some of them are length or direction, and which may vanish.
-
-        Returns
-        -------
-        Preimages
-            Ready to be searched.
-        """
+        """Build the tree."""
         size = np.array([1.0, 2.0 * np.pi, 1.0]) / (np.array(values.shape[:3]) - 1)
         circular = np.array(angles)
         place = _octree_order(tuple(n - 1 for n in values.shape[:3]))

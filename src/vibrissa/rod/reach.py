@@ -24,9 +24,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from vibrissa.rod.arrays import AnyArray, Array
+from vibrissa.numerics.arrays import AnyArray, Array
+from vibrissa.numerics.compiled import inlined, kernel
 from vibrissa.rod.batch import solve_forces
-from vibrissa.rod.compiled import inlined, kernel
 from vibrissa.rod.discretize import STEPS, Discretization, discretize
 
 if TYPE_CHECKING:
@@ -54,27 +54,7 @@ Fold = tuple[Array, Array]
 
 @dataclass(frozen=True, eq=False)
 class Reach:
-    """The chart of the stable contacts of one whisker, non-dimensional.
-
-    Attributes
-    ----------
-    discretization : Discretization
-        The whisker.
-    stations, bearings, loads : (n + 1,), (m + 1,), (k + 1,) arrays
-        Grid of s/L, ψ (rad, both ends of the circle) and ρ = √(force / fold force).
-    fold : tuple of arrays
-        (proximal, a), and ln f* with its derivatives, (n + 1, m + 1, 4); for :func:`fold_force`.
-    contacts : (n, m + 1, k, 3) array
-        ξ at the nodes.
-    values : (n, m + 1, k, 6) array
-        (F, p) at the nodes.
-    tangents : (n, m + 1, k, 6, 3) array
-        ∂(F, p)/∂ξ at the nodes.
-    frames : (n, m + 1, k, 3, 3) array
-        ∂ξ/∂(η, ψ, ρ) at the nodes.
-    folded : (n, m + 1) bool array
-        Whether the ray reaches a fold; False where it was followed to the largest force considered.
-    """
+    """The chart of the stable contacts of one whisker, non-dimensional."""
 
     discretization: Discretization
     stations: Array
@@ -104,24 +84,7 @@ def reach(
     cells: tuple[int, int, int] = CELLS,
     steps: int = STEPS,
 ) -> Reach:
-    """Chart the stable contacts of a whisker; see the module.
-
-    Parameters
-    ----------
-    whisker : Whisker
-        What is touched.
-    proximal : float
-        Smallest s_c/L.
-    cells : tuple of int
-        Cells along η, ψ and ρ; powers of two.
-    steps : int
-        Integration steps along the whisker.
-
-    Returns
-    -------
-    Reach
-        Cached per whisker.
-    """
+    """Chart the stable contacts of a whisker; see the module."""
     if not 0.05 <= proximal < 1.0:
         raise ValueError(
             f"the smallest arc length is {proximal} L; it must be from 0.05 L to below L"

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vibrissa.rod.arrays import Array
+from vibrissa.numerics.arrays import Array
+from vibrissa.objects.surface import Placement, Surface, between
 from vibrissa.rod.pegs import Rest
-from vibrissa.rod.surface import Placement, Surface, between
 
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
@@ -25,24 +25,7 @@ _SIDES = 16
 
 
 class Resting:
-    """The resting whisker among surfaces.
-
-    Parameters
-    ----------
-    whisker : Whisker
-        In its own frame.
-    surfaces : sequence of Surface
-        In theirs.
-
-    Attributes
-    ----------
-    s : (n,) array
-        Samples along it, s/L.
-    place : (n, 3) array
-        Places there, m.
-    radius : (n,) array
-        Radii there, m.
-    """
+    """The resting whisker among surfaces."""
 
     def __init__(self, whisker: Whisker, surfaces: Sequence[Surface]) -> None:
         rest = Rest.of(whisker)

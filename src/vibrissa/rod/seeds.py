@@ -15,8 +15,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibrissa.rod.arrays import Array, IntArray
-from vibrissa.rod.compiled import copy, inlined, kernel
+from vibrissa.numerics.arrays import Array, IntArray
+from vibrissa.numerics.compiled import copy, inlined, kernel
 from vibrissa.rod.preimage import EVEN, FOLDED, Tree
 
 #: At most so many contacts are found for one target.
@@ -436,27 +436,7 @@ def _keep(
 
 @kernel
 def seeds(tree: Tree, target: Array, found: Array, inverses: Array, quality: IntArray) -> int:
-    """All contacts that may have the target's values, as chart coordinates.
-
-    Parameters
-    ----------
-    tree : Tree
-        See :class:`~vibrissa.rod.preimage.Preimages`.
-    target : (3,) array
-        The values.
-    found : (MOST_SEEDS, 3) array
-        Filled with (η, ψ, ρ).
-    inverses : (MOST_SEEDS, 3, 3) array
-        Filled with the interpolant's ∂(η, ψ, ρ)/∂T there; NaN where it has none.
-    quality : (MOST_SEEDS,) int array
-        Filled with 2 (the interpolant is solved), 1 (nearly so: near a fold of the map) or 0 (it
-        is missed: to one side of a fold).
-
-    Returns
-    -------
-    int
-        How many.
-    """
+    """All contacts that may have the target's values, as chart coordinates."""
     grid, turns, offsets, boxes, place = (
         tree.grid,
         tree.turns,

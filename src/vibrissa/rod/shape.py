@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibrissa.rod.arrays import Array, Rod
+from vibrissa.numerics.arrays import Array, Rod
+from vibrissa.numerics.compiled import copy, inlined, kernel
 from vibrissa.rod.batch import share_out
-from vibrissa.rod.compiled import copy, inlined, kernel
 from vibrissa.rod.discretize import Discretization
 
 WEIGHTS = np.array([11.0, 0.0, 81.0, 81.0, -32.0, -32.0, 11.0]) / 120.0
@@ -105,24 +105,7 @@ def _shapes(
 
 
 def shapes(discretization: Discretization, values: Array, arc: Array, s: Array) -> Array:
-    """Centrelines of deflected whiskers, non-dimensional.
-
-    Parameters
-    ----------
-    discretization : Discretization
-        The whisker.
-    values : (n, 6) array
-        (F, p); zero force gives the resting whisker.
-    arc : (n,) array
-        s_c of the contacts.
-    s : (m,) array
-        Arc lengths wanted, increasing.
-
-    Returns
-    -------
-    (n, m, 3) array
-        Places; NaN for rows with NaN.
-    """
+    """Centrelines of deflected whiskers, non-dimensional."""
     places = np.full((len(values), s.size, 3), np.nan)
     rows = np.flatnonzero(np.isfinite(values).all(axis=1) & np.isfinite(arc))
     kept, where = np.ascontiguousarray(values[rows]), np.ascontiguousarray(arc[rows])
@@ -134,22 +117,7 @@ def shapes(discretization: Discretization, values: Array, arc: Array, s: Array) 
 
 
 def contact_frames(discretization: Discretization, values: Array, arc: Array) -> Array:
-    """Material frames of deflected whiskers where they are touched.
-
-    Parameters
-    ----------
-    discretization : Discretization
-        The whisker.
-    values : (n, 6) array
-        (F, p), non-dimensional.
-    arc : (n,) array
-        s_c of the contacts.
-
-    Returns
-    -------
-    (n, 3, 3) array
-        Columns (tangent, d₁, d₂) at s_c; NaN for rows with NaN.
-    """
+    """Material frames of deflected whiskers where they are touched."""
     frames = np.full((len(values), 3, 3), np.nan)
     rows = np.flatnonzero(np.isfinite(values).all(axis=1) & np.isfinite(arc))
     # Contacts at the same arc length, such as the nodes of a chart, go together.

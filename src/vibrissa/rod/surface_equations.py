@@ -27,8 +27,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibrissa.rod.arrays import Array
-from vibrissa.rod.compiled import kernel
+from vibrissa.numerics.arrays import Array
+from vibrissa.numerics.compiled import kernel
 
 EITHER, STICKING, SLIDING = 0, 1, 2
 
@@ -49,49 +49,7 @@ def surface_equations(
     jacobian: Array,
     step: Array,
 ) -> tuple[float, float, float, bool, bool]:
-    """Residual and its derivatives, solved for Newton's step; lengths over L, forces over EI/L².
-
-    Parameters
-    ----------
-    contact : (4,) array
-        s_c and (f_x, f_y, f_z).
-    state : (9, 5) array
-        (F, p, t) and its derivatives.
-    whisker_radius, whisker_slope : float
-        At s_c.
-    geometry : (13,) array
-        The surface at p: d, n, ∂n/∂p row by row.
-    lean : (3,) array
-        By how much the normal differs from n, to first order; zero unless the surface is known at
-        another point only and continued from there.
-    softness : float
-        1/k.
-    friction : float
-        µ.
-    earlier : (7,) array
-        p₁, t₁, s₁ on the object as it now is.
-    tip : bool
-        Whether the contact is at the tip.
-    mode : int
-        ``STICKING`` or ``SLIDING`` if it is to be that, or ``EITHER``, as the projection has it.
-    jacobian : (4, 4) array
-        Overwritten.
-    step : (4,) array
-        Filled with what Newton's method adds to the contact.
-
-    Returns
-    -------
-    misfit : float
-        Size of the residual, all of it as lengths or angles.
-    determinant : float
-        Negative where stable.
-    pressing : float
-        N.
-    sliding : bool
-        Whether the friction was taken to be at its limit.
-    right : bool
-        Whether the projection agrees.
-    """
+    """Residual and its derivatives, solved for Newton's step; lengths over L, forces over EI/L²."""
     n, e = geometry[1:4], np.empty((2, 3))
     least = 0
     for i in range(1, 3):

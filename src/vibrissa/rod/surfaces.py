@@ -22,7 +22,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vibrissa.rod.arrays import Array, IntArray
+from vibrissa.numerics.arrays import Array, IntArray
+from vibrissa.objects.surface import Placement, Surface, between
 from vibrissa.rod.deflection import Deflection, dimensional
 from vibrissa.rod.discretize import STEPS, discretize
 from vibrissa.rod.loads import PointForce
@@ -30,7 +31,6 @@ from vibrissa.rod.points import Solutions, point_solver
 from vibrissa.rod.reach import LEAST_ARC
 from vibrissa.rod.resting import ZOOM, ZOOMS, Resting
 from vibrissa.rod.shape import shapes
-from vibrissa.rod.surface import Placement, Surface, between
 from vibrissa.rod.touch import Touch, TouchSolver
 from vibrissa.status import Status
 
@@ -57,22 +57,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class SurfaceDeflection:
-    """What became of a whisker carried past surfaces, n placements.
-
-    Attributes
-    ----------
-    bent : Deflection
-        Of the whisker, in its own frame, (n,); its load is the contact force that was found.
-    surface : (n,) int array
-        Which surface it touches; -1 for none.
-    normal : (n, 3) array
-        Outward normal of the surface there, in the surfaces' frame.
-    surface_point : (n, 3) array
-        Where on the surface, m, in the surfaces' frame; of a compliant one, as it would be
-        undeformed.
-    sliding : (n,) bool array
-        Whether the contact slides (or the friction is at its limit); False without contact.
-    """
+    """What became of a whisker carried past surfaces, n placements."""
 
     bent: Deflection
     surface: IntArray
@@ -98,37 +83,7 @@ def follow_surfaces(
     steps: int = STEPS,
     progress: Progress | None = None,
 ) -> SurfaceDeflection:
-    """Carry a whisker past surfaces, quasi-statically.
-
-    Parameters
-    ----------
-    whisker : Whisker
-        What bends.
-    surfaces : sequence of Surface
-        What it may touch.
-    rotations : (n, 3, 3) array
-        Of its base: from the whisker's frame to that of the surfaces.
-    positions : (n, 3) array
-        Of its base in the surfaces' frame, m.
-    friction : float
-        Coulomb's coefficient µ, for sticking and sliding alike.
-    proximal : float
-        Contacts at less than this share of the length from the base get a status, not an answer.
-    steps : int
-        Integration steps along the whisker.
-    progress : callable, optional
-        Told after every placement how many are done, of how many.
-
-    Returns
-    -------
-    SurfaceDeflection
-        One row a placement. Each goes on from the one before.
-
-    Raises
-    ------
-    ValueError
-        If the friction is negative.
-    """
+    """Carry a whisker past surfaces, quasi-statically."""
     if not (np.isfinite(friction) and friction >= 0.0):
         raise ValueError(f"friction is {friction!r}; a coefficient from 0 on is needed")
     follower = _Follower(whisker, surfaces, friction, steps)

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vibrissa.rod.arrays import Array
+from vibrissa.numerics.arrays import Array
+from vibrissa.objects.surface import Placement, Surface
 from vibrissa.rod.contact_state import STATES, contact_state
 from vibrissa.rod.discretize import Discretization
 from vibrissa.rod.reach import LEAST_ARC
-from vibrissa.rod.surface import Placement, Surface
 from vibrissa.rod.surface_equations import EITHER, SLIDING, STICKING, surface_equations
 
 _TOLERANCE = 1e-12
@@ -46,15 +46,7 @@ class Touch:
 
 
 class TouchSolver:
-    """Contacts of one whisker with surfaces.
-
-    Parameters
-    ----------
-    discretization : Discretization
-        The whisker.
-    surfaces : sequence of Surface
-        What it may touch.
-    """
+    """Contacts of one whisker with surfaces."""
 
     def __init__(self, discretization: Discretization, surfaces: Sequence[Surface]) -> None:
         self.discretization, self._surfaces = discretization, surfaces

@@ -16,9 +16,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibrissa.rod.arrays import Array, IntArray, Rod
+from vibrissa.numerics.arrays import Array, IntArray, Rod
+from vibrissa.numerics.compiled import copy, inlined, kernel
 from vibrissa.rod.batch import share_out
-from vibrissa.rod.compiled import copy, inlined, kernel
 from vibrissa.rod.discretize import Discretization
 from vibrissa.rod.shape import NODES, STAGES, WEIGHTS
 
@@ -127,25 +127,7 @@ def _places(
 def vanishing_moments(
     discretization: Discretization, wrenches: Array, least: float
 ) -> tuple[IntArray, Array]:
-    """Find where the moment in the whisker comes nearest to zero, for known base wrenches.
-
-    Parameters
-    ----------
-    discretization : Discretization
-        The whisker.
-    wrenches : (n, 6) array
-        (F, M) at the base, non-dimensional and finite.
-    least : float
-        Smallest arc length of a contact, over L.
-
-    Returns
-    -------
-    count : (n,) int array
-        How many places there are.
-    contacts : (n, MOST_PLACES, 4) array
-        Arc length and the force in the material frame there, from the base outward, padded with
-        NaN; the last may be the tip, with the moment still falling.
-    """
+    """Find where the moment in the whisker comes nearest to zero, for known base wrenches."""
     count = np.zeros(len(wrenches), np.int64)
     contacts = np.full((len(wrenches), MOST_PLACES, 4), np.nan)
     rod, wrenches = discretization.rod, np.ascontiguousarray(wrenches)

@@ -19,9 +19,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
+from vibrissa.numerics.arrays import AnyArray, Array, IntArray
+from vibrissa.numerics.compiled import inlined
 from vibrissa.quantities import attributes
-from vibrissa.rod.arrays import AnyArray, Array, IntArray
-from vibrissa.rod.compiled import inlined
 
 # Of a DataArray, by name.
 Coordinates: TypeAlias = dict[Hashable, xr.Variable]

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial import cKDTree
 
-from vibrissa.rod.arrays import AnyArray, Array
+from vibrissa.numerics.arrays import AnyArray, Array
 
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker

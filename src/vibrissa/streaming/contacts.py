@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.mapping import ContactFilter, Estimator, Followed, Located
-from vibrissa.mapping.contact_map import spherical
+from vibrissa.contacts import ContactFilter, Estimator, Followed, Located
+from vibrissa.contacts.contact_map import spherical
 from vibrissa.rod import PointForce, deflect
 from vibrissa.signals import SIGNALS
 from vibrissa.signals.base import signals_of
@@ -229,20 +229,7 @@ def _components(signals: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def located_record(found: Located) -> dict[str, Any]:
-    """What a single sample tells, in the whisker's frame and SI units.
-
-    Parameters
-    ----------
-    found : Located
-        Of an estimator.
-
-    Returns
-    -------
-    dict
-        ``status``, and of a contact ``x``, ``y``, ``z``, ``r``, ``theta``, ``phi``,
-        ``arc_length``, ``force`` (N, on the whisker, as at its base), ``sigma_x``, ..., and all
-        ``candidates``.
-    """
+    """What a single sample tells, in the whisker's frame and SI units."""
     record: dict[str, Any] = {"status": found.status.name.lower()}
     if not len(found.candidates):
         return record
@@ -258,22 +245,7 @@ def located_record(found: Located) -> dict[str, Any]:
 
 
 def followed_record(known: Followed, rotation: Array | None = None) -> dict[str, Any]:
-    """What a filter knows.
-
-    Parameters
-    ----------
-    known : Followed
-        Of a filter.
-    rotation : (3, 3) array, optional
-        From the whisker's to the laboratory frame; by default they are the same.
-
-    Returns
-    -------
-    dict
-        ``x``, ``y``, ``z``, ``r``, ``theta``, ``phi`` and ``sigma_x``, ... in the whisker's frame;
-        ``lab_x``, ..., ``lab_sigma_x``, ..., ``velocity`` and ``hypotheses`` with their
-        ``probabilities`` in the laboratory.
-    """
+    """What a filter knows."""
     record: dict[str, Any] = {"status": known.status.name.lower()}
     if not len(known.points):
         return record
@@ -290,18 +262,7 @@ def followed_record(known: Followed, rotation: Array | None = None) -> dict[str,
 
 
 def as_json(record: dict[str, Any]) -> str:
-    """One line of JSON; what is not finite is null.
-
-    Parameters
-    ----------
-    record : dict
-        Of numbers, texts and lists.
-
-    Returns
-    -------
-    str
-        Without an end of line.
-    """
+    """One line of JSON; what is not finite is null."""
     return json.dumps(_finite(record), ensure_ascii=False)
 
 

@@ -126,23 +126,7 @@ class Lines:
         self._refused = 0
 
     def __call__(self, line: str) -> Sample | None:
-        """Read one line.
-
-        Parameters
-        ----------
-        line : str
-            With or without its end.
-
-        Returns
-        -------
-        Sample or None
-            None for a header, an empty line, and a comment after ``#``.
-
-        Raises
-        ------
-        ValueError
-            If it is neither, or lacks a value; what is wrong with it.
-        """
+        """Read one line."""
         self.number += 1
         if len(line) > LONGEST:
             raise ValueError(f"a line of more than {LONGEST} characters")
@@ -319,23 +303,7 @@ def _number(name: str, value: object) -> float:
 
 
 def rotation_of(quaternion: Sequence[float]) -> Array:
-    """Return the matrix of a quaternion.
-
-    Parameters
-    ----------
-    quaternion : sequence of float
-        W, x, y, z, of unit length.
-
-    Returns
-    -------
-    array (3, 3)
-        NaN for NaN.
-
-    Raises
-    ------
-    ValueError
-        If it is not of unit length.
-    """
+    """Return the matrix of a quaternion."""
     q = np.array(quaternion)
     size = math.hypot(*quaternion)
     if not math.isfinite(size):

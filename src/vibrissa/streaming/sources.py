@@ -88,18 +88,7 @@ def file_lines(
 
 
 def bounded_lines(file: TextIO) -> Iterator[str]:
-    """Read lines, each at once, of which none fills the memory.
-
-    Parameters
-    ----------
-    file : text file
-        Open for reading.
-
-    Yields
-    ------
-    str
-        A line with its end; of one that is longer than `LONGEST`, one character more than that.
-    """
+    """Read lines, each at once, of which none fills the memory."""
     while line := file.readline(LONGEST + 1):
         yield line
         while len(line) > LONGEST and not line.endswith("\n"):
@@ -107,25 +96,7 @@ def bounded_lines(file: TextIO) -> Iterator[str]:
 
 
 def udp_address(text: str) -> tuple[str, int]:
-    """Read ``HOST:PORT``.
-
-    Parameters
-    ----------
-    text : str
-        Such as ``127.0.0.1:5005``, or ``:5005`` for all of this machine's addresses.
-
-    Returns
-    -------
-    host : str
-        Empty for all.
-    port : int
-        Its number.
-
-    Raises
-    ------
-    ValueError
-        If it is something else.
-    """
+    """Read ``HOST:PORT``."""
     host, colon, port = text.rpartition(":")
     if not colon or not port.isdigit() or int(port) > 65535:
         raise ValueError(f"an address is HOST:PORT, such as 127.0.0.1:5005; got {text!r}")
@@ -133,25 +104,7 @@ def udp_address(text: str) -> tuple[str, int]:
 
 
 def udp_socket(host: str, port: int) -> socket.socket:
-    """Open the socket that `udp_lines` reads.
-
-    Parameters
-    ----------
-    host : str
-        An address of this machine; empty for all.
-    port : int
-        Number; 0 for any that is free.
-
-    Returns
-    -------
-    socket
-        Bound.
-
-    Raises
-    ------
-    ValueError
-        If it cannot be bound.
-    """
+    """Open the socket that `udp_lines` reads."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     opened = socket.socket(family, socket.SOCK_DGRAM)
     opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _WAITING)  # or what the system allows
@@ -181,18 +134,7 @@ def udp_lines(opened: socket.socket) -> Iterator[str]:
 
 
 def udp_lost(opened: socket.socket) -> int:
-    """Count datagrams that the system threw away because too many waited.
-
-    Parameters
-    ----------
-    opened : socket
-        Of `udp_socket`.
-
-    Returns
-    -------
-    int
-        Since it was opened; 0 where the system does not count them (other than Linux).
-    """
+    """Count datagrams that the system threw away because too many waited."""
     if sys.platform != "linux":
         return 0
     try:

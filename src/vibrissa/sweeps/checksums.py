@@ -26,20 +26,7 @@ TOLD = ("status", "seconds", "origin", "identity")
 
 
 def checksum(told: Bytes, numbers: Bytes = b"") -> int:
-    """Checksum of one cell.
-
-    Parameters
-    ----------
-    told : bytes-like
-        What is told of it, as it is written, in the order of `TOLD`.
-    numbers : bytes-like
-        Description of the whisker and numbers of the result, of a cell that is done.
-
-    Returns
-    -------
-    int
-        32 bits.
-    """
+    """Checksum of one cell."""
     return crc32(numbers, crc32(told))
 
 
@@ -48,23 +35,7 @@ def damaged(
     whiskers: Sequence[Rows],
     results: Sequence[Sequence[Rows]],
 ) -> NDArray[np.bool_]:
-    """Find cells that do not hold what was written.
-
-    Parameters
-    ----------
-    cells : mapping
-        What is told of cells, and their checksums, by name, (whisker, task) each.
-    whiskers : sequence of Rows
-        Arrays of what describes the whiskers.
-    results : sequence of sequence of Rows
-        By task, the arrays of its numbers, in the order of their names; none if it has no group.
-
-    Returns
-    -------
-    array (whisker, task) of bool
-        True where a checksum is not that of what is there, and where there are some of cells that
-        are not done.
-    """
+    """Find cells that do not hold what was written."""
     status, sums = cells["status"], cells["checksum"]
     kept = np.isin(status, (DONE, FAILED))
     out = np.asarray((sums != 0) & ~kept)

@@ -19,32 +19,7 @@ _DIED = "the workers that had this cell died (killed, or out of memory)\n"
 def answers_by_dask(
     cells: Iterable[Cell], scheduler: str, workers: int
 ) -> Generator[tuple[Cell, dict[str, Any]], None, None]:
-    """Answers from a Dask cluster.
-
-    Parameters
-    ----------
-    cells : iterable of Cell
-        What to do.
-    scheduler : str
-        Its address, or "local": a cluster on this machine, for as long as it takes.
-    workers : int
-        Of a local one.
-
-    Yields
-    ------
-    cell : Cell
-        What was asked.
-    answer : dict
-        Of `vibrissa.sweeps.study.answer`.
-
-    Raises
-    ------
-    ValueError
-        If there is no such scheduler, it has no workers or those of another version, or it goes
-        away.
-    ModuleNotFoundError
-        If Dask is not installed.
-    """
+    """Answers from a Dask cluster."""
     try:
         from distributed import Client, LocalCluster
     except ModuleNotFoundError as missing:

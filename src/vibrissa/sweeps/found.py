@@ -19,18 +19,7 @@ _ALL, _SUM = ".zmetadata", "checksum"
 
 
 class Found:
-    """The arrays of a task, open for writing and reading.
-
-    Parameters
-    ----------
-    path : Path
-        Of the group, made by `lay_out`.
-
-    Raises
-    ------
-    ValueError
-        If what describes its arrays, or a coordinate, is damaged.
-    """
+    """The arrays of a task, open for writing and reading."""
 
     def __init__(self, path: Path) -> None:
         self.rows: dict[str, Rows] = {}
@@ -62,18 +51,7 @@ class Found:
         return [self.rows[name] for name in sorted(self.rows)]
 
     def misfit(self, result: xr.Dataset) -> str:
-        """Say what keeps a result from standing beside those of other whiskers.
-
-        Parameters
-        ----------
-        result : Dataset
-            Of one whisker.
-
-        Returns
-        -------
-        str
-            Empty if nothing does.
-        """
+        """Say what keeps a result from standing beside those of other whiskers."""
         # Variables, not data arrays, which take longer to make than to write.
         for name, variable in result.variables.items():
             others = self.coordinates.get(str(name))
@@ -89,25 +67,7 @@ class Found:
         return ""
 
     def write(self, result: xr.Dataset, index: int) -> bytes:
-        """Write a whisker's result.
-
-        Parameters
-        ----------
-        result : Dataset
-            One without a `misfit`.
-        index : int
-            Number of the whisker.
-
-        Returns
-        -------
-        bytes
-            All that was written, array by array in the order of their names.
-
-        Raises
-        ------
-        OSError
-            If it cannot be written.
-        """
+        """Write a whisker's result."""
         content = []
         for name, rows in sorted(self.rows.items()):
             content.append(rows.encoded(result.variables[name].values if name in result else None))
@@ -116,17 +76,7 @@ class Found:
 
 
 def lay_out(group: zarr.Group, result: xr.Dataset, count: int) -> None:
-    """Make the arrays of a task.
-
-    Parameters
-    ----------
-    group : zarr.Group
-        An empty one.
-    result : Dataset
-        A first whisker's result, whose coordinates those of all others share.
-    count : int
-        Number of whiskers.
-    """
+    """Make the arrays of a task."""
     for name, variable in result.data_vars.items():
         word = variable.dtype.kind in "ib"
         make_rows(
@@ -149,13 +99,7 @@ def lay_out(group: zarr.Group, result: xr.Dataset, count: int) -> None:
 
 
 def seal(group: zarr.Group) -> None:
-    """Note the checksum of all arrays of a group that are not written to any more.
-
-    Parameters
-    ----------
-    group : zarr.Group
-        A new one, with all its arrays.
-    """
+    """Note the checksum of all arrays of a group that are not written to any more."""
     fixed = {name: np.asarray(one[...]) for name, one in group.arrays() if not is_rows(one)}
     group.attrs[_SUM] = _sum_of(fixed)
 

@@ -9,25 +9,7 @@ from typing import IO
 
 
 def hold(path: Path) -> IO[str]:
-    """Take a lock.
-
-    Parameters
-    ----------
-    path : Path
-        A file, made if need be, and left there.
-
-    Returns
-    -------
-    file
-        Holds the lock until it is closed or this process ends.
-
-    Raises
-    ------
-    BlockingIOError
-        If somebody else has it.
-    OSError
-        If there can be no lock here.
-    """
+    """Take a lock."""
     file = path.open("a", encoding="utf-8")
     try:
         if sys.platform == "win32":

@@ -17,8 +17,12 @@ COMPUTING = (
     "io",
     "rod",
     "signals",
-    "sensing",
-    "mapping",
+    "numerics",
+    "objects",
+    "sensors",
+    "contacts",
+    "identifiability",
+    "paper",
     "sweeps/population.py",
     "sweeps/study.py",
     "sweeps/tasks.py",
@@ -29,14 +33,7 @@ _LIBRARIES = ("numpy", "scipy", "numba")
 
 @cache
 def origin() -> str:
-    """Say which code this process computes with.
-
-    Returns
-    -------
-    str
-        Versions of vibrissa and of the libraries whose rounding shows, and the first digits of the
-        SHA-256 of the sources in `COMPUTING`.
-    """
+    """Say which code this process computes with."""
     package = Path(__file__).parents[1]
     digest = hashlib.sha256()
     for name in COMPUTING:
@@ -48,16 +45,5 @@ def origin() -> str:
 
 
 def own(said: str) -> str:
-    """Tell the part of an origin that is vibrissa's.
-
-    Parameters
-    ----------
-    said : str
-        Of `origin`.
-
-    Returns
-    -------
-    str
-        Version and sources.
-    """
+    """Tell the part of an origin that is vibrissa's."""
     return said.partition(",")[0]

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from vibrissa.trial.said import only
+from vibrissa.simulation.values import only
 from vibrissa.whisker import Whisker, whisker_array
 
 PARAMETERS: Mapping[str, tuple[float, float, float]] = {
@@ -46,21 +46,7 @@ _MOST = 10_000_000
 
 @dataclass(frozen=True)
 class Specimen:
-    """A whisker that can be made.
-
-    Parameters
-    ----------
-    name : str
-        Its name, one of a kind in the study.
-    said : mapping
-        Of a grid or a random population: its parameters as in `PARAMETERS`.
-    identity : str
-        What it is, as a hash; of the same whisker it is the same anywhere.
-    make : callable
-        Makes the whisker.
-    group : str
-        Which it belongs to in the study.
-    """
+    """A whisker that can be made."""
 
     name: str
     said: Mapping[str, float]
@@ -70,28 +56,7 @@ class Specimen:
 
 
 def population(tables: Sequence[Any], folder: Path, seed: int) -> list[Specimen]:
-    """List the whiskers of a study.
-
-    Parameters
-    ----------
-    tables : sequence of dict
-        The ``[[whiskers]]`` of a study.
-    folder : Path
-        That its file names are relative to.
-    seed : int
-        Of random populations.
-
-    Returns
-    -------
-    list of Specimen
-        In the order in which they are stated.
-
-    Raises
-    ------
-    ValueError
-        If something is said that is not known, numbers are out of range, files hold no whisker, or
-        two whiskers share a name.
-    """
+    """List the whiskers of a study."""
     found: list[Specimen] = []
     for number, table in enumerate(tables):
         where = f"[[whiskers]] {number + 1}"

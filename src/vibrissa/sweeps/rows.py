@@ -32,25 +32,7 @@ def make_rows(
     dims: list[str],
     attributes: Mapping[str, Any] | None = None,
 ) -> None:
-    """Make an array of which the first dimension is the whisker, with nothing in it.
-
-    Parameters
-    ----------
-    group : zarr.Group
-        Where.
-    name : str
-        Its name.
-    shape : tuple of int
-        Whiskers first.
-    dtype : str
-        Of its numbers.
-    fill : scalar
-        What means that nothing is known.
-    dims : list of str
-        Names of the dimensions.
-    attributes : mapping, optional
-        Of the array.
-    """
+    """Make an array of which the first dimension is the whisker, with nothing in it."""
     group.create_array(
         name,
         shape=shape,
@@ -64,29 +46,12 @@ def make_rows(
 
 
 def is_rows(array: zarr.Array[Any]) -> bool:
-    """Tell whether an array is one of `make_rows`.
-
-    Parameters
-    ----------
-    array : zarr.Array
-        Of a store.
-
-    Returns
-    -------
-    bool
-        Whether its chunks hold plain numbers.
-    """
+    """Tell whether an array is one of `make_rows`."""
     return not array.compressors
 
 
 class Rows:
-    """An array made by `make_rows`, to be written to and read from.
-
-    Parameters
-    ----------
-    path : Path
-        Its folder.
-    """
+    """An array made by `make_rows`, to be written to and read from."""
 
     def __init__(self, path: Path) -> None:
         array = zarr.open_array(path, mode="r", zarr_format=2)
@@ -100,22 +65,7 @@ class Rows:
         self.count, self.shape, self.block = array.shape[0], array.shape[1:], array.chunks[0]
 
     def write(self, values: ArrayLike, index: int, column: int = 0) -> None:
-        """Write a whisker's numbers, or those from a column on.
-
-        Parameters
-        ----------
-        values : array_like
-            As many as there are, or one of a column.
-        index : int
-            Number of the whisker.
-        column : int
-            Of the second dimension.
-
-        Raises
-        ------
-        OSError
-            If they cannot be written.
-        """
+        """Write a whisker's numbers, or those from a column on."""
         block, row = divmod(index, self._chunk[0])
         path = f"{self._path}/{block}{self._rest}"
         try:
@@ -128,31 +78,13 @@ class Rows:
             file.write(self.encoded(values))
 
     def encoded(self, values: ArrayLike | None) -> bytes:
-        """Numbers as they are written.
-
-        Parameters
-        ----------
-        values : array_like or None
-            As many as there are of a whisker, or one of a column; None for what means that nothing
-            is known of a whisker.
-
-        Returns
-        -------
-        bytes
-            Of the file.
-        """
+        """Numbers as they are written."""
         if values is None:
             values = np.full(self.shape, self._fill)
         return np.asarray(values, dtype=self.dtype).tobytes()
 
     def blocks(self) -> Iterator[NDArray[Any]]:
-        """Read all numbers, chunk by chunk.
-
-        Yields
-        ------
-        array (whiskers of the chunk, ...)
-            What a file lacks, because it was cut or is not there, means that nothing is known.
-        """
+        """Read all numbers, chunk by chunk."""
         for first in range(0, self.count, self._chunk[0]):
             block = np.full(self._chunk, self._fill, dtype=self.dtype)
             with contextlib.suppress(FileNotFoundError):
@@ -161,23 +93,11 @@ class Rows:
             yield block[: self.count - first]
 
     def read(self) -> NDArray[Any]:
-        """Read all numbers.
-
-        Returns
-        -------
-        array (whisker, ...)
-            As `blocks` gives them.
-        """
+        """Read all numbers."""
         return np.concatenate(list(self.blocks()))
 
     def whole(self) -> bool:
-        """Tell whether Zarr can read it.
-
-        Returns
-        -------
-        bool
-            Whether all files that are there have the size of a chunk.
-        """
+        """Tell whether Zarr can read it."""
         size = int(np.prod(self._chunk)) * self.dtype.itemsize
         files = map(self._file, range(-(-self.count // self._chunk[0])))
         return all(file.stat().st_size == size for file in files if file.exists())

@@ -330,23 +330,7 @@ class Store:
 
 
 def noted(path: Path) -> dict[str, Any]:
-    """Read what a store says of itself.
-
-    Parameters
-    ----------
-    path : Path
-        Of the store.
-
-    Returns
-    -------
-    dict
-        What the study says, and ``origins``: which codes found the results.
-
-    Raises
-    ------
-    ValueError
-        If it is no store, or one that is laid out otherwise.
-    """
+    """Read what a store says of itself."""
     if not (path / _STUDY).exists():
         raise ValueError(f"{path} is no store of a sweep")
     try:

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from vibrissa.mapping.explanation import seen
-from vibrissa.mapping.least_squares import seeding_triplet
+from vibrissa.contacts.explanation import seen
+from vibrissa.contacts.least_squares import seeding_triplet
 from vibrissa.rod.discretize import discretize
 from vibrissa.rod.points import point_solver
 from vibrissa.rod.reach import reach
@@ -286,19 +286,7 @@ def _groups(value: Any, where: str) -> tuple[str, ...]:
 
 
 def answer(cell: Cell) -> dict[str, Any]:
-    """Do one task for one whisker, wherever this runs.
-
-    Parameters
-    ----------
-    cell : Cell
-        What to do.
-
-    Returns
-    -------
-    dict
-        ``result`` (Dataset), ``whisker`` (numbers that describe it, SI units) and ``seconds`` of
-        CPU; or ``failure``, the traceback as text.
-    """
+    """Do one task for one whisker, wherever this runs."""
     started = time.process_time()
     try:
         whisker = cell.specimen.make()

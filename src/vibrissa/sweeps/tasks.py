@@ -17,11 +17,12 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from vibrissa.mapping import ContactMap, estimate_from_wrench, uniqueness
-from vibrissa.mapping.best_triplet import best_triplet
+from vibrissa.contacts import ContactMap, estimate_from_wrench
+from vibrissa.identifiability import uniqueness
+from vibrissa.identifiability.best_triplet import best_triplet
 from vibrissa.quantities import attributes
 from vibrissa.rod import PointForce, deflect
-from vibrissa.sensing import FORCE_NOISE, MOMENT_NOISE
+from vibrissa.sensors import FORCE_NOISE, MOMENT_NOISE
 from vibrissa.signals import REGIONS, SIGNALS, TRIPLETS, base_signals, selection
 from vibrissa.status import Status
 
@@ -43,21 +44,7 @@ _STATIONS = np.linspace(0.3, 1.0, 15)
 
 @dataclass(frozen=True)
 class Task:
-    """One question to every whisker.
-
-    Parameters
-    ----------
-    run : callable
-        ``run(whisker, settings, seed)`` gives a dataset.
-    defaults : mapping
-        What can be set, with its default.
-    check : callable
-        Raises a ValueError where settings do not fit.
-    seconds : callable
-        What a whisker takes on one core, roughly, by the settings; s.
-    numbers : callable
-        How many numbers its dataset has, by the settings.
-    """
+    """One question to every whisker."""
 
     run: Callable[[Whisker, Settings, int], xr.Dataset]
     defaults: Settings
@@ -67,27 +54,7 @@ class Task:
 
 
 def settings_of(said: Mapping[str, Any], where: str) -> tuple[str, Settings]:
-    """Read what a study says of a task.
-
-    Parameters
-    ----------
-    said : mapping
-        The ``[[tasks]]``.
-    where : str
-        For messages.
-
-    Returns
-    -------
-    kind : str
-        Name of the task.
-    settings : mapping
-        All that can be set.
-
-    Raises
-    ------
-    ValueError
-        If the task or a setting is not known, or out of range.
-    """
+    """Read what a study says of a task."""
     kind = said.get("kind")
     if not isinstance(kind, str) or kind not in TASKS:
         raise ValueError(f"{where}: kind is {kind!r}; one of {', '.join(TASKS)} is needed")

@@ -39,27 +39,7 @@ class _Worker:
 def answers_by_processes(
     cells: Iterable[Cell], workers: int
 ) -> Generator[tuple[Cell, dict[str, Any]], None, None]:
-    """Answers from processes on this machine.
-
-    Parameters
-    ----------
-    cells : iterable of Cell
-        What to do.
-    workers : int
-        How many processes.
-
-    Yields
-    ------
-    cell : Cell
-        What was asked.
-    answer : dict
-        Of `vibrissa.sweeps.study.answer`; a failure for a cell that takes its process with it.
-
-    Raises
-    ------
-    OSError
-        If processes die before they are ready.
-    """
+    """Answers from processes on this machine."""
     waiting, again = iter(cells), deque[Cell]()
     deaths: Counter[tuple[str, int]] = Counter()
     stillborn = 0

@@ -15,15 +15,7 @@ Array = NDArray[np.float64]
 
 
 class Smoother:
-    """Normal equations of a trial.
-
-    Parameters
-    ----------
-    hessian : array (time, n, n)
-        Of each frame by itself, from its measurements.
-    gradient : array (time, n)
-        The same for the right side: what the measurements pull to.
-    """
+    """Normal equations of a trial."""
 
     def __init__(self, hessian: Array, gradient: Array) -> None:
         self.diagonal = hessian.copy()
@@ -32,24 +24,7 @@ class Smoother:
         self.gradient = gradient.copy()
 
     def add_at(self, values: Array, weight: Array, begin: int, target: Array) -> float:
-        """Pull unknowns to a target.
-
-        Parameters
-        ----------
-        values : array (time, m)
-            What they are now.
-        weight : array (time, 1)
-            One over the variance.
-        begin : int
-            The first of the m unknowns.
-        target : array (m,)
-            What they are to be.
-
-        Returns
-        -------
-        float
-            What it costs now.
-        """
+        """Pull unknowns to a target."""
         m = values.shape[1]
         places = np.arange(begin, begin + m)
         self.diagonal[:, places, places] += weight
@@ -57,46 +32,14 @@ class Smoother:
         return float((weight * (values - target) ** 2).sum())
 
     def add_along(self, axis: Array, value: Array, begin: int, weight: float) -> float:
-        """Pull one direction of three unknowns to zero.
-
-        Parameters
-        ----------
-        axis : array (time, 3)
-            The direction.
-        value : array (time,)
-            How far it is from zero now.
-        begin : int
-            The first of the three unknowns.
-        weight : float
-            One over the standard deviation.
-
-        Returns
-        -------
-        float
-            What it costs now.
-        """
+        """Pull one direction of three unknowns to zero."""
         part = slice(begin, begin + 3)
         self.diagonal[:, part, part] += weight**2 * axis[:, :, None] * axis[:, None, :]
         self.gradient[:, part] -= weight**2 * axis * value[:, None]
         return float(((weight * value) ** 2).sum())
 
     def add_second(self, i: int, value: Array, weight: Array) -> float:
-        """Pull the second difference at a frame to zero.
-
-        Parameters
-        ----------
-        i : int
-            The middle frame.
-        value : array (n,)
-            The second difference now.
-        weight : array (n,)
-            One over its standard deviation.
-
-        Returns
-        -------
-        float
-            What it costs now.
-        """
+        """Pull the second difference at a frame to zero."""
         square = weight**2
         n = np.arange(len(square))
         for j, factor in ((i - 1, 1.0), (i, 4.0), (i + 1, 1.0)):
@@ -111,18 +54,7 @@ class Smoother:
         return float((pull * value).sum())
 
     def solved(self, damping: float = 0.0) -> Array:
-        """Solve for the step.
-
-        Parameters
-        ----------
-        damping : float
-            Levenberg–Marquardt's, relative to the diagonal.
-
-        Returns
-        -------
-        array (time, n)
-            The step.
-        """
+        """Solve for the step."""
         count, n, _ = self.diagonal.shape
         total = count * n
         band = np.zeros((3 * n, total))
@@ -140,13 +72,7 @@ class Smoother:
         return np.asarray(step).reshape(count, n)
 
     def covariances(self) -> Array:
-        """Invert, and keep what each frame has to do with itself.
-
-        Returns
-        -------
-        array (time, n, n)
-            Covariance of each frame's unknowns, all frames counted.
-        """
+        """Invert, and keep what each frame has to do with itself."""
         count, n, _ = self.diagonal.shape
         pairs = (count + 1) // 2
         size = 2 * n

@@ -19,14 +19,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vibrissa.cameras.camera import Camera
+from vibrissa.cameras.triangulation import triangulate
 from vibrissa.io.video import Frame
 from vibrissa.tracking import ridge
 from vibrissa.tracking.curves import Curve, find_curves
 from vibrissa.tracking.follow import start_at
 from vibrissa.tracking.scene import Scene
 from vibrissa.tracking.trace import TraceOptions
-from vibrissa.trial.cameras import Camera
-from vibrissa.trial.triangulation import triangulate
 
 Array = NDArray[np.float64]
 
@@ -124,18 +124,7 @@ class _Combination(NamedTuple):
 
 
 def negative(frame: Frame) -> Frame:
-    """Turn bright into dark.
-
-    Parameters
-    ----------
-    frame : array (height, width)
-        Grey values.
-
-    Returns
-    -------
-    array (height, width)
-        The largest grey value there can be, less these.
-    """
+    """Turn bright into dark."""
     return np.asarray(np.iinfo(frame.dtype).max - frame, dtype=frame.dtype)
 
 
@@ -449,20 +438,7 @@ def _start(search: _Search, vote: _Vote, bright: bool) -> Start:
 
 
 def base_gap(cameras: Sequence[Camera], pixels: Array) -> Array:
-    """Say how far points are from where the views together see them.
-
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        The views.
-    pixels : array (view, ..., 2)
-        Of points that are to be the same.
-
-    Returns
-    -------
-    array (...)
-        Largest distance in any view, pixels; NaN where a view does not tell.
-    """
+    """Say how far points are from where the views together see them."""
     place, _ = triangulate(cameras, pixels)
     seen = np.stack([camera.project(place) for camera in cameras])
     return np.asarray(np.linalg.norm(seen - pixels, axis=-1).max(axis=0))

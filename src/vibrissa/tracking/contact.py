@@ -13,10 +13,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from vibrissa.rod.surface import Surface
+from vibrissa.cameras.camera import Camera
+from vibrissa.cameras.triangulation import triangulate
+from vibrissa.objects.surface import Surface
 from vibrissa.tracking.refine import Refined
-from vibrissa.trial.cameras import Camera
-from vibrissa.trial.triangulation import triangulate
 
 Array = NDArray[np.float64]
 
@@ -25,19 +25,7 @@ _NEAR = 0.5
 
 
 class Contacts(NamedTuple):
-    """Contact points of one whisker.
-
-    Parameters
-    ----------
-    points : array (time, 3)
-        Laboratory frame, m; NaN where there is none.
-    arc_length : array (time,)
-        Of the place of the fitted rod that is nearest to them, m.
-    difference : array (time,)
-        Their distance from the contact point of the rod, m.
-    source : str
-        Where they come from.
-    """
+    """Contact points of one whisker."""
 
     points: Array
     arc_length: Array
@@ -48,24 +36,7 @@ class Contacts(NamedTuple):
 def contacts_at(
     objects: Sequence[Surface], curves: Array, touching: NDArray[np.bool_], rod: Refined
 ) -> Contacts:
-    """Take the point of the whisker that is nearest to an object for the contact point.
-
-    Parameters
-    ----------
-    objects : sequence of Surface
-        Laboratory frame.
-    curves : array (time, node, 3)
-        The whisker as it was measured, laboratory frame, m; NaN where it is missing.
-    touching : array (time,)
-        Frames in contact.
-    rod : Refined
-        To compare with.
-
-    Returns
-    -------
-    Contacts
-        In frames in contact.
-    """
+    """Take the point of the whisker that is nearest to an object for the contact point."""
     points = np.full((len(curves), 3), np.nan)
     rows = np.flatnonzero(touching & np.isfinite(curves).all(axis=(1, 2)))
     if rows.size:
@@ -82,33 +53,7 @@ def given_contacts(
     whisker: int,
     rod: Refined,
 ) -> Contacts:
-    """Take contact points from a table.
-
-    Parameters
-    ----------
-    table : xarray.Dataset
-        Of `vibrissa.io.load_contact_points`: points in the laboratory, or in the views.
-    cameras : sequence of Camera
-        The views.
-    pairs : array (time, view)
-        Frames of the videos that belong together.
-    rate : float
-        Frames per second.
-    whisker : int
-        Which.
-    rod : Refined
-        To compare with.
-
-    Returns
-    -------
-    Contacts
-        In frames of which the table tells.
-
-    Raises
-    ------
-    ValueError
-        If the table tells of other whiskers or views than there are, or of no frame of the videos.
-    """
+    """Take contact points from a table."""
     points = np.full((len(pairs), 3), np.nan)
     number = table["whisker"].values
     if not np.isin(whisker, number):

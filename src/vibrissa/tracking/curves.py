@@ -66,21 +66,7 @@ _RAGGED = 0.35
 
 
 class Curve(NamedTuple):
-    """What may be a whisker, in one frame of one view.
-
-    Parameters
-    ----------
-    line : array (n, 2)
-        Column and row from the base on.
-    length : float
-        How much of it is seen, pixels.
-    from_face : bool
-        Whether it begins at a large body at the border of the image.
-    score : float
-        Length, pixels, the less the less it is like a whisker.
-    moved : float
-        Share of it that is usually not there.
-    """
+    """What may be a whisker, in one frame of one view."""
 
     line: Array
     length: float
@@ -92,24 +78,7 @@ class Curve(NamedTuple):
 def find_curves(
     frame: Frame, scene: Scene, options: TraceOptions, inside: bool = False
 ) -> list[Curve]:
-    """Find what may be whiskers in a frame.
-
-    Parameters
-    ----------
-    frame : array (height, width)
-        Grey values; whiskers are dark.
-    scene : Scene
-        Of its view.
-    options : TraceOptions
-        How whiskers are traced.
-    inside : bool
-        Whether they may be before bodies, so that these do not show where they begin.
-
-    Returns
-    -------
-    list of Curve
-        The best first.
-    """
+    """Find what may be whiskers in a frame."""
     bodies = scene.bodies(frame)
     found = segments(scene.difference(frame), bodies, options.scale, inside)
     curves = []
@@ -123,20 +92,7 @@ def find_curves(
 
 
 def joined(found: Sequence[Segment], bodies: Bodies) -> list[Segment]:
-    """Join segments that are parts of one curve.
-
-    Parameters
-    ----------
-    found : sequence of Segment
-        Lines without gaps.
-    bodies : Bodies
-        What may hide the way between them.
-
-    Returns
-    -------
-    list of Segment
-        Curves, with gaps.
-    """
+    """Join segments that are parts of one curve."""
     if not found:
         return []
     # End 2 k is the first of segment k, end 2 k + 1 its last; directions point outward.

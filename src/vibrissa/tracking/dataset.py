@@ -9,17 +9,17 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from vibrissa.cameras.camera import Camera
+from vibrissa.cameras.files import cameras_dataset
 from vibrissa.io.recording import KIND
+from vibrissa.objects.dataset import objects_datasets
+from vibrissa.objects.surface import Surface
 from vibrissa.quantities import attributes
-from vibrissa.rod.surface import Surface
+from vibrissa.recording.tree import head_variables, recorded
 from vibrissa.status import Status
 from vibrissa.tracking.contact import Contacts
 from vibrissa.tracking.filtering import CUTOFF
 from vibrissa.tracking.head import HeadPose
-from vibrissa.trial.camera_files import cameras_dataset
-from vibrissa.trial.cameras import Camera
-from vibrissa.trial.object_files import objects_datasets
-from vibrissa.trial.recording import head_variables, recorded
 from vibrissa.whisker.emergence import angles_of
 
 if TYPE_CHECKING:
@@ -37,30 +37,7 @@ def tracked_recording(
     objects: Sequence[Surface] = (),
     cutoff: float | None = CUTOFF,
 ) -> xr.DataTree:
-    """Write tracked whiskers as a recording.
-
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        The views.
-    found : sequence of Tracked
-        The whiskers.
-    pairs : array (time, view)
-        Frame numbers.
-    rate : float
-        Frames per second.
-    head : HeadPose, optional
-        How the head moved, if that is known.
-    objects : sequence of Surface
-        What stands there.
-    cutoff : float, optional
-        Of the filter on the whiskers' poses, Hz; None if they are not filtered.
-
-    Returns
-    -------
-    xarray.DataTree
-        See `vibrissa.tracking.track`.
-    """
+    """Write tracked whiskers as a recording."""
     coordinates = {
         "time": xr.Variable("time", pairs[:, 0] / rate, attributes("time")),
         "whisker": [one.whisker.name for one in found],

@@ -42,28 +42,7 @@ _BESIDE = (4.0, 7.0)
 def traced(
     frame: Frame, noise: float, line: Array, options: TraceOptions, before: float = OUTSIDE
 ) -> tuple[Trace, bool]:
-    """Trace a whisker that is about known, and find its ends.
-
-    Parameters
-    ----------
-    frame : array (height, width)
-        Grey values.
-    noise : float
-        Of the image.
-    line : array (n, 2)
-        Within three pixels of the whisker, from about the base to about the tip.
-    options : TraceOptions
-        How.
-    before : float
-        How far before its beginning the face may end, pixels.
-
-    Returns
-    -------
-    trace : Trace
-        Empty if there is nothing.
-    from_face : bool
-        Whether it begins at something dark.
-    """
+    """Trace a whisker that is about known, and find its ends."""
     line = _lengthened(even(line))
     for gate in (3, 2):
         line = even(smoothed(frame, line, gate, noise, options)[0])
@@ -93,24 +72,7 @@ def traced(
 
 
 def with_base(frame: Frame, line: Array, before: float) -> tuple[Array, bool]:
-    """Let a line begin where the whisker leaves the face.
-
-    Parameters
-    ----------
-    frame : array (height, width)
-        Grey values.
-    line : array (n, 2)
-        From about there outward.
-    before : float
-        How far before its beginning that may be, pixels.
-
-    Returns
-    -------
-    line : array (m, 2)
-        From the base on; the same line if nothing dark is at its beginning.
-    from_face : bool
-        Whether there is.
-    """
+    """Let a line begin where the whisker leaves the face."""
     longer = even(line, -before)
     near, far = (_edge(frame, longer[:40], distance) for distance in _BESIDE)
     if near is None:
@@ -143,16 +105,6 @@ def tip(fit: Fit) -> int:
 
     Beyond the tip the line is as light as its surroundings; before it, it goes on being about as
     dark as it was. The end is where that is most likely, by the sum of log-likelihood ratios.
-
-    Parameters
-    ----------
-    fit : Fit
-        Measured along the line and beyond the tip.
-
-    Returns
-    -------
-    int
-        Points up to the tip.
     """
     sigma = fit.noise * np.sqrt(ridge.DEPTH_VARIANCE)
     amplitude = np.where(fit.open, fit.amplitude, 0.0)

@@ -61,20 +61,7 @@ def find_whiskers(frame: Frame, options: TraceOptions | None = None) -> list[Fou
 
 
 def overlap(line: Array, other: Array, near: float = 3.0) -> float:
-    """Say which share of a line runs along another.
-
-    Parameters
-    ----------
-    line, other : array (n, 2), array (m, 2)
-        Columns and rows.
-    near : float
-        How near is the same, pixels.
-
-    Returns
-    -------
-    float
-        Between 0 and 1.
-    """
+    """Say which share of a line runs along another."""
     from scipy.spatial import cKDTree
 
     if not len(line) or not len(other):

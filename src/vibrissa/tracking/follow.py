@@ -381,20 +381,7 @@ class Follower:
 
 
 def turned_line(line: Array, angle: float) -> Array:
-    """Turn a line about its first point.
-
-    Parameters
-    ----------
-    line : array (n, 2)
-        Column and row.
-    angle : float
-        From the columns toward the rows, rad.
-
-    Returns
-    -------
-    array (n, 2)
-        The line there.
-    """
+    """Turn a line about its first point."""
     c, s = np.cos(angle), np.sin(angle)
     return np.asarray(line[0] + (line - line[0]) @ np.array([[c, s], [-s, c]]))
 

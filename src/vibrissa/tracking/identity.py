@@ -63,21 +63,7 @@ _DEARER = 14.0
 
 @dataclass
 class Seen:
-    """Lines that are seen in one frame.
-
-    Parameters
-    ----------
-    lines : list of Trace
-        Different ones.
-    looks : list of array
-        How they look.
-    chosen : list of int
-        Which line each whisker was given; −1 if it was lost.
-    fixed : set of int
-        Whiskers whose line is known.
-    clear : bool
-        Whether there was no doubt who is who.
-    """
+    """Lines that are seen in one frame."""
 
     lines: list[Trace]
     looks: list[Array]
@@ -86,15 +72,7 @@ class Seen:
     clear: bool = False
 
     def settle(self, whisker: int, trace: Trace) -> None:
-        """Say where a whisker is.
-
-        Parameters
-        ----------
-        whisker : int
-            Its number.
-        trace : Trace
-            Of it.
-        """
+        """Say where a whisker is."""
         self.chosen[whisker] = len(self.lines)
         self.fixed.add(whisker)
         self.lines.append(trace)
@@ -107,20 +85,7 @@ class _Frame(NamedTuple):
 
 
 def decided(frames: Sequence[Seen], bases: Array) -> list[list[int]]:
-    """Say which line each whisker has in each frame.
-
-    Parameters
-    ----------
-    frames : sequence of Seen
-        One after the other. The first is believed; so is who was hardly ever found.
-    bases : array (n, 2)
-        Where the whiskers begin in the first one, column and row.
-
-    Returns
-    -------
-    list of list of int
-        Frame by frame the number of each whisker's line; −1 if it is lost.
-    """
+    """Say which line each whisker has in each frame."""
     clashes = [_clashes(seen.lines) for seen in frames]
     motions = [_motions(a.lines, b.lines) for a, b in pairwise(frames)]
     everyone = set(range(len(bases)))
@@ -280,18 +245,7 @@ def _motion(line: Array, other: Array) -> Array:
 
 
 def sideways(expected: Array, line: Array) -> Array:
-    """Say how far a line is to the left (−dy, dx) of an expected one.
-
-    Parameters
-    ----------
-    expected, line : array (n, 2), array (m, 2)
-        Columns and rows.
-
-    Returns
-    -------
-    array
-        At `PLACES`, pixels.
-    """
+    """Say how far a line is to the left (−dy, dx) of an expected one."""
     places = np.minimum(PLACES, min(len(expected), len(line)) - 1)
     tangent = np.gradient(expected[: PLACES[-1] + 2], axis=0)
     size = np.linalg.norm(tangent[places], axis=1, keepdims=True)

@@ -32,35 +32,14 @@ _OUTER = 0.4
 
 
 class Length(NamedTuple):
-    """Of a whisker.
-
-    Parameters
-    ----------
-    value : float
-        m.
-    sigma : float
-        Standard deviation, m; NaN where only what is seen is known, which is the value.
-    """
+    """Of a whisker."""
 
     value: float
     sigma: float
 
 
 def lengthened(shape: RestShape, length: float) -> RestShape:
-    """Let a shape go on as it ends.
-
-    Parameters
-    ----------
-    shape : RestShape
-        Of what is seen.
-    length : float
-        That it is to have, m; not less than its own.
-
-    Returns
-    -------
-    RestShape
-        Equally spaced as before.
-    """
+    """Let a shape go on as it ends."""
     points, spacing = shape.points, shape.spacing
     more = round((length - shape.length) / spacing)
     if more < 1:
@@ -74,19 +53,7 @@ def lengthened(shape: RestShape, length: float) -> RestShape:
 
 
 def likeliest_length(seen: float, cost: Callable[[float], float]) -> Length:
-    """Find the length with which the rod explains the traces best.
-
-    Parameters
-    ----------
-    seen : float
-        What is seen of it, m.
-    cost : callable
-        Of a length, m: the sum of squares in standard deviations.
-
-    Returns
-    -------
-    Length
-    """
+    """Find the length with which the rod explains the traces best."""
     lengths = [seen, (1.0 + _STEP) * seen]
     costs = [cost(length) for length in lengths]
     while costs[-1] <= min(costs) and lengths[-1] < _LONGEST * seen:
@@ -111,22 +78,7 @@ def likeliest_length(seen: float, cost: Callable[[float], float]) -> Length:
 
 
 def with_length_unsure(found: Refined, other: Refined, share: float) -> Refined:
-    """Add to all covariances that the length is not known.
-
-    Parameters
-    ----------
-    found : Refined
-        With the likeliest length.
-    other : Refined
-        With another.
-    share : float
-        Standard deviation of the length, as a share of by how much the other differs.
-
-    Returns
-    -------
-    Refined
-        The same, less sure.
-    """
+    """Add to all covariances that the length is not known."""
     point = share * (other.contact_point - found.contact_point)
     turn = np.full_like(found.position, np.nan)
     known = np.isfinite(found.rotation).all(axis=(1, 2)) & np.isfinite(other.rotation).all((1, 2))

@@ -45,21 +45,7 @@ ENOUGH = 5
 
 
 def look_of(frame: Frame, trace: Trace) -> Array:
-    """Say how a whisker looks in a frame.
-
-    Parameters
-    ----------
-    frame : array (height, width)
-        Grey values.
-    trace : Trace
-        Of it.
-
-    Returns
-    -------
-    array (`FEATURES`,)
-        Logarithm of the length seen, pixels; logarithms of the contrast of three pieces; and by
-        how much three pieces turn, rad. NaN where it is too short.
-    """
+    """Say how a whisker looks in a frame."""
     look = np.full(FEATURES, np.nan)
     n = len(trace.line)
     if n < 2 or not trace.seen.any():
@@ -81,18 +67,7 @@ def look_of(frame: Frame, trace: Trace) -> Array:
 
 
 def usual_look(looks: Sequence[Array]) -> tuple[Array, Array]:
-    """Say how a whisker usually looks.
-
-    Parameters
-    ----------
-    looks : sequence of array (`FEATURES`,)
-        Of it, one a frame.
-
-    Returns
-    -------
-    middle, spread : array (`FEATURES`,)
-        Medians, NaN where nothing is known, and standard deviations.
-    """
+    """Say how a whisker usually looks."""
     if len(looks) < ENOUGH:
         return np.full(FEATURES, np.nan), _SPREAD
     known = np.array(looks)
@@ -104,20 +79,7 @@ def usual_look(looks: Sequence[Array]) -> tuple[Array, Array]:
 
 
 def unlikeness(look: Array, middle: Array, spread: Array) -> float:
-    """Say how much a line looks unlike a whisker.
-
-    Parameters
-    ----------
-    look : array (`FEATURES`,)
-        Of the line.
-    middle, spread : array (`FEATURES`,)
-        How the whisker usually looks.
-
-    Returns
-    -------
-    float
-        Minus the logarithm of the likelihood, bounded; 0 if nothing is known.
-    """
+    """Say how much a line looks unlike a whisker."""
     away = (look - middle) / spread
     if away[0] < 0.0:
         away[0] /= _SHORTER

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.rod.compiled import inlined, kernel
+from vibrissa.numerics.compiled import inlined, kernel
 from vibrissa.tracking.scene import Bodies, Image
 
 Array = NDArray[np.float64]
@@ -38,15 +38,7 @@ _MOST = 60_000
 
 
 class Segment(NamedTuple):
-    """A line without gaps.
-
-    Parameters
-    ----------
-    places : array (n, 2)
-        Column and row.
-    strength : array (n,)
-        Of the ridge, in units of the noise.
-    """
+    """A line without gaps."""
 
     places: Array
     strength: Array
@@ -55,24 +47,7 @@ class Segment(NamedTuple):
 def segments(
     difference: Image, bodies: Bodies, scale: float = 1.0, inside: bool = False
 ) -> list[Segment]:
-    """Find the lines of a difference image.
-
-    Parameters
-    ----------
-    difference : array (height, width)
-        How much darker each pixel is than what is around it.
-    bodies : Bodies
-        In the same frame.
-    scale : float
-        Width of a whisker, relative to a usual one.
-    inside : bool
-        Whether lines before bodies are looked for too.
-
-    Returns
-    -------
-    list of Segment
-        In no order.
-    """
+    """Find the lines of a difference image."""
     sigma = SIGMA * scale
     reach = math.ceil(3.0 * sigma)
     taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
@@ -99,17 +74,7 @@ def segments(
 
 @kernel
 def blur(image: Any, taps: Any, work: Any, out: Any) -> None:
-    """Convolve an image with a symmetric row of numbers, along rows and columns.
-
-    Parameters
-    ----------
-    image : array (height, width)
-        Values; those at the border go on outside.
-    taps : array (2 n + 1,)
-        The numbers.
-    work, out : array (height, width)
-        Room, and the result.
-    """
+    """Convolve an image with a symmetric row of numbers, along rows and columns."""
     rows, columns = image.shape
     reach = taps.shape[0] // 2
     for row in range(rows):
@@ -134,24 +99,7 @@ def blur(image: Any, taps: Any, work: Any, out: Any) -> None:
 
 @kernel
 def roughness(smooth: Any, label: Any, inside: bool, out: Any) -> int:
-    """How much second derivatives along rows and columns differ, on a sparse grid.
-
-    Parameters
-    ----------
-    smooth : array (height, width)
-        Values.
-    label : array (height / 2, width / 2)
-        Not 0 where there is a body.
-    inside : bool
-        Whether places on bodies count, rather than those beside them.
-    out : array (n,)
-        Result.
-
-    Returns
-    -------
-    int
-        How many there are.
-    """
+    """How much second derivatives along rows and columns differ, on a sparse grid."""
     rows, columns = smooth.shape
     count = 0
     for row in range(4, min(rows - 4, 2 * label.shape[0]), 5):
@@ -179,28 +127,7 @@ def near_body(label: Any, row: int, column: int) -> Any:
 def ridge_points(
     smooth: Any, label: Any, factors: Any, least: float, points: Any, index: Any
 ) -> int:
-    """Find pixels through which a ridge runs.
-
-    Parameters
-    ----------
-    smooth : array (height, width)
-        Values.
-    label : array (height / 2, width / 2)
-        Not 0 where there is a body.
-    factors : array (2,)
-        Strength of a ridge of second derivative −1, beside bodies and on them; 0: not looked at.
-    least : float
-        Strength that counts.
-    points : array (n, 4)
-        Result: column, row, direction along the ridge, rad, and strength.
-    index : array (height, width)
-        Result: number of the point of a pixel, unchanged where there is none.
-
-    Returns
-    -------
-    int
-        How many points, at most n.
-    """
+    """Find pixels through which a ridge runs."""
     rows, columns = smooth.shape
     count = 0
     highest = max(factors[0], factors[1])
@@ -241,28 +168,7 @@ def ridge_points(
 
 @kernel
 def link(points: Any, index: Any, order: Any, shortest: int, member: Any, first: Any) -> int:
-    """Put points in rows.
-
-    Parameters
-    ----------
-    points : array (n, 4)
-        Of `ridge_points`.
-    index : array (height, width)
-        Number of the point of a pixel, else below 0.
-    order : array (m,)
-        Numbers of the points from which rows are begun, one after the other.
-    shortest : int
-        Fewest points of a row that is kept.
-    member : array (n,)
-        Result: numbers of points, row after row.
-    first : array (n + 1,)
-        Result: where each row begins, and the last ends.
-
-    Returns
-    -------
-    int
-        How many rows.
-    """
+    """Put points in rows."""
     used = np.zeros(points.shape[0], np.bool_)
     way = np.empty(2 * points.shape[0] + 1, np.int32)
     number, filled, middle = 0, 0, points.shape[0]

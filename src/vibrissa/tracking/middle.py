@@ -24,21 +24,7 @@ _MEDIAN = 0.455
 
 
 class Fit(NamedTuple):
-    """What was measured along a line.
-
-    Parameters
-    ----------
-    amplitude : array (n,)
-        How dark it is, grey values.
-    sigma : array (n,)
-        Standard deviation across, pixels.
-    seen : array (n,)
-        Whether each point is seen.
-    open : array (n,)
-        Whether it is neither beside nor behind something dark.
-    noise : float
-        Of the image along the line, grey values: as much as was said, or more.
-    """
+    """What was measured along a line."""
 
     amplitude: Array
     sigma: Array
@@ -47,18 +33,7 @@ class Fit(NamedTuple):
     noise: float
 
     def part(self, rows: slice) -> Fit:
-        """Give some of the points.
-
-        Parameters
-        ----------
-        rows : slice
-            Which.
-
-        Returns
-        -------
-        Fit
-            Of these.
-        """
+        """Give some of the points."""
         return Fit(
             self.amplitude[rows], self.sigma[rows], self.seen[rows], self.open[rows], self.noise
         )
@@ -67,30 +42,7 @@ class Fit(NamedTuple):
 def smoothed(
     frame: Frame, line: Array, gate: int, noise: float, options: TraceOptions, skipped: int = 0
 ) -> tuple[Array, Fit]:
-    """Measure across a line and smooth it.
-
-    Parameters
-    ----------
-    frame : array (height, width)
-        Grey values.
-    line : array (n, 2)
-        Near the whisker.
-    gate : int
-        How far from it to look, samples.
-    noise : float
-        Of the image.
-    options : TraceOptions
-        How.
-    skipped : int
-        Points at the base that are not measured, because the face's edge is beside them.
-
-    Returns
-    -------
-    line : array (n, 2)
-        Nearer the whisker, point by point.
-    fit : Fit
-        What was measured.
-    """
+    """Measure across a line and smooth it."""
     n = len(line)
     offset, amplitude, flank, support = (np.empty(n) for _ in range(4))
     ridge.measure(frame, line, gate, noise, options.scale, offset, amplitude, flank, support)
@@ -120,22 +72,7 @@ def smoothed(
 
 
 def smooth(line: Array, weight: Array, stiffness: float) -> Array:
-    """Smooth a line.
-
-    Parameters
-    ----------
-    line : array (n, 2)
-        Column and row.
-    weight : array (n,)
-        One over the variance of each point; 0 where it is not known.
-    stiffness : float
-        Of the penalty on third differences.
-
-    Returns
-    -------
-    array (n, 2)
-        The smooth line.
-    """
+    """Smooth a line."""
     out = np.empty_like(line)
     for k in range(2):
         column = np.empty(len(line))

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from vibrissa.cameras.camera import Camera
 from vibrissa.rod.batch import solve_forces
 from vibrissa.rod.discretize import Discretization, discretize
 from vibrissa.tracking.banded import Smoother
@@ -27,7 +28,6 @@ from vibrissa.tracking.pose import BasePose
 from vibrissa.tracking.rods import UNKNOWNS, State, bent, first_contacts, rods, tangents
 from vibrissa.tracking.sight import Sight
 from vibrissa.tracking.trust import trace_variance
-from vibrissa.trial.cameras import Camera
 from vibrissa.whisker import Whisker
 
 Array = NDArray[np.float64]
@@ -174,30 +174,7 @@ def cost_of(
     options: RefineOptions,
     head: HeadPose,
 ) -> Callable[[Whisker, BasePose], float]:
-    """Say how whiskers are compared: by how well they explain the same traces.
-
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        The views.
-    sight : Sight
-        The traces of one whisker.
-    touching : array (time,)
-        Frames in contact.
-    curves : array (time, node, 3)
-        The whisker, about, relative to the head, m; NaN in frames that do not count.
-    rate : float
-        Frames per second.
-    options : RefineOptions
-        How smooth.
-    head : HeadPose
-        The head in these frames.
-
-    Returns
-    -------
-    callable
-        Gives the sum of squares, in standard deviations, of a whisker with its pose.
-    """
+    """Say how whiskers are compared: by how well they explain the same traces."""
     variance: Array | None = None
 
     def cost(whisker: Whisker, pose: BasePose) -> float:

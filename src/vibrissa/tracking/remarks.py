@@ -11,12 +11,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from vibrissa.cameras.camera import Camera
 from vibrissa.tracking.begin import base_gap
 from vibrissa.tracking.length import Length
 from vibrissa.tracking.sight import Sight
 from vibrissa.tracking.timing import better_offset
 from vibrissa.tracking.trace import Trace
-from vibrissa.trial.cameras import Camera
 
 Array = NDArray[np.float64]
 
@@ -32,22 +32,7 @@ _SHARE = 0.03
 
 
 def check_views(cameras: Sequence[Camera], sight: Sight, name: str) -> None:
-    """Make sure that views show one whisker.
-
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        The views.
-    sight : Sight
-        The traces of one whisker.
-    name : str
-        Of the whisker.
-
-    Raises
-    ------
-    ValueError
-        If its bases miss each other by more than any calibration does.
-    """
+    """Make sure that views show one whisker."""
     gap = _gap(cameras, sight)
     lengths = np.linalg.norm(np.diff(sight.line, axis=2), axis=3).sum(axis=2)
     allowed = max(_FAR, _SHARE * float(np.nanmax(lengths, initial=0.0)))
@@ -62,26 +47,7 @@ def check_views(cameras: Sequence[Camera], sight: Sight, name: str) -> None:
 def remarks_on(
     cameras: Sequence[Camera], sight: Sight, length: Length, misfit: Array, name: str
 ) -> list[str]:
-    """Say what is unusual about a tracked whisker.
-
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        The views.
-    sight : Sight
-        Its traces.
-    length : Length
-        Of it.
-    misfit : array (time,)
-        Of the rod from the traces, in their standard deviations; NaN where it is lost.
-    name : str
-        Of it.
-
-    Returns
-    -------
-    list of str
-        Sentences.
-    """
+    """Say what is unusual about a tracked whisker."""
     found = []
     gap = _gap(cameras, sight)
     if gap > _NEAR:
@@ -120,22 +86,7 @@ def remarks_on(
 def remarks_on_time(
     cameras: Sequence[Camera], traces: Sequence[Sequence[Trace]], offset: int | None
 ) -> list[str]:
-    """Say whether cameras seem to be out of step.
-
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        The views.
-    traces : sequence of sequence of Trace
-        Of one whisker, view by view, frame by frame.
-    offset : int, optional
-        By which frames were paired; None: found out.
-
-    Returns
-    -------
-    list of str
-        Sentences.
-    """
+    """Say whether cameras seem to be out of step."""
     if offset is None:
         return []
     found = []

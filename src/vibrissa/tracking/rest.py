@@ -154,28 +154,7 @@ def _length(curves: Array, tips: Mask | None) -> tuple[float, bool]:
 
 
 def known_rest(curves: Array, whisker: Whisker, least: float = 0.1) -> RestShape:
-    """Find the frames in which a known whisker is at rest.
-
-    Parameters
-    ----------
-    curves : array (time, node, 3)
-        The whisker in every frame, equally spaced from base to tip, m; NaN where it is missing.
-    whisker : Whisker
-        At rest; it begins where the curves begin.
-    least : float
-        Share of the frames that are free of contact, if any is.
-
-    Returns
-    -------
-    RestShape
-        The known points. No frame is free if even those that come nearest to the whisker at rest
-        are a hundredth of its length away from it.
-
-    Raises
-    ------
-    ValueError
-        If the whisker is seen in less than three frames, or is shorter than it is seen.
-    """
+    """Find the frames in which a known whisker is at rest."""
     seen = np.isfinite(curves).all(axis=(1, 2))
     if seen.sum() < 3:
         raise ValueError(f"the whisker is seen in {int(seen.sum())} frames; 3 are needed at least")
@@ -232,22 +211,7 @@ def whisker_at_rest(shape: RestShape, name: str = "tracked", **properties: float
 
 
 def aligned_lengths(curves: Array, spacing: float | None = None) -> tuple[float, Array]:
-    """Cut curves at the same arc lengths.
-
-    Parameters
-    ----------
-    curves : array (time, node, 3)
-        Each equally spaced from base to tip, m.
-    spacing : float, optional
-        Of the arc lengths, m; by default such that the curves have about as many points.
-
-    Returns
-    -------
-    spacing : float
-        Of the arc lengths, m.
-    shapes : array (time, n, 3)
-        Points; NaN beyond a curve's end.
-    """
+    """Cut curves at the same arc lengths."""
     steps = np.linalg.norm(np.diff(curves, axis=1), axis=2)
     lengths = steps.sum(axis=1)
     count = curves.shape[1]
@@ -281,21 +245,7 @@ def _largest_group(signatures: Array, least: float) -> tuple[int, Mask]:
 
 
 def motions(shapes: Array, target: Array) -> tuple[Array, Array]:
-    """Find the rigid motions that bring shapes nearest to a target.
-
-    Parameters
-    ----------
-    shapes : array (time, n, 3)
-        Points, m.
-    target : array (m, 3)
-        Where they are to go, point by point; the first of both count.
-
-    Returns
-    -------
-    rotation : array (time, 3, 3)
-    shift : array (time, 3)
-        Target ≈ rotation @ point + shift.
-    """
+    """Find the rigid motions that bring shapes nearest to a target."""
     n = min(shapes.shape[1], len(target))
     a, b = shapes[:, :n], target[:n]
     middle, goal = a.mean(axis=1), b.mean(axis=0)

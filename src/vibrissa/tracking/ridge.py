@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.rod.compiled import inlined, kernel
+from vibrissa.numerics.compiled import inlined, kernel
 
 Array = NDArray[np.float64]
 
@@ -132,36 +132,6 @@ def march(
     Its state is the sideways offset, the direction and the curvature; what it measures is where
     across its way the image is darkest. Where nothing is seen it goes straight on with the
     curvature it had, and looks the farther to the sides the longer that lasts.
-
-    Parameters
-    ----------
-    frame : array (height, width)
-        Grey values.
-    start : array (3,)
-        Column, row and direction, rad, at the start.
-    curvature : array (n,)
-        What the curvature is expected to be at each step, 1/pixel.
-    spread : array (3,)
-        Standard deviations at the start: offset, direction, curvature.
-    drift : float
-        How much the curvature changes: standard deviation over one pixel.
-    step : float
-        Length of a step, pixels.
-    bridge : float
-        Longest way without support, pixels.
-    noise : float
-        Of the image, grey values.
-    scale : float
-        Distance of samples across, pixels.
-    line : array (n, 2)
-        Result: where it went.
-    support : array (n,)
-        Result: depth over noise where it is supported, else 0.
-
-    Returns
-    -------
-    int
-        How many steps, up to the last supported one.
     """
     rows, columns = frame.shape
     x, y, angle, bend = start[0], start[1], start[2], 0.0
@@ -247,29 +217,7 @@ def measure(
     flank: Any,
     support: Any,
 ) -> None:
-    """Measure a line across a curve near it.
-
-    Parameters
-    ----------
-    frame : array (height, width)
-        Grey values.
-    line : array (n, 2)
-        The curve, column and row.
-    gate : int
-        How far from it to look, in samples.
-    noise : float
-        Of the image, grey values.
-    scale : float
-        Distance of samples, pixels.
-    offset : array (n,)
-        Result: where the line is along the left normal (−dy, dx), pixels.
-    amplitude : array (n,)
-        Result: how dark it is there, grey values.
-    flank : array (n,)
-        Result: grey value on both sides.
-    support : array (n,)
-        Result: depth over noise; not above zero where one side is as dark as the line.
-    """
+    """Measure a line across a curve near it."""
     n = line.shape[0]
     rows, columns = frame.shape
     reach = gate + 5
@@ -303,17 +251,7 @@ def measure(
 
 @kernel
 def smooth(value: Any, weight: Any, stiffness: float, out: Any) -> None:
-    """Smooth a row of values: least squares with a penalty on third differences.
-
-    Parameters
-    ----------
-    value, weight : array (n,)
-        What is measured, and one over its variance; 0 where nothing is.
-    stiffness : float
-        Of the penalty.
-    out : array (n,)
-        Result.
-    """
+    """Smooth a row of values: least squares with a penalty on third differences."""
     n = value.shape[0]
     band = np.zeros((n, 4))  # diagonal, then the next three above
     right = np.empty(n)
@@ -352,19 +290,7 @@ def smooth(value: Any, weight: Any, stiffness: float, out: Any) -> None:
 
 @kernel
 def beside(frame: Any, line: Any, distance: float, out: Any) -> None:
-    """Grey values beside a curve, on its left (−dy, dx) and on its right.
-
-    Parameters
-    ----------
-    frame : array (height, width)
-        Grey values.
-    line : array (n, 2)
-        Column and row.
-    distance : float
-        From the curve, pixels.
-    out : array (n, 2)
-        Result.
-    """
+    """Grey values beside a curve, on its left (−dy, dx) and on its right."""
     n = line.shape[0]
     for k in range(n):
         a, b = max(k - 1, 0), min(k + 1, n - 1)

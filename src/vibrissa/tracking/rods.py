@@ -26,17 +26,7 @@ _STEP = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Pose and contact of some frames.
-
-    Parameters
-    ----------
-    rotation : array (time, 3, 3)
-        From the whisker's frame.
-    position : array (time, 3)
-        Of the base, units of L.
-    contact : array (time, 4)
-        s_c, f_x, f_y, f_z, units of L and EI/L² at the base.
-    """
+    """Pose and contact of some frames."""
 
     rotation: Array
     position: Array
@@ -51,24 +41,7 @@ class State:
 
 
 def bent(d: Discretization, state: State, touching: Mask) -> tuple[Array, Array]:
-    """Points of the bent rods and their derivatives.
-
-    Parameters
-    ----------
-    d : Discretization
-        The whisker.
-    state : State
-        Pose and contact of every frame.
-    touching : array (time,)
-        Frames in contact.
-
-    Returns
-    -------
-    points : array (time, n, 3)
-        Equally spaced, laboratory frame, units of L.
-    slopes : array (time, n, 3, 10)
-        By shift, turn and contact.
-    """
+    """Points of the bent rods and their derivatives."""
     s = np.linspace(0.0, 1.0, _SAMPLES)
     local = rods(d, state.contact, s)
     turned = np.einsum("tij,tnj->tni", state.rotation, local)
@@ -109,26 +82,7 @@ def tangents(d: Discretization, contact: Array) -> Array:
 def first_contacts(
     d: Discretization, state: State, curves: Array, touching: Mask
 ) -> tuple[Array, Array]:
-    """Contacts (n, 4) of the touching frames that make the rod look most like the curves.
-
-    Parameters
-    ----------
-    d : Discretization
-        The whisker.
-    state : State
-        How it is held in every frame.
-    curves : array (time, node, 3)
-        What it looks like, m.
-    touching : array (time,)
-        Frames in contact; n of them.
-
-    Returns
-    -------
-    contacts : array (n, 4)
-        Units of L and EI/L² at the base; without friction.
-    cost : array (n,)
-        Sum of the squared distances of 25 points that are left, units of L².
-    """
+    """Contacts (n, 4) of the touching frames that make the rod look most like the curves."""
     rows = np.flatnonzero(touching)
     if not rows.size:
         return np.empty((0, 4)), np.empty(0)

@@ -23,22 +23,7 @@ _TURNS = 24
 
 
 def rolled(pose: BasePose, curves: Array, whisker: Whisker) -> BasePose:
-    """Give a pose the roll that the bent shapes show.
-
-    Parameters
-    ----------
-    pose : BasePose
-        Its azimuth, elevation and place count.
-    curves : array (time, node, 3)
-        The whisker in contact, in the frame of the pose, m; NaN where it is missing.
-    whisker : Whisker
-        At rest.
-
-    Returns
-    -------
-    BasePose
-        With one roll for all frames, to about a degree or two.
-    """
+    """Give a pose the roll that the bent shapes show."""
     known = np.flatnonzero(np.isfinite(pose.azimuth) & np.isfinite(curves).all(axis=(1, 2)))
     frames = known[np.linspace(0, len(known) - 1, min(_FRAMES, len(known))).astype(int)]
     d = discretize(whisker)

@@ -59,24 +59,7 @@ def follow_row(
     known: Mapping[int, ArrayLike],
     record: list[Seen] | None = None,
 ) -> list[Trace]:
-    """Find every whisker in the next frame; no two are the same.
-
-    Parameters
-    ----------
-    followers : sequence of Follower
-        One a whisker.
-    frame : array (height, width)
-        Grey values.
-    known : mapping of int to array_like (n, 2)
-        Traces that are given.
-    record : list of Seen, optional
-        Gets what was seen, from which `vibrissa.tracking.identity.decided` tells who is who.
-
-    Returns
-    -------
-    list of Trace
-        One a whisker; empty where it is lost.
-    """
+    """Find every whisker in the next frame; no two are the same."""
     noise = ridge.noise_level(frame)
     fixed = {k: given(points) for k, points in known.items()}
     free = [k for k in range(len(followers)) if k not in fixed]

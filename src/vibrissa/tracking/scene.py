@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vibrissa.io.video import Frame
-from vibrissa.rod.compiled import kernel
+from vibrissa.numerics.compiled import kernel
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -57,32 +57,13 @@ _RANGE = (-20.0, 80.0)
 
 @dataclass(frozen=True, eq=False)
 class Bodies:
-    """Dark bodies in one frame, in an image of half its size.
-
-    Parameters
-    ----------
-    label : array (height / 2, width / 2)
-        Number of the body that covers a pixel, from 1; 0 where there is none.
-    face : array (n + 1,)
-        Whether each body is at the border of the image and large, as a face is.
-    """
+    """Dark bodies in one frame, in an image of half its size."""
 
     label: Labels
     face: NDArray[np.bool_]
 
     def at(self, places: Array) -> Labels:
-        """Say which body covers pixels of the frame.
-
-        Parameters
-        ----------
-        places : array (n, 2)
-            Column and row.
-
-        Returns
-        -------
-        array (n,)
-            Its number; 0 where there is none.
-        """
+        """Say which body covers pixels of the frame."""
         at = np.asarray(places / _HALF, dtype=np.int64)
         rows, columns = self.label.shape
         row, column = at[:, 1].clip(0, rows - 1), at[:, 0].clip(0, columns - 1)
@@ -91,21 +72,7 @@ class Bodies:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """One view without its whiskers.
-
-    Parameters
-    ----------
-    light : array (height, width)
-        Grey values where nothing thin is.
-    level : array (height / 2, width / 2)
-        Grey values below which there is a body; 0 everywhere if nothing stands out as dark.
-    background : array (height, width), optional
-        Grey values of what does not move; None if too few frames are known.
-    sample : array (n, m)
-        The usual frame, at every eighth pixel, to which the light of others is compared.
-    thin : int
-        Width of what the closing removes, pixels of half the size.
-    """
+    """One view without its whiskers."""
 
     light: Image
     level: Image
@@ -115,19 +82,7 @@ class Scene:
 
     @classmethod
     def of(cls, frames: Sequence[Frame], scale: float = 1.0) -> Scene:
-        """Take the scene from frames of one view.
-
-        Parameters
-        ----------
-        frames : sequence of array (height, width)
-            Grey values, of moments that are as different as can be had; one will do.
-        scale : float
-            Width of a whisker, relative to a usual one.
-
-        Returns
-        -------
-        Scene
-        """
+        """Take the scene from frames of one view."""
         sparse = np.stack([f[::_SPARSE, ::_SPARSE] for f in frames]).astype(np.float32)
         usual = np.median(sparse, axis=0)
         thin = 2 * int(np.ceil(0.5 * _THIN * scale)) - 1
@@ -149,32 +104,11 @@ class Scene:
         )
 
     def gain(self, frame: Frame) -> float:
-        """Say how much brighter a frame is than the scene.
-
-        Parameters
-        ----------
-        frame : array (height, width)
-            Grey values.
-
-        Returns
-        -------
-        float
-            1 if it is as bright: lamps flicker.
-        """
+        """Say how much brighter a frame is than the scene."""
         return _gain(frame[::_SPARSE, ::_SPARSE], self.sample)
 
     def bodies(self, frame: Frame) -> Bodies:
-        """Find what is dark and not thin in a frame.
-
-        Parameters
-        ----------
-        frame : array (height, width)
-            Grey values.
-
-        Returns
-        -------
-        Bodies
-        """
+        """Find what is dark and not thin in a frame."""
         from scipy.ndimage import label
 
         dark = smoothed(closed(halved(frame), self.thin), 0.75) < self.level * self.gain(frame)
@@ -188,38 +122,13 @@ class Scene:
         return Bodies(number[labels].astype(np.int32), border & (area > _LARGE * labels.size))
 
     def difference(self, frame: Frame) -> Image:
-        """Say how much darker a frame is than the light.
-
-        Parameters
-        ----------
-        frame : array (height, width)
-            Grey values.
-
-        Returns
-        -------
-        array (height, width)
-            Grey values, clipped where they are large.
-        """
+        """Say how much darker a frame is than the light."""
         out = np.empty(frame.shape, dtype=np.float32)
         darker(frame, self.light, self.gain(frame), *_RANGE, out)
         return out
 
     def moved(self, frame: Frame, places: Array) -> NDArray[np.bool_]:
-        """Say where what is dark in a frame is usually not.
-
-        Parameters
-        ----------
-        frame : array (height, width)
-            Grey values.
-        places : array (n, 2)
-            Column and row of pixels that are darker than the light.
-
-        Returns
-        -------
-        array (n,)
-            Whether at least half of the darkness is missing in the background; everywhere if that
-            is not known.
-        """
+        """Say where what is dark in a frame is usually not."""
         if self.background is None:
             return np.ones(len(places), dtype=bool)
         column, row = np.rint(places).astype(np.int64).T
@@ -248,20 +157,7 @@ def doubled(image: Image, shape: tuple[int, ...]) -> Image:
 
 
 def closed(image: Image, width: int) -> Image:
-    """Grey closing with a square: what is dark and thinner than it vanishes.
-
-    Parameters
-    ----------
-    image : array (height, width)
-        Grey values.
-    width : int
-        Of the square, pixels; odd.
-
-    Returns
-    -------
-    array (height, width)
-        Grey values.
-    """
+    """Grey closing with a square: what is dark and thinner than it vanishes."""
     from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
     for extreme in (maximum_filter1d, minimum_filter1d):
@@ -324,19 +220,7 @@ def _threshold(share: Array) -> float:
 
 @kernel
 def nth_largest(frames: Any, gains: Any, rank: int, out: Any) -> None:
-    """Per pixel the value that is the n-th largest of all frames.
-
-    Parameters
-    ----------
-    frames : array (n, height, width)
-        Grey values.
-    gains : array (n,)
-        How bright each frame is: its grey values are divided by it.
-    rank : int
-        Which, from 1.
-    out : array (height, width)
-        Result.
-    """
+    """Per pixel the value that is the n-th largest of all frames."""
     count, rows, columns = frames.shape
     top = np.empty((rank, columns), np.float32)
     for row in range(rows):
@@ -358,19 +242,7 @@ def nth_largest(frames: Any, gains: Any, rank: int, out: Any) -> None:
 
 @kernel
 def darker(frame: Any, light: Any, gain: float, low: float, high: float, out: Any) -> None:
-    """How much darker a frame is than the light.
-
-    Parameters
-    ----------
-    frame, light : array (height, width)
-        Grey values.
-    gain : float
-        How bright the frame is: the light is multiplied by it.
-    low, high : float
-        To which differences are clipped.
-    out : array (height, width)
-        Result.
-    """
+    """How much darker a frame is than the light."""
     rows, columns = frame.shape
     for row in range(rows):
         for column in range(columns):

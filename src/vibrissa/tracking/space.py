@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
-from vibrissa.rod.compiled import kernel
+from vibrissa.cameras.camera import Camera
+from vibrissa.cameras.triangulation import triangulate
+from vibrissa.numerics.compiled import kernel
 from vibrissa.tracking.trace import Trace
-from vibrissa.trial.cameras import Camera
-from vibrissa.trial.triangulation import triangulate
 
 Array = NDArray[np.float64]
 
@@ -147,20 +147,7 @@ def _partners(cost: Array) -> Array:
 
 @kernel
 def cheapest(cost: Any, rows: Any, columns: Any) -> int:
-    """Cheapest way from the first corner to the last row or column, never going back.
-
-    Parameters
-    ----------
-    cost : array (n, m)
-        Of each place.
-    rows, columns : array (n + m,)
-        Result: the way, from its end to its beginning.
-
-    Returns
-    -------
-    int
-        How many places it has.
-    """
+    """Cheapest way from the first corner to the last row or column, never going back."""
     n, m = cost.shape
     total = np.empty((n, m))
     for i in range(n):

@@ -12,9 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from vibrissa.cameras.camera import Camera
+from vibrissa.cameras.triangulation import triangulate
 from vibrissa.tracking.trace import Trace
-from vibrissa.trial.cameras import Camera
-from vibrissa.trial.triangulation import triangulate
 
 Array = NDArray[np.float64]
 Pairs = NDArray[np.int64]
@@ -82,20 +82,6 @@ def better_offset(
     """Say whether two videos fit clearly better with another shift between them.
 
     What a calibration is off by all shifts share, and it does not count.
-
-    Parameters
-    ----------
-    first, second : Camera
-        The views.
-    a, b : sequence of Trace
-        Of one whisker, frame by frame.
-    offset : int
-        By how many frames the second began earlier, as it is said.
-
-    Returns
-    -------
-    array (n,)
-        Shifts that fit better, in the order of time; none if this one is as good.
     """
     cost = np.zeros((len(a), 2 * LARGEST + 1))
     for end in (0, -1):

@@ -97,23 +97,7 @@ class Trace(NamedTuple):
 
 
 def given(points: ArrayLike) -> Trace:
-    """Make a trace of points that a person says are right.
-
-    Parameters
-    ----------
-    points : array_like (n, 2)
-        Column and row, from base to tip; at least two.
-
-    Returns
-    -------
-    Trace
-        A smooth curve through them, known to half a pixel.
-
-    Raises
-    ------
-    ValueError
-        If there are less than two points, or they are no finite pixels.
-    """
+    """Make a trace of points that a person says are right."""
     from scipy.interpolate import make_interp_spline
 
     array = np.asarray(points, dtype=np.float64)

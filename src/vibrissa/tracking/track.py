@@ -11,7 +11,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from vibrissa.rod.surface import Surface
+from vibrissa.cameras.camera import Camera
+from vibrissa.objects.surface import Surface
 from vibrissa.tracking.contact import Contacts, contacts_at, given_contacts
 from vibrissa.tracking.dataset import tracked_recording
 from vibrissa.tracking.filtering import CUTOFF
@@ -31,7 +32,6 @@ from vibrissa.tracking.sight import Sight
 from vibrissa.tracking.space import merge
 from vibrissa.tracking.timing import paired_frames
 from vibrissa.tracking.trace import Trace
-from vibrissa.trial.cameras import Camera
 from vibrissa.whisker import Whisker
 
 Array = NDArray[np.float64]

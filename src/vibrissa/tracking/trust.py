@@ -29,20 +29,7 @@ _FREE = 0.25
 
 
 def trace_variance(misses: Sequence[Array], fitted: Array) -> Array:
-    """Say by how much the variance of traces differs from what they claim.
-
-    Parameters
-    ----------
-    misses : sequence of array (time, n)
-        Residuals of each view along the rod, in standard deviations; 0 where there is none.
-    fitted : array (time,)
-        How many numbers were fitted to the residuals of each frame.
-
-    Returns
-    -------
-    array (time,)
-        The factor of each frame, not below 1.
-    """
+    """Say by how much the variance of traces differs from what they claim."""
     square = np.sum([(one**2).sum(axis=1) for one in misses], axis=0)
     count = np.sum([(one != 0.0).sum(axis=1) for one in misses], axis=0)
     shown = count > 0

@@ -180,24 +180,7 @@ def follow_all(
     known: Mapping[int, ArrayLike],
     record: list[Seen] | None = None,
 ) -> list[Trace]:
-    """Find every whisker in the next frame.
-
-    Parameters
-    ----------
-    followers : sequence of Follower
-        One a whisker.
-    frame : array (height, width)
-        Grey values.
-    known : mapping of int to array_like (n, 2)
-        Traces that are given.
-    record : list of Seen, optional
-        Of several whiskers gets what was seen of them.
-
-    Returns
-    -------
-    list of Trace
-        One a whisker; several are told apart by `vibrissa.tracking.row.follow_row`.
-    """
+    """Find every whisker in the next frame."""
     if len(followers) > 1:
         return follow_row(followers, frame, known, record)
     (follower,) = followers

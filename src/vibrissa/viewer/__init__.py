@@ -10,7 +10,10 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from vibrissa.viewer.server import Viewer, view
 
-__all__ = ["Viewer", "view"]
+__all__ = [
+    "Viewer",
+    "view",
+]
 
 
 def __getattr__(name: str) -> object:

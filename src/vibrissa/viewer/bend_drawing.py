@@ -85,20 +85,7 @@ def force_arrow(whisker: Whisker, force: Array, at: Array) -> dict[str, Thing]:
 
 
 def bend_drawing(bend: Bend, exaggeration: float) -> Drawing:
-    """Draw whisker, load and force; without an answer the last shape as a ghost.
-
-    Parameters
-    ----------
-    bend : Bend
-        The state.
-    exaggeration : float
-        How many times thicker than it is the whisker is drawn.
-
-    Returns
-    -------
-    mapping of str to thing
-        In the whisker frame, mm.
-    """
+    """Draw whisker, load and force; without an answer the last shape as a ghost."""
     whisker, held, ok = bend.whisker, bend.held, bend.status.ok
     out = dict(_resting(whisker, exaggeration))
     line = held.centerline(NODES)

@@ -25,13 +25,7 @@ _HELD = "The whisker holds this force."
 
 
 class BendMode:
-    """The controls of a load, and the whisker that it bends.
-
-    Parameters
-    ----------
-    page : Page
-        To which it belongs.
-    """
+    """The controls of a load, and the whisker that it bends."""
 
     name = "Bend"
 

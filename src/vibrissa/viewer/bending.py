@@ -23,29 +23,7 @@ KINDS: tuple[Kind, ...] = ("point", "peg", "force")
 
 @dataclass(frozen=True, eq=False)
 class Bend:
-    """A whisker, a load, and the deflection by it.
-
-    Parameters
-    ----------
-    whisker : Whisker
-        What is bent.
-    kind : {"point", "peg", "force"}
-        Which load counts.
-    point : array (3,)
-        Where the contact point is wanted, whisker frame, m.
-    origin, axis : array (3,)
-        A point of the peg's axis, m, and its direction, whisker frame.
-    radius : float
-        Of the peg, m; 0 is a line.
-    place : float
-        Arc length of the force, as a share of the length.
-    magnitude, direction : float
-        Size, N, and direction from d1 toward d2 at the contact, rad, of the force.
-    deflection : Deflection
-        By the load that counts.
-    held : Deflection
-        The last one that has an answer.
-    """
+    """A whisker, a load, and the deflection by it."""
 
     whisker: Whisker
     kind: Kind

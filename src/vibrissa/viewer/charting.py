@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
-from vibrissa.mapping import ContactMap
+from vibrissa.contacts import ContactMap
 from vibrissa.plots.chart import fine_chart
 from vibrissa.quantities import to_display
 from vibrissa.signals import SIGNALS
@@ -22,21 +22,7 @@ _POINT = 0.008
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """A whisker's map with the samples that are drawn.
-
-    Parameters
-    ----------
-    contacts : ContactMap
-        The map.
-    samples : Dataset
-        Its nodes, ``ContactMap.to_dataset()``.
-    line : array (k, 3)
-        Centreline of the resting whisker, m.
-    points : array (n, 3)
-        Contacts of the cloud, m; those within 2° of rest are left out.
-    signals : mapping of str to array (n,)
-        What they feel like, SI units.
-    """
+    """A whisker's map with the samples that are drawn."""
 
     contacts: ContactMap
     samples: xr.Dataset

@@ -31,23 +31,7 @@ CLOUD: Colour = (150, 175, 200)
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A surface of one colour.
-
-    Parameters
-    ----------
-    vertices : array (n, 3)
-        mm.
-    faces : array (m, 3)
-        Triangles: numbers of their corners.
-    colour : tuple of int
-        Red, green, blue, 0 to 255.
-    opacity : float, optional
-        From 0 to 1; without it nothing shines through.
-    side : {"front", "back", "double"}
-        From which it is seen; a closed surface has nothing to show on its back.
-    place : tuple of float
-        Where the origin of the vertices is, mm: what only moves need not be sent again.
-    """
+    """A surface of one colour."""
 
     vertices: Array
     faces: Ints
@@ -59,19 +43,7 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class Painted:
-    """A surface of many colours, or one that is large: it costs little to draw.
-
-    Parameters
-    ----------
-    triangles : array (n, 3, 3)
-        Places of their corners, mm.
-    colours : array (n, 3, 3)
-        Of their corners.
-    opacity : float, optional
-        From 0 to 1; without it nothing shines through.
-    side : {"double", "front", "back"}
-        From which it is seen.
-    """
+    """A surface of many colours, or one that is large: it costs little to draw."""
 
     triangles: Array
     colours: Bytes

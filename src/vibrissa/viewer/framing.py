@@ -20,17 +20,7 @@ _WIDTH = 1.25
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A place to be looked at.
-
-    Parameters
-    ----------
-    centre : array (3,)
-        mm.
-    distance : float
-        From which it is seen as large as it should be, mm.
-    way : array (3,)
-        Direction from it to who looks.
-    """
+    """A place to be looked at."""
 
     centre: Array
     distance: float
@@ -38,22 +28,7 @@ class Shot:
 
 
 def framed(shot: Shot, width: float, height: float, fov: float) -> tuple[Array, Array]:
-    """Where someone stands and looks, mm, whose window is so large.
-
-    Parameters
-    ----------
-    shot : Shot
-        What is to be seen.
-    width, height : float
-        Of the window, pixels.
-    fov : float
-        Angle of view from top to bottom, rad.
-
-    Returns
-    -------
-    position, look_at : array (3,)
-        mm.
-    """
+    """Where someone stands and looks, mm, whose window is so large."""
     free = max(width - PANEL * height, 0.5 * width)
     across = 2.0 * np.tan(0.5 * fov) / height  # of a pixel, over the distance
     distance = shot.distance * max(1.0, _WIDTH / (free * across))
@@ -65,13 +40,7 @@ def framed(shot: Shot, width: float, height: float, fov: float) -> tuple[Array, 
 
 
 class Framing:
-    """Lets everyone look at a shot, now and when they come.
-
-    Parameters
-    ----------
-    server : viser.ViserServer
-        Whose clients look.
-    """
+    """Lets everyone look at a shot, now and when they come."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server

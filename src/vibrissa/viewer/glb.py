@@ -39,24 +39,7 @@ def glb(
     opacity: float | None = None,
     side: Side = "double",
 ) -> bytes:
-    """Write triangles with coloured corners as a GLB file.
-
-    Parameters
-    ----------
-    triangles : array (n, 3, 3)
-        Places of their corners; corners at one place should have one colour.
-    colours : array (n, 3, 3)
-        Of their corners, as the screen shows them.
-    opacity : float, optional
-        From 0 to 1; without it nothing shines through.
-    side : {"double", "front", "back"}
-        From which they are seen.
-
-    Returns
-    -------
-    bytes
-        The file.
-    """
+    """Write triangles with coloured corners as a GLB file."""
     shades = np.repeat(_shade(triangles), 3)
     vertices, first, which = _welded(triangles.reshape(-1, 3))
     shade = np.bincount(which, shades) / np.bincount(which)

@@ -20,17 +20,7 @@ Moved = Callable[[Array, Array], None]
 
 
 class Grip:
-    """A ball and a gizmo at one place of the scene.
-
-    Parameters
-    ----------
-    server : viser.ViserServer
-        In whose scene.
-    size : float
-        How long the gizmo's arrows are, mm.
-    moved : callable
-        Told while it is dragged.
-    """
+    """A ball and a gizmo at one place of the scene."""
 
     def __init__(self, server: viser.ViserServer, size: float, moved: Moved) -> None:
         self._moved = moved

@@ -32,23 +32,7 @@ def is_loopback(host: str) -> bool:
 
 
 def from_own_page(origin: str | None, asked: str | None, host: str) -> bool:
-    """Tell whether a request comes from a page of this server, or from no browser.
-
-    Parameters
-    ----------
-    origin : str or None
-        Of the page that asks, as its browser tells it; None from programs that are no browser.
-    asked : str or None
-        The name, with the port, under which this server was asked.
-    host : str
-        The address on which it listens.
-
-    Returns
-    -------
-    bool
-        False for pages from elsewhere. A server that only this machine can reach is asked under a
-        name of this machine: others are a stranger's name that was made to lead here.
-    """
+    """Tell whether a request comes from a page of this server, or from no browser."""
     if origin is None:
         return True
     try:
@@ -66,21 +50,6 @@ def guarded(host: str) -> Iterator[None]:
     """Let servers that start meanwhile refuse pages from elsewhere.
 
     viser has no place for such a check, so what it calls to listen is wrapped while it starts.
-
-    Parameters
-    ----------
-    host : str
-        The address on which it will listen.
-
-    Yields
-    ------
-    None
-        While it starts.
-
-    Warns
-    -----
-    UserWarning
-        If no server started in a way that could be guarded.
     """
     from websockets.asyncio import server
 

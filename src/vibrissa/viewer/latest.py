@@ -16,13 +16,7 @@ Job = Callable[[], None]
 
 
 class Latest:
-    """One thread, one pending job per topic, the one that is due first comes first.
-
-    Parameters
-    ----------
-    fault : callable
-        Called with an exception that a job raised; the thread goes on.
-    """
+    """One thread, one pending job per topic, the one that is due first comes first."""
 
     def __init__(self, fault: Callable[[Exception], None]) -> None:
         self._fault = fault
@@ -34,17 +28,7 @@ class Latest:
         self._thread.start()
 
     def put(self, topic: str, job: Job, due: float = 0.0) -> None:
-        """Ask for a job, in place of a pending one of the same topic; not once it is closed.
-
-        Parameters
-        ----------
-        topic : str
-            What it is about.
-        job : callable
-            To be done, not before its time.
-        due : float
-            When, by ``time.monotonic()``, s.
-        """
+        """Ask for a job, in place of a pending one of the same topic; not once it is closed."""
         with self._wake:
             if self._closed:
                 return

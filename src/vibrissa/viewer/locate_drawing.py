@@ -22,22 +22,7 @@ MOST = 0.3
 
 
 def locate_drawing(whisker: Whisker, found: Located, exaggeration: float) -> Drawing:
-    """Draw the whisker in every other contact that feels the same, and the errors of all.
-
-    Parameters
-    ----------
-    whisker : Whisker
-        That is bent.
-    found : Located
-        What its signals tell.
-    exaggeration : float
-        How many times thicker than it is the whisker is drawn.
-
-    Returns
-    -------
-    mapping of str to thing
-        In the whisker frame, mm.
-    """
+    """Draw the whisker in every other contact that feels the same, and the errors of all."""
     out: dict[str, Thing] = {}
     covariances = found.estimate.candidate_covariances
     others = set(found.others(whisker.length).tolist())

@@ -18,13 +18,7 @@ _UNM = quantity("moment").display_factor
 
 
 class LocateMode:
-    """The controls of a sensor, and what it cannot tell apart.
-
-    Parameters
-    ----------
-    page : Page
-        To which it belongs.
-    """
+    """The controls of a sensor, and what it cannot tell apart."""
 
     name = "Locate"
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
-from vibrissa.mapping import Estimate, sensitivity
+from vibrissa.contacts import Estimate
+from vibrissa.identifiability import sensitivity
 from vibrissa.rod import PointContact, deflect
 from vibrissa.signals import SIGNALS, base_signals
 from vibrissa.status import Status
@@ -28,15 +29,7 @@ _APART = 0.005
 
 @dataclass(frozen=True)
 class Sensor:
-    """What locates the contact.
-
-    Parameters
-    ----------
-    triplet : tuple of str
-        The three signals.
-    force_noise, moment_noise : float
-        Standard deviations of each component of force, N, and moment, N·m.
-    """
+    """What locates the contact."""
 
     triplet: tuple[str, ...] = ("Fx", "MB", "MD")
     force_noise: float = 1e-6
@@ -50,18 +43,7 @@ class Sensor:
 
 
 def usual_sensor(whisker: Whisker) -> Sensor:
-    """A sensor that suits a whisker: as exact for a rod as 1 µN and 0.02 µN·m are for a rat's.
-
-    Parameters
-    ----------
-    whisker : Whisker
-        That stands on it.
-
-    Returns
-    -------
-    Sensor
-        Its noise goes with EI/L² and EI/L, in powers of ten.
-    """
+    """A sensor that suits a whisker: as exact for a rod as 1 µN and 0.02 µN·m are for a rat's."""
     moment = whisker.base_bending_stiffness / whisker.length
     powers = np.log10([moment / whisker.length / _RAT[0], moment / _RAT[1]])
     force, turning = 10.0 ** np.round(powers)
@@ -74,21 +56,7 @@ def usual_sensor(whisker: Whisker) -> Sensor:
 
 @dataclass(frozen=True, eq=False)
 class Located:
-    """What three signals of a bent whisker tell.
-
-    Parameters
-    ----------
-    sensor : Sensor
-        That felt them.
-    signals : Dataset
-        The six signals of the contact.
-    contact : array (3,)
-        Where it truly is, m.
-    estimate : Estimate
-        All contacts that explain the three.
-    lines : array (k, n, 3)
-        Centrelines of the whisker in all of them, m.
-    """
+    """What three signals of a bent whisker tell."""
 
     sensor: Sensor
     signals: xr.Dataset
@@ -125,24 +93,7 @@ def located(chart: Chart, bend: Bend, sensor: Sensor) -> Located | None:
 
 
 def coloured(chart: Chart, what: str, sensor: Sensor) -> tuple[Bytes, Legend]:
-    """Colours (n, 3) of the cloud: how many contacts feel the same there, or how far apart.
-
-    Parameters
-    ----------
-    chart : Chart
-        The cloud.
-    what : str
-        One of :data:`COLOURS`.
-    sensor : Sensor
-        The three signals and their noise, for the first three.
-
-    Returns
-    -------
-    colours : array (n, 3)
-        Bytes.
-    legend : Legend
-        Of the colours.
-    """
+    """Colours (n, 3) of the cloud: how many contacts feel the same there, or how far apart."""
     if what in SIGNALS:
         return shaded(what, chart.signals[what])
     if what == "sensitivity":

@@ -77,24 +77,7 @@ def _moved(body: Body, by: Array) -> Body:
 def solids_drawing(
     solids: Solids, triangles: Array, by: str
 ) -> tuple[dict[str, Painted], dict[str, Legend]]:
-    """Paint contacts where they are, coloured by a coordinate, and where their signals are.
-
-    Parameters
-    ----------
-    solids : Solids
-        Whose.
-    triangles : array (n, 3, columns)
-        Of the skin, or of a slice.
-    by : str
-        The coordinate that colours the space of contacts.
-
-    Returns
-    -------
-    drawing : dict of str to Painted
-        ``contacts``, and ``r``, ``theta``, ``phi`` in the spaces of signals.
-    legends : dict of str to Legend
-        Of the three coordinates.
-    """
+    """Paint contacts where they are, coloured by a coordinate, and where their signals are."""
     painted: dict[str, Painted] = {}
     legends: dict[str, Legend] = {}
     for i, name in enumerate(COORDINATES):
@@ -106,24 +89,7 @@ def solids_drawing(
 
 
 def picked_drawing(solids: Solids, row: Array, exaggeration: float) -> tuple[Drawing, str]:
-    """Mark a contact in all spaces, bend the whisker there, and say what it feels.
-
-    Parameters
-    ----------
-    solids : Solids
-        Whose.
-    row : array (columns,)
-        The contact.
-    exaggeration : float
-        How many times thicker than it is the whisker is drawn.
-
-    Returns
-    -------
-    drawing : mapping of str to thing
-        In mm.
-    words : str
-        HTML.
-    """
+    """Mark a contact in all spaces, bend the whisker there, and say what it feels."""
     whisker = solids.chart.whisker
     radius = 0.016 * solids.length
     out: dict[str, Thing] = {}

@@ -20,13 +20,7 @@ _HINT = "Click on a solid: the same contact is marked in all four spaces."
 
 
 class MapMode:
-    """The controls of solids and slices, and what was picked.
-
-    Parameters
-    ----------
-    page : Page
-        To which it belongs.
-    """
+    """The controls of solids and slices, and what was picked."""
 
     name = "Map"
 

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 import viser
 
-from vibrissa.mapping import ContactMap
+from vibrissa.contacts import ContactMap
 from vibrissa.quantities import to_display
 from vibrissa.viewer.bending import Bend, begin, loaded, moved, with_whisker
 from vibrissa.viewer.charting import Chart, charted
@@ -57,17 +57,7 @@ class Mode(Protocol):
 
 
 class Page:
-    """What all modes share.
-
-    Parameters
-    ----------
-    server : viser.ViserServer
-        That serves it.
-    whisker : Whisker
-        That is looked at.
-    contacts : ContactMap, optional
-        Its map, if there is one already.
-    """
+    """What all modes share."""
 
     def __init__(
         self, server: viser.ViserServer, whisker: Whisker, contacts: ContactMap | None = None

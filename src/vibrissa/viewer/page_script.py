@@ -98,18 +98,7 @@ _ICON = (
 
 
 def amended(response: Any) -> Any:
-    """Put the script into a response that is a page; leave every other as it is.
-
-    Parameters
-    ----------
-    response : websockets.http11.Response or None
-        Of viser's server.
-
-    Returns
-    -------
-    websockets.http11.Response or None
-        The same.
-    """
+    """Put the script into a response that is a page; leave every other as it is."""
     if response is None or not response.headers.get("Content-Type", "").startswith("text/html"):
         return response
     zipped = response.headers.get("Content-Encoding") == "gzip"
@@ -125,17 +114,6 @@ def _zipped(page: bytes) -> bytes:
 
 
 def with_script(page: bytes) -> bytes:
-    """Put the script, an icon and a title first of all that a page loads.
-
-    Parameters
-    ----------
-    page : bytes
-        HTML.
-
-    Returns
-    -------
-    bytes
-        The same page where it has no head to put them.
-    """
+    """Put the script, an icon and a title first of all that a page loads."""
     ours = f'<link rel="icon" href="{_ICON}"/><title>vibrissa</title><script>{SCRIPT}</script>'
     return page.replace(b"<head>", b"<head>" + ours.encode(), 1)

@@ -11,13 +11,7 @@ RATE = 25.0
 
 
 class Player:
-    """Tells the time that has passed while it plays, in a thread of its own.
-
-    Parameters
-    ----------
-    tick : callable
-        Called with the seconds that have passed since the last call.
-    """
+    """Tells the time that has passed while it plays, in a thread of its own."""
 
     def __init__(self, tick: Callable[[float], None]) -> None:
         self._tick = tick

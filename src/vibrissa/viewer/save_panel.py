@@ -24,15 +24,7 @@ _TIMEOUT = 20.0
 
 
 class SaveControls:
-    """Whisker, picture and data, downloaded by whoever asks.
-
-    Parameters
-    ----------
-    page : Page
-        What is saved.
-    recording : DataTree, optional
-        The trial that is watched.
-    """
+    """Whisker, picture and data, downloaded by whoever asks."""
 
     def __init__(self, page: Page, recording: xr.DataTree | None = None) -> None:
         self._page = page

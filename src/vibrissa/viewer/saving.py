@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from vibrissa.contacts import ContactMap
 from vibrissa.io import save_centerline, save_recording
 from vibrissa.io.netcdf import netcdf_image
-from vibrissa.mapping import ContactMap
 from vibrissa.quantities import attributes
 from vibrissa.rod import Deflection
 from vibrissa.signals import base_signals
@@ -50,19 +50,7 @@ def netcdf(data: xr.Dataset) -> bytes:
 
 
 def deflection_dataset(bent: Deflection) -> xr.Dataset:
-    """One bent whisker as a labelled dataset.
-
-    Parameters
-    ----------
-    bent : Deflection
-        By one load.
-
-    Returns
-    -------
-    Dataset
-        Centreline over ``node``, force, moment, contact point, arc length, the six signals and
-        the status, in the whisker frame and SI units; missing is NaN.
-    """
+    """One bent whisker as a labelled dataset."""
     values: dict[str, Any] = {
         "centerline": (("node", "space"), bent.centerline(NODES), attributes("centerline")),
         "force": ("space", np.asarray(bent.force), attributes("force")),

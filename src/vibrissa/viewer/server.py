@@ -18,8 +18,8 @@ import viser
 import xarray as xr
 from numpy.typing import ArrayLike
 
+from vibrissa.contacts import ContactMap
 from vibrissa.io.footage import Footage
-from vibrissa.mapping import ContactMap
 from vibrissa.viewer.bend_panel import BendMode
 from vibrissa.viewer.bending import loaded, moved
 from vibrissa.viewer.guard import guarded
@@ -261,25 +261,7 @@ def free_port(host: str) -> int:
 
 
 def is_free(host: str, port: int) -> bool:
-    """Tell whether a port can be listened on.
-
-    Parameters
-    ----------
-    host : str
-        Address on this machine.
-    port : int
-        Which.
-
-    Returns
-    -------
-    bool
-        False where it is taken.
-
-    Raises
-    ------
-    ValueError
-        If that is not for being taken: the host is none of this machine's, the port no port.
-    """
+    """Tell whether a port can be listened on."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as probe:
         if os.name == "posix":  # a port that was just given back is free

@@ -21,17 +21,7 @@ _COUNTS = ((0.80, 0.82, 0.84), (0.35, 0.62, 0.80), (0.90, 0.55, 0.10), (0.75, 0.
 
 @dataclass(frozen=True)
 class Legend:
-    """What the colours mean.
-
-    Parameters
-    ----------
-    title : str
-        HTML.
-    steps : tuple of (str, str)
-        Colours as CSS has them, each with a word beside it or nothing.
-    smooth : bool
-        Whether colours pass into each other.
-    """
+    """What the colours mean."""
 
     title: str
     steps: tuple[tuple[str, str], ...]

@@ -12,19 +12,7 @@ from vibrissa.whisker.profile import constant
 
 @dataclass(frozen=True)
 class Shape:
-    """What the sliders say.
-
-    Parameters
-    ----------
-    length : float
-        m.
-    turn : float
-        By how much the whisker turns from base to tip, ∫|κ| ds, rad.
-    taper : float
-        Base radius over tip radius.
-    modulus : float
-        Young's modulus, Pa.
-    """
+    """What the sliders say."""
 
     length: float
     turn: float

@@ -17,22 +17,7 @@ _MOST = 700
 
 
 def chart(time: Array, signals: dict[str, Array], felt: NDArray[np.bool_]) -> str:
-    """Draw the six signals over time.
-
-    Parameters
-    ----------
-    time : array (n,)
-        s.
-    signals : mapping of str to array (n,)
-        SI units.
-    felt : array (n,) of bool
-        Where the whisker touches; shaded.
-
-    Returns
-    -------
-    str
-        HTML, :func:`height` pixels high, over which :func:`cursor` is to be laid.
-    """
+    """Draw the six signals over time."""
     parts = [_shade(time, felt)]
     for row, names in enumerate(ROWS):
         parts.append(_row(time, signals, names, row * ROW))

@@ -39,18 +39,7 @@ TURN = float(np.deg2rad(62.0))
 
 @dataclass(frozen=True, eq=False)
 class Solids:
-    """The contacts of a whisker, ready to be laid out.
-
-    Parameters
-    ----------
-    chart : Chart
-        Whose.
-    nodes : array (a, b, c, columns)
-        Contacts and their signals over arc length, bearing and load; see
-        :mod:`vibrissa.plots.chart`.
-    cut : bool
-        Whether a quarter is left out, so that one looks inside.
-    """
+    """The contacts of a whisker, ready to be laid out."""
 
     chart: Chart
     nodes: Array
@@ -85,18 +74,7 @@ class Solids:
         return float(values.min()), float(values.max())
 
     def felt(self, rows: Array) -> Array:
-        """Places (..., 3), mm, of rows in the space of signals, its axis at the origin.
-
-        Parameters
-        ----------
-        rows : array (..., columns)
-            Contacts.
-
-        Returns
-        -------
-        array (..., 3)
-            As large as the whisker is long.
-        """
+        """Places (..., 3), mm, of rows in the space of signals, its axis at the origin."""
         reach, low, high = self._limits
         size = np.sqrt(values_of("MB", rows)) / reach
         turn = values_of("MD", rows) + TURN
@@ -135,22 +113,7 @@ def solids(chart: Chart, cut: bool) -> Solids:
 
 
 def picked(triangles: Array, places: Array, origin: Array, direction: Array) -> Array | None:
-    """The contact that a ray meets first.
-
-    Parameters
-    ----------
-    triangles : array (n, 3, columns)
-        Rows of what is drawn.
-    places : array (n, 3, 3)
-        Where it is drawn, mm.
-    origin, direction : array (3,)
-        Of the ray.
-
-    Returns
-    -------
-    array (columns,) or None
-        Row at the point that is met; None where nothing is.
-    """
+    """The contact that a ray meets first."""
     a, b, c = places.transpose(1, 0, 2)
     first, second = b - a, c - a
     across = np.cross(direction, second)

@@ -16,11 +16,6 @@ def lit(scene: viser.SceneApi) -> None:
 
     Reflections of a surrounding, which viser lights with, take most of the time of a frame where
     there is no graphics card, and nothing here is shiny; so do shadows.
-
-    Parameters
-    ----------
-    scene : viser.SceneApi
-        Of a server.
     """
     scene.configure_environment_map(None)
     scene.configure_default_lights(cast_shadow=False)
@@ -34,13 +29,7 @@ def lit(scene: viser.SceneApi) -> None:
 
 
 class Stage:
-    """The 3D scene of a server, in layers of things by name.
-
-    Parameters
-    ----------
-    server : viser.ViserServer
-        Whose scene.
-    """
+    """The 3D scene of a server, in layers of things by name."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server

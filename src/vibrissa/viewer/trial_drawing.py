@@ -6,10 +6,10 @@ import numpy as np
 import xarray as xr
 
 from vibrissa.contour import CylinderFit, SphereFit, shape_from_dataset, surface_grid
+from vibrissa.objects.dataset import objects_datasets
+from vibrissa.objects.surface import Surface
 from vibrissa.plots.things import object_surface
 from vibrissa.quantities import to_display
-from vibrissa.rod.surface import Surface
-from vibrissa.trial.object_files import objects_datasets
 from vibrissa.viewer.bend_drawing import arrow, whisker_body
 from vibrissa.viewer.bending import force_scale
 from vibrissa.viewer.drawing import (
@@ -43,22 +43,7 @@ def extent(trial: Watched) -> tuple[Array, float]:
 
 
 def moment_drawing(trial: Watched, frame: int, exaggeration: float) -> Drawing:
-    """Draw whiskers, forces and contacts of one frame.
-
-    Parameters
-    ----------
-    trial : Watched
-        The trial.
-    frame : int
-        Which.
-    exaggeration : float
-        How many times thicker than they are whiskers are drawn.
-
-    Returns
-    -------
-    mapping of str to thing
-        Laboratory frame, mm.
-    """
+    """Draw whiskers, forces and contacts of one frame."""
     out: dict[str, Thing] = {}
     for i, whisker in enumerate(trial.whiskers):
         line = trial.lines[frame, i]
@@ -127,20 +112,7 @@ def _known(trial: Watched) -> Array:
 
 
 def fitted_body(contour: xr.Dataset, near: Array) -> tuple[Array, Ints] | None:
-    """Vertices, m, and triangles of a fitted shape; None for what has no picture.
-
-    Parameters
-    ----------
-    contour : Dataset
-        The group ``contour`` of a recording.
-    near : array (n, 3)
-        The contacts, m: what has no end reaches a little beyond them.
-
-    Returns
-    -------
-    tuple of arrays, or None
-        Vertices and triangles.
-    """
+    """Vertices, m, and triangles of a fitted shape; None for what has no picture."""
     try:
         shape = shape_from_dataset(contour)
     except ValueError:

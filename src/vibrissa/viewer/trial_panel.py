@@ -22,17 +22,7 @@ _USUAL = "1 : 10"
 
 
 class TrialMode:
-    """Time, and all that goes with it.
-
-    Parameters
-    ----------
-    page : Page
-        To which it belongs.
-    trial : Watched
-        What is watched.
-    videos : sequence of Footage
-        The frames of its cameras, in their order; may be empty.
-    """
+    """Time, and all that goes with it."""
 
     name = "Trial"
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.trial.shadows import silhouette
+from vibrissa.simulation.shadows import silhouette
 from vibrissa.viewer.drawing import Array, Bytes
 from vibrissa.viewer.watching import Watched
 
@@ -23,19 +23,7 @@ _CONTACT = np.array([0, 150, 255], dtype=np.uint8)
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One camera's window onto a trial.
-
-    Parameters
-    ----------
-    name : str
-        Of the camera.
-    number : int
-        Of the view.
-    box : tuple of int
-        Left, top, right and bottom of what is shown, pixels of the image.
-    empty : array (height, width)
-        Grey values of the whole image where there is no video: objects before a light wall.
-    """
+    """One camera's window onto a trial."""
 
     name: str
     number: int
@@ -70,24 +58,7 @@ def views(trial: Watched) -> tuple[View, ...]:
 
 
 def picture(view: View, trial: Watched, frame: int, image: Frame | None = None) -> Bytes:
-    """Show one frame of one camera.
-
-    Parameters
-    ----------
-    view : View
-        Of the camera.
-    trial : Watched
-        With its traces.
-    frame : int
-        Which.
-    image : array (height, width), optional
-        The video's frame; by default the objects alone.
-
-    Returns
-    -------
-    array (rows, columns, 3)
-        Red, green, blue.
-    """
+    """Show one frame of one camera."""
     left, top, right, bottom = view.box
     source = view.empty if image is None else image
     rows = np.arange(top, bottom, 1.0 / view.scale).astype(int)

@@ -42,14 +42,7 @@ def rehearsal(page: Page) -> list[Job]:
 
 
 class Warming(event.Listener):
-    """Goes through jobs in a thread of its own, and tells when kernels are being compiled.
-
-    Parameters
-    ----------
-    told : callable
-        Called with True when a kernel of this package begins to be compiled, in whatever thread,
-        and with False when there are no more to come.
-    """
+    """Goes through jobs in a thread of its own, and tells when kernels are being compiled."""
 
     def __init__(self, told: Callable[[bool], None]) -> None:
         self._told = told

@@ -13,9 +13,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from vibrissa.rod.surface import Surface
+from vibrissa.cameras import Camera
+from vibrissa.objects.surface import Surface
+from vibrissa.recording import recorded_cameras, recorded_objects, recorded_whisker
 from vibrissa.signals import SIGNALS, base_signals
-from vibrissa.trial import Camera, recorded_cameras, recorded_objects, recorded_whisker
 from vibrissa.viewer.bend_drawing import NODES
 from vibrissa.viewer.drawing import Array
 from vibrissa.whisker import Whisker
@@ -25,35 +26,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Watched:
-    """A trial of n frames, w whiskers and v views.
-
-    Parameters
-    ----------
-    time : array (n,)
-        s.
-    whiskers : tuple of Whisker
-        That whisk.
-    names : tuple of str
-        Their names.
-    lines : array (n, w, k, 3)
-        Their centrelines, m.
-    contacts : array (n, w, 3)
-        Contact points, m; NaN without contact.
-    felt : array (n, w) of bool
-        Whether they touch.
-    forces : array (n, w, 3)
-        On the whiskers, N.
-    signals : mapping of str to array (n, w)
-        The six signals, SI units.
-    objects : tuple
-        That stand in the laboratory.
-    contour : Dataset, optional
-        The shape fitted to the contacts.
-    cameras : tuple of Camera
-        That filmed it; none if that is not known.
-    traces : array (n, w, v, k, 2), optional
-        Whiskers in the images, pixels.
-    """
+    """A trial of n frames, w whiskers and v views."""
 
     time: Array
     whiskers: tuple[Whisker, ...]
@@ -95,24 +68,7 @@ class Watched:
 
 
 def watched(recording: xr.DataTree) -> Watched:
-    """Take from a recording what can be looked at.
-
-    Parameters
-    ----------
-    recording : DataTree
-        Simulated or tracked, with or without the groups ``signals``, ``estimates``, ``contour``,
-        ``cameras`` and ``truth``.
-
-    Returns
-    -------
-    Watched
-        For all its whiskers.
-
-    Raises
-    ------
-    ValueError
-        If it has no frames, or neither centrelines nor poses of a whisker.
-    """
+    """Take from a recording what can be looked at."""
     root = recording.to_dataset()
     if not root.sizes.get("time") or not root.sizes.get("whisker"):
         raise ValueError("the recording has no frames of a whisker to look at")

@@ -13,13 +13,7 @@ _GPA = 1e-9
 
 
 class WhiskerControls:
-    """Length, turn, taper, modulus, and how thick the whisker is drawn.
-
-    Parameters
-    ----------
-    page : Page
-        To which they belong.
-    """
+    """Length, turn, taper, modulus, and how thick the whisker is drawn."""
 
     def __init__(self, page: Page) -> None:
         own = shape_of(page.original)

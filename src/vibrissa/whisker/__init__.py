@@ -7,4 +7,11 @@ from vibrissa.whisker.model import Whisker
 from vibrissa.whisker.pose import Pose
 from vibrissa.whisker.profile import Profile
 
-__all__ = ["Identity", "Pose", "Profile", "Whisker", "WhiskerArray", "whisker_array"]
+__all__ = [
+    "Identity",
+    "Pose",
+    "Profile",
+    "Whisker",
+    "WhiskerArray",
+    "whisker_array",
+]

@@ -220,22 +220,7 @@ class WhiskerArray(Mapping[str, Whisker]):
 
 
 def sides(side: str) -> tuple[Side, ...]:
-    """List the sides that are meant.
-
-    Parameters
-    ----------
-    side : {"both", "left", "right"}
-        In a word.
-
-    Returns
-    -------
-    tuple of {"left", "right"}
-
-    Raises
-    ------
-    ValueError
-        If it is none of these words.
-    """
+    """List the sides that are meant."""
     meant = BOTH if side == "both" else tuple(one for one in BOTH if one == side)
     if not meant:
         raise ValueError(f"side is {side!r}; both, left or right is needed")

@@ -30,20 +30,7 @@ _OF_HEAD = "In the head's frame: origin at the snout, x to the animal's right, y
 
 
 def array_tree(whiskers: Iterable[Whisker], identities: Iterable[Identity]) -> xr.DataTree:
-    """Write an array of whiskers.
-
-    Parameters
-    ----------
-    whiskers : iterable of Whisker
-        With poses in the head's frame.
-    identities : iterable of Identity
-        Which they are.
-
-    Returns
-    -------
-    xarray.DataTree
-        See the module.
-    """
+    """Write an array of whiskers."""
     them, which = list(whiskers), list(identities)
     rotation = np.stack([w.pose.rotation for w in them])
     angles = angles_of(rotation)
@@ -80,23 +67,7 @@ def array_tree(whiskers: Iterable[Whisker], identities: Iterable[Identity]) -> x
 
 
 def whiskers_of(tree: xr.DataTree) -> list[Whisker]:
-    """Make the whiskers of a tree again.
-
-    Parameters
-    ----------
-    tree : xarray.DataTree
-        Of `array_tree`.
-
-    Returns
-    -------
-    list of Whisker
-        As they were.
-
-    Raises
-    ------
-    ValueError
-        If it is no such tree.
-    """
+    """Make the whiskers of a tree again."""
     from vibrissa.whisker.model import Whisker
 
     kind = tree.attrs.get("kind")

@@ -84,25 +84,7 @@ def whisker_array(
 
 
 def average_whisker(identity: Identity, **properties: Unpack[Properties]) -> Whisker:
-    """Make one whisker of an average rat; see `whisker_array`.
-
-    Parameters
-    ----------
-    identity : Identity
-        Which, with its side.
-    **properties
-        Radius and material instead of the published ones and the defaults; see `Whisker`.
-
-    Returns
-    -------
-    Whisker
-        With its pose in the head's frame.
-
-    Raises
-    ------
-    ValueError
-        If it tells no side, or the equations leave it no length.
-    """
+    """Make one whisker of an average rat; see `whisker_array`."""
     if identity.side is None:
         raise ValueError(f"{identity.name} tells no side; left or right is needed")
     row, column = identity.row_number, identity.column

@@ -15,22 +15,7 @@ _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(12)
 
 
 class ArcLength:
-    """Arc length of a spline curve between two parameters.
-
-    Parameters
-    ----------
-    curve : scipy.interpolate.BSpline
-        The curve, (…) → (…, d).
-    start, end : float, optional
-        Parameters where arc length begins and ends; by default those of the first and last knot.
-
-    Attributes
-    ----------
-    ends : array (m,)
-        Arc lengths of start, knots in between, and end.
-    total : float
-        Arc length from start to end.
-    """
+    """Arc length of a spline curve between two parameters."""
 
     def __init__(
         self, curve: BSpline, start: float | None = None, end: float | None = None
@@ -73,24 +58,7 @@ class ArcLength:
 
 
 def nearest_parameters(curve: BSpline, points: Array, guesses: Array, window: float) -> Array:
-    """Find the nearest points on a curve, each within a window of parameters.
-
-    Parameters
-    ----------
-    curve : scipy.interpolate.BSpline
-        The curve, parameter 0 to 1.
-    points : array (n, d)
-        Points near it.
-    guesses : array (n,)
-        Middle of each point's window.
-    window : float
-        Half its width, in parameters: a curve that comes near itself is not mixed up.
-
-    Returns
-    -------
-    array (n,)
-        Parameters; they may lie a little beyond 0 and 1, where the end's polynomial goes on.
-    """
+    """Find the nearest points on a curve, each within a window of parameters."""
     grid = np.linspace(-0.02, 1.02, 521)
     apart = np.sum((points[:, np.newaxis] - np.asarray(curve(grid))) ** 2, axis=-1)
     apart[np.abs(grid - guesses[:, np.newaxis]) > window] = np.inf

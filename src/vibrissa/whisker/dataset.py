@@ -27,18 +27,7 @@ Row = tuple[str, tuple[str, ...], object, str, str]
 
 
 def whisker_dataset(whisker: "Whisker") -> xr.Dataset:
-    """Write a whisker as a dataset.
-
-    Parameters
-    ----------
-    whisker : Whisker
-        What is written.
-
-    Returns
-    -------
-    xarray.Dataset
-        Every variable has the attributes `units` and `long_name`.
-    """
+    """Write a whisker as a dataset."""
     bending, twist = whisker.base_stiffness or (np.inf, np.inf)
     s = np.linspace(0.0, whisker.length, NODES)
     known: dict[str, tuple[tuple[str, ...], object]] = {
@@ -108,21 +97,7 @@ def _profile_rows(name: str, profile: Profile, units: str, long_name: str) -> li
 
 
 def check_drawn(dataset: xr.Dataset, whisker: "Whisker") -> None:
-    """Raise if a file draws another whisker than its polynomials make.
-
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        What `whisker_dataset` wrote, as far as nobody changed it.
-    whisker : Whisker
-        Made of it.
-
-    Raises
-    ------
-    ValueError
-        If centreline or radius at the points that come along are not those of the whisker, so
-        that it is open which of both is meant.
-    """
+    """Raise if a file draws another whisker than its polynomials make."""
     if dataset.variables.keys().isdisjoint(_DRAWN):
         return
     s, line, radius = (np.asarray(dataset[name].values, dtype=np.float64) for name in _DRAWN)
@@ -148,23 +123,7 @@ _SAME = 1e-6
 
 
 def whisker_fields(dataset: xr.Dataset) -> dict[str, Any]:
-    """Read the fields of a `Whisker` from a dataset that `whisker_dataset` wrote.
-
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        What `whisker_dataset` wrote.
-
-    Returns
-    -------
-    dict
-        Keyword arguments of `Whisker`.
-
-    Raises
-    ------
-    ValueError
-        If variables are missing.
-    """
+    """Read the fields of a `Whisker` from a dataset that `whisker_dataset` wrote."""
     needed = {"length", "youngs_modulus", "poisson_ratio", "breaks"}
     needed |= {"base_bending_stiffness", "base_twist_stiffness"}
     needed |= {"pose_rotation", "pose_origin", "curvature_knots", "curvature_coefficients"}

@@ -51,19 +51,7 @@ WANDERING = 4.0
 
 @dataclass(frozen=True, eq=False)
 class Digitized:
-    """The shape found in points, in a frame along the base tangent with any roll.
-
-    Parameters
-    ----------
-    length : float
-        Arc length of the fitted curve, m.
-    curvature : Profile
-        u₀ in the rotation-minimising frame, 1/m.
-    pose : Pose
-        From that frame to the points' frame.
-    noise : float
-        Standard deviation per coordinate, m, that was found or stated.
-    """
+    """The shape found in points, in a frame along the base tangent with any roll."""
 
     length: float
     curvature: Profile
@@ -77,28 +65,7 @@ def digitize(
     base: str | ArrayLike | None,
     any_length: bool = False,
 ) -> Digitized:
-    """Find length, intrinsic curvature and pose in digitised points.
-
-    Parameters
-    ----------
-    points : array (n, 3) or (n, 2)
-        Points along the whisker, m, in any frame and at any spacing; two columns mean z = 0.
-    noise : float, optional
-        Standard deviation of a coordinate, m; 0 asks for interpolation. By default it is estimated.
-    base : {"first", "last"} or array (3,) or (2,), optional
-        Which end is the base: by name, or a point near it. By default the first.
-    any_length : bool
-        Whether a length that no animal's whisker has is meant.
-
-    Returns
-    -------
-    Digitized
-
-    Raises
-    ------
-    ValueError
-        If the points are no centreline, with all that is wrong with them.
-    """
+    """Find length, intrinsic curvature and pose in digitised points."""
     array = checked_points(points, noise, any_length)
     array = array[::-1] if _starts_at_tip(array, base) else array
     line = _Line.fitted(array)

@@ -17,23 +17,7 @@ Array = NDArray[np.float64]
 
 
 def base_rotation(azimuth: ArrayLike, elevation: ArrayLike, roll: ArrayLike) -> Array:
-    """Turn emergence angles into rotations.
-
-    Parameters
-    ----------
-    azimuth, elevation, roll : array_like (...)
-        Of the base, rad.
-
-    Returns
-    -------
-    array (..., 3, 3)
-        From the whisker's frame to that of the angles, R_z(azimuth) R_y(−elevation) R_x(roll).
-
-    Examples
-    --------
-    >>> base_rotation(np.pi / 2, 0.0, 0.0).round(3)[:, 0]
-    array([0., 1., 0.])
-    """
+    """Turn emergence angles into rotations."""
     az, el, ro = np.broadcast_arrays(azimuth, elevation, roll)
     ca, sa = np.cos(az), np.sin(az)
     ce, se = np.cos(el), np.sin(el)
@@ -47,18 +31,7 @@ def base_rotation(azimuth: ArrayLike, elevation: ArrayLike, roll: ArrayLike) -> 
 
 
 def angles_of(rotation: Array) -> Array:
-    """Say the emergence angles of orientations of the base.
-
-    Parameters
-    ----------
-    rotation : array (..., 3, 3)
-        From the whisker's frame to that of the angles.
-
-    Returns
-    -------
-    array (..., 3)
-        Azimuth, elevation and roll, rad: the inverse of `base_rotation`.
-    """
+    """Say the emergence angles of orientations of the base."""
     azimuth = np.arctan2(rotation[..., 1, 0], rotation[..., 0, 0])
     elevation = np.arcsin(np.clip(rotation[..., 2, 0], -1.0, 1.0))
     level = base_rotation(azimuth, elevation, 0.0 * azimuth)
@@ -69,17 +42,6 @@ def angles_of(rotation: Array) -> Array:
 
 
 def mirrored(angles: ArrayLike) -> Array:
-    """Give the emergence angles of the mirror image in the y–z plane, on the other side of a face.
-
-    Parameters
-    ----------
-    angles : array_like (..., 3)
-        Azimuth, elevation and roll, rad.
-
-    Returns
-    -------
-    array (..., 3)
-        Of the mirror image, which bends to the mirrored side.
-    """
+    """Mirror emergence angles in the y–z plane, to the other side of a face."""
     azimuth, elevation, roll = np.moveaxis(np.asarray(angles, dtype=np.float64), -1, 0)
     return np.stack([np.pi - azimuth, elevation, np.pi - roll], axis=-1)

@@ -63,18 +63,6 @@ def arc_length(row: ArrayLike, column: ArrayLike) -> Array:
     """Length of whiskers (Towal et al. 2011).
 
     S = −7.9312 column + 2.2224 row + 52.1110 mm.
-
-    Parameters
-    ----------
-    row : array_like (...)
-        1 (A) to 5 (E).
-    column : array_like (...)
-        0 (Greek) to 6.
-
-    Returns
-    -------
-    array (...)
-        m. Not positive for columns far beyond those measured.
     """
     row, column = _towal(row, column)
     return np.asarray(1e-3 * (-7.9312 * column + 2.2224 * row + 52.1110))
@@ -85,16 +73,6 @@ def curvature_coefficient(column: ArrayLike) -> Array:
 
     A = exp(1 / (−0.02052 column − 0.2045)) per mm. The table printed in the paper has a misprint;
     this form gives the value of its text, 0.0233 per mm for C2.
-
-    Parameters
-    ----------
-    column : array_like (...)
-        0 (Greek) to 6.
-
-    Returns
-    -------
-    array (...)
-        1/m.
     """
     _, column = _towal(1, column)
     return np.asarray(1e3 * np.exp(1.0 / (-0.02052 * column - 0.2045)))
@@ -104,16 +82,6 @@ def curvature_bound(length: ArrayLike) -> Array:
     """Say how large the coefficient A of a real whisker is at most (Quist & Hartmann 2012).
 
     A ≤ 0.156 exp(−S / 15.6 mm) + 0.015 per mm.
-
-    Parameters
-    ----------
-    length : array_like (...)
-        Arc length, m.
-
-    Returns
-    -------
-    array (...)
-        1/m.
     """
     s = 1e3 * np.asarray(length, dtype=np.float64)
     return np.asarray(1e3 * (0.156 * np.exp(-s / 15.6) + 0.015))
@@ -124,18 +92,6 @@ def base_point(row: ArrayLike, column: ArrayLike) -> Array:
 
     On the ellipsoid of the cheek, in whose own axes the direction from its centre has the azimuth
     15.2953 column − 144.2220 and the angle 18.2237 row + 34.7558 from the third axis, in degrees.
-
-    Parameters
-    ----------
-    row : array_like (...)
-        1 (A) to 5 (E).
-    column : array_like (...)
-        0 (Greek) to 6.
-
-    Returns
-    -------
-    array (..., 3)
-        m, head's frame.
     """
     row, column = _towal(row, column)
     azimuth = np.radians(15.2953 * column - 144.2220)
@@ -157,20 +113,7 @@ def _cheek() -> Array:
 
 
 def projection_angles(row: ArrayLike, column: ArrayLike) -> Array:
-    """Angles of whiskers as Towal et al. (2011) give them; see the module.
-
-    Parameters
-    ----------
-    row : array_like (...)
-        1 (A) to 5 (E).
-    column : array_like (...)
-        0 (Greek) to 6.
-
-    Returns
-    -------
-    array (..., 4)
-        θ, φ, ψ and ζ, rad.
-    """
+    """Angles of whiskers as Towal et al. (2011) give them; see the module."""
     row, column = _towal(row, column)
     degrees = [
         10.6475 * column + 37.3178,
@@ -183,20 +126,7 @@ def projection_angles(row: ArrayLike, column: ArrayLike) -> Array:
 
 
 def emergence_angles(row: ArrayLike, column: ArrayLike) -> Array:
-    """How whiskers of the right side leave the face (Towal et al. 2011).
-
-    Parameters
-    ----------
-    row : array_like (...)
-        1 (A) to 5 (E).
-    column : array_like (...)
-        0 (Greek) to 6.
-
-    Returns
-    -------
-    array (..., 3)
-        Azimuth, elevation and roll, rad, head's frame, for `base_rotation`.
-    """
+    """How whiskers of the right side leave the face (Towal et al. 2011)."""
     theta, phi, _, zeta = np.moveaxis(projection_angles(row, column), -1, 0)
     azimuth = theta - np.pi / 2.0
     elevation = np.arctan(np.tan(phi) * np.cos(azimuth))
@@ -207,20 +137,6 @@ def base_radius(row: ArrayLike, column: ArrayLike, length: ArrayLike) -> Array:
     """Radius of whiskers at the base (Belli et al. 2017).
 
     Its diameter is 0.041 + 0.002 S + 0.011 row − 0.0039 column, mm, with the length S in mm.
-
-    Parameters
-    ----------
-    row : array_like (...)
-        1 (A) to 5 (E).
-    column : array_like (...)
-        0 (Greek) to 6.
-    length : array_like (...)
-        Arc length, m.
-
-    Returns
-    -------
-    array (...)
-        m.
     """
     row, column = _belli(row, column)
     s = 1e3 * np.asarray(length, dtype=np.float64)
@@ -231,18 +147,6 @@ def radius_slope(row: ArrayLike, column: ArrayLike) -> Array:
     """Radius that whiskers lose per length, from base to tip (Belli et al. 2017).
 
     0.0012 + 0.00017 row − 0.000066 column + 0.00011 column².
-
-    Parameters
-    ----------
-    row : array_like (...)
-        1 (A) to 5 (E).
-    column : array_like (...)
-        0 (Greek) to 6.
-
-    Returns
-    -------
-    array (...)
-        m/m.
     """
     row, column = _belli(row, column)
     return np.asarray(0.0012 + 0.00017 * row - 0.000066 * column + 0.00011 * column**2)
@@ -253,20 +157,6 @@ def tip_radius(row: ArrayLike, column: ArrayLike, length: ArrayLike) -> Array:
 
     Where the slope would lead to less than the base radius over `MOST_TAPER` (often to less than
     nothing), that is taken instead.
-
-    Parameters
-    ----------
-    row : array_like (...)
-        1 (A) to 5 (E).
-    column : array_like (...)
-        0 (Greek) to 6.
-    length : array_like (...)
-        Arc length, m.
-
-    Returns
-    -------
-    array (...)
-        m.
     """
     base = base_radius(row, column, length)
     by_slope = base - radius_slope(row, column) * np.asarray(length)

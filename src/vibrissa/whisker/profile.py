@@ -184,22 +184,7 @@ def linear(start: float, end: float, length: float) -> Profile:
 def approximate(
     function: Function, joints: Sequence[float] | Array, tolerance: float = TOLERANCE
 ) -> Profile:
-    """Bring a function into piecewise polynomial form.
-
-    Parameters
-    ----------
-    function : callable
-        Takes arc lengths (n,), m, and returns (n, ...).
-    joints : sequence of float
-        Start, end, and in between every arc length where the function is not smooth, m, increasing.
-    tolerance : float
-        Largest error, relative to the function's largest value.
-
-    Returns
-    -------
-    Profile
-        Its `error` tells how well the function was met between the interpolation points.
-    """
+    """Bring a function into piecewise polynomial form."""
     joints = np.asarray(joints, dtype=np.float64)
     profile, unresolved = _halved(function, joints, tolerance)
     if 0 < len(unresolved) <= MOST_SEARCHED:
@@ -284,23 +269,7 @@ def _padded(pieces: Sequence[Array]) -> Array:
 
 
 def array_function(function: Callable[..., object], shape: tuple[int, ...], what: str) -> Function:
-    """Make a caller's function of arc length take arrays, and check what it returns.
-
-    Parameters
-    ----------
-    function : callable
-        Takes arc length, m; one value at a time or arrays of them.
-    shape : tuple of int
-        Shape of one value.
-    what : str
-        What it is called in messages.
-
-    Returns
-    -------
-    callable
-        Takes (n,) and returns (n, *shape). It raises ValueError where a value has the wrong shape
-        or is not finite.
-    """
+    """Make a caller's function of arc length take arrays, and check what it returns."""
 
     def one(s: float) -> Array:
         value = np.asarray(function(s), dtype=np.float64)

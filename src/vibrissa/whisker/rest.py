@@ -79,22 +79,7 @@ def _sum(*terms: tuple[float, Screw]) -> Screw:
 
 
 def advance(rate: Rate, start: Array, step: Array, direction: Array) -> tuple[Array, Array]:
-    """Motions over the steps [start, start + step], all (...), m.
-
-    Parameters
-    ----------
-    rate : callable
-        Rate of rotation in the moving frame, (...) → (..., 3), 1/m.
-    start, step : array (...)
-        Where each step begins and how long it is, m.
-    direction : array (3,)
-        Velocity in the moving frame per arc length: e₁, or 0 where only frames are wanted.
-
-    Returns
-    -------
-    rotation : array (..., 3, 3)
-    translation : array (..., 3)
-    """
+    """Motions over the steps [start, start + step], all (...), m."""
     u = rate(start[..., np.newaxis] + _GAUSS * step[..., np.newaxis])
     h = step[..., np.newaxis]
     still = np.zeros_like(u[..., 0, :])
@@ -109,21 +94,7 @@ def advance(rate: Rate, start: Array, step: Array, direction: Array) -> tuple[Ar
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """Frames and points along a curve, known at nodes and reached in between by one step.
-
-    Parameters
-    ----------
-    rate : callable
-        Rate of rotation in the moving frame, (...) → (..., 3), 1/m.
-    nodes : array (n,)
-        Arc lengths, m.
-    rotations : array (n, 3, 3)
-        Frames at the nodes.
-    points : array (n, 3)
-        Points at the nodes, m.
-    direction : array (3,)
-        Velocity in the moving frame per arc length.
-    """
+    """Frames and points along a curve, known at nodes and reached in between by one step."""
 
     rate: Rate
     nodes: Array
@@ -133,21 +104,7 @@ class Path:
 
     @classmethod
     def integrate(cls, rate: Rate, joints: Array, direction: tuple[float, float, float]) -> "Path":
-        """Integrate from joints[0], where the frame is the identity, to joints[-1].
-
-        Parameters
-        ----------
-        rate : callable
-            Rate of rotation in the moving frame, (...) → (..., 3), 1/m.
-        joints : array (m,)
-            Arc lengths between which the rate is smooth, m.
-        direction : tuple of float
-            Velocity in the moving frame per arc length.
-
-        Returns
-        -------
-        Path
-        """
+        """Integrate from joints[0], where the frame is the identity, to joints[-1]."""
         nodes = _step_ends(rate, joints)
         along = np.array(direction)
         turns, moves = advance(rate, nodes[:-1], np.diff(nodes), along)
@@ -180,21 +137,7 @@ def _step_ends(rate: Rate, joints: Array) -> Array:
 
 
 def proximal_roll(points: Array, weights: Array) -> float:
-    """Roll about x that brings the proximal part closest to the x–y plane, bending toward +y.
-
-    Parameters
-    ----------
-    points : array (n, 3)
-        Points of the proximal part, the base tangent along x, m.
-    weights : array (n,)
-        Arc length each point stands for, m.
-
-    Returns
-    -------
-    float
-        Angle, rad, from the present y axis to the new one, counted toward z: the new axes
-        minimise ∫ z² ds and make ∫ y ds positive.
-    """
+    """Roll about x that brings the proximal part closest to the x–y plane, bending toward +y."""
     across = points[:, 1:]
     moments = (weights[:, np.newaxis] * across).T @ across
     _, axes = np.linalg.eigh(moments)

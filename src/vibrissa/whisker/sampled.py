@@ -50,22 +50,7 @@ _QUARTILE = 0.3186
 
 
 def sampled_radius(length: float, s: Array, r: Array) -> Profile:
-    """Join samples of a radius.
-
-    Parameters
-    ----------
-    length : float
-        Arc length of the whisker, m.
-    s : array (n,)
-        Arc lengths, m, not falling; two equal ones state a jump.
-    r : array (n,)
-        Radii, m, positive.
-
-    Returns
-    -------
-    Profile
-        From 0 to `length`, constant beyond the first and the last sample.
-    """
+    """Join samples of a radius."""
     ends = _pieces(s, r, jumps(s, r))
     if len(ends) - 1 > MOST:
         ends = _pieces(s, r, _stated(s, r), kinked=False)
@@ -86,20 +71,7 @@ def sampled_radius(length: float, s: Array, r: Array) -> Profile:
 
 
 def jumps(s: Array, r: Array) -> NDArray[np.intp]:
-    """Find the intervals between samples in which a radius jumps.
-
-    Parameters
-    ----------
-    s : array (n,)
-        Arc lengths, m, not falling.
-    r : array (n,)
-        Radii, m.
-
-    Returns
-    -------
-    array (m,) of int
-        Numbers of the samples just before the jumps.
-    """
+    """Find the intervals between samples in which a radius jumps."""
     stated = _stated(s, r)
     found = [stated]
     for first, last in pairwise([0, *(stated + 1), s.size]):
@@ -108,20 +80,7 @@ def jumps(s: Array, r: Array) -> NDArray[np.intp]:
 
 
 def scatter(s: Array, r: Array) -> float:
-    """Estimate the noise of samples, as a share of the radius, from their nearest neighbours.
-
-    Parameters
-    ----------
-    s : array (n,)
-        Arc lengths, m, not falling.
-    r : array (n,)
-        Radii, m.
-
-    Returns
-    -------
-    float
-        Standard deviation; 0 where samples are too few to tell noise from shape.
-    """
+    """Estimate the noise of samples, as a share of the radius, from their nearest neighbours."""
     if s.size < _MANY:
         return 0.0
     with np.errstate(divide="ignore", invalid="ignore"):

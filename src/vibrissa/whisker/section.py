@@ -96,29 +96,7 @@ _NOTED = {"youngs_modulus": "Young's modulus", "poisson_ratio": "Poisson's ratio
 
 
 def settled(length: float, properties: Properties) -> tuple[Profile, Holding, tuple[str, ...]]:
-    """Turn the keywords of a constructor into a radius profile and checked material.
-
-    Parameters
-    ----------
-    length : float
-        Arc length of the whisker, m.
-    properties : Properties
-        What the caller stated.
-
-    Returns
-    -------
-    section : Profile
-        Radius over arc length, m.
-    holding : Holding
-        Material, holding and name as stated.
-    notes : tuple of str
-        What the user should know about them.
-
-    Raises
-    ------
-    ValueError
-        All faults of them in one message.
-    """
+    """Turn the keywords of a constructor into a radius profile and checked material."""
     stated, holding = split(properties)
     faults = material_faults(
         holding.get("youngs_modulus", YOUNGS_MODULUS),
@@ -141,22 +119,7 @@ def settled(length: float, properties: Properties) -> tuple[Profile, Holding, tu
 
 
 def assumptions(length: float, section: Profile, properties: Properties) -> tuple[str, ...]:
-    """Say what of a measured whisker was not stated and is assumed.
-
-    Parameters
-    ----------
-    length : float
-        Arc length of the whisker, m.
-    section : Profile
-        Its radius, m.
-    properties : Properties
-        What was stated.
-
-    Returns
-    -------
-    tuple of str
-        Sentences that begin with what they are about.
-    """
+    """Say what of a measured whisker was not stated and is assumed."""
     notes = []
     stated = {name for name, value in properties.items() if value is not None}
     if not stated & {"radius", "base_radius", "rat"}:
@@ -183,19 +146,7 @@ def _assumed_radius(length: float, section: Profile) -> str:
 
 
 def kept_notes(notes: Sequence[str], properties: Section | Holding) -> tuple[str, ...]:
-    """Leave out the notes on what is stated anew.
-
-    Parameters
-    ----------
-    notes : sequence of str
-        Those of a whisker.
-    properties : Section or Holding
-        What is stated now.
-
-    Returns
-    -------
-    tuple of str
-    """
+    """Leave out the notes on what is stated anew."""
     about = []
     if properties.keys() & _SECTION_KEYS - {"breaks"}:
         about += ["radius", "the radius", "the tip"]
@@ -269,19 +220,7 @@ def material_faults(
 
 
 def length_faults(length: float, any_length: bool | None = False) -> list[str]:
-    """Say what is wrong with a length; empty if nothing is.
-
-    Parameters
-    ----------
-    length : float
-        Arc length, m.
-    any_length : bool, optional
-        Whether a length that no animal's whisker has is meant.
-
-    Returns
-    -------
-    list of str
-    """
+    """Say what is wrong with a length; empty if nothing is."""
     if not (np.isfinite(length) and length > 0.0):
         return [f"length is {length!r} m; it must be positive"]
     if any_length or SHORTEST <= length <= LONGEST:
@@ -308,34 +247,7 @@ def radius_profile(
     breaks: Sequence[float] = (),
     rat: str | None = None,
 ) -> Profile:
-    """Radius over arc length from any of the ways to state it.
-
-    Parameters
-    ----------
-    length : float
-        Arc length of the whisker, m.
-    base_radius : float, optional
-        Radius at the base, m, 100 µm by default; not used where `radius` is given.
-    tip_radius : float, optional
-        Radius at the tip, m; by default a fifteenth of the base's.
-    radius : callable or array, optional
-        Radius r(s), m, of arc length s, m; or radii (n,) equally spaced from base to tip; or pairs
-        (n, 2) of arc length and radius; two pairs at one arc length state a jump.
-    breaks : sequence of float
-        Arc lengths, m, where a callable radius has a kink or a jump.
-    rat : str, optional
-        Row and column of a rat's whisker, such as ``"C2"``, or ``"any"``: its radii by published
-        regressions, instead of all others.
-
-    Returns
-    -------
-    Profile
-
-    Raises
-    ------
-    ValueError
-        If radii are not positive or do not cover the whisker.
-    """
+    """Radius over arc length from any of the ways to state it."""
     if rat is not None:
         if not all(other is None for other in (radius, tip_radius, base_radius)):
             raise ValueError("rat and a radius were both given; give one of them")

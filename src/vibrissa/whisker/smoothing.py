@@ -43,19 +43,7 @@ LEVELS = 90
 
 
 def natural_spline(t: Array, values: Array) -> BSpline:
-    """Interpolate with a quintic spline that has no third and fourth derivative at the ends.
-
-    Parameters
-    ----------
-    t : array (n,)
-        Parameters, increasing, n ≥ 4.
-    values : array (n, d)
-        Points to go through.
-
-    Returns
-    -------
-    scipy.interpolate.BSpline
-    """
+    """Interpolate with a quintic spline that has no third and fourth derivative at the ends."""
     zero = np.zeros(values.shape[1:])
     # The stubs know conditions by name only.
     ends: Any = ([(3, zero), (4, zero)], [(3, zero), (4, zero)])
@@ -64,17 +52,7 @@ def natural_spline(t: Array, values: Array) -> BSpline:
 
 @dataclass(frozen=True, eq=False)
 class Smoothed:
-    """A smoothing spline and what is known about it.
-
-    Parameters
-    ----------
-    curve : scipy.interpolate.BSpline
-        The spline (…) → (…, d), parameter 0 to 1.
-    residuals : array (n, d)
-        Points minus curve at their parameters.
-    freedom : float
-        tr H, the number of parameters the spline spends per coordinate.
-    """
+    """A smoothing spline and what is known about it."""
 
     curve: BSpline
     residuals: Array
@@ -87,23 +65,7 @@ class Smoothed:
 
 
 def smooth(t: Array, points: Array, noise: float | None, components: int) -> Smoothed:
-    """Fit a smoothing spline.
-
-    Parameters
-    ----------
-    t : array (n,)
-        Parameters, any order, about 0 to 1.
-    points : array (n, d)
-        Noisy points.
-    noise : float, optional
-        Standard deviation per coordinate; by default λ follows from cross-validation.
-    components : int
-        Components of a residual that are not zero by construction.
-
-    Returns
-    -------
-    Smoothed
-    """
+    """Fit a smoothing spline."""
     n = len(t)
     cardinal, roughness = _cardinal()
     # The least λ does nothing to what n points can show, and makes the system regular where there

@@ -1,0 +1,83 @@
+"""Points in space from the pixels of two views or more, with their covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vibrissa.cameras.camera import Camera
+
+Array = NDArray[np.float64]
+
+
+def triangulate(
+    cameras: Sequence[Camera], pixels: ArrayLike, sigma: ArrayLike = 1.0
+) -> tuple[Array, Array]:
+    """Find the points that two or more cameras see.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        At least two views.
+    pixels : array_like (camera, ..., 2)
+        Where each camera sees each point; NaN gives NaN.
+    sigma : array_like
+        Standard deviation of a pixel coordinate, broadcast to (camera, ...).
+
+    Returns
+    -------
+    points : array (..., 3)
+        Those that are seen nearest to the pixels, each weighted by its sigma, m.
+    covariance : array (..., 3, 3)
+        Of the points, m².
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than two views, or shapes do not fit.
+    """
+    pixels = np.asarray(pixels, dtype=np.float64)
+    if len(cameras) < 2 or pixels.ndim < 2 or pixels.shape[0] != len(cameras):
+        raise ValueError(
+            f"{len(cameras)} cameras and pixels of shape {pixels.shape} do not fit; two or more "
+            "cameras and (camera, ..., 2) are needed"
+        )
+    weight = 1.0 / np.broadcast_to(np.asarray(sigma, np.float64), pixels.shape[:-1])
+    points = _nearest_to_rays(cameras, pixels)
+    hessian = np.zeros((*points.shape, 3))
+    for _ in range(8):
+        hessian = np.zeros((*points.shape, 3))
+        gradient = np.zeros(points.shape)
+        for camera, wanted, w in zip(cameras, pixels, weight, strict=True):
+            seen, slopes = camera.project_with_slopes(points)
+            scaled = slopes * w[..., None, None]
+            miss = (wanted - seen) * w[..., None]
+            hessian += np.swapaxes(scaled, -1, -2) @ scaled
+            gradient += (np.swapaxes(scaled, -1, -2) @ miss[..., None])[..., 0]
+        step = np.linalg.solve(_regular(hessian), gradient[..., None])[..., 0]
+        points = points + step
+        if not np.nanmax(np.abs(step), initial=0.0) > 1e-12:
+            break
+    return points, np.asarray(np.linalg.inv(_regular(hessian)), dtype=np.float64)
+
+
+def _regular(hessian: Array) -> Array:
+    """The same; NaN stays NaN, and rays that are parallel leave a finite, huge uncertainty."""
+    scale = np.trace(hessian, axis1=-2, axis2=-1)[..., None, None]
+    floored: Array = hessian + 1e-12 * scale * np.eye(3)
+    return floored
+
+
+def _nearest_to_rays(cameras: Sequence[Camera], pixels: Array) -> Array:
+    """Points (..., 3) that are nearest to all rays."""
+    matrix: Array = np.zeros((*pixels.shape[1:-1], 3, 3))
+    right: Array = np.zeros((*pixels.shape[1:-1], 3))
+    for camera, seen in zip(cameras, pixels, strict=True):
+        origin, direction = camera.rays(seen)
+        across: Array = np.eye(3) - direction[..., :, None] * direction[..., None, :]
+        matrix += across
+        right += (across @ origin[..., None])[..., 0]
+    solved = np.linalg.solve(_regular(matrix), right[..., None])[..., 0]
+    return np.asarray(solved, dtype=np.float64)

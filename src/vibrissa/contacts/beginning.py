@@ -1,0 +1,322 @@
+"""Hypotheses about a contact that begins: all that one measurement leaves, as a sum of Gaussians.
+
+A light touch tells where it is badly: noise leaves a long, bent valley of contacts. So the
+likelihood is taken apart along the whisker by windows N(s; s_j, h²) that together are even. Where
+likelihood and window together are largest lies a Gaussian (Laplace's approximation), of weight
+
+    log w = -χ²/2 + ½ log det P + log det W + log π(p),
+
+and these are again one where the measurement tells the arc length well.
+
+A contact that was not felt a moment ago has bent the whisker no farther than it has moved since.
+With u for how far the contact's place on the whisker is from where it rests, over L, the density of
+contacts beforehand is
+
+    π = m (m² + u²)^(-3/2) / 2π,
+
+with m for how far the whisker and things may have moved toward each other: not more than likely,
+for the tail is long. It is one over the volume of all places.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from vibrissa.contacts.channels import (
+    CHANNELS,
+    CIRCULAR,
+    channel_derivatives,
+    channel_gradients,
+    channels_of,
+)
+from vibrissa.contacts.estimator import Estimator
+from vibrissa.contacts.fitting import charted, fit
+from vibrissa.contacts.learning import log_weights
+from vibrissa.contacts.located import Located
+from vibrissa.contacts.minima import reliable, unknowns_covariance
+from vibrissa.contacts.noise import common_channels
+from vibrissa.contacts.readout import Measurement, Named
+from vibrissa.contacts.weighing import Weighing, weigh
+from vibrissa.numerics.arrays import Array, IntArray
+from vibrissa.rod.batch import solve_forces
+from vibrissa.rod.reach import LEAST_ARC
+
+# Windows along the whisker, and in each of them so many sectors of bearings to start from.
+_WINDOWS = 16
+_SECTORS = 4
+# Of the valley's components those this much worse (χ²) than the best do not count.
+_WORSE = 30.0
+# A candidate whose arc length is known to this share of a window may stay whole; its parts are the
+# Gaussians this near (Mahalanobis distance squared, by the sum of both covariances).
+_SHARP, _PART = 0.5, 9.0
+# Of a curve or surface at most so many samples start.
+_MOST = 24
+# Standard deviation, over L, of what a measurement does not tell.
+_VAGUE = 0.2
+# Smallest standard deviation of a starting hypothesis, over L, so that matrices stay regular.
+_FINEST = 1e-7
+_FREE = [0, 2, 3]
+
+
+class Gaussians(NamedTuple):
+    """Of contact points in the whisker's frame, in L: one for each of some contacts.
+
+    x (n, 4), (F, p) (n, 6), covariances (n, 3, 3), what errors that all samples
+    share change in p (n, 3, e), log weights (n,).
+    """
+
+    contacts: Array
+    values: Array
+    covariances: Array
+    by_errors: Array
+    weights: Array
+
+
+class Beginning:
+    """Makes Gaussians of what one measurement tells."""
+
+    def __init__(self, estimator: Estimator) -> None:
+        self._readout, self._chart = estimator.readout, estimator.contacts.chart
+        how = self._readout.how
+        self._names = tuple(CHANNELS[code] for code in how.codes)
+        # Noise alone, which differs from sample to sample.
+        self._quiet = how._replace(errors=np.zeros((0, 6, 7)))
+        chart = self._chart
+        n = len(chart.stations)
+        some = np.unique(np.linspace(0, n - 1, _WINDOWS).round().astype(int))
+        some = np.minimum(some, len(chart.contacts) - 1)
+        self._stations = chart.contacts[some, 0, 0, 0]
+        self._width = float(np.diff(self._stations).mean())
+        self._nodes = chart.contacts[some]
+        self._values = chart.values[some]
+        self._seen = channels_of(self._values)[..., how.codes] @ how.mixing.T
+        named = isinstance(self._readout, Named)
+        self._circular = np.array([named and CIRCULAR[code] for code in how.codes])
+        self._kinds = [CHANNELS[code][0] if named else "" for code in how.codes]
+        places = np.linspace(0.0, 1.0, 101)
+        at = np.zeros((101, 4))
+        at[:, 0] = places
+        self._rest = np.array(solve_forces(chart.discretization, at)[0][:, 3:])
+        self._rest_places = places
+
+    def all_that_may_be(
+        self, measurement: Measurement, located: Located, reach: float
+    ) -> Gaussians:
+        """Take the likelihood of all places apart."""
+        nodes, values, window = self._starts(measurement)
+        exact, there = self.exact(located)
+        nearest = np.abs(exact[:, :1] - self._stations).argmin(axis=1)
+        x = np.concatenate([np.insert(nodes, 1, 0.0, axis=1), exact])
+        values, window = np.concatenate([values, there]), np.concatenate([window, nearest])
+        targets = np.column_stack(
+            [np.tile(measurement.target, (len(x), 1)), self._stations[window]]
+        )
+        x, values, tangents, misfits = self._fitted(measurement, x, values, targets)
+        worst = misfits.min(initial=np.inf) + _WORSE
+        good = np.isfinite(misfits) & (misfits <= worst)
+        rows = _distinct(x, window, np.flatnonzero(good))
+        evenly = -0.5 * math.log(2.0 * math.pi)
+        valley = self._gaussians(
+            measurement,
+            x[rows],
+            values[rows],
+            tangents[rows],
+            evenly - 0.5 * misfits[rows],
+            reach,
+            windowed=True,
+        )
+        whole = self.candidates(measurement, located, reach)
+        sharp = self._known_well(measurement, whole)
+        kept = np.ones(len(valley.contacts), np.bool_)
+        for i in sharp.tolist():
+            away = valley.values[:, 3:] - whole.values[i, 3:]
+            both = valley.covariances + whole.covariances[i]
+            far = (away * np.linalg.solve(both, away[..., None])[..., 0]).sum(axis=1)
+            kept &= far > _PART
+        parts = zip(valley, whole, strict=True)
+        return Gaussians(*(np.concatenate([a[kept], b[sharp]]) for a, b in parts))
+
+    def _known_well(self, measurement: Measurement, found: Gaussians) -> IntArray:
+        """Rows of contacts that lie well within a window, and that noise moves about linearly."""
+        d, x, values = self._chart.discretization, found.contacts, found.values
+        if not len(x):
+            return np.empty(0, np.int64)
+        w = self._weights(self._quiet, measurement, values)
+        slope = np.insert(solve_forces(d, x, tangents=True)[1], 1, 0.0, axis=2)
+        with np.errstate(over="ignore", invalid="ignore"):
+            own = unknowns_covariance(self._names, values, slope, w, friction=False)
+            linear = reliable(d, self._names, w, x, values, slope, own, LEAST_ARC)
+            narrow = own[:, 0, 0] < (_SHARP * self._width) ** 2
+        return np.flatnonzero(linear & narrow)
+
+    def candidates(self, measurement: Measurement, located: Located, reach: float) -> Gaussians:
+        """Take the candidates of one sample, which lie apart, as they are."""
+        x, values = self.exact(located)
+        _, slope = solve_forces(self._chart.discretization, x, tangents=True)
+        tangents = np.insert(slope, 1, 0.0, axis=2)
+        weights = np.full(len(x), -0.5 * located.misfit)
+        return self._gaussians(measurement, x, values, tangents, weights, reach, windowed=False)
+
+    def samples(self, measurement: Measurement, located: Located, reach: float) -> Gaussians:
+        """Take samples of a curve or surface of contacts, that between them leave no gap."""
+        number = len(located.candidates)
+        some = np.linspace(0, number - 1, min(number, _MOST)).astype(int)
+        x, values = (part[some] for part in self.exact(located))
+        _, slope = solve_forces(self._chart.discretization, x, tangents=True)
+        across, by_errors = self._across(measurement, values, slope)
+        covariance = across + _gaps_between(values[:, 3:]) + _FINEST**2 * np.eye(3)
+        weights = 0.5 * np.linalg.slogdet(covariance)[1] - 0.5 * located.misfit
+        return Gaussians(
+            x, values, covariance, by_errors, weights + self._log_prior(x, values, reach)
+        )
+
+    def _across(self, measurement: Measurement, values: Array, slope: Array) -> tuple[Array, Array]:
+        """Covariances across a curve or surface, and what errors that all samples share change."""
+        w = self._weights(self._quiet, measurement, values)
+        force = np.linalg.norm(values[:, :3], axis=1)
+        unit = slope * np.stack([np.ones_like(force), force, force], axis=1)[:, None]
+        back = np.linalg.pinv(w @ channel_derivatives(values, unit, self._names), rcond=1e-9)
+        root = unit[:, 3:] @ back
+        return root @ np.swapaxes(root, 1, 2), root @ w @ self._wrong(values)
+
+    def _wrong(self, values: Array) -> Array:
+        """What errors that all samples share change in channels, (n, k, e)."""
+        wrench = np.concatenate([values[:, :3], np.cross(values[:, 3:], values[:, :3])], axis=1)
+        g = channel_gradients(values, self._names)
+        return common_channels(self._readout.how.errors, g, wrench)
+
+    def exact(self, located: Located) -> tuple[Array, Array]:
+        """The candidates of one sample as x (n, 4) and (F, p) (n, 6), non-dimensional."""
+        d, n = self._chart.discretization, len(located.candidates)
+        x, values = np.empty((n, 4)), np.empty((n, 6))
+        x[:, 0], x[:, 1:] = located.arc_lengths / d.length, located.contact_forces / d.force
+        values[:, :3], values[:, 3:] = located.forces / d.force, located.candidates / d.length
+        return x, values
+
+    def _starts(self, measurement: Measurement) -> tuple[Array, Array, IntArray]:
+        """Nodes ξ (n, 3) of the chart that come nearest, with (F, p), and in which windows."""
+        how = self._readout.how
+        wanted = how.mixing @ measurement.target
+        away = self._seen - wanted
+        turns = self._circular[: len(wanted)]
+        if turns.any():
+            away[..., turns] = np.pi - (np.pi - away[..., turns]) % (2.0 * np.pi)
+        for kind in ("F", "M"):
+            same = [i for i, k in enumerate(self._kinds) if k == kind and not self._circular[i]]
+            if same:
+                size = float(np.linalg.norm(wanted[same]))
+                away[..., same] /= size if size > 0.0 else 1.0
+        far = (away * away).sum(axis=-1)
+        n, m, k = far.shape
+        edges = np.linspace(0, m, _SECTORS + 1).astype(int)
+        place = []
+        for first, last in pairwise(edges.tolist()):
+            least = far[:, first:last].reshape(n, -1).argmin(axis=1)
+            place.append((np.arange(n), first + least // k, least % k))
+        i, j, load = (np.concatenate(part) for part in zip(*place, strict=True))
+        return self._nodes[i, j, load], self._values[i, j, load], i
+
+    def _weights(self, how: Weighing, measurement: Measurement, values: Array) -> Array:
+        k = len(self._names)
+        out = np.zeros((len(values), k, k))
+        for value, one in zip(values, out, strict=True):
+            if not weigh(how, value, measurement.measured, one):
+                one[:] = 0.0
+        return out
+
+    def _fitted(
+        self, measurement: Measurement, x: Array, values: Array, targets: Array
+    ) -> tuple[Array, Array, Array, Array]:
+        """Contacts, (F, p), ∂(F, p)/∂x and χ² where it is least; infinite where none is."""
+        chart, k = self._chart, len(self._names)
+        weights = np.zeros((len(x), k + 1, k + 1))
+        weights[:, k, k] = 1.0 / self._width
+        for _ in range(self._readout.passes):
+            weights[:, :k, :k] = self._weights(self._readout.how, measurement, values)
+            fits = fit(
+                chart.discretization,
+                (*self._names, "s"),
+                targets,
+                weights,
+                x,
+                friction=False,
+                least=chart.proximal,
+                worth=np.inf,
+            )
+            x = fits.contacts
+            values = np.where(np.isfinite(fits.values), fits.values, values)
+        good = charted(chart, fits, chart.proximal) & np.isfinite(fits.misfits)
+        return x, values, fits.tangents, np.where(good, fits.misfits, np.inf)
+
+    def _gaussians(
+        self,
+        measurement: Measurement,
+        x: Array,
+        values: Array,
+        tangents: Array,
+        weights: Array,
+        reach: float,
+        *,
+        windowed: bool,
+    ) -> Gaussians:
+        """Covariances and weights of contacts; `weights` has what else counts."""
+        q = len(self._readout.how.mixing)
+        w = self._weights(self._quiet, measurement, values)
+        slope = tangents[..., _FREE]
+        j = w @ channel_derivatives(values, slope, self._names)
+        by_point = np.linalg.inv(slope[:, 3:])  # ∂ξ/∂p
+        seen = j @ by_point
+        information = np.swapaxes(seen, 1, 2) @ seen + np.eye(3) / _VAGUE**2
+        if windowed:
+            row = by_point[:, 0] / self._width
+            information = information + row[:, :, None] * row[:, None, :]
+        covariance = np.linalg.inv(information) + _FINEST**2 * np.eye(3)
+        by_errors = covariance @ np.swapaxes(seen, 1, 2) @ w @ self._wrong(values)
+        total = weights + 0.5 * np.linalg.slogdet(covariance)[1] + 1.5 * math.log(2.0 * math.pi)
+        total = total + np.array([log_weights(one, q) for one in w])
+        return Gaussians(
+            x, values, covariance, by_errors, total + self._log_prior(x, values, reach)
+        )
+
+    def _log_prior(self, x: Array, values: Array, reach: float) -> Array:
+        rest = np.stack(
+            [np.interp(x[:, 0], self._rest_places, column) for column in self._rest.T], axis=1
+        )
+        u2 = ((values[:, 3:] - rest) ** 2).sum(axis=1)
+        return np.asarray(math.log(reach / (2.0 * math.pi)) - 1.5 * np.log(reach**2 + u2))
+
+    def moved(self, turn: Array, base: Array, before: tuple[Array, Array]) -> float:
+        """How far the resting whisker has moved at most, in L, since another pose of its base."""
+        now = self._rest @ turn.T + base
+        then = self._rest @ before[0].T + before[1]
+        return float(np.sqrt(((now - then) ** 2).sum(axis=1).max()))
+
+
+def _gaps_between(points: Array) -> Array:
+    """Covariances (n, 3, 3) with which samples of a curve or surface fill what lies between them.
+
+    Along the ways to the nearest two others, half way.
+    """
+    if len(points) < 2:
+        return np.zeros((len(points), 3, 3))
+    apart = points[None] - points[:, None]
+    order = np.argsort((apart**2).sum(axis=2), axis=1)[:, 1:3]
+    near = np.take_along_axis(apart, order[:, :, None], axis=1)
+    return np.asarray(0.25 * np.einsum("nki,nkj->nij", near, near) / near.shape[1])
+
+
+def _distinct(x: Array, window: IntArray, rows: IntArray) -> list[int]:
+    """Rows that are not the same contact in the same window as one before."""
+    kept: list[int] = []
+    for row in rows.tolist():
+        others = [other for other in kept if window[other] == window[row]]
+        force = math.hypot(x[row, 2], x[row, 3])
+        same = np.abs(x[others, 0] - x[row, 0]) < 1e-3
+        same &= np.abs(x[others, 2:] - x[row, 2:]).sum(axis=1) < 1e-2 * force
+        if not same.any():
+            kept.append(row)
+    return kept

@@ -1,0 +1,127 @@
+"""Channels: what a contact is fitted to, so that noise is as nearly Gaussian as may be.
+
+A size and its direction, F_T with F_D or M_B with M_D, where both are measured, are taken together
+as the two components that they came from: these stay regular where the size is zero. A size or a
+direction alone is a channel of its own. Everything is non-dimensional.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vibrissa.contacts.noise import SensorNoise, common_covariance, scaled_errors
+from vibrissa.contacts.whitening import trusted
+from vibrissa.numerics.arrays import Array
+from vibrissa.rod.discretize import Discretization
+from vibrissa.signals import CIRCULAR as CIRCULAR_SIGNALS
+from vibrissa.signals import SIGNALS, signal_scales
+from vibrissa.signals.base import signals_of, wrench_derivatives
+
+#: What can be fitted to: the signals, and the components that they are made of.
+CHANNELS = (*SIGNALS, "Fy", "Fz", "My", "Mz")
+#: What can be held on to as well: arc length and contact point, over L.
+FITTED = (*CHANNELS, "s", "px", "py", "pz")
+#: Which of the channels are angles.
+CIRCULAR = (*CIRCULAR_SIGNALS, False, False, False, False)
+#: The six components of force and moment.
+WRENCH = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
+_PAIRS = {("FT", "FD"): ("Fy", "Fz"), ("MB", "MD"): ("My", "Mz")}
+
+
+@dataclass(frozen=True)
+class Channels:
+    """How a set of signals is fitted."""
+
+    signals: tuple[str, ...]
+    names: tuple[str, ...]
+
+    @classmethod
+    def of(cls, signals: tuple[str, ...]) -> Channels:
+        """Choose the channels of signals in canonical order."""
+        names = list(signals)
+        for pair, components in _PAIRS.items():
+            if set(pair) <= set(names):
+                i = names.index(pair[0])
+                names[i : i + 2] = components
+        return cls(signals, tuple(names))
+
+    def pairs(self) -> list[int]:
+        """Where a size is followed by its direction, and both are one vector."""
+        return [i for i, name in enumerate(self.names) if name in ("Fy", "My")]
+
+    def targets(self, measured: Array) -> Array:
+        """Turn measured signals (n, k) into channels (n, k)."""
+        out = measured.copy()
+        for i in self.pairs():
+            size, angle = measured[:, i], measured[:, i + 1]
+            out[:, i], out[:, i + 1] = size * np.cos(angle), size * np.sin(angle)
+        return out
+
+    def covariance(
+        self,
+        sensor: SensorNoise | None,
+        measured: Array,
+        values: Array,
+        discretization: Discretization,
+    ) -> Array:
+        """Covariance of the channels."""
+        if sensor is not None and sensor.deviations is not None:
+            own = self._by_deviations(sensor.deviations, measured, discretization)
+            if not len(sensor.errors):
+                return own
+        wrench = np.concatenate([values[:, :3], np.cross(values[:, 3:], values[:, :3])], axis=1)
+        g = channel_gradients(values, self.names)
+        with np.errstate(invalid="ignore"):
+            if sensor is None:
+                return np.asarray(g @ trusted(wrench) @ np.swapaxes(g, -1, -2))
+            if sensor.wrench is not None:
+                sizes = np.repeat([discretization.force, discretization.moment], 3)
+                components = sensor.wrench / np.outer(sizes, sizes)
+                own = np.asarray(g @ components @ np.swapaxes(g, -1, -2))
+            errors = scaled_errors(sensor.errors, discretization.force, discretization.moment)
+            return own + common_covariance(errors, g, wrench)
+
+    def _by_deviations(
+        self, deviations: dict[str, float], measured: Array, discretization: Discretization
+    ) -> Array:
+        scale = signal_scales(self.signals, discretization.force, discretization.moment)
+        sigma = np.array([deviations[name] for name in self.signals]) / scale
+        out = np.tile(np.diag(sigma**2), (len(measured), 1, 1))
+        for i in self.pairs():
+            size, angle = measured[:, i], measured[:, i + 1]
+            cos, sin = np.cos(angle), np.sin(angle)
+            turn = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
+            spread = np.zeros_like(turn)
+            spread[:, 0, 0], spread[:, 1, 1] = sigma[i] ** 2, (size * sigma[i + 1]) ** 2
+            out[:, i : i + 2, i : i + 2] = turn @ spread @ np.swapaxes(turn, -1, -2)
+        return out
+
+
+def channels_of(values: Array) -> Array:
+    """All channels (..., 10) of (F, p) (..., 6)."""
+    force = values[..., :3]
+    moment = np.cross(values[..., 3:], force)
+    return np.concatenate([signals_of(force, moment), force[..., 1:], moment[..., 1:]], axis=-1)
+
+
+def channel_gradients(values: Array, names: tuple[str, ...]) -> Array:
+    """∂(channels)/∂(F, M), shape (..., k, 6)."""
+    force = values[..., :3]
+    by_wrench = np.zeros((*values.shape[:-1], len(CHANNELS), 6))
+    by_wrench[..., : len(SIGNALS), :] = wrench_derivatives(force, np.cross(values[..., 3:], force))
+    for i, component in enumerate((1, 2, 4, 5), start=len(SIGNALS)):
+        by_wrench[..., i, component] = 1.0
+    return by_wrench[..., [CHANNELS.index(name) for name in names], :]
+
+
+def channel_derivatives(values: Array, tangents: Array, names: tuple[str, ...]) -> Array:
+    """∂(channels)/∂x, shape (..., k, p), from (F, p) (..., 6) and ∂(F, p)/∂x (..., 6, p)."""
+    force, point = values[..., :3], values[..., 3:]
+    d_force, d_point = tangents[..., :3, :], tangents[..., 3:, :]
+    d_moment = np.cross(d_point, force[..., None], axis=-2) + np.cross(
+        point[..., None], d_force, axis=-2
+    )
+    gradients = channel_gradients(values, names)
+    return np.asarray(gradients @ np.concatenate([d_force, d_moment], axis=-2))

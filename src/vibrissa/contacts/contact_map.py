@@ -1,0 +1,433 @@
+"""All contacts that a whisker can hold, and what each feels like at the base.
+
+A :class:`ContactMap` holds the chart of the stable, reachable contacts Ω of one whisker
+(:mod:`vibrissa.rod.reach`): contact point, force and moment with exact derivatives at its nodes.
+Everything in between is solved exactly when it is asked for; nothing is interpolated. On request it
+also holds the paper's grid of contact points: 15 radii from 0.3 L to L, azimuth ±65° and elevation
+±60° in steps of 1°.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike
+
+from vibrissa.numerics.arrays import AnyArray, Array
+from vibrissa.quantities import attributes
+from vibrissa.rod.batch import contact_tangents
+from vibrissa.rod.deflection import deflect
+from vibrissa.rod.discretize import STEPS
+from vibrissa.rod.loads import PointContact
+from vibrissa.rod.preimage import Preimages
+from vibrissa.rod.reach import CELLS, PROXIMAL, Reach, reach, with_normal_force
+from vibrissa.signals import SIGNALS, base_signals, concave_backward, selection, within_cone
+from vibrissa.sketch import CONTACT, REST, Mark, card, lines, shown, symbol, views
+from vibrissa.status import Status, flag_attributes
+from vibrissa.whisker import Whisker
+
+if TYPE_CHECKING:
+    from vibrissa.contacts.estimate import Estimate
+    from vibrissa.contacts.prior import Prior
+    from vibrissa.paper.lookup import LookupTable
+    from vibrissa.paper.network import NetworkSolver
+
+#: The paper's grid: radii over L, azimuth and elevation in rad.
+GRID_RADII = np.linspace(0.3, 1.0, 15)
+GRID_AZIMUTHS = np.deg2rad(np.arange(-65.0, 66.0))
+GRID_ELEVATIONS = np.deg2rad(np.arange(-60.0, 61.0))
+
+Progress = Callable[[int, int], None]
+Domain = Literal["reachable", "paper"]
+
+
+@dataclass(frozen=True, eq=False)
+class ContactMap:
+    """The contacts of one whisker and their signals; made by :meth:`simulate` or :meth:`load`.
+
+    Attributes
+    ----------
+    whisker : Whisker
+        Whose contacts.
+    chart : Reach
+        The stable contacts, non-dimensional.
+    steps : int
+        Integration steps along the whisker.
+    grid : Dataset or None
+        The paper's grid: ``force``, ``moment``, ``arc_length``, the six signals and ``status`` over
+        (r, theta, phi).
+    approximations : dict
+        Look-up tables and networks made so far, by kind and signals.
+    """
+
+    whisker: Whisker
+    chart: Reach
+    steps: int = STEPS
+    grid: xr.Dataset | None = None
+    approximations: dict[tuple[str, tuple[str, ...]], LookupTable | NetworkSolver] = field(
+        default_factory=dict, repr=False
+    )
+    _trees: dict[tuple[str, ...], Preimages] = field(default_factory=dict, repr=False)
+    _determining: dict[tuple[str, ...], bool] = field(default_factory=dict, repr=False)
+
+    @classmethod
+    def simulate(
+        cls,
+        whisker: Whisker,
+        *,
+        proximal: float = PROXIMAL,
+        cells: tuple[int, int, int] = CELLS,
+        steps: int = STEPS,
+        grid: bool = True,
+        progress: Progress | None = None,
+    ) -> ContactMap:
+        """Chart all stable contacts of a whisker.
+
+        Parameters
+        ----------
+        whisker : Whisker
+            The whisker.
+        proximal : float
+            Smallest arc length of a contact, as a fraction of the length.
+        cells : tuple of int
+            Cells of the chart along arc length, bearing and load; each the same power of two times
+            a small number. They set how fast estimates are found, not how exact they are.
+        steps : int
+            Integration steps along the whisker.
+        grid : bool
+            Whether the paper's grid of 237,765 contact points is solved too (about two seconds).
+        progress : callable, optional
+            Called as ``progress(done, total)`` while the grid is solved.
+
+        Returns
+        -------
+        ContactMap
+            The map.
+        """
+        chart = reach(whisker, proximal=proximal, cells=cells, steps=steps)
+        solved = _solve_grid(whisker, proximal, steps, progress) if grid else None
+        return cls(whisker, chart, steps, solved)
+
+    def estimate(
+        self,
+        signals: xr.Dataset | Mapping[str, ArrayLike],
+        triplet: str | tuple[str, ...] = ("Fx", "MB", "MD"),
+        noise: Mapping[str, float] | ArrayLike | None = None,
+        method: str = "exact",
+        stiffness_sigma: float = 0.0,
+        gain_sigma: float | ArrayLike = 0.0,
+        mixing_sigma: float | ArrayLike = 0.0,
+        prior: Prior | None = None,
+    ) -> Estimate:
+        """Find the contacts that explain measured signals.
+
+        Parameters
+        ----------
+        signals : Dataset or mapping
+            Measured signals by name, SI units, any shape.
+        triplet : str or tuple of str
+            The signals to use, three or more.
+        noise : mapping or (6, 6) array_like, optional
+            Standard deviation of each signal, or covariance of (F, M), SI units; gives each
+            estimate's covariance, and weighs more than three signals.
+        method : {"exact", "lookup", "lookup-linear", "network"}
+            Exact; or, for comparison, the paper's ways, from three signals: its look-up table,
+            natural-neighbour or linear, which needs the grid, or a network, trained on first use
+            (ten seconds). They see one contact where there are several.
+        stiffness_sigma : float
+            Relative standard deviation of the whisker's bending stiffness E r⁴, such as
+            ``fit_stiffness`` tells or √(σ_E² + 16 σ_r²) of those of modulus and radius; it adds to
+            the covariances, and needs noise.
+        gain_sigma : float or (6,) array_like
+            Relative standard deviation of the sensor's gains, of all or each of Fx, Fy, Fz, Mx, My
+            and Mz; likewise.
+        mixing_sigma : float or (6, 6) array_like
+            Standard deviations of what each of these reads of all six; or one number, relative: of
+            the cross-talk among forces, and among moments. Likewise.
+        prior : Prior, optional
+            Which contacts are possible; others are left out of the candidates.
+
+        Returns
+        -------
+        Estimate
+            One for each measurement, with all candidates.
+        """
+        from vibrissa.contacts.estimate import estimate  # it knows this class
+
+        return estimate(
+            self,
+            signals,
+            triplet,
+            noise,
+            method,
+            stiffness_sigma,
+            gain_sigma,
+            mixing_sigma,
+            prior,
+        )
+
+    def tree(self, triplet: tuple[str, ...]) -> Preimages:
+        """Return the search tree of three signals, made on first use.
+
+        Parameters
+        ----------
+        triplet : tuple of str
+            The signals, in canonical order.
+
+        Returns
+        -------
+        Preimages
+            The tree.
+        """
+        from vibrissa.contacts.inversion import triplet_tree
+
+        if triplet not in self._trees:
+            self._trees[triplet] = triplet_tree(self.chart, selection(triplet))
+        return self._trees[triplet]
+
+    def determines(self, signals: str | tuple[str, ...]) -> bool:
+        """Tell whether signals determine contacts on this whisker, but for single ones.
+
+        Parameters
+        ----------
+        signals : str or tuple of str
+            Three or more.
+
+        Returns
+        -------
+        bool
+            False if almost everywhere the contact can move without changing them, as on a straight
+            whisker, which never twists, for any three with Mx. Found out on first use.
+        """
+        from vibrissa.identifiability.fibres import determining
+
+        names = selection(signals)
+        if names not in self._determining:
+            self._determining[names] = determining(self, names)
+        return self._determining[names]
+
+    @cached_property
+    def _samples(self) -> xr.Dataset:
+        return _dataset(self.whisker, self.chart)
+
+    def to_dataset(self, domain: Domain = "reachable") -> xr.Dataset:
+        """Return the contacts at the chart's nodes as a labelled dataset in SI units.
+
+        Parameters
+        ----------
+        domain : {"reachable", "paper"}
+            All of Ω, or only the contacts within the bounds of the paper's grid, the others NaN.
+
+        Returns
+        -------
+        Dataset
+            Over ``station`` (arc length over L), ``bearing`` (of the force, rad) and ``load``
+            (square root of the force over the fold force): contact point, its spherical form, arc
+            length, force, moment, signals, derivatives of contact point and force with respect to
+            (arc length, f_y, f_z), regions and status.
+        """
+        if domain not in ("reachable", "paper"):
+            raise ValueError(f"domain is 'reachable' or 'paper'; got {domain!r}")
+        data = self._samples
+        if domain == "paper":
+            inside = within_paper_bounds(self.whisker, data.contact_point.to_numpy())
+            kept = xr.DataArray(inside, dims=("station", "bearing", "load"))
+            floats = [name for name, v in data.data_vars.items() if v.dtype.kind == "f"]
+            floats = [name for name in floats if "load" in data[name].dims]
+            data = data.assign({name: data[name].where(kept) for name in floats})
+        return data.copy()
+
+    def save(self, path: str | Path) -> None:
+        """Write the map as NetCDF, without loss.
+
+        Parameters
+        ----------
+        path : str or Path
+            The file, ``.nc``; replaced if it exists.
+        """
+        from vibrissa.contacts.files import save_map
+
+        save_map(self, Path(path))
+
+    @classmethod
+    def load(cls, path: str | Path) -> ContactMap:
+        """Read a map written by :meth:`save`.
+
+        Parameters
+        ----------
+        path : str or Path
+            The file.
+
+        Returns
+        -------
+        ContactMap
+            The same map.
+        """
+        from vibrissa.contacts.files import load_map
+
+        return load_map(Path(path))
+
+    def __repr__(self) -> str:
+        """Say whose map it is and what it holds."""
+        nodes = " × ".join(str(n) for n in self.chart.values.shape[:3])
+        grid = "" if self.grid is None else f", paper's grid of {self.grid.status.size} points"
+        return f"<ContactMap of {self.whisker!r}: {nodes} nodes{grid}>"
+
+    def _repr_html_(self) -> str:
+        """Show the contact points that the whisker can hold, with the range of each signal."""
+        data = self._samples
+        points = data.contact_point.transpose(..., "space").to_numpy()
+        picture = views(
+            [
+                Mark(points, CONTACT, dots=True, width=1.5, label="contacts"),
+                Mark(self.whisker.centerline(41), REST, width=2.5, label="at rest"),
+            ]
+        )
+        return card("ContactMap", self._rows(), picture)
+
+    def __str__(self) -> str:
+        """Tell the range of each signal as well."""
+        return lines("ContactMap", self._rows())
+
+    def _rows(self) -> list[tuple[str, str]]:
+        """Whose contacts they are, how many, and how large the signals."""
+        data = self._samples
+        rows = [("whisker", repr(self.whisker))]
+        rows += [("note", note) for note in self.whisker.notes]
+        rows.append(("contacts at nodes", str(data.status.size)))
+        if self.grid is not None:
+            reached = int((self.grid.status == Status.OK).sum())
+            rows.append(("paper's grid", f"{reached} of {self.grid.status.size} points reached"))
+        rows.append(("signals", "median (least to largest)"))
+        return rows + [(symbol(name), shown(name, data[name])) for name in (*SIGNALS, "r")]
+
+
+def within_paper_bounds(whisker: Whisker, points: Array) -> AnyArray:
+    """Whether contact points (..., 3), m, lie within the bounds of the paper's grid."""
+    r, theta, phi = np.moveaxis(spherical(points), -1, 0)
+    inside = (r >= 0.3 * whisker.length) & (r <= whisker.length)
+    inside &= np.abs(theta) <= GRID_AZIMUTHS[-1]
+    return np.asarray(inside & (np.abs(phi) <= GRID_ELEVATIONS[-1]))
+
+
+def spherical(points: Array) -> Array:
+    """(r, θ, φ) of points (..., 3): distance, azimuth atan2(y, x), elevation asin(z / r)."""
+    r = np.linalg.norm(points, axis=-1)
+    theta = np.arctan2(points[..., 1], points[..., 0])
+    phi = np.arctan2(points[..., 2], np.hypot(points[..., 0], points[..., 1]))
+    return np.stack([r, theta, phi], axis=-1)
+
+
+def _solve_grid(
+    whisker: Whisker, proximal: float, steps: int, progress: Progress | None
+) -> xr.Dataset:
+    shape = (GRID_RADII.size, GRID_AZIMUTHS.size, GRID_ELEVATIONS.size)
+    force, moment = np.empty((*shape, 3)), np.empty((*shape, 3))
+    arc_length, status = np.empty(shape), np.empty(shape, np.int64)
+    theta, phi = np.meshgrid(GRID_AZIMUTHS, GRID_ELEVATIONS, indexing="ij")
+    direction = np.stack(
+        [np.cos(phi) * np.cos(theta), np.cos(phi) * np.sin(theta), np.sin(phi)], axis=-1
+    )
+    for i, r in enumerate(GRID_RADII * whisker.length):
+        bent = deflect(whisker, PointContact(r * direction), proximal=proximal, steps=steps)
+        force[i], moment[i] = bent.force, bent.moment
+        arc_length[i], status[i] = bent.arc_length, bent.status
+        if progress is not None:
+            progress(i + 1, GRID_RADII.size)
+    return grid_dataset(whisker, force, moment, arc_length, status)
+
+
+def grid_dataset(
+    whisker: Whisker, force: Array, moment: Array, arc_length: Array, status: AnyArray
+) -> xr.Dataset:
+    """Label the paper's grid."""
+    dims = ("r", "theta", "phi")
+    data = xr.Dataset(
+        {
+            "force": ((*dims, "space"), force, attributes("force")),
+            "moment": ((*dims, "space"), moment, attributes("moment")),
+            "arc_length": (dims, arc_length, attributes("arc_length")),
+            "status": (dims, status, {**attributes("status"), **flag_attributes()}),
+        },
+        coords={
+            "r": ("r", GRID_RADII * whisker.length, attributes("r")),
+            "theta": ("theta", GRID_AZIMUTHS, attributes("theta")),
+            "phi": ("phi", GRID_ELEVATIONS, attributes("phi")),
+            "space": ["x", "y", "z"],
+        },
+    )
+    return data.merge(base_signals(data.force, data.moment))
+
+
+def _dataset(whisker: Whisker, chart: Reach) -> xr.Dataset:
+    d = chart.discretization
+    dims = ("station", "bearing", "load")
+    force = chart.values[..., :3] * d.force
+    point = chart.values[..., 3:] * d.length
+    moment = np.cross(point, force)
+    # Unknowns are s in L and f in EI/L²; in SI: m and N.
+    per_unknown = np.array([d.length, d.force, d.force])
+    space = (*dims, "space")
+    ball = spherical(point)
+    xi = with_normal_force(chart.contacts.reshape(-1, 3))
+    tangent = contact_tangents(d, xi).reshape(point.shape)
+    data: dict[str, Any] = {
+        "arc_length": (dims, chart.contacts[..., 0] * d.length, attributes("arc_length")),
+        "contact_point": (space, point, attributes("contact_point_whisker")),
+        "force": (space, force, attributes("force")),
+        "moment": (space, moment, attributes("moment")),
+        "contact_point_derivative": (
+            (*space, "unknown"),
+            chart.tangents[..., 3:, :] * d.length / per_unknown,
+            {
+                "units": "m / (m, N, N)",
+                "long_name": "derivative of the contact point by (s, f_y, f_z)",
+            },
+        ),
+        "force_derivative": (
+            (*space, "unknown"),
+            chart.tangents[..., :3, :] * d.force / per_unknown,
+            {
+                "units": "N / (m, N, N)",
+                "long_name": "derivative of the base force by (s, f_y, f_z)",
+            },
+        ),
+        "fold_force": (
+            ("station", "bearing"),
+            np.exp(chart.fold[1][..., 0]) * d.force,
+            {"units": "N", "long_name": "force at which the whisker slips off"},
+        ),
+        "small_deflection": (dims, within_cone(whisker, point), _label("within 2° of rest")),
+        "concave_backward": (dims, concave_backward(whisker, point), _label("CB, not CF")),
+        "large_deflection": (dims, tangent[..., 0] < 0.0, _label("tangent at contact points back")),
+        "status": (
+            dims,
+            np.full(point.shape[:3], int(Status.OK)),
+            {**attributes("status"), **flag_attributes()},
+        ),
+    }
+    for i, name in enumerate(("r", "theta", "phi")):
+        data[name] = (dims, ball[..., i], attributes(name))
+    coords = {
+        "station": ("station", chart.stations, _label("arc length of the contact over L")),
+        "bearing": (
+            "bearing",
+            chart.bearings,
+            {"units": "rad", "long_name": "force's angle from d1 to d2"},
+        ),
+        "load": ("load", chart.loads, _label("square root of force over fold force")),
+        "space": ["x", "y", "z"],
+        "unknown": ["s", "fy", "fz"],
+    }
+    out = xr.Dataset(data, coords=coords)
+    return out.merge(base_signals(out.force, out.moment))
+
+
+def _label(long_name: str) -> dict[str, str]:
+    return {"units": "1", "long_name": long_name}

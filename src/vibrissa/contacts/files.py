@@ -1,0 +1,90 @@
+"""Maps as NetCDF files: for a person in the root, for the solver in the group ``chart``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import xarray as xr
+
+from vibrissa.io.hdf5 import naming
+from vibrissa.io.netcdf import COMPRESSED, kind_of, read_tree, write_netcdf
+from vibrissa.rod.discretize import discretize
+from vibrissa.rod.reach import Reach
+from vibrissa.whisker import Whisker
+
+if TYPE_CHECKING:
+    from vibrissa.contacts.contact_map import ContactMap
+
+_KIND = "vibrissa contact map"
+_NODE = ("station", "bearing", "load")
+
+
+def save_map(contacts: ContactMap, path: Path) -> None:
+    """Write a map; a file that exists is replaced only when the new one is complete."""
+    chart = contacts.chart
+    raw = xr.Dataset(
+        {
+            "stations": ("station", chart.stations),
+            "bearings": ("bearing", chart.bearings),
+            "loads": ("load", chart.loads),
+            "bounds": ("bound", chart.fold[0]),
+            "fold": (("station", "bearing", "derivative"), chart.fold[1]),
+            "folded": (("station", "bearing"), chart.folded),
+            "contacts": ((*_NODE, "unknown"), chart.contacts),
+            "values": ((*_NODE, "value"), chart.values),
+            "tangents": ((*_NODE, "value", "unknown"), chart.tangents),
+            "frames": ((*_NODE, "unknown", "coordinate"), chart.frames),
+        },
+        attrs={"description": "non-dimensional: lengths over L, forces over EI/L²"},
+    )
+    for name, variable in raw.data_vars.items():
+        variable.attrs |= {"units": "1", "long_name": f"chart: {name}, non-dimensional"}
+    root = contacts.to_dataset()
+    root.attrs |= {"kind": _KIND, "steps": contacts.steps}
+    groups = {"/": root, "whisker": contacts.whisker.to_dataset(), "chart": raw}
+    if contacts.grid is not None:
+        groups["grid"] = contacts.grid
+    tree = xr.DataTree.from_dict(groups)
+    grid = [] if contacts.grid is None else list(map(str, contacts.grid.data_vars))
+    write_netcdf(path, tree, {"/grid": dict.fromkeys(grid, COMPRESSED)})
+
+
+def load_map(path: Path) -> ContactMap:
+    """Read a map; raise a ValueError if the file is not one."""
+    kind = kind_of(path)
+    if kind != _KIND:
+        raise ValueError(f"{path} holds {kind or 'data of another kind'}, not a contact map")
+    tree = read_tree(path)
+    missing = [name for name in ("whisker", "chart") if name not in tree.children]
+    if missing:
+        raise ValueError(f"{path} lacks the group {' and '.join(missing)} of a contact map")
+    with naming(path, "a contact map"):
+        return _from_tree(tree)
+
+
+def _from_tree(tree: xr.DataTree) -> ContactMap:
+    from vibrissa.contacts.contact_map import ContactMap
+
+    whisker = Whisker.from_dataset(tree["whisker"].to_dataset())
+    steps = int(tree.attrs["steps"])
+    raw = {str(name): np.asarray(v) for name, v in tree["chart"].to_dataset().variables.items()}
+    chart = Reach(
+        discretization=discretize(whisker, steps),
+        stations=raw["stations"],
+        bearings=raw["bearings"],
+        loads=raw["loads"],
+        fold=(raw["bounds"], np.ascontiguousarray(raw["fold"])),
+        contacts=raw["contacts"],
+        values=raw["values"],
+        tangents=raw["tangents"],
+        frames=raw["frames"],
+        folded=raw["folded"].astype(bool),
+    )
+    grid = None
+    if "grid" in tree.children:
+        # Files keep a coordinate of the root only there.
+        grid = tree.children["grid"].to_dataset(inherit=False)
+        grid = grid.assign_coords(space=["x", "y", "z"])
+    return ContactMap(whisker, chart, steps, grid)

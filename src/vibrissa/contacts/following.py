@@ -1,0 +1,272 @@
+"""A contact followed over time: a Bayesian filter, one hypothesis for each explanation.
+
+What a whisker touches mostly stands still, so in the laboratory the contact point moves smoothly
+while the base turns and travels. A hypothesis is a Gaussian over contact point p and velocity v,
+whose velocity forgets itself (:mod:`~vibrissa.contacts.drift`).
+
+The first sample of a contact is taken apart into Gaussians (:mod:`~vibrissa.contacts.beginning`).
+Each further one moves them and weighs them by how well they predicted it
+(:mod:`~vibrissa.contacts.learning`); of two signals it moves p only across the curve of contacts
+that explains them (:mod:`~vibrissa.contacts.ambiguity`), and as the base moves, the curves of
+successive samples cross where the contact is. A candidate that no hypothesis accounts for starts
+another, as improbable as new contacts are.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from vibrissa.contacts.beginning import Beginning, Gaussians
+from vibrissa.contacts.drift import Drift
+from vibrissa.contacts.estimator import Estimator
+from vibrissa.contacts.hypotheses import Followed, told
+from vibrissa.contacts.learning import learn
+from vibrissa.contacts.located import Located
+from vibrissa.contacts.mixture import Mixture, predict, room, tidy, unaccounted
+from vibrissa.contacts.prior import Prior
+from vibrissa.contacts.readout import Measurement
+from vibrissa.contacts.whitening import explained
+from vibrissa.numerics.arrays import AnyArray, Array
+from vibrissa.sensors.sensor import GRAVITY
+from vibrissa.status import Status
+
+_UNKNOWNS = 3
+# The pose of a base that rests in the laboratory's frame.
+_LEVEL, _ORIGIN = np.eye(3), np.zeros(3)
+# Hypotheses less probable than this next to the best are dropped.
+_LEAST = 1e-6
+# At most so many are kept.
+_MOST = 24
+# Two hypotheses this near (Mahalanobis distance squared, by the sum of both covariances) are one.
+_ONE = 0.1
+# A candidate so far (the same) from every hypothesis is a new one.
+_NEW = 16.0
+# How far (over L) a whisker may have been bent before it was felt: where it is not known since when
+# it touches, and at least.
+_ANYWHERE = 0.3
+_LEAST_REACH = 0.01
+# After a gap in which a contact may have gone so far (over L) all begins anew if nothing is known
+# better than this (RMS error).
+_GAP, _FORGOTTEN = 0.1, 0.5
+
+
+class ContactFilter:
+    """Follow a contact through a stream of signals, with the motion of the base.
+
+    Parameters
+    ----------
+    estimator : Estimator
+        Locates single samples; it must know the noise.
+    speed : float, optional
+        Standard deviation of a component of the contact point's velocity in the laboratory, m/s; by
+        default a quarter of the whisker's length a second.
+    persistence : float
+        Time after which the velocity has changed, τ, s.
+    pose_sigma : float
+        Standard deviation of a component of the base's position, m: independent from sample to
+        sample.
+    birth : float
+        Probability that a sample shows another contact than any before.
+
+    Raises
+    ------
+    ValueError
+        If the estimator has no noise, or a number is out of range.
+    """
+
+    def __init__(
+        self,
+        estimator: Estimator,
+        *,
+        speed: float | None = None,
+        persistence: float = 0.05,
+        pose_sigma: float = 0.0,
+        birth: float = 1e-4,
+    ) -> None:
+        self._length = estimator.contacts.whisker.length
+        speed = 0.25 * self._length if speed is None else speed
+        if not (speed > 0.0 and persistence > 0.0 and pose_sigma >= 0.0 and 0.0 < birth < 1.0):
+            raise ValueError(
+                "speed and persistence are positive, pose_sigma is not negative and birth between "
+                f"0 and 1; got {speed}, {persistence}, {pose_sigma} and {birth}"
+            )
+        if not estimator.noisy:
+            raise ValueError(
+                "a filter weighs what it knows against the noise: give its estimator's"
+            )
+        self.estimator = estimator
+        self._drift = Drift(speed / self._length, persistence)
+        self._pose = (pose_sigma / self._length) ** 2
+        self._birth = math.log(birth)
+        self._beginning = Beginning(estimator)
+        how = estimator.readout.how
+        self._errors = len(how.errors)
+        self._limit = explained(len(how.own))
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything, as when the whisker has lost touch."""
+        self._mixture = room(0, self._errors)
+        self._time: float | None = None
+        self._free: tuple[float, Array, Array] | None = None  # when and where last nothing was felt
+        self.estimator.reset()
+
+    def __call__(
+        self,
+        time: float,
+        signals: ArrayLike,
+        rotation: ArrayLike | None = None,
+        position: ArrayLike | None = None,
+        gravity: ArrayLike = GRAVITY,
+    ) -> Followed:
+        """Take one sample."""
+        turn = np.ascontiguousarray(_LEVEL if rotation is None else rotation, dtype=np.float64)
+        base = np.asarray(_ORIGIN if position is None else position, dtype=np.float64)
+        if turn.shape != (3, 3) or base.shape != (3,):
+            raise ValueError(f"a pose is (3, 3) and (3,); got {turn.shape} and {base.shape}")
+        if not math.isfinite(time):
+            raise ValueError(f"time is a finite number, s; got {time!r}")
+        if self._time is not None and not time > self._time:
+            raise ValueError(f"time goes on; got {time} s after {self._time} s")
+        measurement = self.estimator.measurement(signals, rotation, gravity)
+        base = base / self._length
+        if self._time is not None:
+            self._predict(time - self._time)
+        self._time = time
+        nothing = self.estimator.nothing_in(measurement)
+        if nothing is None and not math.isfinite(float(turn.sum() + base.sum())):
+            nothing = Status.MISSING
+        if nothing is None:
+            return self._known(*self._learned(measurement, turn, base), turn, base)
+        if nothing != Status.MISSING:
+            self._mixture = room(0, self._errors)
+            felt = nothing != Status.NOT_FELT or not np.isfinite(turn).all()
+            self._free = None if felt else (time, turn, base)
+        return self._known(nothing, None, turn, base)
+
+    def _learned(
+        self, measurement: Measurement, turn: Array, base: Array
+    ) -> tuple[Status, Located | None]:
+        """Take a measurement that is not empty: what it alone tells."""
+        three = self.estimator.readout.told >= _UNKNOWNS
+        located = self.estimator.locate(measurement) if three else None
+        x, values = np.empty((0, 4)), np.empty((0, 6))
+        if located is not None and located.status in (Status.UNIQUE, Status.AMBIGUOUS):
+            x, values = self._beginning.exact(located)
+        first = not len(self._mixture.weight)
+        explains = not first and self._update(measurement, x, values, turn, base)
+        if not three and not explains:
+            located = self.estimator.locate(measurement)
+        lost = not len(self._mixture.weight)
+        reach = self._reach(turn, base) if first else _ANYWHERE
+        prior = 0.0 if lost else self._birth
+        if three and lost:
+            assert located is not None
+            found = self._beginning.all_that_may_be(measurement, located, reach)
+            self._add(found, turn, base, prior)
+        elif len(x) and located is not None:
+            new = self._unaccounted(values, located, turn, base)
+            if new.any():
+                found = self._beginning.candidates(measurement, located, reach)
+                self._add(Gaussians(*(part[new] for part in found)), turn, base, prior)
+        elif located is not None and located.status == Status.UNDERDETERMINED:
+            found = self._beginning.samples(measurement, located, reach)
+            self._add(found, turn, base, prior)
+        self._free = None
+        if explains or located is None:
+            return Status.AMBIGUOUS, located
+        return located.status, located
+
+    def _update(
+        self, measurement: Measurement, x: Array, values: Array, turn: Array, base: Array
+    ) -> bool:
+        """Let all hypotheses learn; whether any of them explains the measurement."""
+        chart, readout = self.estimator.contacts.chart, self.estimator.readout
+        most = len(self._mixture.weight) * (1 + len(x))
+        out, misfits = room(most, self._errors), np.empty(most)
+        try:
+            n = learn(
+                chart.discretization.rod,
+                chart.fold,
+                chart.proximal,
+                readout.how,
+                measurement.target,
+                measurement.measured,
+                readout.passes,
+                turn,
+                base,
+                self._pose,
+                self._mixture,
+                x,
+                values,
+                out,
+                misfits,
+            )
+        except np.linalg.LinAlgError:  # a covariance that rounding has made singular
+            n = 0
+        explains = bool((misfits[:n] < self._limit).any())
+        self._mixture = _tidied(out, n)
+        return explains
+
+    def _unaccounted(self, values: Array, located: Located, turn: Array, base: Array) -> AnyArray:
+        """Which candidates (n,) no hypothesis accounts for."""
+        own = turn @ (located.covariances / self._length**2) @ turn.T
+        if not math.isfinite(float(own.sum())):  # a place that the signals do not determine
+            unknown = ~np.isfinite(own).all(axis=(1, 2))
+            own[unknown] = _FORGOTTEN**2 * np.eye(3)
+        out = np.empty(len(values), np.bool_)
+        points = values[:, 3:] @ turn.T + base
+        unaccounted(self._mixture, points, own, _NEW, out)
+        return out
+
+    def _reach(self, turn: Array, base: Array) -> float:
+        """How far whisker and things may have moved toward each other since nothing was felt."""
+        if self._free is None or self._time is None:
+            return _ANYWHERE
+        time, *pose = self._free
+        moved = self._beginning.moved(turn, base, (pose[0], pose[1]))
+        moved += 3.0 * self._drift.speed * (self._time - time)
+        return min(max(moved, _LEAST_REACH), _ANYWHERE)
+
+    def _add(self, found: Gaussians, turn: Array, base: Array, log_prior: float) -> None:
+        """Put Gaussians of the whisker's frame to the hypotheses, those that are possible."""
+        if self.estimator.prior is not None:
+            found = self._possible(self.estimator.prior, found)
+        n, old = len(found.weights), len(self._mixture.weight)
+        out = room(old + n, self._errors)
+        for mine, before in zip(out, self._mixture, strict=True):
+            mine[:old] = before
+        out.mean[old:, :3] = found.values[:, 3:] @ turn.T + base
+        out.spread[old:, :3, :3] = turn @ found.covariances @ turn.T + self._pose * np.eye(3)
+        out.spread[old:, 3:, 3:] = self._drift.speed**2 * np.eye(3)
+        out.by_errors[old:, :3] = turn @ found.by_errors
+        out.contact[old:], out.value[old:] = found.contacts, found.values
+        out.weight[old:] = found.weights + log_prior
+        self._mixture = _tidied(out, old + n)
+
+    def _possible(self, prior: Prior, found: Gaussians) -> Gaussians:
+        d, whisker = self.estimator.contacts.chart.discretization, self.estimator.contacts.whisker
+        x, points = found.contacts, found.values[:, 3:] * d.length
+        kept = prior.allows(whisker, points, x[:, 0] * d.length, x[:, 1:] * d.force)
+        return Gaussians(*(part[kept] for part in found))
+
+    def _predict(self, step: float) -> None:
+        if not len(self._mixture.weight):
+            return
+        predict(self._mixture, *self._drift.over(step))
+        if step * self._drift.speed < _GAP:
+            return
+        variance = np.trace(self._mixture.spread[:, :3, :3], axis1=1, axis2=2)
+        if (variance > _FORGOTTEN**2).all():
+            self._mixture = room(0, self._errors)
+
+    def _known(self, status: Status, located: Located | None, turn: Array, base: Array) -> Followed:
+        return told(self._mixture, status, located, turn, base, self._length)
+
+
+def _tidied(mixture: Mixture, number: int) -> Mixture:
+    kept = tidy(mixture, number, _LEAST, _MOST, _ONE)
+    return Mixture(*(part[:kept] for part in mixture))

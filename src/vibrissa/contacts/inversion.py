@@ -1,0 +1,279 @@
+"""From three signals back to every stable contact that gives them.
+
+The chart's subdivision tree for the triplet gives a seed for each contact; Newton's method on
+T(ξ) = T_measured makes it exact. Residuals are relative: forces to |F|, moments to |M|, angles in
+rad.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from vibrissa.numerics.arrays import Array, IntArray, Rod
+from vibrissa.numerics.compiled import copy, inlined, kernel
+from vibrissa.rod.batch import share_out
+from vibrissa.rod.kernels import BUFFER_SIZE, LANES
+from vibrissa.rod.newton import TOLERANCE, newton_group, stable, start_from
+from vibrissa.rod.preimage import Plane, Preimages, Tree
+from vibrissa.rod.reach import Fold, Reach, chart_to_contact
+from vibrissa.rod.seeds import MOST_SEEDS, seeds, wrapped
+from vibrissa.signals.base import (
+    CIRCULAR,
+    SIGNALS,
+    signal_derivatives,
+    signal_equations,
+    signals_of,
+)
+
+#: At most so many contacts are kept for one measurement, those with the least force.
+MOST_CANDIDATES = 8
+# Two solutions this near (relative to L and to the force) are one.
+_SAME = 1e-7
+# More targets than this are brought into an order in which the tree's nodes stay at hand.
+_MANY = 1000
+_RANK_BITS = 5
+
+
+class Contacts(NamedTuple):
+    """Contacts that explain measurements, non-dimensional, sorted by force.
+
+    number (n,); contacts ξ (n, MOST_CANDIDATES, 3) and (F, p) (n, MOST_CANDIDATES, 6), NaN-padded.
+    """
+
+    number: IntArray
+    contacts: Array
+    values: Array
+
+
+def triplet_tree(chart: Reach, triplet: tuple[str, ...]) -> Preimages:
+    """Build the subdivision tree of three signals over a chart."""
+    which = [SIGNALS.index(name) for name in triplet]
+    force, point = chart.values[..., :3], chart.values[..., 3:]
+    values = signals_of(force, np.cross(point, force))[..., which]
+    derivatives = signal_derivatives(chart.values, chart.tangents)[..., which, :]
+    angles = tuple(CIRCULAR[w] for w in which)
+    plane = _plane(chart, triplet)
+    return Preimages.of(chart, np.ascontiguousarray(values), derivatives, angles, plane)
+
+
+def _plane(chart: Reach, triplet: tuple[str, ...]) -> Plane | None:
+    """The transverse force or the bending moment, if its size or direction is in the triplet."""
+    force, point = chart.values[..., :3], chart.values[..., 3:]
+    d_force, d_point = chart.tangents[..., :3, :], chart.tangents[..., 3:, :]
+    for size, direction in (("FT", "FD"), ("MB", "MD")):
+        if size not in triplet and direction not in triplet:
+            continue
+        vector, slopes = force, d_force
+        if size == "MB":
+            vector = np.cross(point, force)
+            slopes = np.cross(d_point, force[..., None], axis=-2)
+            slopes = slopes + np.cross(point[..., None], d_force, axis=-2)
+        places = [triplet.index(name) if name in triplet else -1 for name in (size, direction)]
+        return Plane(vector[..., 1:], slopes[..., 1:, :], *places)
+    return None
+
+
+def invert(chart: Reach, tree: Preimages, triplet: tuple[str, ...], targets: Array) -> Contacts:
+    """Find all stable contacts for each measured triplet."""
+    if len(targets) > _MANY:
+        order = _by_neighbourhood(targets)
+        found = _inverted(chart, tree, triplet, targets[order])
+        place = np.empty_like(order)
+        place[order] = np.arange(len(order))
+        return Contacts(found.number[place], found.contacts[place], found.values[place])
+    return _inverted(chart, tree, triplet, targets)
+
+
+def _by_neighbourhood(targets: Array) -> IntArray:
+    """Numbers of targets in an order in which neighbours follow each other (Z-order of ranks)."""
+    code = np.zeros(len(targets), np.int64)
+    shares = np.linspace(0.0, 1.0, 2**_RANK_BITS + 1)[1:-1]
+    for c, column in enumerate(targets.T):
+        sample = column[:: max(1, len(column) // 1000)]
+        edges = np.sort(sample)[(shares * len(sample)).astype(int)]
+        rank = np.searchsorted(edges, column)
+        for bit in range(_RANK_BITS):
+            code |= ((rank >> bit) & 1) << (3 * bit + c)
+    return np.argsort(code, kind="stable")
+
+
+def _inverted(chart: Reach, tree: Preimages, triplet: tuple[str, ...], targets: Array) -> Contacts:
+    n = len(targets)
+    out = Contacts(
+        np.zeros(n, np.int64),
+        np.full((n, MOST_CANDIDATES, 3), np.nan),
+        np.full((n, MOST_CANDIDATES, 6), np.nan),
+    )
+    targets = _with_choice(targets, triplet)
+    rod = chart.discretization.rod
+    share_out(
+        n,
+        lambda first, last: _invert(
+            rod, chart.fold, tree.tree, chart.proximal, targets, *out, first, last
+        ),
+    )
+    return out
+
+
+def polish(
+    chart: Reach, triplet: tuple[str, ...], targets: Array, contacts: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Newton's method on T(ξ) = target from given contacts, stable or not."""
+    n = len(targets)
+    xi = np.array(contacts, dtype=np.float64)
+    values, misfits, signs = np.full((n, 6), np.nan), np.full(n, np.inf), np.full(n, np.nan)
+    targets = _with_choice(targets, triplet)
+    rod, fold = chart.discretization.rod, chart.fold
+    share_out(
+        n,
+        lambda first, last: _polish(rod, fold, targets, xi, values, misfits, signs, first, last),
+    )
+    return xi, values, misfits, signs
+
+
+def _with_choice(targets: Array, triplet: tuple[str, ...]) -> Array:
+    """Each target with the numbers of its signals behind it, as the equations want it."""
+    which = [float(SIGNALS.index(name)) for name in triplet]
+    return np.concatenate([targets, np.tile(which, (len(targets), 1))], axis=1)
+
+
+@inlined
+def _match(
+    value: Array, tangents: Array, wanted: bool, target: Array, residual: Array, jacobian: Array
+) -> float:
+    which = np.empty(3, np.int64)
+    for k in range(3):
+        which[k] = int(target[3 + k])
+    signal_equations(value, tangents, wanted, which, residual, jacobian)
+    fx, fy, fz = value[0], value[1], value[2]
+    px, py, pz = value[3], value[4], value[5]
+    mx, my, mz = py * fz - pz * fy, pz * fx - px * fz, px * fy - py * fx
+    force, moment = np.sqrt(fx * fx + fy * fy + fz * fz), np.sqrt(mx * mx + my * my + mz * mz)
+    total = 0.0
+    for k in range(3):
+        residual[k] -= target[k]
+        w = which[k]
+        scale = 1.0
+        if w == 2 or w == 5:
+            residual[k] = wrapped(residual[k])
+        else:
+            scale = 1.0 / (force if w < 2 else moment)
+        total += (scale * residual[k]) ** 2
+    return float(np.sqrt(total))
+
+
+@inlined
+def _add(
+    row: int, xi: Array, value: Array, count: IntArray, contacts: Array, values: Array
+) -> None:
+    """Put a solution in its place by force, unless it is there already."""
+    force = np.hypot(xi[1], xi[2])
+    n = count[row]
+    place = n
+    for k in range(n):
+        other = contacts[row, k]
+        away = max(abs(xi[0] - other[0]), np.hypot(xi[1] - other[1], xi[2] - other[2]) / force)
+        if away < _SAME:
+            return
+        if place == n and np.hypot(other[1], other[2]) > force:
+            place = k
+    if place >= MOST_CANDIDATES:
+        return
+    for k in range(min(n, MOST_CANDIDATES - 1), place, -1):
+        copy(contacts[row, k - 1], contacts[row, k])
+        copy(values[row, k - 1], values[row, k])
+    copy(xi, contacts[row, place])
+    copy(value, values[row, place])
+    count[row] = min(n + 1, MOST_CANDIDATES)
+
+
+@kernel
+def _invert(
+    rod: Rod,
+    fold: Fold,
+    tree: Tree,
+    proximal: float,
+    targets: Array,
+    number: IntArray,
+    contacts: Array,
+    values: Array,
+    first: int,
+    last: int,
+) -> None:
+    b = np.zeros(BUFFER_SIZE)
+    found, quality = np.empty((MOST_SEEDS, 3)), np.empty(MOST_SEEDS, np.int64)
+    slopes = np.empty((MOST_SEEDS, 3, 3))
+    charts, inverses = np.empty((LANES, 3)), np.empty((LANES, 3, 3))
+    rows, group_targets = np.empty(LANES, np.int64), np.empty((LANES, 6))
+    group, group_values = np.empty((LANES, 3)), np.empty((LANES, 6))
+    misfits, signs = np.empty(LANES), np.empty(LANES)
+    waiting = 0
+    for row in range(first, last + 1):
+        n = 0
+        if row < last:
+            n = seeds(tree, targets[row], found, slopes, quality)
+        elif waiting > 0:
+            n = 1  # the last few, fewer than there are lanes
+        for seed in range(n):
+            if row < last:
+                rows[waiting] = row
+                copy(targets[row], group_targets[waiting])
+                chart_to_contact(fold, found[seed], group[waiting])
+                start_from(
+                    found[seed], slopes[seed], quality[seed], charts[waiting], inverses[waiting]
+                )
+                waiting += 1
+            if waiting < LANES and row < last:
+                continue
+            newton_group(
+                _match,
+                rod,
+                fold,
+                b,
+                waiting,
+                group_targets,
+                charts,
+                inverses,
+                group,
+                group_values,
+                misfits,
+                signs,
+            )
+            for i in range(waiting):
+                if misfits[i] <= TOLERANCE and stable(fold, proximal, group[i], signs[i]):
+                    _add(rows[i], group[i], group_values[i], number, contacts, values)
+            waiting = 0
+
+
+@kernel
+def _polish(
+    rod: Rod,
+    fold: Fold,
+    targets: Array,
+    xi: Array,
+    values: Array,
+    misfits: Array,
+    signs: Array,
+    first: int,
+    last: int,
+) -> None:
+    b = np.zeros(BUFFER_SIZE)
+    charts, inverses = np.zeros((LANES, 3)), np.full((LANES, 3, 3), np.nan)
+    for row in range(first, last, LANES):
+        end = min(row + LANES, last)
+        newton_group(
+            _match,
+            rod,
+            fold,
+            b,
+            end - row,
+            targets[row:end],
+            charts,
+            inverses,
+            xi[row:end],
+            values[row:end],
+            misfits[row:end],
+            signs[row:end],
+        )

@@ -1,0 +1,197 @@
+"""What the noise of a sensor does to the signals, and to the contact point found from them.
+
+Noise is told as one standard deviation a signal, the same everywhere, or as a covariance of force
+and moment, as a force/torque sensor has it: then a direction is the noisier the smaller the force
+or moment that it belongs to.
+
+Errors that all measurements share, of the whisker's stiffness and of the sensor's gain and mixing,
+add to that: a measured wrench is (F, M) + Σ ε E (F, M, 1), with matrices E (6, 7) and ε of standard
+deviation 1, drawn once (:mod:`vibrissa.sensors.errors`). So Σ E (F, M, 1) (F, M, 1)ᵀ Eᵀ is part of
+the covariance of each measurement, but averaging many does not make it smaller.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike
+
+from vibrissa.numerics.arrays import Array
+from vibrissa.quantities import attributes
+from vibrissa.sensors import Sensor
+from vibrissa.signals import SIGNALS
+from vibrissa.signals.base import wrench_derivatives
+
+#: Standard deviation of each signal, or covariance (6, 6) of (F, M), SI units.
+Noise: TypeAlias = Mapping[str, float] | ArrayLike
+
+
+_NONE = np.zeros((0, 6, 7))
+
+
+@dataclass(frozen=True, eq=False)
+class SensorNoise:
+    """Noise of a sensor; made by :meth:`of`."""
+
+    deviations: dict[str, float] | None
+    wrench: Array | None
+    errors: Array = field(default_factory=_NONE.copy)
+
+    @classmethod
+    def of(cls, noise: Noise, names: tuple[str, ...], errors: Array = _NONE) -> SensorNoise:
+        """Read noise and check it."""
+        if isinstance(noise, Mapping):
+            missing = [name for name in names if name not in noise]
+            if missing:
+                raise ValueError(
+                    f"noise lacks {', '.join(missing)}; it has {', '.join(noise) or 'none'}"
+                )
+            try:
+                sigma = {name: float(noise[name]) for name in names}
+            except (TypeError, ValueError) as error:
+                given = {name: noise[name] for name in names}
+                raise ValueError(f"noise must be standard deviations ≥ 0; got {given}") from error
+            if not all(0.0 <= value < np.inf for value in sigma.values()):
+                raise ValueError(f"noise must be standard deviations ≥ 0; got {sigma}")
+            return cls(sigma, None, errors)
+        try:
+            wrench = np.asarray(noise, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                "noise must be {signal: standard deviation} or a symmetric 6 × 6 covariance of "
+                f"(F, M); got {noise!r}"
+            ) from error
+        if wrench.shape != (6, 6) or not np.allclose(wrench, wrench.T, rtol=1e-9, atol=0.0):
+            raise ValueError(
+                "noise must be {signal: standard deviation} or a symmetric 6 × 6 covariance of "
+                f"(F, M); got shape {wrench.shape}"
+            )
+        variances = np.diag(wrench)
+        if not np.isfinite(wrench).all() or (variances < 0.0).any():
+            raise ValueError(f"a covariance has finite variances ≥ 0; got {variances}")
+        size = np.sqrt(np.where(variances > 0.0, variances, 1.0))
+        least = np.linalg.eigvalsh(wrench / np.outer(size, size))[0]
+        if least < -1e-9:
+            raise ValueError(
+                f"a covariance has no negative eigenvalue; that of its correlations is {least:.3g}"
+            )
+        return cls(None, wrench, errors)
+
+    def covariance(self, names: tuple[str, ...], force: Array, moment: Array) -> Array:
+        """Covariance of signals."""
+        if self.wrench is None:
+            assert self.deviations is not None
+            sigma = np.array([self.deviations[name] for name in names])
+            own = np.broadcast_to(np.diag(sigma**2), (len(force), len(names), len(names)))
+            if not len(self.errors):
+                return own
+        g = wrench_derivatives(force, moment)[:, [SIGNALS.index(name) for name in names]]
+        with np.errstate(invalid="ignore"):
+            if self.wrench is not None:
+                own = np.asarray(g @ self.wrench @ np.swapaxes(g, -1, -2))
+            wrenches = np.concatenate([force, moment], axis=-1)
+            out = own + common_covariance(self.errors, g, wrenches)
+        out[~np.isfinite(out)] = np.nan
+        return out
+
+
+def common_errors(
+    stiffness_sigma: float = 0.0,
+    gain_sigma: float | ArrayLike = 0.0,
+    mixing_sigma: float | ArrayLike = 0.0,
+) -> Array:
+    """Errors that all measurements of force and moment share."""
+    for name, sigma, shape in (("gain", gain_sigma, (6,)), ("mixing", mixing_sigma, (6, 6))):
+        given = np.asarray(sigma, dtype=np.float64)
+        if given.shape not in ((), shape) or not (np.isfinite(given) & (given >= 0.0)).all():
+            raise ValueError(
+                f"{name}_sigma is one standard deviation ≥ 0, or has shape {shape}; got {sigma!r}"
+            )
+    sensor = Sensor(gain_error=gain_sigma, mixing_error=mixing_sigma)
+    return np.concatenate([by_stiffness(np.eye(6), stiffness_sigma), sensor.common_errors])
+
+
+def by_stiffness(mixing: Array, sigma: float) -> Array:
+    """Error that the stiffness of the whisker makes in channels of force and moment."""
+    if not 0.0 <= sigma < np.inf:
+        raise ValueError(
+            f"the stiffness's relative standard deviation is not negative; got {sigma}"
+        )
+    out = np.zeros((1 if sigma > 0.0 else 0, len(mixing), 7))
+    out[..., :6] = sigma * mixing
+    return out
+
+
+def scaled_errors(errors: Array, force: float, moment: float) -> Array:
+    """Make errors (n, 6, 7) of wrenches non-dimensional, for these units of force and moment."""
+    sizes = np.repeat([force, moment], 3)
+    return np.ascontiguousarray(errors * np.append(sizes, 1.0) / sizes[:, None])
+
+
+def common_channels(errors: Array, gradients: Array, wrenches: Array) -> Array:
+    """What errors of one standard deviation change in channels."""
+    wrong = np.einsum("nac,mc->man", errors[..., :6], wrenches) + errors[..., 6].T
+    return np.asarray(gradients @ wrong)
+
+
+def common_covariance(errors: Array, gradients: Array, wrenches: Array) -> Array:
+    """Covariance (m, k, k) that errors add to channels; as for :func:`common_channels`."""
+    changed = common_channels(errors, gradients, wrenches)
+    return np.asarray(changed @ np.swapaxes(changed, -1, -2))
+
+
+def sensor_noise(
+    noise: Noise | None, names: tuple[str, ...], errors: Array = _NONE
+) -> SensorNoise | None:
+    """Read noise if there is any."""
+    if noise is not None:
+        return SensorNoise.of(noise, names, errors)
+    if len(errors):
+        raise ValueError(
+            "the uncertainty of stiffness, gain and mixing adds to that of a sensor: give its noise"
+        )
+    return None
+
+
+def ellipsoids(covariance: Array, dims: tuple[str, ...], shape: tuple[int, ...]) -> xr.Dataset:
+    """Covariances (n, 3, 3), m², with the ellipsoids of one standard deviation, labelled."""
+    n = len(covariance)
+    sizes, directions = np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan)
+    known = np.isfinite(covariance).all(axis=(1, 2))
+    squares, columns = np.linalg.eigh(covariance[known])
+    sizes[known] = np.sqrt(np.maximum(squares[:, ::-1], 0.0))
+    directions[known] = columns[:, :, ::-1]
+    return xr.Dataset(
+        {
+            "covariance": (
+                (*dims, "space", "space_2"),
+                covariance.reshape(*shape, 3, 3),
+                attributes("covariance"),
+            ),
+            "semi_axes": (
+                (*dims, "axis"),
+                sizes.reshape(*shape, 3),
+                {"units": "m", "long_name": "semi-axes of the error ellipsoid, one sigma"},
+            ),
+            "axis_directions": (
+                (*dims, "space", "axis"),
+                directions.reshape(*shape, 3, 3),
+                {"units": "1", "long_name": "unit vectors along the semi-axes"},
+            ),
+            "predicted_error": (
+                dims,
+                rms_error(covariance).reshape(shape),
+                attributes("predicted_error"),
+            ),
+        },
+        {"space": ["x", "y", "z"], "space_2": ["x", "y", "z"], "axis": [1, 2, 3]},
+    )
+
+
+def rms_error(covariance: Array) -> Array:
+    """RMS 3D error of covariances (..., 3, 3), shape (...)."""
+    return np.asarray(np.sqrt(np.trace(covariance, axis1=-2, axis2=-1)))

@@ -1,0 +1,621 @@
+"""What noise leaves open about a contact: covariance, its validity, and what a candidate weighs.
+
+A contact x explains measured channels with residuals r = W (c(x) - c̃), in standard deviations, and
+gives outputs y: the contact point p, and with friction the friction angle. About the candidate both
+are followed to second order along N axes a_i, the principal axes of the noise seen in x:
+
+    x = x̂ + Σ a_i u_i,    r(u) = r̂ + B u + H_r(u, u)/2,    y(u) = ŷ + A u + H_y(u, u)/2.
+
+Contact points of Ω are equally probable beforehand, so that the posterior density of u is
+exp(-|r(u)|²/2) det ∂y/∂u within Ω and zero outside: beyond the tip, before the proximal limit, and
+without friction beyond the fold, where the determinant changes its sign. Its moments are sums over
+nodes u_k, normally distributed. To first order the covariance of p is A Aᵀ; near a fold of p that
+is a sheet that contacts leave, and the second moment about p̂ is not. Tails longer than a normal
+distribution's show in the kurtosis κ, relative to a normal distribution's (Mardia, Biometrika 57,
+1970), and in nodes of uneven density, of which a share η counts, (Σ w)²/(n Σ w²). So that stated
+regions hold these too, the covariance is widened by κ^(3/4)/η, which makes 95 % regions hold 93 to
+97 % of simulated contacts, and 3σ regions at least 99.6 %, up to the fold.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import ndtri
+
+from vibrissa.contacts.channels import FITTED
+from vibrissa.contacts.fitting import channel_equations, whiten
+from vibrissa.numerics.arrays import AnyArray, Array, IntArray, Rod
+from vibrissa.numerics.compiled import copy, inlined, kernel
+from vibrissa.rod.batch import share_out
+from vibrissa.rod.discretize import Discretization
+from vibrissa.rod.kernels import (
+    BUFFER_SIZE,
+    LANES,
+    integrate,
+    lane_tangents,
+    lane_value,
+    set_lane,
+)
+
+#: A candidate more probable than this is the only one.
+CERTAIN = 0.95
+# How far along each axis the second order is taken from, in standard deviations.
+_REACH = 2.0
+# What the second order misses there (in standard deviations of the channels) where a covariance can
+# be relied on, the largest kurtosis relative to a normal distribution's, and the least share of the
+# nodes that counts.
+_MISSED, _TAILED, _COUNTING = 0.03, 1.8, 0.3
+# Where the second order misses so much, densities are not to be trusted: the first order tells what
+# a candidate weighs. A node's log density gains at most so much over the first order's.
+_BROKEN, _MOST_GAIN = 0.3, 3.0
+# With a smaller share than this moments mean nothing.
+_TOO_FEW = 0.1
+# Below this second order (relative to the first, at two standard deviations) the first will do.
+_STRAIGHT = 0.03
+# Unknowns that a measurement determines this much worse than others it does not determine.
+_OPEN = 1e-10
+_NODES = 64
+_SWEEPS = 12
+
+
+def _normal(dimension: int) -> Array:
+    """Nodes (n, dimension) in pairs ±u with the covariance of a standard normal distribution.
+
+    An additive recurrence with the powers of the root of g^(d + 1) = g + 1 fills the cube evenly.
+    """
+    g = 1.0
+    for _ in range(60):
+        g = (1.0 + g) ** (1.0 / (dimension + 1))
+    steps = g ** -np.arange(1.0, dimension + 1)
+    half = ndtri((0.5 + np.arange(1, _NODES // 2 + 1)[:, None] * steps) % 1.0)
+    nodes = np.concatenate([half, -half])
+    root = np.linalg.cholesky(nodes.T @ nodes / _NODES)
+    return np.ascontiguousarray(nodes @ np.linalg.inv(root).T)
+
+
+def _kurtosis(nodes: Array) -> float:
+    return float(((nodes**2).sum(axis=1) ** 2).mean())
+
+
+#: Fourth moment of three coordinates that are normally distributed.
+NORMAL_KURTOSIS = 15.0
+_NODES_3, _NODES_4 = _normal(3), _normal(4)
+# Fourth moment of the point's three coordinates: of the nodes, and with friction, where they are
+# three of four unknowns, that of a normal distribution.
+_KURTOSIS_3, _KURTOSIS_4 = _kurtosis(_NODES_3), _kurtosis(_NODES_4[:, :3])
+
+# Working memory for one candidate: r̂ (k), B (k, 4), H_r (k, 4, 4); A (4, 4), H_y (4, 4, 4); axes
+# (4, 4), in columns, by unknown.
+Model = tuple[Array, Array, Array, Array, Array, Array]
+
+
+@inlined
+def _outputs(x: Array, t: Array, friction: bool, slopes: Array) -> None:
+    """Fill ∂y/∂x (4, 4): of the contact point, and of the friction angle."""
+    for a in range(3):
+        copy(t[3 + a], slopes[a])
+    if friction:
+        normal = math.hypot(x[2], x[3])
+        size = normal * normal + x[1] * x[1]
+        slopes[3, 0], slopes[3, 1] = 0.0, normal / size
+        slopes[3, 2] = -x[1] * x[2] / (normal * size)
+        slopes[3, 3] = -x[1] * x[3] / (normal * size)
+
+
+@inlined
+def _principal(j: Array, k: int, unknowns: IntArray, axes: Array) -> bool:
+    """Fill principal axes of the noise in x, one standard deviation long; whether there are all.
+
+    One-sided Jacobi rotations make the columns of W ∂c/∂x, brought to length one, orthogonal.
+    """
+    n = unknowns.shape[0]
+    c, size = np.empty((k, n)), np.empty(n)
+    for i in range(4):
+        for p in range(4):
+            axes[i, p] = 0.0
+    for p in range(n):
+        total = 0.0
+        for i in range(k):
+            total += j[i, unknowns[p]] ** 2
+        size[p] = math.sqrt(total)
+        if not 0.0 < size[p] < np.inf:
+            return False
+        axes[unknowns[p], p] = 1.0 / size[p]
+        for i in range(k):
+            c[i, p] = j[i, unknowns[p]] / size[p]
+    for _ in range(_SWEEPS):
+        largest = 0.0
+        for p in range(n - 1):
+            for q in range(p + 1, n):
+                pp, qq, pq = 0.0, 0.0, 0.0
+                for i in range(k):
+                    pp += c[i, p] * c[i, p]
+                    qq += c[i, q] * c[i, q]
+                    pq += c[i, p] * c[i, q]
+                if abs(pq) <= 1e-15 * math.sqrt(pp * qq):
+                    continue
+                largest = max(largest, abs(pq) / math.sqrt(pp * qq))
+                zeta = (qq - pp) / (2.0 * pq)
+                tan = (1.0 if zeta >= 0.0 else -1.0) / (abs(zeta) + math.sqrt(1.0 + zeta * zeta))
+                cos = 1.0 / math.sqrt(1.0 + tan * tan)
+                sin = cos * tan
+                for i in range(k):
+                    a, b = c[i, p], c[i, q]
+                    c[i, p], c[i, q] = cos * a - sin * b, sin * a + cos * b
+                for i in range(4):
+                    a, b = axes[i, p], axes[i, q]
+                    axes[i, p], axes[i, q] = cos * a - sin * b, sin * a + cos * b
+        if largest < 1e-9:
+            break
+    known = True
+    for p in range(n):  # longest first: rounding must not choose the axes' order either
+        for q in range(p + 1, n):
+            pp, qq = 0.0, 0.0
+            for i in range(k):
+                pp += c[i, p] * c[i, p]
+                qq += c[i, q] * c[i, q]
+            if qq < pp:
+                for i in range(k):
+                    c[i, p], c[i, q] = c[i, q], c[i, p]
+                for i in range(4):
+                    axes[i, p], axes[i, q] = axes[i, q], axes[i, p]
+        total = 0.0
+        for i in range(k):
+            total += c[i, p] * c[i, p]
+        length = math.sqrt(total)
+        known = known and length > _OPEN
+        largest, best = -1.0, 0
+        for i in range(n):  # rounding must not choose an axis's sign: nodes are not symmetric
+            share = abs(axes[unknowns[i], p]) * size[i]
+            if share > 1.001 * largest:
+                largest, best = share, unknowns[i]
+        scale = math.copysign(1.0 / max(length, _OPEN), axes[best, p])
+        for i in range(4):
+            axes[i, p] *= scale
+    return known
+
+
+@inlined
+def _step(x: Array, axes: Array, i: int, least: float) -> float:
+    """How far to go along an axis, signed: to the side on which there is more room."""
+    along = axes[0, i]
+    if along == 0.0:
+        return _REACH
+    up, down = (1.0 - x[0]) / abs(along), (x[0] - least) / abs(along)
+    if along < 0.0:
+        up, down = down, up
+    return float(min(_REACH, up) if up >= down else -min(_REACH, down))
+
+
+@inlined
+def _load(
+    b: Array, x: Array, axes: Array, steps: Array, first: int, lanes: int, moved: Array
+) -> None:
+    """Load displaced contacts, ``lanes`` lanes each, from axis ``first`` on; ``moved`` (4, 4)."""
+    n = steps.shape[0]
+    for i in range(LANES):
+        at = min(first + i // lanes, n - 1)
+        for a in range(4):
+            moved[i, a] = x[a] + steps[at] * axes[a, at]
+        set_lane(b, i, moved[i, 0], moved[i, 1], moved[i, 2], moved[i, 3], i % lanes == 1)
+
+
+@inlined
+def _unload(b: Array, lane: int, friction: bool, value: Array, t: Array, third: Array) -> None:
+    """Copy (F, p) and ∂(F, p)/∂x (6, 4) of a displaced contact."""
+    lane_value(b, lane, value)
+    lane_tangents(b, lane, third)
+    for a in range(6):
+        t[a, 0], t[a, 1], t[a, 2], t[a, 3] = third[a, 0], 0.0, third[a, 1], third[a, 2]
+    if friction:
+        lane_tangents(b, lane + 1, third)
+        for a in range(6):
+            t[a, 1] = third[a, 0]
+
+
+@inlined
+def _by_axes(derivatives: Array, axes: Array, row: int, n: int, i: int) -> float:
+    """One derivative along axis i."""
+    total = 0.0
+    for a in range(4):
+        total += derivatives[row, a] * axes[a, i]
+    return total
+
+
+@inlined
+def _second_order(
+    rod: Rod,
+    b: Array,
+    friction: bool,
+    least: float,
+    codes: IntArray,
+    target: Array,
+    weights: Array,
+    x: Array,
+    slopes: Array,
+    j: Array,
+    n: int,
+    model: Model,
+) -> float:
+    """Fill B, H_r, A and H_y of the model; what they miss of the channels at the ends of the steps.
+
+    Derivatives at contacts displaced along each axis tell the second order; as the contacts there
+    are solved anyway, their channels tell what it misses.
+    """
+    r0, by_r, bent_r, by_y, bent_y, axes = model
+    k, lanes, missed = codes.shape[0], 2 if friction else 1, 0.0
+    steps, moved, third = np.empty(n), np.empty((LANES, 4)), np.empty((6, 3))
+    value, t, slopes_there = np.empty(6), np.zeros((6, 4)), np.zeros((4, 4))
+    residual, jacobian = np.empty(k), np.empty((k, 4))
+    r, there = np.empty(k), np.empty((k, 4))
+    for i in range(n):
+        steps[i] = _step(x, axes, i, least)
+        for a in range(k):
+            by_r[a, i] = _by_axes(j, axes, a, n, i)
+        for a in range(4):
+            by_y[a, i] = _by_axes(slopes, axes, a, n, i)
+    for first in range(0, n, LANES // lanes):
+        _load(b, x, axes, steps, first, lanes, moved)
+        integrate(rod, b, 3)
+        for i in range(first, min(first + LANES // lanes, n)):
+            lane = lanes * (i - first)
+            _unload(b, lane, friction, value, t, third)
+            channel_equations(moved[lane], value, t, codes, target, residual, jacobian)
+            whiten(weights, residual, jacobian, k, r, there)
+            _outputs(moved[lane], t, friction, slopes_there)
+            h = steps[i]
+            for q in range(n):
+                for a in range(k):
+                    bent_r[a, i, q] = (_by_axes(there, axes, a, n, q) - by_r[a, q]) / h
+                for a in range(4):
+                    bent_y[a, i, q] = (_by_axes(slopes_there, axes, a, n, q) - by_y[a, q]) / h
+            away = 0.0
+            for a in range(k):
+                away += (r[a] - r0[a] - h * by_r[a, i] - 0.5 * h * h * bent_r[a, i, i]) ** 2
+            missed = max(missed, math.sqrt(away) * (_REACH / abs(h)) ** 3)
+    return missed
+
+
+@inlined
+def _even(model: Model, n: int) -> float:
+    """Make second derivatives symmetric; how large they are in standard deviations of the point."""
+    bent_r, by_y, bent_y = model[2], model[3], model[4]
+    for a in range(bent_r.shape[0]):
+        for i in range(n):
+            for q in range(i):
+                bent_r[a, i, q] = bent_r[a, q, i] = 0.5 * (bent_r[a, i, q] + bent_r[a, q, i])
+    for a in range(4):
+        for i in range(n):
+            for q in range(i):
+                bent_y[a, i, q] = bent_y[a, q, i] = 0.5 * (bent_y[a, i, q] + bent_y[a, q, i])
+    root, back, v = np.zeros((3, 3)), np.empty(3), np.empty((3, 3))
+    for a in range(3):
+        for c in range(3):
+            v[a, c] = 0.0
+            for i in range(n):
+                v[a, c] += by_y[a, i] * by_y[c, i]
+    if not _cholesky(v, root):
+        return np.inf
+    largest = 0.0
+    for i in range(n):
+        for q in range(n):
+            total = 0.0
+            for a in range(bent_r.shape[0]):
+                total += bent_r[a, i, q] ** 2
+            for a in range(3):
+                back[a] = bent_y[a, i, q]
+                for c in range(a):
+                    back[a] -= root[a, c] * back[c]
+                back[a] /= root[a, a]
+                total += back[a] ** 2
+            largest = max(largest, total)
+    return math.sqrt(largest)
+
+
+@inlined
+def _cholesky(v: Array, root: Array) -> bool:
+    """Fill the lower root (3, 3) of a covariance; False where it is singular."""
+    for a in range(3):
+        for c in range(a + 1):
+            total = v[a, c]
+            for i in range(c):
+                total -= root[a, i] * root[c, i]
+            if a > c:
+                root[a, c] = total / root[c, c]
+            elif total > 1e-14 * v[a, a]:
+                root[a, a] = math.sqrt(total)
+            else:
+                return False
+    return True
+
+
+@inlined
+def _determinant(m: Array, n: int) -> float:
+    """Determinant of the leading (n, n) of a matrix, which is overwritten."""
+    det = 1.0
+    for c in range(n):
+        best = c
+        for i in range(c + 1, n):
+            if abs(m[i, c]) > abs(m[best, c]):
+                best = i
+        if m[best, c] == 0.0:
+            return 0.0
+        if best != c:
+            det = -det
+            for q in range(n):
+                m[c, q], m[best, q] = m[best, q], m[c, q]
+        det *= m[c, c]
+        for i in range(c + 1, n):
+            f = m[i, c] / m[c, c]
+            for q in range(c + 1, n):
+                m[i, q] -= f * m[c, q]
+    return det
+
+
+@inlined
+def _density(
+    model: Model,
+    u: Array,
+    s: float,
+    proximal: float,
+    friction: bool,
+    turn: float,
+    y: Array,
+    m: Array,
+) -> float:
+    """Posterior density at a node relative to the nodes' own, and the displacement y of the point.
+
+    ``turn`` is 1 where the axes are right-handed, -1 otherwise; ``m`` (4, 4) is working memory.
+    """
+    r0, by_r, bent_r, by_y, bent_y, axes = model
+    n, log = u.shape[0], 0.0
+    for i in range(n):
+        s += axes[0, i] * u[i]
+        log += 0.5 * u[i] * u[i]
+    for a in range(4 if friction else 3):
+        total = 0.0
+        for i in range(n):
+            slope, bent = by_y[a, i], 0.0
+            for q in range(n):
+                bent += bent_y[a, i, q] * u[q]
+            m[a, i] = slope + bent
+            total += (slope + 0.5 * bent) * u[i]
+        if a < 3:
+            y[a] = total
+    if not proximal <= s <= 1.0:
+        return 0.0
+    for a in range(r0.shape[0]):
+        total = r0[a]
+        for i in range(n):
+            slope = by_r[a, i]
+            for q in range(n):
+                slope += 0.5 * bent_r[a, i, q] * u[q]
+            total += slope * u[i]
+        log -= 0.5 * (total * total - r0[a] * r0[a])
+    det = turn * _determinant(m, n)
+    return (abs(det) if friction else max(det, 0.0)) * math.exp(min(log, _MOST_GAIN))
+
+
+@inlined
+def second_moment(
+    points: Array, density: Array, total: float, normal: float, covariance: Array
+) -> float:
+    """Fill the second moment (3, 3) of points (n, 3) of some density, widened for their tails.
+
+    Their kurtosis is returned, relative to what is normal; infinite where there is none.
+    """
+    root, back = np.zeros((3, 3)), np.empty(3)
+    for a in range(3):
+        for c in range(3):
+            covariance[a, c] = 0.0
+            for k in range(points.shape[0]):
+                covariance[a, c] += density[k] / total * points[k, a] * points[k, c]
+    if not _cholesky(covariance, root):
+        return np.inf
+    fourth = 0.0
+    for k in range(points.shape[0]):
+        size = 0.0
+        for a in range(3):
+            back[a] = points[k, a]
+            for c in range(a):
+                back[a] -= root[a, c] * back[c]
+            back[a] /= root[a, a]
+            size += back[a] * back[a]
+        fourth += density[k] / total * size * size
+    wider = max(fourth / normal, 1.0) ** 0.75
+    for a in range(3):
+        for c in range(3):
+            covariance[a, c] *= wider
+    return fourth / normal
+
+
+@inlined
+def _moments(
+    model: Model,
+    nodes: Array,
+    s: float,
+    proximal: float,
+    friction: bool,
+    turn: float,
+    covariance: Array,
+) -> tuple[float, bool]:
+    """Fill the second moment about the point, widened; mean density, and whether it can serve."""
+    number = nodes.shape[0]
+    points, density = np.empty((number, 3)), np.empty(number)
+    m, total, squares = np.empty((4, 4)), 0.0, 0.0
+    for k in range(number):
+        density[k] = _density(model, nodes[k], s, proximal, friction, turn, points[k], m)
+        total += density[k]
+        squares += density[k] * density[k]
+    counting = total * total / (number * squares) if squares > 0.0 else 0.0
+    if not counting > _TOO_FEW:
+        for a in range(3):  # too few of the nodes are in Ω: what they say is added to first order
+            for c in range(3):
+                for k in range(number):
+                    share = density[k] / total if total > 0.0 else 0.0
+                    covariance[a, c] += share * points[k, a] * points[k, c]
+        return total / number, False
+    normal = _KURTOSIS_4 if friction else _KURTOSIS_3
+    tailed = second_moment(points, density, total, normal, covariance)
+    for a in range(3):
+        for c in range(3):
+            covariance[a, c] /= counting
+    return total / number, tailed < _TAILED and counting > _COUNTING
+
+
+@kernel
+def judge(
+    rod: Rod,
+    friction: bool,
+    least: float,
+    proximal: float,
+    codes: IntArray,
+    targets: Array,
+    weights: Array,
+    contacts: Array,
+    values: Array,
+    tangents: Array,
+    covariances: Array,
+    weight: Array,
+    valid: AnyArray,
+    first: int,
+    last: int,
+) -> None:
+    """Judge candidates; see the module."""
+    k, n = codes.shape[0], 4 if friction else 3
+    b, unknowns = np.zeros(BUFFER_SIZE), np.empty(n, np.int64)
+    for i in range(n):
+        unknowns[i] = i if friction or i == 0 else i + 1
+    residual, jacobian = np.empty(k), np.empty((k, 4))
+    r0, j, slopes = np.empty(k), np.empty((k, 4)), np.zeros((4, 4))
+    by_r, bent_r = np.zeros((k, 4)), np.zeros((k, 4, 4))
+    by_y, bent_y, axes = np.zeros((4, 4)), np.zeros((4, 4, 4)), np.zeros((4, 4))
+    model = (r0, by_r, bent_r, by_y, bent_y, axes)
+    for row in range(first, last):
+        x, covariance = contacts[row], covariances[row]
+        weight[row], valid[row] = -np.inf, False
+        for a in range(3):
+            for c in range(3):
+                covariance[a, c] = np.nan
+        if not values[row, 0] < np.inf:
+            continue
+        channel_equations(x, values[row], tangents[row], codes, targets[row], residual, jacobian)
+        misfit = whiten(weights[row], residual, jacobian, k, r0, j)
+        if not _principal(j, k, unknowns, axes):
+            continue
+        _outputs(x, tangents[row], friction, slopes)
+        missed = _second_order(
+            rod, b, friction, least, codes, targets[row], weights[row], x, slopes, j, n, model
+        )
+        bent, away = _even(model, n), 0.0
+        for a in range(3):
+            for c in range(3):
+                covariance[a, c] = 0.0
+                for i in range(n):
+                    covariance[a, c] += by_y[a, i] * by_y[c, i]
+        pulled = 0.0
+        for i in range(n):
+            away += axes[0, i] ** 2
+            pull = 0.0
+            for a in range(k):
+                pull += r0[a] * by_r[a, i]
+            pulled = max(pulled, abs(pull))
+        away = 4.0 * math.sqrt(away)
+        inside = proximal + away < x[0] < 1.0 - away
+        for a in range(4):
+            copy(by_y[a], slopes[a])
+        first_order, density, fair = abs(_determinant(slopes, n)), 0.0, True
+        straight = inside and bent < _STRAIGHT and pulled < _STRAIGHT
+        if not straight:
+            for p in range(n):
+                for q in range(n):
+                    slopes[p, q] = axes[unknowns[p], q]
+            turn = math.copysign(1.0, _determinant(slopes, n))
+            nodes = _NODES_4 if friction else _NODES_3
+            density, fair = _moments(model, nodes, x[0], proximal, friction, turn, covariance)
+            for a in range(4):
+                for q in range(4):
+                    slopes[a, q] = 0.0
+        if straight or (missed > _BROKEN and first_order > 0.0):
+            density = first_order
+        weight[row] = math.log(density) - 0.5 * misfit if density > 0.0 else -np.inf
+        valid[row] = missed < _MISSED and fair
+
+
+@kernel
+def rank(weight: Array, number: IntArray, probability: Array, order: IntArray) -> None:
+    """Posterior probabilities of candidates, and their order by falling probability."""
+    for row in range(number.shape[0]):
+        n, log = number[row], weight[row]
+        for i in range(order.shape[1]):
+            order[row, i], probability[row, i] = i, np.nan
+        for i in range(1, n):  # stable: candidates of equal weight stay by force
+            place = i
+            while place > 0 and log[order[row, place - 1]] < log[i]:
+                order[row, place] = order[row, place - 1]
+                place -= 1
+            order[row, place] = i
+        total = 0.0
+        for i in range(n):
+            away = log[order[row, i]] - log[order[row, 0]]
+            probability[row, i] = math.exp(away) if away <= 0.0 else 1.0
+            total += probability[row, i]
+        for i in range(n):
+            probability[row, i] /= total
+
+
+class Judgement(NamedTuple):
+    """Covariances of points (n, 3, 3), log weights (n,), and validity (n,) of candidates."""
+
+    covariances: Array
+    weight: Array
+    valid: AnyArray
+
+
+def judged(
+    discretization: Discretization,
+    names: tuple[str, ...],
+    targets: Array,
+    weights: Array,
+    contacts: Array,
+    values: Array,
+    tangents: Array,
+    *,
+    friction: bool,
+    least: float,
+    proximal: float,
+) -> Judgement:
+    """Judge candidates of many measurements; the arguments are those of :func:`judge`."""
+    n, rod = len(contacts), discretization.rod
+    out = Judgement(np.full((n, 3, 3), np.nan), np.full(n, -np.inf), np.zeros(n, np.bool_))
+    codes = np.array([FITTED.index(name) for name in names])
+    targets, weights = np.ascontiguousarray(targets), np.ascontiguousarray(weights)
+    share_out(
+        n,
+        lambda first, last: judge(
+            rod,
+            friction,
+            least,
+            proximal,
+            codes,
+            targets,
+            weights,
+            contacts,
+            values,
+            tangents,
+            *out,
+            first,
+            last,
+        ),
+    )
+    return out
+
+
+def ranked(weight: Array, number: IntArray) -> tuple[Array, IntArray]:
+    """Probabilities (rows, most) of candidates, and their order; see :func:`rank`."""
+    probability, order = np.empty(weight.shape), np.empty(weight.shape, np.int64)
+    rank(weight, number, probability, order)
+    return probability, order

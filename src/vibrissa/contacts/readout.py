@@ -1,0 +1,276 @@
+"""What a stream carries, ready for one measurement at a time: signals by name, or a linear mix.
+
+A readout turns a measurement into channels with weights (:class:`~vibrissa.contacts.weighing`), and
+knows where contacts that explain it may lie: from a search tree of three quantities over the map.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vibrissa.contacts.channels import CHANNELS, FITTED, WRENCH, Channels
+from vibrissa.contacts.explanation import Bounds, check_signals
+from vibrissa.contacts.least_squares import (
+    at_nodes,
+    constant_weights,
+    parts,
+    seeding_triplet,
+    volumes,
+)
+from vibrissa.contacts.locating import Searched
+from vibrissa.contacts.noise import SensorNoise, scaled_errors
+from vibrissa.contacts.weighing import Weighing
+from vibrissa.contacts.whitening import TRUSTED, rank
+from vibrissa.numerics.arrays import Array
+from vibrissa.rod.preimage import Preimages, Tree
+from vibrissa.rod.reach import Reach
+from vibrissa.signals import CIRCULAR, SIGNALS, signal_scales
+
+if TYPE_CHECKING:
+    from vibrissa.contacts.contact_map import ContactMap
+
+# A direction of the readings in which contacts of the map vary so much less than the noise and the
+# others tells nothing.
+_UNTOLD = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """One measurement, non-dimensional: what was measured, and what the channels should be."""
+
+    measured: Array
+    target: Array
+
+
+class Named:
+    """Signals by name, and components of force and moment."""
+
+    def __init__(
+        self, contacts: ContactMap, names: tuple[str, ...], sensor: SensorNoise | None
+    ) -> None:
+        chart = contacts.chart
+        d = chart.discretization
+        self.names, self.sensor, self.channels = names, sensor, Channels.of(names)
+        self.noisy = sensor is not None
+        self.scale = signal_scales(names, d.force, d.moment)
+        self._pairs = self.channels.pairs()
+        self._circular = [CIRCULAR[SIGNALS.index(name)] for name in names]
+        self._sizes = [i for i, name in enumerate(names) if name in ("FT", "MB")]
+        self.bounds = Bounds.of(contacts, names)
+        self._most = self.bounds.most()
+        self._straight = [i for i, turns in enumerate(self._circular) if not turns]
+        self.how = _weighing(self.channels, sensor, d.force, d.moment, self.scale)
+        self.passes = 1 if constant_weights(self.channels, sensor) else 2
+        self.told = len(names)
+        self._noise = [] if sensor is None else self._deviations(sensor)
+        if len(names) >= 3:
+            three = names if len(names) == 3 else seeding_triplet(chart, names)
+            known, turns, _ = at_nodes(chart, self.channels.names)
+            self.searched = _searched(
+                chart,
+                contacts.tree(three).tree,
+                [names.index(name) for name in three],
+                [SIGNALS.index(name) for name in three],
+                known,
+                turns,
+                [
+                    2 if turn else "FM".index(name[0])
+                    for name, turn in zip(self.channels.names, turns, strict=True)
+                ],
+            )
+
+    def _deviations(self, sensor: SensorNoise) -> list[tuple[int, float]]:
+        """Standard deviations of signals that are no directions, where nothing is felt."""
+        out = []
+        for i in self._straight:
+            name, scale = self.names[i], float(self.scale[i])
+            if sensor.deviations is not None:
+                sigma = sensor.deviations[name]
+            else:
+                assert sensor.wrench is not None
+                parts = {"Fx": [0], "FT": [1, 2], "Mx": [3], "MB": [4, 5]}[name]
+                sigma = float(np.sqrt(np.diag(sensor.wrench)[parts].mean()))
+            out.append((i, sigma / scale))
+        return out
+
+    def scaled(self, values: Array) -> Measurement:
+        """Check one measurement (k,), SI units, and make it non-dimensional; NaN stays NaN."""
+        for i, value in enumerate(values.tolist()):
+            if self._circular[i]:
+                if abs(value) > 2.0 * math.pi:
+                    check_signals(values, self.names)
+            elif value < 0.0 and i in self._sizes:
+                check_signals(values, self.names)
+        measured = values / self.scale
+        if not self._pairs:
+            return Measurement(measured, measured)
+        target = measured.copy()
+        for i in self._pairs:
+            size, angle = measured[i], measured[i + 1]
+            target[i], target[i + 1] = size * math.cos(angle), size * math.sin(angle)
+        return Measurement(measured, target)
+
+    def nothing(self, measurement: Measurement) -> bool:
+        """Whether the whisker touches nothing."""
+        values = measurement.measured.tolist()
+        return bool(self._straight) and not any(values[i] for i in self._straight)
+
+    def felt(self, measurement: Measurement, above: float) -> bool:
+        """Whether a signal other than a direction is so many standard deviations from zero."""
+        values = measurement.measured.tolist()
+        return any(abs(values[i]) > above * sigma for i, sigma in self._noise)
+
+    def beyond(self, measurement: Measurement) -> bool:
+        """Whether the signals are far larger than any on the map."""
+        values = measurement.measured.tolist()
+        return any(abs(values[i]) > most for i, most in self._most)
+
+
+class Mixed:
+    """A linear mix of force and moment, z = H (F, M) + noise."""
+
+    def __init__(
+        self, contacts: ContactMap, mixing: Array, covariance: Array, errors: Array
+    ) -> None:
+        chart = contacts.chart
+        d = chart.discretization
+        sizes = np.repeat([d.force, d.moment], 3)
+        size, axes = np.linalg.eigh(covariance)
+        if not size[0] > 0.0:
+            raise ValueError(
+                "a mix of force and moment can only be weighed with noise in all of it"
+            )
+        whiten = axes.T / np.sqrt(size)[:, None]
+        known = chart.values.reshape(-1, 6)
+        wrenches = np.concatenate([known[:, :3], np.cross(known[:, 3:], known[:, :3])], axis=1)
+        typical = np.sqrt((wrenches**2).mean(axis=0))
+        # Singular directions of what contacts make of whitened readings, the strongest first.
+        u, strength, _ = np.linalg.svd(whiten @ (mixing * sizes) * typical)
+        self.noisy = True
+        self.told = int((strength > _UNTOLD * strength[0]).sum())
+        self._reduce = (u.T @ whiten)[: self.told]
+        h = self._reduce @ (mixing * sizes)
+        self._back = np.linalg.pinv(h)
+        self.how = Weighing(
+            np.array([FITTED.index(name) for name in WRENCH]),
+            np.ascontiguousarray(h),
+            np.eye(self.told),
+            np.zeros((6, 6)),
+            0.0,
+            np.full(6, np.nan),
+            # What is told has full rank, so that wrong readings are those of wrong wrenches.
+            np.ascontiguousarray(self._back @ (self._reduce @ errors) * np.append(sizes, 1.0)),
+        )
+        self.passes = 2 if errors[..., :6].any() else 1
+        seen = wrenches @ h.T
+        self._largest = 10.0 * np.abs(seen).max(axis=0)
+        if self.told >= 3:
+            n, m, k = chart.values.shape[:3]
+            three = h[:3]
+            values = seen[:, :3].reshape(n, m, k, 3)
+            force, point = chart.tangents[..., :3, :], chart.tangents[..., 3:, :]
+            moment = np.cross(point, chart.values[..., :3, None], axis=-2)
+            moment = moment + np.cross(chart.values[..., 3:, None], force, axis=-2)
+            slopes = three @ np.concatenate([force, moment], axis=-2)
+            straight = (False, False, False)
+            tree = Preimages.of(chart, np.ascontiguousarray(values), slopes, straight).tree
+            self.searched = _searched(
+                chart,
+                tree,
+                range(3),
+                range(3),
+                np.ascontiguousarray(seen.T),
+                np.zeros(self.told),
+                [2] * self.told,
+            )
+            size = np.linalg.norm(slopes, axis=-1, keepdims=True)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                volume = np.abs(np.linalg.det(slopes / size))
+            if np.nanmedian(volume) < _UNTOLD:
+                self.told = 2
+
+    def scaled(self, values: Array) -> Measurement:
+        """Make one measurement (k,) non-dimensional and white; NaN stays NaN."""
+        z = self._reduce @ values
+        return Measurement(z, self._back @ z)
+
+    def nothing(self, measurement: Measurement) -> bool:
+        """Whether the whisker touches nothing."""
+        return not measurement.measured.any()
+
+    def felt(self, measurement: Measurement, above: float) -> bool:
+        """Whether all readings together are so many standard deviations from zero."""
+        size = float((measurement.measured**2).sum())
+        return size > len(measurement.measured) - 1 + above**2
+
+    def beyond(self, measurement: Measurement) -> bool:
+        """Whether the readings are far larger than any on the map."""
+        return bool((np.abs(measurement.measured) > self._largest).any())
+
+
+def _searched(
+    chart: Reach,
+    tree: Tree,
+    where: Sequence[int],
+    codes: Sequence[int],
+    seen: Array,
+    turns: Array,
+    kinds: Sequence[int],
+) -> Searched:
+    """What is searched; see there."""
+    d = chart.discretization
+    return Searched(
+        d.rod,
+        chart.fold,
+        chart.proximal,
+        tree,
+        np.array(where),
+        np.array(codes, dtype=np.float64),
+        chart.contacts.reshape(-1, 3),
+        chart.values.reshape(-1, 6),
+        seen,
+        turns,
+        np.array(kinds),
+        parts(chart),
+        volumes(chart),
+        d.length,
+        d.force,
+    )
+
+
+def _weighing(
+    channels: Channels, sensor: SensorNoise | None, force: float, moment: float, scale: Array
+) -> Weighing:
+    k = len(channels.names)
+    sizes = np.repeat([force, moment], 3)
+    components, deviations = np.zeros((6, 6)), np.full(k, np.nan)
+    if sensor is not None and sensor.wrench is not None:
+        components = sensor.wrench / np.outer(sizes, sizes)
+    elif sensor is not None and sensor.deviations is not None:
+        deviations = np.array([sensor.deviations[name] for name in channels.signals]) / scale
+    return Weighing(
+        np.array([CHANNELS.index(name) for name in channels.names]),
+        np.eye(k),
+        np.zeros((k, k)),
+        np.ascontiguousarray(components, dtype=np.float64),
+        TRUSTED if sensor is None else 0.0,
+        deviations,
+        np.zeros((0, 6, 7)) if sensor is None else scaled_errors(sensor.errors, force, moment),
+    )
+
+
+def independent(contacts: ContactMap, readout: Named | Mixed) -> int:
+    """How many independent numbers a measurement tells."""
+    if isinstance(readout, Mixed):
+        return len(readout.how.own)
+    sensor, channels = readout.sensor, readout.channels
+    if sensor is None or sensor.wrench is None:
+        return len(channels.names)
+    node = contacts.chart.values[-1, :1, -1]
+    ones = np.ones((1, len(channels.names)))
+    return rank(channels.covariance(sensor, ones, node, contacts.chart.discretization)[0])

@@ -1,0 +1,143 @@
+"""What one measurement weighs; compiled.
+
+What batches do with arrays (:mod:`~vibrissa.contacts.whitening`,
+:mod:`~vibrissa.contacts.channels`), here for one row at a time, where NumPy's overhead would be ten
+times the work. A measurement is z = A c(x) + noise: a mix A of channels c, the identity for signals
+by name.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from vibrissa.numerics.arrays import Array, IntArray
+from vibrissa.numerics.compiled import copy, inlined, kernel
+
+# Of a channel's variance, what others do not explain; below this the covariance is singular.
+_SINGULAR = 1e-10
+
+
+class Weighing(NamedTuple):
+    """How a measurement is weighed, non-dimensional."""
+
+    codes: IntArray
+    mixing: Array
+    own: Array
+    components: Array
+    share: float
+    deviations: Array
+    errors: Array
+
+
+@inlined
+def gradients(codes: IntArray, force: Array, moment: Array, out: Array) -> None:
+    """∂(channels)/∂(F, M), (k, 6)."""
+    for k in range(codes.shape[0]):
+        for a in range(6):
+            out[k, a] = 0.0
+        w = codes[k]
+        if w == 0 or w == 3:
+            out[k, w] = 1.0
+        elif w == 6 or w == 7:
+            out[k, w - 5] = 1.0
+        elif w == 8 or w == 9:
+            out[k, w - 4] = 1.0
+        else:
+            first = 0 if w < 3 else 3
+            y, z = (force[1], force[2]) if w < 3 else (moment[1], moment[2])
+            size = np.sqrt(y * y + z * z)
+            if w == 1 or w == 4:
+                out[k, first + 1], out[k, first + 2] = y / size, z / size
+            else:
+                out[k, first + 1], out[k, first + 2] = -z / size**2, y / size**2
+
+
+@inlined
+def wrong_by(error: Array, force: Array, moment: Array, out: Array) -> None:
+    """E (F, M, 1), (6,), for an error E (6, 7)."""
+    for a in range(6):
+        out[a] = error[a, 6]
+        for c in range(3):
+            out[a] += error[a, c] * force[c] + error[a, 3 + c] * moment[c]
+
+
+@inlined
+def _covariance(how: Weighing, value: Array, measured: Array, sigma: Array) -> None:
+    """Covariance (k, k) of the channels at a contact with (F, p)."""
+    codes, deviations = how.codes, how.deviations
+    k = codes.shape[0]
+    force, moment, g = np.empty(3), np.empty(3), np.empty((k, 6))
+    copy(value[:3], force)
+    px, py, pz = value[3], value[4], value[5]
+    moment[0] = py * force[2] - pz * force[1]
+    moment[1] = pz * force[0] - px * force[2]
+    moment[2] = px * force[1] - py * force[0]
+    gradients(codes, force, moment, g)
+    f2 = force[0] ** 2 + force[1] ** 2 + force[2] ** 2
+    m2 = moment[0] ** 2 + moment[1] ** 2 + moment[2] ** 2
+    common, wrong = how.components.copy(), np.empty(6)
+    for error in how.errors:
+        wrong_by(error, force, moment, wrong)
+        for a in range(6):
+            for c in range(6):
+                common[a, c] += wrong[a] * wrong[c]
+    for i in range(k):
+        for j in range(k):
+            total = 0.0
+            for a in range(6):
+                size = f2 if a < 3 else m2
+                total += how.share**2 * size * g[i, a] * g[j, a]
+                for c in range(6):
+                    total += g[i, a] * common[a, c] * g[j, c]
+            sigma[i, j] = total
+    if not deviations[0] >= 0.0:
+        return
+    for i in range(k):
+        w = codes[i]
+        if w == 6 or w == 8:  # a size is followed by its direction
+            size, cos, sin = measured[i], np.cos(measured[i + 1]), np.sin(measured[i + 1])
+            along, across = deviations[i] ** 2, (size * deviations[i + 1]) ** 2
+            sigma[i, i] += cos * cos * along + sin * sin * across
+            sigma[i + 1, i + 1] += sin * sin * along + cos * cos * across
+            sigma[i, i + 1] += cos * sin * (along - across)
+            sigma[i + 1, i] += cos * sin * (along - across)
+        elif w != 7 and w != 9:
+            sigma[i, i] += deviations[i] ** 2
+
+
+@kernel
+def weigh(how: Weighing, value: Array, measured: Array, out: Array) -> bool:
+    """Fill weights W (k, k), rows beyond q zero, for a contact with (F, p)."""
+    mixing = how.mixing
+    q, k = mixing.shape
+    sigma, mixed, low = np.empty((k, k)), np.zeros((q, k)), np.zeros((q, q))
+    _covariance(how, value, measured, sigma)
+    for i in range(q):
+        for j in range(k):
+            for a in range(k):
+                mixed[i, j] += mixing[i, a] * sigma[a, j]
+    for i in range(q):
+        for j in range(i + 1):
+            total = how.own[i, j]
+            for a in range(k):
+                total += mixed[i, a] * mixing[j, a]
+            whole = total
+            for a in range(j):
+                total -= low[i, a] * low[j, a]
+            if i > j:
+                low[i, j] = total / low[j, j]
+            elif total > _SINGULAR * whole and total < np.inf:
+                low[i, i] = np.sqrt(total)
+            else:
+                return False
+    for j in range(k):
+        for i in range(k):
+            total = mixing[i, j] if i < q else 0.0
+            if i < q:
+                for a in range(i):
+                    total -= low[i, a] * out[a, j]
+                total /= low[i, i]
+            out[i, j] = total
+    return True

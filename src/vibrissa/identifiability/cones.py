@@ -1,0 +1,118 @@
+"""How curvature and taper decide which triplets locate a contact: critical cones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike
+
+from vibrissa.contacts.contact_map import ContactMap
+from vibrissa.identifiability.verdicts import SEPARATION, uniqueness
+from vibrissa.whisker import Whisker
+
+#: The triplets that the paper finds unique for its γ whisker.
+PAPER = ("Fx MB MD", "Mx MB MD", "Fx FD MD")
+#: A·L of the whiskers y = A x², and ratios of base to tip radius.
+CURVATURES = np.arange(16) / 10.0
+TAPER_RATIOS = (1.0, 2.0, 4.0, 8.0, 15.0, 30.0, 60.0)
+
+# Verdicts do not depend on size or stiffness: one length and one base radius stand for all.
+_LENGTH, _BASE_RADIUS = 40e-3, 100e-6
+# Verdicts stop searching where a witness is found; here all are wanted.
+_ROUNDS = 2
+
+
+def critical_cones(
+    curvatures: ArrayLike = CURVATURES,
+    taper_ratios: ArrayLike = TAPER_RATIOS,
+    triplets: Sequence[str] = PAPER,
+    *,
+    min_separation: float = SEPARATION,
+    samples: int = 1024,
+    progress: Callable[[int, int], None] | None = None,
+) -> xr.Dataset:
+    """Compute critical cones of planar whiskers y = A x² over curvature and taper.
+
+    The critical cone is the smallest cone about the resting whisker outside which no two contacts
+    give the same triplet; see :func:`vibrissa.uniqueness`. Contacts that only the plane of the
+    whisker makes equal do not count.
+
+    Parameters
+    ----------
+    curvatures : (n,) array_like
+        A·L of the whiskers, A the coefficient of the parabola and L the length.
+    taper_ratios : (m,) array_like
+        Base radius over tip radius.
+    triplets : sequence of str
+        The triplets.
+    min_separation : float
+        Contacts nearer to each other than this share of the length count as one.
+    samples : int
+        How many contacts of each whisker are tried.
+    progress : callable, optional
+        Called as ``progress(done, total)`` after each whisker.
+
+    Returns
+    -------
+    Dataset
+        ``critical_cone`` (rad) over ``triplet``, ``taper_ratio`` and ``curvature``; 0 where no
+        witness was found.
+
+    Raises
+    ------
+    ValueError
+        If a curvature is negative or not finite, or a ratio below 1.
+    """
+    curved = np.atleast_1d(np.asarray(curvatures, dtype=np.float64))
+    ratios = np.atleast_1d(np.asarray(taper_ratios, dtype=np.float64))
+    if not (np.isfinite(curved).all() and (curved >= 0.0).all()):
+        raise ValueError(f"curvatures A·L must be finite and ≥ 0; got {curved}")
+    if not (np.isfinite(ratios).all() and (ratios >= 1.0).all()):
+        raise ValueError(f"taper ratios must be finite and ≥ 1; got {ratios}")
+    cone = np.full((len(triplets), ratios.size, curved.size), np.nan)
+    for j, ratio in enumerate(ratios.tolist()):
+        for k, curvature in enumerate(curved.tolist()):
+            whisker = Whisker.parabola(
+                _LENGTH,
+                curvature / _LENGTH,
+                base_radius=_BASE_RADIUS,
+                tip_radius=_BASE_RADIUS / ratio,
+            )
+            contacts = ContactMap.simulate(whisker, grid=False)
+            for i, triplet in enumerate(triplets):
+                cone[i, j, k] = _critical_cone(contacts, triplet, min_separation, samples)
+            if progress is not None:
+                progress(j * curved.size + k + 1, cone[0].size)
+    about = {"units": "rad", "long_name": "smallest cone without witnesses outside it"}
+    return xr.Dataset(
+        {"critical_cone": (("triplet", "taper_ratio", "curvature"), cone, about)},
+        {
+            "triplet": list(triplets),
+            "taper_ratio": ("taper_ratio", ratios, {"units": "1", "long_name": "taper ratio"}),
+            "curvature": ("curvature", curved, {"units": "1", "long_name": "A·L of y = A x²"}),
+        },
+        {"kind": "vibrissa critical cones", "min_separation": min_separation, "samples": samples},
+    )
+
+
+def _critical_cone(
+    contacts: ContactMap, triplet: str, min_separation: float, samples: int
+) -> float:
+    """The cone found, and whatever is found when outside that cone is searched harder."""
+    cone = 0.0
+    for seed in range(_ROUNDS):
+        found = uniqueness(
+            contacts,
+            [triplet],
+            ["all"],
+            min_separation=min_separation,
+            cone=cone,
+            samples=samples,
+            resolution=False,
+            seed=seed,
+        )
+        # Below a right angle, where the cone is all of space.
+        cone = min(max(cone, float(found["critical_cone"].squeeze())), 0.499 * np.pi)
+    return cone

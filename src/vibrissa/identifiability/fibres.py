@@ -1,0 +1,154 @@
+"""Fibres: curves of contacts with equal triplets, where a triplet has lost a dimension.
+
+A straight whisker never twists: M_x = 0 everywhere. In a whisker of one stiffness and one curvature
+the axial force and the bending moment at the base hang together, F_x = -M²/2EI for a straight
+cylinder. Then the contacts with equal triplets form curves, which are followed along the direction
+in which the triplet does not change.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vibrissa.contacts.contact_map import Domain
+from vibrissa.identifiability.regions import Places, place, sample, spread
+from vibrissa.identifiability.twins import AGREEMENT, Pairs, sizes, triplet_derivatives
+from vibrissa.numerics.arrays import AnyArray, Array
+from vibrissa.rod.batch import solve_forces
+from vibrissa.rod.discretize import Discretization, discretize
+from vibrissa.rod.reach import fold_forces, with_normal_force
+from vibrissa.signals import SIGNALS, circular_among, within_turn
+from vibrissa.signals.base import signals_of
+
+if TYPE_CHECKING:
+    from vibrissa.contacts.contact_map import ContactMap
+
+# Length of a step in units in which the chart is about one wide, and how many each way.
+_STRIDE = 0.02
+_STRIDES = 60
+_CORRECTIONS = 5
+# Singular values smaller than this share of the largest count as zero.
+_RANK = 1e-8
+# A triplet has lost a dimension if it has at all but this share of the contacts.
+_LOST = 0.99
+# Where the equations make signals depend on each other, the integration does so to its own error.
+# With so many times the steps that is below ``_RANK``.
+_FINER = 8
+# How many contacts tell whether signals determine contacts at all.
+_TRIED = 256
+
+
+def determining(contacts: ContactMap, names: tuple[str, ...]) -> bool:
+    """Tell whether signals determine contacts, but for single ones."""
+    places = sample(contacts, spread(_TRIED, seed=0), "reachable").places
+    which = [SIGNALS.index(name) for name in names]
+    circular = circular_among(names)
+    span = np.where(circular, 2.0 * np.pi, np.ptp(places.signals[:, which], axis=0))
+    return deficient(contacts, names, places.contacts, span) is None
+
+
+def deficient(contacts: ContactMap, names: tuple[str, ...], xi: Array, span: Array) -> int | None:
+    """Whether a triplet has lost a dimension at contacts, but for rounding."""
+    # A signal without a range is zero everywhere, but for rounding.
+    weight = np.where(span > _RANK, 1.0 / np.maximum(span, _RANK), 0.0)
+    unit = units(contacts, xi)
+    for steps in (contacts.steps, _FINER * contacts.steps):
+        d = discretize(contacts.whisker, steps)
+        values, tangents = solve_forces(d, with_normal_force(xi), tangents=True)
+        slope = triplet_derivatives(values, tangents, names) * unit[:, None, :]
+        singular = np.linalg.svd(slope * weight[:, None], compute_uv=False)
+        if (singular[:, 2] <= _RANK * singular[:, 0]).mean() > _LOST:
+            return steps
+    return None
+
+
+def fibres(
+    contacts: ContactMap,
+    names: tuple[str, ...],
+    steps: int,
+    chart: Array,
+    first: Places,
+    domain: Domain,
+) -> Pairs:
+    """Follow the curves of equal triplets through contacts where these have lost a dimension."""
+    d = discretize(contacts.whisker, steps)
+    values, _ = solve_forces(d, with_normal_force(first.contacts))
+    first = place(contacts, first.contacts, values, domain)
+    targets = first.signals[:, [SIGNALS.index(name) for name in names]]
+    unit = units(contacts, first.contacts)
+    rows, found = [], []
+    for sense in (1.0, -1.0):
+        running, xi = np.arange(len(chart)), first.contacts
+        direction = np.full(xi.shape, np.nan)
+        for _ in range(_STRIDES):
+            _, slope, _ = _equations(d, names, xi, targets[running])
+            direction = _along(slope * unit[running, None, :], direction, sense)
+            xi = xi + _STRIDE * direction * unit[running]
+            xi, values, misfit = corrected(d, names, xi, targets[running], unit[running])
+            stays = (misfit <= AGREEMENT) & _stable(contacts, xi)
+            xi, running, direction = xi[stays], running[stays], direction[stays]
+            if not running.size:
+                break
+            rows.append(running)
+            found.append(np.concatenate([xi, values[stays]], axis=1))
+    row = np.concatenate(rows) if rows else np.zeros(0, dtype=np.int64)
+    both = np.concatenate(found) if found else np.zeros((0, 9))
+    second = place(contacts, both[:, :3], both[:, 3:], domain)
+    apart = np.linalg.norm(second.values[:, 3:] - first.values[row, 3:], axis=1)
+    return Pairs(chart[row], row, first.rows(row), second, apart)
+
+
+def _along(slope: Array, before: Array, sense: float) -> Array:
+    """Unit vectors (n, 3) in which T does not change, as near to those before as there are."""
+    _, singular, rows = np.linalg.svd(slope)
+    null = singular <= _RANK * singular[:, :1]
+    null[:, 2] = True
+    onto = np.einsum("nk,nki,ni->nk", null, rows, before)
+    turned = np.einsum("nk,nki->ni", onto, rows)
+    fresh = np.isnan(before).any(axis=1)
+    turned[fresh] = sense * rows[fresh, 2]
+    return np.asarray(turned / np.linalg.norm(turned, axis=1, keepdims=True))
+
+
+def corrected(
+    discretization: Discretization, names: tuple[str, ...], xi: Array, targets: Array, unit: Array
+) -> tuple[Array, Array, Array]:
+    """Move contacts the least way to where they have given signals (Gauss and Newton)."""
+    for _ in range(_CORRECTIONS):
+        away, slope, _ = _equations(discretization, names, xi, targets)
+        inverse = np.linalg.pinv(slope * unit[:, None, :], rcond=1e-6)
+        xi = xi - np.einsum("nij,nj->ni", inverse, away) * unit
+    away, _, values = _equations(discretization, names, xi, targets)
+    # Where a fibre comes to rest nothing is left to compare with: infinitely far off.
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        misfit = np.abs(away / sizes(values, names)).max(axis=1)
+    return xi, values, np.where(np.isfinite(misfit), misfit, np.inf)
+
+
+def units(contacts: ContactMap, xi: Array) -> Array:
+    """What a change of each unknown is small beside (n, 3): L, and the fold force there."""
+    force = fold_forces(contacts.chart.fold, xi)
+    return np.stack([np.ones(len(xi)), force, force], axis=1)
+
+
+def _equations(
+    discretization: Discretization, names: tuple[str, ...], xi: Array, targets: Array
+) -> tuple[Array, Array, Array]:
+    """T(ξ) - target (n, 3), ∂T/∂ξ (n, 3, 3) and (F, p) (n, 6)."""
+    which = [SIGNALS.index(name) for name in names]
+    values, tangents = solve_forces(discretization, with_normal_force(xi), tangents=True)
+    force, point = values[:, :3], values[:, 3:]
+    away = signals_of(force, np.cross(point, force))[:, which] - targets
+    return (
+        within_turn(away, circular_among(names)),
+        triplet_derivatives(values, tangents, names),
+        values,
+    )
+
+
+def _stable(contacts: ContactMap, xi: Array) -> AnyArray:
+    force = np.hypot(xi[:, 1], xi[:, 2])
+    inside = (xi[:, 0] >= contacts.chart.proximal) & (xi[:, 0] <= 1.0)
+    return np.asarray(inside & (force > 0.0) & (force < units(contacts, xi)[:, 1]))

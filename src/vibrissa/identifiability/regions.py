@@ -1,0 +1,128 @@
+"""Contacts and the regions that they lie in: what the search for twins works on.
+
+All arrays are non-dimensional (lengths over L, forces over EI/L²), as in :mod:`vibrissa.rod`.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy.stats import qmc
+
+from vibrissa.contacts.contact_map import Domain, within_paper_bounds
+from vibrissa.numerics.arrays import AnyArray, Array
+from vibrissa.rod.batch import contact_tangents, solve_forces
+from vibrissa.rod.reach import Fold, contacts_at, determinant, with_normal_force
+from vibrissa.signals import concave_backward, cone_angle, in_region
+from vibrissa.signals.base import signals_of
+
+if TYPE_CHECKING:
+    from vibrissa.contacts.contact_map import ContactMap
+
+# Directions have no value at zero force: samples stay off it.
+_LEAST_LOAD = 0.01
+
+
+class Places(NamedTuple):
+    """Contacts with the regions they lie in."""
+
+    contacts: Array
+    values: Array
+    angle: Array
+    backward: AnyArray
+    large: AnyArray
+    inside: AnyArray
+
+    def rows(self, which: AnyArray | slice) -> Places:
+        """Pick some."""
+        return Places(*(a[which] for a in self))
+
+    def members(self, region: str) -> AnyArray:
+        """Whether each belongs to a region, whatever its angle."""
+        return self.inside & in_region(region, self.backward, self.large)
+
+    @property
+    def signals(self) -> Array:
+        """The six signals (n, 6)."""
+        force, point = self.values[:, :3], self.values[:, 3:]
+        return signals_of(force, np.cross(point, force))
+
+
+class Samples(NamedTuple):
+    """Places spread over Ω.
+
+    chart (n, 3): (η, ψ, ρ); places; tangents ∂(F, p)/∂ξ (n, 6, 3); volume (n,): each one's share of
+    the contact points' space, up to a common factor.
+    """
+
+    chart: Array
+    places: Places
+    tangents: Array
+    volume: Array
+
+    def rows(self, which: AnyArray | slice) -> Samples:
+        """Pick some."""
+        return Samples(
+            self.chart[which], self.places.rows(which), self.tangents[which], self.volume[which]
+        )
+
+
+def place(contacts: ContactMap, xi: Array, values: Array, domain: Domain) -> Places:
+    """Find the regions of contacts ξ (n, 3) with known (F, p) (n, 6)."""
+    whisker, d = contacts.whisker, contacts.chart.discretization
+    points = values[:, 3:] * d.length
+    tangent = contact_tangents(d, with_normal_force(xi))
+    inside = np.ones(len(xi), dtype=bool)
+    if domain == "paper":
+        inside = within_paper_bounds(whisker, points)
+    return Places(
+        contacts=xi,
+        values=values,
+        angle=cone_angle(whisker, points),
+        backward=concave_backward(whisker, points),
+        large=tangent[:, 0] < 0.0,
+        inside=inside,
+    )
+
+
+def sample(contacts: ContactMap, chart: Array, domain: Domain) -> Samples:
+    """Solve the contacts at chart coordinates (n, 3)."""
+    fold, d = contacts.chart.fold, contacts.chart.discretization
+    xi = contacts_at(fold, chart)
+    values, tangents = solve_forces(d, with_normal_force(xi), tangents=True)
+    places = place(contacts, xi, values, domain)
+    # The chart knows the fold to a part in a million: what lies beyond it does not count.
+    stable = determinant(tangents) > 0.0
+    by_chart = np.linalg.det(tangents[:, 3:] @ _frames(fold, chart))
+    return Samples(
+        chart, places._replace(inside=places.inside & stable), tangents, np.abs(by_chart)
+    )
+
+
+def spread(number: int, seed: int) -> Array:
+    """Low-discrepancy chart coordinates (n, 3), at least ``number`` of them: a power of two."""
+    sobol = qmc.Sobol(3, seed=np.random.default_rng(seed))
+    unit = sobol.random_base2(max(1, int(np.ceil(np.log2(number)))))
+    return in_chart(unit * [1.0, 2.0 * np.pi, 1.0])
+
+
+def in_chart(chart: Array) -> Array:
+    """Bring chart coordinates (n, 3) back into the chart: reflected at its faces, ψ on a circle."""
+    chart = np.array(chart)
+    for axis in (0, 2):
+        x = np.abs(chart[:, axis]) % 2.0
+        chart[:, axis] = np.minimum(x, 2.0 - x)
+    chart[:, 1] %= 2.0 * np.pi
+    chart[:, 2] = np.maximum(chart[:, 2], _LEAST_LOAD)
+    return chart
+
+
+def _frames(fold: Fold, chart: Array) -> Array:
+    """∂ξ/∂(η, ψ, ρ), (n, 3, 3), by central differences of the chart itself."""
+    columns = []
+    for axis in range(3):
+        step = np.zeros(3)
+        step[axis] = 1e-6
+        columns.append((contacts_at(fold, chart + step) - contacts_at(fold, chart - step)) / 2e-6)
+    return np.stack(columns, axis=-1)

@@ -1,0 +1,1 @@
+"""Support for compiled kernels: array types, compilation, the cache on disk."""

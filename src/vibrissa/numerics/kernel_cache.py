@@ -1,0 +1,130 @@
+"""What is compiled is kept on disk, and a listener says so while it happens.
+
+Numba knows a cached kernel by its own file alone, and would go on using it after a function that it
+inlines from another file has changed; here all files with kernels of its own package, of
+``numerics`` and of the rod, whose helpers others use, are part of the key.
+
+A result must not hang on the cache. A file in it that is not as it was written, whatever cut it or
+changed it, counts as none: each has its SHA-256 in front, for machine code that is not whole would
+not be noticed otherwise. Where nothing can be written, as on a full disk, kernels are compiled anew
+in each run.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+import sys
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from numba.core import event
+from numba.core.caching import FunctionCache, IndexDataCacheFile
+
+_SHARED = (Path(__file__).parent, Path(__file__).parents[1] / "rod")
+_DIGEST = hashlib.sha256().digest_size
+
+
+@cache
+def _sources(package: Path) -> str:
+    digest = hashlib.sha256()
+    for path in sorted(path for folder in {package, *_SHARED} for path in folder.glob("*.py")):
+        source = path.read_bytes()
+        # Written so that this file, which has no kernels, is none of them.
+        if b"@" + b"kernel" in source or b"@" + b"inlined" in source:
+            digest.update(source)
+    return digest.hexdigest()
+
+
+class _CheckedFiles(IndexDataCacheFile):
+    """An index and its data, of which damaged ones count as none."""
+
+    def _dump(self, obj: object) -> bytes:
+        content: bytes = super()._dump(obj)  # type: ignore[no-untyped-call]
+        return hashlib.sha256(content).digest() + content
+
+    def _load_index(self) -> dict[Any, str]:
+        try:
+            with open(self._index_path, "rb") as file:
+                version = pickle.load(file)
+                stamp, overloads = _whole(file.read())
+        except Exception:  # of what is damaged, pickle raises whatever it stumbles over
+            return {}
+        fresh = version == self._version and stamp == self._source_stamp
+        return overloads if fresh else {}
+
+    def _load_data(self, name: str) -> Any:
+        return _whole(Path(self._data_path(name)).read_bytes())  # type: ignore[no-untyped-call]
+
+
+def _whole(content: bytes) -> Any:
+    """Unpickle what has its digest in front."""
+    if hashlib.sha256(content[_DIGEST:]).digest() != content[:_DIGEST]:
+        raise ValueError("this is not what was written")
+    return pickle.loads(content[_DIGEST:])
+
+
+class PackageCache(FunctionCache):
+    """Keeps a compiled function on disk, as long as the kernels of its package are the same."""
+
+    _told = False
+
+    def __init__(self, function: object) -> None:
+        super().__init__(function)  # type: ignore[no-untyped-call]
+        self._cache_file.__class__ = _CheckedFiles
+
+    def _index_key(self, sig: object, codegen: object) -> tuple[object, ...]:
+        package = Path(self._py_func.__code__.co_filename).parent
+        return (*super()._index_key(sig, codegen), _sources(package))  # type: ignore[no-untyped-call]
+
+    def load_overload(self, sig: object, target_context: object) -> Any:
+        """Load what was compiled; None if there is none that can be used."""
+        try:
+            return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+        except Exception:
+            return None
+
+    def save_overload(self, sig: object, data: object) -> None:
+        """Keep what was compiled, if that is possible; say once if it is not."""
+        try:
+            super().save_overload(sig, data)  # type: ignore[no-untyped-call]
+        except (OSError, pickle.PickleError) as fault:
+            if not PackageCache._told:
+                PackageCache._told = True
+                _say(f"compiled kernels cannot be kept and are compiled in each run: {fault}")
+
+
+class _FirstCompilation(event.Listener):
+    """Say once for a verb, in a library once a package, that kernels are being compiled."""
+
+    def __init__(self) -> None:
+        self.said: set[str] = set()
+
+    def on_start(self, event: event.Event) -> None:
+        dispatcher = (event.data or {}).get("dispatcher")
+        module = getattr(getattr(dispatcher, "py_func", None), "__module__", "") or ""
+        package = ".".join(module.split(".")[:2])
+        verb = _verb()
+        what = f"for `{verb}`" if verb else f"of {package}"
+        if module.startswith("vibrissa.") and what not in self.said:
+            self.said.add(what)
+            _say(f"compiling kernels {what} (once for this installation, under a minute) ...")
+
+    def on_end(self, event: event.Event) -> None:
+        pass
+
+
+def _verb() -> str:
+    """Verb of the command line that this process was called with; nothing in a library."""
+    if "vibrissa.cli.app" not in sys.modules:
+        return ""
+    return next((word for word in sys.argv[1:] if not word.startswith("-")), "")
+
+
+def _say(sentence: str) -> None:
+    sys.stderr.write(f"vibrissa: {sentence}\n")
+    sys.stderr.flush()
+
+
+event.register("numba:compile", _FirstCompilation())

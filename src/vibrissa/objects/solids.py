@@ -1,0 +1,376 @@
+"""What a whisker meets in the laboratory: pegs, spheres, planes, boxes (meshes: `trial.mesh`).
+
+Each is a solid with a signed distance d (negative inside), its gradient, the outward normal n, and
+∂n/∂x, in closed form; a `vibrissa.rod.surfaces.Surface`. Each may be compliant: pressed with N it
+gives way by N over its stiffness, locally and along the normal, and keeps its shape elsewhere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vibrissa.objects.surface import Surface
+from vibrissa.whisker.pose import ORTHOGONALITY
+
+Array = NDArray[np.float64]
+
+
+class _Faults:
+    """Collects what is wrong with the numbers of one object."""
+
+    def __init__(self, what: str) -> None:
+        self._what = what
+        self._said: list[str] = []
+
+    def vector(self, name: str, value: Any, direction: bool = False) -> Array:
+        """Three finite numbers, of length one if a direction; read-only."""
+        vector = np.array(value, dtype=np.float64)
+        if vector.shape != (3,) or not np.isfinite(vector).all():
+            self._said.append(f"{name} is {vector.tolist()}; three finite numbers are needed")
+        elif direction:
+            size = float(np.linalg.norm(vector))
+            if size == 0.0:
+                self._said.append(f"{name} is (0, 0, 0), which is no direction")
+            # What already is a unit vector stays as it is, to the last bit, so that files keep it.
+            elif abs(size - 1.0) > 4.0 * np.finfo(np.float64).eps:
+                vector = vector / size
+        vector.flags.writeable = False
+        return vector
+
+    def positive(self, name: str, value: Any, unit: str, also: str = "") -> float:
+        """Return a positive number; ``also`` names what else is allowed."""
+        number = float(value)
+        allowed = number > 0.0 and (np.isfinite(number) or also == "infinite")
+        if not (allowed or (also == "zero" and number == 0.0)):
+            said = f", or {also}" if also else ""
+            self._said.append(f"{name} is {number!r}; it must be positive{said}, in {unit}")
+        return number
+
+    def check(self, ok: bool, said: str) -> None:
+        """Add a fault of another kind."""
+        if not ok:
+            self._said.append(said)
+
+    def tell(self) -> None:
+        """Raise a ValueError with all faults, if there are any."""
+        if self._said:
+            raise ValueError(f"no {self._what}: " + "; ".join(self._said))
+
+
+def _set(thing: Any, **values: Any) -> None:
+    for name, value in values.items():
+        object.__setattr__(thing, name, value)
+
+
+def _mm(vector: Array) -> str:
+    return "(" + ", ".join(f"{x * 1e3:.3f}" for x in vector) + ") mm"
+
+
+def _direction(vector: Array) -> str:
+    return "(" + ", ".join(f"{x:.3f}" for x in vector) + ")"
+
+
+def _soft(stiffness: float) -> str:
+    return "" if np.isinf(stiffness) else f", stiffness {stiffness:.3g} N/m"
+
+
+@dataclass(frozen=True, eq=False)
+class Peg(Surface):
+    """A solid straight cylinder without ends.
+
+    Parameters
+    ----------
+    origin : array_like (3,)
+        A point of its axis in the laboratory frame, m.
+    axis : array_like (3,)
+        Direction of its axis in the laboratory frame, of any length but zero; kept as a unit
+        vector.
+    radius : float
+        Radius of its surface, m.
+    stiffness : float
+        Force over indentation, N/m; infinite for a rigid one.
+
+    Raises
+    ------
+    ValueError
+        If a number is missing, the axis is zero or radius or stiffness are not positive.
+
+    Examples
+    --------
+    >>> Peg(origin=[25e-3, 0.0, 0.0], axis=[0.0, 0.0, 1.0], radius=1.35e-3)
+    Peg(origin=(25.000, 0.000, 0.000) mm, axis=(0.000, 0.000, 1.000), diameter 2.700 mm)
+    """
+
+    origin: Array
+    axis: Array
+    radius: float
+    stiffness: float = np.inf
+
+    def __post_init__(self) -> None:
+        """Check and make the arrays read-only."""
+        faults = _Faults("peg")
+        _set(
+            self,
+            origin=faults.vector("origin", self.origin),
+            axis=faults.vector("axis", self.axis, direction=True),
+            radius=faults.positive("radius", self.radius, "m"),
+            stiffness=faults.positive("stiffness", self.stiffness, "N/m", "infinite"),
+        )
+        faults.tell()
+
+    def _distance(self, points: Array) -> Array:
+        away = points - self.origin
+        along = away @ self.axis
+        distance: Array = np.linalg.norm(away - along[..., None] * self.axis, axis=-1) - self.radius
+        return distance
+
+    def _geometry(self, point: Array) -> tuple[float, Array, Array]:
+        away = point - self.origin
+        away = away - (away @ self.axis) * self.axis
+        size = float(np.sqrt(away @ away))
+        normal = away / size
+        flat = np.eye(3) - np.outer(self.axis, self.axis) - np.outer(normal, normal)
+        return size - self.radius, normal, flat / size
+
+    def in_whisker_frame(
+        self, base_rotation: ArrayLike, base_position: ArrayLike
+    ) -> tuple[Array, Array]:
+        """Say where the peg is as seen from the base of the whisker.
+
+        Parameters
+        ----------
+        base_rotation : array_like (..., 3, 3)
+            From the whisker's to the laboratory frame.
+        base_position : array_like (..., 3)
+            The base in the laboratory frame, m.
+
+        Returns
+        -------
+        tuple of arrays (..., 3)
+            A point of the axis, m, and its unit direction, in the whisker's frame.
+        """
+        rotation = np.asarray(base_rotation, dtype=np.float64)
+        away = self.origin - np.asarray(base_position, dtype=np.float64)
+        origin = np.einsum("...ji,...j->...i", rotation, away)
+        return origin, np.einsum("...ji,j->...i", rotation, self.axis)
+
+    def __repr__(self) -> str:
+        """Show it in mm."""
+        return (
+            f"Peg(origin={_mm(self.origin)}, axis={_direction(self.axis)}, diameter "
+            f"{self.radius * 2e3:.3f} mm{_soft(self.stiffness)})"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Sphere(Surface):
+    """A solid ball.
+
+    Parameters
+    ----------
+    origin : array_like (3,)
+        Its centre in the laboratory frame, m.
+    radius : float
+        Of its surface, m.
+    stiffness : float
+        Force over indentation, N/m; infinite for a rigid one.
+
+    Raises
+    ------
+    ValueError
+        If a number is missing, or radius or stiffness are not positive.
+
+    Examples
+    --------
+    >>> Sphere(origin=[25e-3, 0.0, 0.0], radius=5e-3)
+    Sphere(origin=(25.000, 0.000, 0.000) mm, diameter 10.000 mm)
+    """
+
+    origin: Array
+    radius: float
+    stiffness: float = np.inf
+
+    def __post_init__(self) -> None:
+        """Check and make the array read-only."""
+        faults = _Faults("sphere")
+        _set(
+            self,
+            origin=faults.vector("origin", self.origin),
+            radius=faults.positive("radius", self.radius, "m"),
+            stiffness=faults.positive("stiffness", self.stiffness, "N/m", "infinite"),
+        )
+        faults.tell()
+
+    def _distance(self, points: Array) -> Array:
+        distance: Array = np.linalg.norm(points - self.origin, axis=-1) - self.radius
+        return distance
+
+    def _geometry(self, point: Array) -> tuple[float, Array, Array]:
+        away = point - self.origin
+        size = float(np.sqrt(away @ away))
+        normal = away / size
+        return size - self.radius, normal, (np.eye(3) - np.outer(normal, normal)) / size
+
+    def __repr__(self) -> str:
+        """Show it in mm."""
+        return (
+            f"Sphere(origin={_mm(self.origin)}, diameter {self.radius * 2e3:.3f} "
+            f"mm{_soft(self.stiffness)})"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Plane(Surface):
+    """A wall: everything behind a plane.
+
+    Parameters
+    ----------
+    origin : array_like (3,)
+        A point of it in the laboratory frame, m.
+    normal : array_like (3,)
+        Outward, toward the free side, of any length but zero; kept as a unit vector.
+    stiffness : float
+        Force over indentation, N/m; infinite for a rigid one.
+
+    Raises
+    ------
+    ValueError
+        If a number is missing, the normal is zero, or the stiffness is not positive.
+
+    Examples
+    --------
+    >>> Plane(origin=[0.0, 10e-3, 0.0], normal=[0.0, -1.0, 0.0])
+    Plane(origin=(0.000, 10.000, 0.000) mm, normal=(0.000, -1.000, 0.000))
+    """
+
+    origin: Array
+    normal: Array
+    stiffness: float = np.inf
+
+    def __post_init__(self) -> None:
+        """Check and make the arrays read-only."""
+        faults = _Faults("plane")
+        _set(
+            self,
+            origin=faults.vector("origin", self.origin),
+            normal=faults.vector("normal", self.normal, direction=True),
+            stiffness=faults.positive("stiffness", self.stiffness, "N/m", "infinite"),
+        )
+        faults.tell()
+
+    def _distance(self, points: Array) -> Array:
+        distance: Array = (points - self.origin) @ self.normal
+        return distance
+
+    def _geometry(self, point: Array) -> tuple[float, Array, Array]:
+        return float((point - self.origin) @ self.normal), self.normal, np.zeros((3, 3))
+
+    def __repr__(self) -> str:
+        """Show it in mm."""
+        return (
+            f"Plane(origin={_mm(self.origin)}, normal={_direction(self.normal)}"
+            f"{_soft(self.stiffness)})"
+        )
+
+
+def _upright() -> Array:
+    return np.eye(3)
+
+
+@dataclass(frozen=True, eq=False)
+class Box(Surface):
+    """A solid block, with sharp or rounded edges.
+
+    Parameters
+    ----------
+    origin : array_like (3,)
+        Its centre in the laboratory frame, m.
+    size : array_like (3,)
+        Its edges, m.
+    rotation : array_like (3, 3)
+        Columns are the directions of its edges in the laboratory frame.
+    edge_radius : float
+        By which its edges and corners are rounded, m; 0 for sharp ones. A whisker lies against a
+        sharp edge with its own radius.
+    stiffness : float
+        Force over indentation, N/m; infinite for a rigid one. A compliant box needs an edge radius
+        larger than it is indented, for want of a normal inside a sharp edge.
+
+    Raises
+    ------
+    ValueError
+        If a number is missing, the rotation is none, an edge or the stiffness is not positive, or
+        the rounding takes more than half of an edge.
+
+    Examples
+    --------
+    >>> Box(origin=[25e-3, 0.0, 0.0], size=[5e-3, 5e-3, 40e-3])
+    Box(origin=(25.000, 0.000, 0.000) mm, size=(5.000, 5.000, 40.000) mm, edge radius 0.000 mm)
+    """
+
+    origin: Array
+    size: Array
+    rotation: Array = field(default_factory=_upright)
+    edge_radius: float = 0.0
+    stiffness: float = np.inf
+
+    def __post_init__(self) -> None:
+        """Check and make the arrays read-only."""
+        faults = _Faults("box")
+        rotation = np.array(self.rotation, dtype=np.float64)
+        turned = rotation.shape == (3, 3) and bool(np.isfinite(rotation).all())
+        turned = turned and np.abs(rotation.T @ rotation - np.eye(3)).max() <= ORTHOGONALITY
+        faults.check(turned and np.linalg.det(rotation) > 0.0, "rotation is no rotation matrix")
+        rotation.flags.writeable = False
+        size = faults.vector("size", self.size)
+        edge = faults.positive("edge_radius", self.edge_radius, "m", "zero")
+        if size.shape == (3,):
+            faults.check(bool((size > 0.0).all()), f"size is {size.tolist()}; it must be positive")
+            faults.check(
+                bool((2.0 * edge <= size).all()),
+                f"edge_radius is {edge}; at most half of the shortest edge, {0.5 * size.min()} m",
+            )
+        _set(
+            self,
+            origin=faults.vector("origin", self.origin),
+            size=size,
+            rotation=rotation,
+            edge_radius=edge,
+            stiffness=faults.positive("stiffness", self.stiffness, "N/m", "infinite"),
+        )
+        faults.tell()
+
+    def _distance(self, points: Array) -> Array:
+        beyond = np.abs((points - self.origin) @ self.rotation)
+        beyond = beyond - (0.5 * self.size - self.edge_radius)
+        outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=-1)
+        distance: Array = outside + np.minimum(beyond.max(axis=-1), 0.0) - self.edge_radius
+        return distance
+
+    def _geometry(self, point: Array) -> tuple[float, Array, Array]:
+        local = (point - self.origin) @ self.rotation
+        beyond = np.abs(local) - (0.5 * self.size - self.edge_radius)
+        over = beyond > 0.0
+        if over.any():
+            size = float(np.linalg.norm(beyond[over]))
+            normal = np.where(over, beyond, 0.0) / size * np.sign(local)
+            turn = (np.diag(over.astype(np.float64)) - np.outer(normal, normal)) / size
+        else:
+            face = int(beyond.argmax())
+            size = float(beyond[face])
+            normal = np.zeros(3)
+            normal[face] = np.copysign(1.0, local[face])
+            turn = np.zeros((3, 3))
+        turned: Array = self.rotation @ turn @ self.rotation.T
+        return size - self.edge_radius, self.rotation @ normal, turned
+
+    def __repr__(self) -> str:
+        """Show it in mm."""
+        return (
+            f"Box(origin={_mm(self.origin)}, size={_mm(self.size)}, edge radius "
+            f"{self.edge_radius * 1e3:.3f} mm{_soft(self.stiffness)})"
+        )

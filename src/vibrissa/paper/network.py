@@ -1,0 +1,236 @@
+"""The paper's network: trained on contacts, it turns three signals into a contact point.
+
+A perceptron of three layers of rectifiers learns contact points from random contacts of Ω outside
+the cone of 2° about rest. Sizes span orders of magnitude, so their cube roots go in, directions as
+cosine and sine, all standardised. Where two contacts have the same signals no function can give
+both; a large error on contacts that it was not trained on is therefore evidence (weak, for it also
+comes from training too short) that the triplet is not unique.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial import cKDTree
+
+from vibrissa.numerics.arrays import AnyArray, Array
+from vibrissa.rod.batch import solve_forces
+from vibrissa.rod.reach import contacts_at, with_normal_force
+from vibrissa.signals import CIRCULAR, SIGNALS, selection, within_cone
+from vibrissa.signals.base import signals_of
+
+if TYPE_CHECKING:
+    from vibrissa.contacts.contact_map import ContactMap
+
+# Up to this share of the force that slips off: the chart knows that force to about 1e-4.
+_SHARE_OF_FOLD = 0.999
+_LAYERS = (64, 64, 64)
+_BATCH = 256
+_EPOCHS = 60
+_PATIENCE = 10
+# Signals this many times as far from those trained on as the farthest held out are outside.
+_MARGIN = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnContacts:
+    """Random stable contacts."""
+
+    contacts: Array
+    point: Array
+    force: Array
+    moment: Array
+
+    @cached_property
+    def signals(self) -> Array:
+        """All six signals (n, 6), SI units."""
+        return signals_of(self.force, self.moment)
+
+
+def draw_contacts(
+    contact_map: ContactMap, number: int, seed: int, *, near_rest: bool = False
+) -> DrawnContacts:
+    """Draw stable contacts, uniform in station, bearing and fraction of the fold force."""
+    rng, kept, missing = np.random.default_rng(seed), [], number
+    d, fold = contact_map.chart.discretization, contact_map.chart.fold
+    while missing > 0:
+        share = rng.uniform(size=(number, 3))
+        share[:, 1] = np.pi * (2.0 * share[:, 1] - 1.0)
+        share[:, 2] = np.sqrt(_SHARE_OF_FOLD * share[:, 2])
+        xi = contacts_at(fold, share)
+        values, _ = solve_forces(d, with_normal_force(xi))
+        wanted = near_rest | ~within_cone(contact_map.whisker, values[:, 3:] * d.length)
+        kept.append(np.concatenate([xi, values], axis=1)[wanted][:missing])
+        missing -= len(kept[-1])
+    rows = np.concatenate(kept) if kept else np.empty((0, 9))
+    force, point = rows[:, 3:6] * d.force, rows[:, 6:] * d.length
+    return DrawnContacts(rows[:, :3], point, force, np.cross(point, force))
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkSolver:
+    """A trained network; made by :func:`train_network`.
+
+    Attributes
+    ----------
+    names : tuple of str
+        The three signals.
+    held_out : DrawnContacts
+        Contacts that it was not trained on.
+    errors : (n,) array
+        How far from each of them its answer is, m.
+    """
+
+    names: tuple[str, ...]
+    held_out: DrawnContacts
+    errors: Array
+    _predict: _Prediction
+
+    def __call__(self, signals: Array) -> Array:
+        """Predict contact points."""
+        return self._predict(signals)
+
+    def error_quantiles(
+        self, shares: ArrayLike = (0.5, 0.95), keep: AnyArray | None = None
+    ) -> Array:
+        """Quantiles of the errors on contacts held out.
+
+        Parameters
+        ----------
+        shares : array_like
+            Which quantiles.
+        keep : (n,) bool array, optional
+            Contacts held out to count, such as those in a region; by default all.
+
+        Returns
+        -------
+        array
+            In m, of the shape of ``shares``; NaN if none is kept.
+        """
+        errors = self.errors if keep is None else self.errors[keep]
+        shares = np.asarray(shares, dtype=np.float64)
+        if errors.size == 0:
+            return np.full(shares.shape, np.nan)
+        return np.asarray(np.quantile(errors, shares))
+
+
+@dataclass(frozen=True, eq=False)
+class _Prediction:
+    """The network between its standardised inputs and contact points."""
+
+    circular: AnyArray
+    mean: Array
+    deviation: Array
+    centre: Array
+    size: Array
+    network: Any
+    known: cKDTree
+    reach: float
+
+    def __call__(self, signals: Array) -> Array:
+        out = np.full((len(signals), 3), np.nan)
+        rows = np.flatnonzero(np.isfinite(signals).all(axis=1))
+        if rows.size:
+            features = (_features(signals[rows], self.circular) - self.mean) / self.deviation
+            near = _away(self.known, features) <= self.reach
+            if near.any():
+                out[rows[near]] = self.centre + self.size * self.network.predict(features[near])
+        return out
+
+
+def train_network(
+    contact_map: ContactMap,
+    triplet: str | tuple[str, ...] = ("Fx", "MB", "MD"),
+    *,
+    samples: int = 30_000,
+    held_out: int = 5_000,
+    seed: int = 0,
+) -> NetworkSolver:
+    """Train a network to give contact points for three signals, and test it on other contacts.
+
+    Parameters
+    ----------
+    contact_map : ContactMap
+        The whisker's map.
+    triplet : str or tuple of str
+        The signals.
+    samples : int
+        Contacts to train on; a tenth of them decide when to stop. About ten seconds for 30,000.
+    held_out : int
+        Contacts to test on.
+    seed : int
+        Of the contacts and of the network's first weights.
+
+    Returns
+    -------
+    NetworkSolver
+        Network, contacts held out, and errors.
+
+    Raises
+    ------
+    ValueError
+        If there are not three signals, or fewer than 100 contacts to train on or 1 to test on.
+    """
+    if samples < 100 or held_out < 1:
+        raise ValueError(
+            f"needs samples ≥ 100 and held_out ≥ 1; got {samples} and {held_out} contacts"
+        )
+    names = selection(triplet, exactly=3)
+    which = [SIGNALS.index(name) for name in names]
+    circular = np.array([CIRCULAR[w] for w in which])
+    # Two different draws from one seed.
+    first, second = np.random.SeedSequence(seed).generate_state(2)
+    trained = draw_contacts(contact_map, samples, int(first))
+    tested = draw_contacts(contact_map, held_out, int(second))
+    features = _features(trained.signals[:, which], circular)
+    mean, deviation = features.mean(axis=0), features.std(axis=0)
+    # A signal that is zero everywhere stays zero.
+    deviation = np.where(deviation > 1e-6 * np.abs(features).max(), deviation, 1.0)
+    features = (features - mean) / deviation
+    centre, size = trained.point.mean(axis=0), trained.point.std(axis=0)
+    network = _fitted(features, (trained.point - centre) / size, seed)
+    known = cKDTree(features)
+    test = (_features(tested.signals[:, which], circular) - mean) / deviation
+    reach = _MARGIN * float(_away(known, test).max())
+    predict = _Prediction(circular, mean, deviation, centre, size, network, known, reach)
+    errors = np.linalg.norm(predict(tested.signals[:, which]) - tested.point, axis=1)
+    return NetworkSolver(names, tested, errors, predict)
+
+
+def _features(signals: Array, circular: AnyArray) -> Array:
+    columns = []
+    for column, turned in zip(signals.T, circular, strict=True):
+        columns += [np.cos(column), np.sin(column)] if turned else [np.cbrt(column)]
+    return np.stack(columns, axis=1)
+
+
+def _away(known: cKDTree, features: Array) -> Array:
+    """Distances (n,) from the nearest of the places in a tree."""
+    return np.asarray(known.query(features)[0])
+
+
+def _fitted(features: Array, targets: Array, seed: int) -> Any:
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.neural_network import MLPRegressor
+    from threadpoolctl import threadpool_limits  # comes with scikit-learn
+
+    network = MLPRegressor(
+        hidden_layer_sizes=_LAYERS,
+        batch_size=min(_BATCH, len(features) // 2),
+        max_iter=_EPOCHS,
+        early_stopping=True,
+        n_iter_no_change=_PATIENCE,
+        tol=1e-5,
+        alpha=0.0,
+        random_state=seed,
+    )
+    # Several threads would wait for each other longer than they compute on matrices this small.
+    with warnings.catch_warnings(), threadpool_limits(limits=1):
+        # The last epoch is as good a place to stop as any.
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        return network.fit(features, targets)

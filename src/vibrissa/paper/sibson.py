@@ -1,0 +1,381 @@
+"""Sibson's weights of the points around a query, by volumes.
+
+A query x, put among the points as one more, would take a piece of volume from the Voronoi cells of
+its neighbours; the shares λᵢ of those pieces are Sibson's weights. They are positive, sum to one,
+and Σ λᵢ xᵢ = x, so linear functions are reproduced; they are smooth but at the points themselves.
+
+Of the Delaunay triangulation the query changes only its cavity, the tetrahedra whose circumspheres
+contain it: they give way to the tetrahedra from x to the cavity's faces. The circumcentre of a
+tetrahedron parts it among its vertices by Voronoi cells, into the signed volumes::
+
+    w_i(T) = Σ over edges ij and triangles ijk of T: |x_i − x_j|² (x_i − x_k)·(x_j − x_k) h / 24|N|²
+
+with N = (x_j − x_i) × (x_k − x_i), and h = ± (c − x_i)·N the circumcentre's height over the
+triangle, positive toward the fourth vertex. What x takes from point i is the sum of w_i over the
+cavity less that over the new tetrahedra. No Voronoi cell is made, and cells need not be bounded.
+
+Four points on a circle make a flat tetrahedron; it belongs to no cell and is passed through. On
+the convex hull, where volumes grow without bound, the weights tend to the barycentric ones; these
+are taken where roundoff has spoilt the volumes: nearer than about 1e-11 to the hull, or to a point.
+
+References
+----------
+R. Sibson, A vector identity for the Dirichlet tessellation, Math. Proc. Camb. Phil. Soc. 87 (1980).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vibrissa.numerics.arrays import Array, IntArray
+from vibrissa.numerics.compiled import copy, inlined, kernel
+
+#: Vertices (n, 3); corners and neighbours (t, 4); circumcentres from the first corner (t, 3);
+#: volumes w_i (t, 4); which tetrahedra are flat (t,).
+Mesh = tuple[Array, IntArray, IntArray, Array, Array, IntArray]
+#: Where each vertex (n,) stands among a query's neighbours or -1; the neighbours; their weights.
+Found = tuple[IntArray, IntArray, Array]
+
+# A tetrahedron is flat below this share of its longest edge cubed.
+_FLAT = 1e-12
+# Points nearer than this, in coordinates with ranges of about one, are one.
+_SAME = 1e-13
+# Volumes below this share of the longest edge cubed have no sure sign.
+_ROUNDOFF = 1e-15
+# Four points are on a circle to this share of its radius.
+_ON_CIRCLE = 1e-6
+# To this share of the neighbours' distance the weights must reproduce the query.
+_REPRODUCED = 1e-9
+
+
+@inlined
+def _part(tetrahedron: Array, centre: Array, shares: Array) -> None:
+    """w_i of a tetrahedron (4, 3) whose circumcentre is given; added to ``shares`` (4,)."""
+    for last in range(4):
+        i, j, k = (last + 1) % 4, (last + 2) % 4, (last + 3) % 4
+        ax = tetrahedron[j, 0] - tetrahedron[i, 0]
+        ay = tetrahedron[j, 1] - tetrahedron[i, 1]
+        az = tetrahedron[j, 2] - tetrahedron[i, 2]
+        bx = tetrahedron[k, 0] - tetrahedron[i, 0]
+        by = tetrahedron[k, 1] - tetrahedron[i, 1]
+        bz = tetrahedron[k, 2] - tetrahedron[i, 2]
+        nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+        square = nx * nx + ny * ny + nz * nz
+        if square == 0.0:
+            continue
+        toward = (
+            nx * (tetrahedron[last, 0] - tetrahedron[i, 0])
+            + ny * (tetrahedron[last, 1] - tetrahedron[i, 1])
+            + nz * (tetrahedron[last, 2] - tetrahedron[i, 2])
+        )
+        height = (
+            nx * (centre[0] - tetrahedron[i, 0])
+            + ny * (centre[1] - tetrahedron[i, 1])
+            + nz * (centre[2] - tetrahedron[i, 2])
+        )
+        if toward < 0.0:
+            height = -height
+        aa, bb = ax * ax + ay * ay + az * az, bx * bx + by * by + bz * bz
+        ab = ax * bx + ay * by + az * bz
+        factor = height / (24.0 * square)
+        # The angles at k, j and i stand over the edges ij, ik and jk.
+        ij = factor * aa * (bb - ab)
+        ik = factor * bb * (aa - ab)
+        jk = factor * (aa + bb - 2.0 * ab) * ab
+        shares[i] += ij + ik
+        shares[j] += ij + jk
+        shares[k] += ik + jk
+
+
+@inlined
+def _circumcentre(tetrahedron: Array, centre: Array) -> float:
+    """Fill the circumcentre relative to the first vertex; return volume over longest edge³."""
+    a0 = tetrahedron[1, 0] - tetrahedron[0, 0]
+    a1 = tetrahedron[1, 1] - tetrahedron[0, 1]
+    a2 = tetrahedron[1, 2] - tetrahedron[0, 2]
+    b0 = tetrahedron[2, 0] - tetrahedron[0, 0]
+    b1 = tetrahedron[2, 1] - tetrahedron[0, 1]
+    b2 = tetrahedron[2, 2] - tetrahedron[0, 2]
+    c0 = tetrahedron[3, 0] - tetrahedron[0, 0]
+    c1 = tetrahedron[3, 1] - tetrahedron[0, 1]
+    c2 = tetrahedron[3, 2] - tetrahedron[0, 2]
+    bc0, bc1, bc2 = b1 * c2 - b2 * c1, b2 * c0 - b0 * c2, b0 * c1 - b1 * c0
+    ca0, ca1, ca2 = c1 * a2 - c2 * a1, c2 * a0 - c0 * a2, c0 * a1 - c1 * a0
+    ab0, ab1, ab2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
+    volume = a0 * bc0 + a1 * bc1 + a2 * bc2
+    aa, bb, cc = (
+        a0 * a0 + a1 * a1 + a2 * a2,
+        b0 * b0 + b1 * b1 + b2 * b2,
+        c0 * c0 + c1 * c1 + c2 * c2,
+    )
+    longest = np.sqrt(max(aa, bb, cc))
+    if volume != 0.0:
+        centre[0] = (aa * bc0 + bb * ca0 + cc * ab0) / (2.0 * volume)
+        centre[1] = (aa * bc1 + bb * ca1 + cc * ab1) / (2.0 * volume)
+        centre[2] = (aa * bc2 + bb * ca2 + cc * ab2) / (2.0 * volume)
+    return float(abs(volume) / (longest * longest * longest))
+
+
+@inlined
+def _on_a_circle(tetrahedron: Array) -> bool:
+    """Whether four points in a plane lie on a circle."""
+    a, b = tetrahedron[1] - tetrahedron[0], tetrahedron[2] - tetrahedron[0]
+    d = tetrahedron[3] - tetrahedron[0]
+    aa, bb, ab = np.sum(a * a), np.sum(b * b), np.sum(a * b)
+    square = aa * bb - ab * ab
+    if square <= 1e-20 * aa * bb:
+        return False
+    centre = (bb * (aa - ab) * a + aa * (bb - ab) * b) / (2.0 * square)
+    power = np.sum(d * (d - 2.0 * centre))
+    return bool(abs(power) < _ON_CIRCLE * np.sum(centre * centre))
+
+
+@kernel
+def measure(
+    vertices: Array,
+    corners: IntArray,
+    centres: Array,
+    shares: Array,
+    flat: IntArray,
+    first: int,
+    last: int,
+) -> None:
+    """Circumcentres (from the first vertex) and parts of tetrahedra.
+
+    ``flat``: 1 for four points on a circle, 2 for four in a plane that are not, at the hull.
+    """
+    tetrahedron, centre = np.empty((4, 3)), np.empty(3)
+    for t in range(first, last):
+        for k in range(4):
+            copy(vertices[corners[t, k]], tetrahedron[k])
+        if _circumcentre(tetrahedron, centre) < _FLAT:
+            flat[t] = 1 if _on_a_circle(tetrahedron) else 2
+            continue
+        copy(centre, centres[t])
+        for c in range(3):
+            centre[c] += tetrahedron[0, c]
+        _part(tetrahedron, centre, shares[t])
+
+
+@inlined
+def _contains(mesh: Mesh, t: int, query: Array) -> bool:
+    """Whether the circumsphere of tetrahedron t contains the query."""
+    vertices, corners, _, centres, _, flat = mesh
+    if flat[t] > 0:
+        return bool(flat[t] == 1)
+    v = corners[t, 0]
+    power = 0.0
+    for c in range(3):
+        away = query[c] - vertices[v, c]
+        power += away * (away - 2.0 * centres[t, c])
+    return bool(power < 0.0)
+
+
+@inlined
+def _distance2(a: Array, b: Array) -> float:
+    return float((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
+
+
+@inlined
+def _volume(a: Array, b: Array, c: Array, d: Array) -> float:
+    """Six times the signed volume of a tetrahedron."""
+    x, y, z = a[0] - d[0], a[1] - d[1], a[2] - d[2]
+    u, v, w = b[0] - d[0], b[1] - d[1], b[2] - d[2]
+    p, q, r = c[0] - d[0], c[1] - d[1], c[2] - d[2]
+    return float(x * (v * r - w * q) + y * (w * p - u * r) + z * (u * q - v * p))
+
+
+@inlined
+def _beyond(mesh: Mesh, t: int, k: int, query: Array) -> bool:
+    """Whether the query lies behind the face opposite corner k, and not only by roundoff."""
+    vertices, corners = mesh[0], mesh[1]
+    a, b = vertices[corners[t, (k + 1) % 4]], vertices[corners[t, (k + 2) % 4]]
+    c, top = vertices[corners[t, (k + 3) % 4]], vertices[corners[t, k]]
+    far = max(_distance2(a, query), _distance2(a, top), _distance2(a, b), _distance2(a, c))
+    here, there = _volume(query, b, c, a), _volume(top, b, c, a)
+    return bool(abs(here) > _ROUNDOFF * far * np.sqrt(far) and (here < 0.0) != (there < 0.0))
+
+
+@inlined
+def _holds(mesh: Mesh, t: int, query: Array) -> bool:
+    """Whether a tetrahedron that is not flat holds the query."""
+    if mesh[5][t] > 0:
+        return False
+    behind = 0
+    for k in range(4):
+        behind += _beyond(mesh, t, k, query)
+    return behind == 0
+
+
+@kernel
+def locate(mesh: Mesh, queries: Array, inside: IntArray, first: int, last: int) -> None:
+    """Fill ``inside`` with the tetrahedra that hold the queries, -1 outside the convex hull.
+
+    From one tetrahedron to the next, through a face that the query lies behind; of a flat one,
+    which has no sides, through any.
+    """
+    neighbours, flat = mesh[2], mesh[5]
+    total = len(neighbours)
+    start, turn = 0, 1
+    for row in range(first, last):
+        inside[row] = -1
+        query = queries[row]
+        if not np.isfinite(query[0] + query[1] + query[2]):
+            continue
+        t, steps = start, 0
+        while t >= 0 and steps < total:
+            steps += 1
+            turn = (turn * 1103515245 + 12345) % 2147483648
+            out = -1
+            for c in range(4):
+                # Another order each time: in the same one roundoff could make it go in circles.
+                k = (turn // 65536 + c) % 4
+                if flat[t] > 0 or _beyond(mesh, t, k, query):
+                    out = k
+                    break
+            if out < 0:
+                inside[row] = start = t
+                break
+            t = neighbours[t, out]
+        if steps == total:
+            for other in range(total):
+                if _holds(mesh, other, query):
+                    inside[row] = start = other
+                    break
+
+
+@inlined
+def _at(v: int, found: Found, count: IntArray) -> int:
+    """Where vertex v stands among the neighbours; it is added if it is new."""
+    slots, members, weights = found
+    if slots[v] < 0:
+        slots[v] = count[0]
+        members[count[0]] = v
+        weights[count[0]] = 0.0
+        count[0] += 1
+    return int(slots[v])
+
+
+@kernel
+def sibson_weights(
+    mesh: Mesh,
+    query: Array,
+    start: int,
+    mark: int,
+    marks: IntArray,
+    cavity: IntArray,
+    found: Found,
+) -> int:
+    """Weights of the query's neighbours; return how many there are.
+
+    ``marks`` (one a tetrahedron) must not hold ``mark``; the slots (one a vertex) are -1 before and
+    after.
+    """
+    vertices, corners, neighbours, _, shares, _ = mesh
+    slots, members, weights = found
+    for k in range(4):
+        if _distance2(query, vertices[corners[start, k]]) <= _SAME**2:
+            members[0], weights[0] = corners[start, k], 1.0
+            return 1
+    tetrahedron, centre, new = np.empty((4, 3)), np.empty(3), np.empty(4)
+    copy(query, tetrahedron[0])
+    count = np.zeros(1, np.int64)
+    cavity[0], marks[start] = start, mark
+    done, size = 0, 1
+    while done < size:
+        t = cavity[done]
+        done += 1
+        for k in range(4):
+            weights[_at(corners[t, k], found, count)] += shares[t, k]
+            other = neighbours[t, k]
+            if other >= 0 and marks[other] == mark:
+                continue
+            if other >= 0 and _contains(mesh, other, query):
+                marks[other], cavity[size] = mark, other
+                size += 1
+                continue
+            # A face of the cavity: with the query a new tetrahedron.
+            for c in range(1, 4):
+                copy(vertices[corners[t, (k + c) % 4]], tetrahedron[c])
+            if _circumcentre(tetrahedron, centre) < _FLAT:
+                continue
+            for c in range(3):
+                centre[c] += query[c]
+            new[:] = 0.0
+            _part(tetrahedron, centre, new)
+            for c in range(1, 4):
+                weights[_at(corners[t, (k + c) % 4], found, count)] -= new[c]
+    for j in range(count[0]):
+        slots[members[j]] = -1
+    if _normalised(vertices, query, count[0], members, weights):
+        return int(count[0])
+    return _barycentric(mesh, query, start, members, weights)
+
+
+@inlined
+def _normalised(
+    vertices: Array, query: Array, count: int, members: IntArray, weights: Array
+) -> bool:
+    """Let the weights sum to one; whether they are not negative and reproduce the query."""
+    total = 0.0
+    for j in range(count):
+        total += weights[j]
+    ax = ay = az = farthest = least = 0.0
+    for j in range(count):
+        weights[j] /= total
+        least = min(least, weights[j])
+        vertex = vertices[members[j]]
+        ax += weights[j] * (vertex[0] - query[0])
+        ay += weights[j] * (vertex[1] - query[1])
+        az += weights[j] * (vertex[2] - query[2])
+        farthest = max(farthest, _distance2(vertex, query))
+    error = np.sqrt((ax * ax + ay * ay + az * az) / farthest)
+    return bool(error <= _REPRODUCED and least >= -_REPRODUCED)
+
+
+@inlined
+def _barycentric(mesh: Mesh, query: Array, t: int, members: IntArray, weights: Array) -> int:
+    """Weights of the corners of the tetrahedron around the query."""
+    vertices, corners = mesh[0], mesh[1]
+    a, b = vertices[corners[t, 0]], vertices[corners[t, 1]]
+    c, d = vertices[corners[t, 2]], vertices[corners[t, 3]]
+    whole = _volume(a, b, c, d)
+    weights[0] = _volume(query, b, c, d) / whole
+    weights[1] = _volume(a, query, c, d) / whole
+    weights[2] = _volume(a, b, query, d) / whole
+    weights[3] = 1.0 - weights[0] - weights[1] - weights[2]
+    for k in range(4):
+        members[k] = corners[t, k]
+    return 4
+
+
+@kernel
+def interpolate(
+    mesh: Mesh,
+    values: Array,
+    queries: Array,
+    inside: IntArray,
+    natural: bool,
+    out: Array,
+    first: int,
+    last: int,
+) -> None:
+    """Fill ``out`` for the queries whose tetrahedron, in ``inside``, is not -1."""
+    vertices, corners = mesh[0], mesh[1]
+    n, tetrahedra = len(vertices), len(corners)
+    found = (np.full(n, -1), np.empty(n, np.int64), np.empty(n))
+    marks, cavity = np.full(tetrahedra, -1), np.empty(tetrahedra, np.int64)
+    _, members, weights = found
+    for row in range(first, last):
+        start = inside[row]
+        if start < 0:
+            continue
+        if natural:
+            count = sibson_weights(mesh, queries[row], start, row, marks, cavity, found)
+        else:
+            count = _barycentric(mesh, queries[row], start, members, weights)
+        for c in range(values.shape[1]):
+            total = 0.0
+            for j in range(count):
+                total += weights[j] * values[members[j], c]
+            out[row, c] = total

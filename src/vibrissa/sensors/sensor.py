@@ -1,0 +1,434 @@
+"""A force and torque sensor at the base: what it reads, and how wrongly.
+
+A sensor has channels, each a linear mix of the six components (F_x, F_y, F_z, M_x, M_y, M_z):
+
+    reading = round((1 + g)(1 + ε)(A w) + b + d(t) + n),    at most ± the largest it can say,
+
+with the mixing A, an error of gain g and noise ε relative to the signal, a bias b, a drift d that
+is a random walk, white noise n, and rounding to the channel's resolution. The usual sensor has the
+six components themselves as channels; whiskers of robots often have two or three.
+
+w is in the sensor's own frame: H = A X⁻¹ mixes the wrench at the whisker's base, with X of
+:class:`~vibrissa.sensors.SensorFrame`. To the contact's wrench comes the weight of what the sensor
+carries: (m g, m c × g) for its mass m with its centre at c, g as seen from the base.
+
+The same description serves both ways: :meth:`Sensor.read` simulates, :meth:`Sensor.felt` takes
+offset and weight away, and :meth:`Sensor.to_wrench` returns to force and moment at the base.
+
+Noise differs from reading to reading. Errors of gain, of the mixing and of what a calibration has
+found are the same in all of them (:mod:`~vibrissa.sensors.errors`), and averaging leaves them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vibrissa.sensors.errors import (
+    by_calibration,
+    by_gain,
+    by_mixing,
+    checked_covariance,
+    with_offset,
+)
+from vibrissa.sensors.frame import SensorFrame
+
+Array = NDArray[np.float64]
+
+FORCE_NOISE = 1e-6
+"""Standard deviation of a component of the measured force, N."""
+
+MOMENT_NOISE = 0.02e-6
+"""Standard deviation of a component of the measured moment, N·m."""
+
+COMPONENTS = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
+"""What a mix is made of, in this order."""
+
+GRAVITY = (0.0, 0.0, -9.80665)
+"""Acceleration of a falling body in the laboratory frame, m/s²."""
+
+# A combination of components that is read this much weaker than the others is not read.
+_UNREAD = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """What a sensor at the base reads.
+
+    Quantities of channels are numbers for all of them or one number each, in the channel's unit:
+    that of the component it reads (N, N·m), or what the mixing makes of those.
+
+    Parameters
+    ----------
+    channels : sequence of str
+        Their names. Without a mixing, which components are read.
+    mixing : array_like (k, 6), optional
+        What each of the k channels reads of (Fx, Fy, Fz, Mx, My, Mz). Of channels that are
+        components, numbers for all or one each are enough: 1e3 for mN and mN·m (= N·mm).
+    noise : array_like, optional
+        Standard deviation of white noise; by default that of `FORCE_NOISE` and `MOMENT_NOISE` in
+        every component.
+    bias : array_like
+        Constant offset.
+    drift : array_like
+        Standard deviation of a random walk after one second; it begins at zero.
+    resolution : array_like
+        Readings are rounded to multiples of this; 0 for none.
+    largest : array_like
+        Size of the largest reading; one that has come to it is saturated, and tells nothing.
+        Infinite, the default, for none.
+    relative_noise : float
+        Standard deviation of white noise relative to the signal.
+    gain_error : array_like
+        Standard deviation of the channels' errors of gain, relative: the same in all readings, one
+        channel's independent of another's.
+    mixing_error : float or array_like (k, 6)
+        Standard deviation of the errors of the mixing, the same in all readings: of each number of
+        it, in its unit; or, as one number, relative to the channel's largest mixing of a force, or
+        of a moment, so that cross-talk among forces and among moments is part of it.
+    mixing_covariance : array_like (k, 7, 7), optional
+        Covariance of each channel's mixing of the six components and, last, its offset, as a
+        calibration leaves it; besides the two stated errors.
+    frame : SensorFrame
+        How it sits at the whisker; by default its frame is the whisker's.
+    mass : float
+        Of what it carries, kg: its weight is in the readings.
+    mass_moment : array_like (3,)
+        That mass times the place of its centre, in the whisker's frame, kg·m.
+
+    Raises
+    ------
+    ValueError
+        If numbers do not fit or are negative where they cannot be.
+
+    Examples
+    --------
+    >>> Sensor(channels=("Fx", "My", "Mz"), resolution=[1e-6, 1e-8, 1e-8]).mixing.shape
+    (3, 6)
+    >>> Sensor(mixing=1e3, noise=[3, 3, 3, 0.1, 0.1, 0.1]).mixing[5, 5]  # in mN and N·mm
+    np.float64(1000.0)
+    """
+
+    channels: Sequence[str] = COMPONENTS
+    mixing: Any = None
+    noise: Any = None
+    bias: Any = 0.0
+    drift: Any = 0.0
+    resolution: Any = 0.0
+    largest: Any = np.inf
+    relative_noise: float = 0.0
+    gain_error: Any = 0.0
+    mixing_error: Any = 0.0
+    mixing_covariance: Any = None
+    frame: SensorFrame = field(default_factory=SensorFrame)
+    mass: float = 0.0
+    mass_moment: Any = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        """Check, and give every channel its numbers."""
+        faults = []
+        names = tuple(self.channels)
+        if not names or len(set(names)) != len(names):
+            faults.append(f"channels are {names}; different names, at least one, are needed")
+        given = np.array(1.0 if self.mixing is None else self.mixing, dtype=np.float64)
+        if given.ndim < 2:
+            unknown = [name for name in names if name not in COMPONENTS]
+            if unknown:
+                known = ", ".join(COMPONENTS)
+                faults.append(f"channels {unknown} are none of {known}, so mixing (k, 6) is needed")
+            rows = [[float(name == component) for component in COMPONENTS] for name in names]
+            if given.shape not in ((), (len(names),)):
+                faults.append(f"mixing has shape {given.shape}; one number a channel is needed")
+                given = np.ones(())
+            given = given[..., None] * np.array(rows).reshape(-1, 6)
+        mixing = given
+        if mixing.shape != (len(names), 6) or not np.isfinite(mixing).all():
+            faults.append(f"mixing has shape {mixing.shape}; finite ({len(names)}, 6) is needed")
+        usual = np.repeat([FORCE_NOISE, MOMENT_NOISE], 3)
+        numbers = {"mixing": mixing, "channels": names}
+        for name in ("noise", "bias", "drift", "resolution", "largest", "gain_error"):
+            value = getattr(self, name)
+            if value is None and mixing.shape == (len(names), 6):
+                value = np.sqrt(mixing**2 @ usual**2)
+            array = np.asarray(value, dtype=np.float64)
+            finite = np.isfinite(array) | ((name == "largest") & (array == np.inf))
+            if array.shape not in ((), (len(names),)):
+                faults.append(f"{name} has shape {array.shape}; () or ({len(names)},) is needed")
+            elif not finite.all():
+                faults.append(f"{name} is {array.tolist()}; it must be finite")
+            elif name == "largest" and not (array > 0.0).all():
+                faults.append(f"{name} is {array.tolist()}; it must be positive")
+            elif name != "bias" and (array < 0.0).any():
+                faults.append(f"{name} is {array.tolist()}; it must not be negative")
+            else:
+                numbers[name] = np.broadcast_to(array, (len(names),))
+        share = float(self.relative_noise)
+        if not (np.isfinite(share) and share >= 0.0):
+            faults.append(f"relative_noise is {share!r}; it must not be negative")
+        error = np.asarray(self.mixing_error, dtype=np.float64)
+        if error.shape not in ((), (len(names), 6)):
+            faults.append(
+                f"mixing_error has shape {error.shape}; () or ({len(names)}, 6) is needed"
+            )
+        elif not (np.isfinite(error) & (error >= 0.0)).all():
+            faults.append(f"mixing_error is {error.tolist()}; it must be finite and not negative")
+        numbers["mixing_error"] = error
+        numbers["mixing_covariance"], fault = checked_covariance(self.mixing_covariance, len(names))
+        faults += fault
+        moment = np.asarray(self.mass_moment, dtype=np.float64)
+        if moment.shape != (3,) or not np.isfinite(moment).all():
+            faults.append(f"mass_moment is {self.mass_moment!r}; three numbers, kg·m, are needed")
+        numbers["mass_moment"] = moment
+        if not (np.isfinite(self.mass) and self.mass >= 0.0):
+            faults.append(f"mass is {self.mass!r}; it must not be negative")
+        if not isinstance(self.frame, SensorFrame):
+            faults.append(f"frame is {self.frame!r}; a SensorFrame is needed")
+        if faults:
+            raise ValueError("no sensor: " + "; ".join(faults))
+        for name, value in numbers.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def reads_wrench(self) -> bool:
+        """Whether the channels are the six components at the whisker's base, in their order."""
+        return self.channels == COMPONENTS and bool((self.base_mixing == np.eye(6)).all())
+
+    @cached_property
+    def base_mixing(self) -> Array:
+        """What the channels read of (F, M) at the whisker's base, H (k, 6)."""
+        plain = (self.frame.to_base() == np.eye(6)).all()
+        return np.asarray(self.mixing if plain else self.mixing @ self.frame.from_base())
+
+    def covariance(self, reading: ArrayLike = 0.0) -> Array:
+        """Covariance of one reading's noise: white, relative, and that of rounding.
+
+        Parameters
+        ----------
+        reading : array_like (k,)
+            What the relative noise is relative to.
+
+        Returns
+        -------
+        array (k, k)
+            Diagonal; drift is not in it, nor are the `common_errors`.
+        """
+        relative = self.relative_noise * np.asarray(reading, dtype=np.float64)
+        variance = self.noise**2 + self.resolution**2 / 12.0 + relative**2
+        return np.diag(variance)
+
+    @cached_property
+    def common_errors(self) -> Array:
+        """Errors of gain, mixing and offset that all readings share, E (n, k, 7).
+
+        Each is independent of the others: readings of (F, M) at the whisker's base are wrong by
+        ε E (F, M, 1), where ε is drawn once, with standard deviation 1.
+        """
+        own = np.concatenate(
+            [
+                by_gain(self.mixing, self.gain_error),
+                by_mixing(self.mixing, self.mixing_error),
+                by_calibration(self.mixing_covariance),
+            ]
+        )
+        if len(own):
+            own[..., :6] = own[..., :6] @ self.frame.from_base()
+        return own
+
+    def with_new_offset(self, readings: int, bias: ArrayLike | None = None) -> Sensor:
+        """Give the same sensor with an offset that was found as the mean of so many readings.
+
+        Parameters
+        ----------
+        readings : int
+            How many.
+        bias : array_like (k,), optional
+            The offset; by default as it is.
+
+        Returns
+        -------
+        Sensor
+            Whose `mixing_covariance` has the offset's new variance, by the noise.
+        """
+        variance = np.diag(self.covariance()) / readings
+        return replace(
+            self,
+            bias=self.bias if bias is None else bias,
+            mixing_covariance=with_offset(self.mixing_covariance, variance),
+        )
+
+    def weight(self, rotation: ArrayLike, gravity: ArrayLike = GRAVITY) -> Array:
+        """Wrench at the base of the weight that the sensor carries.
+
+        Parameters
+        ----------
+        rotation : array_like (..., 3, 3)
+            From the whisker's to the laboratory frame.
+        gravity : array_like (3,)
+            In the laboratory frame, m/s².
+
+        Returns
+        -------
+        array (..., 6)
+            (F, M), whisker's frame, N and N·m.
+        """
+        turned = np.asarray(rotation, dtype=np.float64)
+        g = np.asarray(gravity, dtype=np.float64) @ turned
+        return np.concatenate([self.mass * g, np.cross(self.mass_moment, g)], axis=-1)
+
+    def felt(
+        self,
+        readings: ArrayLike,
+        rotation: ArrayLike | None = None,
+        gravity: ArrayLike = GRAVITY,
+    ) -> Array:
+        """Take offset and weight away: what is left is H (F, M) of the contact, and noise.
+
+        Parameters
+        ----------
+        readings : array_like (..., k)
+            The channels.
+        rotation : array_like (..., 3, 3), optional
+            From the whisker's to the laboratory frame; needed where the sensor carries a mass.
+        gravity : array_like (3,)
+            In the laboratory frame, m/s².
+
+        Returns
+        -------
+        array (..., k)
+            In the units of the channels; NaN for what is saturated.
+
+        Raises
+        ------
+        ValueError
+            If there are not as many channels, or the orientation is not known but needed.
+        """
+        values = np.asarray(readings, dtype=np.float64)
+        if values.shape[-1:] != (len(self.channels),):
+            raise ValueError(
+                f"readings of {', '.join(self.channels)} have a last axis of "
+                f"{len(self.channels)}; got shape {values.shape}"
+            )
+        values = np.asarray(np.where(np.abs(values) < self.largest, values, np.nan) - self.bias)
+        if self.mass == 0.0 and not self.mass_moment.any():
+            return values
+        if rotation is None:
+            raise ValueError(
+                "the sensor carries a mass, so the rotation from whisker to laboratory is needed "
+                "to take its weight away"
+            )
+        return np.asarray(values - self.weight(rotation, gravity) @ self.base_mixing.T)
+
+    def to_wrench(
+        self,
+        readings: ArrayLike,
+        rotation: ArrayLike | None = None,
+        gravity: ArrayLike = GRAVITY,
+    ) -> tuple[Array, Array]:
+        """Return to force and moment at the whisker's base, weighted by the noise.
+
+        Parameters
+        ----------
+        readings : array_like (..., k)
+            The channels, six or more.
+        rotation : array_like (..., 3, 3), optional
+            From the whisker's to the laboratory frame; needed where the sensor carries a mass.
+        gravity : array_like (3,)
+            In the laboratory frame, m/s².
+
+        Returns
+        -------
+        wrench : array (..., 6)
+            (F, M), whisker's frame, N and N·m.
+        covariance : array (6, 6)
+            Of its noise; the `common_errors` are not in it.
+
+        Raises
+        ------
+        ValueError
+            If the channels do not tell all six components.
+        """
+        h, noise = self.base_mixing, np.sqrt(np.diag(self.covariance()))
+        weight = 1.0 / np.where(noise > 0.0, noise, 1.0)
+        size = np.linalg.norm(h, axis=0)
+        if h.shape[0] < 6 or np.linalg.cond(h / np.where(size > 0.0, size, 1.0)) > 1.0 / _UNREAD:
+            raise ValueError(
+                f"the channels {', '.join(self.channels)} do not tell all six components of force "
+                "and moment: estimate from the channels themselves"
+            )
+        back = np.linalg.pinv(weight[:, None] * h) * weight
+        wrench = self.felt(readings, rotation, gravity) @ back.T
+        return np.asarray(wrench), np.asarray(back @ self.covariance() @ back.T)
+
+    def read(
+        self,
+        time: ArrayLike,
+        wrench: ArrayLike,
+        seed: int = 0,
+        rotation: ArrayLike | None = None,
+    ) -> Array:
+        """Read a wrench over time.
+
+        Parameters
+        ----------
+        time : array_like (n,)
+            Of the samples, s; it must not fall.
+        wrench : array_like (n, 6)
+            Force, N, and moment, N·m, at the whisker's base; NaN gives NaN.
+        seed : int
+            Of all that is random.
+        rotation : array_like (n, 3, 3), optional
+            From the whisker's to the laboratory frame; needed where the sensor carries a mass.
+
+        Returns
+        -------
+        array (n, k)
+            The channels.
+
+        Raises
+        ------
+        ValueError
+            If shapes do not fit, time falls or is not finite, or the orientation is not known but
+            needed.
+        """
+        at, true = np.asarray(time, dtype=np.float64), np.asarray(wrench, dtype=np.float64)
+        if at.ndim != 1 or true.shape != (at.size, 6):
+            raise ValueError(
+                f"times (n,) and wrenches (n, 6) are needed; got {at.shape} and {true.shape}"
+            )
+        if not np.isfinite(at).all() or (np.diff(at) < 0.0).any():
+            raise ValueError(f"times are finite and do not fall; got {_first_fault(at)}")
+        generator = np.random.default_rng(seed)
+        if self.mass > 0.0 or self.mass_moment.any():
+            if rotation is None:
+                raise ValueError("the sensor carries a mass, so the rotation is needed to weigh it")
+            true = true + self.weight(rotation)
+        reading = true @ self.base_mixing.T
+        size = reading.shape
+        noise = generator.normal(size=size) * self.noise
+        if self.relative_noise > 0.0:
+            reading = reading * (1.0 + generator.normal(scale=self.relative_noise, size=size))
+        errors = self.common_errors
+        wrong = np.tensordot(generator.normal(size=len(errors)), errors, axes=1)
+        reading = reading + true @ wrong[:, :6].T + wrong[:, 6]
+        reading = reading + self.bias + noise
+        if (self.drift > 0.0).any():
+            steps = np.sqrt(np.diff(at, prepend=at[:1]))
+            walk = generator.normal(size=size) * steps[:, None] * self.drift
+            reading = reading + np.cumsum(walk, axis=0)
+        coarse = self.resolution > 0.0
+        steps = np.where(coarse, self.resolution, 1.0)
+        reading = np.where(coarse, np.round(reading / steps) * steps, reading)
+        return np.asarray(np.clip(reading, -self.largest, self.largest))
+
+
+def _first_fault(time: Array) -> str:
+    """Say where times fall or are not finite."""
+    bad = ~np.isfinite(time)
+    bad[1:] |= np.diff(time) < 0.0
+    i = int(bad.argmax())
+    return f"{time[i]} s" + (f" after {time[i - 1]} s" if i else "") + f" in place {i}"

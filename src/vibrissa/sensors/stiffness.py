@@ -1,0 +1,240 @@
+"""Modulus and base radius from measured loads, and what of them loads can tell.
+
+For contacts at known points on the centreline the shape does not depend on how stiff the whisker
+is: force and moment are proportional to EI = E π r⁴ / 4 at the base (the twisting stiffness follows
+by Poisson's ratio, the others by the taper). So loads tell EI, and nothing tells E from r⁴ but
+another measurement: a radius under the microscope, or a modulus from a data sheet. Given the
+uncertainties of both before, log E and log r are moved along their line
+
+    log E + 4 log r = log(4 EI / π)
+
+as Bayes' rule says. How the stiffness falls toward the tip loads do tell, if contacts lie at
+several places along the whisker: the taper can be fitted too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import least_squares
+
+from vibrissa.sensors.contacts import wrenches_of_contacts
+from vibrissa.sensors.misfit import warn_of_misfit, warn_of_surprise
+from vibrissa.sensors.sensor import Sensor
+
+if TYPE_CHECKING:
+    from vibrissa.whisker import Whisker
+
+Array = NDArray[np.float64]
+
+# A taper whose logarithm is known no better than this is not determined.
+_OPEN = 2.0
+_SLIM, _WIDE = 0.01, 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class StiffnessFit:
+    """A whisker as loads make it out; standard deviations are relative.
+
+    Attributes
+    ----------
+    whisker : Whisker
+        With the modulus, radius and taper that were found.
+    stiffness : float
+        EI at the base, N·m².
+    stiffness_sigma : float
+        Of it.
+    modulus, radius : float
+        E, Pa, and base radius, m.
+    modulus_sigma, radius_sigma : float
+        Of these; infinite prior uncertainty of both leaves both infinite.
+    covariance : (2, 2) array
+        Of (log E, log r): strongly correlated, as 1 log E + 4 log r is what the loads tell.
+    taper, taper_sigma : float
+        Tip radius over base radius; the deviation is 0 where it was not fitted.
+    misfit : float
+        χ² over its degrees of freedom; where larger than 1 the deviations are scaled up by its
+        root.
+    """
+
+    whisker: Whisker
+    stiffness: float
+    stiffness_sigma: float
+    modulus: float
+    modulus_sigma: float
+    radius: float
+    radius_sigma: float
+    covariance: Array
+    taper: float
+    taper_sigma: float
+    misfit: float
+
+
+def fit_stiffness(
+    whisker: Whisker,
+    points: ArrayLike,
+    readings: ArrayLike,
+    sensor: Sensor | None = None,
+    *,
+    modulus_sigma: float = np.inf,
+    radius_sigma: float = 0.02,
+    taper: bool = False,
+) -> StiffnessFit:
+    """Fit modulus and base radius to measured loads.
+
+    Parameters
+    ----------
+    whisker : Whisker
+        As it is thought to be: shape, modulus, radius.
+    points : array_like (n, 3)
+        Contact points on the centreline, whisker's frame, m; without friction.
+    readings : array_like (n, k)
+        Of the sensor's channels there, offset and weight taken away (`Sensor.felt`).
+    sensor : Sensor, optional
+        Its mixing and noise; by default (F, M) at the base with the usual noise. It must not have
+        been calibrated on contacts of this whisker: that makes the stiffness part of the mix.
+    modulus_sigma, radius_sigma : float
+        Relative standard deviations of the whisker's modulus and radius before: ``inf`` for
+        unknown, 0 for exact. At least one must be finite.
+    taper : bool
+        Whether the ratio of tip to base radius is fitted too (the radius then is linear).
+
+    Returns
+    -------
+    StiffnessFit
+        With uncertainties.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit, nothing is felt, or what is asked for is not determined.
+
+    Warns
+    -----
+    UserWarning
+        If residuals are more than five times the noise, or E r⁴ is more than five standard
+        deviations from what was known before.
+    """
+    sensor = sensor or Sensor()
+    y = np.asarray(readings, dtype=np.float64)
+    places = np.asarray(points, dtype=np.float64)
+    if y.shape != (len(places), len(sensor.channels)):
+        raise ValueError(f"readings are ({len(places)}, {len(sensor.channels)}); got {y.shape}")
+    if modulus_sigma < 0.0 or radius_sigma < 0.0 or np.isinf([modulus_sigma, radius_sigma]).all():
+        raise ValueError(
+            "loads tell E r⁴ only: modulus_sigma or radius_sigma must be finite, none negative; "
+            f"got {modulus_sigma} and {radius_sigma}"
+        )
+    known = np.isfinite(y).all(axis=1) & np.isfinite(places).all(axis=1)
+    y, places = y[known], places[known]
+    noise = np.sqrt(np.diag(sensor.covariance()))
+    size = np.sqrt((y**2).mean(axis=0)) if len(y) else noise
+    noise = np.where(noise > 0.0, noise, 0.01 * np.where(size > 0.0, size, 1.0))
+
+    def modelled(ratio: float) -> Array:
+        return wrenches_of_contacts(_tapered(whisker, ratio), places) @ sensor.base_mixing.T / noise
+
+    ratio = whisker.tip_radius / whisker.base_radius
+    scaled = y / noise
+    if not len(y) or not (modelled(ratio) * scaled).sum() > 0.0:
+        raise ValueError(
+            "the readings do not grow with the loads: check the sensor's axes, sign (`reaction`) "
+            "and offset, or nothing is felt"
+        )
+    ratio, factor, spread, left = _fitted(modelled, scaled, ratio, taper)
+    degrees = y.size - (2 if taper else 1)
+    misfit = float((left**2).sum() / max(degrees, 1))
+    warn_of_misfit(
+        misfit,
+        "contact points, shape and taper (which end is the base?), the sensor's frame, "
+        "offset and weight",
+    )
+    spread = spread * max(1.0, misfit)
+    if taper and np.sqrt(spread[1, 1]) > _OPEN:
+        raise ValueError(
+            "the contacts do not determine the taper: touch the whisker nearer to the tip as well"
+        )
+    sigma = float(np.sqrt(spread[0, 0]))
+    shift, covariance = _told_apart(np.log(factor), sigma, modulus_sigma, radius_sigma)
+    modulus = whisker.youngs_modulus * float(np.exp(shift[0]))
+    growth = float(np.exp(shift[1]))
+    shaped = _tapered(whisker, ratio).scaled(radius_factor=growth)
+    found = shaped.with_properties(youngs_modulus=modulus)
+    return StiffnessFit(
+        whisker=found,
+        stiffness=found.base_bending_stiffness,
+        stiffness_sigma=sigma,
+        modulus=modulus,
+        modulus_sigma=float(np.sqrt(covariance[0, 0])),
+        radius=found.base_radius,
+        radius_sigma=float(np.sqrt(covariance[1, 1])),
+        covariance=covariance,
+        taper=float(ratio),
+        taper_sigma=float(np.sqrt(spread[1, 1])) if taper else 0.0,
+        misfit=misfit,
+    )
+
+
+def _tapered(whisker: Whisker, ratio: float) -> Whisker:
+    if ratio == whisker.tip_radius / whisker.base_radius:
+        return whisker
+    return whisker.with_properties(
+        base_radius=whisker.base_radius, tip_radius=ratio * whisker.base_radius
+    )
+
+
+def _fitted(
+    modelled: Callable[[float], Array], scaled: Array, ratio: float, taper: bool
+) -> tuple[float, float, Array, Array]:
+    """Taper, factor of the stiffness, covariance of (log factor, log taper), and residuals."""
+    if not taper:
+        model = modelled(ratio)
+        factor = float((model * scaled).sum() / (model**2).sum())
+        spread = np.zeros((2, 2))
+        spread[0, 0] = 1.0 / (factor**2 * (model**2).sum())
+        return ratio, factor, spread, scaled - factor * model
+    start = modelled(ratio)
+    factor = float((start * scaled).sum() / (start**2).sum())
+
+    def residuals(unknowns: Array) -> Array:
+        return np.asarray((np.exp(unknowns[0]) * modelled(np.exp(unknowns[1])) - scaled).ravel())
+
+    found = least_squares(
+        residuals,
+        [np.log(factor), np.log(ratio)],
+        bounds=([-np.inf, np.log(_SLIM)], [np.inf, np.log(_WIDE)]),
+        diff_step=[1e-4, 1e-4],
+    )
+    log_factor, log_ratio = found.x
+    jacobian = np.asarray(found.jac, dtype=np.float64)
+    inverse = np.asarray(np.linalg.pinv(jacobian.T @ jacobian), dtype=np.float64)
+    return float(np.exp(log_ratio)), float(np.exp(log_factor)), inverse, found.fun
+
+
+def _told_apart(
+    log_factor: float, sigma: float, modulus_sigma: float, radius_sigma: float
+) -> tuple[Array, Array]:
+    """How far (log E, log r) move for log E + 4 log r to grow so much, and their covariance."""
+    by = np.array([1.0, 4.0])
+    if np.isinf(modulus_sigma) or np.isinf(radius_sigma):
+        # One is free: the other keeps its value and uncertainty, and it takes up the rest.
+        free = 0 if np.isinf(modulus_sigma) else 1
+        kept = radius_sigma if free == 0 else modulus_sigma
+        slope = by[1 - free] / by[free]
+        shift, covariance = np.zeros(2), np.empty((2, 2))
+        shift[free] = log_factor / by[free]
+        covariance[1 - free, 1 - free] = kept**2
+        covariance[0, 1] = covariance[1, 0] = -slope * kept**2
+        covariance[free, free] = (sigma / by[free]) ** 2 + (slope * kept) ** 2
+        return shift, covariance
+    prior = np.diag([modulus_sigma**2, radius_sigma**2])
+    total = by @ prior @ by + sigma**2
+    warn_of_surprise(log_factor, float(np.sqrt(total)))
+    if total == 0.0:
+        return np.zeros(2), prior
+    gain = prior @ by / total
+    return gain * log_factor, prior - np.outer(gain, by @ prior)

@@ -1,0 +1,228 @@
+"""Offset, and weight of what a sensor carries, from readings while nothing is touched.
+
+    y = b + H (m g, μ × g),
+
+linear in the offset b, the mass m and its moment μ = m c, with g turning as the base does.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vibrissa.sensors.errors import with_offset
+from vibrissa.sensors.frame import cross_matrix
+from vibrissa.sensors.linear import Solution, solve
+from vibrissa.sensors.misfit import warn_of_misfit
+from vibrissa.sensors.sensor import GRAVITY, Sensor
+
+Array = NDArray[np.float64]
+AnyArray = NDArray[np.bool_]
+
+# No sensor of a whisker carries as much, kg.
+_HEAVY = 5.0
+# A mass so many standard deviations below zero is no noise.
+_SURELY = 4.0
+
+_ADVICE = (
+    "hold the whisker free in more orientations, at least three that differ in how the weight pulls"
+)
+_MASS = ("the mass", "its moment along x", "along y", "along z")
+
+
+@dataclass(frozen=True, eq=False)
+class WeightCalibration:
+    """What free poses tell.
+
+    Attributes
+    ----------
+    sensor : Sensor
+        With offset, and where orientations were given mass and its moment.
+    covariance : (k + 4, k + 4) array
+        Of the offsets, the mass (kg) and its moment (kg·m); zero for what was not asked or has no
+        effect on these channels.
+    residual : (k,) array
+        RMS of what is left in each channel.
+    misfit : float
+        χ² over its degrees of freedom: near 1, unless the noise or something else is not as stated.
+    """
+
+    sensor: Sensor
+    covariance: Array
+    residual: Array
+    misfit: float
+
+
+def calibrate_weight(
+    sensor: Sensor,
+    readings: ArrayLike,
+    rotations: ArrayLike | None = None,
+    gravity: ArrayLike = GRAVITY,
+) -> WeightCalibration:
+    """Find offset and weight from readings of a free whisker.
+
+    Parameters
+    ----------
+    sensor : Sensor
+        Whose mixing and frame are known; its noise weighs the channels.
+    readings : array_like (n, k)
+        While nothing is touched; rows with NaN or a saturated channel are left out.
+    rotations : array_like (n, 3, 3), optional
+        From the whisker's to the laboratory frame. Without them only the offset is found, for this
+        one orientation: the weight is part of it.
+    gravity : array_like (3,)
+        In the laboratory frame, m/s².
+
+    Returns
+    -------
+    WeightCalibration
+        The sensor with offset and weight.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit, the orientations do not tell weight from offset, or the weight comes
+        out negative.
+
+    Warns
+    -----
+    UserWarning
+        If residuals are more than five times the noise, or the mass is more than 5 kg.
+    """
+    y = np.asarray(readings, dtype=np.float64)
+    k = len(sensor.channels)
+    if y.ndim != 2 or y.shape[1] != k:
+        raise ValueError(f"readings are (n, {k}): {', '.join(sensor.channels)}; got {y.shape}")
+    known = np.flatnonzero((np.abs(y) < sensor.largest).all(axis=1))  # False for NaN
+    n, y = len(y), y[known]
+    if not len(y):
+        raise ValueError("there is no reading without NaN or a saturated channel")
+    noise = np.sqrt(np.diag(sensor.covariance()))
+    noise = np.where(noise > 0.0, noise, np.median(noise[noise > 0.0]) if noise.any() else 1.0)
+    if rotations is None:
+        return _tared(sensor, y, noise)
+    turn = np.asarray(rotations, dtype=np.float64)
+    if turn.shape != (n, 3, 3):
+        raise ValueError(f"{n} readings need as many rotations (3, 3); got {turn.shape}")
+    design = _design(sensor, turn[known], np.asarray(gravity, dtype=np.float64))
+    # What no orientation makes felt is left at zero; what others would must be felt here.
+    every = np.array([np.eye(3), *np.eye(3)[[[1, 2, 0], [2, 0, 1]]]])
+    every = np.concatenate([every, -every, every[:, ::-1]])
+    possible = _design(sensor, every, np.asarray(gravity, dtype=np.float64))[:, :, k:]
+    effect = np.abs(possible).max(axis=(0, 1))
+    felt = np.concatenate([np.ones(k, bool), effect > 1e-12 * max(float(effect.max()), 1e-300)])
+    found, unknowns, covariance = _solved(sensor, design, y, noise, felt)
+    if unknowns[k] < 0.0:
+        sigma = float(np.sqrt(covariance[k, k]))
+        if unknowns[k] < -_SURELY * sigma:
+            raise ValueError(
+                f"the readings weigh {1e3 * unknowns[k]:.3g} ± {1e3 * sigma:.2g} g: the sensor "
+                "reports a reaction (`reaction` of its frame), has other axes, or gravity or the "
+                "rotations point the other way"
+            )
+        felt[k] = False  # nothing that can be weighed
+        found, unknowns, covariance = _solved(sensor, design, y, noise, felt)
+    calibrated = replace(
+        sensor,
+        bias=unknowns[:k],
+        mass=float(unknowns[k]),
+        mass_moment=unknowns[k + 1 :],
+        mixing_covariance=with_offset(sensor.mixing_covariance, np.diag(covariance)[:k]),
+    )
+    if unknowns[k] > _HEAVY:
+        warnings.warn(
+            f"the sensor seems to carry {unknowns[k]:.3g} kg: are its channels in N and N·m, or "
+            "does its mixing say what they are in?",
+            stacklevel=2,
+        )
+    left = found.residuals.reshape(-1, k) * noise
+    misfit = float((found.residuals**2).sum() / max(found.residuals.size - felt.sum(), 1))
+    warn_of_misfit(
+        misfit,
+        "that the rotations are of the whisker's base (not of a flange), that they turn the "
+        "whisker's into the laboratory frame, and the sensor's axes and hand",
+    )
+    return WeightCalibration(calibrated, covariance, np.sqrt((left**2).mean(axis=0)), misfit)
+
+
+def tare(
+    sensor: Sensor,
+    readings: ArrayLike,
+    rotations: ArrayLike | None = None,
+    gravity: ArrayLike = GRAVITY,
+) -> Sensor:
+    """Find the offset anew, as after it has drifted; mass and its moment stay as they are known.
+
+    Parameters
+    ----------
+    sensor : Sensor
+        As calibrated.
+    readings : array_like (n, k)
+        While nothing is touched; those with NaN or a saturated channel are left out.
+    rotations : array_like (3, 3) or (n, 3, 3), optional
+        From the whisker's to the laboratory frame; needed where the sensor carries a mass.
+    gravity : array_like (3,)
+        In the laboratory frame, m/s².
+
+    Returns
+    -------
+    Sensor
+        With the new offset.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit, the rotation is needed but not given, or no reading is complete.
+    """
+    felt = np.atleast_2d(sensor.felt(readings, rotations, gravity))
+    felt = felt[np.isfinite(felt).all(axis=1)]
+    if not len(felt):
+        raise ValueError("there is no reading without NaN or a saturated channel")
+    return sensor.with_new_offset(len(felt), sensor.bias + felt.mean(axis=0))
+
+
+def _solved(
+    sensor: Sensor, design: Array, y: Array, noise: Array, felt: AnyArray
+) -> tuple[Solution, Array, Array]:
+    """Solution for what is felt, all unknowns and their covariance."""
+    k = len(sensor.channels)
+    names = [f"the offset of {name}" for name in sensor.channels] + list(_MASS)
+    rows = (design / noise[:, None]).reshape(-1, k + 4)[:, felt]
+    found = solve(
+        rows,
+        (y / noise).reshape(-1),
+        [name for name, used in zip(names, felt, strict=True) if used],
+        _ADVICE,
+    )
+    unknowns, covariance = np.zeros(k + 4), np.zeros((k + 4, k + 4))
+    unknowns[felt] = found.unknowns
+    covariance[np.ix_(felt, felt)] = found.spread
+    return found, unknowns, covariance
+
+
+def _tared(sensor: Sensor, y: Array, noise: Array) -> WeightCalibration:
+    k = y.shape[1]
+    bias = y.mean(axis=0)
+    covariance = np.zeros((k + 4, k + 4))
+    covariance[:k, :k] = np.diag(noise**2 / len(y))
+    left = np.sqrt(((y - bias) ** 2).mean(axis=0))
+    light = replace(sensor, mass=0.0, mass_moment=np.zeros(3))
+    tared = light.with_new_offset(len(y), bias)
+    misfit = float((left**2 / noise**2).sum() * len(y) / max(len(y) - 1, 1) / k)
+    warn_of_misfit(misfit, "that nothing was touched, and that the orientation stayed the same")
+    return WeightCalibration(tared, covariance, left, misfit)
+
+
+def _design(sensor: Sensor, rotations: Array, gravity: Array) -> Array:
+    """∂y/∂(b, m, μ), shape (n, k, k + 4)."""
+    g = gravity @ rotations
+    h = sensor.base_mixing
+    n, k = len(g), len(h)
+    out = np.zeros((n, k, k + 4))
+    out[:, :, :k] = np.eye(k)
+    out[:, :, k] = g @ h[:, :3].T
+    out[:, :, k + 1 :] = -h[:, 3:] @ cross_matrix(g)  # μ × g = -g × μ
+    return out

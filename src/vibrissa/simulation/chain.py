@@ -1,0 +1,260 @@
+"""A whisker as a chain of straight links and elastic joints, for motion that is not slow.
+
+Cut into segments of length h, the whisker bends and twists at one joint in the middle of each: the
+joint turns by a rotation vector θ, R' = R exp θ, against a spring whose compliance is that of its
+segment, ∫ ds/B. Links cannot stretch or shear, so θ is all there is, and statics and small
+vibrations are those of the Kirchhoff rod to second order in h. A base of finite stiffness is one
+more joint, at s = 0.
+
+Turning joint j by δφ_j = A_j δθ_j (laboratory frame, A = R times the left Jacobian of exp) moves
+every point x beyond it by δφ_j × (x - p_j). The mass, two points a link, therefore enters by its
+first three moments beyond each joint alone.
+
+The smooth centreline, which touches objects, is the quadratic B-spline of the joints: on each
+segment the parabola through its two ends, with the joint as control point.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from vibrissa.numerics.arrays import Array, IntArray
+from vibrissa.numerics.compiled import kernel
+from vibrissa.whisker import Whisker
+
+_GRADING = 0.4
+_GAUSS = np.polynomial.legendre.leggauss(5)
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """A whisker in links; SI units."""
+
+    nodes: Array
+    joints: Array
+    stiffness: Array
+    rest: Array
+    mass: Array
+    mass_arc: Array
+    mass_link: IntArray
+
+    @classmethod
+    def of(cls, whisker: Whisker, density: tuple[float, float], segments: int) -> Chain:
+        """Cut a whisker into segments, shorter where it is thin."""
+        nodes = _nodes(whisker, segments)
+        h = np.diff(nodes)
+        joints = nodes[:-1] + 0.5 * h
+        s = nodes[:-1, None] + 0.5 * h[:, None] * (1.0 + _GAUSS[0])
+        bending = whisker.youngs_modulus * np.pi / 4.0 * whisker.radius(s) ** 4
+        bend = 1.0 / (0.5 * h * (_GAUSS[1] / bending).sum(axis=1))
+        twist = bend / (1.0 + whisker.poisson_ratio)
+        stiffness = np.stack([twist, bend, bend], axis=1)
+        frames = whisker.frame(nodes)
+        rest = np.array([_rotation_vector(a.T @ b) for a, b in pairwise(frames)])
+        if whisker.base_stiffness is not None:
+            soft_bend, soft_twist = whisker.base_stiffness
+            joints = np.concatenate([[0.0], joints])
+            stiffness = np.concatenate([[[soft_twist, soft_bend, soft_bend]], stiffness])
+            rest = np.concatenate([np.zeros((1, 3)), rest])
+        edges = np.concatenate([[0.0], joints, [whisker.length]])
+        # Two points with half of a link's mass have its centre and moment of inertia, about.
+        middle, half = 0.5 * (edges[1:] + edges[:-1]), 0.5 * np.diff(edges)
+        arc = (middle[:, None] + half[:, None] * np.array([-1.0, 1.0]) / np.sqrt(3.0)).ravel()
+        rho = density[0] + (density[1] - density[0]) * arc / whisker.length
+        mass = rho * np.pi * whisker.radius(arc) ** 2 * np.repeat(half, 2)
+        link = np.repeat(np.arange(edges.size - 1), 2)
+        return cls(nodes, joints, stiffness, rest, mass, arc, link)
+
+    @property
+    def soft_base(self) -> bool:
+        """Whether the first joint is that of a compliant base."""
+        return bool(self.joints[0] == 0.0)
+
+    def places(
+        self, frames: Array, pivots: Array, base: Array, arc: Array, link: IntArray
+    ) -> Array:
+        """Points (k, 3) of the links at arc lengths (k,), laboratory frame, m."""
+        start = np.concatenate([base[None], pivots])[link]
+        from_ = np.concatenate([[0.0], self.joints])[link]
+        return np.asarray(start + (arc - from_)[:, None] * frames[link, :, 0])
+
+    def controls(self, frames: Array, pivots: Array, base: Array) -> Array:
+        """Control points (n, 3, 3) of the smooth centreline on each segment."""
+        first = 1 if self.soft_base else 0
+        links = np.arange(self.nodes.size) + first
+        ends = self.places(frames, pivots, base, self.nodes, links)
+        return np.stack([ends[:-1], pivots[first:], ends[1:]], axis=1)
+
+
+def bezier(t: Array) -> Array:
+    """Weights (..., 3) of the control points at the fractions t of a segment."""
+    return np.stack([(1.0 - t) ** 2, 2.0 * t * (1.0 - t), t * t], axis=-1)
+
+
+def _nodes(whisker: Whisker, segments: int) -> Array:
+    s = np.linspace(0.0, whisker.length, 1025)
+    middle = 0.5 * (s[1:] + s[:-1])
+    thin = np.maximum(whisker.radius(middle) / whisker.base_radius, 0.02)
+    share = np.concatenate([[0.0], np.cumsum(thin**-_GRADING)])
+    return np.interp(np.linspace(0.0, share[-1], segments + 1), share, s)
+
+
+def _rotation_vector(turn: Array) -> Array:
+    axis = 0.5 * np.array(
+        [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
+    )
+    sine = float(np.linalg.norm(axis))
+    angle = np.arctan2(sine, 0.5 * (np.trace(turn) - 1.0))
+    return np.asarray(axis * (angle / sine if sine > 1e-12 else 1.0))
+
+
+@kernel
+def configure(
+    theta: Array,
+    joints: Array,
+    rotation: Array,
+    base: Array,
+    frames: Array,
+    pivots: Array,
+    turns: Array,
+) -> None:
+    """Where the links are."""
+    exp, left = np.empty((3, 3)), np.empty((3, 3))
+    for a in range(3):
+        for b in range(3):
+            frames[0, a, b] = rotation[a, b]
+    for j in range(joints.shape[0]):
+        length = joints[j] - (joints[j - 1] if j > 0 else 0.0)
+        for a in range(3):
+            start = pivots[j - 1, a] if j > 0 else base[a]
+            pivots[j, a] = start + length * frames[j, a, 0]
+        _exponential(theta[j], exp, left)
+        for a in range(3):
+            for b in range(3):
+                turned, moved = 0.0, 0.0
+                for c in range(3):
+                    turned += frames[j, a, c] * exp[c, b]
+                    moved += frames[j, a, c] * left[c, b]
+                frames[j + 1, a, b] = turned
+                turns[j, a, b] = moved
+
+
+@kernel
+def _exponential(v: Array, exp: Array, left: Array) -> None:
+    """Rotation exp [v]× and its left Jacobian."""
+    square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+    if square < 1e-8:
+        a, b, c = 1.0 - square / 6.0, 0.5 - square / 24.0, 1.0 / 6.0 - square / 120.0
+    else:
+        angle = np.sqrt(square)
+        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / square
+        c = (1.0 - a) / square
+    for i in range(3):
+        for k in range(3):
+            outer = v[i] * v[k] - (square if i == k else 0.0)
+            exp[i, k] = b * outer + (1.0 if i == k else 0.0)
+            left[i, k] = c * outer + (1.0 if i == k else 0.0)
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        exp[k, j] += a * v[i]
+        exp[j, k] -= a * v[i]
+        left[k, j] += b * v[i]
+        left[j, k] -= b * v[i]
+
+
+@kernel
+def inertia(
+    places: Array,
+    mass: Array,
+    link: IntArray,
+    pull: Array,
+    pivots: Array,
+    turns: Array,
+    residual: Array,
+    matrix: Array,
+) -> None:
+    """Generalised inertial forces and the mass matrix."""
+    m = pivots.shape[0]
+    total, first, second = 0.0, np.zeros(3), np.zeros((3, 3))
+    force, moment = np.zeros(3), np.zeros(3)
+    block, half = np.empty((3, 3)), np.empty((3, 3))
+    i = mass.shape[0] - 1
+    for l in range(m - 1, -1, -1):
+        while i >= 0 and link[i] > l:
+            total += mass[i]
+            for a in range(3):
+                b, c = (a + 1) % 3, (a + 2) % 3
+                first[a] += mass[i] * places[i, a]
+                force[a] += pull[i, a]
+                moment[a] += places[i, b] * pull[i, c] - places[i, c] * pull[i, b]
+                for b in range(3):
+                    second[a, b] += mass[i] * places[i, a] * places[i, b]
+            i -= 1
+        p = pivots[l]
+        for a in range(3):
+            value = 0.0
+            for b in range(3):
+                c, d = (b + 1) % 3, (b + 2) % 3
+                value += turns[l, b, a] * (moment[b] - p[c] * force[d] + p[d] * force[c])
+            residual[3 * l + a] = value
+        for j in range(l + 1):
+            q = pivots[j]
+            trace = 0.0
+            for a in range(3):
+                trace += second[a, a] - first[a] * (p[a] + q[a]) + total * p[a] * q[a]
+            for a in range(3):
+                for b in range(3):
+                    # -Σ m (x - p)(x - q)ᵀ, and the trace on the diagonal.
+                    block[a, b] = -(
+                        second[a, b] - first[a] * q[b] - p[a] * first[b] + total * p[a] * q[b]
+                    )
+                block[a, a] += trace
+            for a in range(3):
+                for b in range(3):
+                    half[a, b] = 0.0
+                    for c in range(3):
+                        half[a, b] += block[a, c] * turns[l, c, b]
+            for a in range(3):
+                for b in range(3):
+                    value = 0.0
+                    for c in range(3):
+                        value += turns[j, c, a] * half[c, b]
+                    matrix[3 * j + a, 3 * l + b] = value
+                    matrix[3 * l + b, 3 * j + a] = value
+
+
+@kernel
+def solve_definite(matrix: Array, vector: Array) -> None:
+    """Solve a symmetric, positive definite system by Cholesky's method."""
+    n = vector.shape[0]
+    for i in range(n):
+        for j in range(i + 1):
+            value = matrix[i, j]
+            for k in range(j):
+                value -= matrix[i, k] * matrix[j, k]
+            if i == j:
+                matrix[i, i] = np.sqrt(value)
+            else:
+                matrix[i, j] = value / matrix[j, j]
+    for i in range(n):
+        value = vector[i]
+        for k in range(i):
+            value -= matrix[i, k] * vector[k]
+        vector[i] = value / matrix[i, i]
+    for i in range(n - 1, -1, -1):
+        value = vector[i]
+        for k in range(i + 1, n):
+            value -= matrix[k, i] * vector[k]
+        vector[i] = value / matrix[i, i]
+
+
+def jacobian(points: Array, links: IntArray, weights: Array, pivots: Array, turns: Array) -> Array:
+    """How a weighted sum of points of links moves with the joints."""
+    out = np.zeros((3, pivots.shape[0], 3))
+    for point, link, weight in zip(points, links, weights, strict=True):
+        away = (point - pivots[:link])[:, None, :]
+        out[:, :link] += weight * np.cross(turns[:link].transpose(0, 2, 1), away).transpose(2, 0, 1)
+    return out.reshape(3, -1)

@@ -1,0 +1,88 @@
+"""A simulated trial as a sensor at the base reads it."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from vibrissa.quantities import attributes
+from vibrissa.sensors import COMPONENTS, FORCE_NOISE, MOMENT_NOISE, Sensor
+
+Array = NDArray[np.float64]
+
+
+def measure(
+    recording: xr.DataTree,
+    force_noise: float = FORCE_NOISE,
+    moment_noise: float = MOMENT_NOISE,
+    seed: int = 0,
+    *,
+    sensor: Sensor | None = None,
+) -> xr.DataTree:
+    """Measure the wrench of a simulated trial.
+
+    Parameters
+    ----------
+    recording : xarray.DataTree
+        A recording with ``force`` and ``moment`` in the group ``truth``.
+    force_noise : float
+        Standard deviation of each component of the force, N: white, Gaussian.
+    moment_noise : float
+        Standard deviation of each component of the moment, N·m.
+    seed : int
+        Of the noise.
+    sensor : Sensor, optional
+        Instead of one with that noise only.
+
+    Returns
+    -------
+    xarray.DataTree
+        A new recording, whose ``force`` and ``moment`` at the top are what the sensor reads and say
+        in the attribute ``noise`` how much of that it has. Missing frames stay missing. A sensor
+        with other channels gives ``reading`` and its ``mixing`` instead of them.
+
+    Raises
+    ------
+    ValueError
+        If a noise is negative, or if the recording has no true wrench.
+    """
+    for name, value in (("force_noise", force_noise), ("moment_noise", moment_noise)):
+        if not (np.isfinite(value) and value >= 0.0):
+            raise ValueError(f"{name} is {value!r}; it must not be negative")
+    truth = recording.children.get("truth")
+    if truth is None or not {"force", "moment"} <= set(truth.data_vars):
+        raise ValueError("the recording has no true force and moment to measure")
+    if sensor is None:
+        sensor = Sensor(noise=np.repeat([force_noise, moment_noise], 3))
+    names = ("force", "moment")
+    true = {name: truth[name].variable.transpose("time", "whisker", "space") for name in names}
+    wrench = np.concatenate([true[name].values for name in names], axis=-1)
+    time = np.asarray(recording.to_dataset()["time"].values, dtype=np.float64)
+    # One sensor a whisker: each has noise of its own.
+    readings = [sensor.read(time, wrench[:, i], seed + i) for i in range(wrench.shape[1])]
+    reading = np.stack(readings, axis=1)
+    measured = recording.copy()
+    if sensor.reads_wrench:
+        rows = {
+            name: xr.Variable(
+                true[name].dims,
+                reading[..., part],
+                {**true[name].attrs, "noise": _one(sensor.noise[part])},
+            )
+            for name, part in (("force", slice(0, 3)), ("moment", slice(3, 6)))
+        }
+        measured.dataset = recording.to_dataset().assign(rows)
+        return measured
+    noise = {"noise": np.asarray(sensor.noise)}
+    dataset = recording.to_dataset().drop_vars(names, errors="ignore")
+    measured.dataset = dataset.assign(
+        reading=(("time", "whisker", "channel"), reading, attributes("reading") | noise),
+        mixing=(("channel", "component"), np.asarray(sensor.mixing), attributes("mixing")),
+    ).assign_coords(channel=list(sensor.channels), component=list(COMPONENTS))
+    return measured
+
+
+def _one(values: Array) -> float | Array:
+    """One number where all are the same."""
+    return float(values[0]) if (values == values[0]).all() else values

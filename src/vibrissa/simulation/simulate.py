@@ -1,0 +1,264 @@
+"""A trial, frame by frame: the base moves, the whisker bends, slips and springs free.
+
+Each frame goes on from the one before: the objects, seen from the base, move a little, and the
+contact sticks or slides along on the stable branch (:mod:`vibrissa.rod.surfaces`). Where that
+branch ends the whisker has slipped off; it springs back to rest, clear of the object (or against
+it, wherever it stands in the way of rest), and meets it next from the side where it then is. A
+whisker is therefore never pulled through a peg. Quasi-static.
+
+One contact is simulated at a time, that with the object met first. Where the bent whisker reaches
+into another object, or into the same one elsewhere, the truth says so (``second_contact``) and how
+far (``overlap``): there the wrench lacks what the second contact would add.
+
+Several whiskers are simulated one after the other: they do not touch each other.
+
+With `vibrissa.simulation.dynamics` the whisker has inertia and damping: it collides, rings after it
+has slipped, and may touch at several places, of which the strongest is recorded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TypeVar
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from vibrissa.objects.surface import Surface
+from vibrissa.recording.tree import trial_recording
+from vibrissa.rod.surfaces import SurfaceDeflection, follow_surfaces
+from vibrissa.simulation.dynamics import Dynamics, move_dynamically
+from vibrissa.simulation.motion import Motion
+from vibrissa.simulation.stepping import Moment
+from vibrissa.status import Status
+from vibrissa.whisker import Whisker
+
+NODES = 33
+"""Points of the recorded centrelines."""
+
+_LOOK_AT = 129
+"""Points along the whisker at which a second contact is looked for."""
+
+_ASIDE = 0.03
+"""How far from the contact another one of the same object is one, as a share of the length."""
+
+OVERLAP = 5e-6
+"""Overlap from which a second contact counts, m; a tapering whisker along a flat one has less."""
+
+_FRAMES_AT_ONCE = 512
+
+Array = NDArray[np.float64]
+
+Progress = Callable[[int, int], None]
+"""Called with the number of frames done and of all frames."""
+
+
+T = TypeVar("T")
+Whiskers = Whisker | Sequence[Whisker] | Mapping[str, Whisker]
+Motions = Motion | Sequence[Motion] | Mapping[str, Motion]
+
+
+def simulate(
+    whisker: Whiskers,
+    motion: Motions,
+    objects: Surface | Sequence[Surface],
+    *,
+    friction: float = 0.0,
+    dynamics: Dynamics | None = None,
+    nodes: int = NODES,
+    progress: Progress | None = None,
+) -> xr.DataTree:
+    """Simulate a trial of one whisker, or of several, among objects.
+
+    Parameters
+    ----------
+    whisker : Whisker, sequence or mapping of Whisker
+        That whisks; several, such as a `WhiskerArray`, do so together.
+    motion : Motion, sequence or mapping of Motion
+        Of its base; as many as there are whiskers, in the same order or by the same names, with
+        the same frames and on the same head.
+    objects : Peg, Sphere, Plane, Box, Mesh or a sequence of them
+        In the laboratory. The one met first holds the whisker.
+    friction : float
+        Coulomb's coefficient between whisker and objects.
+    dynamics : Dynamics, optional
+        Its inertia and damping; by default it moves quasi-statically.
+    nodes : int
+        Points of the recorded centrelines, equally spaced in arc length.
+    progress : callable, optional
+        Told after every frame of every whisker how many are done, of how many.
+
+    Returns
+    -------
+    xarray.DataTree
+        A recording (`vibrissa.recording.tree`): what a perfect sensor at the base reads, where the
+        base is, and everything else in the group ``truth``.
+
+    Raises
+    ------
+    ValueError
+        If the friction is negative, or whiskers and motions do not belong together.
+    """
+    pairs = _pairs(whisker, motion)
+    solids = list(objects) if isinstance(objects, Sequence) else [objects]
+    touch = "frictionless" if friction == 0.0 else f"friction {friction:g}"
+    how = "quasi-static"
+    if dynamics is not None:
+        how = f"with inertia, damping ratio {dynamics.damping_ratio:g}"
+    truths: list[dict[str, Array]] = []
+    for one, moves in pairs:
+        before, total = len(truths) * len(moves), len(pairs) * len(moves)
+
+        def told(done: int, _: int, before: int = before, total: int = total) -> None:
+            if progress is not None:
+                progress(before + done, total)
+
+        if dynamics is not None:
+            moments = move_dynamically(
+                one, solids, moves, dynamics, friction=friction, progress=told
+            )
+            truths.append(_dynamic_truth(one, moves, moments, nodes))
+            continue
+        found = follow_surfaces(
+            one,
+            solids,
+            moves.base_rotation,
+            moves.base_position,
+            friction=friction,
+            progress=told,
+        )
+        truths.append(_truth(one, moves, solids, found, nodes))
+    whiskers, motions = zip(*pairs, strict=True)
+    return trial_recording(whiskers, motions, solids, truths, f"simulated: {how}, {touch}")
+
+
+def _pairs(whisker: Whiskers, motion: Motions) -> list[tuple[Whisker, Motion]]:
+    """Whiskers with their motions."""
+    if isinstance(whisker, Mapping) and isinstance(motion, Mapping):
+        missing = [name for name in whisker if name not in motion]
+        if missing:
+            raise ValueError(f"there is no motion of {', '.join(missing)}")
+        motion = [motion[name] for name in whisker]
+    whiskers = [whisker] if isinstance(whisker, Whisker) else _listed(whisker)
+    motions = [motion] if isinstance(motion, Motion) else _listed(motion)
+    if not whiskers or len(whiskers) != len(motions):
+        raise ValueError(
+            f"there are {len(whiskers)} whiskers and {len(motions)} motions; one motion a whisker, "
+            "and at least one, is needed"
+        )
+    names = [one.name for one in whiskers]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ValueError(f"several whiskers are called {', '.join(twice)}; names must differ")
+    first = motions[0]
+    for name, other in zip(names, motions, strict=True):
+        for what in ("time", "head_rotation", "head_position"):
+            if not _same(getattr(first, what), getattr(other, what)):
+                raise ValueError(f"the motions of {names[0]} and {name} differ in {what}")
+    return list(zip(whiskers, motions, strict=True))
+
+
+def _listed(things: Sequence[T] | Mapping[str, T]) -> list[T]:
+    return list(things.values() if isinstance(things, Mapping) else things)
+
+
+def _same(a: Array | None, b: Array | None) -> bool:
+    return a is b if a is None or b is None else np.array_equal(a, b)
+
+
+def _truth(
+    whisker: Whisker,
+    motion: Motion,
+    solids: Sequence[Surface],
+    found: SurfaceDeflection,
+    nodes: int,
+) -> dict[str, Array]:
+    """Variables of the truth, quasi-static."""
+    rotation, position, bent = motion.base_rotation, motion.base_position, found.bent
+    turn = "tij,t...j->t...i"
+    contact = np.isin(bent.status, (Status.OK, Status.TIP_CONTACT))
+    overlap = _overlap(whisker, motion, solids, found)
+    return {
+        "force": bent.force,
+        "moment": bent.moment,
+        "centerline": bent.centerline(nodes) @ np.swapaxes(rotation, 1, 2) + position[:, None],
+        "contact_point": np.einsum(turn, rotation, bent.contact_point) + position,
+        "contact_point_whisker": bent.contact_point,
+        "arc_length": bent.arc_length,
+        "in_contact": contact,
+        "confidence": np.isin(bent.status, [s for s in Status if s.ok]).astype(np.float64),
+        "status": bent.status.astype(np.int8),
+        "contact_force": np.where(contact[:, None], np.einsum(turn, rotation, bent.force), np.nan),
+        "contact_object": found.surface.astype(np.int16),
+        "surface_point": found.surface_point,
+        "surface_normal": found.normal,
+        "sliding": found.sliding,
+        "overlap": overlap,
+        "second_contact": overlap > OVERLAP,
+    }
+
+
+def _dynamic_truth(
+    whisker: Whisker, motion: Motion, moments: Sequence[Moment], nodes: int
+) -> dict[str, Array]:
+    """Variables of the truth, with inertia."""
+    rotation, position = motion.base_rotation, motion.base_position
+    n = len(moments)
+    truth = {
+        name: np.full((n, 3), np.nan)
+        for name in ("contact_point", "contact_force", "surface_point", "surface_normal")
+    }
+    arc_length, surface = np.full(n, np.nan), np.full(n, -1, dtype=np.int16)
+    second, status = np.zeros(n, dtype=bool), np.full(n, int(Status.NO_CONTACT), dtype=np.int8)
+    for i, moment in enumerate(moments):
+        if not moment.contacts:
+            continue
+        first = moment.contacts[0]
+        arc_length[i], surface[i] = first.arc_length, first.surface
+        truth["contact_point"][i], truth["surface_normal"][i] = first.place, first.normal
+        truth["contact_force"][i] = moment.contact_force
+        away = first.gap + float(whisker.radius(first.arc_length))
+        truth["surface_point"][i] = first.place - away * first.normal
+        second[i] = len(moment.contacts) > 1
+        at_tip = first.arc_length >= whisker.length * (1.0 - 1e-9)
+        status[i] = int(Status.TIP_CONTACT if at_tip else Status.OK)
+    to_whisker = "tji,tj->ti"
+    return truth | {
+        "force": np.einsum(to_whisker, rotation, np.array([m.force for m in moments])),
+        "moment": np.einsum(to_whisker, rotation, np.array([m.moment for m in moments])),
+        "centerline": np.array([m.centerline(nodes) for m in moments]),
+        "contact_point_whisker": np.einsum(to_whisker, rotation, truth["contact_point"] - position),
+        "arc_length": arc_length,
+        "in_contact": surface >= 0,
+        "confidence": np.ones(n),
+        "status": status,
+        "contact_object": surface,
+        "sliding": np.array([m.sliding for m in moments]),
+        "overlap": np.zeros(n),
+        "second_contact": second,
+    }
+
+
+def _overlap(
+    whisker: Whisker, motion: Motion, solids: Sequence[Surface], found: SurfaceDeflection
+) -> Array:
+    """How far (n,) the bent whisker reaches into objects away from its contact, m."""
+    bent, rotation, position = found.bent, motion.base_rotation, motion.base_position
+    s = np.linspace(0.0, whisker.length, _LOOK_AT)
+    radius = whisker.radius(s)
+    deepest = np.zeros(len(motion))
+    # A whisker at rest was looked at when it was found to be free.
+    touching = np.flatnonzero(np.isin(bent.status, (Status.OK, Status.TIP_CONTACT)))
+    if not touching.size:
+        return deepest
+    lines = bent.centerline(_LOOK_AT)
+    for first in range(0, touching.size, _FRAMES_AT_ONCE):
+        rows = touching[first : first + _FRAMES_AT_ONCE]
+        line = lines[rows] @ np.swapaxes(rotation[rows], 1, 2) + position[rows, None]
+        beside = np.abs(s - bent.arc_length[rows, None]) < _ASIDE * whisker.length
+        for i, solid in enumerate(solids):
+            gap = solid.signed_distance(line) - radius
+            gap[beside & (found.surface[rows, None] == i)] = np.inf
+            deepest[rows] = np.maximum(deepest[rows], -gap.min(axis=1))
+    return deepest

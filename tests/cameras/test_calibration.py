@@ -1,0 +1,142 @@
+"""Calibration from painted images of a checkerboard by cameras that are known."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from vibrissa.cameras import Camera, calibrate, load_cameras, triangulate
+from vibrissa.cli.app import app
+from vibrissa.io import load_series, write_video
+
+cv2 = pytest.importorskip("cv2")
+typer_testing = pytest.importorskip("typer.testing")
+
+SQUARE = 2e-3
+CORNERS = (7, 5)
+
+
+SIZE = (400, 300)
+FINE = 2
+
+
+def camera(name, turn, shift):
+    matrix = [[950.0, 0.0, 199.5], [0.0, 950.0, 149.5], [0.0, 0.0, 1.0]]
+    rotation = Rotation.from_rotvec(turn).as_matrix()
+    return Camera(matrix, rotation, shift, [-0.08], size=SIZE, name=name)
+
+
+PAIR = (
+    camera("left", [0.0, 0.0, 0.0], [0.0, 0.0, 0.08]),
+    camera("right", [0.0, 0.6, 0.0], [0.002, 0.0, 0.085]),
+)
+
+
+def sights(view):
+    """Lines of sight of all samples."""
+    fine = (np.arange(FINE) + 0.5) / FINE - 0.5
+    columns, rows = ((np.arange(n)[:, None] + fine).reshape(-1) for n in SIZE)
+    return view.rays(np.stack(np.meshgrid(columns, rows), axis=-1))
+
+
+def painted(sight, turn, shift):
+    """The board as a camera sees it."""
+    origin, direction = sight
+    rotation = Rotation.from_rotvec(turn).as_matrix()
+    along = ((shift - origin) @ rotation[:, 2]) / (direction @ rotation[:, 2])
+    place = (origin + along[..., None] * direction - shift) @ rotation[:, :2] / SQUARE
+    square = np.floor(place)
+    board = (np.abs(square - np.array([3.0, 2.0]) + 0.5) < np.array([4.5, 3.5])).all(axis=-1)
+    dark = board & (square.sum(axis=-1) % 2 == 0)
+    grey = np.where(dark, 30.0, 220.0)
+    return grey.reshape(SIZE[1], FINE, SIZE[0], FINE).mean(axis=(1, 3)).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def images():
+    generator = np.random.default_rng(0)
+    series = {view.name: [] for view in PAIR}
+    seen = {view.name: sights(view) for view in PAIR}
+    for _ in range(10):
+        turn = generator.uniform(-0.45, 0.45, 3)
+        shift = generator.uniform(-2e-3, 2e-3, 3) - np.array([6e-3, 4e-3, 0.0])
+        for view in PAIR:
+            series[view.name].append(painted(seen[view.name], turn, shift))
+    return series
+
+
+def test_cameras_are_found_again(images):
+    cameras, error = calibrate(images, CORNERS, SQUARE)
+    assert error < 0.1
+    assert [c.name for c in cameras] == ["left", "right"]
+    for found, true in zip(cameras, PAIR, strict=True):
+        assert found.matrix[0, 0] == pytest.approx(true.matrix[0, 0], rel=0.02)
+    # What matters is where the cameras stand relative to each other.
+    turn, wanted = (b.rotation @ a.rotation.T for a, b in (cameras, PAIR))
+    angle = Rotation.from_matrix(turn @ wanted.T).magnitude()
+    assert np.degrees(angle) < 0.7
+
+
+def test_too_few_boards_say_so(images):
+    few = {name: series[:2] for name, series in images.items()}
+    with pytest.raises(ValueError, match="in 2 images"):
+        calibrate(few, CORNERS, SQUARE)
+    with pytest.raises(ValueError, match="as many each"):
+        calibrate({"left": images["left"]}, CORNERS, SQUARE)
+
+
+def run(*words):
+    return typer_testing.CliRunner().invoke(app, [str(word) for word in words])
+
+
+@pytest.fixture
+def files(images, tmp_path):
+    for name, series in images.items():
+        for i, image in enumerate(series):
+            cv2.imwrite(str(tmp_path / f"{name}_{i:02d}.png"), image)
+    return tmp_path
+
+
+def test_the_verb_writes_cameras_that_see_the_same_points(files):
+    out = files / "cameras.toml"
+    words = ["calibrate", "--pattern", "7x5", "--square", SQUARE, *sorted(files.glob("*.png"))]
+    done = run(*words, "-o", out)
+    assert done.exit_code == 0, done.exception
+    assert "reprojection error 0.0" in done.stdout
+    cameras = load_cameras(out)
+    # Distances between points that both cameras see do not depend on the laboratory frame.
+    points = np.random.default_rng(0).uniform(-5e-3, 5e-3, (20, 3))
+    seen = triangulate(cameras, np.stack([view.project(points) for view in PAIR]))[0]
+    true, found = (np.linalg.norm(p[:, None] - p[None], axis=2) for p in (points, seen))
+    assert np.abs(found - true).max() < 0.02 * true.max()
+
+
+def test_the_verb_takes_a_video_of_each_camera(images, tmp_path):
+    for name, series in images.items():
+        write_video(tmp_path / f"{name}.mkv", series)
+    videos = [tmp_path / "left.mkv", tmp_path / "right.mkv"]
+    series = load_series(videos, most=4)
+    assert list(series) == ["left", "right"]
+    for name, frames in series.items():
+        np.testing.assert_array_equal(frames, [images[name][i] for i in (0, 3, 6, 9)])
+    out = tmp_path / "cameras.toml"
+    done = run("calibrate", "--pattern", "7x5", "--square", SQUARE, *videos, "-o", out)
+    assert done.exit_code == 0, done.exception
+    assert [camera.name for camera in load_cameras(out)] == ["left", "right"]
+
+
+def test_what_cannot_be_calibrated_says_why(files):
+    def said(*words, pattern="7x5", square=SQUARE):
+        done = run("calibrate", "--pattern", pattern, "--square", square, *words)
+        assert done.exit_code != 0
+        return str(done.exception)
+
+    images = sorted(files.glob("*.png"))
+    out = ("-o", files / "c.toml")
+    assert "in m is needed" in said(*images, *out, square=2.0)
+    assert "as 9x6" in said(*images, *out, pattern="seven")
+    assert "camera right has no image 9" in said(*images[:-1], *out)
+    assert ".toml is needed" in said(*images, "-o", files / "c.csv")
+    (files / "plain.png").write_bytes(images[0].read_bytes())
+    assert "has no number" in said(*images, files / "plain.png", *out)
+    cv2.imwrite(str(files / "left_00.png"), np.zeros((30, 40), np.uint8))
+    assert "differ in size" in said(*images, *out)

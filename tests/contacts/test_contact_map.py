@@ -1,0 +1,111 @@
+"""The map: its samples are equilibria, its domains are told apart, and files keep it whole."""
+
+import h5py
+import numpy as np
+import pytest
+import xarray as xr
+
+import vibrissa as vb
+from vibrissa.contacts.contact_map import spherical, within_paper_bounds
+
+
+def test_samples_are_equilibria_of_their_contact_points(gamma_map):
+    data = gamma_map.to_dataset().isel(station=slice(1, -1, 4), bearing=slice(0, -1, 5))
+    data = data.isel(load=slice(2, -1, 4))
+    bent = vb.deflect(gamma_map.whisker, vb.PointContact(data.contact_point.to_numpy()))
+    assert (bent.status == vb.Status.OK).all()
+    np.testing.assert_allclose(bent.arc_length, data.arc_length, atol=1e-9)
+    np.testing.assert_allclose(bent.moment, data.moment, rtol=1e-6, atol=1e-14)
+
+
+def test_derivatives_are_those_of_the_samples(gamma_map):
+    """By a point force a little further along: first differences agree with the stored slopes."""
+    data = gamma_map.to_dataset().isel(station=8, bearing=5, load=9)
+    s, force = data.arc_length.item(), gamma_map.chart.contacts[8, 5, 9, 1:]
+    force = force * gamma_map.chart.discretization.force
+    ds = 1e-8
+    ends = [
+        vb.deflect(gamma_map.whisker, vb.PointForce(s + d, components=(0.0, *force)))
+        for d in (ds, -ds)
+    ]
+    slope = (ends[0].contact_point - ends[1].contact_point) / (2.0 * ds)
+    np.testing.assert_allclose(
+        data.contact_point_derivative.sel(unknown="s"), slope, rtol=1e-5, atol=1e-6
+    )
+
+
+def test_paper_domain_keeps_the_grid_bounds(gamma_map):
+    everything = gamma_map.to_dataset()
+    paper = gamma_map.to_dataset("paper")
+    inside = within_paper_bounds(gamma_map.whisker, everything.contact_point.to_numpy())
+    assert 0.2 < inside.mean() < 1.0
+    np.testing.assert_array_equal(np.isfinite(paper.Fx), inside)
+    with pytest.raises(ValueError, match="'reachable' or 'paper'; got 'all'"):
+        gamma_map.to_dataset("all")
+
+
+def test_every_variable_says_what_it_is(gamma_map):
+    data = gamma_map.to_dataset()
+    for name in data.data_vars:
+        assert data[name].attrs.get("long_name"), name
+        assert "units" in data[name].attrs or "flag_values" in data[name].attrs, name
+
+
+def test_files_keep_the_map_whole(gamma_map, tmp_path):
+    path = tmp_path / "map.nc"
+    gamma_map.save(path)
+    again = vb.ContactMap.load(path)
+    xr.testing.assert_identical(again.to_dataset(), gamma_map.to_dataset())
+    np.testing.assert_array_equal(again.chart.values, gamma_map.chart.values)
+    signals = {"Fx": 2e-5, "MB": 1.5e-6, "MD": 1.4}
+    np.testing.assert_array_equal(
+        again.estimate(signals).candidates, gamma_map.estimate(signals).candidates
+    )
+
+
+def test_a_file_of_another_kind_is_refused(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        vb.ContactMap.load(tmp_path / "none.nc")
+    text = tmp_path / "text.nc"
+    text.write_text("not a map")
+    with pytest.raises(ValueError, match="cannot be read as NetCDF-4"):
+        vb.ContactMap.load(text)
+    other = tmp_path / "other.nc"
+    xr.Dataset({"a": 1.0}).to_netcdf(other, engine="h5netcdf")
+    with pytest.raises(ValueError, match="not a contact map"):
+        vb.ContactMap.load(other)
+
+
+@pytest.mark.parametrize(
+    "lost", ["chart", "whisker", "chart/fold", "chart/values", "whisker/radius"]
+)
+def test_a_map_without_a_part_of_it_is_refused(tmp_path, gamma_map, lost):
+    path = tmp_path / "map.nc"
+    gamma_map.save(path)
+    with h5py.File(path, "r+") as file:
+        del file[lost]
+    with pytest.raises(ValueError, match=lost.rpartition("/")[2]) as caught:
+        vb.ContactMap.load(path)
+    assert str(path) in str(caught.value)
+
+
+def test_the_papers_grid(tmp_path):
+    """Signals on it are those of point contacts; unreachable points say why."""
+    calls = []
+    whisker = vb.samples.gamma()
+    contacts = vb.ContactMap.simulate(whisker, progress=lambda done, total: calls.append(done))
+    grid = contacts.grid
+    assert grid.status.shape == (15, 131, 121)
+    assert calls == list(range(1, 16))
+    reached = (grid.status == vb.Status.OK).to_numpy()
+    assert 0.1 < reached.mean() < 0.9
+    assert not (grid.status == vb.Status.NOT_CONVERGED).any()
+    assert np.isnan(grid.Fx.to_numpy()[~reached]).all()
+    i, j, k = np.argwhere(reached)[1234]
+    r, theta, phi = grid.r[i].item(), grid.theta[j].item(), grid.phi[k].item()
+    point = r * np.array([np.cos(phi) * np.cos(theta), np.cos(phi) * np.sin(theta), np.sin(phi)])
+    np.testing.assert_allclose(spherical(point), [r, theta, phi], rtol=1e-12)
+    bent = vb.deflect(whisker, vb.PointContact(point))
+    np.testing.assert_allclose(bent.moment, grid.moment[i, j, k], rtol=1e-9)
+    contacts.save(tmp_path / "map.nc")
+    xr.testing.assert_identical(vb.ContactMap.load(tmp_path / "map.nc").grid, grid)

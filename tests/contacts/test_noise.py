@@ -1,0 +1,187 @@
+"""Under noise: stated regions hold what they state, there is an answer, and its probability."""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+import vibrissa as vb
+from vibrissa.contacts.posterior import ranked
+from vibrissa.identifiability.regions import sample
+from vibrissa.signals import SIGNALS
+
+SIGMA = np.repeat([1e-6, 2e-8], 3)
+HELD, BEYOND = chi2.ppf([0.95, 0.9973], 3)
+EVERY = " ".join(SIGNALS)
+
+
+def contacts_of(contact_map, low, high, number, rng):
+    """Force, moment and contact point, uniform over Ω between two loads (of the fold's)."""
+    d, many = contact_map.chart.discretization, 12 * number
+    load = rng.uniform(low, high, many)
+    place = np.column_stack([rng.uniform(size=(many, 2)) * [1.0, 2.0 * np.pi], np.sqrt(load)])
+    found = sample(contact_map, place, "reachable")
+    volume = np.where(found.places.inside, found.volume, 0.0) / place[:, 2]
+    values = found.places.values[rng.choice(many, number, p=volume / volume.sum())]
+    force, point = values[:, :3] * d.force, values[:, 3:] * d.length
+    return force, np.cross(point, force), point
+
+
+def noisy_wrenches(force, moment, rng, sigma=SIGMA):
+    wrench = np.concatenate([force, moment], axis=1)
+    wrench = wrench + sigma * rng.normal(size=wrench.shape)
+    return wrench[:, :3], wrench[:, 3:]
+
+
+def distances(found, point, rows):
+    """Squared distances of true contact points, in standard deviations of the estimates."""
+    away = (found.point - point)[rows]
+    return (away * np.linalg.solve(found.covariance[rows], away[..., None])[..., 0]).sum(axis=1)
+
+
+@pytest.fixture(scope="module")
+def beside_slip_off(gamma_map):
+    rng = np.random.default_rng(4)
+    force, moment, point = contacts_of(gamma_map, 0.97, 0.995, 1500, rng)
+    return *noisy_wrenches(force, moment, rng), point
+
+
+@pytest.mark.parametrize("using", ["Fx MB MD", "Fx FT MB MD", EVERY, "wrench"])
+def test_regions_hold_what_they_state_up_to_slip_off(gamma_map, beside_slip_off, using):
+    """Of 1,500 contacts, to three binomial standard deviations of 93 to 97 %, and of 0.4 %."""
+    force, moment, point = beside_slip_off
+    covariance = np.diag(SIGMA**2)
+    if using == "wrench":
+        found = vb.estimate_from_wrench(gamma_map.whisker, force, moment, noise=covariance)
+    else:
+        found = gamma_map.estimate(vb.base_signals(force, moment), using, covariance)
+    rows = (found.status == vb.Status.UNIQUE) & found.linear
+    assert rows.mean() > (0.7 if using == "wrench" else 0.97)
+    squares = distances(found, point, rows)
+    error = 3.0 / np.sqrt(rows.sum())
+    assert 0.93 - 0.25 * error < (squares <= HELD).mean() < 0.97 + 0.17 * error
+    assert (squares > BEYOND).mean() < 0.004 + 0.063 * error
+
+
+def test_where_it_cannot_be_relied_on_a_covariance_is_wide(gamma_map, rng):
+    """Light contacts of a wrench, where to first order a fifth of the truths is not held."""
+    force, moment, point = contacts_of(gamma_map, 0.0, 0.2, 1500, rng)
+    noisy = noisy_wrenches(force, moment, rng)
+    found = vb.estimate_from_wrench(gamma_map.whisker, *noisy, noise=np.diag(SIGMA**2))
+    rows = (found.status == vb.Status.UNIQUE) & ~found.linear
+    assert rows.sum() > 100
+    assert (distances(found, point, rows) <= HELD).mean() > 0.86
+
+
+@pytest.fixture(scope="module")
+def wire():
+    """A steel wire of one diameter: much of what noise does to it no contact of it gives."""
+    wire = vb.Whisker.straight(0.15, base_radius=5e-4, tip_radius=5e-4, youngs_modulus=200e9)
+    return vb.ContactMap.simulate(wire, grid=False)
+
+
+@pytest.mark.parametrize("using", ["Fx FT MD", "Fx FT FD"])
+def test_with_noise_there_is_an_answer(wire, rng, using):
+    number, sigma = 300, np.repeat([1e-3, 20e-6], 3)
+    load = vb.PointForce(
+        rng.uniform(0.35, 0.99, number) * wire.whisker.length,
+        rng.uniform(10e-3, 50e-3, number),
+        rng.uniform(-np.pi, np.pi, number),
+    )
+    bent = vb.deflect(wire.whisker, load)
+    signals = vb.base_signals(*noisy_wrenches(bent.force, bent.moment, rng, sigma))
+    found = wire.estimate(signals, using, np.diag(sigma**2))
+    answered = np.isin(found.status, [vb.Status.UNIQUE, vb.Status.AMBIGUOUS])
+    assert answered.mean() > 0.99
+    assert np.isfinite(found.covariance[answered]).all()
+    moved = found.misfit > 1e-6
+    assert moved.mean() > 0.02  # those had no answer without noise
+    without = wire.estimate(signals, using)
+    assert (without.n_candidates[moved] == 0).mean() > 0.95
+    assert (without.n_candidates[answered & ~moved] > 0).all()
+
+
+def test_an_answer_beside_the_map_is_the_contact_of_least_misfit(gamma_map, beside_slip_off):
+    """No true contact has a smaller χ² of its own noise, in the signals' own deviations."""
+    force, moment, point = beside_slip_off
+    measured = vb.base_signals(force, moment)
+    sigma = {"Fx": 1e-6, "MB": 2.5e-8, "MD": 0.01}
+    found = gamma_map.estimate(measured, tuple(sigma), sigma)
+    moved = np.flatnonzero(found.misfit > 1e-3)
+    assert moved.size > 20
+    true = vb.deflect(gamma_map.whisker, vb.PointContact(point[moved]))
+
+    def misfit(signals):
+        away = [measured[name].to_numpy()[moved] - signals[name].to_numpy() for name in sigma]
+        away[2] = np.angle(np.exp(1j * away[2]))
+        return sum((a / one) ** 2 for a, one in zip(away, sigma.values(), strict=True))
+
+    own = misfit(vb.base_signals(found.force[moved], found.moment[moved]))
+    # Size and direction of M are fitted as components: the same to second order in the noise.
+    np.testing.assert_allclose(own, found.misfit[moved], rtol=1e-2)
+    assert (own <= 1.01 * misfit(vb.base_signals(true.force, true.moment)) + 1e-3).all()
+
+
+def test_probabilities_are_how_often_candidates_are_true(gamma_map, rng):
+    """Calibration: of candidates called 5-35 and 35-65 % probable as many are the truth."""
+    force, moment, point = contacts_of(gamma_map, 0.05, 0.9, 2000, rng)
+    noisy = noisy_wrenches(force, moment, rng)
+    found = gamma_map.estimate(vb.base_signals(*noisy), "Fx FT MB", np.diag(SIGMA**2))
+    several = found.n_candidates > 1
+    assert several.sum() > 100
+    chance = found.candidate_probabilities[several]
+    np.testing.assert_allclose(np.nansum(chance, axis=1), 1.0)
+    assert (np.diff(chance, axis=1)[np.isfinite(chance[:, 1:])] <= 0.0).all()
+    assert ((found.probability > 0.95) == (found.status == vb.Status.UNIQUE))[several].all()
+    away = found.candidates[several] - point[several, None]
+    away = np.linalg.norm(away, axis=2)
+    true = away == np.nanmin(away, axis=1, keepdims=True)
+    for low, high in ((0.05, 0.35), (0.35, 0.65)):
+        within = (chance > low) & (chance <= high)
+        error = 0.5 / np.sqrt(within.sum())
+        assert abs(true[within].mean() - chance[within].mean()) < 3.0 * error + 0.05
+
+
+def test_what_is_unique_is_the_truth(gamma_map, rng):
+    """Other contacts are not taken for it, though these signals often have two."""
+    force, moment, point = contacts_of(gamma_map, 0.05, 0.9, 3000, rng)
+    noisy = noisy_wrenches(force, moment, rng)
+    found = gamma_map.estimate(vb.base_signals(*noisy), "Fx FT MD", np.diag(SIGMA**2))
+    rows = found.status == vb.Status.UNIQUE
+    assert 0.6 < rows.mean() < 0.9
+    assert (distances(found, point, rows) > BEYOND).mean() < 0.012
+
+
+@pytest.mark.parametrize("using", ["Fx MB MD", "Fx FT MB", "Fx FT MB MD"])
+def test_a_stream_answers_as_a_batch_beside_the_map(gamma_map, beside_slip_off, using):
+    signals = vb.base_signals(beside_slip_off[0], beside_slip_off[1])
+    batch = gamma_map.estimate(signals, using, np.diag(SIGMA**2))
+    rows = np.stack([signals[name] for name in using.split()], axis=-1)
+    locate = vb.Estimator(gamma_map, using, np.diag(SIGMA**2))
+    lost = np.flatnonzero(gamma_map.estimate(signals, using).n_candidates == 0)[:20]
+    for i in [*range(20), *lost]:
+        locate.reset()
+        one = locate(rows[i])
+        assert one.status == batch.status[i]
+        assert one.linear == batch.linear[i]
+        np.testing.assert_allclose(one.point, batch.point[i], atol=2e-3 * SIGMA[3] / SIGMA[0])
+        np.testing.assert_allclose(one.probability, batch.probability[i], atol=0.02)
+
+
+def test_without_noise_nothing_is_probable(gamma_map, beside_slip_off):
+    signals = vb.base_signals(beside_slip_off[0][:20], beside_slip_off[1][:20])
+    found = gamma_map.estimate(signals)
+    assert np.isnan(found.probability).all()
+    assert not found.linear.any()
+    assert set(found.to_dataset().probability.dims) == set(found.dims)
+
+
+def test_ranks_are_probabilities(rng):
+    weight = rng.normal(size=(50, 6)) * 10.0
+    number = rng.integers(0, 7, 50)
+    probability, order = ranked(weight, number)
+    for row, n in enumerate(number):
+        assert sorted(order[row]) == list(range(6))
+        expected = np.exp(weight[row, order[row, :n]])
+        np.testing.assert_allclose(probability[row, :n], expected / expected.sum(), rtol=1e-12)
+        assert (np.diff(probability[row, :n]) <= 0.0).all()
+        assert np.isnan(probability[row, n:]).all()

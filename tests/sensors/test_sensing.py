@@ -1,0 +1,462 @@
+"""A sensor described once serves both ways, and known loads give back what it is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+import vibrissa as vb
+from vibrissa.cli.information import info
+from vibrissa.sensors import (
+    Sensor,
+    SensorFrame,
+    calibrate_frame,
+    calibrate_mixing,
+    calibrate_on_contacts,
+    calibrate_weight,
+    fit_stiffness,
+    load_sensor,
+    save_sensor,
+    tare,
+)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(4)
+
+
+@pytest.fixture(scope="module")
+def wire():
+    """Steel, 300 mm, 1 mm thick at the base."""
+    return vb.Whisker.straight(
+        0.3, base_radius=0.5e-3, tip_radius=0.25e-3, youngs_modulus=200e9, poisson_ratio=0.29
+    )
+
+
+@pytest.fixture(scope="module")
+def touched(wire):
+    rng = np.random.default_rng(5)
+    bearing = rng.uniform(-np.pi, np.pi, 60)
+    load = vb.PointForce(rng.uniform(0.1, 0.3, 60), rng.uniform(0.01, 0.08, 60), bearing)
+    return vb.deflect(wire, load)
+
+
+def wrench_of(bent):
+    return np.concatenate([bent.force, bent.moment], axis=-1)
+
+
+def frames(rng, n):
+    for i in range(n):
+        turn = Rotation.random(random_state=rng.integers(1 << 30)).as_matrix()
+        if i % 2:
+            turn = turn @ np.diag([1.0, 1.0, -1.0])
+        yield SensorFrame(turn, rng.normal(size=3) * 5e-3, reaction=bool(i // 2 % 2))
+
+
+def test_a_force_has_the_moment_of_its_place_in_any_right_handed_frame(rng):
+    """The frame is checked by geometry: the same force at the same place, in both frames."""
+    for frame in list(frames(rng, 8))[::2]:
+        place, force = rng.normal(size=(2, 3))
+        at_base = np.concatenate([force, np.cross(place, force)])
+        sign = -1.0 if frame.reaction else 1.0
+        own_place = frame.axes.T @ (place - frame.position)
+        own_force = sign * frame.axes.T @ force
+        seen = np.concatenate([own_force, np.cross(own_place, own_force)])
+        np.testing.assert_allclose(frame.to_base() @ seen, at_base, atol=1e-12)
+
+
+def test_a_left_hand_has_moments_of_its_own_numbers(rng):
+    frame = SensorFrame(("x", "-y", "z"), (0.0, 0.0, 0.01))
+    assert frame.handedness == -1
+    place, force = rng.normal(size=(2, 3))
+    own_place = frame.axes.T @ (place - frame.position)
+    own_force = frame.axes.T @ force
+    seen = np.concatenate([own_force, np.cross(own_place, own_force)])
+    at_base = np.concatenate([force, np.cross(place, force)])
+    np.testing.assert_allclose(frame.to_base() @ seen, at_base, atol=1e-12)
+    np.testing.assert_allclose(frame.from_base() @ at_base, seen, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("given_axes", "message"),
+    [
+        (("x", "x", "y"), "once each"),
+        (np.diag([1.0, 1.0, 2.0]), "right angles"),
+        (np.eye(2), "three columns"),
+    ],
+)
+def test_what_are_no_axes_is_refused(given_axes, message):
+    with pytest.raises(ValueError, match=message):
+        SensorFrame(given_axes)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_felt_and_to_wrench_undo_read(seed):
+    rng = np.random.default_rng(seed)
+    frame = next(frames(rng, 1))
+    k = int(rng.integers(6, 9))
+    sensor = Sensor(
+        [f"c{i}" for i in range(k)],
+        rng.normal(size=(k, 6)),
+        noise=0.0,
+        bias=rng.normal(size=k),
+        frame=frame,
+        mass=0.01,
+        mass_moment=rng.normal(size=3) * 1e-4,
+    )
+    wrench = rng.normal(size=(5, 6))
+    turn = Rotation.random(5, random_state=seed).as_matrix()
+    reading = sensor.read(np.arange(5.0), wrench, rotation=turn)
+    found, _ = sensor.to_wrench(reading, turn)
+    np.testing.assert_allclose(found, wrench, rtol=1e-6, atol=1e-7)
+    with pytest.raises(ValueError, match="carries a mass"):
+        sensor.felt(reading)
+
+
+def test_the_covariance_of_a_wrench_is_that_of_its_scatter(rng):
+    sensor = Sensor(
+        [f"c{i}" for i in range(8)], rng.normal(size=(8, 6)), noise=rng.uniform(0.1, 1.0, 8)
+    )
+    reading = sensor.read(np.arange(4000.0), np.zeros((4000, 6)))
+    found, covariance = sensor.to_wrench(reading)
+    np.testing.assert_allclose(np.cov(found.T), covariance, atol=0.08 * covariance.max())
+
+
+def test_too_few_channels_make_no_wrench():
+    with pytest.raises(ValueError, match="do not tell all six"):
+        Sensor(("Fx", "My", "Mz")).to_wrench(np.zeros((2, 3)))
+
+
+def test_a_sensor_is_read_as_it_was_written(tmp_path, rng):
+    sensor = Sensor(
+        ("strain a", "strain b"),
+        rng.normal(size=(2, 6)),
+        noise=[1e-3, 2e-3],
+        bias=[0.1, -0.2],
+        resolution=1e-4,
+        relative_noise=0.01,
+        frame=next(frames(rng, 1)),
+        mass=0.02,
+        mass_moment=(1e-5, 0.0, 2e-5),
+    )
+    save_sensor(tmp_path / "sensor.toml", sensor)
+    same = load_sensor(tmp_path / "sensor.toml")
+    assert same.channels == sensor.channels
+    np.testing.assert_allclose(same.base_mixing, sensor.base_mixing, rtol=1e-12)
+    for name in ("noise", "bias", "resolution", "mass_moment"):
+        np.testing.assert_array_equal(getattr(same, name), getattr(sensor, name))
+    np.testing.assert_array_equal(same.covariance([1.0, 2.0]), sensor.covariance([1.0, 2.0]))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("channels = 3", "no sensor"),
+        ('channels = ["Fx"]\nnois = 1.0', "has nois"),
+        ('channels = ["Fx"\n', "it is no TOML"),
+        ('[frame]\naxes = ["x", "y", "y"]', "once each"),
+    ],
+)
+def test_a_file_that_describes_no_sensor_is_refused(tmp_path, text, message):
+    (tmp_path / "sensor.toml").write_text(text)
+    with pytest.raises(ValueError, match=message):
+        load_sensor(tmp_path / "sensor.toml")
+
+
+def test_mixing_and_offset_are_found_as_surely_as_said(wire, touched, rng):
+    """Over repeated calibrations errors have the variances that each calibration states."""
+    true = Sensor(
+        ("a", "b"),
+        [[0, 2.0, 0, 0, 0, 30.0], [0, 0, 1.5, 0, -20.0, 0]],
+        noise=[2e-3, 3e-3],
+        bias=[0.5, -1.0],
+    )
+    which = [1, 2, 4, 5]
+    errors = []
+    for seed in range(40):
+        readings = true.read(np.arange(60.0), wrench_of(touched), seed)
+        found = calibrate_on_contacts(
+            wire, touched.contact_point, readings, components=("Fy", "Fz", "My", "Mz")
+        )
+        away = np.column_stack(
+            [found.sensor.mixing[:, which] - true.mixing[:, which], found.sensor.bias - true.bias]
+        )
+        errors.append(
+            [e @ np.linalg.solve(c, e) for e, c in zip(away, found.covariance, strict=True)]
+        )
+    assert np.mean(errors) == pytest.approx(5.0, rel=0.2)
+    np.testing.assert_allclose(found.sensor.noise, true.noise, rtol=0.3)
+
+
+def test_mixing_that_contacts_do_not_tell_is_refused(wire, touched, rng):
+    """A straight whisker never twists; contacts in one plane leave the other open."""
+    readings = rng.normal(size=(60, 2))
+    with pytest.raises(ValueError, match="say nothing about Mx"):
+        calibrate_on_contacts(wire, touched.contact_point, readings)
+    load = vb.PointForce(np.full(20, 0.2), np.linspace(0.01, 0.08, 20), np.zeros(20))
+    planar = wrench_of(vb.deflect(wire, load))
+    with pytest.raises(ValueError, match="Fz"):
+        calibrate_mixing(readings[:20], planar, components=("Fy", "Fz"))
+    with pytest.raises(ValueError, match="do not determine 7 unknowns"):
+        calibrate_mixing(readings[:3], np.eye(6)[:3])
+
+
+def test_a_contact_that_is_not_possible_is_said(wire):
+    with pytest.raises(ValueError, match="1 of 2 contacts are not possible"):
+        calibrate_on_contacts(wire, [[0.2, 0.01, 0.0], [0.5, 0.0, 0.0]], np.zeros((2, 1)))
+
+
+@pytest.mark.parametrize("number", range(4))
+def test_any_frame_is_found_from_known_loads(rng, number):
+    frame = list(frames(rng, 4))[number]
+    force = rng.normal(size=(30, 3)) * 0.2
+    loads = np.concatenate([force, np.cross(rng.normal(size=(30, 3)) * 0.05, force)], axis=1)
+    noise = np.repeat([1e-3, 1e-5], 3)
+    away = []
+    for _ in range(30):
+        seen = loads @ frame.from_base().T + noise * rng.normal(size=(30, 6))
+        found = calibrate_frame(seen, loads, force_noise=1e-3, moment_noise=1e-5)
+        assert found.frame.handedness == frame.handedness
+        assert found.frame.reaction == frame.reaction
+        turn = Rotation.from_matrix(found.frame.axes @ frame.axes.T).as_rotvec()
+        error = np.concatenate([turn, found.frame.position - frame.position])
+        away.append(error @ np.linalg.solve(found.covariance, error))
+    assert np.mean(away) == pytest.approx(6.0, rel=0.35)
+
+
+def test_loads_that_leave_the_frame_open_are_refused(rng):
+    force = np.outer(rng.uniform(0.1, 1.0, 10), [0.0, 0.0, 1.0])
+    loads = np.concatenate([force, np.zeros((10, 3))], axis=1)
+    with pytest.raises(ValueError, match="one line"):
+        calibrate_frame(loads, loads, force_noise=1e-3, moment_noise=1e-5)
+    force = rng.normal(size=(10, 3)) * [1.0, 1.0, 0.0]
+    loads = np.concatenate([force, np.cross([0.0, 0.0, 0.01], force)], axis=1)
+    with pytest.raises(ValueError, match="one plane"):
+        calibrate_frame(loads, loads, force_noise=1e-3, moment_noise=1e-5)
+
+
+def test_offset_and_weight_are_found_from_free_poses(rng):
+    true = Sensor(noise=np.repeat([1e-3, 1e-5], 3), bias=rng.normal(size=6), mass=0.03)
+    true = Sensor(noise=true.noise, bias=true.bias, mass=0.03, mass_moment=(1e-4, 2e-4, -3e-4))
+    turn = Rotation.random(25, random_state=3).as_matrix()
+    readings = true.read(np.arange(25.0), np.zeros((25, 6)), seed=1, rotation=turn)
+    found = calibrate_weight(Sensor(noise=true.noise), readings, turn)
+    away = np.concatenate(
+        [
+            found.sensor.bias - true.bias,
+            [found.sensor.mass - true.mass],
+            found.sensor.mass_moment - true.mass_moment,
+        ]
+    )
+    assert away @ np.linalg.solve(found.covariance, away) < 25.0  # χ² of 10
+    assert np.abs(found.sensor.felt(readings, turn)).max() < 5e-3
+    tared = calibrate_weight(Sensor(noise=true.noise), readings[:1])
+    assert np.abs(tared.sensor.felt(readings[:1])).max() < 1e-12
+    drifted = Sensor(noise=true.noise, bias=true.bias + 0.1, mass=0.03, mass_moment=(1e-4, 0, 0))
+    later = drifted.read(np.arange(400.0), np.zeros((400, 6)), rotation=[turn[3]] * 400)
+    again = tare(Sensor(noise=true.noise, mass=0.03, mass_moment=(1e-4, 0, 0)), later, turn[3])
+    np.testing.assert_allclose(again.bias, drifted.bias, atol=5 * 1e-3 / 20)
+    with pytest.raises(ValueError, match="no reading without NaN"):
+        tare(Sensor(), np.full((2, 6), np.nan))
+    still = np.broadcast_to(turn[0], (25, 3, 3))
+    with pytest.raises(ValueError, match="hold the whisker free in more orientations"):
+        calibrate_weight(Sensor(), readings, still)
+
+
+def test_moments_alone_weigh_no_mass(rng):
+    true = Sensor(("My", "Mz"), noise=1e-6, bias=[1e-3, 2e-3], mass=0.05, mass_moment=(3e-4, 0, 0))
+    turn = Rotation.random(25, random_state=3).as_matrix()
+    readings = true.read(np.arange(25.0), np.zeros((25, 6)), rotation=turn)
+    found = calibrate_weight(Sensor(("My", "Mz"), noise=1e-6), readings, turn)
+    assert found.sensor.mass == 0.0
+    np.testing.assert_allclose(found.sensor.mass_moment, true.mass_moment, atol=1e-6)
+    assert np.abs(found.sensor.felt(readings, turn)).max() < 1e-5
+
+
+def test_stiffness_is_found_as_surely_as_said(wire, touched):
+    """The truth is 12 % stiffer; radius known to 2 %, so the modulus to 8 %."""
+    sensor = Sensor(noise=np.repeat([0.02, 1e-3], 3))
+    stiff = wire.with_properties(youngs_modulus=1.12 * wire.youngs_modulus)
+    bent = vb.deflect(stiff, vb.PointContact(touched.contact_point))
+    away = []
+    for seed in range(30):
+        readings = sensor.read(np.arange(60.0), wrench_of(bent), seed)
+        found = fit_stiffness(wire, touched.contact_point, readings, sensor)
+        true = stiff.base_bending_stiffness
+        away.append(np.log(found.stiffness / true) / found.stiffness_sigma)
+    assert np.mean(np.square(away)) == pytest.approx(1.0, rel=0.5)
+    assert found.misfit == pytest.approx(1.0, rel=0.2)
+    assert found.radius == wire.base_radius
+    assert found.radius_sigma == 0.02
+    expected = np.hypot(4.0 * 0.02, found.stiffness_sigma)
+    assert found.modulus_sigma == pytest.approx(expected, rel=1e-9)
+    by = np.array([1.0, 4.0])  # what loads do tell
+    assert np.sqrt(by @ found.covariance @ by) == pytest.approx(found.stiffness_sigma, rel=1e-6)
+    assert found.whisker.base_bending_stiffness == pytest.approx(found.stiffness, rel=1e-12)
+
+
+def test_prior_uncertainty_decides_what_moves(wire, touched):
+    bent = vb.deflect(
+        wire.with_properties(youngs_modulus=1.1 * wire.youngs_modulus),
+        vb.PointContact(touched.contact_point),
+    )
+    sensor = Sensor(noise=np.repeat([1e-5, 1e-6], 3))
+    given = (wire, touched.contact_point, wrench_of(bent), sensor)
+    exact_modulus = fit_stiffness(*given, modulus_sigma=0.0, radius_sigma=np.inf)
+    assert exact_modulus.modulus == wire.youngs_modulus
+    assert exact_modulus.radius == pytest.approx(1.1**0.25 * wire.base_radius, rel=1e-6)
+    both = fit_stiffness(*given, modulus_sigma=0.08, radius_sigma=0.02)
+    assert both.modulus == pytest.approx(1.1**0.5 * wire.youngs_modulus, rel=1e-6)
+    assert both.stiffness == pytest.approx(1.1 * wire.base_bending_stiffness, rel=1e-6)
+    with pytest.raises(ValueError, match="E r⁴ only"):
+        fit_stiffness(*given, modulus_sigma=np.inf, radius_sigma=np.inf)
+
+
+def test_taper_is_found_where_contacts_lie_at_several_places(wire, touched):
+    sensor = Sensor(noise=np.repeat([1e-3, 1e-4], 3))
+    true = wire.with_properties(base_radius=wire.base_radius, tip_radius=0.35e-3)
+    bent = vb.deflect(true, vb.PointContact(touched.contact_point))
+    readings = sensor.read(np.arange(60.0), wrench_of(bent))
+    found = fit_stiffness(wire, touched.contact_point, readings, sensor, taper=True)
+    assert abs(np.log(found.taper / 0.7)) < 4.0 * found.taper_sigma
+    assert found.taper_sigma < 0.05
+    blind = fit_stiffness(wire, touched.contact_point, readings, sensor)
+    assert blind.misfit > 3.0
+
+
+def test_two_moments_tell_stiffness_too(wire, touched):
+    sensor = Sensor(("My", "Mz"), noise=1e-4)
+    readings = sensor.read(np.arange(60.0), wrench_of(touched))
+    found = fit_stiffness(wire, touched.contact_point, readings, sensor)
+    away = np.log(found.stiffness / wire.base_bending_stiffness) / found.stiffness_sigma
+    assert abs(away) < 4.0
+    with pytest.raises(ValueError, match="do not grow with the loads: check"):
+        fit_stiffness(wire, touched.contact_point, -readings, sensor)
+
+
+def test_a_weight_that_comes_out_negative_is_said(rng):
+    """Far from zero it is a fault of sign; within noise there is no mass."""
+    turn = Rotation.random(25, random_state=3).as_matrix()
+    noise = np.repeat([1e-3, 1e-5], 3)
+    heavy = Sensor(noise=noise, mass=0.03)
+    readings = heavy.read(np.arange(25.0), np.zeros((25, 6)), rotation=turn)
+    with pytest.raises(ValueError, match=r"weigh -30 ± .* g.*reaction"):
+        calibrate_weight(Sensor(noise=noise), readings, turn, gravity=(0.0, 0.0, 9.81))
+    bias = rng.normal(size=6)
+    empty = Sensor(noise=noise, bias=bias)
+    found = [
+        calibrate_weight(
+            Sensor(noise=noise), empty.read(np.arange(25.0), np.zeros((25, 6)), seed), turn
+        )
+        for seed in range(6)
+    ]
+    weightless = [one for one in found if one.sensor.mass == 0.0]
+    assert 0 < len(weightless) < 6
+    for one in weightless:
+        assert not one.covariance[6].any()
+        away = one.sensor.bias - bias
+        assert away @ np.linalg.solve(one.covariance[:6, :6], away) < 25.0
+
+
+def test_contacts_that_are_not_known_are_left_out(wire, touched):
+    readings = wrench_of(touched)[:, [4, 5]]
+    points = touched.contact_point.copy()
+    points[3] = np.nan
+    found, clean = (
+        calibrate_on_contacts(wire, p, y, components=("My", "Mz"))
+        for p, y in (
+            (points, readings),
+            (np.delete(points, 3, axis=0), np.delete(readings, 3, axis=0)),
+        )
+    )
+    np.testing.assert_allclose(found.sensor.mixing, clean.sensor.mixing, rtol=1e-9)
+    with pytest.raises(ValueError, match="none of 60 rows"):
+        calibrate_on_contacts(wire, np.full((60, 3), np.nan), readings)
+    with pytest.raises(ValueError, match=r"points are \(n, 3\)"):
+        calibrate_on_contacts(wire, points[:, :2], readings)
+
+
+def test_contacts_that_leave_something_open_are_refused_by_name(wire):
+    """All in one plane, all at one place, too few."""
+    flat = vb.deflect(wire, vb.PointForce(np.linspace(0.1, 0.3, 20), 0.03, np.zeros(20)))
+    readings = np.zeros((20, 2))
+    with pytest.raises(ValueError, match="say nothing about Fz, My: touch the whisker at other"):
+        calibrate_on_contacts(
+            wire, flat.contact_point, readings, components=("Fy", "Fz", "My", "Mz")
+        )
+    with pytest.raises(ValueError, match="3 equations do not determine 5 unknowns: touch"):
+        calibrate_on_contacts(
+            wire, flat.contact_point[:3], readings[:3], components=("Fy", "Fz", "My", "Mz")
+        )
+
+
+@pytest.mark.parametrize(
+    ("time", "said"), [([0.0, 0.2, 0.1], "0.1 s after 0.2 s"), ([0.0, np.nan, 1.0], "nan s")]
+)
+def test_time_that_falls_or_is_not_finite_is_refused(time, said):
+    with pytest.raises(ValueError, match=said):
+        Sensor(drift=1e-6).read(time, np.zeros((3, 6)))
+    with pytest.raises(ValueError, match=r"wrenches \(n, 6\) are needed"):
+        Sensor().read(np.arange(3.0), np.zeros((2, 6)))
+
+
+def test_a_saturated_reading_tells_nothing(tmp_path):
+    sensor = Sensor(("My", "Mz"), noise=1e-9, bias=[0.5, 0.0], largest=[1.0, np.inf])
+    readings = sensor.read(np.arange(3.0), np.outer([0.1, 0.4, 3.0], [0, 0, 0, 0, 1.0, 1.0]))
+    assert readings[2, 0] == 1.0
+    felt = sensor.felt(readings)
+    np.testing.assert_allclose(felt[:2, 0], [0.1, 0.4], atol=1e-7)
+    assert np.isnan(felt[2, 0])
+    assert np.isfinite(felt[:, 1]).all()
+    save_sensor(tmp_path / "sensor.toml", sensor)
+    np.testing.assert_array_equal(load_sensor(tmp_path / "sensor.toml").largest, sensor.largest)
+    with pytest.raises(ValueError, match=r"largest is 0\.0; it must be positive"):
+        Sensor(largest=0.0)
+
+
+def test_components_in_other_units_need_one_number(rng):
+    wrench = rng.normal(size=(3, 6))
+    sensor = Sensor(mixing=1e3, noise=1e-9)  # mN and mN·m
+    np.testing.assert_allclose(sensor.read(np.arange(3.0), wrench), 1e3 * wrench, rtol=1e-6)
+    two = Sensor(("Fx", "Mz"), mixing=[1e3, 1e6])
+    assert (two.mixing[0, 0], two.mixing[1, 5], np.count_nonzero(two.mixing)) == (1e3, 1e6, 2)
+    with pytest.raises(ValueError, match="one number a channel"):
+        Sensor(("Fx", "Mz"), mixing=[1e3, 1e3, 1e3])
+
+
+def test_usual_mistakes_of_calibrations_are_said(wire, touched, rng):
+    """Another unit, rotations the wrong way, a base taken for the tip, a diameter for a radius."""
+    noise = np.repeat([1e-3, 1e-5], 3)
+    loads = rng.normal(size=(12, 6))
+    with pytest.raises(ValueError, match=r"1e\+03 times the loads"):
+        calibrate_frame(1e3 * loads, loads, force_noise=1e-3, moment_noise=1e-5)
+    turn = Rotation.random(25, random_state=3).as_matrix()
+    heavy = Sensor(noise=noise, mass=0.03, mass_moment=(3e-4, 0, 0), largest=[9.0, *5 * [8.0]])
+    readings = heavy.read(np.arange(25.0), np.zeros((25, 6)), rotation=turn)
+    with pytest.warns(UserWarning, match="turn the whisker's into the laboratory frame"):
+        calibrate_weight(Sensor(noise=noise), readings, turn.transpose(0, 2, 1))
+    with pytest.warns(UserWarning, match="carry 30 kg"):
+        calibrate_weight(Sensor(noise=1e3 * noise), 1e3 * readings, turn)
+    readings[0, 0] = 9.0  # saturated
+    assert calibrate_weight(replace(heavy, mass=0.0), readings, turn).misfit < 2.0
+    points, wrench = touched.contact_point, wrench_of(touched)
+    thin = wire.with_properties(base_radius=0.25e-3, tip_radius=0.5e-3)
+    assert "thicker than the base" in repr(thin)
+    with pytest.warns(UserWarning, match="which end is the base"):
+        fit_stiffness(thin, points, wrench, Sensor(noise=noise))
+    thick = wire.scaled(radius_factor=2.0)
+    with pytest.warns(UserWarning, match=r"E r⁴ 0\.0625 times .* whether the radius is a diameter"):
+        fit_stiffness(thick, points, wrench, Sensor(noise=noise), modulus_sigma=0.1)
+
+
+def test_a_sensor_file_can_be_looked_into(tmp_path, capsys):
+    frame = SensorFrame(("x", "-z", "-y"), (-0.03, 0.0, 0.0))
+    save_sensor(tmp_path / "s.toml", Sensor(("My",), mixing=1e3, noise=0.1, frame=frame, mass=0.01))
+    info(tmp_path / "s.toml")
+    said = capsys.readouterr().out
+    for part in ("1000 My + 0, noise 0.1", "left-handed, origin at (-30.00", "10 g"):
+        assert part in said

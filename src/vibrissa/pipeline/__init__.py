@@ -22,6 +22,7 @@ from vibrissa.pipeline.signals import (
 )
 from vibrissa.pipeline.stages import (
     STAGES,
+    due_stages,
     with_contour,
     with_estimates,
     with_group,
@@ -42,6 +43,7 @@ __all__ = [
     "contour_points",
     "default_source",
     "distances_by_class",
+    "due_stages",
     "estimates_of",
     "fit_contacts",
     "in_laboratory",

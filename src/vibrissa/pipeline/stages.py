@@ -6,6 +6,7 @@ it makes anew. Nothing else of the recording is touched, and the recording given
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,40 @@ from vibrissa.pipeline.signals import signals_of
 
 STAGES = ("signals", "estimates", "contour")
 """Groups in the order in which they are made."""
+
+
+def due_stages(recording: xr.DataTree, last: str, asked: Collection[str] = ()) -> tuple[str, ...]:
+    """List the stages that have to be made so that the last one is new.
+
+    Parameters
+    ----------
+    recording : xarray.DataTree
+        Recording to be worked on.
+    last : {"signals", "estimates", "contour"}
+        Stage that is wanted; it is always due.
+    asked : collection of str
+        Earlier stages that are to be made anew even if they are there.
+
+    Returns
+    -------
+    tuple of str
+        Names in the order in which they are to be made. A stage before the last is due if it is
+        missing, if it is asked for, or if one that it depends on is asked for.
+
+    Raises
+    ------
+    ValueError
+        If there is no such stage.
+    """
+    for name in (last, *asked):
+        if name not in STAGES:
+            raise ValueError(f"the stage is called {name!r}; one of {', '.join(STAGES)} is needed")
+    first = STAGES.index(last)
+    for number in reversed(range(first)):
+        if STAGES[number] in recording.children and not set(asked) & set(STAGES[: number + 1]):
+            break
+        first = number
+    return STAGES[first : STAGES.index(last) + 1]
 
 
 def with_group(recording: xr.DataTree, name: str, dataset: xr.Dataset) -> xr.DataTree:
@@ -101,7 +136,7 @@ def with_estimates(
     xarray.DataTree
         With it.
     """
-    if "signals" not in recording.children:
+    if "signals" in due_stages(recording, "estimates"):
         recording = with_signals(recording, whiskers=options.get("whiskers"))
     estimates = estimates_of(recording, *args, progress=progress, **options)
     return with_group(recording, "estimates", estimates)
@@ -128,6 +163,6 @@ def with_contour(
     xarray.DataTree
         With it.
     """
-    if "estimates" not in recording.children:
+    if "estimates" in due_stages(recording, "contour"):
         recording = with_estimates(recording, whiskers=options.get("whiskers"), progress=progress)
     return with_group(recording, "contour", reconstruct(recording, *args, **options))

@@ -86,12 +86,12 @@ def tracked() -> Iterator[Row]:
 
 def estimated() -> Iterator[Row]:
     whisker = vb.samples.gamma()
-    chart = vb.ContactMap.simulate(whisker, grid=False)
+    contact_map = vb.ContactMap.simulate(whisker, grid=False)
     for count in (100, 1_000, 10_000, 100_000):
-        signals = draw_contacts(chart, count, seed=1).signals
+        signals = draw_contacts(contact_map, count, seed=1).signals
         known = {name: signals[:, SIGNALS.index(name)] for name in TRIPLET}
-        chart.estimate({name: known[name][:10] for name in known}, TRIPLET)
-        _, seconds = timed(lambda known=known: chart.estimate(known, TRIPLET))
+        contact_map.estimate({name: known[name][:10] for name in known}, TRIPLET)
+        _, seconds = timed(lambda known=known: contact_map.estimate(known, TRIPLET))
         yield f"estimate, ({', '.join(TRIPLET)})", f"{count} frames", seconds, seconds / count, ""
 
 

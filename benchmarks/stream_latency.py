@@ -57,7 +57,7 @@ def measured(locate, rows):
 
 def main(samples, path=None):
     whisker = vb.samples.gamma()
-    contacts = vb.ContactMap.simulate(whisker, grid=False)
+    contact_map = vb.ContactMap.simulate(whisker, grid=False)
     bent = glide(whisker, samples)
     wrench = np.concatenate([bent.force, bent.moment], axis=1)
     wrench += NOISE * np.random.default_rng(0).normal(size=wrench.shape)
@@ -74,27 +74,27 @@ def main(samples, path=None):
     ):
         felt = clean if noise is None else signals
         rows = np.stack([felt[name].to_numpy() for name in names], axis=-1)
-        cases[what] = (vb.Estimator(contacts, names, noise), rows)
+        cases[what] = (vb.Estimator(contact_map, names, noise), rows)
     rows = np.stack([clean[name].to_numpy() for name in SIGNALS], axis=-1)
     rubbed = rows * np.where(np.arange(6) == 0, 1.5, 1.0)
     cases["six signals that no contact explains"] = (
-        vb.Estimator(contacts, SIGNALS, covariance),
+        vb.Estimator(contact_map, SIGNALS, covariance),
         rubbed[: samples // 5],
     )
     mixing = np.random.default_rng(3).normal(size=(4, 6)) / np.repeat([1e-5, 2e-7], 3)
     mixed = Sensor("abcd", mixing, np.sqrt(mixing**2 @ NOISE**2))
     cases["four channels that mix all components"] = (
-        vb.Estimator.of_sensor(contacts, mixed),
+        vb.Estimator.of_sensor(contact_map, mixed),
         wrench @ mixing.T,
     )
     pair = Sensor(("My", "Mz"), noise=NOISE[4:])
     cases["two moments: a curve of contacts"] = (
-        vb.Estimator.of_sensor(contacts, pair),
+        vb.Estimator.of_sensor(contact_map, pair),
         wrench[: samples // 10, 4:],
     )
     filters = {
-        "filter, three signals": vb.Estimator(contacts, ("Fx", "MB", "MD"), covariance),
-        "filter, two moments": vb.Estimator.of_sensor(contacts, pair),
+        "filter, three signals": vb.Estimator(contact_map, ("Fx", "MB", "MD"), covariance),
+        "filter, two moments": vb.Estimator.of_sensor(contact_map, pair),
     }
     for what, estimator in filters.items():
         rows = np.stack([signals[name].to_numpy() for name in ("Fx", "MB", "MD")], axis=-1)

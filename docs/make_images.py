@@ -67,8 +67,8 @@ def witness(whisker: vb.Whisker, found: xr.Dataset, triplet: str) -> Figure:
 def c2() -> Figure:
     """A witness for a whisker that is more curved than the γ whisker."""
     whisker = vb.Whisker.parabola(length=40e-3, coefficient=20.5, name="A·L = 0.82")
-    contacts = vb.ContactMap.simulate(whisker, grid=False)
-    found = vb.uniqueness(contacts, ["Fx MB MD"], ["all"], resolution=False)
+    contact_map = vb.ContactMap.simulate(whisker, grid=False)
+    found = vb.uniqueness(contact_map, ["Fx MB MD"], ["all"], resolution=False)
     return witness(whisker, found, "Fx MB MD")
 
 

@@ -55,7 +55,7 @@ FITTED: dict[str, Any] = {
 }
 
 
-def title_picture(trial: xr.DataTree, chart: vb.ContactMap) -> Figure:
+def title_picture(trial: xr.DataTree, contact_map: vb.ContactMap) -> Figure:
     """Draw a trial with signals, estimates and a fitted peg, of one whisker and its map."""
     course = course_of(trial)
     assert course.signals is not None
@@ -65,7 +65,7 @@ def title_picture(trial: xr.DataTree, chart: vb.ContactMap) -> Figure:
     fit = shape_from_dataset(trial["contour"].to_dataset())
     assert isinstance(peg, Peg)
     assert isinstance(fit, CylinderFit)
-    samples, line = chart.to_dataset(), chart.whisker.centerline(101)
+    samples, line = contact_map.to_dataset(), contact_map.whisker.centerline(101)
     now = trial["signals"].to_dataset().isel(whisker=0, time=moment)
     with looking():
         figure = sized_figure(WIDTH, HEIGHT)

@@ -33,9 +33,9 @@ read_force, read_moment = (
 )
 
 # %% Three signals that know of no friction, and the wrench
-contacts = vb.ContactMap.simulate(whisker, grid=False)
+contact_map = vb.ContactMap.simulate(whisker, grid=False)
 signals = vb.base_signals(read_force, read_moment)
-three = contacts.estimate(signals, ("Fx", "MB", "MD"))
+three = contact_map.estimate(signals, ("Fx", "MB", "MD"))
 six = vb.estimate_from_wrench(whisker, read_force, read_moment, noise=noise)
 for i, mu in enumerate(friction):
     true = bent.contact_point[i]

@@ -18,9 +18,9 @@ folder = Path(sys.argv[1] if len(sys.argv) > 1 else "output")
 folder.mkdir(parents=True, exist_ok=True)
 
 whisker = vb.samples.gamma()
-contacts = vb.ContactMap.simulate(whisker, grid=False)
-samples = contacts.to_dataset()
-print(contacts)
+contact_map = vb.ContactMap.simulate(whisker, grid=False)
+samples = contact_map.to_dataset()
+print(contact_map)
 
 # %% How far it can be pushed aside, and how hard, before it slips off
 length = whisker.length

@@ -29,8 +29,8 @@ save_signals(folder / "signals.csv", trial.to_dataset())
 
 # %% Your own is read in the same way, with vb.load_whisker("whisker.csv") as whisker
 wrench = load_signals(folder / "signals.csv")
-contacts = vb.ContactMap.simulate(whisker, grid=False)
-found = locate(contacts, wrench, ("Fx", "MB", "MD"), noise=component_noise(1e-6, 2e-8))
+contact_map = vb.ContactMap.simulate(whisker, grid=False)
+found = locate(contact_map, wrench, ("Fx", "MB", "MD"), noise=component_noise(1e-6, 2e-8))
 save_contacts(folder / "contacts.csv", contact_columns(found))
 # The same on the command line: vibrissa estimate signals.csv --whisker whisker.csv -o contacts.csv
 

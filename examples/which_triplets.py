@@ -15,9 +15,9 @@ from vibrissa.identifiability import verdict_table
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "output")
 folder.mkdir(parents=True, exist_ok=True)
 
-contacts = vb.ContactMap.simulate(vb.samples.gamma(), grid=False)
+contact_map = vb.ContactMap.simulate(vb.samples.gamma(), grid=False)
 triplets = ["Fx MB MD", "Fx FD MD", "Mx MB MD"]
-verdicts = vb.uniqueness(contacts, triplets, ["all", "CF", "CB"], samples=512, resolution=False)
+verdicts = vb.uniqueness(contact_map, triplets, ["all", "CF", "CB"], samples=512, resolution=False)
 print(verdict_table(verdicts))
 
 # %% How surely: pairs that feel the same are proofs, found to rounding

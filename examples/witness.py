@@ -20,8 +20,8 @@ folder.mkdir(parents=True, exist_ok=True)
 
 triplet = "Fx MB MD"
 whisker = vb.Whisker.parabola(length=40e-3, coefficient=20.5)
-contacts = vb.ContactMap.simulate(whisker, grid=False)
-verdicts = vb.uniqueness(contacts, [triplet], ["all"], samples=1024, resolution=False)
+contact_map = vb.ContactMap.simulate(whisker, grid=False)
+verdicts = vb.uniqueness(contact_map, [triplet], ["all"], samples=1024, resolution=False)
 found = verdicts.sel(triplet=triplet, region="all")
 print(
     f"({triplet}) is {found.verdict.item()};",
@@ -38,7 +38,7 @@ for name in felt:
     print(f"{name}: {one:.10g} and {other:.10g} {felt[name].attrs['units']}")
 
 # %% An estimator that is asked gives both, and says so
-estimate = contacts.estimate(felt.isel(sample=0), tuple(triplet.split()))
+estimate = contact_map.estimate(felt.isel(sample=0), tuple(triplet.split()))
 print(vb.Status(int(estimate.status)).explanation)
 print("candidates, mm:", (1e3 * estimate.candidates).round(2).tolist())
 

@@ -114,11 +114,11 @@ def main(seeds=3):
     print(f"{'':31}{head}   (least force, filter)")
     everything = []
     for name, (whisker, sigma) in WHISKERS.items():
-        contacts = vb.ContactMap.simulate(whisker, grid=False)
+        contact_map = vb.ContactMap.simulate(whisker, grid=False)
         trials = list(touches(whisker))
         for names in TRIPLETS:
             runs = [
-                followed(contacts, trial, names, sigma, seed + 10 * i)
+                followed(contact_map, trial, names, sigma, seed + 10 * i)
                 for i, trial in enumerate(trials)
                 for seed in range(seeds)
             ]

@@ -51,14 +51,14 @@ def drawn(contacts):
 def located(force_noise, moment_noise):
     """Contact points and, by set of signals, what is found."""
     whisker = vb.samples.gamma()
-    contacts = vb.ContactMap.simulate(whisker, grid=False)
-    point, force, rng = drawn(contacts)
+    contact_map = vb.ContactMap.simulate(whisker, grid=False)
+    point, force, rng = drawn(contact_map)
     moment = np.cross(point, force)
     felt_force = force + force_noise * rng.standard_normal(force.shape)
     felt_moment = moment + moment_noise * rng.standard_normal(moment.shape)
     noise = np.diag([force_noise] * 3 + [moment_noise] * 3) ** 2
     felt = vb.base_signals(felt_force, felt_moment)
-    found = {" ".join(names): contacts.estimate(felt, names, noise=noise) for names in SETS}
+    found = {" ".join(names): contact_map.estimate(felt, names, noise=noise) for names in SETS}
     found[WRENCH] = vb.estimate_from_wrench(whisker, felt_force, felt_moment, noise=noise)
     return point, found
 

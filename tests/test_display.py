@@ -68,8 +68,8 @@ def test_without_an_answer_nothing_is_drawn_but_the_reason_is_told():
 
 
 def test_a_map_shows_where_contacts_are_and_their_signals():
-    contacts = vb.ContactMap.simulate(WHISKER, grid=False)
-    html = contacts._repr_html_()
+    contact_map = vb.ContactMap.simulate(WHISKER, grid=False)
+    html = contact_map._repr_html_()
     (top, _front) = paths(html, CONTACT)
     assert len(top) == MOST_POINTS
     for name in ("F_x", "F_T", "F_D", "M_x", "M_B", "M_D"):
@@ -82,8 +82,8 @@ def test_estimates_show_points_and_their_uncertainty(bent, whole):
     if whole:
         found = vb.estimate_from_wrench(WHISKER, bent.force, bent.moment, noise=noise)
     else:
-        contacts = vb.ContactMap.simulate(WHISKER, grid=False)
-        found = contacts.estimate(vb.base_signals(bent.force, bent.moment), noise=noise)
+        contact_map = vb.ContactMap.simulate(WHISKER, grid=False)
+        found = contact_map.estimate(vb.base_signals(bent.force, bent.moment), noise=noise)
     html = found._repr_html_()
     assert len(paths(html, CONTACT)[0]) == 5
     sigma = np.sqrt(np.einsum("nii->ni", found.covariance).max(axis=1))
@@ -102,8 +102,8 @@ def test_a_recording_shows_what_it_holds():
 
 
 def test_verdicts_show_as_a_table():
-    contacts = vb.ContactMap.simulate(vb.Whisker.straight(40e-3), grid=False)
-    found = vb.uniqueness(contacts, triplets=["Fx MB MD"], regions=["all"], samples=256)
+    contact_map = vb.ContactMap.simulate(vb.Whisker.straight(40e-3), grid=False)
+    found = vb.uniqueness(contact_map, triplets=["Fx MB MD"], regions=["all"], samples=256)
     seen = vb.show(found)
     assert "<th" in seen._repr_html_()
     assert "Fx MB MD" in seen._repr_html_()

@@ -103,18 +103,18 @@ def chart(whisker: Whisker) -> ContactMap:
     return ContactMap.simulate(whisker, grid=False)
 
 
-def located(way: str, trial: xr.DataTree, contacts: ContactMap) -> xr.Dataset:
+def located(way: str, trial: xr.DataTree, contact_map: ContactMap) -> xr.Dataset:
     """Contacts from the sensor's wrench, whisker frame."""
     wrench = trial.to_dataset()[["force", "moment"]].isel(whisker=0)
     if way != WRENCH:
         names = SIGNALS if way == SIX else tuple(way.split())
-        return locate(contacts, wrench, names, noise=NOISE)
-    found = locate_from_wrench(contacts.whisker, wrench, NOISE)
+        return locate(contact_map, wrench, names, noise=NOISE)
+    found = locate_from_wrench(contact_map.whisker, wrench, NOISE)
     rows = found["in_contact"].values
     force, moment = (wrench[name].values[rows] for name in ("force", "moment"))
     sigma = np.full(rows.size, np.nan)
     sigma[rows] = vb.estimate_from_wrench(
-        contacts.whisker, force, moment, noise=NOISE
+        contact_map.whisker, force, moment, noise=NOISE
     ).friction_angle_sigma
     return found.assign(friction_angle_sigma=("time", sigma))
 

@@ -89,11 +89,11 @@ def peg(result: DemoResult) -> str:
 def draws(duration: float, number: int) -> str:
     """The peg from one trial with so many draws of the sensor's noise, true pose."""
     whisker = vb.samples.gamma()
-    chart, thing = vb.ContactMap.simulate(whisker, grid=False), facing_peg(whisker)
+    contact_map, thing = vb.ContactMap.simulate(whisker, grid=False), facing_peg(whisker)
     trial = simulate(whisker, sweep_past(whisker, thing, duration), thing)
     away = []
     for seed in range(number):
-        felt = with_contour(with_estimates(measure(trial, seed=seed), contact_maps=[chart]))
+        felt = with_contour(with_estimates(measure(trial, seed=seed), contact_maps=[contact_map]))
         fit = shape_from_dataset(felt["contour"].to_dataset())
         (true,) = recorded_objects(felt)
         assert isinstance(fit, CylinderFit)

@@ -74,8 +74,8 @@ def test_stated_errors_are_in_what_estimate_writes(folder, tmp_path, bent, how):
     force, moment = np.hsplit(bent[0], 2)
     noise = np.diag(NOISE**2)
     if how:
-        contacts, names = ContactMap.load(folder / "map.nc"), how[1]
-        found = contacts.estimate(vb.base_signals(force, moment), names, noise, **sigmas)
+        contact_map, names = ContactMap.load(folder / "map.nc"), how[1]
+        found = contact_map.estimate(vb.base_signals(force, moment), names, noise, **sigmas)
     else:
         found = vb.estimate_from_wrench(vb.samples.gamma(), force, moment, noise=noise, **sigmas)
     one = found.status == Status.UNIQUE

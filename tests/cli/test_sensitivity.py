@@ -49,8 +49,8 @@ def wrench(points):
 def test_the_whole_map(chart):
     out = chart.with_name("sensitivity.nc")
     text = run("sensitivity", chart, "-o", out)
-    contacts = vb.ContactMap.load(chart)
-    wanted = vb.sensitivity(contacts, noise=NOISE)
+    contact_map = vb.ContactMap.load(chart)
+    wanted = vb.sensitivity(contact_map, noise=NOISE)
     with xr.open_dataset(out, engine="h5netcdf") as data:
         assert data.attrs["kind"] == "vibrissa sensitivity"
         np.testing.assert_array_equal(data["sensitivity"], wanted["sensitivity"])
@@ -58,7 +58,7 @@ def test_the_whole_map(chart):
         np.testing.assert_array_equal(data["small_deflection"], wanted["small_deflection"])
     median = float(vb.sensitivity_findings(wanted).median_size.sel(coordinate="r", signal="MB"))
     assert f"r MB {median * 1e-3:.3g} mm/(µN·m)" in text
-    best = vb.best_triplet(contacts, NOISE)
+    best = vb.best_triplet(contact_map, NOISE)
     winner = str(best.triplet[np.argmax(best.share.values)].values)
     assert f"{winner} {100 * float(best.share.max()):.1f} %" in text
     assert f"wrote {out}" in text

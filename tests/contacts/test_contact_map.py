@@ -93,8 +93,8 @@ def test_the_papers_grid(tmp_path):
     """Signals on it are those of point contacts; unreachable points say why."""
     calls = []
     whisker = vb.samples.gamma()
-    contacts = vb.ContactMap.simulate(whisker, progress=lambda done, total: calls.append(done))
-    grid = contacts.grid
+    contact_map = vb.ContactMap.simulate(whisker, progress=lambda done, total: calls.append(done))
+    grid = contact_map.grid
     assert grid.status.shape == (15, 131, 121)
     assert calls == list(range(1, 16))
     reached = (grid.status == vb.Status.OK).to_numpy()
@@ -107,5 +107,5 @@ def test_the_papers_grid(tmp_path):
     np.testing.assert_allclose(spherical(point), [r, theta, phi], rtol=1e-12)
     bent = vb.deflect(whisker, vb.PointContact(point))
     np.testing.assert_allclose(bent.moment, grid.moment[i, j, k], rtol=1e-9)
-    contacts.save(tmp_path / "map.nc")
+    contact_map.save(tmp_path / "map.nc")
     xr.testing.assert_identical(vb.ContactMap.load(tmp_path / "map.nc").grid, grid)

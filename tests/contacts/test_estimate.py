@@ -81,17 +81,17 @@ def test_round_trip_on_the_default_whisker(gamma_map, rng):
     ids=["straight", "strongly curved", "thin tip", "robot, out of plane"],
 )
 def test_round_trip_on_other_whiskers(whisker, rng):
-    contacts = vb.ContactMap.simulate(whisker, grid=False)
-    hit, cone, *_ = recovered(contacts, CANONICAL, 4000, rng)
+    contact_map = vb.ContactMap.simulate(whisker, grid=False)
+    hit, cone, *_ = recovered(contact_map, CANONICAL, 4000, rng)
     assert hit[~cone].mean() >= 0.999
 
 
 def test_the_compliant_base_is_part_of_the_inversion(rng):
     whisker = vb.Whisker.parabola(0.04, 10.0, base_stiffness=(2e-5, 1e-5))
-    contacts = vb.ContactMap.simulate(whisker, grid=False)
+    contact_map = vb.ContactMap.simulate(whisker, grid=False)
     # Such a base folds the map from contacts to these signals; of two contacts next to that fold
     # one may be missed.
-    hit, cone, *_ = recovered(contacts, CANONICAL, 4000, rng)
+    hit, cone, *_ = recovered(contact_map, CANONICAL, 4000, rng)
     assert hit[~cone].mean() >= 0.998
 
 

@@ -395,8 +395,8 @@ def test_wrong_questions_are_answered_with_what_is_allowed(straight, arguments, 
 def test_what_only_coarse_steps_make_equal_is_no_witness():
     # Near the base few steps are left: there the rod errs by more than twins' signals differ.
     whisker = vb.Whisker.parabola(40e-3, 10.0)
-    contacts = vb.ContactMap.simulate(whisker, grid=False, proximal=0.1)
-    found = vb.uniqueness(contacts, ["Fx MB MD"], samples=512, resolution=False)
+    contact_map = vb.ContactMap.simulate(whisker, grid=False, proximal=0.1)
+    found = vb.uniqueness(contact_map, ["Fx MB MD"], samples=512, resolution=False)
     assert (found.verdict == "unique").all()
     assert float(found.critical_cone.max()) < np.deg2rad(1.5)
 

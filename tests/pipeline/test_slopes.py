@@ -43,11 +43,11 @@ def point_and_normal(arc_length, contact_force, point):
 )
 def test_contacts_move_with_the_wrench_as_the_gain_says(names):
     bent = vb.deflect(WHISKER, LOAD)
-    contacts = vb.ContactMap.simulate(WHISKER, grid=False)
+    contact_map = vb.ContactMap.simulate(WHISKER, grid=False)
     noise = np.diag(np.repeat([1e-12, 4e-16], 3))
 
     def found(force, moment):
-        e = contacts.estimate(base_signals(force, moment), names, noise)
+        e = contact_map.estimate(base_signals(force, moment), names, noise)
         return point_and_normal(
             e.candidate_arc_lengths[:, 0], e.candidate_contact_forces[:, 0], e.point
         )
@@ -77,10 +77,10 @@ def test_contacts_that_rub_move_as_the_gain_says():
 def test_the_covariance_is_that_of_the_map():
     """With noise so small that the first order, which slopes are, is all there is."""
     bent = vb.deflect(WHISKER, LOAD)
-    contacts = vb.ContactMap.simulate(WHISKER, grid=False)
+    contact_map = vb.ContactMap.simulate(WHISKER, grid=False)
     noise = 1e-8 * np.diag([1e-12, 4e-12, 1e-12, 1e-16, 4e-16, 9e-16])
     for names in (("Fx", "MB", "MD"), ("Fx", "FT", "Mx", "MB", "MD")):
-        found = contacts.estimate(base_signals(bent.force, bent.moment), names, noise)
+        found = contact_map.estimate(base_signals(bent.force, bent.moment), names, noise)
         gain = gains(
             WHISKER,
             names,

@@ -121,9 +121,9 @@ def written(folder):
 @pytest.fixture(scope="module")
 def map_page(folder):
     """The page of the map, with verdicts, and the words that make it; figures are small."""
-    contacts = ContactMap.load(folder / "map.nc")
+    contact_map = ContactMap.load(folder / "map.nc")
     verdicts = vb.uniqueness(
-        contacts, [("Fx", "MB", "MD"), ("FT", "FD", "MD")], ["all", "ELD"], samples=256
+        contact_map, [("Fx", "MB", "MD"), ("FT", "FD", "MD")], ["all", "ELD"], samples=256
     )
     vb.identifiability.save_uniqueness(verdicts, folder / "uniqueness.nc")
     words = (folder / "map.nc", "--uniqueness", folder / "uniqueness.nc")
@@ -365,7 +365,7 @@ def test_the_same_command_gives_the_same_page(map_page, folder, monkeypatch):
 
 
 def test_a_map_with_verdicts(map_page, folder):
-    contacts = ContactMap.load(folder / "map.nc")
+    contact_map = ContactMap.load(folder / "map.nc")
     verdicts = dataset_with(folder / "uniqueness.nc", "verdict")
     page = Page(map_page[0].read_text(encoding="utf-8"))
     nothing_is_loaded(page)
@@ -380,7 +380,7 @@ def test_a_map_with_verdicts(map_page, folder):
     for row in page.tables["Farthest contacts that feel the same"][1:]:
         apart = float(verdicts["witness_separation"].sel(triplet=row[0]).max())
         assert number(row[2]) == pytest.approx(1e3 * apart, abs=1e-3)
-    samples = contacts.to_dataset()
+    samples = contact_map.to_dataset()
     ranges = {row[0]: row[1:] for row in page.tables["Over all contacts of the map"]}
     most = number(ranges["bending moment (µN·m)"][1])
     assert most == pytest.approx(1e6 * float(samples["MB"].max()), rel=1e-3)

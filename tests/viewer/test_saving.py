@@ -41,10 +41,10 @@ def test_a_bent_whisker_is_a_labelled_dataset(tmp_path):
 
 
 def test_a_map_comes_back(tmp_path):
-    contacts = vb.ContactMap.simulate(vb.samples.curved(), grid=False, cells=(8, 16, 8))
-    (tmp_path / "map.nc").write_bytes(map_netcdf(contacts))
+    contact_map = vb.ContactMap.simulate(vb.samples.curved(), grid=False, cells=(8, 16, 8))
+    (tmp_path / "map.nc").write_bytes(map_netcdf(contact_map))
     back = vb.ContactMap.load(tmp_path / "map.nc")
-    np.testing.assert_array_equal(back.chart.values, contacts.chart.values)
+    np.testing.assert_array_equal(back.chart.values, contact_map.chart.values)
 
 
 def test_a_trial_comes_back(tmp_path, recording):

@@ -66,15 +66,15 @@ def chart(
     tell_notes(chosen)
     with progress_bars() as tell:
         tell("map of all contacts", 0, 1)
-        contacts = ContactMap.simulate(
+        contact_map = ContactMap.simulate(
             chosen,
             grid=grid,
             progress=lambda done, total: tell("map of all contacts", done, total),
             proximal=smallest_arc(proximal),
         )
         tell("map of all contacts", 1, 1)
-        contacts.save(path)
-    output.print(repr(contacts), highlight=False, soft_wrap=True)
+        contact_map.save(path)
+    output.print(repr(contact_map), highlight=False, soft_wrap=True)
     output.print(f"wrote {path}", highlight=False, soft_wrap=True)
 
 

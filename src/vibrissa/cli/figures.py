@@ -147,15 +147,15 @@ def dataset_with(path: Path, needed: str) -> xr.Dataset:
 
 
 def map_drawings(
-    contacts: ContactMap, width: Any, verdicts: xr.Dataset | None, cones: xr.Dataset | None
+    contact_map: ContactMap, width: Any, verdicts: xr.Dataset | None, cones: xr.Dataset | None
 ) -> Iterator[tuple[str, Draw]]:
     """Say what can be drawn of a map."""
     from vibrissa import plots
 
-    whisker = contacts.whisker
+    whisker = contact_map.whisker
     line = whisker.centerline(_NODES)
     radius = whisker.radius(np.linspace(0.0, whisker.length, _NODES))
-    samples = contacts.to_dataset()
+    samples = contact_map.to_dataset()
     assumed = whisker.assumed
     yield (
         "whisker",
@@ -163,8 +163,8 @@ def map_drawings(
     )
     yield "signal_space", lambda: plots.signal_clouds(samples, line, width=width)
     yield "contact_surfaces", lambda: plots.contact_surfaces(samples, line, width=width)
-    yield "sensitivity", lambda: plots.sensitivity_panels(_derivatives(contacts), width=width)
-    yield "solid", lambda: plots.solid_slices(*_solid(contacts), width=width)
+    yield "sensitivity", lambda: plots.sensitivity_panels(_derivatives(contact_map), width=width)
+    yield "solid", lambda: plots.solid_slices(*_solid(contact_map), width=width)
     if cones is not None:
         yield "critical_cones", lambda: plots.critical_cones(cones, width=width)
     if verdicts is None:
@@ -177,18 +177,18 @@ def map_drawings(
         yield f"witness_{name.replace(' ', '_')}", drawn
 
 
-def _derivatives(contacts: ContactMap) -> xr.Dataset:
+def _derivatives(contact_map: ContactMap) -> xr.Dataset:
     """Derivatives at the paper's contacts, which fill the panels best, or at the map's."""
     from vibrissa.identifiability import sensitivity
 
-    return sensitivity(contacts, at=None if contacts.grid is None else "grid")
+    return sensitivity(contact_map, at=None if contact_map.grid is None else "grid")
 
 
-def _solid(contacts: ContactMap) -> tuple[xr.Dataset, xr.Dataset | None]:
+def _solid(contact_map: ContactMap) -> tuple[xr.Dataset, xr.Dataset | None]:
     """The slice at M_D = −π/2, and all contacts with the errors of a look-up in the grid."""
     from vibrissa.identifiability import error_solid, signal_slice
 
-    return signal_slice(contacts), None if contacts.grid is None else error_solid(contacts)
+    return signal_slice(contact_map), None if contact_map.grid is None else error_solid(contact_map)
 
 
 def witnesses(whisker: Whisker, verdicts: xr.Dataset) -> Iterator[tuple[str, xr.Dataset]]:

@@ -163,8 +163,10 @@ def _signal_frames(
     from vibrissa.cli.trial_views import map_of
     from vibrissa.plots import signal_frames
 
-    contacts = map_of(trial, chart, whisker, tell)
-    return signal_frames(course, contacts.to_dataset(), contacts.whisker.centerline(101), rows)
+    contact_map = map_of(trial, chart, whisker, tell)
+    return signal_frames(
+        course, contact_map.to_dataset(), contact_map.whisker.centerline(101), rows
+    )
 
 
 def _contour_frames(

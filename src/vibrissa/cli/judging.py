@@ -74,11 +74,11 @@ def uniqueness(
     if path is not None:
         check_writable(path, ENDINGS)
         free([path], force)
-    contacts = map_from(chart)
+    contact_map = map_from(chart)
     with progress_bars() as tell:
         tell("verdicts", 0, 1)
         found = judge(
-            contacts,
+            contact_map,
             triplets or "all",
             regions or "all",
             cone=float(np.deg2rad(cone)),
@@ -89,7 +89,7 @@ def uniqueness(
             network=network,
             progress=lambda done, total: tell("verdicts", done, total),
         )
-    output.print(f"{contacts.whisker!r}\n", highlight=False, soft_wrap=True)
+    output.print(f"{contact_map.whisker!r}\n", highlight=False, soft_wrap=True)
     output.print(verdict_table(found), highlight=False, soft_wrap=True, markup=False)
     _print_witness(found)
     if path is not None:

@@ -186,13 +186,13 @@ def _of_map(
     from vibrissa.cli.sources import map_from
     from vibrissa.report import chart_sections, reachable_space, space_section
 
-    contacts = map_from(path)
+    contact_map = map_from(path)
     verdicts = None if uniqueness is None else dataset_with(uniqueness, "verdict")
-    sections = chart_sections(contacts, verdicts)
-    drawings = dict(map_drawings(contacts, "double", verdicts, None))
+    sections = chart_sections(contact_map, verdicts)
+    drawings = dict(map_drawings(contact_map, "double", verdicts, None))
     if not _can_draw():
         return sections, "", drawings
-    picture = reachable_space(contacts.to_dataset(), contacts.whisker.centerline(101))
+    picture = reachable_space(contact_map.to_dataset(), contact_map.whisker.centerline(101))
     section, script = space_section(picture, "All contacts that the whisker can hold.")
     return [*sections, section], script, drawings
 

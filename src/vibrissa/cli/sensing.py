@@ -57,18 +57,18 @@ def sensitivity(
         check_writable(path, NETCDF)
         free([path], force)
     names = selection([name.strip() for name in triplet.split(",")], exactly=3)
-    contacts = map_from(chart)
+    contact_map = map_from(chart)
     noise = np.diag(np.repeat([(force_noise * 1e-6) ** 2, (moment_noise * 1e-6) ** 2], 3))
     at = None if trial is None else _contacts_of(trial, moment_noise * 1e-6)
     with progress_bars() as tell:
         tell("derivatives", 0, 2)
-        found = derivatives(contacts, names, at, noise=noise)
+        found = derivatives(contact_map, names, at, noise=noise)
         tell("derivatives", 1, 2)
-        rivals = best_triplet(contacts, noise, at)
+        rivals = best_triplet(contact_map, noise, at)
         tell("derivatives", 2, 2)
     if not weights(found).any():
         raise ValueError(f"{trial or chart} holds no contact farther than 2° from rest")
-    output.print(f"{contacts.whisker!r}", highlight=False, soft_wrap=True)
+    output.print(f"{contact_map.whisker!r}", highlight=False, soft_wrap=True)
     output.print(_derivative_table(found, sensitivity_findings(found)))
     output.print(_rival_table(rivals, names, force_noise, moment_noise))
     if path is not None:

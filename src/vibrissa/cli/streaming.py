@@ -381,7 +381,7 @@ def _map(chart: Path | None, whisker: Path | None, proximal: float | None) -> Co
 
 
 def _estimator(
-    contacts: ContactMap,
+    contact_map: ContactMap,
     sensor: Sensor | None,
     signals: str,
     noise: tuple[float, float],
@@ -398,10 +398,10 @@ def _estimator(
         stiffness = beforehand.errors.get("stiffness_sigma", 0.0)
         if tare:
             sensor = sensor.with_new_offset(tare)
-        return Estimator.of_sensor(contacts, sensor, stiffness, felt, prior)
+        return Estimator.of_sensor(contact_map, sensor, stiffness, felt, prior)
     covariance = np.diag(np.repeat([1e-6 * noise[0], 1e-6 * noise[1]], 3) ** 2)
     return Estimator(
-        contacts, signals, covariance, felt_above=felt, prior=prior, **beforehand.errors
+        contact_map, signals, covariance, felt_above=felt, prior=prior, **beforehand.errors
     )
 
 

@@ -80,7 +80,7 @@ class Beginning:
     """Makes Gaussians of what one measurement tells."""
 
     def __init__(self, estimator: Estimator) -> None:
-        self._readout, self._chart = estimator.readout, estimator.contacts.chart
+        self._readout, self._chart = estimator.readout, estimator.contact_map.chart
         how = self._readout.how
         self._names = tuple(CHANNELS[code] for code in how.codes)
         # Noise alone, which differs from sample to sample.

@@ -217,7 +217,7 @@ class Estimate:
 
 
 def estimate(
-    contacts: ContactMap,
+    contact_map: ContactMap,
     signals: xr.Dataset | Mapping[str, ArrayLike],
     triplet: str | tuple[str, ...] = ("Fx", "MB", "MD"),
     noise: Mapping[str, float] | ArrayLike | None = None,
@@ -235,12 +235,12 @@ def estimate(
     values, dims, coords = measured(signals, names)
     check_signals(values, names)
     shape = values.shape[:-1]
-    d = contacts.chart.discretization
+    d = contact_map.chart.discretization
     targets = values.reshape(-1, len(names)) / signal_scales(names, d.force, d.moment)
-    found = explain(contacts, names, targets, sensor)
+    found = explain(contact_map, names, targets, sensor)
     if prior is not None:
-        readout = Named(contacts, names, sensor)
-        found = among_allowed(prior, contacts, readout, targets, found)
+        readout = Named(contact_map, names, sensor)
+        found = among_allowed(prior, contact_map, readout, targets, found)
     most = max(1, int(found.number.max(initial=0)))
 
     def whole(array: AnyArray) -> AnyArray:
@@ -270,15 +270,15 @@ def estimate(
 
 
 def _exact(
-    contacts: ContactMap, names: tuple[str, ...], targets: Array, sensor: SensorNoise | None
+    contact_map: ContactMap, names: tuple[str, ...], targets: Array, sensor: SensorNoise | None
 ) -> Explanation:
-    if not contacts.determines(names):
+    if not contact_map.determines(names):
         return undetermined(targets)
     if len(names) == 3:
-        found = by_triplet(contacts, names, targets)
+        found = by_triplet(contact_map, names, targets)
     else:
-        found = by_least_squares(contacts, names, targets, sensor)
-    return found if sensor is None else under_noise(contacts, names, targets, sensor, found)
+        found = by_least_squares(contact_map, names, targets, sensor)
+    return found if sensor is None else under_noise(contact_map, names, targets, sensor, found)
 
 
 def _method(

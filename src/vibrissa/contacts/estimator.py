@@ -42,7 +42,7 @@ class Estimator:
 
     Parameters
     ----------
-    contacts : ContactMap
+    contact_map : ContactMap
         The whisker's map.
     triplet : str or sequence of str
         The signals that the stream carries, in this order; fewer than three do not determine a
@@ -71,7 +71,7 @@ class Estimator:
 
     def __init__(
         self,
-        contacts: ContactMap,
+        contact_map: ContactMap,
         triplet: str | Sequence[str] = ("Fx", "MB", "MD"),
         noise: Mapping[str, float] | ArrayLike | None = None,
         stiffness_sigma: float = 0.0,
@@ -87,12 +87,12 @@ class Estimator:
         self._order: list[int] | None = [order.index(name) for name in names]
         if felt_above > 0.0 and sensor is None:
             raise ValueError("what is felt is judged by the noise, and there is none")
-        self._start(contacts, Named(contacts, names, sensor), len(names), felt_above, prior)
+        self._start(contact_map, Named(contact_map, names, sensor), len(names), felt_above, prior)
 
     @classmethod
     def of_sensor(
         cls,
-        contacts: ContactMap,
+        contact_map: ContactMap,
         sensor: Sensor,
         stiffness_sigma: float = 0.0,
         felt_above: float = 0.0,
@@ -102,7 +102,7 @@ class Estimator:
 
         Parameters
         ----------
-        contacts : ContactMap
+        contact_map : ContactMap
             The whisker's map.
         sensor : Sensor
             What it reads, how it is mounted, its noise and the errors of its gain, mixing and
@@ -133,15 +133,15 @@ class Estimator:
         if not h.any():
             raise ValueError("the sensor's channels read nothing of force and moment")
         errors = np.concatenate([by_stiffness(h, stiffness_sigma), sensor.common_errors])
-        readout = readout_of(contacts, h, covariance, errors)
+        readout = readout_of(contact_map, h, covariance, errors)
         out._order = None
-        out._start(contacts, readout, len(sensor.channels), felt_above, prior)
+        out._start(contact_map, readout, len(sensor.channels), felt_above, prior)
         out._sensor = sensor
         return out
 
     def _start(
         self,
-        contacts: ContactMap,
+        contact_map: ContactMap,
         readout: ByName | Named | Mixed,
         width: int,
         felt_above: float,
@@ -153,19 +153,19 @@ class Estimator:
         self._components = readout if isinstance(readout, ByName) else None
         self.readout = readout.named if isinstance(readout, ByName) else readout
         self._width = width
-        self.contacts = contacts
+        self.contact_map = contact_map
         told, named = self.readout.told, isinstance(self.readout, Named)
-        self._determining = told < _UNKNOWNS or not named or contacts.determines(self.names)
+        self._determining = told < _UNKNOWNS or not named or contact_map.determines(self.names)
         self._search = self._chosen_search()
 
     def _chosen_search(self) -> ExactSearch | LeastSquaresSearch | SetSearch:
         """How contacts are looked for, by how many independent numbers a measurement tells."""
-        contacts, readout = self.contacts, self.readout
+        contact_map, readout = self.contact_map, self.readout
         if readout.told < _UNKNOWNS:
-            return SetSearch(contacts, readout)
+            return SetSearch(contact_map, readout)
         if isinstance(readout, Named) and len(readout.names) == _UNKNOWNS:
-            return ExactSearch(contacts, readout)
-        return LeastSquaresSearch(contacts, readout)
+            return ExactSearch(contact_map, readout)
+        return LeastSquaresSearch(contact_map, readout)
 
     @property
     def noisy(self) -> bool:
@@ -262,7 +262,7 @@ class Estimator:
             if self.prior is None:
                 return found
             return located_where_allowed(
-                self.prior, self.contacts, self.readout, measurement, found
+                self.prior, self.contact_map, self.readout, measurement, found
             )
         self._search.forget()
         return nowhere(nothing)

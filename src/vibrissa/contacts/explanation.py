@@ -34,10 +34,10 @@ class Bounds(NamedTuple):
     largest: Array
 
     @classmethod
-    def of(cls, contacts: ContactMap, names: tuple[str, ...]) -> Bounds:
+    def of(cls, contact_map: ContactMap, names: tuple[str, ...]) -> Bounds:
         """Find them for signals of a map."""
         sizes = [k for k, name in enumerate(names) if not CIRCULAR[SIGNALS.index(name)]]
-        values = contacts.chart.values.reshape(-1, 6)
+        values = contact_map.chart.values.reshape(-1, 6)
         known = signals_of(values[:, :3], np.cross(values[:, 3:], values[:, :3]))
         largest = np.abs(known[:, [SIGNALS.index(names[k]) for k in sizes]]).max(axis=0)
         # M_x is next to nothing on a planar whisker, but for that noise in it is not out of bounds.
@@ -92,32 +92,32 @@ class Explanation(NamedTuple):
         )
 
 
-def by_triplet(contacts: ContactMap, names: tuple[str, ...], targets: Array) -> Explanation:
+def by_triplet(contact_map: ContactMap, names: tuple[str, ...], targets: Array) -> Explanation:
     """Find the contacts that give three signals exactly."""
-    found = invert(contacts.chart, contacts.tree(names), names, targets)
+    found = invert(contact_map.chart, contact_map.tree(names), names, targets)
     status = np.where(found.number == 1, int(Status.UNIQUE), int(Status.AMBIGUOUS))
     misfit = np.zeros(len(targets))
     missing = ~np.isfinite(targets).all(axis=1)
     status[missing], misfit[missing] = int(Status.MISSING), np.nan
     rows = np.flatnonzero((found.number == 0) & ~missing)
     if rows.size:
-        status[rows], misfit[rows] = why_none(contacts, names, targets[rows])
+        status[rows], misfit[rows] = why_none(contact_map, names, targets[rows])
     xi = with_normal_force(found.contacts.reshape(-1, 3)).reshape(*found.contacts.shape[:2], 4)
     return Explanation.without_noise(found.number, xi, found.values, misfit, status)
 
 
 def by_least_squares(
-    contacts: ContactMap, names: tuple[str, ...], targets: Array, sensor: SensorNoise | None
+    contact_map: ContactMap, names: tuple[str, ...], targets: Array, sensor: SensorNoise | None
 ) -> Explanation:
     """Find the contacts that explain more than three signals best."""
     n = len(targets)
     status, misfit = np.full(n, int(Status.MISSING)), np.full(n, np.nan)
     known = np.isfinite(targets).all(axis=1)
-    bounds = Bounds.of(contacts, names)
+    bounds = Bounds.of(contact_map, names)
     nothing, beyond = bounds.nothing(targets) & known, bounds.exceeded(targets) & known
     status[nothing], status[beyond] = int(Status.DEGENERATE), int(Status.OUTSIDE_MAP)
     rows = np.flatnonzero(known & ~nothing & ~beyond)
-    found, status[rows] = least_squares(contacts, names, targets[rows], sensor)
+    found, status[rows] = least_squares(contact_map, names, targets[rows], sensor)
     misfit[rows] = found.misfits[:, 0]
     most = found.contacts.shape[1]
     number, xi = np.zeros(n, np.int64), np.full((n, most, 3), np.nan)
@@ -145,11 +145,11 @@ def undetermined(targets: Array) -> Explanation:
 
 
 def why_none(
-    contacts: ContactMap, names: tuple[str, ...], targets: Array
+    contact_map: ContactMap, names: tuple[str, ...], targets: Array
 ) -> tuple[IntArray, Array]:
     """Say why three signals have no contact."""
-    chart, turned = contacts.chart, circular_among(names)
-    known, size, tree, bounds = seen(contacts, names)
+    chart, turned = contact_map.chart, circular_among(names)
+    known, size, tree, bounds = seen(contact_map, names)
     _, nearest = tree.query(_on_circle(targets, turned, size))
     away = within_turn(known[nearest] - targets, turned)
     span = np.where(turned, 2.0 * np.pi, size)
@@ -165,15 +165,15 @@ def why_none(
 
 
 @lru_cache(maxsize=16)
-def seen(contacts: ContactMap, names: tuple[str, ...]) -> tuple[Array, Array, cKDTree, Bounds]:
+def seen(contact_map: ContactMap, names: tuple[str, ...]) -> tuple[Array, Array, cKDTree, Bounds]:
     """Signals (n, k) at the chart's nodes, their ranges, the same as a tree, and their bounds."""
-    values = contacts.chart.values.reshape(-1, 6)
+    values = contact_map.chart.values.reshape(-1, 6)
     which = [SIGNALS.index(name) for name in names]
     known = signals_of(values[:, :3], np.cross(values[:, 3:], values[:, :3]))[:, which]
     turned = circular_among(names)
     size = np.where(turned, 1.0, np.ptp(known, axis=0))
     tree = cKDTree(_on_circle(known, turned, size))
-    return known, size, tree, Bounds.of(contacts, names)
+    return known, size, tree, Bounds.of(contact_map, names)
 
 
 def _on_circle(values: Array, turned: AnyArray, size: Array) -> Array:

@@ -21,9 +21,9 @@ _KIND = "vibrissa contact map"
 _NODE = ("station", "bearing", "load")
 
 
-def save_map(contacts: ContactMap, path: Path) -> None:
+def save_map(contact_map: ContactMap, path: Path) -> None:
     """Write a map; a file that exists is replaced only when the new one is complete."""
-    chart = contacts.chart
+    chart = contact_map.chart
     raw = xr.Dataset(
         {
             "stations": ("station", chart.stations),
@@ -41,13 +41,13 @@ def save_map(contacts: ContactMap, path: Path) -> None:
     )
     for name, variable in raw.data_vars.items():
         variable.attrs |= {"units": "1", "long_name": f"chart: {name}, non-dimensional"}
-    root = contacts.to_dataset()
-    root.attrs |= {"kind": _KIND, "steps": contacts.steps}
-    groups = {"/": root, "whisker": contacts.whisker.to_dataset(), "chart": raw}
-    if contacts.grid is not None:
-        groups["grid"] = contacts.grid
+    root = contact_map.to_dataset()
+    root.attrs |= {"kind": _KIND, "steps": contact_map.steps}
+    groups = {"/": root, "whisker": contact_map.whisker.to_dataset(), "chart": raw}
+    if contact_map.grid is not None:
+        groups["grid"] = contact_map.grid
     tree = xr.DataTree.from_dict(groups)
-    grid = [] if contacts.grid is None else list(map(str, contacts.grid.data_vars))
+    grid = [] if contact_map.grid is None else list(map(str, contact_map.grid.data_vars))
     write_netcdf(path, tree, {"/grid": dict.fromkeys(grid, COMPRESSED)})
 
 

@@ -86,7 +86,7 @@ class ContactFilter:
         pose_sigma: float = 0.0,
         birth: float = 1e-4,
     ) -> None:
-        self._length = estimator.contacts.whisker.length
+        self._length = estimator.contact_map.whisker.length
         speed = 0.25 * self._length if speed is None else speed
         if not (speed > 0.0 and persistence > 0.0 and pose_sigma >= 0.0 and 0.0 < birth < 1.0):
             raise ValueError(
@@ -184,7 +184,7 @@ class ContactFilter:
         self, measurement: Measurement, x: Array, values: Array, turn: Array, base: Array
     ) -> bool:
         """Let all hypotheses learn; whether any of them explains the measurement."""
-        chart, readout = self.estimator.contacts.chart, self.estimator.readout
+        chart, readout = self.estimator.contact_map.chart, self.estimator.readout
         most = len(self._mixture.weight) * (1 + len(x))
         out, misfits = room(most, self._errors), np.empty(most)
         try:
@@ -248,7 +248,10 @@ class ContactFilter:
         self._mixture = _tidied(out, old + n)
 
     def _possible(self, prior: Prior, found: Gaussians) -> Gaussians:
-        d, whisker = self.estimator.contacts.chart.discretization, self.estimator.contacts.whisker
+        d, whisker = (
+            self.estimator.contact_map.chart.discretization,
+            self.estimator.contact_map.whisker,
+        )
         x, points = found.contacts, found.values[:, 3:] * d.length
         kept = prior.allows(whisker, points, x[:, 0] * d.length, x[:, 1:] * d.force)
         return Gaussians(*(part[kept] for part in found))

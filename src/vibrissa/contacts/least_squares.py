@@ -66,23 +66,23 @@ def seeding_triplet(chart: Reach, names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def least_squares(
-    contacts: ContactMap,
+    contact_map: ContactMap,
     names: tuple[str, ...],
     measured: Array,
     sensor: SensorNoise | None,
     starts: Array | None = None,
 ) -> tuple[Candidates, IntArray]:
     """Find the contacts that explain more than three signals best."""
-    chart, channels = contacts.chart, Channels.of(names)
+    chart, channels = contact_map.chart, Channels.of(names)
     triplet = seeding_triplet(chart, names)
     three = measured[:, [names.index(name) for name in triplet]]
-    exact = invert(chart, contacts.tree(triplet), triplet, three)
+    exact = invert(chart, contact_map.tree(triplet), triplet, three)
     row, place = np.nonzero(np.arange(exact.contacts.shape[1]) < exact.number[:, None])
     seeds = exact.contacts[row, place]
     if starts is not None:
         more = np.flatnonzero(np.isfinite(starts).all(axis=1))
         row, seeds = np.concatenate([row, more]), np.concatenate([seeds, starts[more]])
-    limit = largest_misfit(channels, sensor, contacts)
+    limit = largest_misfit(channels, sensor, contact_map)
     fits = nearby(chart, channels, sensor, measured[row], seeds, limit)
     inside = charted(chart, fits, chart.proximal)
     lost = np.ones(len(measured), np.bool_)
@@ -118,12 +118,14 @@ def by_doubt(fits: Fits) -> Array:
     return np.asarray(fits.misfits + _FORCE * (1.0 + fits.misfits) * force / (1.0 + force))
 
 
-def largest_misfit(channels: Channels, sensor: SensorNoise | None, contacts: ContactMap) -> float:
+def largest_misfit(
+    channels: Channels, sensor: SensorNoise | None, contact_map: ContactMap
+) -> float:
     """Largest χ² of what counts as explained."""
     degrees = len(channels.names)
     if sensor is not None and sensor.wrench is not None:
-        node = contacts.chart.values[-1, :1, -1]
-        d = contacts.chart.discretization
+        node = contact_map.chart.values[-1, :1, -1]
+        d = contact_map.chart.discretization
         covariance = channels.covariance(sensor, np.ones((1, degrees)), node, d)
         degrees = rank(covariance[0])
     return explained(degrees - _UNKNOWNS)

@@ -27,15 +27,15 @@ _ANSWERED = [int(Status.UNIQUE), int(Status.AMBIGUOUS)]
 
 
 def under_noise(
-    contacts: ContactMap,
+    contact_map: ContactMap,
     names: tuple[str, ...],
     targets: Array,
     sensor: SensorNoise,
     found: Explanation,
 ) -> Explanation:
     """Complete and judge the contacts that explain measured signals."""
-    readout = Named(contacts, names, sensor)
-    limit = explained(independent(contacts, readout) - _UNKNOWNS)
+    readout = Named(contact_map, names, sensor)
+    limit = explained(independent(contact_map, readout) - _UNKNOWNS)
     n, k, most = len(targets), found.contacts.shape[1], MOST_CANDIDATES
     aims = readout.channels.targets(targets)
     aims[np.isin(found.status, _SETTLED) | readout.bounds.exceeded(targets)] = np.nan

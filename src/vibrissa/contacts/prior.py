@@ -147,15 +147,15 @@ def allowed_first(allowed: AnyArray, values: Array) -> Array:
 
 
 def among_allowed(
-    prior: Prior, contacts: ContactMap, readout: Named, measured: Array, found: Explanation
+    prior: Prior, contact_map: ContactMap, readout: Named, measured: Array, found: Explanation
 ) -> Explanation:
     """Leave out candidates of a batch that a prior does not allow."""
-    d, most = contacts.chart.discretization, found.contacts.shape[1]
+    d, most = contact_map.chart.discretization, found.contacts.shape[1]
     there = np.arange(most) < found.number[:, None]
     allowed = np.zeros_like(there)
     x = found.contacts[there]
     allowed[there] = prior.allows(
-        contacts.whisker,
+        contact_map.whisker,
         found.values[there][:, 3:] * d.length,
         x[:, 0] * d.length,
         x[:, 1:] * d.force,
@@ -185,13 +185,13 @@ def among_allowed(
 
 def located_where_allowed(
     prior: Prior,
-    contacts: ContactMap,
+    contact_map: ContactMap,
     readout: Named | Mixed,
     measurement: Measurement,
     located: Located,
 ) -> Located:
     """Leave out candidates of one measurement that a prior does not allow."""
-    whisker, d = contacts.whisker, contacts.chart.discretization
+    whisker, d = contact_map.whisker, contact_map.chart.discretization
     points, forces = located.candidates, located.contact_forces
     kept = np.flatnonzero(prior.allows(whisker, points, located.arc_lengths, forces))
     if len(kept) == len(points):

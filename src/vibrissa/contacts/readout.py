@@ -51,9 +51,9 @@ class Named:
     """Signals by name, and components of force and moment."""
 
     def __init__(
-        self, contacts: ContactMap, names: tuple[str, ...], sensor: SensorNoise | None
+        self, contact_map: ContactMap, names: tuple[str, ...], sensor: SensorNoise | None
     ) -> None:
-        chart = contacts.chart
+        chart = contact_map.chart
         d = chart.discretization
         self.names, self.sensor, self.channels = names, sensor, Channels.of(names)
         self.noisy = sensor is not None
@@ -61,7 +61,7 @@ class Named:
         self._pairs = self.channels.pairs()
         self._circular = [CIRCULAR[SIGNALS.index(name)] for name in names]
         self._sizes = [i for i, name in enumerate(names) if name in ("FT", "MB")]
-        self.bounds = Bounds.of(contacts, names)
+        self.bounds = Bounds.of(contact_map, names)
         self._most = self.bounds.most()
         self._straight = [i for i, turns in enumerate(self._circular) if not turns]
         self.how = _weighing(self.channels, sensor, d.force, d.moment, self.scale)
@@ -73,7 +73,7 @@ class Named:
             known, turns, _ = at_nodes(chart, self.channels.names)
             self.searched = _searched(
                 chart,
-                contacts.tree(three).tree,
+                contact_map.tree(three).tree,
                 [names.index(name) for name in three],
                 [SIGNALS.index(name) for name in three],
                 known,
@@ -135,9 +135,9 @@ class Mixed:
     """A linear mix of force and moment, z = H (F, M) + noise."""
 
     def __init__(
-        self, contacts: ContactMap, mixing: Array, covariance: Array, errors: Array
+        self, contact_map: ContactMap, mixing: Array, covariance: Array, errors: Array
     ) -> None:
-        chart = contacts.chart
+        chart = contact_map.chart
         d = chart.discretization
         sizes = np.repeat([d.force, d.moment], 3)
         size, axes = np.linalg.eigh(covariance)
@@ -264,13 +264,13 @@ def _weighing(
     )
 
 
-def independent(contacts: ContactMap, readout: Named | Mixed) -> int:
+def independent(contact_map: ContactMap, readout: Named | Mixed) -> int:
     """How many independent numbers a measurement tells."""
     if isinstance(readout, Mixed):
         return len(readout.how.own)
     sensor, channels = readout.sensor, readout.channels
     if sensor is None or sensor.wrench is None:
         return len(channels.names)
-    node = contacts.chart.values[-1, :1, -1]
+    node = contact_map.chart.values[-1, :1, -1]
     ones = np.ones((1, len(channels.names)))
-    return rank(channels.covariance(sensor, ones, node, contacts.chart.discretization)[0])
+    return rank(channels.covariance(sensor, ones, node, contact_map.chart.discretization)[0])

@@ -43,7 +43,9 @@ class ByName:
         return np.array([known[name] for name in self.named.names])
 
 
-def readout_of(contacts: ContactMap, h: Array, covariance: Array, errors: Array) -> ByName | Mixed:
+def readout_of(
+    contact_map: ContactMap, h: Array, covariance: Array, errors: Array
+) -> ByName | Mixed:
     """Signals by name if the channels tell these and nothing else, or a mix."""
     read = [name for name, column in zip(COMPONENTS, h.T, strict=True) if column.any()]
     whole = [group for group in _BY_NAME if set(group) <= set(read)]
@@ -51,7 +53,7 @@ def readout_of(contacts: ContactMap, h: Array, covariance: Array, errors: Array)
     own = h[:, places]
     complete = sum(map(len, whole)) == len(read) and len(read) >= _UNKNOWNS
     if not complete or np.linalg.matrix_rank(own / np.linalg.norm(own, axis=0)) < len(read):
-        return Mixed(contacts, h, covariance, errors)
+        return Mixed(contact_map, h, covariance, errors)
     root = np.linalg.inv(np.linalg.cholesky(covariance))
     back = np.linalg.pinv(root @ own) @ root
     wrench = np.zeros((6, 6))
@@ -67,4 +69,4 @@ def readout_of(contacts: ContactMap, h: Array, covariance: Array, errors: Array)
     wrong = np.zeros((len(errors), 6, 7))
     wrong[:, places] = back @ errors
     noise = SensorNoise.of(0.5 * (wrench + wrench.T), signals, wrong)
-    return ByName(Named(contacts, signals, noise), np.asarray(back, dtype=np.float64), places)
+    return ByName(Named(contact_map, signals, noise), np.asarray(back, dtype=np.float64), places)

@@ -29,9 +29,9 @@ _STATUSES = {int(status): status for status in Status}
 class ExactSearch:
     """All contacts that give three signals exactly."""
 
-    def __init__(self, contacts: ContactMap, readout: Named) -> None:
-        self._contacts, self._readout, self._trail = contacts, readout, Trail.new()
-        self._limit = explained(independent(contacts, readout) - _UNKNOWNS)
+    def __init__(self, contact_map: ContactMap, readout: Named) -> None:
+        self._contact_map, self._readout, self._trail = contact_map, readout, Trail.new()
+        self._limit = explained(independent(contact_map, readout) - _UNKNOWNS)
 
     def forget(self) -> None:
         """Begin anew, as when the whisker has lost touch."""
@@ -67,16 +67,16 @@ class ExactSearch:
     def _none(self, measurement: Measurement) -> Located:
         """Say why there is no contact."""
         measured = measurement.measured[None]
-        why, misfit = why_none(self._contacts, self._readout.names, measured)
+        why, misfit = why_none(self._contact_map, self._readout.names, measured)
         return nowhere(_STATUSES[int(why[0])], float(misfit[0]))
 
 
 class LeastSquaresSearch:
     """The contacts that explain more than three signals, or a mix, best."""
 
-    def __init__(self, contacts: ContactMap, readout: Named | Mixed) -> None:
+    def __init__(self, contact_map: ContactMap, readout: Named | Mixed) -> None:
         self._readout, self._trail = readout, Trail.new()
-        self._limit = explained(independent(contacts, readout) - _UNKNOWNS)
+        self._limit = explained(independent(contact_map, readout) - _UNKNOWNS)
 
     def forget(self) -> None:
         """Begin anew, as when the whisker has lost touch."""
@@ -115,8 +115,8 @@ class LeastSquaresSearch:
 class SetSearch:
     """Samples of the curve or surface of contacts that explain fewer than three signals."""
 
-    def __init__(self, contacts: ContactMap, readout: Named | Mixed) -> None:
-        self._ambiguity = Ambiguity(contacts.chart, readout)
+    def __init__(self, contact_map: ContactMap, readout: Named | Mixed) -> None:
+        self._ambiguity = Ambiguity(contact_map.chart, readout)
         self._readout = readout
 
     def forget(self) -> None:

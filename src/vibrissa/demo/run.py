@@ -172,18 +172,18 @@ def run_demo(
             held = with_truth(tracked(trial, folder, tell), trial)
             scores = tracking_scores(held.to_dataset().isel(DIM), truth_of(held)[0])
         tell("map of all contacts", 0, 1)
-        chart = ContactMap.simulate(recorded_whisker(held), grid=False)
+        contact_map = ContactMap.simulate(recorded_whisker(held), grid=False)
         tell("map of all contacts", 1, 1)
         read = placed_by(signals_of(trial, "sensor"), held) if video else signals_of(trial)
-        sensed = _located(with_group(held, "signals", read), chart, seed)
+        sensed = _located(with_group(held, "signals", read), contact_map, seed)
         tell("contact points", 1, 2 if video else 1)
         if video:
             read = signals_of(held, "contact point")
-            seen = _located(with_group(held, "signals", read), chart, seed)
+            seen = _located(with_group(held, "signals", read), contact_map, seed)
             tell("contact points", 2, 2)
         (peg,) = recorded_objects(trial)
         assert isinstance(peg, Peg)
-        result = DemoResult(whisker, peg, trial, chart, sensed, seen, scores, ())
+        result = DemoResult(whisker, peg, trial, contact_map, sensed, seen, scores, ())
         return result if output is None else _written(result, folder, tell)
 
 
@@ -214,9 +214,9 @@ def _simulated(
     return measure(trial, force_noise, moment_noise, seed)
 
 
-def _located(recording: xr.DataTree, chart: ContactMap, seed: int) -> Located:
+def _located(recording: xr.DataTree, contact_map: ContactMap, seed: int) -> Located:
     """Estimate contacts from a recording's signals, fit the peg, and compare with the truth."""
-    recording = with_contour(with_estimates(recording, contact_maps=[chart]))
+    recording = with_contour(with_estimates(recording, contact_maps=[contact_map]))
     contacts = recording["estimates"].to_dataset().isel(DIM)
     fit = shape_from_dataset(recording["contour"].to_dataset())
     assert isinstance(fit, CylinderFit)

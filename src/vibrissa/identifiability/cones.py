@@ -80,9 +80,9 @@ def critical_cones(
                 base_radius=_BASE_RADIUS,
                 tip_radius=_BASE_RADIUS / ratio,
             )
-            contacts = ContactMap.simulate(whisker, grid=False)
+            contact_map = ContactMap.simulate(whisker, grid=False)
             for i, triplet in enumerate(triplets):
-                cone[i, j, k] = _critical_cone(contacts, triplet, min_separation, samples)
+                cone[i, j, k] = _critical_cone(contact_map, triplet, min_separation, samples)
             if progress is not None:
                 progress(j * curved.size + k + 1, cone[0].size)
     about = {"units": "rad", "long_name": "smallest cone without witnesses outside it"}
@@ -98,13 +98,13 @@ def critical_cones(
 
 
 def _critical_cone(
-    contacts: ContactMap, triplet: str, min_separation: float, samples: int
+    contact_map: ContactMap, triplet: str, min_separation: float, samples: int
 ) -> float:
     """The cone found, and whatever is found when outside that cone is searched harder."""
     cone = 0.0
     for seed in range(_ROUNDS):
         found = uniqueness(
-            contacts,
+            contact_map,
             [triplet],
             ["all"],
             min_separation=min_separation,

@@ -29,33 +29,35 @@ _STEADY = 0.2
 
 
 def found_again(
-    contacts: ContactMap, names: tuple[str, ...], first: Array, second: Array, steps: int
+    contact_map: ContactMap, names: tuple[str, ...], first: Array, second: Array, steps: int
 ) -> tuple[Array, Array]:
     """Solve for the second contact of each pair on a finer rod, with the first as it is."""
     which = [SIGNALS.index(name) for name in names]
-    coarse = discretize(contacts.whisker, steps)
-    finer = discretize(contacts.whisker, FINER * steps)
+    coarse = discretize(contact_map.whisker, steps)
+    finer = discretize(contact_map.whisker, FINER * steps)
     at_first, _ = solve_forces(finer, with_normal_force(first))
     before, _ = solve_forces(coarse, with_normal_force(second))
     force, point = at_first[:, :3], at_first[:, 3:]
     target = signals_of(force, np.cross(point, force))[:, which]
-    _, values, misfit = corrected(finer, names, second, target, units(contacts, second))
+    _, values, misfit = corrected(finer, names, second, target, units(contact_map, second))
     points = np.stack([point, values[:, 3:]], axis=1)
     points[~(misfit <= AGREEMENT)] = np.nan
     return points, np.linalg.norm(points[:, 1] - before[:, 3:], axis=1)
 
 
 def confirmed(
-    contacts: ContactMap,
+    contact_map: ContactMap,
     names: tuple[str, ...],
     pairs: Pairs,
     steps: int,
     separation: float,
 ) -> tuple[AnyArray, Array]:
     """Whether pairs stay on a finer rod."""
-    points, moved = found_again(contacts, names, pairs.first.contacts, pairs.second.contacts, steps)
+    points, moved = found_again(
+        contact_map, names, pairs.first.contacts, pairs.second.contacts, steps
+    )
     apart = np.linalg.norm(points[:, 1] - points[:, 0], axis=1)
     stays = (apart >= separation) & (moved <= _STEADY * apart)
-    length = contacts.chart.discretization.length
-    angle = cone_angle(contacts.whisker, points * length).min(axis=1)
+    length = contact_map.chart.discretization.length
+    angle = cone_angle(contact_map.whisker, points * length).min(axis=1)
     return np.asarray(stays), angle

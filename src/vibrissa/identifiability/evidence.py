@@ -60,7 +60,7 @@ _PLANAR = 1e-9
 class Question:
     """What is asked."""
 
-    contacts: ContactMap
+    contact_map: ContactMap
     regions: tuple[str, ...]
     separation: float
     cone: float
@@ -96,7 +96,7 @@ class Answer:
 
 
 def ask(
-    contacts: ContactMap,
+    contact_map: ContactMap,
     regions: tuple[str, ...],
     separation: float,
     cone: float,
@@ -105,20 +105,20 @@ def ask(
     seed: int,
 ) -> Question:
     """Spread samples over Ω and find what all triplets share."""
-    wide = sample(contacts, spread(_WIDER * number, seed), domain)
+    wide = sample(contact_map, spread(_WIDER * number, seed), domain)
     samples = wide.rows(slice(len(wide.chart) // _WIDER))
     signals = samples.places.signals
     span = np.ptp(signals, axis=0)
     span[list(CIRCULAR)] = 2.0 * np.pi
     probed = np.flatnonzero(samples.places.inside & (samples.places.angle > cone))[:_PROBED]
-    normal, bearing = _plane(contacts.whisker)
+    normal, bearing = _plane(contact_map.whisker)
     plane = None
     if bearing is not None:
         chart = spread(256, seed)
         chart[:, 1] = bearing + np.where(chart[:, 1] < np.pi, 0.0, np.pi)
-        plane = sample(contacts, chart, domain)
+        plane = sample(contact_map, chart, domain)
     return Question(
-        contacts,
+        contact_map,
         regions,
         separation,
         cone,
@@ -163,7 +163,7 @@ def answer(question: Question, names: tuple[str, ...], resolution: bool) -> Answ
     """All evidence on one triplet."""
     samples, span = question.samples, question.span[[SIGNALS.index(name) for name in names]]
     by_contact = triplet_derivatives(question.wide.places.values, question.wide.tangents, names)
-    lost = deficient(question.contacts, names, samples.places.contacts[:_PROBED], span)
+    lost = deficient(question.contact_map, names, samples.places.contacts[:_PROBED], span)
     local = local_evidence(
         question.wide,
         by_contact,
@@ -177,16 +177,16 @@ def answer(question: Question, names: tuple[str, ...], resolution: bool) -> Answ
         tried = _some(question, samples)
         followed = np.union1d(tried, _farthest(question, samples))
         start = samples.rows(followed)
-        pool = fibres(question.contacts, names, lost, start.chart, start.places, question.domain)
+        pool = fibres(question.contact_map, names, lost, start.chart, start.places, question.domain)
         own = pool._replace(sample=followed[pool.sample])
     else:
         tried = np.arange(len(samples.chart))
-        own = twins(question.contacts, names, samples.chart, samples.places, question.domain)
+        own = twins(question.contact_map, names, samples.chart, samples.places, question.domain)
         pool = _searched(question, names, own, local.beside)
         on_surface = _on_plane(question, names, span)
     own, pool = (p.rows(p.apart >= question.separation) for p in (own, pool))
     twin = _twinned(question, own)
-    steps = lost or question.contacts.steps
+    steps = lost or question.contact_map.steps
     cells = [
         _judge(question, names, pool, steps, on_surface, region) for region in question.regions
     ]
@@ -197,7 +197,7 @@ def answer(question: Question, names: tuple[str, ...], resolution: bool) -> Answ
     if resolution and lost is None:
         probed = question.probed
         hit = ambiguous(
-            question.contacts,
+            question.contact_map,
             names,
             samples.places.rows(probed),
             twin[:, probed],
@@ -226,13 +226,13 @@ def _searched(question: Question, names: tuple[str, ...], own: Pairs, beside: An
     Regions that seem to have none outside the cone are searched again and again.
     """
     start = question.wide.rows(beside)
-    more = twins(question.contacts, names, start.chart, start.places, question.domain)
+    more = twins(question.contact_map, names, start.chart, start.places, question.domain)
     pool = joined([own, more])
     rng = np.random.default_rng(question.seed)
     regions = question.regions
     for _ in range(1 + _AGAIN):
         found = better_twins(
-            question.contacts, names, pool, regions, question.separation, question.domain, rng
+            question.contact_map, names, pool, regions, question.separation, question.domain, rng
         )
         pool = joined([pool, found])
         far = pool.apart >= question.separation
@@ -287,7 +287,7 @@ def _confirmed(
         tried = joined([tried, pairs.rows(order[start : start + _CONFIRMED])])
         if not len(tried.apart):
             break
-        stays, angle = confirmed(question.contacts, names, tried, steps, question.separation)
+        stays, angle = confirmed(question.contact_map, names, tried, steps, question.separation)
         if stays.any():
             kept.append(tried.rows(stays))
             critical = float(angle[stays].max())
@@ -319,11 +319,11 @@ def _on_plane(question: Question, names: tuple[str, ...], span: Array) -> tuple[
     if question.plane is None:
         return None
     plane = question.plane
-    lost = deficient(question.contacts, names, plane.places.contacts, span)
+    lost = deficient(question.contact_map, names, plane.places.contacts, span)
     if lost is None:
         return None
     start = plane.rows(np.union1d(_some(question, plane), _farthest(question, plane)))
-    found = fibres(question.contacts, names, lost, start.chart, start.places, question.domain)
+    found = fibres(question.contact_map, names, lost, start.chart, start.places, question.domain)
     return found.rows(found.apart >= question.separation), lost
 
 

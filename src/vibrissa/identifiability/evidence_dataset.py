@@ -93,7 +93,7 @@ def labelled(
         "component": ["fy", "fz"],
     }
     out = xr.Dataset(data, coords=coords).merge(_witnesses(question, names, answers))
-    whisker, d = question.contacts.whisker, question.contacts.chart.discretization
+    whisker, d = question.contact_map.whisker, question.contact_map.chart.discretization
     out.attrs = {
         "kind": "vibrissa uniqueness",
         "whisker": repr(whisker),
@@ -101,7 +101,7 @@ def labelled(
         "cone": question.cone,
         "min_separation": question.separation * d.length,
         "samples": len(question.samples.chart),
-        "steps": question.contacts.steps,
+        "steps": question.contact_map.steps,
         "seed": question.seed,
         "volume_shares": ", ".join(
             f"{region} {share:.3f}"
@@ -138,7 +138,7 @@ def _witnesses(
     question: Question, names: tuple[tuple[str, ...], ...], answers: list[Answer]
 ) -> xr.Dataset:
     """Both contacts of each witness, in SI units, with how well they agree."""
-    contacts = question.contacts
+    contact_map = question.contact_map
     shape = (len(names), len(question.regions), WITNESSES)
     arc_length, point = np.full((*shape, 2), np.nan), np.full((*shape, 2, 3), np.nan)
     force, signals = np.full((*shape, 2, 2), np.nan), np.full((*shape, 3), np.nan)
@@ -150,8 +150,8 @@ def _witnesses(
             if not n:
                 continue
             here = (i, j, slice(n))
-            d = discretize(contacts.whisker, found.steps[j])
-            first, unit = pairs.first.contacts, units(contacts, pairs.second.contacts)
+            d = discretize(contact_map.whisker, found.steps[j])
+            first, unit = pairs.first.contacts, units(contact_map, pairs.second.contacts)
             target = pairs.first.signals[:, which]
             second, values, difference[here] = corrected(
                 d, triplet, pairs.second.contacts, target, unit
@@ -162,7 +162,7 @@ def _witnesses(
             point[here] = places[..., 3:] * d.length
             apart[here] = np.linalg.norm(point[here][:, 0] - point[here][:, 1], axis=1)
             signals[here] = target * signal_scales(triplet, d.force, d.moment)
-            _, moved = found_again(contacts, triplet, first, second, found.steps[j])
+            _, moved = found_again(contact_map, triplet, first, second, found.steps[j])
             shift[here] = d.length * moved
     cell = ("triplet", "region", "witness")
     return xr.Dataset(
@@ -203,12 +203,12 @@ def network_errors(question: Question, names: tuple[str, ...]) -> Array:
     """Quantiles of the errors of a trained network, (regions, quantiles), m."""
     from vibrissa.paper.network import train_network
 
-    contacts = question.contacts
-    d = contacts.chart.discretization
-    solver = train_network(contacts, names, seed=question.seed)
+    contact_map = question.contact_map
+    d = contact_map.chart.discretization
+    solver = train_network(contact_map, names, seed=question.seed)
     held = solver.held_out
     values = np.concatenate([held.force / d.force, held.point / d.length], axis=1)
-    places = place(contacts, held.contacts, values, question.domain)
+    places = place(contact_map, held.contacts, values, question.domain)
     outside = places.angle > question.cone
     return np.stack(
         [

@@ -40,22 +40,24 @@ _FINER = 8
 _TRIED = 256
 
 
-def determining(contacts: ContactMap, names: tuple[str, ...]) -> bool:
+def determining(contact_map: ContactMap, names: tuple[str, ...]) -> bool:
     """Tell whether signals determine contacts, but for single ones."""
-    places = sample(contacts, spread(_TRIED, seed=0), "reachable").places
+    places = sample(contact_map, spread(_TRIED, seed=0), "reachable").places
     which = [SIGNALS.index(name) for name in names]
     circular = circular_among(names)
     span = np.where(circular, 2.0 * np.pi, np.ptp(places.signals[:, which], axis=0))
-    return deficient(contacts, names, places.contacts, span) is None
+    return deficient(contact_map, names, places.contacts, span) is None
 
 
-def deficient(contacts: ContactMap, names: tuple[str, ...], xi: Array, span: Array) -> int | None:
+def deficient(
+    contact_map: ContactMap, names: tuple[str, ...], xi: Array, span: Array
+) -> int | None:
     """Whether a triplet has lost a dimension at contacts, but for rounding."""
     # A signal without a range is zero everywhere, but for rounding.
     weight = np.where(span > _RANK, 1.0 / np.maximum(span, _RANK), 0.0)
-    unit = units(contacts, xi)
-    for steps in (contacts.steps, _FINER * contacts.steps):
-        d = discretize(contacts.whisker, steps)
+    unit = units(contact_map, xi)
+    for steps in (contact_map.steps, _FINER * contact_map.steps):
+        d = discretize(contact_map.whisker, steps)
         values, tangents = solve_forces(d, with_normal_force(xi), tangents=True)
         slope = triplet_derivatives(values, tangents, names) * unit[:, None, :]
         singular = np.linalg.svd(slope * weight[:, None], compute_uv=False)
@@ -65,7 +67,7 @@ def deficient(contacts: ContactMap, names: tuple[str, ...], xi: Array, span: Arr
 
 
 def fibres(
-    contacts: ContactMap,
+    contact_map: ContactMap,
     names: tuple[str, ...],
     steps: int,
     chart: Array,
@@ -73,11 +75,11 @@ def fibres(
     domain: Domain,
 ) -> Pairs:
     """Follow the curves of equal triplets through contacts where these have lost a dimension."""
-    d = discretize(contacts.whisker, steps)
+    d = discretize(contact_map.whisker, steps)
     values, _ = solve_forces(d, with_normal_force(first.contacts))
-    first = place(contacts, first.contacts, values, domain)
+    first = place(contact_map, first.contacts, values, domain)
     targets = first.signals[:, [SIGNALS.index(name) for name in names]]
-    unit = units(contacts, first.contacts)
+    unit = units(contact_map, first.contacts)
     rows, found = [], []
     for sense in (1.0, -1.0):
         running, xi = np.arange(len(chart)), first.contacts
@@ -87,7 +89,7 @@ def fibres(
             direction = _along(slope * unit[running, None, :], direction, sense)
             xi = xi + _STRIDE * direction * unit[running]
             xi, values, misfit = corrected(d, names, xi, targets[running], unit[running])
-            stays = (misfit <= AGREEMENT) & _stable(contacts, xi)
+            stays = (misfit <= AGREEMENT) & _stable(contact_map, xi)
             xi, running, direction = xi[stays], running[stays], direction[stays]
             if not running.size:
                 break
@@ -95,7 +97,7 @@ def fibres(
             found.append(np.concatenate([xi, values[stays]], axis=1))
     row = np.concatenate(rows) if rows else np.zeros(0, dtype=np.int64)
     both = np.concatenate(found) if found else np.zeros((0, 9))
-    second = place(contacts, both[:, :3], both[:, 3:], domain)
+    second = place(contact_map, both[:, :3], both[:, 3:], domain)
     apart = np.linalg.norm(second.values[:, 3:] - first.values[row, 3:], axis=1)
     return Pairs(chart[row], row, first.rows(row), second, apart)
 
@@ -127,9 +129,9 @@ def corrected(
     return xi, values, np.where(np.isfinite(misfit), misfit, np.inf)
 
 
-def units(contacts: ContactMap, xi: Array) -> Array:
+def units(contact_map: ContactMap, xi: Array) -> Array:
     """What a change of each unknown is small beside (n, 3): L, and the fold force there."""
-    force = fold_forces(contacts.chart.fold, xi)
+    force = fold_forces(contact_map.chart.fold, xi)
     return np.stack([np.ones(len(xi)), force, force], axis=1)
 
 
@@ -148,7 +150,7 @@ def _equations(
     )
 
 
-def _stable(contacts: ContactMap, xi: Array) -> AnyArray:
+def _stable(contact_map: ContactMap, xi: Array) -> AnyArray:
     force = np.hypot(xi[:, 1], xi[:, 2])
-    inside = (xi[:, 0] >= contacts.chart.proximal) & (xi[:, 0] <= 1.0)
-    return np.asarray(inside & (force > 0.0) & (force < units(contacts, xi)[:, 1]))
+    inside = (xi[:, 0] >= contact_map.chart.proximal) & (xi[:, 0] <= 1.0)
+    return np.asarray(inside & (force > 0.0) & (force < units(contact_map, xi)[:, 1]))

@@ -68,9 +68,9 @@ class Samples(NamedTuple):
         )
 
 
-def place(contacts: ContactMap, xi: Array, values: Array, domain: Domain) -> Places:
+def place(contact_map: ContactMap, xi: Array, values: Array, domain: Domain) -> Places:
     """Find the regions of contacts ξ (n, 3) with known (F, p) (n, 6)."""
-    whisker, d = contacts.whisker, contacts.chart.discretization
+    whisker, d = contact_map.whisker, contact_map.chart.discretization
     points = values[:, 3:] * d.length
     tangent = contact_tangents(d, with_normal_force(xi))
     inside = np.ones(len(xi), dtype=bool)
@@ -86,12 +86,12 @@ def place(contacts: ContactMap, xi: Array, values: Array, domain: Domain) -> Pla
     )
 
 
-def sample(contacts: ContactMap, chart: Array, domain: Domain) -> Samples:
+def sample(contact_map: ContactMap, chart: Array, domain: Domain) -> Samples:
     """Solve the contacts at chart coordinates (n, 3)."""
-    fold, d = contacts.chart.fold, contacts.chart.discretization
+    fold, d = contact_map.chart.fold, contact_map.chart.discretization
     xi = contacts_at(fold, chart)
     values, tangents = solve_forces(d, with_normal_force(xi), tangents=True)
-    places = place(contacts, xi, values, domain)
+    places = place(contact_map, xi, values, domain)
     # The chart knows the fold to a part in a million: what lies beyond it does not count.
     stable = determinant(tangents) > 0.0
     by_chart = np.linalg.det(tangents[:, 3:] @ _frames(fold, chart))

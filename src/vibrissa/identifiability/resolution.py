@@ -23,7 +23,7 @@ _MOVES = np.concatenate([_CORNERS, np.eye(3), -np.eye(3)])
 
 
 def ambiguous(
-    contacts: ContactMap,
+    contact_map: ContactMap,
     names: tuple[str, ...],
     own: Places,
     twinned: AnyArray,
@@ -47,12 +47,12 @@ def ambiguous(
         if not active.size:
             break
         targets = own.signals[active][:, None, which] + TOLERANCES[t] * span * _MOVES
-        found = invert(contacts.chart, contacts.tree(names), names, targets.reshape(-1, 3))
+        found = invert(contact_map.chart, contact_map.tree(names), names, targets.reshape(-1, 3))
         points = found.values[:, :, 3:].reshape(active.size, -1, 3)
         away = np.linalg.norm(points - own.values[active, None, 3:], axis=2)
         i, j = np.nonzero(away >= separation)
         other = place(
-            contacts,
+            contact_map,
             found.contacts.reshape(active.size, -1, 3)[i, j],
             found.values.reshape(active.size, -1, 6)[i, j],
             domain,

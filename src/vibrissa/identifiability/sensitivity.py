@@ -90,8 +90,8 @@ def sensitivity(
     Examples
     --------
     >>> import vibrissa as vb
-    >>> contacts = vb.ContactMap.simulate(vb.samples.gamma(), grid=False)
-    >>> found = vb.sensitivity(contacts)
+    >>> contact_map = vb.ContactMap.simulate(vb.samples.gamma(), grid=False)
+    >>> found = vb.sensitivity(contact_map)
     >>> str(found.sensitivity.sel(coordinate="r", signal="MB").unit.values)
     'm/(N m)'
     """

@@ -82,7 +82,7 @@ def triplet_derivatives(values: Array, tangents: Array, names: tuple[str, ...]) 
 
 
 def twins(
-    contacts: ContactMap,
+    contact_map: ContactMap,
     names: tuple[str, ...],
     chart: Array,
     first: Places,
@@ -91,20 +91,20 @@ def twins(
 ) -> Pairs:
     """Find all twins of contacts."""
     which = [SIGNALS.index(name) for name in names]
-    found = invert(contacts.chart, contacts.tree(names), names, first.signals[:, which])
+    found = invert(contact_map.chart, contact_map.tree(names), names, first.signals[:, which])
     apart = np.linalg.norm(found.values[:, :, 3:] - first.values[:, None, 3:], axis=2)
     rows, columns = np.nonzero(apart >= least)  # NaN is not
     xi, values = found.contacts[rows, columns], found.values[rows, columns]
-    firm = _firm(contacts, names, xi)
+    firm = _firm(contact_map, names, xi)
     rows, columns, xi, values = rows[firm], columns[firm], xi[firm], values[firm]
-    second = place(contacts, xi, values, domain)
+    second = place(contact_map, xi, values, domain)
     return Pairs(chart[rows], rows, first.rows(rows), second, apart[rows, columns])
 
 
-def _firm(contacts: ContactMap, names: tuple[str, ...], xi: Array) -> AnyArray:
+def _firm(contact_map: ContactMap, names: tuple[str, ...], xi: Array) -> AnyArray:
     """Whether solutions stay where they are when their signals change by ``AGREEMENT``."""
     values, tangents = solve_forces(
-        contacts.chart.discretization, with_normal_force(xi), tangents=True
+        contact_map.chart.discretization, with_normal_force(xi), tangents=True
     )
     by_contact = triplet_derivatives(values, tangents, names)
     regular = np.abs(np.linalg.det(by_contact)) > 0.0
@@ -115,7 +115,7 @@ def _firm(contacts: ContactMap, names: tuple[str, ...], xi: Array) -> AnyArray:
 
 
 def better_twins(
-    contacts: ContactMap,
+    contact_map: ContactMap,
     names: tuple[str, ...],
     pairs: Pairs,
     regions: tuple[str, ...],
@@ -133,13 +133,13 @@ def better_twins(
     for width in _WIDTHS:
         if not len(best.apart):
             break
-        both = np.concatenate([best.chart, chart_of(contacts.chart.fold, best.second.contacts)])
+        both = np.concatenate([best.chart, chart_of(contact_map.chart.fold, best.second.contacts)])
         noise = width * rng.standard_normal(both.shape) * [1.0, np.pi, 1.0]
         # Differences of good ones point along thin sets of them, which noise alone would miss.
         step = both[rng.permutation(len(both))] - both[rng.permutation(len(both))]
         step = within_turn(step, [False, True, False])
         chart = in_chart(np.concatenate([both + noise, both + 0.7 * step + 0.03 * noise]))
-        found = twins(contacts, names, chart, sample(contacts, chart, domain).places, domain)
+        found = twins(contact_map, names, chart, sample(contact_map, chart, domain).places, domain)
         best = _best(joined([best, found]), regions, separation)
     return best
 

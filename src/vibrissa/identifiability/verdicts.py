@@ -32,7 +32,7 @@ SAMPLES = 4096
 
 
 def uniqueness(
-    contacts: ContactMap,
+    contact_map: ContactMap,
     triplets: str | Sequence[str | tuple[str, ...]] = "all",
     regions: str | Sequence[str] = "all",
     *,
@@ -49,7 +49,7 @@ def uniqueness(
 
     Parameters
     ----------
-    contacts : ContactMap
+    contact_map : ContactMap
         The whisker's map.
     triplets : "all" or sequence
         Which of the 20 triplets: names like ``"Fx MB MD"`` or tuples of signals; or three signals.
@@ -105,8 +105,8 @@ def uniqueness(
     Examples
     --------
     >>> import vibrissa as vb
-    >>> contacts = vb.ContactMap.simulate(vb.samples.straight(), grid=False)
-    >>> found = vb.uniqueness(contacts, ["Fx MB MD"], resolution=False, samples=512)
+    >>> contact_map = vb.ContactMap.simulate(vb.samples.straight(), grid=False)
+    >>> found = vb.uniqueness(contact_map, ["Fx MB MD"], resolution=False, samples=512)
     >>> str(found.verdict.sel(triplet="Fx MB MD", region="all").item())
     'unique'
     """
@@ -122,7 +122,7 @@ def uniqueness(
         raise ValueError(f"domain is 'reachable' or 'paper'; got {domain!r}")
     if samples < 16:
         raise ValueError(f"at least 16 samples are needed; got {samples}")
-    question = ask(contacts, wanted, min_separation, cone, domain, samples, seed)
+    question = ask(contact_map, wanted, min_separation, cone, domain, samples, seed)
     answers = []
     for number, triplet in enumerate(names):
         answers.append(answer(question, triplet, resolution))

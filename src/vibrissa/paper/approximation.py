@@ -53,7 +53,7 @@ def solver(contact_map: ContactMap, method: str, names: tuple[str, ...]) -> Solv
 
 def by_approximation(
     method: str,
-    contacts: ContactMap,
+    contact_map: ContactMap,
     names: tuple[str, ...],
     targets: Array,
     sensor: SensorNoise | None,
@@ -63,23 +63,23 @@ def by_approximation(
         raise ValueError(
             f"a table or network takes three signals; got {len(names)}: {', '.join(names)}"
         )
-    solve = solver(contacts, method, names)
-    d = contacts.chart.discretization
+    solve = solver(contact_map, method, names)
+    d = contact_map.chart.discretization
     signals = targets * signal_scales(names, d.force, d.moment)
     point = solve(signals)
     found = np.asarray(np.isfinite(point).all(axis=1))
     bent = deflect(
-        contacts.whisker,
+        contact_map.whisker,
         PointContact(point),
-        proximal=contacts.chart.proximal,
-        steps=contacts.steps,
+        proximal=contact_map.chart.proximal,
+        steps=contact_map.steps,
     )
     status = np.where(found, int(Status.APPROXIMATE), int(Status.OUTSIDE_MAP))
     status[~np.isfinite(targets).all(axis=1)] = int(Status.MISSING)
     covariances = np.full((len(targets), 3, 3), np.nan)
     if sensor is not None:
         sigma = sensor.covariance(names, bent.force, bent.moment)
-        slope = _differences(solve, signals, _ranges(contacts, names))
+        slope = _differences(solve, signals, _ranges(contact_map, names))
         covariances = slope @ sigma @ np.swapaxes(slope, -1, -2) / d.length**2
     return Explanation(
         number=np.where(found, 1, 0),
@@ -88,17 +88,17 @@ def by_approximation(
         )[:, None],
         values=np.concatenate([bent.force / d.force, point / d.length], axis=1)[:, None],
         covariances=covariances[:, None],
-        misfit=_misfit(signals, bent.force, bent.moment, names, _ranges(contacts, names)),
+        misfit=_misfit(signals, bent.force, bent.moment, names, _ranges(contact_map, names)),
         status=status,
         linear=np.zeros(len(targets), dtype=bool),
         probability=np.full((len(targets), 1), np.nan),
     )
 
 
-def _ranges(contacts: ContactMap, names: tuple[str, ...]) -> Array:
+def _ranges(contact_map: ContactMap, names: tuple[str, ...]) -> Array:
     """Of each signal over the map, SI units; of directions a turn."""
-    d = contacts.chart.discretization
-    values = contacts.chart.values.reshape(-1, 6)
+    d = contact_map.chart.discretization
+    values = contact_map.chart.values.reshape(-1, 6)
     known = signals_of(values[:, :3], np.cross(values[:, 3:], values[:, :3]))
     which = [SIGNALS.index(name) for name in names]
     span = np.ptp(known[:, which], axis=0) * signal_scales(names, d.force, d.moment)

@@ -139,14 +139,14 @@ def estimates_of(
             found = locate_from_wrench(whisker, wrench, sigma, errors, prior)
         elif found is None:
             if contact_maps is not None:
-                chart = contact_maps[k]
+                contact_map = contact_maps[k]
             else:
                 tell("map of all contacts", k, count)
                 grid = method.startswith("lookup")
-                chart = ContactMap.simulate(whisker, grid=grid, proximal=proximal)
+                contact_map = ContactMap.simulate(whisker, grid=grid, proximal=proximal)
                 tell("map of all contacts", k + 1, count)
             found = locate(
-                chart, wrench, names, noise=sigma, method=method, errors=errors, prior=prior
+                contact_map, wrench, names, noise=sigma, method=method, errors=errors, prior=prior
             )
         parts.append(_placed(one, found, given=noise is not None))
         tell("contact points", k + 1, count)

@@ -13,12 +13,12 @@ from vibrissa.signals import SIGNALS
 from vibrissa.status import describe
 
 
-def chart_sections(contacts: ContactMap, verdicts: xr.Dataset | None = None) -> list[Section]:
+def chart_sections(contact_map: ContactMap, verdicts: xr.Dataset | None = None) -> list[Section]:
     """Tell what a map holds, and which signals locate its contacts.
 
     Parameters
     ----------
-    contacts : ContactMap
+    contact_map : ContactMap
         The map.
     verdicts : Dataset, optional
         Of :func:`vibrissa.uniqueness` for it.
@@ -28,7 +28,7 @@ def chart_sections(contacts: ContactMap, verdicts: xr.Dataset | None = None) -> 
     list of Section
         The map; verdicts, or how to have them.
     """
-    about = Section("map", "The map", contacts._repr_html_() + _ranges(contacts.to_dataset()))
+    about = Section("map", "The map", contact_map._repr_html_() + _ranges(contact_map.to_dataset()))
     if verdicts is None:
         told = paragraph(
             "Which signals locate a contact was not judged: `vibrissa uniqueness MAP -o FILE.nc` "

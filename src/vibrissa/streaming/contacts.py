@@ -131,7 +131,7 @@ class ContactStream:
 
     def warm_up(self) -> None:
         """Locate a contact of the whisker once, so that no sample waits for code to be compiled."""
-        whisker, sensor = self._estimator.contacts.whisker, self._estimator.sensor
+        whisker, sensor = self._estimator.contact_map.whisker, self._estimator.sensor
         size = 0.5 * whisker.base_bending_stiffness / whisker.length**2
         bent = deflect(whisker, PointForce(0.7 * whisker.length, size, 0.5))
         turn = np.eye(3)

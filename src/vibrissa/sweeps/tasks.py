@@ -125,8 +125,8 @@ def _sensitivity(whisker: Whisker, settings: Settings, seed: int) -> xr.Dataset:
 
 def _estimation(whisker: Whisker, settings: Settings, seed: int) -> xr.Dataset:
     """Errors of contacts estimated from noisy signals."""
-    chart = ContactMap.simulate(whisker, grid=False)
-    s, load = _some_contacts(chart, int(settings["contacts"]), seed)
+    contact_map = ContactMap.simulate(whisker, grid=False)
+    s, load = _some_contacts(contact_map, int(settings["contacts"]), seed)
     bent = deflect(whisker, PointForce(s, components=tuple(load)))
     noise = _noise(settings)
     generator = np.random.default_rng(seed + 1)
@@ -139,7 +139,9 @@ def _estimation(whisker: Whisker, settings: Settings, seed: int) -> xr.Dataset:
         if names == "wrench":
             found: Any = estimate_from_wrench(whisker, force, moment, noise=noise)
         else:
-            found = chart.estimate(base_signals(force, moment), tuple(names.split()), noise=noise)
+            found = contact_map.estimate(
+                base_signals(force, moment), tuple(names.split()), noise=noise
+            )
         error = np.linalg.norm(found.point - bent.contact_point, axis=-1)
         predicted = np.sqrt(np.einsum("nii->n", found.covariance))
         rows.append(
@@ -156,14 +158,14 @@ def _estimation(whisker: Whisker, settings: Settings, seed: int) -> xr.Dataset:
 
 def _friction(whisker: Whisker, settings: Settings, seed: int) -> xr.Dataset:
     """Errors where friction, fully mobilised along the whisker, is not looked for."""
-    chart = ContactMap.simulate(whisker, grid=False)
-    s, (_, fy, fz) = _some_contacts(chart, int(settings["contacts"]), seed)
+    contact_map = ContactMap.simulate(whisker, grid=False)
+    s, (_, fy, fz) = _some_contacts(contact_map, int(settings["contacts"]), seed)
     across = np.hypot(fy, fz)
     sign = np.random.default_rng(seed + 1).choice([-1.0, 1.0], size=len(s))
     rows = []
     for mu in settings["friction"]:
         bent = deflect(whisker, PointForce(s, components=(mu * sign * across, fy, fz)))
-        found = chart.estimate(
+        found = contact_map.estimate(
             base_signals(bent.force, bent.moment), selection(settings["triplet"], exactly=3)
         )
         whole = estimate_from_wrench(whisker, bent.force, bent.moment)
@@ -176,9 +178,9 @@ def _friction(whisker: Whisker, settings: Settings, seed: int) -> xr.Dataset:
     return _table(columns, rows, "friction", [float(mu) for mu in settings["friction"]])
 
 
-def _some_contacts(chart: ContactMap, count: int, seed: int) -> tuple[Array, Array]:
+def _some_contacts(contact_map: ContactMap, count: int, seed: int) -> tuple[Array, Array]:
     """Arc lengths (n,) and material forces (3, n) of contacts spread over the reachable space."""
-    data = chart.to_dataset()
+    data = contact_map.to_dataset()
     fold = _fold_forces(data)
     generator = np.random.default_rng(seed)
     i = generator.integers(1, data.sizes["station"], count)
@@ -186,7 +188,7 @@ def _some_contacts(chart: ContactMap, count: int, seed: int) -> tuple[Array, Arr
     share = generator.uniform(0.05, 0.9, count)
     size = share**2 * fold[i, j]
     bearing = data["bearing"].values[j]
-    s = data["station"].values[i] * chart.whisker.length
+    s = data["station"].values[i] * contact_map.whisker.length
     zero = np.zeros(count)
     return s, np.stack([zero, size * np.cos(bearing), size * np.sin(bearing)])
 

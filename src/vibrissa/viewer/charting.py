@@ -24,7 +24,7 @@ _POINT = 0.008
 class Chart:
     """A whisker's map with the samples that are drawn."""
 
-    contacts: ContactMap
+    contact_map: ContactMap
     samples: xr.Dataset
     line: Array
     points: Array
@@ -33,18 +33,18 @@ class Chart:
     @property
     def whisker(self) -> Whisker:
         """Whose contacts."""
-        return self.contacts.whisker
+        return self.contact_map.whisker
 
 
-def charted(whisker: Whisker, contacts: ContactMap | None = None) -> Chart:
+def charted(whisker: Whisker, contact_map: ContactMap | None = None) -> Chart:
     """Sample all stable contacts of a whisker; its map is made unless it is given."""
-    contacts = contacts or ContactMap.simulate(whisker, grid=False)
-    samples, line = contacts.to_dataset(), whisker.centerline()
+    contact_map = contact_map or ContactMap.simulate(whisker, grid=False)
+    samples, line = contact_map.to_dataset(), whisker.centerline()
     # The last bearing is the first again, and no load is no contact.
     kept = samples.isel(bearing=slice(0, -1), load=slice(2, None, 2))
     aside = ~kept["small_deflection"].to_numpy().astype(bool)
     signals = {name: kept[name].to_numpy()[aside] for name in SIGNALS}
-    return Chart(contacts, samples, line, kept["contact_point"].to_numpy()[aside], signals)
+    return Chart(contact_map, samples, line, kept["contact_point"].to_numpy()[aside], signals)
 
 
 def places(chart: Chart) -> Array:

@@ -86,7 +86,7 @@ def located(chart: Chart, bend: Bend, sensor: Sensor) -> Located | None:
     if not bend.status.ok or bend.status is Status.NO_CONTACT:
         return None
     signals = base_signals(np.asarray(bent.force), np.asarray(bent.moment))
-    estimate = chart.contacts.estimate(signals, sensor.triplet, noise=sensor.covariance)
+    estimate = chart.contact_map.estimate(signals, sensor.triplet, noise=sensor.covariance)
     points = estimate.candidates[np.isfinite(estimate.candidates).all(axis=-1)]
     lines = deflect(chart.whisker, PointContact(points.reshape(-1, 3))).centerline(NODES)
     return Located(sensor, signals, np.asarray(bent.contact_point), estimate, lines)
@@ -99,7 +99,7 @@ def coloured(chart: Chart, what: str, sensor: Sensor) -> tuple[Bytes, Legend]:
     if what == "sensitivity":
         return shaded("predicted_error", _predicted_error(chart, sensor))
     felt = {name: chart.signals[name] for name in sensor.triplet}
-    estimate = chart.contacts.estimate(felt, sensor.triplet)
+    estimate = chart.contact_map.estimate(felt, sensor.triplet)
     if what == "uniqueness":
         return counted(estimate.n_candidates)
     if what == "ambiguity":
@@ -111,7 +111,7 @@ def _predicted_error(chart: Chart, sensor: Sensor) -> Array:
     """RMS 3D error (n,), m, of the contacts of the cloud."""
     if sensor.covariance is None:
         return np.full(len(chart.points), np.nan)
-    found = sensitivity(chart.contacts, sensor.triplet, chart.points, noise=sensor.covariance)
+    found = sensitivity(chart.contact_map, sensor.triplet, chart.points, noise=sensor.covariance)
     return np.asarray(found["predicted_error"].to_numpy(), dtype=np.float64)
 
 

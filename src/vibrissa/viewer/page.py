@@ -60,7 +60,7 @@ class Page:
     """What all modes share."""
 
     def __init__(
-        self, server: viser.ViserServer, whisker: Whisker, contacts: ContactMap | None = None
+        self, server: viser.ViserServer, whisker: Whisker, contact_map: ContactMap | None = None
     ) -> None:
         self.server = server
         self.stage = Stage(server)
@@ -68,7 +68,7 @@ class Page:
         self.work = Latest(self._fault)
         self.slow_work = Latest(self._fault)
         self.original = whisker
-        self._contacts = contacts
+        self._contact_map = contact_map
         self.chart: Chart | None = None
         self.shape = shape_of(whisker)
         self.bend = begin(whisker)
@@ -98,7 +98,7 @@ class Page:
     @property
     def has_map(self) -> bool:
         """Whether a map was given, rather than made."""
-        return self._contacts is not None
+        return self._contact_map is not None
 
     def reshape(self, **asked: float) -> None:
         """Change the whisker: length, turn, taper, modulus (SI)."""
@@ -117,7 +117,7 @@ class Page:
     def prepare(self) -> None:
         """Chart the whisker's contacts beside everything else, and redraw when that is done."""
         whisker = self.bend.whisker
-        own = self._contacts if whisker is self.original else None
+        own = self._contact_map if whisker is self.original else None
 
         def ready(chart: Chart) -> None:
             if chart.whisker is self.bend.whisker:

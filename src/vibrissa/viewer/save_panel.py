@@ -55,7 +55,7 @@ class SaveControls:
             return "trial.nc", lambda: recording_netcdf(recording)
         chart = page.chart
         if mode == "Map" and chart is not None:
-            return "map.nc", lambda: map_netcdf(chart.contacts)
+            return "map.nc", lambda: map_netcdf(chart.contact_map)
         bent = page.bend.deflection
         return "bent.nc", lambda: netcdf(deflection_dataset(bent))
 

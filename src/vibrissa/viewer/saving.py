@@ -34,9 +34,9 @@ def whisker_netcdf(whisker: Whisker) -> bytes:
     return netcdf(whisker.to_dataset())
 
 
-def map_netcdf(contacts: ContactMap) -> bytes:
+def map_netcdf(contact_map: ContactMap) -> bytes:
     """A map without loss, which `ContactMap.load` reads."""
-    return _written("map.nc", contacts.save)
+    return _written("map.nc", contact_map.save)
 
 
 def recording_netcdf(recording: xr.DataTree) -> bytes:

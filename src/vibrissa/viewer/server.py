@@ -102,7 +102,7 @@ class Viewer:
 def view(
     shown: Whisker | ContactMap | xr.DataTree,
     *,
-    contacts: ContactMap | None = None,
+    contact_map: ContactMap | None = None,
     recording: xr.DataTree | None = None,
     videos: Sequence[str | PathLike[str]] = (),
     host: str = HOST,
@@ -115,7 +115,7 @@ def view(
     shown : Whisker, ContactMap or DataTree
         To look at: a whisker, its map, or a recording, whose whisker is the one that touches most
         of the time.
-    contacts : ContactMap, optional
+    contact_map : ContactMap, optional
         The map of the whisker, if there is one already.
     recording : DataTree, optional
         A trial to watch beside another whisker or a map.
@@ -141,7 +141,7 @@ def view(
     if isinstance(shown, xr.DataTree):
         recording = _once(recording, shown, "recording")
     elif isinstance(shown, ContactMap):
-        contacts = _once(contacts, shown, "map")
+        contact_map = _once(contact_map, shown, "map")
     elif not isinstance(shown, Whisker):
         raise ValueError(
             "what is shown is a Whisker, a ContactMap or a recording (DataTree); got "
@@ -151,16 +151,16 @@ def view(
     trial = None if recording is None else watched(recording)
     if isinstance(shown, Whisker):
         whisker = shown
-    elif contacts is not None:
-        whisker = contacts.whisker
+    elif contact_map is not None:
+        whisker = contact_map.whisker
     else:
         assert trial is not None  # there is nothing else
         whisker = trial.whiskers[trial.busiest]
-    if contacts is not None and contacts.whisker is not whisker:
-        whisker = _of_one(contacts, whisker)
+    if contact_map is not None and contact_map.whisker is not whisker:
+        whisker = _of_one(contact_map, whisker)
     with contextlib.ExitStack() as opened:  # closed again if a later step fails
         footage = _footage(trial, videos, opened)
-        page = Page(_served(host, port, opened), whisker, contacts)
+        page = Page(_served(host, port, opened), whisker, contact_map)
         opened.pop_all()
         page.closing += [film.close for film in footage]
         viewer = Viewer(page)
@@ -177,9 +177,9 @@ def _once(given: Any, shown: Any, name: str) -> Any:
     return shown
 
 
-def _of_one(contacts: ContactMap, whisker: Whisker) -> Whisker:
+def _of_one(contact_map: ContactMap, whisker: Whisker) -> Whisker:
     """The whisker of a map, where it is the one that is asked for."""
-    own = contacts.whisker
+    own = contact_map.whisker
     names = ("length", "base_radius", "tip_radius", "youngs_modulus")
     same = all(np.isclose(getattr(own, name), getattr(whisker, name)) for name in names)
     if not (same and np.allclose(own.centerline(20), whisker.centerline(20), atol=1e-9)):

@@ -25,8 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import vibrissa as vb
-from vibrissa.rod.batch import solve_forces
-from vibrissa.rod.discretize import Discretization, discretize
+from vibrissa.rod import Discretization, discretize, solve_forces
 
 Array = NDArray[np.float64]
 

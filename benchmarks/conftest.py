@@ -18,9 +18,8 @@ from scipy.interpolate import CubicSpline
 
 import vibrissa as vb
 from vibrissa import samples
-from vibrissa.rod.batch import solve_forces, threads
-from vibrissa.rod.discretize import discretize
-from vibrissa.rod.reach import fold_forces, reach
+from vibrissa.numerics import threads
+from vibrissa.rod import discretize, fold_forces, solve_forces, stable_set
 
 _ROWS: list[tuple[str, float, float, float, str]] = []
 
@@ -53,7 +52,7 @@ class Contacts:
         """Draw s_c, bearing and share of the fold's force, uniformly."""
         rng = np.random.default_rng(8)
         s, bearing = rng.uniform(0.3, 1.0, n), rng.uniform(-np.pi, np.pi, n)
-        fold = reach(whisker).fold
+        fold = stable_set(whisker).fold
         force = fold_forces(fold, np.stack([s, np.cos(bearing), np.sin(bearing)], axis=-1))
         force *= rng.uniform(0.0, 0.95, n)
         rows = np.stack([s, 0.0 * s, force * np.cos(bearing), force * np.sin(bearing)], axis=-1)
@@ -99,7 +98,7 @@ def scipy_solve(whisker):
 
     # A contact at 0.7 L, well bent.
     place = np.array([[0.7, np.cos(0.5), np.sin(0.5)]])
-    force = 0.8 * fold_forces(reach(whisker).fold, place)[0]
+    force = 0.8 * fold_forces(stable_set(whisker).fold, place)[0]
     contact = np.array([[0.7, 0.0, force * np.cos(0.5), force * np.sin(0.5)]])
 
     def solve(rtol: float, atol: float = 1e-12) -> np.ndarray:

@@ -21,8 +21,7 @@ os.environ["VIBRISSA_THREADS"] = "1"
 import numpy as np
 
 import vibrissa as vb
-from vibrissa.rod.discretize import discretize
-from vibrissa.rod.reach import fold_forces, reach
+from vibrissa.rod import discretize, fold_forces, stable_set
 from vibrissa.sensors import Sensor
 from vibrissa.signals import SIGNALS
 
@@ -34,7 +33,7 @@ def glide(whisker, n):
     """Contacts between 0.5 L and 0.85 L, all around, at 20 to 80 % of what slips off."""
     t = np.linspace(0.0, 1.0, n)
     s, bearing = 0.675 + 0.175 * np.cos(9.0 * t), (0.5 + 6.0 * t) % (2.0 * np.pi)
-    fold, unit = reach(whisker).fold, discretize(whisker).force
+    fold, unit = stable_set(whisker).fold, discretize(whisker).force
     most = fold_forces(fold, np.stack([s, np.cos(bearing), np.sin(bearing)], axis=-1))
     share = 0.5 - 0.3 * np.cos(31.0 * t)
     return vb.deflect(whisker, vb.PointForce(s * whisker.length, share * most * unit, bearing))

@@ -5,8 +5,7 @@ import pytest
 
 import vibrissa as vb
 from vibrissa.contacts.inversion import invert
-from vibrissa.rod.batch import solve_forces
-from vibrissa.rod.discretize import discretize
+from vibrissa.rod import discretize, solve_forces
 from vibrissa.signals import SIGNALS
 
 TRIPLET = ("Fx", "MB", "MD")

@@ -6,9 +6,7 @@ import sys
 import numpy as np
 
 import vibrissa as vb
-from vibrissa.rod.batch import solve_forces
-from vibrissa.rod.discretize import discretize
-from vibrissa.rod.points import point_solver
+from vibrissa.rod import discretize, point_solver, solve_forces
 
 
 def test_force_to_signals(whisker, contacts, scipy_solve, report):

@@ -4,8 +4,7 @@ import numpy as np
 from pages import few, percent, power, table
 
 import vibrissa as vb
-from vibrissa.rod.discretize import discretize
-from vibrissa.rod.reach import contacts_at, reach
+from vibrissa.rod import contacts_at, discretize, stable_set
 from vibrissa.signals import SIGNALS, TRIPLETS, within_cone
 
 FINE = 500
@@ -48,7 +47,7 @@ def name_of(signals):
 def drawn(whisker, n, rng, load=(0.0, 0.99), friction=0.0, steps=36):
     """Contacts all over Ω: uniform in arc length, bearing and root of the load over the fold's."""
     low, high = [0.0, -np.pi, load[0]], [1.0, np.pi, load[1]]
-    s, fy, fz = contacts_at(reach(whisker).fold, rng.uniform(low, high, (n, 3))).T
+    s, fy, fz = contacts_at(stable_set(whisker).fold, rng.uniform(low, high, (n, 3))).T
     fx = rng.uniform(-friction, friction, n) * np.hypot(fy, fz)
     unit = discretize(whisker).force
     load_at = vb.PointForce(s * whisker.length, components=(fx * unit, fy * unit, fz * unit))

@@ -10,7 +10,7 @@ from vibrissa.cli.app import app
 from vibrissa.contacts import ContactMap
 from vibrissa.io import load_contacts
 from vibrissa.sensors import Sensor, save_sensor
-from vibrissa.signals.regions import concave_backward
+from vibrissa.signals import concave_backward
 from vibrissa.status import Status
 
 typer_testing = pytest.importorskip("typer.testing")

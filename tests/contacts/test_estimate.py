@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 
 import vibrissa as vb
-from vibrissa.rod.batch import solve_forces
-from vibrissa.rod.discretize import discretize
-from vibrissa.rod.reach import contacts_at, determinant
+from vibrissa.rod import contacts_at, determinant, discretize, solve_forces
 from vibrissa.signals import TRIPLETS, within_cone
 
 CANONICAL = ("Fx", "MB", "MD")

@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 
 import vibrissa as vb
-from vibrissa.rod.reach import contacts_at
+from vibrissa.rod import contacts_at
 from vibrissa.signals import SIGNALS
 
 SIGMA = np.repeat([1e-6, 2e-8], 3)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import vibrissa as vb
-from vibrissa.signals.regions import REGIONS, concave_backward
+from vibrissa.signals import REGIONS, concave_backward
 from vibrissa.status import Status
 
 NOISE = np.diag(np.repeat([1e-6, 2e-8], 3) ** 2)

@@ -7,8 +7,7 @@ import pytest
 import xarray as xr
 
 import vibrissa as vb
-from vibrissa.rod.discretize import discretize
-from vibrissa.rod.reach import contacts_at, reach
+from vibrissa.rod import contacts_at, discretize, stable_set
 
 REAL = Path(__file__).parents[3] / "shared" / "real_whiskers"
 SIGMA = np.repeat([1e-6, 2e-8], 3)
@@ -26,7 +25,7 @@ WHISKERS = {
 
 def frictional_load(whisker, n, rng, most=0.5):
     """Loads up to those that slip off, with friction coefficients up to ``most`` either way."""
-    chart = reach(whisker)
+    chart = stable_set(whisker)
     place = np.stack(
         [rng.uniform(0, 1, n), rng.uniform(-np.pi, np.pi, n), rng.uniform(0.1, 0.99, n)], axis=1
     )

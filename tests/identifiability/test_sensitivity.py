@@ -9,7 +9,7 @@ import xarray as xr
 import vibrissa as vb
 from vibrissa.contacts.contact_map import spherical
 from vibrissa.identifiability import error_solid, signal_slice
-from vibrissa.numerics.quantiles import quantile, weights
+from vibrissa.numerics import contact_weights, weighted_quantile
 from vibrissa.paper.differences import interpolation_errors, within_turn
 from vibrissa.signals import TRIPLETS
 
@@ -272,19 +272,21 @@ def test_findings_ask_only_the_region(nodes):
     found = vb.sensitivity_findings(nodes, region)
     sizes = np.abs(nodes.sensitivity.sel(coordinate="r", signal="Fx")).to_numpy()[region.to_numpy()]
     volume = nodes.volume.to_numpy()[region.to_numpy()]
-    wanted = quantile(sizes, volume)
+    wanted = weighted_quantile(sizes, volume)
     assert float(found.median_size.sel(coordinate="r", signal="Fx")) == pytest.approx(float(wanted))
     assert np.isnan(found.backward_over_forward).all()
-    assert weights(nodes, region).sum() == pytest.approx(volume.sum())
+    assert contact_weights(nodes, region).sum() == pytest.approx(volume.sum())
 
 
 def test_weighted_quantiles():
     values = np.random.default_rng(4).normal(size=501)
-    assert quantile(values, np.ones(501)) == pytest.approx(np.median(values))
-    doubled = quantile(np.concatenate([values, values[:100]]), np.ones(601), np.array([0.3]))
+    assert weighted_quantile(values, np.ones(501)) == pytest.approx(np.median(values))
+    doubled = weighted_quantile(
+        np.concatenate([values, values[:100]]), np.ones(601), np.array([0.3])
+    )
     weight = np.where(np.arange(501) < 100, 2.0, 1.0)
-    assert quantile(values, weight, np.array([0.3])) == pytest.approx(doubled, abs=0.02)
-    assert np.isnan(quantile(values, np.zeros(501)))
+    assert weighted_quantile(values, weight, np.array([0.3])) == pytest.approx(doubled, abs=0.02)
+    assert np.isnan(weighted_quantile(values, np.zeros(501)))
 
 
 @pytest.mark.parametrize(

@@ -12,9 +12,7 @@ from vibrissa.identifiability.regions import place, sample, spread
 from vibrissa.identifiability.summary import choice, notation
 from vibrissa.identifiability.twins import twins
 from vibrissa.paper import network
-from vibrissa.rod.batch import contact_tangents, solve_forces
-from vibrissa.rod.discretize import discretize
-from vibrissa.rod.reach import chart_of, with_normal_force
+from vibrissa.rod import chart_of, contact_tangents, discretize, solve_forces, with_normal_force
 from vibrissa.signals import REGIONS, TRIPLETS
 
 PAPER = ("Fx MB MD", "Mx MB MD", "Fx FD MD")

@@ -6,7 +6,7 @@ import pytest
 from vibrissa import Status, samples
 from vibrissa.objects import Box, Mesh, Peg
 from vibrissa.recording import recorded_objects
-from vibrissa.rod.surfaces import follow_surfaces
+from vibrissa.rod import follow_surfaces
 from vibrissa.simulation import simulate, whisking
 from vibrissa.simulation.motion import base_rotation
 

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 import vibrissa as vb
-from vibrissa.rod.discretize import discretize
-from vibrissa.rod.reach import fold_forces, reach
+from vibrissa.rod import discretize, fold_forces, stable_set
 
 DATA = Path(__file__).parent.parent / "data"
 LENGTH = 39.4e-3
@@ -66,7 +65,7 @@ class Loads:
     def forces(self, whisker, most=1.0):
         """Forces in N, from a share of ``most`` of the fold force down to nothing."""
         places = np.stack([self.s, np.cos(self.bearing), np.sin(self.bearing)], axis=-1)
-        force = self.share * fold_forces(reach(whisker).fold, places)
+        force = self.share * fold_forces(stable_set(whisker).fold, places)
         return most * force * discretize(whisker).force
 
     def on(self, whisker, most=0.98):

@@ -7,7 +7,7 @@ import textwrap
 
 import pytest
 
-from vibrissa.numerics.compiled import copy
+from vibrissa.numerics import copy
 
 
 def run(code, **environment):

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 import vibrissa as vb
-from vibrissa.rod.discretize import discretize
+from vibrissa.rod import discretize
 
 OK, TOO_STRONG = vb.Status.OK, vb.Status.TOO_STRONG
 

@@ -6,9 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import vibrissa as vb
-from vibrissa.rod.batch import solve_forces
-from vibrissa.rod.discretize import discretize
-from vibrissa.rod.shape import shapes
+from vibrissa.rod import discretize, shapes, solve_forces
 
 few = settings(max_examples=15)
 
@@ -24,7 +22,7 @@ def agree(found, expected, share):
 
 def steps_ends(whisker, n=12):
     """Arc lengths (over L) at which steps of the integration end, and their neighbours."""
-    start = discretize(whisker).rod[0]
+    start = discretize(whisker).rod.start
     ends = start[start > 0.3][:: max(1, (start > 0.3).sum() // n)][:n]
     return np.concatenate([ends, np.nextafter(ends, 0.0), np.nextafter(ends, 1.0)])
 

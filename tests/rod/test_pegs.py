@@ -6,9 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import vibrissa as vb
-from vibrissa.rod.batch import contact_tangents, solve_forces
-from vibrissa.rod.discretize import discretize
-from vibrissa.rod.reach import fold_forces, reach
+from vibrissa.rod import contact_tangents, discretize, fold_forces, solve_forces, stable_set
 
 few = settings(max_examples=15)
 OK, TIP, FREE = vb.Status.OK, vb.Status.TIP_CONTACT, vb.Status.NO_CONTACT
@@ -71,7 +69,9 @@ def test_a_line_near_the_tip_holds_the_bent_whisker(whisker):
     n = 300
     s, bearing = rng.uniform(0.97, 0.999, n), rng.uniform(-np.pi, np.pi, n)
     contacts = np.stack([s, 0.0 * s, np.cos(bearing), np.sin(bearing)], axis=-1)
-    share = rng.uniform(0.02, 0.2, n) * fold_forces(reach(whisker).fold, contacts[:, [0, 2, 3]])
+    share = rng.uniform(0.02, 0.2, n) * fold_forces(
+        stable_set(whisker).fold, contacts[:, [0, 2, 3]]
+    )
     contacts[:, 2:] *= share[:, None]
     pushed = vb.deflect(whisker, vb.PointForce(s * d.length, share * d.force, bearing))
     along = contact_tangents(d, contacts)

@@ -7,9 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 import vibrissa as vb
-from vibrissa.rod.batch import solve_forces
-from vibrissa.rod.discretize import discretize
-from vibrissa.rod.reach import fold_forces, reach
+from vibrissa.rod import discretize, fold_forces, solve_forces, stable_set
 
 few = settings(max_examples=15)
 
@@ -165,7 +163,7 @@ def test_a_light_contact_is_light_on_a_cylinder_too(cylinder, off):
 
 def test_where_two_contacts_are_at_one_point_the_lighter_one_is_the_answer(cylinder):
     """Heavy contacts that pass the resting whisker, where a light one holds it as well."""
-    d, fold = discretize(cylinder), reach(cylinder).fold
+    d, fold = discretize(cylinder), stable_set(cylinder).fold
     rng = np.random.default_rng(6)
     heavy = np.zeros((300_000, 4))
     s, bearing = rng.uniform(0.4, 0.98, len(heavy)), rng.normal(np.pi, 0.2, len(heavy))

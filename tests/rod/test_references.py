@@ -6,8 +6,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
 import vibrissa as vb
-from vibrissa.rod.batch import solve_forces
-from vibrissa.rod.discretize import discretize
+from vibrissa.rod import discretize, solve_forces
 
 LENGTH = 39.4e-3
 

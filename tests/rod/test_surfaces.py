@@ -5,9 +5,7 @@ import pytest
 
 import vibrissa as vb
 from vibrissa.objects import Box, Peg, Plane, Sphere
-from vibrissa.rod.contact_state import contact_state
-from vibrissa.rod.discretize import discretize
-from vibrissa.rod.surfaces import follow_surfaces
+from vibrissa.rod import contact_state, discretize, follow_surfaces
 from vibrissa.simulation import whisking
 from vibrissa.simulation.motion import base_rotation
 from vibrissa.status import Status

@@ -5,8 +5,7 @@ import pytest
 import xarray as xr
 
 import vibrissa as vb
-from vibrissa.rod.batch import solve_forces
-from vibrissa.rod.discretize import discretize
+from vibrissa.rod import discretize, solve_forces
 from vibrissa.signals import (
     SIGNALS,
     TRIPLETS,
@@ -14,9 +13,11 @@ from vibrissa.signals import (
     measured,
     nearest_on_rest,
     selection,
+    signal_derivatives,
+    signals_of,
     within_cone,
+    wrench_derivatives,
 )
-from vibrissa.signals.base import signal_derivatives, signals_of, wrench_derivatives
 
 
 def test_definition_on_a_known_wrench():

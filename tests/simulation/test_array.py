@@ -7,7 +7,7 @@ import vibrissa as vb
 from vibrissa.io import load_recording, save_recording
 from vibrissa.objects import Plane, Sphere
 from vibrissa.recording import recorded_objects, recorded_whisker
-from vibrissa.rod.surfaces import follow_surfaces
+from vibrissa.rod import follow_surfaces
 from vibrissa.simulation import (
     Dynamics,
     Look,

@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter1d
 
 import vibrissa as vb
 from vibrissa.objects import Peg
-from vibrissa.rod.surfaces import follow_surfaces
+from vibrissa.rod import follow_surfaces
 from vibrissa.simulation import Dynamics, Motion, resonances, simulate, whisking
 from vibrissa.simulation.chain import Chain, configure, inertia, jacobian, solve_definite
 from vibrissa.simulation.dynamics import move_dynamically

@@ -126,7 +126,7 @@ def test_friction_is_found_in_the_shape(share):
 def test_a_step_to_a_contact_that_no_rod_withstands_is_not_taken():
     from vibrissa import samples
     from vibrissa.cameras import orthogonal_views
-    from vibrissa.rod.discretize import discretize
+    from vibrissa.rod import discretize
     from vibrissa.tracking import RefineOptions, Sight, Trace
     from vibrissa.tracking.head import HeadPose
     from vibrissa.tracking.refine import _Problem

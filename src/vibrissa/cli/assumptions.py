@@ -134,7 +134,7 @@ def assumed(
 
 def smallest_arc(proximal: float | None) -> float:
     """Give the smallest arc length of a contact, share of the length: what is given, or 0.3."""
-    from vibrissa.rod.reach import PROXIMAL
+    from vibrissa.rod import PROXIMAL
 
     return PROXIMAL if proximal is None else proximal
 

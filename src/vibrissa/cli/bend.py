@@ -11,8 +11,7 @@ import typer
 from vibrissa.cli.terminal import fixed, numbers, output, refuse
 
 if TYPE_CHECKING:
-    from vibrissa.rod import Deflection
-    from vibrissa.rod.loads import Load
+    from vibrissa.rod import Deflection, Load
     from vibrissa.status import Status
     from vibrissa.whisker import Whisker
 
@@ -68,8 +67,7 @@ def bend(
     says why, and the exit status is 1. Example: `vibrissa deflect --point 25,12,1`
     """
     from vibrissa.cli.sources import tell_notes, whisker_from
-    from vibrissa.rod import deflect
-    from vibrissa.rod.reach import PROXIMAL
+    from vibrissa.rod import PROXIMAL, deflect
     from vibrissa.status import Status
 
     load = _load(point, force, peg, axis, side)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from vibrissa.cli.locating import How
-    from vibrissa.numerics.arrays import Array
+    from vibrissa.numerics import Array
     from vibrissa.objects.surface import Surface
     from vibrissa.whisker import Whisker
 

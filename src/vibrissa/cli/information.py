@@ -55,8 +55,8 @@ def _installation() -> Iterator[tuple[str, str]]:
     from importlib.metadata import version
 
     import vibrissa
-    from vibrissa.rod.batch import threads
-    from vibrissa.rod.kernels import evaluate
+    from vibrissa.numerics import threads
+    from vibrissa.rod import evaluate
 
     yield "vibrissa", f"{vibrissa.__version__}, {Path(vibrissa.__file__).parent}"
     yield "python", f"{platform.python_version()}, {platform.system()} {platform.machine()}"

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     import xarray as xr
 
-    from vibrissa.numerics.arrays import Array
+    from vibrissa.numerics import Array
     from vibrissa.whisker import Whisker
 
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from vibrissa.contacts import ContactMap
-    from vibrissa.numerics.arrays import Array
+    from vibrissa.numerics import Array
     from vibrissa.whisker import Whisker
 
 

@@ -49,7 +49,7 @@ def sensitivity(
     from vibrissa.identifiability import best_triplet
     from vibrissa.identifiability import sensitivity as derivatives
     from vibrissa.io.paths import NETCDF, check_writable
-    from vibrissa.numerics.quantiles import weights
+    from vibrissa.numerics import contact_weights
     from vibrissa.paper import sensitivity_findings
     from vibrissa.signals import selection
 
@@ -66,7 +66,7 @@ def sensitivity(
         tell("derivatives", 1, 2)
         rivals = best_triplet(contact_map, noise, at)
         tell("derivatives", 2, 2)
-    if not weights(found).any():
+    if not contact_weights(found).any():
         raise ValueError(f"{trial or chart} holds no contact farther than 2° from rest")
     output.print(f"{contact_map.whisker!r}", highlight=False, soft_wrap=True)
     output.print(_derivative_table(found, sensitivity_findings(found)))

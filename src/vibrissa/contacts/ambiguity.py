@@ -18,18 +18,21 @@ from vibrissa.contacts.fitting import channel_equations
 from vibrissa.contacts.locating import COLUMNS, tell
 from vibrissa.contacts.readout import Measurement, Mixed, Named
 from vibrissa.contacts.weighing import Weighing, weigh
-from vibrissa.numerics.arrays import AnyArray, Array, Rod
-from vibrissa.numerics.compiled import copy, inlined, kernel
-from vibrissa.rod.kernels import (
+from vibrissa.numerics import AnyArray, Array, copy, inlined, kernel
+from vibrissa.rod import (
     BUFFER_SIZE,
     LANES,
+    Fold,
+    Rod,
+    StableSet,
+    chart_to_contact,
     integrate,
     lane_tangents,
     lane_value,
+    point_determinant,
     set_lane,
+    stable,
 )
-from vibrissa.rod.newton import point_determinant, stable
-from vibrissa.rod.reach import Fold, Reach, chart_to_contact
 
 # Every so many of the chart's stations is a sample of arc length, of a surface also of bearings.
 _STATIONS = 2
@@ -72,7 +75,7 @@ class Sections(NamedTuple):
 class Ambiguity:
     """Samples of the contacts that explain one or two signals."""
 
-    def __init__(self, chart: Reach, readout: Named | Mixed) -> None:
+    def __init__(self, chart: StableSet, readout: Named | Mixed) -> None:
         how, d = readout.how, chart.discretization
         codes = how.codes.tolist()
         named = isinstance(readout, Named)

@@ -41,9 +41,8 @@ from vibrissa.contacts.minima import reliable, unknowns_covariance
 from vibrissa.contacts.noise import common_channels
 from vibrissa.contacts.readout import Measurement, Named
 from vibrissa.contacts.weighing import Weighing, weigh
-from vibrissa.numerics.arrays import Array, IntArray
-from vibrissa.rod.batch import solve_forces
-from vibrissa.rod.reach import LEAST_ARC
+from vibrissa.numerics import Array, IntArray
+from vibrissa.rod import LEAST_ARC, solve_forces
 
 # Windows along the whisker, and in each of them so many sectors of bearings to start from.
 _WINDOWS = 16

@@ -16,17 +16,17 @@ import math
 import numpy as np
 
 from vibrissa.contacts.fitting import channel_equations, whiten
-from vibrissa.numerics.arrays import Array, IntArray, Rod
-from vibrissa.numerics.compiled import copy, inlined, kernel
-from vibrissa.rod.kernels import (
+from vibrissa.numerics import Array, IntArray, copy, inlined, kernel, solve3
+from vibrissa.rod import (
     BUFFER_SIZE,
+    Fold,
+    Rod,
+    fold_force,
     integrate,
     lane_value,
     lanes_tangents,
     set_all_lanes,
 )
-from vibrissa.rod.reach import Fold, fold_force
-from vibrissa.rod.seeds import solve3
 
 _ROUNDS = 40
 _MOST_DAMPING = 1e8

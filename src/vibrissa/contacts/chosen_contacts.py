@@ -10,12 +10,16 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from vibrissa.numerics.arrays import AnyArray, Array, IntArray
-from vibrissa.rod.batch import contact_tangents, solve_forces
-from vibrissa.rod.deflection import deflect
-from vibrissa.rod.loads import PointContact
-from vibrissa.rod.reach import determinant, with_normal_force
-from vibrissa.rod.shape import contact_frames
+from vibrissa.numerics import AnyArray, Array, IntArray
+from vibrissa.rod import (
+    PointContact,
+    contact_frames,
+    contact_tangents,
+    deflect,
+    determinant,
+    solve_forces,
+    with_normal_force,
+)
 from vibrissa.signals import base_signals
 from vibrissa.status import Status
 

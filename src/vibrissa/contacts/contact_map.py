@@ -1,7 +1,7 @@
 """All contacts that a whisker can hold, and what each feels like at the base.
 
 A :class:`ContactMap` holds the chart of the stable, reachable contacts Ω of one whisker
-(:mod:`vibrissa.rod.reach`): contact point, force and moment with exact derivatives at its nodes.
+(:mod:`vibrissa.rod.chart`): contact point, force and moment with exact derivatives at its nodes.
 Everything in between is solved exactly when it is asked for; nothing is interpolated. On request it
 also holds the paper's grid of contact points: 15 radii from 0.3 L to L, azimuth ±65° and elevation
 ±60° in steps of 1°.
@@ -19,14 +19,20 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from vibrissa.numerics.arrays import AnyArray, Array
+from vibrissa.numerics import AnyArray, Array
 from vibrissa.quantities import attributes
-from vibrissa.rod.batch import contact_tangents
-from vibrissa.rod.deflection import deflect
-from vibrissa.rod.discretize import STEPS
-from vibrissa.rod.loads import PointContact
-from vibrissa.rod.preimage import Preimages
-from vibrissa.rod.reach import CELLS, PROXIMAL, Reach, reach, with_normal_force
+from vibrissa.rod import (
+    CELLS,
+    PROXIMAL,
+    STEPS,
+    PointContact,
+    SearchTree,
+    StableSet,
+    contact_tangents,
+    deflect,
+    stable_set,
+    with_normal_force,
+)
 from vibrissa.signals import SIGNALS, base_signals, concave_backward, selection, within_cone
 from vibrissa.sketch import CONTACT, REST, Mark, card, lines, shown, symbol, views
 from vibrissa.status import Status, flag_attributes
@@ -55,7 +61,7 @@ class ContactMap:
     ----------
     whisker : Whisker
         Whose contacts.
-    chart : Reach
+    chart : StableSet
         The stable contacts, non-dimensional.
     steps : int
         Integration steps along the whisker.
@@ -67,13 +73,13 @@ class ContactMap:
     """
 
     whisker: Whisker
-    chart: Reach
+    chart: StableSet
     steps: int = STEPS
     grid: xr.Dataset | None = None
     approximations: dict[tuple[str, tuple[str, ...]], LookupTable | NetworkSolver] = field(
         default_factory=dict, repr=False
     )
-    _trees: dict[tuple[str, ...], Preimages] = field(default_factory=dict, repr=False)
+    _trees: dict[tuple[str, ...], SearchTree] = field(default_factory=dict, repr=False)
     _determining: dict[tuple[str, ...], bool] = field(default_factory=dict, repr=False)
 
     @classmethod
@@ -110,7 +116,7 @@ class ContactMap:
         ContactMap
             The map.
         """
-        chart = reach(whisker, proximal=proximal, cells=cells, steps=steps)
+        chart = stable_set(whisker, proximal=proximal, cells=cells, steps=steps)
         solved = _solve_grid(whisker, proximal, steps, progress) if grid else None
         return cls(whisker, chart, steps, solved)
 
@@ -172,7 +178,7 @@ class ContactMap:
             prior,
         )
 
-    def tree(self, triplet: tuple[str, ...]) -> Preimages:
+    def tree(self, triplet: tuple[str, ...]) -> SearchTree:
         """Return the search tree of three signals, made on first use.
 
         Parameters
@@ -182,7 +188,7 @@ class ContactMap:
 
         Returns
         -------
-        Preimages
+        SearchTree
             The tree.
         """
         from vibrissa.contacts.inversion import triplet_tree
@@ -365,7 +371,7 @@ def grid_dataset(
     return data.merge(base_signals(data.force, data.moment))
 
 
-def _dataset(whisker: Whisker, chart: Reach) -> xr.Dataset:
+def _dataset(whisker: Whisker, chart: StableSet) -> xr.Dataset:
     d = chart.discretization
     dims = ("station", "bearing", "load")
     force = chart.values[..., :3] * d.force
@@ -400,7 +406,7 @@ def _dataset(whisker: Whisker, chart: Reach) -> xr.Dataset:
         ),
         "fold_force": (
             ("station", "bearing"),
-            np.exp(chart.fold[1][..., 0]) * d.force,
+            np.exp(chart.fold.log_force[..., 0]) * d.force,
             {"units": "N", "long_name": "force at which the whisker slips off"},
         ),
         "small_deflection": (dims, within_cone(whisker, point), _label("within 2° of rest")),

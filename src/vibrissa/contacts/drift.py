@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from vibrissa.numerics.arrays import Array
+from vibrissa.numerics import Array
 
 
 class Drift:

@@ -32,7 +32,7 @@ from vibrissa.contacts.noisy import under_noise
 from vibrissa.contacts.prior import Prior, among_allowed
 from vibrissa.contacts.readout import Named
 from vibrissa.contacts.showing import estimate_card, estimate_rows
-from vibrissa.numerics.arrays import AnyArray, Array, IntArray
+from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.paper.approximation import APPROXIMATE, by_approximation
 from vibrissa.quantities import attributes
 from vibrissa.signals import Coordinates, measured, selection, signal_scales

@@ -17,19 +17,23 @@ from vibrissa.contacts.locating import Searched, Trail, conclude, near
 from vibrissa.contacts.posterior import CERTAIN
 from vibrissa.contacts.weighing import Weighing, weigh
 from vibrissa.contacts.whitening import INDISTINCT
-from vibrissa.numerics.arrays import Array, IntArray, Rod
-from vibrissa.numerics.compiled import copy, inlined, kernel
-from vibrissa.rod.kernels import (
+from vibrissa.numerics import Array, IntArray, copy, inlined, kernel
+from vibrissa.rod import (
     BUFFER_SIZE,
     LANES,
+    LEAST_ARC,
+    MOST_SEEDS,
+    ROUNDING,
+    Rod,
+    chart_to_contact,
     evaluate,
     integrate,
     lane_value,
+    point_determinant,
+    seeds,
     set_lane,
+    stable,
 )
-from vibrissa.rod.newton import ROUNDING, point_determinant, stable
-from vibrissa.rod.reach import LEAST_ARC, chart_to_contact
-from vibrissa.rod.seeds import MOST_SEEDS, seeds
 from vibrissa.status import Status
 
 _UNIQUE, _AMBIGUOUS = int(Status.UNIQUE), int(Status.AMBIGUOUS)

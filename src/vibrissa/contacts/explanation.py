@@ -11,11 +11,9 @@ from scipy.spatial import cKDTree
 from vibrissa.contacts.inversion import invert, polish
 from vibrissa.contacts.least_squares import least_squares
 from vibrissa.contacts.noise import SensorNoise
-from vibrissa.numerics.arrays import AnyArray, Array, IntArray
-from vibrissa.rod.newton import TOLERANCE
-from vibrissa.rod.reach import with_normal_force
-from vibrissa.signals import CIRCULAR, SIGNALS, circular_among, within_turn
-from vibrissa.signals.base import signals_of
+from vibrissa.numerics import AnyArray, Array, IntArray
+from vibrissa.rod import TOLERANCE, with_normal_force
+from vibrissa.signals import CIRCULAR, SIGNALS, circular_among, signals_of, within_turn
 from vibrissa.status import Status
 
 if TYPE_CHECKING:

@@ -10,8 +10,7 @@ import xarray as xr
 
 from vibrissa.io.hdf5 import naming
 from vibrissa.io.netcdf import COMPRESSED, kind_of, read_tree, write_netcdf
-from vibrissa.rod.discretize import discretize
-from vibrissa.rod.reach import Reach
+from vibrissa.rod import Fold, StableSet, discretize
 from vibrissa.whisker import Whisker
 
 if TYPE_CHECKING:
@@ -29,8 +28,8 @@ def save_map(contact_map: ContactMap, path: Path) -> None:
             "stations": ("station", chart.stations),
             "bearings": ("bearing", chart.bearings),
             "loads": ("load", chart.loads),
-            "bounds": ("bound", chart.fold[0]),
-            "fold": (("station", "bearing", "derivative"), chart.fold[1]),
+            "bounds": ("bound", chart.fold.bounds),
+            "fold": (("station", "bearing", "derivative"), chart.fold.log_force),
             "folded": (("station", "bearing"), chart.folded),
             "contacts": ((*_NODE, "unknown"), chart.contacts),
             "values": ((*_NODE, "value"), chart.values),
@@ -70,12 +69,12 @@ def _from_tree(tree: xr.DataTree) -> ContactMap:
     whisker = Whisker.from_dataset(tree["whisker"].to_dataset())
     steps = int(tree.attrs["steps"])
     raw = {str(name): np.asarray(v) for name, v in tree["chart"].to_dataset().variables.items()}
-    chart = Reach(
+    chart = StableSet(
         discretization=discretize(whisker, steps),
         stations=raw["stations"],
         bearings=raw["bearings"],
         loads=raw["loads"],
-        fold=(raw["bounds"], np.ascontiguousarray(raw["fold"])),
+        fold=Fold(raw["bounds"], np.ascontiguousarray(raw["fold"])),
         contacts=raw["contacts"],
         values=raw["values"],
         tangents=raw["tangents"],

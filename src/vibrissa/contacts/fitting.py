@@ -18,23 +18,23 @@ from typing import NamedTuple
 import numpy as np
 
 from vibrissa.contacts.channels import FITTED
-from vibrissa.numerics.arrays import AnyArray, Array, IntArray, Rod
-from vibrissa.numerics.compiled import copy, inlined, kernel
-from vibrissa.rod.batch import share_out
-from vibrissa.rod.discretize import Discretization
-from vibrissa.rod.kernels import (
+from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel, share_out, wrapped
+from vibrissa.rod import (
     BUFFER_SIZE,
     LANES,
+    Discretization,
+    Fold,
+    Rod,
+    StableSet,
     integrate,
     lane_tangents,
     lane_value,
     lanes_tangents,
+    point_determinant,
     set_all_lanes,
     set_lane,
+    stable,
 )
-from vibrissa.rod.newton import point_determinant, stable
-from vibrissa.rod.reach import Fold, Reach
-from vibrissa.rod.seeds import wrapped
 
 # Some valleys of χ² are narrow and bent: most fits take 5 rounds, but a few a hundred. What is not
 # at rest after so many goes on only if it may still count.
@@ -368,7 +368,7 @@ def _charted(
         found[row] = stable(fold, proximal, xi, point_determinant(by_xi))
 
 
-def charted(chart: Reach, fits: Fits, proximal: float) -> AnyArray:
+def charted(chart: StableSet, fits: Fits, proximal: float) -> AnyArray:
     """Whether fits without friction are stable contacts beyond an arc length, (n,)."""
     found = np.zeros(len(fits.contacts), np.bool_)
     share_out(

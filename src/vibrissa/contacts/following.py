@@ -29,7 +29,7 @@ from vibrissa.contacts.mixture import Mixture, predict, room, tidy, unaccounted
 from vibrissa.contacts.prior import Prior
 from vibrissa.contacts.readout import Measurement
 from vibrissa.contacts.whitening import explained
-from vibrissa.numerics.arrays import AnyArray, Array
+from vibrissa.numerics import AnyArray, Array
 from vibrissa.sensors.sensor import GRAVITY
 from vibrissa.status import Status
 

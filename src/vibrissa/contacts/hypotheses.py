@@ -8,7 +8,7 @@ import numpy as np
 
 from vibrissa.contacts.located import Located
 from vibrissa.contacts.mixture import Mixture
-from vibrissa.numerics.arrays import Array, IntArray
+from vibrissa.numerics import Array, IntArray
 from vibrissa.status import Status
 
 # What is surer than this is no longer ambiguous.

@@ -11,21 +11,25 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.numerics.arrays import Array, IntArray, Rod
-from vibrissa.numerics.compiled import copy, inlined, kernel
-from vibrissa.rod.batch import share_out
-from vibrissa.rod.kernels import BUFFER_SIZE, LANES
-from vibrissa.rod.newton import TOLERANCE, newton_group, stable, start_from
-from vibrissa.rod.preimage import Plane, Preimages, Tree
-from vibrissa.rod.reach import Fold, Reach, chart_to_contact
-from vibrissa.rod.seeds import MOST_SEEDS, seeds, wrapped
-from vibrissa.signals.base import (
-    CIRCULAR,
-    SIGNALS,
-    signal_derivatives,
-    signal_equations,
-    signals_of,
+from vibrissa.numerics import Array, IntArray, copy, inlined, kernel, share_out, wrapped
+from vibrissa.rod import (
+    BUFFER_SIZE,
+    LANES,
+    MOST_SEEDS,
+    TOLERANCE,
+    Fold,
+    PlaneVector,
+    Rod,
+    SearchTree,
+    StableSet,
+    chart_to_contact,
+    newton_group,
+    search_tree,
+    seeds,
+    stable,
+    start_from,
 )
+from vibrissa.signals import CIRCULAR, SIGNALS, signal_derivatives, signal_equations, signals_of
 
 #: At most so many contacts are kept for one measurement, those with the least force.
 MOST_CANDIDATES = 8
@@ -47,7 +51,7 @@ class Contacts(NamedTuple):
     values: Array
 
 
-def triplet_tree(chart: Reach, triplet: tuple[str, ...]) -> Preimages:
+def triplet_tree(chart: StableSet, triplet: tuple[str, ...]) -> SearchTree:
     """Build the subdivision tree of three signals over a chart."""
     which = [SIGNALS.index(name) for name in triplet]
     force, point = chart.values[..., :3], chart.values[..., 3:]
@@ -55,10 +59,10 @@ def triplet_tree(chart: Reach, triplet: tuple[str, ...]) -> Preimages:
     derivatives = signal_derivatives(chart.values, chart.tangents)[..., which, :]
     angles = tuple(CIRCULAR[w] for w in which)
     plane = _plane(chart, triplet)
-    return Preimages.of(chart, np.ascontiguousarray(values), derivatives, angles, plane)
+    return search_tree(chart, np.ascontiguousarray(values), derivatives, angles, plane)
 
 
-def _plane(chart: Reach, triplet: tuple[str, ...]) -> Plane | None:
+def _plane(chart: StableSet, triplet: tuple[str, ...]) -> PlaneVector | None:
     """The transverse force or the bending moment, if its size or direction is in the triplet."""
     force, point = chart.values[..., :3], chart.values[..., 3:]
     d_force, d_point = chart.tangents[..., :3, :], chart.tangents[..., 3:, :]
@@ -71,11 +75,13 @@ def _plane(chart: Reach, triplet: tuple[str, ...]) -> Plane | None:
             slopes = np.cross(d_point, force[..., None], axis=-2)
             slopes = slopes + np.cross(point[..., None], d_force, axis=-2)
         places = [triplet.index(name) if name in triplet else -1 for name in (size, direction)]
-        return Plane(vector[..., 1:], slopes[..., 1:, :], *places)
+        return PlaneVector(vector[..., 1:], slopes[..., 1:, :], *places)
     return None
 
 
-def invert(chart: Reach, tree: Preimages, triplet: tuple[str, ...], targets: Array) -> Contacts:
+def invert(
+    chart: StableSet, tree: SearchTree, triplet: tuple[str, ...], targets: Array
+) -> Contacts:
     """Find all stable contacts for each measured triplet."""
     if len(targets) > _MANY:
         order = _by_neighbourhood(targets)
@@ -99,7 +105,9 @@ def _by_neighbourhood(targets: Array) -> IntArray:
     return np.argsort(code, kind="stable")
 
 
-def _inverted(chart: Reach, tree: Preimages, triplet: tuple[str, ...], targets: Array) -> Contacts:
+def _inverted(
+    chart: StableSet, tree: SearchTree, triplet: tuple[str, ...], targets: Array
+) -> Contacts:
     n = len(targets)
     out = Contacts(
         np.zeros(n, np.int64),
@@ -111,14 +119,14 @@ def _inverted(chart: Reach, tree: Preimages, triplet: tuple[str, ...], targets: 
     share_out(
         n,
         lambda first, last: _invert(
-            rod, chart.fold, tree.tree, chart.proximal, targets, *out, first, last
+            rod, chart.fold, tree, chart.proximal, targets, *out, first, last
         ),
     )
     return out
 
 
 def polish(
-    chart: Reach, triplet: tuple[str, ...], targets: Array, contacts: Array
+    chart: StableSet, triplet: tuple[str, ...], targets: Array, contacts: Array
 ) -> tuple[Array, Array, Array, Array]:
     """Newton's method on T(ξ) = target from given contacts, stable or not."""
     n = len(targets)
@@ -193,7 +201,7 @@ def _add(
 def _invert(
     rod: Rod,
     fold: Fold,
-    tree: Tree,
+    tree: SearchTree,
     proximal: float,
     targets: Array,
     number: IntArray,

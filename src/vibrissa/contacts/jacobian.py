@@ -13,10 +13,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibrissa.numerics.arrays import Array
-from vibrissa.rod.discretize import Discretization
-from vibrissa.signals import SIGNALS, signal_scales
-from vibrissa.signals.base import signal_derivatives
+from vibrissa.numerics import Array
+from vibrissa.rod import Discretization
+from vibrissa.signals import SIGNALS, signal_derivatives, signal_scales
 
 #: A determinant smaller than this, rows and columns being of size one, is zero to rounding.
 SINGULAR = 1e-11

@@ -24,10 +24,8 @@ import numpy as np
 from vibrissa.contacts.fitting import _fit, channel_equations
 from vibrissa.contacts.mixture import Mixture
 from vibrissa.contacts.weighing import Weighing, gradients, weigh, wrong_by
-from vibrissa.numerics.arrays import Array, IntArray, Rod
-from vibrissa.numerics.compiled import copy, inlined, kernel
-from vibrissa.rod.newton import point_determinant, stable
-from vibrissa.rod.reach import Fold
+from vibrissa.numerics import Array, IntArray, copy, inlined, kernel
+from vibrissa.rod import Fold, Rod, point_determinant, stable
 
 _TIMES = 8
 # A contact that gives the signals is a place to look from if it is no farther (Mahalanobis distance

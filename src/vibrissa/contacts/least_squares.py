@@ -20,13 +20,9 @@ from vibrissa.contacts.inversion import invert
 from vibrissa.contacts.minima import Candidates, candidates
 from vibrissa.contacts.noise import SensorNoise
 from vibrissa.contacts.whitening import INDISTINCT, explained, rank, whitening
-from vibrissa.numerics.arrays import Array, IntArray
-from vibrissa.numerics.compiled import kernel
-from vibrissa.rod.batch import share_out, solve_forces
-from vibrissa.rod.newton import ROUNDING
-from vibrissa.rod.reach import LEAST_ARC, Reach, with_normal_force
-from vibrissa.signals import SIGNALS
-from vibrissa.signals.base import signal_derivatives, signals_of
+from vibrissa.numerics import Array, IntArray, kernel, share_out
+from vibrissa.rod import LEAST_ARC, ROUNDING, StableSet, solve_forces, with_normal_force
+from vibrissa.signals import SIGNALS, signal_derivatives, signals_of
 from vibrissa.status import Status
 
 if TYPE_CHECKING:
@@ -41,7 +37,7 @@ _FORCE = 1e-6
 
 
 @lru_cache(maxsize=64)
-def seeding_triplet(chart: Reach, names: tuple[str, ...]) -> tuple[str, ...]:
+def seeding_triplet(chart: StableSet, names: tuple[str, ...]) -> tuple[str, ...]:
     """The three signals among these that determine contacts best, as seen over the chart.
 
     Judged by the median volume of the error ellipsoid, with forces and moments known to a share of
@@ -139,13 +135,13 @@ def constant_weights(channels: Channels, sensor: SensorNoise | None) -> bool:
 
 
 def _weights(
-    chart: Reach, channels: Channels, sensor: SensorNoise | None, measured: Array, values: Array
+    chart: StableSet, channels: Channels, sensor: SensorNoise | None, measured: Array, values: Array
 ) -> Array:
     return whitening(channels.covariance(sensor, measured, values, chart.discretization))
 
 
 def nearby(
-    chart: Reach,
+    chart: StableSet,
     channels: Channels,
     sensor: SensorNoise | None,
     measured: Array,
@@ -177,7 +173,7 @@ def nearby(
     return fits
 
 
-def nearest_nodes(chart: Reach, channels: Channels, measured: Array) -> IntArray:
+def nearest_nodes(chart: StableSet, channels: Channels, measured: Array) -> IntArray:
     """The chart's nodes that come nearest to measured signals, in each part of the chart."""
     known = at_nodes(chart, channels.names)
     targets = channels.targets(measured)
@@ -194,7 +190,7 @@ def nearest_nodes(chart: Reach, channels: Channels, measured: Array) -> IntArray
 
 
 @lru_cache(maxsize=64)
-def at_nodes(chart: Reach, names: tuple[str, ...]) -> tuple[Array, Array, IntArray]:
+def at_nodes(chart: StableSet, names: tuple[str, ...]) -> tuple[Array, Array, IntArray]:
     """Channels (k, nodes) at the chart's nodes, 1/2π for those that are angles, and each's part."""
     which = [CHANNELS.index(name) for name in names]
     known = np.ascontiguousarray(channels_of(chart.values.reshape(-1, 6))[:, which].T)
@@ -202,7 +198,7 @@ def at_nodes(chart: Reach, names: tuple[str, ...]) -> tuple[Array, Array, IntArr
     return known, turns, parts(chart)
 
 
-def parts(chart: Reach) -> IntArray:
+def parts(chart: StableSet) -> IntArray:
     """To which of sixteen parts of the chart each of its nodes belongs, flat."""
     n, m, k = chart.values.shape[:3]
     i, j, _ = np.meshgrid(np.arange(n), np.arange(m), np.arange(k), indexing="ij")
@@ -210,7 +206,7 @@ def parts(chart: Reach) -> IntArray:
 
 
 @lru_cache(maxsize=16)
-def volumes(chart: Reach) -> Array:
+def volumes(chart: StableSet) -> Array:
     """Volumes of contact points that the chart's nodes stand for, flat."""
     size = np.abs(np.linalg.det(chart.tangents[..., 3:, :] @ chart.frames))
     for axis in range(3):  # nodes on its faces stand for half a cell

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.numerics.arrays import Array
+from vibrissa.numerics import Array
 from vibrissa.status import Status
 
 

@@ -14,11 +14,8 @@ import numpy as np
 from vibrissa.contacts.inversion import MOST_CANDIDATES, _invert, _polish
 from vibrissa.contacts.modes import settle
 from vibrissa.contacts.weighing import Weighing
-from vibrissa.numerics.arrays import Array, IntArray, Rod
-from vibrissa.numerics.compiled import copy, inlined, kernel
-from vibrissa.rod.newton import TOLERANCE
-from vibrissa.rod.preimage import Tree
-from vibrissa.rod.reach import Fold
+from vibrissa.numerics import Array, IntArray, copy, inlined, kernel
+from vibrissa.rod import TOLERANCE, Fold, Rod, SearchTree
 
 # Columns of a candidate: contact point, arc length, force in the material frame, base force, and
 # the covariance of the point.
@@ -33,7 +30,7 @@ class Searched(NamedTuple):
     rod: Rod
     fold: Fold
     proximal: float
-    tree: Tree
+    tree: SearchTree
     where: IntArray
     codes: Array
     contacts: Array

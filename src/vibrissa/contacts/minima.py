@@ -10,9 +10,8 @@ import numpy as np
 from vibrissa.contacts.channels import CHANNELS, CIRCULAR, channel_derivatives, channels_of
 from vibrissa.contacts.fitting import Fits
 from vibrissa.contacts.whitening import INDISTINCT
-from vibrissa.numerics.arrays import AnyArray, Array, IntArray
-from vibrissa.rod.batch import solve_forces
-from vibrissa.rod.discretize import Discretization
+from vibrissa.numerics import AnyArray, Array, IntArray
+from vibrissa.rod import Discretization, solve_forces
 from vibrissa.signals import within_turn
 
 # Contacts within this (over L, and ten times that relative to the force) are one.

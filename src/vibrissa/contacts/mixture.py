@@ -6,8 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.numerics.arrays import AnyArray, Array
-from vibrissa.numerics.compiled import copy, kernel
+from vibrissa.numerics import AnyArray, Array, copy, kernel
 
 
 class Mixture(NamedTuple):

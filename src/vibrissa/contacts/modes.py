@@ -25,11 +25,8 @@ from vibrissa.contacts.least_squares import PARTS, nearest_of
 from vibrissa.contacts.posterior import CERTAIN, NORMAL_KURTOSIS, judge, rank, second_moment
 from vibrissa.contacts.weighing import Weighing, _covariance, weigh
 from vibrissa.contacts.whitening import INDISTINCT
-from vibrissa.numerics.arrays import AnyArray, Array, IntArray
-from vibrissa.numerics.compiled import copy, inlined, kernel
-from vibrissa.rod.kernels import evaluate
-from vibrissa.rod.reach import LEAST_ARC, along, chart_to_contact, fold_force
-from vibrissa.rod.seeds import MOST_SEEDS, seeds, wrapped
+from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel, wrapped
+from vibrissa.rod import LEAST_ARC, MOST_SEEDS, along, chart_to_contact, evaluate, fold_force, seeds
 
 if TYPE_CHECKING:
     from vibrissa.contacts.locating import Searched
@@ -125,7 +122,7 @@ def _deviations(of: Searched, how: Weighing, value: Array, measured: Array, out:
 def _chart_of(of: Searched, x: Array, out: Array) -> None:
     """Chart coordinates (η, ψ, ρ) of a contact x (4,)."""
     out[1] = math.atan2(x[3], x[2])
-    out[0] = along(of.fold[0], x[0])
+    out[0] = along(of.fold.bounds, x[0])
     out[2] = math.sqrt(math.hypot(x[2], x[3]) / fold_force(of.fold, x[0], out[1]))
 
 

@@ -20,11 +20,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from vibrissa.numerics.arrays import Array
+from vibrissa.numerics import Array
 from vibrissa.quantities import attributes
 from vibrissa.sensors import Sensor
-from vibrissa.signals import SIGNALS
-from vibrissa.signals.base import wrench_derivatives
+from vibrissa.signals import SIGNALS, wrench_derivatives
 
 #: Standard deviation of each signal, or covariance (6, 6) of (F, M), SI units.
 Noise: TypeAlias = Mapping[str, float] | ArrayLike

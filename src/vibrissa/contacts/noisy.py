@@ -13,8 +13,7 @@ from vibrissa.contacts.noise import SensorNoise
 from vibrissa.contacts.posterior import CERTAIN
 from vibrissa.contacts.readout import Named, independent
 from vibrissa.contacts.whitening import explained
-from vibrissa.numerics.arrays import Array
-from vibrissa.rod.batch import share_out
+from vibrissa.numerics import Array, share_out
 from vibrissa.status import Status
 
 if TYPE_CHECKING:

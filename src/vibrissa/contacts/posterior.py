@@ -27,13 +27,12 @@ from scipy.special import ndtri
 
 from vibrissa.contacts.channels import FITTED
 from vibrissa.contacts.fitting import channel_equations, whiten
-from vibrissa.numerics.arrays import AnyArray, Array, IntArray, Rod
-from vibrissa.numerics.compiled import copy, inlined, kernel
-from vibrissa.rod.batch import share_out
-from vibrissa.rod.discretize import Discretization
-from vibrissa.rod.kernels import (
+from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel, share_out
+from vibrissa.rod import (
     BUFFER_SIZE,
     LANES,
+    Discretization,
+    Rod,
     integrate,
     lane_tangents,
     lane_value,

@@ -21,11 +21,9 @@ from vibrissa.contacts.located import Located, nowhere
 from vibrissa.contacts.posterior import CERTAIN
 from vibrissa.contacts.readout import Measurement, Mixed, Named
 from vibrissa.contacts.weighing import weigh
-from vibrissa.numerics.arrays import AnyArray, Array
-from vibrissa.rod.batch import contact_tangents
-from vibrissa.rod.discretize import discretize
-from vibrissa.signals import within_turn
-from vibrissa.signals.regions import REGIONS, concave_backward, in_region
+from vibrissa.numerics import AnyArray, Array
+from vibrissa.rod import contact_tangents, discretize
+from vibrissa.signals import REGIONS, concave_backward, in_region, within_turn
 from vibrissa.status import Status
 
 if TYPE_CHECKING:

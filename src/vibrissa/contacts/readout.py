@@ -26,9 +26,8 @@ from vibrissa.contacts.locating import Searched
 from vibrissa.contacts.noise import SensorNoise, scaled_errors
 from vibrissa.contacts.weighing import Weighing
 from vibrissa.contacts.whitening import TRUSTED, rank
-from vibrissa.numerics.arrays import Array
-from vibrissa.rod.preimage import Preimages, Tree
-from vibrissa.rod.reach import Reach
+from vibrissa.numerics import Array
+from vibrissa.rod import SearchTree, StableSet, search_tree
 from vibrissa.signals import CIRCULAR, SIGNALS, signal_scales
 
 if TYPE_CHECKING:
@@ -73,7 +72,7 @@ class Named:
             known, turns, _ = at_nodes(chart, self.channels.names)
             self.searched = _searched(
                 chart,
-                contact_map.tree(three).tree,
+                contact_map.tree(three),
                 [names.index(name) for name in three],
                 [SIGNALS.index(name) for name in three],
                 known,
@@ -178,7 +177,7 @@ class Mixed:
             moment = moment + np.cross(chart.values[..., 3:, None], force, axis=-2)
             slopes = three @ np.concatenate([force, moment], axis=-2)
             straight = (False, False, False)
-            tree = Preimages.of(chart, np.ascontiguousarray(values), slopes, straight).tree
+            tree = search_tree(chart, np.ascontiguousarray(values), slopes, straight)
             self.searched = _searched(
                 chart,
                 tree,
@@ -214,8 +213,8 @@ class Mixed:
 
 
 def _searched(
-    chart: Reach,
-    tree: Tree,
+    chart: StableSet,
+    tree: SearchTree,
     where: Sequence[int],
     codes: Sequence[int],
     seen: Array,

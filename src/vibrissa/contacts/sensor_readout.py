@@ -8,7 +8,7 @@ import numpy as np
 
 from vibrissa.contacts.noise import SensorNoise
 from vibrissa.contacts.readout import Mixed, Named
-from vibrissa.numerics.arrays import Array
+from vibrissa.numerics import Array
 from vibrissa.sensors import COMPONENTS
 from vibrissa.signals import SIGNALS
 

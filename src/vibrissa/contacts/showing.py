@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from vibrissa.numerics.arrays import Array, IntArray
+from vibrissa.numerics import Array, IntArray
 from vibrissa.sketch import CONTACT, REST, Mark, card, shown, views
 from vibrissa.status import counted, describe
 

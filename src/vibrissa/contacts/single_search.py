@@ -16,7 +16,7 @@ from vibrissa.contacts.locating import COLUMNS, Trail, meet
 from vibrissa.contacts.posterior import CERTAIN
 from vibrissa.contacts.readout import Measurement, Mixed, Named, independent
 from vibrissa.contacts.whitening import explained
-from vibrissa.numerics.arrays import Array
+from vibrissa.numerics import Array
 from vibrissa.status import Status
 
 if TYPE_CHECKING:

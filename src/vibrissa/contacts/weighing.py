@@ -12,8 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.numerics.arrays import Array, IntArray
-from vibrissa.numerics.compiled import copy, inlined, kernel
+from vibrissa.numerics import Array, IntArray, copy, inlined, kernel
 
 # Of a channel's variance, what others do not explain; below this the covariance is singular.
 _SINGULAR = 1e-10

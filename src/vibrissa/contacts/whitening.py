@@ -13,7 +13,7 @@ from functools import cache
 import numpy as np
 from scipy.stats import chi2
 
-from vibrissa.numerics.arrays import Array
+from vibrissa.numerics import Array
 
 #: Without noise to go by, components of force and moment count as known to this share of |F|, |M|.
 TRUSTED = 0.01

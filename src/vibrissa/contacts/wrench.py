@@ -36,11 +36,9 @@ from vibrissa.contacts.posterior import CERTAIN, judged, ranked
 from vibrissa.contacts.prior import Prior, allowed_first
 from vibrissa.contacts.showing import estimate_card, estimate_rows
 from vibrissa.contacts.whitening import INDISTINCT, explained, rank, trusted, whitening
-from vibrissa.numerics.arrays import AnyArray, Array, IntArray
+from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.quantities import attributes
-from vibrissa.rod.batch import solve_forces
-from vibrissa.rod.discretize import Discretization, discretize
-from vibrissa.rod.wrench import vanishing_moments
+from vibrissa.rod import Discretization, discretize, solve_forces, vanishing_moments
 from vibrissa.signals import Coordinates, labelled_wrench
 from vibrissa.sketch import lines, shown
 from vibrissa.status import Status, counted, flag_attributes

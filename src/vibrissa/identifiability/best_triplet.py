@@ -17,8 +17,7 @@ from vibrissa.contacts.chosen_contacts import At, ChosenContacts, chosen_contact
 from vibrissa.contacts.jacobian import contact_signal_derivatives
 from vibrissa.contacts.noise import Noise, SensorNoise, rms_error
 from vibrissa.identifiability.sensitivity import contacts_dataset
-from vibrissa.numerics.arrays import Array
-from vibrissa.numerics.quantiles import quantile, weights
+from vibrissa.numerics import Array, contact_weights, weighted_quantile
 from vibrissa.quantities import attributes
 from vibrissa.signals import TRIPLETS, selection
 
@@ -72,7 +71,7 @@ def best_triplet(
     known = np.isfinite(errors).any(axis=0)
     winner = np.where(known, np.argmin(np.where(np.isfinite(errors), errors, np.inf), axis=0), -1)
     data = contacts_dataset(contact_map, chosen)
-    weight = weights(data)
+    weight = contact_weights(data)
     wins = winner == np.arange(len(labels))[:, None]
     finite = np.isfinite(errors)
     total = weight.sum()
@@ -82,9 +81,9 @@ def best_triplet(
             "determined": (finite @ weight / total, "share where it determines the contact"),
         }
     medians = {
-        "median_error": np.array([quantile(e, weight) for e in errors]),
+        "median_error": np.array([weighted_quantile(e, weight) for e in errors]),
         "median_error_where_best": np.array(
-            [quantile(e, weight * w) for e, w in zip(errors, wins, strict=True)]
+            [weighted_quantile(e, weight * w) for e, w in zip(errors, wins, strict=True)]
         ),
     }
     best = np.where(known, labels[winner], "").reshape(chosen.shape)

@@ -12,12 +12,9 @@ import numpy as np
 
 from vibrissa.identifiability.fibres import corrected, units
 from vibrissa.identifiability.twins import AGREEMENT, Pairs
-from vibrissa.numerics.arrays import AnyArray, Array
-from vibrissa.rod.batch import solve_forces
-from vibrissa.rod.discretize import discretize
-from vibrissa.rod.reach import with_normal_force
-from vibrissa.signals import SIGNALS, cone_angle
-from vibrissa.signals.base import signals_of
+from vibrissa.numerics import AnyArray, Array
+from vibrissa.rod import discretize, solve_forces, with_normal_force
+from vibrissa.signals import SIGNALS, cone_angle, signals_of
 
 if TYPE_CHECKING:
     from vibrissa.contacts.contact_map import ContactMap

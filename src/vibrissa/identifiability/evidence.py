@@ -26,7 +26,7 @@ from vibrissa.identifiability.twins import (
     triplet_derivatives,
     twins,
 )
-from vibrissa.numerics.arrays import AnyArray, Array
+from vibrissa.numerics import AnyArray, Array
 from vibrissa.signals import CIRCULAR, SIGNALS
 
 if TYPE_CHECKING:

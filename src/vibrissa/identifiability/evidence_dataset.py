@@ -13,9 +13,9 @@ from vibrissa.identifiability.fibres import corrected, units
 from vibrissa.identifiability.regions import place
 from vibrissa.identifiability.resolution import TOLERANCES
 from vibrissa.identifiability.summary import choice, notation
-from vibrissa.numerics.arrays import Array
+from vibrissa.numerics import Array
 from vibrissa.quantities import attributes
-from vibrissa.rod.discretize import discretize
+from vibrissa.rod import discretize
 from vibrissa.signals import SIGNALS, signal_scales
 
 #: Quantiles of a network's errors.

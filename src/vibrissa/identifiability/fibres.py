@@ -15,12 +15,9 @@ import numpy as np
 from vibrissa.contacts.contact_map import Domain
 from vibrissa.identifiability.regions import Places, place, sample, spread
 from vibrissa.identifiability.twins import AGREEMENT, Pairs, sizes, triplet_derivatives
-from vibrissa.numerics.arrays import AnyArray, Array
-from vibrissa.rod.batch import solve_forces
-from vibrissa.rod.discretize import Discretization, discretize
-from vibrissa.rod.reach import fold_forces, with_normal_force
-from vibrissa.signals import SIGNALS, circular_among, within_turn
-from vibrissa.signals.base import signals_of
+from vibrissa.numerics import AnyArray, Array
+from vibrissa.rod import Discretization, discretize, fold_forces, solve_forces, with_normal_force
+from vibrissa.signals import SIGNALS, circular_among, signals_of, within_turn
 
 if TYPE_CHECKING:
     from vibrissa.contacts.contact_map import ContactMap

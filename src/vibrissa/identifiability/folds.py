@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vibrissa.identifiability.regions import Samples
-from vibrissa.numerics.arrays import AnyArray, Array
+from vibrissa.numerics import AnyArray, Array
 
 # So many contacts of each region that are beside folds, or nearest to it, are named.
 _BESIDE = 24

@@ -11,11 +11,16 @@ import numpy as np
 from scipy.stats import qmc
 
 from vibrissa.contacts.contact_map import Domain, within_paper_bounds
-from vibrissa.numerics.arrays import AnyArray, Array
-from vibrissa.rod.batch import contact_tangents, solve_forces
-from vibrissa.rod.reach import Fold, contacts_at, determinant, with_normal_force
-from vibrissa.signals import concave_backward, cone_angle, in_region
-from vibrissa.signals.base import signals_of
+from vibrissa.numerics import AnyArray, Array
+from vibrissa.rod import (
+    Fold,
+    contact_tangents,
+    contacts_at,
+    determinant,
+    solve_forces,
+    with_normal_force,
+)
+from vibrissa.signals import concave_backward, cone_angle, in_region, signals_of
 
 if TYPE_CHECKING:
     from vibrissa.contacts.contact_map import ContactMap

@@ -9,7 +9,7 @@ import numpy as np
 from vibrissa.contacts.contact_map import Domain
 from vibrissa.contacts.inversion import invert
 from vibrissa.identifiability.regions import Places, place
-from vibrissa.numerics.arrays import AnyArray, Array
+from vibrissa.numerics import AnyArray, Array
 from vibrissa.signals import SIGNALS
 
 if TYPE_CHECKING:

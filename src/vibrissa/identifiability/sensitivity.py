@@ -26,7 +26,7 @@ from vibrissa.contacts.chosen_contacts import (
 from vibrissa.contacts.contact_map import spherical, within_paper_bounds
 from vibrissa.contacts.jacobian import contact_signal_derivatives, spherical_derivatives
 from vibrissa.contacts.noise import Noise, SensorNoise, ellipsoids
-from vibrissa.numerics.arrays import Array
+from vibrissa.numerics import Array
 from vibrissa.paper.differences import STEP, Interpolation, central_differences
 from vibrissa.quantities import attributes, quantity
 from vibrissa.signals import base_signals, concave_backward, nearest_on_rest, selection, within_cone

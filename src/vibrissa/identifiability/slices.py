@@ -11,7 +11,7 @@ import xarray as xr
 from vibrissa.contacts.chosen_contacts import chosen_contacts
 from vibrissa.contacts.contact_map import Domain, spherical, within_paper_bounds
 from vibrissa.identifiability.sensitivity import contacts_dataset
-from vibrissa.numerics.arrays import Array
+from vibrissa.numerics import Array
 from vibrissa.paper.differences import Interpolation, interpolation_errors
 from vibrissa.quantities import attributes
 from vibrissa.signals import CIRCULAR, SIGNALS, selection, within_cone

@@ -14,11 +14,9 @@ import numpy as np
 from vibrissa.contacts.contact_map import Domain
 from vibrissa.contacts.inversion import invert
 from vibrissa.identifiability.regions import Places, in_chart, place, sample
-from vibrissa.numerics.arrays import AnyArray, Array
-from vibrissa.rod.batch import solve_forces
-from vibrissa.rod.reach import chart_of, with_normal_force
-from vibrissa.signals import SIGNALS, within_turn
-from vibrissa.signals.base import signal_derivatives
+from vibrissa.numerics import AnyArray, Array
+from vibrissa.rod import chart_of, solve_forces, with_normal_force
+from vibrissa.signals import SIGNALS, signal_derivatives, within_turn
 
 if TYPE_CHECKING:
     from vibrissa.contacts.contact_map import ContactMap

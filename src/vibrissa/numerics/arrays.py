@@ -11,6 +11,3 @@ Array: TypeAlias = NDArray[np.float64]
 IntArray: TypeAlias = NDArray[np.int64]
 AnyArray: TypeAlias = NDArray[Any]
 Vector: TypeAlias = tuple[float, float, float]
-# start, width, extent, twist compliance, bending compliance (n,), shape (n, 4, 4): see
-# Discretization.
-Rod: TypeAlias = tuple[Array, Array, Array, Array, Array, Array]

@@ -35,7 +35,18 @@ class _Inlined(CPUDispatcher):
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a function that Python calls; cached on disk, releases the GIL."""
+    """Compile a function that Python calls; cached on disk, releases the GIL.
+
+    Parameters
+    ----------
+    function : callable
+        Function in Numba's subset of Python.
+
+    Returns
+    -------
+    callable
+        Compiled function.
+    """
     compiled = numba.njit(**_OPTIONS)(function)
     with suppress(RuntimeError):  # numba finds no folder that it may write to
         compiled._cache = PackageCache(function)
@@ -43,7 +54,18 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def inlined(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a small function into its callers, so that their lane loops still vectorise."""
+    """Compile a small function into its callers, so that their lane loops still vectorise.
+
+    Parameters
+    ----------
+    function : callable
+        Function in Numba's subset of Python.
+
+    Returns
+    -------
+    callable
+        Function that only kernels can call.
+    """
     compiled: Any = numba.njit(**_OPTIONS | {"forceinline": True, "no_cpython_wrapper": True})(
         function
     )

@@ -1,8 +1,8 @@
 """What is compiled is kept on disk, and a listener says so while it happens.
 
 Numba knows a cached kernel by its own file alone, and would go on using it after a function that it
-inlines from another file has changed; here all files with kernels of its own package, of
-``numerics`` and of the rod, whose helpers others use, are part of the key.
+inlines from another file has changed; here all files with kernels of its own package, and of
+``numerics``, ``rod`` and ``signals``, whose helpers others use, are part of the key.
 
 A result must not hang on the cache. A file in it that is not as it was written, whatever cut it or
 changed it, counts as none: each has its SHA-256 in front, for machine code that is not whole would
@@ -22,7 +22,7 @@ from typing import Any
 from numba.core import event
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 
-_SHARED = (Path(__file__).parent, Path(__file__).parents[1] / "rod")
+_SHARED = tuple(Path(__file__).parents[1] / name for name in ("numerics", "rod", "signals"))
 _DIGEST = hashlib.sha256().digest_size
 
 

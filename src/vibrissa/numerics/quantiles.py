@@ -1,4 +1,4 @@
-"""Quantiles of what contacts tell, each counted by the volume that it stands for."""
+"""Quantiles of quantities over contacts, each contact counted by the volume that it stands for."""
 
 from __future__ import annotations
 
@@ -8,16 +8,45 @@ import xarray as xr
 from vibrissa.numerics.arrays import AnyArray, Array
 
 
-def weights(data: xr.Dataset, region: xr.DataArray | None = None) -> Array:
-    """Weights of contacts in a region, as one row."""
+def contact_weights(data: xr.Dataset, region: xr.DataArray | None = None) -> Array:
+    """Volumes that contacts of a region stand for, as one row.
+
+    Parameters
+    ----------
+    data : Dataset
+        Contacts with ``status``, ``r`` and ``small_deflection``, and ``volume`` where they are
+        nodes of unequal cells.
+    region : DataArray, optional
+        Truth value of each contact's membership; without it the small deflections are left out.
+
+    Returns
+    -------
+    (n,) array
+        Weights, 0 outside the region and where there is no contact.
+    """
     kept = ~data["small_deflection"] if region is None else region.broadcast_like(data["status"])
     kept = kept.transpose(*data["status"].dims).astype(bool) & np.isfinite(data["r"])
     size = data["volume"] if "volume" in data else xr.ones_like(data["r"])
     return np.where(kept, size, 0.0).ravel()
 
 
-def quantile(values: AnyArray, weight: Array, shares: float | AnyArray = 0.5) -> Array:
-    """Quantiles of values (n,) that are finite and have weight; NaN where there are none."""
+def weighted_quantile(values: AnyArray, weight: Array, shares: float | AnyArray = 0.5) -> Array:
+    """Quantiles of values that are finite and have weight.
+
+    Parameters
+    ----------
+    values : (n,) array
+        Values of any unit.
+    weight : (n,) array
+        Weights, not negative.
+    shares : float or array
+        Shares of the total weight, from 0 to 1.
+
+    Returns
+    -------
+    array
+        Quantiles, of the shape of ``shares``; NaN where no value has weight.
+    """
     shares = np.asarray(shares, dtype=np.float64)
     kept = np.isfinite(values) & (weight > 0.0)
     if not kept.any():

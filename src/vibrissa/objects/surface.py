@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.numerics.arrays import Array
+from vibrissa.numerics import Array
 
 
 class Surface(ABC):

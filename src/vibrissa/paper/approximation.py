@@ -15,14 +15,19 @@ import numpy as np
 
 from vibrissa.contacts.explanation import Explanation
 from vibrissa.contacts.noise import SensorNoise
-from vibrissa.numerics.arrays import Array
+from vibrissa.numerics import Array
 from vibrissa.paper.differences import STEP
 from vibrissa.paper.lookup import LookupTable
 from vibrissa.paper.network import train_network
-from vibrissa.rod.deflection import deflect
-from vibrissa.rod.loads import PointContact
-from vibrissa.signals import CIRCULAR, SIGNALS, circular_among, signal_scales, within_turn
-from vibrissa.signals.base import signals_of
+from vibrissa.rod import PointContact, deflect
+from vibrissa.signals import (
+    CIRCULAR,
+    SIGNALS,
+    circular_among,
+    signal_scales,
+    signals_of,
+    within_turn,
+)
 from vibrissa.status import Status
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 import xarray as xr
 
-from vibrissa.numerics.arrays import AnyArray, Array
+from vibrissa.numerics import AnyArray, Array
 from vibrissa.paper.natural import NaturalNeighbour
 from vibrissa.quantities import attributes
 from vibrissa.signals import circular_among, measured, selection, within_turn

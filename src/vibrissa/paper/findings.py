@@ -11,8 +11,7 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from vibrissa.numerics.arrays import Array
-from vibrissa.numerics.quantiles import quantile, weights
+from vibrissa.numerics import Array, contact_weights, weighted_quantile
 
 #: Central share of a quantity's values that makes its range.
 RANGE = 0.99
@@ -48,7 +47,7 @@ def sensitivity_findings(data: xr.Dataset, region: xr.DataArray | None = None) -
         - ``backward_over_forward`` (coordinate, signal): the median for concave backward over that
           for concave forward.
     """
-    weight = weights(data, region)
+    weight = contact_weights(data, region)
     names = [str(n) for n in data["signal"].values]
     jacobian = data["sensitivity"].transpose(*data["status"].dims, "coordinate", "signal")
     size = np.abs(jacobian.to_numpy().reshape(-1, 3, 3))
@@ -94,13 +93,15 @@ def _stacked(tables: list[Array]) -> Array:
 
 
 def _range(values: Array, weight: Array) -> float:
-    low, high = quantile(values, weight, np.array([0.5 - 0.5 * RANGE, 0.5 + 0.5 * RANGE]))
+    low, high = weighted_quantile(values, weight, np.array([0.5 - 0.5 * RANGE, 0.5 + 0.5 * RANGE]))
     return float(high - low)
 
 
 def _medians(size: Array, weight: Array) -> Array:
     """Medians (3, 3) of sizes (n, 3, 3)."""
-    return np.array([[float(quantile(size[:, i, j], weight)) for j in range(3)] for i in range(3)])
+    return np.array(
+        [[float(weighted_quantile(size[:, i, j], weight)) for j in range(3)] for i in range(3)]
+    )
 
 
 def _motion(size: Array, r: Array, phi: Array, weight: Array) -> Array:
@@ -118,7 +119,7 @@ def _motion(size: Array, r: Array, phi: Array, weight: Array) -> Array:
 def _small_over_large(size: Array, signal: Array, weight: Array) -> Array:
     """Medians over the fifth with the smallest |signal|, over those with the largest."""
     signal = np.abs(signal)
-    low, high = quantile(signal, weight, np.array([_FIFTH, 1.0 - _FIFTH]))
+    low, high = weighted_quantile(signal, weight, np.array([_FIFTH, 1.0 - _FIFTH]))
     return _medians(size, weight * (signal <= low)) / _medians(size, weight * (signal >= high))
 
 

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vibrissa.numerics.arrays import AnyArray, Array
+from vibrissa.numerics import AnyArray, Array
 from vibrissa.paper.differences import closed_table, grid_table
 from vibrissa.paper.natural import Interpolation, NaturalNeighbour
 from vibrissa.signals import circular_among, within_cone, within_turn

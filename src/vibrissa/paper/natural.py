@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import Delaunay, QhullError
 
-from vibrissa.numerics.arrays import Array, IntArray
+from vibrissa.numerics import Array, IntArray, share_out
 from vibrissa.paper.sibson import Mesh, interpolate, locate, measure, sibson_weights
-from vibrissa.rod.batch import share_out
 
 Interpolation = Literal["natural", "linear"]
 

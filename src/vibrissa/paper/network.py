@@ -18,11 +18,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from vibrissa.numerics.arrays import AnyArray, Array
-from vibrissa.rod.batch import solve_forces
-from vibrissa.rod.reach import contacts_at, with_normal_force
-from vibrissa.signals import CIRCULAR, SIGNALS, selection, within_cone
-from vibrissa.signals.base import signals_of
+from vibrissa.numerics import AnyArray, Array
+from vibrissa.rod import contacts_at, solve_forces, with_normal_force
+from vibrissa.signals import CIRCULAR, SIGNALS, selection, signals_of, within_cone
 
 if TYPE_CHECKING:
     from vibrissa.contacts.contact_map import ContactMap

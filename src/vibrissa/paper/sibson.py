@@ -27,8 +27,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibrissa.numerics.arrays import Array, IntArray
-from vibrissa.numerics.compiled import copy, inlined, kernel
+from vibrissa.numerics import Array, IntArray, copy, inlined, kernel
 
 #: Vertices (n, 3); corners and neighbours (t, 4); circumcentres from the first corner (t, 3);
 #: volumes w_i (t, 4); which tetrahedra are flat (t,).

@@ -14,7 +14,7 @@ from vibrissa.pipeline.frames import signals_in, whiskers_in
 from vibrissa.pipeline.laboratory import in_laboratory
 from vibrissa.pipeline.locate import TRIPLET, locate, locate_from_wrench, unfelt
 from vibrissa.pipeline.signals import sensor_noise
-from vibrissa.rod.reach import PROXIMAL
+from vibrissa.rod import PROXIMAL
 from vibrissa.signals import selection
 from vibrissa.status import is_ok
 from vibrissa.whisker import Whisker

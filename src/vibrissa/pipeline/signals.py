@@ -33,7 +33,7 @@ from vibrissa.pipeline.frames import (
 from vibrissa.pipeline.locate import FELT
 from vibrissa.pipeline.tracked_points import paper_pose, signals_by_point
 from vibrissa.quantities import attributes
-from vibrissa.rod.reach import PROXIMAL
+from vibrissa.rod import PROXIMAL
 from vibrissa.sensors import Sensor
 from vibrissa.status import Status
 from vibrissa.tracking.filtering import CUTOFF

@@ -31,9 +31,8 @@ from vibrissa.contacts.channels import (
 )
 from vibrissa.contacts.noise import SensorNoise
 from vibrissa.contacts.whitening import whitening
-from vibrissa.rod.batch import contact_tangents, solve_forces
-from vibrissa.rod.discretize import Discretization, discretize
-from vibrissa.signals.base import signals_of
+from vibrissa.rod import Discretization, contact_tangents, discretize, solve_forces
+from vibrissa.signals import signals_of
 from vibrissa.whisker import Whisker
 
 Array = NDArray[np.float64]

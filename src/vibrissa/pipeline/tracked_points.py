@@ -16,8 +16,7 @@ from vibrissa.pipeline.frames import SQUARES, needed, one_whisker
 from vibrissa.pipeline.laboratory import cross_matrices
 from vibrissa.pipeline.slopes import wrench_slopes
 from vibrissa.quantities import attributes
-from vibrissa.rod.deflection import deflect
-from vibrissa.rod.loads import PointContact
+from vibrissa.rod import PointContact, deflect
 from vibrissa.status import Status
 from vibrissa.tracking.filtering import CUTOFF
 from vibrissa.tracking.head import HeadPose

@@ -1,13 +1,110 @@
-"""How a whisker bends: the rod, its loads, and the stable contacts it can hold."""
+"""How a whisker bends: the rod, its loads, and the stable contacts it can hold.
 
+Beyond loads and :func:`deflect` this is what the inverse problem is built on: the rod's kernels,
+the chart of the stable contacts, and the search for contacts of given signals in it.
+"""
+
+from vibrissa.rod.chart import (
+    CELLS,
+    LEAST_ARC,
+    PROXIMAL,
+    Fold,
+    StableSet,
+    along,
+    chart_of,
+    chart_to_contact,
+    contacts_at,
+    determinant,
+    fold_force,
+    fold_forces,
+    stable_set,
+    with_normal_force,
+)
+from vibrissa.rod.contact_state import contact_state
 from vibrissa.rod.deflection import Deflection, deflect
+from vibrissa.rod.discretization import STEPS, Discretization, Rod, discretize
+from vibrissa.rod.kernels import (
+    BUFFER_SIZE,
+    LANES,
+    contact_tangents,
+    evaluate,
+    integrate,
+    lane_tangents,
+    lane_value,
+    lanes_tangents,
+    set_all_lanes,
+    set_lane,
+    solve_forces,
+)
 from vibrissa.rod.loads import Load, PegContact, PointContact, PointForce
+from vibrissa.rod.newton import (
+    ROUNDING,
+    TOLERANCE,
+    newton_group,
+    point_determinant,
+    stable,
+    start_from,
+)
+from vibrissa.rod.points import PointSolver, point_solver
+from vibrissa.rod.search import MOST_SEEDS, seeds
+from vibrissa.rod.shape import contact_frames, shapes
+from vibrissa.rod.surfaces import SurfaceDeflection, follow_surfaces
+from vibrissa.rod.tree import PlaneVector, SearchTree, search_tree
+from vibrissa.rod.wrench import vanishing_moments
 
 __all__ = [
+    "BUFFER_SIZE",
+    "CELLS",
+    "LANES",
+    "LEAST_ARC",
+    "MOST_SEEDS",
+    "PROXIMAL",
+    "ROUNDING",
+    "STEPS",
+    "TOLERANCE",
     "Deflection",
+    "Discretization",
+    "Fold",
     "Load",
     "PegContact",
+    "PlaneVector",
     "PointContact",
     "PointForce",
+    "PointSolver",
+    "Rod",
+    "SearchTree",
+    "StableSet",
+    "SurfaceDeflection",
+    "along",
+    "chart_of",
+    "chart_to_contact",
+    "contact_frames",
+    "contact_state",
+    "contact_tangents",
+    "contacts_at",
     "deflect",
+    "determinant",
+    "discretize",
+    "evaluate",
+    "fold_force",
+    "fold_forces",
+    "follow_surfaces",
+    "integrate",
+    "lane_tangents",
+    "lane_value",
+    "lanes_tangents",
+    "newton_group",
+    "point_determinant",
+    "point_solver",
+    "search_tree",
+    "seeds",
+    "set_all_lanes",
+    "set_lane",
+    "shapes",
+    "solve_forces",
+    "stable",
+    "stable_set",
+    "start_from",
+    "vanishing_moments",
+    "with_normal_force",
 ]

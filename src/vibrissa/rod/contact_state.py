@@ -17,8 +17,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibrissa.numerics.arrays import Array, Rod
-from vibrissa.numerics.compiled import inlined, kernel
+from vibrissa.numerics import Array, inlined, kernel
+from vibrissa.rod.discretization import Rod
 from vibrissa.rod.equations import whisker_radius
 from vibrissa.rod.shape import NODES, STAGES, WEIGHTS
 
@@ -35,11 +35,11 @@ def _rates(rod: Rod, k: int, t: float, y: Array, dy: Array) -> None:
 
     Column 0 holds the values, the others the tangents.
     """
-    c = rod[5][k]
+    c = rod.shape[k]
     radius = c[3, 0] + t * (c[3, 1] + t * (c[3, 2] + t * c[3, 3]))
     inverse = 1.0 / (radius * radius)
     inverse *= inverse
-    soft0, soft1 = rod[3][k] * inverse, rod[4][k] * inverse
+    soft0, soft1 = rod.twist[k] * inverse, rod.bending[k] * inverse
     n0, n1, n2 = y[0, 0], y[1, 0], y[2, 0]
     q0, q1, q2 = y[3, 0], y[4, 0], y[5, 0]
     u0 = c[0, 0] + t * (c[0, 1] + t * (c[0, 2] + t * c[0, 3])) + soft0 * (q1 * n2 - q2 * n1)
@@ -50,7 +50,7 @@ def _rates(rod: Rod, k: int, t: float, y: Array, dy: Array) -> None:
             dy[a, j] = y[a + 1, j] * u2 - y[a + 2, j] * u1
             dy[a + 1, j] = y[a + 2, j] * u0 - y[a, j] * u2
             dy[a + 2, j] = y[a, j] * u1 - y[a + 1, j] * u0
-    dy[3, 0] -= rod[2][k]
+    dy[3, 0] -= rod.extent[k]
     for j in range(1, _COLUMNS):
         d0 = soft0 * (y[4, j] * n2 - y[5, j] * n1 + q1 * y[2, j] - q2 * y[1, j])
         d1 = soft1 * (y[5, j] * n0 - y[3, j] * n2 + q2 * y[0, j] - q0 * y[2, j])
@@ -64,7 +64,7 @@ def _rates(rod: Rod, k: int, t: float, y: Array, dy: Array) -> None:
 @kernel
 def contact_state(rod: Rod, contact: Array, state: Array) -> tuple[float, float]:
     """Integrate one contact to the base."""
-    start, width = rod[0], rod[1]
+    start, width = rod.start, rod.width
     s = contact[0]
     slopes = np.zeros((7, STATES, _COLUMNS))
     argument = np.empty((STATES, _COLUMNS))

@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibrissa.numerics.arrays import Array, IntArray, Rod
-from vibrissa.numerics.compiled import copy, inlined, kernel
+from vibrissa.numerics import Array, IntArray, copy, inlined, kernel, norm3, solve3
+from vibrissa.rod.chart import LEAST_ARC, Fold
+from vibrissa.rod.discretization import Rod
 from vibrissa.rod.equations import (
     POINT,
     SIDE,
@@ -26,9 +27,7 @@ from vibrissa.rod.equations import (
     longest_step,
 )
 from vibrissa.rod.kernels import BUFFER_SIZE, LANES, integrate, lane_tangents, lane_value, set_lane
-from vibrissa.rod.newton import ROUNDING, TOLERANCE, norm3
-from vibrissa.rod.reach import LEAST_ARC, Fold
-from vibrissa.rod.seeds import solve3
+from vibrissa.rod.newton import ROUNDING, TOLERANCE
 from vibrissa.status import Status
 
 #: A force this small (EI/L²) only says where an object touches.

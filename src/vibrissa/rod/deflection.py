@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vibrissa.numerics.arrays import AnyArray, Array, IntArray
-from vibrissa.rod.discretize import STEPS, Discretization, discretize
+from vibrissa.numerics import AnyArray, Array, IntArray
+from vibrissa.rod.chart import PROXIMAL
+from vibrissa.rod.discretization import STEPS, Discretization, discretize
 from vibrissa.rod.forces import solve_known_forces
 from vibrissa.rod.loads import Load, PegContact, PointContact, PointForce
 from vibrissa.rod.pegs import Pegs, Rest, nearest_side, solve_from_contact, solve_from_rest
 from vibrissa.rod.points import Solutions, point_solver
-from vibrissa.rod.reach import PROXIMAL
 from vibrissa.rod.shape import shapes
 from vibrissa.sketch import (
     BENT,

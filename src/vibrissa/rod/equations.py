@@ -16,9 +16,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibrissa.numerics.arrays import Array, Rod
-from vibrissa.numerics.compiled import inlined
-from vibrissa.rod.reach import Fold, fold_force
+from vibrissa.numerics import Array, inlined
+from vibrissa.rod.chart import Fold, fold_force
+from vibrissa.rod.discretization import Rod
 
 POINT, SIDE, TIP = 0, 1, 2
 
@@ -59,7 +59,7 @@ def by_unknowns(kind: int, x: Array, t: Array) -> None:
 @inlined
 def whisker_radius(rod: Rod, s: float) -> tuple[float, float]:
     """Radius relative to the base radius at s, and its derivative."""
-    start, width, shape = rod[0], rod[1], rod[5]
+    start, width, shape = rod.start, rod.width, rod.shape
     k = start.shape[0] - 1
     while k > 0 and start[k] > s:
         k -= 1

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vibrissa.numerics.arrays import AnyArray, Array, IntArray
-from vibrissa.rod.batch import solve_forces
-from vibrissa.rod.discretize import MOST_STEPS, discretize
+from vibrissa.numerics import AnyArray, Array, IntArray
+from vibrissa.rod.discretization import MOST_STEPS, discretize
+from vibrissa.rod.kernels import solve_forces
 
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
@@ -42,6 +42,9 @@ def solve_known_forces(
             steps *= 2
             finer = solve_forces(discretize(whisker, steps), contacts[rows])[0]
             settled = (np.abs(finer - values[rows]) <= _SETTLED * scale[rows]).all(axis=1)
+            # Halving changes nothing while the whole contact is within the first step.
+            error = np.abs(np.linalg.norm(finer[:, :3], axis=1) - size[rows])
+            settled &= error <= _SETTLED * size[rows]
             rows, finer = rows[~settled], finer[~settled]
             values[rows], needed[rows] = finer, min(2 * steps, MOST_STEPS)
     good = np.ones(len(contacts), dtype=bool)

@@ -31,8 +31,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibrissa.numerics.arrays import Array, Rod, Vector
-from vibrissa.numerics.compiled import inlined, kernel
+from vibrissa.numerics import Array, Vector, inlined, kernel, share_out
+from vibrissa.rod.discretization import Discretization, Rod
 
 LANES = 4
 _STAGE = 11 * LANES  # a stage keeps n, q, u (3 each) and the two compliances, for the tangents
@@ -180,12 +180,18 @@ def _section(
 @inlined
 def _value_step(rod: Rod, b: Array, k: int, tangents: bool) -> None:
     """Take step k with (n, q) of every lane; keep the stages if tangents follow."""
-    start, width, extent, twist, bend = rod[0][k], rod[1][k], rod[2][k], rod[3][k], rod[4][k]
+    start, width, extent, twist, bend = (
+        rod.start[k],
+        rod.width[k],
+        rod.extent[k],
+        rod.twist[k],
+        rod.bending[k],
+    )
     shape = (
-        _polynomial(rod[5], k, 0),
-        _polynomial(rod[5], k, 1),
-        _polynomial(rod[5], k, 2),
-        _polynomial(rod[5], k, 3),
+        _polynomial(rod.shape, k, 0),
+        _polynomial(rod.shape, k, 1),
+        _polynomial(rod.shape, k, 2),
+        _polynomial(rod.shape, k, 3),
     )
     inverse_width = 1.0 / width
     for i in range(LANES):
@@ -332,7 +338,7 @@ def _carry_step(b: Array, row: int) -> None:
 @kernel
 def integrate(rod: Rod, b: Array, tangents: int) -> None:
     """Integrate every lane from its contact to the base, with its first so many tangents."""
-    start = rod[0]
+    start = rod.start
     farthest = b[_ARC]
     for i in range(1, LANES):
         farthest = max(farthest, b[_ARC + i])
@@ -375,7 +381,7 @@ def evaluate(
 
 
 @kernel
-def carry_tangents(rod: Rod, contacts: Array, tangents: Array, first: int, last: int) -> None:
+def _carry_tangents(rod: Rod, contacts: Array, tangents: Array, first: int, last: int) -> None:
     """Unit tangents of the deflected whisker at its contacts, in the base frame."""
     b = np.zeros(BUFFER_SIZE)
     for row in range(first, last, LANES):
@@ -383,9 +389,63 @@ def carry_tangents(rod: Rod, contacts: Array, tangents: Array, first: int, last:
             j = min(row + i, last - 1)
             set_lane(b, i, contacts[j, 0], contacts[j, 1], contacts[j, 2], contacts[j, 3], True)
             _put(b, _TANGENT, i, (1.0, 0.0, 0.0))
-        for k in range(rod[0].shape[0] - 1, -1, -1):
+        for k in range(rod.start.shape[0] - 1, -1, -1):
             _value_step(rod, b, k, True)
             _carry_step(b, _TANGENT)
         for i in range(min(LANES, last - row)):
             for j in range(3):
                 tangents[row + i, j] = b[_TANGENT + j * LANES + i]
+
+
+def solve_forces(
+    discretization: Discretization, contacts: Array, tangents: bool = False
+) -> tuple[Array, Array]:
+    """Base force and contact point of contacts whose force is known, non-dimensional.
+
+    Parameters
+    ----------
+    discretization : Discretization
+        Rod.
+    contacts : (n, 4) array
+        Arc length and force in the material frame there, (s, f_x, f_y, f_z).
+    tangents : bool
+        Whether derivatives are wanted.
+
+    Returns
+    -------
+    values : (n, 6) array
+        Base force and contact point (F, p).
+    tangents : (n, 6, 3) array
+        Derivatives by ξ = (s, f_y, f_z); no rows unless wanted.
+    """
+    contacts = np.ascontiguousarray(contacts, dtype=np.float64)
+    n = contacts.shape[0]
+    values = np.empty((n, 6))
+    derivatives = np.empty((n if tangents else 0, 6, 3))
+    rod = discretization.rod
+    share_out(n, lambda first, last: evaluate(rod, contacts, values, derivatives, first, last))
+    return values, derivatives
+
+
+def contact_tangents(discretization: Discretization, contacts: Array) -> Array:
+    """Unit tangents of the deflected whisker at its contacts.
+
+    Parameters
+    ----------
+    discretization : Discretization
+        Rod.
+    contacts : (n, 4) array
+        Arc length and force in the material frame there, (s, f_x, f_y, f_z).
+
+    Returns
+    -------
+    (n, 3) array
+        Tangents in the whisker frame.
+    """
+    contacts = np.ascontiguousarray(contacts, dtype=np.float64)
+    tangents = np.empty((len(contacts), 3))
+    rod = discretization.rod
+    share_out(
+        len(contacts), lambda first, last: _carry_tangents(rod, contacts, tangents, first, last)
+    )
+    return tangents

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.numerics.arrays import Array
+from vibrissa.numerics import Array
 
 if TYPE_CHECKING:
     from vibrissa.rod.deflection import Deflection

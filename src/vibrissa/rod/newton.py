@@ -1,6 +1,6 @@
 """Newton's method on the rod, four contacts at a time.
 
-A problem that starts from a seed of the chart (:mod:`vibrissa.rod.preimage`) first takes chord
+A problem that starts from a seed of the chart (:mod:`vibrissa.rod.tree`) first takes chord
 steps in the chart's coordinates with the interpolant's own Jacobian, which is right to a part in a
 thousand: three or four evaluations of the rod, no derivatives. What that does not solve takes
 Newton steps in ξ. The exact Jacobian costs four times the values, so it is computed again only
@@ -21,8 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from vibrissa.numerics.arrays import Array, Rod
-from vibrissa.numerics.compiled import copy, inlined
+from vibrissa.numerics import Array, copy, inlined, solve3
+from vibrissa.rod.chart import LEAST_ARC, Fold, chart_to_contact, fold_force
+from vibrissa.rod.discretization import Rod
 from vibrissa.rod.kernels import (
     LANES,
     integrate,
@@ -32,8 +33,6 @@ from vibrissa.rod.kernels import (
     set_all_lanes,
     set_lane,
 )
-from vibrissa.rod.reach import LEAST_ARC, Fold, chart_to_contact, fold_force
-from vibrissa.rod.seeds import solve3
 
 #: Residual at which an equation is solved.
 TOLERANCE = 1e-11
@@ -49,12 +48,6 @@ _NEAR_FOLD = 0.97
 #: The interpolated fold force is good to a few parts in 10⁴; up to this much above it the
 #: determinant's sign decides.
 ABOVE_FOLD = 1.01
-
-
-@inlined
-def norm3(v: Array) -> float:
-    """Euclidean length."""
-    return float(np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]))
 
 
 @inlined

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from vibrissa.numerics.arrays import AnyArray, Array, IntArray
+from vibrissa.numerics import AnyArray, Array, IntArray
+from vibrissa.rod.chart import LEAST_ARC, stable_set
 from vibrissa.rod.continuation import LEAST_FORCE
 from vibrissa.rod.equations import SIDE, TIP
 from vibrissa.rod.points import Solutions, follow_all
-from vibrissa.rod.reach import LEAST_ARC, reach
 from vibrissa.status import Status
 
 if TYPE_CHECKING:
@@ -201,7 +201,7 @@ def _follow(
     proximal: float,
     steps: int,
 ) -> None:
-    chart = reach(whisker, proximal=proximal, steps=steps)
+    chart = stable_set(whisker, proximal=proximal, steps=steps)
     solved = follow_all(
         chart, np.ascontiguousarray(begins), np.ascontiguousarray(ends), kinds.copy(), unknowns
     )

@@ -16,27 +16,26 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from vibrissa.numerics.arrays import AnyArray, Array, IntArray, Rod
-from vibrissa.numerics.compiled import copy, inlined, kernel
-from vibrissa.rod.batch import share_out, solve_forces
-from vibrissa.rod.continuation import follow
-from vibrissa.rod.equations import POINT
-from vibrissa.rod.kernels import BUFFER_SIZE, LANES
-from vibrissa.rod.newton import ABOVE_FOLD, TOLERANCE, newton_group, norm3, stable, start_from
-from vibrissa.rod.preimage import Preimages, Tree
-from vibrissa.rod.reach import (
+from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel, norm3, share_out
+from vibrissa.rod.chart import (
     LEAST_ARC,
     Fold,
-    Reach,
+    StableSet,
     arc_length,
     chart_to_contact,
     contacts_at,
     fold_force,
     fold_forces,
-    reach,
+    stable_set,
     with_normal_force,
 )
-from vibrissa.rod.seeds import MOST_SEEDS, seeds
+from vibrissa.rod.continuation import follow
+from vibrissa.rod.discretization import Rod
+from vibrissa.rod.equations import POINT
+from vibrissa.rod.kernels import BUFFER_SIZE, LANES, solve_forces
+from vibrissa.rod.newton import ABOVE_FOLD, TOLERANCE, newton_group, stable, start_from
+from vibrissa.rod.search import MOST_SEEDS, seeds
+from vibrissa.rod.tree import SearchTree, search_tree
 from vibrissa.status import Status
 
 if TYPE_CHECKING:
@@ -100,7 +99,7 @@ def _at_point(
 @inlined
 def _force(fold: Fold, chart: Array) -> float:
     """Force of a seed."""
-    strength = fold_force(fold, arc_length(fold[0], chart[0]), chart[1])
+    strength = fold_force(fold, arc_length(fold.bounds, chart[0]), chart[1])
     return float(chart[2] * chart[2] * strength)
 
 
@@ -173,7 +172,13 @@ def _in_doubt(fold: Fold, resting: Array, point: Array, found: Array, n: int, be
 
 @kernel
 def _find_starts(
-    fold: Fold, tree: Tree, resting: Array, points: Array, starts: Array, first: int, last: int
+    fold: Fold,
+    tree: SearchTree,
+    resting: Array,
+    points: Array,
+    starts: Array,
+    first: int,
+    last: int,
 ) -> None:
     """Fill contacts (n, _STARTS, 3) from which points may be reached, by increasing force.
 
@@ -212,7 +217,7 @@ def _find_starts(
 def _solve_points(
     rod: Rod,
     fold: Fold,
-    tree: Tree,
+    tree: SearchTree,
     resting: Array,
     proximal: float,
     points: Array,
@@ -279,14 +284,18 @@ def _solve_points(
 
 
 class PointSolver:
-    """Contact at a point, for one whisker: tables made once, then microseconds a point."""
+    """Contact at a point, for one whisker: tables made once, then microseconds a point.
 
-    def __init__(self, chart: Reach) -> None:
+    Parameters
+    ----------
+    chart : StableSet
+        Stable contacts of the whisker.
+    """
+
+    def __init__(self, chart: StableSet) -> None:
         self.chart = chart
         points = np.ascontiguousarray(chart.values[..., 3:])
-        self._tree = Preimages.of(
-            chart, points, chart.tangents[..., 3:, :], (False, False, False)
-        ).tree
+        self._tree = search_tree(chart, points, chart.tangents[..., 3:, :], (False, False, False))
         # Paths start short of the fold, where there is room to move.
         inner = points[:, :-1, :-1].reshape(-1, 3)
         held = np.isfinite(inner).all(axis=1)
@@ -300,7 +309,18 @@ class PointSolver:
         )
 
     def solve(self, points: Array) -> Solutions:
-        """Solve contact points."""
+        """Find the contact of least force that holds the whisker at each point.
+
+        Parameters
+        ----------
+        points : (n, 3) array
+            Contact points over L, whisker frame; NaN means missing.
+
+        Returns
+        -------
+        Solutions
+            Contacts, base force and contact point, residual and status of each point.
+        """
         n = len(points)
         out = Solutions.empty(n)
         contacts, values, misfits, statuses = out
@@ -390,7 +410,7 @@ def _drop_unanswered(out: Solutions, rows: IntArray) -> None:
     out.contacts[lost], out.values[lost] = np.nan, np.nan
 
 
-def _faces(chart: Reach) -> list[tuple[Array, Status]]:
+def _faces(chart: StableSet) -> list[tuple[Array, Status]]:
     """Places on the chart's outer faces (n, 3), and what lies beyond each."""
     eta, rho = np.linspace(0.0, 1.0, _FACE), np.linspace(0.0, 1.0, _FACE)
     psi = np.linspace(0.0, 2.0 * np.pi, 2 * _FACE, endpoint=False)
@@ -408,7 +428,7 @@ def _faces(chart: Reach) -> list[tuple[Array, Status]]:
     return faces
 
 
-def _at_rest(chart: Reach) -> Array:
+def _at_rest(chart: StableSet) -> Array:
     """Points along the resting whisker from ``LEAST_ARC`` to the tip, (3, n)."""
     contacts = np.zeros((_RESTING, 4))
     contacts[:, 0] = np.linspace(LEAST_ARC, 1.0, _RESTING)
@@ -416,7 +436,7 @@ def _at_rest(chart: Reach) -> Array:
 
 
 def follow_all(
-    chart: Reach, begins: Array, ends: Array, kinds: IntArray, unknowns: Array
+    chart: StableSet, begins: Array, ends: Array, kinds: IntArray, unknowns: Array
 ) -> Solutions:
     """Run :func:`~vibrissa.rod.continuation.follow` over all rows, updating the unknowns."""
     n = len(begins)
@@ -443,5 +463,20 @@ def follow_all(
 
 @lru_cache(maxsize=16)
 def point_solver(whisker: Whisker, proximal: float, steps: int) -> PointSolver:
-    """Return the point solver of a whisker, made on first use."""
-    return PointSolver(reach(whisker, proximal=proximal, steps=steps))
+    """Return the point solver of a whisker, made on first use.
+
+    Parameters
+    ----------
+    whisker : Whisker
+        Whisker to be bent.
+    proximal : float
+        Smallest arc length of a contact, over L.
+    steps : int
+        Number of integration steps along the whisker.
+
+    Returns
+    -------
+    PointSolver
+        Solver of contact points.
+    """
+    return PointSolver(stable_set(whisker, proximal=proximal, steps=steps))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vibrissa.numerics.arrays import Array
+from vibrissa.numerics import Array
 from vibrissa.objects.surface import Placement, Surface, between
 from vibrissa.rod.pegs import Rest
 

@@ -13,10 +13,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibrissa.numerics.arrays import Array, Rod
-from vibrissa.numerics.compiled import copy, inlined, kernel
-from vibrissa.rod.batch import share_out
-from vibrissa.rod.discretize import Discretization
+from vibrissa.numerics import Array, copy, inlined, kernel, share_out
+from vibrissa.rod.discretization import Discretization, Rod
 
 WEIGHTS = np.array([11.0, 0.0, 81.0, 81.0, -32.0, -32.0, 11.0]) / 120.0
 NODES = np.array([0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0 / 3.0, 0.5, 0.5, 1.0])
@@ -38,7 +36,7 @@ def _rates(
     rod: Rod, k: int, t: float, loaded: bool, force: Array, point: Array, y: Array, dy: Array
 ) -> None:
     """Derivatives of (r, t, d₁, d₂), 12 numbers, at the fraction t of step k."""
-    c = rod[5][k]
+    c = rod.shape[k]
     u = np.empty(3)
     for a in range(3):
         u[a] = c[a, 0] + t * (c[a, 1] + t * (c[a, 2] + t * c[a, 3]))
@@ -51,10 +49,10 @@ def _rates(
         m2 = x0 * force[1] - x1 * force[0]
         for a in range(3):
             m = y[3 + 3 * a] * m0 + y[4 + 3 * a] * m1 + y[5 + 3 * a] * m2
-            u[a] += compliance * (rod[3][k] if a == 0 else rod[4][k]) * m
+            u[a] += compliance * (rod.twist[k] if a == 0 else rod.bending[k]) * m
     for i in range(3):
         t_i, d1, d2 = y[3 + i], y[6 + i], y[9 + i]
-        dy[i] = rod[2][k] * t_i
+        dy[i] = rod.extent[k] * t_i
         dy[3 + i] = u[2] * d1 - u[1] * d2
         dy[6 + i] = u[0] * d2 - u[2] * t_i
         dy[9 + i] = u[1] * t_i - u[0] * d1
@@ -65,7 +63,7 @@ def _shapes(
     rod: Rod, values: Array, arc: Array, s: Array, places: Array, first: int, last: int
 ) -> None:
     """Places (n, m, 3) at increasing arc lengths s (m,), for values (F, p) and contacts at arc."""
-    start, width = rod[0], rod[1]
+    start, width = rod.start, rod.width
     y, argument, slopes = np.empty(12), np.empty(12), np.empty((7, 12))
     for row in range(first, last):
         force, point, contact = values[row, :3], values[row, 3:], arc[row]
@@ -76,13 +74,13 @@ def _shapes(
         for k in range(start.shape[0]):
             here, end = start[k], start[k] + width[k]
             while True:
-                while wanted < s.shape[0] and s[wanted] <= here + 1e-12 and rod[2][k] > 0.0:
+                while wanted < s.shape[0] and s[wanted] <= here + 1e-12 and rod.extent[k] > 0.0:
                     copy(y, places[row, wanted])
                     wanted += 1
                 if here >= end - 1e-15:
                     break
                 to = end
-                if rod[2][k] > 0.0 and wanted < s.shape[0]:
+                if rod.extent[k] > 0.0 and wanted < s.shape[0]:
                     to = min(to, s[wanted])
                 loaded = here < contact - 1e-14
                 if loaded:
@@ -105,7 +103,24 @@ def _shapes(
 
 
 def shapes(discretization: Discretization, values: Array, arc: Array, s: Array) -> Array:
-    """Centrelines of deflected whiskers, non-dimensional."""
+    """Centrelines of deflected whiskers, non-dimensional.
+
+    Parameters
+    ----------
+    discretization : Discretization
+        Rod.
+    values : (n, 6) array
+        Base force and contact point (F, p) of each whisker.
+    arc : (n,) array
+        Arc length of each contact, over L.
+    s : (m,) array
+        Arc lengths of the wanted points, over L, increasing.
+
+    Returns
+    -------
+    (n, m, 3) array
+        Points over L, whisker frame; NaN where a row has no values.
+    """
     places = np.full((len(values), s.size, 3), np.nan)
     rows = np.flatnonzero(np.isfinite(values).all(axis=1) & np.isfinite(arc))
     kept, where = np.ascontiguousarray(values[rows]), np.ascontiguousarray(arc[rows])
@@ -117,7 +132,22 @@ def shapes(discretization: Discretization, values: Array, arc: Array, s: Array) 
 
 
 def contact_frames(discretization: Discretization, values: Array, arc: Array) -> Array:
-    """Material frames of deflected whiskers where they are touched."""
+    """Material frames of deflected whiskers where they are touched.
+
+    Parameters
+    ----------
+    discretization : Discretization
+        Rod.
+    values : (n, 6) array
+        Base force and contact point (F, p) of each whisker, non-dimensional.
+    arc : (n,) array
+        Arc length of each contact, over L.
+
+    Returns
+    -------
+    (n, 3, 3) array
+        Frames with columns (tangent, d1, d2), whisker frame; NaN where a row has no values.
+    """
     frames = np.full((len(values), 3, 3), np.nan)
     rows = np.flatnonzero(np.isfinite(values).all(axis=1) & np.isfinite(arc))
     # Contacts at the same arc length, such as the nodes of a chart, go together.

@@ -27,8 +27,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibrissa.numerics.arrays import Array
-from vibrissa.numerics.compiled import kernel
+from vibrissa.numerics import Array, kernel, solve
 
 EITHER, STICKING, SLIDING = 0, 1, 2
 
@@ -136,33 +135,4 @@ def surface_equations(
             jacobian[2, j], jacobian[3, j] = d_way[0], d_way[1]
     if tip:
         jacobian[1, 0], jacobian[1, 1], jacobian[1, 2], jacobian[1, 3] = 1.0, 0.0, 0.0, 0.0
-    return misfit, _solve4(jacobian, step), pressing, sliding, sliding == beyond
-
-
-@kernel
-def _solve4(a: Array, x: Array) -> float:
-    """Solve a y = x in place (y in x) with pivoting; return det a."""
-    det = 1.0
-    for c in range(4):
-        pivot = c
-        for r in range(c + 1, 4):
-            if abs(a[r, c]) > abs(a[pivot, c]):
-                pivot = r
-        if pivot != c:
-            det = -det
-            for k in range(4):
-                a[c, k], a[pivot, k] = a[pivot, k], a[c, k]
-            x[c], x[pivot] = x[pivot], x[c]
-        det *= a[c, c]
-        if a[c, c] == 0.0:
-            return 0.0
-        for r in range(c + 1, 4):
-            factor = a[r, c] / a[c, c]
-            for k in range(c, 4):
-                a[r, k] -= factor * a[c, k]
-            x[r] -= factor * x[c]
-    for c in range(3, -1, -1):
-        for k in range(c + 1, 4):
-            x[c] -= a[c, k] * x[k]
-        x[c] /= a[c, c]
-    return det
+    return misfit, solve(jacobian, step), pressing, sliding, sliding == beyond

@@ -22,13 +22,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vibrissa.numerics.arrays import Array, IntArray
+from vibrissa.numerics import Array, IntArray
 from vibrissa.objects.surface import Placement, Surface, between
+from vibrissa.rod.chart import LEAST_ARC
 from vibrissa.rod.deflection import Deflection, dimensional
-from vibrissa.rod.discretize import STEPS, discretize
+from vibrissa.rod.discretization import STEPS, discretize
 from vibrissa.rod.loads import PointForce
 from vibrissa.rod.points import Solutions, point_solver
-from vibrissa.rod.reach import LEAST_ARC
 from vibrissa.rod.resting import ZOOM, ZOOMS, Resting
 from vibrissa.rod.shape import shapes
 from vibrissa.rod.touch import Touch, TouchSolver
@@ -57,7 +57,21 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class SurfaceDeflection:
-    """What became of a whisker carried past surfaces, n placements."""
+    """Whisker carried past surfaces, at n placements.
+
+    Attributes
+    ----------
+    bent : Deflection
+        Base force and moment, contact and status at each placement.
+    surface : (n,) int array
+        Number of the surface that is touched, -1 without contact.
+    normal : (n, 3) array
+        Its outward normal at the contact, laboratory frame.
+    surface_point : (n, 3) array
+        Touched point of the surface, laboratory frame, m.
+    sliding : (n,) bool array
+        Whether the contact slides rather than sticks.
+    """
 
     bent: Deflection
     surface: IntArray
@@ -83,7 +97,37 @@ def follow_surfaces(
     steps: int = STEPS,
     progress: Progress | None = None,
 ) -> SurfaceDeflection:
-    """Carry a whisker past surfaces, quasi-statically."""
+    """Carry a whisker past surfaces, quasi-statically.
+
+    Parameters
+    ----------
+    whisker : Whisker
+        Whisker that is carried.
+    surfaces : sequence of Surface
+        Surfaces in the laboratory frame.
+    rotations : (n, 3, 3) array
+        Rotations from the whisker frame to the laboratory frame.
+    positions : (n, 3) array
+        Base positions in the laboratory frame, m.
+    friction : float
+        Coulomb's coefficient of friction.
+    proximal : float
+        Smallest arc length of a contact, over L; nearer ones get a status.
+    steps : int
+        Number of integration steps along the whisker.
+    progress : callable, optional
+        Function of the placements done and of all, called after each.
+
+    Returns
+    -------
+    SurfaceDeflection
+        Deflection and contact at each placement.
+
+    Raises
+    ------
+    ValueError
+        If ``friction`` is negative or not finite.
+    """
     if not (np.isfinite(friction) and friction >= 0.0):
         raise ValueError(f"friction is {friction!r}; a coefficient from 0 on is needed")
     follower = _Follower(whisker, surfaces, friction, steps)

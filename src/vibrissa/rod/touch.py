@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vibrissa.numerics.arrays import Array
+from vibrissa.numerics import Array
 from vibrissa.objects.surface import Placement, Surface
+from vibrissa.rod.chart import LEAST_ARC
 from vibrissa.rod.contact_state import STATES, contact_state
-from vibrissa.rod.discretize import Discretization
-from vibrissa.rod.reach import LEAST_ARC
+from vibrissa.rod.discretization import Discretization
 from vibrissa.rod.surface_equations import EITHER, SLIDING, STICKING, surface_equations
 
 _TOLERANCE = 1e-12

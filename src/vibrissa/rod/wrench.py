@@ -16,10 +16,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibrissa.numerics.arrays import Array, IntArray, Rod
-from vibrissa.numerics.compiled import copy, inlined, kernel
-from vibrissa.rod.batch import share_out
-from vibrissa.rod.discretize import Discretization
+from vibrissa.numerics import Array, IntArray, copy, inlined, kernel, share_out
+from vibrissa.rod.discretization import Discretization, Rod
 from vibrissa.rod.shape import NODES, STAGES, WEIGHTS
 
 #: At most so many places are kept for one wrench.
@@ -31,11 +29,11 @@ _MOST_TURN = 1.5
 @inlined
 def _rates(rod: Rod, k: int, t: float, y: Array, dy: Array) -> None:
     """Derivatives of (n, m), 6 numbers, at the fraction t of step k."""
-    c, extent = rod[5][k], rod[2][k]
+    c, extent = rod.shape[k], rod.extent[k]
     r = c[3, 0] + t * (c[3, 1] + t * (c[3, 2] + t * c[3, 3]))
     compliance = 1.0 / (r * r * r * r)
-    bend = compliance * rod[4][k]
-    u0 = c[0, 0] + t * (c[0, 1] + t * (c[0, 2] + t * c[0, 3])) + compliance * rod[3][k] * y[3]
+    bend = compliance * rod.bending[k]
+    u0 = c[0, 0] + t * (c[0, 1] + t * (c[0, 2] + t * c[0, 3])) + compliance * rod.twist[k] * y[3]
     u1 = c[1, 0] + t * (c[1, 1] + t * (c[1, 2] + t * c[1, 3])) + bend * y[4]
     u2 = c[2, 0] + t * (c[2, 1] + t * (c[2, 2] + t * c[2, 3])) + bend * y[5]
     for i in range(0, 6, 3):
@@ -51,7 +49,7 @@ def _advance(
     rod: Rod, k: int, h: float, y: Array, slopes: Array, argument: Array, end: Array
 ) -> None:
     """(n, m) at a distance h into step k, from y at its beginning."""
-    width = rod[1][k]
+    width = rod.width[k]
     for stage in range(7):
         for a in range(6):
             argument[a] = y[a]
@@ -74,7 +72,7 @@ def _slope(y: Array) -> float:
 def _places(
     rod: Rod, wrenches: Array, least: float, count: IntArray, contacts: Array, first: int, last: int
 ) -> None:
-    start, width, extent = rod[0], rod[1], rod[2]
+    start, width, extent = rod.start, rod.width, rod.extent
     y, end, inside = np.empty(6), np.empty(6), np.empty(6)
     slopes, argument = np.empty((7, 6)), np.empty(6)
     for row in range(first, last):
@@ -127,7 +125,24 @@ def _places(
 def vanishing_moments(
     discretization: Discretization, wrenches: Array, least: float
 ) -> tuple[IntArray, Array]:
-    """Find where the moment in the whisker comes nearest to zero, for known base wrenches."""
+    """Find where the moment in the whisker comes nearest to zero, for known base wrenches.
+
+    Parameters
+    ----------
+    discretization : Discretization
+        Rod.
+    wrenches : (n, 6) array
+        Base force and moment, non-dimensional.
+    least : float
+        Smallest arc length of a contact, over L.
+
+    Returns
+    -------
+    count : (n,) int array
+        Number of contacts found.
+    contacts : (n, MOST_PLACES, 4) array
+        Arc length and force in the material frame of each; NaN beyond the count.
+    """
     count = np.zeros(len(wrenches), np.int64)
     contacts = np.full((len(wrenches), MOST_PLACES, 4), np.nan)
     rod, wrenches = discretization.rod, np.ascontiguousarray(wrenches)

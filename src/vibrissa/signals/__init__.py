@@ -8,8 +8,12 @@ from vibrissa.signals.base import (
     circular_among,
     labelled_wrench,
     measured,
+    signal_derivatives,
+    signal_equations,
     signal_scales,
+    signals_of,
     within_turn,
+    wrench_derivatives,
 )
 from vibrissa.signals.regions import (
     CONE,
@@ -18,6 +22,7 @@ from vibrissa.signals.regions import (
     cone_angle,
     in_region,
     nearest_on_rest,
+    resting,
     within_cone,
 )
 from vibrissa.signals.triplets import TRIPLETS, selection
@@ -37,8 +42,13 @@ __all__ = [
     "labelled_wrench",
     "measured",
     "nearest_on_rest",
+    "resting",
     "selection",
+    "signal_derivatives",
+    "signal_equations",
     "signal_scales",
+    "signals_of",
     "within_cone",
     "within_turn",
+    "wrench_derivatives",
 ]

@@ -19,8 +19,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from vibrissa.numerics.arrays import AnyArray, Array, IntArray
-from vibrissa.numerics.compiled import inlined
+from vibrissa.numerics import AnyArray, Array, IntArray, inlined
 from vibrissa.quantities import attributes
 
 # Of a DataArray, by name.
@@ -134,7 +133,18 @@ def coordinates(array: xr.DataArray, dims: tuple[str, ...]) -> Coordinates:
 
 
 def signals_of(force: Array, moment: Array) -> Array:
-    """The six signals as one array (..., 6), in the order of :data:`SIGNALS`."""
+    """Stack the six signals of force and moment.
+
+    Parameters
+    ----------
+    force, moment : (..., 3) array
+        Base force and moment in the whisker frame, any unit.
+
+    Returns
+    -------
+    (..., 6) array
+        Signals in the order of :data:`SIGNALS`.
+    """
     return np.stack(
         [
             force[..., 0],
@@ -149,7 +159,18 @@ def signals_of(force: Array, moment: Array) -> Array:
 
 
 def wrench_derivatives(force: Array, moment: Array) -> Array:
-    """∂(six signals)/∂(F, M), shape (..., 6, 6); not finite where a direction has no meaning."""
+    """Derivatives of the six signals by force and moment.
+
+    Parameters
+    ----------
+    force, moment : (..., 3) array
+        Base force and moment in the whisker frame, any unit.
+
+    Returns
+    -------
+    (..., 6, 6) array
+        Derivatives by (F, M); not finite where a direction has no meaning.
+    """
     out = np.zeros((*force.shape[:-1], 6, 6))
     for first, vector in ((0, force), (3, moment)):
         y, z = vector[..., 1], vector[..., 2]
@@ -329,7 +350,20 @@ def signal_equations(
 
 
 def signal_derivatives(values: Array, tangents: Array) -> Array:
-    """∂(six signals)/∂ξ, shape (..., 6, 3), from (F, p) (..., 6) and ∂(F, p)/∂ξ (..., 6, 3)."""
+    """Derivatives of the six signals by the contact.
+
+    Parameters
+    ----------
+    values : (..., 6) array
+        Base force and contact point (F, p).
+    tangents : (..., 6, k) array
+        Their derivatives by k unknowns.
+
+    Returns
+    -------
+    (..., 6, k) array
+        Derivatives of the signals by the unknowns; not finite where a direction has no meaning.
+    """
     force, point = values[..., :3], values[..., 3:]
     d_force, d_point = tangents[..., :3, :], tangents[..., 3:, :]
     d_moment = np.cross(d_point, force[..., None], axis=-2) + np.cross(

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial import cKDTree
 
-from vibrissa.numerics.arrays import AnyArray, Array
+from vibrissa.numerics import AnyArray, Array
 
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
@@ -30,7 +30,22 @@ _SAMPLES = 2049
 
 @lru_cache(maxsize=16)
 def resting(whisker: Whisker) -> tuple[Array, Array, cKDTree]:
-    """Arc lengths (n,), places (n, 3) and a tree of them, of the resting whisker; cached."""
+    """Sample the resting whisker; cached.
+
+    Parameters
+    ----------
+    whisker : Whisker
+        Whisker at rest.
+
+    Returns
+    -------
+    s : (n,) array
+        Arc lengths, m.
+    places : (n, 3) array
+        Points of the centreline, m.
+    tree : cKDTree
+        Search tree of these points.
+    """
     s = np.linspace(0.0, whisker.length, _SAMPLES)
     places = whisker.position(s)
     return s, places, cKDTree(places)

@@ -21,8 +21,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from vibrissa.numerics.arrays import Array, IntArray
-from vibrissa.numerics.compiled import kernel
+from vibrissa.numerics import Array, IntArray, kernel
 from vibrissa.whisker import Whisker
 
 _GRADING = 0.4

@@ -29,7 +29,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from vibrissa.numerics.arrays import Array, IntArray
+from vibrissa.numerics import Array, IntArray
 from vibrissa.objects.surface import Surface
 from vibrissa.simulation.chain import Chain
 from vibrissa.simulation.motion import Motion

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from vibrissa.numerics.compiled import kernel
+from vibrissa.numerics import kernel
 
 _REACH = 3.5
 """Standard deviations of the blur beyond which nothing is painted."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from vibrissa.objects.solids import Box, Peg, Plane, Sphere
 from vibrissa.objects.surface import Surface
-from vibrissa.rod.surfaces import follow_surfaces
+from vibrissa.rod import follow_surfaces
 from vibrissa.simulation.motion import (
     ELEVATION_PER_AZIMUTH,
     ROLL_PER_AZIMUTH,

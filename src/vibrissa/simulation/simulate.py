@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from vibrissa.objects.surface import Surface
 from vibrissa.recording.tree import trial_recording
-from vibrissa.rod.surfaces import SurfaceDeflection, follow_surfaces
+from vibrissa.rod import SurfaceDeflection, follow_surfaces
 from vibrissa.simulation.dynamics import Dynamics, move_dynamically
 from vibrissa.simulation.motion import Motion
 from vibrissa.simulation.stepping import Moment

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import eigh
 
-from vibrissa.numerics.arrays import Array, IntArray
+from vibrissa.numerics import Array, IntArray
 from vibrissa.objects.surface import Surface
 from vibrissa.simulation.chain import Chain, bezier, configure, inertia, jacobian, solve_definite
 from vibrissa.whisker import Whisker

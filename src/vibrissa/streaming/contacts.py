@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from vibrissa.contacts import ContactFilter, Estimator, Followed, Located
 from vibrissa.contacts.contact_map import spherical
 from vibrissa.rod import PointForce, deflect
-from vibrissa.signals import SIGNALS
-from vibrissa.signals.base import signals_of
+from vibrissa.signals import SIGNALS, signals_of
 from vibrissa.streaming.lines import FRAME, Lines, Sample
 from vibrissa.streaming.poses import Poses
 

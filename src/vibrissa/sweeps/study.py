@@ -17,10 +17,8 @@ from threadpoolctl import threadpool_limits
 
 from vibrissa.contacts.explanation import seen
 from vibrissa.contacts.least_squares import seeding_triplet
-from vibrissa.rod.discretize import discretize
-from vibrissa.rod.points import point_solver
-from vibrissa.rod.reach import reach
-from vibrissa.signals.regions import resting
+from vibrissa.rod import discretize, point_solver, stable_set
+from vibrissa.signals import resting
 from vibrissa.sweeps.population import Specimen, population
 from vibrissa.sweeps.tasks import TASKS, Settings, settings_of
 from vibrissa.whisker import Whisker
@@ -80,7 +78,7 @@ moment_noise = 0.02              # µN·m
 # Others: "map"; "sensitivity" (triplets, noise); "friction" (triplet, friction, contacts).
 """
 
-_KEPT = (discretize, reach, point_solver, resting, seen, seeding_triplet)
+_KEPT = (discretize, stable_set, point_solver, resting, seen, seeding_triplet)
 """Functions that keep what they found of the last whiskers; a study does not come back to any."""
 _OF_WHISKER, _OF_CELL = 16, 4
 """Numbers kept of each whisker, with its name, and of each cell."""

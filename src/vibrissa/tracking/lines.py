@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.numerics.compiled import inlined, kernel
+from vibrissa.numerics import inlined, kernel
 from vibrissa.tracking.scene import Bodies, Image
 
 Array = NDArray[np.float64]

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from vibrissa.cameras.camera import Camera
-from vibrissa.rod.batch import solve_forces
-from vibrissa.rod.discretize import Discretization, discretize
+from vibrissa.rod import Discretization, discretize, solve_forces
 from vibrissa.tracking.banded import Smoother
 from vibrissa.tracking.head import HeadPose
 from vibrissa.tracking.pose import BasePose

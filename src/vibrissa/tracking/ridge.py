@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.numerics.compiled import inlined, kernel
+from vibrissa.numerics import inlined, kernel
 
 Array = NDArray[np.float64]
 

@@ -8,9 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from vibrissa.rod.batch import solve_forces
-from vibrissa.rod.discretize import Discretization
-from vibrissa.rod.shape import shapes
+from vibrissa.rod import Discretization, shapes, solve_forces
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

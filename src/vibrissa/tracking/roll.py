@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.rod.discretize import discretize
+from vibrissa.rod import discretize
 from vibrissa.tracking.pose import BasePose
 from vibrissa.tracking.rods import State, first_contacts
 from vibrissa.whisker import Whisker

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vibrissa.io.video import Frame
-from vibrissa.numerics.compiled import kernel
+from vibrissa.numerics import kernel
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]

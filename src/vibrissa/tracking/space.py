@@ -20,7 +20,7 @@ from scipy.interpolate import BSpline
 
 from vibrissa.cameras.camera import Camera
 from vibrissa.cameras.triangulation import triangulate
-from vibrissa.numerics.compiled import kernel
+from vibrissa.numerics import kernel
 from vibrissa.tracking.trace import Trace
 
 Array = NDArray[np.float64]

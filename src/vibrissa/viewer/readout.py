@@ -10,8 +10,7 @@ import numpy as np
 
 from vibrissa.quantities import quantity
 from vibrissa.rod import Deflection
-from vibrissa.signals import SIGNALS
-from vibrissa.signals.base import signals_of
+from vibrissa.signals import SIGNALS, signals_of
 from vibrissa.status import Status
 
 _GREEK = {"theta": "θ", "varphi": "φ", "sigma": "σ"}

@@ -15,11 +15,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vibrissa.numerics.arrays import Array, Rod
+from vibrissa.numerics import Array
 
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
@@ -39,9 +39,51 @@ _ORDER = 4
 _ROUGH = 1e-4
 
 
+class Rod(NamedTuple):
+    """The rod in n steps from base to tip, non-dimensional, for the kernels.
+
+    Attributes
+    ----------
+    start : (n,) array
+        Arc length at which each step begins, over L; negative in a compliant base.
+    width : (n,) array
+        Length of each step in arc length, over L.
+    extent : (n,) array
+        Centreline length per arc length: 1 in the whisker, 0 in a compliant base.
+    twist : (n,) array
+        Compliance in twist where the radius is that of the base, over that in bending.
+    bending : (n,) array
+        Compliance in bending there, 1 in the whisker.
+    shape : (n, 4, 4) array
+        Cubics in the fraction of the step, constant term first: the three intrinsic curvatures
+        (times L), and the radius over that of the base.
+    """
+
+    start: Array
+    width: Array
+    extent: Array
+    twist: Array
+    bending: Array
+    shape: Array
+
+
 @dataclass(frozen=True, eq=False)
 class Discretization:
-    """Arrays for the kernels and the scales that make their results dimensional."""
+    """Rod for the kernels, and the scales that make their results dimensional.
+
+    Attributes
+    ----------
+    rod : Rod
+        The steps.
+    length : float
+        Unit of length: that of the whisker, m.
+    force : float
+        Unit of force, EI/L² at the base, N.
+    moment : float
+        Unit of moment, EI/L at the base, N·m.
+    radius : float
+        Radius at the base, over L.
+    """
 
     rod: Rod
     length: float
@@ -52,7 +94,20 @@ class Discretization:
 
 @lru_cache(maxsize=64)
 def discretize(whisker: Whisker, steps: int = STEPS) -> Discretization:
-    """Cut a whisker into steps for the kernels."""
+    """Cut a whisker into steps for the kernels; cached.
+
+    Parameters
+    ----------
+    whisker : Whisker
+        Whisker to be bent.
+    steps : int
+        Number of integration steps along it, at least; a corkscrew gets more.
+
+    Returns
+    -------
+    Discretization
+        Rod and units.
+    """
     if not 4 <= steps <= MOST_STEPS or int(steps) != steps:
         raise ValueError(f"steps is {steps}; it must be a whole number from 4 to {MOST_STEPS}")
     steps, length = int(steps), whisker.length
@@ -65,13 +120,13 @@ def discretize(whisker: Whisker, steps: int = STEPS) -> Discretization:
     _match_moments(whisker, nodes, shape)
     n = width.size
     ones = np.ones(n)
-    rod = (nodes[:-1].copy(), width, ones, ones * (1.0 + whisker.poisson_ratio), ones, shape)
+    rod = Rod(nodes[:-1].copy(), width, ones, ones * (1.0 + whisker.poisson_ratio), ones, shape)
     stiffness = whisker.base_bending_stiffness
     if whisker.base_stiffness is not None:
         pieces = _JOINT_STEPS * max(1, steps // STEPS)
         rod = _with_joint(rod, pieces, stiffness / length, *whisker.base_stiffness)
     return Discretization(
-        rod=tuple(np.ascontiguousarray(a, dtype=np.float64) for a in rod),  # type: ignore[arg-type]
+        rod=Rod(*(np.ascontiguousarray(a, dtype=np.float64) for a in rod)),
         length=length,
         force=stiffness / length**2,
         moment=stiffness / length,
@@ -169,14 +224,14 @@ def _with_joint(rod: Rod, n: int, moment_scale: float, bending: float, twist: fl
     Such a piece turns by the rotation that its moment asks for and moves nothing, so it is a
     torsion spring; being rod, it needs no equations of its own. It is cut into n steps.
     """
-    start, width, extent, twists, bends, shape = rod
     unit = np.zeros((n, 4, 4))
     unit[:, 3, 0] = 1.0
-    return (
-        np.concatenate([np.arange(-n, 0) / n, start]),
-        np.concatenate([np.full(n, 1.0 / n), width]),
-        np.concatenate([np.zeros(n), extent]),
-        np.concatenate([np.full(n, moment_scale / twist), twists]),
-        np.concatenate([np.full(n, moment_scale / bending), bends]),
-        np.concatenate([unit, shape]),
+    joint = Rod(
+        start=np.arange(-n, 0) / n,
+        width=np.full(n, 1.0 / n),
+        extent=np.zeros(n),
+        twist=np.full(n, moment_scale / twist),
+        bending=np.full(n, moment_scale / bending),
+        shape=unit,
     )
+    return Rod(*(np.concatenate(parts) for parts in zip(joint, rod, strict=True)))

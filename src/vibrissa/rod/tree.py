@@ -1,7 +1,7 @@
 """Which contacts give these three numbers: the tree of all preimages of a map from the chart.
 
 Three quantities T (the contact point's coordinates, or three base signals) are known with their
-exact derivatives at the nodes of the chart (:mod:`vibrissa.rod.reach`). In each cell T is the cubic
+exact derivatives at the nodes of the chart (:mod:`vibrissa.rod.chart`). In each cell T is the cubic
 blended between the cell's twelve edges: with H the cubic Hermite curve along an edge and V the
 straight line between its ends, Σ w H over the four edges along η plus Σ w (H - V) over those along
 ψ and ρ, w the bilinear weights across. It reproduces all cubics, so its error is of fourth order;
@@ -9,7 +9,7 @@ the Bézier points of the edges bound it.
 
 Boxes around the cells' values, and around those of 2 × 2 × 2 neighbours, and so on, form a tree;
 the cells that may contain a target are those whose boxes, and all boxes above them, contain it, and
-which still contain it in coordinates aligned with the cell (:mod:`vibrissa.rod.seeds`). Angles are
+which still contain it in coordinates aligned with the cell (:mod:`vibrissa.rod.search`). Angles are
 compared on the circle.
 
 Length and direction of a vector of the plane, as those of the transverse force, are not smooth
@@ -19,13 +19,12 @@ where the vector vanishes, and no polynomial of them is any good there. Cells wh
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.numerics.arrays import AnyArray, Array, IntArray
-from vibrissa.rod.reach import Reach
+from vibrissa.numerics import AnyArray, Array, IntArray
+from vibrissa.rod.chart import StableSet
 
 # Boxes are widened by this share of their size for what the cubic misses.
 _MARGIN = 0.08
@@ -43,8 +42,40 @@ _SHEARED = 3.0
 _TURNED = 0.9
 
 
-class Tree(NamedTuple):
-    """The tree, for the kernels."""
+class SearchTree(NamedTuple):
+    """Cells of a chart by the values of three quantities in them, for the kernels.
+
+    Attributes
+    ----------
+    grid : (2, 3) array
+        Chart coordinates of the first corner, and size of a cell.
+    turns : (3,) array
+        1/2π for angles, 0 for other quantities.
+    offsets : (levels + 1,) int array
+        First row of each level in ``boxes``.
+    boxes : (m, 6, 8) array
+        Middle and half width of the values in eight sibling blocks.
+    place : (n, 3) int array
+        Position of each cell in the grid.
+    frame : (n, 6, 3) array
+        Coordinates in which a cell is nearly the unit cube (inverse, origin), and its extent there.
+    edges : (n, 160) array
+        Coefficients of the cells' interpolants.
+    care : (n,) int array
+        Starts that a cell needs: 0 one, 1 several until one is solved, 2 all of them.
+    polar : (n,) int array
+        Row of a polar cell in the arrays below, -1 for other cells.
+    polar_edges : (p, 160) array
+        Coefficients of the polar cells' interpolants.
+    polar_frame : (p, 8) array
+        Base values, and the sizes that count as the cell's extent.
+    polar_linear : (p, 4, 5) array
+        Mean slopes, and middle and half width of the rest.
+    polar_volumes : (p, 8, 2) array
+        Volumes that the slopes span at the corners, for each component of the vector.
+    roles : (4,) int array
+        Numbers of length, direction and the others among the quantities; -1 for none.
+    """
 
     grid: Array
     turns: Array
@@ -62,8 +93,18 @@ class Tree(NamedTuple):
     roles: IntArray
 
 
-class Plane(NamedTuple):
-    """A vector of the plane, of which quantities are the length or the direction."""
+class PlaneVector(NamedTuple):
+    """Vector of the plane of which one or two quantities are length and direction.
+
+    Attributes
+    ----------
+    values : (i, j, k, 2) array
+        Components at the chart's nodes.
+    derivatives : (i, j, k, 2, 3) array
+        Their derivatives by ξ there.
+    length, direction : int
+        Number of its length and of its direction among the quantities, -1 if it is none of them.
+    """
 
     values: Array
     derivatives: Array
@@ -71,63 +112,72 @@ class Plane(NamedTuple):
     direction: int
 
 
-@dataclass(frozen=True, eq=False)
-class Preimages:
-    """Subdivision tree of three quantities over a chart."""
+def search_tree(
+    chart: StableSet,
+    values: Array,
+    derivatives: Array,
+    angles: tuple[bool, ...],
+    plane: PlaneVector | None = None,
+) -> SearchTree:
+    """Build the tree in which contacts of given quantities are searched.
 
-    tree: Tree
+    Parameters
+    ----------
+    chart : StableSet
+        Contacts at whose nodes the quantities are known.
+    values : (i, j, k, 3) array
+        Three quantities at the nodes, of any unit.
+    derivatives : (i, j, k, 3, 3) array
+        Their derivatives by ξ there.
+    angles : tuple of bool
+        Whether each of them is an angle, compared on the circle.
+    plane : PlaneVector, optional
+        Vector of which one or two of the quantities are length and direction.
 
-    @classmethod
-    def of(
-        cls,
-        reach: Reach,
-        values: Array,
-        derivatives: Array,
-        angles: tuple[bool, ...],
-        plane: Plane | None = None,
-    ) -> Preimages:
-        """Build the tree."""
-        size = np.array([1.0, 2.0 * np.pi, 1.0]) / (np.array(values.shape[:3]) - 1)
-        circular = np.array(angles)
-        place = _octree_order(tuple(n - 1 for n in values.shape[:3]))
-        cells = _Cells.of(place, values, reach.charted(derivatives) * size, circular)
-        points = cells.points()
-        aligned = _aligned(cells, points)
-        low, high = points.min(axis=1), points.max(axis=1)
-        care = _care(cells.slope, aligned)
-        polar = _Polar.none()
-        if plane is not None:
-            slopes = reach.charted(plane.derivatives) * size
-            vector = _Cells.of(place, plane.values, slopes, np.zeros(2, dtype=bool))
-            polar = _Polar.of(cells, vector, plane.length, plane.direction, 0.5 * (high - low))
-            if plane.length >= 0:
-                low[polar.rows, plane.length] = 0.0
-                high[polar.rows, plane.length] = polar.frame[:, 7]
-            if plane.direction >= 0:
-                low[polar.rows, plane.direction] = -np.pi
-                high[polar.rows, plane.direction] = np.pi
-            care[polar.rows] = 2
-        offsets, boxes = _boxes(low, high, circular)
-        row = np.full(len(place), -1)
-        row[polar.rows] = np.arange(len(polar.rows))
-        return cls(
-            Tree(
-                np.stack([np.zeros(3), size]),
-                np.where(circular, 0.5 / np.pi, 0.0),
-                offsets,
-                boxes,
-                place,
-                aligned,
-                _edges(cells),
-                care,
-                row,
-                polar.edges,
-                polar.frame,
-                polar.linear,
-                polar.volumes,
-                polar.roles,
-            )
-        )
+    Returns
+    -------
+    SearchTree
+        Arrays for the kernels.
+    """
+    size = np.array([1.0, 2.0 * np.pi, 1.0]) / (np.array(values.shape[:3]) - 1)
+    circular = np.array(angles)
+    place = _octree_order(tuple(n - 1 for n in values.shape[:3]))
+    cells = _Cells.of(place, values, chart.charted(derivatives) * size, circular)
+    points = cells.points()
+    aligned = _aligned(cells, points)
+    low, high = points.min(axis=1), points.max(axis=1)
+    care = _care(cells.slope, aligned)
+    polar = _Polar.none()
+    if plane is not None:
+        slopes = chart.charted(plane.derivatives) * size
+        vector = _Cells.of(place, plane.values, slopes, np.zeros(2, dtype=bool))
+        polar = _Polar.of(cells, vector, plane.length, plane.direction, 0.5 * (high - low))
+        if plane.length >= 0:
+            low[polar.rows, plane.length] = 0.0
+            high[polar.rows, plane.length] = polar.frame[:, 7]
+        if plane.direction >= 0:
+            low[polar.rows, plane.direction] = -np.pi
+            high[polar.rows, plane.direction] = np.pi
+        care[polar.rows] = 2
+    offsets, boxes = _boxes(low, high, circular)
+    row = np.full(len(place), -1)
+    row[polar.rows] = np.arange(len(polar.rows))
+    return SearchTree(
+        np.stack([np.zeros(3), size]),
+        np.where(circular, 0.5 / np.pi, 0.0),
+        offsets,
+        boxes,
+        place,
+        aligned,
+        _edges(cells),
+        care,
+        row,
+        polar.edges,
+        polar.frame,
+        polar.linear,
+        polar.volumes,
+        polar.roles,
+    )
 
 
 class _Cells(NamedTuple):
@@ -180,7 +230,7 @@ class _Cells(NamedTuple):
 
 
 class _Polar(NamedTuple):
-    """Polar cells: rows (n,), which they are; the rest as in `Tree`."""
+    """Polar cells: rows (n,), which they are; the rest as in `SearchTree`."""
 
     rows: IntArray
     edges: Array
@@ -224,7 +274,7 @@ class _Polar(NamedTuple):
 
 
 def _volumes(slope: Array, others: int) -> Array:
-    """See `Tree.polar_volumes`; relative to the slopes' lengths."""
+    """See `SearchTree.polar_volumes`; relative to the slopes' lengths."""
     slope = slope.reshape(len(slope), 8, slope.shape[-2], 3)
     out = np.zeros((len(slope), 8, 2))
     size = np.linalg.norm(slope[..., 2:, :], axis=-1).prod(axis=-1)

@@ -1,10 +1,10 @@
 """Seeds: where in the chart three quantities have given values, by the cells' interpolants.
 
-The tree (:mod:`vibrissa.rod.preimage`) tells which cells may hold a target. In each the interpolant
+The tree (:mod:`vibrissa.rod.tree`) tells which cells may hold a target. In each the interpolant
 is inverted by Newton's method, which gives seeds so near the exact solution that it converges at
 once.
 
-In a cell where a vector of the plane may vanish (:class:`~vibrissa.rod.preimage.Tree`), its length
+In a cell where a vector of the plane may vanish (:class:`~vibrissa.rod.SearchTree`), its length
 ℓ and direction β are not smooth, but its components v are: there the equations are
 
     both known: v - ℓ (cos β, sin β) = 0;   β alone: v × (cos β, sin β) = 0, v · (cos β, sin β) > 0;
@@ -15,9 +15,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibrissa.numerics.arrays import Array, IntArray
-from vibrissa.numerics.compiled import copy, inlined, kernel
-from vibrissa.rod.preimage import EVEN, FOLDED, Tree
+from vibrissa.numerics import Array, IntArray, copy, inlined, kernel, solve3, wrapped
+from vibrissa.rod.tree import EVEN, FOLDED, SearchTree
 
 #: At most so many contacts are found for one target.
 MOST_SEEDS = 32
@@ -36,12 +35,6 @@ _RESTING = 3
 # Linear equations whose determinant is below this share of the product of their rows are singular.
 _SINGULAR = 1e-3
 _STACK = 256
-
-
-@inlined
-def wrapped(angle: float) -> float:
-    """Angle in [-π, π]."""
-    return float(angle - 2.0 * np.pi * np.rint(angle / (2.0 * np.pi)))
 
 
 # The interpolant's four lanes, three quantities and padding, lie in one flat buffer, without which
@@ -144,47 +137,20 @@ def _adjugate(b: Array, rows: Array) -> float:
 
 
 @inlined
-def solve3(a: Array, r: Array, x: Array) -> float:
-    """Solve a x = r by Cramer's rule; return det a (x is not set if that is 0)."""
-    c0 = a[1, 1] * a[2, 2] - a[1, 2] * a[2, 1]
-    c1 = a[1, 2] * a[2, 0] - a[1, 0] * a[2, 2]
-    c2 = a[1, 0] * a[2, 1] - a[1, 1] * a[2, 0]
-    det = a[0, 0] * c0 + a[0, 1] * c1 + a[0, 2] * c2
-    if det != 0.0:
-        inverse = 1.0 / det
-        x[0] = inverse * (
-            c0 * r[0]
-            + (a[0, 2] * a[2, 1] - a[0, 1] * a[2, 2]) * r[1]
-            + (a[0, 1] * a[1, 2] - a[0, 2] * a[1, 1]) * r[2]
-        )
-        x[1] = inverse * (
-            c1 * r[0]
-            + (a[0, 0] * a[2, 2] - a[0, 2] * a[2, 0]) * r[1]
-            + (a[0, 2] * a[1, 0] - a[0, 0] * a[1, 2]) * r[2]
-        )
-        x[2] = inverse * (
-            c2 * r[0]
-            + (a[0, 1] * a[2, 0] - a[0, 0] * a[2, 1]) * r[1]
-            + (a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]) * r[2]
-        )
-    return float(det)
-
-
-@inlined
 def _outside(x: Array) -> float:
     """How far a place lies outside its cell, in cell widths."""
     return float(max(abs(x[0] - 0.5), abs(x[1] - 0.5), abs(x[2] - 0.5)) - 0.5)
 
 
 @inlined
-def _less(tree: Tree, q: int, target: float, base: float) -> float:
+def _less(tree: SearchTree, q: int, target: float, base: float) -> float:
     """By how much a target is larger than a base; an angle by at most half a turn."""
     d = target - base
     return float(d - 2.0 * np.pi * np.rint(d * tree.turns[q]))
 
 
 @inlined
-def _aim(tree: Tree, target: Array, b: Array) -> None:
+def _aim(tree: SearchTree, target: Array, b: Array) -> None:
     """Bring direction and length of the target, where polar cells need them, into the buffer."""
     length, direction = tree.roles[0], tree.roles[1]
     b[_TARGET] = b[_TARGET + 1] = b[_TARGET + 3] = 0.0
@@ -194,7 +160,7 @@ def _aim(tree: Tree, target: Array, b: Array) -> None:
 
 
 @inlined
-def _begin_polar(tree: Tree, row: int, target: Array, b: Array) -> None:
+def _begin_polar(tree: SearchTree, row: int, target: Array, b: Array) -> None:
     """Bring the target as a polar cell sees it into the buffer."""
     frame = tree.polar_frame[row]
     b[_RELATIVE], b[_RELATIVE + 1] = -frame[0], -frame[1]
@@ -204,7 +170,7 @@ def _begin_polar(tree: Tree, row: int, target: Array, b: Array) -> None:
 
 
 @inlined
-def _locate_polar(tree: Tree, row: int, b: Array, work: Array, x: Array) -> bool:
+def _locate_polar(tree: SearchTree, row: int, b: Array, work: Array, x: Array) -> bool:
     """Whether a polar cell in the buffer may contain its target; if so, about where.
 
     Its equations are linear in the components and the other quantities if the direction is known:
@@ -245,7 +211,7 @@ def _locate_polar(tree: Tree, row: int, b: Array, work: Array, x: Array) -> bool
 
 
 @inlined
-def _polar_care(tree: Tree, row: int, b: Array) -> int:
+def _polar_care(tree: SearchTree, row: int, b: Array) -> int:
     """How many starts a polar cell in the buffer needs; see `Tree.care`."""
     cos, sin, length = b[_TARGET], b[_TARGET + 1], b[_TARGET + 2]
     if cos == 0.0 and sin == 0.0:
@@ -293,7 +259,7 @@ def _within(matrix: Array, right: Array, slack: Array, x: Array) -> bool:
 
 
 @inlined
-def _locate(tree: Tree, cell: int, target: Array, relative: Array, x: Array) -> bool:
+def _locate(tree: SearchTree, cell: int, target: Array, relative: Array, x: Array) -> bool:
     """Whether a cell may contain the target; if so, about where."""
     frame = tree.frame[cell]
     for q in range(3):
@@ -435,7 +401,7 @@ def _keep(
 
 
 @kernel
-def seeds(tree: Tree, target: Array, found: Array, inverses: Array, quality: IntArray) -> int:
+def seeds(tree: SearchTree, target: Array, found: Array, inverses: Array, quality: IntArray) -> int:
     """All contacts that may have the target's values, as chart coordinates."""
     grid, turns, offsets, boxes, place = (
         tree.grid,

@@ -19,15 +19,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from vibrissa.numerics.arrays import AnyArray, Array
-from vibrissa.numerics.compiled import inlined, kernel
-from vibrissa.rod.batch import solve_forces
-from vibrissa.rod.discretize import STEPS, Discretization, discretize
+from vibrissa.numerics import AnyArray, Array, inlined, kernel
+from vibrissa.rod.discretization import STEPS, Discretization, discretize
+from vibrissa.rod.kernels import solve_forces
 
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
@@ -47,14 +46,49 @@ LEAST_ARC = 0.05
 # Directions have no value at zero force; just above it they have their limit.
 _LEAST_LOAD = 0.01
 
-# The fold's share in the kernels: stations s (n,), ln f* and its derivatives in s, ψ and both (n, m
-# + 1, 4).
-Fold = tuple[Array, Array]
+
+class Fold(NamedTuple):
+    """The fold force over the chart, for the kernels.
+
+    Attributes
+    ----------
+    bounds : (2,) array
+        Smallest arc length, over L, and grading a of the chart.
+    log_force : (n, m + 1, 4) array
+        ln f* and its derivatives by η, by ψ and by both, at the chart's nodes.
+    """
+
+    bounds: Array
+    log_force: Array
 
 
 @dataclass(frozen=True, eq=False)
-class Reach:
-    """The chart of the stable contacts of one whisker, non-dimensional."""
+class StableSet:
+    """Chart of the stable contacts of one whisker, non-dimensional.
+
+    Attributes
+    ----------
+    discretization : Discretization
+        Rod and units.
+    stations : (i,) array
+        Arc lengths of the nodes, over L.
+    bearings : (j,) array
+        Directions ψ of the force at the nodes, rad; the last is the first, a turn on.
+    loads : (k,) array
+        Square roots ρ of the force at the nodes, relative to the fold force.
+    fold : Fold
+        Fold force over the chart.
+    contacts : (i, j, k, 3) array
+        Contacts ξ = (s, f_y, f_z) at the nodes.
+    values : (i, j, k, 6) array
+        Base force and contact point (F, p) there.
+    tangents : (i, j, k, 6, 3) array
+        Their derivatives by ξ.
+    frames : (i, j, k, 3, 3) array
+        Derivatives of ξ by (η, ψ, ρ).
+    folded : (i, j) bool array
+        Whether a fold was found along each ray.
+    """
 
     discretization: Discretization
     stations: Array
@@ -73,18 +107,51 @@ class Reach:
         return float(self.stations[0])
 
     def charted(self, derivatives: Array) -> Array:
-        """Turn derivatives with respect to ξ at the nodes into ones with respect to (η, ψ, ρ)."""
+        """Turn derivatives by ξ at the nodes into ones by (η, ψ, ρ).
+
+        Parameters
+        ----------
+        derivatives : (..., n, 3) array
+            Derivatives by ξ at all nodes.
+
+        Returns
+        -------
+        (..., n, 3) array
+            Derivatives by the chart's coordinates.
+        """
         return np.asarray(np.einsum("...ij,...jk->...ik", derivatives, self.frames))
 
 
 @lru_cache(maxsize=16)
-def reach(
+def stable_set(
     whisker: Whisker,
     proximal: float = PROXIMAL,
     cells: tuple[int, int, int] = CELLS,
     steps: int = STEPS,
-) -> Reach:
-    """Chart the stable contacts of a whisker; see the module."""
+) -> StableSet:
+    """Chart the stable contacts of a whisker; cached.
+
+    Parameters
+    ----------
+    whisker : Whisker
+        Whisker to be touched.
+    proximal : float
+        Smallest arc length of a contact, over L.
+    cells : tuple of int
+        Number of cells along (η, ψ, ρ).
+    steps : int
+        Number of integration steps along the whisker.
+
+    Returns
+    -------
+    StableSet
+        Contacts at the nodes, with base force, contact point and derivatives.
+
+    Raises
+    ------
+    ValueError
+        If ``proximal`` is below 0.05 or not below 1.
+    """
     if not 0.05 <= proximal < 1.0:
         raise ValueError(
             f"the smallest arc length is {proximal} L; it must be from 0.05 L to below L"
@@ -121,12 +188,12 @@ def reach(
         discretization, with_normal_force(contacts.reshape(-1, 3)), tangents=True
     )
     grid = s.shape
-    return Reach(
+    return StableSet(
         discretization=discretization,
         stations=stations,
         bearings=bearings,
         loads=loads,
-        fold=(np.array([proximal, grading]), log_fold),
+        fold=Fold(np.array([proximal, grading]), log_fold),
         contacts=contacts,
         values=values.reshape(*grid, 6),
         tangents=tangents.reshape(*grid, 6, 3),
@@ -136,12 +203,34 @@ def reach(
 
 
 def with_normal_force(contacts: Array) -> Array:
-    """ξ = (s, f_y, f_z) as (s, 0, f_y, f_z): a frictionless force is normal to the whisker."""
+    """ξ = (s, f_y, f_z) as (s, 0, f_y, f_z): a frictionless force is normal to the whisker.
+
+    Parameters
+    ----------
+    contacts : (..., 3) array
+        Contacts ξ.
+
+    Returns
+    -------
+    (..., 4) array
+        Arc length and force.
+    """
     return np.insert(contacts, 1, 0.0, axis=-1)
 
 
 def determinant(tangents: Array) -> Array:
-    """Det ∂p/∂ξ of tangents (..., 6, 3): positive at rest, zero at the fold."""
+    """Det ∂p/∂ξ: positive at rest, zero at the fold.
+
+    Parameters
+    ----------
+    tangents : (..., 6, 3) array
+        Derivatives of (F, p) by ξ.
+
+    Returns
+    -------
+    (...) array
+        Determinants, non-dimensional.
+    """
     a, b, c = (tangents[..., 3:, j] for j in range(3))
     return np.asarray(np.einsum("...i,...i->...", a, np.cross(b, c)))
 
@@ -215,7 +304,20 @@ def _expand(log_fold: Array) -> tuple[Array, Array, Array]:
 
 
 def contacts_at(fold: Fold, chart: Array) -> Array:
-    """Turn chart coordinates (η, ψ, ρ), shape (n, 3), into contacts ξ, shape (n, 3)."""
+    """Turn chart coordinates into contacts.
+
+    Parameters
+    ----------
+    fold : Fold
+        Fold force over the chart.
+    chart : (n, 3) array
+        Coordinates (η, ψ, ρ).
+
+    Returns
+    -------
+    (n, 3) array
+        Contacts ξ.
+    """
     contacts = np.empty((len(chart), 3))
     _contacts_at(fold, np.ascontiguousarray(chart), contacts)
     return contacts
@@ -248,7 +350,7 @@ def arc_length(bounds: Array, eta: float) -> float:
 @inlined
 def fold_force(fold: Fold, s: float, psi: float) -> float:
     """Fold force f*(s, ψ), non-dimensional; s is clipped to the chart, ψ is any angle."""
-    bounds, table = fold
+    bounds, table = fold.bounds, fold.log_force
     n, m = table.shape[0] - 1, table.shape[1] - 1
     dpsi = 2.0 * np.pi / m
     x = n * min(max(along(bounds, s), 0.0), 1.0)
@@ -268,7 +370,7 @@ def fold_force(fold: Fold, s: float, psi: float) -> float:
 @inlined
 def chart_to_contact(fold: Fold, chart: Array, xi: Array) -> None:
     """Turn (η, ψ, ρ) into ξ."""
-    xi[0] = min(max(arc_length(fold[0], chart[0]), LEAST_ARC), 1.0)
+    xi[0] = min(max(arc_length(fold.bounds, chart[0]), LEAST_ARC), 1.0)
     force = chart[2] * chart[2] * fold_force(fold, xi[0], chart[1])
     xi[1], xi[2] = force * np.cos(chart[1]), force * np.sin(chart[1])
 
@@ -280,14 +382,40 @@ def _contacts_at(fold: Fold, chart: Array, contacts: Array) -> None:
 
 
 def chart_of(fold: Fold, contacts: Array) -> Array:
-    """Turn contacts ξ (n, 3) into chart coordinates (η, ψ, ρ), shape (n, 3)."""
+    """Turn contacts into chart coordinates.
+
+    Parameters
+    ----------
+    fold : Fold
+        Fold force over the chart.
+    contacts : (n, 3) array
+        Contacts ξ.
+
+    Returns
+    -------
+    (n, 3) array
+        Coordinates (η, ψ, ρ).
+    """
     chart = np.empty((len(contacts), 3))
     _chart_of(fold, np.ascontiguousarray(contacts), chart)
     return chart
 
 
 def fold_forces(fold: Fold, contacts: Array) -> Array:
-    """Fold force (n,) at the arc length and bearing of contacts ξ (n, 3), non-dimensional."""
+    """Fold force at the arc length and bearing of contacts.
+
+    Parameters
+    ----------
+    fold : Fold
+        Fold force over the chart.
+    contacts : (n, 3) array
+        Contacts ξ.
+
+    Returns
+    -------
+    (n,) array
+        Forces, over EI/L².
+    """
     forces = np.empty(len(contacts))
     _fold_forces_at(fold, np.ascontiguousarray(contacts), forces)
     return forces
@@ -298,7 +426,7 @@ def _chart_of(fold: Fold, contacts: Array, chart: Array) -> None:
     for i in range(contacts.shape[0]):
         s, fy, fz = contacts[i, 0], contacts[i, 1], contacts[i, 2]
         psi = np.arctan2(fz, fy)
-        chart[i, 0] = along(fold[0], s)
+        chart[i, 0] = along(fold.bounds, s)
         chart[i, 1] = psi
         chart[i, 2] = np.sqrt(np.hypot(fy, fz) / fold_force(fold, s, psi))
 

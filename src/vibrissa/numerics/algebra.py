@@ -1,0 +1,76 @@
+"""Small linear systems and angles inside kernels."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vibrissa.numerics.arrays import Array
+from vibrissa.numerics.compiled import inlined
+
+
+@inlined
+def wrapped(angle: float) -> float:
+    """Angle in [-π, π]."""
+    return float(angle - 2.0 * np.pi * np.rint(angle / (2.0 * np.pi)))
+
+
+@inlined
+def norm3(v: Array) -> float:
+    """Euclidean length."""
+    return float(np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]))
+
+
+@inlined
+def solve3(a: Array, r: Array, x: Array) -> float:
+    """Solve a x = r by Cramer's rule; return det a (x is not set if that is 0)."""
+    c0 = a[1, 1] * a[2, 2] - a[1, 2] * a[2, 1]
+    c1 = a[1, 2] * a[2, 0] - a[1, 0] * a[2, 2]
+    c2 = a[1, 0] * a[2, 1] - a[1, 1] * a[2, 0]
+    det = a[0, 0] * c0 + a[0, 1] * c1 + a[0, 2] * c2
+    if det != 0.0:
+        inverse = 1.0 / det
+        x[0] = inverse * (
+            c0 * r[0]
+            + (a[0, 2] * a[2, 1] - a[0, 1] * a[2, 2]) * r[1]
+            + (a[0, 1] * a[1, 2] - a[0, 2] * a[1, 1]) * r[2]
+        )
+        x[1] = inverse * (
+            c1 * r[0]
+            + (a[0, 0] * a[2, 2] - a[0, 2] * a[2, 0]) * r[1]
+            + (a[0, 2] * a[1, 0] - a[0, 0] * a[1, 2]) * r[2]
+        )
+        x[2] = inverse * (
+            c2 * r[0]
+            + (a[0, 1] * a[2, 0] - a[0, 0] * a[2, 1]) * r[1]
+            + (a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]) * r[2]
+        )
+    return float(det)
+
+
+@inlined
+def solve(a: Array, x: Array) -> float:
+    """Solve a y = x in place (y in x; a is lost) with pivoting; return det a."""
+    n, det = x.shape[0], 1.0
+    for c in range(n):
+        pivot = c
+        for r in range(c + 1, n):
+            if abs(a[r, c]) > abs(a[pivot, c]):
+                pivot = r
+        if pivot != c:
+            det = -det
+            for k in range(n):
+                a[c, k], a[pivot, k] = a[pivot, k], a[c, k]
+            x[c], x[pivot] = x[pivot], x[c]
+        det *= a[c, c]
+        if a[c, c] == 0.0:
+            return 0.0
+        for r in range(c + 1, n):
+            factor = a[r, c] / a[c, c]
+            for k in range(c, n):
+                a[r, k] -= factor * a[c, k]
+            x[r] -= factor * x[c]
+    for c in range(n - 1, -1, -1):
+        for k in range(c + 1, n):
+            x[c] -= a[c, k] * x[k]
+        x[c] /= a[c, c]
+    return det

@@ -24,7 +24,7 @@ from vibrissa.cli.figures import witnesses
 from vibrissa.contour import compare_with, distances_by, shape_from_dataset
 from vibrissa.identifiability import critical_cones, error_solid, signal_slice
 from vibrissa.pipeline import with_contour, with_estimates
-from vibrissa.recording.tree import recorded_objects
+from vibrissa.recording import Recording
 from vibrissa.signals import nearest_on_rest
 from vibrissa.simulation import (
     array_whisking,
@@ -114,7 +114,7 @@ def long_trial() -> xr.DataTree:
 
 def contour() -> Figure:
     """Its contacts and the peg that was fitted to them."""
-    course, (peg,) = plots.course_of(long_trial()), recorded_objects(long_trial())
+    course, (peg,) = plots.course_of(long_trial()), Recording(long_trial()).objects
     return plots.contour_views(
         course.places,
         peg,
@@ -139,7 +139,7 @@ def overview() -> Figure:
 def places() -> Figure:
     """Its contacts about the whisker and in the laboratory."""
     course, fit = plots.course_of(trial()), shape_from_dataset(trial()["contour"].to_dataset())
-    return plots.contact_places(course, line(), recorded_objects(trial()), [fit])
+    return plots.contact_places(course, line(), Recording(trial()).objects, [fit])
 
 
 def signal_movie() -> np.ndarray:
@@ -154,7 +154,7 @@ def contour_movie() -> np.ndarray:
     course = plots.course_of(trial())
     rows = [0, plots.telling_rows(course)[-1] - 4]
     return list(
-        plots.contour_frames(course, line(), filmed(rows), rows, recorded_objects(trial()))
+        plots.contour_frames(course, line(), filmed(rows), rows, Recording(trial()).objects)
     )[-1]
 
 
@@ -198,7 +198,7 @@ def free_surface() -> Figure:
 def distances() -> Figure:
     """Contacts of the trial from the peg that was touched."""
     estimates = trial()["estimates"].to_dataset().isel(whisker=0)
-    whisker, (peg,) = chart().whisker, recorded_objects(trial())
+    whisker, (peg,) = chart().whisker, Recording(trial()).objects
     own = estimates["contact_point_whisker"].values
     away, along = nearest_on_rest(whisker, own)
     arc_length = estimates["arc_length"].values

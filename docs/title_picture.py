@@ -23,7 +23,7 @@ from vibrissa.plots.space import bounds, name_axes, paint, painted, space_axes
 from vibrissa.plots.style import BLUE, INK, MUTED, ORANGE, Array, box_axes, looking, sized_figure
 from vibrissa.plots.surfaces import coordinate_bar, levels
 from vibrissa.quantities import axis_label, quantity, to_display
-from vibrissa.recording.tree import recorded_objects
+from vibrissa.recording import Recording
 from vibrissa.signals import SIGNALS
 
 WIDTH, HEIGHT = 182.0, 119.0
@@ -61,7 +61,7 @@ def title_picture(trial: xr.DataTree, contact_map: vb.ContactMap) -> Figure:
     assert course.signals is not None
     # Shortly before the whisker, bent most, slips off.
     moment = max(telling_rows(course), key=lambda row: course.signals["MB"][row]) - 3
-    (peg,) = recorded_objects(trial)
+    (peg,) = Recording(trial).objects
     fit = shape_from_dataset(trial["contour"].to_dataset())
     assert isinstance(peg, Peg)
     assert isinstance(fit, CylinderFit)

@@ -20,7 +20,7 @@ from honest.video import cutoffs, paper_test, tracked_scores
 from honest.ways import WAYS, chart, located, scored, truth_of
 from pages import save
 
-from vibrissa.recording import recorded_whisker
+from vibrissa.recording import Recording
 
 TRIALS = 3
 ROOT = Path(__file__).parent.parent
@@ -32,7 +32,7 @@ def from_wrench(trials: list[Recorded]) -> dict[str, Any]:
     for way in WAYS:
         rows = []
         for trial in trials:
-            truth, contacts = truth_of(trial.true), chart(recorded_whisker(trial.true))
+            truth, contacts = truth_of(trial.true), chart(Recording(trial.true).whisker())
             found = located(way, trial.true, contacts)
             rows.append(scored(found, truth, truth.pose, trial.true))
         out[way] = summary(rows)

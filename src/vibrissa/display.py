@@ -14,7 +14,7 @@ import xarray as xr
 
 from vibrissa.identifiability.summary import verdict_rows, verdict_table
 from vibrissa.io.recording import KIND
-from vibrissa.recording import recorded_objects
+from vibrissa.recording import Recording
 from vibrissa.sketch import BENT, CONTACT, MOST_CURVES, REST, Mark, card, table, thinned, views
 
 
@@ -94,7 +94,7 @@ def _facts(recording: xr.DataTree) -> list[tuple[str, str]]:
     if "in_contact" in root:
         share = 100.0 * float(root["in_contact"].mean())
         facts.append(("in contact", f"{share:.3g} % of the frames"))
-    facts += [("object", repr(thing)) for thing in recorded_objects(recording)]
+    facts += [("object", repr(thing)) for thing in Recording(recording).objects]
     if "cameras" in recording.children:
         facts.append(("cameras", str(recording["cameras"].to_dataset().sizes.get("view", 0))))
     return [*facts, ("groups", ", ".join(sorted(recording.children)))]
@@ -103,18 +103,15 @@ def _facts(recording: xr.DataTree) -> list[tuple[str, str]]:
 def _picture(recording: xr.DataTree) -> str:
     """The whisker now and then, where its base was, and the contact points, laboratory frame."""
     marks = []
-    sources = [recording.to_dataset()]
-    if "truth" in recording.children:
-        sources.append(recording["truth"].to_dataset())
+    trial = Recording(recording)
     for name, colour, dots, label in (
         ("centerline", BENT, False, "whisker"),
         ("base_position", REST, True, "its base"),
         ("contact_point", CONTACT, True, "contacts"),
     ):
-        found = next((data[name] for data in sources if name in data), None)
-        if found is None:
+        values = trial.known(name, ("", "truth"))
+        if values is None:
             continue
-        values = found.transpose("time", ..., "space").values
         values = values if dots else thinned(values, MOST_CURVES)
         marks.append(Mark(values, colour, dots, 3.0 if dots else 0.7, label))
     return views(marks) if marks else ""

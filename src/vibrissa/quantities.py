@@ -369,6 +369,7 @@ _ROWS: tuple[tuple[str, str, _Unit, str, str], ...] = (
         "roll of the base",
         "About the tangent at the base.",
     ),
+    ("frame", "i", _NUMBER, "frame of each video", "Counted from its first frame, which is 0."),
     ("trace", r"\mathbf{u}", _PIXEL, "whisker in the image", "Column and row from the top left."),
     (
         "trace_sigma",

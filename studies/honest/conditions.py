@@ -8,7 +8,7 @@ import xarray as xr
 
 import vibrissa as vb
 from vibrissa.io import load_recording, read_video, save_recording
-from vibrissa.recording import recorded_cameras
+from vibrissa.recording import Recording
 from vibrissa.simulation import Dynamics, facing_peg, film, measure, simulate, sweep_past
 from vibrissa.tracking import trace_video, track
 
@@ -92,7 +92,7 @@ def _simulated(condition: Condition, seed: int, duration: float) -> xr.DataTree:
 def _tracked(trial: xr.DataTree, seed: int, folder: Path) -> xr.DataTree:
     """Film a trial, track the whisker in the two videos, and throw these away."""
     paths = {view: folder / f"begun-{view}.mp4" for view in VIEWS}
-    cameras = recorded_cameras(film(trial, paths, seed=seed))
+    cameras = Recording(film(trial, paths, seed=seed)).cameras
     traces = [trace_video(read_video(paths[camera.name])) for camera in cameras]
     for path in paths.values():
         path.unlink()

@@ -9,7 +9,7 @@ import xarray as xr
 import vibrissa as vb
 from honest.conditions import RATE, Recorded
 from honest.ways import TRIPLET, Pose, Truth, chart, located, poses_of, scored, truth_of
-from vibrissa.recording import recorded_whisker
+from vibrissa.recording import Recording
 from vibrissa.tracking.pose import base_pose
 from vibrissa.tracking.rest import rest_shape
 from vibrissa.whisker import Whisker
@@ -28,7 +28,7 @@ def paper_test(trials: Sequence[Recorded]) -> dict[str, Any]:
         name: [] for name in ("agreement", "error", "force", "moment", "answered")
     }
     for trial in trials:
-        truth, whisker = truth_of(trial.true), recorded_whisker(trial.tracked)
+        truth, whisker = truth_of(trial.true), Recording(trial.tracked).whisker()
         rotation, position = poses_of(trial.tracked)["85 Hz"]
         root = trial.tracked.to_dataset().isel(whisker=0)
         point = in_whisker(root["contact_point"].values, (rotation, position))
@@ -51,7 +51,7 @@ def paper_test(trials: Sequence[Recorded]) -> dict[str, Any]:
 def cutoffs(trials: Sequence[Recorded]) -> dict[str, Any]:
     """Errors in contact by the cut-off of the pose; medians and 95 %."""
     contacts = [
-        located(TRIPLET, trial.true, chart(recorded_whisker(trial.true))) for trial in trials
+        located(TRIPLET, trial.true, chart(Recording(trial.true).whisker())) for trial in trials
     ]
     out = {}
     for cutoff in CUTOFFS:
@@ -68,7 +68,7 @@ def filtered_errors(
     trial: Recorded, found: xr.Dataset, cutoff: float | None
 ) -> dict[str, np.ndarray]:
     """Of the pose, of the signals the paper's way, of contacts from the sensor, frame by frame."""
-    truth, whisker = truth_of(trial.true), recorded_whisker(trial.tracked)
+    truth, whisker = truth_of(trial.true), Recording(trial.tracked).whisker()
     curves = trial.tracked["measured"].to_dataset().isel(whisker=0)["centerline"].values
     pose = base_pose(curves, rest_shape(curves), whisker).filtered(RATE, cutoff)
     return pose_errors(trial, truth, whisker, found, (pose.rotation, pose.position))
@@ -118,7 +118,7 @@ def middle(values: np.ndarray) -> list[float]:
 def tracked_scores(trial: Recorded, way: str) -> dict[str, xr.Dataset]:
     """One way, placed by the tracked poses; with the true whisker's map and with the tracked's."""
     truth, poses = truth_of(trial.true), poses_of(trial.tracked)
-    true, seen = (chart(recorded_whisker(tree)) for tree in (trial.true, trial.tracked))
+    true, seen = (chart(Recording(tree).whisker()) for tree in (trial.true, trial.tracked))
     found = located(way, trial.true, true)
     # Pegs are shown of the triplet only.
     fits = way == TRIPLET

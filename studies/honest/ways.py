@@ -20,7 +20,7 @@ from vibrissa.pipeline import (
     locate_from_wrench,
     whisker_radii,
 )
-from vibrissa.recording import recorded_pegs, recorded_whisker
+from vibrissa.recording import Recording
 from vibrissa.sensors import FORCE_NOISE, MOMENT_NOISE
 from vibrissa.signals import SIGNALS, nearest_on_rest
 from vibrissa.whisker import Whisker
@@ -58,7 +58,7 @@ class Truth:
 def truth_of(trial: xr.DataTree) -> Truth:
     true = trial["truth"].to_dataset().isel(whisker=0)
     root = trial.to_dataset().isel(whisker=0)
-    whisker = recorded_whisker(trial)
+    whisker = Recording(trial).whisker()
     s, touching = true["arc_length"].values, true["in_contact"].values.astype(bool)
     line = true["centerline"].values
     nodes = np.linspace(0.0, whisker.length, line.shape[1])
@@ -174,7 +174,7 @@ def peg_error(placed: xr.Dataset, trial: xr.DataTree, normals: str) -> dict[str,
 
     With normals that are as uncertain as their covariance says, exact, or with no normals.
     """
-    (peg,), whisker = recorded_pegs(trial), recorded_whisker(trial)
+    (peg,), whisker = Recording(trial).pegs, Recording(trial).whisker()
     each = placed.expand_dims(whisker=1, axis=1)
     try:
         if normals == "uncertain":

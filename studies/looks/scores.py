@@ -12,7 +12,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
 from looks.cases import Case, Filmed, filmed
-from vibrissa.recording import recorded_whisker
+from vibrissa.recording import Recording
 from vibrissa.tracking import (
     Start,
     Trace,
@@ -119,7 +119,7 @@ def rod_scores(film: Filmed, found: Any) -> dict[str, Any]:
     truth = film.trial["truth"].to_dataset().isel(whisker=0, time=rows)
     known = data["confidence"].values > 0.0
     truly, said = truth["in_contact"].values > 0, data["in_contact"].values > 0
-    whisker, true = recorded_whisker(found), recorded_whisker(film.trial)
+    whisker, true = Recording(found).whisker(), Recording(film.trial).whisker()
     both = truly & said
     gap = data["contact_point"].values - truth["contact_point"].values
     size = np.linalg.norm(gap, axis=1)[both]

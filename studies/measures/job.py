@@ -7,7 +7,7 @@ import vibrissa as vb
 from vibrissa.contour import CylinderFit, shape_from_dataset
 from vibrissa.demo import DemoResult, Located, run_demo
 from vibrissa.pipeline import with_contour, with_estimates
-from vibrissa.recording import recorded_objects
+from vibrissa.recording import Recording
 from vibrissa.simulation import facing_peg, measure, simulate, sweep_past
 
 WAYS = ("felt by a sensor", "the paper's way")
@@ -95,7 +95,7 @@ def draws(duration: float, number: int) -> str:
     for seed in range(number):
         felt = with_contour(with_estimates(measure(trial, seed=seed), contact_maps=[contact_map]))
         fit = shape_from_dataset(felt["contour"].to_dataset())
-        (true,) = recorded_objects(felt)
+        (true,) = Recording(felt).objects
         assert isinstance(fit, CylinderFit)
         along = (true.origin[2] - fit.origin[2]) / fit.axis[2]
         place = fit.origin + along * fit.axis - true.origin

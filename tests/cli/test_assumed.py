@@ -12,7 +12,7 @@ from vibrissa import samples
 from vibrissa.cli.app import app
 from vibrissa.io import load_recording, save_centerline, save_recording
 from vibrissa.objects import Peg
-from vibrissa.recording import recorded_whisker
+from vibrissa.recording import Recording
 from vibrissa.simulation import Motion, measure, simulate
 from vibrissa.whisker import morphology
 
@@ -66,7 +66,7 @@ def test_what_is_assumed_survives_a_recording(centerline, tmp_path):
     still = Motion(np.arange(3) * 1e-3, *np.zeros((3, 3)), np.zeros((3, 3)))
     far = Peg([0.02, 0.02, 0.0], [0.0, 0.0, 1.0], 1e-3)
     save_recording(tmp_path / "t.nc", measure(simulate(whisker, still, far)))
-    assert recorded_whisker(load_recording(tmp_path / "t.nc")).notes == whisker.notes
+    assert Recording(load_recording(tmp_path / "t.nc")).whisker().notes == whisker.notes
     text = " ".join(ran("info", tmp_path / "t.nc").output.split())
     for name in whisker.assumed:
         assert f"{name} assumed" in text

@@ -9,7 +9,7 @@ import xarray as xr
 from vibrissa.cli.app import app
 from vibrissa.contacts import ContactMap
 from vibrissa.io import load_contacts, load_recording, load_signals, save_recording
-from vibrissa.recording import recorded_whisker
+from vibrissa.recording import Recording
 
 typer_testing = pytest.importorskip("typer.testing")
 
@@ -36,7 +36,7 @@ def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("stages")
     done("simulate", "--duration", 0.6, "--rate", 300, "--seed", 2, "-o", path / "sim.nc")
     trial = load_recording(path / "sim.nc")
-    ContactMap.simulate(recorded_whisker(trial), grid=False).save(path / "map.nc")
+    ContactMap.simulate(Recording(trial).whisker(), grid=False).save(path / "map.nc")
     root, truth = trial.to_dataset(), trial["truth"].to_dataset()
     kept = root.drop_vars(["force", "moment"])
     kept = kept.assign(contact_point=truth["contact_point"], in_contact=truth["in_contact"])
@@ -153,7 +153,7 @@ def test_another_whisker_makes_signals_and_contacts_anew(folder, tmp_path):
     done("signals", folder / "tracked.nc", "--cutoff", 60, "-o", work)
     done("reconstruct", work, "--map", folder / "map.nc")
     first = load_recording(work)
-    soft = recorded_whisker(first).with_properties(youngs_modulus=1.5e9)
+    soft = Recording(first).whisker().with_properties(youngs_modulus=1.5e9)
     ContactMap.simulate(soft, grid=False).save(tmp_path / "soft.nc")
     done("reconstruct", work, "--whisker", tmp_path / "soft.nc", "--force")
     other = load_recording(work)

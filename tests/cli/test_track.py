@@ -17,7 +17,7 @@ from vibrissa.io import (
     write_video,
 )
 from vibrissa.objects import Peg
-from vibrissa.recording import recorded_objects, recorded_whisker
+from vibrissa.recording import Recording
 from vibrissa.simulation import Motion, film, simulate
 
 typer_testing = pytest.importorskip("typer.testing")
@@ -130,8 +130,8 @@ def test_what_is_known_besides_the_videos_is_used(videos, tmp_path):
     recording = load_recording(out)
     place = recording["base_position"].values - recording["base_position_head"].values
     np.testing.assert_allclose(place[:, 0], np.tile([1e-3, 0.0, 0.0], (16, 1)), atol=1e-12)
-    assert len(recorded_objects(recording)) == 1
-    assert recorded_whisker(recording).length == pytest.approx(8e-3, rel=1e-3)
+    assert len(Recording(recording).objects) == 1
+    assert Recording(recording).whisker().length == pytest.approx(8e-3, rel=1e-3)
     told = run("info", out).stdout
     assert "contact point (nearest to the object)" in " ".join(told.split())
     for table, kind in ((head, "the head's pose"), (whisker, "centreline of a whisker")):

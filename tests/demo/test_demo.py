@@ -13,7 +13,7 @@ from vibrissa.evaluation import caution, tracking_scores, truth_of
 from vibrissa.evaluation.stages import from_curves, refined
 from vibrissa.io import load_contacts, load_recording
 from vibrissa.pipeline import fit_contacts
-from vibrissa.recording import recorded_whisker
+from vibrissa.recording import Recording
 from vibrissa.report import trial_sections
 from vibrissa.report.values import shown_value
 
@@ -102,7 +102,7 @@ def test_what_is_written_comes_back(result):
         np.testing.assert_array_equal(contacts[name], estimated[:, i])
     map_ = vb.ContactMap.load(folder / "map.nc")
     np.testing.assert_array_equal(
-        map_.whisker.centerline(5), recorded_whisker(recording).centerline(5)
+        map_.whisker.centerline(5), Recording(recording).whisker().centerline(5)
     )
 
 
@@ -170,7 +170,7 @@ def test_a_report_of_the_trial_has_the_same_errors(from_video, folder):
         recording = load_recording(folder / name)
         truth, whisker = truth_of(recording)
         np.testing.assert_array_equal(
-            whisker.centerline(9), recorded_whisker(from_video.simulated).centerline(9)
+            whisker.centerline(9), Recording(from_video.simulated).whisker().centerline(9)
         )
         scores = tracking_scores(recording.to_dataset().isel(whisker=0), truth)
         for field in ("trace", "centerline", "base", "contact", "told"):

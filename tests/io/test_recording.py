@@ -9,7 +9,7 @@ import xarray as xr
 from vibrissa import samples
 from vibrissa.io.netcdf import kind_of
 from vibrissa.io.recording import load_recording, save_recording
-from vibrissa.recording import recorded_whisker
+from vibrissa.recording import Recording
 from vibrissa.simulation import facing_peg, measure, simulate, whisking
 
 WHISKER = samples.gamma()
@@ -29,7 +29,7 @@ def test_nothing_is_lost(tmp_path, recording):
     for node, other in zip(recording.subtree, again.subtree, strict=True):
         for name, variable in node.data_vars.items():
             assert other[name].dtype == variable.dtype, name
-    np.testing.assert_array_equal(recorded_whisker(again).centerline(9), WHISKER.centerline(9))
+    np.testing.assert_array_equal(Recording(again).whisker().centerline(9), WHISKER.centerline(9))
     assert kind_of(path) == "vibrissa recording"
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from vibrissa import Status, samples
 from vibrissa.objects import Box, Mesh, Peg
-from vibrissa.recording import recorded_objects
+from vibrissa.recording import Recording
 from vibrissa.rod import follow_surfaces
 from vibrissa.simulation import simulate, whisking
 from vibrissa.simulation.motion import base_rotation
@@ -115,7 +115,7 @@ def test_a_cylinder_of_triangles_is_a_peg(mesh, peg):
 
 def test_it_rides_along_in_a_recording(mesh):
     motion = whisking(0.002, 1000.0, set_point=-2.0)
-    (read,) = recorded_objects(simulate(WHISKER, motion, mesh))
+    (read,) = Recording(simulate(WHISKER, motion, mesh)).objects
     points = mesh.origin + np.random.default_rng(3).normal(scale=1e-3, size=(10, 3))
     np.testing.assert_allclose(read.signed_distance(points), mesh.signed_distance(points))
 

@@ -6,7 +6,7 @@ import pytest
 from vibrissa import samples
 from vibrissa.io import load_recording, save_recording
 from vibrissa.objects import Box, Peg, Plane, Sphere
-from vibrissa.recording import recorded_objects, recorded_pegs
+from vibrissa.recording import Recording
 from vibrissa.simulation import Motion, simulate, sweep_past, tabulated, whisking
 from vibrissa.simulation.motion import base_rotation
 
@@ -56,11 +56,11 @@ def test_they_come_back_from_a_file(tmp_path):
     motion = whisking(duration=0.004, rate=1000.0, set_point=-2.5)
     trial = simulate(WHISKER, motion, OBJECTS)
     save_recording(tmp_path / "trial.nc", trial)
-    read = recorded_objects(load_recording(tmp_path / "trial.nc"))
+    read = Recording(load_recording(tmp_path / "trial.nc")).objects
     assert [repr(thing) for thing in read] == [repr(thing) for thing in OBJECTS]
     assert read[1].stiffness == 10.0
     np.testing.assert_array_equal(read[3].rotation, OBJECTS[3].rotation)
-    assert len(recorded_pegs(trial)) == 1
+    assert len(Recording(trial).pegs) == 1
 
 
 def test_a_second_contact_is_told():

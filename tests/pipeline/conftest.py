@@ -7,7 +7,7 @@ import xarray as xr
 from vibrissa import samples
 from vibrissa.contacts import ContactMap
 from vibrissa.quantities import attributes
-from vibrissa.recording.tree import recorded
+from vibrissa.recording import recorded
 from vibrissa.simulation import facing_peg, measure, simulate, sweep_past
 
 WHISKER = samples.gamma()

@@ -28,7 +28,7 @@ from vibrissa.pipeline import (
 from vibrissa.pipeline.locate import unfelt
 from vibrissa.pipeline.reconstruct import frames_together
 from vibrissa.pipeline.shapes import GOES, STRONG
-from vibrissa.recording import recorded_pegs, recorded_whisker
+from vibrissa.recording import Recording
 from vibrissa.simulation import facing_peg, measure, simulate, sweep_past
 from vibrissa.status import Status
 
@@ -184,7 +184,7 @@ def test_other_shapes_are_fitted_and_come_back_from_a_file(quiet, tmp_path, shap
     fit = shape_from_dataset(contour)
     assert fit.kind == shape == contour.attrs["shape"]
     points = done["estimates"]["contact_point"].values[:, 0]
-    radius = whisker_radii(done["estimates"].to_dataset(), [recorded_whisker(done)])[:, 0]
+    radius = whisker_radii(done["estimates"].to_dataset(), [Recording(done).whisker()])[:, 0]
     there = contour["inlier"].values[:, 0]
     np.testing.assert_allclose(
         fit.signed_distance(points[there]) - radius[there],
@@ -311,9 +311,9 @@ def test_two_whiskers_touch_one_peg(quiet):
             done["estimates"]["contact_point"].values[:, k],
             alone["estimates"]["contact_point"].values[:, 0],
         )
-    contour = reconstruct(done, objects=recorded_pegs(trial))
+    contour = reconstruct(done, objects=Recording(trial).pegs)
     assert contour["inlier"].shape == (trial.sizes["time"], 2)
-    one = reconstruct(alone, objects=recorded_pegs(trial))
+    one = reconstruct(alone, objects=Recording(trial).pegs)
     np.testing.assert_allclose(contour["object_radius"], one["object_radius"], atol=1e-6)
     assert "object_distance" not in reconstruct(done)
     ratio = np.diag(one["parameter_covariance"])[6] / np.diag(contour["parameter_covariance"])[6]
@@ -352,7 +352,7 @@ def test_without_noise_there_is_no_covariance_but_a_fit(trial):
     data = signals_of(trial).drop_attrs().assign_attrs(source="contact point")
     done = with_estimates(with_group(trial, "signals", data))
     assert np.isnan(done["estimates"]["contact_covariance"].values).all()
-    assert recorded_whisker(done).length == pytest.approx(40e-3)
+    assert Recording(done).whisker().length == pytest.approx(40e-3)
     contour = reconstruct(done)
     assert float(contour["object_radius"]) > 0
 
@@ -360,7 +360,7 @@ def test_without_noise_there_is_no_covariance_but_a_fit(trial):
 def test_contacts_are_as_far_from_the_known_object_as_predicted(trial):
     done = with_estimates(trial)
     other = Sphere([0.1, 0.1, 0.1], 1e-3)
-    compared = compare_contacts(done, [other, *recorded_pegs(trial)])
+    compared = compare_contacts(done, [other, *Recording(trial).pegs])
     assert compared.attrs["object"] == 1
     there = done["estimates"]["candidates"].values > 0
     assert (np.isfinite(compared["surface_distance"].values) == there).all()

@@ -300,7 +300,7 @@ def test_contact_points_from_a_table_count_more(tracked, trial):
         ),
         (lambda d: d.assign_coords(time=d["time"].values[::-1]), "its time does not rise"),
         (lambda d: d.assign_coords(time=d["time"] * np.nan), "its time does not rise"),
-        (lambda d: d.assign(force=d["force"].astype(str)), "no numbers"),
+        (lambda d: d.assign(force=d["force"].astype(str)), "not numbers"),
     ],
 )
 def test_recordings_from_elsewhere_are_checked(trial, change, said):

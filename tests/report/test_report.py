@@ -19,7 +19,7 @@ from vibrissa.cli.figures import dataset_with
 from vibrissa.contacts import ContactMap
 from vibrissa.io import load_recording, save_recording, video_info
 from vibrissa.quantities import quantity
-from vibrissa.recording import recorded_whisker
+from vibrissa.recording import Recording
 from vibrissa.report import document, figure_sections, movies_section, table, trial_sections
 from vibrissa.report.page import Section
 from vibrissa.report.tracked import contacts_by_whisker, tracked_table, whiskers_table
@@ -99,7 +99,7 @@ def folder(tmp_path_factory):
     """A simulated trial with all groups, and the map of its whisker."""
     path = tmp_path_factory.mktemp("report")
     run("simulate", "--duration", 0.5, "--rate", 250, "--seed", 2, "-o", path / "trial.nc")
-    whisker = recorded_whisker(load_recording(path / "trial.nc"))
+    whisker = Recording(load_recording(path / "trial.nc")).whisker()
     ContactMap.simulate(whisker, grid=False, cells=(8, 16, 8)).save(path / "map.nc")
     (path / "bare.nc").write_bytes((path / "trial.nc").read_bytes())
     run("signals", path / "trial.nc")

@@ -6,7 +6,7 @@ import pytest
 import vibrissa as vb
 from vibrissa.io import load_recording, save_recording
 from vibrissa.objects import Plane, Sphere
-from vibrissa.recording import recorded_objects, recorded_whisker
+from vibrissa.recording import Recording
 from vibrissa.rod import follow_surfaces
 from vibrissa.simulation import (
     Dynamics,
@@ -112,9 +112,9 @@ def test_one_recording_of_all(trial, motions):
     for i, (name, moves) in enumerate(motions.items()):
         np.testing.assert_array_equal(trial["base_position"].values[:, i], moves.base_position)
         np.testing.assert_array_equal(trial["base_rotation"].values[:, i], moves.base_rotation)
-        assert recorded_whisker(trial, i).name == name
+        assert Recording(trial).whisker(i).name == name
         np.testing.assert_array_equal(
-            recorded_whisker(trial, i).pose.origin, ARRAY[name].pose.origin
+            Recording(trial).whisker(i).pose.origin, ARRAY[name].pose.origin
         )
     np.testing.assert_array_equal(trial["head_position"].values, moves.head_position)
     touched = trial["truth"]["in_contact"].values.any(axis=0)
@@ -144,7 +144,7 @@ def test_contacts_of_all_whiskers_outline_the_object(trial):
     points = truth["contact_point"].values
     touching = truth["in_contact"].values
     s = truth["arc_length"].values
-    (wall,) = recorded_objects(trial)
+    (wall,) = Recording(trial).objects
     for i, whisker in enumerate(ARRAY.values()):
         rows = touching[:, i]
         gap = wall.signed_distance(points[rows, i]) - whisker.radius(s[rows, i])

@@ -9,7 +9,7 @@ from vibrissa import samples
 from vibrissa.cli.app import app
 from vibrissa.io import load_recording
 from vibrissa.objects import Box, Mesh, Peg, Plane, Sphere
-from vibrissa.recording import recorded_objects
+from vibrissa.recording import Recording
 from vibrissa.simulation.script import EXAMPLE, read_script
 
 
@@ -141,7 +141,7 @@ def test_the_command_writes_a_recording(tmp_path, capsys):
     assert trial.sizes["time"] == 40
     assert "friction 0.2" in trial.attrs["origin"]
     assert trial["force"].attrs["noise"] == pytest.approx(1e-6)
-    (peg,) = recorded_objects(trial)
+    (peg,) = Recording(trial).objects
     assert peg.origin[0] == pytest.approx(26e-3)
     said = capsys.readouterr().out
     assert "contacts, up to" in said

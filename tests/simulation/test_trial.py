@@ -5,7 +5,7 @@ import pytest
 
 from vibrissa import Status, samples
 from vibrissa.objects import Peg
-from vibrissa.recording import recorded_pegs, recorded_whisker
+from vibrissa.recording import Recording
 from vibrissa.simulation import Motion, facing_peg, measure, simulate, sweep_past, whisking
 from vibrissa.simulation.motion import base_rotation
 
@@ -164,12 +164,12 @@ def test_every_variable_is_labelled(trial):
 
 
 def test_whisker_and_peg_ride_along(trial):
-    whisker = recorded_whisker(trial)
+    whisker = Recording(trial).whisker()
     np.testing.assert_array_equal(whisker.centerline(7), WHISKER.centerline(7))
-    (peg,) = recorded_pegs(trial)
+    (peg,) = Recording(trial).pegs
     np.testing.assert_array_equal(peg.origin, PEG.origin)
     with pytest.raises(ValueError, match="carries 1"):
-        recorded_whisker(trial, 1)
+        Recording(trial).whisker(1)
 
 
 def test_the_sensor_adds_its_noise_and_no_more(trial):

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from vibrissa import Whisker
 from vibrissa.objects import Peg
-from vibrissa.recording import recorded_objects, recorded_whisker
+from vibrissa.recording import Recording
 from vibrissa.simulation import Motion, simulate
 from vibrissa.tracking import HeadPose, TrackOptions, trace_video, track
 
@@ -37,7 +37,7 @@ def traces(nodding):
 @pytest.fixture(scope="module")
 def recording(nodding, traces):
     head = nodding.recording.to_dataset()[["head_position", "head_rotation"]]
-    things = recorded_objects(nodding.recording)
+    things = Recording(nodding.recording).objects
     return track(nodding.cameras, traces, RATE, head=head, objects=things)
 
 
@@ -83,7 +83,7 @@ def test_the_contact_nearest_to_the_object_agrees(nodding, recording):
     np.testing.assert_allclose(measured["contact_difference"].values, expected)
     assert np.isnan(measured["contact_point"].values[found["in_contact"].values == 0]).all()
     assert measured["contact_point"].attrs["source"] == "nearest to the object"
-    assert isinstance(recorded_objects(recording)[0], Peg)
+    assert isinstance(Recording(recording).objects[0], Peg)
 
 
 def test_contact_points_of_a_table_are_compared(nodding, traces, recording):
@@ -113,7 +113,7 @@ def test_contact_points_of_a_table_are_compared(nodding, traces, recording):
 
 def test_a_known_whisker_needs_no_free_frames(filmed):
     """All frames in contact: without the whisker's shape nothing says that it is bent."""
-    whisker = recorded_whisker(filmed.recording)
+    whisker = Recording(filmed.recording).whisker()
     touching = np.flatnonzero(filmed.truth["in_contact"].values > 0)
     # After the first touch, so that no frame is nearly free.
     rows = touching[len(touching) // 2 :]
@@ -128,13 +128,12 @@ def test_a_known_whisker_needs_no_free_frames(filmed):
         true = filmed.truth[name].values[rows]
         error = np.linalg.norm(known[name].values - true, axis=1) / np.linalg.norm(true, axis=1)
         assert np.median(error) < 0.1
-    assert recorded_whisker(
-        track(filmed.cameras, traces, RATE, TrackOptions(whisker=whisker))
-    ).length == pytest.approx(whisker.length)
+    again = track(filmed.cameras, traces, RATE, TrackOptions(whisker=whisker))
+    assert Recording(again).whisker().length == pytest.approx(whisker.length)
 
 
 def test_a_known_whisker_tells_contact_from_none(filmed):
-    whisker = recorded_whisker(filmed.recording)
+    whisker = Recording(filmed.recording).whisker()
     traces = [trace_video(frames) for frames in filmed.frames]
     found = track(filmed.cameras, traces, RATE, TrackOptions(whisker=whisker)).to_dataset()
     truly = filmed.truth["in_contact"].values > 0

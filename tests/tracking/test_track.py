@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from vibrissa.recording import recorded_whisker
+from vibrissa.recording import Recording
 from vibrissa.status import Status
 from vibrissa.tracking import (
     RefineOptions,
@@ -56,7 +56,7 @@ def test_the_whisker_is_where_it_is(filmed, found):
 
 
 def test_the_rest_shape_is_the_whisker_s(filmed, recording):
-    whisker, true = recorded_whisker(recording), recorded_whisker(filmed.recording)
+    whisker, true = Recording(recording).whisker(), Recording(filmed.recording).whisker()
     assert whisker.length == pytest.approx(true.length, rel=0.03)
     s = np.linspace(0.0, 0.9 * true.length, 20)
     assert np.abs(whisker.position(s) - true.position(s)).max() < 100e-6
@@ -234,8 +234,8 @@ def test_a_tip_that_is_not_seen_is_found_by_how_the_whisker_bends(filmed, traces
         )
     how = TrackOptions(refine=RefineOptions(rounds=6))
     recording = track(filmed.cameras, [[row] for row in cut], 500.0, how)
-    true = recorded_whisker(filmed.recording).length
-    assert recorded_whisker(recording).length == pytest.approx(true, rel=0.03)
+    true = Recording(filmed.recording).whisker().length
+    assert Recording(recording).whisker().length == pytest.approx(true, rel=0.03)
     assert "its tip is too faint" in recording.attrs["remarks"]
     found = recording.to_dataset().isel(whisker=0)
     truth = filmed.truth.isel(time=slice(None, None, 2))

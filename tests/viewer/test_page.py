@@ -162,10 +162,10 @@ def test_a_click_on_a_solid_marks_the_contact_in_all_spaces(looking):
 
 
 def test_a_trial_plays(browser, recording):
-    from vibrissa.recording import recorded_whisker
+    from vibrissa.recording import Recording
     from vibrissa.viewer import view
 
-    with view(recorded_whisker(recording), recording=recording) as viewer:
+    with view(Recording(recording).whisker(), recording=recording) as viewer:
         person = Looking(browser, viewer)
         trial = viewer.page.modes["Trial"]
         person.page.get_by_role("button", name="Next contact").click()

@@ -11,7 +11,7 @@ import vibrissa as vb
 from vibrissa.contour import fit_cylinder, fit_free, fit_plane, fit_sphere
 from vibrissa.io import write_video
 from vibrissa.io.footage import Footage
-from vibrissa.recording import recorded_pegs
+from vibrissa.recording import Recording
 from vibrissa.viewer.signal_chart import chart, cursor
 from vibrissa.viewer.trial_drawing import fitted_body, moment_drawing, surroundings, touched
 from vibrissa.viewer.views import picture, views
@@ -93,7 +93,7 @@ def test_a_moment_shows_whisker_contact_and_force(trial):
 
 
 def test_a_fitted_cylinder_lies_where_it_was_fitted(trial, recording):
-    peg = recorded_pegs(recording)[0]
+    peg = Recording(recording).pegs[0]
     near = trial.contacts[trial.felt]
     normals = recording["truth"]["surface_normal"].values[trial.felt]
     fit = fit_cylinder(near, whisker_radius=np.full(len(near), 50e-6), normals=normals)

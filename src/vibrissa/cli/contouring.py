@@ -122,7 +122,7 @@ def reconstruct(
     from vibrissa.io import save_contour, save_recording
     from vibrissa.io.paths import CSV, NETCDF, check_writable
     from vibrissa.pipeline import contour_points
-    from vibrissa.recording import recorded_objects
+    from vibrissa.recording import Recording
 
     target = recording if path is None else path
     points = target.with_name(f"{target.stem}_contour.csv") if csv is None else csv
@@ -144,7 +144,7 @@ def reconstruct(
         lean=None if lean is None else math.radians(lean),
     )
     tree = recording_from(recording)
-    known = recorded_objects(tree if objects is None else recording_from(objects))
+    known = Recording(tree if objects is None else recording_from(objects)).objects
     with progress_bars() as tell:
         made = []
         try:

@@ -180,9 +180,9 @@ def _contour_frames(
 ) -> Iterator[Any]:
     from vibrissa.cli.trial_views import bodies_of, fits_of, sights_of
     from vibrissa.plots import contour_frames
-    from vibrissa.recording import recorded_whisker
+    from vibrissa.recording import Recording
 
-    rest = recorded_whisker(trial, whisker).centerline(101)
+    rest = Recording(trial).whisker(whisker).centerline(101)
     sights = sights_of(trial, course, videos, rows)
     return contour_frames(course, rest, sights, rows, bodies_of(trial), fits_of(trial))
 

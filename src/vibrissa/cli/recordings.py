@@ -43,7 +43,7 @@ def is_recording(path: Path) -> bool:
 def whiskers_for(recording: xr.DataTree, path: Path | None) -> list[Whisker]:
     """Find the whisker of each that a recording has signals of."""
     from vibrissa.cli.sources import whisker_from
-    from vibrissa.recording import recorded_whisker
+    from vibrissa.recording import Recording
 
     count = recording.sizes["whisker"]
     if path is not None:
@@ -51,7 +51,7 @@ def whiskers_for(recording: xr.DataTree, path: Path | None) -> list[Whisker]:
             raise ValueError(f"--whisker is one whisker; the recording has {count}")
         return [whisker_from(path)]
     try:
-        return [recorded_whisker(recording, k) for k in range(count)]
+        return Recording(recording).whiskers
     except ValueError as fault:
         raise ValueError(f"{fault}; give its centreline with --whisker") from None
 

@@ -76,7 +76,7 @@ def report(
     from vibrissa.io import load_recording
     from vibrissa.io.paths import check_readable, check_writable
     from vibrissa.io.replace import replacing
-    from vibrissa.recording import recorded_whisker
+    from vibrissa.recording import Recording
     from vibrissa.report import (
         contacts_by_whisker,
         document,
@@ -104,7 +104,7 @@ def report(
                 path, trial, videos or [], chart, whisker, seed or 0, tell
             )
             if trial.sizes["whisker"] > 1:
-                title += f", whisker {recorded_whisker(trial, whisker).name}"
+                title += f", whisker {Recording(trial).whisker(whisker).name}"
         else:
             options = {"--video": videos, "--map": chart, "--movies": make_movies}
             refuse(options | {"--whisker": whisker, "--seed": seed}, f"{path} is a map")

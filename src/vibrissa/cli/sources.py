@@ -93,9 +93,9 @@ def whisker_from(path: Path | None) -> Whisker:
         return load_whisker(path, **stated())
     kind, rat = kind_of(path), _stated.get().get("rat")
     if kind == "vibrissa recording":
-        from vibrissa.recording import recorded_whisker
+        from vibrissa.recording import Recording
 
-        whisker = recorded_whisker(load_recording(path))
+        whisker = Recording(load_recording(path)).whisker()
         return whisker if rat is None else whisker.with_properties(rat=rat)
     if kind == "vibrissa contact map":
         whisker = map_from(path).whisker
@@ -126,7 +126,7 @@ def wrench_from(path: Path) -> tuple[xr.Dataset, Whisker | None]:
         raise FileNotFoundError(f"there is no file {path}")
     if not (is_netcdf(path) and kind_of(path) == "vibrissa recording"):
         return load_signals(path), None
-    from vibrissa.recording import recorded_whisker
+    from vibrissa.recording import Recording
 
     recording = load_recording(path)
     if not {"force", "moment"} <= set(recording.data_vars):
@@ -134,4 +134,4 @@ def wrench_from(path: Path) -> tuple[xr.Dataset, Whisker | None]:
     wrench = recording.to_dataset()[["force", "moment"]]
     if wrench.sizes["whisker"] != 1:
         raise ValueError(f"{path} is a recording of {wrench.sizes['whisker']} whiskers, not of one")
-    return wrench.isel(whisker=0), recorded_whisker(recording)
+    return wrench.isel(whisker=0), Recording(recording).whisker()

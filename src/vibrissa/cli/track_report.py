@@ -56,13 +56,13 @@ def tell_recording(result: xr.DataTree, path: Path) -> None:
     import numpy as np
 
     from vibrissa.cli.sources import tell_notes
-    from vibrissa.recording import recorded_whisker
+    from vibrissa.recording import Group, Recording
 
     data = result.to_dataset()
     for k, name in enumerate(data["whisker"].values):
-        one = data.isel(whisker=k)
+        one = Group(data).whisker(k).data
         lost = int((one["confidence"] == 0.0).sum())
-        length = recorded_whisker(result, k).length
+        length = Recording(result).whisker(k).length
         touching = int(np.nansum(one["in_contact"].values))
         line = (
             f"{name}: {shown('length', length)} long, in contact in {touching} of "
@@ -79,7 +79,7 @@ def tell_recording(result: xr.DataTree, path: Path) -> None:
             )
         for line in compared_contacts(result, k):
             output.print(f"  {line}", highlight=False, soft_wrap=True)
-    tell_notes(*(recorded_whisker(result, k) for k in range(data.sizes["whisker"])))
+    tell_notes(*(Recording(result).whisker(k) for k in range(data.sizes["whisker"])))
     for line in result.attrs.get("remarks", "").splitlines():
         output.print(f"note: {line}", highlight=False, soft_wrap=True)
     output.print(f"wrote {path}", highlight=False, soft_wrap=True)
@@ -89,16 +89,18 @@ def compared_contacts(recording: xr.DataTree, whisker: int) -> Iterator[str]:
     """Say how contact points found otherwise compare with those of the rod."""
     import numpy as np
 
-    measured = recording.children.get("measured")
+    from vibrissa.recording import Recording
+
+    trial = Recording(recording)
+    measured = trial.find("measured")
     if measured is None or "contact_difference" not in measured:
         return
-    one = measured.to_dataset().isel(whisker=whisker)
-    away = one["contact_difference"].values
-    of_rod = recording.to_dataset()["arc_length"].isel(whisker=whisker)
-    along = one["arc_length"].values - of_rod.values
+    one = measured.whisker(whisker)
+    away = one["contact_difference"]
+    along = one["arc_length"] - trial.root.whisker(whisker)["arc_length"]
     both = np.isfinite(away) & np.isfinite(along)
-    found = int(np.isfinite(one["contact_point"].values).all(axis=-1).sum())
-    source = one["contact_point"].attrs["source"]
+    found = int(np.isfinite(one["contact_point"]).all(axis=-1).sum())
+    source = one.data["contact_point"].attrs["source"]
     if not both.any():
         yield f"contact point ({source}): in {found} frames, in none of them has the rod one"
         return

@@ -252,12 +252,12 @@ def _cameras(
     from vibrissa.cameras.camera import PIXEL_SIZE
     from vibrissa.io import load_recording, video_info
     from vibrissa.io.paths import NETCDF
-    from vibrissa.recording import recorded_cameras
+    from vibrissa.recording import Recording
 
     if path is not None:
         refuse({"--pixel-size": pixel_size}, "the --cameras tell it")
         if path.suffix.lower() in NETCDF:
-            cameras = recorded_cameras(load_recording(path))
+            cameras = Recording(load_recording(path)).cameras
         else:
             cameras = load_cameras(path)
         if len(cameras) < 2:
@@ -353,7 +353,7 @@ def _beside(head: Path | None, contact: Path | None, thing: Path | None) -> dict
     from vibrissa.io.paths import NETCDF
     from vibrissa.io.table import read_text
     from vibrissa.io.toml import in_file
-    from vibrissa.recording import recorded_objects
+    from vibrissa.recording import Recording
     from vibrissa.simulation.script import read_objects
 
     if contact is not None and thing is not None:
@@ -368,7 +368,7 @@ def _beside(head: Path | None, contact: Path | None, thing: Path | None) -> dict
     if contact is not None:
         beside["contacts"] = load_contact_points(contact)
     if thing is not None and thing.suffix.lower() in NETCDF:
-        beside["objects"] = recorded_objects(load_recording(thing))
+        beside["objects"] = Recording(load_recording(thing)).objects
         if not beside["objects"]:
             raise ValueError(f"{thing} is a recording without objects")
     elif thing is not None:

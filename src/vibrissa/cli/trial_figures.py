@@ -32,12 +32,12 @@ def trial_drawings(
     """Say what can be drawn of a trial; what cannot is told, with the verb that makes it."""
     from vibrissa.io import load_recording
     from vibrissa.plots import course_of
-    from vibrissa.recording import recorded_whisker
+    from vibrissa.recording import Recording
 
     trial = load_recording(path)
     course = course_of(trial, whisker)
     _say_what_is_lacking(course, trial, path)
-    bent = recorded_whisker(trial, whisker)
+    bent = Recording(trial).whisker(whisker)
     drawings = dict(_of_contacts(trial, course, bent, (width, colour)))
     if course.signals is not None:
         drawings |= _of_signals(trial, course, bent, width, (videos, chart, whisker, tell))

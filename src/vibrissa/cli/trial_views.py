@@ -50,11 +50,11 @@ def sights_of(
 
 def _cameras(trial: xr.DataTree) -> tuple[Camera, ...]:
     """Cameras of a recording; for a simulated trial without, two that look at it."""
-    from vibrissa.recording import recorded_cameras
+    from vibrissa.recording import Recording
     from vibrissa.simulation import views_of
 
     if "cameras" in trial.children:
-        return recorded_cameras(trial)
+        return Recording(trial).cameras
     if "truth" in trial.children and "centerline" in trial["truth"]:
         return views_of(trial)
     return ()
@@ -91,9 +91,9 @@ def _backdrop(trial: xr.DataTree, camera: Camera, course: Course) -> Any:
 
 def bodies_of(trial: xr.DataTree) -> list[Surface]:
     """List the objects of a trial, as far as they are known."""
-    from vibrissa.recording import recorded_objects
+    from vibrissa.recording import Recording
 
-    return list(recorded_objects(trial))
+    return list(Recording(trial).objects)
 
 
 def fits_of(trial: xr.DataTree) -> list[FittedShape]:
@@ -109,9 +109,9 @@ def map_of(trial: xr.DataTree, path: Path | None, whisker: int, tell: Any) -> Co
     """Read the map of a trial's whisker, or simulate it."""
     from vibrissa.cli.sources import map_from
     from vibrissa.contacts import ContactMap
-    from vibrissa.recording import recorded_whisker
+    from vibrissa.recording import Recording
 
-    own = recorded_whisker(trial, whisker)
+    own = Recording(trial).whisker(whisker)
     if path is None:
         stage = "map of all contacts"
         tell(stage, 0, 1)

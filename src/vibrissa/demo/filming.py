@@ -13,7 +13,7 @@ import vibrissa
 from vibrissa.io import load_recording, save_recording
 from vibrissa.io.replace import replacing
 from vibrissa.pipeline.estimates import Progress
-from vibrissa.recording import recorded_cameras, recorded_whisker
+from vibrissa.recording import Recording
 from vibrissa.simulation import film, views_of
 from vibrissa.simulation.film import with_true_traces
 from vibrissa.tracking import TrackOptions, partial_traces, trace_file, track
@@ -79,14 +79,14 @@ def tracked(trial: xr.DataTree, folder: Path, tell: Progress) -> xr.DataTree:
     path = folder / TRACKED
     if path.exists():
         return load_recording(path)
-    cameras = recorded_cameras(trial)
+    cameras = Recording(trial).cameras
     kept = [partial_traces(path, view) for view in range(len(VIEWS))]
     traces = [
         trace_file(file, kept[view], progress=partial(tell, f"tracing, {file.stem}"))
         for view, file in enumerate(video_files(folder))
     ]
     rate = 1.0 / float(np.median(np.diff(trial.to_dataset()["time"].values)))
-    own = recorded_whisker(trial)
+    own = Recording(trial).whisker()
     properties = {name: getattr(own, name) for name in _PROPERTIES}
     found = track(cameras, traces, rate, TrackOptions(properties=properties), progress=tell)
     save_recording(path, found)

@@ -39,7 +39,7 @@ from vibrissa.pipeline import (
     with_group,
 )
 from vibrissa.pipeline.estimates import Progress
-from vibrissa.recording import recorded_objects, recorded_whisker
+from vibrissa.recording import Recording
 from vibrissa.sensors import FORCE_NOISE, MOMENT_NOISE
 from vibrissa.simulation import facing_peg, measure, simulate, sweep_past
 from vibrissa.whisker import Whisker
@@ -172,7 +172,7 @@ def run_demo(
             held = with_truth(tracked(trial, folder, tell), trial)
             scores = tracking_scores(held.to_dataset().isel(DIM), truth_of(held)[0])
         tell("map of all contacts", 0, 1)
-        contact_map = ContactMap.simulate(recorded_whisker(held), grid=False)
+        contact_map = ContactMap.simulate(Recording(held).whisker(), grid=False)
         tell("map of all contacts", 1, 1)
         read = placed_by(signals_of(trial, "sensor"), held) if video else signals_of(trial)
         sensed = _located(with_group(held, "signals", read), contact_map, seed)
@@ -181,7 +181,7 @@ def run_demo(
             read = signals_of(held, "contact point")
             seen = _located(with_group(held, "signals", read), contact_map, seed)
             tell("contact points", 2, 2)
-        (peg,) = recorded_objects(trial)
+        (peg,) = Recording(trial).objects
         assert isinstance(peg, Peg)
         result = DemoResult(whisker, peg, trial, contact_map, sensed, seen, scores, ())
         return result if output is None else _written(result, folder, tell)
@@ -221,7 +221,7 @@ def _located(recording: xr.DataTree, contact_map: ContactMap, seed: int) -> Loca
     fit = shape_from_dataset(recording["contour"].to_dataset())
     assert isinstance(fit, CylinderFit)
     truth, whisker = truth_of(recording)
-    (peg,) = recorded_objects(recording)
+    (peg,) = Recording(recording).objects
     assert isinstance(peg, Peg)
     radii = whisker_radii(recording["truth"].to_dataset(), [whisker])[:, 0]
     known = truth.assign(

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
 from vibrissa.evaluation.contacts import ANGLES, angle_label
+from vibrissa.recording import Group
 
 Array = NDArray[np.float64]
 
@@ -84,14 +85,14 @@ def tracking_scores(tracked: xr.Dataset, truth: xr.Dataset) -> TrackingScores:
         The numbers; NaN for what is not known of both.
     """
     unknown = np.full(2, np.nan)
-    touching = [data["in_contact"].values.astype(bool) for data in (tracked, truth)]
+    touching = [Group(data)["in_contact"] for data in (tracked, truth)]
     away = _distances(tracked, truth, "contact_point")[touching[0] & touching[1]]
     base = centerline = unknown
     if "base_position" in tracked and "base_position" in truth:
         base = spread(_distances(tracked, truth, "base_position"))
     if "centerline" in tracked and "centerline" in truth:
-        lines = [data["centerline"].transpose("time", ..., "space") for data in (tracked, truth)]
-        centerline = spread(from_curves(lines[0].values, refined(lines[1].values)))
+        lines = [Group(data)["centerline"] for data in (tracked, truth)]
+        centerline = spread(from_curves(lines[0], refined(lines[1])))
     lost = int((tracked["confidence"].values == 0.0).sum()) if "confidence" in tracked else 0
     return TrackingScores(
         frames=tracked.sizes["time"],
@@ -106,7 +107,7 @@ def tracking_scores(tracked: xr.Dataset, truth: xr.Dataset) -> TrackingScores:
 
 def _distances(tracked: xr.Dataset, truth: xr.Dataset, name: str) -> Array:
     """How far a point (time, space) is from the true one."""
-    pair = [data[name].transpose("time", "space").values for data in (tracked, truth)]
+    pair = [Group(data)[name] for data in (tracked, truth)]
     return np.asarray(np.linalg.norm(pair[0] - pair[1], axis=-1))
 
 
@@ -114,11 +115,10 @@ def _trace_errors(tracked: xr.Dataset, truth: xr.Dataset) -> Array:
     """Median and 95 % distance of traced points that were seen, view by view."""
     if "trace" not in tracked or "trace" not in truth:
         return np.empty((0, 2))
-    order = ("view", "time", ..., "image_axis")
-    traced, true = (data["trace"].transpose(*order).values for data in (tracked, truth))
+    traced, true = (np.swapaxes(Group(data)["trace"], 0, 1) for data in (tracked, truth))
     seen = np.ones(traced.shape[:3], dtype=bool)
     if "trace_visible" in tracked:
-        seen = tracked["trace_visible"].transpose("view", "time", "node").values.astype(bool)
+        seen = np.swapaxes(Group(tracked)["trace_visible"], 0, 1)
     views = zip(traced, map(refined, true), seen, strict=True)
     return np.array([spread(from_curves(a, b)[visible]) for a, b, visible in views])
 
@@ -145,7 +145,7 @@ def signal_errors(signals: xr.Dataset, truth: xr.Dataset, angle: Array) -> tuple
         found, true = (_in_laboratory(data, name) for data in (signals, truth))
         with np.errstate(invalid="ignore", divide="ignore"):
             errors[name] = np.linalg.norm(found - true, axis=1) / np.linalg.norm(true, axis=1)
-    known = truth["in_contact"].values.astype(bool) & signals["in_contact"].values.astype(bool)
+    known = Group(truth)["in_contact"] & Group(signals)["in_contact"]
     known &= np.isfinite(errors["force"]) & np.isfinite(errors["moment"])
     rows = []
     for low, high in itertools.pairwise(ANGLES):
@@ -158,8 +158,8 @@ def signal_errors(signals: xr.Dataset, truth: xr.Dataset, angle: Array) -> tuple
 
 def _in_laboratory(data: xr.Dataset, name: str) -> Array:
     """Turn vectors (time, 3) from the whisker's frame into the laboratory's."""
-    turned = data["base_rotation"].transpose("time", "space", "whisker_axis").values
-    return np.asarray(np.einsum("tij,tj->ti", turned, data[name].transpose("time", "space").values))
+    known = Group(data)
+    return np.asarray(np.einsum("tij,tj->ti", known["base_rotation"], known[name]))
 
 
 def refined(curves: Array, times: int = 8) -> Array:

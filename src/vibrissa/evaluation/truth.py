@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import xarray as xr
 
-from vibrissa.recording import recorded_whisker
+from vibrissa.recording import Group, Recording
 from vibrissa.whisker import Whisker
 
 _POSE = ("base_position", "base_rotation")
@@ -68,7 +68,7 @@ def truth_of(recording: xr.DataTree, whisker: int = 0) -> tuple[xr.Dataset, Whis
         root = recording.to_dataset()
         truth = truth.assign({n: root[n] for n in _POSE if n in root and n not in truth})
     known = group if "whiskers" in group.children else recording
-    return truth.isel(whisker=whisker), recorded_whisker(known, whisker)
+    return Group(truth).whisker(whisker).data, Recording(known).whisker(whisker)
 
 
 def caution(source: object) -> str | None:

@@ -2,7 +2,7 @@
 
 Every float is kept to the last bit; arrays are compressed. Any reader of NetCDF or HDF5 can open
 the file; what the groups and variables mean is told by their own attributes and in
-:mod:`vibrissa.recording.tree`. In the file several whiskers stand side by side in one group
+:mod:`vibrissa.recording.schema`. In the file several whiskers stand side by side in one group
 (:mod:`vibrissa.io.whisker_stack`).
 """
 

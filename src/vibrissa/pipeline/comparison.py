@@ -9,9 +9,9 @@ import xarray as xr
 
 from vibrissa.contour import compare_with, distances_by
 from vibrissa.objects.surface import Surface
-from vibrissa.pipeline.frames import EACH, estimates_in, whisker_radii, whiskers_in
+from vibrissa.pipeline.frames import EACH, estimates_in, whisker_radii
 from vibrissa.quantities import attributes
-from vibrissa.recording.tree import recorded_objects
+from vibrissa.recording import Group, Recording
 from vibrissa.signals import nearest_on_rest
 from vibrissa.whisker import Whisker
 
@@ -28,7 +28,7 @@ def nearest_object(
     """Find the object that contacts are nearest to."""
     if not objects:
         raise ValueError("no object is known to compare with")
-    points = estimates["contact_point"].transpose(*EACH, "space").values
+    points = Group(estimates)["contact_point"]
     there = np.isfinite(points).all(axis=-1)
     if not there.any():
         raise ValueError("there are no contacts to compare with the objects")
@@ -72,28 +72,29 @@ def compare_contacts(
         If there are no estimates, no contacts or no objects.
     """
     estimates = estimates_in(recording)
-    known = recorded_objects(recording) if objects is None else tuple(objects)
-    touching = whiskers_in(recording) if whiskers is None else whiskers
+    trial, contacts = Recording(recording), Group(estimates)
+    known = trial.objects if objects is None else tuple(objects)
+    touching = trial.whiskers if whiskers is None else whiskers
     number = nearest_object(estimates, touching, known)
-    spread = estimates["contact_covariance"].transpose(*EACH, ...).values
+    spread = contacts["contact_covariance"]
     out = compare_with(
         known[number],
-        estimates["contact_point"].transpose(*EACH, "space").values,
+        contacts["contact_point"],
         spread if np.isfinite(spread).any() else None,
         whisker_radii(estimates, touching),
         dims=EACH,
         coords={name: estimates[name].variable for name in EACH if name in estimates.coords},
         seed=seed,
     )
-    local = estimates["contact_point_whisker"].transpose(*EACH, "space").values
+    local = contacts["contact_point_whisker"]
     angle = np.full(local.shape[:2], np.nan)
     for k, whisker in enumerate(touching):
         rows = np.flatnonzero(np.isfinite(local[:, k]).all(axis=1))
         distance, arc_length = nearest_on_rest(whisker, local[rows, k])
         angle[rows, k] = np.arctan2(distance, arc_length)
     by = {"deflection_angle": angle, "r": np.linalg.norm(local, axis=-1)}
-    if "signals" in recording.children:
-        by["MB"] = recording["signals"].to_dataset()["MB"].transpose(*EACH).values
+    if "signals" in trial:
+        by["MB"] = trial["signals"]["MB"]
     out = out.assign({name: (EACH, v, attributes(name)) for name, v in by.items()})
     return out.assign_attrs(object=number)
 

@@ -10,10 +10,11 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.contacts import ContactMap, Prior
-from vibrissa.pipeline.frames import signals_in, whiskers_in
+from vibrissa.pipeline.frames import signals_in
 from vibrissa.pipeline.laboratory import in_laboratory
 from vibrissa.pipeline.locate import TRIPLET, locate, locate_from_wrench, unfelt
 from vibrissa.pipeline.signals import sensor_noise
+from vibrissa.recording import Group, Recording
 from vibrissa.rod import PROXIMAL
 from vibrissa.signals import selection
 from vibrissa.status import is_ok
@@ -120,7 +121,7 @@ def estimates_of(
         if contact_maps is not None:
             whiskers = [one.whisker for one in contact_maps]
         else:
-            whiskers = whiskers_in(recording)
+            whiskers = Recording(recording).whiskers
     for given in (whiskers, contact_maps):
         if given is not None and len(given) != count:
             raise ValueError(f"there are signals of {count} whiskers; {len(given)} are given")
@@ -129,7 +130,7 @@ def estimates_of(
     parts = []
     for k, whisker in enumerate(whiskers):
         tell("contact points", k, count)
-        one = data.isel(whisker=k)
+        one = Group(data).whisker(k).data
         sigma = sensor_noise(one) if noise is None else np.asarray(noise, dtype=np.float64)
         wrench = one[["force", "moment"]]
         if data.attrs.get("source") != "sensor":
@@ -171,20 +172,13 @@ def _silent(stage: str, done: int, total: int) -> None:
 
 def _placed(signals: xr.Dataset, found: xr.Dataset, *, given: bool) -> xr.Dataset:
     """Contacts of one whisker in the laboratory, with what became of frames without signals."""
-    pose = {
-        name: signals[name].transpose("time", ...).values
-        for name in ("pose_covariance", "pose_wrench_covariance")
-        if name in signals
-    }
+    known = Group(signals)
+    names = ("pose_covariance", "pose_wrench_covariance")
+    pose = {name: known[name] for name in names if name in known}
     if given:
         # The noise given is that of another instrument.
         pose.pop("pose_wrench_covariance", None)
-    placed = in_laboratory(
-        found,
-        signals["base_rotation"].transpose("time", "space", "whisker_axis").values,
-        signals["base_position"].transpose("time", "space").values,
-        **pose,
-    )
+    placed = in_laboratory(found, known["base_rotation"], known["base_position"], **pose)
     said = signals["status"].values
     status = np.where(is_ok(said), placed["status"].values, said).astype(np.int8)
     placed["status"] = placed["status"].copy(data=status)

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from vibrissa.recording.tree import recorded, recorded_whisker, variable_faults
+from vibrissa.recording import Group, faults_in, recorded
 from vibrissa.signals import base_signals
 from vibrissa.whisker import Whisker
 
@@ -18,13 +18,8 @@ Array = NDArray[np.float64]
 EACH = ("time", "whisker")
 """What contacts run along."""
 
-SQUARES = {
-    "wrench_covariance": ("component", "component_"),
-    "pose_covariance": ("pose", "pose_"),
-    "pose_wrench_covariance": ("pose", "component_"),
-}
-"""Dimensions of covariances beside time and whisker."""
-
+SQUARES = ("wrench_covariance", "pose_covariance", "pose_wrench_covariance")
+"""Covariances of what is measured and of the pose."""
 
 _SKEW = 1e-3
 """How far a rotation times its transpose may be from the identity."""
@@ -56,9 +51,9 @@ def check_recording(recording: xr.DataTree) -> None:
             f"the recording lacks the dimensions {', '.join(missing)}; it has {got}: one that was "
             "tracked, simulated or measured is needed"
         )
-    faults = variable_faults(root)
+    faults = faults_in(root)
     if not faults and "base_rotation" in root:
-        turned = root["base_rotation"].transpose(*EACH, "space", "whisker_axis").values
+        turned = Group(root)["base_rotation"]
         known = turned[np.isfinite(turned).all(axis=(-2, -1))]
         away = np.abs(np.swapaxes(known, -2, -1) @ known - np.eye(3)).max(initial=0.0)
         if away > _SKEW or (np.linalg.det(known) < 0.0).any():
@@ -89,12 +84,13 @@ def needed(root: xr.Dataset, names: Sequence[str], source: str) -> None:
 
 def one_whisker(values: Mapping[str, Any], status: NDArray[np.int64]) -> xr.Dataset:
     """Give signals of one whisker as a dataset with a dimension ``whisker`` of length one."""
-    data = {name: recorded(name, array) for name, array in values.items()}
-    data["status"] = recorded("status", np.asarray(status, dtype=np.int8))
     six = base_signals(values["force"], values["moment"])
-    for name, signal in six.data_vars.items():
-        data[str(name)] = xr.Variable(("time", "whisker"), signal.values[:, None], signal.attrs)
-    return xr.Dataset(data)
+    known = {
+        **values,
+        "status": np.asarray(status, dtype=np.int8),
+        **{str(name): signal.values for name, signal in six.data_vars.items()},
+    }
+    return xr.Dataset({name: recorded(name, array) for name, array in known.items()})
 
 
 def with_coordinates(data: xr.Dataset, root: xr.Dataset, about: Mapping[str, Any]) -> xr.Dataset:
@@ -102,11 +98,6 @@ def with_coordinates(data: xr.Dataset, root: xr.Dataset, about: Mapping[str, Any
     names = ("time", "whisker", "space", "whisker_axis")
     coordinates = {name: root[name].variable for name in names if name in root.coords}
     return data.assign_coords({"space": list("xyz"), **coordinates}).assign_attrs(about)
-
-
-def whiskers_in(recording: xr.DataTree) -> list[Whisker]:
-    """Make the whiskers of a recording again."""
-    return [recorded_whisker(recording, k) for k in range(recording.sizes["whisker"])]
 
 
 def estimates_in(recording: xr.DataTree) -> xr.Dataset:
@@ -136,7 +127,7 @@ def _group_in(recording: xr.DataTree, name: str, needs: Sequence[str]) -> xr.Dat
     data = group.to_dataset()
     missing = [variable for variable in needs if variable not in data]
     faults = [f"it lacks {', '.join(missing)}"] if missing else []
-    faults += variable_faults(data)
+    faults += faults_in(data)
     if faults:
         raise ValueError(
             f"the group {name} of the recording cannot be used: {'; '.join(faults)}; make it anew "
@@ -160,7 +151,7 @@ def whisker_radii(estimates: xr.Dataset, whiskers: Sequence[Whisker]) -> Array:
     array (time, whisker)
         m; NaN where the arc length is.
     """
-    arc_length = estimates["arc_length"].transpose(*EACH).values
+    arc_length = Group(estimates)["arc_length"]
     radius = np.full(arc_length.shape, np.nan)
     for k, whisker in enumerate(whiskers):
         known = np.isfinite(arc_length[:, k])

@@ -19,6 +19,7 @@ from vibrissa.contacts.channels import WRENCH
 from vibrissa.contacts.noise import common_covariance, common_errors
 from vibrissa.pipeline.slopes import contact_normals, gains
 from vibrissa.quantities import attributes
+from vibrissa.recording import Group
 from vibrissa.signals import base_signals, selection
 from vibrissa.status import Status, flag_attributes
 from vibrissa.whisker import Whisker
@@ -216,10 +217,7 @@ class _Felt(NamedTuple):
         cls, wrench: xr.Dataset, noise: ArrayLike | None, errors: Mapping[str, Any] | None = None
     ) -> _Felt:
         """Look at a measured wrench."""
-        force, moment = (
-            np.asarray(wrench[name].transpose("time", "space").values, dtype=np.float64)
-            for name in ("force", "moment")
-        )
+        force, moment = (Group(wrench)[name] for name in ("force", "moment"))
         n = len(force)
         covariance = _noise_of_frames(noise, n)
         known = np.isfinite(force.sum(axis=1) + moment.sum(axis=1))
@@ -232,7 +230,7 @@ class _Felt(NamedTuple):
             rows = known & (size > least)
         free = known & ~force.any(axis=1) & ~moment.any(axis=1)
         if "in_contact" in wrench:
-            touching = wrench["in_contact"].values.astype(bool)
+            touching = Group(wrench)["in_contact"]
             rows &= touching
             free |= known & ~touching
         above = float(np.median(least[rows])) if rows.any() else float(np.nanmax(least, initial=0))

@@ -29,9 +29,9 @@ from vibrissa.objects import Peg, Sphere
 from vibrissa.objects.surface import Surface
 from vibrissa.pipeline.comparison import nearest_object
 from vibrissa.pipeline.estimates import WHOLE
-from vibrissa.pipeline.frames import EACH, estimates_in, whisker_radii, whiskers_in
+from vibrissa.pipeline.frames import EACH, estimates_in, whisker_radii
 from vibrissa.quantities import attributes
-from vibrissa.recording.tree import recorded_objects
+from vibrissa.recording import Group, Recording
 from vibrissa.whisker import Whisker
 
 Array = NDArray[np.float64]
@@ -107,8 +107,8 @@ def reconstruct(
     if shape not in get_args(Shape):
         raise ValueError(f"shape is {shape!r}; one of {', '.join(get_args(Shape))} is needed")
     estimates = estimates_in(recording)
-    whiskers = whiskers_in(recording) if whiskers is None else whiskers
-    known = recorded_objects(recording) if objects is None else tuple(objects)
+    whiskers = Recording(recording).whiskers if whiskers is None else whiskers
+    known = Recording(recording).objects if objects is None else tuple(objects)
     fit = fit_contacts(estimates, whiskers, shape, axis=axis, lean=lean)
     together = frames_together(scores_of(fit, estimates))
     fit = _less_sure(fit, together)
@@ -265,7 +265,7 @@ def contour_points(recording: xr.DataTree, whiskers: Sequence[Whisker] | None = 
         If there are no estimates.
     """
     estimates = estimates_in(recording)
-    known = whiskers_in(recording) if whiskers is None else whiskers
+    known = Recording(recording).whiskers if whiskers is None else whiskers
     point = _rows(estimates["contact_point"])
     normal = _rows(estimates["contact_normal"])
     radius = whisker_radii(estimates, known).reshape(-1, 1)
@@ -297,7 +297,7 @@ def _compared(
 ) -> dict[str, Any]:
     """Distances of contacts from the known object nearest to them, and of the fit from it."""
     number = nearest_object(estimates, whiskers, objects)
-    points = estimates["contact_point"].transpose(*EACH, "space").values
+    points = Group(estimates)["contact_point"]
     there = np.isfinite(points).all(axis=-1)
     gap = np.full(there.shape, np.nan)
     gap[there] = objects[number].signed_distance(points[there])

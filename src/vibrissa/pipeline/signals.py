@@ -27,12 +27,11 @@ from vibrissa.pipeline.frames import (
     names_of,
     needed,
     one_whisker,
-    whiskers_in,
     with_coordinates,
 )
 from vibrissa.pipeline.locate import FELT
 from vibrissa.pipeline.tracked_points import paper_pose, signals_by_point
-from vibrissa.quantities import attributes
+from vibrissa.recording import Group, Recording, recorded
 from vibrissa.rod import PROXIMAL
 from vibrissa.sensors import Sensor
 from vibrissa.status import Status
@@ -93,26 +92,21 @@ def signals_of(
     chosen = default_source(recording) if source is None else source
     if chosen not in get_args(Source):
         raise ValueError(f"source is {chosen!r}; one of {', '.join(get_args(Source))} is needed")
-    root = recording.to_dataset()
+    known_trial = Recording(recording)
+    root = known_trial.root.data
     if chosen == "sensor":
         return _by_sensor(root)
     if chosen == "rod":
         return _by_rod(root)
     count = root.sizes["whisker"]
-    known = whiskers_in(recording) if whiskers is None else whiskers
+    known = known_trial.whiskers if whiskers is None else whiskers
     needed(root, ("contact_point",), "contact point")
     if len(known) != count:
         raise ValueError(f"{len(known)} whiskers are given; the recording has {count}")
-    poses, table = paper_pose(recording, cutoff), _given_points(recording)
+    poses, table = paper_pose(known_trial, cutoff), _given_points(known_trial)
     parts = [
-        signals_by_point(
-            root.isel(whisker=k),
-            None if table is None else table.isel(whisker=k),
-            poses[k],
-            whisker,
-            proximal,
-        )
-        for k, whisker in enumerate(known)
+        signals_by_point(one, None if table is None else table[:, k], poses[k], known[k], proximal)
+        for k, one in enumerate(known_trial.root.each_whisker())
     ]
     data = xr.concat(parts, "whisker")
     about: dict[str, Any] = {"source": chosen}
@@ -155,13 +149,13 @@ def default_source(recording: xr.DataTree) -> Source:
     )
 
 
-def _given_points(recording: xr.DataTree) -> xr.DataArray | None:
-    """Contact points that were not tracked but given in a table."""
-    measured = recording.children.get("measured")
+def _given_points(recording: Recording) -> Array | None:
+    """Contact points (time, whisker, 3) that were not tracked but given in a table."""
+    measured = recording.find("measured")
     if measured is None or "contact_point" not in measured:
         return None
-    points = measured.to_dataset()["contact_point"]
-    return points if points.attrs.get("source") == "table" else None
+    given = measured.data["contact_point"].attrs.get("source") == "table"
+    return measured["contact_point"] if given else None
 
 
 def _by_sensor(root: xr.Dataset) -> xr.Dataset:
@@ -177,27 +171,23 @@ def _by_sensor(root: xr.Dataset) -> xr.Dataset:
             "no sensor was there: force and moment of this recording are those of the rod that "
             "fits its images; take them from the source 'rod'"
         )
-    wrench = root[["force", "moment"]]
-    known = _known(wrench)
+    force, moment = (Group(root)[name] for name in ("force", "moment"))
+    known = _known(force, moment)
     least = 0.0
     if covariance is not None:
         least = FELT * float(np.sqrt(0.5 * (covariance[4, 4] + covariance[5, 5])))
-    moment = wrench["moment"].transpose("time", "whisker", "space").values
     touching = known & (np.hypot(moment[..., 1], moment[..., 2]) > least)
-    force = wrench["force"].transpose("time", "whisker", "space").values
     nothing = ~force.any(axis=-1) & ~moment.any(axis=-1)
     status = np.where(nothing, int(Status.NO_CONTACT), int(Status.NOT_FELT))
     status[touching] = int(Status.OK)
     status[~known] = int(Status.MISSING)
-    data = _labelled(root, wrench, touching, status, {"source": "sensor"})
+    data = _labelled(root, touching, status, {"source": "sensor"})
     if covariance is None:
         return data
     if (covariance == np.diag(np.diag(covariance))).all():
         return data.assign_attrs(noise=np.sqrt(np.diag(covariance)))
     whole = np.broadcast_to(covariance, (*known.shape, 6, 6))
-    dims = ("time", "whisker", *SQUARES["wrench_covariance"])
-    about = attributes("wrench_covariance")
-    return data.assign(wrench_covariance=xr.Variable(dims, whole, about))
+    return data.assign(wrench_covariance=recorded("wrench_covariance", whole))
 
 
 def _own_noise(root: xr.Dataset) -> Array | None:
@@ -213,55 +203,48 @@ def _own_noise(root: xr.Dataset) -> Array | None:
 
 def _from_channels(root: xr.Dataset) -> tuple[xr.Dataset, Array]:
     """Force and moment, and their covariance (6, 6), from what other channels read of them."""
-    reading = root["reading"].transpose("time", "whisker", "channel")
+    known = Group(root)
     sensor = Sensor(
         [str(name) for name in root["channel"].values],
-        root["mixing"].transpose("channel", "component").values,
-        noise=reading.attrs.get("noise"),
+        known["mixing"],
+        noise=root["reading"].attrs.get("noise"),
     )
-    wrench, covariance = sensor.to_wrench(reading.values)
-    dims = ("time", "whisker", "space")
-    parts = {"force": (dims, wrench[..., :3]), "moment": (dims, wrench[..., 3:])}
-    return root.assign(parts), covariance
+    wrench, covariance = sensor.to_wrench(known["reading"])
+    parts = {"force": wrench[..., :3], "moment": wrench[..., 3:]}
+    return root.assign({name: recorded(name, part) for name, part in parts.items()}), covariance
 
 
 def _by_rod(root: xr.Dataset) -> xr.Dataset:
     names = ("force", "moment", "base_position", "base_rotation", "wrench_covariance")
     needed(root, names, "rod")
-    wrench = root[["force", "moment"]]
-    known = _known(wrench)
-    touching = known & (wrench["force"] != 0.0).any("space").transpose("time", "whisker").values
-    if "in_contact" in root:
-        touching &= root["in_contact"].transpose("time", "whisker").values.astype(bool)
+    trial = Group(root)
+    known = _known(trial["force"], trial["moment"])
+    touching = known & trial["force"].any(axis=-1)
+    if "in_contact" in trial:
+        touching &= trial["in_contact"]
     status = np.where(touching, int(Status.OK), int(Status.NO_CONTACT))
     status[~known] = int(Status.MISSING)
-    data = _labelled(root, wrench, touching, status, {"source": "rod"})
+    data = _labelled(root, touching, status, {"source": "rod"})
     kept = {name: root[name].variable for name in SQUARES if name in root}
     return data.assign(kept)
 
 
-def _known(wrench: xr.Dataset) -> NDArray[np.bool_]:
+def _known(force: Array, moment: Array) -> NDArray[np.bool_]:
     """In which frames (time, whisker) force and moment are numbers."""
-    whole = sum(wrench[name].transpose("time", "whisker", "space") for name in ("force", "moment"))
-    return np.asarray(np.isfinite(np.asarray(whole)).all(axis=-1))
+    return np.asarray(np.isfinite(force + moment).all(axis=-1))
 
 
 def _labelled(
     root: xr.Dataset,
-    wrench: xr.Dataset,
     touching: NDArray[np.bool_],
     status: NDArray[np.int64],
     about: Mapping[str, Any],
 ) -> xr.Dataset:
     """Signals of a wrench that the recording itself has, with its own pose."""
-    order = ("time", "whisker", "space")
-    names = ("force", "moment", "base_position")
-    values = {name: root[name].transpose(*order).values for name in names}
-    turned = root["base_rotation"].transpose(*order, "whisker_axis").values
+    names = ("force", "moment", "base_position", "base_rotation")
     parts = []
-    for k in range(root.sizes["whisker"]):
-        data = {name: array[:, k] for name, array in values.items()}
-        data |= {"base_rotation": turned[:, k], "in_contact": touching[:, k]}
+    for k, one in enumerate(Group(root).each_whisker()):
+        data = {name: one[name] for name in names} | {"in_contact": touching[:, k]}
         parts.append(one_whisker(data, status[:, k]))
     return with_coordinates(xr.concat(parts, "whisker"), root, about)
 
@@ -280,9 +263,7 @@ def sensor_noise(signals: xr.Dataset) -> Array | None:
         Covariance of (F, M), SI units; None where it is not known.
     """
     if "wrench_covariance" in signals:
-        dims = [d for d in ("time", "whisker") if d in signals["wrench_covariance"].dims]
-        order = (*dims, *SQUARES["wrench_covariance"])
-        return np.asarray(signals["wrench_covariance"].transpose(*order).values)
+        return Group(signals)["wrench_covariance"]
     if "noise" in signals.attrs:
         return np.diag(np.asarray(signals.attrs["noise"], dtype=np.float64) ** 2)
     return None

@@ -12,10 +12,10 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from vibrissa.pipeline.frames import SQUARES, needed, one_whisker
+from vibrissa.pipeline.frames import needed, one_whisker
 from vibrissa.pipeline.laboratory import cross_matrices
 from vibrissa.pipeline.slopes import wrench_slopes
-from vibrissa.quantities import attributes
+from vibrissa.recording import Group, Recording, recorded
 from vibrissa.rod import PointContact, deflect
 from vibrissa.status import Status
 from vibrissa.tracking.filtering import CUTOFF
@@ -35,40 +35,39 @@ class Pose(NamedTuple):
     covariance: Array
 
 
-def paper_pose(recording: xr.DataTree, cutoff: float | None) -> list[Pose]:
+def paper_pose(recording: Recording, cutoff: float | None) -> list[Pose]:
     """How each whisker is held, filtered: from before the rod was fitted, or the recording's own.
 
     What is filtered is how it is held relative to the head.
     """
-    root = recording.to_dataset()
-    head = HeadPose.still(root.sizes["time"])
-    if {"head_position", "head_rotation"} <= set(root.data_vars):
-        head = HeadPose(root["head_position"].values, root["head_rotation"].values)
-    rate, cutoff = _rate(root["time"].values, cutoff)
-    group = recording.children.get("measured")
-    measured = None if group is None or "base_azimuth" not in group else group.to_dataset()
+    root = recording.root
+    head = HeadPose.still(root.data.sizes["time"])
+    if "head_position" in root and "head_rotation" in root:
+        head = HeadPose(root["head_position"], root["head_rotation"])
+    rate, cutoff = _rate(root.data["time"].values, cutoff)
+    measured = recording.find("measured")
+    if measured is not None and "base_azimuth" not in measured:
+        measured = None
     prefix = "unfiltered_"
     if measured is None:
-        needed(root, ("contact_point", "base_position", "base_rotation"), "contact point")
+        needed(root.data, ("contact_point", "base_position", "base_rotation"), "contact point")
     elif f"{prefix}base_azimuth" not in measured:
-        if measured.attrs.get("cutoff", CUTOFF) != cutoff:
+        if measured.data.attrs.get("cutoff", CUTOFF) != cutoff:
             raise ValueError(
                 f"the pose of this recording is kept as it was filtered; a cut-off of {cutoff} Hz "
                 "needs the unfiltered one: track the videos again"
             )
         prefix, cutoff = "", None
     poses = []
-    for k in range(root.sizes["whisker"]):
-        own = root.isel(whisker=k)
+    for k, own in enumerate(root.each_whisker()):
         if measured is None:
-            place = own["base_position"].transpose("time", "space").values
-            turned = own["base_rotation"].transpose("time", "space", "whisker_axis").values
-            angles = angles_of(np.swapaxes(head.rotation, 1, 2) @ turned).T
+            place = own["base_position"]
+            angles = angles_of(np.swapaxes(head.rotation, 1, 2) @ own["base_rotation"]).T
         else:
-            one = measured.isel(whisker=k)
-            place = one[f"{prefix}base_position"].transpose("time", "space").values
+            one = measured.whisker(k)
+            place = one[f"{prefix}base_position"]
             names = ("azimuth", "elevation", "roll")
-            angles = np.stack([one[f"{prefix}base_{name}"].values for name in names])
+            angles = np.stack([one[f"{prefix}base_{name}"] for name in names])
         pose = BasePose(head.seen_from(place), *angles).filtered(rate, cutoff)
         rotation, position = head.rotation @ pose.rotation, head.put_in(pose.position)
         poses.append(Pose(rotation, position, _pose_covariance(own, rotation, position)))
@@ -85,7 +84,7 @@ def _rate(time: Array, cutoff: float | None) -> tuple[float, float | None]:
     return 1.0 / step, cutoff
 
 
-def _pose_covariance(own: xr.Dataset, rotation: Array, position: Array) -> Array:
+def _pose_covariance(own: Group, rotation: Array, position: Array) -> Array:
     """Covariance (time, 6, 6) of a pose beside that of the recording.
 
     As far as they differ, which is hardly of the same cause, the recording's counts as the truth,
@@ -94,37 +93,37 @@ def _pose_covariance(own: xr.Dataset, rotation: Array, position: Array) -> Array
     out = np.zeros((len(rotation), 6, 6))
     if "pose_covariance" not in own:
         return out
-    out += own["pose_covariance"].transpose("time", "pose", "pose_").values
-    turned = own["base_rotation"].transpose("time", "space", "whisker_axis").values
+    out += own["pose_covariance"]
+    turned = own["base_rotation"]
     there = np.isfinite(turned.sum(axis=(1, 2)) + rotation.sum(axis=(1, 2)))
     if "in_contact" in own:
-        there &= own["in_contact"].values.astype(bool)
+        there &= own["in_contact"]
     if not there.any():
         return out
     turn = Rotation.from_matrix(rotation[there] @ np.swapaxes(turned[there], 1, 2)).as_rotvec()
-    shift = (position - own["base_position"].transpose("time", "space").values)[there]
+    shift = (position - own["base_position"])[there]
     away = np.concatenate([shift, turn], axis=1)
     return np.asarray(out + away.T @ away / len(away))
 
 
 def signals_by_point(
-    one: xr.Dataset,
-    given: xr.DataArray | None,
+    one: Group,
+    given: Array | None,
     pose: Pose,
     whisker: Whisker,
     proximal: float,
 ) -> xr.Dataset:
     """Give the signals of the rod that passes through the tracked contact point."""
     rotation, position = pose.rotation, pose.position
-    point = one["contact_point"].transpose("time", "space").values
+    point = one["contact_point"]
     told = np.zeros(len(point), dtype=bool)
     if given is not None:
-        told = np.asarray(np.isfinite(given.transpose("time", "space").values).all(axis=1))
-        point = np.where(told[:, None], given.transpose("time", "space").values, point)
+        told = np.asarray(np.isfinite(given).all(axis=1))
+        point = np.where(told[:, None], given, point)
     held = np.isfinite(rotation.sum(axis=(1, 2)) + position.sum(axis=1))
     touching = np.isfinite(point).all(axis=1)
     if "in_contact" in one:
-        touching = told | one["in_contact"].values.astype(bool)
+        touching = told | one["in_contact"]
     local = np.einsum("tji,tj->ti", rotation, point - position)
     bent = deflect(whisker, PointContact(local[touching]), proximal=proximal)
     status = np.where(held, int(Status.NO_CONTACT), int(Status.MISSING))
@@ -147,7 +146,7 @@ def signals_by_point(
     slopes = np.zeros((len(point), 6, 3))
     slopes[touching] = wrench_slopes(whisker, bent.arc_length, bent.contact_force)
     slopes = slopes @ np.swapaxes(rotation, 1, 2)
-    spread = one["contact_covariance"].transpose("time", "space", ...).values
+    spread = one["contact_covariance"]
     spread = np.where(touching[:, None, None], spread, 0.0)
     spread[told] = np.nan
     # The point is seen from a base that is a little elsewhere and turned by a little.
@@ -161,11 +160,4 @@ def signals_by_point(
         "pose_covariance": pose.covariance,
         "pose_wrench_covariance": both @ np.swapaxes(slopes, 1, 2),
     }
-    return data.assign(
-        {
-            name: xr.Variable(
-                ("time", "whisker", *SQUARES[name]), square[:, None], attributes(name)
-            )
-            for name, square in squares.items()
-        }
-    )
+    return data.assign({name: recorded(name, square) for name, square in squares.items()})

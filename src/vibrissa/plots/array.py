@@ -34,6 +34,7 @@ from vibrissa.plots.style import (
 )
 from vibrissa.plots.things import ends_nearby, eye_triangles, head_triangles, object_triangles
 from vibrissa.quantities import axis_label, to_display
+from vibrissa.recording import Group
 from vibrissa.whisker.identity import Identity
 
 ROW_COLOURS: Mapping[str, str] = MappingProxyType(
@@ -265,7 +266,7 @@ def _scene(tree: xr.DataTree, frame: int | None, contacts: str) -> _Scene | None
     line = held["centerline"]
     names = [str(name) for name in np.atleast_1d(root["whisker"].values)]
     if "time" not in line.dims:
-        lines = to_display("centerline", line.transpose("whisker", ..., "space").values)
+        lines = to_display("centerline", Group(held)["centerline"])
         none = np.zeros(len(names), dtype=bool)
         empty = [np.empty((0, 3)) for _ in names]
         still = np.eye(3), np.zeros(3)
@@ -275,13 +276,13 @@ def _scene(tree: xr.DataTree, frame: int | None, contacts: str) -> _Scene | None
     at = most if frame is None else frame
     if not 0 <= at < len(touching):
         raise ValueError(f"frame is {frame}; from 0 to {len(touching) - 1} is needed")
-    lines = line.transpose("time", "whisker", ..., "space").values[at]
+    lines = Group(held)["centerline"][at]
     if not np.isfinite(lines).any():
         return None
     turn, place = np.eye(3), np.zeros(3)
     if "head_position" in root:
-        place = root["head_position"].transpose("time", "space").values[at]
-        turn = root["head_rotation"].transpose("time", "space", "head_axis").values[at]
+        moves = Group(root)
+        place, turn = moves["head_position"][at], moves["head_rotation"][at]
     group = tree.children.get("objects")
     things = {} if group is None else group.children
     return _Scene(
@@ -301,11 +302,9 @@ def _contacts(tree: xr.DataTree, group: str) -> tuple[Mask, Array]:
     part = tree if group in ("/", "") else tree.children.get(group)
     if part is None or "contact_point" not in part:
         raise ValueError(f"the recording has no contact points in its group {group!r}")
-    data = part.to_dataset()
-    places = to_display(
-        "contact_point", data["contact_point"].transpose("time", "whisker", "space").values
-    )
+    data = Group(part.to_dataset())
+    places = to_display("contact_point", data["contact_point"])
     touching: Mask = np.asarray(np.isfinite(places).all(axis=-1))
     if "in_contact" in data:
-        touching &= data["in_contact"].transpose("time", "whisker").values.astype(bool)
+        touching &= data["in_contact"]
     return touching, places

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from vibrissa.plots.chart import nearest_at_rest
 from vibrissa.plots.style import Array, Mask
+from vibrissa.recording import Group, Recording
 
 TRIPLET = ("Fx", "MB", "MD")
 """The signals that are drawn, those of the paper."""
@@ -111,86 +112,66 @@ def course_of(trial: xr.DataTree, whisker: int = 0) -> Course:
     lacking = [n for n in ("time", "base_position", "base_rotation") if n not in trial.variables]
     if lacking:
         raise ValueError(f"the recording lacks {', '.join(lacking)}")
-    groups = {name: _one(trial, name, whisker) for name in ("", "signals", "estimates", "truth")}
-    root, signals, estimates, truth = groups.values()
+    found = (Recording(trial).find(name) for name in ("", "signals", "estimates", "truth"))
+    nothing = Group(xr.Dataset())
+    root, signals, estimates, truth = ((each or nothing).whisker(whisker) for each in found)
     tracked = "measured" in trial.children
-    known = _values(truth, "contact_point_whisker")
+    known = truth.known("contact_point_whisker")
     known_as = "true"
     if known is None and tracked:
-        known, known_as = _values(root, "contact_point_whisker"), "tracked"
-    estimated = _values(estimates, "contact_point_whisker")
+        known, known_as = root.known("contact_point_whisker"), "tracked"
+    estimated = estimates.known("contact_point_whisker")
     if estimated is None and not tracked:
-        estimated = _values(root, "contact_point_whisker")
-    places, places_as = _values(estimates, "contact_point"), "estimated"
+        estimated = root.known("contact_point_whisker")
+    places, places_as = estimates.known("contact_point"), "estimated"
     if places is None:
-        places, places_as = _values(root, "contact_point"), "tracked" if tracked else "estimated"
+        places, places_as = root.known("contact_point"), "tracked" if tracked else "estimated"
     if places is None:
-        places, places_as = _values(truth, "contact_point"), "true"
-    line = _values(root, "centerline")
+        places, places_as = truth.known("contact_point"), "true"
+    line = root.known("centerline")
     order = (signals, estimates, root, truth)
     return Course(
-        time=np.asarray(root["time"].values, dtype=np.float64),
-        touching=_touching(order, root.sizes["time"]),
+        time=np.asarray(root.data["time"].values, dtype=np.float64),
+        touching=_touching(order, root.data.sizes["time"]),
         signals=_signals(signals),
         known=known,
         known_as=known_as,
         estimated=estimated,
         places=places,
         places_as=places_as,
-        centerline=_values(truth, "centerline") if line is None else line,
+        centerline=truth.known("centerline") if line is None else line,
         traces=_traces(root, truth),
-        position=np.asarray(root["base_position"].values, dtype=np.float64),
-        rotation=np.asarray(root["base_rotation"].values, dtype=np.float64),
-        frames=root["frame"].values if "frame" in root else None,
+        position=root["base_position"],
+        rotation=root["base_rotation"],
+        frames=root.get("frame"),
         head=_head(root),
     )
 
 
-def _one(trial: xr.DataTree, name: str, whisker: int) -> xr.Dataset:
-    """One whisker of a group; an empty dataset if there is no such group."""
-    if name and name not in trial.children:
-        return xr.Dataset()
-    data = (trial[name] if name else trial).to_dataset()
-    count = data.sizes.get("whisker", 1)
-    if not 0 <= whisker < count:
-        raise ValueError(f"whisker {whisker} was asked for; the recording has {count} of them")
-    return data.isel(whisker=whisker) if "whisker" in data.dims else data
-
-
-def _values(data: xr.Dataset, name: str) -> Array | None:
-    """Values over time; None where nothing is known."""
-    if name not in data:
-        return None
-    found = data[name]
-    values = found.transpose("time", *(dim for dim in found.dims if dim != "time")).values
-    return np.asarray(values, dtype=np.float64) if np.isfinite(values).any() else None
-
-
-def _signals(data: xr.Dataset) -> dict[str, Array] | None:
-    found = {name: _values(data, name) for name in TRIPLET}
+def _signals(data: Group) -> dict[str, Array] | None:
+    found = {name: data.known(name) for name in TRIPLET}
     known = {name: values for name, values in found.items() if values is not None}
     return known if len(known) == len(TRIPLET) else None
 
 
-def _touching(order: tuple[xr.Dataset, ...], count: int) -> Mask:
-    """In contact as the first says that knows."""
-    for data in order:
-        if "in_contact" in data:
-            values = data["in_contact"].values.astype(np.float64)
-            return np.asarray(np.nan_to_num(values) > 0.5)
+def _touching(order: tuple[Group, ...], count: int) -> Mask:
+    """In contact by the first group that has it."""
+    for group in order:
+        if "in_contact" in group:
+            return group["in_contact"]
     return np.zeros(count, dtype=bool)
 
 
-def _head(root: xr.Dataset) -> tuple[Array, Array] | None:
-    position, rotation = (_values(root, name) for name in ("head_position", "head_rotation"))
+def _head(root: Group) -> tuple[Array, Array] | None:
+    position, rotation = (root.known(name) for name in ("head_position", "head_rotation"))
     return None if position is None or rotation is None else (position, rotation)
 
 
-def _traces(root: xr.Dataset, truth: xr.Dataset) -> tuple[Array, ...]:
+def _traces(root: Group, truth: Group) -> tuple[Array, ...]:
     """Traces in each view: tracked ones, or else true ones."""
     for data in (root, truth):
-        if "trace" in data and "view" in data["trace"].dims:
-            return tuple(data["trace"].transpose("view", "time", ..., "image_axis").values)
+        if "trace" in data:
+            return tuple(np.swapaxes(data["trace"], 0, 1))
     return ()
 
 

@@ -24,6 +24,7 @@ from vibrissa.plots.style import (
     say,
 )
 from vibrissa.quantities import axis_label, quantity, to_display
+from vibrissa.recording import Group
 
 _COLUMNS = (("Fx", "FT", "FD"), ("Mx", "MB", "MD"))
 _DIRECTIONS = ("FD", "MD")
@@ -67,8 +68,8 @@ def signals_over_time(
             "time and some of Fx, FT, FD, Mx, MB, MD are needed (vibrissa.base_signals makes them "
             f"from force and moment); the dataset has {', '.join(map(str, signals.variables))}"
         )
-    signals = _one(signals, whisker)
-    truth = None if truth is None else _one(truth, whisker)
+    signals = Group(signals).whisker(whisker).data
+    truth = None if truth is None else Group(truth).whisker(whisker).data
     time = to_display("time", signals["time"])
     if truth is not None and truth.sizes.get("time") != time.size:
         raise ValueError(f"the truth has {dict(truth.sizes)}, the signals {time.size} times")
@@ -90,10 +91,6 @@ def signals_over_time(
         figure.align_ylabels()
         _legend(figure, truth is not None, contact is not None)
         return figure
-
-
-def _one(data: xr.Dataset, whisker: int) -> xr.Dataset:
-    return data.isel(whisker=whisker) if "whisker" in data.dims else data
 
 
 def _contact(signals: xr.Dataset) -> Mask | None:

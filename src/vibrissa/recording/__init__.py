@@ -1,15 +1,21 @@
-"""The recording: one tree of labelled datasets for all that is known of a trial."""
+"""The recording: all that is known of a trial, declared once and read by one accessor."""
 
-from vibrissa.recording.tree import (
-    recorded_cameras,
-    recorded_objects,
-    recorded_pegs,
-    recorded_whisker,
+from vibrissa.recording.recording import Group, Recording, recording_tree
+from vibrissa.recording.schema import (
+    VARIABLES,
+    RecordedVariable,
+    coordinates,
+    faults_in,
+    recorded,
 )
 
 __all__ = [
-    "recorded_cameras",
-    "recorded_objects",
-    "recorded_pegs",
-    "recorded_whisker",
+    "VARIABLES",
+    "Group",
+    "RecordedVariable",
+    "Recording",
+    "coordinates",
+    "faults_in",
+    "recorded",
+    "recording_tree",
 ]

@@ -7,6 +7,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa.quantities import quantity
+from vibrissa.recording import Recording
 from vibrissa.report.page import paragraph, table
 from vibrissa.report.values import shown_value
 
@@ -15,12 +16,12 @@ def whiskers_table(recording: xr.DataTree, chosen: int) -> str:
     """Tell which whiskers touched for how long, and how strongly."""
     names = [str(name) for name in recording.coords["whisker"].values]
     touching = contacts_by_whisker(recording)
-    force = recording.to_dataset().get("force")
+    force = Recording(recording).root.get("force")
     rows = []
     for k in np.flatnonzero(touching):
         largest = np.nan
         if force is not None:
-            size = np.linalg.norm(force.isel(whisker=k).transpose("time", "space").values, axis=1)
+            size = np.linalg.norm(force[:, k], axis=1)
             largest = float(np.max(size, initial=0.0, where=np.isfinite(size)))
         rows.append((names[k], str(k), str(touching[k]), shown_value("force", largest)))
     told = paragraph(
@@ -47,13 +48,10 @@ def contacts_by_whisker(recording: xr.DataTree) -> NDArray[np.int64]:
     array (whiskers,) of int
         Frames; zero where nothing tells.
     """
-    for name in ("estimates", "signals", "", "truth"):
-        if name and name not in recording.children:
-            continue
-        data = (recording[name] if name else recording).to_dataset()
-        if "in_contact" in data:
-            touching = data["in_contact"].transpose("time", "whisker").values.astype(bool)
-            return np.asarray(touching.sum(axis=0), dtype=np.int64)
+    trial = Recording(recording)
+    for group in map(trial.find, ("estimates", "signals", "", "truth")):
+        if group is not None and "in_contact" in group:
+            return np.asarray(group["in_contact"].sum(axis=0), dtype=np.int64)
     return np.zeros(recording.sizes["whisker"], dtype=np.int64)
 
 

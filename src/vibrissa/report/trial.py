@@ -27,7 +27,7 @@ from vibrissa.evaluation import (
 )
 from vibrissa.pipeline import compare_contacts, distances_by_class
 from vibrissa.quantities import QUANTITIES, quantity
-from vibrissa.recording import recorded_objects, recorded_whisker
+from vibrissa.recording import Recording
 from vibrissa.report.page import Section, paragraph, table
 from vibrissa.report.tracked import tracked_table, whiskers_table
 from vibrissa.report.values import shown_value
@@ -77,7 +77,7 @@ def trial_sections(recording: xr.DataTree, whisker: int = 0, seed: int = 0) -> l
     ValueError
         If there is no such whisker.
     """
-    bent = recorded_whisker(recording, whisker)
+    bent = Recording(recording).whisker(whisker)
     groups = {name: _one(recording, name, whisker) for name in ("", "signals", "estimates")}
     truth, true_whisker = None, bent
     if "truth" in recording.children:
@@ -101,10 +101,8 @@ def trial_sections(recording: xr.DataTree, whisker: int = 0, seed: int = 0) -> l
 
 def _one(recording: xr.DataTree, name: str, whisker: int) -> xr.Dataset | None:
     """A group for one whisker."""
-    if name and name not in recording.children:
-        return None
-    data = (recording[name] if name else recording).to_dataset()
-    return data.isel(whisker=whisker) if "whisker" in data.dims else data
+    group = Recording(recording).find(name)
+    return None if group is None else group.whisker(whisker).data
 
 
 def _settings(recording: xr.DataTree) -> str:
@@ -395,7 +393,7 @@ def _distances(recording: xr.DataTree, seed: int) -> str:
         return ""
     assert estimates is not None
     points = recording["estimates"].to_dataset()["contact_point"].values
-    if not recorded_objects(recording) or not np.isfinite(points).any():
+    if not Recording(recording).objects or not np.isfinite(points).any():
         return ""
     classes = distances_by_class(compare_contacts(recording, seed=seed))
     parts = []

@@ -24,8 +24,7 @@ from vibrissa.cameras.camera import PIXEL_SIZE, Camera, orthogonal_views
 from vibrissa.cameras.files import cameras_dataset
 from vibrissa.io.video import Frame, write_video
 from vibrissa.objects.surface import Surface
-from vibrissa.quantities import attributes
-from vibrissa.recording.tree import recorded_objects, recorded_whisker
+from vibrissa.recording import Group, Recording, recorded
 from vibrissa.simulation.shadows import hidden, silhouette
 
 Array = NDArray[np.float64]
@@ -198,9 +197,9 @@ def film_frames(
     look = look or Look()
     truth = _truth(recording)
     lines = truth["centerline"].values
-    objects = recorded_objects(recording)
+    objects = Recording(recording).objects
     moves = _moves(lines, truth["time"].values, look.exposure)
-    whiskers = [recorded_whisker(recording, i) for i in range(lines.shape[1])]
+    whiskers = [Recording(recording).whisker(i) for i in range(lines.shape[1])]
     generator = np.random.default_rng(seed)
     width, height = camera.size
     scene = _scene(camera, objects, look, np.nanmean(lines, axis=(0, 1, 2)))
@@ -238,9 +237,8 @@ def film_frames(
 def with_true_traces(recording: xr.DataTree, cameras: Sequence[Camera]) -> xr.DataTree:
     """Say what cameras truly see of a simulated trial."""
     truth = _truth(recording)
-    line = truth["centerline"].values
-    objects = recorded_objects(recording)
-    dims = ("time", "whisker", "view", "node", "image_axis")
+    line = Group(truth)["centerline"]
+    objects = Recording(recording).objects
     trace = np.stack([camera.project(line) for camera in cameras], axis=2)
     inside = np.stack(
         [
@@ -251,10 +249,8 @@ def with_true_traces(recording: xr.DataTree, cameras: Sequence[Camera]) -> xr.Da
     )
     behind = np.stack([hidden(line, camera, objects) for camera in cameras], axis=2)
     seen = {
-        "trace": xr.Variable(dims, trace, attributes("trace")),
-        "trace_visible": xr.Variable(
-            dims[:-1], inside & (behind < 0.5), attributes("trace_visible")
-        ),
+        "trace": recorded("trace", trace),
+        "trace_visible": recorded("trace_visible", inside & (behind < 0.5)),
     }
     filmed = recording.copy()
     filmed["truth"].dataset = truth.drop_vars("time").assign(seen)

@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from vibrissa.quantities import attributes
+from vibrissa.recording import Recording, recorded
 from vibrissa.sensors import COMPONENTS, FORCE_NOISE, MOMENT_NOISE, Sensor
 
 Array = NDArray[np.float64]
@@ -50,35 +50,30 @@ def measure(
     for name, value in (("force_noise", force_noise), ("moment_noise", moment_noise)):
         if not (np.isfinite(value) and value >= 0.0):
             raise ValueError(f"{name} is {value!r}; it must not be negative")
-    truth = recording.children.get("truth")
-    if truth is None or not {"force", "moment"} <= set(truth.data_vars):
+    names = ("force", "moment")
+    truth = Recording(recording).find("truth")
+    if truth is None or not all(name in truth for name in names):
         raise ValueError("the recording has no true force and moment to measure")
     if sensor is None:
         sensor = Sensor(noise=np.repeat([force_noise, moment_noise], 3))
-    names = ("force", "moment")
-    true = {name: truth[name].variable.transpose("time", "whisker", "space") for name in names}
-    wrench = np.concatenate([true[name].values for name in names], axis=-1)
+    wrench = np.concatenate([truth[name] for name in names], axis=-1)
     time = np.asarray(recording.to_dataset()["time"].values, dtype=np.float64)
     # One sensor a whisker: each has noise of its own.
     readings = [sensor.read(time, wrench[:, i], seed + i) for i in range(wrench.shape[1])]
     reading = np.stack(readings, axis=1)
     measured = recording.copy()
     if sensor.reads_wrench:
-        rows = {
-            name: xr.Variable(
-                true[name].dims,
-                reading[..., part],
-                {**true[name].attrs, "noise": _one(sensor.noise[part])},
-            )
-            for name, part in (("force", slice(0, 3)), ("moment", slice(3, 6)))
-        }
+        parts = {"force": slice(0, 3), "moment": slice(3, 6)}
+        rows = {name: recorded(name, reading[..., part]) for name, part in parts.items()}
+        for name, part in parts.items():
+            rows[name].attrs["noise"] = _one(sensor.noise[part])
         measured.dataset = recording.to_dataset().assign(rows)
         return measured
-    noise = {"noise": np.asarray(sensor.noise)}
+    channels = recorded("reading", reading)
+    channels.attrs["noise"] = np.asarray(sensor.noise)
     dataset = recording.to_dataset().drop_vars(names, errors="ignore")
     measured.dataset = dataset.assign(
-        reading=(("time", "whisker", "channel"), reading, attributes("reading") | noise),
-        mixing=(("channel", "component"), np.asarray(sensor.mixing), attributes("mixing")),
+        reading=channels, mixing=recorded("mixing", sensor.mixing)
     ).assign_coords(channel=list(sensor.channels), component=list(COMPONENTS))
     return measured
 

@@ -26,7 +26,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa.objects.surface import Surface
-from vibrissa.recording.tree import trial_recording
+from vibrissa.recording import coordinates, recorded, recording_tree
 from vibrissa.rod import SurfaceDeflection, follow_surfaces
 from vibrissa.simulation.dynamics import Dynamics, move_dynamically
 from vibrissa.simulation.motion import Motion
@@ -92,7 +92,7 @@ def simulate(
     Returns
     -------
     xarray.DataTree
-        A recording (`vibrissa.recording.tree`): what a perfect sensor at the base reads, where the
+        A recording (`vibrissa.recording`): what a perfect sensor at the base reads, where the
         base is, and everything else in the group ``truth``.
 
     Raises
@@ -130,7 +130,39 @@ def simulate(
         )
         truths.append(_truth(one, moves, solids, found, nodes))
     whiskers, motions = zip(*pairs, strict=True)
-    return trial_recording(whiskers, motions, solids, truths, f"simulated: {how}, {touch}")
+    return _recording(whiskers, motions, solids, truths, f"simulated: {how}, {touch}")
+
+
+def _recording(
+    whiskers: Sequence[Whisker],
+    motions: Sequence[Motion],
+    solids: Sequence[Surface],
+    truths: Sequence[Mapping[str, Array]],
+    origin: str,
+) -> xr.DataTree:
+    """Write a simulated trial as a recording."""
+    pose = {
+        "base_position": [motion.base_position for motion in motions],
+        "base_rotation": [motion.base_rotation for motion in motions],
+        "base_azimuth": [motion.azimuth for motion in motions],
+        "base_elevation": [motion.elevation for motion in motions],
+        "base_roll": [motion.roll for motion in motions],
+    }
+    truth = {
+        name: recorded(name, np.stack([one[name] for one in truths], axis=1)) for name in truths[0]
+    }
+    known = {name: recorded(name, np.stack(values, axis=1)) for name, values in pose.items()}
+    known |= {name: truth[name].copy() for name in ("force", "moment")}
+    first = motions[0]
+    head = {"head_position": first.head_position, "head_rotation": first.head_rotation}
+    known |= {name: recorded(name, array) for name, array in head.items() if array is not None}
+    return recording_tree(
+        xr.Dataset(known, coordinates(first.time, [whisker.name for whisker in whiskers])),
+        whiskers,
+        origin,
+        groups={"truth": xr.Dataset(truth)},
+        objects=solids,
+    )
 
 
 def _pairs(whisker: Whiskers, motion: Motions) -> list[tuple[Whisker, Motion]]:

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa.cameras.camera import Camera
-from vibrissa.cameras.files import cameras_dataset
-from vibrissa.io.recording import KIND
-from vibrissa.objects.dataset import objects_datasets
 from vibrissa.objects.surface import Surface
-from vibrissa.quantities import attributes
-from vibrissa.recording.tree import head_variables, recorded
+from vibrissa.recording import coordinates, recorded, recording_tree
 from vibrissa.status import Status
 from vibrissa.tracking.contact import Contacts
 from vibrissa.tracking.filtering import CUTOFF
@@ -24,8 +20,6 @@ from vibrissa.whisker.emergence import angles_of
 
 if TYPE_CHECKING:
     from vibrissa.tracking.track import Tracked
-
-IMAGE = ("time", "whisker", "view", "node", "image_axis")
 
 
 def tracked_recording(
@@ -38,37 +32,31 @@ def tracked_recording(
     cutoff: float | None = CUTOFF,
 ) -> xr.DataTree:
     """Write tracked whiskers as a recording."""
-    coordinates = {
-        "time": xr.Variable("time", pairs[:, 0] / rate, attributes("time")),
-        "whisker": [one.whisker.name for one in found],
-        "view": [camera.name for camera in cameras],
-        "space": list("xyz"),
-        "whisker_axis": list("xyz"),
-        "image_axis": ["column", "row"],
-    }
-    root = xr.concat([_variables(one) for one in found], "whisker").assign_coords(coordinates)
-    frame = {"units": "1", "long_name": "frame of each video"}
-    root = root.assign(frame=xr.Variable(("time", "view"), pairs, frame))
+    root = xr.concat([_variables(one) for one in found], "whisker").assign_coords(
+        coordinates(pairs[:, 0] / rate, [one.whisker.name for one in found])
+        | {"view": [camera.name for camera in cameras], "image_axis": ["column", "row"]}
+    )
+    root = root.assign(frame=recorded("frame", pairs))
     if head is None:
         root = root.drop_vars("base_position_head")
     else:
-        root = root.assign(head_variables(head.position, head.rotation))
-    root.attrs = {"kind": KIND, "origin": "tracked in video"}
+        moves = {"head_position": head.position, "head_rotation": head.rotation}
+        root = root.assign(_labelled(moves))
     measured = xr.concat([_measured(one) for one in found], "whisker")
     if cutoff is not None:
         measured.attrs["cutoff"] = cutoff
-    groups = {
-        "/": root,
-        "/measured": measured,
-        "/cameras": cameras_dataset(cameras).drop_vars("view"),
-    }
-    for k, one in enumerate(found):
-        groups[f"/whiskers/{k}"] = one.whisker.to_dataset().drop_dims("node")
-    if objects:
-        groups["/objects"] = xr.Dataset(attrs={"reference_frame": "laboratory"})
-    for name, dataset in objects_datasets(objects).items():
-        groups[f"/objects/{name}"] = dataset.drop_vars("space")
-    return xr.DataTree.from_dict(groups)
+    return recording_tree(
+        root,
+        [one.whisker for one in found],
+        "tracked in video",
+        groups={"measured": measured},
+        objects=objects or None,
+        cameras=cameras,
+    )
+
+
+def _labelled(values: Mapping[str, Any]) -> dict[str, xr.Variable]:
+    return {name: recorded(name, array) for name, array in values.items()}
 
 
 def _variables(one: Tracked) -> xr.Dataset:
@@ -96,34 +84,17 @@ def _variables(one: Tracked) -> xr.Dataset:
         "in_contact": one.touching,
         "confidence": confidence,
         "status": status,
+        "contact_covariance": r.contact_covariance,
+        "wrench_covariance": r.wrench_covariance,
+        "pose_covariance": r.pose_covariance,
+        "pose_wrench_covariance": r.pose_wrench_covariance,
+        "trace_misfit": r.misfit,
+        "trace": one.sight.line,
+        "trace_sigma": one.sight.sigma,
+        "trace_visible": one.sight.seen,
+        "trace_confidence": one.sight.confidence,
     }
-    data = {name: recorded(name, array) for name, array in values.items()}
-    spread = ("time", "whisker", "space", "space_")
-    data["contact_covariance"] = xr.Variable(
-        spread, r.contact_covariance[:, None], attributes("contact_covariance")
-    )
-    data["wrench_covariance"] = xr.Variable(
-        ("time", "whisker", "component", "component_"),
-        r.wrench_covariance[:, None],
-        attributes("wrench_covariance"),
-    )
-    for name, covariance, axes in (
-        ("pose_covariance", r.pose_covariance, ("pose", "pose_")),
-        ("pose_wrench_covariance", r.pose_wrench_covariance, ("pose", "component_")),
-    ):
-        data[name] = xr.Variable(("time", "whisker", *axes), covariance[:, None], attributes(name))
-    data["trace_misfit"] = xr.Variable(
-        ("time", "whisker"), r.misfit[:, None], attributes("trace_misfit")
-    )
-    data["trace"] = xr.Variable(IMAGE, one.sight.line[:, None], attributes("trace"))
-    for name, array in (
-        ("trace_sigma", one.sight.sigma),
-        ("trace_visible", one.sight.seen),
-        ("trace_confidence", one.sight.confidence),
-    ):
-        dims = IMAGE[: array.ndim + 1]
-        data[name] = xr.Variable(dims, array[:, None], attributes(name))
-    return xr.Dataset(data)
+    return xr.Dataset(_labelled(values))
 
 
 def _measured(one: Tracked) -> xr.Dataset:
@@ -135,26 +106,16 @@ def _measured(one: Tracked) -> xr.Dataset:
         "base_azimuth": one.pose.azimuth,
         "base_elevation": one.pose.elevation,
         "base_roll": one.pose.roll,
+        # What another cut-off is tried on.
+        "unfiltered_base_position": one.head.put_in(one.unfiltered.position),
+        "unfiltered_base_azimuth": one.unfiltered.azimuth,
+        "unfiltered_base_elevation": one.unfiltered.elevation,
+        "unfiltered_base_roll": one.unfiltered.roll,
+        "centerline_sigma": np.sqrt(np.einsum("tnii->tni", one.covariance)),
+        "deviation": one.shape.deviation,
     }
-    data = {name: recorded(name, array) for name, array in values.items()}
-    # What another cut-off is tried on.
-    for name, array in (
-        ("base_position", one.head.put_in(one.unfiltered.position)),
-        ("base_azimuth", one.unfiltered.azimuth),
-        ("base_elevation", one.unfiltered.elevation),
-        ("base_roll", one.unfiltered.roll),
-    ):
-        raw = recorded(name, array)
-        raw.attrs["long_name"] += ", unfiltered"
-        data[f"unfiltered_{name}"] = raw
-    sigma = np.sqrt(np.einsum("tnii->tni", one.covariance))
-    about = attributes("centerline_sigma")
-    dims = ("time", "whisker", "node", "space")
-    data["centerline_sigma"] = xr.Variable(dims, sigma[:, None], about)
-    data["deviation"] = xr.Variable(
-        ("time", "whisker"), one.shape.deviation[:, None], attributes("deviation")
-    )
-    return xr.Dataset(data) if one.contacts is None else xr.Dataset(data | _contacts(one.contacts))
+    contacts = {} if one.contacts is None else _contacts(one.contacts)
+    return xr.Dataset(_labelled(values) | contacts)
 
 
 def _contacts(other: Contacts) -> dict[str, xr.Variable]:
@@ -164,7 +125,7 @@ def _contacts(other: Contacts) -> dict[str, xr.Variable]:
         "arc_length": other.arc_length,
         "contact_difference": other.difference,
     }
-    data = {name: recorded(name, array) for name, array in values.items()}
+    data = _labelled(values)
     for variable in data.values():
         variable.attrs["source"] = other.source
     return data

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from vibrissa.cameras import Camera
 from vibrissa.objects.surface import Surface
-from vibrissa.recording import recorded_cameras, recorded_objects, recorded_whisker
+from vibrissa.recording import Recording
 from vibrissa.signals import SIGNALS, base_signals
 from vibrissa.viewer.bend_drawing import NODES
 from vibrissa.viewer.drawing import Array
@@ -72,74 +72,56 @@ def watched(recording: xr.DataTree) -> Watched:
     root = recording.to_dataset()
     if not root.sizes.get("time") or not root.sizes.get("whisker"):
         raise ValueError("the recording has no frames of a whisker to look at")
-    groups = {name: _group(recording, name) for name in ("estimates", "signals", "truth")}
-    groups["root"] = root
+    trial = Recording(recording)
     shape = (root.sizes["time"], root.sizes["whisker"])
-    whiskers = tuple(recorded_whisker(recording, i) for i in range(shape[1]))
-    contacts = _first(groups, "contact_point", ("estimates", "root", "truth"))
+    whiskers = tuple(trial.whiskers)
+    contacts = trial.known("contact_point", ("estimates", "", "truth"))
     if contacts is None:
         contacts = np.full((*shape, 3), np.nan)
-    felt = _first(groups, "in_contact", ("estimates", "root", "truth"))
+    felt = trial.known("in_contact", ("estimates", "", "truth"))
     touching: Mask = np.asarray(np.isfinite(contacts).all(axis=-1))
     if felt is not None:
-        touching = touching & (np.nan_to_num(felt) > 0.0)
-    forces, signals = _felt(groups, shape)
-    cameras = recorded_cameras(recording) if "cameras" in recording.children else ()
+        touching = touching & felt
+    forces, signals = _felt(trial, shape)
+    cameras = trial.cameras if "cameras" in trial else ()
+    contour = trial.find("contour")
     return Watched(
         time=np.asarray(root["time"].to_numpy(), dtype=np.float64),
         whiskers=whiskers,
-        names=tuple(str(name) for name in root["whisker"].to_numpy()),
-        lines=_lines(groups, whiskers),
+        names=tuple(trial.names),
+        lines=_lines(trial, whiskers),
         contacts=np.where(touching[..., None], contacts, np.nan),
         felt=touching,
         forces=forces,
         signals=signals,
-        objects=recorded_objects(recording),
-        contour=_group(recording, "contour"),
+        objects=trial.objects,
+        contour=contour.data if contour else None,
         cameras=cameras,
-        traces=_first(groups, "trace", ("root", "truth")) if cameras else None,
+        traces=trial.known("trace", ("", "truth")) if cameras else None,
     )
 
 
-def _group(recording: xr.DataTree, name: str) -> xr.Dataset | None:
-    group = recording.children.get(name)
-    return None if group is None else group.to_dataset()
-
-
-def _first(groups: dict[str, xr.Dataset | None], name: str, order: Sequence[str]) -> Array | None:
-    """Values of a variable out of the first group that has some."""
-    for key in order:
-        group = groups[key]
-        if group is not None and name in group:
-            values = np.asarray(group[name].to_numpy(), dtype=np.float64)
-            if np.isfinite(values).any():
-                return values
-    return None
-
-
-def _lines(groups: dict[str, xr.Dataset | None], whiskers: Sequence[Whisker]) -> Array:
+def _lines(trial: Recording, whiskers: Sequence[Whisker]) -> Array:
     """Centrelines as recorded, else the resting whisker where its base is."""
-    lines = _first(groups, "centerline", ("root", "truth"))
+    lines = trial.known("centerline", ("", "truth"))
     if lines is not None:
         return lines
-    place = _first(groups, "base_position", ("root", "truth"))
-    turn = _first(groups, "base_rotation", ("root", "truth"))
+    place = trial.known("base_position", ("", "truth"))
+    turn = trial.known("base_rotation", ("", "truth"))
     if place is None or turn is None:
         raise ValueError("the recording has neither centrelines nor poses of the whisker's base")
     rest = np.stack([whisker.centerline(NODES) for whisker in whiskers])
     return np.asarray(np.einsum("twij,wkj->twki", turn, rest) + place[:, :, None])
 
 
-def _felt(
-    groups: dict[str, xr.Dataset | None], shape: tuple[int, int]
-) -> tuple[Array, dict[str, Array]]:
+def _felt(trial: Recording, shape: tuple[int, int]) -> tuple[Array, dict[str, Array]]:
     """Forces in the laboratory and the six signals; NaN where nothing is known."""
     missing = np.full((*shape, 3), np.nan)
-    force = _first(groups, "force", ("signals", "root", "truth"))
-    moment = _first(groups, "moment", ("signals", "root", "truth"))
+    force = trial.known("force", ("signals", "", "truth"))
+    moment = trial.known("moment", ("signals", "", "truth"))
     if force is None or moment is None:
         force, moment = missing, missing
-    turn = _first(groups, "base_rotation", ("signals", "root", "truth"))
+    turn = trial.known("base_rotation", ("signals", "", "truth"))
     in_lab = missing if turn is None else np.einsum("twij,twj->twi", turn, force)
     signals = base_signals(force, moment)
     return in_lab, {name: np.asarray(signals[name].to_numpy()) for name in SIGNALS}

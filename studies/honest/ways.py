@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline
 
 import vibrissa as vb
 from vibrissa.contacts import ContactMap
-from vibrissa.contour import axis_offset, fit_cylinder
+from vibrissa.contour import axis_offset, fit_shape
 from vibrissa.evaluation import REPLICATES
 from vibrissa.pipeline import (
     SOLVED_TO,
@@ -180,7 +180,8 @@ def peg_error(placed: xr.Dataset, trial: xr.DataTree, normals: str) -> dict[str,
         if normals == "uncertain":
             fit = fit_contacts(each, [whisker], lean=0.0)
         else:
-            fit = fit_cylinder(
+            fit = fit_shape(
+                "cylinder",
                 placed["contact_point"].values,
                 placed["contact_covariance"].values + SOLVED_TO**2 * np.eye(3),
                 whisker_radii(each, [whisker])[:, 0],

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vibrissa.contour import compare_with, distances_by, ellipsoids, fit_sphere
+from vibrissa.contour import compare_with, distances_by, ellipsoids, fit_shape
 from vibrissa.objects import Peg, Plane, Sphere
 
 
@@ -68,7 +68,7 @@ def test_a_fitted_shape_is_compared_like_an_object():
     generator = np.random.default_rng(2)
     normal = generator.normal(size=(60, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    compared = compare_with(fit_sphere(normal), 1.5 * normal, whisker_radius=0.25)
+    compared = compare_with(fit_shape("sphere", normal), 1.5 * normal, whisker_radius=0.25)
     np.testing.assert_allclose(compared["surface_distance"], 0.25, atol=1e-6)
 
 
@@ -79,7 +79,7 @@ def test_what_does_not_fit_is_refused():
         compare_with(body, np.ones(3))
     with pytest.raises(ValueError, match="covariance has shape"):
         compare_with(body, np.ones((4, 3)), np.eye(3))
-    with pytest.raises(ValueError, match="no known quantity"):
+    with pytest.raises(ValueError, match="not a known quantity"):
         distances_by(compared, "colour", np.ones(4))
     with pytest.raises(ValueError, match="values have shape"):
         distances_by(compared, "r", np.ones(3))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from vibrissa.contour import fit_free, shape_from_dataset, surface_grid
-from vibrissa.contour.merging import Support, merged
+from vibrissa.contour.free_surface import Support, merged
 
 SEMIAXES = np.array([3e-3, 2e-3, 4e-3])
 CENTER = np.array([20e-3, 1e-3, 0.0])

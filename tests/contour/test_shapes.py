@@ -5,16 +5,14 @@ import pytest
 
 from vibrissa.contour import (
     axis_offset,
-    fit_cylinder,
-    fit_plane,
-    fit_sphere,
+    fit_shape,
     shape_from_dataset,
-    surface_distances,
 )
+from vibrissa.objects import Peg
 
 CENTER = np.array([25e-3, 1e-3, -2e-3])
 RADIUS = 2e-3
-FITS = {"cylinder": fit_cylinder, "sphere": fit_sphere, "plane": fit_plane}
+KINDS = ("cylinder", "sphere", "plane")
 
 
 def touched(kind, generator, n):
@@ -73,7 +71,7 @@ def test_no_bias_and_an_honest_spread(kind, joint_errors):
     found = []
     for seed in range(30):
         points, known = noisy(kind, joint_errors, np.random.default_rng(seed), 150)
-        found.append(scores(kind, FITS[kind](points, **known)))
+        found.append(scores(kind, fit_shape(kind, points, **known)))
     z = np.array(found)
     k = z.shape[1]
     # The mean of 30 scores has a standard deviation of 0.18, their spread one of 0.13.
@@ -87,29 +85,32 @@ def test_no_bias_and_an_honest_spread(kind, joint_errors):
 @pytest.mark.parametrize("kind", ["cylinder", "sphere", "plane"])
 def test_a_wrong_shape_is_told_by_its_misfit_and_is_unsure(kind, joint_errors):
     points, known = noisy(kind, joint_errors, np.random.default_rng(4), 150)
-    right = FITS[kind](points, **known)
+    right = fit_shape(kind, points, **known)
     # The median of 150 scores of three degrees of freedom has a standard deviation of 9 %.
     assert right.misfit == pytest.approx(1.0, abs=0.3)
     assert right.used.all()
-    wrong = [fit for name, fit in FITS.items() if name != kind and (kind, name) != ("plane", name)]
-    for fit in (one(points, **known) for one in wrong):
+    wrong = [name for name in KINDS if name != kind and kind != "plane"]
+    for fit in (fit_shape(name, points, **known) for name in wrong):
         assert fit.misfit > 100.0
         # What it claims to know of its place is as much worse.
         assert fit.sigma["origin_x"] > 10.0 * right.sigma["origin_x"]
     points[::10] += 2e-3
-    assert FITS[kind](points, **known).misfit == pytest.approx(1.0, abs=0.5)
+    assert fit_shape(kind, points, **known).misfit == pytest.approx(1.0, abs=0.5)
 
 
 def test_without_noise_there_is_no_misfit():
     points, normal, whisker = touched("sphere", np.random.default_rng(5), 40)
-    assert np.isnan(fit_sphere(points, whisker_radius=whisker, normals=normal).misfit)
+    assert np.isnan(fit_shape("sphere", points, whisker_radius=whisker, normals=normal).misfit)
 
 
 def test_normals_with_their_covariance_tell_the_axis(joint_errors):
     for seed in range(3):
         points, known = noisy("cylinder", joint_errors, np.random.default_rng(seed), 150)
         exact = {name: known[name] for name in ("covariance", "whisker_radius", "normals")}
-        sigma, coarse = fit_cylinder(points, **known).sigma, fit_cylinder(points, **exact).sigma
+        sigma, coarse = (
+            fit_shape("cylinder", points, **known).sigma,
+            fit_shape("cylinder", points, **exact).sigma,
+        )
         assert sigma["axis_x"] < 0.7 * coarse["axis_x"]
         assert sigma["radius"] < coarse["radius"]
 
@@ -122,7 +123,7 @@ def test_exact_contacts_give_the_shape_back(kind, normals):
     given = {"normals": normal} if normals else {}
     if kind == "plane" and not normals:
         given["outside"] = CENTER + np.array([0.0, -1e-2, 1e-2])
-    fit = FITS[kind](points, whisker_radius=whisker, **given)
+    fit = fit_shape(kind, points, whisker_radius=whisker, **given)
     np.testing.assert_allclose(fit.signed_distance(points), whisker, rtol=0, atol=1e-10)
     np.testing.assert_allclose(fit.outward_normals(points), normal, rtol=0, atol=1e-6)
     assert fit.rms < 1e-10
@@ -138,7 +139,7 @@ def test_outliers_do_little_harm(kind, known):
     points = points + generator.normal(scale=1e-5, size=points.shape)
     points[::10] += generator.normal(scale=2e-3, size=points[::10].shape)
     covariance = np.broadcast_to(1e-10 * np.eye(3), (200, 3, 3)) if known else None
-    fit = FITS[kind](points, covariance, whisker)
+    fit = fit_shape(kind, points, covariance, whisker)
     if kind == "plane":
         assert abs(fit.normal @ [0.0, -0.6, 0.8]) > np.cos(2e-3)
     else:
@@ -152,9 +153,9 @@ def test_outliers_do_little_harm(kind, known):
 def test_a_plane_faces_the_free_side():
     generator = np.random.default_rng(1)
     points, normal, whisker = touched("plane", generator, 30)
-    assert fit_plane(points, normals=-normal).normal @ normal[0] < -0.999
-    assert fit_plane(points).normal[2] > 0.0
-    below = fit_plane(points, outside=CENTER - normal[0], whisker_radius=whisker)
+    assert fit_shape("plane", points, normals=-normal).normal @ normal[0] < -0.999
+    assert fit_shape("plane", points).normal[2] > 0.0
+    below = fit_shape("plane", points, outside=CENTER - normal[0], whisker_radius=whisker)
     assert below.normal @ normal[0] < -0.99
 
 
@@ -162,7 +163,7 @@ def test_a_plane_faces_the_free_side():
 def test_datasets_keep_fits(kind, joint_errors):
     points, known = noisy(kind, joint_errors, np.random.default_rng(2), 60)
     points[7] = np.nan
-    fit = FITS[kind](points, **known)
+    fit = fit_shape(kind, points, **known)
     stored = fit.to_dataset(("time", "whisker"), (30, 2), {"time": np.arange(30) * 1e-3})
     assert stored["surface_distance"].dims == ("time", "whisker")
     assert stored.attrs["shape"] == kind
@@ -180,11 +181,11 @@ def test_datasets_keep_fits(kind, joint_errors):
 
 def test_residuals_of_a_sphere_are_distances(joint_errors):
     points, known = noisy("sphere", joint_errors, np.random.default_rng(3), 60)
-    fit = fit_sphere(points, **known)
+    fit = fit_shape("sphere", points, **known)
     expected = np.linalg.norm(points - fit.origin, axis=1) - fit.radius - known["whisker_radius"]
     np.testing.assert_allclose(fit.residuals, expected, rtol=0, atol=1e-12)
-    cylinder = fit_cylinder(points, **known)
-    gap = surface_distances(points, cylinder.origin, cylinder.axis, cylinder.radius)
+    cylinder = fit_shape("cylinder", points, **known)
+    gap = Peg(cylinder.origin, cylinder.axis, cylinder.radius).signed_distance(points)
     np.testing.assert_allclose(cylinder.signed_distance(points), gap, rtol=0, atol=1e-12)
 
 
@@ -193,23 +194,27 @@ def test_what_is_no_shape_is_refused(joint_errors):
     angle = np.linspace(0.0, 2.0 * np.pi, 40)
     circle = np.stack([np.cos(angle), np.sin(angle), np.zeros(40)], axis=1)
     with pytest.raises(ValueError, match="do not determine one"):
-        fit_sphere(circle)
-    assert fit_sphere(circle, normals=circle).radius == pytest.approx(1.0)
+        fit_shape("sphere", circle)
+    assert fit_shape("sphere", circle, normals=circle).radius == pytest.approx(1.0)
     line = np.linspace(0, 1, 20)[:, None] * [1e-3, 2e-3, 3e-3]
-    for fit in (fit_sphere, fit_plane):
+    for kind in ("sphere", "plane"):
         with pytest.raises(ValueError, match="on a line"):
-            fit(line)
+            fit_shape(kind, line)
+    with pytest.raises(ValueError, match="'cone'"):
+        fit_shape("cone", points)
+    with pytest.raises(ValueError, match="axis is given"):
+        fit_shape("sphere", points, axis=[0.0, 0.0, 1.0])
     with pytest.raises(ValueError, match="4 usable points; at least 5"):
-        fit_sphere(points[:4])
+        fit_shape("sphere", points[:4])
     with pytest.raises(ValueError, match="3 usable points; at least 4"):
-        fit_plane(points[:3])
+        fit_shape("plane", points[:3])
     with pytest.raises(ValueError, match="without normals and covariance"):
-        fit_sphere(points, normal_covariance=known["normal_covariance"])
+        fit_shape("sphere", points, normal_covariance=known["normal_covariance"])
     with pytest.raises(ValueError, match="without normal_covariance"):
-        fit_sphere(points, point_normal_covariance=known["point_normal_covariance"])
+        fit_shape("sphere", points, point_normal_covariance=known["point_normal_covariance"])
     wrong = known["covariance"].copy()
     wrong[3, 0, 0] = -1.0
     with pytest.raises(ValueError, match="point 3"):
-        fit_sphere(points, wrong)
+        fit_shape("sphere", points, wrong)
     with pytest.raises(ValueError, match="outside is"):
-        fit_plane(points, outside=[0.0, 1.0])
+        fit_shape("plane", points, outside=[0.0, 1.0])

@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from vibrissa.contour import compare_with, distances_by, fit_free, fit_plane, fit_sphere
+from vibrissa.contour import compare_with, distances_by, fit_free, fit_shape
 from vibrissa.objects import Plane, Sphere
 from vibrissa.plots import contour_views, distances_by_class
 from vibrissa.quantities import axis_label
@@ -38,7 +38,7 @@ def lines(figure: Figure, panel: int) -> list[np.ndarray]:
 
 def test_a_fitted_sphere_is_cut_where_it_was_touched() -> None:
     points = near_side()
-    figure = contour_views(points, BALL, fit_sphere(points))
+    figure = contour_views(points, BALL, fit_shape("sphere", points))
     written = texts(figure)
     assert {"object, 8.00 mm", "fitted, 8.00 mm", "95 % band"} <= written
     middle = 1e3 * np.median(points, axis=0)
@@ -62,7 +62,7 @@ def test_a_free_surface_ends_where_it_is_not_known() -> None:
 def test_planes_and_what_lies_elsewhere_can_be_drawn() -> None:
     flat = np.random.default_rng(1).uniform(-4e-3, 4e-3, (60, 3)) * [1.0, 0.0, 1.0]
     wall = Plane(origin=[0.0, 0.0, 0.0], normal=[0.0, -1.0, 0.0])
-    fitted = fit_plane(flat, outside=[0.0, -1.0, 0.0])
+    fitted = fit_shape("plane", flat, outside=[0.0, -1.0, 0.0])
     figure = contour_views(flat, wall, fitted)
     assert {"object", "fitted"} <= texts(figure)
     assert np.abs(np.concatenate(lines(figure, 0))[:, 1]).max() < 1e-6

@@ -2,13 +2,14 @@
 
 import re
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 import xarray as xr
 
 import vibrissa as vb
-from vibrissa.contour import fit_cylinder, fit_free, fit_plane, fit_sphere
+from vibrissa.contour import fit_free, fit_shape
 from vibrissa.io import write_video
 from vibrissa.io.footage import Footage
 from vibrissa.recording import Recording
@@ -96,7 +97,7 @@ def test_a_fitted_cylinder_lies_where_it_was_fitted(trial, recording):
     peg = Recording(recording).pegs[0]
     near = trial.contacts[trial.felt]
     normals = recording["truth"]["surface_normal"].values[trial.felt]
-    fit = fit_cylinder(near, whisker_radius=np.full(len(near), 50e-6), normals=normals)
+    fit = fit_shape("cylinder", near, whisker_radius=np.full(len(near), 50e-6), normals=normals)
     vertices, faces = fitted_body(fit.to_dataset(), near)
     assert faces.max() < len(vertices)
     np.testing.assert_allclose(fit.signed_distance(vertices[:-2]), 0.0, atol=1e-9)
@@ -104,7 +105,9 @@ def test_a_fitted_cylinder_lies_where_it_was_fitted(trial, recording):
     assert heights[0].min() < heights[1].min() < heights[1].max() < heights[0].max()
 
 
-@pytest.mark.parametrize("fit", [fit_sphere, fit_plane, fit_free])
+@pytest.mark.parametrize(
+    "fit", [partial(fit_shape, "sphere"), partial(fit_shape, "plane"), fit_free]
+)
 def test_other_fitted_shapes_have_a_picture_too(fit):
     rng = np.random.default_rng(0)
     toward = rng.normal(size=(60, 3)) * [0.4, 0.4, 0.0] + [0.0, 0.0, 1.0]

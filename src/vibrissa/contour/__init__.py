@@ -1,18 +1,17 @@
-"""From contact points to the object's contour, in the laboratory; knows no solver."""
+"""From contact points to the object's contour, in the laboratory frame, without a solver."""
 
-from vibrissa.contour.compare import axis_offset, surface_distances
-from vibrissa.contour.continuity import continuing_candidates
-from vibrissa.contour.cylinder import CylinderFit, fit_cylinder
-from vibrissa.contour.distances import compare_with, distances_by
-from vibrissa.contour.ellipsoids import Ellipsoids, ellipsoids
-from vibrissa.contour.frames import covariance_to_laboratory, to_laboratory
-from vibrissa.contour.free import FreeFit
-from vibrissa.contour.free_fitting import fit_free
-from vibrissa.contour.mesh import surface_grid
-from vibrissa.contour.plane import PlaneFit, fit_plane
-from vibrissa.contour.shape import FittedShape
-from vibrissa.contour.sphere import SphereFit, fit_sphere
-from vibrissa.contour.stored import shape_from_dataset
+from vibrissa.contour.comparison import axis_offset, compare_with, distances_by
+from vibrissa.contour.drawing import Ellipsoids, ellipsoids, surface_grid
+from vibrissa.contour.fit import fit_shape
+from vibrissa.contour.fitted_shape import FittedShape, evidence_of
+from vibrissa.contour.free_fit import fit_free
+from vibrissa.contour.free_surface import FreeFit, shape_from_dataset
+from vibrissa.contour.laboratory import (
+    continuing_candidates,
+    covariance_to_laboratory,
+    to_laboratory,
+)
+from vibrissa.contour.simple_shapes import CylinderFit, PlaneFit, SphereFit
 
 __all__ = [
     "CylinderFit",
@@ -27,12 +26,10 @@ __all__ = [
     "covariance_to_laboratory",
     "distances_by",
     "ellipsoids",
-    "fit_cylinder",
+    "evidence_of",
     "fit_free",
-    "fit_plane",
-    "fit_sphere",
+    "fit_shape",
     "shape_from_dataset",
-    "surface_distances",
     "surface_grid",
     "to_laboratory",
 ]

@@ -1,4 +1,4 @@
-"""Contacts as fits take them: checked, about their mean, in units of their extent."""
+"""Contacts as fits use them: checked, about their mean, in units of their extent."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _NEGATIVE = 1e-8
 
 
 class Touches(NamedTuple):
-    """Contacts in units of their extent, and what is known of them."""
+    """Contacts in units of their extent, with what is known of them."""
 
     position: Array
     whisker_radius: Array
@@ -30,7 +30,7 @@ class Touches(NamedTuple):
     covariance: Array | None
 
     def rows(self, which: Mask) -> Touches:
-        """Pick some."""
+        """Some of the contacts."""
         normal = None if self.normal is None else self.normal[which]
         spread = None if self.covariance is None else self.covariance[which]
         return Touches(self.position[which], self.whisker_radius[which], normal, spread)
@@ -41,7 +41,7 @@ class Touches(NamedTuple):
         return self.covariance is not None and self.covariance.shape[1] == 6
 
     def weights(self) -> Array:
-        """How much each point counts, (n,), whatever the direction of its error; at most 1."""
+        """Weight (n,) of each point, whatever the direction of its error; at most 1."""
         if self.covariance is None:
             return np.ones(len(self.position))
         spread = np.trace(self.covariance[:, :3, :3], axis1=1, axis2=2) + FLOOR**2
@@ -49,13 +49,13 @@ class Touches(NamedTuple):
 
     @property
     def point_covariance(self) -> Array | None:
-        """Of the points alone, (n, 3, 3)."""
+        """Covariances (n, 3, 3) of the points alone."""
         return None if self.covariance is None else self.covariance[:, :3, :3]
 
 
 @dataclass(frozen=True, eq=False)
 class Checked:
-    """What of the given contacts can be used."""
+    """Contacts that can be used."""
 
     usable: Mask
     touches: Touches
@@ -128,7 +128,7 @@ def _scaled(what: str, arrays: dict[str, Array], n: int, least: int) -> Checked:
     extent = float(np.sqrt((centered**2).sum(axis=1).mean()))
     size = np.linalg.svd(centered, compute_uv=False)
     if not size[1] > FLOOR * size[0]:
-        raise ValueError(f"no {what}: all points lie on a line, or are the same")
+        raise ValueError(f"no {what}: all points are on a line, or the same")
     normal = kept["normals"] / length[usable][:, None] if "normals" in kept else None
     spread = _covariance(what, kept, np.flatnonzero(usable), extent)
     touches = Touches(centered / extent, kept["whisker_radius"] / extent, normal, spread)
@@ -150,7 +150,7 @@ def _covariance(
     bad = np.flatnonzero(least < -_NEGATIVE * np.abs(largest))
     if bad.size:
         raise ValueError(
-            f"no {what}: the covariance of point {rows[bad[0]]} is none, a variance being negative"
+            f"no {what}: the covariance of point {rows[bad[0]]} is not one: a variance is negative"
         )
     return np.asarray(out)
 

@@ -15,7 +15,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa.contacts.contact_map import spherical
-from vibrissa.contour import CylinderFit, axis_offset, surface_distances
+from vibrissa.contour import CylinderFit, axis_offset
+from vibrissa.objects import Peg
 from vibrissa.pipeline.comparison import ANGLE_CLASSES
 from vibrissa.signals import nearest_on_rest, within_turn
 from vibrissa.whisker import Whisker
@@ -204,7 +205,7 @@ def score(contacts: xr.Dataset, truth: xr.Dataset, errors: xr.Dataset, fit: Cyli
     radius = float(truth["peg_radius"])
     offset, tilt = axis_offset(fit.origin, fit.axis, origin, axis)
     points, whisker_radius = contacts["contact_point"].values, truth["radius"].values
-    gap = surface_distances(points[known], origin, axis, radius, whisker_radius[known])
+    gap = Peg(origin, axis, radius).signed_distance(points[known]) - whisker_radius[known]
     return Scores(
         touching=int(touching.sum()),
         felt=int(felt.sum()),

@@ -6,7 +6,7 @@ account. All whiskers of a recording count together: they touch one object.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Literal, get_args
 
@@ -20,10 +20,8 @@ from vibrissa.contour import (
     FreeFit,
     SphereFit,
     axis_offset,
-    fit_cylinder,
     fit_free,
-    fit_plane,
-    fit_sphere,
+    fit_shape,
 )
 from vibrissa.objects import Peg, Sphere
 from vibrissa.objects.surface import Surface
@@ -49,13 +47,6 @@ As a standard deviation, rad. Friction along the whisker is seen in the wrench, 
 across the whisker and along the object it is not. Pegs are found best with 0.05 to 0.3 at any
 coefficient of friction up to 0.5, and hardly worse without friction (docs/honest-test.md).
 """
-
-_FITS: dict[str, Callable[..., FittedShape]] = {
-    "cylinder": fit_cylinder,
-    "sphere": fit_sphere,
-    "plane": fit_plane,
-    "free": fit_free,
-}
 
 
 def reconstruct(
@@ -231,9 +222,9 @@ def fit_contacts(
         across = np.eye(3) - known["normals"][:, :, None] * known["normals"][:, None, :]
         known["normal_covariance"] = known["normal_covariance"] + lean**2 * across
     try:
-        if axis is not None:
-            return fit_cylinder(points, axis=axis, **known)
-        return _FITS[shape](points, **known)
+        if shape == "free":
+            return fit_free(points, **known)
+        return fit_shape(shape, points, axis=axis, **known)
     except ValueError as fault:
         found = int(np.isfinite(points).all(axis=1).sum())
         raise ValueError(

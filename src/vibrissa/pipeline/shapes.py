@@ -15,8 +15,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from vibrissa.contour import FittedShape
-from vibrissa.contour.goodness import evidence_of
+from vibrissa.contour import FittedShape, evidence_of
 from vibrissa.pipeline.reconstruct import Shape, fit_contacts, frames_together, scores_of
 from vibrissa.whisker import Whisker
 

@@ -15,8 +15,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from vibrissa.contour import FittedShape
-from vibrissa.contour.mesh import surface_grid
+from vibrissa.contour import FittedShape, surface_grid
 from vibrissa.plots import Course, object_triangles
 from vibrissa.quantities import quantity, shown_unit
 from vibrissa.report.page import Section, paragraph

@@ -1,9 +1,9 @@
-"""How far contact points lie from an object that is known, and how far their covariance says.
+"""Comparison of contact points and fitted axes with objects that are known.
 
 Distances are those of the whisker's surface from the object's, d(p) − ρ. What to expect is drawn,
 not linearised: each point is put where the object's surface should be, moved by errors of its
-covariance as many times as there are replicates, and its distance taken again. So a point that is
-uncertain along a small round object is expected outside of it.
+covariance as many times as there are replicates, and its distance is computed again. So a point
+that is uncertain along a small round object is expected outside of it.
 """
 
 from __future__ import annotations
@@ -16,16 +16,18 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from vibrissa.contour.shape import Body
+from vibrissa.contour.fitted_shape import Body
 from vibrissa.contour.touches import Array
 from vibrissa.quantities import QUANTITIES, attributes, to_display
 
 REPLICATES = 20
+"""Number of draws of each distance."""
+
 CLASSES = 5
-"""How many classes are made where their edges are not given."""
+"""Number of classes where their edges are not given."""
 
 _STEP = 1e-6
-"""Of differences, m."""
+"""Step of differences, m."""
 
 
 def compare_with(
@@ -43,19 +45,19 @@ def compare_with(
     Parameters
     ----------
     body : object of a trial, or fitted shape
-        Anything with ``signed_distance(points)``, m, in the frame of the points.
+        Body with ``signed_distance(points)``, m, in the frame of the points.
     points : array_like (..., 3)
         Contact points on the whisker's centreline, m; NaN gives NaN.
     covariance : array_like (..., 3, 3), optional
-        Of the points, m²; without it nothing is predicted.
+        Covariance of the points, m²; without it nothing is predicted.
     whisker_radius : array_like (...)
-        Of the whisker at the contacts, m.
+        Radius of the whisker at the contacts, m.
     dims : sequence of str
-        Of the points, without that of space.
+        Dimensions of the points, without that of space.
     coords : mapping, optional
-        Of these dims.
+        Coordinates of these dimensions.
     seed : int
-        Of the draws.
+        Seed of the draws.
 
     Returns
     -------
@@ -108,26 +110,26 @@ def distances_by(
     values: ArrayLike,
     edges: ArrayLike | None = None,
 ) -> xr.Dataset:
-    """Sum up sizes of distances by classes of something else.
+    """Summarise sizes of distances by classes of another quantity.
 
     Parameters
     ----------
     compared : xarray.Dataset
-        Of `compare_with`.
+        Dataset of `compare_with`.
     quantity : str
-        What the classes are of, such as ``"deflection_angle"``, ``"r"`` or ``"MB"``.
+        Quantity of the classes, such as ``"deflection_angle"``, ``"r"`` or ``"MB"``.
     values : array_like (...)
-        It at each contact, SI units.
+        Value of the quantity at each contact, SI units.
     edges : array_like (k + 1,), optional
-        Of the classes, rising; the last class holds its upper edge. By default five classes of as
-        many contacts each.
+        Edges of the classes, rising; the last class includes its upper edge. By default five
+        classes of equally many contacts.
 
     Returns
     -------
     xarray.Dataset
-        Dim class with its label: ``lower``, ``upper``, the number of ``contacts``, ``median`` and
-        ``largest_95`` (95 %) of the size of the distance, and both as predicted, m. Classes
-        without contacts are there, with NaN.
+        Dataset of dimension class with its label: ``lower``, ``upper``, the number of ``contacts``,
+        ``median`` and ``largest_95`` (95 %) of the size of the distance, and both as predicted, m.
+        Classes without contacts are kept, with NaN.
 
     Raises
     ------
@@ -135,7 +137,7 @@ def distances_by(
         If shapes do not fit, the quantity is unknown, or the edges do not rise.
     """
     if quantity not in QUANTITIES:
-        raise ValueError(f"{quantity!r} is no known quantity")
+        raise ValueError(f"{quantity!r} is not a known quantity")
     size = np.abs(compared["surface_distance"].values)
     v = np.asarray(values, dtype=np.float64)
     if v.shape != size.shape:
@@ -168,8 +170,8 @@ def distances_by(
 _SUMS = {
     "median": "median distance from the surface",
     "largest_95": "95 % of distances from the surface are smaller",
-    "median_predicted": "median distance as the covariance predicts it",
-    "largest_95_predicted": "95 % of distances, as the covariance predicts it",
+    "median_predicted": "median distance as the covariance predicts",
+    "largest_95_predicted": "95 % of distances, as the covariance predicts",
 }
 
 
@@ -182,7 +184,7 @@ def _edges(values: Array) -> Array:
 
 
 def _sums(size: Array) -> tuple[float, float]:
-    """Median and 95 %; NaN of nothing."""
+    """Median and 95 %; NaN without values."""
     if size.size == 0:
         return float("nan"), float("nan")
     median, most = np.quantile(size, [0.5, 0.95])
@@ -190,7 +192,7 @@ def _sums(size: Array) -> tuple[float, float]:
 
 
 def _predicted(drawn: Array | None, within: Any) -> tuple[float, float]:
-    """The same of draws, the median over replicates."""
+    """Median and 95 % of draws, the median over replicates."""
     if drawn is None:
         return float("nan"), float("nan")
     rows = drawn[:, within]
@@ -205,3 +207,31 @@ def _label(quantity: str, low: float, high: float) -> str:
     """Name a class by its edges, as shown."""
     ends = to_display(quantity, [low, high])
     return f"{ends[0]:.3g}–{ends[1]:.3g}"
+
+
+def axis_offset(
+    origin: ArrayLike, axis: ArrayLike, true_origin: ArrayLike, true_axis: ArrayLike
+) -> tuple[Array, float]:
+    """Offset and tilt of one axis relative to another.
+
+    Parameters
+    ----------
+    origin, axis : array_like (3,)
+        Point, m, and direction of the axis in question; the offset is that of this point.
+    true_origin, true_axis : array_like (3,)
+        Point and direction of the true axis.
+
+    Returns
+    -------
+    offset : array (3,)
+        Vector from the true axis to ``origin``, at right angles to the true axis, m.
+    tilt : float
+        Angle between the axes, rad, at most a quarter turn.
+    """
+    direction, true = (np.asarray(a, dtype=np.float64) for a in (axis, true_axis))
+    direction, true = direction / np.linalg.norm(direction), true / np.linalg.norm(true)
+    away = np.asarray(origin, dtype=np.float64) - np.asarray(true_origin, dtype=np.float64)
+    offset = away - (away @ true) * true
+    # From the cross product: the arc cosine loses half the digits of a small angle.
+    tilt = np.arctan2(np.linalg.norm(np.cross(direction, true)), abs(direction @ true))
+    return offset, float(tilt)

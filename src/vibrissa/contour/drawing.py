@@ -1,16 +1,17 @@
-"""Fitted shapes as grids of points, as far as they were touched: for drawing and export."""
+"""Grids of points for drawing: fitted shapes as far as they were touched, and error ellipsoids."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
+from scipy.stats import chi2
 
-from vibrissa.contour.cylinder import CylinderFit
-from vibrissa.contour.free import FreeFit
-from vibrissa.contour.plane import PlaneFit
-from vibrissa.contour.shape import FittedShape
-from vibrissa.contour.sphere import SphereFit
+from vibrissa.contour.fitted_shape import FittedShape
+from vibrissa.contour.free_surface import FreeFit
+from vibrissa.contour.simple_shapes import CylinderFit, PlaneFit, SphereFit, frame_across
 from vibrissa.contour.touches import Array
 from vibrissa.quantities import attributes
 
@@ -24,29 +25,29 @@ _ROUND = np.pi / 3.0
 def surface_grid(
     shape: FittedShape, points: ArrayLike, count: int = 41, margin: float = 0.15
 ) -> xr.Dataset:
-    """Lay a grid over the part of a fitted shape that was touched.
+    """Grid over the part of a fitted shape that was touched.
 
     Parameters
     ----------
     shape : CylinderFit, SphereFit, PlaneFit or FreeFit
-        The shape.
+        Fitted shape.
     points : array_like (n, 3)
         Contact points, in its frame, m; rows with NaN are left out.
     count : int
-        Points of the grid in each of its two directions.
+        Number of points of the grid in each of its two directions.
     margin : float
-        How far it goes beyond the points, as a share of their width.
+        Margin beyond the points, as a share of their width.
 
     Returns
     -------
     xarray.Dataset
-        Dims u, v, space: ``surface_grid_point`` and its standard deviation ``surface_sigma``
-        across the surface, m.
+        Dataset of dimensions u, v, space: ``surface_grid_point`` and its standard deviation
+        ``surface_sigma`` across the surface, m.
 
     Raises
     ------
     ValueError
-        If there are no points, or the grid has less than two points in a direction.
+        If there are no points, or the grid has fewer than two points in a direction.
     """
     if count < 2:
         raise ValueError(f"count is {count}; at least 2 are needed")
@@ -58,7 +59,7 @@ def surface_grid(
     grid = _over(base, p, count, margin)
     if isinstance(shape, FreeFit):
         added, _ = shape.deviation(grid)
-        # Where nothing is known the surface must not pass through the middle of the base.
+        # Far from all contacts the surface must not pass through the middle of the base.
         added = np.minimum(added, _INWARD * getattr(base, "radius", np.inf))
         grid = grid - added[..., None] * base.outward_normals(grid)
     data = {
@@ -79,7 +80,7 @@ def _over(base: FittedShape, points: Array, count: int, margin: float) -> Array:
         u, v = (_range(away @ axis, count, margin) for axis in (first, second))
         return np.asarray(base.origin + u[:, None, None] * first + v[:, None] * second)
     if isinstance(base, CylinderFit):
-        across = _across(base.axis)
+        across = frame_across(base.axis)
         away = points - base.origin
         u = _turn(np.arctan2(away @ across[1], away @ across[0]), count, margin)[:, None, None]
         v = _range(away @ base.axis, count, margin)[:, None]
@@ -88,19 +89,12 @@ def _over(base: FittedShape, points: Array, count: int, margin: float) -> Array:
     assert isinstance(base, SphereFit)
     normal = base.outward_normals(points)
     pole = np.linalg.svd(normal, full_matrices=True)[2][-1]
-    across = _across(pole)
+    across = frame_across(pole)
     u = _turn(np.arctan2(normal @ across[1], normal @ across[0]), count, margin)[:, None, None]
     latitude = np.arcsin(np.clip(normal @ pole, -1.0, 1.0))
     v = np.clip(_range(latitude, count, margin), -0.5 * np.pi, 0.5 * np.pi)[:, None]
     round_ = np.cos(v) * (np.cos(u) * across[0] + np.sin(u) * across[1]) + np.sin(v) * pole
     return np.asarray(base.origin + base.radius * round_)
-
-
-def _across(axis: Array) -> Array:
-    """Two unit vectors (2, 3) across an axis."""
-    first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
-    first = first / np.linalg.norm(first)
-    return np.stack([first, np.cross(axis, first)])
 
 
 def _range(values: Array, count: int, margin: float) -> Array:
@@ -121,3 +115,83 @@ def _turn(angles: Array, count: int, margin: float) -> Array:
     width = 2.0 * np.pi - gaps[widest]
     beyond = min(margin * width, 0.5 * gaps[widest])
     return np.linspace(start - beyond, start + width + beyond, count)
+
+
+class Ellipsoids(NamedTuple):
+    """Ellipsoids about points.
+
+    Attributes
+    ----------
+    semiaxes : array (..., 3)
+        Lengths of the semiaxes, m, the longest first; NaN where the covariance is.
+    directions : array (..., 3, 3)
+        Unit vectors along them, in rows, right-handed.
+    """
+
+    semiaxes: Array
+    directions: Array
+
+    def surface(self, points: ArrayLike, count: int = 21) -> Array:
+        """Grids over the ellipsoids.
+
+        Parameters
+        ----------
+        points : array_like (..., 3)
+            Centres of the ellipsoids, m.
+        count : int
+            Number of points of a grid in each of its two directions.
+
+        Returns
+        -------
+        array (..., count, count, 3)
+            Points of the ellipsoids, m.
+        """
+        u, v = np.meshgrid(
+            np.linspace(0.0, 2.0 * np.pi, count), np.linspace(0.0, np.pi, count), indexing="ij"
+        )
+        ball = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)], axis=-1)
+        stretched = self.semiaxes[..., :, None] * self.directions
+        away = np.einsum("uvk,...ki->...uvi", ball, stretched)
+        return np.asarray(np.asarray(points, dtype=np.float64)[..., None, None, :] + away)
+
+
+def ellipsoids(covariance: ArrayLike, share: float = 0.95) -> Ellipsoids:
+    """Ellipsoids that contain points with a given probability.
+
+    Parameters
+    ----------
+    covariance : array_like (..., 3, 3)
+        Covariance of points with normally distributed errors, m².
+    share : float
+        Probability, between 0 and 1.
+
+    Returns
+    -------
+    Ellipsoids
+        Semiaxes and their directions.
+
+    Raises
+    ------
+    ValueError
+        If the shape is wrong, or the share is not between 0 and 1.
+
+    Examples
+    --------
+    >>> ellipsoids(np.diag([1.0, 4.0, 9.0])).semiaxes.round(2)
+    array([8.39, 5.59, 2.8 ])
+    """
+    s = np.asarray(covariance, dtype=np.float64)
+    if s.ndim < 2 or s.shape[-2:] != (3, 3):
+        raise ValueError(f"covariance has shape {s.shape}; (..., 3, 3) is needed")
+    if not 0.0 < share < 1.0:
+        raise ValueError(f"share is {share!r}; it must be between 0 and 1")
+    known = np.asarray(np.isfinite(s).all(axis=(-2, -1)))
+    size, direction = np.linalg.eigh(np.where(known[..., None, None], s, np.eye(3)))
+    axes = np.swapaxes(direction, -1, -2)[..., ::-1, :]
+    axes = np.concatenate(
+        [axes[..., :2, :], np.cross(axes[..., :1, :], axes[..., 1:2, :])], axis=-2
+    )
+    half = np.sqrt(chi2.ppf(share, 3) * np.maximum(size[..., ::-1], 0.0))
+    return Ellipsoids(
+        np.where(known[..., None], half, np.nan), np.where(known[..., None, None], axes, np.nan)
+    )

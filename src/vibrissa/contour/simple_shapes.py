@@ -1,0 +1,471 @@
+"""Shapes of a few numbers, each declared by what a fit to contacts needs of it.
+
+With a contact's point p on the whisker's centreline, n the surface's outward normal there and ρ the
+whisker's radius, the equations of contacts with normals are
+
+    cylinder (q the part of p − c across the axis a through c):  q = (R + ρ) n,  n · a = 0,
+    sphere (centre c):  p − c = (R + ρ) n,
+    plane (normal N, height h):  N · p = h + ρ,  n · t = 0 for both t across N.
+
+Normals that count as exact are first projected across a cylinder's axis and contain nothing about
+its direction; of a plane they show only on which side the whisker is.
+
+While a shape is being fitted its lengths are in units of the points' extent. It moves by steps in a
+frame: two unit vectors (2, 3) across its direction, which the fit carries along smoothly.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from vibrissa.contour.fitted_shape import DIRECTION, FittedShape
+from vibrissa.contour.touches import FLOOR, Array, Checked, Touches
+
+_SMALLEST = 1e-3
+"""Radius to start from, at least, as a share of that of the surface that the points are on."""
+
+_TINY = 1e-12
+"""Squared radius to start from, at least, in units of the extent squared."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class SimpleShape(FittedShape):
+    """A shape of a few numbers."""
+
+    origin: Array
+
+    steps: ClassVar[int]
+    """Number of free steps."""
+
+    @classmethod
+    @abstractmethod
+    def starts(cls, given: Checked, known: ArrayLike | None) -> list[tuple[Self, Array]]:
+        """Shapes to start a fit from, and where their frame's first vector points to.
+
+        ``known`` is a cylinder's axis or a point on a plane's free side.
+        """
+
+    @property
+    def direction(self) -> Array:
+        """Unit vector (3,) across which the frame is; any for a shape without one."""
+        return np.array([0.0, 0.0, 1.0])
+
+    @property
+    def size(self) -> float:
+        """Length that a point's scatter is compared with, and that must be positive."""
+        return 1.0
+
+    @abstractmethod
+    def moved(self, step: Array, frame: Array) -> Self:
+        """Shape changed by a step, smoothly, as derivatives by differences need it."""
+
+    @abstractmethod
+    def step_slopes(self, frame: Array) -> Array:
+        """Derivatives (parameters, steps) of the parameters with respect to a step."""
+
+    @abstractmethod
+    def misses(self, touches: Touches, frame: Array) -> tuple[Array, Array]:
+        """Misses (n, m) of contacts with normals, and their derivatives (n, m, 3 or 6)."""
+
+    def relevant(self, frame: Array) -> Array:
+        """Directions (k, 3) in which the scatter of a point matters."""
+        return np.eye(3)
+
+    def arranged(self) -> Self:
+        """Same shape in its usual form."""
+        return self
+
+    def gaps(self, touches: Touches) -> Array:
+        """Distances (n,) of the whisker's surface from the shape's."""
+        return np.asarray(self._distance(touches.position) - touches.whisker_radius)
+
+    def local(self, touches: Touches) -> tuple[Array, Array]:
+        """Normals (n, 3) at the points and their derivatives (n, 3, 3)."""
+        points = touches.position
+        return self._normals(points), self._curvature(points, touches.whisker_radius)
+
+    def in_metres(self, given: Checked, **statistics: Any) -> Self:
+        """Same shape in the frame and unit of the points, with the statistics of its fit."""
+        lengths = {
+            name: given.extent * getattr(self, name)
+            for name, quantity in self.fields.items()
+            if quantity != DIRECTION
+        }
+        lengths["origin"] = given.mean + lengths["origin"]
+        return replace(self, **lengths, **statistics)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class RoundShape(SimpleShape):
+    """A shape whose surface is at one distance from its middle, an axis or a point."""
+
+    radius: float
+
+    @abstractmethod
+    def _away(self, points: Array) -> Array:
+        """Vectors (..., 3) from the middle to points."""
+
+    @property
+    def size(self) -> float:
+        """Radius of the surface."""
+        return self.radius
+
+    @property
+    def diameter(self) -> float:
+        """Diameter of the surface, m."""
+        return 2.0 * self.radius
+
+    @property
+    def diameter_sigma(self) -> float:
+        """Standard deviation of the diameter, m."""
+        return 2.0 * self.sigma["radius"]
+
+    @property
+    def origin_sigma(self) -> Array:
+        """Standard deviations (3,) of the coordinates of the origin, m."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)[:3]))
+
+    def _distance(self, points: Array) -> Array:
+        return np.asarray(np.linalg.norm(self._away(points), axis=-1) - self.radius)
+
+    def _normals(self, points: Array) -> Array:
+        away = self._away(points)
+        size = np.linalg.norm(away, axis=-1, keepdims=True)
+        return np.asarray(away / np.where(size > 0.0, size, 1.0))
+
+    def _far(self, height: Array | float) -> Array:
+        """Distances (..., 1, 1) from the middle at a height above the surface."""
+        far = np.maximum(np.abs(self.radius + np.asarray(height)), FLOOR)
+        return np.asarray(far[..., None, None])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class CylinderFit(RoundShape):
+    """A fitted cylinder, in the frame of the points.
+
+    Attributes
+    ----------
+    origin : array (3,)
+        Point of the axis at the height of the points' mean, m.
+    axis : array (3,)
+        Unit vector along the axis; its largest component is positive.
+    radius : float
+        Radius of the surface, m.
+    covariance : array (7, 7)
+        Covariance of (origin, axis, radius), m and 1; of rank 5, or 3 where the axis was given.
+    residuals : array (n,)
+        Distances of the whisker's surface from the cylinder's, m, positive outside; NaN for
+        points that were missing.
+    inliers : array (n,) of bool
+        Points that were used and whose misfit is at most that of four standard deviations in one
+        dimension.
+    chi_squared : array (n,)
+        Squared misfits of the points used, in standard deviations.
+    equations : int
+        Number of equations of each point; 0 if its noise is not known.
+    """
+
+    axis: Array
+
+    kind: ClassVar[str] = "cylinder"
+    fields: ClassVar[dict[str, str]] = {
+        "origin": "object_position",
+        "axis": "object_axis",
+        "radius": "object_radius",
+    }
+    steps: ClassVar[int] = 5
+    """Two of the origin, one of the radius, two of the axis, which may be left out."""
+
+    @classmethod
+    def starts(cls, given: Checked, known: ArrayLike | None) -> list[tuple[Self, Array]]:
+        """Circles fitted algebraically across the likely axes."""
+        touches = given.touches
+        axes: list[Array] = [np.asarray(known, dtype=np.float64)]
+        if known is None:
+            axes = [*np.linalg.svd(touches.position, full_matrices=False)[2], *np.eye(3)]
+            if touches.normal is not None:
+                axes.append(np.linalg.svd(touches.normal, full_matrices=False)[2][-1])
+        weight = touches.weights()
+        whisker = float(np.average(touches.whisker_radius, weights=weight))
+        shapes = []
+        for axis in axes:
+            axis = axis / np.linalg.norm(axis)
+            sideways = np.eye(3)[int(np.argmin(np.abs(axis)))]
+            frame = frame_across(axis, sideways)
+            center, size = _round(touches.position @ frame.T, weight)
+            radius = max(size - whisker, _SMALLEST * size)
+            shapes.append((cls(origin=center @ frame, axis=axis, radius=radius), sideways))
+        return shapes
+
+    @property
+    def direction(self) -> Array:
+        """The axis."""
+        return self.axis
+
+    def moved(self, step: Array, frame: Array) -> Self:
+        """See `SimpleShape.moved`."""
+        axis = self.axis + step[3:] @ frame[: len(step) - 3]
+        return type(self)(
+            origin=self.origin + step[:2] @ frame,
+            axis=axis / np.linalg.norm(axis),
+            radius=self.radius + float(step[2]),
+        )
+
+    def step_slopes(self, frame: Array) -> Array:
+        """See `SimpleShape.step_slopes`."""
+        slopes = np.zeros((7, 5))
+        slopes[:3, :2] = slopes[3:6, 3:] = frame.T
+        slopes[6, 2] = 1.0
+        return slopes
+
+    def misses(self, touches: Touches, frame: Array) -> tuple[Array, Array]:
+        """See `SimpleShape.misses`."""
+        assert touches.normal is not None
+        far = (self.radius + touches.whisker_radius)[:, None]
+        q = (touches.position - self.origin) @ frame.T
+        normal = touches.normal @ frame.T
+        n = len(q)
+        if not touches.joint:
+            normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+            return q - far * normal, np.broadcast_to(frame, (n, 2, 3))
+        by = np.zeros((n, 3, 6))
+        by[:, :2, :3] = frame
+        by[:, :2, 3:] = -far[..., None] * frame
+        by[:, 2, 3:] = self.axis
+        return np.column_stack([q - far * normal, touches.normal @ self.axis]), by
+
+    def relevant(self, frame: Array) -> Array:
+        """See `SimpleShape.relevant`: across the axis."""
+        return frame
+
+    def arranged(self) -> Self:
+        """Same cylinder, its origin at the height of the mean and its axis upward."""
+        origin = self.origin - (self.origin @ self.axis) * self.axis
+        return replace(self, origin=origin, axis=_upward(self.axis))
+
+    def _away(self, points: Array) -> Array:
+        away = points - self.origin
+        return np.asarray(away - (away @ self.axis)[..., None] * self.axis)
+
+    def _curvature(self, points: Array, height: Array | float = 0.0) -> Array:
+        tangent = np.cross(self.axis, self._normals(points))
+        return np.asarray(tangent[..., :, None] * tangent[..., None, :] / self._far(height))
+
+    def _slopes(self, points: Array) -> Array:
+        normal = self._normals(points)
+        along = ((points - self.origin) @ self.axis)[..., None]
+        return np.concatenate([-normal, -along * normal, -np.ones_like(along)], axis=-1)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class SphereFit(RoundShape):
+    """A fitted sphere, in the frame of the points.
+
+    Attributes
+    ----------
+    origin : array (3,)
+        Centre, m.
+    radius : float
+        Radius of the surface, m.
+    covariance : array (4, 4)
+        Covariance of (origin, radius), m².
+    residuals : array (n,)
+        Distances of the whisker's surface from the sphere's, m, positive outside; NaN for
+        points that were missing.
+    inliers : array (n,) of bool
+        Points that were used and whose misfit is at most that of four standard deviations in one
+        dimension.
+    chi_squared : array (n,)
+        Squared misfits of the points used, in standard deviations.
+    equations : int
+        Number of equations of each point; 0 if its noise is not known.
+    """
+
+    kind: ClassVar[str] = "sphere"
+    fields: ClassVar[dict[str, str]] = {"origin": "object_position", "radius": "object_radius"}
+    steps: ClassVar[int] = 4
+    """Three of the origin, one of the radius."""
+
+    @classmethod
+    def starts(cls, given: Checked, known: ArrayLike | None) -> list[tuple[Self, Array]]:
+        """Spheres fitted algebraically to the points, and linearly to points and normals."""
+        touches = given.touches
+        p, n, weight = touches.position, len(touches.position), touches.weights()
+        whisker = float(np.average(touches.whisker_radius, weights=weight))
+        center, size = _round(p, weight)
+        any_ = np.array([1.0, 0.0, 0.0])
+        shapes = [(cls(origin=center, radius=max(size - whisker, _SMALLEST * size)), any_)]
+        if touches.normal is not None:
+            # p = c + (R + ρ) n
+            normal = touches.normal[:, :, None]
+            system = np.concatenate([np.broadcast_to(np.eye(3), (n, 3, 3)), normal], axis=2)
+            right = p - touches.whisker_radius[:, None] * touches.normal
+            root = np.sqrt(weight)
+            solution = np.linalg.lstsq(
+                (system * root[:, None, None]).reshape(-1, 4),
+                (right * root[:, None]).reshape(-1),
+                rcond=None,
+            )[0]
+            radius = max(float(solution[3]), _SMALLEST)
+            shapes.append((cls(origin=solution[:3], radius=radius), any_))
+        return shapes
+
+    def moved(self, step: Array, frame: Array) -> Self:
+        """See `SimpleShape.moved`."""
+        return type(self)(origin=self.origin + step[:3], radius=self.radius + float(step[3]))
+
+    def step_slopes(self, frame: Array) -> Array:
+        """See `SimpleShape.step_slopes`."""
+        return np.eye(4)
+
+    def misses(self, touches: Touches, frame: Array) -> tuple[Array, Array]:
+        """See `SimpleShape.misses`."""
+        assert touches.normal is not None
+        far = self.radius + touches.whisker_radius
+        by = np.zeros((len(far), 3, 6))
+        by[:, :, :3] = np.eye(3)
+        by[:, :, 3:] = -far[:, None, None] * np.eye(3)
+        miss = touches.position - self.origin - far[:, None] * touches.normal
+        return miss, by if touches.joint else by[:, :, :3]
+
+    def _away(self, points: Array) -> Array:
+        return np.asarray(points - self.origin)
+
+    def _curvature(self, points: Array, height: Array | float = 0.0) -> Array:
+        normal = self._normals(points)
+        flat = np.eye(3) - normal[..., :, None] * normal[..., None, :]
+        return np.asarray(flat / self._far(height))
+
+    def _slopes(self, points: Array) -> Array:
+        normal = self._normals(points)
+        return np.concatenate([-normal, -np.ones((*normal.shape[:-1], 1))], axis=-1)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class PlaneFit(SimpleShape):
+    """A fitted plane, in the frame of the points.
+
+    Attributes
+    ----------
+    origin : array (3,)
+        Point of the plane nearest to the points' mean, m.
+    normal : array (3,)
+        Outward unit vector, toward the whisker.
+    covariance : array (6, 6)
+        Covariance of (origin, normal), m and 1; of rank 3.
+    residuals : array (n,)
+        Distances of the whisker's surface from the plane, m, positive outside; NaN for points
+        that were missing.
+    inliers : array (n,) of bool
+        Points that were used and whose misfit is at most that of four standard deviations in one
+        dimension.
+    chi_squared : array (n,)
+        Squared misfits of the points used, in standard deviations.
+    equations : int
+        Number of equations of each point; 0 if its noise is not known.
+    """
+
+    normal: Array
+
+    kind: ClassVar[str] = "plane"
+    fields: ClassVar[dict[str, str]] = {"origin": "object_position", "normal": "object_axis"}
+    steps: ClassVar[int] = 3
+    """One of the height, two of the normal."""
+
+    @classmethod
+    def starts(cls, given: Checked, known: ArrayLike | None) -> list[tuple[Self, Array]]:
+        """The plane across which the points spread least, facing the free side."""
+        touches = given.touches
+        weight = touches.weights()[:, None]
+        middle = (weight * touches.position).sum(axis=0) / weight.sum()
+        spread = (touches.position - middle) * np.sqrt(weight)
+        widest, _, normal = np.linalg.svd(spread, full_matrices=False)[2]
+        if touches.normal is not None:
+            side = float(np.median(touches.normal @ normal))
+        elif known is not None:
+            outside = np.asarray(known, dtype=np.float64)
+            side = float((outside - given.mean) / given.extent @ normal)
+        else:
+            side = float(normal @ _upward(normal))
+        normal = normal if side >= 0.0 else -normal
+        height = middle @ normal - np.average(touches.whisker_radius, weights=weight[:, 0])
+        return [(cls(origin=height * normal, normal=normal), widest)]
+
+    @property
+    def direction(self) -> Array:
+        """The normal."""
+        return self.normal
+
+    def moved(self, step: Array, frame: Array) -> Self:
+        """See `SimpleShape.moved`."""
+        normal = self.normal + step[1:] @ frame
+        normal = normal / np.linalg.norm(normal)
+        height = self.origin @ self.normal + float(step[0])
+        return type(self)(origin=height * normal, normal=normal)
+
+    def step_slopes(self, frame: Array) -> Array:
+        """See `SimpleShape.step_slopes`: the origin is at the height along the normal."""
+        slopes = np.zeros((6, 3))
+        slopes[:3, 0] = self.normal
+        slopes[:3, 1:] = (self.origin @ self.normal) * frame.T
+        slopes[3:, 1:] = frame.T
+        return slopes
+
+    def misses(self, touches: Touches, frame: Array) -> tuple[Array, Array]:
+        """See `SimpleShape.misses`."""
+        gap, n = self.gaps(touches)[:, None], len(touches.position)
+        if not touches.joint:
+            return gap, np.broadcast_to(self.normal, (n, 1, 3))
+        assert touches.normal is not None
+        by = np.zeros((n, 3, 6))
+        by[:, 0, :3] = self.normal
+        by[:, 1:, 3:] = frame
+        return np.column_stack([gap, touches.normal @ frame.T]), by
+
+    def _distance(self, points: Array) -> Array:
+        return np.asarray((points - self.origin) @ self.normal)
+
+    def _normals(self, points: Array) -> Array:
+        return np.broadcast_to(self.normal, np.shape(points))
+
+    def _curvature(self, points: Array, height: Array | float = 0.0) -> Array:
+        return np.zeros((*points.shape, 3))
+
+    def _slopes(self, points: Array) -> Array:
+        return np.concatenate([-self._normals(points), points - self.origin], axis=-1)
+
+
+SHAPES: dict[str, type[SimpleShape]] = {
+    shape.kind: shape for shape in (PlaneFit, SphereFit, CylinderFit)
+}
+"""Shapes by their kind, the simpler first."""
+
+
+def frame_across(direction: Array, toward: Array | None = None) -> Array:
+    """Two unit vectors (..., 2, 3) across directions, the first as near to ``toward`` as can be."""
+    if toward is None:
+        toward = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction), axis=-1)])
+    along = (toward * direction).sum(axis=-1, keepdims=True)
+    first = toward - along * direction
+    first = first / np.linalg.norm(first, axis=-1, keepdims=True)
+    return np.stack([first, np.cross(direction, first)], axis=-2)
+
+
+def _upward(direction: Array) -> Array:
+    """The direction or its opposite, so that its largest component is positive."""
+    return np.asarray(direction * np.sign(direction[np.argmax(np.abs(direction))]))
+
+
+def _round(points: Array, weight: Array) -> tuple[Array, float]:
+    """Centre and radius of the circle or sphere, fitted algebraically to points (n, 2 or 3)."""
+    root = np.sqrt(weight)
+    # |x|² = 2 c·x + (R² − c²)
+    system = np.column_stack([2.0 * points, np.ones(len(points))]) * root[:, None]
+    solution = np.linalg.lstsq(system, (points**2).sum(axis=1) * root, rcond=None)[0]
+    center = solution[:-1]
+    return center, float(np.sqrt(max(float(solution[-1] + center @ center), _TINY)))

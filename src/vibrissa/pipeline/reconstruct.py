@@ -211,7 +211,7 @@ def fit_contacts(
     if not (np.isfinite(lean) and lean >= 0.0):
         raise ValueError(f"lean is {lean!r}; an angle from 0 is needed, rad")
     points = _rows(estimates["contact_point"])
-    known = {
+    known: dict[str, Any] = {
         "normals": _rows(estimates["contact_normal"]),
         "whisker_radius": whisker_radii(estimates, whiskers).reshape(-1),
     }

@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 import vibrissa as vb
 from vibrissa.contacts.contact_map import within_paper_bounds
 from vibrissa.evaluation import ANGLES
-from vibrissa.paper import LookupTable
-from vibrissa.paper.network import DrawnContacts, draw_contacts
+from vibrissa.paper import DrawnContacts, LookupTable, draw_contacts
 from vibrissa.signals import SIGNALS, nearest_on_rest, selection
 
 Array = NDArray[np.float64]
@@ -47,11 +46,17 @@ def timed(work: Callable[[], object]) -> tuple[object, float]:
     return answer, time.process_time() - begun
 
 
+def estimate(contacts, signals, triplet, method):
+    if method == "exact":
+        return contacts.estimate(signals, triplet)
+    return vb.paper.estimate(contacts, signals, triplet, method=method)
+
+
 def by_estimate(contacts, drawn, rows, triplet, method, name) -> Result:
     signals = dict(zip(SIGNALS, drawn.signals[rows].T, strict=True))
     few = {key: column[:1] for key, column in signals.items()}
-    _, first = timed(lambda: contacts.estimate(few, triplet, method=method))
-    found, all_of_them = timed(lambda: contacts.estimate(signals, triplet, method=method))
+    _, first = timed(lambda: estimate(contacts, few, triplet, method))
+    found, all_of_them = timed(lambda: estimate(contacts, signals, triplet, method))
     away = np.linalg.norm(found.candidates - drawn.point[rows, None], axis=-1)
     errors = np.where(np.isnan(away), np.inf, away).min(axis=1)
     errors[np.isinf(errors)] = np.nan
@@ -82,8 +87,8 @@ def main() -> None:
     angle = np.degrees(np.arctan2(distance, arc_length))
     # Compiled kernels load once; what follows is the methods' own time.
     warm = dict(zip(SIGNALS, drawn.signals[:2].T, strict=True))
-    contact_map.estimate(warm, "FT Mx MB", method="exact")
-    contact_map.estimate(warm, "FT Mx MB", method="lookup")
+    contact_map.estimate(warm, "FT Mx MB")
+    vb.paper.estimate(contact_map, warm, "FT Mx MB", method="lookup")
     results = [
         by_estimate(contact_map, drawn, rows, triplet, "exact", "exact"),
         by_estimate(contact_map, drawn, rows, triplet, "lookup", "natural"),

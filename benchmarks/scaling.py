@@ -19,7 +19,7 @@ from typing import Any
 
 import vibrissa as vb
 from vibrissa.cameras import orthogonal_views
-from vibrissa.paper.network import draw_contacts
+from vibrissa.paper import draw_contacts
 from vibrissa.signals import SIGNALS
 from vibrissa.simulation import array_whisking, facing_peg, simulate, sweep_past
 from vibrissa.simulation.film import film_frames

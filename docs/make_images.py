@@ -22,7 +22,8 @@ import vibrissa as vb
 from vibrissa import plots
 from vibrissa.cli.figures import witnesses
 from vibrissa.contour import compare_with, distances_by, shape_from_dataset
-from vibrissa.identifiability import critical_cones, error_solid, signal_slice
+from vibrissa.identifiability import critical_cones
+from vibrissa.paper import error_solid, signal_slice
 from vibrissa.pipeline import with_contour, with_estimates
 from vibrissa.recording import Recording
 from vibrissa.signals import nearest_on_rest

@@ -5,6 +5,7 @@ import importlib
 import os
 import shutil
 import signal
+from dataclasses import replace
 from pathlib import Path
 
 os.environ.setdefault("MPLBACKEND", "Agg")
@@ -118,6 +119,12 @@ def browser():
 def gamma_map() -> vb.ContactMap:
     """The default whisker's map."""
     return vb.ContactMap.simulate(vb.samples.gamma(), grid=False)
+
+
+@pytest.fixture(scope="session")
+def gridded_map(gamma_map) -> vb.ContactMap:
+    """The default whisker's map with the paper's grid."""
+    return replace(gamma_map, grid=vb.ContactMap.simulate(gamma_map.whisker).grid)
 
 
 @pytest.fixture

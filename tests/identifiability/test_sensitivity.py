@@ -8,24 +8,22 @@ import xarray as xr
 
 import vibrissa as vb
 from vibrissa.contacts.contact_map import spherical
-from vibrissa.identifiability import error_solid, signal_slice
-from vibrissa.numerics import contact_weights, weighted_quantile
-from vibrissa.paper.differences import interpolation_errors, within_turn
+from vibrissa.numerics import weighted_quantile
 from vibrissa.signals import TRIPLETS
 
 NOISE = np.diag(np.repeat([1e-12, 4e-16], 3))
 
 
 @pytest.fixture(scope="module")
-def nodes(gamma_map):
-    return vb.sensitivity(gamma_map, noise=NOISE)
+def coarse(gridded_map):
+    """The map with every third azimuth and elevation of the paper's grid."""
+    grid = gridded_map.grid.isel(theta=slice(None, None, 3), phi=slice(1, None, 3))
+    return replace(gridded_map, grid=grid)
 
 
 @pytest.fixture(scope="module")
-def coarse(gamma_map):
-    """The map with every third azimuth and elevation of the paper's grid."""
-    grid = vb.ContactMap.simulate(gamma_map.whisker).grid
-    return replace(gamma_map, grid=grid.isel(theta=slice(None, None, 3), phi=slice(1, None, 3)))
+def nodes(gamma_map):
+    return vb.sensitivity(gamma_map, noise=NOISE)
 
 
 @pytest.fixture(scope="module")
@@ -162,7 +160,8 @@ def test_ellipsoids_are_those_of_the_covariance_of_estimates(gamma_map, nodes, r
 def test_regions_and_volume(coarse, nodes, rng):
     at = some(nodes, rng, 40)
     bent = vb.deflect(
-        coarse.whisker, vb.PointContact(at.contact_point.transpose("contact", "space").to_numpy())
+        coarse.whisker,
+        vb.PointContact(at.contact_point.transpose("contact", "space").to_numpy()),
     )
     line = bent.centerline(2001)
     node = np.rint(bent.arc_length / coarse.whisker.length * 2000).astype(int)
@@ -177,52 +176,6 @@ def test_regions_and_volume(coarse, nodes, rng):
     by_grid = float((grid.volume * np.where(ends, 0.5, 1.0)).sum())
     by_nodes = float(nodes.volume.where(nodes.within_paper_bounds).sum())
     assert by_nodes == pytest.approx(by_grid, rel=0.05)
-
-
-def test_differences_on_an_exact_table_are_the_derivatives(coarse, nodes, rng):
-    at = some(nodes, rng, 15)
-    points = at.contact_point.transpose("contact", "space").to_numpy()
-    exact = vb.sensitivity(coarse, at=points)
-    grid = coarse.grid
-    reached = (grid.status == vb.Status.OK).to_numpy()
-    span = [np.ptp(grid[n].to_numpy()[reached]) for n in ("Fx", "MB")]
-    low = [grid[n].to_numpy()[reached].min() for n in ("Fx", "MB")]
-
-    def inversion(places, values):
-        def look_up(wanted):
-            signals = {
-                "Fx": low[0] + wanted[:, 0] * span[0],
-                "MB": low[1] + wanted[:, 1] * span[1],
-                "MD": -np.pi + wanted[:, 2] * 2.0 * np.pi,
-            }
-            return spherical(nearest(coarse.estimate(signals), points))
-
-        return look_up
-
-    found = vb.sensitivity(
-        coarse, at=points, method="differences", interpolation=inversion, step=1e-7
-    )
-    for name in ("sensitivity", "point_sensitivity"):
-        got, wanted = found[name].to_numpy(), exact[name].to_numpy()
-        scale = np.linalg.norm(wanted, axis=1, keepdims=True)
-        assert np.nanmedian(np.abs(got - wanted) / scale) < 1e-4
-
-
-def test_differences_come_nearer_on_a_finer_table(coarse, nodes, rng):
-    at = some(nodes, rng, 200)
-    inside = at.within_paper_bounds.to_numpy()
-    points = at.contact_point.transpose("contact", "space").to_numpy()[inside]
-    exact = vb.sensitivity(coarse, at=points).sensitivity
-    thinned = replace(
-        coarse, grid=coarse.grid.isel(theta=slice(None, None, 3), phi=slice(None, None, 3))
-    )
-    errors = []
-    for contacts in (thinned, coarse):
-        found = vb.sensitivity(contacts, at=points, method="differences", interpolation="linear")
-        away = np.abs(found.sensitivity - exact) / np.abs(exact)
-        errors.append(np.nanmedian(away))
-    # In r, where both have the paper's 15 steps, neither is better.
-    assert errors[1] < 0.85 * errors[0]
 
 
 def test_the_best_triplet_has_the_least_error(gamma_map, nodes, rng):
@@ -249,35 +202,6 @@ def test_the_best_triplet_has_the_least_error(gamma_map, nodes, rng):
     assert float(deaf.share.sel(triplet="Fx FT FD")) > 0.99
 
 
-def test_findings_of_a_straight_whisker_follow_from_its_symmetry(straight_map):
-    found = vb.sensitivity_findings(vb.sensitivity(straight_map))
-    # About its axis all is the same: M_D turns the contact and leaves r alone.
-    assert float(found.share_of_motion.sel(coordinate="r", signal="MD")) < 1e-20
-    np.testing.assert_allclose(found.share_of_motion.sum("coordinate"), 1.0)
-    ratio = found.backward_over_forward.stack(entry=("coordinate", "signal"))
-    np.testing.assert_allclose(ratio.drop_sel(entry=("r", "MD")), 1.0, atol=1e-3)
-
-
-def test_the_papers_findings_hold_for_the_gamma_whisker(nodes):
-    found = vb.sensitivity_findings(nodes)
-    assert float(found.share_of_motion.sel(coordinate="r", signal="MD")) < 0.25
-    sizes = found.small_over_large.sel(signal=["Fx", "MB"])
-    assert (sizes > 1.0).all()
-    ratio = found.backward_over_forward.sel(coordinate="theta", signal="MB")
-    assert not 0.5 < float(ratio) < 2.0
-
-
-def test_findings_ask_only_the_region(nodes):
-    region = nodes.concave_backward & ~nodes.small_deflection
-    found = vb.sensitivity_findings(nodes, region)
-    sizes = np.abs(nodes.sensitivity.sel(coordinate="r", signal="Fx")).to_numpy()[region.to_numpy()]
-    volume = nodes.volume.to_numpy()[region.to_numpy()]
-    wanted = weighted_quantile(sizes, volume)
-    assert float(found.median_size.sel(coordinate="r", signal="Fx")) == pytest.approx(float(wanted))
-    assert np.isnan(found.backward_over_forward).all()
-    assert contact_weights(nodes, region).sum() == pytest.approx(volume.sum())
-
-
 def test_weighted_quantiles():
     values = np.random.default_rng(4).normal(size=501)
     assert weighted_quantile(values, np.ones(501)) == pytest.approx(np.median(values))
@@ -300,8 +224,6 @@ def test_weighted_quantiles():
         ({"noise": {"Fx": 1.0}}, "lacks MB, MD"),
         ({"noise": np.eye(3)}, r"got shape \(3, 3\)"),
         ({"noise": {"Fx": -1.0, "MB": 1.0, "MD": 1.0}}, "≥ 0"),
-        ({"method": "guess"}, "'guess'"),
-        ({"method": "differences"}, "has no grid"),
     ],
 )
 def test_what_does_not_fit_is_said(gamma_map, arguments, words):
@@ -309,48 +231,6 @@ def test_what_does_not_fit_is_said(gamma_map, arguments, words):
         vb.sensitivity(gamma_map, **arguments)
 
 
-def test_bad_steps_and_no_triplets_are_refused(coarse):
-    with pytest.raises(ValueError, match="step"):
-        vb.sensitivity(coarse, method="differences", step=0.0)
+def test_no_triplets_are_refused(gamma_map):
     with pytest.raises(ValueError, match="at least one triplet"):
-        vb.best_triplet(coarse, NOISE, triplets=[])
-
-
-def test_a_slice_holds_one_signal_and_is_exact(coarse):
-    found = signal_slice(coarse, points=24)
-    there = np.isfinite(found.r.to_numpy())
-    assert 0.2 < there.mean() < 0.95
-    points = found.contact_point.to_numpy()[there]
-    bent = vb.deflect(coarse.whisker, vb.PointContact(points))
-    signals = vb.base_signals(bent.force, bent.moment)
-    fx, mb = np.meshgrid(found.Fx, found.MB, indexing="ij")
-    assert found.r.dims == ("Fx", "MB")
-    # A point near rest tells its force no better than it is met.
-    strong = mb[there] > 1e-7
-    np.testing.assert_allclose(signals.MB[strong], mb[there][strong], rtol=1e-4)
-    np.testing.assert_allclose(signals.Fx[strong], fx[there][strong], rtol=1e-3, atol=2e-8)
-    np.testing.assert_allclose(signals.MD[strong], -0.5 * np.pi, atol=1e-4)
-    error = found.error_distance.to_numpy()[there]
-    assert 0.0 < np.nanmedian(error) < 2e-3
-    with pytest.raises(ValueError, match="to be fixed"):
-        signal_slice(coarse, {"Mx": 0.0})
-
-
-def test_contacts_between_the_grid_have_errors(coarse):
-    found = error_solid(coarse, stride=6)
-    assert np.isfinite(found.error_distance).sum() > 50
-    # On the grid itself there is none.
-    on_grid = vb.sensitivity(coarse, at="grid").isel(contact=slice(None, None, 97))
-    assert np.nanmedian(interpolation_errors(coarse, on_grid, interpolation="linear")) < 1e-8
-    assert np.nanmedian(found.error_distance) > 1e-5
-
-
-def test_directions_a_turn_away_are_looked_up_at_the_same_place(coarse):
-    at = coarse.to_dataset("paper").isel(station=slice(None, None, 3), bearing=slice(None, None, 4))
-    turned = at.assign(MD=at["MD"] + 2.0 * np.pi)
-    errors = interpolation_errors(coarse, at, interpolation="linear")
-    assert np.isfinite(errors).sum() > 50
-    np.testing.assert_allclose(interpolation_errors(coarse, turned, interpolation="linear"), errors)
-    directions = np.array([[1.5 * np.pi, 5.0], [-np.pi, -5.0], [np.pi, 0.0]])
-    wanted = [[-0.5 * np.pi, 5.0], [np.pi, -5.0], [np.pi, 0.0]]
-    np.testing.assert_allclose(within_turn(directions, np.array([True, False])), wanted)
+        vb.best_triplet(gamma_map, NOISE, triplets=[])

@@ -1,7 +1,5 @@
 """Verdicts against physics: what is known of straight, planar, tapered and cylindrical whiskers."""
 
-import functools
-
 import numpy as np
 import pytest
 import xarray as xr
@@ -11,7 +9,6 @@ from vibrissa.identifiability import save_uniqueness, verdict_table
 from vibrissa.identifiability.regions import place, sample, spread
 from vibrissa.identifiability.summary import choice, notation
 from vibrissa.identifiability.twins import twins
-from vibrissa.paper import network
 from vibrissa.rod import chart_of, contact_tangents, discretize, solve_forces, with_normal_force
 from vibrissa.signals import REGIONS, TRIPLETS
 
@@ -297,23 +294,6 @@ def test_tangents_at_contacts_are_those_of_the_centreline():
     np.testing.assert_allclose(
         contact_tangents(d, contact)[0], chord / np.linalg.norm(chord), atol=1e-6
     )
-
-
-def test_a_network_is_evidence_too(curved, monkeypatch, tmp_path):
-    # A small one, so that it is quick: it errs far more where contacts feel the same.
-    small = functools.partial(network.train_network, samples=1500, held_out=500)
-    monkeypatch.setattr(network, "train_network", small)
-    found = vb.uniqueness(
-        curved, ["Fx FT MB", "Fx MB MD"], ["all"], samples=64, resolution=False, network=True
-    )
-    error = found.network_error.sel(region="all")
-    assert error.sizes["quantile"] == 2
-    assert (error.sel(quantile=0.95) > error.sel(quantile=0.5)).all()
-    assert float(error.sel(triplet="Fx FT MB", quantile=0.5)) > 4.0 * float(
-        error.sel(triplet="Fx MB MD", quantile=0.5)
-    )
-    save_uniqueness(found, tmp_path / "u.csv")
-    assert "network_error_0.95" in (tmp_path / "u.csv").read_text()
 
 
 def verdicts(**words):

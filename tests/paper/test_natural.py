@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull, Voronoi
 
-from vibrissa.paper.natural import NaturalNeighbour
+from vibrissa.paper import NaturalNeighbour
 
 METHODS = ("natural", "linear")
 UNSCALED = np.ones(3)

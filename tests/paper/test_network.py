@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 import vibrissa as vb
-from vibrissa.paper.network import draw_contacts, train_network
+from vibrissa.identifiability import save_uniqueness
+from vibrissa.paper import draw_contacts, estimate, train_network, with_network_errors
 from vibrissa.signals import SIGNALS, within_cone
 
 SMALL = {"samples": 4000, "held_out": 1000}
@@ -60,17 +61,37 @@ def test_the_same_seed_gives_the_same_network(gamma_map):
 
 
 def test_estimates_by_network(gamma_map, trained, monkeypatch):
-    monkeypatch.setitem(gamma_map.approximations, ("network", trained.names), trained)
+    monkeypatch.setattr(
+        "vibrissa.paper.approximation.train_network", lambda contacts, names: trained
+    )
     drawn = draw_contacts(gamma_map, 200, seed=4)
     signals = dict(zip(SIGNALS, drawn.signals.T, strict=True))
-    found = gamma_map.estimate(signals, method="network", noise={"Fx": 1e-6, "MB": 1e-8, "MD": 0.1})
+    noise = {"Fx": 1e-6, "MB": 1e-8, "MD": 0.1}
+    found = estimate(gamma_map, signals, method="network", noise=noise)
     assert (found.status == vb.Status.APPROXIMATE).mean() > 0.98
     away = np.linalg.norm(found.point - drawn.point, axis=1)
     assert np.nanmedian(away) < 0.02 * gamma_map.whisker.length
     assert np.isfinite(found.covariance).all(axis=(1, 2)).mean() > 0.98
-    far = gamma_map.estimate({"Fx": [1.0, np.nan], "MB": 1e-3, "MD": 0.0}, method="network")
+    far = estimate(gamma_map, {"Fx": [1.0, np.nan], "MB": 1e-3, "MD": 0.0}, method="network")
     assert far.status.tolist() == [vb.Status.OUTSIDE_MAP, vb.Status.MISSING]
     assert np.isnan(far.point).all()
+
+
+def test_a_network_is_evidence_on_verdicts(tmp_path):
+    # A small one, so that it is quick: it errs far more where contacts have the same signals.
+    curved = vb.ContactMap.simulate(vb.samples.curved(), grid=False)
+    verdicts = vb.uniqueness(
+        curved, ["Fx FT MB", "Fx MB MD"], ["all"], samples=64, resolution=False
+    )
+    found = with_network_errors(curved, verdicts, samples=1500, held_out=500)
+    error = found.network_error.sel(region="all")
+    assert error.sizes["quantile"] == 2
+    assert (error.sel(quantile=0.95) > error.sel(quantile=0.5)).all()
+    assert float(error.sel(triplet="Fx FT MB", quantile=0.5)) > 4.0 * float(
+        error.sel(triplet="Fx MB MD", quantile=0.5)
+    )
+    save_uniqueness(found, tmp_path / "u.csv")
+    assert "network_error_0.95" in (tmp_path / "u.csv").read_text()
 
 
 def test_what_it_refuses(gamma_map):

@@ -186,7 +186,7 @@ def _derivatives(contact_map: ContactMap) -> xr.Dataset:
 
 def _solid(contact_map: ContactMap) -> tuple[xr.Dataset, xr.Dataset | None]:
     """The slice at M_D = −π/2, and all contacts with the errors of a look-up in the grid."""
-    from vibrissa.identifiability import error_solid, signal_slice
+    from vibrissa.paper import error_solid, signal_slice
 
     return signal_slice(contact_map), None if contact_map.grid is None else error_solid(contact_map)
 

@@ -70,6 +70,7 @@ def uniqueness(
     from vibrissa.identifiability import uniqueness as judge
     from vibrissa.identifiability.summary import ENDINGS
     from vibrissa.io.paths import check_writable
+    from vibrissa.paper import with_network_errors
 
     if path is not None:
         check_writable(path, ENDINGS)
@@ -86,9 +87,12 @@ def uniqueness(
             min_separation=min_separation,
             samples=samples,
             resolution=resolution,
-            network=network,
             progress=lambda done, total: tell("verdicts", done, total),
         )
+        if network:
+            found = with_network_errors(
+                contact_map, found, progress=lambda done, total: tell("networks", done, total)
+            )
     output.print(f"{contact_map.whisker!r}\n", highlight=False, soft_wrap=True)
     output.print(verdict_table(found), highlight=False, soft_wrap=True, markup=False)
     _print_witness(found)

@@ -327,10 +327,10 @@ def estimated(
 
 
 def _check_method(method: str, names: tuple[str, ...], all_six: bool) -> None:
-    from vibrissa.paper.approximation import APPROXIMATE
+    from vibrissa.paper import METHODS
 
-    if method not in ("exact", *APPROXIMATE):
-        allowed = ", ".join(("exact", *APPROXIMATE))
+    if method not in ("exact", *METHODS):
+        allowed = ", ".join(("exact", *METHODS))
         raise ValueError(f"--method is {method!r}; one of {allowed} is needed")
     if method == "exact":
         return

@@ -41,8 +41,6 @@ from vibrissa.whisker import Whisker
 if TYPE_CHECKING:
     from vibrissa.contacts.estimate import Estimate
     from vibrissa.contacts.prior import Prior
-    from vibrissa.paper.lookup import LookupTable
-    from vibrissa.paper.network import NetworkSolver
 
 #: The paper's grid: radii over L, azimuth and elevation in rad.
 GRID_RADII = np.linspace(0.3, 1.0, 15)
@@ -68,17 +66,12 @@ class ContactMap:
     grid : Dataset or None
         The paper's grid: ``force``, ``moment``, ``arc_length``, the six signals and ``status`` over
         (r, theta, phi).
-    approximations : dict
-        Look-up tables and networks made so far, by kind and signals.
     """
 
     whisker: Whisker
     chart: StableSet
     steps: int = STEPS
     grid: xr.Dataset | None = None
-    approximations: dict[tuple[str, tuple[str, ...]], LookupTable | NetworkSolver] = field(
-        default_factory=dict, repr=False
-    )
     _trees: dict[tuple[str, ...], SearchTree] = field(default_factory=dict, repr=False)
     _determining: dict[tuple[str, ...], bool] = field(default_factory=dict, repr=False)
 
@@ -125,7 +118,6 @@ class ContactMap:
         signals: xr.Dataset | Mapping[str, ArrayLike],
         triplet: str | tuple[str, ...] = ("Fx", "MB", "MD"),
         noise: Mapping[str, float] | ArrayLike | None = None,
-        method: str = "exact",
         stiffness_sigma: float = 0.0,
         gain_sigma: float | ArrayLike = 0.0,
         mixing_sigma: float | ArrayLike = 0.0,
@@ -142,10 +134,6 @@ class ContactMap:
         noise : mapping or (6, 6) array_like, optional
             Standard deviation of each signal, or covariance of (F, M), SI units; gives each
             estimate's covariance, and weighs more than three signals.
-        method : {"exact", "lookup", "lookup-linear", "network"}
-            Exact; or, for comparison, the paper's ways, from three signals: its look-up table,
-            natural-neighbour or linear, which needs the grid, or a network, trained on first use
-            (ten seconds). They see one contact where there are several.
         stiffness_sigma : float
             Relative standard deviation of the whisker's bending stiffness E r⁴, such as
             ``fit_stiffness`` tells or √(σ_E² + 16 σ_r²) of those of modulus and radius; it adds to
@@ -171,7 +159,6 @@ class ContactMap:
             signals,
             triplet,
             noise,
-            method,
             stiffness_sigma,
             gain_sigma,
             mixing_sigma,

@@ -10,9 +10,8 @@ signals by their derivatives.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,7 +32,6 @@ from vibrissa.contacts.prior import Prior, among_allowed
 from vibrissa.contacts.readout import Named
 from vibrissa.contacts.showing import estimate_card, estimate_rows
 from vibrissa.numerics import AnyArray, Array, IntArray
-from vibrissa.paper.approximation import APPROXIMATE, by_approximation
 from vibrissa.quantities import attributes
 from vibrissa.signals import Coordinates, measured, selection, signal_scales
 from vibrissa.sketch import lines
@@ -221,14 +219,12 @@ def estimate(
     signals: xr.Dataset | Mapping[str, ArrayLike],
     triplet: str | tuple[str, ...] = ("Fx", "MB", "MD"),
     noise: Mapping[str, float] | ArrayLike | None = None,
-    method: str = "exact",
     stiffness_sigma: float = 0.0,
     gain_sigma: float | ArrayLike = 0.0,
     mixing_sigma: float | ArrayLike = 0.0,
     prior: Prior | None = None,
 ) -> Estimate:
     """Find all frictionless contacts of a whisker that explain measured signals."""
-    explain = _method(method)
     names = selection(triplet)
     errors = common_errors(stiffness_sigma, gain_sigma, mixing_sigma)
     sensor = sensor_noise(noise, names, errors)
@@ -237,7 +233,7 @@ def estimate(
     shape = values.shape[:-1]
     d = contact_map.chart.discretization
     targets = values.reshape(-1, len(names)) / signal_scales(names, d.force, d.moment)
-    found = explain(contact_map, names, targets, sensor)
+    found = _explained(contact_map, names, targets, sensor)
     if prior is not None:
         readout = Named(contact_map, names, sensor)
         found = among_allowed(prior, contact_map, readout, targets, found)
@@ -269,7 +265,7 @@ def estimate(
     )
 
 
-def _exact(
+def _explained(
     contact_map: ContactMap, names: tuple[str, ...], targets: Array, sensor: SensorNoise | None
 ) -> Explanation:
     if not contact_map.determines(names):
@@ -279,14 +275,3 @@ def _exact(
     else:
         found = by_least_squares(contact_map, names, targets, sensor)
     return found if sensor is None else under_noise(contact_map, names, targets, sensor, found)
-
-
-def _method(
-    method: str,
-) -> Callable[[ContactMap, tuple[str, ...], Array, SensorNoise | None], Explanation]:
-    if method == "exact":
-        return _exact
-    if method in APPROXIMATE:
-        return partial(by_approximation, method)
-    known = ", ".join(repr(name) for name in ("exact", *APPROXIMATE))
-    raise ValueError(f"method is one of {known}; got {method!r}")

@@ -3,17 +3,14 @@
 from vibrissa.identifiability.best_triplet import best_triplet
 from vibrissa.identifiability.cones import critical_cones
 from vibrissa.identifiability.sensitivity import sensitivity
-from vibrissa.identifiability.slices import error_solid, signal_slice
 from vibrissa.identifiability.summary import save_uniqueness, verdict_table
 from vibrissa.identifiability.verdicts import uniqueness
 
 __all__ = [
     "best_triplet",
     "critical_cones",
-    "error_solid",
     "save_uniqueness",
     "sensitivity",
-    "signal_slice",
     "uniqueness",
     "verdict_table",
 ]

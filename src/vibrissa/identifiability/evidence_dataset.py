@@ -10,16 +10,11 @@ import xarray as xr
 from vibrissa.identifiability.confirm import FINER, found_again
 from vibrissa.identifiability.evidence import OFF_SURFACE, WITNESSES, Answer, Question
 from vibrissa.identifiability.fibres import corrected, units
-from vibrissa.identifiability.regions import place
 from vibrissa.identifiability.resolution import TOLERANCES
 from vibrissa.identifiability.summary import choice, notation
-from vibrissa.numerics import Array
 from vibrissa.quantities import attributes
 from vibrissa.rod import discretize
 from vibrissa.signals import SIGNALS, signal_scales
-
-#: Quantiles of a network's errors.
-QUANTILES = (0.5, 0.95)
 
 
 def labelled(
@@ -27,7 +22,6 @@ def labelled(
     names: tuple[tuple[str, ...], ...],
     answers: list[Answer],
     resolution: bool,
-    errors: Array | None,
 ) -> xr.Dataset:
     """Put everything into one dataset."""
     cell = ("triplet", "region")
@@ -76,14 +70,7 @@ def labelled(
             np.stack([a.surface_angle.T for a in answers]),
             _about("rad", "elevation from the surface that ambiguous contacts reach"),
         )
-    if errors is not None:
-        data["network_error"] = (
-            (*cell, "quantile"),
-            errors,
-            _about("m", "error of a network on contacts that it was not trained on"),
-        )
     coords = {
-        "quantile": list(QUANTILES),
         "triplet": [" ".join(triplet) for triplet in names],
         "region": list(question.regions),
         "signal_tolerance": list(TOLERANCES),
@@ -196,23 +183,4 @@ def _witnesses(
                 _about("m", f"move of the second contact at {FINER} times the steps"),
             ),
         }
-    )
-
-
-def network_errors(question: Question, names: tuple[str, ...]) -> Array:
-    """Quantiles of the errors of a trained network, (regions, quantiles), m."""
-    from vibrissa.paper.network import train_network
-
-    contact_map = question.contact_map
-    d = contact_map.chart.discretization
-    solver = train_network(contact_map, names, seed=question.seed)
-    held = solver.held_out
-    values = np.concatenate([held.force / d.force, held.point / d.length], axis=1)
-    places = place(contact_map, held.contacts, values, question.domain)
-    outside = places.angle > question.cone
-    return np.stack(
-        [
-            solver.error_quantiles(QUANTILES, places.members(region) & outside)
-            for region in question.regions
-        ]
     )

@@ -2,8 +2,8 @@
 
 Three signals T locate the contact point p, so ∂p/∂T says what a small change of a signal, or its
 noise, does to the estimate: noise of covariance Σ spreads p by ∂p/∂T Σ (∂p/∂T)ᵀ, an ellipsoid. The
-derivatives are exact (:mod:`vibrissa.contacts.jacobian`), or for comparison the central differences
-of Huet, Emnett & Hartmann (2022) on an interpolated table (:mod:`vibrissa.paper.differences`).
+derivatives are exact (:mod:`vibrissa.contacts.jacobian`); for those of Huet, Emnett & Hartmann
+(2022) on an interpolated table see :func:`vibrissa.paper.central_differences`.
 
 Toward rest, where force and moment vanish and directions lose their meaning, the derivatives grow
 without bound. They are given there all the same; summaries leave out contacts within 2° of rest, as
@@ -12,7 +12,7 @@ the paper does.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
@@ -27,7 +27,6 @@ from vibrissa.contacts.contact_map import spherical, within_paper_bounds
 from vibrissa.contacts.jacobian import contact_signal_derivatives, spherical_derivatives
 from vibrissa.contacts.noise import Noise, SensorNoise, ellipsoids
 from vibrissa.numerics import Array
-from vibrissa.paper.differences import STEP, Interpolation, central_differences
 from vibrissa.quantities import attributes, quantity
 from vibrissa.signals import base_signals, concave_backward, nearest_on_rest, selection, within_cone
 from vibrissa.status import flag_attributes
@@ -42,9 +41,6 @@ def sensitivity(
     at: At = None,
     *,
     noise: Noise | None = None,
-    method: Literal["exact", "differences"] = "exact",
-    interpolation: Interpolation = "natural",
-    step: float = STEP,
 ) -> xr.Dataset:
     """Derivatives of the contact point with respect to the three signals that locate it.
 
@@ -62,13 +58,6 @@ def sensitivity(
     noise : mapping or (6, 6) array_like, optional
         Standard deviation of each signal of the triplet, or covariance of (F, M), SI units; gives
         the error ellipsoids.
-    method : {"exact", "differences"}
-        Exact, or the paper's central differences on the interpolated grid.
-    interpolation : {"natural", "linear"} or callable
-        For differences: natural-neighbour as the paper's, or linear; or what, called as
-        ``interpolation(places, values)``, returns what is called with other places.
-    step : float
-        Of the differences, as a share of each signal's range; the paper's is 0.05 %.
 
     Returns
     -------
@@ -85,7 +74,7 @@ def sensitivity(
     Raises
     ------
     ValueError
-        If the triplet, the contacts, the noise or the method do not fit.
+        If the triplet, the contacts or the noise do not fit.
 
     Examples
     --------
@@ -101,20 +90,14 @@ def sensitivity(
     d = contact_map.chart.discretization
     out = contacts_dataset(contact_map, chosen)
     point = chosen.values[:, 3:] * d.length
-    if method == "exact":
-        by_signal = contact_signal_derivatives(d, chosen.values, chosen.tangents, names)
-        in_sphere = spherical_derivatives(point) @ by_signal
-    elif method == "differences":
-        in_sphere = central_differences(contact_map, names, out, interpolation, step)
-        by_signal = _inverted(spherical_derivatives(point)) @ in_sphere
-    else:
-        raise ValueError(f"method is 'exact' or 'differences'; got {method!r}")
+    by_signal = contact_signal_derivatives(d, chosen.values, chosen.tangents, names)
+    in_sphere = spherical_derivatives(point) @ by_signal
     for name, matrix, rows, long_name in (
         ("sensitivity", in_sphere, ("coordinate", ("r", "theta", "phi")), "spherical coordinates"),
         ("point_sensitivity", by_signal, ("space", ("x", "y", "z")), "the contact point"),
     ):
         out = out.merge(_matrix(name, matrix, chosen, rows, names, long_name))
-    out.attrs |= {"triplet": " ".join(names), "method": method}
+    out.attrs |= {"triplet": " ".join(names), "method": "exact"}
     if sensor is not None:
         force = chosen.values[:, :3] * d.force
         sigma = sensor.covariance(names, force, np.cross(point, force))
@@ -163,14 +146,6 @@ def contacts_dataset(contact_map: ContactMap, chosen: ChosenContacts) -> xr.Data
 
 def _flag(long_name: str) -> dict[str, str]:
     return {"units": "1", "long_name": long_name}
-
-
-def _inverted(matrices: Array) -> Array:
-    """Inverses of matrices (n, 3, 3), NaN for those with NaN."""
-    out = np.full_like(matrices, np.nan)
-    known = np.isfinite(matrices).all(axis=(1, 2))
-    out[known] = np.linalg.inv(matrices[known])
-    return out
 
 
 def _matrix(

@@ -19,7 +19,7 @@ import xarray as xr
 
 from vibrissa.contacts.contact_map import Domain, Progress
 from vibrissa.identifiability.evidence import answer, ask
-from vibrissa.identifiability.evidence_dataset import labelled, network_errors
+from vibrissa.identifiability.evidence_dataset import labelled
 from vibrissa.signals import CONE, REGIONS, SIGNALS, TRIPLETS, selection
 
 if TYPE_CHECKING:
@@ -41,7 +41,6 @@ def uniqueness(
     domain: Domain = "reachable",
     samples: int = SAMPLES,
     resolution: bool = True,
-    network: bool = False,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> xr.Dataset:
@@ -67,9 +66,6 @@ def uniqueness(
         How many contacts are tried; rounded up to a power of two.
     resolution : bool
         Whether the shares of contacts that are ambiguous within tolerances are computed too.
-    network : bool
-        Whether a network is trained for each triplet as function solver, the paper's evidence:
-        about ten seconds each.
     seed : int
         Of the samples and of the search.
     progress : callable, optional
@@ -92,8 +88,7 @@ def uniqueness(
         relative difference (in :func:`vibrissa.deflect` with ``witness_steps``, the default but
         where signals depend on each other only as finely as the rod is integrated), the
         separation, and by how much the second contact moves when the pair is found again with
-        four times the steps. ``network_error`` (m): median and 95 % quantile of the errors of a
-        network on contacts that it was not trained on. ``region_share``: the regions' share of the
+        four times the steps. ``region_share``: the regions' share of the
         contacts' space; ``notation``: the verdicts of a triplet in short. Attributes name the
         chosen triplet, the domain, the cone and the separation.
 
@@ -128,10 +123,7 @@ def uniqueness(
         answers.append(answer(question, triplet, resolution))
         if progress is not None:
             progress(number + 1, len(names))
-    errors = None
-    if network:
-        errors = np.stack([network_errors(question, triplet) for triplet in names])
-    return labelled(question, names, answers, resolution, errors)
+    return labelled(question, names, answers, resolution)
 
 
 def _listed(triplets: str | Sequence[str | tuple[str, ...]]) -> tuple[tuple[str, ...], ...]:

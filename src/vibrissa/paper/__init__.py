@@ -1,14 +1,32 @@
 """The methods of Huet, Emnett & Hartmann (2022), for comparison."""
 
+from vibrissa.paper.approximation import METHODS, estimate
+from vibrissa.paper.differences import central_differences
 from vibrissa.paper.findings import sensitivity_findings
 from vibrissa.paper.lookup import LookupTable
-from vibrissa.paper.natural import NaturalNeighbour
-from vibrissa.paper.network import NetworkSolver, train_network
+from vibrissa.paper.natural_neighbour import NaturalNeighbour
+from vibrissa.paper.network import (
+    DrawnContacts,
+    NetworkSolver,
+    draw_contacts,
+    train_network,
+    with_network_errors,
+)
+from vibrissa.paper.slices import error_solid, interpolation_errors, signal_slice
 
 __all__ = [
+    "METHODS",
+    "DrawnContacts",
     "LookupTable",
     "NaturalNeighbour",
     "NetworkSolver",
+    "central_differences",
+    "draw_contacts",
+    "error_solid",
+    "estimate",
+    "interpolation_errors",
     "sensitivity_findings",
+    "signal_slice",
     "train_network",
+    "with_network_errors",
 ]

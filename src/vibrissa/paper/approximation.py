@@ -1,107 +1,169 @@
-"""Contacts by the paper's ways, a table or a network, as estimates.
+"""Contacts by the paper's methods, a look-up table or a network, for comparison.
 
-An approximation gives one contact point for three signals. Its force, moment and arc length are
-those of the exact contact at that point, and the misfit is how far that contact's signals are from
-the measured ones, in shares of each signal's range. The covariance comes from central differences
-of the approximation, steps of 0.05 % of each signal's range, as in the paper's sensitivity.
+Either gives one contact point for three signals. Its force, moment and arc length are those of the
+exact contact at that point, and the misfit compares that contact's signals with the measured ones,
+in shares of each signal's range. The covariance comes from central differences of the table or
+network, steps of 0.05 % of each signal's range, as in the paper's sensitivity.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Literal
+from collections.abc import Callable, Mapping
+from weakref import WeakKeyDictionary
 
 import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike
 
-from vibrissa.contacts.explanation import Explanation
+from vibrissa.contacts import ContactMap, Estimate, Prior
+from vibrissa.contacts.explanation import check_signals
 from vibrissa.contacts.noise import SensorNoise
-from vibrissa.numerics import Array
-from vibrissa.paper.differences import STEP
-from vibrissa.paper.lookup import LookupTable
-from vibrissa.paper.network import train_network
+from vibrissa.numerics import AnyArray, Array
+from vibrissa.paper.lookup import STEP, LookupTable
+from vibrissa.paper.network import NetworkSolver, train_network
 from vibrissa.rod import PointContact, deflect
 from vibrissa.signals import (
     CIRCULAR,
     SIGNALS,
     circular_among,
+    measured,
+    selection,
     signal_scales,
     signals_of,
     within_turn,
 )
 from vibrissa.status import Status
 
-if TYPE_CHECKING:
-    from vibrissa.contacts.contact_map import ContactMap
-
-#: Ways to estimate but the exact one.
-Approximate = Literal["lookup", "lookup-linear", "network"]
-APPROXIMATE: tuple[Approximate, ...] = ("lookup", "lookup-linear", "network")
+#: Methods of estimating other than the exact one.
+METHODS = ("lookup", "lookup-linear", "network")
 
 #: Signals (n, 3), SI units, to contact points (n, 3), m.
 Solver = Callable[[Array], Array]
 
-
-def solver(contact_map: ContactMap, method: str, names: tuple[str, ...]) -> Solver:
-    """Make what approximates contact points; the map keeps tables and networks."""
-    kept = contact_map.approximations
-    key = (method.split("-", maxsplit=1)[0], names)
-    if method == "network":
-        if key not in kept:
-            kept[key] = train_network(contact_map, names)
-        return kept[key]
-    if key not in kept:
-        kept[key] = LookupTable.of(contact_map, names)
-    table = kept[key]
-    assert isinstance(table, LookupTable)
-    return lambda signals: table(signals, "natural" if method == "lookup" else "linear")
+# Tables and networks of each map that is alive, by kind and signals.
+_made: WeakKeyDictionary[
+    ContactMap, dict[tuple[str, tuple[str, ...]], LookupTable | NetworkSolver]
+] = WeakKeyDictionary()
 
 
-def by_approximation(
-    method: str,
+def estimate(
     contact_map: ContactMap,
-    names: tuple[str, ...],
-    targets: Array,
-    sensor: SensorNoise | None,
-) -> Explanation:
-    """Find one contact for three signals by a table or a network."""
+    signals: xr.Dataset | Mapping[str, ArrayLike],
+    using: str | tuple[str, ...] = ("Fx", "MB", "MD"),
+    *,
+    method: str = "lookup",
+    noise: Mapping[str, float] | ArrayLike | None = None,
+    prior: Prior | None = None,
+) -> Estimate:
+    """Estimate contacts from three signals by the paper's look-up table or network.
+
+    Parameters
+    ----------
+    contact_map : ContactMap
+        Map of the whisker's contacts; with the paper's grid, for a look-up table.
+    signals : Dataset or mapping
+        Measured signals by name, SI units, any shape.
+    using : str or tuple of str
+        Three signals to use.
+    method : {"lookup", "lookup-linear", "network"}
+        Look-up table interpolated by natural neighbours or linearly, or a network. Either is made
+        at the first use and kept as long as the map (the network: ten seconds).
+    noise : mapping or (6, 6) array_like, optional
+        Standard deviation of each signal, or covariance of (F, M), SI units; gives covariances.
+    prior : Prior, optional
+        Possible contacts; others get the status ``OUTSIDE_PRIOR``.
+
+    Returns
+    -------
+    Estimate
+        At most one candidate for each measurement. The status is ``APPROXIMATE``, as neither table
+        nor network shows whether contacts are ambiguous; ``OUTSIDE_MAP`` outside the table;
+        ``OUTSIDE_PRIOR``; or ``MISSING``. The misfit is the largest difference between the signals
+        of the contact given and those measured, in shares of their ranges.
+
+    Raises
+    ------
+    ValueError
+        If the method is not known, there are not three signals, the map has no grid to look up in,
+        or signals or noise do not fit.
+    """
+    if method not in METHODS:
+        known = ", ".join(repr(name) for name in METHODS)
+        raise ValueError(f"method is one of {known}; got {method!r}")
+    names = selection(using)
     if len(names) != 3:
         raise ValueError(
             f"a table or network takes three signals; got {len(names)}: {', '.join(names)}"
         )
-    solve = solver(contact_map, method, names)
-    d = contact_map.chart.discretization
-    signals = targets * signal_scales(names, d.force, d.moment)
-    point = solve(signals)
-    found = np.asarray(np.isfinite(point).all(axis=1))
-    bent = deflect(
-        contact_map.whisker,
-        PointContact(point),
-        proximal=contact_map.chart.proximal,
-        steps=contact_map.steps,
-    )
-    status = np.where(found, int(Status.APPROXIMATE), int(Status.OUTSIDE_MAP))
-    status[~np.isfinite(targets).all(axis=1)] = int(Status.MISSING)
-    covariances = np.full((len(targets), 3, 3), np.nan)
+    sensor = None if noise is None else SensorNoise.of(noise, names)
+    values, dims, coords = measured(signals, names)
+    check_signals(values, names)
+    solve = _solver(contact_map, method, names)
+    rows = values.reshape(-1, 3)
+    point = solve(rows)
+    chart = contact_map.chart
+    load = PointContact(point)
+    bent = deflect(contact_map.whisker, load, proximal=chart.proximal, steps=contact_map.steps)
+    status = np.where(np.isfinite(point).all(axis=1), Status.APPROXIMATE, Status.OUTSIDE_MAP)
+    status[~np.isfinite(rows).all(axis=1)] = Status.MISSING
+    if prior is not None:
+        rows_found = np.flatnonzero(status == Status.APPROXIMATE)
+        contact = (array[rows_found] for array in (point, bent.arc_length, bent.contact_force))
+        allowed = prior.allows(contact_map.whisker, *contact)
+        status[rows_found[~allowed]] = Status.OUTSIDE_PRIOR
+    found = status == Status.APPROXIMATE
+    ranges = _ranges(contact_map, names)
+    covariance = np.full((len(rows), 3, 3), np.nan)
     if sensor is not None:
         sigma = sensor.covariance(names, bent.force, bent.moment)
-        slope = _differences(solve, signals, _ranges(contact_map, names))
-        covariances = slope @ sigma @ np.swapaxes(slope, -1, -2) / d.length**2
-    return Explanation(
-        number=np.where(found, 1, 0),
-        contacts=np.concatenate(
-            [bent.arc_length[:, None] / d.length, bent.contact_force / d.force], axis=1
-        )[:, None],
-        values=np.concatenate([bent.force / d.force, point / d.length], axis=1)[:, None],
-        covariances=covariances[:, None],
-        misfit=_misfit(signals, bent.force, bent.moment, names, _ranges(contact_map, names)),
-        status=status,
-        linear=np.zeros(len(targets), dtype=bool),
-        probability=np.full((len(targets), 1), np.nan),
+        slope = _differences(solve, rows, ranges)
+        covariance = slope @ sigma @ np.swapaxes(slope, -1, -2)
+    shape = values.shape[:-1]
+
+    def answer(array: AnyArray) -> AnyArray:
+        only = np.where(found.reshape(-1, *[1] * (array.ndim - 1)), array, np.nan)
+        return only.reshape(*shape, *array.shape[1:])
+
+    def candidate(array: AnyArray) -> AnyArray:
+        return np.expand_dims(answer(array), len(shape))
+
+    return Estimate(
+        point=answer(point),
+        covariance=answer(covariance),
+        linear=np.zeros(shape, dtype=bool),
+        status=status.reshape(shape),
+        misfit=_misfit(rows, bent.force, bent.moment, names, ranges).reshape(shape),
+        arc_length=answer(bent.arc_length),
+        force=answer(bent.force),
+        moment=answer(bent.moment),
+        candidates=candidate(point),
+        candidate_covariances=candidate(covariance),
+        candidate_arc_lengths=candidate(bent.arc_length),
+        candidate_forces=candidate(bent.force),
+        candidate_contact_forces=candidate(bent.contact_force),
+        candidate_probabilities=np.full((*shape, 1), np.nan),
+        n_candidates=found.astype(np.int64).reshape(shape),
+        triplet=names,
+        dims=dims,
+        coords=coords,
     )
+
+
+def _solver(contact_map: ContactMap, method: str, names: tuple[str, ...]) -> Solver:
+    """The table or network of three signals, made if it is not there yet."""
+    made = _made.setdefault(contact_map, {})
+    key = (method.split("-", maxsplit=1)[0], names)
+    if key not in made:
+        make = train_network if method == "network" else LookupTable.of
+        made[key] = make(contact_map, names)
+    solver = made[key]
+    if isinstance(solver, NetworkSolver):
+        return solver
+    return lambda signals: solver(signals, "natural" if method == "lookup" else "linear")
 
 
 def _ranges(contact_map: ContactMap, names: tuple[str, ...]) -> Array:
-    """Of each signal over the map, SI units; of directions a turn."""
+    """Range of each signal over the map, SI units; of a direction, a turn."""
     d = contact_map.chart.discretization
     values = contact_map.chart.values.reshape(-1, 6)
     known = signals_of(values[:, :3], np.cross(values[:, 3:], values[:, :3]))

@@ -1,4 +1,4 @@
-"""The paper's network: trained on contacts, it turns three signals into a contact point.
+"""The paper's network: trained on contacts, it computes a contact point from three signals.
 
 A perceptron of three layers of rectifiers learns contact points from random contacts of Ω outside
 the cone of 2° about rest. Sizes span orders of magnitude, so their cube roots go in, directions as
@@ -10,22 +10,28 @@ comes from training too short) that the triplet is not unique.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import xarray as xr
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
+from vibrissa.contacts import Prior
+from vibrissa.contacts.contact_map import within_paper_bounds
 from vibrissa.numerics import AnyArray, Array
 from vibrissa.rod import contacts_at, solve_forces, with_normal_force
-from vibrissa.signals import CIRCULAR, SIGNALS, selection, signals_of, within_cone
+from vibrissa.signals import CIRCULAR, SIGNALS, cone_angle, selection, signals_of, within_cone
 
 if TYPE_CHECKING:
-    from vibrissa.contacts.contact_map import ContactMap
+    from vibrissa.contacts import ContactMap
 
-# Up to this share of the force that slips off: the chart knows that force to about 1e-4.
+#: Quantiles of a network's errors that are evidence on a triplet.
+QUANTILES = (0.5, 0.95)
+# Up to this share of the force at slip-off, which the chart has to about 1e-4.
 _SHARE_OF_FOLD = 0.999
 _LAYERS = (64, 64, 64)
 _BATCH = 256
@@ -37,7 +43,15 @@ _MARGIN = 2.0
 
 @dataclass(frozen=True, eq=False)
 class DrawnContacts:
-    """Random stable contacts."""
+    """Random stable contacts.
+
+    Attributes
+    ----------
+    contacts : (n, 3) array
+        Arc length and force across the whisker along d1 and d2, non-dimensional.
+    point, force, moment : (n, 3) arrays
+        Contact points and base force and moment, m, N and N·m.
+    """
 
     contacts: Array
     point: Array
@@ -53,7 +67,24 @@ class DrawnContacts:
 def draw_contacts(
     contact_map: ContactMap, number: int, seed: int, *, near_rest: bool = False
 ) -> DrawnContacts:
-    """Draw stable contacts, uniform in station, bearing and fraction of the fold force."""
+    """Draw stable contacts, uniform in arc length, bearing and share of the force at slip-off.
+
+    Parameters
+    ----------
+    contact_map : ContactMap
+        Map of the whisker's contacts.
+    number : int
+        Number of contacts.
+    seed : int
+        Seed of the draw.
+    near_rest : bool
+        Whether contacts within 2° of rest are drawn too.
+
+    Returns
+    -------
+    DrawnContacts
+        The contacts.
+    """
     rng, kept, missing = np.random.default_rng(seed), [], number
     d, fold = contact_map.chart.discretization, contact_map.chart.fold
     while missing > 0:
@@ -81,7 +112,7 @@ class NetworkSolver:
     held_out : DrawnContacts
         Contacts that it was not trained on.
     errors : (n,) array
-        How far from each of them its answer is, m.
+        Distances of its answers from those contacts, m.
     """
 
     names: tuple[str, ...]
@@ -101,14 +132,14 @@ class NetworkSolver:
         Parameters
         ----------
         shares : array_like
-            Which quantiles.
+            Quantiles, as shares of the contacts.
         keep : (n,) bool array, optional
             Contacts held out to count, such as those in a region; by default all.
 
         Returns
         -------
         array
-            In m, of the shape of ``shares``; NaN if none is kept.
+            Errors, m, of the shape of ``shares``; NaN if no contact is kept.
         """
         errors = self.errors if keep is None else self.errors[keep]
         shares = np.asarray(shares, dtype=np.float64)
@@ -158,11 +189,12 @@ def train_network(
     triplet : str or tuple of str
         The signals.
     samples : int
-        Contacts to train on; a tenth of them decide when to stop. About ten seconds for 30,000.
+        Number of contacts to train on; a tenth of them decide when to stop. About ten seconds for
+        30,000.
     held_out : int
-        Contacts to test on.
+        Number of contacts to test on.
     seed : int
-        Of the contacts and of the network's first weights.
+        Seed of the contacts and of the network's first weights.
 
     Returns
     -------
@@ -200,6 +232,72 @@ def train_network(
     return NetworkSolver(names, tested, errors, predict)
 
 
+def with_network_errors(
+    contact_map: ContactMap,
+    verdicts: xr.Dataset,
+    *,
+    samples: int = 30_000,
+    held_out: int = 5_000,
+    progress: Callable[[int, int], None] | None = None,
+) -> xr.Dataset:
+    """Add the paper's evidence to verdicts on triplets: errors of a network trained for each.
+
+    Parameters
+    ----------
+    contact_map : ContactMap
+        Map that the verdicts are of.
+    verdicts : Dataset
+        Verdicts of :func:`vibrissa.uniqueness`.
+    samples : int
+        Number of contacts to train each network on; about ten seconds for 30,000.
+    held_out : int
+        Number of other contacts to test it on.
+    progress : callable, optional
+        Function called as ``progress(done, total)`` after each triplet.
+
+    Returns
+    -------
+    Dataset
+        The verdicts with ``network_error`` (triplet, region, quantile), m: median and 95 %
+        quantile of the errors on contacts of each region, outside the cone, that the network was
+        not trained on. A network that fails is evidence that the triplet is not unique.
+    """
+    errors = []
+    for triplet in verdicts["triplet"].to_numpy().tolist():
+        solver = train_network(
+            contact_map,
+            triplet,
+            samples=samples,
+            held_out=held_out,
+            seed=int(verdicts.attrs["seed"]),
+        )
+        counted = _counted(contact_map, solver.held_out, verdicts)
+        errors.append([solver.error_quantiles(QUANTILES, keep) for keep in counted])
+        if progress is not None:
+            progress(len(errors), verdicts.sizes["triplet"])
+    about = {
+        "units": "m",
+        "long_name": "error of a network on contacts that it was not trained on",
+    }
+    return verdicts.assign_coords(quantile=list(QUANTILES)).assign(
+        network_error=(("triplet", "region", "quantile"), errors, about)
+    )
+
+
+def _counted(contact_map: ContactMap, drawn: DrawnContacts, verdicts: xr.Dataset) -> list[AnyArray]:
+    """Which contacts are in each region of verdicts, outside the cone."""
+    whisker, d = contact_map.whisker, contact_map.chart.discretization
+    inside = cone_angle(whisker, drawn.point) > verdicts.attrs["cone"]
+    if verdicts.attrs["domain"] == "paper":
+        inside &= within_paper_bounds(whisker, drawn.point)
+    arc_length = d.length * drawn.contacts[:, 0]
+    force = d.force * np.insert(drawn.contacts[:, 1:], 0, 0.0, axis=1)
+    return [
+        inside & Prior(region).allows(whisker, drawn.point, arc_length, force)
+        for region in verdicts["region"].to_numpy().tolist()
+    ]
+
+
 def _features(signals: Array, circular: AnyArray) -> Array:
     columns = []
     for column, turned in zip(signals.T, circular, strict=True):
@@ -208,7 +306,7 @@ def _features(signals: Array, circular: AnyArray) -> Array:
 
 
 def _away(known: cKDTree, features: Array) -> Array:
-    """Distances (n,) from the nearest of the places in a tree."""
+    """Distances (n,) from the nearest of the points in a tree."""
     return np.asarray(known.query(features)[0])
 
 

@@ -75,7 +75,7 @@ def estimates_of(
     whiskers : sequence of Whisker, optional
         One for each, where there are no maps; by default those of the recording.
     method : {"exact", "lookup", "lookup-linear", "network"}
-        As of ``ContactMap.estimate``.
+        Exact, or one of the paper's methods, as of :func:`vibrissa.paper.estimate`.
     errors : mapping of str to float, optional
         ``stiffness_sigma``, ``gain_sigma`` and ``mixing_sigma``, as of ``ContactMap.estimate``:
         the same errors in all frames. They need noise.

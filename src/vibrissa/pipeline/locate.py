@@ -87,7 +87,7 @@ def locate(
         Covariance of (F, M), SI units, of all frames or of each; see `component_noise`. None: not
         known; then there are no covariances, and a contact is felt wherever M_B is not zero.
     method : {"exact", "lookup", "lookup-linear", "network"}
-        As of ``ContactMap.estimate``.
+        Exact, or one of the paper's methods, as of :func:`vibrissa.paper.estimate`.
     errors : mapping of str to float, optional
         ``stiffness_sigma``, ``gain_sigma`` and ``mixing_sigma``, as of ``ContactMap.estimate``:
         the same errors in all frames. They need noise.
@@ -114,9 +114,12 @@ def locate(
     names = selection(triplet)
     felt = _Felt.of(wrench, noise, errors)
     signals = base_signals(felt.force[felt.rows], felt.moment[felt.rows])
-    found = contact_map.estimate(
-        signals, names, felt.typical, method, prior=prior, **(errors or {})
-    )
+    if method == "exact":
+        found = contact_map.estimate(signals, names, felt.typical, prior=prior, **(errors or {}))
+    else:
+        from vibrissa.paper import estimate  # it loads what only comparisons need
+
+        found = estimate(contact_map, signals, names, method=method, prior=prior)
     candidates = _Candidates(
         found.candidates,
         found.candidate_arc_lengths,

@@ -53,7 +53,7 @@ def solid_slices(
     Parameters
     ----------
     plane : Dataset
-        From ``vibrissa.identifiability.signal_slice``: ``r``, ``theta``, ``phi`` and, if known,
+        From ``vibrissa.paper.signal_slice``: ``r``, ``theta``, ``phi`` and, if known,
         ``error_distance`` over two signals, SI units; NaN outside the solid.
     solid : Dataset, optional
         Contacts with the three signals and ``error_distance``, such as the nodes of a map; with

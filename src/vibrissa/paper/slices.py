@@ -1,4 +1,4 @@
-"""A slice through the solid that the contacts fill in the space of three signals."""
+"""The solid that contacts fill in the space of three signals: slices, and errors of a look-up."""
 
 from __future__ import annotations
 
@@ -8,26 +8,25 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
-from vibrissa.contacts.chosen_contacts import chosen_contacts
 from vibrissa.contacts.contact_map import Domain, spherical, within_paper_bounds
-from vibrissa.identifiability.sensitivity import contacts_dataset
+from vibrissa.identifiability import sensitivity
 from vibrissa.numerics import Array
-from vibrissa.paper.differences import Interpolation, interpolation_errors
+from vibrissa.paper.lookup import Interpolation, LookupTable, cartesian
 from vibrissa.quantities import attributes
-from vibrissa.signals import CIRCULAR, SIGNALS, selection, within_cone
+from vibrissa.signals import CIRCULAR, SIGNALS, measured, selection, within_cone
 
 if TYPE_CHECKING:
-    from vibrissa.contacts.contact_map import ContactMap
+    from vibrissa.contacts import ContactMap
 
-# Nodes of the map within this share of a signal's range (an angle's: of a turn) of the slice tell
-# how far the slice reaches.
+# The slice extends as far as the map's nodes within this share of the held signal's range (of a
+# turn, for an angle).
 _NEAR = 0.04
 
 
 def signal_slice(
     contact_map: ContactMap,
     fixed: Mapping[str, float] | None = None,
-    triplet: str | tuple[str, ...] = ("Fx", "MB", "MD"),
+    using: str | tuple[str, ...] = ("Fx", "MB", "MD"),
     *,
     points: int = 160,
     domain: Domain = "paper",
@@ -40,16 +39,16 @@ def signal_slice(
     contact_map : ContactMap
         The whisker's map.
     fixed : mapping, optional
-        The signal that is held and its value, SI units; by default the paper's M_D = 3π/2, which is
+        Signal that is held, with its value, SI units; by default the paper's M_D = 3π/2, which is
         −π/2.
-    triplet : str or tuple of str
+    using : str or tuple of str
         The three signals.
     points : int
-        Along each of the other two signals.
+        Number of samples of each of the other two signals.
     domain : {"paper", "reachable"}
-        Only the contacts within the bounds of the paper's grid, or all of Ω.
+        Contacts within the bounds of the paper's grid, or all of Ω.
     interpolation : {"natural", "linear"} or callable
-        How the look-up whose errors are told interpolates.
+        Interpolation of the look-up whose errors are given.
 
     Returns
     -------
@@ -64,7 +63,7 @@ def signal_slice(
     ValueError
         If not one signal of the triplet is held, or there are too few points.
     """
-    names = selection(triplet, exactly=3)
+    names = selection(using, exactly=3)
     fixed = {"MD": -0.5 * np.pi} if fixed is None else fixed
     if len(fixed) != 1 or not set(fixed) <= set(names):
         raise ValueError(f"one of {', '.join(names)} is to be fixed; got {dict(fixed)}")
@@ -112,28 +111,28 @@ def signal_slice(
 
 def error_solid(
     contact_map: ContactMap,
-    triplet: str | tuple[str, ...] = ("Fx", "MB", "MD"),
+    using: str | tuple[str, ...] = ("Fx", "MB", "MD"),
     *,
     stride: int = 3,
     interpolation: Interpolation = "natural",
 ) -> xr.Dataset:
-    """Look contacts up that lie midway between those of the paper's grid, where it knows least.
+    """Look up contacts midway between those of the paper's grid, where its errors are largest.
 
     Parameters
     ----------
     contact_map : ContactMap
-        With the paper's grid.
-    triplet : str or tuple of str
+        Map with the paper's grid.
+    using : str or tuple of str
         The three signals.
     stride : int
-        Steps of azimuth and elevation from one contact to the next.
+        Number of the grid's steps of azimuth and elevation from one contact to the next.
     interpolation : {"natural", "linear"} or callable
-        How the grid is looked up.
+        Interpolation of the look-up.
 
     Returns
     -------
     Dataset
-        What :func:`vibrissa.sensitivity` says of these contacts, and ``error_distance``, m.
+        As of :func:`vibrissa.sensitivity` at these contacts, with ``error_distance``, m.
 
     Raises
     ------
@@ -144,13 +143,50 @@ def error_solid(
         raise ValueError("the map has no grid to interpolate: simulate it with grid=True")
     axes = [contact_map.grid[name].to_numpy() for name in ("r", "theta", "phi")]
     r, theta, phi = (0.5 * (a[1:] + a[:-1]) for a in axes)
-    r, theta, phi = np.meshgrid(r, theta[::stride], phi[::stride], indexing="ij")
-    along = (np.cos(phi) * np.cos(theta), np.cos(phi) * np.sin(theta), np.sin(phi))
-    points = (r[..., None] * np.stack(along, axis=-1)).reshape(-1, 3)
-    out = contacts_dataset(contact_map, chosen_contacts(contact_map, points))
-    names = selection(triplet, exactly=3)
-    out["error_distance"] = interpolation_errors(contact_map, out, names, interpolation)
-    return out.assign_attrs(triplet=" ".join(names))
+    between = np.meshgrid(r, theta[::stride], phi[::stride], indexing="ij")
+    points = cartesian(np.stack(between, axis=-1)).reshape(-1, 3)
+    out = sensitivity(contact_map, using, points)
+    return out.assign(error_distance=interpolation_errors(contact_map, out, using, interpolation))
+
+
+def interpolation_errors(
+    contact_map: ContactMap,
+    contacts: xr.Dataset,
+    using: str | tuple[str, ...] = ("Fx", "MB", "MD"),
+    interpolation: Interpolation = "natural",
+) -> xr.DataArray:
+    """Look up contacts in the interpolated grid, and compare them with the true ones.
+
+    Parameters
+    ----------
+    contact_map : ContactMap
+        Map with the paper's grid.
+    contacts : Dataset
+        True contacts: ``contact_point`` with the signals used.
+    using : str or tuple of str
+        Three signals.
+    interpolation : {"natural", "linear"} or callable
+        Interpolation of the look-up.
+
+    Returns
+    -------
+    DataArray
+        Distances of the contact points, m; NaN outside the table.
+    """
+    names = selection(using, exactly=3)
+    values, dims, _ = measured(contacts, names)
+    table = LookupTable.of(contact_map, names, near_rest=True, interpolation=interpolation)
+    rows = values.reshape(-1, 3)
+    known = np.isfinite(rows).all(axis=1)
+    true = contacts["contact_point"].transpose(*dims, "space").to_numpy().reshape(-1, 3)
+    error = np.full(len(rows), np.nan)
+    error[known] = np.linalg.norm(table(rows[known]) - true[known], axis=1)
+    return xr.DataArray(
+        error.reshape(values.shape[:-1]),
+        dims=dims,
+        name="error_distance",
+        attrs=attributes("error_distance"),
+    )
 
 
 def _axes(

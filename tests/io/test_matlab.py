@@ -9,7 +9,7 @@ import pytest
 from scipy.io import savemat
 
 from vibrissa.io import load_matlab, load_tracks
-from vibrissa.io.matlab_values import matlab_values
+from vibrissa.io.matlab import matlab_values
 
 generator = np.random.default_rng(0)
 LENGTHS = (5, 7, 0, 6)

@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from vibrissa.io import check_folder, check_readable, check_writable, is_netcdf
-from vibrissa.io.paths import CSV, NETCDF
-from vibrissa.io.replace import replacing
+from vibrissa.io.paths import CSV, NETCDF, replacing
 from vibrissa.io.table import read_text
 
 

@@ -6,8 +6,13 @@ import pytest
 import xarray as xr
 
 import vibrissa as vb
-from vibrissa.io.recording import KIND, load_recording, save_recording
-from vibrissa.io.whisker_stack import separate_whiskers, stacked_whiskers
+from vibrissa.io.recording import (
+    KIND,
+    load_recording,
+    save_recording,
+    separate_whiskers,
+    stacked_whiskers,
+)
 
 WHISKERS = [
     vb.Whisker.parabola(40e-3, 10.0, name="β"),

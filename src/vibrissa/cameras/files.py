@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa.cameras.camera import Camera
-from vibrissa.io.calibration import read_calibration, write_calibration
+from vibrissa.io.anipose import read_calibration, write_calibration
 from vibrissa.io.toml import in_file
 
 Array = NDArray[np.float64]
@@ -22,7 +22,7 @@ def load_cameras(path: str | PathLike[str], unit: float = 1e-3) -> tuple[Camera,
     Parameters
     ----------
     path : str or path
-        TOML of Anipose (`vibrissa.io.calibration`).
+        TOML of Anipose (`vibrissa.io.anipose`).
     unit : float
         Of the file's lengths, m; that of the board that calibrated the cameras, usually mm.
 

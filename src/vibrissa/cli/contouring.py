@@ -255,7 +255,7 @@ def _tell(
 def _of_contour(points: Path, recording: Path, whisker: Path | None) -> bool:
     """Whether a table holds what the recording does: replaced with it, nothing else is lost."""
     from vibrissa.cli.recordings import is_recording, recording_from, whiskers_for
-    from vibrissa.io.contour_table import holds_contour
+    from vibrissa.io.contacts_table import holds_contour
     from vibrissa.pipeline import contour_points
 
     if not points.is_file() or not is_recording(recording):

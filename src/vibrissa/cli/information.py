@@ -69,7 +69,7 @@ def _installation() -> Iterator[tuple[str, str]]:
 
 def _file(path: Path) -> Iterator[tuple[str, str]]:
     from vibrissa.io import Kind, check_readable, recognise
-    from vibrissa.io.load import READERS
+    from vibrissa.io.kinds import READERS
 
     if path.is_dir():
         yield from _array(path, "folder of centrelines")
@@ -174,7 +174,7 @@ def _video(path: Path) -> Iterator[tuple[str, str]]:
 
 
 def _calibration(path: Path) -> Iterator[tuple[str, str]]:
-    from vibrissa.io.calibration import read_calibration
+    from vibrissa.io.anipose import read_calibration
 
     yield "kind", "calibration of cameras"
     for camera in read_calibration(path):
@@ -195,7 +195,7 @@ def _is_text(path: Path) -> bool:
 def _tracks(path: Path, kind: str) -> Iterator[tuple[str, str]]:
     """Sizes, times and how much is missing of tracks; also where their unit is not told."""
     from vibrissa.io import Kind, load_tracks
-    from vibrissa.io.load import READERS
+    from vibrissa.io.kinds import READERS
 
     yield "kind", kind
     note = ""
@@ -247,7 +247,7 @@ def _groups(path: Path) -> Iterator[tuple[str, str]]:
     import h5netcdf
 
     from vibrissa.io import kind_of
-    from vibrissa.io.hdf5 import opened
+    from vibrissa.io.netcdf import opened
 
     yield "kind", kind_of(path) or "unknown"
     with opened(path, "NetCDF-4", soft_links=False), h5netcdf.File(path, "r") as file:
@@ -319,8 +319,7 @@ def _compared(path: Path) -> Iterator[tuple[str, str]]:
     import xarray as xr
 
     from vibrissa.cli.track_report import compared_contacts
-    from vibrissa.io.hdf5 import opened
-    from vibrissa.io.netcdf import read_dataset
+    from vibrissa.io.netcdf import opened, read_dataset
 
     with opened(path, "a recording") as file:
         if "measured/contact_difference" not in file:

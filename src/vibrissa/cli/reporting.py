@@ -74,8 +74,7 @@ def report(
     import numpy as np
 
     from vibrissa.io import load_recording
-    from vibrissa.io.paths import check_readable, check_writable
-    from vibrissa.io.replace import replacing
+    from vibrissa.io.paths import check_readable, check_writable, replacing
     from vibrissa.recording import Recording
     from vibrissa.report import (
         contacts_by_whisker,

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
-from vibrissa.io.hdf5 import naming
-from vibrissa.io.netcdf import COMPRESSED, kind_of, read_tree, write_netcdf
+from vibrissa.io.netcdf import COMPRESSED, kind_of, naming, read_tree, write_netcdf
 from vibrissa.rod import Fold, StableSet, discretize
 from vibrissa.whisker import Whisker
 

@@ -11,7 +11,7 @@ import xarray as xr
 
 import vibrissa
 from vibrissa.io import load_recording, save_recording
-from vibrissa.io.replace import replacing
+from vibrissa.io.paths import replacing
 from vibrissa.pipeline.estimates import Progress
 from vibrissa.recording import Recording
 from vibrissa.simulation import film, views_of

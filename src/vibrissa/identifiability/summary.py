@@ -10,8 +10,7 @@ import xarray as xr
 
 from vibrissa.identifiability.evidence import NOT_UNIQUE, OFF_SURFACE, UNIQUE
 from vibrissa.io.netcdf import write_netcdf
-from vibrissa.io.paths import check_writable
-from vibrissa.io.replace import replacing
+from vibrissa.io.paths import check_writable, replacing
 
 # What lies within what.
 _PARTS = {

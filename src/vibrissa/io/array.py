@@ -20,27 +20,36 @@ Other columns are left alone.
 
 **Folder**: a CSV file each with columns ``x_mm,y_mm,z_mm`` (`load_centerline`), from base to tip,
 named after the whisker: ``C2.csv``, ``left_gamma.csv``.
+
+A lab's own whiskers as a table; the columns are told in `vibrissa.io.array`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from numpy.typing import ArrayLike
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.io.array_table import few, table_lines, whiskers_from_table
-from vibrissa.io.centerline import load_whisker, tells_radius
-from vibrissa.io.hdf5 import naming
-from vibrissa.io.netcdf import is_netcdf, kind_of, read_tree, write_netcdf
-from vibrissa.io.replace import replacing
-from vibrissa.io.whisker_stack import separate_whiskers, stacked_whiskers
+from vibrissa.io.centerline import UNITS, check_slender, load_whisker, tells_radius
+from vibrissa.io.netcdf import is_netcdf, kind_of, naming, read_tree, write_netcdf
+from vibrissa.io.paths import replacing
+from vibrissa.io.recording import separate_whiskers, stacked_whiskers
+from vibrissa.io.table import read_text, table_rows
 from vibrissa.whisker import Whisker
 from vibrissa.whisker.array import WhiskerArray
 from vibrissa.whisker.array_dataset import KIND
+from vibrissa.whisker.emergence import angles_of, base_rotation
 from vibrissa.whisker.identity import Identity
+from vibrissa.whisker.morphology import curvature_bound
+from vibrissa.whisker.parabola import parabola_curvature
+from vibrissa.whisker.pose import Pose
+from vibrissa.whisker.published import published_note, published_radii
 
 
 def load_array(
@@ -137,7 +146,7 @@ def _folder(path: Path, base: Any, noise: float | None) -> WhiskerArray:
             whisker = whisker.with_properties(rat=identity.name)
         whiskers.append(whisker)
     if faults:
-        raise ValueError(f"{path}: {few(faults)}")
+        raise ValueError(f"{path}: {_few(faults)}")
     return _array(path, whiskers)
 
 
@@ -146,7 +155,7 @@ def _of_folder(path: Path) -> str:
     names = sorted(file.name for file in path.iterdir())
     if {".zgroup", ".zarray", "zarr.json"}.intersection(names):
         return "is a Zarr folder, as NWB can be kept in; save it as HDF5, in one file .nwb"
-    held = few(names) if names else "nothing"
+    held = _few(names) if names else "nothing"
     return f"is a folder of {held}; one of centrelines, such as C2.csv, or a file is needed"
 
 
@@ -155,3 +164,168 @@ def _array(path: Path, whiskers: Sequence[Whisker]) -> WhiskerArray:
         return WhiskerArray(whiskers)
     except ValueError as fault:
         raise ValueError(f"{path}: {fault}") from None
+
+
+Array = NDArray[np.float64]
+
+_ANGLES = ("azimuth", "elevation", "roll")
+_ROTATION = tuple(f"r{i}{j}" for i in "123" for j in "123")
+_TURNS = {"_deg": np.pi / 180.0, "_rad": 1.0}
+_CURVATURES = {"_per_mm": 1e3, "_per_m": 1.0}
+_PLAIN = {"": 1.0}
+_RADII = ("base_radius", "tip_radius")
+_NEEDED = (
+    "name, x_mm, y_mm, z_mm, azimuth_deg, elevation_deg, roll_deg, length_mm and coefficient_per_mm"
+)
+_NEARLY = 1e-3
+"""Largest entry of RᵀR − 1 that rounding in a table explains."""
+
+
+def whiskers_from_table(path: Path) -> list[Whisker]:
+    """Read a table of whiskers."""
+    columns = _Columns(path)
+    place = np.stack([columns.numbers(axis, UNITS) for axis in "xyz"], axis=-1)
+    length = columns.numbers("length", UNITS)
+    coefficient = columns.numbers("coefficient", _CURVATURES)
+    radii = {name: columns.numbers(name, UNITS) for name in _RADII if columns.has(name, UNITS)}
+    rotation = _rotations(columns)
+    columns.tell()
+    whiskers = []
+    for i, name in enumerate(columns.text("name")):
+        own = {key: float(values[i]) for key, values in radii.items()}
+        try:
+            pose = Pose(rotation[i], place[i])
+            whiskers.append(_whisker(name, pose, float(length[i]), float(coefficient[i]), own))
+        except ValueError as fault:
+            columns.faults.append(f"line {columns.lines[i]}: {fault}")
+    columns.tell()
+    return whiskers
+
+
+def _whisker(
+    name: str, pose: Pose, length: float, coefficient: float, radii: dict[str, float]
+) -> Whisker:
+    """One line's whisker."""
+    published = dict(zip(_RADII, published_radii(name, length), strict=True))
+    stated: Any = published | radii
+    whisker = Whisker.parabola(length, coefficient, name=name, **stated)
+    if len(radii) < len(published):
+        whisker = replace(whisker, notes=(*whisker.notes, published_note(name)))
+    for radius in radii.values():
+        check_slender(radius, length)
+    bound = float(curvature_bound(length))
+    if abs(coefficient) > bound:
+        warnings.warn(
+            f"{name}: its coefficient, {coefficient * 1e-3:.4g} per mm, is larger than that of any "
+            f"rat's whisker of this length ({bound * 1e-3:.4f} per mm): check the units",
+            stacklevel=4,
+        )
+    # A negative coefficient turns the whisker's frame within that of the table.
+    return replace(whisker, pose=Pose(pose.rotation @ whisker.pose.rotation, pose.origin))
+
+
+def _few(faults: Sequence[str]) -> str:
+    """Join faults, and count those after the fifth."""
+    more = "" if len(faults) <= 5 else f"; and {len(faults) - 5} more"
+    return "; ".join(faults[:5]) + more
+
+
+class _Columns:
+    """Numbers of a table by name, in SI units, and what is wrong with it."""
+
+    def __init__(self, path: Path) -> None:
+        self.faults: list[str] = []
+        self._path = path
+        rows = list(table_rows(read_text(path)))
+        header = rows[0][1] if rows else []
+        self._names = [name.lower() for name in header]
+        self._cells = [cells for _, cells in rows[1:]]
+        self.lines = [line for line, _ in rows[1:]]
+        if "name" not in self._names or not self._cells:
+            raise ValueError(
+                f"{path} has the columns {', '.join(header) or 'none'} and {len(self._cells)} "
+                f"rows; {_NEEDED}, and at least one whisker, are needed"
+            )
+        for line, cells in rows[1:]:
+            if len(cells) != len(header):
+                self.faults.append(f"line {line} has {len(cells)} cells, not {len(header)}")
+        self.tell()
+
+    def tell(self) -> None:
+        """Raise a ValueError with all faults, if there are any."""
+        if self.faults:
+            raise ValueError(f"{self._path}: {_few(self.faults)}")
+
+    def text(self, name: str) -> list[str]:
+        """Cells as they are."""
+        at = self._names.index(name)
+        return [cells[at] for cells in self._cells]
+
+    def has(self, name: str, units: Mapping[str, float]) -> bool:
+        """Whether there is such a quantity, in any of the units."""
+        return any(name + suffix in self._names for suffix in units)
+
+    def numbers(self, name: str, units: Mapping[str, float]) -> Array:
+        """Values of a quantity; NaN, and a fault, where there is none."""
+        values = np.full(len(self._cells), np.nan)
+        suffix = next((suffix for suffix in units if name + suffix in self._names), None)
+        if suffix is None:
+            allowed = " or ".join(name + suffix for suffix in units if suffix) or name
+            self.faults.append(f"there is no column {allowed}")
+            return values
+        for i, cell in enumerate(self.text(name + suffix)):
+            try:
+                values[i] = float(cell)
+            except ValueError:
+                self.faults.append(f"line {self.lines[i]} has no number for {name}: {cell!r}")
+        return values * units[suffix]
+
+
+def _rotations(columns: _Columns) -> Array:
+    """Rotations (n, 3, 3), from angles or from matrices."""
+    if not columns.has("r11", _PLAIN):
+        return base_rotation(*(columns.numbers(name, _TURNS) for name in _ANGLES))
+    entries = np.stack([columns.numbers(name, _PLAIN) for name in _ROTATION], axis=-1)
+    if columns.faults:
+        return entries
+    matrix = entries.reshape(-1, 3, 3)
+    off = np.abs(np.swapaxes(matrix, 1, 2) @ matrix - np.eye(3)).max(axis=(1, 2))
+    for i in np.flatnonzero(~(off <= _NEARLY) | (np.linalg.det(matrix) < 0.0)):
+        columns.faults.append(
+            f"line {columns.lines[i]}: r11 … r33 are no rotation, whose columns are a right-handed "
+            "frame of unit vectors"
+        )
+    if columns.faults:
+        return matrix
+    # What rounding in the table left over is taken away: the nearest rotation.
+    left, _, right = np.linalg.svd(matrix)
+    return np.asarray(left @ right)
+
+
+def table_lines(array: WhiskerArray) -> list[str]:
+    """Write whiskers as the lines of a table."""
+    header = ["name", "x_mm", "y_mm", "z_mm", *(f"{name}_deg" for name in _ANGLES)]
+    header += ["length_mm", "coefficient_per_mm", "base_radius_um", "tip_radius_um"]
+    lines = [",".join(header)]
+    for name, whisker in array.items():
+        angles = np.degrees(angles_of(whisker.pose.rotation))
+        numbers = [*(1e3 * whisker.pose.origin), *angles, 1e3 * whisker.length]
+        numbers += [1e-3 * _coefficient(whisker), 1e6 * whisker.base_radius]
+        numbers += [1e6 * whisker.tip_radius]
+        lines.append(",".join([name, *(f"{value:.12g}" for value in numbers)]))
+    return lines
+
+
+def _coefficient(whisker: Whisker) -> float:
+    """A of a whisker on y = A x² with a linear taper."""
+    s = np.linspace(0.0, whisker.length, 33)
+    coefficient = 0.5 * float(whisker.curvature(0.0)[2])
+    parabola = parabola_curvature(whisker.length, max(coefficient, 0.0))(s)
+    taper = np.linspace(whisker.base_radius, whisker.tip_radius, s.size)
+    bent = np.abs(whisker.curvature(s) - parabola).max() * whisker.length
+    if bent > 1e-6 or np.abs(whisker.radius(s) / taper - 1.0).max() > 1e-6:
+        raise ValueError(
+            f"{whisker.name} is no planar parabola with a linear taper, which is all that a table "
+            "holds; NetCDF (.nc) keeps it"
+        )
+    return coefficient

@@ -18,9 +18,8 @@ from typing import Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.io.columns import LENGTHS, unit_factor
-from vibrissa.io.replace import replacing
-from vibrissa.io.table import is_number, read_rows, read_text, table_rows
+from vibrissa.io.paths import replacing
+from vibrissa.io.table import LENGTHS, is_number, read_rows, read_text, table_rows, unit_factor
 from vibrissa.whisker import Whisker
 from vibrissa.whisker.section import Properties
 

@@ -14,8 +14,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from vibrissa.io.hdf5 import naming
-from vibrissa.io.netcdf import read_dataset
+from vibrissa.io.netcdf import naming, read_dataset
 from vibrissa.io.tracks import Labels, RawTracks, labelled
 
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.io.replace import replacing
+from vibrissa.io.paths import replacing
 
 Picture = NDArray[np.uint8]
 

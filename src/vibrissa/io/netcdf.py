@@ -1,4 +1,11 @@
-"""Datasets and trees of datasets as NetCDF-4 files.
+"""Files in HDF5, opened as what somebody else may have damaged or made to do harm.
+
+Before anything is read, everything in a file is looked at: nothing may lead out of it (external
+links, external storage, virtual datasets), go round in circles, or claim to be larger than a file
+of its size can hold, and no type may be built by name. What is read after that can still be
+damaged; whatever the libraries raise then becomes one error that names the file.
+
+Datasets and trees of datasets as NetCDF-4 files.
 
 They are written in memory and then to the disk with ordinary calls, because HDF5 takes the whole
 interpreter down when a disk that is full lets it not close a file. So writing takes as much memory
@@ -8,16 +15,140 @@ as the file is large, compressed, beside the data.
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+import math
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from mmap import ACCESS_READ, mmap
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
+import h5py
 import xarray as xr
+from h5py import h5d, h5o, h5t
 
-from vibrissa.io.hdf5 import opened
-from vibrissa.io.paths import NETCDF, refuse_whisk
-from vibrissa.io.replace import replacing
+from vibrissa.io.paths import NETCDF, check_readable, refuse_whisk, replacing
+
+# Deflate, the densest of the filters that are read, makes at most 1032 bytes of one.
+_DENSEST = 1100
+_ALWAYS_ALLOWED = 1 << 28
+_HEAP = b"GCOL\1\0\0\0"
+
+
+@contextmanager
+def opened(path: str | PathLike[str], what: str, *, soft_links: bool = True) -> Iterator[h5py.File]:
+    """Open a file in HDF5 for reading, once it has been found harmless."""
+    path = check_readable(path)
+    with naming(path, what):
+        _check_heaps(path)
+    with naming(path, what), h5py.File(path, "r") as file:
+        _check(file, path.stat().st_size, soft_links)
+        yield file
+
+
+@contextmanager
+def naming(path: Path, what: str) -> Iterator[None]:
+    """Turn whatever is raised while a file is read into one error that names it."""
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        raise ValueError(
+            f"{path} cannot be read as {what}: it is of another format, cut off or damaged "
+            f"({_line(error)})"
+        ) from error
+    except ValueError as error:
+        # Those of our own name the file already.
+        if str(path) in str(error):
+            raise
+        raise ValueError(f"{path}: {_line(error)}") from error
+    except Exception as error:  # What libraries raise for a damaged file is not documented.
+        raise ValueError(f"{path} is not {what} as it is known, or damaged: {error!r}") from error
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split()) or repr(error)
+
+
+def _check_heaps(path: Path) -> None:
+    """Refuse heaps with an entry of no size, through which the library would go for ever."""
+    with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as content:
+        start = content.find(_HEAP)
+        while start >= 0:
+            (size,) = struct.unpack_from("<Q", content, start + 8)
+            end = min(start + size, len(content))
+            entry = start + 16
+            while entry + 16 <= end:
+                number, length = struct.unpack_from("<H6xQ", content, entry)
+                if number == 0 and length == 0:
+                    raise ValueError("a heap of text is damaged")
+                # That of free space counts its own head.
+                entry += length if number == 0 else 16 + -(-length // 8) * 8
+            start = content.find(_HEAP, start + 4)
+
+
+def _items(file: h5py.File, soft_links: bool) -> Iterator[tuple[str, h5py.HLObject]]:
+    """All that a file holds, each once; raise at a link that leads out of it or in a circle."""
+    groups: list[tuple[str, h5py.Group]] = [("", file)]
+    while groups:
+        above, group = groups.pop()
+        if h5o.get_info(group.id).rc > 1:
+            raise ValueError(f"the group {above or '/'} is in several places, which is not read")
+        yield above or "/", group
+        for key in group:
+            name = f"{above}/{key}"
+            link = group.get(key, getlink=True)
+            if isinstance(link, h5py.SoftLink) and soft_links:
+                continue
+            if not isinstance(link, h5py.HardLink):
+                what = "soft link" if isinstance(link, h5py.SoftLink) else "link out of the file"
+                raise ValueError(f"{name} is a {what}, which is not followed")
+            item = group[key]
+            if isinstance(item, h5py.Group):
+                groups.append((name, item))
+            else:
+                yield name, item
+
+
+def _check(file: h5py.File, size: int, soft_links: bool) -> None:
+    """Refuse data kept elsewhere, and more of them than a file of `size` bytes holds."""
+    claimed = 0
+    for name, item in _items(file, soft_links):
+        for key in item.attrs:
+            attribute = item.attrs.get_id(key)
+            _check_type(f"the attribute {key} of {name}", attribute.get_type())
+            claimed += _bytes(attribute.shape, attribute.get_type())
+            # The library would read past the end of a list that is too long or too short.
+            if key == "DIMENSION_LIST" and attribute.shape != (item.ndim,):
+                raise ValueError(f"{name} has {item.ndim} dimensions, and scales of others")
+        if isinstance(item, h5py.Dataset):
+            claimed += _checked_size(name, item)
+        if claimed > max(_ALWAYS_ALLOWED, _DENSEST * size):
+            raise ValueError(
+                f"{name} and what comes before it claim to hold {claimed / 1e9:.3g} GB, more than "
+                f"a file of {size / 1e3:.3g} kB can: it is damaged, or made to fill the memory"
+            )
+
+
+def _checked_size(name: str, data: h5py.Dataset) -> int:
+    """Bytes that reading a dataset takes; raise if they are kept elsewhere."""
+    _check_type(name, data.id.get_type())
+    layout = data.id.get_create_plist()
+    if layout.get_external_count() or layout.get_layout() == h5d.VIRTUAL:
+        raise ValueError(f"the data of {name} are kept in other files, which are not read")
+    chunk = layout.get_chunk() if layout.get_layout() == h5d.CHUNKED else ()
+    return max(_bytes(shape, data.id.get_type()) for shape in (data.id.shape, chunk))
+
+
+def _bytes(shape: tuple[int, ...] | None, kind: h5t.TypeID) -> int:
+    return math.prod(shape or ()) * int(kind.get_size())
+
+
+def _check_type(name: str, kind: h5t.TypeID) -> None:
+    """Refuse bytes without a meaning, for which a file may name any type of NumPy's."""
+    if kind.get_class() == h5t.OPAQUE or kind.detect_class(h5t.OPAQUE):
+        raise ValueError(f"{name} holds opaque bytes, which are not read")
+
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 

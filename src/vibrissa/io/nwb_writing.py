@@ -27,8 +27,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from vibrissa.io.paths import NWB, check_writable
-from vibrissa.io.replace import replacing
+from vibrissa.io.paths import NWB, check_writable, replacing
 
 if TYPE_CHECKING:
     from pynwb import NWBFile

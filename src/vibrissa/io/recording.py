@@ -3,19 +3,32 @@
 Every float is kept to the last bit; arrays are compressed. Any reader of NetCDF or HDF5 can open
 the file; what the groups and variables mean is told by their own attributes and in
 :mod:`vibrissa.recording.schema`. In the file several whiskers stand side by side in one group
-(:mod:`vibrissa.io.whisker_stack`).
+(:mod:`vibrissa.io.recording`).
+
+The whiskers of a tree, side by side in one group of its file.
+
+In memory every whisker has a group, ``/whiskers/0``, ``/whiskers/1``, … A file takes its time by
+the variable, not by the byte: sixty whiskers of fourteen variables each are some nine hundred,
+and ten seconds. So in files two whiskers or more are one group ``/whiskers`` with the dimension
+``whisker``, and what each calls its own (name, notes) is a variable of text. Where whiskers differ
+in size along a dimension, the shorter ones are filled up with NaN, and a variable
+``size_of_DIMENSION`` tells how far each goes.
+
+Whiskers that do not fit together so, whatever the reason, keep a group each; so do those of files
+written before.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import xarray as xr
 
-from vibrissa.io.hdf5 import naming
-from vibrissa.io.netcdf import COMPRESSED, kind_of, read_tree, write_netcdf
-from vibrissa.io.whisker_stack import separate_whiskers, stacked_whiskers
+from vibrissa.io.netcdf import COMPRESSED, kind_of, naming, read_tree, write_netcdf
 
 KIND = "vibrissa recording"
 """What the attribute ``kind`` of a recording says."""
@@ -83,3 +96,132 @@ def load_recording(path: str | PathLike[str]) -> xr.DataTree:
     tree = read_tree(path)
     with naming(path, "a recording"):
         return separate_whiskers(tree)
+
+
+GROUP = "whiskers"
+_WHISKER = "whisker"
+_OWN = "attributes_of_each"
+_SIZE = "size_of_"
+
+
+def stacked_whiskers(tree: xr.DataTree) -> xr.DataTree:
+    """Lay the whiskers of a tree side by side, if they fit."""
+    group = tree.children.get(GROUP)
+    if group is None or len(group.children) < 2 or group.to_dataset(inherit=False).variables:
+        return tree
+    count = len(group.children)
+    if set(group.children) != {str(i) for i in range(count)}:
+        return tree
+    if group.attrs or tree.sizes.get(_WHISKER, count) != count:
+        return tree
+    each = [group.children[str(i)] for i in range(count)]
+    if any(one.children for one in each):
+        return tree
+    together = _stacked([one.to_dataset(inherit=False) for one in each])
+    return tree if together is None else _with_group(tree, {f"/{GROUP}": together})
+
+
+def separate_whiskers(tree: xr.DataTree) -> xr.DataTree:
+    """Give every whisker its own group again."""
+    group = tree.children.get(GROUP)
+    if group is None or _OWN not in group.attrs:
+        return tree
+    together = group.to_dataset(inherit=False)
+    each = {f"/{GROUP}/{i}": _unstacked(together, i) for i in range(together.sizes[_WHISKER])}
+    return _with_group(tree, {f"/{GROUP}": xr.Dataset()} | each)
+
+
+def _with_group(tree: xr.DataTree, groups: Mapping[str, xr.Dataset]) -> xr.DataTree:
+    """Exchange the whiskers of a tree; all else and the order of groups stay."""
+    out: dict[str, xr.Dataset] = {}
+    for node in tree.subtree:
+        if node.path == f"/{GROUP}":
+            out |= groups
+        elif not node.path.startswith(f"/{GROUP}/"):
+            out[node.path] = node.to_dataset(inherit=False)
+    return xr.DataTree.from_dict(out, name=tree.name)
+
+
+def _stacked(each: Sequence[xr.Dataset]) -> xr.Dataset | None:
+    """Several whiskers as one dataset; None where that would lose something."""
+    first = each[0]
+    own = [
+        name
+        for name in first.attrs
+        if any(one.attrs.get(name) != first.attrs[name] for one in each)
+    ]
+    uneven = {dim for dim in first.sizes if len({one.sizes.get(dim) for one in each}) > 1}
+    if not all(_alike(one, first, own, uneven) for one in each):
+        return None
+    variables = {
+        name: xr.Variable(
+            (_WHISKER, *variable.dims), _filled([one[name].values for one in each]), variable.attrs
+        )
+        for name, variable in first.data_vars.items()
+    }
+    for dim in sorted(map(str, uneven)):
+        about = {"units": "1", "long_name": f"size of each whisker along {dim}"}
+        variables[f"{_SIZE}{dim}"] = xr.Variable(_WHISKER, [one.sizes[dim] for one in each], about)
+    for name in own:
+        about = {"long_name": f"attribute {name} of each whisker"}
+        variables[name] = xr.Variable(_WHISKER, [one.attrs[name] for one in each], about)
+    same = {name: value for name, value in first.attrs.items() if name not in own}
+    return xr.Dataset(variables, first.coords, same | {_OWN: " ".join(own)})
+
+
+def _alike(one: xr.Dataset, first: xr.Dataset, own: Sequence[str], uneven: set[Any]) -> bool:
+    """Whether a whisker differs from the first in nothing but what a stack can tell."""
+    if set(one.attrs) != set(first.attrs) or set(own) & set(map(str, first.variables)):
+        return False
+    if not all(type(one.attrs[name]) is str and name.isidentifier() for name in own):
+        return False
+    if list(one.variables) != list(first.variables) or set(one.coords) != set(first.coords):
+        return False
+    return all(
+        bool(one.variables[name].identical(variable))  # type: ignore[no-untyped-call]
+        if name in first.coords
+        else _fits(one.variables[name], variable, uneven)
+        for name, variable in first.variables.items()
+    )
+
+
+def _fits(one: xr.Variable, first: xr.Variable, uneven: set[Any]) -> bool:
+    if one.dims != first.dims or one.dtype != first.dtype or one.attrs != first.attrs:
+        return False
+    return _WHISKER not in one.dims and (one.dtype.kind == "f" or not uneven.intersection(one.dims))
+
+
+def _filled(each: Sequence[np.ndarray]) -> np.ndarray:
+    """Arrays one upon the other, the smaller filled up with NaN."""
+    shape = np.max([one.shape for one in each], axis=0).astype(int)
+    if all(one.shape == tuple(shape) for one in each):
+        return np.stack(each)
+    values = np.full((len(each), *shape), np.nan, dtype=each[0].dtype)
+    for row, one in zip(values, each, strict=True):
+        row[tuple(slice(size) for size in one.shape)] = one
+    return values
+
+
+def _unstacked(together: xr.Dataset, index: int) -> xr.Dataset:
+    """A whisker of a stack as it was before."""
+    own = str(together.attrs[_OWN]).split()
+    attrs = {key: value for key, value in together.attrs.items() if key != _OWN}
+    attrs |= {name: str(together[name].values[index]) for name in own}
+    size = {
+        dim: int(together[_SIZE + str(dim)].values[index])
+        for dim in together.sizes
+        if _SIZE + str(dim) in together
+    }
+    told = {*own, *(f"{_SIZE}{dim}" for dim in size)}
+    variables = {}
+    for name, variable in together.variables.items():
+        if name in told or name == _WHISKER:
+            continue
+        dims = variable.dims
+        values = variable.values
+        if _WHISKER in dims:
+            dims, values = dims[1:], values[index]
+        within = tuple(slice(size.get(dim)) for dim in dims)
+        variables[name] = xr.Variable(dims, np.array(values[within]), variable.attrs)
+    labels = [name for name in together.coords if name in variables]
+    return xr.Dataset(variables, attrs=attrs).set_coords(labels)

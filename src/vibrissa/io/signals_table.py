@@ -2,7 +2,7 @@
 
 CSV, or a NetCDF file with variables of these names along one dimension. Lines that are empty or
 begin with # are passed over, other columns are left alone, and an empty cell or ``nan`` is missing.
-A name may carry a unit (:mod:`vibrissa.io.columns`), ``Fx_mN`` or ``Mx (µN·m)``; what is no unit is
+A name may carry a unit (:mod:`vibrissa.io.table`), ``Fx_mN`` or ``Mx (µN·m)``; what is no unit is
 refused by name, and so are numbers that cannot be what they say: too large, or with a moment too
 large or small for the force, as |M| / |F| is at most the distance of the contact.
 """
@@ -17,11 +17,17 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from vibrissa.io.columns import signal_columns, unit_factor, units_of
-from vibrissa.io.hdf5 import naming
-from vibrissa.io.netcdf import is_netcdf, read_dataset
-from vibrissa.io.replace import replacing
-from vibrissa.io.table import is_number, read_rows, read_text, table_rows
+from vibrissa.io.netcdf import is_netcdf, naming, read_dataset
+from vibrissa.io.paths import replacing
+from vibrissa.io.table import (
+    is_number,
+    read_rows,
+    read_text,
+    signal_columns,
+    table_rows,
+    unit_factor,
+    units_of,
+)
 from vibrissa.quantities import attributes
 from vibrissa.whisker import Whisker
 

@@ -17,7 +17,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from vibrissa.io.hdf5 import opened
+from vibrissa.io.netcdf import opened
 from vibrissa.io.paths import check_readable
 from vibrissa.io.tracks import Labels, RawTracks, labelled
 

@@ -2,19 +2,25 @@
 
 A file holds the traces of some whiskers from the first frame on, as one array of points with their
 number per frame, and a key that says of which video and with which settings.
+
+Corrected traces as CSV: points that a person says are right.
+
+Columns ``view,frame,whisker,x,y``: the points of a whisker in one frame of one view (a number from
+0), from base to tip, column and row in pixels, a line each.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from zipfile import BadZipFile
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.io.replace import replacing
+from vibrissa.io.paths import replacing
+from vibrissa.io.table import read_text, table_rows
 
 Array = NDArray[np.float64]
 Row = tuple[Array, Array, NDArray[np.bool_], float, bool, bool]
@@ -84,3 +90,90 @@ def load_traces(path: str | PathLike[str], key: str) -> list[list[Row]] | None:
 
 
 _COLUMNS = ("line", "sigma", "seen")
+
+
+CORRECTION_COLUMNS = ("view", "frame", "whisker", "x", "y")
+
+
+def load_corrections(path: str | PathLike[str]) -> dict[int, dict[tuple[int, int], Array]]:
+    """Read corrected traces.
+
+    Parameters
+    ----------
+    path : str or path
+        CSV file.
+
+    Returns
+    -------
+    dict
+        By view: by frame and whisker the points (n, 2) from base to tip, column and row.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If it has other columns, a row that cannot be read, or a trace of one point.
+    """
+    path = Path(path)
+    rows = table_rows(read_text(path))
+    header = next(rows, None)
+    if header is None or tuple(header[1]) != CORRECTION_COLUMNS:
+        got = "is empty" if header is None else f"has the columns {', '.join(header[1])}"
+        raise ValueError(f"{path} {got}; {', '.join(CORRECTION_COLUMNS)} are needed")
+    points: dict[int, dict[tuple[int, int], list[tuple[float, float]]]] = {}
+    for line, cells in rows:
+        try:
+            view, frame, whisker = (int(cell) for cell in cells[:3])
+            x, y = (float(cell) for cell in cells[3:])
+            if min(view, frame, whisker) < 0 or not np.isfinite([x, y]).all():
+                raise ValueError
+        except ValueError:
+            raise ValueError(
+                f"{path}: line {line} reads {','.join(cells)!r}, which is no point of a trace"
+            ) from None
+        points.setdefault(view, {}).setdefault((frame, whisker), []).append((x, y))
+    short = [(v, *key) for v, each in points.items() for key, p in each.items() if len(p) < 2]
+    if short:
+        view, frame, whisker = short[0]
+        raise ValueError(
+            f"{path}: whisker {whisker} in frame {frame} of view {view} has one point; from base "
+            "to tip at least two are needed"
+        )
+    return {view: {key: np.array(p) for key, p in each.items()} for view, each in points.items()}
+
+
+def save_corrections(
+    path: str | PathLike[str], corrections: Mapping[int, Mapping[tuple[int, int], ArrayLike]]
+) -> None:
+    """Write corrected traces so that `load_corrections` reads them.
+
+    Parameters
+    ----------
+    path : str or path
+        CSV file; an existing one is replaced once the new one is complete.
+    corrections : mapping
+        By view: by frame and whisker the points (n, 2) from base to tip, column and row.
+
+    Raises
+    ------
+    ValueError
+        If a trace has less than two points, or one that is not finite.
+    """
+    lines = [",".join(CORRECTION_COLUMNS)]
+    for view, each in sorted(corrections.items()):
+        for (frame, whisker), points in sorted(each.items()):
+            array = np.asarray(points, dtype=np.float64)
+            if array.ndim != 2 or array.shape[1:] != (2,) or len(array) < 2:
+                raise ValueError(
+                    f"whisker {whisker} in frame {frame} of view {view}: points of shape "
+                    f"{array.shape}; (n, 2), n ≥ 2, is needed"
+                )
+            if not np.isfinite(array).all():
+                raise ValueError(
+                    f"whisker {whisker} in frame {frame} of view {view} has points that are not "
+                    "finite"
+                )
+            lines += [f"{view},{frame},{whisker},{x!r},{y!r}" for x, y in array.tolist()]
+    with replacing(path) as part:
+        part.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -22,8 +22,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa.io.netcdf import COMPRESSED, kind_of, read_dataset, write_netcdf
-from vibrissa.io.paths import CSV, NETCDF, check_writable
-from vibrissa.io.replace import replacing
+from vibrissa.io.paths import CSV, NETCDF, check_writable, replacing
 from vibrissa.io.table import read_text, table_rows
 from vibrissa.io.tracks import KIND, UNITS, Labels, RawTracks, labelled
 

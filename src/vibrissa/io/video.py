@@ -2,12 +2,23 @@
 
 Any container and codec that FFmpeg knows can be read; colour is turned into grey. Written are 8 bit
 grey frames: FFV1 (lossless) in Matroska by default, H.264 in MP4.
+
+Single frames of a video, in any order.
+
+Any frame of a video, in any order.
+
+Images that cameras took at the same moments: numbered image files, or a video each.
+
+``top_01.png … front_01.png …`` are images of the cameras ``top`` and ``front``; where the names are
+only numbers, the folder is the camera. Images of one number belong together. Of videos some frames
+are taken, the same ones of each.
 """
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterable, Iterator
+import re
+from collections import OrderedDict, deque
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import chain, pairwise
@@ -18,8 +29,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.io.paths import refuse_whisk
-from vibrissa.io.replace import replacing
+from vibrissa.io.kinds import Kind, recognise
+from vibrissa.io.paths import refuse_whisk, replacing
 
 if TYPE_CHECKING:
     from av.container import InputContainer
@@ -293,3 +304,196 @@ def grey_frame(frame: Any) -> Frame:
         grey: Frame = rows[: frame.height, : frame.width]
         return grey
     return np.asarray(frame.to_ndarray(format="gray"), dtype=np.uint8)
+
+
+Frame = NDArray[np.uint8]
+
+AHEAD = 60
+"""Frames that are rather decoded one after another than jumped over."""
+
+
+class Footage:
+    """A video to look at frame by frame; keeps the file open until it is closed."""
+
+    def __init__(self, path: str | PathLike[str]) -> None:
+        self.info = video_info(path)
+        self._path = path
+        self._container = opened_video(path)
+        self._stream = self._container.streams.video[0]
+        self._stream.thread_type = "AUTO"
+        self._start = self._stream.start_time or 0
+        self._frames: Any = self._container.decode(self._stream)
+        self._shown = -1
+        self._last: Frame | None = None
+
+    def frame(self, number: int) -> Frame:
+        """Give one frame."""
+        import av
+
+        if number < 0:
+            raise ValueError(f"frames are numbered from 0; got {number}")
+        if number == self._shown and self._last is not None:
+            return self._last
+        try:
+            if not self._shown < number <= self._shown + AHEAD:
+                self._jump(number)
+            while self._shown < number:
+                frame = next(self._frames, None)
+                if frame is None:
+                    raise ValueError(f"{self._path} ends before frame {number}")
+                self._shown = self._number(frame)
+                self._last = grey_frame(frame)
+        except av.FFmpegError as error:
+            raise ValueError(f"{self._path} is damaged near frame {number}") from error
+        assert self._last is not None  # a frame was decoded
+        return self._last
+
+    def _jump(self, number: int) -> None:
+        """Go on from the last frame before that can be decoded by itself."""
+        rate, base = self._stream.average_rate, self._stream.time_base
+        place = 0 if rate is None or base is None else round(number / rate / base)
+        self._container.seek(self._start + place, stream=self._stream)
+        self._frames = self._container.decode(self._stream)
+        self._shown = -1
+
+    def _number(self, frame: Any) -> int:
+        rate = self._stream.average_rate
+        if frame.pts is None or rate is None:
+            return self._shown + 1
+        number: int = round((frame.pts - self._start) * frame.time_base * rate)
+        return number
+
+    def close(self) -> None:
+        """Close the file."""
+        self._container.close()
+
+
+_MEMORY = 200e6
+
+
+class FrameReader:
+    """Frames of a video by number.
+
+    Frames are decoded one after the other, so that their numbers are right in every kind of video;
+    the latest are kept. Going back farther than that begins anew.
+
+    Parameters
+    ----------
+    path : str or path
+        Of the video.
+    memory : float
+        What is kept, bytes.
+    """
+
+    def __init__(self, path: str | PathLike[str], memory: float = _MEMORY) -> None:
+        self.path = Path(path)
+        self._memory = memory
+        self._kept: OrderedDict[int, Frame] = OrderedDict()
+        self._coming: Iterator[Frame] = read_video(self.path)
+        self._next = 0
+        self._count: int | None = None
+
+    def __getitem__(self, number: int) -> Frame:
+        """Give a frame, counted from 0; an ``IndexError`` if there are fewer."""
+        if number < 0:
+            raise IndexError(f"frame {number}; they are counted from 0")
+        if number in self._kept:
+            return self._kept[number]
+        if self._count is not None and number >= self._count:
+            raise self._beyond(number)
+        if number < self._next:
+            self._coming, self._next = read_video(self.path), 0
+        while self._next <= number:
+            frame = next(self._coming, None)
+            if frame is None:
+                # So that the next request does not go on with a decoder that is done.
+                self._count, self._coming, self._next = self._next, read_video(self.path), 0
+                raise self._beyond(number)
+            self._keep(self._next, frame)
+            self._next += 1
+        return self._kept[number]
+
+    def _beyond(self, number: int) -> IndexError:
+        return IndexError(f"{self.path} has {self._count} frames; there is no frame {number}")
+
+    def _keep(self, number: int, frame: Frame) -> None:
+        self._kept[number] = frame.copy()
+        self._kept.move_to_end(number)
+        while len(self._kept) > max(2, int(self._memory / frame.nbytes)):
+            self._kept.popitem(last=False)
+
+
+_NUMBERED = re.compile(r"^(.*?)[ _.-]*(\d+)$")
+
+
+def load_series(paths: Sequence[str | PathLike[str]], most: int = 40) -> dict[str, list[Frame]]:
+    """Read images of several cameras.
+
+    Parameters
+    ----------
+    paths : sequence of str or path
+        Images (PNG, JPEG, TIFF, …), or videos.
+    most : int
+        Frames that are taken of a video, evenly spread.
+
+    Returns
+    -------
+    dict
+        By name of the camera its grey images, moment by moment.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If one is neither image nor video, both are mixed, or the cameras' images do not belong
+        together.
+    """
+    files = [Path(path) for path in paths]
+    videos = [recognise(path) == Kind.VIDEO for path in files]
+    if all(videos):
+        return _of_videos(files, most)
+    if any(videos):
+        raise ValueError(f"{files[videos.index(True)]} is a video; give images or videos, not both")
+    return _of_images(files)
+
+
+def _of_videos(files: Sequence[Path], most: int) -> dict[str, list[Frame]]:
+    names = [path.stem for path in files]
+    if len(set(names)) < len(names):
+        names = [f"{path.parent.name} {path.stem}" for path in files]
+    if len(set(names)) < len(names):
+        raise ValueError(f"two videos have the same name: {', '.join(sorted(names))}")
+    count = min(video_info(path).frames for path in files)
+    if not count:
+        raise ValueError("a video does not say how many frames it has: save frames as images")
+    chosen = set(np.linspace(0, count - 1, min(most, count)).astype(int).tolist())
+    return {
+        name: [frame.copy() for i, frame in enumerate(read_video(path)) if i in chosen]
+        for name, path in zip(names, files, strict=True)
+    }
+
+
+def _of_images(files: Sequence[Path]) -> dict[str, list[Frame]]:
+    numbered: dict[str, dict[int, Path]] = {}
+    for path in files:
+        match = _NUMBERED.match(path.stem)
+        if match is None:
+            raise ValueError(f"{path} has no number; images are called like top_01.png")
+        name, number = match[1] or path.resolve().parent.name, int(match[2])
+        if number in numbered.setdefault(name, {}):
+            raise ValueError(f"{path} and {numbered[name][number]} have the same camera and number")
+        numbered[name][number] = path
+    moments = sorted(set().union(*numbered.values()))
+    for name, images in numbered.items():
+        missing = [number for number in moments if number not in images]
+        if missing:
+            raise ValueError(
+                f"camera {name} has no image {missing[0]} ({len(missing)} are missing of "
+                f"{len(moments)}): images of one number belong together"
+            )
+    return {name: [_image(images[n]) for n in moments] for name, images in numbered.items()}
+
+
+def _image(path: Path) -> Frame:
+    return next(read_video(path)).copy()

@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.io.replace import replacing
+from vibrissa.io.paths import replacing
 from vibrissa.io.toml import number_array, quoted, read_toml
 from vibrissa.sensors.frame import SensorFrame
 from vibrissa.sensors.sensor import Sensor

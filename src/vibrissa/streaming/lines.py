@@ -1,7 +1,7 @@
 """Lines of signals: CSV with a header, or one JSON object a line.
 
 Both carry numbers by name, in SI units; signals of a table may be in others if its header says so
-(:mod:`vibrissa.io.columns`), and its cells may be parted by semicolons, tabs or blanks. The pose of
+(:mod:`vibrissa.io.table`), and its cells may be parted by semicolons, tabs or blanks. The pose of
 the base may ride along: ``base_x``, ``base_y`` and ``base_z`` (m, laboratory), and a unit
 quaternion ``base_qw``, ``base_qx``, ``base_qy``, ``base_qz`` that turns the whisker's into the
 laboratory frame. A JSON object may hold a pose and its time alone. What ROS says of a message is
@@ -24,8 +24,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.io.columns import signal_column, signal_columns
-from vibrissa.io.table import cells_of, delimiter_of, is_number, number, with_point
+from vibrissa.io.table import (
+    cells_of,
+    delimiter_of,
+    is_number,
+    number,
+    signal_column,
+    signal_columns,
+    with_point,
+)
 from vibrissa.signals import SIGNALS
 
 Array = NDArray[np.float64]

@@ -11,6 +11,7 @@ from vibrissa import __version__
 
 COMPUTING = (
     "quantities.py",
+    "quantities.csv",
     "sketch.py",
     "status.py",
     "whisker",

@@ -20,9 +20,8 @@ from tracking_picture import tracking_picture
 
 import vibrissa as vb
 from vibrissa import plots
-from vibrissa.cli.figures import witnesses
 from vibrissa.contour import compare_with, distances_by, shape_from_dataset
-from vibrissa.identifiability import critical_cones
+from vibrissa.identifiability import critical_cones, witness_pairs
 from vibrissa.paper import error_solid, signal_slice
 from vibrissa.pipeline import with_contour, with_estimates
 from vibrissa.recording import Recording
@@ -62,7 +61,7 @@ def verdicts() -> xr.Dataset:
 
 def witness(whisker: vb.Whisker, found: xr.Dataset, triplet: str) -> Figure:
     """Two contacts that feel the same."""
-    return plots.witness_pair(dict(witnesses(whisker, found))[triplet])
+    return plots.witness_pair(dict(witness_pairs(whisker, found, [triplet]))[triplet])
 
 
 def c2() -> Figure:

@@ -98,7 +98,14 @@ def files(images, tmp_path):
 
 def test_the_verb_writes_cameras_that_see_the_same_points(files):
     out = files / "cameras.toml"
-    words = ["calibrate", "--pattern", "7x5", "--square", SQUARE, *sorted(files.glob("*.png"))]
+    words = [
+        "calibrate",
+        "--pattern",
+        "7x5",
+        "--square",
+        1e3 * SQUARE,
+        *sorted(files.glob("*.png")),
+    ]
     done = run(*words, "-o", out)
     assert done.exit_code == 0, done.exception
     assert "reprojection error 0.0" in done.stdout
@@ -119,20 +126,20 @@ def test_the_verb_takes_a_video_of_each_camera(images, tmp_path):
     for name, frames in series.items():
         np.testing.assert_array_equal(frames, [images[name][i] for i in (0, 3, 6, 9)])
     out = tmp_path / "cameras.toml"
-    done = run("calibrate", "--pattern", "7x5", "--square", SQUARE, *videos, "-o", out)
+    done = run("calibrate", "--pattern", "7x5", "--square", 1e3 * SQUARE, *videos, "-o", out)
     assert done.exit_code == 0, done.exception
     assert [camera.name for camera in load_cameras(out)] == ["left", "right"]
 
 
 def test_what_cannot_be_calibrated_says_why(files):
-    def said(*words, pattern="7x5", square=SQUARE):
+    def said(*words, pattern="7x5", square=1e3 * SQUARE):
         done = run("calibrate", "--pattern", pattern, "--square", square, *words)
         assert done.exit_code != 0
         return str(done.exception)
 
     images = sorted(files.glob("*.png"))
     out = ("-o", files / "c.toml")
-    assert "in m is needed" in said(*images, *out, square=2.0)
+    assert "in mm is needed" in said(*images, *out, square=SQUARE)
     assert "as 9x6" in said(*images, *out, pattern="seven")
     assert "camera right has no image 9" in said(*images[:-1], *out)
     assert ".toml is needed" in said(*images, "-o", files / "c.csv")

@@ -63,10 +63,10 @@ def estimated(folder, tmp_path, *words):
     return load_contacts(path)
 
 
-@pytest.mark.parametrize("how", [("--signals", "Fx,MB,MD"), ("--signals", "Fx,FT,MB,MD"), ()])
+@pytest.mark.parametrize("how", [("--using", "Fx,MB,MD"), ("--using", "Fx,FT,MB,MD"), ()])
 def test_stated_errors_are_in_what_estimate_writes(folder, tmp_path, bent, how):
     """The same covariances as in Python, of three signals, of four and of the whole wrench."""
-    given = how or ("--wrench",)
+    given = how or ("--using", "wrench")
     maps = ("--map", folder / "map.nc") if how else ()
     options = ("--gain-sigma", 1, "--mixing-sigma", 2, "--stiffness-sigma", 3)
     sigmas = {"gain_sigma": 0.01, "mixing_sigma": 0.02, "stiffness_sigma": 0.03}
@@ -88,7 +88,7 @@ def test_stated_errors_are_in_what_estimate_writes(folder, tmp_path, bent, how):
 
 
 def test_a_prior_is_in_what_estimate_writes(folder, tmp_path, bent):
-    options = ("--map", folder / "map.nc", "--signals", "Fx,FT,FD,Mx,MB,MD")
+    options = ("--map", folder / "map.nc", "--using", "Fx,FT,FD,Mx,MB,MD")
     back = concave_backward(vb.samples.gamma(), bent[1])
     table = estimated(folder, tmp_path, *options, "--region", "CB")
     assert (table["status"].values[back] == Status.UNIQUE).mean() > 0.9
@@ -125,7 +125,7 @@ def test_a_stream_knows_the_same(folder, tmp_path, bent):
     wider = [b["sigma_x"] / a["sigma_x"] for a, b in zip(plain, wide, strict=True) if "x" in a]
     assert np.median(wider) > 1.2
     back = concave_backward(vb.samples.gamma(), bent[1])
-    some = lines(folder, tmp_path, "--region", "CB", "--signals", "Fx,FT,FD,Mx,MB,MD")
+    some = lines(folder, tmp_path, "--region", "CB", "--using", "Fx,FT,FD,Mx,MB,MD")
     for record, holds in zip(some, back, strict=True):
         assert record["status"] == ("unique" if holds else "outside_prior")
 
@@ -134,7 +134,7 @@ def test_a_stream_takes_errors_from_the_sensors_file(folder, tmp_path):
     sigma = {}
     for gain in (0.0, 0.05):
         save_sensor(tmp_path / "sensor.toml", Sensor(noise=NOISE, gain_error=gain))
-        some = lines(folder, tmp_path, "--sensor", tmp_path / "sensor.toml", "--felt", 0)
+        some = lines(folder, tmp_path, "--sensor", tmp_path / "sensor.toml", "--threshold", 0)
         sigma[gain] = some[0]["sigma_x"]
     assert sigma[0.05] > 1.2 * sigma[0.0]
     words = ("stream", "--map", folder / "map.nc", "--sensor", tmp_path / "sensor.toml")
@@ -146,8 +146,8 @@ def test_maps_begin_where_they_are_asked_to(folder, tmp_path):
     """The option is of maps that are made; with one that is given it would have no effect."""
     done("map", "--no-grid", "--proximal", 0.6, "-o", tmp_path / "map.nc")
     assert ContactMap.load(tmp_path / "map.nc").chart.proximal == 0.6
-    table = estimated(folder, tmp_path, "--proximal", 0.6, "--signals", "Fx,MB,MD")
-    near = estimated(folder, tmp_path, "--map", folder / "map.nc", "--signals", "Fx,MB,MD")
+    table = estimated(folder, tmp_path, "--proximal", 0.6, "--using", "Fx,MB,MD")
+    near = estimated(folder, tmp_path, "--map", folder / "map.nc", "--using", "Fx,MB,MD")
     distal, here = table["r"].values, near["r"].values
     same = np.isclose(distal, here, rtol=1e-4)
     assert 5 < same.sum() < len(same) - 5

@@ -10,7 +10,8 @@ from typer.testing import CliRunner
 import vibrissa as vb
 from vibrissa import samples
 from vibrissa.cli.app import app, main
-from vibrissa.cli.terminal import fixed, numbers, shown
+from vibrissa.cli.options import numbers
+from vibrissa.cli.terminal import fixed, shown
 from vibrissa.io import load_contacts, save_centerline, save_signals
 
 VERBS = ("demo", "deflect", "map", "uniqueness", "sensitivity", "signals", "estimate")
@@ -108,11 +109,11 @@ def test_deflect_prints_what_deflect_gives():
 
 
 def test_deflect_by_force_and_by_peg():
-    text = run("deflect", "--force", "25,50,90")
+    text = run("deflect", "--point-force", "25,50,90")
     assert "25.0000 mm" in text
     assert "OK" not in text
     assert str(vb.Status.NO_CONTACT) in run("deflect", "--peg", "-5,20,0,2.7")
-    text = run("deflect", "--peg", "25,8,0,2.7", "--side", "0,1,0")
+    text = run("deflect", "--peg", "25,8,0,2.7", "--push", "0,1,0")
     assert str(vb.Status.OK) in text
 
 
@@ -136,10 +137,10 @@ def test_estimate_from_more_signals_and_from_all(folder, chart, table):
     np.savetxt(noise, np.diag(np.repeat([1e-12, 4e-16], 3)), delimiter=",")
     for i, options in enumerate(
         [
-            ("--signals", "Fx FT MB MD"),
-            ("--signals", "Fx,FT,FD,Mx,MB,MD", "--noise", noise),
-            ("--wrench",),
-            ("--triplet", "Fx,MB,MD"),
+            ("--using", "Fx FT MB MD"),
+            ("--using", "Fx,FT,FD,Mx,MB,MD", "--covariance", noise),
+            ("--using", "wrench"),
+            ("--using", "Fx,MB,MD"),
         ]
     ):
         out = folder / f"more{i}.csv"
@@ -152,7 +153,7 @@ def test_estimate_from_more_signals_and_from_all(folder, chart, table):
         np.testing.assert_allclose(found, points[:2], atol=3e-7)
         assert np.isfinite(contacts["sigma_x"].values[:2]).all()
     # Of the built-in whisker; all six need no map.
-    run("estimate", path, "--wrench", "-o", folder / "no_map.csv")
+    run("estimate", path, "--using", "wrench", "-o", folder / "no_map.csv")
 
 
 def test_a_lookup_needs_a_map_with_a_grid(folder, table, chart, monkeypatch, capsys):
@@ -173,7 +174,7 @@ def test_estimate_without_a_map_simulates_one_and_says_so(folder, table):
 
 def test_demo_writes_and_reports(folder):
     out = folder / "demo"
-    text = run("demo", "--output", out, "--no-video", "--duration", 0.4, "--rate", 250)
+    text = run("demo", "--output", out, "--no-tracking", "--duration", 0.4, "--rate", 250)
     for words in ("exactly one candidate", "3D error by deflection angle", "diameter", "median*"):
         assert words in text
     written = {file.name for file in out.iterdir()}
@@ -207,19 +208,25 @@ def test_info(folder, table, chart):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("deflect",), "one of --point, --force and --peg is needed; got none"),
-        (("deflect", "--point", "1,2,3", "--force", "1,2,3"), "got --point and --force"),
+        (("deflect",), "one of --point, --point-force and --peg is needed; got none"),
+        (
+            ("deflect", "--point", "1,2,3", "--point-force", "1,2,3"),
+            "got --point and --point-force",
+        ),
         (("deflect", "--point", "1,2"), "X,Y,Z are needed"),
         (("deflect", "--whisker", "none.csv", "--point", "1,2,3"), "there is no file none.csv"),
         (("estimate", "none.csv"), "there is no file none.csv"),
-        (("estimate", "none.csv", "--signals", "Fx MB"), "at least 3 different signals"),
-        (("estimate", "none.csv", "--method", "guess"), "one of exact, lookup, lookup-linear, net"),
+        (("estimate", "none.csv", "--using", "Fx MB"), "at least 3 different signals"),
+        (("estimate", "none.csv", "--method", "guess"), "is not one of"),
         (
-            ("estimate", "none.csv", "--method", "lookup", "--signals", "Fx,FT,MB,MD"),
-            "--method lookup takes three signals; got 4",
+            ("estimate", "none.csv", "--method", "lookup", "--using", "Fx,FT,MB,MD"),
+            "--method lookup needs three signals; got 4",
         ),
-        (("estimate", "none.csv", "--method", "network", "--wrench"), "no --method network"),
-        (("estimate", "none.csv", "--noise", "no.csv"), "there is no file no.csv"),
+        (
+            ("estimate", "none.csv", "--method", "network", "--using", "wrench"),
+            "no --method network",
+        ),
+        (("estimate", "none.csv", "--covariance", "no.csv"), "there is no file no.csv"),
         (("info", "none.nc"), "there is no file none.nc"),
         (("demo", "--whisker", "none.csv"), "there is no file none.csv"),
     ],
@@ -233,10 +240,10 @@ def test_files_of_the_wrong_kind(monkeypatch, capsys, folder, table, chart):
     bad = folder / "bad.csv"
     bad.write_text("time,Fx\n0,1\n")
     assert "lacks Fy" in fault(monkeypatch, capsys, "estimate", bad, "--map", chart)
-    assert "no table that is known" in fault(monkeypatch, capsys, "info", bad)
+    assert "not a table that is known" in fault(monkeypatch, capsys, "info", bad)
     both = ("--map", chart, "--whisker", table[0])
     assert "either --map" in fault(monkeypatch, capsys, "estimate", table[0], *both)
-    triplet = ("--triplet", "Fx,MB")
+    triplet = ("--using", "Fx,MB")
     said = fault(monkeypatch, capsys, "estimate", table[0], "--map", chart, *triplet)
     assert "Error" in said
 

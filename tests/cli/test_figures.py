@@ -9,8 +9,9 @@ from typer.testing import CliRunner
 
 import vibrissa as vb
 from vibrissa import plots
-from vibrissa.cli import figures as verb
 from vibrissa.cli.app import app, main
+from vibrissa.identifiability import witness_pairs
+from vibrissa.plots.evidence import HIGHLIGHTED
 
 # The known pair of contacts that feel the same by (F_x, M_B, M_D): parabola with A·L = 0.82,
 # arc length in L and force in EI/L² (the second found by Newton from (0.645, 0.440)).
@@ -104,7 +105,7 @@ def test_a_map_gives_three_figures_and_verdicts_three_more(
 
 
 def test_witnesses_feel_the_same_and_lie_apart(whisker, verdicts) -> None:
-    ((triplet, pair),) = verb.witnesses(whisker, verdicts)
+    ((triplet, pair),) = witness_pairs(whisker, verdicts, HIGHLIGHTED)
     assert triplet == pair.attrs["triplet"] == "Fx MB MD"
     for name in triplet.split():
         np.testing.assert_allclose(*pair[name].values, rtol=1e-7)
@@ -120,8 +121,8 @@ def test_without_a_verdict_on_all_contacts_another_region_is_drawn(whisker, verd
     none = verdicts.assign_coords(region=["CB"])
     none["witness_separation"] = none["witness_separation"] * np.nan
     found = xr.concat([none, partly], "region")
-    ((triplet, pair),) = verb.witnesses(whisker, found)
-    ((_, wanted),) = verb.witnesses(whisker, verdicts)
+    ((triplet, pair),) = witness_pairs(whisker, found, HIGHLIGHTED)
+    ((_, wanted),) = witness_pairs(whisker, verdicts, HIGHLIGHTED)
     assert triplet == "Fx MB MD"
     xr.testing.assert_allclose(pair, wanted)
     (axes,) = plots.verdict_table(found).axes
@@ -131,14 +132,14 @@ def test_without_a_verdict_on_all_contacts_another_region_is_drawn(whisker, verd
 def test_verdicts_of_another_whisker_are_refused(verdicts) -> None:
     other = vb.Whisker.parabola(length=LENGTH, coefficient=0.8 / LENGTH)
     with pytest.raises(ValueError, match="not of this map's whisker"):
-        list(verb.witnesses(other, verdicts))
+        list(witness_pairs(other, verdicts, HIGHLIGHTED))
 
 
 def test_faults_are_told_before_anything_is_drawn(chart, tmp_path, monkeypatch, capsys) -> None:
     folder = tmp_path / "none"
     there = (chart, "-o", folder)
-    assert "--format is 'bmp'" in fault(monkeypatch, capsys, *there, "--format", "bmp")
-    assert "one of single, double" in fault(monkeypatch, capsys, *there, "--width", "triple")
+    assert "is not one of" in fault(monkeypatch, capsys, *there, "--format", "bmp")
+    assert "is not one of" in fault(monkeypatch, capsys, *there, "--width", "triple")
     missing = tmp_path / "missing.nc"
     assert "there is no file" in fault(monkeypatch, capsys, missing, "-o", folder)
     assert "there is no file" in fault(monkeypatch, capsys, *there, "--uniqueness", missing)

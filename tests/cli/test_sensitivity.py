@@ -74,7 +74,7 @@ def test_a_trial_as_signals_or_as_contact_points(chart, points, wrench):
     wanted = vb.sensitivity(vb.ContactMap.load(chart), "FT,MB,MD", points).sensitivity
     for path, rows in ((table, 4), (recording, 3)):
         out = chart.with_name("trial_sensitivity.nc")
-        run("sensitivity", chart, "--trial", path, "--triplet", "FT,MB,MD", "-o", out, "--force")
+        run("sensitivity", chart, "--trial", path, "--using", "FT,MB,MD", "-o", out, "--force")
         with xr.open_dataset(out, engine="h5netcdf") as data:
             assert data.sizes["time"] == rows
             assert np.isnan(data["sensitivity"][3:]).all()

@@ -127,7 +127,7 @@ def test_what_is_asked_for_is_made_anew(folder, tmp_path):
     done("reconstruct", work, "--axis", "0,0,1")
     assert load_recording(work)["contour"]["object_axis"].values.tolist() == [0, 0, 1]
     xr.testing.assert_identical(load_recording(work)["estimates"], first["estimates"])
-    done("reconstruct", work, "--wrench", "--force-noise", "2", "--force")
+    done("reconstruct", work, "--using", "wrench", "--force-noise", "2", "--force")
     other = load_recording(work)
     assert other["estimates"].attrs["signals"] == "wrench"
     xr.testing.assert_identical(other["signals"], first["signals"])
@@ -141,11 +141,11 @@ def test_a_shape_that_does_not_fit_is_said(folder, tmp_path):
     text = done("reconstruct", *words)
     assert "agree with it" in text
     assert "another shape" not in text
-    assert "goes better" not in text
+    assert "better" not in text
     text = " ".join(done("reconstruct", work, "--shape", "plane", "--force").split())
-    assert "do not go with a plane" in text
+    assert "do not fit a plane" in text
     assert "another shape (--shape)" in text
-    assert "A cylinder goes better with them" in text
+    assert "A cylinder fits them better" in text
 
 
 def test_another_whisker_makes_signals_and_contacts_anew(folder, tmp_path):
@@ -196,11 +196,11 @@ def test_files_that_are_no_recordings_are_refused(folder, tmp_path, verb):
         (("signals", "bare.nc"), "give its centreline with --whisker"),
         (("signals", "sim.nc", "--source", "rod"), "need wrench_covariance"),
         (("signals", "sim.nc", "--source", "contact-point"), "need contact_point"),
-        (("signals", "sim.nc", "--source", "magic"), "one of contact point, rod, sensor"),
+        (("signals", "sim.nc", "--source", "magic"), "is not one of"),
         (("signals", "tracked.nc", "--cutoff", 400), "below half of"),
         (("signals", "sim.nc", "-o", "s.txt"), ".csv is needed"),
         (("estimate", "sim.nc", "--map", "map.nc", "--map", "map.nc"), "2 --map for 1 whiskers"),
-        (("reconstruct", "sim.nc", "--shape", "cube"), "one of cylinder, sphere, plane, free"),
+        (("reconstruct", "sim.nc", "--shape", "cube"), "is not one of"),
         (
             ("reconstruct", "sim.nc", "--shape", "plane", "--axis", "0,0,1"),
             "--axis is for a cylinder",

@@ -124,7 +124,7 @@ def test_what_is_known_besides_the_videos_is_used(videos, tmp_path):
     whisker = tmp_path / "whisker.csv"
     save_centerline(whisker, Whisker.parabola(length=8e-3, coefficient=15.0).centerline(60))
     words = arguments(videos, "--cameras", videos / "cameras.toml", "-o", out)
-    done = run(*words, "--head", head, "--object", objects, "--whisker", whisker)
+    done = run(*words, "--head", head, "--objects", objects, "--whisker", whisker)
     assert done.exit_code == 0, done.exception
     assert "contact point (nearest to the object)" in done.stdout
     recording = load_recording(out)
@@ -139,8 +139,8 @@ def test_what_is_known_besides_the_videos_is_used(videos, tmp_path):
     head.write_text(head.read_text().rsplit("\n", 3)[0])
     done = run(*words, "--head", head, "--force")
     assert "missing for 3 frames of the video, the first of which is 13" in str(done.exception)
-    done = run(*words, "--contact", head, "--object", objects, "--force")
-    assert "give one of them" in str(done.exception)
+    done = run(*words, "--contact", head, "--objects", objects, "--force")
+    assert "give one" in str(done.exception)
 
 
 @pytest.mark.parametrize(
@@ -148,12 +148,12 @@ def test_what_is_known_besides_the_videos_is_used(videos, tmp_path):
     [
         (("--base", "20,30"), "each needs as many"),
         (("--offset", "some"), "a number of frames or auto"),
-        (("--pixel-size", "0"), "--pixel-size is 0 m"),
-        (("--width", "nan"), "--width is nan"),
+        (("--pixel-size", "0"), "--pixel-size is 0 mm"),
+        (("--base-width", "nan"), "--base-width is nan"),
         (("--jump", "-1"), "--jump is -1"),
-        (("--pixel-size", "0.058"), "11.136 m wide; it is in metres"),
-        (("--fps", "0"), "--fps is 0"),
-        (("--fps", "170"), "below half of 170 frames/s"),
+        (("--pixel-size", "58"), "11.136 m wide; it is in mm"),
+        (("--rate", "0"), "--rate is 0"),
+        (("--rate", "170"), "below half of 170 frames/s"),
         (("--base-radius", "-1"), "--base-radius is -1"),
         (("--base", "20,30", "--base", "20,192"), "outside of view 1, 192 × 192 pixels"),
     ],

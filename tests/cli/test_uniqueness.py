@@ -20,7 +20,7 @@ def chart(tmp_path_factory):
 
 def test_verdicts_and_a_witness(chart, tmp_path):
     out = tmp_path / "u.nc"
-    arguments = ["--triplet", "Fx,MB,MD", "--samples", "512", "--no-resolution", "-o", str(out)]
+    arguments = ["--using", "Fx,MB,MD", "--samples", "512", "--no-resolution", "-o", str(out)]
     result = CliRunner().invoke(app, ["uniqueness", str(chart), *arguments])
     assert result.exit_code == 0, result.output
     assert "Fx MB MD" in result.output
@@ -32,7 +32,7 @@ def test_verdicts_and_a_witness(chart, tmp_path):
 
 
 def test_cone_and_region(chart):
-    arguments = ["--triplet", "Fx MB MD", "--region", "all", "--cone", "8", "--samples", "512"]
+    arguments = ["--using", "Fx MB MD", "--region", "all", "--cone", "8", "--samples", "512"]
     result = CliRunner().invoke(app, ["uniqueness", str(chart), *arguments, "--no-resolution"])
     assert result.exit_code == 0, result.output
     assert "The triplet to use: (Fx, MB, MD), unique in: all." in result.output
@@ -41,9 +41,9 @@ def test_cone_and_region(chart):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--triplet", "Fx,MB"], "exactly 3"),
-        (["--region", "up"], "regions are among"),
-        (["--domain", "mars"], "domain is 'reachable' or 'paper'"),
+        (["--using", "Fx,MB"], "exactly 3"),
+        (["--region", "up"], "is not one of"),
+        (["--domain", "mars"], "is not one of"),
         (["-o", "verdicts.txt"], ".nc or .csv is needed"),
     ],
 )

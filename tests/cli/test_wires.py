@@ -1,22 +1,21 @@
 """Maps of wires from the command line: any length, thickness and material."""
 
 import pytest
+from typer.testing import CliRunner
 
 import vibrissa as vb
-from vibrissa.cli.charting import chart
+from vibrissa.cli.app import app
+
+
+def run(*words):
+    return CliRunner().invoke(app, ["map", "--no-grid", *map(str, words)])
 
 
 def test_a_map_of_a_steel_wire(tmp_path):
     path = tmp_path / "wire.nc"
-    chart(
-        length=300.0,
-        base_radius=500.0,
-        tip_radius=250.0,
-        modulus=200.0,
-        poisson=0.29,
-        path=path,
-        grid=False,
-    )
+    radii = ("--base-radius", 0.5, "--tip-radius", 0.25)
+    done = run("--length", 300, *radii, "--modulus", 200, "--poisson", 0.29, "-o", path)
+    assert done.exit_code == 0, done.exception
     wire = vb.ContactMap.load(path).whisker
     assert (wire.length, wire.base_radius, wire.tip_radius) == pytest.approx((0.3, 5e-4, 2.5e-4))
     assert (wire.youngs_modulus, wire.poisson_ratio) == (200e9, 0.29)
@@ -26,7 +25,7 @@ def test_a_map_of_a_steel_wire(tmp_path):
 
 def test_the_same_shape_in_another_material(tmp_path):
     path = tmp_path / "map.nc"
-    chart(base_radius=150.0, modulus=2.0, path=path, grid=False)
+    assert run("--base-radius", 0.15, "--modulus", 2, "-o", path).exit_code == 0
     whisker, usual = vb.ContactMap.load(path).whisker, vb.samples.gamma()
     assert whisker.base_radius == pytest.approx(1.5e-4)
     assert whisker.tip_radius == pytest.approx(1e-5)
@@ -35,6 +34,12 @@ def test_the_same_shape_in_another_material(tmp_path):
     assert abs(whisker.centerline(20) - usual.centerline(20)).max() < 1e-12
 
 
-def test_a_file_and_a_length_do_not_go_together(tmp_path):
-    with pytest.raises(ValueError, match="either --whisker or the --length"):
-        chart(whisker=tmp_path / "a.csv", length=30.0, path=tmp_path / "map.nc")
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--whisker", "a.csv", "--length", 30), "either --whisker or the --length"),
+        (("--base-radius", 500), "--base-radius is 500 mm; more than 0 and less than 10"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(tmp_path, words, message):
+    assert message in str(run(*words, "-o", tmp_path / "map.nc").exception)

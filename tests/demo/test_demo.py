@@ -6,9 +6,10 @@ import xarray as xr
 from typer.testing import CliRunner
 
 import vibrissa as vb
+import vibrissa.demo as filming
 from vibrissa import samples
 from vibrissa.cli.app import app
-from vibrissa.demo import filming, run_demo
+from vibrissa.demo import run_demo
 from vibrissa.evaluation import caution, tracking_scores, truth_of
 from vibrissa.evaluation.stages import from_curves, refined
 from vibrissa.io import load_contacts, load_recording
@@ -219,7 +220,13 @@ def test_the_command_reports_every_stage_from_video(from_video, folder, tmp_path
         return done.output
 
     text = run("demo", "-o", folder, "--duration", 0.4, "--rate", 250, "--seed", 2)
-    for words in ("0 of 100 frames lost", "contact point", "px", "Signals, median", "paper's way"):
+    for words in (
+        "0 of 100 frames lost",
+        "contact point",
+        "px",
+        "Signals, median",
+        "paper's method",
+    ):
         assert words in text
     assert {"top.mp4", "front.mp4", "tracked.nc"} <= {file.name for file in folder.iterdir()}
     assert "cylinder" in run("reconstruct", folder / "tracked.nc", "-o", tmp_path / "contour.nc")

@@ -220,7 +220,7 @@ def test_cameras_that_do_not_fit_the_videos_are_refused(tmp_path):
 
     def fault(views):
         save_cameras(tmp_path / "cameras.toml", views)
-        words = ["track", *videos, "--cameras", tmp_path / "cameras.toml", "--fps", 500]
+        words = ["track", *videos, "--cameras", tmp_path / "cameras.toml", "--rate", 500]
         words += ["-o", tmp_path / "trial.nc"]
         result = typer_testing.CliRunner().invoke(app, [str(word) for word in words])
         assert isinstance(result.exception, ValueError), result.exception
@@ -233,7 +233,7 @@ def test_cameras_that_do_not_fit_the_videos_are_refused(tmp_path):
     assert "calibrates camera 'top' for 64 × 48" in said
 
 
-@pytest.mark.parametrize(("verb", "option"), [("simulate", "--script"), ("track", "--object")])
+@pytest.mark.parametrize(("verb", "option"), [("simulate", "--script"), ("track", "--objects")])
 def test_a_verb_names_the_file_that_is_wrong(tmp_path, verb, option):
     path = tmp_path / "said.toml"
     path.write_text("[[object]]\nkind = 'egg'\n")
@@ -242,7 +242,7 @@ def test_a_verb_names_the_file_that_is_wrong(tmp_path, verb, option):
         for name in ("top", "front"):
             write_video(tmp_path / f"{name}.mkv", np.zeros((3, 64, 64), np.uint8), rate=25.0)
             words.append(tmp_path / f"{name}.mkv")
-        words += ["--fps", 500]
+        words += ["--rate", 500]
     else:
         words = [verb, path]
     words += ["-o", tmp_path / "trial.nc"]

@@ -87,8 +87,8 @@ verbs = [
     ["map", "--no-grid", "-o", chart],
     ["simulate", "--duration", "0.1", "-o", trial],
     ["signals", trial],
-    ["estimate", trial, "--wrench"],
-    ["estimate", trial, "--wrench", "-o", folder / "contacts.csv"],
+    ["estimate", trial, "--using", "wrench"],
+    ["estimate", trial, "--using", "wrench", "-o", folder / "contacts.csv"],
     ["report", trial, "-o", page, "--map", chart],
 ]
 for limit in (hard, 1500):

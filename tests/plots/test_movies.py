@@ -11,9 +11,10 @@ import xarray as xr
 from typer.testing import CliRunner
 
 import vibrissa as vb
-from vibrissa.cli import filming
+from vibrissa.cli import movie as movie_module
 from vibrissa.cli.app import app, main
-from vibrissa.cli.trial_views import sights_of
+from vibrissa.cli.drawings import sights_of
+from vibrissa.cli.movie import FrameOptions
 from vibrissa.io import save_recording, video_frames, video_info, write_movie, write_video
 from vibrissa.plots import Sight, contour_frames, course_of, signal_frames
 from vibrissa.plots.contour_movie import _SIDE_BOXES, _SIGHT_BOXES
@@ -172,14 +173,14 @@ def test_single_frames_are_those_of_the_whole_video(tmp_path, ending):
 
 def test_frames_are_chosen_by_time():
     time = np.arange(3500) * 1e-3
-    rows = filming.movie_rows(time, 25.0)
+    rows = FrameOptions().rows(time)
     assert 30.0 <= rows.size / 25.0 <= 60.0
     np.testing.assert_array_equal(
-        filming.movie_rows(time, 25.0, 10, 0.1, 0.13), [100, 110, 120, 130]
+        FrameOptions(25.0, 10, 0.1, 0.13).rows(time), [100, 110, 120, 130]
     )
     for wrong in ({"fps": 0.0}, {"step": 0}, {"start": 4.0}):
         with pytest.raises(ValueError, match=r"--fps|--step|no frames from"):
-            filming.movie_rows(time, **({"fps": 25.0} | wrong))
+            FrameOptions(**wrong).rows(time)
 
 
 @pytest.fixture
@@ -239,7 +240,7 @@ def repeat_frames(grey, count):
 
 
 def test_stopped_it_leaves_what_was_done(trial, tmp_path, monkeypatch):
-    made = filming._FRAMES["contour"]
+    made = movie_module._FRAMES["contour"]
 
     def interrupted(*arguments):
         for k, frame in enumerate(made(*arguments)):
@@ -247,7 +248,7 @@ def test_stopped_it_leaves_what_was_done(trial, tmp_path, monkeypatch):
                 signal.raise_signal(signal.SIGINT)
             yield frame
 
-    monkeypatch.setitem(filming._FRAMES, "contour", interrupted)
+    monkeypatch.setitem(movie_module._FRAMES, "contour", interrupted)
     done = run(trial, "-o", tmp_path / "a.mp4", "--kind", "contour")
     assert done.exit_code == 130
     assert "stopped after 3 of 12 frames" in done.output

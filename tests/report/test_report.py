@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 import vibrissa as vb
 from vibrissa import __version__, plots
-from vibrissa.cli import reporting
+from vibrissa.cli import report as reporting
 from vibrissa.cli.app import app
 from vibrissa.cli.figures import dataset_with
 from vibrissa.contacts import ContactMap
@@ -453,7 +453,7 @@ def test_movies_are_made_and_put_into_the_page(folder, tmp_path, monkeypatch):
     }
     save_recording(tmp_path / "short.nc", xr.DataTree.from_dict(groups))
     monkeypatch.setattr(reporting, "_drawn", lambda drawings, tell: {})
-    words = ("report", tmp_path / "short.nc", "--map", folder / "map.nc", "--movies")
+    words = ("report", tmp_path / "short.nc", "--map", folder / "map.nc", "--make-movies")
     run(*words, "-o", tmp_path / "short.html")
     page = Page((tmp_path / "short.html").read_text(encoding="utf-8"))
     assert page.sections.index("movies") == len(page.sections) - 2

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import vibrissa as vb
-from vibrissa.cli.information import info
+from vibrissa.cli.info import info
 from vibrissa.sensors import (
     Sensor,
     SensorFrame,

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
 from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
 import vibrissa as vb
-from vibrissa.cli.streaming import stream
+from vibrissa.cli.app import app
 from vibrissa.contacts import ContactFilter, Estimator
 from vibrissa.io.rosbag import bag_wrenches
 from vibrissa.sensors import Sensor, SensorFrame, save_sensor
@@ -26,6 +26,15 @@ from vibrissa.streaming import ContactStream, Lines, NewestLines, Poses, advice,
 from vibrissa.streaming.contacts import COMPONENTS, as_json
 from vibrissa.streaming.lines import POSITION, QUATERNION
 from vibrissa.streaming.sources import udp_lost, udp_socket
+
+
+def stream(*words):
+    """What the verb prints; its exception where it fails."""
+    done = CliRunner().invoke(app, ["stream", *map(str, words)])
+    if done.exception is not None and not isinstance(done.exception, SystemExit):
+        raise done.exception
+    return done
+
 
 START = "from vibrissa.cli import main; main()"
 NOISE = np.repeat([1e-6, 2e-8], 3)
@@ -576,7 +585,7 @@ def test_time_stamps_and_frames_go_through_unchanged(gamma_map, wrench, tmp_path
     stamps = 1_700_000_000_123_456_789 + 1_000_003 * np.arange(12)
     write_wrenches(tmp_path / "in", {"/wrench": wrench}, stamps=stamps.tolist())
     gamma_map.save(tmp_path / "map.nc")
-    stream(tmp_path / "in", chart=tmp_path / "map.nc", bag=tmp_path / "out")
+    stream(tmp_path / "in", "--map", tmp_path / "map.nc", "--bag-out", tmp_path / "out")
     assert [each.stamp for each in bag_wrenches(tmp_path / "in")] == stamps.tolist()
     messages = bag_messages(tmp_path / "out")
     for name in ("/contact_point", "/contact_candidates"):
@@ -648,7 +657,7 @@ def test_a_bag_that_was_killed_while_it_was_written_is_finished_by_the_reader(wr
 
 
 def test_a_bag_that_cannot_be_written_is_said_and_the_stream_goes_on(
-    map_file, wrench, tmp_path, capsys, monkeypatch
+    map_file, wrench, tmp_path, monkeypatch
 ):
     pytest.importorskip("rosbags")
 
@@ -658,12 +667,10 @@ def test_a_bag_that_cannot_be_written_is_said_and_the_stream_goes_on(
     lines = list(csv_lines(wrench))
     (tmp_path / "lines.csv").write_text("\n".join(lines))
     monkeypatch.setattr("vibrissa.io.rosbag.ContactBag.write", lambda *_: full(None))
-    with pytest.raises(typer.Exit) as ended:
-        stream(tmp_path / "lines.csv", chart=map_file, bag=tmp_path / "out")
-    assert ended.value.exit_code == 1
-    out, said = capsys.readouterr()
-    assert len(out.splitlines()) == len(wrench)
-    assert said.count("no space; the stream goes on without it") == 1
+    done = stream(tmp_path / "lines.csv", "--map", map_file, "--bag-out", tmp_path / "out")
+    assert done.exit_code == 1
+    assert len(done.stdout.splitlines()) == len(wrench)
+    assert done.stderr.count("no space; the stream goes on without it") == 1
 
 
 def test_bags_that_hold_something_else(wrench, tmp_path):
@@ -684,15 +691,14 @@ def test_bags_that_hold_something_else(wrench, tmp_path):
     assert stamps == [7_000_000_000, 7_001_000_000, 7_002_000_000]
 
 
-def test_a_bag_goes_in_and_a_bag_comes_out(map_file, bent, wrench, tmp_path, capsys):
+def test_a_bag_goes_in_and_a_bag_comes_out(map_file, bent, wrench, tmp_path):
     pytest.importorskip("rosbags")
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
     write_wrenches(tmp_path / "in", {"/wrench": wrench})
-    stream(tmp_path / "in", chart=map_file, bag=tmp_path / "out")
-    output = capsys.readouterr().out
+    output = stream(tmp_path / "in", "--map", map_file, "--bag-out", tmp_path / "out").stdout
     records = [json.loads(line) for line in output.splitlines()]
     assert [record["time"] for record in records] == pytest.approx(7.0 + 1e-3 * np.arange(12))
     with AnyReader([tmp_path / "out"], default_typestore=store) as reader:
@@ -713,13 +719,12 @@ def test_a_bag_goes_in_and_a_bag_comes_out(map_file, bent, wrench, tmp_path, cap
         assert cloud.row_step == cloud.data.size == 32 * cloud.width
 
 
-def test_a_bag_may_hold_the_pose_of_what_carries_the_base(map_file, wrench, tmp_path, capsys):
+def test_a_bag_may_hold_the_pose_of_what_carries_the_base(map_file, wrench, tmp_path):
     """A quarter turn about z, and the base 10 mm along the flange's x."""
     pytest.importorskip("rosbags")
     write_wrenches(tmp_path / "in", {"/wrench": wrench[5:9]}, position=[0.1, 0.2, 0.3])
-    mount = "10,0,0,1,0,0,0"
-    stream(tmp_path / "in", chart=map_file, follow=True, pose_topic="/flange", mount=mount)
-    for line in capsys.readouterr().out.splitlines():
+    pose = ("--filter", "--pose-topic", "/flange", "--mount", "10,0,0,1,0,0,0")
+    for line in stream(tmp_path / "in", "--map", map_file, *pose).stdout.splitlines():
         record = json.loads(line)
         x, y, z = (record[name] for name in "xyz")
         lab = [record[name] for name in ("lab_x", "lab_y", "lab_z")]
@@ -729,17 +734,17 @@ def test_a_bag_may_hold_the_pose_of_what_carries_the_base(map_file, wrench, tmp_
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"mount": "1,2,3"}, "seven numbers"),
-        ({"source": Path("nothing.csv")}, "there is no file"),
-        ({"udp": "here"}, "HOST:PORT"),
-        ({"source": Path("x"), "udp": "127.0.0.1:0"}, "either a source or --udp"),
-        ({"sensor": Path("none.toml")}, r"none\.toml"),
-        ({"udp": "127.0.0.1:0", "speed": 1.0}, "add --filter"),
-        ({"every": True}, "only of what comes by --udp"),
-        ({"reconnect": True}, "neither a named pipe nor a device"),
-        ({"source": Path(__file__), "reconnect": True}, "for pipes and devices"),
+        (["--mount", "1,2,3"], "X,Y,Z,QW,QX,QY,QZ are needed"),
+        (["nothing.csv"], "there is no file"),
+        (["--udp", "here"], "HOST:PORT"),
+        (["x", "--udp", "127.0.0.1:0"], "either a source or --udp"),
+        (["--sensor", "none.toml"], r"none\.toml"),
+        (["--udp", "127.0.0.1:0", "--speed", 1.0], "add --filter"),
+        (["--every"], "only of what comes by --udp"),
+        (["--reconnect"], "neither a named pipe nor a device"),
+        ([__file__, "--reconnect"], "for pipes and devices"),
     ],
 )
 def test_what_cannot_be_is_said(options, message, map_file):
     with pytest.raises((ValueError, OSError), match=message):
-        stream(chart=map_file, **options)
+        stream(*options, "--map", map_file)

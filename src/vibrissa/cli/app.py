@@ -3,69 +3,72 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from typing import Annotated
 
 import typer
 from rich.text import Text
 
-from vibrissa.cli import (
-    bend,
-    calibrating,
-    charting,
-    contouring,
-    correcting,
-    feeling,
-    figures,
-    filming,
-    information,
-    judging,
-    locating,
-    reporting,
-    sensing,
-    simulating,
-    streaming,
-    sweeping,
-    tracking,
-    viewing,
-    whole_job,
-)
-from vibrissa.cli.sources import about_whisker
-from vibrissa.cli.terminal import errors, output
+from vibrissa.cli.calibrate import calibrate
+from vibrissa.cli.correct import correct
+from vibrissa.cli.deflect import deflect
+from vibrissa.cli.demo import demo
+from vibrissa.cli.estimate import estimate
+from vibrissa.cli.figures import figures
+from vibrissa.cli.info import info
+from vibrissa.cli.map import simulate_map
+from vibrissa.cli.movie import movie
+from vibrissa.cli.reconstruct import reconstruct
+from vibrissa.cli.report import report
+from vibrissa.cli.sensitivity import sensitivity
+from vibrissa.cli.signals import signals
+from vibrissa.cli.simulate import simulate
+from vibrissa.cli.stream import stream
+from vibrissa.cli.sweep import sweep
+from vibrissa.cli.terminal import errors, output, remark
+from vibrissa.cli.track import track
+from vibrissa.cli.uniqueness import uniqueness
+from vibrissa.cli.view import view
 
-HELP = """From what a whisker feels at its base to what it touched.
+HELP = """From the forces at a whisker's base to what it touched.
 
-Numbers typed and printed are in mm, µN, µN·m and degrees unless an option says otherwise; files
-hold SI units. No file that is there is replaced without --force; stages are added to a recording
-where it is.
+Lengths typed and printed are in mm, forces in µN, moments in µN·m and angles in degrees; files hold
+SI units. No file that is there is replaced without --force; stages are added to a recording where
+it is.
 """
+
+VERBS: dict[str, Callable[..., None]] = {
+    "demo": demo,
+    "deflect": deflect,
+    "map": simulate_map,
+    "uniqueness": uniqueness,
+    "sensitivity": sensitivity,
+    "simulate": simulate,
+    "track": track,
+    "calibrate": calibrate,
+    "correct": correct,
+    "signals": signals,
+    "estimate": estimate,
+    "reconstruct": reconstruct,
+    "figures": figures,
+    "movie": movie,
+    "report": report,
+    "view": view,
+    "stream": stream,
+    "sweep": sweep,
+    "info": info,
+}
+"""The verbs, in the order in which they are listed."""
 
 app = typer.Typer(
     help=HELP,
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.command("demo")(about_whisker(whole_job.demo))
-app.command("deflect")(about_whisker(bend.bend))
-app.command("map")(about_whisker(charting.chart))
-app.command("uniqueness")(judging.uniqueness)
-app.command("simulate")(about_whisker(simulating.simulate))
-app.command("track")(about_whisker(tracking.track))
-app.command("correct")(correcting.correct)
-app.command("calibrate")(calibrating.calibrate)
-app.command("sensitivity")(sensing.sensitivity)
-app.command("signals")(about_whisker(feeling.signals))
-app.command("estimate")(about_whisker(locating.estimate))
-app.command("reconstruct")(about_whisker(contouring.reconstruct))
-app.command("stream")(about_whisker(streaming.stream))
-app.command("figures")(figures.figures)
-app.command("view")(about_whisker(viewing.view))
-app.command("movie")(filming.movie)
-app.command("report")(reporting.report)
-app.command("sweep")(sweeping.sweep)
-app.command("info")(information.info)
+for _name, _verb in VERBS.items():
+    app.command(_name)(_verb)
 
 
 def _version(asked: bool) -> None:
@@ -91,9 +94,9 @@ def main() -> None:
     try:
         app()
     except (ValueError, OSError, ModuleNotFoundError) as error:
-        said = Text.assemble(("Error:", "bold red"), " ", str(error))
-        errors.print(said, highlight=False, soft_wrap=True)
+        message = Text.assemble(("Error:", "bold red"), " ", str(error))
+        errors.print(message, highlight=False, soft_wrap=True)
         sys.exit(2)
     except KeyboardInterrupt:
-        errors.print("stopped")
+        remark("stopped")
         sys.exit(130)

@@ -1,38 +1,41 @@
-"""Consoles, progress bars and tables; numbers in display units."""
+"""Consoles, progress bars and signals; numbers in display units."""
 
 from __future__ import annotations
 
-import math
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
 
 from vibrissa.quantities import quantity
 
-_NAMED = 3
 output = Console(markup=False, emoji=False)
 """Where results go, as they are: names of files and whiskers may have brackets."""
 
 errors = Console(stderr=True, markup=False, emoji=False)
 """Where progress and messages go, so that results can be piped."""
 
-Force = Annotated[bool, typer.Option("--force", help="Replace files that are there already.")]
-"""The option of every verb that writes files of its own."""
-
 Tell = Callable[[str, int, int], None]
 """Called with what is being done, and how much of how much is."""
 
 
+def say(line: str = "") -> None:
+    """Print a line of the results."""
+    output.print(line, highlight=False, soft_wrap=True)
+
+
+def remark(line: str) -> None:
+    """Print a line that is not a result: what is assumed, or done by default."""
+    errors.print(line, highlight=False, soft_wrap=True)
+
+
 @contextmanager
 def progress_bars() -> Iterator[Tell]:
-    """Show a bar for each stage that is told about."""
+    """Show a bar for each stage that is reported."""
     columns = (
         SpinnerColumn(finished_text="[green]✓"),
         TextColumn("{task.description}", markup=False),
@@ -125,38 +128,3 @@ def fixed(name: str, value: float, decimals: int = 4) -> str:
 def _with_unit(number: str, name: str) -> str:
     unit = quantity(name).display_unit
     return f"{number}{'' if unit in ('', '°') else ' '}{unit}"
-
-
-def numbers(text: str, names: Sequence[str], option: str) -> list[float]:
-    """Read numbers parted by commas."""
-    try:
-        values = [float(part) for part in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) != len(names) or not all(map(math.isfinite, values)):
-        raise ValueError(f"{option} is {text!r}; {','.join(names)} are needed")
-    return values
-
-
-def free(files: Iterable[Path], force: bool) -> None:
-    """Raise if files are there that nobody said to replace."""
-    there = [str(file) for file in files if not force and file.exists()]
-    if there:
-        more = f" and {len(there) - _NAMED} more" if len(there) > _NAMED else ""
-        are = "is" if len(there) == 1 else "are"
-        raise FileExistsError(
-            f"{', '.join(there[:_NAMED])}{more} {are} there already: write elsewhere with "
-            "--output, or replace with --force"
-        )
-
-
-def refuse(options: Mapping[str, object], reason: str) -> None:
-    """Raise if options are given that would have no effect."""
-    given = [name for name, value in options.items() if not _nothing(value)]
-    if given:
-        raise ValueError(f"{', '.join(given)} cannot be used: {reason}")
-
-
-def _nothing(value: object) -> bool:
-    # Zero is a number that was given.
-    return value is None or value is False or value in ([], ())

@@ -5,6 +5,7 @@ from vibrissa.identifiability.cones import critical_cones
 from vibrissa.identifiability.sensitivity import sensitivity
 from vibrissa.identifiability.summary import save_uniqueness, verdict_table
 from vibrissa.identifiability.verdicts import uniqueness
+from vibrissa.identifiability.witness_pair import witness_pairs
 
 __all__ = [
     "best_triplet",
@@ -13,4 +14,5 @@ __all__ = [
     "sensitivity",
     "uniqueness",
     "verdict_table",
+    "witness_pairs",
 ]

@@ -26,7 +26,7 @@ def whiskers_table(recording: xr.DataTree, chosen: int) -> str:
         rows.append((names[k], str(k), str(touching[k]), shown_value("force", largest)))
     told = paragraph(
         f"Signals and estimated contacts below are of whisker {names[chosen]}, number {chosen}; "
-        "`--whisker` chooses another. The contour is of all."
+        "`--which` chooses another. The contour is of all."
     )
     if not rows:
         return told + paragraph(f"None of the {len(names)} whiskers is known to touch anything.")

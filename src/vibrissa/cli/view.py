@@ -1,4 +1,4 @@
-"""`vibrissa view`: look at a whisker, a map or a trial in the browser."""
+"""`vibrissa view`: a whisker, a map or a trial in the browser."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vibrissa.cli.terminal import output
+from vibrissa.cli.inputs import MAP, RECORDING, WhiskerOptions, kind_in, map_from, print_notes
+from vibrissa.cli.options import AnyLengthOption, RatOption, VideosOption
+from vibrissa.cli.terminal import say
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -25,14 +27,7 @@ def view(
             metavar="[WHISKER | MAP | TRIAL]",
         ),
     ] = None,
-    videos: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--video",
-            help="Of a trial: the video of each of its cameras, in their order.",
-            metavar="FILE",
-        ),
-    ] = None,
+    videos: VideosOption = None,
     host: Annotated[
         str,
         typer.Option(help="Address to listen on; 0.0.0.0 lets other machines in.", metavar="HOST"),
@@ -42,34 +37,35 @@ def view(
         typer.Option(help="Port to listen on; by default the first free one from 8080."),
     ] = None,
     browser: Annotated[bool, typer.Option(help="Whether the browser is opened.")] = True,
+    rat: RatOption = None,
+    any_length: AnyLengthOption = False,
 ) -> None:
-    """Bend a whisker with the mouse and see what it feels; look at a map; watch a trial.
+    """Bend a whisker with the mouse and see its signals; look at a map; watch a trial.
 
     Serves a page on this machine until Ctrl-C. Example: `vibrissa view trial.nc --video top.mp4
     --video front.mp4`
     """
-    from vibrissa.cli.sources import map_from, refuse_stated, tell_notes, whisker_from
-    from vibrissa.io import is_netcdf, kind_of, load_recording
+    from vibrissa.io import load_recording
     from vibrissa.viewer import view as serve
 
-    kind = kind_of(path) if path is not None and is_netcdf(path) else ""
-    shown: Whisker | ContactMap | xr.DataTree
-    if kind in ("vibrissa contact map", "vibrissa recording"):
-        refuse_stated(path)
-    if kind == "vibrissa contact map" and path is not None:
-        shown = map_from(path)
-    elif kind == "vibrissa recording" and path is not None:
-        shown = load_recording(path)
+    kind = "" if path is None else kind_in(path)
+    viewed: Whisker | ContactMap | xr.DataTree
+    if path is not None and kind in (MAP, RECORDING):
+        if rat is not None or any_length:
+            raise ValueError(
+                f"--rat and --any-length are about a whisker, and {path} is not its file"
+            )
+        viewed = map_from(path) if kind == MAP else load_recording(path)
     else:
-        shown = whisker_from(path)
-        tell_notes(shown)
+        viewed = WhiskerOptions(path, rat, any_length).read()
+        print_notes(viewed)
     try:
-        with serve(shown, videos=videos or (), host=host, port=port) as viewer:
-            output.print(f"{viewer.url}   Ctrl-C ends it", highlight=False, soft_wrap=True)
+        with serve(viewed, videos=videos or (), host=host, port=port) as viewer:
+            say(f"{viewer.url}   Ctrl-C ends it")
             if browser:
                 import webbrowser
 
                 webbrowser.open(viewer.url)
             viewer.wait()
     except KeyboardInterrupt:
-        output.print("stopped")
+        say("stopped")

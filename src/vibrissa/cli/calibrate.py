@@ -7,12 +7,17 @@ from typing import Annotated
 
 import typer
 
-from vibrissa.cli.terminal import Force, free, output, refuse
+from vibrissa.cli.options import ForceOption, free, refuse, written
+from vibrissa.cli.terminal import say
 
 _POOR = 1.0
 """Reprojection error above which something is wrong, pixels."""
 
-_LARGEST = 0.2
+_SMALLEST, _LARGEST = 0.05, 200.0
+"""Sides of squares, mm: what is smaller was typed in m."""
+
+_FRAMES = 40
+"""Frames that are used of a video, by default."""
 
 
 def calibrate(
@@ -24,23 +29,24 @@ def calibrate(
         ),
     ],
     pattern: Annotated[
-        str, typer.Option(help="Inner corners of the board, along its longer side first: 9x6.")
+        str,
+        typer.Option(
+            help="Inner corners of the board, along its longer side first: 9x6.", metavar="NxM"
+        ),
     ],
-    square: Annotated[float, typer.Option(help="Side of a square, m.")],
-    cameras: Annotated[
-        Path,
-        typer.Option("--output", "-o", help="Cameras to write, TOML of Anipose.", metavar="FILE"),
-    ],
+    square: Annotated[float, typer.Option(help="Side of a square, mm.", metavar="MM")],
+    path: Annotated[Path, written("the cameras, TOML of Anipose")],
     frames: Annotated[
-        int | None, typer.Option(help="Frames to take of a video, evenly spread; 40 by default.")
+        int | None,
+        typer.Option(help="Frames that are used of a video, evenly spread; 40 by default."),
     ] = None,
-    force: Force = False,
+    force: ForceOption = False,
 ) -> None:
     """Calibrate cameras by a checkerboard that they see at the same moments (extra cameras).
 
     The board is to be turned and moved between images. The file is for `vibrissa track --cameras`;
     its laboratory frame is that of the board in the first moment in which all cameras see it.
-    Example: `vibrissa calibrate --pattern 9x6 --square 5e-3 top_*.png front_*.png -o cameras.toml`
+    Example: `vibrissa calibrate --pattern 9x6 --square 5 top_*.png front_*.png -o cameras.toml`
     """
     from vibrissa.cameras import calibrate as calibrated
     from vibrissa.cameras import save_cameras
@@ -48,33 +54,28 @@ def calibrate(
     from vibrissa.io.paths import check_readable, check_writable
 
     corners = _corners(pattern)
-    if not 0.0 < square < _LARGEST:
-        raise ValueError(f"--square is {square:g}; the side of a square in m is needed, as 5e-3")
+    if not _SMALLEST < square < _LARGEST:
+        raise ValueError(f"--square is {square:g}; the side of a square in mm is needed, as 5")
     if frames is not None and frames < 2:
         raise ValueError(f"--frames is {frames}; a few dozen are needed")
-    check_writable(cameras, (".toml",))
-    free([cameras], force)
+    check_writable(path, (".toml",))
+    free([path], force)
     if not any(recognise(check_readable(image)) == Kind.VIDEO for image in images):
         refuse({"--frames": frames}, "it is of videos, and these are images")
-    series = load_series(images, frames or 40)
-    found, error = calibrated(series, corners, square)
-    save_cameras(cameras, found)
-    for camera in found:
-        output.print(
+    cameras, error = calibrated(load_series(images, frames or _FRAMES), corners, 1e-3 * square)
+    save_cameras(path, cameras)
+    for camera in cameras:
+        say(
             f"{camera.name}: {camera.size[0]} × {camera.size[1]} pixels, focal length "
-            f"{camera.matrix[0, 0]:.1f} × {camera.matrix[1, 1]:.1f} pixels",
-            highlight=False,
-            soft_wrap=True,
+            f"{camera.matrix[0, 0]:.1f} × {camera.matrix[1, 1]:.1f} pixels"
         )
-    output.print(f"reprojection error {error:.3f} pixels (root mean square)", highlight=False)
+    say(f"reprojection error {error:.3f} pixels (root mean square)")
     if error > _POOR:
-        output.print(
+        say(
             "  That is much: perhaps the images do not belong together, are blurred, or the "
-            "pattern has other corners.",
-            highlight=False,
-            soft_wrap=True,
+            "pattern has other corners."
         )
-    output.print(f"wrote {cameras}", highlight=False, soft_wrap=True)
+    say(f"wrote {path}")
 
 
 def _corners(text: str) -> tuple[int, int]:

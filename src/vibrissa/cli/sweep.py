@@ -7,12 +7,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vibrissa.cli.terminal import Force, errors, free, output, progress_bars, refuse
+from vibrissa.cli.options import ExampleOption, ForceOption, free, refuse, written
+from vibrissa.cli.terminal import output, progress_bars, remark, say
 
 if TYPE_CHECKING:
     from vibrissa.sweeps import Study
 
 _SHOW = "show"
+_LISTED = 3
+"""Number of failures that are listed."""
 
 
 def sweep(
@@ -28,12 +31,7 @@ def sweep(
     ] = None,
     path: Annotated[
         Path | None,
-        typer.Option(
-            "--output",
-            "-o",
-            help="Where results go, a Zarr folder; with `show`, the folder of the figure.",
-            metavar="FOLDER",
-        ),
+        written("the results, a Zarr folder; with `show`, a folder for the figures", "FOLDER"),
     ] = None,
     workers: Annotated[
         int | None,
@@ -42,7 +40,8 @@ def sweep(
     scheduler: Annotated[
         str | None,
         typer.Option(
-            help="Of Dask instead: its address, or `local` for a cluster of `--workers` processes.",
+            help="Address of a Dask scheduler instead, or `local` for a cluster of `--workers` "
+            "processes.",
             metavar="ADDRESS",
         ),
     ] = None,
@@ -54,12 +53,10 @@ def sweep(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Print number of cells, time and size, and stop.")
     ] = False,
-    example: Annotated[
-        bool, typer.Option("--example", help="Print a study with all that one can say, and stop.")
-    ] = False,
-    force: Force = False,
+    example: ExampleOption = False,
+    force: ForceOption = False,
 ) -> None:
-    """Ask the same of many whiskers, here or on a cluster; stopped, it goes on where it was.
+    """Ask the same of many whiskers, here or on a cluster; stopped, it continues where it was.
 
     Example: `vibrissa sweep study.toml -o study.zarr`, then `vibrissa sweep show study.zarr`
     """
@@ -69,42 +66,43 @@ def sweep(
         raise ModuleNotFoundError(
             "studies are kept with zarr: pip install 'vibrissa[sweeps]'"
         ) from missing
-    from vibrissa.io.paths import check_readable
-    from vibrissa.io.table import read_text
-    from vibrissa.sweeps import EXAMPLE, read_study
+    from vibrissa.sweeps import EXAMPLE
 
     if example:
-        output.print(EXAMPLE, end="", markup=False, highlight=False, soft_wrap=True)
+        output.out(EXAMPLE, highlight=False, end="")
     elif study is None:
         raise ValueError("a study is needed; `vibrissa sweep --example` prints one")
     elif study == _SHOW:
         options = {"--workers": workers, "--scheduler": scheduler, "--again": again}
         refuse(options | {"--dry-run": dry_run}, "results are only shown")
-        _show(store, path, force)
+        _show(store, path or Path(), force)
     elif store is not None:
-        raise ValueError(f"{store} is one word too many; the store is said with -o")
+        raise ValueError(f"{store} is one word too many; the store is stated with -o")
     elif force:
         raise ValueError("--force is for the figures of `show`; a study goes on with its results")
     else:
         if scheduler not in (None, "local"):
             refuse({"--workers": workers}, f"the workers are those of {scheduler}")
         workers = 1 if workers is None else workers
-        text = read_text(check_readable(study))
-        try:
-            plan = read_study(text, Path(study).parent)
-        except ValueError as fault:
-            raise ValueError(f"{study}: {fault}") from None
+        plan = _plan(Path(study))
         if dry_run:
             _cost(plan, max(workers, 1))
-        else:
-            _run(
-                plan,
-                path or Path(study).with_suffix(".zarr"),
-                workers=workers,
-                scheduler=scheduler,
-                again=again,
-                any_version=any_version,
-            )
+            return
+        target = path or Path(study).with_suffix(".zarr")
+        how = {"scheduler": scheduler, "again": again, "any_version": any_version}
+        _run(plan, target, workers=workers, **how)
+
+
+def _plan(path: Path) -> Study:
+    from vibrissa.io.paths import check_readable
+    from vibrissa.io.table import read_text
+    from vibrissa.sweeps import read_study
+
+    text = read_text(check_readable(path))
+    try:
+        return read_study(text, path.parent)
+    except ValueError as fault:
+        raise ValueError(f"{path}: {fault}") from None
 
 
 def _run(plan: Study, path: Path, **how: Any) -> None:
@@ -113,72 +111,61 @@ def _run(plan: Study, path: Path, **how: Any) -> None:
     try:
         with progress_bars() as tell:
             outcome = run_sweep(
-                plan,
-                path,
-                **how,
-                progress=lambda done, total: tell("cells", done, total),
+                plan, path, **how, progress=lambda done, total: tell("cells", done, total)
             )
     except KeyboardInterrupt:
-        errors.print(
-            f"stopped; what is in {path} is whole, and the same command goes on from it",
-            highlight=False,
-            soft_wrap=True,
-        )
+        remark(f"stopped; what is in {path} is whole, and the same command goes on from it")
         raise typer.Exit(130) from None
-    said = f"{outcome.done} cells done, {outcome.failed} of them failed"
+    except OSError as fault:
+        if fault.errno is None or str(path) in str(fault):
+            raise
+        reason = fault.strerror or str(fault)
+        raise OSError(fault.errno, f"{path} cannot be written: {reason}") from fault
+    text = f"{outcome.done} cells done, {outcome.failed} of them failed"
     if outcome.skipped:
-        said += f"; {outcome.skipped} were there before and skipped"
+        text += f"; {outcome.skipped} were there before and skipped"
     if outcome.failed_before:
-        said += f", {outcome.failed_before} of which had failed (--again tries them again)"
+        text += f", {outcome.failed_before} of which had failed (--again tries them again)"
     if outcome.damaged:
-        said += f"; {outcome.damaged} were damaged since they were written, and were done again"
-    for fault in outcome.faults:
-        errors.print(fault, highlight=False, soft_wrap=True, markup=False)
-    output.print(said, highlight=False, soft_wrap=True)
-    output.print(sweep_summary(open_sweep(path)), highlight=False, soft_wrap=True, markup=False)
+        text += f"; {outcome.damaged} were damaged since they were written, and were done again"
+    for line in outcome.faults:
+        remark(line)
+    say(text)
+    say(sweep_summary(open_sweep(path)))
     _print_failures(failures(path))
-    output.print(f"results are in {path}", highlight=False, soft_wrap=True)
+    say(f"results are in {path}")
 
 
 def _cost(plan: Study, workers: int) -> None:
-    output.print(
+    say(
         f"{plan.size} cells: {len(plan.specimens)} whiskers, "
         f"{', '.join(f'{task} of {plan.count(task)}' for task in plan.tasks)}\n"
         f"about {plan.seconds / 60:.1f} min of one core, {plan.seconds / workers / 60:.1f} min "
         f"with {workers} worker{'s' if workers > 1 else ''} on idle cores\n"
-        f"about {max(plan.bytes / 1e6, 1.0):.0f} MB",
-        highlight=False,
-        soft_wrap=True,
+        f"about {max(plan.bytes / 1e6, 1.0):.0f} MB"
     )
 
 
-def _show(store: Path | None, folder: Path | None, force: bool) -> None:
+def _show(store: Path | None, folder: Path, force: bool) -> None:
     if store is None:
-        raise ValueError("say what to show: vibrissa sweep show STORE")
+        raise ValueError("state what to show: vibrissa sweep show STORE")
     from vibrissa import plots
     from vibrissa.sweeps import failures, open_sweep, sweep_summary
 
     found = open_sweep(store).load()
-    output.print(sweep_summary(found), highlight=False, soft_wrap=True, markup=False)
+    say(sweep_summary(found))
     _print_failures(failures(store))
-    folder = folder or Path()
     folder.mkdir(parents=True, exist_ok=True)
     names = {task: folder / f"{store.resolve().stem}-{task}" for task in plots.drawable(found)}
     free([name.with_name(f"{name.name}.png") for name in names.values()], force)
     for task, name in names.items():
-        figure = plots.sweep_overview(found, task=task)
-        for file in plots.save(figure, name, ("png",)):
-            output.print(f"wrote {file}", highlight=False, soft_wrap=True)
+        for file in plots.save(plots.sweep_overview(found, task=task), name, ("png",)):
+            say(f"wrote {file}")
 
 
-def _print_failures(faults: dict[str, str], most: int = 3) -> None:
-    for cell, text in list(faults.items())[:most]:
+def _print_failures(faults: dict[str, str]) -> None:
+    for cell, text in list(faults.items())[:_LISTED]:
         lines = text.strip().splitlines()
-        output.print(
-            f"failed: {cell.rpartition('-')[0]} of {lines[0]}: {lines[-1]}",
-            highlight=False,
-            soft_wrap=True,
-            markup=False,
-        )
-    if len(faults) > most:
-        output.print(f"and {len(faults) - most} more, in .failures of the store", highlight=False)
+        say(f"failed: {cell.rpartition('-')[0]} of {lines[0]}: {lines[-1]}")
+    if len(faults) > _LISTED:
+        say(f"and {len(faults) - _LISTED} more, in .failures of the store")

@@ -1,4 +1,4 @@
-"""`vibrissa correct`: a window in which traces are put right."""
+"""`vibrissa correct`: a window in which traces are corrected."""
 
 from __future__ import annotations
 
@@ -7,29 +7,24 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vibrissa.cli.terminal import output
+from vibrissa.cli.options import TraceOption, written
+from vibrissa.cli.terminal import say
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+_ENDLESS = 1 << 31
+"""Number of frames of a video that does not state it."""
+
 
 def correct(
     video: Annotated[Path, typer.Argument(help="The video of one view.", metavar="VIDEO")],
-    corrections: Annotated[
-        Path,
-        typer.Option(
-            "--output",
-            "-o",
-            help="Corrections to write, CSV; those that it holds already are kept.",
-            metavar="FILE",
-        ),
+    path: Annotated[
+        Path, written("corrections, .csv, which are added to those that it holds already")
     ],
-    trace: Annotated[
-        Path | None,
-        typer.Option(help="Tracked recording whose traces are shown, .nc.", metavar="FILE"),
-    ] = None,
-    view: Annotated[int, typer.Option(help="Which view the video is, from 0.")] = 0,
+    trace: TraceOption = None,
+    view: Annotated[int, typer.Option(help="Number of the view in the video, from 0.")] = 0,
 ) -> None:
     """Click the right trace of a whisker in some frames, for `vibrissa track --corrections`.
 
@@ -42,19 +37,17 @@ def correct(
 
     if view < 0:
         raise ValueError(f"--view is {view}; views are counted from 0")
-    check_writable(corrections, (".csv",))
-    all_ = load_corrections(corrections) if corrections.exists() else {}
+    check_writable(path, (".csv",))
+    all_ = load_corrections(path) if path.exists() else {}
     traces = {} if trace is None else _traces(trace, view)
 
     def save(found: dict[tuple[int, int], NDArray[np.float64]]) -> None:
-        save_corrections(corrections, {**all_, view: found})
+        save_corrections(path, {**all_, view: found})
 
-    count = video_info(video).frames or 1 << 31
+    count = video_info(video).frames or _ENDLESS
     found = corrected(FrameReader(video), count, all_.get(view), traces, save)
-    output.print(f"{len(found)} corrected traces of view {view}", highlight=False)
-    output.print(
-        f"use them: vibrissa track … --corrections {corrections}", highlight=False, soft_wrap=True
-    )
+    say(f"{len(found)} corrected traces of view {view}")
+    say(f"use them: vibrissa track … --corrections {path}")
 
 
 def _traces(path: Path, view: int) -> dict[tuple[int, int], Any]:

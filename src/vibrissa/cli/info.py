@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from vibrissa.cli.terminal import output
+from vibrissa.cli.tables import print_properties
+from vibrissa.cli.track import compared_contacts
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -36,18 +37,11 @@ def info(
         Path | None, typer.Argument(help="A file to look into.", metavar="FILE")
     ] = None,
 ) -> None:
-    """Say which versions and how many threads are used, or what a file holds.
+    """List versions and settings of this installation, or what a file holds.
 
     Example: `vibrissa info trial.nc`
     """
-    rows = _installation() if path is None else _file(path)
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(show_header=False, box=None)
-    for name, value in rows:
-        table.add_row(Text(name, style="bold"), value)
-    output.print(table, highlight=False)
+    print_properties(_installation() if path is None else _file(path))
 
 
 def _installation() -> Iterator[tuple[str, str]]:
@@ -105,10 +99,10 @@ def _settings(path: Path) -> Iterator[tuple[str, str]]:
     """What other settings are for; they are checked by the verb that takes them."""
     from vibrissa.io.toml import read_toml
 
-    said = read_toml(path)
-    study = {"whiskers", "tasks"} & set(said)
+    settings = read_toml(path)
+    study = {"whiskers", "tasks"} & set(settings)
     yield "kind", "a study, for vibrissa sweep" if study else "settings, as of vibrissa simulate"
-    yield "says", ", ".join(said) or "nothing"
+    yield "states", ", ".join(settings) or "nothing"
 
 
 def _is_sensor(path: Path) -> bool:
@@ -116,8 +110,8 @@ def _is_sensor(path: Path) -> bool:
 
     if path.suffix != ".toml":
         return False
-    said = read_toml(path)
-    return "noise" in said and not isinstance(said["noise"], dict)
+    settings = read_toml(path)
+    return "noise" in settings and not isinstance(settings["noise"], dict)
 
 
 def _sensor(path: Path) -> Iterator[tuple[str, str]]:
@@ -135,7 +129,7 @@ def _sensor(path: Path) -> Iterator[tuple[str, str]]:
         yield name, f"{' + '.join(parts)} + {bias:.4g}, noise {noise:.3g}{ends}"
     x, y, z = 1e3 * sensor.frame.position
     hand = "right" if sensor.frame.handedness > 0 else "left"
-    counts = ", tells the reaction" if sensor.frame.reaction else ""
+    counts = ", measures the reaction" if sensor.frame.reaction else ""
     yield "frame", f"{hand}-handed, origin at ({x:.2f}, {y:.2f}, {z:.2f}) mm{counts}"
     yield "carries", f"{1e3 * sensor.mass:.3g} g"
     known = []
@@ -170,16 +164,15 @@ def _video(path: Path) -> Iterator[tuple[str, str]]:
     found = video_info(path)
     yield "kind", f"video, {found.codec}"
     yield "size", f"{found.width} × {found.height} pixels"
-    yield "frames", f"{found.frames or 'number not told'}, shown at {found.rate:g} a second"
+    yield "frames", f"{found.frames or 'number not stated'}, shown at {found.rate:g} a second"
 
 
 def _calibration(path: Path) -> Iterator[tuple[str, str]]:
-    from vibrissa.io.anipose import read_calibration
+    from vibrissa.cameras import load_cameras
 
     yield "kind", "calibration of cameras"
-    for camera in read_calibration(path):
-        size = " × ".join(map(str, camera["size"]))
-        yield str(camera["name"]), f"{size} pixels, {camera.get('projection', 'perspective')}"
+    for camera in load_cameras(path):
+        yield camera.name, f"{camera.size[0]} × {camera.size[1]} pixels, {camera.projection}"
 
 
 def _is_text(path: Path) -> bool:
@@ -193,7 +186,7 @@ def _is_text(path: Path) -> bool:
 
 
 def _tracks(path: Path, kind: str) -> Iterator[tuple[str, str]]:
-    """Sizes, times and how much is missing of tracks; also where their unit is not told."""
+    """Sizes, times and how much is missing of tracks; also where their unit is not stated."""
     from vibrissa.io import Kind, load_tracks
     from vibrissa.io.kinds import READERS
 
@@ -225,13 +218,13 @@ def _tracks(path: Path, kind: str) -> Iterator[tuple[str, str]]:
 
 
 def _without_unit(raw: RawTracks, path: Path) -> tuple[Dataset, str]:
-    """Label tracks even if nobody tells the unit of their points; then say so."""
+    """Label tracks even if the unit of their points is not stated, with a note on it."""
     from vibrissa.io.tracks import labelled
 
     if raw.space is None or raw.unit:
         return labelled(raw, path), ""
     # The smallest unit passes for any: no number is shown.
-    return labelled(raw, path, unit="um"), "unit not told: give it when reading"
+    return labelled(raw, path, unit="um"), "unit not stated: give it when reading"
 
 
 def _listed(tracks: Dataset, dim: str) -> str:
@@ -261,7 +254,7 @@ def _groups(path: Path) -> Iterator[tuple[str, str]]:
 
 
 def _many(file: Any) -> bool:
-    """Whether whiskers are so many that their names tell more than their variables."""
+    """Whether there are several whiskers, whose names are listed instead of their variables."""
     if "whiskers" not in file.groups or "whisker" not in file.variables:
         return False
     group = file.groups["whiskers"]
@@ -278,12 +271,12 @@ def _within(group: Any, name: str) -> Iterator[tuple[str, Any]]:
 def _variables(name: str, group: Any) -> Iterator[tuple[str, str]]:
     """Sizes of a group and its variables; coordinates are known by their dimension."""
     sizes: dict[str, int] = {}
-    beside: set[str] = set()
+    apart: set[str] = set()
     for variable in group.variables.values():
         sizes |= dict(zip(variable.dimensions, variable.shape, strict=True))
-        beside |= set(_text(variable.attrs.get("coordinates", "")).split())
-    beside |= set(_text(group.attrs.get("coordinates", "")).split())
-    shown = {n: v for n, v in group.variables.items() if n not in sizes and n not in beside}
+        apart |= set(_text(variable.attrs.get("coordinates", "")).split())
+    apart |= set(_text(group.attrs.get("coordinates", "")).split())
+    shown = {n: v for n, v in group.variables.items() if n not in sizes and n not in apart}
     if not shown:
         return
     listed = ", ".join(f"{dim} {size}" for dim, size in sizes.items())
@@ -300,13 +293,13 @@ def _notes(group: Any) -> Iterator[tuple[str, str]]:
 
     if _text(group.attrs.get("kind", "")) != "vibrissa whisker":
         return
-    told = [_text(group.attrs["notes"])] if "notes" in group.attrs else []
+    texts = [_text(group.attrs["notes"])] if "notes" in group.attrs else []
     if "notes" in group.variables:
-        told += [_text(one) for one in group.variables["notes"][...]]
+        texts += [_text(one) for one in group.variables["notes"][...]]
     try:
-        notes = [str(note) for text in told for note in json.loads(text)]
+        notes = [str(note) for text in texts for note in json.loads(text)]
     except (ValueError, TypeError):
-        notes = told
+        notes = texts
     yield from (("note", note) for note in dict.fromkeys(notes))
 
 
@@ -318,7 +311,6 @@ def _compared(path: Path) -> Iterator[tuple[str, str]]:
     """How contact points that do not come from the rod compare with those that do."""
     import xarray as xr
 
-    from vibrissa.cli.track_report import compared_contacts
     from vibrissa.io.netcdf import opened, read_dataset
 
     with opened(path, "a recording") as file:
@@ -363,14 +355,14 @@ def _table(path: Path) -> Iterator[tuple[str, str]]:
         try:
             data = reader(path)
         except ValueError:
-            # What it looks like tells best what is wrong with it.
+            # What it looks like explains best what is wrong with it.
             if known == looks:
                 raise
             continue
         yield "kind", f"table of {kind}" if kind != "whisker" else "centreline of a whisker"
         yield from _rows(kind, data)
         return
-    raise ValueError(f"{path} is no table that is known: {_header(path)}. Known are\n{_TABLES}")
+    raise ValueError(f"{path} is not a table that is known: {_header(path)}. Known are\n{_TABLES}")
 
 
 def _header(path: Path) -> str:
@@ -401,8 +393,8 @@ def _rows(kind: str, data: Any) -> Iterator[tuple[str, str]]:
         yield "rows", f"{data.sizes['frame']}, from frame {first} to {last}"
     else:
         time = data["time"].values
-        told = time[np.isfinite(time)]
-        span = f"from {told.min():g} to {told.max():g} s" if told.size else "at times not told"
+        known = time[np.isfinite(time)]
+        span = f"from {known.min():g} to {known.max():g} s" if known.size else "at unknown times"
         yield "rows", f"{time.size}, {span}"
         yield from (("note", note) for note in data.attrs.get("notes", ()))
         if kind == "contacts":

@@ -3,37 +3,39 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
+import numpy as np
 import typer
 
-from vibrissa.cli.terminal import Force, free, output, progress_bars
+from vibrissa.cli.inputs import map_from
+from vibrissa.cli.options import (
+    ForceOption,
+    MapArgument,
+    RegionsOption,
+    TripletsOption,
+    free,
+    written,
+)
+from vibrissa.cli.terminal import output, progress_bars, say, shown
 
 if TYPE_CHECKING:
     from xarray import Dataset
 
-# Enough for the signals to agree to 1e-10 when the pair is bent again.
 _DIGITS = 14
+"""Enough for the signals to agree to 1e-10 when the pair is bent again."""
+
+_ASKED = "Fx MB MD"
+"""The triplet whose witness is printed, if it has one: that of the paper."""
 
 
 def uniqueness(
-    chart: Annotated[Path, typer.Argument(help="The map, NetCDF.", metavar="MAP")],
-    triplets: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--triplet", help="Only this one; may be repeated. Default: all 20.", metavar="A,B,C"
-        ),
-    ] = None,
-    regions: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--region",
-            help="all, ELD, CF, CB, 'ELD CF' or 'ELD CB'; may be repeated. Default: all six.",
-            metavar="REGION",
-        ),
-    ] = None,
+    path: MapArgument,
+    using: TripletsOption = None,
+    region: RegionsOption = None,
     domain: Annotated[
-        str, typer.Option(help="reachable: all contacts; paper: those within the paper's grid.")
+        Literal["reachable", "paper"],
+        typer.Option(help="All contacts, or those within the paper's grid."),
     ] = "reachable",
     cone: Annotated[
         float,
@@ -41,11 +43,13 @@ def uniqueness(
     ] = 2.0,
     min_separation: Annotated[
         float,
-        typer.Option(help="Contacts nearer to each other count as one; share of the length."),
+        typer.Option(
+            help="Distance within which two contacts count as one, share of the whisker's length."
+        ),
     ] = 0.025,
-    samples: Annotated[int, typer.Option(help="How many contacts are tried.", min=16)] = 4096,
+    samples: Annotated[int, typer.Option(help="Number of contacts that are tried.", min=16)] = 4096,
     resolution: Annotated[
-        bool, typer.Option(help="Whether to tell how finely signals must be measured.")
+        bool, typer.Option(help="Whether to find how finely signals must be measured.")
     ] = True,
     network: Annotated[
         bool,
@@ -53,37 +57,31 @@ def uniqueness(
             "--network", help="Also train a network for each triplet, as the paper did; slow."
         ),
     ] = False,
-    path: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", help="All evidence, .nc or .csv.", metavar="FILE"),
-    ] = None,
-    force: Force = False,
+    target: Annotated[Path | None, written("all evidence, .nc or .csv; by default nowhere")] = None,
+    force: ForceOption = False,
 ) -> None:
-    """Tell which triplets of signals locate the contact uniquely, with witnesses where not.
+    """Find which triplets of signals locate the contact uniquely, with witnesses where not.
 
     Example: `vibrissa uniqueness map.nc -o uniqueness.nc`
     """
-    import numpy as np
-
-    from vibrissa.cli.sources import map_from
     from vibrissa.identifiability import save_uniqueness, verdict_table
     from vibrissa.identifiability import uniqueness as judge
     from vibrissa.identifiability.summary import ENDINGS
     from vibrissa.io.paths import check_writable
     from vibrissa.paper import with_network_errors
 
-    if path is not None:
-        check_writable(path, ENDINGS)
-        free([path], force)
-    contact_map = map_from(chart)
+    if target is not None:
+        check_writable(target, ENDINGS)
+        free([target], force)
+    contact_map = map_from(path)
     with progress_bars() as tell:
         tell("verdicts", 0, 1)
         found = judge(
             contact_map,
-            triplets or "all",
-            regions or "all",
+            using or "all",
+            [str(one) for one in region] if region else "all",
             cone=float(np.deg2rad(cone)),
-            domain=domain,  # type: ignore[arg-type]
+            domain=domain,
             min_separation=min_separation,
             samples=samples,
             resolution=resolution,
@@ -93,39 +91,33 @@ def uniqueness(
             found = with_network_errors(
                 contact_map, found, progress=lambda done, total: tell("networks", done, total)
             )
-    output.print(f"{contact_map.whisker!r}\n", highlight=False, soft_wrap=True)
+    say(f"{contact_map.whisker!r}\n")
     output.print(verdict_table(found), highlight=False, soft_wrap=True, markup=False)
     _print_witness(found)
-    if path is not None:
-        save_uniqueness(found, path)
-        output.print(f"wrote {path}", highlight=False, soft_wrap=True)
+    if target is not None:
+        save_uniqueness(found, target)
+        say(f"wrote {target}")
 
 
 def _print_witness(found: Dataset) -> None:
     """One witness in numbers, so that it can be bent again."""
-    import numpy as np
-
-    from vibrissa.cli.terminal import shown
-
     apart = found["witness_separation"].isel(witness=0).max("region").to_series().dropna()
     if apart.empty:
         return
-    # Of the triplet that people ask about, if it has one.
-    triplet = "Fx MB MD" if "Fx MB MD" in apart.index else str(apart.index[0])
+    triplet = _ASKED if _ASKED in apart.index else str(apart.index[0])
     row = found.sel(triplet=triplet).isel(witness=0)
     cell = row.isel(region=int(np.nanargmax(row["witness_separation"].values)))
-    lines = [
+    say(
         f"\nA witness for ({triplet.replace(' ', ', ')}), {cell['region'].item()}: two contacts "
-        f"{shown('contact_point', float(cell['witness_separation']))} apart that feel the same, "
-        f"with {int(cell['witness_steps'])} integration steps."
-    ]
+        f"{shown('contact_point', float(cell['witness_separation']))} apart that have the same "
+        f"signals, with {int(cell['witness_steps'])} integration steps."
+    )
     for pair in ("first", "second"):
         one = cell.sel(pair=pair)
         fy, fz = one["witness_contact_force"].values
-        lines.append(
+        say(
             f"  at {shown('arc_length', float(one['witness_arc_length']), _DIGITS)} with the force "
             f"({shown('Fx', fy, _DIGITS)}, {shown('Fx', fz, _DIGITS)}) along d1 and d2"
         )
     values = zip(triplet.split(), cell["witness_signals"].values, strict=True)
-    lines.append("  " + ", ".join(f"{name} {shown(name, value, 10)}" for name, value in values))
-    output.print("\n".join(lines), highlight=False, soft_wrap=True)
+    say("  " + ", ".join(f"{name} {shown(name, value, 10)}" for name, value in values))

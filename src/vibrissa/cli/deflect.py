@@ -1,0 +1,145 @@
+"""`vibrissa deflect`: bend a whisker once."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from vibrissa.cli.inputs import WhiskerOptions, print_notes, smallest_arc
+from vibrissa.cli.options import AxisOption, ProximalOption, numbers, refuse, with_bundles
+from vibrissa.cli.tables import print_table
+from vibrissa.cli.terminal import fixed, remark, say
+
+if TYPE_CHECKING:
+    from vibrissa.rod import Deflection, Load
+    from vibrissa.whisker import Whisker
+
+_MM = 1e-3
+_MICRO = 1e-6
+# Share of the length below which a position looks like metres typed for mm.
+_NEXT_TO_BASE = 0.02
+_XYZ = ("X", "Y", "Z")
+
+
+@with_bundles
+def deflect(
+    own: WhiskerOptions,
+    point: Annotated[str | None, typer.Option(help="Contact point, mm.", metavar="X,Y,Z")] = None,
+    point_force: Annotated[
+        str | None,
+        typer.Option(
+            help="Arc length of a force, mm, its size, µN, and its angle from d1 to d2, degrees.",
+            metavar="S,F,ANGLE",
+        ),
+    ] = None,
+    peg: Annotated[
+        str | None,
+        typer.Option(
+            help="A point of a peg's axis and its diameter, mm; 0 for a line.", metavar="X,Y,Z,D"
+        ),
+    ] = None,
+    axis: AxisOption = None,
+    push: Annotated[
+        str | None,
+        typer.Option(
+            help="Approximate direction in which the peg pushes; by default from its nearest side.",
+            metavar="X,Y,Z",
+        ),
+    ] = None,
+    proximal: ProximalOption = None,
+) -> None:
+    """Bend a whisker by a point, a force or a peg, and print force and moment at its base.
+
+    All in the whisker's frame. Give one of --point, --point-force, --peg (upright without --axis).
+    Without an answer the status states why, and the exit status is 1.
+    Example: `vibrissa deflect --point 25,12,1`
+    """
+    from vibrissa.rod import deflect as deflected
+    from vibrissa.status import Status
+
+    load = _load(point, point_force, peg, axis, push)
+    if point_force is not None:
+        refuse({"--proximal": proximal}, "a --point-force acts where it is stated")
+    whisker = own.read()
+    say(repr(whisker))
+    print_notes(whisker)
+    bent = deflected(whisker, load, proximal=smallest_arc(proximal))
+    status = Status(int(bent.status))
+    # The advice by the name that the option has here.
+    option = " The option is --proximal." if status == Status.TOO_PROXIMAL else ""
+    say(f"{status}{option}")
+    _doubt_the_unit(load, whisker)
+    if not (status.ok and math.isfinite(bent.arc_length)):
+        raise typer.Exit(1)
+    _print(bent)
+
+
+def _doubt_the_unit(load: Load, whisker: Whisker) -> None:
+    """Ask whether metres were meant where a position would then be on the whisker."""
+    import numpy as np
+
+    from vibrissa.rod import PointContact, PointForce
+
+    if isinstance(load, PointForce):
+        away = float(load.arc_length)
+    else:
+        position = load.points if isinstance(load, PointContact) else load.origin
+        away = float(np.linalg.norm(position))
+    if 0.0 < away < _NEXT_TO_BASE * whisker.length:
+        remark(
+            f"lengths are typed in mm: the load is {away / _MM:.4g} mm from the base of a whisker "
+            f"of {whisker.length / _MM:.4g} mm. Were metres meant? {away / _MM:.4g} m is "
+            f"{away / _MM / _MM:.4g} mm"
+        )
+
+
+def _load(
+    point: str | None, force: str | None, peg: str | None, axis: str | None, push: str | None
+) -> Load:
+    """Make the one load that was asked for."""
+    from vibrissa.rod import PegContact, PointContact, PointForce
+
+    kinds = {"--point": point, "--point-force": force, "--peg": peg}
+    given = [name for name, value in kinds.items() if value]
+    if len(given) != 1:
+        got = " and ".join(given) or "none of them"
+        raise ValueError(f"one of --point, --point-force and --peg is needed; got {got}")
+    if peg is None:
+        refuse({"--axis": axis, "--push": push}, "they are of a --peg")
+    if point is not None:
+        return PointContact([x * _MM for x in numbers(point, _XYZ, "--point")])
+    if force is not None:
+        s, size, angle = numbers(force, ("S", "F", "ANGLE"), "--point-force")
+        return PointForce(s * _MM, size * _MICRO, math.radians(angle))
+    *origin, diameter = numbers(peg or "", (*_XYZ, "D"), "--peg")
+    direction = numbers(axis or "0,0,1", _XYZ, "--axis")
+    side = None if push is None else numbers(push, _XYZ, "--push")
+    return PegContact([x * _MM for x in origin], direction, 0.5 * diameter * _MM, side=side)
+
+
+def _print(bent: Deflection) -> None:
+    from vibrissa.contacts.contact_map import spherical
+    from vibrissa.quantities import quantity
+    from vibrissa.signals import SIGNALS, base_signals
+
+    signals = base_signals(bent.force, bent.moment)
+    point, components = bent.contact_point, ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
+    groups = {
+        "contact": [
+            *zip("xyz", point, strict=True),
+            *zip(("r", "theta", "phi"), spherical(point), strict=True),
+            ("arc_length", bent.arc_length),
+        ],
+        "signal": [(name, signals[name]) for name in SIGNALS],
+        "wrench": list(zip(components, (*bent.force, *bent.moment), strict=True)),
+    }
+    rows: list[tuple[str, ...] | None] = []
+    for kind, values in groups.items():
+        rows += [
+            (kind, name, quantity(name).long_name, fixed(name, float(value)))
+            for name, value in values
+        ]
+        rows.append(None)
+    print_table([""] * 4, rows[:-1], left=range(4))

@@ -1,0 +1,218 @@
+"""`vibrissa demo`: the main job from end to end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from vibrissa.cli import options
+from vibrissa.cli.drawings import NODES, TrialOptions, trial_drawings
+from vibrissa.cli.figures import saved
+from vibrissa.cli.inputs import WhiskerOptions, print_notes
+from vibrissa.cli.options import with_bundles, written
+from vibrissa.cli.tables import Row, print_table
+from vibrissa.cli.terminal import Tell, progress_bars, say, shown
+
+if TYPE_CHECKING:
+    from vibrissa.demo import DemoResult, Located
+    from vibrissa.evaluation import ErrorRow, TrackingScores
+
+_SENSED = "measured by a sensor"
+_SEEN = "the paper's method"
+
+
+@with_bundles
+def demo(
+    own: WhiskerOptions,
+    folder: Annotated[Path, written("all files, in a folder", "DIR")] = Path("vibrissa-demo"),
+    full: Annotated[
+        bool | None,
+        typer.Option(
+            "--full/--quick",
+            help="3.5 s of video, as in the paper, or half a second.",
+            show_default="quick",
+        ),
+    ] = None,
+    seed: options.SeedOption = None,
+    noise: options.NoiseOption = True,
+    tracking: Annotated[
+        bool,
+        typer.Option(help="Whether the trial is filmed and tracked, or the true pose is taken."),
+    ] = True,
+    duration: options.DurationOption = None,
+    rate: options.RateOption = None,
+) -> None:
+    """Whisk against a peg, film it, measure at the whisker's base, and find the peg again.
+
+    A whisker sweeps past a peg and back before two cameras. Its track gives how its base is held,
+    three signals at its base where it touches, and the contact points draw the peg. All stages are
+    compared with the truth. Stopped with Ctrl-C it continues when it is called again.
+    Example: `vibrissa demo --output try --seed 1`
+    """
+    from vibrissa.demo import DURATION, FULL_DURATION, run_demo
+    from vibrissa.io.paths import check_folder
+
+    if duration is not None and full is not None:
+        raise ValueError("give either --duration or one of --full and --quick")
+    check_folder(folder)
+    whisker = own.read()
+    say(repr(whisker))
+    print_notes(whisker)
+    if duration is None:
+        duration = FULL_DURATION if full else DURATION
+    with progress_bars() as tell:
+        result = run_demo(
+            whisker,
+            folder,
+            seed=seed or 0,
+            noise=noise,
+            duration=duration,
+            rate=1000.0 if rate is None else rate,
+            video=tracking,
+            progress=tell,
+        )
+        pictures = _pictures(result, folder, tell)
+    _report(result, noise)
+    for file in (*result.files, *pictures):
+        say(f"wrote {file}")
+
+
+def _pictures(result: DemoResult, folder: Path, tell: Tell) -> list[Path]:
+    """The figures of the trial, and signals over the space of all contacts."""
+    from vibrissa import plots
+    from vibrissa.demo import video_files
+
+    videos = None if result.tracking is None else video_files(folder)
+    given = TrialOptions(videos, folder / "map.nc")
+    drawings = trial_drawings(folder / "trial.nc", "double", given, tell)
+    contact_map = result.contact_map
+    line = contact_map.whisker.centerline(NODES)
+    drawings["signal_space"] = lambda: plots.signal_clouds(contact_map.to_dataset(), line)
+    return saved(drawings, folder, ("png",), tell)
+
+
+def _report(result: DemoResult, noise: bool) -> None:
+    from vibrissa.evaluation import caution
+
+    sensed, seen = result.sensed, result.seen
+    scores = sensed.scores
+    none, one, several = scores.candidates
+    least = shown("MB", sensed.contacts.attrs["felt_above"], 3)
+    say()
+    say(f"{sensed.contacts.sizes['time']} frames, {scores.touching} in contact")
+    say(f"{scores.felt} contacts measured (M_B over {least}), {scores.false} of them false")
+    say(f"estimated from ({', '.join(sensed.contacts.attrs['signals'].split())}) only")
+    say(
+        f"{100 * scores.share_with_one:.1f} % have exactly one candidate ({one}); {none} none, as "
+        f"noise can have it; {several} several, of which the one that goes on from the frames "
+        "around is taken"
+    )
+    say()
+    if result.tracking is not None:
+        _print_tracking(result.tracking)
+    if seen is not None:
+        _print_signals(sensed, seen)
+    _print_errors("Error of the contact point", "of", scores.errors, noise, _coordinate)
+    _print_errors("3D error by deflection angle", "angle", scores.by_angle, noise, _label)
+    if seen is not None:
+        title = f"The same by {_SEEN}*, signals and map being of one model"
+        _print_errors(title, "angle", seen.scores.by_angle, False, _label)
+        say(f"* {caution(seen.contacts.attrs['source'])}")
+        say()
+    _print_peg(result)
+
+
+def _print_tracking(scores: TrackingScores) -> None:
+    views, lengths = ("top", "front"), ("centreline in space", "base", "contact point")
+    rows = [
+        (f"trace, {name}", *(f"{value:.3f} px" for value in pixels))
+        for name, pixels in zip(views, scores.trace, strict=True)
+    ]
+    errors = (scores.centerline, scores.base, scores.contact)
+    rows += [
+        (name, *(f"{1e6 * value:.1f} µm" for value in values))
+        for name, values in zip(lengths, errors, strict=True)
+    ]
+    print_table(
+        ["error of", "median", "95 %"],
+        rows,
+        f"Tracking: {scores.lost} of {scores.frames} frames lost, contact distinguished from none "
+        f"in {100 * scores.told:.1f} %",
+    )
+
+
+def _print_signals(sensed: Located, seen: Located) -> None:
+    """Errors of force and moment by deflection angle, from both sources."""
+    of_seen = {row.label: row for row in seen.signals}
+    rows = []
+    for row in sensed.signals:
+        cells = [row.label]
+        for name in ("force", "moment"):
+            for source in (row, of_seen.get(row.label)):
+                error = None if source is None else getattr(source, name)[0]
+                cells.append("–" if error is None else f"{100 * error:.2g} %")
+        rows.append(cells)
+    columns = ["angle", "force: sensor", _SEEN, "moment: sensor", _SEEN]
+    print_table(columns, rows, "Signals, median error by deflection angle")
+
+
+def _coordinate(row: ErrorRow) -> str:
+    return {"error_r": "r", "error_theta": "θ", "error_phi": "φ"}.get(row.quantity, "3D")
+
+
+def _label(row: ErrorRow) -> str:
+    return row.label
+
+
+def _print_errors(
+    title: str,
+    first: str,
+    rows: Sequence[ErrorRow],
+    noise: bool,
+    label: Callable[[ErrorRow], str],
+) -> None:
+    """Errors as measured and, with noise, as predicted."""
+    cells: list[Row] = []
+    for row in rows:
+        values = [*row.measured, *(row.predicted[:2] if noise else ())]
+        numbers = [shown(row.quantity, float(value), 3) for value in values]
+        cells.append([label(row), str(row.contacts), *numbers])
+    print_table(
+        [first, "contacts", "median", "95 %", "largest", *(["median*", "95 %*"] * noise)],
+        cells,
+        title,
+        "* what the estimates' own covariance predicts" if noise else None,
+    )
+
+
+def _print_peg(result: DemoResult) -> None:
+    """The peg, fitted and true."""
+    from rich.text import Text
+
+    found = {_SENSED: result.sensed}
+    if result.seen is not None:
+        found[_SEEN] = result.seen
+    rows: list[Row | None] = []
+    for name, one in found.items():
+        fit, scores = one.fit, one.scores
+        true = fit.origin - scores.offset
+        if len(found) > 1:
+            rows.append([Text(name, style="bold")])
+        values = [
+            (f"axis, {axis}", fit.origin[i], true[i], scores.offset[i], fit.origin_sigma[i])
+            for i, axis in enumerate("xy")
+        ]
+        diameter = (fit.diameter, 2 * result.peg.radius, scores.diameter_error, fit.diameter_sigma)
+        for label, *lengths in (*values, ("diameter", *diameter)):
+            rows.append([label, *(f"{1e3 * float(value):.4f} mm" for value in lengths)])
+        rows += [["tilt", "", "", shown("base_azimuth", scores.tilt, 2), ""], None]
+    away = shown("peg_position", float((result.sensed.scores.offset**2).sum() ** 0.5), 2)
+    print_table(
+        ["", "fitted", "true", "error", "its sigma"],
+        rows,
+        "The peg",
+        f"its axis, {_SENSED}, is {away} from the true one",
+    )

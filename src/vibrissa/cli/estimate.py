@@ -1,0 +1,255 @@
+"""`vibrissa estimate`: from signals to contact points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from vibrissa.cli import options
+from vibrissa.cli.inputs import (
+    RECORDING,
+    AssumptionOptions,
+    NoiseOptions,
+    WhiskerOptions,
+    check_one_whisker,
+    free_beside,
+    kind_in,
+    map_of,
+    maps_from,
+    print_notes,
+    print_statuses,
+    print_written,
+    recording_from,
+    smallest_arc,
+    wrench_from,
+)
+from vibrissa.cli.options import ForceOption, refuse, with_bundles, written
+from vibrissa.cli.signals import SourceOptions, described
+from vibrissa.cli.terminal import Tell, progress_bars, remark, shown
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from vibrissa.whisker import Whisker
+
+WRENCH = "wrench"
+
+
+@dataclass(frozen=True, kw_only=True)
+class EstimateOptions:
+    """From which signals contacts are estimated, and how."""
+
+    maps: options.MapsOption = None
+    using: options.UsingOption = None
+    method: options.MethodOption = "exact"
+    proximal: options.ProximalOption = None
+    noise: NoiseOptions
+    assumed: AssumptionOptions
+    own: WhiskerOptions
+
+    def __post_init__(self) -> None:
+        """Refuse what does not go together."""
+        from vibrissa.pipeline import TRIPLET
+
+        names = self.names or TRIPLET
+        if self.whole and self.method != "exact":
+            raise ValueError(f"--using wrench has no --method {self.method}")
+        if self.method != "exact" and len(names) != 3:
+            raise ValueError(
+                f"--method {self.method} needs three signals; got {len(names)}: {', '.join(names)}"
+            )
+        if self.maps and self.own.whisker is not None:
+            raise ValueError("give either --map or --whisker: a map already has its whisker")
+        if self.whole:
+            refuse({"--proximal": self.proximal}, "it is of a map, and --using wrench needs none")
+        if self.maps:
+            refuse({"--proximal": self.proximal}, "it is of maps that are simulated")
+        _ = self.assumed.prior
+
+    @property
+    def whole(self) -> bool:
+        """Whether force and moment are used whole."""
+        return self.using == WRENCH
+
+    @property
+    def names(self) -> tuple[str, ...] | None:
+        """Signals that are stated, but the wrench."""
+        from vibrissa.signals import selection
+
+        return None if self.using is None or self.whole else selection(self.using)
+
+    @property
+    def grid(self) -> bool:
+        """Whether contacts are looked up in the paper's grid."""
+        return self.method.startswith("lookup")
+
+    @property
+    def given(self) -> bool:
+        """Whether anything is stated, so that contacts are to be estimated anew."""
+        stated = (self.maps, self.using, self.own.whisker, self.noise.given)
+        other = (self.method != "exact", self.proximal is not None, self.assumed.described())
+        return any(bool(one) for one in (*stated, *other))
+
+    @property
+    def known(self) -> WhiskerOptions:
+        """The one whisker that is stated, perhaps by its map."""
+        one = self.maps is not None and len(self.maps) == 1
+        return WhiskerOptions(self.maps[0]) if self.maps and one else self.own
+
+    def keywords(self) -> dict[str, Any]:
+        """Options of all functions that estimate."""
+        return {"method": self.method, "errors": self.assumed.errors, "prior": self.assumed.prior}
+
+    def described(self, names: str, noise: str, least: float) -> str:
+        """State from which signals contacts are found, and what is known beforehand."""
+        by = "" if self.method == "exact" else f" by {self.method}"
+        used = f"signals ({', '.join(names.split())}){by}"
+        return (
+            f"{'force and moment whole' if names == WRENCH else used}{self.assumed.described()}; "
+            f"{noise}; contacts are measured where M_B exceeds {shown('MB', least)}"
+        )
+
+
+@with_bundles
+def estimate(
+    signals: Annotated[
+        Path,
+        typer.Argument(
+            help="A recording, .nc; or a table with time, Fx, Fy, Fz, Mx, My, Mz in SI units.",
+            metavar="SIGNALS",
+        ),
+    ],
+    how: EstimateOptions,
+    path: Annotated[
+        Path | None,
+        written(
+            "the recording with the contacts added, .nc, by default where it is; or the contacts "
+            "as a table, .csv, by default contacts.csv"
+        ),
+    ] = None,
+    force: ForceOption = False,
+) -> None:
+    """Find the contact point in each frame or row of signals, with its uncertainty.
+
+    From three signals all contacts that give them exactly, from more by least squares; with
+    --using wrench whatever the friction. Where M_B is within five standard deviations of zero the
+    status is not_felt. To a recording they are added as a group `estimates`, in the laboratory too,
+    where continuity decides which of several contacts it was; signals are made first where there
+    are none (see `vibrissa signals`), and a contour that was made of other contacts is left out. A
+    table goes to a table.
+    Example: `vibrissa estimate signals.csv --map map.nc --using Fx,FT,MB,MD -o contacts.csv`
+    """
+    from vibrissa.io.paths import CSV, NETCDF, check_readable, check_writable
+
+    if how.noise.covariance is not None:
+        how.noise.matrix()
+    recorded = kind_in(check_readable(signals)) == RECORDING
+    target = path or (signals if recorded else Path("contacts.csv"))
+    check_writable(target, (*NETCDF, *CSV) if recorded else CSV)
+    free_beside(signals, [target], force)
+    if recorded:
+        _from_recording(signals, target, how)
+    else:
+        _from_table(signals, target, how)
+
+
+def _from_table(signals: Path, target: Path, how: EstimateOptions) -> None:
+    """Contacts in the whisker's frame, as a table."""
+    from vibrissa.io import save_contacts
+    from vibrissa.pipeline import TRIPLET, contact_columns, locate, locate_from_wrench
+
+    noise = how.noise.matrix()
+    wrench = wrench_from(signals)
+    for note in wrench.attrs.get("notes", ()):
+        remark(f"{signals}: {note}")
+    maps = maps_from(how.maps, 1, how.grid) if how.maps else []
+    known = maps[0].whisker if maps else how.own.read()
+    print_notes(known)
+    _check_scale(signals, wrench, known)
+    with progress_bars() as tell:
+        if not maps and not how.whole:
+            remark(f"no map given; simulating that of {known!r}")
+            maps = [map_of(known, tell, grid=how.grid, proximal=smallest_arc(how.proximal))]
+        tell("contact points", 0, 1)
+        if how.whole:
+            errors, prior = how.assumed.errors, how.assumed.prior
+            found = locate_from_wrench(known, wrench, noise, errors, prior)
+        else:
+            found = locate(maps[0], wrench, how.names or TRIPLET, noise=noise, **how.keywords())
+        tell("contact points", 1, 1)
+    save_contacts(target, contact_columns(found))
+    used = WRENCH if how.whole else found.attrs["triplet"]
+    remark(how.described(used, how.noise.described(), found.attrs["felt_above"]))
+    print_statuses(found["status"].values)
+    print_written(target)
+
+
+def _from_recording(signals: Path, target: Path, how: EstimateOptions) -> None:
+    """Contacts added to a recording, or as a table."""
+    from vibrissa.io import save_contacts, save_recording
+    from vibrissa.io.paths import CSV
+    from vibrissa.pipeline import contact_columns, due_stages, with_signals
+
+    tree = recording_from(signals)
+    table = target.suffix.lower() in CSV
+    if table:
+        check_one_whisker(tree, signals)
+    with progress_bars() as tell:
+        if "signals" in due_stages(tree, "estimates"):
+            tree = with_signals(tree, **SourceOptions().as_keywords(tree, how.known, how.proximal))
+        done, used = estimated(tree, how, tell, str(signals))
+    remark(f"{described(done)}; {used}")
+    found = done["estimates"].to_dataset()
+    print_statuses(found["status"].values)
+    if table:
+        save_contacts(target, contact_columns(found.isel(whisker=0)))
+    else:
+        save_recording(target, done)
+    print_written(target, signals, "estimates")
+
+
+def estimated(
+    tree: xr.DataTree, how: EstimateOptions, tell: Tell, name: str
+) -> tuple[xr.DataTree, str]:
+    """Add contacts to a recording that has signals, and describe how they were found."""
+    from vibrissa.pipeline import sensor_noise, with_estimates
+
+    signals = tree["signals"].to_dataset()
+    source = signals.attrs.get("source")
+    # A sensor that does not state its noise is a usual one.
+    noisy = how.noise.given or (source == "sensor" and sensor_noise(signals) is None)
+    maps = maps_from(how.maps, tree.sizes["whisker"], how.grid) if how.maps else []
+    whiskers = [one.whisker for one in maps] if maps else how.own.in_recording(tree)
+    print_notes(*whiskers)
+    for k, whisker in enumerate(whiskers):
+        _check_scale(name, signals.isel(whisker=k), whisker)
+    by_default = how.using is None and how.method == "exact"
+    whole = how.whole or (by_default and source == "rod")
+    if not maps and not whole:
+        one = f"no map given; simulating that of {whiskers[0]!r}"
+        several = "no maps given; simulating those of the whiskers that have a contact"
+        remark(one if len(whiskers) == 1 else several)
+    done = with_estimates(
+        tree,
+        WRENCH if whole else how.names,
+        noise=how.noise.matrix() if noisy else None,
+        proximal=smallest_arc(how.proximal),
+        progress=tell,
+        **how.keywords(),
+        **({"contact_maps": maps} if maps else {"whiskers": whiskers}),
+    )
+    about = done["estimates"].attrs
+    noise = how.noise.described() if noisy else "noise as the recording states"
+    return done, how.described(str(about["signals"]), noise, float(about["felt_above"]))
+
+
+def _check_scale(path: Path | str, wrench: xr.Dataset, whisker: Whisker) -> None:
+    from vibrissa.io.signals_table import check_scale
+
+    try:
+        check_scale(wrench, whisker)
+    except ValueError as fault:
+        raise ValueError(f"{path}: {fault}") from None

@@ -1,0 +1,370 @@
+"""What verbs share: options that belong together, and the files that are read and written."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vibrissa.cli import options
+from vibrissa.cli.options import free, refuse
+from vibrissa.cli.terminal import Tell, remark, say
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from vibrissa.contacts import ContactMap, Prior
+    from vibrissa.numerics import Array
+    from vibrissa.objects.surface import Surface
+    from vibrissa.whisker import Whisker
+
+RECORDING, MAP = "vibrissa recording", "vibrissa contact map"
+"""Kinds of NetCDF files."""
+
+_THICKEST = 10.0
+"""Radius of a whisker from which micrometres were typed for mm, mm."""
+
+# Unit of each limit of a region on the command line.
+_UNITS = {"r": 1e-3, "theta": math.pi / 180.0, "phi": math.pi / 180.0}
+
+
+@dataclass(frozen=True)
+class WhiskerOptions:
+    """A whisker, and what its file does not state."""
+
+    whisker: options.WhiskerOption = None
+    rat: options.RatOption = None
+    any_length: options.AnyLengthOption = False
+
+    def __post_init__(self) -> None:
+        """Refuse statements about no whisker."""
+        self.check(self.whisker is not None)
+
+    def check(self, given: bool) -> None:
+        """Raise if something is stated about a whisker that is not given."""
+        if (self.rat is not None or self.any_length) and not given:
+            raise ValueError("--rat and --any-length are about a --whisker, and none is given")
+
+    def read(self, path: Path | None = None) -> Whisker:
+        """Read the whisker, or that of another file; by default it is the γ whisker."""
+        from vibrissa import samples
+        from vibrissa.io import is_netcdf, load_whisker
+
+        path = self.whisker if path is None else path
+        if path is None:
+            return samples.gamma()
+        if not path.exists():
+            raise FileNotFoundError(f"there is no file {path}")
+        if not is_netcdf(path):
+            return load_whisker(path, rat=self.rat, any_length=self.any_length)
+        whisker = _whisker_in(path)
+        return whisker if self.rat is None else whisker.with_properties(rat=self.rat)
+
+    def in_recording(self, recording: xr.DataTree) -> list[Whisker]:
+        """Find the whisker of each that a recording has signals of."""
+        from vibrissa.recording import Recording
+
+        count = recording.sizes["whisker"]
+        if self.whisker is not None:
+            if count > 1:
+                raise ValueError(f"--whisker is one whisker; the recording has {count}")
+            return [self.read()]
+        try:
+            return Recording(recording).whiskers
+        except ValueError as fault:
+            raise ValueError(f"{fault}; give its centreline with --whisker") from None
+
+
+@dataclass(frozen=True)
+class NoiseOptions:
+    """Noise of the sensor: that of each component, or their covariance."""
+
+    force_noise: options.ForceNoiseOption = None
+    moment_noise: options.MomentNoiseOption = None
+    covariance: options.CovarianceOption = None
+
+    def __post_init__(self) -> None:
+        """Refuse two statements about the same."""
+        if self.covariance is not None:
+            components = {name: v for name, v in self.stated.items() if name != "--covariance"}
+            refuse(components, "--covariance holds the noise")
+
+    @property
+    def stated(self) -> dict[str, object]:
+        """Options by their names."""
+        return {
+            "--force-noise": self.force_noise,
+            "--moment-noise": self.moment_noise,
+            "--covariance": self.covariance,
+        }
+
+    @property
+    def given(self) -> bool:
+        """Whether any noise is stated."""
+        return any(one is not None for one in self.stated.values())
+
+    def _usual(self) -> tuple[float, float]:
+        """Noise of force and moment, µN and µN·m; what is not stated is that of a usual sensor."""
+        from vibrissa.sensors import FORCE_NOISE, MOMENT_NOISE
+
+        return (
+            FORCE_NOISE * 1e6 if self.force_noise is None else self.force_noise,
+            MOMENT_NOISE * 1e6 if self.moment_noise is None else self.moment_noise,
+        )
+
+    def matrix(self) -> Array:
+        """Covariance of force and moment, (6, 6), SI units."""
+        import numpy as np
+
+        from vibrissa.io.table import read_text, table_rows
+        from vibrissa.pipeline import component_noise
+
+        if self.covariance is None:
+            force, moment = self._usual()
+            return component_noise(force * 1e-6, moment * 1e-6)
+        try:
+            rows = table_rows(read_text(self.covariance))
+            covariance = np.array([[float(cell) for cell in cells] for _, cells in rows])
+        except ValueError as fault:
+            raise ValueError(f"{self.covariance} is not a covariance: {fault}") from None
+        if covariance.shape != (6, 6):
+            got = covariance.shape
+            raise ValueError(f"{self.covariance} must hold six lines of six numbers; got {got}")
+        return covariance
+
+    def described(self) -> str:
+        """State the noise, in the units of the options."""
+        if self.covariance is not None:
+            return f"noise of {self.covariance}"
+        return "noise {:g} µN and {:g} µN·m".format(*self._usual())
+
+
+@dataclass(frozen=True)
+class AssumptionOptions:
+    """What is known beforehand: errors that all samples share, and which contacts are possible."""
+
+    stiffness_sigma: options.StiffnessSigmaOption = 0.0
+    gain_sigma: options.GainSigmaOption = 0.0
+    mixing_sigma: options.MixingSigmaOption = 0.0
+    region: options.RegionOption = None
+    least_force: options.LeastForceOption = None
+    greatest_force: options.GreatestForceOption = None
+
+    @property
+    def errors(self) -> dict[str, float]:
+        """Standard deviations by the names that estimates take; only those that are not zero."""
+        names = ("stiffness_sigma", "gain_sigma", "mixing_sigma")
+        return {name: 0.01 * getattr(self, name) for name in names if getattr(self, name) > 0.0}
+
+    @property
+    def prior(self) -> Prior | None:
+        """The contacts that are possible; None: all."""
+        if self.region is None and self.least_force is None and self.greatest_force is None:
+            return None
+        from vibrissa.contacts import Prior
+
+        least = 0.0 if self.least_force is None else 1e-6 * self.least_force
+        greatest = math.inf if self.greatest_force is None else 1e-6 * self.greatest_force
+        if not least < greatest:
+            raise ValueError(
+                f"--least-force must be below --greatest-force; got {1e6 * least:g} and "
+                f"{1e6 * greatest:g} µN"
+            )
+        region = self.region or "all"
+        return Prior(_limits(region) if "=" in region else region, least, greatest)
+
+    def described(self) -> str:
+        """State all of it, to be put at the end of a sentence; empty where there is nothing."""
+        parts = [
+            f"{name.removesuffix('_sigma')} known to {100.0 * value:g} %"
+            for name, value in self.errors.items()
+        ]
+        possible = []
+        if self.region is not None and "=" in self.region:
+            possible.append(f"where {self.region} (mm, degrees)")
+        elif self.region is not None and self.region != "all":
+            possible.append(f"in {self.region}")
+        if self.least_force:
+            possible.append(f"of at least {self.least_force:g} µN")
+        if self.greatest_force is not None:
+            possible.append(f"of at most {self.greatest_force:g} µN")
+        if possible:
+            parts.append(f"contacts only {' and '.join(possible)}")
+        return "".join(f"; {part}" for part in parts)
+
+
+def _limits(text: str) -> dict[str, tuple[float, float]]:
+    """Read limits as ``r=20:35,theta=-30:30``, in SI units."""
+    limits = {}
+    for part in text.split(","):
+        name, _, values = part.partition("=")
+        try:
+            least, greatest = (float(value) * _UNITS[name.strip()] for value in values.split(":"))
+        except (KeyError, ValueError):
+            raise ValueError(
+                f"--region is {text!r}; a name, or limits of r (mm), theta and phi (degrees) as "
+                "r=20:35,theta=-30:30 are needed"
+            ) from None
+        limits[name.strip()] = (least, greatest)
+    return limits
+
+
+def metres_of(radius: float, option: str) -> float:
+    """Take the radius of a whisker from mm to m."""
+    if not 0.0 < radius < _THICKEST:
+        raise ValueError(
+            f"{option} is {radius:g} mm; more than 0 and less than {_THICKEST:g} are needed"
+        )
+    return 1e-3 * radius
+
+
+def smallest_arc(proximal: float | None) -> float:
+    """Return the smallest arc length of a contact, share of the whisker's length."""
+    from vibrissa.rod import PROXIMAL
+
+    return PROXIMAL if proximal is None else proximal
+
+
+def print_notes(*whiskers: Whisker) -> None:
+    """Print what is assumed about whiskers, and all else that their user should know."""
+    for note in dict.fromkeys(note for whisker in whiskers for note in whisker.notes):
+        remark(f"note: {note}")
+
+
+def kind_in(path: Path) -> str:
+    """Return the kind of a NetCDF file; empty for other files."""
+    from vibrissa.io import is_netcdf, kind_of
+
+    if not path.is_file() or path.stat().st_size == 0:
+        return ""
+    return (kind_of(path) or "") if is_netcdf(path) else ""
+
+
+def _whisker_in(path: Path) -> Whisker:
+    """Read the whisker of a recording or a map."""
+    from vibrissa.io import kind_of, load_recording
+    from vibrissa.recording import Recording
+
+    kind = kind_of(path)
+    if kind == RECORDING:
+        return Recording(load_recording(path)).whisker()
+    if kind == MAP:
+        return map_from(path).whisker
+    raise ValueError(f"{path} holds {kind or 'data of another kind'}, and no whisker")
+
+
+def recording_from(path: Path) -> xr.DataTree:
+    """Read a recording."""
+    from vibrissa.io import load_recording
+    from vibrissa.io.paths import check_readable
+    from vibrissa.pipeline.frames import check_recording
+
+    recording = load_recording(check_readable(path))
+    try:
+        check_recording(recording)
+    except ValueError as fault:
+        raise ValueError(f"{path}: {fault}") from None
+    return recording
+
+
+def map_from(path: Path) -> ContactMap:
+    """Read a map."""
+    from vibrissa.contacts import ContactMap
+
+    return ContactMap.load(path)
+
+
+def map_of(whisker: Whisker, tell: Tell, *, grid: bool = False, **how: Any) -> ContactMap:
+    """Simulate the map of a whisker."""
+    from vibrissa.contacts import ContactMap
+
+    stage = "map of all contacts"
+    tell(stage, 0, 1)
+    made = ContactMap.simulate(
+        whisker, grid=grid, progress=lambda done, total: tell(stage, done, total), **how
+    )
+    tell(stage, 1, 1)
+    return made
+
+
+def wrench_from(path: Path) -> xr.Dataset:
+    """Read force and moment over time from a table of signals or a recording."""
+    from vibrissa.io import load_recording, load_signals
+
+    if not path.exists():
+        raise FileNotFoundError(f"there is no file {path}")
+    if kind_in(path) != RECORDING:
+        return load_signals(path)
+    recording = load_recording(path)
+    if not {"force", "moment"} <= set(recording.data_vars):
+        raise ValueError(f"{path} is a recording without force and moment")
+    wrench = recording.to_dataset()[["force", "moment"]]
+    if wrench.sizes["whisker"] != 1:
+        raise ValueError(f"{path} is a recording of {wrench.sizes['whisker']} whiskers, not of one")
+    return wrench.isel(whisker=0)
+
+
+def objects_from(path: Path) -> tuple[Surface, ...]:
+    """Read known objects from a recording, or from TOML with ``[[object]]``."""
+    from vibrissa.io import load_recording
+    from vibrissa.io.paths import NETCDF
+    from vibrissa.io.table import read_text
+    from vibrissa.io.toml import in_file
+    from vibrissa.recording import Recording
+    from vibrissa.simulation.script import read_objects
+
+    if path.suffix.lower() not in NETCDF:
+        with in_file(path):
+            return tuple(read_objects(read_text(path), path.parent))
+    objects = Recording(load_recording(path)).objects
+    if not objects:
+        raise ValueError(f"{path} is a recording without objects")
+    return objects
+
+
+def print_statuses(codes: object, each: str = "") -> None:
+    """Print how many frames have which status."""
+    from vibrissa.status import describe
+
+    for sentence, count in describe(codes).most_common():  # type: ignore[arg-type]
+        say(f"{count:6d} {each} {sentence}")
+
+
+def free_beside(recording: Path, files: Iterable[Path], force: bool) -> None:
+    """Raise if files are there that are not to be replaced; a recording is added to."""
+    free([file for file in files if not _same(file, recording)], force)
+
+
+def _same(path: Path, other: Path) -> bool:
+    return path.resolve() == other.resolve()
+
+
+def print_written(path: Path, recording: Path | None = None, stage: str = "") -> None:
+    """Print that a file is there, or that a recording has a stage more."""
+    added = recording is not None and _same(path, recording)
+    say(f"added {stage} to {path}" if added else f"wrote {path}")
+
+
+def check_one_whisker(recording: xr.DataTree, path: Path) -> None:
+    """Raise if a recording has several whiskers, of which a table has no room."""
+    count = recording.sizes["whisker"]
+    if count != 1:
+        raise ValueError(
+            f"{path} is a recording of {count} whiskers; a table has room for one: give an "
+            "--output that ends in .nc"
+        )
+
+
+def maps_from(paths: Sequence[Path], count: int, grid: bool = False) -> list[ContactMap]:
+    """Read the map of each whisker."""
+    if len(paths) != count:
+        raise ValueError(f"there are {len(paths)} --map for {count} whiskers; each needs one")
+    found = [map_from(path) for path in paths]
+    for path, contact_map in zip(paths, found, strict=True):
+        if grid and contact_map.grid is None:
+            raise ValueError(
+                f"{path} has no grid to look up in: make it by `vibrissa map` without --no-grid"
+            )
+    return found

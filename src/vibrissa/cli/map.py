@@ -1,0 +1,101 @@
+"""`vibrissa map`: all contacts of a whisker."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from vibrissa.cli.inputs import WhiskerOptions, map_of, metres_of, print_notes, smallest_arc
+from vibrissa.cli.options import (
+    BaseRadiusOption,
+    ForceOption,
+    GridOption,
+    ProximalOption,
+    free,
+    with_bundles,
+    written,
+)
+from vibrissa.cli.terminal import progress_bars, say
+
+if TYPE_CHECKING:
+    from vibrissa.whisker import Whisker
+
+
+@dataclass(frozen=True)
+class MadeOptions(WhiskerOptions):
+    """A whisker of a file or a straight one, of any thickness and material."""
+
+    length: Annotated[
+        float | None,
+        typer.Option(help="Length of a straight whisker, mm, instead.", min=0.0, metavar="MM"),
+    ] = None
+    base_radius: BaseRadiusOption = None
+    tip_radius: Annotated[
+        float | None,
+        typer.Option(
+            help="Radius at the tip, mm; by default 1/15 of the base's.", min=0.0, metavar="MM"
+        ),
+    ] = None
+    modulus: Annotated[
+        float | None, typer.Option(help="Young's modulus, GPa.", min=0.0, metavar="GPA")
+    ] = None
+    poisson: Annotated[float | None, typer.Option(help="Poisson's ratio.", metavar="RATIO")] = None
+
+    def __post_init__(self) -> None:
+        """Refuse what does not go together."""
+        self.check(self.whisker is not None or self.length is not None)
+        if self.length is not None and self.whisker is not None:
+            raise ValueError("give either --whisker or the --length of a straight one")
+
+    def read(self, path: Path | None = None) -> Whisker:
+        """Read or make the whisker, of the thickness and material that are stated."""
+        from vibrissa.whisker import Whisker
+        from vibrissa.whisker.section import TAPER
+
+        if self.length is None:
+            whisker = super().read(path)
+        else:
+            whisker = Whisker.straight(1e-3 * self.length, rat=self.rat, any_length=self.any_length)
+        changes: dict[str, Any] = {}
+        if self.base_radius is not None or self.tip_radius is not None:
+            base, tip = whisker.base_radius, None
+            if self.base_radius is not None:
+                base = metres_of(self.base_radius, "--base-radius")
+            if self.tip_radius is not None:
+                tip = metres_of(self.tip_radius, "--tip-radius")
+            changes |= {"base_radius": base, "tip_radius": base / TAPER if tip is None else tip}
+        if self.modulus is not None:
+            changes["youngs_modulus"] = 1e9 * self.modulus
+        if self.poisson is not None:
+            changes["poisson_ratio"] = self.poisson
+        return whisker.with_properties(**changes) if changes else whisker
+
+
+@with_bundles
+def simulate_map(
+    own: MadeOptions,
+    proximal: ProximalOption = None,
+    path: Annotated[Path, written("the map, .nc")] = Path("map.nc"),
+    grid: GridOption = True,
+    force: ForceOption = False,
+) -> None:
+    """Find all stable contacts of a whisker, and the paper's grid of them.
+
+    Radii, modulus and ratio are those of the file or, where not given, of an average whisker.
+    Example: `vibrissa map --whisker C1.csv -o map.nc`; steel wire:
+    `vibrissa map --length 300 --base-radius 0.5 --tip-radius 0.25 --modulus 200 --poisson 0.29`
+    """
+    from vibrissa.io.paths import NETCDF, check_writable
+
+    check_writable(path, NETCDF)
+    free([path], force)
+    whisker = own.read()
+    print_notes(whisker)
+    with progress_bars() as tell:
+        contact_map = map_of(whisker, tell, grid=grid, proximal=smallest_arc(proximal))
+        contact_map.save(path)
+    say(repr(contact_map))
+    say(f"wrote {path}")

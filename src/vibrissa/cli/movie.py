@@ -1,0 +1,222 @@
+"""`vibrissa movie`: a trial as movies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+import typer
+
+from vibrissa.cli.drawings import NODES, TrialOptions, fits_of, sights_of
+from vibrissa.cli.options import (
+    ForceOption,
+    RecordingArgument,
+    free,
+    refuse,
+    with_bundles,
+    written,
+)
+from vibrissa.cli.terminal import Tell, progress_bars, say, stoppable
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from numpy.typing import NDArray
+
+    from vibrissa.plots import Course
+
+_KINDS = ("signals", "contour")
+_LASTS = 45.0
+"""How long a movie of a whole trial lasts at most, s, unless a step is given."""
+
+
+@dataclass(frozen=True)
+class FrameOptions:
+    """Which frames a movie shows, and how fast."""
+
+    fps: Annotated[float, typer.Option(help="Frames per second at which it is shown.")] = 25.0
+    step: Annotated[
+        int | None,
+        typer.Option(
+            help="Number of frames of the trial from one that is shown to the next; by default "
+            "such that the movie lasts up to 45 s."
+        ),
+    ] = None
+    start: Annotated[
+        float | None, typer.Option("--from", help="Time of the first frame, s.", metavar="S")
+    ] = None
+    stop: Annotated[
+        float | None, typer.Option("--to", help="Time of the last frame, s.", metavar="S")
+    ] = None
+
+    def rows(self, time: NDArray[np.float64]) -> NDArray[np.intp]:
+        """Choose frames of a trial."""
+        if not (np.isfinite(self.fps) and self.fps > 0.0):
+            raise ValueError(f"--fps is {self.fps!r}; it must be positive")
+        if self.step is not None and self.step < 1:
+            raise ValueError(f"--step is {self.step}; 1 or more is needed")
+        first = time[0] if self.start is None else self.start
+        last = time[-1] if self.stop is None else self.stop
+        rows = np.flatnonzero((time >= first - 1e-9) & (time <= last + 1e-9))
+        if not rows.size:
+            raise ValueError(
+                f"there are no frames from {first:g} to {last:g} s; the trial has some from "
+                f"{time[0]:g} to {time[-1]:g} s"
+            )
+        return rows[:: self.step or int(np.ceil(rows.size / (_LASTS * self.fps)))]
+
+
+@with_bundles
+def movie(
+    path: RecordingArgument,
+    of_trial: TrialOptions,
+    frames: FrameOptions,
+    kind: Annotated[
+        Literal["signals", "contour", "both"], typer.Option(help="What the movies show.")
+    ] = "both",
+    target: Annotated[
+        Path, written("the movies, in a folder, or one kind as a file .mp4", "DIR")
+    ] = Path("movies"),
+    force: ForceOption = False,
+) -> None:
+    """Make movies of a trial: its signals in the solids of all contacts; the contour as it grows.
+
+    Without videos the whisker is drawn as the cameras would see it. Stopped with Ctrl-C it leaves
+    what was done in a file NAME-part.mp4 that can be played.
+    Example: `vibrissa movie trial.nc --video top.mp4 --video front.mp4 -o movies`
+    """
+    if kind == "contour":
+        refuse({"--map": of_trial.map}, "the movie of the contour shows no map")
+    if kind == "signals":
+        refuse({"--video": of_trial.videos}, "the movie of the signals shows no video")
+    kinds = _KINDS if kind == "both" else (kind,)
+    make_movies(path, target, kinds, of_trial, frames, force)
+
+
+def make_movies(
+    path: Path,
+    target: Path,
+    kinds: Sequence[str],
+    of_trial: TrialOptions,
+    frames: FrameOptions,
+    force: bool,
+) -> list[Path]:
+    """Make the movies that a trial allows."""
+    from vibrissa.io import load_recording
+    from vibrissa.plots import course_of
+
+    files = _files(target, path, kinds)
+    free(files.values(), force)
+    trial = load_recording(path)
+    course = course_of(trial, of_trial.whisker)
+    rows = frames.rows(course.time)
+    possible = _possible(kinds, course, rows, path)
+    with progress_bars() as tell, stoppable() as stopped:
+        for name in possible:
+            images = _FRAMES[name](trial, course, rows, of_trial, tell)
+            files[name].parent.mkdir(parents=True, exist_ok=True)
+            _write(files[name], images, (name, len(rows)), frames.fps, tell, stopped)
+            if stopped():
+                raise typer.Exit(130)
+    return [files[name] for name in possible]
+
+
+def _files(target: Path, trial: Path, kinds: Sequence[str]) -> dict[str, Path]:
+    """Where each movie goes."""
+    from vibrissa.io.paths import check_folder, check_writable
+
+    if target.suffix.lower() == ".mp4":
+        if len(kinds) > 1:
+            raise ValueError(f"--output is the file {target}; for one file choose one --kind")
+        check_writable(target)
+        return {kinds[0]: target}
+    check_folder(target)
+    return {name: target / f"{trial.stem}-{name}.mp4" for name in kinds}
+
+
+def _possible(
+    kinds: Sequence[str], course: Course, rows: NDArray[np.intp], path: Path
+) -> list[str]:
+    """Kinds for which the trial has what is needed; prints what is lacking for others."""
+    lacking = {}
+    if course.signals is None:
+        lacking["signals"] = f"no signals: `vibrissa signals {path}` makes them"
+    span = slice(rows[0], rows[-1] + 1)
+    if course.places is None:
+        lacking["contour"] = f"no contact points: `vibrissa reconstruct {path}` makes them"
+    elif not np.isfinite(course.places[span]).any():
+        lacking["contour"] = "no contact points at these times"
+    reasons = [f"{path} has {lacking[name]}" for name in kinds if name in lacking]
+    possible = [name for name in kinds if name not in lacking]
+    if not possible:
+        raise ValueError("; ".join(dict.fromkeys(reasons)))
+    for reason in reasons:
+        say(f"{reason}; left out")
+    return possible
+
+
+def _signal_frames(
+    trial: xr.DataTree,
+    course: Course,
+    rows: NDArray[np.intp],
+    of_trial: TrialOptions,
+    tell: Tell,
+) -> Iterator[Any]:
+    from vibrissa.plots import signal_frames
+
+    contact_map = of_trial.contact_map(trial, tell)
+    return signal_frames(
+        course, contact_map.to_dataset(), contact_map.whisker.centerline(NODES), rows
+    )
+
+
+def _contour_frames(
+    trial: xr.DataTree,
+    course: Course,
+    rows: NDArray[np.intp],
+    of_trial: TrialOptions,
+    tell: Tell,
+) -> Iterator[Any]:
+    from vibrissa.plots import contour_frames
+    from vibrissa.recording import Recording
+
+    rest = Recording(trial).whisker(of_trial.whisker).centerline(NODES)
+    sights = sights_of(trial, course, of_trial.videos or (), rows)
+    bodies = list(Recording(trial).objects)
+    return contour_frames(course, rest, sights, rows, bodies, fits_of(trial))
+
+
+_FRAMES = {"signals": _signal_frames, "contour": _contour_frames}
+
+
+def _write(
+    path: Path,
+    frames: Iterable[Any],
+    about: tuple[str, int],
+    fps: float,
+    tell: Tell,
+    stopped: Callable[[], bool],
+) -> None:
+    """Write a movie; if it is stopped, what was done stays next to it."""
+    from vibrissa.io import write_movie
+
+    name, total = about
+    stage = f"movie of {'the contour' if name == 'contour' else name}"
+
+    def counted() -> Iterator[Any]:
+        tell(stage, 0, total)
+        for done, frame in enumerate(frames, 1):
+            yield frame
+            tell(stage, done, total)
+            if stopped():
+                return
+
+    part = path.with_name(f"{path.stem}-part.mp4")
+    count = write_movie(part, counted(), fps)
+    if count < total:
+        say(f"stopped after {count} of {total} frames: {part} holds these")
+        return
+    part.replace(path)
+    say(f"wrote {path}, {count} frames, {count / fps:.1f} s")

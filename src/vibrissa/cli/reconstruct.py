@@ -1,0 +1,337 @@
+"""`vibrissa reconstruct`: from a recording to the object that was touched."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+import typer
+
+from vibrissa.cli.estimate import EstimateOptions, estimated
+from vibrissa.cli.inputs import (
+    RECORDING,
+    WhiskerOptions,
+    free_beside,
+    kind_in,
+    objects_from,
+    print_statuses,
+    print_written,
+    recording_from,
+)
+from vibrissa.cli.options import (
+    AxisOption,
+    ForceOption,
+    ObjectsOption,
+    RecordingArgument,
+    TableOption,
+    numbers,
+    with_bundles,
+    written,
+)
+from vibrissa.cli.signals import SourceOptions, described
+from vibrissa.cli.tables import print_table
+from vibrissa.cli.terminal import Tell, fixed, progress_bars, remark, say
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from vibrissa.contour import FittedShape
+    from vibrissa.objects.surface import Surface
+    from vibrissa.whisker import Whisker
+
+_SUSPECT = 1.5
+"""χ² per degree of freedom from which it is asked whether another shape fits better."""
+
+_TURNED = ("axis", "normal")
+"""Parameters of a shape that are directions, not lengths."""
+
+
+@dataclass(frozen=True)
+class ShapeOptions:
+    """The object that is looked for."""
+
+    shape: Annotated[
+        Literal["cylinder", "sphere", "plane", "free"],
+        typer.Option(help="Shape of the object that was touched."),
+    ] = "cylinder"
+    axis: AxisOption = None
+    lean: Annotated[
+        float | None,
+        typer.Option(
+            help="Standard deviation of the angle between normals and forces, degrees; by default "
+            "5.7 for contacts from --using wrench, which allows for friction, and else 0."
+        ),
+    ] = None
+
+    def __post_init__(self) -> None:
+        """Refuse what does not go together."""
+        self.keywords()
+        if self.axis is not None and self.shape != "cylinder":
+            raise ValueError(f"--axis is for a cylinder; --shape is {self.shape}")
+        if self.lean is not None and not 0.0 <= self.lean < 90.0:
+            raise ValueError(f"--lean is {self.lean:g}; degrees from 0 to 90 are needed")
+
+    def keywords(self) -> dict[str, Any]:
+        """Options of fits."""
+        axis = None if self.axis is None else numbers(self.axis, ("X", "Y", "Z"), "--axis")
+        return {"axis": axis, "lean": None if self.lean is None else math.radians(self.lean)}
+
+
+@with_bundles
+def reconstruct(
+    recording: RecordingArgument,
+    wanted: ShapeOptions,
+    source: SourceOptions,
+    how: EstimateOptions,
+    objects: ObjectsOption = None,
+    path: Annotated[
+        Path | None, written("the recording with all that was found added, by default where it is")
+    ] = None,
+    csv: TableOption = None,
+    force: ForceOption = False,
+) -> None:
+    """Find the object that was touched from a recording alone.
+
+    Signals and estimates that the recording already has are used; what is missing is made first, by
+    defaults that are printed, and what options ask for is made anew. All is added to the recording
+    as groups `signals`, `estimates` and `contour`; what else it held stays as it was. The contour
+    points go to a table as well; one that holds just what the recording held is replaced with it.
+    The contacts are compared with --objects, by default those of the recording.
+    Example: `vibrissa reconstruct trial.nc --shape cylinder`
+    """
+    from vibrissa.io import save_contour, save_recording
+    from vibrissa.io.paths import CSV, NETCDF, check_writable
+    from vibrissa.pipeline import contour_points
+    from vibrissa.recording import Recording
+
+    target = recording if path is None else path
+    points = target.with_name(f"{target.stem}_contour.csv") if csv is None else csv
+    check_writable(target, NETCDF)
+    check_writable(points, CSV)
+    own = not force and _of_contour(points, recording, how.own)
+    free_beside(recording, [target] if own else [target, points], force)
+    tree = recording_from(recording)
+    known = Recording(tree).objects if objects is None else objects_from(objects)
+    with progress_bars() as tell:
+        made = []
+        try:
+            for name, after in _stages(tree, wanted, source, how, known, tell, str(recording)):
+                made.append(name)
+                tree = after
+        except ValueError as fault:
+            if not made:
+                raise
+            save_recording(target, tree)
+            raise ValueError(f"{fault}; {' and '.join(made)} are in {target}") from None
+    whiskers = how.known.in_recording(tree)
+    _report(tree, known, whiskers, wanted)
+    save_recording(target, tree)
+    save_contour(points, contour_points(tree, whiskers))
+    print_written(target, recording, "contour")
+    print_written(points)
+
+
+def _stages(
+    tree: xr.DataTree,
+    wanted: ShapeOptions,
+    source: SourceOptions,
+    how: EstimateOptions,
+    known: tuple[Surface, ...],
+    tell: Tell,
+    name: str,
+) -> Iterator[tuple[str, xr.DataTree]]:
+    """The recording after each stage that is due."""
+    from vibrissa.pipeline import due_stages, with_contour, with_signals
+
+    made = tree["signals"].attrs if "signals" in tree.children else None
+    if made and how.own.whisker is not None and not source.given:
+        source = _as_made(made)  # by another whisker
+    asked = {"signals": source.given, "estimates": how.given}
+    due = due_stages(tree, "contour", [stage for stage, again in asked.items() if again])
+    if "signals" in due:
+        tell("signals", 0, 1)
+        tree = with_signals(tree, **source.as_keywords(tree, how.known, how.proximal))
+        tell("signals", 1, 1)
+        yield "signals", tree
+    remark(described(tree))
+    if "estimates" in due:
+        tree, used = estimated(tree, how, tell, name)
+        remark(used)
+        yield "estimates", tree
+    tell(wanted.shape, 0, 1)
+    whiskers = how.known.in_recording(tree)
+    yield (
+        "contour",
+        with_contour(tree, wanted.shape, whiskers=whiskers, objects=known, **wanted.keywords()),
+    )
+    tell(wanted.shape, 1, 1)
+
+
+def _as_made(about: Any) -> SourceOptions:
+    """What signals that are there were made from."""
+    source: Any = str(about.get("source")).replace(" ", "-")
+    cutoff = float(about.get("cutoff", 0.0)) if source == "contact-point" else None
+    return SourceOptions(source, cutoff)
+
+
+def _of_contour(points: Path, recording: Path, own: WhiskerOptions) -> bool:
+    """Whether a table holds what the recording does: replaced with it, nothing else is lost."""
+    from vibrissa.io.contacts_table import holds_contour
+    from vibrissa.pipeline import contour_points
+
+    if not points.is_file() or kind_in(recording) != RECORDING:
+        return False
+    tree = recording_from(recording)
+    if not {"estimates", "contour"} <= set(tree.children):
+        return False
+    try:
+        return holds_contour(points, contour_points(tree, own.in_recording(tree)))
+    except ValueError:
+        return False
+
+
+# What is printed of the object --------------------------------------------------------------------
+
+
+def _report(
+    tree: xr.DataTree, known: tuple[Surface, ...], whiskers: list[Whisker], wanted: ShapeOptions
+) -> None:
+    """What became of the frames, the object, and how far contacts are from one that is known."""
+    from vibrissa.contour import shape_from_dataset
+    from vibrissa.evaluation import caution
+    from vibrissa.pipeline import compare_contacts, compare_shapes, distances_by_class
+
+    contour, estimates = (tree[name].to_dataset() for name in ("contour", "estimates"))
+    shapes, fit = None, shape_from_dataset(contour)
+    if wanted.shape != "free" and fit.misfit > _SUSPECT:
+        shapes = compare_shapes(estimates, whiskers, **wanted.keywords())
+    print_statuses(estimates["status"].values)
+    _print_object(fit, contour, known)
+    for line in (_agreement(fit, contour), *_judgement(fit, shapes)):
+        say(line)
+    if known:
+        compared = compare_contacts(tree, known, whiskers)
+        _print_distances(distances_by_class(compared)["deflection_angle"])
+    if warning := caution(contour.attrs.get("source")):
+        say(warning)
+
+
+def _print_object(fit: FittedShape, contour: xr.Dataset, known: tuple[Surface, ...]) -> None:
+    """The fitted object with its uncertainty, and how far it is from the known one."""
+    from vibrissa.contour import FreeFit
+
+    true = _matching(contour, known)
+    title = f"The {fit.kind}"
+    if isinstance(fit, FreeFit):
+        deviation = fixed("surface_distance", fit.amplitude, 0)
+        title = f"A surface within about {deviation} of this {fit.base.kind}"
+        fit = fit.base
+    rows = []
+    for name, value, sigma in _parameters(fit):
+        factor, unit = (1.0, "") if name in _TURNED else (1e3, " mm")
+        values = np.atleast_1d(value)
+        for i, pair in enumerate(zip(values, np.atleast_1d(sigma), strict=True)):
+            label = name if values.size == 1 else f"{name}, {'xyz'[i]}"
+            # Adding zero turns −0 into 0.
+            cells = [f"{round(factor * float(x), 4) + 0.0:.4f}{unit}" for x in pair]
+            rows.append([label, *cells, *(true.get(label, ["", ""]) if true else ())])
+    if "tilt" in true:
+        rows.append(["tilt", "", "", *true["tilt"]])
+    print_table(["", "fitted", "sigma", *(("known", "error") if true else ())], rows, title)
+
+
+def _parameters(fit: FittedShape) -> list[tuple[str, Any, Any]]:
+    """Name, value and standard deviation of each parameter; diameters instead of radii."""
+    rows = []
+    for name in fit.fields:
+        value = getattr(fit, name)
+        sigma = [s for parameter, s in fit.sigma.items() if parameter.startswith(name)]
+        if name == "radius":
+            rows.append(("diameter", 2.0 * value, [2.0 * s for s in sigma]))
+        else:
+            rows.append((name, value, sigma))
+    return rows
+
+
+def _matching(contour: xr.Dataset, known: tuple[Surface, ...]) -> dict[str, list[str]]:
+    """Known value and error of each row, where a known object is of the fitted kind."""
+    offset = next((n for n in ("axis_offset", "center_offset") if n in contour), None)
+    if offset is None:
+        return {}
+    true: Any = known[int(contour["object_distance"].attrs["object"])]
+    away = contour[offset].values
+    rows = {}
+    for letter, position, error in zip(
+        "xyz", contour["object_position"].values - away, away, strict=True
+    ):
+        rows[f"origin, {letter}"] = [f"{1e3 * float(x):.4f} mm" for x in (position, error)]
+    diameters = 2.0 * float(true.radius), float(contour["diameter_error"])
+    rows["diameter"] = [f"{1e3 * x:.4f} mm" for x in diameters]
+    if "axis_tilt" in contour:
+        rows["tilt"] = ["", fixed("axis_tilt", float(contour["axis_tilt"]), 2)]
+    return rows
+
+
+def _agreement(fit: FittedShape, contour: xr.Dataset) -> str:
+    """How well contacts agree with the fitted object."""
+    found, used = int(np.isfinite(fit.residuals).sum()), int(fit.used.sum())
+    inside = int((fit.used & fit.inliers).sum())
+    share = f"all {used}" if used < inside + 1 else f"{inside} of {used}"
+    text = f"{share} contacts that were used agree with it"
+    if inside:
+        text += f", to {fixed('surface_distance', fit.rms, 1)}"
+    if found > used:
+        text += f"; {found - used} more are too uncertain to be used"
+    together = float(contour.attrs["frames_together"])
+    if together > 1.5:
+        text += f"; about {together:.0f} frames err together, which sigma takes into account"
+    return text
+
+
+def _judgement(fit: FittedShape, shapes: xr.Dataset | None) -> Iterator[str]:
+    """Whether the contacts are of another shape."""
+    from vibrissa.pipeline.shapes import GOES, STRONG
+
+    if fit.misfit > GOES:
+        yield (
+            f"The contacts do not fit a {fit.kind}{_by(fit.misfit)}: the object has another "
+            "shape (--shape), or there is more than the noise, such as friction; sigma is as much "
+            "larger, but does not describe an object of another shape"
+        )
+    if shapes is None or fit.kind not in shapes["shape"].values:
+        return
+    if not shapes["evidence"].sel(shape=fit.kind).item() > STRONG:
+        return
+    best = shapes.isel(shape=int(np.nanargmin(shapes["evidence"].values)))
+    kind, misfit = str(best["shape"].item()), float(best["misfit"])
+    if misfit < GOES:
+        yield f"A {kind} fits them better{_by(misfit)}: --shape {kind}"
+    elif fit.misfit > GOES:
+        yield f"No simple shape fits them, a {kind} best{_by(misfit)}: --shape free"
+
+
+def _by(misfit: float) -> str:
+    return f" (χ² per degree of freedom {misfit:.3g})"
+
+
+def _print_distances(rows: xr.Dataset) -> None:
+    """Distances of contacts from the known object, by how far the whisker is bent."""
+    predicted = bool(np.isfinite(rows["median_predicted"]).any())
+    names = ["median", "largest_95"]
+    names += ["median_predicted", "largest_95_predicted"] if predicted else []
+    cells = []
+    for k in range(rows.sizes["class"]):
+        row = rows.isel({"class": k})
+        if count := int(row["contacts"]):
+            values = [fixed("surface_distance", float(row[name]), 1) for name in names]
+            cells.append([f"{row['label'].item()}°", str(count), *values])
+    print_table(
+        ["deflection angle", "contacts", "median", "95 %", *(["median*", "95 %*"] * predicted)],
+        cells,
+        "Distance of contacts from the known object",
+        "* what the estimates' own covariance predicts" if predicted else None,
+    )

@@ -1,0 +1,173 @@
+"""`vibrissa sensitivity`: how far the contact point moves when a signal changes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+
+from vibrissa.cli.inputs import RECORDING, NoiseOptions, kind_in, map_from, wrench_from
+from vibrissa.cli.options import (
+    ForceOption,
+    MapArgument,
+    TrialOption,
+    TripletOption,
+    free,
+    with_bundles,
+    written,
+)
+from vibrissa.cli.tables import Row, print_table
+from vibrissa.cli.terminal import progress_bars, say, shown
+
+if TYPE_CHECKING:
+    from xarray import Dataset
+
+_SHOWN = 5
+"""Number of the best triplets that are shown."""
+
+
+@with_bundles
+def sensitivity(
+    path: MapArgument,
+    noise: NoiseOptions,
+    using: TripletOption = "Fx,MB,MD",
+    trial: TrialOption = None,
+    target: Annotated[
+        Path | None, written("everything, NetCDF (.nc), SI units; by default nowhere")
+    ] = None,
+    force: ForceOption = False,
+) -> None:
+    """Find how the contact point depends on three signals, and which three would be the best.
+
+    Derivatives are exact. Without --trial they are those of all contacts on the map. Contacts
+    within 2° of rest are left out of the tables, not of the file.
+    Example: `vibrissa sensitivity map.nc --using Fx,MB,MD -o sensitivity.nc`
+    """
+    from vibrissa.identifiability import best_triplet
+    from vibrissa.identifiability import sensitivity as derivatives
+    from vibrissa.io.paths import NETCDF, check_writable
+    from vibrissa.numerics import contact_weights
+    from vibrissa.paper import sensitivity_findings
+    from vibrissa.signals import selection
+
+    if target is not None:
+        check_writable(target, NETCDF)
+        free([target], force)
+    names = selection([name.strip() for name in using.split(",")], exactly=3)
+    contact_map = map_from(path)
+    covariance = noise.matrix()
+    moment_noise = float(np.sqrt(0.5 * (covariance[4, 4] + covariance[5, 5])))
+    at = None if trial is None else _contacts_of(trial, moment_noise)
+    with progress_bars() as tell:
+        tell("derivatives", 0, 2)
+        found = derivatives(contact_map, names, at, noise=covariance)
+        tell("derivatives", 1, 2)
+        rivals = best_triplet(contact_map, covariance, at)
+        tell("derivatives", 2, 2)
+    if not contact_weights(found).any():
+        raise ValueError(f"{trial or path} holds no contact farther than 2° from rest")
+    say(repr(contact_map.whisker))
+    _print_derivatives(sensitivity_findings(found))
+    _print_rivals(rivals, names, noise.described())
+    if target is not None:
+        _save(target, found)
+        say(f"wrote {target}")
+
+
+def _contacts_of(path: Path, moment_noise: float) -> Dataset:
+    """Contact points or, where they are not known, signals of a trial; NaN without contact.
+
+    As for estimates, there is a contact where M_B exceeds five standard deviations of its noise.
+    """
+    from vibrissa.io import load_recording
+    from vibrissa.pipeline import FELT
+    from vibrissa.signals import base_signals
+
+    if kind_in(path) == RECORDING:
+        recording = load_recording(path).to_dataset(inherit=False)
+        if "contact_point_whisker" in recording:
+            return recording
+    wrench = wrench_from(path)
+    touching = base_signals(wrench["force"], wrench["moment"])["MB"] > FELT * moment_noise
+    return wrench[["force", "moment"]].where(touching)
+
+
+def _print_derivatives(findings: Dataset) -> None:
+    """Median sizes, where they are large, and what differs between the sides."""
+    from vibrissa.quantities import quantity
+
+    by = [str(n) for n in findings["sorted_by"].values]
+    rows: list[list[str] | None] = []
+    for signal in map(str, findings["signal"].values):
+        below = quantity(signal)
+        for coordinate in ("r", "theta", "phi"):
+            above = quantity(coordinate)
+            entry = findings.sel(coordinate=coordinate, signal=signal)
+            factor = above.display_factor / below.display_factor
+            unit = below.display_unit
+            rows.append(
+                [
+                    {"theta": "θ", "phi": "φ"}.get(coordinate, coordinate),
+                    signal,
+                    f"{float(entry['median_size']) * factor:.3g}",
+                    f"{above.display_unit}/{f'({unit})' if '·' in unit else unit}",
+                    *(_ratio(float(entry["small_over_large"].sel(sorted_by=n))) for n in by),
+                    _ratio(float(entry["backward_over_forward"])),
+                    f"{100.0 * float(entry['share_of_motion']):.0f} %",
+                ]
+            )
+        rows.append(None)
+    print_table(
+        ["of", "by", "median", "unit", *(f"× small {n}" for n in by), "CB/CF", "motion"],
+        rows,
+        "Sensitivity of the contact point",
+        "medians of absolute values. × small: where that signal is in its smallest fifth, "
+        "over where it is in its largest; CB/CF: concave backward over concave forward; motion: "
+        "share of the contact's squared motion along this coordinate",
+        left=(0, 1, 3),
+    )
+
+
+def _ratio(value: float) -> str:
+    return f"{value:.0f}" if value >= 10.0 else f"{value:.2g}"
+
+
+def _print_rivals(rivals: Dataset, names: tuple[str, ...], noise: str) -> None:
+    """The triplets that are best most often, and the one that was asked for."""
+    from rich.text import Text
+
+    order = np.argsort(-rivals["share"].values, kind="stable")
+    best = [i for i in order[:_SHOWN] if rivals["share"].values[i] > 0.0]
+    asked = list(rivals["triplet"].values).index(" ".join(names))
+    rows: list[Row] = []
+    for i in dict.fromkeys([*best, asked]):
+        row = rivals.isel(triplet=i)
+        rows.append(
+            [
+                Text(str(row["triplet"].values), style="bold" if i == asked else ""),
+                f"{100.0 * float(row['share']):.1f} %",
+                _error(float(row["median_error"])),
+                _error(float(row["median_error_where_best"])),
+                f"{100.0 * float(row['determined']):.1f} %",
+            ]
+        )
+    print_table(
+        ["triplet", "best in", "median error", "where best", "determines"],
+        rows,
+        f"Which triplet for a sensor with {noise}",
+        "3D error (RMS) predicted for small noise; whether a triplet is unique is another "
+        "question: vibrissa uniqueness",
+    )
+
+
+def _error(value: float) -> str:
+    return shown("predicted_error", value, 3) if value == value else "-"
+
+
+def _save(path: Path, found: Dataset) -> None:
+    from vibrissa.io.netcdf import COMPRESSED, write_netcdf
+
+    floats = [str(name) for name, v in found.data_vars.items() if v.dtype.kind == "f"]
+    about = found.assign_attrs(kind="vibrissa sensitivity")
+    write_netcdf(path, about, {"/": dict.fromkeys(floats, COMPRESSED)})

@@ -1,0 +1,137 @@
+"""`vibrissa signals`: force, moment and signals at a whisker's base, from a recording."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+
+from vibrissa.cli import options
+from vibrissa.cli.inputs import (
+    WhiskerOptions,
+    check_one_whisker,
+    free_beside,
+    print_notes,
+    print_statuses,
+    print_written,
+    recording_from,
+    smallest_arc,
+)
+from vibrissa.cli.options import ForceOption, RecordingArgument, refuse, with_bundles, written
+from vibrissa.cli.terminal import progress_bars, remark, say, shown
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+@dataclass(frozen=True)
+class SourceOptions:
+    """What signals come from."""
+
+    source: options.SourceOption = None
+    cutoff: options.CutoffOption = None
+
+    @property
+    def given(self) -> bool:
+        """Whether anything is stated."""
+        return self.source is not None or self.cutoff is not None
+
+    def as_keywords(
+        self, recording: xr.DataTree, own: WhiskerOptions, proximal: float | None = None
+    ) -> dict[str, Any]:
+        """Turn options into those of `signals_of`."""
+        from vibrissa.pipeline import default_source
+        from vibrissa.tracking.filtering import CUTOFF
+
+        source = default_source(recording) if self.source is None else self.source.replace("-", " ")
+        if source != "contact point":
+            refuse({"--cutoff": self.cutoff}, f"signals of the {source} have a pose of their own")
+            return {"source": source, "whiskers": None}
+        return {
+            "source": source,
+            "cutoff": CUTOFF if self.cutoff is None else self.cutoff or None,
+            "whiskers": own.in_recording(recording),
+            "proximal": smallest_arc(proximal),
+        }
+
+
+@with_bundles
+def signals(
+    recording: RecordingArgument,
+    how: SourceOptions,
+    own: WhiskerOptions,
+    proximal: options.ProximalOption = None,
+    path: Annotated[
+        Path | None,
+        written(
+            "the recording with the signals added, .nc, by default where it is; or the signals of "
+            "its one whisker as a table, .csv"
+        ),
+    ] = None,
+    force: ForceOption = False,
+) -> None:
+    """Find force, moment and the six signals at the base in every frame.
+
+    They are added to the recording as a group `signals`; what it already holds stays, but estimates
+    and a contour that were made of other signals are left out. Example: `vibrissa signals trial.nc`
+    """
+    from vibrissa.io import save_recording, save_signals
+    from vibrissa.io.paths import CSV, NETCDF, check_writable
+    from vibrissa.pipeline import with_signals
+
+    target = recording if path is None else path
+    check_writable(target, (*NETCDF, *CSV))
+    free_beside(recording, [target], force)
+    tree = recording_from(recording)
+    table = target.suffix.lower() in CSV
+    if table:
+        check_one_whisker(tree, recording)
+    with progress_bars() as tell:
+        tell("signals", 0, 1)
+        keywords = how.as_keywords(tree, own, proximal)
+        if keywords["whiskers"] is None:
+            unused = {"--whisker": own.whisker, "--proximal": proximal}
+            refuse(unused, f"signals of the {keywords['source']} need none")
+        done = with_signals(tree, **keywords)
+        tell("signals", 1, 1)
+    print_notes(*(keywords["whiskers"] or ()))
+    remark(described(done))
+    found = done["signals"].to_dataset()
+    print_statuses(found["status"].values)
+    _print_largest(found)
+    if table:
+        save_signals(target, found.isel(whisker=0)[["force", "moment"]])
+    else:
+        save_recording(target, done)
+    print_written(target, recording, "signals")
+
+
+def described(tree: xr.DataTree) -> str:
+    """State what the signals of a recording come from."""
+    about = tree["signals"].attrs if "signals" in tree.children else {}
+    source = str(about.get("source", "a source that is not known"))
+    if source == "sensor":
+        return "signals as the sensor read them"
+    if source == "rod":
+        return "signals of the rod that fits the images"
+    if source != "contact point":
+        return f"signals from {source}"
+    cutoff = about.get("cutoff")
+    filtered = "not filtered" if cutoff is None else f"filtered at {float(cutoff):g} Hz"
+    whiskers = tree["whiskers"].children.values() if "whiskers" in tree.children else ()
+    moduli = [float(one.to_dataset(inherit=False)["youngs_modulus"]) / 1e9 for one in whiskers]
+    of = f", Young's modulus {moduli[0]:g} GPa" if moduli else ""
+    return f"signals from the tracked contact point; the base's pose is {filtered}{of}"
+
+
+def _print_largest(found: xr.Dataset) -> None:
+    """Print in how many frames each whisker is in contact, and the largest force and moment."""
+    for k, name in enumerate(found["whisker"].values):
+        one = found.isel(whisker=k)
+        sizes = {n: np.linalg.norm(one[n].values, axis=-1) for n in ("force", "moment")}
+        with np.errstate(invalid="ignore"):
+            largest = [shown(n, float(np.nanmax(v, initial=0.0)), 3) for n, v in sizes.items()]
+        frames = f"{int(one['in_contact'].sum())} of {one.sizes['time']} frames"
+        say(f"{name}: in contact in {frames}, up to {largest[0]} and {largest[1]}")

@@ -1,0 +1,187 @@
+"""`vibrissa simulate`: a trial whose truth is known."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+import typer
+
+from vibrissa.cli import options
+from vibrissa.cli.inputs import WhiskerOptions, print_notes, print_statuses
+from vibrissa.cli.options import ExampleOption, FilmOption, ForceOption, free, with_bundles, written
+from vibrissa.cli.terminal import output, progress_bars, say, shown
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+@dataclass(frozen=True)
+class PlanOptions:
+    """What is simulated; it counts more than the file. Names are those of `read_script`."""
+
+    array: Annotated[
+        str | None,
+        typer.Option(
+            help="All whiskers of a face: `average` for an average rat's, or a file or folder.",
+            metavar="FILE|average",
+        ),
+    ] = None
+    side: Annotated[
+        Literal["both", "left", "right"] | None,
+        typer.Option(help="Side of the array; both by default."),
+    ] = None
+    names: Annotated[
+        str | None,
+        typer.Option(help="Names of whiskers of the array: `C1,C2,gamma`.", metavar="NAMES"),
+    ] = None
+    object: Annotated[
+        Literal["peg", "sphere", "box", "plane"] | None,
+        typer.Option(help="Kind of an object that is put within reach."),
+    ] = None
+    duration: options.DurationOption = None
+    rate: options.RateOption = None
+    frequency: Annotated[
+        float | None, typer.Option(help="Whisks per second; 5 by default.", metavar="HZ")
+    ] = None
+    protraction: Annotated[
+        float | None,
+        typer.Option(help="Share of a whisk that is protraction, 0.3 to 0.7.", metavar="SHARE"),
+    ] = None
+    row: Annotated[
+        Literal["A", "B", "C", "D", "E"] | None,
+        typer.Option(
+            help="Row of the one whisker, which determines how elevation and roll depend on the "
+            "azimuth; C by default."
+        ),
+    ] = None
+    friction: Annotated[
+        float | None, typer.Option(help="Coefficient of Coulomb friction; 0 by default.")
+    ] = None
+    dynamic: Annotated[
+        bool,
+        typer.Option(
+            "--dynamic", help="With inertia and damping: takes half a minute a second or so."
+        ),
+    ] = False
+    noise: options.NoiseOption = True
+    seed: options.SeedOption = None
+
+    def changes(self) -> dict[str, Any]:
+        """Return them by the names that a trial has."""
+        names = None if self.names is None else self.names.replace(",", " ").split()
+        return {name: v for name, v in asdict(self).items() if name != "names"} | {
+            "whiskers": names
+        }
+
+
+@with_bundles
+def simulate(
+    own: WhiskerOptions,
+    wanted: PlanOptions,
+    script: Annotated[
+        Path | None,
+        typer.Argument(help="The trial as TOML; `--example` prints one.", metavar="TRIAL.toml"),
+    ] = None,
+    path: Annotated[Path, written("the recording, .nc")] = Path("trial.nc"),
+    film: FilmOption = None,
+    example: ExampleOption = False,
+    force: ForceOption = False,
+) -> None:
+    """Simulate a whisking trial among objects, with its truth.
+
+    By default the trial of the demo: a γ whisker sweeps past a peg and back, in 3.5 s (an array:
+    0.5 s). Options count more than the file. Example: `vibrissa simulate --duration 0.5
+    --friction 0.3 -o trial.nc`; `vibrissa simulate --array average --object sphere -o face.nc`
+    """
+    from vibrissa.io import save_recording
+    from vibrissa.io.paths import NETCDF, check_writable
+    from vibrissa.io.table import read_text
+    from vibrissa.io.toml import in_file
+    from vibrissa.simulation import measure
+    from vibrissa.simulation import simulate as simulated
+    from vibrissa.simulation.script import EXAMPLE, read_script
+    from vibrissa.whisker import Whisker
+
+    if example:
+        output.out(EXAMPLE, highlight=False, end="")
+        return
+    check_writable(path, NETCDF)
+    free([path, *(() if film is None else _films(film))], force)
+    with progress_bars() as tell:
+        tell("how far to whisk", 0, 1)
+        text, folder = ("", Path()) if script is None else (read_text(script), script.parent)
+        with nullcontext() if script is None else in_file(script):
+            plan = read_script(text, folder, own.read, whisker=own.whisker, **wanted.changes())
+        tell("how far to whisk", 1, 1)
+        trial = simulated(
+            plan.whisker,
+            plan.motion,
+            plan.objects,
+            friction=plan.friction,
+            dynamics=plan.dynamics,
+            progress=lambda done, total: tell("whisking trial", done, total),
+        )
+        trial = measure(trial, seed=plan.seed, sensor=plan.sensor)
+        save_recording(path, trial)
+    say(repr(plan.whisker))
+    if isinstance(plan.whisker, Whisker):
+        print_notes(plan.whisker)
+    for solid in plan.objects:
+        say(repr(solid))
+    _report(trial)
+    say(f"wrote {path}")
+    if film is not None:
+        _film(trial, path, film, plan.seed)
+
+
+def _report(trial: xr.DataTree) -> None:
+    """What happened, in a few lines."""
+    truth = trial["truth"].to_dataset()
+    names = trial.to_dataset()["whisker"].values.tolist()
+    print_statuses(truth["status"].values.ravel(), "frames:")
+    contact = truth["in_contact"].values.astype(int)
+    begun = contact[0] + (np.diff(contact, axis=0) == 1).sum(axis=0)
+    if len(names) > 1:
+        touched = [f"{name} {count}" for name, count in zip(names, begun, strict=True) if count]
+        contacts = ", ".join(touched) or "none"
+        say(f"{len(touched)} of {len(names)} whiskers touched; contacts: {contacts}")
+    largest = [
+        shown(name, float(np.nanmax(np.linalg.norm(truth[name].values, axis=-1))), 3)
+        for name in ("force", "moment")
+    ]
+    say(f"{begun.sum()} contacts, up to {largest[0]} and {largest[1]}")
+    if second := int(truth["second_contact"].values.sum()):
+        say(
+            f"in {second} frames a whisker would touch elsewhere too (second_contact), which is "
+            "not in the forces"
+        )
+
+
+def _films(folder: Path) -> list[Path]:
+    """Where the videos of the two views go."""
+    return [folder / f"{view}.mkv" for view in ("top", "front")]
+
+
+def _film(trial: xr.DataTree, path: Path, folder: Path, seed: int) -> None:
+    """Film the trial, and add cameras and true traces to the recording."""
+    from vibrissa.io import save_recording
+    from vibrissa.simulation import film, views_of
+
+    folder.mkdir(parents=True, exist_ok=True)
+    cameras = views_of(trial)
+    files = dict(zip([camera.name for camera in cameras], _films(folder), strict=True))
+    with progress_bars() as tell:
+        filmed = film(
+            trial,
+            files,
+            cameras,
+            seed=seed,
+            progress=lambda done, total: tell("filming", done, total),
+        )
+        save_recording(path, filmed)
+    for file in files.values():
+        say(f"wrote {file}")

@@ -1,0 +1,412 @@
+"""`vibrissa stream`: contacts while signals come in."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from io import TextIOWrapper
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from vibrissa.cli import options
+from vibrissa.cli.inputs import (
+    AssumptionOptions,
+    NoiseOptions,
+    WhiskerOptions,
+    map_from,
+    print_notes,
+    smallest_arc,
+)
+from vibrissa.cli.options import numbers, refuse, with_bundles
+from vibrissa.cli.terminal import Ended, ending_in_order, remark
+
+if TYPE_CHECKING:
+    import socket
+
+    from vibrissa.contacts import ContactMap, Estimator
+    from vibrissa.sensors import Sensor
+    from vibrissa.streaming import ContactStream, NewestLines, Poses
+    from vibrissa.streaming.bag import ContactRecorder
+
+_SOON = 500
+"""Samples after which advice is given; it is given again at the end."""
+
+_REPORTED = 1.0
+"""Seconds between two reports of samples that are dropped."""
+
+_MOUNT = ("X", "Y", "Z", "QW", "QX", "QY", "QZ")
+
+
+@dataclass(frozen=True)
+class LineOptions:
+    """Where lines come from."""
+
+    source: Annotated[
+        Path | None,
+        typer.Argument(
+            help="A file, named pipe or serial device with lines, or a ROS bag; by default "
+            "standard input.",
+            metavar="SOURCE",
+        ),
+    ] = None
+    udp: Annotated[
+        str | None,
+        typer.Option(help="Receive lines as UDP datagrams here instead.", metavar="HOST:PORT"),
+    ] = None
+    every: Annotated[
+        bool,
+        typer.Option(
+            "--every",
+            help="Answer every sample that comes by UDP, however late; by default the newest, and "
+            "those before it that wait are dropped and counted.",
+        ),
+    ] = False
+    reconnect: Annotated[
+        bool,
+        typer.Option(
+            "--reconnect",
+            help="Wait for a named pipe or serial device that closes to open again.",
+        ),
+    ] = False
+    topic: Annotated[
+        str | None,
+        typer.Option(
+            help="Topic of WrenchStamped in a bag, where there are several.", metavar="NAME"
+        ),
+    ] = None
+    pose_topic: Annotated[
+        str | None,
+        typer.Option(
+            help="Topic of PoseStamped or TransformStamped in a bag: poses of the base, or of the "
+            "flange.",
+            metavar="NAME",
+        ),
+    ] = None
+    count: Annotated[
+        int | None, typer.Option(help="Number of lines after which to stop.", min=1, metavar="N")
+    ] = None
+
+    def __post_init__(self) -> None:
+        """Refuse what does not go together."""
+        from vibrissa.io.paths import refuse_whisk
+
+        if self.source is not None and self.udp is not None:
+            raise ValueError("give either a source or --udp")
+        if self.source is not None:
+            refuse_whisk(self.source)
+        if not self.bag:
+            topics = {"--topic": self.topic, "--pose-topic": self.pose_topic}
+            refuse(topics, "it is of a ROS bag, and the source is not one")
+        if self.udp is None:
+            refuse({"--every": self.every}, "only of what comes by --udp are samples dropped")
+        if self.source is None or self.bag:
+            refuse(
+                {"--reconnect": self.reconnect}, "the source is neither a named pipe nor a device"
+            )
+
+    @property
+    def bag(self) -> bool:
+        """Whether the source is a ROS bag."""
+        from vibrissa.io.rosbag import is_bag
+
+        return self.source is not None and is_bag(self.source)
+
+    def lines(self, heard: socket.socket | None) -> Iterator[str]:
+        """Return lines as they come."""
+        from vibrissa.io.paths import check_readable
+        from vibrissa.streaming.bag import bag_lines
+        from vibrissa.streaming.sources import bounded_lines, file_lines, udp_lines
+
+        if heard is not None:
+            return udp_lines(heard)
+        if self.source is None or str(self.source) == "-":
+            refuse({"--reconnect": self.reconnect}, "standard input does not open again")
+            if isinstance(sys.stdin, TextIOWrapper):  # noise on a serial line must not end a stream
+                sys.stdin.reconfigure(errors="replace")
+            return bounded_lines(sys.stdin)
+        if self.bag:
+            return bag_lines(self.source, self.topic, self.pose_topic)
+        if self.source.is_dir() or not self.source.exists():
+            check_readable(self.source)
+        if self.reconnect and self.source.is_file():
+            raise ValueError(
+                f"{self.source} is a file, which ends; --reconnect is for pipes and devices"
+            )
+        return file_lines(self.source, self.reconnect, remark)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasurementOptions:
+    """The whisker and what is measured at its base."""
+
+    map: options.MapOption = None
+    proximal: options.ProximalOption = None
+    own: WhiskerOptions
+    sensor: options.SensorOption = None
+    using: options.UsingOption = None
+    noise: NoiseOptions
+    assumed: AssumptionOptions
+    threshold: options.ThresholdOption = 5.0
+    tare: Annotated[
+        int | None,
+        typer.Option(
+            help="Number of first samples, of a free whisker, that give the sensor's offset anew.",
+            min=1,
+            metavar="N",
+        ),
+    ] = None
+
+    def __post_init__(self) -> None:
+        """Refuse what does not go together."""
+        if self.map is not None:
+            if self.own.whisker is not None:
+                raise ValueError("give either --map or --whisker: a map already has its whisker")
+            refuse({"--proximal": self.proximal}, "it is of a map that is simulated")
+        if self.sensor is None:
+            reason = "the offset is that of a sensor's channels: give the --sensor"
+            refuse({"--tare": self.tare}, reason)
+            return
+        stated = {"--using": self.using, **self.noise.stated}
+        refuse(stated, "channels and noise are those of the --sensor")
+        errors = {f"--{name.replace('_', '-')}": v for name, v in self.assumed.errors.items()}
+        errors.pop("--stiffness-sigma", None)
+        refuse(errors, "the --sensor's file states gain_error and mixing_error")
+
+    def contact_map(self) -> ContactMap:
+        """Read or simulate the map."""
+        from vibrissa.contacts import ContactMap
+
+        if self.map is not None:
+            return map_from(self.map)
+        whisker = self.own.read()
+        print_notes(whisker)
+        remark(f"no map given; simulating that of {whisker!r}")
+        return ContactMap.simulate(whisker, grid=False, proximal=smallest_arc(self.proximal))
+
+    def described(self) -> Sensor | None:
+        """Read the sensor."""
+        from vibrissa.sensors import load_sensor
+
+        return None if self.sensor is None else load_sensor(self.sensor)
+
+    def estimator(self, sensor: Sensor | None) -> Estimator:
+        """Return what estimates contacts from measurements."""
+        from vibrissa.contacts import Estimator
+
+        contact_map, prior, errors = self.contact_map(), self.assumed.prior, self.assumed.errors
+        if sensor is not None:
+            stiffness = errors.get("stiffness_sigma", 0.0)
+            if self.tare:
+                sensor = sensor.with_new_offset(self.tare)
+            return Estimator.of_sensor(contact_map, sensor, stiffness, self.threshold, prior)
+        return Estimator(
+            contact_map,
+            self.using or "Fx,MB,MD",
+            self.noise.matrix(),
+            felt_above=self.threshold,
+            prior=prior,
+            **errors,
+        )
+
+
+@dataclass(frozen=True)
+class FollowOptions:
+    """How contacts are followed over time, and where the whisker is mounted."""
+
+    filter: Annotated[
+        bool,
+        typer.Option(
+            "--filter",
+            help="Follow contacts over time, with the pose of the base: base_x, base_y, base_z (m) "
+            "and base_qw, base_qx, base_qy, base_qz, in each line or in lines of their own.",
+        ),
+    ] = False
+    speed: Annotated[
+        float | None,
+        typer.Option(
+            help="Speed of contacts in the laboratory, for the filter, mm/s; by default a quarter "
+            "of the whisker's length a second.",
+            metavar="MM/S",
+        ),
+    ] = None
+    mount: Annotated[
+        str | None,
+        typer.Option(
+            help="Position of the whisker's base on a robot's flange, whose poses come: mm, and a "
+            "quaternion from the whisker's to the flange's frame.",
+            metavar=",".join(_MOUNT),
+        ),
+    ] = None
+
+    def __post_init__(self) -> None:
+        """Refuse what does not go together."""
+        if not self.filter:
+            refuse({"--speed": self.speed}, "it is of the filter: add --filter")
+
+    def poses(self) -> Poses:
+        """Return the poses of what the whisker is mounted on."""
+        from vibrissa.streaming import Poses
+        from vibrissa.streaming.lines import rotation_of
+
+        if self.mount is None:
+            return Poses()
+        values = numbers(self.mount, _MOUNT, "--mount")
+        return Poses(rotation_of(values[3:]), [1e-3 * x for x in values[:3]])
+
+    def running(
+        self, estimator: Estimator, sensor: Sensor | None, poses: Poses, bag: bool, tare: int
+    ) -> ContactStream:
+        """Return what turns lines into contacts."""
+        from vibrissa.contacts import ContactFilter
+        from vibrissa.streaming import ContactStream
+        from vibrissa.streaming.contacts import COMPONENTS
+
+        speed = None if self.speed is None else 1e-3 * self.speed
+        filtered = ContactFilter(estimator, speed=speed) if self.filter else None
+        names = None if sensor is None else tuple(sensor.channels)
+        if bag and names is not None and not set(names) <= set(COMPONENTS):
+            raise ValueError(
+                f"a bag of wrenches carries {', '.join(COMPONENTS)}; the sensor has "
+                f"{', '.join(names)}"
+            )
+        return ContactStream(estimator, names, filtered, poses, tare)
+
+
+@with_bundles
+def stream(
+    source: LineOptions,
+    measured: MeasurementOptions,
+    follow: FollowOptions,
+    bag: options.BagOption = None,
+) -> None:
+    """Find contacts while signals come in, one line of JSON each.
+
+    Lines are CSV with a header, or JSON objects, in SI units, with the signals that are used or
+    Fx, Fy, Fz, Mx, My, Mz; a column time is passed on. A line that cannot be read gives a line with
+    its number and the error; after a header that cannot be used, rows wait for another one. Points
+    are in the whisker's frame, m; with --filter also in the laboratory's (lab_x, ...). Stop with
+    Ctrl-C or any signal.
+    Example: `vibrissa stream --udp 127.0.0.1:5005 --map wire.nc --sensor sensor.toml`
+    """
+    from vibrissa.io.rosbag import ContactBag
+    from vibrissa.streaming.bag import ContactRecorder
+
+    sensor, poses = measured.described(), follow.poses()
+    with ending_in_order(), ExitStack() as opened:
+        writer = None
+        if bag is not None:
+            frame = "laboratory" if follow.filter else "whisker"
+            writer = opened.enter_context(ContactBag(bag, frame=frame))
+        heard = None if source.udp is None else _socket(source.udp, opened)
+        lines: Iterable[str] = source.lines(heard)
+        estimator = measured.estimator(sensor)
+        running = follow.running(estimator, sensor, poses, source.bag, measured.tare or 0)
+        running.warm_up()
+        losses = None if heard is None else _Losses(heard)
+        if losses is not None:
+            remark("ready")
+            if not source.every:
+                lines = losses.newest(running)
+        recorder = None
+        if writer is not None:
+            recorder = ContactRecorder(writer, running, sensor, follow.filter, remark)
+        try:
+            _write(running, islice(lines, source.count), recorder, losses)
+        except Ended as signalled:  # the usual end
+            remark(f"stopped: {signalled}")
+        lost = "" if losses is None else losses.described()
+    _report(running, lost, follow.filter)
+    if recorder is not None and recorder.broken:
+        raise typer.Exit(1)
+
+
+def _report(running: ContactStream, lost: str, follow: bool) -> None:
+    if follow and not running.poses.number:
+        remark("no pose came: the base was taken to stand still")
+    remark(f"{running.samples} samples, {running.faults} lines that could not be read{lost}")
+    _advise(running)
+
+
+def _advise(running: ContactStream) -> None:
+    from vibrissa.streaming import advice
+
+    for sentence in advice(running):
+        remark(sentence)
+
+
+def _socket(udp: str, opened: ExitStack) -> socket.socket:
+    """Listen before the map is made, so that nothing is lost."""
+    from vibrissa.streaming.sources import udp_address, udp_socket
+
+    heard = opened.enter_context(udp_socket(*udp_address(udp)))
+    host, port = heard.getsockname()[:2]
+    remark(f"listening at {host}:{port}")
+    return heard
+
+
+class _Losses:
+    """Samples that came by UDP and are not answered, reported once a second."""
+
+    def __init__(self, heard: socket.socket) -> None:
+        self._heard = heard
+        self._lines: NewestLines | None = None
+        self._before, self._next = (0, 0), 0.0
+
+    def newest(self, running: ContactStream) -> NewestLines:
+        """Lines of which only the newest are passed on."""
+        from vibrissa.streaming import NewestLines
+
+        self._lines = NewestLines(self._heard, running.lines.kind)
+        return self._lines
+
+    def report(self) -> None:
+        """Print how many there are so far, if it is time to, and there are more."""
+        if (now := time.monotonic()) < self._next:
+            return
+        self._next = now + _REPORTED
+        if (counts := self._counts()) != self._before:
+            self._before = counts
+            remark(f"so far{self.described()[1:]}")
+
+    def described(self) -> str:
+        """All of them, as the end of a sentence; nothing where there are none."""
+        dropped, lost = self._counts()
+        text = f", {dropped} samples dropped because newer ones had come" if dropped else ""
+        return text + (f", {lost} datagrams lost because too many waited" if lost else "")
+
+    def _counts(self) -> tuple[int, int]:
+        from vibrissa.streaming.sources import udp_lost
+
+        return 0 if self._lines is None else self._lines.dropped, udp_lost(self._heard)
+
+
+def _write(
+    running: ContactStream,
+    lines: Iterator[str],
+    recorder: ContactRecorder | None,
+    losses: _Losses | None,
+) -> None:
+    """Print records as they come, each at once; stop quietly when nobody reads any more."""
+    from vibrissa.streaming.contacts import as_json
+
+    try:
+        for record in running.records(lines):
+            # First, so that all that was answered is in the bag, wherever a signal comes.
+            if recorder is not None:
+                recorder.put(record)
+            sys.stdout.write(as_json(record) + "\n")
+            sys.stdout.flush()
+            if losses is not None:
+                losses.report()
+            if running.samples == _SOON:
+                _advise(running)
+    except BrokenPipeError:
+        # What is flushed at the end must not fail again.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

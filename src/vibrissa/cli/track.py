@@ -1,0 +1,474 @@
+"""`vibrissa track`: from two videos to a recording."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import typer
+
+from vibrissa.cli import options
+from vibrissa.cli.inputs import WhiskerOptions, metres_of, objects_from, print_notes
+from vibrissa.cli.options import ForceOption, free, numbers, refuse, with_bundles, written
+from vibrissa.cli.terminal import progress_bars, say, shown
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from vibrissa.cameras import Camera
+    from vibrissa.tracking import Start, TraceOptions, TrackOptions
+
+_WIDEST = 1.0
+"""Largest width of views of a whisker, m."""
+
+_FINEST = 3.0
+"""Width of a whisker's base in the images for which traces are tuned, pixels."""
+
+_POOR = 2.0
+"""Misfit of traces, in their standard deviation, from which the rod does not explain them."""
+
+_RATE, _CUTOFF = 1000.0, 85.0
+
+
+@dataclass(frozen=True)
+class FilmOptions:
+    """How the videos were filmed."""
+
+    pixel_size: Annotated[
+        float | None,
+        typer.Option(
+            help="Size of a pixel of both views in space, mm, without --cameras; 0.058 by default.",
+            metavar="MM",
+        ),
+    ] = None
+    rate: options.RateOption = None
+    cameras: options.CamerasOption = None
+    offset: Annotated[
+        str, typer.Option(help="Frames by which the second camera began earlier, or auto.")
+    ] = "0"
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be."""
+        if self.offset != "auto" and not self.offset.lstrip("+-").isdigit():
+            raise ValueError(f"--offset is {self.offset!r}; a number of frames or auto is needed")
+        if not 0.0 < self.frames_per_second < math.inf:
+            raise ValueError(f"--rate is {self.rate:g}; frames per second, more than 0, are needed")
+        if self.cameras is not None:
+            refuse({"--pixel-size": self.pixel_size}, "the --cameras determine it")
+
+    @property
+    def frames_per_second(self) -> float:
+        """Frames per second, 1000 by default."""
+        return _RATE if self.rate is None else self.rate
+
+    def views(self, videos: Sequence[Path]) -> tuple[Camera, ...]:
+        """Return the cameras of the views: those that are calibrated, or orthogonal ones."""
+        from vibrissa.cameras import orthogonal_views
+        from vibrissa.cameras.camera import PIXEL_SIZE
+        from vibrissa.io import video_info
+
+        if self.cameras is not None:
+            return _calibrated(self.cameras, videos)
+        if len(videos) % 2:
+            raise ValueError(f"{len(videos)} videos: give two a trial, or their --cameras")
+        sizes = [(info.width, info.height) for info in map(video_info, videos)]
+        if len(set(sizes)) > 1:
+            raise ValueError(f"the videos differ in size, {sorted(set(sizes))}: give --cameras")
+        pixel_size = PIXEL_SIZE if self.pixel_size is None else 1e-3 * self.pixel_size
+        wide = pixel_size * sizes[0][0]
+        if not 0.0 < wide <= _WIDEST:
+            raise ValueError(
+                f"--pixel-size is {1e3 * pixel_size:g} mm, by which the views are {wide:g} m wide; "
+                "it is in mm, such as 0.058"
+            )
+        return orthogonal_views(pixel_size, sizes[0])
+
+
+@dataclass(frozen=True)
+class TraceStatements:
+    """How whiskers look in the images, and where they begin."""
+
+    base: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Column and row where a whisker leaves the face in the first frame, view by view "
+            "and then whisker by whisker; by default the whisker is traced that all views show: "
+            "start.png, next to the recording, shows which.",
+            metavar="X,Y",
+        ),
+    ] = None
+    base_width: Annotated[
+        float,
+        typer.Option(help="Width of the whisker's base in the images, pixels, at least 3."),
+    ] = _FINEST
+    jump: Annotated[
+        float,
+        typer.Option(
+            help="Largest distance of a whisker from where the frames before predict it, pixels; "
+            "what is farther away is another whisker."
+        ),
+    ] = 5.0
+    bright: Annotated[
+        bool | None,
+        typer.Option(
+            "--bright/--dark",
+            help="Whether whiskers are bright on dark; by default the first frame decides.",
+        ),
+    ] = None
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be."""
+        for name, pixels in (("base-width", self.base_width), ("jump", self.jump)):
+            if not 0.0 < pixels < math.inf:
+                raise ValueError(f"--{name} is {pixels:g}; pixels, more than 0, are needed")
+
+    def trace_options(self) -> TraceOptions:
+        """Return the options of traces."""
+        from vibrissa.tracking import TraceOptions
+
+        scale = max(self.base_width / _FINEST, 1.0)
+        return TraceOptions(scale=scale, jump=self.jump, bright=self.bright)
+
+    def bases(self, cameras: Sequence[Camera]) -> list[list[list[float]] | None]:
+        """Return the bases in each view; None: to be found."""
+        views = len(cameras)
+        if not self.base:
+            return [None] * views
+        points = [numbers(text, ("x", "y"), "--base") for text in self.base]
+        if len(points) % views:
+            raise ValueError(
+                f"there are {len(points)} --base for {views} views; each needs as many"
+            )
+        each = len(points) // views
+        for i, (x, y) in enumerate(points):
+            width, height = cameras[i // each].size
+            if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
+                raise ValueError(
+                    f"--base {self.base[i]} is outside of view {i // each}, {width} × {height} "
+                    "pixels"
+                )
+        return [points[v * each : (v + 1) * each] for v in range(views)]
+
+
+@dataclass(frozen=True)
+class KnownOptions:
+    """What is known besides the videos."""
+
+    corrections: options.CorrectionsOption = None
+    head: options.HeadOption = None
+    contact: options.ContactOption = None
+    objects: options.ObjectsOption = None
+
+    def alone(self) -> dict[str, Path | None]:
+        """Return the options that are for one trial only."""
+        return {"--corrections": self.corrections, "--head": self.head, "--contact": self.contact}
+
+    def corrected(self, views: int) -> Any:
+        """Read corrected traces, by view."""
+        from vibrissa.io import load_corrections
+
+        fixed = {} if self.corrections is None else load_corrections(self.corrections)
+        if unknown := sorted(view for view in fixed if view >= views):
+            raise ValueError(
+                f"{self.corrections} corrects view {unknown[0]}; views are counted from 0"
+            )
+        return fixed
+
+    def read(self, video: Path, rate: float) -> dict[str, Any]:
+        """Read the head, the contact points and the objects, by the names that `track` has."""
+        from vibrissa.io import load_contact_points
+
+        if self.contact is not None and self.objects is not None:
+            raise ValueError("--contact and --objects both state where the contact is; give one")
+        known: dict[str, Any] = {}
+        if self.head is not None:
+            known["head"] = _head(self.head, video, rate)
+        if self.contact is not None:
+            known["contacts"] = load_contact_points(self.contact)
+        if self.objects is not None:
+            known["objects"] = objects_from(self.objects)
+        return known
+
+
+@with_bundles
+def track(
+    videos: Annotated[
+        list[Path],
+        typer.Argument(
+            help="The video of each view, top and then front; of several trials one after the "
+            "other.",
+            metavar="VIDEO...",
+        ),
+    ],
+    path: Annotated[Path, written("the recording, .nc; of several trials a folder for them")],
+    filmed: FilmOptions,
+    traced: TraceStatements,
+    known: KnownOptions,
+    own: WhiskerOptions,
+    base_radius: options.BaseRadiusOption = None,
+    cutoff: options.CutoffOption = None,
+    force: ForceOption = False,
+) -> None:
+    """Track a whisker in two videos: its shape, pose, contact, and force and moment at its base.
+
+    The whisker at rest is that of --whisker, or is taken from the frames without contact; its base
+    is 0.1 mm in radius if nothing else is stated. With --objects or --contact the contact is
+    compared with one that was found otherwise. The result is a recording. Stopped with Ctrl-C it
+    continues when it is called again.
+    Example: `vibrissa track top.mp4 front.mp4 --pixel-size 0.058 --rate 1000 -o trial.nc`
+    """
+    from vibrissa.io.paths import check_readable
+    from vibrissa.tracking import TrackOptions
+
+    for video in videos:
+        check_readable(video)
+    views = filmed.views(videos)
+    trials = _trials(videos, len(views), path, known.alone())
+    free(trials, force)
+    rate = filmed.frames_per_second
+    low_pass = _CUTOFF if cutoff is None else cutoff
+    if not 0.0 <= low_pass < 0.5 * rate:
+        raise ValueError(
+            f"--cutoff is {low_pass:g} Hz; it must be below half of {rate:g} frames/s, or 0 for "
+            "none"
+        )
+    properties: dict[str, Any] = {}
+    if base_radius is not None:
+        properties["base_radius"] = metres_of(base_radius, "--base-radius")
+    how = TrackOptions(
+        cutoff=low_pass or None,
+        offset=None if filmed.offset == "auto" else int(filmed.offset),
+        properties=properties,
+        whisker=None if own.whisker is None else own.read().with_properties(**properties),
+    )
+    bases, fixed = traced.bases(views), known.corrected(len(views))
+    beside = known.read(videos[0], rate)
+    for file, trial in trials.items():
+        picture = file.with_name("start.png" if len(trials) == 1 else f"{file.stem}.start.png")
+        _track(trial, file, picture, views, rate, bases, fixed, traced.trace_options(), how, beside)
+
+
+def _track(
+    videos: Sequence[Path],
+    recording: Path,
+    picture: Path,
+    cameras: tuple[Camera, ...],
+    rate: float,
+    bases: Sequence[Any],
+    corrections: Any,
+    options: TraceOptions,
+    how: TrackOptions,
+    known: Mapping[str, Any],
+) -> None:
+    """Track one trial and report what was found."""
+    from vibrissa.io import save_recording
+    from vibrissa.tracking import partial_traces, trace_file
+    from vibrissa.tracking import track as tracked
+
+    if bases[0] is None:
+        bases, options = _found(videos, picture, cameras, options, how.offset or 0)
+    kept = [partial_traces(recording, view) for view in range(len(videos))]
+    with progress_bars() as tell:
+        traces = [
+            trace_file(
+                path,
+                kept[view],
+                bases[view],
+                options,
+                corrections=corrections.get(view, {}),
+                progress=partial(tell, f"trace {path.name}"),
+            )
+            for view, path in enumerate(videos)
+        ]
+        result = tracked(cameras, traces, rate, how, progress=tell, **known)
+    _compare_lengths(videos, traces, result.sizes["time"])
+    save_recording(recording, result)
+    for file in kept:
+        file.unlink(missing_ok=True)
+    _report(result, recording)
+
+
+def _found(
+    videos: Sequence[Path],
+    picture: Path,
+    cameras: tuple[Camera, ...],
+    options: TraceOptions,
+    offset: int,
+) -> tuple[list[Any], TraceOptions]:
+    """Find the whisker, and show what is taken for it before any time is spent on it."""
+    from vibrissa.plots import save, start_views
+    from vibrissa.tracking import find_start, start_frames
+
+    numbers, frames = start_frames(videos, offset)
+    start = find_start(cameras, frames, options)
+    names = [camera.name for camera in cameras]
+    images = [view[start.frame] for view in frames]
+    remarks = [f"frame {numbers[start.frame]} of {videos[0].name}: {why}" for why in start.doubts]
+    figure = start_views(images, start.lines, names, start.confidence, remarks)
+    save(figure, picture.with_suffix(""), ("png",))
+    if start.bases is None:
+        raise ValueError(
+            f"where the whisker begins was not found: {start.doubts[0]}. See {picture}, and state "
+            "where it leaves the face, once for each view: "
+            + " ".join("--base X,Y" for _ in videos)
+        )
+    _report_start(start, names, picture)
+    return [[base.tolist()] for base in start.bases], replace(options, bright=start.bright)
+
+
+def _calibrated(path: Path, videos: Sequence[Path]) -> tuple[Camera, ...]:
+    """Cameras of a file, each for videos of its size."""
+    from vibrissa.cameras import load_cameras
+    from vibrissa.io import load_recording, video_info
+    from vibrissa.io.paths import NETCDF
+    from vibrissa.recording import Recording
+
+    if path.suffix.lower() in NETCDF:
+        cameras = Recording(load_recording(path)).cameras
+    else:
+        cameras = load_cameras(path)
+    if len(cameras) < 2:
+        raise ValueError(
+            f"{path} holds one camera, {cameras[0].name!r}; a whisker in space is seen by two or "
+            "more: calibrate them together, or leave --cameras out"
+        )
+    if len(videos) % len(cameras):
+        raise ValueError(f"{path} holds {len(cameras)} cameras; there are {len(videos)} videos")
+    for i, video in enumerate(videos):
+        camera, info = cameras[i % len(cameras)], video_info(video)
+        if (info.width, info.height) != tuple(camera.size):
+            raise ValueError(
+                f"{video} is {info.width} × {info.height} pixels; {path} calibrates camera "
+                f"{camera.name!r} for {camera.size[0]} × {camera.size[1]}: calibrate with images "
+                "of the video's size, or give the videos in the cameras' order"
+            )
+    return cameras
+
+
+def _trials(
+    videos: Sequence[Path], count: int, recording: Path, alone: Mapping[str, Path | None]
+) -> dict[Path, Sequence[Path]]:
+    """Videos of each trial, by the recording that they give."""
+    from vibrissa.io.paths import NETCDF, check_writable
+
+    trials = [videos[i : i + count] for i in range(0, len(videos), count)]
+    files = [recording]
+    if len(trials) > 1:
+        refuse(alone, "it is for one trial; track that by itself")
+        if not recording.is_dir():
+            raise ValueError(f"--output is {recording}; for several trials a folder is needed")
+        files = [recording / f"{trial[0].stem}.nc" for trial in trials]
+        if len(set(files)) < len(files):
+            raise ValueError("two trials would have one file: their first videos share a name")
+    for file, trial in zip(files, trials, strict=True):
+        check_writable(file, NETCDF)
+        # One video cannot show a whisker from two sides.
+        if len({path.resolve() for path in trial}) < len(trial):
+            names = ", ".join(map(str, trial))
+            raise ValueError(f"{names}: a video is there twice; each view needs its own")
+    return dict(zip(files, trials, strict=True))
+
+
+def _head(path: Path, video: Path, rate: float) -> xr.Dataset:
+    """The head's pose; whether it is known in all frames is found out before the work."""
+    from vibrissa.io import load_head, load_recording, video_info
+    from vibrissa.io.paths import NETCDF
+    from vibrissa.tracking import HeadPose
+
+    if path.suffix.lower() in NETCDF:
+        head = load_recording(path).to_dataset()
+        if "head_rotation" not in head:
+            raise ValueError(f"{path} is a recording without the pose of a head")
+    else:
+        head = load_head(path)
+    if frames := video_info(video).frames:
+        HeadPose.of(head, np.arange(frames), rate)
+    return head
+
+
+# What is printed ----------------------------------------------------------------------------------
+
+
+def _compare_lengths(videos: Sequence[Path], traces: Sequence[Sequence[Any]], used: int) -> None:
+    """Report videos that differ in length."""
+    frames = [len(view[0]) for view in traces]
+    if len(set(frames)) > 1:
+        listed = ", ".join(f"{path} {n}" for path, n in zip(videos, frames, strict=True))
+        say(
+            f"the videos differ in frames ({listed}); {used} of each are used: if the cameras did "
+            "not start together or dropped frames, track with --offset auto"
+        )
+
+
+def _report_start(start: Start, names: Sequence[str], picture: Path) -> None:
+    """Report what is taken for the whisker."""
+    bases = start.bases or []
+    points = " and ".join(
+        f"{column:.0f},{row:.0f} ({name})" for name, (column, row) in zip(names, bases, strict=True)
+    )
+    say(
+        f"the whisker is taken to begin at {points}, as in {start.agreed[0]} of {start.agreed[1]} "
+        f"frames, with confidence {start.confidence:.2f}: see {picture}"
+    )
+    if start.doubts:
+        say(
+            f"not sure: {'; '.join(start.doubts)}. If it is not the whisker, state where that "
+            f"leaves the face, once for each view: {' '.join('--base X,Y' for _ in names)}"
+        )
+
+
+def _report(result: xr.DataTree, path: Path) -> None:
+    """Report what was tracked of each whisker."""
+    from vibrissa.recording import Recording
+
+    data = result.to_dataset()
+    for k, name in enumerate(data["whisker"].values):
+        one = data.isel(whisker=k)
+        misfit = float(one["trace_misfit"].median())
+        say(
+            f"{name}: {shown('length', Recording(result).whisker(k).length)} long, in contact in "
+            f"{int(np.nansum(one['in_contact'].values))} of {one.sizes['time']} frames, lost in "
+            f"{int((one['confidence'] == 0.0).sum())}, misfit of the traces {misfit:.2f} of their "
+            "standard deviation"
+        )
+        if misfit > _POOR:
+            say(
+                "  The bent rod does not explain the traces: perhaps too few frames are free of "
+                "contact, or the traces are wrong; see trace_misfit and deviation."
+            )
+        for line in compared_contacts(result, k):
+            say(f"  {line}")
+    print_notes(*(Recording(result).whisker(k) for k in range(data.sizes["whisker"])))
+    for line in result.attrs.get("remarks", "").splitlines():
+        say(f"note: {line}")
+    say(f"wrote {path}")
+
+
+def compared_contacts(recording: xr.DataTree, whisker: int) -> Iterator[str]:
+    """Compare contact points that were found otherwise with those of the rod."""
+    measured = recording.children.get("measured")
+    if measured is None or "contact_difference" not in measured:
+        return
+    one = measured.to_dataset().isel(whisker=whisker)
+    away = one["contact_difference"].values
+    of_rod = recording.to_dataset()["arc_length"].isel(whisker=whisker)
+    along = one["arc_length"].values - of_rod.values
+    both = np.isfinite(away) & np.isfinite(along)
+    found = int(np.isfinite(one["contact_point"].values).all(axis=-1).sum())
+    source = one["contact_point"].attrs["source"]
+    if not both.any():
+        yield f"contact point ({source}): in {found} frames, in none of them has the rod one"
+        return
+    half, most = np.percentile(away[both], [50.0, 95.0])
+    yield (
+        f"contact point ({source}): in {found} frames; in {int(both.sum())} the rod has one too, "
+        f"{shown('contact_difference', half, 3)} away (median; 95 % within "
+        f"{shown('contact_difference', most, 3)}), "
+        f"{shown('contact_difference', float(np.median(along[both])), 3)} farther out along the "
+        "whisker"
+    )

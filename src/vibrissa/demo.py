@@ -1,0 +1,386 @@
+"""The main job from end to end, compared with the truth: a trial filmed, tracked, located, fitted.
+
+Files go to a folder. What is there of the same trial is not done again.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from vibrissa import samples
+from vibrissa.contacts import ContactMap
+from vibrissa.contour import CylinderFit, shape_from_dataset
+from vibrissa.evaluation import (
+    Scores,
+    SignalRow,
+    TrackingScores,
+    contact_errors,
+    score,
+    signal_errors,
+    tracking_scores,
+    truth_of,
+    with_truth,
+)
+from vibrissa.io import load_recording, save_contacts, save_recording
+from vibrissa.io.paths import replacing
+from vibrissa.objects import Peg
+from vibrissa.pipeline import (
+    contact_columns,
+    placed_by,
+    signals_of,
+    whisker_radii,
+    with_contour,
+    with_estimates,
+    with_group,
+)
+from vibrissa.pipeline.estimates import Progress
+from vibrissa.recording import Recording
+from vibrissa.sensors import FORCE_NOISE, MOMENT_NOISE
+from vibrissa.simulation import facing_peg, film, measure, simulate, sweep_past, views_of
+from vibrissa.simulation.film import with_true_traces
+from vibrissa.tracking import TrackOptions, partial_traces, trace_file, track
+from vibrissa.whisker import Whisker
+
+DURATION = 0.5
+"""Of the trial, s."""
+
+FULL_DURATION = 3.5
+"""Of a trial like the paper's, s."""
+
+SIMULATED, TRACKED = "simulated.nc", "tracked.nc"
+"""Recordings that are kept from one run to the next, as videos are."""
+
+_VIEWS = ("top", "front")
+_WRITTEN = ("trial.nc", "seen.nc", "contacts.csv", "map.nc")
+"""What is made anew each time."""
+
+_SETTINGS = ".settings.json"
+_NODES = 9
+"""Points by which it is known whether a whisker is the same."""
+
+_PROPERTIES = ("base_radius", "tip_radius", "youngs_modulus", "poisson_ratio")
+"""What no camera sees, and a lab has from elsewhere."""
+
+_DIM = {"whisker": 0}
+
+
+@dataclass(frozen=True, eq=False)
+class Located:
+    """Contact points estimated from signals of one source, and how good they are.
+
+    Parameters
+    ----------
+    recording : xarray.DataTree
+        Recording with the groups ``signals``, ``estimates`` and ``contour``.
+    contacts : xarray.Dataset
+        Estimates, dim time.
+    errors : xarray.Dataset
+        Errors of the contacts, dim time.
+    fit : CylinderFit
+        Peg that was fitted to the contacts.
+    scores : Scores
+        Errors in numbers.
+    signals : tuple of SignalRow
+        Errors of the signals by deflection angle.
+    """
+
+    recording: xr.DataTree
+    contacts: xr.Dataset
+    errors: xr.Dataset
+    fit: CylinderFit
+    scores: Scores
+    signals: tuple[SignalRow, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class DemoResult:
+    """Everything that the main job gives.
+
+    Parameters
+    ----------
+    whisker : Whisker
+        Whisker that whisked.
+    peg : Peg
+        Peg that it met.
+    simulated : xarray.DataTree
+        Trial with its truth and what the sensor read.
+    contact_map : ContactMap
+        Map by which contacts were found: of the whisker as it was tracked, or without video of the
+        one that whisked.
+    sensed : Located
+        Contacts from what the sensor read, in the laboratory by the pose that was tracked, or
+        without video by the true one.
+    seen : Located or None
+        Contacts by the paper's method: from signals that the model gives for the contact point
+        that was tracked.
+    tracking : TrackingScores or None
+        Errors of what was tracked.
+    files : tuple of Path
+        Files that were written.
+    """
+
+    whisker: Whisker
+    peg: Peg
+    simulated: xr.DataTree
+    contact_map: ContactMap
+    sensed: Located
+    seen: Located | None
+    tracking: TrackingScores | None
+    files: tuple[Path, ...]
+
+
+def run_demo(
+    whisker: Whisker | None = None,
+    output: str | PathLike[str] | None = None,
+    *,
+    seed: int = 0,
+    noise: bool = True,
+    duration: float = DURATION,
+    rate: float = 1000.0,
+    video: bool = True,
+    progress: Progress | None = None,
+) -> DemoResult:
+    """Whisk against a peg, film it, measure at the whisker's base, and find the peg again.
+
+    Parameters
+    ----------
+    whisker : Whisker, optional
+        Whisker that whisks; by default the built-in γ whisker.
+    output : str or path, optional
+        Folder for the recordings, videos and tables, made if need be; by default nothing is kept.
+        What is there already of the same trial is not done again.
+    seed : int
+        Seed of the trial's drifts, the sensor's noise and the videos'.
+    noise : bool
+        Whether the sensor has noise: 1 µN and 0.02 µN·m standard deviation a component.
+    duration : float
+        Duration of the trial, s.
+    rate : float
+        Frames per second.
+    video : bool
+        Whether the trial is filmed and tracked. If not, the base's true pose is taken.
+    progress : callable, optional
+        Function called as ``progress(stage, done, total)``.
+
+    Returns
+    -------
+    DemoResult
+        Everything, with how good it is.
+
+    Raises
+    ------
+    ValueError
+        If the whisker cannot whisk past the peg, there are too few contacts to fit it, or files are
+        in the way.
+    """
+    tell = progress or _silent
+    whisker = samples.gamma() if whisker is None else whisker
+    with _folder(output) as folder:
+        begin(folder, whisker, seed=seed, noise=noise, duration=duration, rate=rate, video=video)
+        trial = _simulated(whisker, seed, noise, duration, rate, tell)
+        held, scores, seen = trial, None, None
+        if video:
+            trial = _filmed(trial, folder, seed, tell)
+            held = with_truth(_tracked(trial, folder, tell), trial)
+            scores = tracking_scores(held.to_dataset().isel(_DIM), truth_of(held)[0])
+        tell("map of all contacts", 0, 1)
+        contact_map = ContactMap.simulate(Recording(held).whisker(), grid=False)
+        tell("map of all contacts", 1, 1)
+        read = placed_by(signals_of(trial, "sensor"), held) if video else signals_of(trial)
+        sensed = _located(with_group(held, "signals", read), contact_map, seed)
+        tell("contact points", 1, 2 if video else 1)
+        if video:
+            read = signals_of(held, "contact point")
+            seen = _located(with_group(held, "signals", read), contact_map, seed)
+            tell("contact points", 2, 2)
+        files: tuple[Path, ...] = ()
+        if output is not None:
+            files = _written(folder, sensed, seen, contact_map, tell)
+        return DemoResult(whisker, _peg(trial), trial, contact_map, sensed, seen, scores, files)
+
+
+def _silent(stage: str, done: int, total: int) -> None:
+    pass
+
+
+@contextmanager
+def _folder(output: str | PathLike[str] | None) -> Iterator[Path]:
+    """The folder that is asked for, or one that goes away again."""
+    if output is not None:
+        yield Path(output)
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        yield Path(folder)
+
+
+def begin(folder: Path, whisker: Whisker, **settings: object) -> None:
+    """Make the folder, and clear away what was made there with other settings.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the demo.
+    whisker : Whisker
+        Whisker that whisks.
+    **settings : object
+        Other settings by name; they can be written as JSON.
+
+    Raises
+    ------
+    ValueError
+        If files would be replaced that the demo has not made.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    arc_length = np.linspace(0.0, whisker.length, _NODES)
+    shape = np.column_stack([whisker.centerline(_NODES), whisker.radius(arc_length)])
+    about = {**settings, "whisker": shape.tolist(), "version": _version()}
+    text = json.dumps(about, sort_keys=True)
+    path = folder / _SETTINGS
+    if path.exists() and path.read_text(encoding="utf-8") == text:
+        return
+    kept = [folder / SIMULATED, folder / TRACKED, *video_files(folder)]
+    made = [*kept, *(folder / name for name in _WRITTEN)]
+    there = [file.name for file in made if file.exists()]
+    if there and not path.exists():
+        raise ValueError(
+            f"{folder} holds {', '.join(there)}, which this would replace: choose another folder"
+        )
+    for file in made:
+        file.unlink(missing_ok=True)
+    with replacing(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+def _version() -> str:
+    import vibrissa
+
+    return vibrissa.__version__
+
+
+def video_files(folder: Path) -> list[Path]:
+    """List the videos of the demo.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the demo.
+
+    Returns
+    -------
+    list of Path
+        One for each view.
+    """
+    return [folder / f"{name}.mp4" for name in _VIEWS]
+
+
+def _simulated(
+    whisker: Whisker, seed: int, noise: bool, duration: float, rate: float, tell: Progress
+) -> xr.DataTree:
+    """The trial, with what a sensor at the whisker's base reads."""
+    force_noise, moment_noise = (FORCE_NOISE, MOMENT_NOISE) if noise else (0.0, 0.0)
+    peg = facing_peg(whisker)
+    tell("how far to whisk", 0, 1)
+    motion = sweep_past(whisker, peg, duration, rate, seed=seed)
+    tell("how far to whisk", 1, 1)
+    trial = simulate(whisker, motion, peg, progress=partial(tell, "whisking trial"))
+    return measure(trial, force_noise, moment_noise, seed)
+
+
+def _filmed(trial: xr.DataTree, folder: Path, seed: int, tell: Progress) -> xr.DataTree:
+    """The trial with cameras and true traces; its videos are made where they are not there."""
+    path = folder / SIMULATED
+    if path.exists():
+        return load_recording(path)
+    cameras = views_of(trial)
+    for view, (camera, file) in enumerate(zip(cameras, video_files(folder), strict=True)):
+        # A video is there only if it is whole.
+        if not file.exists():
+            told = partial(tell, f"filming, {camera.name}")
+            film(trial, {camera.name: file}, [camera], seed=seed + view, progress=told)
+    done = with_true_traces(trial, cameras)
+    save_recording(path, done)
+    return done
+
+
+def _tracked(trial: xr.DataTree, folder: Path, tell: Progress) -> xr.DataTree:
+    """The whisker as it is tracked in the videos of a trial."""
+    path = folder / TRACKED
+    if path.exists():
+        return load_recording(path)
+    kept = [partial_traces(path, view) for view in range(len(_VIEWS))]
+    traces = [
+        trace_file(file, kept[view], progress=partial(tell, f"tracing, {file.stem}"))
+        for view, file in enumerate(video_files(folder))
+    ]
+    rate = 1.0 / float(np.median(np.diff(trial.to_dataset()["time"].values)))
+    own = Recording(trial).whisker()
+    how = TrackOptions(properties={name: getattr(own, name) for name in _PROPERTIES})
+    found = track(Recording(trial).cameras, traces, rate, how, progress=tell)
+    save_recording(path, found)
+    for file in kept:
+        file.unlink(missing_ok=True)
+    return found
+
+
+def _peg(recording: xr.DataTree) -> Peg:
+    (peg,) = Recording(recording).objects
+    assert isinstance(peg, Peg)
+    return peg
+
+
+def _located(recording: xr.DataTree, contact_map: ContactMap, seed: int) -> Located:
+    """Estimate contacts from a recording's signals, fit the peg, and compare with the truth."""
+    recording = with_contour(with_estimates(recording, contact_maps=[contact_map]))
+    contacts = recording["estimates"].to_dataset().isel(_DIM)
+    fit = shape_from_dataset(recording["contour"].to_dataset())
+    assert isinstance(fit, CylinderFit)
+    truth, whisker = truth_of(recording)
+    peg = _peg(recording)
+    radii = whisker_radii(recording["truth"].to_dataset(), [whisker])[:, 0]
+    known = truth.assign(
+        radius=("time", radii),
+        peg_position=("space", peg.origin),
+        peg_axis=("space", peg.axis),
+        peg_radius=((), peg.radius),
+    )
+    errors = contact_errors(contacts, truth, whisker, seed)
+    signals = recording["signals"].to_dataset().isel(_DIM)
+    return Located(
+        recording=recording,
+        contacts=contacts,
+        errors=errors,
+        fit=fit,
+        scores=score(contacts, known, errors, fit),
+        signals=signal_errors(signals, truth, errors["deflection_angle"].values),
+    )
+
+
+def _written(
+    folder: Path, sensed: Located, seen: Located | None, contact_map: ContactMap, tell: Progress
+) -> tuple[Path, ...]:
+    """Write everything and return where."""
+    recordings = {"trial.nc": sensed.recording}
+    if seen is not None:
+        recordings["seen.nc"] = seen.recording
+    count = len(recordings) + 2
+    for i, (name, recording) in enumerate(recordings.items()):
+        tell("files", i, count)
+        save_recording(folder / name, recording)
+    tell("files", len(recordings), count)
+    save_contacts(folder / "contacts.csv", contact_columns(sensed.contacts))
+    contact_map.save(folder / "map.nc")
+    tell("files", count, count)
+    files = [folder / name for name in (*recordings, "contacts.csv", "map.nc")]
+    if seen is not None:
+        files = [folder / SIMULATED, *video_files(folder), folder / TRACKED, *files]
+    return tuple(files)

@@ -112,7 +112,10 @@ def test_deflect_by_force_and_by_peg():
     text = run("deflect", "--point-force", "25,50,90")
     assert "25.0000 mm" in text
     assert "OK" not in text
-    assert str(vb.Status.NO_CONTACT) in run("deflect", "--peg", "-5,20,0,2.7")
+    away = CliRunner().invoke(app, ["deflect", "--peg", "-5,20,0,2.7"])
+    assert away.exit_code == 1
+    assert away.stdout.splitlines()[-1] == str(vb.Status.NO_CONTACT)
+    assert "nan" not in away.output
     text = run("deflect", "--peg", "25,8,0,2.7", "--push", "0,1,0")
     assert str(vb.Status.OK) in text
 

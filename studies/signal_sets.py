@@ -42,9 +42,9 @@ def drawn(contacts):
     """Contact points and forces that stand for equal volumes."""
     rng, scale = np.random.default_rng(0), contacts.chart.discretization
     spread_out = sample(contacts, spread(8 * NUMBER, 0), "reachable")
-    places = spread_out.places
-    volume = spread_out.volume * (places.inside & (places.angle > np.deg2rad(2)))
-    values = places.values[rng.choice(len(volume), NUMBER, p=volume / volume.sum())]
+    drawn = spread_out.contacts
+    volume = spread_out.volume * (drawn.inside & (drawn.angle > np.deg2rad(2)))
+    values = drawn.values[rng.choice(len(volume), NUMBER, p=volume / volume.sum())]
     return values[:, 3:] * scale.length, values[:, :3] * scale.force, rng
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from vibrissa.identifiability.summary import verdict_rows, verdict_table
+from vibrissa.identifiability import verdict_rows, verdict_table
 from vibrissa.io.recording import KIND
 from vibrissa.recording import Recording
 from vibrissa.sketch import BENT, CONTACT, MOST_CURVES, REST, Mark, card, table, thinned, views

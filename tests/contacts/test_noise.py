@@ -20,8 +20,8 @@ def contacts_of(contact_map, low, high, number, rng):
     load = rng.uniform(low, high, many)
     place = np.column_stack([rng.uniform(size=(many, 2)) * [1.0, 2.0 * np.pi], np.sqrt(load)])
     found = sample(contact_map, place, "reachable")
-    volume = np.where(found.places.inside, found.volume, 0.0) / place[:, 2]
-    values = found.places.values[rng.choice(many, number, p=volume / volume.sum())]
+    volume = np.where(found.contacts.inside, found.volume, 0.0) / place[:, 2]
+    values = found.contacts.values[rng.choice(many, number, p=volume / volume.sum())]
     force, point = values[:, :3] * d.force, values[:, 3:] * d.length
     return force, np.cross(point, force), point
 

@@ -6,7 +6,7 @@ import xarray as xr
 
 import vibrissa as vb
 from vibrissa.identifiability import save_uniqueness, verdict_table
-from vibrissa.identifiability.regions import place, sample, spread
+from vibrissa.identifiability.regions import contact_set, sample, spread
 from vibrissa.identifiability.summary import choice, notation
 from vibrissa.identifiability.twins import twins
 from vibrissa.rod import chart_of, contact_tangents, discretize, solve_forces, with_normal_force
@@ -167,12 +167,12 @@ def test_the_known_pair_of_a_strongly_curved_whisker(strongly_curved):
     xi = np.array([[0.323051, 0.762684, 0.0]])
     d = strongly_curved.chart.discretization
     values, _ = solve_forces(d, with_normal_force(xi))
-    first = place(strongly_curved, xi, values, "reachable")
+    first = contact_set(strongly_curved, xi, values, "reachable")
     chart = chart_of(strongly_curved.chart.fold, xi)
     pairs = twins(strongly_curved, ("Fx", "MB", "MD"), chart, first, "reachable")
     assert len(pairs.apart) == 1
     assert pairs.apart[0] == pytest.approx(0.32, abs=0.005)
-    np.testing.assert_allclose(pairs.second.contacts[0], [0.645, 0.440, 0.0], atol=1e-3)
+    np.testing.assert_allclose(pairs.second.xi[0], [0.645, 0.440, 0.0], atol=1e-3)
 
 
 def test_the_cone_of_a_strongly_curved_whisker(strongly_curved):
@@ -251,18 +251,18 @@ def test_resolution_is_what_a_dense_search_finds(straight):
     dense = sample(straight, spread(2**17, 3), "reachable")
     # The same samples: the first of eight times as many.
     own = sample(straight, spread(8 * 256, 0), "reachable").rows(slice(256))
-    out, outside = own.places.angle > np.deg2rad(2.0), dense.places.angle > np.deg2rad(2.0)
-    others, points = dense.places.signals[outside], dense.places.values[outside, 3:]
-    span = np.ptp(own.places.signals, axis=0)
+    out, outside = own.contacts.angle > np.deg2rad(2.0), dense.contacts.angle > np.deg2rad(2.0)
+    others, points = dense.contacts.signals[outside], dense.contacts.values[outside, 3:]
+    span = np.ptp(own.contacts.signals, axis=0)
     span[5] = 2.0 * np.pi
 
     def ambiguous(tolerance):
         hit = np.zeros(len(out), dtype=bool)
         for i in np.flatnonzero(out):
-            away = others - own.places.signals[i]
+            away = others - own.contacts.signals[i]
             away[:, 5] = (away[:, 5] + np.pi) % (2.0 * np.pi) - np.pi
             near = (np.abs(away[:, [0, 4, 5]]) <= tolerance * span[[0, 4, 5]]).all(axis=1)
-            apart = np.linalg.norm(points[near] - own.places.values[i, 3:], axis=1)
+            apart = np.linalg.norm(points[near] - own.contacts.values[i, 3:], axis=1)
             hit[i] = (apart >= 0.025).any()
         return own.volume[hit & out].sum() / own.volume[out].sum()
 

@@ -64,9 +64,8 @@ def uniqueness(
 
     Example: `vibrissa uniqueness map.nc -o uniqueness.nc`
     """
-    from vibrissa.identifiability import save_uniqueness, verdict_table
+    from vibrissa.identifiability import ENDINGS, save_uniqueness, verdict_table
     from vibrissa.identifiability import uniqueness as judge
-    from vibrissa.identifiability.summary import ENDINGS
     from vibrissa.io.paths import check_writable
     from vibrissa.paper import with_network_errors
 

@@ -1,18 +1,24 @@
 """Which signals locate a contact: witnesses, verdicts, critical cones, sensitivity."""
 
-from vibrissa.identifiability.best_triplet import best_triplet
 from vibrissa.identifiability.cones import critical_cones
-from vibrissa.identifiability.sensitivity import sensitivity
-from vibrissa.identifiability.summary import save_uniqueness, verdict_table
+from vibrissa.identifiability.sensitivity import best_triplet, sensitivity
+from vibrissa.identifiability.summary import (
+    ENDINGS,
+    save_uniqueness,
+    verdict_rows,
+    verdict_table,
+)
 from vibrissa.identifiability.verdicts import uniqueness
 from vibrissa.identifiability.witness_pair import witness_pairs
 
 __all__ = [
+    "ENDINGS",
     "best_triplet",
     "critical_cones",
     "save_uniqueness",
     "sensitivity",
     "uniqueness",
+    "verdict_rows",
     "verdict_table",
     "witness_pairs",
 ]

@@ -36,23 +36,23 @@ def critical_cones(
     """Compute critical cones of planar whiskers y = A x² over curvature and taper.
 
     The critical cone is the smallest cone about the resting whisker outside which no two contacts
-    give the same triplet; see :func:`vibrissa.uniqueness`. Contacts that only the plane of the
+    have the same triplet; see :func:`vibrissa.uniqueness`. Contacts that only the plane of the
     whisker makes equal do not count.
 
     Parameters
     ----------
     curvatures : (n,) array_like
-        A·L of the whiskers, A the coefficient of the parabola and L the length.
+        Curvatures A·L of the whiskers, A the coefficient of the parabola and L the length.
     taper_ratios : (m,) array_like
-        Base radius over tip radius.
+        Ratios of base radius to tip radius.
     triplets : sequence of str
-        The triplets.
+        Triplets, such as ``"Fx MB MD"``.
     min_separation : float
-        Contacts nearer to each other than this share of the length count as one.
+        Distance, as a share of the length, below which two contacts count as one.
     samples : int
-        How many contacts of each whisker are tried.
+        Number of contacts of each whisker that are tried.
     progress : callable, optional
-        Called as ``progress(done, total)`` after each whisker.
+        Function called as ``progress(done, total)`` after each whisker.
 
     Returns
     -------
@@ -100,7 +100,7 @@ def critical_cones(
 def _critical_cone(
     contact_map: ContactMap, triplet: str, min_separation: float, samples: int
 ) -> float:
-    """The cone found, and whatever is found when outside that cone is searched harder."""
+    """The cone of a search, and of further ones outside that cone."""
     cone = 0.0
     for seed in range(_ROUNDS):
         found = uniqueness(

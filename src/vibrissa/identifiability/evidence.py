@@ -2,8 +2,9 @@
 
 Samples spread over Ω are inverted exactly, which finds all twins of each; an evolution from the
 best of them looks for twins farther from rest. The *critical cone* of a region is the smallest cone
-about the resting whisker that all pairs of twins touch. The resolution comes from inverting signals
-moved by a tolerance.
+about the resting whisker that all pairs of twins touch. Local evidence is the sign of det ∂T/∂p,
+which changes where the map from contacts to the triplet folds. The resolution, how finely signals
+must be measured, comes from inverting signals moved by a tolerance.
 """
 
 from __future__ import annotations
@@ -14,23 +15,23 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from vibrissa.contacts.contact_map import Domain
-from vibrissa.identifiability.confirm import confirmed
+from vibrissa.contacts.inversion import invert
 from vibrissa.identifiability.fibres import deficient, fibres
-from vibrissa.identifiability.folds import Local, local_evidence
-from vibrissa.identifiability.regions import Samples, sample, spread
-from vibrissa.identifiability.resolution import TOLERANCES, ambiguous
+from vibrissa.identifiability.regions import ContactSet, Samples, contact_set, sample, spread
 from vibrissa.identifiability.twins import (
     Pairs,
     better_twins,
+    confirmed,
     joined,
+    signal_columns,
     triplet_derivatives,
     twins,
 )
 from vibrissa.numerics import AnyArray, Array
-from vibrissa.signals import CIRCULAR, SIGNALS
+from vibrissa.signals import CIRCULAR
 
 if TYPE_CHECKING:
-    from vibrissa.contacts.contact_map import ContactMap
+    from vibrissa.contacts import ContactMap
     from vibrissa.whisker import Whisker
 
 UNIQUE, OFF_SURFACE, NOT_UNIQUE, EMPTY = (
@@ -39,26 +40,49 @@ UNIQUE, OFF_SURFACE, NOT_UNIQUE, EMPTY = (
     "not unique",
     "no contacts",
 )
-#: How many witnesses of each cell are kept.
+#: Number of witnesses kept of each triplet and region.
 WITNESSES = 3
-# So many times more the regions without witnesses are searched.
+#: Shares of each signal's range within which signals count as equal.
+TOLERANCES = (1e-6, 1e-4, 1e-3, 1e-2)
+# Further searches of regions without witnesses.
 _AGAIN = 4
-# So many times the samples are looked at for signs of a fold: that costs little.
+# Samples in which folds are looked for, per sample that is inverted: they cost little.
 _WIDER = 8
-# So many pairs at a time are found again on a finer rod, and so many times.
+# Pairs found again on a finer rod at a time, and how many times at most.
 _CONFIRMED = 24
 _ROUNDS = 20
-# So many of the samples tell the resolution.
+# Samples that the resolution is probed at.
 _PROBED = 512
-# Fibres are followed from so many contacts of each region.
+# Contacts of each region from which fibres are followed, and at which folds are searched.
 _FOLLOWED = 24
-# A whisker is planar if it leaves the x-y plane by no more than this share of its length.
+_NEAR_FOLDS = 24
+# Contacts in the plane of a planar whisker that are tried.
+_IN_PLANE = 256
+# A whisker is planar if it leaves its plane by no more than this share of its length.
 _PLANAR = 1e-9
+# The corners of the box of a tolerance and the middles of its faces.
+_CORNERS = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(8, 3)
+_MOVES = np.concatenate([_CORNERS, np.eye(3), -np.eye(3)])
+
+
+class Local(NamedTuple):
+    """Local evidence, region by region.
+
+    minority (regions,): share of the volume in which the determinant has the rarer sign; one_sided
+    (regions,): the same with the two sides of the whisker's plane separated; angle (regions, 2):
+    least and largest cone angle of contacts with the rarer sign of their side, rad; near_folds:
+    samples near folds.
+    """
+
+    minority: Array
+    one_sided: Array
+    angle: Array
+    near_folds: AnyArray
 
 
 @dataclass(frozen=True)
 class Question:
-    """What is asked."""
+    """What is asked of every triplet, with the samples that answer it."""
 
     contact_map: ContactMap
     regions: tuple[str, ...]
@@ -75,22 +99,21 @@ class Question:
 
     def volumes(self) -> Array:
         """Share of the contact points' space, outside the cone, that each region takes."""
-        places, volume = self.samples.places, self.samples.volume
-        outside = volume * (places.inside & (places.angle > self.cone))
-        parts = [float((outside * places.members(r)).sum()) for r in self.regions]
+        contacts, volume = self.samples.contacts, self.samples.volume
+        outside = volume * (contacts.inside & (contacts.angle > self.cone))
+        parts = [float((outside * contacts.members(r)).sum()) for r in self.regions]
         return np.array(parts) / max(float(outside.sum()), np.finfo(np.float64).tiny)
 
 
-@dataclass
+@dataclass(frozen=True)
 class Answer:
-    """What one triplet gives, region by region."""
+    """Evidence on one triplet, region by region.
 
-    verdict: list[str]
-    critical_cone: Array
-    local: Local
-    twin_share: Array
-    ambiguous: Array
-    surface_angle: Array
+    variables: arrays (regions, ...) by their names in the dataset; witnesses: pairs of contacts,
+    with the integration steps with which they agree.
+    """
+
+    variables: dict[str, AnyArray]
     witnesses: list[Pairs]
     steps: list[int]
 
@@ -107,14 +130,14 @@ def ask(
     """Spread samples over Ω and find what all triplets share."""
     wide = sample(contact_map, spread(_WIDER * number, seed), domain)
     samples = wide.rows(slice(len(wide.chart) // _WIDER))
-    signals = samples.places.signals
+    signals = samples.contacts.signals
     span = np.ptp(signals, axis=0)
     span[list(CIRCULAR)] = 2.0 * np.pi
-    probed = np.flatnonzero(samples.places.inside & (samples.places.angle > cone))[:_PROBED]
+    probed = np.flatnonzero(samples.contacts.inside & (samples.contacts.angle > cone))[:_PROBED]
     normal, bearing = _plane(contact_map.whisker)
     plane = None
     if bearing is not None:
-        chart = spread(256, seed)
+        chart = spread(_IN_PLANE, seed)
         chart[:, 1] = bearing + np.where(chart[:, 1] < np.pi, 0.0, np.pi)
         plane = sample(contact_map, chart, domain)
     return Question(
@@ -134,9 +157,9 @@ def ask(
 
 
 def _plane(whisker: Whisker) -> tuple[Array, float | None]:
-    """Normal of the plane to which a whisker keeps, and the bearing of forces in it.
+    """Normal of the plane of a whisker, and the bearing of forces in it.
 
-    The normal is z, and there is no bearing, if it keeps to none.
+    The normal is z, and there is no bearing, if the whisker is not planar.
     """
     line = whisker.centerline(101)
     normal = np.array([0.0, 0.0, 1.0])
@@ -161,28 +184,23 @@ class _Cell(NamedTuple):
 
 def answer(question: Question, names: tuple[str, ...], resolution: bool) -> Answer:
     """All evidence on one triplet."""
-    samples, span = question.samples, question.span[[SIGNALS.index(name) for name in names]]
-    by_contact = triplet_derivatives(question.wide.places.values, question.wide.tangents, names)
-    lost = deficient(question.contact_map, names, samples.places.contacts[:_PROBED], span)
-    local = local_evidence(
-        question.wide,
-        by_contact,
-        question.regions,
-        question.cone,
-        question.normal,
-        lost is not None,
-    )
-    on_surface = None
+    samples, span = question.samples, question.span[signal_columns(names)]
+    by_contact = triplet_derivatives(question.wide.contacts.values, question.wide.tangents, names)
+    lost = deficient(question.contact_map, names, samples.contacts.xi[:_PROBED], span)
+    local = _nothing_local(question) if lost is not None else _local(question, by_contact)
+    on_surface: tuple[Pairs, int] | None = None
     if lost is not None:
-        tried = _some(question, samples)
-        followed = np.union1d(tried, _farthest(question, samples))
+        tried = _some(question, samples.contacts)
+        followed = np.union1d(tried, _farthest(question, samples.contacts))
         start = samples.rows(followed)
-        pool = fibres(question.contact_map, names, lost, start.chart, start.places, question.domain)
+        pool = fibres(
+            question.contact_map, names, lost, start.chart, start.contacts, question.domain
+        )
         own = pool._replace(sample=followed[pool.sample])
     else:
         tried = np.arange(len(samples.chart))
-        own = twins(question.contact_map, names, samples.chart, samples.places, question.domain)
-        pool = _searched(question, names, own, local.beside)
+        own = twins(question.contact_map, names, samples.chart, samples.contacts, question.domain)
+        pool = _searched(question, names, own, local.near_folds)
         on_surface = _on_plane(question, names, span)
     own, pool = (p.rows(p.apart >= question.separation) for p in (own, pool))
     twin = _twinned(question, own)
@@ -196,37 +214,30 @@ def answer(question: Question, names: tuple[str, ...], resolution: bool) -> Answ
     probed, hit = tried, twin[None, :, tried]
     if resolution and lost is None:
         probed = question.probed
-        hit = ambiguous(
-            question.contact_map,
-            names,
-            samples.places.rows(probed),
-            twin[:, probed],
-            span,
-            question.regions,
-            question.separation,
-            question.cone,
-            question.domain,
-        )
-    shares, surface_angle = _shares(question, hit if resolution else None, probed, verdict)
-    return Answer(
-        verdict=verdict,
-        critical_cone=np.array([cell.critical_cone for cell in cells]),
-        local=local,
-        twin_share=_weighted(question, twin[:, tried], tried),
-        ambiguous=shares,
-        surface_angle=surface_angle,
-        witnesses=[cell.witnesses for cell in cells],
-        steps=[cell.steps for cell in cells],
-    )
+        hit = _ambiguous(question, names, samples.contacts.rows(probed), twin[:, probed], span)
+    variables = {
+        "verdict": np.array(verdict),
+        "critical_cone": np.array([cell.critical_cone for cell in cells]),
+        "minority_share": local.minority,
+        "minority_share_one_side": local.one_sided,
+        "fold_angle": local.angle,
+        "twin_share": _weighted(question, twin[:, tried], tried),
+    }
+    if resolution:
+        shares, elevation = _shares(question, hit, probed, verdict)
+        variables |= {"ambiguous_share": shares.T, "surface_angle": elevation.T}
+    return Answer(variables, [cell.witnesses for cell in cells], [cell.steps for cell in cells])
 
 
-def _searched(question: Question, names: tuple[str, ...], own: Pairs, beside: AnyArray) -> Pairs:
-    """Better twins than those of the samples, from these and from contacts beside folds.
+def _searched(
+    question: Question, names: tuple[str, ...], own: Pairs, near_folds: AnyArray
+) -> Pairs:
+    """Better twins than those of the samples, from these and from contacts near folds.
 
-    Regions that seem to have none outside the cone are searched again and again.
+    Regions that seem to have none outside the cone are searched several times.
     """
-    start = question.wide.rows(beside)
-    more = twins(question.contact_map, names, start.chart, start.places, question.domain)
+    start = question.wide.rows(near_folds)
+    more = twins(question.contact_map, names, start.chart, start.contacts, question.domain)
     pool = joined([own, more])
     rng = np.random.default_rng(question.seed)
     regions = question.regions
@@ -255,9 +266,9 @@ def _judge(
     region: str,
 ) -> _Cell:
     """Judge a region by the pairs there are, and those on the plane."""
-    nothing = pool.rows(np.zeros(0, dtype=np.int64))
-    places = question.wide.places
-    if not (places.members(region) & (places.angle > question.cone)).any():
+    nothing = pool.rows(np.flatnonzero(pool.apart < 0.0))
+    contacts = question.wide.contacts
+    if not (contacts.members(region) & (contacts.angle > question.cone)).any():
         return _Cell(EMPTY, 0.0, nothing, steps)
     pairs, critical = _confirmed(question, names, pool.rows(pool.members(region)), steps)
     if critical > question.cone:
@@ -281,37 +292,32 @@ def _confirmed(
     """
     order = np.argsort(-pairs.angle, kind="stable")
     tried = _chosen(question, pairs, _CONFIRMED)
-    kept: list[Pairs] = []
-    critical = 0.0
+    nothing = pairs.rows(order[:0])
     for start in range(0, _ROUNDS * _CONFIRMED, _CONFIRMED):
         tried = joined([tried, pairs.rows(order[start : start + _CONFIRMED])])
         if not len(tried.apart):
             break
         stays, angle = confirmed(question.contact_map, names, tried, steps, question.separation)
         if stays.any():
-            kept.append(tried.rows(stays))
-            critical = float(angle[stays].max())
-            break
-        tried = tried.rows(np.zeros(0, dtype=np.int64))
-    return joined(kept) if kept else pairs.rows(np.zeros(0, dtype=np.int64)), critical
+            return tried.rows(stays), float(angle[stays].max())
+        tried = nothing
+    return nothing, 0.0
 
 
-def _some(question: Question, samples: Samples) -> AnyArray:
-    """A few samples outside the cone, of every region."""
-    outside = samples.places.angle > question.cone
-    rows: set[int] = set()
-    for region in question.regions:
-        rows.update(np.flatnonzero(samples.places.members(region) & outside)[:_FOLLOWED].tolist())
-    return np.array(sorted(rows), dtype=np.int64)
+def _some(question: Question, contacts: ContactSet) -> AnyArray:
+    """A few contacts outside the cone, of every region."""
+    outside = np.flatnonzero(contacts.angle > question.cone)
+    return _first_of_regions(question, contacts, outside)
 
 
-def _farthest(question: Question, samples: Samples) -> AnyArray:
-    """The samples farthest from rest, of every region."""
-    order = np.argsort(-samples.places.angle, kind="stable")
-    rows: set[int] = set()
-    for region in question.regions:
-        rows.update(order[samples.places.members(region)[order]][:_FOLLOWED].tolist())
-    return np.array(sorted(rows), dtype=np.int64)
+def _farthest(question: Question, contacts: ContactSet) -> AnyArray:
+    """The contacts farthest from rest, of every region."""
+    return _first_of_regions(question, contacts, np.argsort(-contacts.angle, kind="stable"))
+
+
+def _first_of_regions(question: Question, contacts: ContactSet, order: AnyArray) -> AnyArray:
+    chosen = [order[contacts.members(region)[order]][:_FOLLOWED] for region in question.regions]
+    return np.unique(np.concatenate(chosen))
 
 
 def _on_plane(question: Question, names: tuple[str, ...], span: Array) -> tuple[Pairs, int] | None:
@@ -319,11 +325,12 @@ def _on_plane(question: Question, names: tuple[str, ...], span: Array) -> tuple[
     if question.plane is None:
         return None
     plane = question.plane
-    lost = deficient(question.contact_map, names, plane.places.contacts, span)
+    lost = deficient(question.contact_map, names, plane.contacts.xi, span)
     if lost is None:
         return None
-    start = plane.rows(np.union1d(_some(question, plane), _farthest(question, plane)))
-    found = fibres(question.contact_map, names, lost, start.chart, start.places, question.domain)
+    followed = np.union1d(_some(question, plane.contacts), _farthest(question, plane.contacts))
+    start = plane.rows(followed)
+    found = fibres(question.contact_map, names, lost, start.chart, start.contacts, question.domain)
     return found.rows(found.apart >= question.separation), lost
 
 
@@ -352,29 +359,110 @@ def _twinned(question: Question, pairs: Pairs) -> AnyArray:
 
 def _weighted(question: Question, hit: AnyArray, rows: AnyArray) -> Array:
     """Share of each region's volume outside the cone, (..., regions), that is hit."""
-    places, volume = question.samples.places.rows(rows), question.samples.volume[rows]
-    outside = places.angle > question.cone
+    contacts, volume = question.samples.contacts.rows(rows), question.samples.volume[rows]
+    outside = contacts.angle > question.cone
     out = np.full(hit.shape[:-1], np.nan)
     for i, region in enumerate(question.regions):
-        weight = volume * (places.members(region) & outside)
+        weight = volume * (contacts.members(region) & outside)
         if weight.sum() > 0.0:
             out[..., i] = (hit[..., i, :] * weight).sum(axis=-1) / weight.sum()
     return out
 
 
 def _shares(
-    question: Question, probed: AnyArray | None, rows: AnyArray, verdict: list[str]
+    question: Question, ambiguous: AnyArray, rows: AnyArray, verdict: list[str]
 ) -> tuple[Array, Array]:
-    """Ambiguous shares (tolerances, regions), and elevations from the surface they reach to."""
+    """Ambiguous shares (tolerances, regions), and their largest elevations from the surface."""
     shape = (len(TOLERANCES), len(question.regions))
-    shares, elevation = np.full(shape, np.nan), np.full(shape, np.nan)
-    if probed is None:
-        return shares, elevation
-    hit = np.broadcast_to(probed, (*shape, rows.size))
-    shares = _weighted(question, hit, rows)
-    points = question.samples.places.values[rows, 3:]
+    elevation = np.full(shape, np.nan)
+    hit = np.broadcast_to(ambiguous, (*shape, rows.size))
+    points = question.samples.contacts.values[rows, 3:]
     above = np.arcsin(np.abs(points @ question.normal) / np.linalg.norm(points, axis=1))
     for i, word in enumerate(verdict):
         if word == OFF_SURFACE:
             elevation[:, i] = (hit[:, i] * above).max(axis=1, initial=0.0)
-    return shares, elevation
+    return _weighted(question, hit, rows), elevation
+
+
+def _nothing_local(question: Question) -> Local:
+    n = len(question.regions)
+    return Local(
+        np.full(n, np.nan), np.full(n, np.nan), np.full((n, 2), np.nan), np.zeros(0, dtype=int)
+    )
+
+
+def _local(question: Question, by_contact: Array) -> Local:
+    """Where det ∂T/∂p changes its sign.
+
+    Where T collapses on the plane of a planar whisker, the sign may change there although T does
+    not fold: with M_x and M_D, for example, both of which change sign with z. So the two sides of
+    the plane are also taken separately.
+    """
+    out, samples = _nothing_local(question), question.wide
+    contacts, volume = samples.contacts, samples.volume
+    # Relative to the lengths of the gradients: how nearly they lie in a plane. det ∂p/∂ξ > 0 in Ω.
+    size = np.prod(np.linalg.norm(by_contact, axis=2), axis=1)
+    det = np.linalg.det(by_contact) / np.where(size > 0.0, size, 1.0)
+    above = contacts.values[:, 3:] @ question.normal > 0.0
+    outside = contacts.angle > question.cone
+    near: set[int] = set()
+    for i, region in enumerate(question.regions):
+        inside = contacts.members(region) & outside
+        total = volume[inside].sum()
+        if total == 0.0:
+            continue
+        out.minority[i] = volume[_rarer(det, inside, volume)[0]].sum() / total
+        rare = np.zeros(len(det), dtype=bool)
+        for side in (inside & above, inside & ~above):
+            rarer, common = _rarer(det, side, volume)
+            rare |= rarer
+            rows = np.flatnonzero(side)
+            near.update(rows[np.argsort(common * det[rows])[: _NEAR_FOLDS // 2]].tolist())
+        out.one_sided[i] = volume[rare].sum() / total
+        if rare.any():
+            out.angle[i] = contacts.angle[rare].min(), contacts.angle[rare].max()
+    return out._replace(near_folds=np.array(sorted(near), dtype=np.int64))
+
+
+def _rarer(det: Array, inside: AnyArray, volume: Array) -> tuple[AnyArray, float]:
+    """Contacts with the rarer sign, and the sign that is more common."""
+    up, down = inside & (det > 0.0), inside & (det < 0.0)
+    if volume[up].sum() < volume[down].sum():
+        return up, -1.0
+    return down, 1.0
+
+
+def _ambiguous(
+    question: Question, names: tuple[str, ...], own: ContactSet, twinned: AnyArray, span: Array
+) -> AnyArray:
+    """Whether contacts have another one, far away, with nearly the same signals.
+
+    Signals are moved to the corners and to the middles of the faces of the box of each tolerance,
+    and inverted there: (tolerances, regions, n).
+    """
+    contact_map = question.contact_map
+    signals = own.signals[:, signal_columns(names)]
+    belongs = np.stack([own.members(region) for region in question.regions])
+    out = np.zeros((len(TOLERANCES), *twinned.shape), dtype=bool)
+    active = np.flatnonzero((belongs & ~twinned).any(axis=0))
+    # From the widest on: contacts separated by a tolerance are separated by a narrower one too.
+    for t in reversed(range(len(TOLERANCES))):
+        if not active.size:
+            break
+        targets = signals[active][:, None] + TOLERANCES[t] * span * _MOVES
+        found = invert(contact_map.chart, contact_map.tree(names), names, targets.reshape(-1, 3))
+        points = found.values[:, :, 3:].reshape(active.size, -1, 3)
+        away = np.linalg.norm(points - own.values[active, None, 3:], axis=2)
+        i, j = np.nonzero(away >= question.separation)
+        other = contact_set(
+            contact_map,
+            found.contacts.reshape(active.size, -1, 3)[i, j],
+            found.values.reshape(active.size, -1, 6)[i, j],
+            question.domain,
+        )
+        for k, region in enumerate(question.regions):
+            hit = other.members(region) & (other.angle > question.cone)
+            out[t, k, active[i[hit]]] = True
+        out[t] &= belongs
+        active = active[(out[t] & ~twinned)[:, active].any(axis=0)]
+    return np.asarray(np.logical_or.accumulate(out | twinned, axis=0))

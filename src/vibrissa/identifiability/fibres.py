@@ -1,7 +1,7 @@
 """Fibres: curves of contacts with equal triplets, where a triplet has lost a dimension.
 
 A straight whisker never twists: M_x = 0 everywhere. In a whisker of one stiffness and one curvature
-the axial force and the bending moment at the base hang together, F_x = -M²/2EI for a straight
+the axial force and the bending moment at the base are related, F_x = -M²/2EI for a straight
 cylinder. Then the contacts with equal triplets form curves, which are followed along the direction
 in which the triplet does not change.
 """
@@ -13,43 +13,50 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vibrissa.contacts.contact_map import Domain
-from vibrissa.identifiability.regions import Places, place, sample, spread
-from vibrissa.identifiability.twins import AGREEMENT, Pairs, sizes, triplet_derivatives
+from vibrissa.identifiability.regions import ContactSet, contact_set, sample, spread
+from vibrissa.identifiability.twins import (
+    AGREEMENT,
+    Pairs,
+    corrected,
+    equations,
+    signal_columns,
+    triplet_derivatives,
+    units,
+)
 from vibrissa.numerics import AnyArray, Array
-from vibrissa.rod import Discretization, discretize, fold_forces, solve_forces, with_normal_force
-from vibrissa.signals import SIGNALS, circular_among, signals_of, within_turn
+from vibrissa.rod import discretize, solve_forces, with_normal_force
+from vibrissa.signals import circular_among
 
 if TYPE_CHECKING:
-    from vibrissa.contacts.contact_map import ContactMap
+    from vibrissa.contacts import ContactMap
 
 # Length of a step in units in which the chart is about one wide, and how many each way.
 _STRIDE = 0.02
 _STRIDES = 60
-_CORRECTIONS = 5
 # Singular values smaller than this share of the largest count as zero.
 _RANK = 1e-8
 # A triplet has lost a dimension if it has at all but this share of the contacts.
 _LOST = 0.99
-# Where the equations make signals depend on each other, the integration does so to its own error.
-# With so many times the steps that is below ``_RANK``.
+# Where the equations relate signals to each other, the integration does so to its own error, which
+# with so many times the steps is below ``_RANK``.
 _FINER = 8
-# How many contacts tell whether signals determine contacts at all.
+# Contacts that decide whether signals determine contacts at all.
 _TRIED = 256
 
 
 def determining(contact_map: ContactMap, names: tuple[str, ...]) -> bool:
-    """Tell whether signals determine contacts, but for single ones."""
-    places = sample(contact_map, spread(_TRIED, seed=0), "reachable").places
-    which = [SIGNALS.index(name) for name in names]
+    """Whether signals determine contacts, but for single ones."""
+    contacts = sample(contact_map, spread(_TRIED, seed=0), "reachable").contacts
+    which = signal_columns(names)
     circular = circular_among(names)
-    span = np.where(circular, 2.0 * np.pi, np.ptp(places.signals[:, which], axis=0))
-    return deficient(contact_map, names, places.contacts, span) is None
+    span = np.where(circular, 2.0 * np.pi, np.ptp(contacts.signals[:, which], axis=0))
+    return deficient(contact_map, names, contacts.xi, span) is None
 
 
 def deficient(
     contact_map: ContactMap, names: tuple[str, ...], xi: Array, span: Array
 ) -> int | None:
-    """Whether a triplet has lost a dimension at contacts, but for rounding."""
+    """Number of steps with which a triplet has lost a dimension at contacts; None if it has not."""
     # A signal without a range is zero everywhere, but for rounding.
     weight = np.where(span > _RANK, 1.0 / np.maximum(span, _RANK), 0.0)
     unit = units(contact_map, xi)
@@ -68,21 +75,21 @@ def fibres(
     names: tuple[str, ...],
     steps: int,
     chart: Array,
-    first: Places,
+    first: ContactSet,
     domain: Domain,
 ) -> Pairs:
     """Follow the curves of equal triplets through contacts where these have lost a dimension."""
     d = discretize(contact_map.whisker, steps)
-    values, _ = solve_forces(d, with_normal_force(first.contacts))
-    first = place(contact_map, first.contacts, values, domain)
-    targets = first.signals[:, [SIGNALS.index(name) for name in names]]
-    unit = units(contact_map, first.contacts)
+    values, _ = solve_forces(d, with_normal_force(first.xi))
+    first = contact_set(contact_map, first.xi, values, domain)
+    targets = first.signals[:, signal_columns(names)]
+    unit = units(contact_map, first.xi)
     rows, found = [], []
     for sense in (1.0, -1.0):
-        running, xi = np.arange(len(chart)), first.contacts
+        running, xi = np.arange(len(chart)), first.xi
         direction = np.full(xi.shape, np.nan)
         for _ in range(_STRIDES):
-            _, slope, _ = _equations(d, names, xi, targets[running])
+            _, slope, _ = equations(d, names, xi, targets[running])
             direction = _along(slope * unit[running, None, :], direction, sense)
             xi = xi + _STRIDE * direction * unit[running]
             xi, values, misfit = corrected(d, names, xi, targets[running], unit[running])
@@ -94,7 +101,7 @@ def fibres(
             found.append(np.concatenate([xi, values[stays]], axis=1))
     row = np.concatenate(rows) if rows else np.zeros(0, dtype=np.int64)
     both = np.concatenate(found) if found else np.zeros((0, 9))
-    second = place(contact_map, both[:, :3], both[:, 3:], domain)
+    second = contact_set(contact_map, both[:, :3], both[:, 3:], domain)
     apart = np.linalg.norm(second.values[:, 3:] - first.values[row, 3:], axis=1)
     return Pairs(chart[row], row, first.rows(row), second, apart)
 
@@ -109,42 +116,6 @@ def _along(slope: Array, before: Array, sense: float) -> Array:
     fresh = np.isnan(before).any(axis=1)
     turned[fresh] = sense * rows[fresh, 2]
     return np.asarray(turned / np.linalg.norm(turned, axis=1, keepdims=True))
-
-
-def corrected(
-    discretization: Discretization, names: tuple[str, ...], xi: Array, targets: Array, unit: Array
-) -> tuple[Array, Array, Array]:
-    """Move contacts the least way to where they have given signals (Gauss and Newton)."""
-    for _ in range(_CORRECTIONS):
-        away, slope, _ = _equations(discretization, names, xi, targets)
-        inverse = np.linalg.pinv(slope * unit[:, None, :], rcond=1e-6)
-        xi = xi - np.einsum("nij,nj->ni", inverse, away) * unit
-    away, _, values = _equations(discretization, names, xi, targets)
-    # Where a fibre comes to rest nothing is left to compare with: infinitely far off.
-    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-        misfit = np.abs(away / sizes(values, names)).max(axis=1)
-    return xi, values, np.where(np.isfinite(misfit), misfit, np.inf)
-
-
-def units(contact_map: ContactMap, xi: Array) -> Array:
-    """What a change of each unknown is small beside (n, 3): L, and the fold force there."""
-    force = fold_forces(contact_map.chart.fold, xi)
-    return np.stack([np.ones(len(xi)), force, force], axis=1)
-
-
-def _equations(
-    discretization: Discretization, names: tuple[str, ...], xi: Array, targets: Array
-) -> tuple[Array, Array, Array]:
-    """T(ξ) - target (n, 3), ∂T/∂ξ (n, 3, 3) and (F, p) (n, 6)."""
-    which = [SIGNALS.index(name) for name in names]
-    values, tangents = solve_forces(discretization, with_normal_force(xi), tangents=True)
-    force, point = values[:, :3], values[:, 3:]
-    away = signals_of(force, np.cross(point, force))[:, which] - targets
-    return (
-        within_turn(away, circular_among(names)),
-        triplet_derivatives(values, tangents, names),
-        values,
-    )
 
 
 def _stable(contact_map: ContactMap, xi: Array) -> AnyArray:

@@ -1,4 +1,4 @@
-"""Contacts and the regions that they lie in: what the search for twins works on.
+"""Contacts with the regions that they belong to: what the search for twins works on.
 
 All arrays are non-dimensional (lengths over L, forces over EI/L²), as in :mod:`vibrissa.rod`.
 """
@@ -23,25 +23,31 @@ from vibrissa.rod import (
 from vibrissa.signals import concave_backward, cone_angle, in_region, signals_of
 
 if TYPE_CHECKING:
-    from vibrissa.contacts.contact_map import ContactMap
+    from vibrissa.contacts import ContactMap
 
-# Directions have no value at zero force: samples stay off it.
+# Directions have no value at zero force: samples are kept off it.
 _LEAST_LOAD = 0.01
+# Step of the derivatives of the chart, a cube root of rounding.
+_STEP = 1e-6
 
 
-class Places(NamedTuple):
-    """Contacts with the regions they lie in."""
+class ContactSet(NamedTuple):
+    """Contacts with the regions they belong to.
 
-    contacts: Array
+    ξ (n, 3); (F, p) (n, 6); cone angle from rest, rad; whether concave backward, deflected far, and
+    inside the domain.
+    """
+
+    xi: Array
     values: Array
     angle: Array
     backward: AnyArray
     large: AnyArray
     inside: AnyArray
 
-    def rows(self, which: AnyArray | slice) -> Places:
+    def rows(self, which: AnyArray | slice) -> ContactSet:
         """Pick some."""
-        return Places(*(a[which] for a in self))
+        return ContactSet(*(a[which] for a in self))
 
     def members(self, region: str) -> AnyArray:
         """Whether each belongs to a region, whatever its angle."""
@@ -55,38 +61,37 @@ class Places(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """Places spread over Ω.
+    """Contacts spread over Ω.
 
-    chart (n, 3): (η, ψ, ρ); places; tangents ∂(F, p)/∂ξ (n, 6, 3); volume (n,): each one's share of
-    the contact points' space, up to a common factor.
+    Chart coordinates (η, ψ, ρ) (n, 3); the contacts; ∂(F, p)/∂ξ (n, 6, 3); each one's share of the
+    volume of contact points (n,), up to a common factor.
     """
 
     chart: Array
-    places: Places
+    contacts: ContactSet
     tangents: Array
     volume: Array
 
     def rows(self, which: AnyArray | slice) -> Samples:
         """Pick some."""
         return Samples(
-            self.chart[which], self.places.rows(which), self.tangents[which], self.volume[which]
+            self.chart[which], self.contacts.rows(which), self.tangents[which], self.volume[which]
         )
 
 
-def place(contact_map: ContactMap, xi: Array, values: Array, domain: Domain) -> Places:
+def contact_set(contact_map: ContactMap, xi: Array, values: Array, domain: Domain) -> ContactSet:
     """Find the regions of contacts ξ (n, 3) with known (F, p) (n, 6)."""
     whisker, d = contact_map.whisker, contact_map.chart.discretization
     points = values[:, 3:] * d.length
-    tangent = contact_tangents(d, with_normal_force(xi))
     inside = np.ones(len(xi), dtype=bool)
     if domain == "paper":
         inside = within_paper_bounds(whisker, points)
-    return Places(
-        contacts=xi,
+    return ContactSet(
+        xi=xi,
         values=values,
         angle=cone_angle(whisker, points),
         backward=concave_backward(whisker, points),
-        large=tangent[:, 0] < 0.0,
+        large=contact_tangents(d, with_normal_force(xi))[:, 0] < 0.0,
         inside=inside,
     )
 
@@ -96,12 +101,12 @@ def sample(contact_map: ContactMap, chart: Array, domain: Domain) -> Samples:
     fold, d = contact_map.chart.fold, contact_map.chart.discretization
     xi = contacts_at(fold, chart)
     values, tangents = solve_forces(d, with_normal_force(xi), tangents=True)
-    places = place(contact_map, xi, values, domain)
-    # The chart knows the fold to a part in a million: what lies beyond it does not count.
+    contacts = contact_set(contact_map, xi, values, domain)
+    # The chart has the fold to a part in a million: contacts beyond it do not count.
     stable = determinant(tangents) > 0.0
-    by_chart = np.linalg.det(tangents[:, 3:] @ _frames(fold, chart))
+    by_chart = np.linalg.det(tangents[:, 3:] @ _chart_derivatives(fold, chart))
     return Samples(
-        chart, places._replace(inside=places.inside & stable), tangents, np.abs(by_chart)
+        chart, contacts._replace(inside=contacts.inside & stable), tangents, np.abs(by_chart)
     )
 
 
@@ -123,11 +128,10 @@ def in_chart(chart: Array) -> Array:
     return chart
 
 
-def _frames(fold: Fold, chart: Array) -> Array:
+def _chart_derivatives(fold: Fold, chart: Array) -> Array:
     """∂ξ/∂(η, ψ, ρ), (n, 3, 3), by central differences of the chart itself."""
-    columns = []
-    for axis in range(3):
-        step = np.zeros(3)
-        step[axis] = 1e-6
-        columns.append((contacts_at(fold, chart + step) - contacts_at(fold, chart - step)) / 2e-6)
+    columns = [
+        (contacts_at(fold, chart + step) - contacts_at(fold, chart - step)) / (2.0 * _STEP)
+        for step in _STEP * np.eye(3)
+    ]
     return np.stack(columns, axis=-1)

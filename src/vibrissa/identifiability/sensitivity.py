@@ -1,17 +1,22 @@
-"""How far the contact point moves when a signal at the base changes.
+"""How far the contact point moves when a signal at the base changes, and the best triplet.
 
-Three signals T locate the contact point p, so ∂p/∂T says what a small change of a signal, or its
-noise, does to the estimate: noise of covariance Σ spreads p by ∂p/∂T Σ (∂p/∂T)ᵀ, an ellipsoid. The
-derivatives are exact (:mod:`vibrissa.contacts.jacobian`); for those of Huet, Emnett & Hartmann
-(2022) on an interpolated table see :func:`vibrissa.paper.central_differences`.
+Three signals T locate the contact point p, so ∂p/∂T is the effect of a small change of a signal on
+the estimate: noise of covariance Σ spreads p by ∂p/∂T Σ (∂p/∂T)ᵀ, an ellipsoid. The derivatives are
+exact (:mod:`vibrissa.contacts.jacobian`); for those of Huet, Emnett & Hartmann (2022) on an
+interpolated table see :func:`vibrissa.paper.central_differences`.
 
 Toward rest, where force and moment vanish and directions lose their meaning, the derivatives grow
 without bound. They are given there all the same; summaries leave out contacts within 2° of rest, as
 the paper does.
+
+The best triplet of a contact is the one with the smallest RMS 3D error predicted from the sensor's
+noise, the square root of the trace of that covariance. It is about small errors: whether another
+contact far away has the same signals is decided by the uniqueness of the triplet.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,14 +30,21 @@ from vibrissa.contacts.chosen_contacts import (
 )
 from vibrissa.contacts.contact_map import spherical, within_paper_bounds
 from vibrissa.contacts.jacobian import contact_signal_derivatives, spherical_derivatives
-from vibrissa.contacts.noise import Noise, SensorNoise, ellipsoids
-from vibrissa.numerics import Array
+from vibrissa.contacts.noise import Noise, SensorNoise, ellipsoids, rms_error
+from vibrissa.numerics import Array, contact_weights, weighted_quantile
 from vibrissa.quantities import attributes, quantity
-from vibrissa.signals import base_signals, concave_backward, nearest_on_rest, selection, within_cone
+from vibrissa.signals import (
+    TRIPLETS,
+    base_signals,
+    concave_backward,
+    nearest_on_rest,
+    selection,
+    within_cone,
+)
 from vibrissa.status import flag_attributes
 
 if TYPE_CHECKING:
-    from vibrissa.contacts.contact_map import ContactMap
+    from vibrissa.contacts import ContactMap
 
 
 def sensitivity(
@@ -51,8 +63,8 @@ def sensitivity(
     triplet : str or tuple of str
         The three signals.
     at : Dataset, DataTree, mapping, array_like, "grid" or None
-        Which contacts: None, the nodes of the map, all over Ω; ``"grid"``, the reachable ones of
-        the paper's grid; contact points (..., 3) in the whisker frame, m; or a recording, or any
+        Contacts: None, the nodes of the map, all over Ω; ``"grid"``, the reachable ones of the
+        paper's grid; contact points (..., 3) in the whisker frame, m; or a recording, or any
         dataset with ``contact_point_whisker``, or else ``force`` and ``moment``, or else the
         signals of the triplet, which locate the contacts.
     noise : mapping or (6, 6) array_like, optional
@@ -88,7 +100,7 @@ def sensitivity(
     sensor = None if noise is None else SensorNoise.of(noise, names)
     chosen = chosen_contacts(contact_map, at, names)
     d = contact_map.chart.discretization
-    out = contacts_dataset(contact_map, chosen)
+    out = _labelled(contact_map, chosen)
     point = chosen.values[:, 3:] * d.length
     by_signal = contact_signal_derivatives(d, chosen.values, chosen.tangents, names)
     in_sphere = spherical_derivatives(point) @ by_signal
@@ -96,7 +108,7 @@ def sensitivity(
         ("sensitivity", in_sphere, ("coordinate", ("r", "theta", "phi")), "spherical coordinates"),
         ("point_sensitivity", by_signal, ("space", ("x", "y", "z")), "the contact point"),
     ):
-        out = out.merge(_matrix(name, matrix, chosen, rows, names, long_name))
+        out = out.merge(_jacobian(name, matrix, chosen, rows, names, long_name))
     out.attrs |= {"triplet": " ".join(names), "method": "exact"}
     if sensor is not None:
         force = chosen.values[:, :3] * d.force
@@ -106,8 +118,8 @@ def sensitivity(
     return out
 
 
-def contacts_dataset(contact_map: ContactMap, chosen: ChosenContacts) -> xr.Dataset:
-    """Label contacts: where they are, what they feel like, in which regions they lie."""
+def _labelled(contact_map: ContactMap, chosen: ChosenContacts) -> xr.Dataset:
+    """Contacts with their points, signals and regions."""
     d, whisker = contact_map.chart.discretization, contact_map.whisker
     force, point = chosen.values[:, :3] * d.force, chosen.values[:, 3:] * d.length
     known = np.isfinite(point).all(axis=1)
@@ -148,7 +160,7 @@ def _flag(long_name: str) -> dict[str, str]:
     return {"units": "1", "long_name": long_name}
 
 
-def _matrix(
+def _jacobian(
     name: str,
     matrix: Array,
     chosen: ChosenContacts,
@@ -156,7 +168,7 @@ def _matrix(
     names: tuple[str, ...],
     long_name: str,
 ) -> xr.Dataset:
-    """One Jacobian (n, 3, 3), the unit of each entry beside it."""
+    """One Jacobian (n, 3, 3), with the unit of each entry."""
     dim, labels = rows
     units = [[_per(quantity(a).unit, quantity(b).unit) for b in names] for a in labels]
     unit = "unit" if name == "sensitivity" else "point_unit"
@@ -170,3 +182,97 @@ def _matrix(
 
 def _per(above: str, below: str) -> str:
     return f"{above}/({below})" if " " in below else f"{above}/{below}"
+
+
+def best_triplet(
+    contact_map: ContactMap,
+    noise: Noise,
+    at: At = None,
+    *,
+    triplets: Sequence[str | tuple[str, ...]] = TRIPLETS,
+) -> xr.Dataset:
+    """Find, contact by contact, the triplet with the smallest predicted 3D error.
+
+    Parameters
+    ----------
+    contact_map : ContactMap
+        The whisker's map.
+    noise : mapping or (6, 6) array_like
+        Standard deviation of each signal, or covariance of (F, M), SI units.
+    at : Dataset, DataTree, mapping, array_like, "grid" or None
+        Contacts, as for :func:`~vibrissa.sensitivity`: all over Ω by default. From signals
+        contacts are found with (Fx, MB, MD).
+    triplets : sequence
+        Triplets that compete; all twenty by default.
+
+    Returns
+    -------
+    Dataset
+        ``predicted_error`` (triplet, ...), m, NaN where the triplet does not determine the contact;
+        ``best`` (...), the triplet with the least, empty where none does; for each triplet, over
+        the contacts outside the cone of 2° about rest: ``share`` where it is best, ``determined``
+        where it determines the contact at all, ``median_error`` where it does, and
+        ``median_error_where_best``. Shares are of the volume of contact points, where contacts
+        sample space, or of contacts. With them the variables of contacts
+        that :func:`~vibrissa.sensitivity` gives.
+
+    Raises
+    ------
+    ValueError
+        If triplets, contacts or noise do not fit.
+    """
+    chosen_names = [selection(triplet, exactly=3) for triplet in triplets]
+    if not chosen_names:
+        raise ValueError("at least one triplet is needed; got none")
+    sensor = SensorNoise.of(noise, tuple(dict.fromkeys(n for t in chosen_names for n in t)))
+    chosen = chosen_contacts(contact_map, at)
+    errors = np.stack([_errors(contact_map, chosen, names, sensor) for names in chosen_names])
+    labels = np.array([" ".join(names) for names in chosen_names])
+    known = np.isfinite(errors).any(axis=0)
+    winner = np.where(known, np.argmin(np.where(np.isfinite(errors), errors, np.inf), axis=0), -1)
+    data = _labelled(contact_map, chosen)
+    weight = contact_weights(data)
+    wins = winner == np.arange(len(labels))[:, None]
+    finite = np.isfinite(errors)
+    total = weight.sum()
+    with np.errstate(invalid="ignore"):
+        summaries = {
+            "share": (wins @ weight / total, "share of contacts where the triplet is best"),
+            "determined": (finite @ weight / total, "share where it determines the contact"),
+        }
+    medians = {
+        "median_error": np.array([weighted_quantile(e, weight) for e in errors]),
+        "median_error_where_best": np.array(
+            [weighted_quantile(e, weight * w) for e, w in zip(errors, wins, strict=True)]
+        ),
+    }
+    best = np.where(known, labels[winner], "").reshape(chosen.shape)
+    return data.assign(
+        {
+            "predicted_error": (
+                ("triplet", *chosen.dims),
+                errors.reshape(-1, *chosen.shape),
+                attributes("predicted_error"),
+            ),
+            "best": (chosen.dims, best, {"units": "1", "long_name": "triplet of least error"}),
+            **{
+                name: ("triplet", values, {"units": "1", "long_name": long_name})
+                for name, (values, long_name) in summaries.items()
+            },
+            **{name: ("triplet", v, attributes("predicted_error")) for name, v in medians.items()},
+        }
+    ).assign_coords(triplet=labels)
+
+
+def _errors(
+    contact_map: ContactMap,
+    chosen: ChosenContacts,
+    names: tuple[str, ...],
+    sensor: SensorNoise,
+) -> Array:
+    """Predicted RMS 3D errors (n,), m; NaN where the triplet does not determine the contact."""
+    d = contact_map.chart.discretization
+    force, point = chosen.values[:, :3] * d.force, chosen.values[:, 3:] * d.length
+    by_signal = contact_signal_derivatives(d, chosen.values, chosen.tangents, names)
+    sigma = sensor.covariance(names, force, np.cross(point, force))
+    return rms_error(by_signal @ sigma @ np.swapaxes(by_signal, -1, -2))

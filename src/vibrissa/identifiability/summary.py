@@ -12,7 +12,7 @@ from vibrissa.identifiability.evidence import NOT_UNIQUE, OFF_SURFACE, UNIQUE
 from vibrissa.io.netcdf import write_netcdf
 from vibrissa.io.paths import check_writable, replacing
 
-# What lies within what.
+# Parts of each region.
 _PARTS = {
     "all": {"ELD", "CF", "CB", "ELD CF", "ELD CB"},
     "ELD": {"ELD CF", "ELD CB"},
@@ -22,17 +22,17 @@ _PARTS = {
     "ELD CB": set(),
 }
 _MARKS = {UNIQUE: "unique", OFF_SURFACE: "unique*", NOT_UNIQUE: "–"}
-#: What verdicts are written as.
+#: Endings of files that verdicts are written to.
 ENDINGS = (".nc", ".csv")
-# By these shares two triplets that are unique over the same region are compared.
+# Tolerance whose ambiguous shares decide between triplets that are unique over the same region.
 _DECIDING = 1e-3
 
 
-def notation(verdicts: xr.DataArray) -> str:
-    """Write the verdicts of a triplet in short."""
-    word = {str(r): str(verdicts.sel(region=r).item()) for r in verdicts.region.to_numpy()}
+def notation(words: xr.DataArray) -> str:
+    """Verdicts of a triplet in short."""
+    word = {str(r): str(words.sel(region=r).item()) for r in words.region.to_numpy()}
     good = [region for region in word if word[region] in (UNIQUE, OFF_SURFACE)]
-    # A part says something new only if it is unique where the whole is so off a surface.
+    # A part adds something only if it is unique where the whole is so off a surface.
     largest = [
         region
         for region in good
@@ -45,19 +45,19 @@ def notation(verdicts: xr.DataArray) -> str:
     return " / ".join(names) or "–"
 
 
-def choice(found: xr.Dataset) -> tuple[str, str]:
-    """Choose the triplet to use, as in the paper's Fig. 1C."""
+def choice(verdicts: xr.Dataset) -> tuple[str, str]:
+    """The triplet to use, with its region, as in the paper's Fig. 1C."""
     best: tuple[float, float, float] | None = None
     chosen = ("", "")
-    share = found.region_share.to_series()
-    for triplet in found.triplet.to_numpy():
-        for region in found.region.to_numpy():
-            cell = found.sel(triplet=triplet, region=region)
+    share = verdicts.region_share.to_series()
+    for triplet in verdicts.triplet.to_numpy():
+        for region in verdicts.region.to_numpy():
+            cell = verdicts.sel(triplet=triplet, region=region)
             word = str(cell.verdict.item())
             if word not in (UNIQUE, OFF_SURFACE):
                 continue
             ambiguous = 0.0
-            if "ambiguous_share" in found:
+            if "ambiguous_share" in verdicts:
                 ambiguous = float(cell.ambiguous_share.sel(signal_tolerance=_DECIDING))
             rank = (-round(float(share[region]), 9), float(word == OFF_SURFACE), ambiguous)
             if best is None or rank < best:
@@ -65,20 +65,20 @@ def choice(found: xr.Dataset) -> tuple[str, str]:
     return chosen
 
 
-def verdict_table(found: xr.Dataset) -> str:
+def verdict_table(verdicts: xr.Dataset) -> str:
     """Write verdicts as a table for people.
 
     Parameters
     ----------
-    found : Dataset
-        From :func:`vibrissa.uniqueness`.
+    verdicts : Dataset
+        Verdicts of :func:`vibrissa.uniqueness`.
 
     Returns
     -------
     str
         A row for each triplet: the critical cone in each region, with the verdict; in short.
     """
-    rows, notes = verdict_rows(found)
+    rows, notes = verdict_rows(verdicts)
     width = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     lines = [
         "  ".join(c.ljust(w) for c, w in zip(row, width, strict=True)).rstrip() for row in rows
@@ -86,76 +86,91 @@ def verdict_table(found: xr.Dataset) -> str:
     return "\n".join([*lines, "", *notes])
 
 
-def verdict_rows(found: xr.Dataset) -> tuple[list[list[str]], list[str]]:
-    """Write verdicts as the cells of a table, with what is to be known to read it."""
-    regions = [str(r) for r in found.region.to_numpy()]
+def verdict_rows(verdicts: xr.Dataset) -> tuple[list[list[str]], list[str]]:
+    """Arrange verdicts as the cells of a table.
+
+    Parameters
+    ----------
+    verdicts : Dataset
+        Verdicts of :func:`vibrissa.uniqueness`.
+
+    Returns
+    -------
+    rows : list of list of str
+        Cells, row by row, the header first.
+    notes : list of str
+        Sentences needed to read them.
+    """
+    regions = [str(r) for r in verdicts.region.to_numpy()]
     rows = [["triplet", *regions, "in short"]]
-    for triplet in found.triplet.to_numpy():
+    for triplet in verdicts.triplet.to_numpy():
         row = [str(triplet)]
         for region in regions:
-            cell = found.sel(triplet=triplet, region=region)
+            cell = verdicts.sel(triplet=triplet, region=region)
             word = str(cell.verdict.item())
             mark = _MARKS.get(word, word)
             row.append(
                 f"{np.rad2deg(float(cell.critical_cone)):.1f}°" if word == NOT_UNIQUE else mark
             )
-        rows.append([*row, str(found.notation.sel(triplet=triplet).item())])
-    chosen, region = found.attrs["chosen_triplet"], found.attrs["chosen_region"]
+        rows.append([*row, str(verdicts.notation.sel(triplet=triplet).item())])
+    chosen, region = verdicts.attrs["chosen_triplet"], verdicts.attrs["chosen_region"]
     use = f"({chosen.replace(' ', ', ')}), unique in: {region}" if chosen else "none is unique"
-    cone = np.rad2deg(found.attrs["cone"])
+    cone = np.rad2deg(verdicts.attrs["cone"])
     return rows, [
-        f"An angle: not unique; twins exist that far from rest. *: off {_surface(found)}.",
-        f"Contacts within {cone:.3g}° of rest left out; domain: {found.attrs['domain']}; contacts "
-        f"nearer than {1e3 * found.attrs['min_separation']:.3g} mm count as one.",
+        f"An angle: not unique; twins exist that far from rest. *: off {_surface(verdicts)}.",
+        f"Contacts within {cone:.3g}° of rest left out; domain: {verdicts.attrs['domain']}; "
+        f"contacts nearer than {1e3 * verdicts.attrs['min_separation']:.3g} mm count as one.",
         f"The triplet to use: {use}.",
     ]
 
 
-def _surface(found: xr.Dataset) -> str:
-    names = sorted({str(s) for s in found.surface.to_numpy().ravel()} - {""})
+def _surface(verdicts: xr.Dataset) -> str:
+    names = sorted({str(s) for s in verdicts.surface.to_numpy().ravel()} - {""})
     return " or ".join(names) or "a surface of measure zero"
 
 
-def save_uniqueness(found: xr.Dataset, path: str | PathLike[str]) -> None:
+def save_uniqueness(verdicts: xr.Dataset, path: str | PathLike[str]) -> None:
     """Write verdicts with their evidence.
 
     Parameters
     ----------
-    found : Dataset
-        From :func:`vibrissa.uniqueness`.
+    verdicts : Dataset
+        Verdicts of :func:`vibrissa.uniqueness`.
     path : str or path
-        ``.nc``: everything, as NetCDF; ``.csv``: a row for each triplet and region, the evidence in
-        columns, angles in rad and lengths in m, of the witnesses the first.
+        File: ``.nc``, everything, as NetCDF; or ``.csv``, a row for each triplet and
+        region, the evidence in columns, angles in rad and lengths in m, of the witnesses the first.
 
     Raises
     ------
     ValueError
-        If the file's ending is another.
+        If the file's ending is another one.
     """
     path = Path(path)
     check_writable(path, ENDINGS)
     if path.suffix == ".nc":
-        write_netcdf(path, found)
+        write_netcdf(path, verdicts)
     else:
         with replacing(path) as part:
-            part.write_text(_rows(found), encoding="utf-8")
+            part.write_text(_rows(verdicts), encoding="utf-8")
 
 
-def _rows(found: xr.Dataset) -> str:
-    plain = [n for n, v in found.data_vars.items() if v.dims == ("triplet", "region")]
+def _rows(verdicts: xr.Dataset) -> str:
+    plain = [n for n, v in verdicts.data_vars.items() if v.dims == ("triplet", "region")]
     header = ["triplet", "region", *map(str, plain)]
-    spread = [n for n in ("ambiguous_share", "surface_angle") if n in found]
-    header += [f"{n}_{t:g}" for n in spread for t in found.signal_tolerance.to_numpy()]
-    trained: list[float] = found["quantile"].values.tolist() if "network_error" in found else []
+    spread = [n for n in ("ambiguous_share", "surface_angle") if n in verdicts]
+    header += [f"{n}_{t:g}" for n in spread for t in verdicts.signal_tolerance.to_numpy()]
+    trained: list[float] = (
+        verdicts["quantile"].values.tolist() if "network_error" in verdicts else []
+    )
     header += [f"network_error_{q:g}" for q in trained]
     header += ["witness_separation", "witness_difference"]
     header += [
         f"witness_{v}_{i}" for i in (1, 2) for v in ("arc_length", "fy", "fz", "x", "y", "z")
     ]
     lines = [",".join(header)]
-    for triplet in found.triplet.to_numpy():
-        for region in found.region.to_numpy():
-            cell = found.sel(triplet=triplet, region=region)
+    for triplet in verdicts.triplet.to_numpy():
+        for region in verdicts.region.to_numpy():
+            cell = verdicts.sel(triplet=triplet, region=region)
             first = cell.isel(witness=0)
             values = [cell[n].item() for n in plain]
             values += [float(x) for n in spread for x in cell[n].to_numpy()]

@@ -1,8 +1,10 @@
-"""Twins: contacts far apart that give the same three signals.
+"""Twins: contacts far apart that have the same three signals.
 
 Where the map ξ → T is regular, all contacts with the triplet of a given one are found exactly
 (:mod:`vibrissa.contacts.inversion`); those far from it are its twins. Where it is not, see
-:mod:`vibrissa.identifiability.fibres`.
+:mod:`vibrissa.identifiability.fibres`. Where the integration errs by more than the signals differ,
+two contacts can agree on the rod as it is discretised and not in truth: a pair counts only if it is
+found again on a finer rod.
 """
 
 from __future__ import annotations
@@ -13,33 +15,58 @@ import numpy as np
 
 from vibrissa.contacts.contact_map import Domain
 from vibrissa.contacts.inversion import invert
-from vibrissa.identifiability.regions import Places, in_chart, place, sample
+from vibrissa.identifiability.regions import ContactSet, contact_set, in_chart, sample
 from vibrissa.numerics import AnyArray, Array
-from vibrissa.rod import chart_of, solve_forces, with_normal_force
-from vibrissa.signals import SIGNALS, signal_derivatives, within_turn
+from vibrissa.rod import (
+    Discretization,
+    chart_of,
+    discretize,
+    fold_forces,
+    solve_forces,
+    with_normal_force,
+)
+from vibrissa.signals import (
+    SIGNALS,
+    circular_among,
+    cone_angle,
+    signal_derivatives,
+    signals_of,
+    within_turn,
+)
 
 if TYPE_CHECKING:
-    from vibrissa.contacts.contact_map import ContactMap
+    from vibrissa.contacts import ContactMap
 
-#: Signals of twins agree to this, forces relative to |F| and moments to |M|, angles in rad.
+#: Agreement of twins' signals: forces relative to |F|, moments to |M|, angles in rad.
 AGREEMENT = 1e-10
-# A solution that such a difference of the signals could move by more than this (over L) is not
-# told apart from its neighbours.
+#: Factor by which the rod is finer on which pairs are found again.
+FINER = 4
+# A pair is confirmed if its second contact moves by less than this share of their distance.
+_STEADY = 0.2
+# A solution that ``AGREEMENT`` could move by more than this (over L) is not distinct from its
+# neighbours.
 _FIRM = 1e-3
-# Nearer than this (over L) two solutions are the same contact.
+# Two solutions nearer than this (over L) are the same contact.
 _SAME = 1e-4
 # The search for better twins starts wide, ends fine, and keeps so many of each region.
 _WIDTHS = np.geomspace(0.2, 0.002, 16)
 _KEPT = 16
+# Gauss-Newton steps that bring a contact back to given signals, and singular values that count.
+_CORRECTIONS = 5
+_RCOND = 1e-6
 
 
 class Pairs(NamedTuple):
-    """Pairs of contacts with equal triplets."""
+    """Pairs of contacts with equal triplets.
+
+    Chart coordinates of the first (n, 3); number of the sample it came from (n,); both contacts;
+    their distance over L (n,).
+    """
 
     chart: Array
     sample: AnyArray
-    first: Places
-    second: Places
+    first: ContactSet
+    second: ContactSet
     apart: Array
 
     def rows(self, which: AnyArray) -> Pairs:
@@ -67,40 +94,44 @@ def joined(parts: list[Pairs]) -> Pairs:
     return Pairs(
         np.concatenate([p.chart for p in parts]),
         np.concatenate([p.sample for p in parts]),
-        Places(*(np.concatenate(a) for a in zip(*(p.first for p in parts), strict=True))),
-        Places(*(np.concatenate(a) for a in zip(*(p.second for p in parts), strict=True))),
+        ContactSet(*(np.concatenate(a) for a in zip(*(p.first for p in parts), strict=True))),
+        ContactSet(*(np.concatenate(a) for a in zip(*(p.second for p in parts), strict=True))),
         np.concatenate([p.apart for p in parts]),
     )
 
 
+def signal_columns(names: tuple[str, ...]) -> list[int]:
+    """Columns of signals among the six."""
+    return [SIGNALS.index(name) for name in names]
+
+
 def triplet_derivatives(values: Array, tangents: Array, names: tuple[str, ...]) -> Array:
     """∂T/∂ξ (n, k, 3); zero where a direction has no value."""
-    which = [SIGNALS.index(name) for name in names]
-    return np.asarray(np.nan_to_num(signal_derivatives(values, tangents)[:, which]))
+    return np.asarray(np.nan_to_num(signal_derivatives(values, tangents)[:, signal_columns(names)]))
 
 
 def twins(
     contact_map: ContactMap,
     names: tuple[str, ...],
     chart: Array,
-    first: Places,
+    first: ContactSet,
     domain: Domain,
     least: float = _SAME,
 ) -> Pairs:
     """Find all twins of contacts."""
-    which = [SIGNALS.index(name) for name in names]
-    found = invert(contact_map.chart, contact_map.tree(names), names, first.signals[:, which])
+    targets = first.signals[:, signal_columns(names)]
+    found = invert(contact_map.chart, contact_map.tree(names), names, targets)
     apart = np.linalg.norm(found.values[:, :, 3:] - first.values[:, None, 3:], axis=2)
     rows, columns = np.nonzero(apart >= least)  # NaN is not
     xi, values = found.contacts[rows, columns], found.values[rows, columns]
     firm = _firm(contact_map, names, xi)
     rows, columns, xi, values = rows[firm], columns[firm], xi[firm], values[firm]
-    second = place(contact_map, xi, values, domain)
+    second = contact_set(contact_map, xi, values, domain)
     return Pairs(chart[rows], rows, first.rows(rows), second, apart[rows, columns])
 
 
 def _firm(contact_map: ContactMap, names: tuple[str, ...], xi: Array) -> AnyArray:
-    """Whether solutions stay where they are when their signals change by ``AGREEMENT``."""
+    """Whether solutions hardly move when their signals change by ``AGREEMENT``."""
     values, tangents = solve_forces(
         contact_map.chart.discretization, with_normal_force(xi), tangents=True
     )
@@ -121,23 +152,24 @@ def better_twins(
     domain: Domain,
     rng: np.random.Generator,
 ) -> Pairs:
-    """Look for twins farther from rest than those known, near them.
+    """Look for twins farther from rest than those found, near them.
 
     An evolution: the pairs of each region that are farthest apart, and among those far enough
-    apart farthest from rest, are varied, ever more finely, and whatever twins the varied contacts
-    have compete with them.
+    apart farthest from rest, are varied, ever more finely, and the twins of the varied contacts
+    compete with them.
     """
     best = _best(pairs, regions, separation)
     for width in _WIDTHS:
         if not len(best.apart):
             break
-        both = np.concatenate([best.chart, chart_of(contact_map.chart.fold, best.second.contacts)])
+        both = np.concatenate([best.chart, chart_of(contact_map.chart.fold, best.second.xi)])
         noise = width * rng.standard_normal(both.shape) * [1.0, np.pi, 1.0]
         # Differences of good ones point along thin sets of them, which noise alone would miss.
         step = both[rng.permutation(len(both))] - both[rng.permutation(len(both))]
         step = within_turn(step, [False, True, False])
         chart = in_chart(np.concatenate([both + noise, both + 0.7 * step + 0.03 * noise]))
-        found = twins(contact_map, names, chart, sample(contact_map, chart, domain).places, domain)
+        varied = sample(contact_map, chart, domain).contacts
+        found = twins(contact_map, names, chart, varied, domain)
         best = _best(joined([best, found]), regions, separation)
     return best
 
@@ -147,7 +179,7 @@ def _best(pairs: Pairs, regions: tuple[str, ...], separation: float) -> Pairs:
     far = pairs.apart >= separation
     part = np.floor(pairs.chart * [4.0, 4.0 / np.pi, 4.0] - 1e-9)
     chosen: set[int] = set()
-    # Those that count, and those that promise to: far from rest, though not yet far apart.
+    # Those that count, and those that may soon: far from rest, though not yet far apart.
     for score in (
         np.where(far, pairs.angle, -1.0),
         pairs.angle * np.minimum(pairs.apart / separation, 1.0) ** 2,
@@ -161,9 +193,76 @@ def _best(pairs: Pairs, regions: tuple[str, ...], separation: float) -> Pairs:
 
 
 def sizes(values: Array, names: tuple[str, ...]) -> Array:
-    """What a difference of each signal is small beside (n, k): |F|, |M|, or 1 for directions."""
+    """Scale of a difference of each signal (n, k): |F|, |M|, or 1 for directions."""
     force = np.linalg.norm(values[:, :3], axis=1)
     moment = np.linalg.norm(np.cross(values[:, 3:], values[:, :3]), axis=1)
     one = np.ones(len(values))
-    sizes = {"Fx": force, "FT": force, "FD": one, "Mx": moment, "MB": moment, "MD": one}
-    return np.stack([sizes[name] for name in names], axis=1)
+    scales = {"Fx": force, "FT": force, "FD": one, "Mx": moment, "MB": moment, "MD": one}
+    return np.stack([scales[name] for name in names], axis=1)
+
+
+def units(contact_map: ContactMap, xi: Array) -> Array:
+    """Scale of a change of each unknown (n, 3): L, and the fold force there."""
+    force = fold_forces(contact_map.chart.fold, xi)
+    return np.stack([np.ones(len(xi)), force, force], axis=1)
+
+
+def equations(
+    discretization: Discretization, names: tuple[str, ...], xi: Array, targets: Array
+) -> tuple[Array, Array, Array]:
+    """T(ξ) - target (n, 3), ∂T/∂ξ (n, 3, 3) and (F, p) (n, 6)."""
+    values, tangents = solve_forces(discretization, with_normal_force(xi), tangents=True)
+    force, point = values[:, :3], values[:, 3:]
+    away = signals_of(force, np.cross(point, force))[:, signal_columns(names)] - targets
+    return (
+        within_turn(away, circular_among(names)),
+        triplet_derivatives(values, tangents, names),
+        values,
+    )
+
+
+def corrected(
+    discretization: Discretization, names: tuple[str, ...], xi: Array, targets: Array, unit: Array
+) -> tuple[Array, Array, Array]:
+    """Move contacts the least way to where they have given signals (Gauss and Newton)."""
+    for _ in range(_CORRECTIONS):
+        away, slope, _ = equations(discretization, names, xi, targets)
+        inverse = np.linalg.pinv(slope * unit[:, None, :], rcond=_RCOND)
+        xi = xi - np.einsum("nij,nj->ni", inverse, away) * unit
+    away, _, values = equations(discretization, names, xi, targets)
+    # Where a fibre ends at rest nothing is left to compare with: the misfit is infinite.
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        misfit = np.abs(away / sizes(values, names)).max(axis=1)
+    return xi, values, np.where(np.isfinite(misfit), misfit, np.inf)
+
+
+def found_again(
+    contact_map: ContactMap, names: tuple[str, ...], first: Array, second: Array, steps: int
+) -> tuple[Array, Array]:
+    """Solve for the second contact of each pair on a finer rod, with the first as it is.
+
+    Returns both contact points (n, 2, 3), NaN where there is no such pair, and by how much the
+    second has moved (n,), over L.
+    """
+    coarse = discretize(contact_map.whisker, steps)
+    finer = discretize(contact_map.whisker, FINER * steps)
+    at_first, _ = solve_forces(finer, with_normal_force(first))
+    before, _ = solve_forces(coarse, with_normal_force(second))
+    force, point = at_first[:, :3], at_first[:, 3:]
+    target = signals_of(force, np.cross(point, force))[:, signal_columns(names)]
+    _, values, misfit = corrected(finer, names, second, target, units(contact_map, second))
+    points = np.stack([point, values[:, 3:]], axis=1)
+    points[~(misfit <= AGREEMENT)] = np.nan
+    return points, np.linalg.norm(points[:, 1] - before[:, 3:], axis=1)
+
+
+def confirmed(
+    contact_map: ContactMap, names: tuple[str, ...], pairs: Pairs, steps: int, separation: float
+) -> tuple[AnyArray, Array]:
+    """Whether pairs are found again on a finer rod, and their cone angles there."""
+    points, moved = found_again(contact_map, names, pairs.first.xi, pairs.second.xi, steps)
+    apart = np.linalg.norm(points[:, 1] - points[:, 0], axis=1)
+    stays = (apart >= separation) & (moved <= _STEADY * apart)
+    length = contact_map.chart.discretization.length
+    angle = cone_angle(contact_map.whisker, points * length).min(axis=1)
+    return np.asarray(stays), angle

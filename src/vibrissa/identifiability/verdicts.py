@@ -1,34 +1,99 @@
 """Which signals locate a contact: verdicts on triplets, with their evidence.
 
 Two contacts with the same triplet are a *witness*: a proof that it does not locate the contact. The
-verdict on a triplet and a region says whether there are witnesses outside the cone that is left
-out; how they are searched for is told in :mod:`vibrissa.identifiability.evidence`.
+verdict on a triplet and a region is whether there are witnesses outside the cone that is left out;
+:mod:`vibrissa.identifiability.evidence` searches for them.
 
 A whisker in one plane is special. There M_x is zero and F_D and M_D are constant for all contacts
-in the plane, a surface of measure zero, so that a triplet with two of these cannot tell contacts in
-the plane from each other although it may tell all others: it is *unique off a surface*.
+in the plane, a surface of measure zero, so that a triplet with two of these cannot distinguish
+contacts in the plane although it may distinguish all others: it is *unique off a surface*.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 
 from vibrissa.contacts.contact_map import Domain, Progress
-from vibrissa.identifiability.evidence import answer, ask
-from vibrissa.identifiability.evidence_dataset import labelled
-from vibrissa.signals import CONE, REGIONS, SIGNALS, TRIPLETS, selection
+from vibrissa.identifiability.evidence import (
+    OFF_SURFACE,
+    TOLERANCES,
+    WITNESSES,
+    Answer,
+    Question,
+    answer,
+    ask,
+)
+from vibrissa.identifiability.summary import choice, notation
+from vibrissa.identifiability.twins import (
+    FINER,
+    Pairs,
+    corrected,
+    found_again,
+    signal_columns,
+    units,
+)
+from vibrissa.numerics import Array
+from vibrissa.quantities import attributes
+from vibrissa.rod import discretize
+from vibrissa.signals import CONE, REGIONS, SIGNALS, TRIPLETS, selection, signal_scales
 
 if TYPE_CHECKING:
-    from vibrissa.contacts.contact_map import ContactMap
+    from vibrissa.contacts import ContactMap
 
 #: Contacts nearer to each other than this share of the length count as one.
 SEPARATION = 0.025
-#: How many contacts are tried.
+#: Number of contacts that are tried.
 SAMPLES = 4096
+
+
+def _about(unit: str, long_name: str) -> dict[str, str]:
+    return {"units": unit, "long_name": long_name}
+
+
+# Variables over (triplet, region) and further dimensions, with their attributes.
+_VARIABLES: dict[str, tuple[tuple[str, ...], dict[str, str]]] = {
+    "verdict": ((), {"long_name": "whether the triplet locates the contact"}),
+    "critical_cone": ((), _about("rad", "smallest cone without witnesses outside it")),
+    "minority_share": ((), _about("1", "share in which det ∂T/∂p has the rarer sign")),
+    "minority_share_one_side": (
+        (),
+        _about("1", "the same with the sides of the whisker's plane separated"),
+    ),
+    "fold_angle": (
+        ("bound",),
+        _about("rad", "cone angles between which contacts have the rarer sign"),
+    ),
+    "twin_share": ((), _about("1", "share that has an exact twin")),
+    "ambiguous_share": (
+        ("signal_tolerance",),
+        _about("1", "share with another contact within the tolerance of the signals' ranges"),
+    ),
+    "surface_angle": (
+        ("signal_tolerance",),
+        _about("rad", "elevation of ambiguous contacts from the surface, the largest"),
+    ),
+}
+# Variables of witnesses, over (triplet, region, witness) and further dimensions.
+_WITNESS_VARIABLES: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {
+    "arc_length": (("pair",), attributes("arc_length")),
+    "contact_force": (
+        ("pair", "component"),
+        _about("N", "contact force across the whisker, along d1 and d2"),
+    ),
+    "point": (("pair", "space"), attributes("contact_point_whisker")),
+    "signals": (
+        ("signal",),
+        _about("N, N m or rad", "signals of both, in the order of the triplet's name"),
+    ),
+    "separation": ((), _about("m", "distance of the contact points")),
+    "difference": ((), _about("1", "largest difference of a signal, over |F|, |M| or in rad")),
+    "shift": ((), _about("m", f"move of the second contact at {FINER} times the steps")),
+}
+_SIZES = {"pair": 2, "component": 2, "space": 3, "signal": 3}
 
 
 def uniqueness(
@@ -44,32 +109,32 @@ def uniqueness(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> xr.Dataset:
-    """Tell which triplets of signals locate the contact uniquely, region by region, with evidence.
+    """Decide which triplets of signals locate the contact uniquely, by region, with evidence.
 
     Parameters
     ----------
     contact_map : ContactMap
         The whisker's map.
     triplets : "all" or sequence
-        Which of the 20 triplets: names like ``"Fx MB MD"`` or tuples of signals; or three signals.
+        Triplets, of the 20: names like ``"Fx MB MD"`` or tuples of signals; or three signals.
     regions : "all" or sequence of str
-        Which of ``"all"``, ``"ELD"`` (excluding large deflections), ``"CF"`` (concave forward),
+        Regions: ``"all"``, ``"ELD"`` (excluding large deflections), ``"CF"`` (concave forward),
         ``"CB"`` (concave backward), ``"ELD CF"``, ``"ELD CB"``; the text ``"all"`` means all six,
         a list ``["all"]`` the region of that name. Of a witness both contacts belong to the region.
     min_separation : float
-        Contact points nearer to each other than this share of the length count as one.
+        Distance, as a share of the length, below which two contact points count as one.
     cone : float
-        Contacts within this half angle about the resting whisker are left out, rad.
+        Half angle about the resting whisker within which contacts are left out, rad.
     domain : {"reachable", "paper"}
-        All stable contacts, or those within the bounds of the paper's grid.
+        Domain of contacts: all stable ones, or those within the bounds of the paper's grid.
     samples : int
-        How many contacts are tried; rounded up to a power of two.
+        Number of contacts that are tried; rounded up to a power of two.
     resolution : bool
         Whether the shares of contacts that are ambiguous within tolerances are computed too.
     seed : int
-        Of the samples and of the search.
+        Seed of the samples and of the search.
     progress : callable, optional
-        Called as ``progress(done, total)`` after each triplet.
+        Function called as ``progress(done, total)`` after each triplet.
 
     Returns
     -------
@@ -77,7 +142,7 @@ def uniqueness(
         Over ``triplet`` and ``region``: ``verdict``; ``critical_cone`` (rad): the smallest cone
         without witnesses outside; ``minority_share``: share of the region's volume in which
         det ∂T/∂p has the rarer sign, and ``minority_share_one_side`` with the two sides of the
-        whisker's plane taken apart (where T collapses on the plane, the sign may change there
+        whisker's plane separated (where T collapses on the plane, the sign may change there
         without a fold); ``fold_angle`` (rad): least and largest cone angle of contacts with the
         rarer sign on their side; ``twin_share``: share that has an exact twin;
         ``ambiguous_share``: share that has another contact farther than ``min_separation`` within
@@ -123,7 +188,7 @@ def uniqueness(
         answers.append(answer(question, triplet, resolution))
         if progress is not None:
             progress(number + 1, len(names))
-    return labelled(question, names, answers, resolution)
+    return _labelled(question, names, answers)
 
 
 def _listed(triplets: str | Sequence[str | tuple[str, ...]]) -> tuple[tuple[str, ...], ...]:
@@ -144,3 +209,120 @@ def _regions(regions: str | Sequence[str]) -> tuple[str, ...]:
     if unknown or not several or len(set(several)) < len(several):
         raise ValueError(f"regions are among {', '.join(REGIONS)}, once each; got {regions!r}")
     return tuple(several)
+
+
+def _labelled(
+    question: Question,
+    names: tuple[tuple[str, ...], ...],
+    answers: list[Answer],
+) -> xr.Dataset:
+    """All verdicts and evidence as one dataset."""
+    data: dict[str, Any] = {
+        name: (
+            ("triplet", "region", *dims),
+            np.stack([a.variables[name] for a in answers]),
+            about,
+        )
+        for name, (dims, about) in _VARIABLES.items()
+        if name in answers[0].variables
+    }
+    surfaces = np.where(data["verdict"][1] == OFF_SURFACE, _surface(question), "")
+    data["surface"] = (
+        ("triplet", "region"),
+        surfaces,
+        {"long_name": "surface on which contacts have the same signals"},
+    )
+    coords = {
+        "triplet": [" ".join(triplet) for triplet in names],
+        "region": list(question.regions),
+        "signal_tolerance": list(TOLERANCES),
+        "bound": ["least", "largest"],
+        "pair": ["first", "second"],
+        "space": ["x", "y", "z"],
+        "component": ["fy", "fz"],
+    }
+    out = xr.Dataset(data, coords=coords).merge(_witnesses(question, names, answers))
+    whisker, d = question.contact_map.whisker, question.contact_map.chart.discretization
+    out.attrs = {
+        "kind": "vibrissa uniqueness",
+        "whisker": repr(whisker),
+        "domain": question.domain,
+        "cone": question.cone,
+        "min_separation": question.separation * d.length,
+        "samples": len(question.samples.chart),
+        "steps": question.contact_map.steps,
+        "seed": question.seed,
+        "volume_shares": ", ".join(
+            f"{region} {share:.3f}"
+            for region, share in zip(question.regions, question.volumes(), strict=True)
+        ),
+    }
+    out["region_share"] = (
+        "region",
+        question.volumes(),
+        _about("1", "share of the contacts' space"),
+    )
+    out["notation"] = (
+        "triplet",
+        [notation(out.verdict.sel(triplet=t)) for t in out.triplet.to_numpy()],
+        {"long_name": "largest regions in which the triplet is unique; *: off a surface"},
+    )
+    out.attrs["chosen_triplet"], out.attrs["chosen_region"] = choice(out)
+    return out
+
+
+def _surface(question: Question) -> str:
+    """Surface off which a triplet of a planar whisker may be unique."""
+    y, z = question.normal[1:]
+    turned = float(np.rad2deg(np.arctan2(-y, z)))
+    where = "z = 0" if abs(turned) < 1e-6 else f"turned by {turned:.4g}° about x from z = 0"
+    return f"the plane of the whisker, {where}"
+
+
+def _witnesses(
+    question: Question, names: tuple[tuple[str, ...], ...], answers: list[Answer]
+) -> xr.Dataset:
+    """Both contacts of each witness, in SI units, with how well they agree."""
+    cells = (len(names), len(question.regions), WITNESSES)
+    arrays = {
+        name: np.full((*cells, *(_SIZES[dim] for dim in dims)), np.nan)
+        for name, (dims, _) in _WITNESS_VARIABLES.items()
+    }
+    for i, (triplet, found) in enumerate(zip(names, answers, strict=True)):
+        for j, pairs in enumerate(found.witnesses):
+            if n := len(pairs.apart):
+                for name, values in _witness(question, triplet, pairs, found.steps[j]).items():
+                    arrays[name][i, j, :n] = values
+    data: dict[str, Any] = {
+        f"witness_{name}": (("triplet", "region", "witness", *dims), arrays[name], about)
+        for name, (dims, about) in _WITNESS_VARIABLES.items()
+    }
+    data["witness_steps"] = (
+        ("triplet", "region"),
+        np.array([found.steps for found in answers]),
+        _about("1", "integration steps with which the witnesses agree"),
+    )
+    return xr.Dataset(data)
+
+
+def _witness(
+    question: Question, triplet: tuple[str, ...], pairs: Pairs, steps: int
+) -> dict[str, Array]:
+    """Variables of the witnesses of one triplet and region."""
+    contact_map = question.contact_map
+    d = discretize(contact_map.whisker, steps)
+    target = pairs.first.signals[:, signal_columns(triplet)]
+    unit = units(contact_map, pairs.second.xi)
+    second, values, difference = corrected(d, triplet, pairs.second.xi, target, unit)
+    both = np.stack([pairs.first.xi, second], axis=1)
+    point = d.length * np.stack([pairs.first.values[:, 3:], values[:, 3:]], axis=1)
+    _, moved = found_again(contact_map, triplet, pairs.first.xi, second, steps)
+    return {
+        "arc_length": both[..., 0] * d.length,
+        "contact_force": both[..., 1:] * d.force,
+        "point": point,
+        "signals": target * signal_scales(triplet, d.force, d.moment),
+        "separation": np.linalg.norm(point[:, 0] - point[:, 1], axis=1),
+        "difference": difference,
+        "shift": d.length * moved,
+    }

@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 
 from vibrissa.contacts import ContactMap
-from vibrissa.identifiability.summary import verdict_rows
+from vibrissa.identifiability import verdict_rows
 from vibrissa.quantities import quantity, shown_unit, to_display
 from vibrissa.report.page import Section, paragraph, table
 from vibrissa.signals import SIGNALS

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from vibrissa.contacts import ContactMap, estimate_from_wrench
-from vibrissa.identifiability import uniqueness
-from vibrissa.identifiability.best_triplet import best_triplet
+from vibrissa.identifiability import best_triplet, uniqueness
 from vibrissa.quantities import attributes
 from vibrissa.rod import PointForce, deflect
 from vibrissa.sensors import FORCE_NOISE, MOMENT_NOISE

@@ -21,8 +21,7 @@ import vibrissa as vb
 from vibrissa.cameras import orthogonal_views
 from vibrissa.paper import draw_contacts
 from vibrissa.signals import SIGNALS
-from vibrissa.simulation import array_whisking, facing_peg, simulate, sweep_past
-from vibrissa.simulation.film import film_frames
+from vibrissa.simulation import array_whisking, facing_peg, film_frames, simulate, sweep_past
 from vibrissa.tracking import TrackOptions, trace_video, track
 
 RATE = 500.0

@@ -29,14 +29,15 @@ from vibrissa.signals import nearest_on_rest
 from vibrissa.simulation import (
     array_whisking,
     facing_peg,
+    film_frames,
     head_path,
     measure,
     simulate,
     sweep_past,
     views_of,
+    with_true_traces,
     within_reach,
 )
-from vibrissa.simulation.film import film_frames, with_true_traces
 
 WIDTH = 1200
 WIDER = {"title": 1360}

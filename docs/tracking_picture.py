@@ -13,8 +13,7 @@ from vibrissa.cameras import orthogonal_views
 from vibrissa.io import read_video
 from vibrissa.plots.style import MUTED, ORANGE, RED, Array, box_axes, head, looking, new_figure
 from vibrissa.quantities import axis_label, to_display
-from vibrissa.simulation import facing_peg, film, simulate, sweep_past
-from vibrissa.simulation.film import with_true_traces
+from vibrissa.simulation import facing_peg, film, simulate, sweep_past, with_true_traces
 from vibrissa.tracking import TrackOptions, trace_video, track
 
 RATE, DURATION = 500.0, 0.2

@@ -19,8 +19,14 @@ from scipy.ndimage import gaussian_filter
 from vibrissa import Whisker
 from vibrissa.cameras import Camera, orthogonal_views
 from vibrissa.samples import gamma
-from vibrissa.simulation import facing_peg, simulate, sweep_past
-from vibrissa.simulation.film import Look, film_frames, with_true_traces
+from vibrissa.simulation import (
+    ImageConditions,
+    facing_peg,
+    film_frames,
+    simulate,
+    sweep_past,
+    with_true_traces,
+)
 
 Array = NDArray[np.float64]
 Frames = list[NDArray[np.uint8]]
@@ -53,7 +59,7 @@ class Case:
         Between the views, rad; by default the paper's two.
     distance : float, optional
         Of perspective cameras, m.
-    look : Look
+    look : ImageConditions
         Light and blur.
     change : callable
         Makes of the frames of a view what is tracked: ``change(frames, view)``.
@@ -76,7 +82,7 @@ class Case:
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
     angle: float | None = None
     distance: float | None = None
-    look: Look = field(default_factory=Look)
+    look: ImageConditions = field(default_factory=ImageConditions)
     change: Callable[[Frames, int], Frames] = lambda frames, view: frames
     shown: Callable[[int, int], NDArray[np.intp]] = lambda count, view: np.arange(count)
     peg: float = 1.0
@@ -126,7 +132,7 @@ def views(case: Case, trial: Any) -> tuple[Camera, ...]:
 
 
 def _camera(name: str, turn: float, case: Case, center: Array) -> Camera:
-    """Look down along −z, turned about x."""
+    """ImageConditions down along −z, turned about x."""
     forward = np.array([0.0, -np.sin(turn), -np.cos(turn)])
     rotation = np.stack([[1.0, 0.0, 0.0], np.cross(forward, [1.0, 0.0, 0.0]), forward])
     middle = (np.asarray(case.size) - 1.0) / 2.0
@@ -288,15 +294,15 @@ _LONG = Whisker.straight(length=55e-3, base_radius=100e-6)
 _WIRE = Whisker.straight(
     length=0.3, base_radius=0.4e-3, tip_radius=0.4e-3, youngs_modulus=200e9, poisson_ratio=0.3
 )
-_ARM = Look(face=(60e-3, 30e-3, 40e-3))
+_ARM = ImageConditions(face=(60e-3, 30e-3, 40e-3))
 
 CASES = (
     Case("as it is", "ordinary"),
     Case("lens out of focus, 2 pixels", "blur", change=defocus(2.0)),
     Case("lens out of focus, 3 pixels", "blur", change=defocus(3.0)),
-    Case("shutter open for 1 ms", "blur", look=Look(exposure=1e-3)),
-    Case("contrast a quarter", "light", look=Look(contrast=0.85 / 4.0)),
-    Case("a third of the light", "light", look=Look(light=65.0, dark=6.0)),
+    Case("shutter open for 1 ms", "blur", look=ImageConditions(exposure=1e-3)),
+    Case("contrast a quarter", "light", look=ImageConditions(contrast=0.85 / 4.0)),
+    Case("a third of the light", "light", look=ImageConditions(light=65.0, dark=6.0)),
     Case("light falls by half", "light", change=drift(0.5)),
     Case("lamp at 60 Hz, 60 %", "light", change=flicker(60.0, 0.6)),
     Case("overexposed, background white", "light", change=each(lambda f: 1.6 * f)),
@@ -305,8 +311,8 @@ CASES = (
     ),
     Case("bright whisker on dark", "light", change=inverted),
     Case("light falls across the image by 80 %", "light", change=shaded(0.8)),
-    Case("no face", "background", look=Look(face=(0.0, 0.0, 0.0))),
-    Case("bright face", "background", look=Look(dark=150.0)),
+    Case("no face", "background", look=ImageConditions(face=(0.0, 0.0, 0.0))),
+    Case("bright face", "background", look=ImageConditions(dark=150.0)),
     Case("noise of 6 grey values", "noise", change=noisy(6.0)),
     Case("noise of 12 grey values", "noise", change=noisy(12.0)),
     Case("cloth, 8 grey values over 3 pixels", "background", change=textured(3.0, 8.0)),

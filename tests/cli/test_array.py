@@ -7,7 +7,7 @@ from typer.testing import CliRunner
 import vibrissa as vb
 from vibrissa.cli.app import app
 from vibrissa.io import load_recording, save_array
-from vibrissa.simulation.script import read_script
+from vibrissa.simulation import read_script
 
 RUN = CliRunner()
 

@@ -15,7 +15,7 @@ from vibrissa.io import write_video
 from vibrissa.io.table import read_text
 from vibrissa.io.toml import in_file
 from vibrissa.sensors import Sensor, SensorFrame, load_sensor, save_sensor
-from vibrissa.simulation.script import EXAMPLE, read_objects, read_script
+from vibrissa.simulation import EXAMPLE, read_objects, read_script
 from vibrissa.whisker import Whisker
 
 typer_testing = pytest.importorskip("typer.testing")

@@ -8,8 +8,7 @@ import vibrissa as vb
 from vibrissa.cameras import orthogonal_views
 from vibrissa.cameras.files import cameras_dataset
 from vibrissa.io.recording import KIND
-from vibrissa.objects import Peg
-from vibrissa.objects.dataset import objects_datasets
+from vibrissa.objects import Peg, objects_datasets
 from vibrissa.quantities import attributes
 
 COUNT, LENGTH, NODES = 12, 40e-3, 21

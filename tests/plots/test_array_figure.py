@@ -5,8 +5,7 @@ import pytest
 import xarray as xr
 
 import vibrissa as vb
-from vibrissa.objects import Box, Mesh, Peg, Plane, Sphere
-from vibrissa.objects.dataset import objects_datasets
+from vibrissa.objects import Box, Mesh, Peg, Plane, Sphere, objects_datasets
 from vibrissa.plots import array_views
 from vibrissa.plots.array import ROW_COLOURS
 from vibrissa.plots.things import head_triangles, object_triangles

@@ -7,8 +7,8 @@ import vibrissa as vb
 from vibrissa.objects import Box, Peg, Plane, Sphere
 from vibrissa.rod import contact_state, discretize, follow_surfaces
 from vibrissa.simulation import whisking
-from vibrissa.simulation.motion import base_rotation
 from vibrissa.status import Status
+from vibrissa.whisker.emergence import base_rotation
 
 WHISKER = vb.samples.gamma()
 LENGTH = WHISKER.length

@@ -10,16 +10,16 @@ from vibrissa.recording import Recording
 from vibrissa.rod import follow_surfaces
 from vibrissa.simulation import (
     Dynamics,
-    Look,
+    ImageConditions,
     Motion,
     array_whisking,
+    film_frames,
     head_path,
     measure,
     protracted,
     simulate,
     views_of,
 )
-from vibrissa.simulation.film import film_frames
 from vibrissa.simulation.motion import ELEVATION_PER_AZIMUTH, ROLL_PER_AZIMUTH
 from vibrissa.whisker.emergence import angles_of, base_rotation
 
@@ -215,7 +215,7 @@ def test_a_film_shows_the_face_between_the_whiskers(trial):
     tips = top.project(trial["truth"]["centerline"].values[:, :, -1])
     assert (tips > 0).all()
     assert (tips < np.array(top.size) - 1).all()
-    first = next(iter(film_frames(trial, top, Look(unevenness=0.0))))
+    first = next(iter(film_frames(trial, top, ImageConditions(unevenness=0.0))))
     snout = top.project(trial["base_position"].values[0].mean(axis=0))
     shaft = top.project(trial["truth"]["centerline"].values[0, 0, 10])
     column, row = snout.round().astype(int)

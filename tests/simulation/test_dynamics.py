@@ -13,8 +13,8 @@ from vibrissa.rod import follow_surfaces
 from vibrissa.simulation import Dynamics, Motion, resonances, simulate, whisking
 from vibrissa.simulation.chain import Chain, configure, inertia, jacobian, solve_definite
 from vibrissa.simulation.dynamics import move_dynamically
-from vibrissa.simulation.motion import base_rotation
 from vibrissa.status import Status
+from vibrissa.whisker.emergence import base_rotation
 
 WHISKER = vb.samples.gamma()
 DENSITY = 1300.0

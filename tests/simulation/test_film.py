@@ -7,12 +7,13 @@ from vibrissa import Whisker
 from vibrissa.cameras import orthogonal_views
 from vibrissa.io import read_video
 from vibrissa.objects import Peg, Sphere
-from vibrissa.simulation import Look, Motion, film, simulate
-from vibrissa.simulation.film import film_frames
+from vibrissa.simulation import ImageConditions, Motion, film, film_frames, simulate
 
 WHISKER = Whisker.parabola(length=10e-3, coefficient=15.0)
 PEG = Peg([6e-3, 2.4e-3, 0.0], [0.0, 0.0, 1.0], 1e-3)
-QUIET = Look(gain=1e9, read_noise=0.0, unevenness=0.0, face=(0.0, 0.0, 0.0), exposure=0.0)
+QUIET = ImageConditions(
+    gain=1e9, read_noise=0.0, unevenness=0.0, face=(0.0, 0.0, 0.0), exposure=0.0
+)
 CAMERAS = orthogonal_views(size=(256, 256), center=(5e-3, 0.0, 0.0))
 
 
@@ -72,13 +73,15 @@ def test_the_peg_hides_what_is_behind_it(trial):
 
 
 def with_traces(trial):
-    from vibrissa.simulation.film import with_true_traces
+    from vibrissa.simulation import with_true_traces
 
     return with_true_traces(trial, CAMERAS)
 
 
 def test_noise_is_shot_and_read_noise(trial):
-    look = Look(light=160.0, unevenness=0.0, gain=20.0, read_noise=2.0, face=(0.0, 0.0, 0.0))
+    look = ImageConditions(
+        light=160.0, unevenness=0.0, gain=20.0, read_noise=2.0, face=(0.0, 0.0, 0.0)
+    )
     (frame,) = film_frames(trial.isel(time=[0]), CAMERAS[0], look, seed=3)
     corner = frame[:40, :].astype(float)
     assert corner.mean() == pytest.approx(160.0, abs=0.1)
@@ -96,7 +99,9 @@ def test_the_same_seed_is_the_same_film(trial):
 
 def test_movement_smears_but_loses_no_light(trial):
     no_peg = trial.isel(time=slice(0, 3)).drop_nodes("objects")
-    long = Look(gain=1e9, read_noise=0.0, unevenness=0.0, face=(0.0, 0.0, 0.0), exposure=5e-4)
+    long = ImageConditions(
+        gain=1e9, read_noise=0.0, unevenness=0.0, face=(0.0, 0.0, 0.0), exposure=5e-4
+    )
     sharp, smeared = (
         200.0 - list(film_frames(no_peg, CAMERAS[0], look))[1].astype(float)
         for look in (QUIET, long)
@@ -107,7 +112,7 @@ def test_movement_smears_but_loses_no_light(trial):
 
 
 def test_the_base_comes_out_of_the_face(trial):
-    (frame,) = film_frames(trial.isel(time=[0]), CAMERAS[0], Look(read_noise=0.0))
+    (frame,) = film_frames(trial.isel(time=[0]), CAMERAS[0], ImageConditions(read_noise=0.0))
     base = CAMERAS[0].project(truth(trial)["centerline"].values[0, 0]).round().astype(int)
     assert frame[base[1], base[0] - 8] < 30
     assert frame[base[1] - 8, base[0] + 8] > 120
@@ -133,12 +138,12 @@ def test_what_cannot_be_filmed_says_why(trial, tmp_path):
     with pytest.raises(ValueError, match="they must agree"):
         film(trial, {"top": tmp_path / "a.mkv"})
     with pytest.raises(ValueError, match=r"contrast is 2\.0"):
-        Look(contrast=2.0)
+        ImageConditions(contrast=2.0)
 
 
 def test_shadows_of_objects_are_as_large_as_they_are():
     """A sphere's and a box's area in both views, to a fraction of a pixel's edge."""
-    from vibrissa.simulation.shadows import silhouette
+    from vibrissa.simulation import silhouette
 
     size = 58e-6
     center = np.array([5e-3, 0.0, 0.0])
@@ -152,7 +157,7 @@ def test_shadows_of_objects_are_as_large_as_they_are():
 
 
 def test_hidden_is_what_is_behind():
-    from vibrissa.simulation.shadows import hidden
+    from vibrissa.simulation.film import hidden
 
     sphere = Sphere([5e-3, 0.0, 0.0], 1e-3)
     points = np.array(

@@ -10,7 +10,7 @@ from vibrissa.cli.app import app
 from vibrissa.io import load_recording
 from vibrissa.objects import Box, Mesh, Peg, Plane, Sphere
 from vibrissa.recording import Recording
-from vibrissa.simulation.script import EXAMPLE, read_script
+from vibrissa.simulation import EXAMPLE, read_script
 
 
 def whisker_of(path):

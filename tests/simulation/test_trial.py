@@ -7,7 +7,7 @@ from vibrissa import Status, samples
 from vibrissa.objects import Peg
 from vibrissa.recording import Recording
 from vibrissa.simulation import Motion, facing_peg, measure, simulate, sweep_past, whisking
-from vibrissa.simulation.motion import base_rotation
+from vibrissa.whisker.emergence import base_rotation
 
 WHISKER = samples.gamma()
 PEG = facing_peg(WHISKER)
@@ -240,7 +240,7 @@ class TestMotion:
         [
             ({"duration": 0.0}, "duration is 0.0"),
             ({"rate": float("nan")}, "rate is nan"),
-            ({"duration": 1e-3}, "less than two frames"),
+            ({"duration": 1e-3}, "fewer than two frames"),
         ],
     )
     def test_faults(self, changes, message):

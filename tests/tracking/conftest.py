@@ -11,8 +11,7 @@ from scipy.spatial import cKDTree
 from vibrissa import Whisker
 from vibrissa.cameras import orthogonal_views
 from vibrissa.objects import Peg
-from vibrissa.simulation import Motion, simulate
-from vibrissa.simulation.film import film_frames, with_true_traces
+from vibrissa.simulation import Motion, film_frames, simulate, with_true_traces
 
 sys.path.append(str(Path(__file__).parent))  # tests and studies share the maker of films, furry.py
 

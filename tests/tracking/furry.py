@@ -18,7 +18,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates, shift
 
 from vibrissa.cameras import orthogonal_views
-from vibrissa.simulation.painting import cover
+from vibrissa.simulation.film import cover
 
 PIXEL = 58e-6
 

@@ -7,8 +7,7 @@ from scipy.spatial import cKDTree
 
 from vibrissa import Whisker
 from vibrissa.cameras import orthogonal_views
-from vibrissa.simulation import Look, Motion, simulate
-from vibrissa.simulation.film import film_frames, with_true_traces
+from vibrissa.simulation import ImageConditions, Motion, film_frames, simulate, with_true_traces
 from vibrissa.tracking import Trace, ridge, start_at, trace_video
 from vibrissa.tracking.row import follow_row
 
@@ -40,7 +39,7 @@ def row():
     order = sorted(range(COUNT), key=lambda k: abs(k - 2.5))
     whiskers, motions = zip(*(one(k, generator) for k in order), strict=True)
     recording = with_true_traces(simulate(whiskers, motions, []), [CAMERA])
-    bare = film_frames(recording, CAMERA, Look(face=(0.0, 0.0, 0.0)), seed=1)
+    bare = film_frames(recording, CAMERA, ImageConditions(face=(0.0, 0.0, 0.0)), seed=1)
     frames = [behind_a_wall(frame) for frame in bare]
     return frames, recording["truth"]["trace"].values[:, :, 0]
 

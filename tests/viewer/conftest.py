@@ -14,8 +14,7 @@ def browser(browser):
 def recording():
     """A short trial against a peg, with the cameras that saw it."""
     import vibrissa as vb
-    from vibrissa.simulation import facing_peg, simulate, sweep_past, views_of
-    from vibrissa.simulation.film import with_true_traces
+    from vibrissa.simulation import facing_peg, simulate, sweep_past, views_of, with_true_traces
 
     whisker = vb.samples.gamma()
     peg = facing_peg(whisker)

@@ -130,7 +130,7 @@ def _check_video(video: Path, camera: Camera, frames: Sequence[int]) -> None:
 def _backdrop(trial: xr.DataTree, camera: Camera, course: Course) -> Any:
     """Objects as a camera sees them, on even light."""
     from vibrissa.recording import Recording
-    from vibrissa.simulation.shadows import silhouette
+    from vibrissa.simulation import silhouette
 
     middle = np.nanmean(course.position, axis=0)
     covered = silhouette(camera, list(Recording(trial).objects), middle, 0.7)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from vibrissa.contacts import ContactMap, Prior
     from vibrissa.numerics import Array
-    from vibrissa.objects.surface import Surface
+    from vibrissa.objects import Surface
     from vibrissa.whisker import Whisker
 
 RECORDING, MAP = "vibrissa recording", "vibrissa contact map"
@@ -313,7 +313,7 @@ def objects_from(path: Path) -> tuple[Surface, ...]:
     from vibrissa.io.table import read_text
     from vibrissa.io.toml import in_file
     from vibrissa.recording import Recording
-    from vibrissa.simulation.script import read_objects
+    from vibrissa.simulation import read_objects
 
     if path.suffix.lower() not in NETCDF:
         with in_file(path):

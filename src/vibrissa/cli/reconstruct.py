@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from vibrissa.contour import FittedShape
-    from vibrissa.objects.surface import Surface
+    from vibrissa.objects import Surface
     from vibrissa.whisker import Whisker
 
 _SUSPECT = 1.5

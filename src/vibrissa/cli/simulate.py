@@ -103,7 +103,7 @@ def simulate(
     from vibrissa.io.toml import in_file
     from vibrissa.simulation import measure
     from vibrissa.simulation import simulate as simulated
-    from vibrissa.simulation.script import EXAMPLE, read_script
+    from vibrissa.simulation import EXAMPLE, read_script
     from vibrissa.whisker import Whisker
 
     if example:

@@ -49,7 +49,18 @@ _DIMS: dict[str, tuple[str, ...]] = {
 
 
 def objects_datasets(objects: Sequence[Surface]) -> dict[str, xr.Dataset]:
-    """Write objects as datasets."""
+    """Write objects as datasets.
+
+    Parameters
+    ----------
+    objects : sequence of Surface
+        Pegs, spheres, planes, boxes and meshes.
+
+    Returns
+    -------
+    dict of str to xarray.Dataset
+        Dataset of each object by its number.
+    """
     return {str(i): _dataset(thing) for i, thing in enumerate(objects)}
 
 
@@ -68,14 +79,30 @@ def _dataset(thing: Surface) -> xr.Dataset:
 
 
 def object_from_dataset(dataset: xr.Dataset) -> Surface:
-    """Make an object again."""
+    """Restore an object from its dataset.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        Dataset of `objects_datasets`.
+
+    Returns
+    -------
+    Peg, Sphere, Plane, Box or Mesh
+        Object as it was.
+
+    Raises
+    ------
+    ValueError
+        If its kind is unknown, or something is missing.
+    """
     kind = dataset.attrs.get("kind")
     if kind not in _FIELDS:
-        raise ValueError(f"the object is of kind {kind!r}; one of {', '.join(_FIELDS)} is known")
+        raise ValueError(f"the object is of kind {kind!r}; it must be one of {', '.join(_FIELDS)}")
     known, fields = _FIELDS[kind]
     missing = sorted({*fields.values(), *_STIFFNESS.values()} - set(dataset.data_vars))
     if missing:
         raise ValueError(f"a {kind} in a file lacks {', '.join(missing)}")
     values = {field: dataset[name].values for field, name in (fields | _STIFFNESS).items()}
-    made: Surface = known(**values)
-    return made
+    restored: Surface = known(**values)
+    return restored

@@ -1,4 +1,4 @@
-"""What a whisker can touch, and how the whisker's base sits beside it."""
+"""Surfaces that a whisker can touch, and placements of the whisker's base among them."""
 
 from __future__ import annotations
 
@@ -12,16 +12,42 @@ from vibrissa.numerics import Array
 
 
 class Surface(ABC):
-    """A body in a frame in which it stands still, known by its signed distance."""
+    """A body in a frame in which it does not move, defined by its signed distance."""
 
     stiffness: float
 
     def signed_distance(self, points: ArrayLike) -> Array:
-        """Tell how far points are from its surface."""
+        """Signed distances of points from the surface.
+
+        Parameters
+        ----------
+        points : array_like (..., 3)
+            Points in the body's frame, m.
+
+        Returns
+        -------
+        array (...)
+            Distances, m; negative inside.
+        """
         return self._distance(np.asarray(points, dtype=np.float64))
 
     def local_geometry(self, point: ArrayLike) -> tuple[float, Array, Array]:
-        """Tell where its surface is as seen from one point."""
+        """Signed distance from one point, with its derivatives.
+
+        Parameters
+        ----------
+        point : array_like (3,)
+            Point in the body's frame, m.
+
+        Returns
+        -------
+        distance : float
+            Signed distance, m.
+        normal : array (3,)
+            Gradient of the distance, the outward normal.
+        curvature : array (3, 3)
+            Derivatives of the normal, 1/m.
+        """
         return self._geometry(np.asarray(point, dtype=np.float64))
 
     @abstractmethod
@@ -34,19 +60,51 @@ class Surface(ABC):
 
 
 class Placement(NamedTuple):
-    """How the whisker's base sits in the surfaces' frame: rotation (3, 3), position (3,), m."""
+    """Placement of the whisker's base in the surfaces' frame.
+
+    Parameters
+    ----------
+    rotation : array (3, 3)
+        Rotation from the whisker's to the surfaces' frame.
+    position : array (3,)
+        Position of the base, m.
+    """
 
     rotation: Array
     position: Array
 
     def outside(self, points: Array) -> Array:
-        """Take points (..., 3) of the whisker's frame, m, to the surfaces' frame."""
+        """Points in the surfaces' frame.
+
+        Parameters
+        ----------
+        points : array (..., 3)
+            Points in the whisker's frame, m.
+
+        Returns
+        -------
+        array (..., 3)
+            Points in the surfaces' frame, m.
+        """
         moved: Array = points @ self.rotation.T + self.position
         return moved
 
 
 def between(before: Placement, now: Placement, share: float) -> Placement:
-    """Give the placement on the way, turning steadily about one axis and moving straight."""
+    """Placement between two others, turned steadily about one axis and moved straight.
+
+    Parameters
+    ----------
+    before, now : Placement
+        Placements at the shares 0 and 1.
+    share : float
+        Share of the movement.
+
+    Returns
+    -------
+    Placement
+        Placement in between.
+    """
     turn = before.rotation.T @ now.rotation
     axis = 0.5 * np.array(
         [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]

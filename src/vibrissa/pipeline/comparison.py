@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 
 from vibrissa.contour import compare_with, distances_by
-from vibrissa.objects.surface import Surface
+from vibrissa.objects import Surface
 from vibrissa.pipeline.frames import EACH, estimates_in, whisker_radii
 from vibrissa.quantities import attributes
 from vibrissa.recording import Group, Recording

@@ -23,8 +23,7 @@ from vibrissa.contour import (
     fit_free,
     fit_shape,
 )
-from vibrissa.objects import Peg, Sphere
-from vibrissa.objects.surface import Surface
+from vibrissa.objects import Peg, Sphere, Surface
 from vibrissa.pipeline.comparison import nearest_object
 from vibrissa.pipeline.estimates import WHOLE
 from vibrissa.pipeline.frames import EACH, estimates_in, whisker_radii

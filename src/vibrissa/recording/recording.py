@@ -13,9 +13,7 @@ from numpy.typing import NDArray
 from vibrissa.cameras.camera import Camera
 from vibrissa.cameras.files import cameras_dataset, cameras_from_dataset
 from vibrissa.io.recording import KIND
-from vibrissa.objects.dataset import object_from_dataset, objects_datasets
-from vibrissa.objects.solids import Peg
-from vibrissa.objects.surface import Surface
+from vibrissa.objects import Peg, Surface, object_from_dataset, objects_datasets
 from vibrissa.recording.schema import ordered
 from vibrissa.whisker import Whisker
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vibrissa.numerics import Array
-from vibrissa.objects.surface import Placement, Surface, between
+from vibrissa.objects import Placement, Surface, between
 from vibrissa.rod.pegs import Rest
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from vibrissa.numerics import Array, IntArray
-from vibrissa.objects.surface import Placement, Surface, between
+from vibrissa.objects import Placement, Surface, between
 from vibrissa.rod.chart import LEAST_ARC
 from vibrissa.rod.deflection import Deflection, dimensional
 from vibrissa.rod.discretization import STEPS, discretize

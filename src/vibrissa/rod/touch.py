@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vibrissa.numerics import Array
-from vibrissa.objects.surface import Placement, Surface
+from vibrissa.objects import Placement, Surface
 from vibrissa.rod.chart import LEAST_ARC
 from vibrissa.rod.contact_state import STATES, contact_state
 from vibrissa.rod.discretization import Discretization

@@ -1,29 +1,51 @@
-"""Simulated trials with known truth: motion, dynamics, film, sensor readings."""
+"""Simulated trials with known truth: motion, dynamics, films, sensor readings."""
 
-from vibrissa.simulation.array_motion import array_whisking, head_path, protracted, shared_whisking
 from vibrissa.simulation.dynamics import Dynamics, resonances
-from vibrissa.simulation.film import Look, film, views_of
-from vibrissa.simulation.measured import measure
-from vibrissa.simulation.motion import Motion, tabulated, whisking
+from vibrissa.simulation.film import (
+    ImageConditions,
+    film,
+    film_frames,
+    silhouette,
+    views_of,
+    with_true_traces,
+)
+from vibrissa.simulation.measurement import measure
+from vibrissa.simulation.motion import (
+    Motion,
+    array_whisking,
+    head_path,
+    protracted,
+    shared_whisking,
+    tabulated,
+    whisking,
+)
 from vibrissa.simulation.plan import facing_peg, sweep_past, within_reach
+from vibrissa.simulation.script import EXAMPLE, Script, read_objects, read_script
 from vibrissa.simulation.simulate import simulate
 
 __all__ = [
+    "EXAMPLE",
     "Dynamics",
-    "Look",
+    "ImageConditions",
     "Motion",
+    "Script",
     "array_whisking",
     "facing_peg",
     "film",
+    "film_frames",
     "head_path",
     "measure",
     "protracted",
+    "read_objects",
+    "read_script",
     "resonances",
     "shared_whisking",
+    "silhouette",
     "simulate",
     "sweep_past",
     "tabulated",
     "views_of",
     "whisking",
+    "with_true_traces",
     "within_reach",
 ]

@@ -25,6 +25,8 @@ from vibrissa.numerics import Array, IntArray, kernel
 from vibrissa.whisker import Whisker
 
 _GRADING = 0.4
+"""Exponent by which segments are shorter where the whisker is thin."""
+
 _GAUSS = np.polynomial.legendre.leggauss(5)
 
 
@@ -42,7 +44,7 @@ class Chain:
 
     @classmethod
     def of(cls, whisker: Whisker, density: tuple[float, float], segments: int) -> Chain:
-        """Cut a whisker into segments, shorter where it is thin."""
+        """Chain of a whisker, with shorter segments where it is thin."""
         nodes = _nodes(whisker, segments)
         h = np.diff(nodes)
         joints = nodes[:-1] + 0.5 * h
@@ -120,7 +122,7 @@ def configure(
     pivots: Array,
     turns: Array,
 ) -> None:
-    """Where the links are."""
+    """Frames, pivots and turns of the links."""
     exp, left = np.empty((3, 3)), np.empty((3, 3))
     for a in range(3):
         for b in range(3):
@@ -251,7 +253,7 @@ def solve_definite(matrix: Array, vector: Array) -> None:
 
 
 def jacobian(points: Array, links: IntArray, weights: Array, pivots: Array, turns: Array) -> Array:
-    """How a weighted sum of points of links moves with the joints."""
+    """Derivatives of a weighted sum of points of links with respect to the joints."""
     out = np.zeros((3, pivots.shape[0], 3))
     for point, link, weight in zip(points, links, weights, strict=True):
         away = (point - pivots[:link])[:, None, :]

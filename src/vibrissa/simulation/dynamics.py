@@ -8,63 +8,91 @@ x the points of mass, p the contacts, η = 2 ζ/ω₁ a damping of the material 
 vibration has the damping ratio ζ (higher ones have more, in proportion to their frequency). The
 base is carried along its path, which is a spline through the frames. At first the whisker moves
 along without bending (or rests against what is in its way, held still). Velocities and
-accelerations are backward differences of second order (BDF2) of places in the laboratory; the step
+accelerations are backward differences of second order (BDF2) of positions in the laboratory; the
+step
 is implicit, solved by Newton's method, and stable whatever the stiffness; vibrations too fast for
-it die away.
+the step decay.
 
 Objects are touched where the distance of the smooth centreline has a minimum that is less than the
-whisker's radius, with a force along the normal in proportion to how far it
-is in: the object's stiffness, or one that gives way by micrometres. Sliding is held up by µ times
-that force, against the velocity of the whisker's material.
+whisker's radius, with a force along the normal in proportion to the indentation: the object's
+stiffness, or one at which it is indented by micrometres. Sliding is opposed by µ times that force,
+against the velocity of the whisker's material.
 
-What the base feels is what the objects push less what the masses take up to be accelerated.
+The wrench at the base is that of the objects minus the rate of change of the masses' momentum.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline
+from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from vibrissa.numerics import Array, IntArray
-from vibrissa.objects.surface import Surface
-from vibrissa.simulation.chain import Chain
+from vibrissa.objects import Surface
+from vibrissa.simulation.chain import Chain, bezier, configure, inertia, jacobian, solve_definite
 from vibrissa.simulation.motion import Motion
-from vibrissa.simulation.stepping import Moment, Walk, frequencies
 from vibrissa.whisker import Whisker
 
 Progress = Callable[[int, int], None]
 
 DENSITY = (1220.0, 1632.0)
-"""Of a rat's whisker at base and tip, kg/m³ (Yang et al. 2019)."""
+"""Density of a rat's whisker at base and tip, kg/m³ (Yang et al. 2019)."""
 
 DAMPING_RATIO = 0.14
-"""Of the first vibration: in the middle of 0.11 to 0.17 (Hartmann et al. 2003)."""
+"""Damping ratio of the first vibration: the middle of 0.11 to 0.17 (Hartmann et al. 2003)."""
 
-# How long a whisker that would rest inside an object is held still at first, to settle, s.
 _SETTLE = 0.06
+"""Time that a whisker whose rest is inside an object is held still at first, to settle, s."""
+
 _AT_ONCE = 4096
+"""Number of steps whose placements are computed together."""
+
+_ROUNDS = 60
+"""Most rounds of Newton's method in a step."""
+
+_EAGER = 8
+"""Rounds with the full derivative of friction, before its secant."""
+
+_TURNED = 1e-9
+"""Largest turn of a joint in the last round of a step, rad."""
+
+_MOST_TURNED = 0.3
+"""Largest turn of a joint in one round, rad."""
+
+_PARTS = 4
+"""Samples of the distance from objects on each segment."""
+
+_NEAR = 1e-4
+"""Distance from which a minimum is refined, m."""
+
+_ZOOM = np.linspace(-1.0, 1.0, 9) / _PARTS
+"""Offsets at which a minimum is refined, in segments."""
+
+_CREEP = 1e-3
+"""Speed below which sliding is opposed by less than full friction, m/s."""
 
 
 @dataclass(frozen=True)
 class Dynamics:
-    """How a whisker moves when it is not slow.
+    """Inertia and damping of a whisker that moves fast.
 
     Parameters
     ----------
     density : tuple of float
-        At base and tip, kg/m³.
+        Density at base and tip, kg/m³.
     damping_ratio : float
-        Of the first vibration.
+        Damping ratio of the first vibration.
     segments : int
-        Of the whisker.
+        Number of segments of the whisker.
     step : float
         Longest step in time, s.
     contact_stiffness : float
-        Of objects that are rigid, N/m: high enough to give way by micrometres only.
+        Stiffness of rigid objects, N/m: indented by micrometres only.
 
     Raises
     ------
@@ -99,21 +127,21 @@ class Dynamics:
 
 
 def resonances(whisker: Whisker, dynamics: Dynamics | None = None, count: int = 3) -> Array:
-    """Frequencies at which a free whisker vibrates, held at its base.
+    """Resonance frequencies of a free whisker, held at its base.
 
     Parameters
     ----------
     whisker : Whisker
-        At rest.
+        Whisker at rest.
     dynamics : Dynamics, optional
-        Its density, and into how many segments it is cut.
+        Density and number of segments.
     count : int
-        How many, from the lowest.
+        Number of frequencies, from the lowest.
 
     Returns
     -------
     array (count,)
-        Hz, without damping.
+        Frequencies without damping, Hz.
 
     Examples
     --------
@@ -167,7 +195,7 @@ def move_dynamically(
 
 
 class _Path:
-    """The base's placements, step by step."""
+    """Placements of the base, step by step."""
 
     def __init__(self, motion: Motion, step: float) -> None:
         time = motion.time - motion.time[0]
@@ -178,6 +206,327 @@ class _Path:
         self.frames = set(np.round(time / step).astype(int).tolist())
 
     def at(self, numbers: IntArray) -> tuple[Array, Array]:
-        """Rotations (n, 3, 3) and places (n, 3) of the base at steps."""
+        """Rotations (n, 3, 3) and positions (n, 3) of the base at steps."""
         time = np.minimum(numbers * self.step, self._last)
         return self._turn(time).as_matrix(), self._shift(time)
+
+
+class Contact(NamedTuple):
+    """One contact: which object, arc length, control points' numbers and weights, gap, normal."""
+
+    surface: int
+    arc_length: float
+    segment: int
+    weights: Array
+    point: Array
+    gap: float
+    normal: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """A moment of the movement, laboratory frame, SI units."""
+
+    force: Array
+    moment: Array
+    controls: Array
+    nodes: Array
+    contacts: tuple[Contact, ...]
+    contact_force: Array
+    sliding: bool
+
+    def centerline(self, n: int) -> Array:
+        """Centreline (n, 3)."""
+        s = np.linspace(0.0, self.nodes[-1], n)
+        segment = np.clip(np.searchsorted(self.nodes, s) - 1, 0, self.nodes.size - 2)
+        part = (s - self.nodes[segment]) / np.diff(self.nodes)[segment]
+        return np.asarray(np.einsum("kc,kci->ki", bezier(part), self.controls[segment]))
+
+
+def frequencies(chain: Chain, count: int) -> Array:
+    """Lowest frequencies of a chain at rest, held at its base: (count,), Hz."""
+    state = State(chain)
+    state.move(chain.rest, np.eye(3), np.zeros(3))
+    inertia(
+        state.masses,
+        chain.mass,
+        chain.mass_link,
+        np.zeros_like(state.masses),
+        state.pivots,
+        state.turns,
+        state.residual,
+        state.matrix,
+    )
+    # The stiffness is regular, the mass need not be: twist of a straight whisker has none.
+    n = chain.stiffness.size
+    slow = eigh(
+        state.matrix,
+        np.diag(chain.stiffness.ravel()),
+        eigvals_only=True,
+        subset_by_index=[n - count, n - 1],
+    )
+    return np.asarray(1.0 / np.sqrt(slow[::-1]) / (2.0 * np.pi))
+
+
+class State:
+    """Present state of the links; its arrays are overwritten in every round."""
+
+    def __init__(self, chain: Chain) -> None:
+        m = chain.joints.size
+        self.chain = chain
+        self.frames, self.pivots = np.empty((m + 1, 3, 3)), np.empty((m, 3))
+        self.turns = np.empty((m, 3, 3))
+        self.residual, self.matrix = np.empty(3 * m), np.empty((3 * m, 3 * m))
+        self.base = np.zeros(3)
+        self.masses = np.empty((chain.mass.size, 3))
+        self.controls = np.empty((chain.nodes.size - 1, 3, 3))
+
+    def move(self, theta: Array, rotation: Array, base: Array) -> None:
+        """Turn the joints and place the base."""
+        chain = self.chain
+        configure(
+            theta,
+            chain.joints,
+            np.ascontiguousarray(rotation),
+            np.ascontiguousarray(base),
+            self.frames,
+            self.pivots,
+            self.turns,
+        )
+        self.base = base
+        self.masses = chain.places(self.frames, self.pivots, base, chain.mass_arc, chain.mass_link)
+        self.controls = chain.controls(self.frames, self.pivots, base)
+
+
+class History(NamedTuple):
+    """Values of one quantity in the last two steps, and its rates."""
+
+    value: Array
+    before: Array
+    rate: Array
+    rate_before: Array
+
+    @classmethod
+    def still(cls, value: Array) -> History:
+        """History of a constant."""
+        zero = np.zeros_like(value)
+        return cls(value.copy(), value.copy(), zero, zero)
+
+    @classmethod
+    def before_first(cls, values: Array, step: float) -> History:
+        """History of the first of four values (4, ...), continued backward smoothly."""
+        # Newton's backward differences, through the first four.
+        one, two, three = (np.diff(values, k, axis=0)[0] for k in (1, 2, 3))
+        value = [
+            values[0] - k * one + k * (k + 1) / 2 * two - k * (k + 1) * (k + 2) / 6 * three
+            for k in (1, 2, 3, 4)
+        ]
+        rates = [(1.5 * value[k] - 2.0 * value[k + 1] + 0.5 * value[k + 2]) / step for k in (0, 1)]
+        return cls(value[0], value[1], rates[0], rates[1])
+
+    def rate_of(self, now: Array, step: float) -> Array:
+        """Rate of a present value."""
+        return np.asarray((1.5 * now - 2.0 * self.value + 0.5 * self.before) / step)
+
+    def acceleration_of(self, rate: Array, step: float) -> Array:
+        """Acceleration of a present rate."""
+        return np.asarray((1.5 * rate - 2.0 * self.rate + 0.5 * self.rate_before) / step)
+
+    def then(self, now: Array, step: float) -> History:
+        """History one step later."""
+        return History(now.copy(), self.value, self.rate_of(now, step), self.rate)
+
+
+class Walk:
+    """The whisker, step by step."""
+
+    def __init__(
+        self,
+        whisker: Whisker,
+        chain: Chain,
+        surfaces: Sequence[Surface],
+        damping_ratio: float,
+        stiffness: float,
+        friction: float,
+        step: float,
+    ) -> None:
+        self._chain, self._surfaces, self._step = chain, surfaces, step
+        self._friction = friction
+        self._stiffness = [
+            solid.stiffness if np.isfinite(solid.stiffness) else stiffness for solid in surfaces
+        ]
+        first = 2.0 * np.pi * frequencies(chain, 1)[0]
+        self._damping = 2.0 * damping_ratio / float(first)
+        self._state = State(chain)
+        t = np.arange(_PARTS) / _PARTS
+        n = chain.nodes.size - 1
+        self._segment = np.append(np.repeat(np.arange(n), _PARTS), n - 1)
+        self._part = np.append(np.tile(t, n), 1.0)
+        self._arc = chain.nodes[self._segment] + self._part * np.diff(chain.nodes)[self._segment]
+        self._radius = whisker.radius(np.minimum(self._arc, whisker.length))
+        self._weights = bezier(self._part)
+        self._links: IntArray = np.arange(n + 1) + (1 if chain.soft_base else 0)
+        self._theta = self._masses = self._controls = History.still(np.zeros(1))
+
+    def begin(self, rotations: Array, places: Array) -> bool:
+        """Begin unbent, moved along by the first placements (4, ...), if nothing is in the way.
+
+        Otherwise begin unbent and still. Returns whether it was free.
+        """
+        state, rest = self._state, self._chain.rest
+        state.move(rest, rotations[0], places[0])
+        free = not self._contacts()
+        self._theta = History.still(rest)
+        self._masses, self._controls = History.still(state.masses), History.still(state.controls)
+        if free:
+            masses, controls = [], []
+            for rotation, place in zip(rotations, places, strict=True):
+                state.move(rest, rotation, place)
+                masses.append(state.masses)
+                controls.append(state.controls)
+            self._masses = History.before_first(np.array(masses), self._step)
+            self._controls = History.before_first(np.array(controls), self._step)
+        return free
+
+    def step(self, rotation: Array, base: Array) -> Moment:
+        """Next step, to a placement of the base."""
+        chain, state = self._chain, self._state
+        h, theta = self._step, self._theta.value.copy()
+        rate = 1.5 / h
+        spring = chain.stiffness * (1.0 + self._damping * rate)
+        pull = np.zeros_like(state.masses)
+        touching: list[tuple[Contact, Array, bool]] = []
+        for rounds in range(_ROUNDS):
+            state.move(theta, rotation, base)
+            speed = self._masses.rate_of(state.masses, h)
+            pull = chain.mass[:, None] * self._masses.acceleration_of(speed, h)
+            inertia(
+                state.masses,
+                chain.mass,
+                chain.mass_link,
+                pull,
+                state.pivots,
+                state.turns,
+                state.residual,
+                state.matrix,
+            )
+            turning = self._theta.rate_of(theta, h)
+            elastic = chain.stiffness * (theta - chain.rest + self._damping * turning)
+            residual: Array = state.residual + elastic.ravel()
+            matrix = rate**2 * state.matrix
+            matrix[np.diag_indices_from(matrix)] += spring.ravel()
+            # Near sticking Newton's method overshoots, where the secant of friction does not.
+            eager = rounds < _EAGER
+            touching = [
+                self._push(contact, residual, matrix, eager) for contact in self._contacts()
+            ]
+            if self._friction > 0.0 and touching:
+                residual[:] = np.linalg.solve(matrix, residual)
+            else:
+                solve_definite(matrix, residual)
+            change = residual.reshape(theta.shape)
+            largest = float(np.abs(change).max())
+            theta -= change * min(1.0, _MOST_TURNED / max(largest, 1e-300))
+            if largest < _TURNED:
+                break
+        self._theta = self._theta.then(theta, h)
+        self._masses = self._masses.then(state.masses, h)
+        self._controls = self._controls.then(state.controls, h)
+        return self._moment(base, pull, touching)
+
+    def _contacts(self) -> list[Contact]:
+        """Contacts of the whisker."""
+        contacts = []
+        controls = self._state.controls
+        line = np.einsum("kc,kci->ki", self._weights, controls[self._segment])
+        for number, solid in enumerate(self._surfaces):
+            away = solid.signed_distance(line)
+            near = away < self._radius + _NEAR
+            if not near.any():
+                continue
+            inner = np.concatenate([[np.inf], away, [np.inf]])
+            dips = (inner[1:-1] < inner[:-2]) & (inner[1:-1] <= inner[2:]) & near
+            for dip in np.flatnonzero(dips).tolist():
+                contact = self._nearest(number, dip)
+                if contact.gap < 0.0:
+                    contacts.append(contact)
+        return contacts
+
+    def _nearest(self, number: int, dip: int) -> Contact:
+        """The minimum of the distance near a sample."""
+        at = np.clip(self._segment[dip] + self._part[dip] + _ZOOM, 0.0, self._chain.nodes.size - 1)
+        away = self._away(number, at)
+        i = int(np.argmin(away))
+        if 0 < i < at.size - 1:
+            bend = away[i - 1] - 2.0 * away[i] + away[i + 1]
+            lean = 0.5 * (away[i + 1] - away[i - 1])
+            part = -lean / bend if bend > 0.0 else 0.0
+            best = float(at[i] + np.clip(part, -1.0, 1.0) * (at[i + 1] - at[i]))
+        else:
+            best = float(at[i])
+        segment = min(int(best), self._chain.nodes.size - 2)
+        weights = bezier(np.array(best - segment))
+        place = weights @ self._state.controls[segment]
+        distance, normal, _ = self._surfaces[number].local_geometry(place)
+        nodes = self._chain.nodes
+        arc = nodes[segment] + (best - segment) * (nodes[segment + 1] - nodes[segment])
+        radius = float(np.interp(arc, self._arc, self._radius))
+        return Contact(number, float(arc), segment, weights, place, distance - radius, normal)
+
+    def _away(self, number: int, at: Array) -> Array:
+        """Distances of the centreline from an object, at segments and fractions of them."""
+        segment = np.minimum(at.astype(int), self._chain.nodes.size - 2)
+        place = np.einsum("kc,kci->ki", bezier(at - segment), self._state.controls[segment])
+        return self._surfaces[number].signed_distance(place)
+
+    def _push(
+        self, contact: Contact, residual: Array, matrix: Array, eager: bool
+    ) -> tuple[Contact, Array, bool]:
+        """Add a contact's force and its derivative to the equations."""
+        state, segment = self._state, contact.segment
+        links = self._links[[segment, segment, segment + 1]]
+        points = state.controls[segment]
+        moves = jacobian(points, links, contact.weights, state.pivots, state.turns)
+        stiffness = self._stiffness[contact.surface]
+        normal, pressing = contact.normal, -stiffness * contact.gap
+        force = pressing * normal
+        across = normal @ moves
+        matrix += stiffness * np.outer(across, across)
+        sliding = True
+        if self._friction > 0.0:
+            rates = self._controls.rate_of(state.controls, self._step)[segment]
+            speed = contact.weights @ rates
+            speed = speed - (speed @ normal) * normal
+            fast = float(np.sqrt(speed @ speed + _CREEP**2))
+            drag = self._friction * pressing / fast
+            force = force - drag * speed
+            rate = 1.5 / self._step * drag
+            sliding = bool(np.linalg.norm(speed) > _CREEP)
+            flat = moves - np.outer(normal, across)
+            along = (speed / fast) @ flat
+            matrix += rate * flat.T @ flat
+            if eager:
+                matrix -= rate * np.outer(along, along)
+            matrix -= self._friction * stiffness * np.outer(along, across)
+        residual -= force @ moves
+        return contact, force, sliding
+
+    def _moment(
+        self, base: Array, pull: Array, touching: Sequence[tuple[Contact, Array, bool]]
+    ) -> Moment:
+        """Wrench at the base, and shape of the whisker."""
+        force = -pull.sum(axis=0)
+        moment = -np.cross(self._state.masses - base, pull).sum(axis=0)
+        for contact, push, _ in touching:
+            force = force + push
+            moment = moment + np.cross(contact.point - base, push)
+        ordered = sorted(touching, key=lambda one: -float(np.linalg.norm(one[1])))
+        return Moment(
+            force=force,
+            moment=moment,
+            controls=self._state.controls.copy(),
+            nodes=self._chain.nodes,
+            contacts=tuple(contact for contact, _, _ in ordered),
+            contact_force=ordered[0][1] if ordered else np.full(3, np.nan),
+            sliding=bool(ordered and ordered[0][2]),
+        )

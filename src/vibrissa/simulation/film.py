@@ -1,19 +1,32 @@
-"""Film a trial: what two cameras would have seen of it.
+"""Films of a simulated trial: the videos that two cameras would have recorded.
 
 Backlit, the whisker, the object and the face are dark on uneven light. The whisker has its true
 tapering width, down to a fraction of a pixel; it is blurred by the lens, by the pixel and by its
 movement while the shutter is open; an object between it and the camera hides it. Photons and
 electronics add noise.
 
-A film is as long as its trial and frame by frame in step with it. What it truly shows goes beside
-it: the centreline in pixels and which part of it is hidden, in the recording's group ``truth``.
+A film has as many frames as its trial. The true traces, the centreline in pixels and which part of
+it is hidden, are added to the recording's group ``truth``.
+
+Objects hide what is behind them, for any signed distance: along a line of sight the distance to the
+nearest surface is also a length on which it is not met, so that few steps lead past an object or
+into it. The least distance along the line gives the share of a pixel that the object covers.
+
+The image of a thin dark strip of half width w, blurred by a Gaussian of standard deviation σ, is
+
+    c(d) = ½ [erf((w + d) / √2 σ) + erf((w − d) / √2 σ)]
+
+at the distance d from its middle, whatever w is: a strip far thinner than a pixel is a faint line
+of the right darkness. σ includes both the blur of the lens and the size of a pixel.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -23,9 +36,9 @@ from scipy.interpolate import CubicSpline
 from vibrissa.cameras.camera import PIXEL_SIZE, Camera, orthogonal_views
 from vibrissa.cameras.files import cameras_dataset
 from vibrissa.io.video import Frame, write_video
-from vibrissa.objects.surface import Surface
+from vibrissa.numerics import kernel
+from vibrissa.objects import Surface
 from vibrissa.recording import Group, Recording, recorded
-from vibrissa.simulation.shadows import hidden, silhouette
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -37,18 +50,36 @@ _STEP = 2.0
 """Length of a piece of painted whisker, pixels."""
 
 _CHEEK = 0.5e-3
-"""How far the face of several whiskers reaches beyond their bases, m."""
+"""Margin of the face of several whiskers beyond their bases, m."""
 
 _MARGIN = 0.05
-"""Room around several whiskers, as a share of how far they reach."""
+"""Margin of the image of several whiskers, as a share of their extent."""
+
+_REACH = 0.15
+"""Distance before and behind the scene up to which objects are searched, m."""
+
+_STEPS = 200
+"""Most steps along a line of sight."""
+
+_COARSE = 8
+"""Pitch of the grid on which an object's outline is searched, pixels."""
+
+_SOFT = 3.0
+"""Standard deviations of the blur up to which an outline is computed pixel by pixel."""
+
+_TAIL = 3.5
+"""Standard deviations of the blur beyond which a strip's image is zero."""
+
+_NEXT_SEED = 7919
+"""Difference between the seeds of two cameras."""
 
 _FUR = 2.0
 """Softness of the face's edge, standard deviation, pixels."""
 
 
 @dataclass(frozen=True)
-class Look:
-    """How a film looks.
+class ImageConditions:
+    """Light, optics and noise of a film.
 
     Parameters
     ----------
@@ -59,18 +90,18 @@ class Look:
     dark : float
         Grey value of face and objects.
     contrast : float
-        Share of the light that the whisker keeps away where it covers a pixel.
+        Share of the light that the whisker blocks where it covers a pixel.
     blur : float
-        Of the lens, standard deviation, pixels.
+        Standard deviation of the lens's blur, pixels.
     exposure : float
-        How long the shutter is open, s.
+        Time that the shutter is open, s.
     gain : float
-        Electrons per grey value, which sets the shot noise.
+        Electrons per grey value, which set the shot noise.
     read_noise : float
-        Standard deviation, grey values.
+        Standard deviation of the read noise, grey values.
     face : tuple of float
-        Half the length, width and height of the face, m. The base is on its surface. Zeros: none.
-        That of several whiskers is as large as they stand on it.
+        Half the length, width and height of the face, m, zeros for none. The base is on its
+        surface; the face of several whiskers is as large as their bases need.
     """
 
     light: float = 200.0
@@ -106,14 +137,15 @@ class Look:
 
 
 def views_of(recording: xr.DataTree, pixel_size: float | None = None) -> tuple[Camera, Camera]:
-    """Point the two cameras of the paper at the middle of where a trial's whiskers go.
+    """Cameras of the paper, pointed at the middle of the space that a trial's whiskers sweep.
 
     Parameters
     ----------
     recording : xarray.DataTree
-        Of a simulated trial.
+        Recording of a simulated trial.
     pixel_size : float, optional
-        What a pixel sees, m; by default 58 µm, or for several whiskers what it takes to see all.
+        Size of a pixel in the object plane, m; by default 58 µm, or for several whiskers as large
+        as is needed to see all.
 
     Returns
     -------
@@ -122,7 +154,7 @@ def views_of(recording: xr.DataTree, pixel_size: float | None = None) -> tuple[C
     """
     lines = _truth(recording)["centerline"].values
     low, high = np.nanmin(lines, axis=(0, 1, 2)), np.nanmax(lines, axis=(0, 1, 2))
-    # A whole tenth of a millimetre is easier to write down.
+    # A whole tenth of a millimetre is easier to note.
     middle = np.round(0.5 * (low + high), 4)
     if pixel_size is None:
         whole = (1.0 + _MARGIN) * float((high - low).max()) / min(orthogonal_views()[0].size)
@@ -134,7 +166,7 @@ def film(
     recording: xr.DataTree,
     paths: Mapping[str, str | PathLike[str]],
     cameras: Sequence[Camera] | None = None,
-    look: Look | None = None,
+    conditions: ImageConditions | None = None,
     *,
     seed: int = 0,
     rate: float = 50.0,
@@ -145,24 +177,24 @@ def film(
     Parameters
     ----------
     recording : xarray.DataTree
-        Of `vibrissa.simulation.simulate`.
+        Recording of `vibrissa.simulation.simulate`.
     paths : mapping of str to path
-        Name of each view and where its video is written, ``.mkv`` (lossless) or ``.mp4``.
+        Path of each view's video by its name, ``.mkv`` (lossless) or ``.mp4``.
     cameras : sequence of Camera, optional
-        The views, whose names are those of the paths; by default `views_of` the trial.
-    look : Look, optional
-        Light, blur, noise.
+        Cameras, whose names are those of the paths; by default `views_of` the trial.
+    conditions : ImageConditions, optional
+        Light, blur and noise of the images.
     seed : int
-        Of the noise.
+        Seed of the noise.
     rate : float
-        Frames per second at which the videos are to be shown.
+        Frame rate at which the videos are to be shown, Hz.
     progress : callable, optional
-        Told after every frame how many are done, of how many.
+        Function called after every frame with the numbers of frames done and of all frames.
 
     Returns
     -------
     xarray.DataTree
-        A new recording: with the cameras in the group ``cameras``, and in ``truth`` the variables
+        New recording with the cameras in the group ``cameras``, and in ``truth`` the variables
         ``trace`` and ``trace_visible``.
 
     Raises
@@ -177,41 +209,60 @@ def film(
     total = len(cameras) * recording.sizes["time"]
     for i, camera in enumerate(cameras):
 
-        def told(frames: Iterator[Frame], before: int) -> Iterator[Frame]:
+        def counted(frames: Iterator[Frame], before: int) -> Iterator[Frame]:
             for done, frame in enumerate(frames):
                 yield frame
                 if progress is not None:
                     progress(before + done + 1, total)
 
-        frames = film_frames(recording, camera, look, seed=seed + 7919 * i)
-        write_video(paths[camera.name], told(frames, i * recording.sizes["time"]), rate)
+        frames = film_frames(recording, camera, conditions, seed=seed + _NEXT_SEED * i)
+        write_video(paths[camera.name], counted(frames, i * recording.sizes["time"]), rate)
     return with_true_traces(recording, cameras)
 
 
 def film_frames(
-    recording: xr.DataTree, camera: Camera, look: Look | None = None, *, seed: int = 0
+    recording: xr.DataTree,
+    camera: Camera,
+    conditions: ImageConditions | None = None,
+    *,
+    seed: int = 0,
 ) -> Iterator[Frame]:
-    """Film a simulated trial with one camera."""
-    from vibrissa.simulation import painting
+    """Frames of a simulated trial, filmed with one camera.
 
-    look = look or Look()
+    Parameters
+    ----------
+    recording : xarray.DataTree
+        Recording of `simulate`.
+    camera : Camera
+        Camera that films it.
+    conditions : ImageConditions, optional
+        Light, blur and noise of the images.
+    seed : int
+        Seed of the noise.
+
+    Yields
+    ------
+    array (height, width) of uint8
+        Image of each frame.
+    """
+    conditions = conditions or ImageConditions()
     truth = _truth(recording)
     lines = truth["centerline"].values
     objects = Recording(recording).objects
-    moves = _moves(lines, truth["time"].values, look.exposure)
+    moves = _moves(lines, truth["time"].values, conditions.exposure)
     whiskers = [Recording(recording).whisker(i) for i in range(lines.shape[1])]
     generator = np.random.default_rng(seed)
     width, height = camera.size
-    scene = _scene(camera, objects, look, np.nanmean(lines, axis=(0, 1, 2)))
+    scene = _scene(camera, objects, conditions, np.nanmean(lines, axis=(0, 1, 2)))
     light, box = scene.copy(), np.zeros(4, np.int64)
     total, covered = np.zeros_like(light), np.zeros_like(light)
     noise = generator.standard_normal(1 << 20).astype(np.float32)
     frame = np.empty((height, width), np.uint8)
     for i in range(len(lines)):
-        if all(look.face):
+        if all(conditions.face):
             light[box[0] : box[1], box[2] : box[3]] = scene[box[0] : box[1], box[2] : box[3]]
-            middle, inverse, box = _face(camera, lines[i, :, 0], look)
-            painting.shade(light, middle, inverse, look.dark, _FUR, box)
+            middle, inverse, box = _face(camera, lines[i, :, 0], conditions)
+            shade(light, middle, inverse, conditions.dark, _FUR, box)
         total[:] = 0.0
         for whisker, line, move in zip(whiskers, lines[i], moves[i], strict=True):
             radius = whisker.radius(np.linspace(0.0, whisker.length, line.shape[0]))
@@ -224,18 +275,36 @@ def film_frames(
             count = max(1, int(np.ceil(np.nanmax(np.linalg.norm(drift, axis=1), initial=0.0))))
             for k in range(count):
                 at = pixels + ((k + 0.5) / count - 0.5) * drift
-                painting.cover(
-                    covered, at, wide * per_m, 1.0 - behind, look.sigma, look.contrast / count
+                cover(
+                    covered,
+                    at,
+                    wide * per_m,
+                    1.0 - behind,
+                    conditions.sigma,
+                    conditions.contrast / count,
                 )
-                reach = float((wide * per_m).max()) + 4.0 * look.sigma
-                painting.collect(covered, total, at, reach)
+                reach = float((wide * per_m).max()) + 4.0 * conditions.sigma
+                collect(covered, total, at, reach)
         starts = generator.integers(0, noise.size - width, height)
-        painting.expose(light, total, noise, starts, look.gain, look.read_noise, frame)
+        expose(light, total, noise, starts, conditions.gain, conditions.read_noise, frame)
         yield frame.copy()
 
 
 def with_true_traces(recording: xr.DataTree, cameras: Sequence[Camera]) -> xr.DataTree:
-    """Say what cameras truly see of a simulated trial."""
+    """Recording with the true traces of a simulated trial in the images of cameras.
+
+    Parameters
+    ----------
+    recording : xarray.DataTree
+        Recording of `simulate`.
+    cameras : sequence of Camera
+        Cameras that film it.
+
+    Returns
+    -------
+    xarray.DataTree
+        New recording, as of `film`.
+    """
     truth = _truth(recording)
     line = Group(truth)["centerline"]
     objects = Recording(recording).objects
@@ -266,10 +335,10 @@ def _truth(recording: xr.DataTree) -> xr.Dataset:
 
 
 def _moves(lines: Array, time: Array, exposure: float) -> Array:
-    """How far each node moves while the shutter is open, (time, whisker, node, 3), m.
+    """Displacement of each node while the shutter is open, (time, whisker, node, 3), m.
 
-    Of the way to the frame before and after the shorter one counts, so that a whisker that springs
-    free is not smeared over the way that it jumped.
+    That toward the frame before or after, whichever is shorter, so that a whisker that springs
+    free is not smeared over the length of its jump.
     """
     if len(lines) < 2:
         return np.zeros_like(lines)
@@ -294,22 +363,26 @@ def _at(move: Array, fine: Array, line: Array) -> Array:
     return np.stack([np.interp(t, s, move[:, k]) for k in range(3)], axis=-1)
 
 
-def _scene(camera: Camera, objects: Sequence[Surface], look: Look, center: Array) -> Image:
+def _scene(
+    camera: Camera, objects: Sequence[Surface], conditions: ImageConditions, center: Array
+) -> Image:
     """Light and objects, (height, width)."""
     width, height = camera.size
     x, y = np.meshgrid(np.linspace(-1.0, 1.0, width), np.linspace(-1.0, 1.0, height))
     patches = np.sin(3.1 * x + 1.0) * np.cos(2.3 * y - 0.5) + np.cos(5.3 * x - 3.7 * y)
     missing = 0.3 * (x**2 + y**2) + 0.1 * (2.0 - patches)
-    light = look.light * (1.0 - look.unevenness * np.clip(missing, 0.0, 1.0))
-    covered = silhouette(camera, objects, center, look.sigma)
-    light = light * (1.0 - covered) + look.dark * covered
+    light = conditions.light * (1.0 - conditions.unevenness * np.clip(missing, 0.0, 1.0))
+    covered = silhouette(camera, objects, center, conditions.sigma)
+    light = light * (1.0 - covered) + conditions.dark * covered
     return np.asarray(light, dtype=np.float32)
 
 
-def _face(camera: Camera, bases: Array, look: Look) -> tuple[Array, Array, NDArray[np.int64]]:
-    """Middle (2,) and matrix (2, 2) of the ellipse that the face shows, and the box around it."""
+def _face(
+    camera: Camera, bases: Array, conditions: ImageConditions
+) -> tuple[Array, Array, NDArray[np.int64]]:
+    """Middle (2,) and matrix (2, 2) of the face's ellipse in the image, and the box around it."""
     if len(bases) == 1:
-        center, size = bases[0] - [look.face[0], 0.0, 0.0], np.array(look.face)
+        center, size = bases[0] - [conditions.face[0], 0.0, 0.0], np.array(conditions.face)
     else:
         center = bases.mean(axis=0)
         size = np.abs(bases - center).max(axis=0) + _CHEEK
@@ -321,3 +394,191 @@ def _face(camera: Camera, bases: Array, look: Look) -> tuple[Array, Array, NDArr
     height, width = camera.size[1], camera.size[0]
     box = np.clip(ends, 0, [height, height, width, width]).astype(np.int64)
     return middle, np.linalg.inv(square), box
+
+
+def hidden(points: Array, camera: Camera, objects: Sequence[Surface]) -> Array:
+    """Which points (...) are hidden by an object: 1, or 0."""
+    flat = points.reshape(-1, 3)
+    out = np.zeros(len(flat))
+    known = np.isfinite(flat).all(axis=1)
+    _, away = camera.rays(camera.project(flat[known]))
+    step = 1.0 / _pixels_per_m(camera, flat[known].mean(axis=0)) if known.any() else 1.0
+    for thing in objects:
+        nearest = _least(thing, flat[known], -away, _REACH, 0.5 * step)
+        out[known] = np.maximum(out[known], nearest < -0.25 * step)
+    return out.reshape(points.shape[:-1])
+
+
+def silhouette(camera: Camera, objects: Sequence[Surface], center: Array, soft: float) -> Array:
+    """Share of each pixel that objects cover.
+
+    Parameters
+    ----------
+    camera : Camera
+        Camera that sees them.
+    objects : sequence of Surface
+        Objects in the laboratory.
+    center : array (3,)
+        Middle of the scene, m.
+    soft : float
+        Standard deviation of the outline's blur, pixels.
+
+    Returns
+    -------
+    array (height, width)
+        Shares from 0 to 1.
+    """
+    from scipy.special import ndtr
+
+    width, height = camera.size
+    covered = np.zeros((height, width))
+    if not objects:
+        return covered
+    scale = _pixels_per_m(camera, center)
+    margin = _COARSE + (_SOFT + 1.0) * soft
+    rows, columns = np.arange(0, height + _COARSE, _COARSE), np.arange(0, width + _COARSE, _COARSE)
+    corners = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+    for thing in objects:
+        rough = _nearest(camera, thing, corners, center, scale) * scale
+        inside = rough < -margin
+        near = np.abs(rough) <= margin
+        for column, row in corners[inside]:
+            covered[_block(row), _block(column)] = 1.0
+        mask = np.zeros((height, width), dtype=bool)
+        for column, row in corners[near]:
+            mask[_block(row), _block(column)] = True
+        pixels = np.stack(np.nonzero(mask)[::-1], axis=-1)
+        if len(pixels):
+            distance = _nearest(camera, thing, pixels, center, scale) * scale
+            covered[mask] = np.maximum(covered[mask], ndtr(-distance / soft))
+    return covered
+
+
+def _block(place: int) -> slice:
+    """Pixels that are nearest to a corner."""
+    return slice(max(place - _COARSE // 2, 0), place + _COARSE // 2)
+
+
+def _pixels_per_m(camera: Camera, point: Array) -> float:
+    return float(np.linalg.norm(camera.project_with_slopes(point)[1]) / np.sqrt(2.0))
+
+
+def _nearest(
+    camera: Camera, thing: Surface, pixels: NDArray[np.int64], center: Array, scale: float
+) -> Array:
+    """Least distance of an object from the lines of sight, m."""
+    origin, direction = camera.rays(pixels)
+    along = ((center - origin) * direction).sum(axis=1) - _REACH
+    start = origin + along[:, None] * direction
+    return _least(thing, start, direction, 2.0 * _REACH, 0.5 / scale)
+
+
+def _least(thing: Surface, start: Array, direction: Array, reach: float, step: float) -> Array:
+    """Least signed distance along the line from each start (n, 3), m."""
+    least = np.full(len(start), np.inf)
+    gone = np.zeros(len(start))
+    active = np.arange(len(start))
+    for _ in range(_STEPS):
+        distance = thing.signed_distance(start[active] + gone[active, None] * direction[active])
+        least[active] = np.minimum(least[active], distance)
+        gone[active] += np.maximum(np.abs(distance), step)
+        # Deep inside the least distance no longer matters.
+        active = active[(gone[active] < reach) & (least[active] > -20.0 * step)]
+        if not active.size:
+            break
+    return least
+
+
+@kernel
+def cover(image: Any, line: Any, half_width: Any, shown: Any, sigma: float, share: float) -> None:
+    """Share of each pixel that a strip covers, at most ``share`` of it."""
+    rows, columns = image.shape
+    last = line.shape[0] - 2
+    scale = 1.0 / (math.sqrt(2.0) * sigma)
+    for k in range(last + 1):
+        x0, y0 = line[k, 0], line[k, 1]
+        ex, ey = line[k + 1, 0] - x0, line[k + 1, 1] - y0
+        length = math.sqrt(ex * ex + ey * ey)
+        if not (length > 1e-9 and (shown[k] > 0.0 or shown[k + 1] > 0.0)):
+            continue
+        ex, ey = ex / length, ey / length
+        reach = max(half_width[k], half_width[k + 1]) + _TAIL * sigma
+        left = max(0, math.floor(min(x0, line[k + 1, 0]) - reach))
+        right = min(columns - 1, math.ceil(max(x0, line[k + 1, 0]) + reach))
+        top = max(0, math.floor(min(y0, line[k + 1, 1]) - reach))
+        bottom = min(rows - 1, math.ceil(max(y0, line[k + 1, 1]) + reach))
+        for row in range(top, bottom + 1):
+            for column in range(left, right + 1):
+                along = (column - x0) * ex + (row - y0) * ey
+                t = max(along, 0.0)
+                end = 1.0
+                if k == last:
+                    end = 0.5 * (1.0 + math.erf((length - along) * scale))
+                else:
+                    t = min(t, length)
+                dx, dy = column - x0 - t * ex, row - y0 - t * ey
+                d = math.sqrt(dx * dx + dy * dy)
+                if d > reach:
+                    continue
+                f = min(t / length, 1.0)
+                w = half_width[k] + f * (half_width[k + 1] - half_width[k])
+                seen = shown[k] + f * (shown[k + 1] - shown[k])
+                c = 0.5 * (math.erf((w + d) * scale) + math.erf((w - d) * scale))
+                value = share * c * end * seen
+                if value > image[row, column]:
+                    image[row, column] = value
+
+
+@kernel
+def collect(covered: Any, total: Any, line: Any, reach: float) -> None:
+    """Move what was covered, near a line, to the total, and clear it."""
+    rows, columns = covered.shape
+    for k in range(line.shape[0] - 1):
+        left = max(0, math.floor(min(line[k, 0], line[k + 1, 0]) - reach))
+        right = min(columns - 1, math.ceil(max(line[k, 0], line[k + 1, 0]) + reach))
+        top = max(0, math.floor(min(line[k, 1], line[k + 1, 1]) - reach))
+        bottom = min(rows - 1, math.ceil(max(line[k, 1], line[k + 1, 1]) + reach))
+        for row in range(top, bottom + 1):
+            for column in range(left, right + 1):
+                if covered[row, column] > 0.0:
+                    total[row, column] += covered[row, column]
+                    covered[row, column] = 0.0
+
+
+@kernel
+def expose(
+    light: Any,
+    total: Any,
+    noise: Any,
+    starts: Any,
+    gain: float,
+    read_noise: float,
+    frame: Any,
+) -> None:
+    """Turn light into grey values with noise."""
+    rows, columns = frame.shape
+    for row in range(rows):
+        start = starts[row]
+        for column in range(columns):
+            value = light[row, column] * (1.0 - min(total[row, column], 1.0))
+            spread = math.sqrt(value / gain + read_noise * read_noise)
+            value += spread * noise[start + column] + 0.5
+            frame[row, column] = np.uint8(min(max(value, 0.0), 255.0))
+
+
+@kernel
+def shade(image: Any, center: Any, inverse: Any, level: float, edge: float, box: Any) -> None:
+    """Paint a soft dark ellipse."""
+    scale = 1.0 / (math.sqrt(2.0) * edge)
+    a, b, c = inverse[0, 0], inverse[0, 1], inverse[1, 1]
+    for row in range(box[0], box[1]):
+        y = row - center[1]
+        for column in range(box[2], box[3]):
+            x = column - center[0]
+            gx, gy = a * x + b * y, b * x + c * y
+            m = math.sqrt(x * gx + y * gy) + 1e-12
+            # Distance from the edge, to first order.
+            v = (m - 1.0) * m / (math.sqrt(gx * gx + gy * gy) + 1e-12) * scale
+            if v <= 2.5:
+                w = 1.0 if v < -2.5 else 0.5 * (1.0 - math.erf(v))
+                image[row, column] += (level - image[row, column]) * w

@@ -1,4 +1,4 @@
-"""How the base of a whisker moves: whisking, given in closed form.
+"""Motion of a whisker's base, whisking in closed form, and of all whiskers of a face.
 
 The laboratory frame has z up; the base sits near its origin, the whisker points along x (away from
 the head) at azimuth 0, and protraction, which raises the azimuth, moves it toward y (forward):
@@ -10,8 +10,13 @@ intrinsic curvature bends its tip forward; pushed against something in front of 
 concave forward, and against something behind it concave backward.
 
 Elevation and roll follow the azimuth by a fixed ratio (Knutsen, Biess & Ahissar 2008), row by row
-of the mystacial array; on top come slow drifts of set point, amplitude, elevation and position,
-sums of three sinusoids with random phases. All is smooth.
+of the mystacial array; to this slow drifts of set point, amplitude, elevation and position are
+added, sums of three sinusoids with random phases. All is smooth.
+
+Every whisker of a face protracts by the same angle, forward on both sides, about its own rest pose
+(`vibrissa.whisker.array`); elevation and roll follow by the ratios of its row. The two sides are
+mirror images of each other. The face is not an obstacle: neither whiskers nor objects are kept out
+of it.
 """
 
 from __future__ import annotations
@@ -19,12 +24,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
-from vibrissa.whisker.emergence import base_rotation
+from vibrissa.whisker.array import WhiskerArray
+from vibrissa.whisker.emergence import angles_of, base_rotation, mirrored
 from vibrissa.whisker.pose import ORTHOGONALITY
 
 Array = NDArray[np.float64]
@@ -45,18 +52,18 @@ _DRIFT = np.array([0.31, 0.57, 0.93])
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Where the base is over time.
+    """Pose of the base over time.
 
     Parameters
     ----------
     time : array (n,)
-        Of the frames, s, rising.
+        Times of the frames, s, rising.
     azimuth, elevation, roll : array (n,)
-        Of the base, rad; see the module. Where the head turns, they are relative to it.
+        Angles of the base, rad; see the module. Where the head turns, they are relative to it.
     base_position : array (n, 3)
-        The base in the laboratory frame, m.
+        Position of the base in the laboratory frame, m.
     head_rotation : array (n, 3, 3), optional
-        From the head's to the laboratory frame, where the head turns.
+        Rotation from the head's to the laboratory frame, where the head turns.
     head_position : array (n, 3), optional
         Origin of the head's frame in the laboratory, m, where the head moves.
 
@@ -101,24 +108,24 @@ class Motion:
         return on_head if self.head_rotation is None else self.head_rotation @ on_head
 
     def on_head(self, rotation: ArrayLike, position: ArrayLike) -> Motion:
-        """Let the head, on which the whisker moves like this, move as well.
+        """Same motion on a head that moves as well.
 
         Parameters
         ----------
         rotation : array_like (n, 3, 3) or (3, 3)
-            From the head's to the laboratory frame.
+            Rotation from the head's to the laboratory frame.
         position : array_like (n, 3) or (3,)
             Origin of the head's frame in the laboratory, m.
 
         Returns
         -------
         Motion
-            With the base carried along.
+            Motion with the base carried along.
 
         Raises
         ------
         ValueError
-            If shapes do not fit, a matrix is no rotation, or the head moves already.
+            If shapes do not fit, a matrix is not a rotation, or the head moves already.
         """
         if self.head_rotation is not None:
             raise ValueError("the head moves already: a motion goes on a head once")
@@ -127,7 +134,7 @@ class Motion:
         shift = np.array(np.broadcast_to(np.asarray(position, dtype=np.float64), (n, 3)))
         off = np.abs(np.swapaxes(turn, 1, 2) @ turn - np.eye(3)).max()
         if not off <= ORTHOGONALITY or (np.linalg.det(turn) < 0.0).any():
-            raise ValueError("the head's rotation is no rotation matrix in every frame")
+            raise ValueError("the head's rotation is not a rotation matrix in every frame")
         base = np.einsum("nij,nj->ni", turn, self.base_position) + shift
         return replace(self, base_position=base, head_rotation=turn, head_position=shift)
 
@@ -152,28 +159,28 @@ def whisking(
     position_drift: float = 1e-3,
     seed: int = 0,
 ) -> Motion:
-    """Whisk: sweep back and forth, a little differently each time.
+    """Whisking: sweeps back and forth, a little different each time.
 
     Parameters
     ----------
     duration : float
-        Of the trial, s.
+        Duration of the trial, s.
     rate : float
-        Frames per second.
+        Frame rate, Hz.
     frequency : float
-        Whisks per second.
+        Frequency of whisking, Hz.
     amplitude : float
-        Half of the sweep, rad; the trial begins at the rear end of one.
+        Half of the sweep, rad; the trial begins at the rear end of a sweep.
     set_point : float
         Azimuth in the middle of the sweep, rad.
     protraction : float
         Share of a whisk that goes forward, from 0.3 to 0.7; above one half retraction is faster.
     row : {"A", "B", "C", "D", "E"}
-        Row of the array, which says how elevation and roll follow the azimuth.
+        Row of the array, by which elevation and roll follow the azimuth.
     elevation : float
-        At the set point, rad.
+        Elevation at the set point, rad.
     elevation_per_azimuth, roll_per_azimuth : float
-        What elevation and roll gain per azimuth from the set point; by default those of the row.
+        Gain of elevation and roll per azimuth from the set point; by default those of the row.
     variation : float
         Largest drift of amplitude and of set point, as a share of the amplitude.
     elevation_drift : float
@@ -181,17 +188,17 @@ def whisking(
     position_drift : float
         Largest drift of the base along each axis of the laboratory, m.
     seed : int
-        Of the drifts.
+        Seed of the drifts.
 
     Returns
     -------
     Motion
-        Frames at 0, 1/rate, … below ``duration``.
+        Motion with frames at 0, 1/rate, … below ``duration``.
 
     Raises
     ------
     ValueError
-        If duration, rate or frequency are not positive, less than two frames result, the share of
+        If duration, rate or frequency are not positive, fewer than two frames result, the share of
         protraction is out of bounds, or there is no such row.
 
     Examples
@@ -206,7 +213,7 @@ def whisking(
         if not (np.isfinite(value) and value > 0.0)
     ]
     if not faults and round(duration * rate) < 2:
-        faults.append(f"{duration} s at {rate} frames/s are less than two frames")
+        faults.append(f"{duration} s at {rate} frames/s are fewer than two frames")
     if row not in ROLL_PER_AZIMUTH:
         faults.append(f"row is {row!r}; one of {', '.join(ROLL_PER_AZIMUTH)} is needed")
     if not 0.3 <= protraction <= 0.7:
@@ -243,23 +250,24 @@ def tabulated(
     *,
     rate: float = 1000.0,
 ) -> Motion:
-    """Move as a table says, smoothly in between.
+    """Motion through the rows of a table, smooth in between.
 
     Parameters
     ----------
     time : array_like (m,)
-        Of the rows, s, rising.
+        Times of the rows, s, rising.
     azimuth, elevation, roll : array_like (m,) or ()
-        Of the base, rad.
+        Angles of the base, rad.
     base_position : array_like (m, 3) or (3,)
-        The base in the laboratory frame, m.
+        Position of the base in the laboratory frame, m.
     rate : float
-        Frames per second.
+        Frame rate, Hz.
 
     Returns
     -------
     Motion
-        Frames at the first time, 1/rate later, … up to the last; cubic splines between the rows.
+        Motion with frames at the first time, 1/rate later, … up to the last; cubic splines between
+        the rows.
 
     Raises
     ------
@@ -273,9 +281,9 @@ def tabulated(
     51
     """
     rows = np.asarray(time, dtype=np.float64)
-    given = {"azimuth": azimuth, "elevation": elevation, "roll": roll}
+    angles = {"azimuth": azimuth, "elevation": elevation, "roll": roll}
     values = {}
-    for name, column in given.items():
+    for name, column in angles.items():
         column = np.asarray(column, dtype=np.float64)
         values[name] = np.full(rows.shape, column) if column.ndim == 0 else column
     place = np.asarray(base_position, dtype=np.float64)
@@ -285,14 +293,202 @@ def tabulated(
     if not rate > 0.0 or count < 2:
         raise ValueError(f"{rows.size} rows at {rate} frames/s give fewer than two frames")
     frames = rows[0] + np.arange(count) / rate
-    smooth = {name: CubicSpline(rows, column)(frames) for name, column in _columns(table).items()}
+    smooth = {
+        name: CubicSpline(rows, column)(frames)
+        for name, column in ((name, getattr(table, name)) for name in values)
+    }
     return Motion(time=frames, **smooth)
 
 
-def _columns(motion: Motion) -> dict[str, Array]:
-    """Angles and place of a motion by name."""
-    names = ("azimuth", "elevation", "roll", "base_position")
-    return {name: getattr(motion, name) for name in names}
+def array_whisking(
+    array: WhiskerArray,
+    duration: float = 0.5,
+    rate: float = 1000.0,
+    *,
+    head_rotation: ArrayLike | None = None,
+    head_position: ArrayLike | None = None,
+    **motion: Any,
+) -> dict[str, Motion]:
+    """Whisking of all whiskers of a face.
+
+    Parameters
+    ----------
+    array : WhiskerArray
+        Whiskers of the face.
+    duration : float
+        Duration of the trial, s.
+    rate : float
+        Frame rate, Hz.
+    head_rotation : array_like (n, 3, 3) or (3, 3), optional
+        Rotation from the head's to the laboratory frame; by default they are the same.
+    head_position : array_like (n, 3) or (3,), optional
+        Position of the snout in the laboratory, m; by default its origin.
+    **motion
+        Other parameters of `shared_whisking`: frequency, amplitude, set point, …
+
+    Returns
+    -------
+    dict of str to Motion
+        Motions by the whiskers' names, n frames each.
+
+    Raises
+    ------
+    ValueError
+        As `whisking` and `Motion.on_head` do.
+
+    Examples
+    --------
+    >>> from vibrissa import whisker_array
+    >>> sorted(array_whisking(whisker_array("left", rows="C", columns=[1, 2]), duration=0.1))
+    ['LC1', 'LC2']
+    """
+    common = shared_whisking(duration, rate, **motion)
+    return protracted(array, common, head_rotation, head_position)
+
+
+def shared_whisking(
+    duration: float = 0.5,
+    rate: float = 1000.0,
+    *,
+    frequency: float = 8.0,
+    amplitude: float = np.radians(25.0),
+    set_point: float = np.radians(25.0),
+    position_drift: float = 0.0,
+    **motion: Any,
+) -> Motion:
+    """Whisking about rest, as all whiskers of an array share it.
+
+    Parameters
+    ----------
+    duration : float
+        Duration of the trial, s.
+    rate : float
+        Frame rate, Hz.
+    frequency : float
+        Frequency of whisking, Hz.
+    amplitude : float
+        Half of the sweep, rad; 0 holds the whiskers still, except for drifts.
+    set_point : float
+        Angle from the pose of rest forward to the middle of the sweep, rad.
+    position_drift : float
+        Largest drift of the bases on the face, m.
+    **motion
+        Other parameters of `whisking`, except ``row`` and the ratios, which are those of each row.
+
+    Returns
+    -------
+    Motion
+        Motion whose azimuth is the protraction from rest; for `protracted`.
+
+    Raises
+    ------
+    ValueError
+        As `whisking` does.
+    """
+    return whisking(
+        duration,
+        rate,
+        frequency=frequency,
+        amplitude=amplitude,
+        set_point=set_point,
+        position_drift=position_drift,
+        elevation_per_azimuth=0.0,
+        roll_per_azimuth=0.0,
+        **motion,
+    )
+
+
+def protracted(
+    array: WhiskerArray,
+    motion: Motion,
+    head_rotation: ArrayLike | None = None,
+    head_position: ArrayLike | None = None,
+) -> dict[str, Motion]:
+    """Motions of all whiskers by one protraction, each from its own pose of rest.
+
+    Parameters
+    ----------
+    array : WhiskerArray
+        Whiskers of the face.
+    motion : Motion
+        Motion whose azimuth is the angle by which whiskers are protracted from rest, to which each
+        row's elevation and roll are added; its own elevation, roll and displacement (of the right
+        side, mirrored on the left one) are added to these.
+    head_rotation : array_like (n, 3, 3) or (3, 3), optional
+        Rotation from the head's to the laboratory frame; by default they are the same.
+    head_position : array_like (n, 3) or (3,), optional
+        Position of the snout in the laboratory, m; by default its origin.
+
+    Returns
+    -------
+    dict of str to Motion
+        Motions by the whiskers' names.
+
+    Raises
+    ------
+    ValueError
+        As `Motion.on_head` does.
+    """
+    turn = np.eye(3) if head_rotation is None else head_rotation
+    shift = np.zeros(3) if head_position is None else head_position
+    flat = np.array([-1.0, 1.0, 1.0])
+    moves = {}
+    for name, whisker in array.items():
+        identity = array.identity(name)
+        left = identity.side == "left"
+        rest = angles_of(whisker.pose.rotation)
+        # On the left the angles are those of the mirror image, mirrored back in the end.
+        azimuth, elevation, roll = mirrored(rest) if left else rest
+        angles = np.stack(
+            [
+                azimuth + motion.azimuth,
+                elevation + ELEVATION_PER_AZIMUTH[identity.row] * motion.azimuth + motion.elevation,
+                roll + ROLL_PER_AZIMUTH[identity.row] * motion.azimuth + motion.roll,
+            ],
+            axis=-1,
+        )
+        azimuth, elevation, roll = (mirrored(angles) if left else angles).T
+        place = whisker.pose.origin + motion.base_position * (flat if left else 1.0)
+        moves[name] = Motion(motion.time, azimuth, elevation, roll, place).on_head(turn, shift)
+    return moves
+
+
+def head_path(
+    time: ArrayLike,
+    position: ArrayLike = (0.0, 0.0, 0.0),
+    angles: ArrayLike = (0.0, 0.0, 0.0),
+    *,
+    to_position: ArrayLike | None = None,
+    to_angles: ArrayLike | None = None,
+) -> tuple[Array, Array]:
+    """Path of a head from one pose to another, smooth, beginning and ending at rest.
+
+    Parameters
+    ----------
+    time : array_like (n,)
+        Times of the frames, s.
+    position : array_like (3,)
+        Position of the snout at the beginning, laboratory frame, m.
+    angles : array_like (3,)
+        Angles of the head at the beginning, rad: azimuth turns it to its left, elevation raises
+        its right side, roll raises its snout (`base_rotation`).
+    to_position, to_angles : array_like (3,), optional
+        Position and angles at the end; by default as at the beginning.
+
+    Returns
+    -------
+    tuple of array (n, 3, 3) and array (n, 3)
+        Rotations from the head's to the laboratory frame, and positions of the snout, m.
+    """
+    t = np.asarray(time, dtype=np.float64)
+    share = (t - t[0]) / (t[-1] - t[0])
+    # The path of least jerk.
+    share = (share**3 * (10.0 - 15.0 * share + 6.0 * share**2))[:, None]
+    ends = [(position, to_position), (angles, to_angles)]
+    place, turned = (
+        np.asarray(a) + share * (np.asarray(a if b is None else b) - np.asarray(a)) for a, b in ends
+    )
+    return base_rotation(*turned.T), place
 
 
 def _drifts(time: Array, count: int, seed: int) -> Array:

@@ -1,8 +1,8 @@
-"""Where to put a peg and how far to whisk, for whiskers of any length and shape.
+"""Position of an object and amplitude of whisking, for whiskers of any length and shape.
 
-The peg stands at a share of the whisker's reach. How far the whisker must be turned before it slips
-past depends on its shape and taper, so it is tried out: a coarse sweep in each direction, from
-clear of the peg until the whisker is clear again on the other side.
+The peg is at a share of the whisker's reach. The turn at which the whisker slips past depends on
+its shape and taper and is found by a coarse sweep in each direction, from clear of the peg until
+the whisker is clear again on the other side.
 """
 
 from __future__ import annotations
@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.objects.solids import Box, Peg, Plane, Sphere
-from vibrissa.objects.surface import Surface
+from vibrissa.objects import Box, Peg, Plane, Sphere, Surface
 from vibrissa.rod import follow_surfaces
 from vibrissa.simulation.motion import (
     ELEVATION_PER_AZIMUTH,
@@ -31,31 +30,37 @@ PEG_RADIUS = 1.35e-3
 """Half the diameter of the paper's peg, m."""
 
 _STEP = np.radians(1.5)
+"""Turn of a step of the coarse sweep."""
+
 _FARTHEST = np.radians(120.0)
+"""Largest turn of the coarse sweep."""
+
 _MARGIN = np.radians(5.0)
+"""Turn beyond the slip."""
 
 
 def facing_peg(whisker: Whisker, distance: float = 0.65, radius: float = PEG_RADIUS) -> Peg:
-    """Stand a vertical peg beside the head, within reach of a whisker.
+    """Vertical peg near the head, within reach of a whisker.
 
     Parameters
     ----------
     whisker : Whisker
-        That is to meet it.
+        Whisker that is to touch it.
     distance : float
-        From the base to the peg's axis, as a share of the farthest reach of the resting whisker.
+        Distance from the base to the peg's axis, as a share of the farthest reach of the resting
+        whisker.
     radius : float
-        Of the peg, m.
+        Radius of the peg, m.
 
     Returns
     -------
     Peg
-        On the x axis of the laboratory.
+        Peg on the x axis of the laboratory.
 
     Raises
     ------
     ValueError
-        If the distance is no share of the reach, or if the base would touch the peg.
+        If the distance is not a share of the reach, or if the base would touch the peg.
     """
     if not 0.0 < distance < 1.0:
         raise ValueError(f"distance is {distance!r}; a share of the reach, in (0, 1), is needed")
@@ -70,26 +75,26 @@ def facing_peg(whisker: Whisker, distance: float = 0.65, radius: float = PEG_RAD
 
 
 def within_reach(whisker: Whisker | WhiskerArray, kind: str | None = None) -> Surface:
-    """Stand something in the way of a whisker, or of the whiskers of a face.
+    """Object within reach of a whisker, or of the whiskers of a face.
 
     Parameters
     ----------
     whisker : Whisker or WhiskerArray
-        That is to meet it.
+        Whisker that is to touch it, or whiskers.
     kind : {"peg", "sphere", "box", "plane"}, optional
-        What; by default a peg for a whisker, and a sphere for an array.
+        Kind of the object; by default a peg for a whisker, and a sphere for an array.
 
     Returns
     -------
     Peg, Sphere, Box or Plane
-        Beside the base of the whisker; or before the right side of a face which is at the origin of
-        the laboratory, out of the reach of whiskers at rest, for whoever moves forward by 14 mm (a
-        plane stands square in the way).
+        Object near the base of the whisker; or before the right side of a face at the origin of the
+        laboratory, out of the reach of whiskers at rest, for a head that moves forward by 14 mm (a
+        plane is square to its path).
 
     Raises
     ------
     ValueError
-        If there is no such kind.
+        If the kind is unknown.
     """
     things: dict[str, Surface]
     if isinstance(whisker, Whisker):
@@ -128,34 +133,34 @@ def sweep_past(
     seed: int = 0,
     **motion: Any,
 ) -> Motion:
-    """Whisk so that the whisker slips past an object, forward and back.
+    """Whisking in which the whisker slips past an object, forward and back.
 
     Parameters
     ----------
     whisker : Whisker
-        That whisks.
+        Whisker that whisks.
     thing : Peg, Sphere or Box
-        Beside it; a peg more or less vertical.
+        Object near it; a peg more or less vertical.
     duration : float
-        Of the trial, s.
+        Duration of the trial, s.
     rate : float
-        Frames per second.
+        Frame rate, Hz.
     row : {"A", "B", "C", "D", "E"}
-        Row of the array, which says how elevation and roll follow the azimuth.
+        Row of the array, by which elevation and roll follow the azimuth.
     seed : int
-        Of the drifts.
+        Seed of the drifts.
     **motion
-        What else `whisking` takes.
+        Other parameters of `whisking`.
 
     Returns
     -------
     Motion
-        Its set point and amplitude lead past the slips on either side of the object.
+        Motion whose set point and amplitude lead past the slips on either side of the object.
 
     Raises
     ------
     ValueError
-        If there is no such row, if the whisker does not meet the object, or does not slip past it
+        If the row is unknown, if the whisker does not touch the object, or does not slip past it
         within 120°.
     """
     if row not in ROLL_PER_AZIMUTH:

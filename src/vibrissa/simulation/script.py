@@ -1,4 +1,4 @@
-"""A trial as a text says it: whiskers, objects, motion, head, sensor; in mm and °.
+"""The text of a trial: whiskers, objects, motion, head, sensor; in mm and °.
 
 The text is TOML, and everything in it may be left out. `EXAMPLE` has all of it.
 """
@@ -12,23 +12,34 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vibrissa.io.array import load_array
-from vibrissa.io.toml import parsed_toml
-from vibrissa.objects.surface import Surface
+from vibrissa.io.table import read_text, table_rows
+from vibrissa.io.toml import number_array, parsed_toml, quoted
+from vibrissa.objects import Box, Mesh, Peg, Plane, Sphere, Surface
 from vibrissa.sensors import COMPONENTS, Sensor
-from vibrissa.simulation.array_motion import protracted
 from vibrissa.simulation.dynamics import Dynamics
-from vibrissa.simulation.motion import Motion
-from vibrissa.simulation.plan import within_reach
-from vibrissa.simulation.scene import array_motion_of, head_of, motion_of, object_of
-from vibrissa.simulation.values import number, only, subtable
+from vibrissa.simulation.motion import (
+    Motion,
+    head_path,
+    protracted,
+    shared_whisking,
+    tabulated,
+    whisking,
+)
+from vibrissa.simulation.plan import sweep_past, within_reach
 from vibrissa.whisker import Whisker, WhiskerArray, whisker_array
+from vibrissa.whisker.emergence import base_rotation
+
+Array = NDArray[np.float64]
 
 _MOST_FRAMES = 10_000_000
+"""Largest number of frames of a trial."""
+
 EXAMPLE = """\
 # A trial for `vibrissa simulate`: lengths in mm, angles in degrees, forces in µN, moments in µN·m.
-# What is left out has the value shown here, unless something else is said.
+# What is left out has the value shown here, unless stated otherwise.
 
 duration = 3.5          # s
 rate = 1000.0           # frames per second
@@ -102,14 +113,39 @@ _MICRO = 1e-6
 _TOP = {"duration", "rate", "friction", "seed"}
 _TOP |= {"whisker", "array", "object", "motion", "head", "sensor", "dynamics"}
 _ADVANCE = MappingProxyType({"to_position": [0.0, 14.0, 0.0]})
-"""How the head of an array moves, if nothing is said: forward, toward what stands there."""
+"""Motion of the head of an array by default: forward, toward the object there."""
+
+MM = 1e-3
+_THREE = "three numbers are needed"
+COLUMNS = ("time", "azimuth", "elevation", "roll", "x", "y", "z")
+"""Columns of a table of motion."""
+_DEGREES = ("amplitude", "set_point", "elevation_drift")
+_SHARES = ("frequency", "protraction", "variation")
 
 _PER_COMPONENT = ("noise", "bias", "drift", "resolution")
 
 
 @dataclass(frozen=True, eq=False)
 class Script:
-    """What is to be simulated."""
+    """Whiskers, objects, motion and sensor of a trial.
+
+    Attributes
+    ----------
+    whisker : Whisker or WhiskerArray
+        Whisker, or whiskers of a face.
+    objects : tuple of Surface
+        Objects in the laboratory.
+    motion : Motion or mapping of str to Motion
+        Motion of the base, or of each base by the whisker's name.
+    friction : float
+        Coulomb's coefficient between whisker and objects.
+    sensor : Sensor
+        Sensor at the base.
+    seed : int
+        Seed of drifts and noise.
+    dynamics : Dynamics, optional
+        Inertia and damping.
+    """
 
     whisker: Whisker | WhiskerArray
     objects: tuple[Surface, ...]
@@ -123,28 +159,45 @@ class Script:
 def read_script(
     text: str, folder: Path, read_whisker: Callable[[Path | None], Whisker], **changes: Any
 ) -> Script:
-    """Read a trial."""
-    said = parsed_toml(text)
+    """Trial from its text.
+
+    Parameters
+    ----------
+    text : str
+        Trial in TOML.
+    folder : Path
+        Folder that its files are relative to.
+    read_whisker : callable
+        Function from the path of a whisker's file, or None, to the whisker.
+    **changes
+        Values that replace those of the text.
+
+    Returns
+    -------
+    Script
+        Whiskers, objects, motion and sensor.
+    """
+    table = parsed_toml(text)
     given = {name: value for name, value in changes.items() if value is not None}
-    said |= {k: given[k] for k in ("duration", "rate", "friction", "seed") if k in given}
-    only(said, _TOP, "the trial")
-    moves = dict(subtable(said, "motion"))
+    table |= {k: given[k] for k in ("duration", "rate", "friction", "seed") if k in given}
+    only(table, _TOP, "the trial")
+    moves = dict(subtable(table, "motion"))
     moves |= {k: given[k] for k in ("frequency", "row", "protraction") if k in given}
-    whisker = _whisker(said, given, folder, read_whisker)
-    objects = _objects(said, given, folder, whisker)
-    sensor = dict(subtable(said, "sensor"))
+    whisker = _whisker(table, given, folder, read_whisker)
+    objects = _objects(table, given, folder, whisker)
+    sensor = dict(subtable(table, "sensor"))
     if given.get("noise") is False:
         sensor = {k: v for k, v in sensor.items() if k in ("channels", "mixing")}
         sensor |= {"force_noise": 0.0, "moment_noise": 0.0}
-    seed = int(number(said, "seed", 0.0))
+    seed = int(number(table, "seed", 0.0))
     usual = 3.5 if isinstance(whisker, Whisker) else 0.5
-    duration, rate = number(said, "duration", usual), number(said, "rate", 1000.0)
+    duration, rate = number(table, "duration", usual), number(table, "rate", 1000.0)
     if not 0.0 < duration * rate <= _MOST_FRAMES:
         raise ValueError(
             f"duration is {duration:g} s and rate {rate:g} frames/s; both are positive, and a "
             f"trial has up to {_MOST_FRAMES:,} frames"
         )
-    head = subtable(said, "head")
+    head = subtable(table, "head")
     motion: Motion | Mapping[str, Motion]
     if isinstance(whisker, Whisker):
         motion = motion_of(moves, whisker, objects, folder, duration, rate, seed)
@@ -156,75 +209,88 @@ def read_script(
         whisker=whisker,
         objects=objects,
         motion=motion,
-        friction=number(said, "friction", 0.0),
+        friction=number(table, "friction", 0.0),
         sensor=_sensor(sensor),
         seed=seed,
-        dynamics=_dynamics(said, given.get("dynamic") is True),
+        dynamics=_dynamics(table, given.get("dynamic") is True),
     )
 
 
 def _whisker(
-    said: Mapping[str, Any],
+    table: Mapping[str, Any],
     given: Mapping[str, Any],
     folder: Path,
     read_whisker: Callable[[Path | None], Whisker],
 ) -> Whisker | WhiskerArray:
     """The whisker, or the array."""
-    alone = "whisker" in given or "whisker" in said
-    together = {"array", "side", "whiskers"} & set(given) or "array" in said
+    alone = "whisker" in given or "whisker" in table
+    together = {"array", "side", "whiskers"} & set(given) or "array" in table
     if alone and together:
         raise ValueError("both a whisker and an array are asked for; one of them is needed")
     if together:
-        return _array(subtable(said, "array"), given, folder)
-    about = subtable(said, "whisker")
+        return _array(subtable(table, "array"), given, folder)
+    about = subtable(table, "whisker")
     only(about, {"file"}, "[whisker]")
     return read_whisker(
         given.get("whisker", folder / str(about["file"]) if "file" in about else None)
     )
 
 
-def _array(said: Mapping[str, Any], given: Mapping[str, Any], folder: Path) -> WhiskerArray:
-    """The array, and of it what was chosen."""
-    only(said, {"file", "side", "rows", "columns", "whiskers"}, "[array]")
-    choice: dict[str, Any] = {"side": str(given.get("side", said.get("side", "both")))}
-    names = given.get("whiskers", said.get("whiskers"))
+def _array(table: Mapping[str, Any], given: Mapping[str, Any], folder: Path) -> WhiskerArray:
+    """Chosen whiskers of the array."""
+    only(table, {"file", "side", "rows", "columns", "whiskers"}, "[array]")
+    choice: dict[str, Any] = {"side": str(given.get("side", table.get("side", "both")))}
+    names = given.get("whiskers", table.get("whiskers"))
     if names is None:
-        choice |= {key: said[key] for key in ("rows", "columns") if key in said}
+        choice |= {key: table[key] for key in ("rows", "columns") if key in table}
     else:
         choice["names"] = [names] if isinstance(names, str) else names
-    file = str(given.get("array", folder / str(said["file"]) if "file" in said else "average"))
+    file = str(given.get("array", folder / str(table["file"]) if "file" in table else "average"))
     return whisker_array(**choice) if file == "average" else load_array(file).select(**choice)
 
 
 def _objects(
-    said: Mapping[str, Any],
+    table: Mapping[str, Any],
     given: Mapping[str, Any],
     folder: Path,
     whisker: Whisker | WhiskerArray,
 ) -> tuple[Surface, ...]:
-    """The objects; if none is said, one within reach."""
-    things = said.get("object", [])
+    """Objects; by default one within reach."""
+    things = table.get("object", [])
     if not isinstance(things, list):
         raise ValueError("objects are written as [[object]], in double brackets")
     if "object" in given and things:
-        raise ValueError("an object is asked for beside those that the text says")
+        raise ValueError("an object is asked for, but the text has objects already")
     known = tuple(object_of(thing, folder) for thing in things)
     return known or (within_reach(whisker, given.get("object")),)
 
 
 def read_objects(text: str, folder: Path) -> tuple[Surface, ...]:
-    """Read the objects of a trial, and nothing else of it."""
+    """Objects of a trial, and nothing else of it.
+
+    Parameters
+    ----------
+    text : str
+        Trial in TOML.
+    folder : Path
+        Folder that its files are relative to.
+
+    Returns
+    -------
+    tuple of Surface
+        Objects in the laboratory.
+    """
     things = parsed_toml(text).get("object", [])
     if not isinstance(things, list) or not things:
         raise ValueError("there is no object; one is written as [[object]], in double brackets")
     return tuple(object_of(thing, folder) for thing in things)
 
 
-def _dynamics(said: Mapping[str, Any], wanted: bool) -> Dynamics | None:
-    """Inertia and damping, where they are said or wanted."""
-    if not (wanted or "dynamics" in said):
+def _dynamics(table: Mapping[str, Any], wanted: bool) -> Dynamics | None:
+    """Inertia and damping, where they are stated or wanted."""
+    if not (wanted or "dynamics" in table):
         return None
-    how = subtable(said, "dynamics")
+    how = subtable(table, "dynamics")
     only(how, {"density", "damping_ratio", "segments", "step"}, "[dynamics]")
     usual = Dynamics()
     density = how.get("density", usual.density)
@@ -238,23 +304,207 @@ def _dynamics(said: Mapping[str, Any], wanted: bool) -> Dynamics | None:
     )
 
 
-def _sensor(said: Mapping[str, Any]) -> Sensor:
-    """The sensor; what is said of forces and moments is what it is of channels' components."""
+def _sensor(table: Mapping[str, Any]) -> Sensor:
+    """Sensor; values of forces and moments are those of its channels' components."""
     own = {f"{part}_{name}" for part in ("force", "moment") for name in _PER_COMPONENT}
-    only(said, own | {"channels", "mixing", "relative_noise", "gain_error"}, "[sensor]")
-    channels = tuple(str(name) for name in said.get("channels", COMPONENTS))
-    plain = Sensor(channels, said.get("mixing"))
+    only(table, own | {"channels", "mixing", "relative_noise", "gain_error"}, "[sensor]")
+    channels = tuple(str(name) for name in table.get("channels", COMPONENTS))
+    plain = Sensor(channels, table.get("mixing"))
     numbers: dict[str, Any] = {}
     for name in _PER_COMPONENT:
         usual = (1.0, 0.02) if name == "noise" else (0.0, 0.0)
-        force = number(said, f"force_{name}", usual[0]) * _MICRO
-        moment = number(said, f"moment_{name}", usual[1]) * _MICRO
+        force = number(table, f"force_{name}", usual[0]) * _MICRO
+        moment = number(table, f"moment_{name}", usual[1]) * _MICRO
         if name != "bias" and min(force, moment) < 0.0:
             part = "force" if force < 0.0 else "moment"
-            raise ValueError(f"{part}_{name} is {said[f'{part}_{name}']}; 0 or more is needed")
+            raise ValueError(f"{part}_{name} is {table[f'{part}_{name}']}; 0 or more is needed")
         each = np.repeat([force, moment], 3)
         mix = np.asarray(plain.mixing)
         numbers[name] = mix @ each if name == "bias" else np.sqrt(mix**2 @ each**2)
     for name in ("relative_noise", "gain_error"):
-        numbers[name] = number(said, name, 0.0)
-    return Sensor(channels, said.get("mixing"), **numbers)
+        numbers[name] = number(table, name, 0.0)
+    return Sensor(channels, table.get("mixing"), **numbers)
+
+
+def object_of(table: Any, folder: Path) -> Surface:
+    """Object of its table."""
+    if not isinstance(table, Mapping):
+        raise ValueError(f"an object is {quoted(table)}; it is written as [[object]]")
+    kind = table.get("kind", "peg")
+    keys = {
+        "peg": {"position", "axis", "diameter"},
+        "sphere": {"position", "diameter"},
+        "plane": {"position", "normal"},
+        "box": {"position", "size", "angles", "edge_radius"},
+        "mesh": {"file", "unit", "resolution"},
+    }
+    if not isinstance(kind, str) or kind not in keys:
+        raise ValueError(f"an object's kind is {quoted(kind)}; one of {', '.join(keys)} is needed")
+    only(table, keys[kind] | {"kind", "stiffness"}, f"an object of kind {kind}")
+    stiffness = number(table, "stiffness", np.inf)
+    if kind == "mesh":
+        if "file" not in table:
+            raise ValueError(
+                'an object of kind mesh is a file: file = "body.stl" (STL, OBJ or PLY) is needed'
+            )
+        resolution = table.get("resolution")
+        return Mesh.load(
+            folder / str(table["file"]),
+            number(table, "unit", 1.0) * MM,
+            resolution=None if resolution is None else number(table, "resolution", 0.0) * MM,
+            stiffness=stiffness,
+        )
+    position = three(table, "position") * MM
+    radius = 0.5 * number(table, "diameter", 2.7) * MM
+    if kind == "peg":
+        return Peg(position, three(table, "axis", (0.0, 0.0, 1.0)), radius, stiffness)
+    if kind == "sphere":
+        return Sphere(position, radius, stiffness)
+    if kind == "plane":
+        return Plane(position, three(table, "normal"), stiffness)
+    edge = number(table, "edge_radius", 0.0) * MM
+    return Box(position, three(table, "size") * MM, turned(table), edge, stiffness)
+
+
+def motion_of(
+    table: dict[str, Any],
+    whisker: Whisker,
+    objects: tuple[Surface, ...],
+    folder: Path,
+    duration: float,
+    rate: float,
+    seed: int,
+) -> Motion:
+    """Motion of the base of one whisker on the head."""
+    kind = table.pop("kind", "past")
+    if kind == "table":
+        return _tabulated(table, folder, rate)
+    only(table, {*_DEGREES, *_SHARES, "elevation", "position_drift", "row"}, "[motion]")
+    how = _numbers(table, (*_DEGREES, "elevation"))
+    how.setdefault("position_drift", 0.03 * whisker.length)
+    row = str(table.get("row", "C"))
+    first = objects[0]
+    if kind == "past" and isinstance(first, Peg | Sphere | Box):
+        return sweep_past(whisker, first, duration, rate, row=row, seed=seed, **how)
+    if kind not in ("past", "whisking"):
+        raise ValueError(f"the motion's kind is {quoted(kind)}; past, whisking or table is needed")
+    return whisking(duration, rate, row=row, seed=seed, **how)
+
+
+def array_motion_of(
+    table: dict[str, Any], folder: Path, duration: float, rate: float, seed: int
+) -> Motion:
+    """Motion of the whiskers of an array about their rest, the same for all."""
+    kind = table.pop("kind", "whisking")
+    if kind == "table":
+        return _tabulated(table, folder, rate)
+    if kind != "whisking":
+        raise ValueError(
+            f"the motion of an array is of kind {quoted(kind)}; whisking or table is needed"
+        )
+    only(table, {*_DEGREES, *_SHARES, "position_drift"}, "[motion] of an array")
+    return shared_whisking(duration, rate, seed=seed, **_numbers(table, _DEGREES))
+
+
+def _numbers(table: Mapping[str, Any], degrees: tuple[str, ...]) -> dict[str, Any]:
+    """Parameters of whisking, in SI units."""
+    how: dict[str, Any] = {name: number(table, name, 0.0) for name in _SHARES if name in table}
+    how |= {name: np.radians(number(table, name, 0.0)) for name in degrees if name in table}
+    if "position_drift" in table:
+        how["position_drift"] = number(table, "position_drift", 0.0) * MM
+    return how
+
+
+def _tabulated(table: Mapping[str, Any], folder: Path, rate: float) -> Motion:
+    only(table, {"file"}, "a motion of kind table")
+    columns = columns_of(folder / str(table.get("file", "")))
+    place = np.stack([columns[axis] for axis in "xyz"], axis=-1)
+    return tabulated(
+        columns["time"],
+        columns["azimuth"],
+        columns["elevation"],
+        columns["roll"],
+        place,
+        rate=rate,
+    )
+
+
+def head_of(table: Mapping[str, Any], folder: Path, time: Array) -> tuple[Array, Array]:
+    """Motion of the head."""
+    ends = {"position", "angles", "to_position", "to_angles"}
+    only(table, {*ends, "file"}, "[head]")
+    if "file" not in table:
+        poses = {name: three(table, name) for name in ends if name in table}
+        units = {name: np.radians(1.0) if name.endswith("angles") else MM for name in poses}
+        return head_path(time, **{name: units[name] * poses[name] for name in poses})
+    columns = columns_of(folder / str(table["file"]))
+    if columns["time"][0] > time[0] or columns["time"][-1] < time[-1]:
+        raise ValueError(
+            f"the head moves from {columns['time'][0]} to {columns['time'][-1]} s; the whisker "
+            f"whisks from {time[0]} to {time[-1]} s"
+        )
+    at = {name: np.interp(time, columns["time"], columns[name]) for name in COLUMNS[1:]}
+    turn = base_rotation(at["azimuth"], at["elevation"], at["roll"])
+    return turn, np.stack([at[axis] for axis in "xyz"], axis=-1)
+
+
+def only(table: Mapping[str, Any], allowed: set[str], where: str) -> None:
+    """Raise a ValueError if a table has an unknown key."""
+    unknown = sorted(set(table) - allowed)
+    if unknown:
+        raise ValueError(
+            f"{where} has {', '.join(unknown)}; known are {', '.join(sorted(allowed))}"
+        )
+
+
+def subtable(table: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    """Table [name]; empty by default."""
+    value = table.get(name, {})
+    if not isinstance(value, Mapping):
+        raise ValueError(f"{name} is {quoted(value)}; it is written as a table, [{name}]")
+    return value
+
+
+def number(table: Mapping[str, Any], name: str, default: float) -> float:
+    """Number of a table, finite if it is there."""
+    value = table.get(name, default)
+    array = number_array(value, name, "a number is needed")
+    if array.ndim or (name in table and not np.isfinite(array)):
+        raise ValueError(f"{name} is {quoted(value)}; a number is needed")
+    return float(array)
+
+
+def three(table: Mapping[str, Any], name: str, default: Any = None) -> Array:
+    """Three numbers of a table."""
+    value = table.get(name, default)
+    array = number_array(list(value) if isinstance(value, tuple) else value, name, _THREE)
+    if array.shape != (3,) or not np.isfinite(array).all():
+        raise ValueError(f"{name} is {quoted(value)}; {_THREE}")
+    return array
+
+
+def turned(table: Mapping[str, Any]) -> Array:
+    """Rotation by the angles of a table."""
+    return base_rotation(*np.radians(three(table, "angles", (0.0, 0.0, 0.0))))
+
+
+def columns_of(path: Path) -> dict[str, Array]:
+    """Columns of a table of motion; those that are missing are zero, except the time."""
+    rows = list(table_rows(read_text(path)))
+    names = rows[0][1] if rows else []
+    unknown = [name for name in names if name not in COLUMNS]
+    if unknown or "time" not in names or len(rows) < 3:
+        raise ValueError(
+            f"{path} has columns {', '.join(names) or 'none'} and {max(len(rows) - 1, 0)} rows; "
+            f"time and any of {', '.join(COLUMNS[1:])} in two rows or more are needed"
+        )
+    try:
+        values = np.array([cells for _, cells in rows[1:]], dtype=np.float64)
+    except ValueError:
+        raise ValueError(
+            f"{path} has a cell that is not a number, or rows of different length"
+        ) from None
+    columns = dict(zip(names, values.T, strict=True))
+    if not (np.isfinite(values).all() and (np.diff(columns["time"]) > 0.0).all()):
+        raise ValueError(f"{path} has a number that is missing, or time that does not rise")
+    return {name: columns.get(name, np.zeros(len(values))) for name in COLUMNS}

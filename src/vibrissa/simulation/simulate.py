@@ -1,14 +1,14 @@
 """A trial, frame by frame: the base moves, the whisker bends, slips and springs free.
 
-Each frame goes on from the one before: the objects, seen from the base, move a little, and the
+Each frame continues the one before: the objects, seen from the base, move a little, and the
 contact sticks or slides along on the stable branch (:mod:`vibrissa.rod.surfaces`). Where that
 branch ends the whisker has slipped off; it springs back to rest, clear of the object (or against
-it, wherever it stands in the way of rest), and meets it next from the side where it then is. A
-whisker is therefore never pulled through a peg. Quasi-static.
+it, where it obstructs the rest shape), and meets it next from the side where it then is. A whisker
+is therefore never pulled through a peg. Quasi-static.
 
 One contact is simulated at a time, that with the object met first. Where the bent whisker reaches
-into another object, or into the same one elsewhere, the truth says so (``second_contact``) and how
-far (``overlap``): there the wrench lacks what the second contact would add.
+into another object, or into the same one elsewhere, the truth has ``second_contact`` and the depth
+``overlap``: there the wrench lacks that of the second contact.
 
 Several whiskers are simulated one after the other: they do not touch each other.
 
@@ -25,28 +25,28 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from vibrissa.objects.surface import Surface
+from vibrissa.objects import Surface
 from vibrissa.recording import coordinates, recorded, recording_tree
 from vibrissa.rod import SurfaceDeflection, follow_surfaces
-from vibrissa.simulation.dynamics import Dynamics, move_dynamically
+from vibrissa.simulation.dynamics import Dynamics, Moment, move_dynamically
 from vibrissa.simulation.motion import Motion
-from vibrissa.simulation.stepping import Moment
 from vibrissa.status import Status
 from vibrissa.whisker import Whisker
 
 NODES = 33
-"""Points of the recorded centrelines."""
+"""Number of points of the recorded centrelines."""
 
-_LOOK_AT = 129
-"""Points along the whisker at which a second contact is looked for."""
+_SAMPLES = 129
+"""Number of points along the whisker at which a second contact is searched."""
 
 _ASIDE = 0.03
-"""How far from the contact another one of the same object is one, as a share of the length."""
+"""Distance from the contact of a second one with the same object, as a share of the length."""
 
 OVERLAP = 5e-6
 """Overlap from which a second contact counts, m; a tapering whisker along a flat one has less."""
 
 _FRAMES_AT_ONCE = 512
+"""Number of frames whose overlap is computed together."""
 
 Array = NDArray[np.float64]
 
@@ -74,31 +74,32 @@ def simulate(
     Parameters
     ----------
     whisker : Whisker, sequence or mapping of Whisker
-        That whisks; several, such as a `WhiskerArray`, do so together.
+        Whisker; several, such as a `WhiskerArray`, whisk together.
     motion : Motion, sequence or mapping of Motion
-        Of its base; as many as there are whiskers, in the same order or by the same names, with
-        the same frames and on the same head.
+        Motion of its base; as many as there are whiskers, in the same order or by the same names,
+        with the same frames and on the same head.
     objects : Peg, Sphere, Plane, Box, Mesh or a sequence of them
-        In the laboratory. The one met first holds the whisker.
+        Objects in the laboratory. The one met first holds the whisker.
     friction : float
         Coulomb's coefficient between whisker and objects.
     dynamics : Dynamics, optional
-        Its inertia and damping; by default it moves quasi-statically.
+        Inertia and damping; by default the whisker moves quasi-statically.
     nodes : int
-        Points of the recorded centrelines, equally spaced in arc length.
+        Number of points of the recorded centrelines, equally spaced in arc length.
     progress : callable, optional
-        Told after every frame of every whisker how many are done, of how many.
+        Function called after every frame of every whisker with the numbers of frames done and of
+        all frames.
 
     Returns
     -------
     xarray.DataTree
-        A recording (`vibrissa.recording`): what a perfect sensor at the base reads, where the
-        base is, and everything else in the group ``truth``.
+        Recording (`vibrissa.recording`): the reading of a perfect sensor at the base, the pose of
+        the base, and everything else in the group ``truth``.
 
     Raises
     ------
     ValueError
-        If the friction is negative, or whiskers and motions do not belong together.
+        If the friction is negative, or whiskers and motions do not match.
     """
     pairs = _pairs(whisker, motion)
     solids = list(objects) if isinstance(objects, Sequence) else [objects]
@@ -110,13 +111,13 @@ def simulate(
     for one, moves in pairs:
         before, total = len(truths) * len(moves), len(pairs) * len(moves)
 
-        def told(done: int, _: int, before: int = before, total: int = total) -> None:
+        def counted(done: int, _: int, before: int = before, total: int = total) -> None:
             if progress is not None:
                 progress(before + done, total)
 
         if dynamics is not None:
             moments = move_dynamically(
-                one, solids, moves, dynamics, friction=friction, progress=told
+                one, solids, moves, dynamics, friction=friction, progress=counted
             )
             truths.append(_dynamic_truth(one, moves, moments, nodes))
             continue
@@ -126,7 +127,7 @@ def simulate(
             moves.base_rotation,
             moves.base_position,
             friction=friction,
-            progress=told,
+            progress=counted,
         )
         truths.append(_truth(one, moves, solids, found, nodes))
     whiskers, motions = zip(*pairs, strict=True)
@@ -248,10 +249,10 @@ def _dynamic_truth(
             continue
         first = moment.contacts[0]
         arc_length[i], surface[i] = first.arc_length, first.surface
-        truth["contact_point"][i], truth["surface_normal"][i] = first.place, first.normal
+        truth["contact_point"][i], truth["surface_normal"][i] = first.point, first.normal
         truth["contact_force"][i] = moment.contact_force
         away = first.gap + float(whisker.radius(first.arc_length))
-        truth["surface_point"][i] = first.place - away * first.normal
+        truth["surface_point"][i] = first.point - away * first.normal
         second[i] = len(moment.contacts) > 1
         at_tip = first.arc_length >= whisker.length * (1.0 - 1e-9)
         status[i] = int(Status.TIP_CONTACT if at_tip else Status.OK)
@@ -275,22 +276,22 @@ def _dynamic_truth(
 def _overlap(
     whisker: Whisker, motion: Motion, solids: Sequence[Surface], found: SurfaceDeflection
 ) -> Array:
-    """How far (n,) the bent whisker reaches into objects away from its contact, m."""
+    """Depth (n,) of the bent whisker in objects away from its contact, m."""
     bent, rotation, position = found.bent, motion.base_rotation, motion.base_position
-    s = np.linspace(0.0, whisker.length, _LOOK_AT)
+    s = np.linspace(0.0, whisker.length, _SAMPLES)
     radius = whisker.radius(s)
     deepest = np.zeros(len(motion))
-    # A whisker at rest was looked at when it was found to be free.
+    # A whisker at rest was found to be free before.
     touching = np.flatnonzero(np.isin(bent.status, (Status.OK, Status.TIP_CONTACT)))
     if not touching.size:
         return deepest
-    lines = bent.centerline(_LOOK_AT)
+    lines = bent.centerline(_SAMPLES)
     for first in range(0, touching.size, _FRAMES_AT_ONCE):
         rows = touching[first : first + _FRAMES_AT_ONCE]
         line = lines[rows] @ np.swapaxes(rotation[rows], 1, 2) + position[rows, None]
-        beside = np.abs(s - bent.arc_length[rows, None]) < _ASIDE * whisker.length
+        near = np.abs(s - bent.arc_length[rows, None]) < _ASIDE * whisker.length
         for i, solid in enumerate(solids):
             gap = solid.signed_distance(line) - radius
-            gap[beside & (found.surface[rows, None] == i)] = np.inf
+            gap[near & (found.surface[rows, None] == i)] = np.inf
             deepest[rows] = np.maximum(deepest[rows], -gap.min(axis=1))
     return deepest

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from vibrissa.simulation.values import only
+from vibrissa.simulation.script import only
 from vibrissa.whisker import Whisker, whisker_array
 
 PARAMETERS: Mapping[str, tuple[float, float, float]] = {

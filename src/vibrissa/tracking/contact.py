@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from vibrissa.cameras.camera import Camera
 from vibrissa.cameras.triangulation import triangulate
-from vibrissa.objects.surface import Surface
+from vibrissa.objects import Surface
 from vibrissa.tracking.refine import Refined
 
 Array = NDArray[np.float64]

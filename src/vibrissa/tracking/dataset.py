@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa.cameras.camera import Camera
-from vibrissa.objects.surface import Surface
+from vibrissa.objects import Surface
 from vibrissa.recording import coordinates, recorded, recording_tree
 from vibrissa.status import Status
 from vibrissa.tracking.contact import Contacts

@@ -12,7 +12,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa.cameras.camera import Camera
-from vibrissa.objects.surface import Surface
+from vibrissa.objects import Surface
 from vibrissa.tracking.contact import Contacts, contacts_at, given_contacts
 from vibrissa.tracking.dataset import tracked_recording
 from vibrissa.tracking.filtering import CUTOFF

@@ -6,8 +6,7 @@ import numpy as np
 import xarray as xr
 
 from vibrissa.contour import CylinderFit, SphereFit, shape_from_dataset, surface_grid
-from vibrissa.objects.dataset import objects_datasets
-from vibrissa.objects.surface import Surface
+from vibrissa.objects import Surface, objects_datasets
 from vibrissa.plots.things import object_surface
 from vibrissa.quantities import to_display
 from vibrissa.viewer.bend_drawing import arrow, whisker_body

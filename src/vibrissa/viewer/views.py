@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.simulation.shadows import silhouette
+from vibrissa.simulation import silhouette
 from vibrissa.viewer.drawing import Array, Bytes
 from vibrissa.viewer.watching import Watched
 

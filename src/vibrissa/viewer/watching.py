@@ -14,7 +14,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa.cameras import Camera
-from vibrissa.objects.surface import Surface
+from vibrissa.objects import Surface
 from vibrissa.recording import Recording
 from vibrissa.signals import SIGNALS, base_signals
 from vibrissa.viewer.bend_drawing import NODES

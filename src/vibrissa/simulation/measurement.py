@@ -1,4 +1,4 @@
-"""A simulated trial as a sensor at the base reads it."""
+"""Measurement of a simulated trial by a sensor at the base."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ def measure(
     Parameters
     ----------
     recording : xarray.DataTree
-        A recording with ``force`` and ``moment`` in the group ``truth``.
+        Recording with ``force`` and ``moment`` in the group ``truth``.
     force_noise : float
         Standard deviation of each component of the force, N: white, Gaussian.
     moment_noise : float
         Standard deviation of each component of the moment, N·m.
     seed : int
-        Of the noise.
+        Seed of the noise.
     sensor : Sensor, optional
-        Instead of one with that noise only.
+        Sensor instead of one with that noise only.
 
     Returns
     -------
     xarray.DataTree
-        A new recording, whose ``force`` and ``moment`` at the top are what the sensor reads and say
-        in the attribute ``noise`` how much of that it has. Missing frames stay missing. A sensor
-        with other channels gives ``reading`` and its ``mixing`` instead of them.
+        New recording, whose ``force`` and ``moment`` at the top are the sensor's readings, with
+        their noise in the attribute ``noise``. Missing frames stay missing. A sensor with other
+        channels gives ``reading`` and its ``mixing`` instead of them.
 
     Raises
     ------

@@ -46,8 +46,15 @@ from vibrissa.pipeline import (
 from vibrissa.pipeline.estimates import Progress
 from vibrissa.recording import Recording
 from vibrissa.sensors import FORCE_NOISE, MOMENT_NOISE
-from vibrissa.simulation import facing_peg, film, measure, simulate, sweep_past, views_of
-from vibrissa.simulation import with_true_traces
+from vibrissa.simulation import (
+    facing_peg,
+    film,
+    measure,
+    simulate,
+    sweep_past,
+    views_of,
+    with_true_traces,
+)
 from vibrissa.tracking import TrackOptions, partial_traces, trace_file, track
 from vibrissa.whisker import Whisker
 

@@ -101,9 +101,8 @@ def simulate(
     from vibrissa.io.paths import NETCDF, check_writable
     from vibrissa.io.table import read_text
     from vibrissa.io.toml import in_file
-    from vibrissa.simulation import measure
+    from vibrissa.simulation import EXAMPLE, measure, read_script
     from vibrissa.simulation import simulate as simulated
-    from vibrissa.simulation import EXAMPLE, read_script
     from vibrissa.whisker import Whisker
 
     if example:

@@ -8,7 +8,7 @@ from vibrissa.io.deeplabcut import load_deeplabcut
 from vibrissa.io.kinds import Kind, load_tracks, recognise
 from vibrissa.io.matlab import load_matlab
 from vibrissa.io.movement import load_movement
-from vibrissa.io.movie import write_movie
+from vibrissa.io.movie import write_movie, write_video
 from vibrissa.io.netcdf import is_netcdf, kind_of
 from vibrissa.io.nwb import load_nwb, load_nwb_series
 from vibrissa.io.nwb_writing import Session, save_nwb
@@ -26,7 +26,6 @@ from vibrissa.io.video import (
     read_video,
     video_frames,
     video_info,
-    write_video,
 )
 from vibrissa.io.video_tables import load_contact_points, load_head
 from vibrissa.io.whisk import load_measurements, load_whiskers

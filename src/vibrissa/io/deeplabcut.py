@@ -175,9 +175,6 @@ def _frames(path: Path, index: list[str], count: int) -> NDArray[np.int64]:
     return frames if len(np.unique(frames)) == count else np.arange(count)
 
 
-Names = list[tuple[str, ...]]
-
-
 def pandas_tables(file: h5py.File) -> Iterator[tuple[str, h5py.Group]]:
     """Find the tables of a file."""
     for name, group in file.items():

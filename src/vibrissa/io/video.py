@@ -1,17 +1,10 @@
-"""Grey videos, read and written frame by frame.
+"""Grey videos, read frame by frame: one after the other, some of them, or any in any order.
 
-Any container and codec that FFmpeg knows can be read; colour is turned into grey. Written are 8 bit
-grey frames: FFV1 (lossless) in Matroska by default, H.264 in MP4.
-
-Single frames of a video, in any order.
-
-Any frame of a video, in any order.
-
-Images that cameras took at the same moments: numbered image files, or a video each.
-
-``top_01.png … front_01.png …`` are images of the cameras ``top`` and ``front``; where the names are
-only numbers, the folder is the camera. Images of one number belong together. Of videos some frames
-are taken, the same ones of each.
+Any container and codec that FFmpeg knows can be read; colour is turned into grey. Images that
+several cameras took at the same moments are numbered files or a video each: ``top_01.png …
+front_01.png …`` are of the cameras ``top`` and ``front``; where the names are only numbers, the
+folder is the camera. Images of one number belong together. Of videos the same frames of each are
+taken.
 """
 
 from __future__ import annotations
@@ -20,7 +13,6 @@ import re
 from collections import OrderedDict, deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from fractions import Fraction
 from itertools import chain, pairwise
 from os import PathLike
 from pathlib import Path
@@ -30,21 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vibrissa.io.kinds import Kind, recognise
-from vibrissa.io.paths import refuse_whisk, replacing
+from vibrissa.io.paths import refuse_whisk
 
 if TYPE_CHECKING:
     from av.container import InputContainer
 
 Frame = NDArray[np.uint8]
-
-CODECS = {".mkv": "ffv1", ".mp4": "h264"}
-"""By the ending of the file: what a video is written with."""
-
-QUALITY = 16
-"""H.264's constant rate factor: 0 is lossless, 23 its usual default; here faint tips must last."""
-
-_FULL = 2
-"""FFmpeg's word for: all grey values from 0 to 255 are meant."""
 
 
 @dataclass(frozen=True)
@@ -206,78 +189,6 @@ def _with_next(packets: Iterable[Any]) -> Iterator[tuple[Any, Any]]:
     return pairwise(chain(packets, [None]))
 
 
-def write_video(
-    path: str | PathLike[str],
-    frames: Iterable[Frame],
-    rate: float = 50.0,
-    quality: int = QUALITY,
-) -> int:
-    """Write a grey video.
-
-    Parameters
-    ----------
-    path : str or path
-        With the ending ``.mkv`` (FFV1, lossless) or ``.mp4`` (H.264); an existing file is replaced
-        once the new one is complete.
-    frames : iterable of array (height, width)
-        8 bit grey values, all of one size.
-    rate : float
-        Frames per second at which it is to be shown.
-    quality : int
-        Constant rate factor of H.264, 0 (lossless) to 51.
-
-    Returns
-    -------
-    int
-        How many frames were written.
-
-    Raises
-    ------
-    FileNotFoundError
-        If the folder does not exist.
-    ValueError
-        If the ending is another, there is no frame, or frames differ in size or type.
-    """
-    import av
-
-    path = Path(path)
-    codec = CODECS.get(path.suffix.lower())
-    if codec is None:
-        raise ValueError(f"{path} ends on {path.suffix!r}; one of {', '.join(CODECS)} is needed")
-    container_format = {"ffv1": "matroska", "h264": "mp4"}[codec]
-    # Of FFV1 every frame is a key frame, so that one can be read without those before it.
-    options = {"ffv1": {"level": "3", "slices": "4", "g": "1"}}.get(
-        codec, {"crf": str(quality), "preset": "ultrafast"}
-    )
-    count = 0
-    with replacing(path) as part, av.open(part, "w", format=container_format) as container:
-        stream: Any = None
-        shape: tuple[int, ...] = ()
-        for frame in frames:
-            if stream is None:
-                shape = frame.shape
-                stream = container.add_stream(
-                    "libx264" if codec == "h264" else codec,
-                    rate=Fraction(rate).limit_denominator(1000),
-                    options=options,
-                )
-                stream.height, stream.width = shape
-                stream.pix_fmt = "gray"
-                stream.codec_context.color_range = _FULL
-            if frame.shape != shape or frame.dtype != np.uint8:
-                raise ValueError(
-                    f"frame {count} is {frame.shape} of {frame.dtype}; {shape} of uint8 is needed"
-                )
-            image = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="gray")
-            image.color_range = _FULL
-            container.mux(stream.encode(image))
-            count += 1
-        if stream is None:
-            raise ValueError(f"{path}: there are no frames to write")
-        container.mux(stream.encode())
-    return count
-
-
 def opened_video(path: str | PathLike[str]) -> InputContainer:
     """Open a file that holds a video, or raise what says why not."""
     import av
@@ -305,8 +216,6 @@ def grey_frame(frame: Any) -> Frame:
         return grey
     return np.asarray(frame.to_ndarray(format="gray"), dtype=np.uint8)
 
-
-Frame = NDArray[np.uint8]
 
 AHEAD = 60
 """Frames that are rather decoded one after another than jumped over."""

@@ -30,6 +30,9 @@ folder, limit = Path(sys.argv[1]), int(sys.argv[2])
 trial = io.load_recording(sys.argv[3])
 noise = np.random.default_rng(0).integers(0, 255, (50, 64, 64, 3), dtype=np.uint8)
 table = trial.to_dataset().isel(whisker=0)[["force", "moment"]]
+truth = trial["truth"].to_dataset().isel(whisker=0)
+axes = {name: truth["contact_point"].sel(space=name, drop=True) for name in "xyz"}
+contacts = table[["time"]].assign(axes | {"status": truth["status"]})
 
 def figure(path):
     from matplotlib.figure import Figure
@@ -45,6 +48,7 @@ writers = {
     "trial.nc": lambda path: io.save_recording(path, trial),
     "data.nc": lambda path: write_netcdf(path, trial["truth"].to_dataset()),
     "signals.csv": lambda path: io.save_signals(path, table),
+    "contacts.csv": lambda path: io.save_contacts(path, contacts),
     "line.csv": lambda path: io.save_centerline(path, samples.gamma().centerline(500)),
     "video.mkv": lambda path: io.write_video(path, iter(noise[..., 0]), 100.0),
     "movie.mp4": lambda path: io.write_movie(path, iter(noise), 25.0),
@@ -85,11 +89,10 @@ hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
 chart, trial, page = folder / "map.nc", folder / "trial.nc", folder / "page.html"
 verbs = [
     ["map", "--no-grid", "-o", chart],
-    ["simulate", "--duration", "0.1", "-o", trial],
+    ["simulate", "--duration", "0.05", "-o", trial],
     ["signals", trial],
     ["estimate", trial, "--using", "wrench"],
-    ["estimate", trial, "--using", "wrench", "-o", folder / "contacts.csv"],
-    ["report", trial, "-o", page, "--map", chart],
+    ["report", trial, "-o", page],
 ]
 for limit in (hard, 1500):
     for verb in verbs:

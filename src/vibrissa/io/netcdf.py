@@ -32,7 +32,9 @@ from vibrissa.io.paths import NETCDF, check_readable, refuse_whisk, replacing
 
 # Deflate, the densest of the filters that are read, makes at most 1032 bytes of one.
 _DENSEST = 1100
-_ALWAYS_ALLOWED = 1 << 28
+ALWAYS_ALLOWED = 1 << 28
+"""Bytes that any file may claim to hold."""
+
 _HEAP = b"GCOL\1\0\0\0"
 
 
@@ -123,7 +125,7 @@ def _check(file: h5py.File, size: int, soft_links: bool) -> None:
                 raise ValueError(f"{name} has {item.ndim} dimensions, and scales of others")
         if isinstance(item, h5py.Dataset):
             claimed += _checked_size(name, item)
-        if claimed > max(_ALWAYS_ALLOWED, _DENSEST * size):
+        if claimed > max(ALWAYS_ALLOWED, _DENSEST * size):
             raise ValueError(
                 f"{name} and what comes before it claim to hold {claimed / 1e9:.3g} GB, more than "
                 f"a file of {size / 1e3:.3g} kB can: it is damaged, or made to fill the memory"

@@ -15,7 +15,9 @@ from vibrissa.cli.app import app
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-PAGES = {page.name: page for page in (ROOT / "README.md", *sorted(DOCS.rglob("*.md")))}
+# Pages in different folders have the same name.
+FOUND = (ROOT / "README.md", *sorted(DOCS.rglob("*.md")))
+PAGES = {page.relative_to(ROOT).as_posix().removeprefix("docs/"): page for page in FOUND}
 LARGEST = 300_000
 
 

@@ -1,6 +1,5 @@
 """The command line: each verb does its stage, and a fault is one message."""
 
-import re
 import sys
 
 import numpy as np
@@ -13,9 +12,6 @@ from vibrissa.cli.app import app, main
 from vibrissa.cli.options import numbers
 from vibrissa.cli.terminal import fixed, shown
 from vibrissa.io import load_contacts, save_centerline, save_signals
-
-VERBS = ("demo", "deflect", "map", "uniqueness", "sensitivity", "signals", "estimate")
-VERBS += ("reconstruct", "figures", "sweep", "info")
 
 
 def run(*arguments):
@@ -65,10 +61,6 @@ def table(folder):
     return path, np.array(points)
 
 
-def test_version():
-    assert run("--version").split() == ["vibrissa", vb.__version__]
-
-
 def test_where_to_write_is_asked_first(folder, table, monkeypatch, capsys):
     monkeypatch.setattr(vb.ContactMap, "simulate", None)
     for verb, said in (
@@ -90,13 +82,6 @@ def test_estimate_refuses_millinewtons(folder, table, chart, monkeypatch, capsys
     said = fault(monkeypatch, capsys, "estimate", path, "--map", chart, "-o", folder / "c.csv")
     assert "millinewtons.csv: the force reaches" in said
     assert "multiply by 1e-3" in said
-
-
-def test_every_verb_has_help_with_an_example():
-    assert all(verb in run("--help") for verb in VERBS)
-    for verb in VERBS:
-        text = re.sub(r"[\s│]+", " ", run(verb, "--help"))
-        assert f"Example: vibrissa {verb}" in text
 
 
 def test_deflect_prints_what_deflect_gives():
@@ -249,6 +234,16 @@ def test_files_of_the_wrong_kind(monkeypatch, capsys, folder, table, chart):
     triplet = ("--using", "Fx,MB")
     said = fault(monkeypatch, capsys, "estimate", table[0], "--map", chart, *triplet)
     assert "Error" in said
+
+
+def test_info_refuses_a_camera_without_a_focal_length(monkeypatch, capsys, tmp_path):
+    camera = "[cam_0]\nname = 'top'\nsize = [64, 48]\nrotation = [0, 0, 0]\n"
+    camera += "translation = [0, 0, 100]\nmatrix = [[0, 0, 32], [0, 100, 24], [0, 0, 1]]\n"
+    path = tmp_path / "cameras.toml"
+    path.write_text(camera, encoding="utf-8")
+    assert "focal lengths are 0 and 100" in fault(monkeypatch, capsys, "info", path)
+    path.write_text(camera.replace("[[0, 0, 32]", "[[100, 0, 32]"), encoding="utf-8")
+    assert "64 × 48 pixels, perspective" in run("info", path)
 
 
 def test_numbers_and_units():

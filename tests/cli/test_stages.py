@@ -135,6 +135,18 @@ def test_what_is_asked_for_is_made_anew(folder, tmp_path):
     assert "estimates" not in load_recording(work).children
 
 
+def test_contacts_near_the_base_can_be_left_out(folder, tmp_path):
+    """As with `estimate`; the map is simulated, and the contacts are estimated anew."""
+    work = tmp_path / "t.nc"
+    done("reconstruct", folder / "sim.nc", "--map", folder / "map.nc", "-o", work)
+    result = run("reconstruct", work, "--proximal", 0.6, "--force")
+    if result.exit_code:  # perhaps too few contacts are left for a peg
+        assert "estimates are in" in str(result.exception)
+    estimates = load_recording(work)["estimates"]
+    found = estimates["arc_length"].values
+    assert (found[np.isfinite(found)] >= 0.6 * 40e-3 - 1e-9).all()
+
+
 def test_a_shape_that_does_not_fit_is_said(folder, tmp_path):
     work = tmp_path / "t.nc"
     words = (folder / "sim.nc", "--map", folder / "map.nc", "-o", work)

@@ -1,5 +1,6 @@
 """Studies on the command line: planned, done, stopped, gone on with, shown."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -102,6 +103,19 @@ def test_ctrl_c_stops_and_says_how_to_go_on(study, tmp_path):
     assert "the same command goes on from it" in " ".join(said.split())
     assert "Traceback" not in said
     assert (open_sweep(store)["status"] == 1).any()
+
+
+def test_a_full_disk_is_named_in_one_line(study, tmp_path, monkeypatch):
+    """Wherever it is found: when the store is begun, when a cell is written."""
+    store = tmp_path / "s.zarr"
+
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("vibrissa.sweeps.run_sweep", full)
+    done = RUN.invoke(app, ["sweep", str(study), "-o", str(store), "--workers", "0"])
+    assert isinstance(done.exception, OSError)
+    assert f"{store} cannot be written: No space left" in str(done.exception)
 
 
 def test_what_is_wrong_is_told(study, tmp_path):

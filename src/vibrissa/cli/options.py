@@ -341,7 +341,7 @@ RegionsOption = Annotated[
     list[Region] | None,
     typer.Option(
         "--region",
-        help="Region of the contacts that are considered; may be repeated. By default all six.",
+        help="Region of the contacts that are considered: may be repeated. By default all six.",
     ),
 ]
 LeastForceOption = Annotated[

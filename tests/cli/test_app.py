@@ -1,0 +1,132 @@
+"""The command line as a whole: verbs, options, completion, and what happens to misspelt words."""
+
+import os
+import re
+import subprocess
+import sys
+from collections import defaultdict
+from typing import get_args, get_type_hints
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+import vibrissa as vb
+from vibrissa.cli import options
+from vibrissa.cli.app import VERBS, app
+from vibrissa.cli.reconstruct import ShapeOptions
+from vibrissa.paper import METHODS
+from vibrissa.pipeline import Shape, Source
+from vibrissa.signals import REGIONS
+
+# What is written differs from verb to verb, and several verbs read lists.
+DIFFERENT = {"--output", "--using", "--map", "--region"}
+
+
+def run(*words, **how):
+    return CliRunner().invoke(app, [str(word) for word in words], **how)
+
+
+@pytest.fixture(scope="module")
+def commands():
+    return typer.main.get_command(app).commands
+
+
+def test_the_verbs():
+    listed = "demo deflect map uniqueness sensitivity simulate track calibrate correct signals"
+    listed += " estimate reconstruct figures movie report view stream sweep info"
+    assert list(VERBS) == listed.split()
+
+
+def test_version():
+    assert run("--version").output.split() == ["vibrissa", vb.__version__]
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_help_has_an_example_of_the_verb(verb):
+    text = re.sub(r"[\s│]+", " ", run(verb, "--help").output)
+    assert f"Example: vibrissa {verb}" in text
+
+
+def test_an_option_has_one_meaning_in_all_verbs(commands):
+    meanings = defaultdict(set)
+    for command in commands.values():
+        for option in (one for one in command.params if one.param_type_name == "option"):
+            for name in option.opts:
+                meanings[name].add((option.help, option.metavar))
+    several = {name for name, found in meanings.items() if len(found) > 1}
+    assert several <= DIFFERENT | {"-o"}
+    for name in DIFFERENT:
+        first = {help_.split(".")[0].split(":")[0] for help_, _ in meanings[name]}
+        assert len(first) == 1, name
+
+
+def test_lengths_are_in_mm_forces_in_micronewtons_and_help_says_so(commands):
+    assert "mm, forces in µN, moments in µN·m" in " ".join(run("--help").output.split())
+    helps = {
+        name: option.help
+        for command in commands.values()
+        for option in command.params
+        for name in option.opts
+    }
+    for name in (
+        "--pixel-size",
+        "--square",
+        "--length",
+        "--base-radius",
+        "--tip-radius",
+        "--point",
+    ):
+        assert ", mm" in helps[name]
+    for name in ("--force-noise", "--least-force", "--greatest-force"):
+        assert "µN" in helps[name]
+    assert "µN·m" in helps["--moment-noise"]
+
+
+def test_choices_are_those_that_the_functions_take():
+    """They are written out again because importing the packages takes seconds."""
+    assert get_args(options.Method) == ("exact", *METHODS)
+    assert {one.replace("-", " ") for one in get_args(options.Source)} == set(get_args(Source))
+    assert tuple(options.Region) == REGIONS
+    shapes = get_type_hints(ShapeOptions)["shape"]
+    assert get_args(shapes) == get_args(Shape)
+
+
+def test_a_word_that_is_misspelt_suggests_the_near_one():
+    assert "Did you mean 'estimate'" in run("estimat").output
+    assert "--using" in run("estimate", "a.csv", "--usin", "Fx,MB,MD").output
+    done = run("reconstruct", "a.nc", "--shape", "cilinder")
+    assert done.exit_code == 2
+    assert "cylinder" in done.output
+
+
+@pytest.mark.parametrize(
+    ("typed", "offered"),
+    [("tra", ["track"]), ("track --pix", ["--pixel-size"]), ("reconstruct --shape s", ["sphere"])],
+)
+def test_the_shell_completes_verbs_options_and_choices(typed, offered):
+    words = f"vibrissa {typed}"
+    asked = {
+        "_VIBRISSA_COMPLETE": "complete_bash",
+        "COMP_WORDS": words,
+        "COMP_CWORD": str(words.count(" ")),
+    }
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            "import sys; sys.argv = ['vibrissa']; from vibrissa.cli import main; main()",
+        ],
+        env=os.environ | asked,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout.split() == offered, done.stderr
+
+
+def test_completion_can_be_shown(monkeypatch):
+    monkeypatch.setenv("_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION", "1")
+    done = run("--show-completion", "bash", prog_name="vibrissa")
+    assert done.exit_code == 0, done.output
+    assert "_VIBRISSA_COMPLETE=complete_bash" in done.output

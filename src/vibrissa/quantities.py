@@ -4,8 +4,9 @@ The table itself is ``quantities.csv``, one row a quantity. The attributes of da
 of figures and the headings of tables come from here. Values are in SI units everywhere (``unit``);
 figures and printed tables show ``value * display_factor`` in ``display_unit``. F is the force of
 the object on the whisker and M = p × F its moment about the base, both in the whisker frame: base
-at the origin, x along the tangent at the base, y toward the side to which the whisker curves. Names and symbols are those of the paper
-(Huet, Emnett & Hartmann 2022, doi:10.1371/journal.pcbi.1007763); its mN·mm is our µN·m.
+at the origin, x along the tangent at the base, y toward the side to which the whisker curves. Names
+and symbols are those of the paper (Huet, Emnett & Hartmann 2022, doi:10.1371/journal.pcbi.1007763);
+its mN·mm is our µN·m.
 """
 
 from __future__ import annotations

@@ -10,8 +10,7 @@ Hartmann (2022). The others are the four canonical rods, straight or curved, tap
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.whisker import Whisker
-from vibrissa.whisker.parabola import parabola_curvature
+from vibrissa.whisker import Whisker, parabola_curvature
 
 LENGTH = 40e-3
 COEFFICIENT = 10.0

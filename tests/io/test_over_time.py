@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vibrissa.io import load_contact_points, load_head
-from vibrissa.whisker.emergence import base_rotation
+from vibrissa.whisker import base_rotation
 
 TURNS = Rotation.random(6, rng=np.random.default_rng(0)).as_matrix()
 ROWS = np.arange(6.0)

@@ -8,7 +8,7 @@ from vibrissa.objects import Box, Mesh, Peg
 from vibrissa.recording import Recording
 from vibrissa.rod import follow_surfaces
 from vibrissa.simulation import simulate, whisking
-from vibrissa.whisker.emergence import base_rotation
+from vibrissa.whisker import base_rotation
 
 WHISKER = samples.gamma()
 RADIUS = 1.35e-3

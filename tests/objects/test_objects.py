@@ -8,7 +8,7 @@ from vibrissa.io import load_recording, save_recording
 from vibrissa.objects import Box, Peg, Plane, Sphere
 from vibrissa.recording import Recording
 from vibrissa.simulation import Motion, simulate, sweep_past, tabulated, whisking
-from vibrissa.whisker.emergence import base_rotation
+from vibrissa.whisker import base_rotation
 
 WHISKER = samples.gamma()
 OBJECTS = [

@@ -8,7 +8,7 @@ from vibrissa.objects import Box, Peg, Plane, Sphere
 from vibrissa.rod import contact_state, discretize, follow_surfaces
 from vibrissa.simulation import whisking
 from vibrissa.status import Status
-from vibrissa.whisker.emergence import base_rotation
+from vibrissa.whisker import base_rotation
 
 WHISKER = vb.samples.gamma()
 LENGTH = WHISKER.length

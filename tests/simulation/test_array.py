@@ -21,7 +21,7 @@ from vibrissa.simulation import (
     views_of,
 )
 from vibrissa.simulation.motion import ELEVATION_PER_AZIMUTH, ROLL_PER_AZIMUTH
-from vibrissa.whisker.emergence import angles_of, base_rotation
+from vibrissa.whisker import angles_of, base_rotation
 
 ARRAY = vb.whisker_array(rows="BCD", columns=[1, 2])
 MIRROR = np.array([-1.0, 1.0, 1.0])

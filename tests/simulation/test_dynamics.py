@@ -14,7 +14,7 @@ from vibrissa.simulation import Dynamics, Motion, resonances, simulate, whisking
 from vibrissa.simulation.chain import Chain, configure, inertia, jacobian, solve_definite
 from vibrissa.simulation.dynamics import move_dynamically
 from vibrissa.status import Status
-from vibrissa.whisker.emergence import base_rotation
+from vibrissa.whisker import base_rotation
 
 WHISKER = vb.samples.gamma()
 DENSITY = 1300.0

@@ -7,7 +7,7 @@ from vibrissa import Status, samples
 from vibrissa.objects import Peg
 from vibrissa.recording import Recording
 from vibrissa.simulation import Motion, facing_peg, measure, simulate, sweep_past, whisking
-from vibrissa.whisker.emergence import base_rotation
+from vibrissa.whisker import base_rotation
 
 WHISKER = samples.gamma()
 PEG = facing_peg(WHISKER)

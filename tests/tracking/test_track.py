@@ -15,7 +15,7 @@ from vibrissa.tracking import (
     whisker_at_rest,
 )
 from vibrissa.tracking.banded import Smoother
-from vibrissa.whisker.emergence import angles_of, base_rotation
+from vibrissa.whisker import angles_of, base_rotation
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import vibrissa as vb
-from vibrissa.whisker import Identity, Pose, morphology
-from vibrissa.whisker.emergence import angles_of, base_rotation, mirrored
+from vibrissa.whisker import Identity, Pose, angles_of, base_rotation, mirrored, morphology
 
 ARRAY = vb.whisker_array()
 MM = 1e-3

@@ -377,7 +377,7 @@ def _header(path: Path) -> str:
 def _rows(kind: str, data: Any) -> Iterator[tuple[str, str]]:
     """What a table holds."""
     from vibrissa.status import describe
-    from vibrissa.whisker.section import length_faults
+    from vibrissa.whisker import length_faults
 
     if kind == "whisker":
         yield "whisker", repr(data)

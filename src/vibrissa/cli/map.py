@@ -52,8 +52,7 @@ class MadeOptions(WhiskerOptions):
 
     def read(self, path: Path | None = None) -> Whisker:
         """Read or make the whisker, of the thickness and material that are stated."""
-        from vibrissa.whisker import Whisker
-        from vibrissa.whisker.section import TAPER
+        from vibrissa.whisker import TAPER, Whisker
 
         if self.length is None:
             whisker = super().read(path)

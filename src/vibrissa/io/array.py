@@ -10,7 +10,7 @@ or ``_m`` for lengths, ``_deg`` or ``_rad`` for angles.
 |---|---|
 | `name` | row and column: C2, gamma; L or R before it, or the side is that of the base |
 | `x_mm, y_mm, z_mm` | base point |
-| `azimuth_deg, elevation_deg, roll_deg` | as `vibrissa.whisker.emergence` has them; or |
+| `azimuth_deg, elevation_deg, roll_deg` | as `vibrissa.whisker.pose` has them; or |
 | `r11, r12, … r33` | the rotation from the whisker's to the head's frame, row by row |
 | `length_mm` | arc length |
 | `coefficient_per_mm` | A of the whisker's shape y = A x² (also ``_per_m``) |
@@ -41,15 +41,18 @@ from vibrissa.io.netcdf import is_netcdf, kind_of, naming, read_tree, write_netc
 from vibrissa.io.paths import replacing
 from vibrissa.io.recording import separate_whiskers, stacked_whiskers
 from vibrissa.io.table import read_text, table_rows
-from vibrissa.whisker import Whisker
-from vibrissa.whisker.array import WhiskerArray
-from vibrissa.whisker.array_dataset import KIND
-from vibrissa.whisker.emergence import angles_of, base_rotation
-from vibrissa.whisker.identity import Identity
-from vibrissa.whisker.morphology import curvature_bound
-from vibrissa.whisker.parabola import parabola_curvature
-from vibrissa.whisker.pose import Pose
-from vibrissa.whisker.published import published_note, published_radii
+from vibrissa.whisker import (
+    Identity,
+    Pose,
+    Whisker,
+    WhiskerArray,
+    angles_of,
+    base_rotation,
+    morphology,
+    parabola_curvature,
+    published_note,
+    published_radii,
+)
 
 
 def load_array(
@@ -122,7 +125,7 @@ def save_array(path: str | PathLike[str], array: WhiskerArray) -> None:
 
 def _netcdf(path: Path) -> WhiskerArray:
     kind = kind_of(path)
-    if kind != KIND:
+    if kind != WhiskerArray.kind:
         raise ValueError(f"{path} holds {kind or 'data of another kind'}, not an array of whiskers")
     tree = read_tree(path)
     with naming(path, "an array of whiskers"):
@@ -213,7 +216,7 @@ def _whisker(
         whisker = replace(whisker, notes=(*whisker.notes, published_note(name)))
     for radius in radii.values():
         check_slender(radius, length)
-    bound = float(curvature_bound(length))
+    bound = float(morphology.curvature_bound(length))
     if abs(coefficient) > bound:
         warnings.warn(
             f"{name}: its coefficient, {coefficient * 1e-3:.4g} per mm, is larger than that of any "

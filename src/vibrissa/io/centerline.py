@@ -20,8 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.io.paths import replacing
 from vibrissa.io.table import LENGTHS, is_number, read_rows, read_text, table_rows, unit_factor
-from vibrissa.whisker import Whisker
-from vibrissa.whisker.section import Properties
+from vibrissa.whisker import Properties, Whisker
 
 Array = NDArray[np.float64]
 

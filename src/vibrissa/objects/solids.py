@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.objects.surface import Surface
-from vibrissa.whisker.pose import ORTHOGONALITY
+from vibrissa.whisker import ORTHOGONALITY
 
 Array = NDArray[np.float64]
 

@@ -21,8 +21,7 @@ from vibrissa.status import Status
 from vibrissa.tracking.filtering import CUTOFF
 from vibrissa.tracking.head import HeadPose
 from vibrissa.tracking.pose import BasePose
-from vibrissa.whisker import Whisker
-from vibrissa.whisker.emergence import angles_of
+from vibrissa.whisker import Whisker, angles_of
 
 Array = NDArray[np.float64]
 

@@ -35,7 +35,7 @@ from vibrissa.plots.style import (
 from vibrissa.plots.things import ends_nearby, eye_triangles, head_triangles, object_triangles
 from vibrissa.quantities import axis_label, to_display
 from vibrissa.recording import Group
-from vibrissa.whisker.identity import Identity
+from vibrissa.whisker import Identity
 
 ROW_COLOURS: Mapping[str, str] = MappingProxyType(
     {"A": "#0072b2", "B": "#56b4e9", "C": "#009e73", "D": "#e69f00", "E": "#d55e00"}

@@ -30,9 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
-from vibrissa.whisker.array import WhiskerArray
-from vibrissa.whisker.emergence import angles_of, base_rotation, mirrored
-from vibrissa.whisker.pose import ORTHOGONALITY
+from vibrissa.whisker import ORTHOGONALITY, WhiskerArray, angles_of, base_rotation, mirrored
 
 Array = NDArray[np.float64]
 

@@ -21,8 +21,7 @@ from vibrissa.simulation.motion import (
     whisking,
 )
 from vibrissa.status import Status
-from vibrissa.whisker import Whisker, WhiskerArray
-from vibrissa.whisker.emergence import base_rotation
+from vibrissa.whisker import Whisker, WhiskerArray, base_rotation
 
 Array = NDArray[np.float64]
 

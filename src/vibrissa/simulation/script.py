@@ -29,8 +29,7 @@ from vibrissa.simulation.motion import (
     whisking,
 )
 from vibrissa.simulation.plan import sweep_past, within_reach
-from vibrissa.whisker import Whisker, WhiskerArray, whisker_array
-from vibrissa.whisker.emergence import base_rotation
+from vibrissa.whisker import Whisker, WhiskerArray, base_rotation, whisker_array
 
 Array = NDArray[np.float64]
 

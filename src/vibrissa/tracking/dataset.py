@@ -16,7 +16,7 @@ from vibrissa.status import Status
 from vibrissa.tracking.contact import Contacts
 from vibrissa.tracking.filtering import CUTOFF
 from vibrissa.tracking.head import HeadPose
-from vibrissa.whisker.emergence import angles_of
+from vibrissa.whisker import angles_of
 
 if TYPE_CHECKING:
     from vibrissa.tracking.track import Tracked

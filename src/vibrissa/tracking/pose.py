@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from vibrissa.tracking.filtering import CUTOFF, low_pass
 from vibrissa.tracking.rest import RestShape, aligned_lengths, motions
-from vibrissa.whisker import Whisker
-from vibrissa.whisker.emergence import angles_of, base_rotation
+from vibrissa.whisker import Whisker, angles_of, base_rotation
 
 Array = NDArray[np.float64]
 

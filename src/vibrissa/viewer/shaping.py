@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vibrissa.whisker import Whisker
-from vibrissa.whisker.profile import constant
+from vibrissa.whisker import Whisker, constant
 
 
 @dataclass(frozen=True)

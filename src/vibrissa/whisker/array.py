@@ -8,18 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
+from vibrissa.quantities import attributes
 from vibrissa.sketch import BENT, Mark, card, shown, views
-from vibrissa.whisker.array_dataset import array_tree, whiskers_of
 from vibrissa.whisker.identity import Identity, Side
 from vibrissa.whisker.model import Whisker
-
-if TYPE_CHECKING:
-    import xarray as xr
+from vibrissa.whisker.pose import angles_of
 
 Array = NDArray[np.float64]
 
@@ -50,6 +49,8 @@ class WhiskerArray(Mapping[str, Whisker]):
     >>> whisker_array(side="right")["gamma"].length
     0.0508...
     """
+
+    kind = "vibrissa whisker array"
 
     def __init__(self, whiskers: Iterable[Whisker]) -> None:
         found = sorted((_named(w) for w in whiskers), key=lambda pair: pair[0].sort_key)
@@ -241,3 +242,57 @@ def _named(whisker: Whisker) -> tuple[Identity, Whisker]:
         )
     same = whisker.name == identity.name
     return identity, whisker if same else replace(whisker, name=identity.name)
+
+
+NODES = 33
+"""Points of the centrelines that come along."""
+
+_OF_HEAD = "In the head's frame: origin at the snout, x to the animal's right, y forward, z up."
+
+
+def array_tree(whiskers: Iterable[Whisker], identities: Iterable[Identity]) -> xr.DataTree:
+    """Write an array of whiskers."""
+    them, which = list(whiskers), list(identities)
+    rotation = np.stack([w.pose.rotation for w in them])
+    angles = angles_of(rotation)
+    line = np.stack([w.pose.to_source(w.centerline(NODES)) for w in them])
+    framed: dict[str, tuple[tuple[str, ...], Any]] = {
+        "base_position": (("whisker", "space"), np.stack([w.pose.origin for w in them])),
+        "base_rotation": (("whisker", "space", "whisker_axis"), rotation),
+        "base_azimuth": (("whisker",), angles[:, 0]),
+        "base_elevation": (("whisker",), angles[:, 1]),
+        "base_roll": (("whisker",), angles[:, 2]),
+        "centerline": (("whisker", "node", "space"), line),
+    }
+    variables = {
+        name: xr.Variable(
+            dims, values, attributes(name) | {"description": _OF_HEAD, "reference_frame": "head"}
+        )
+        for name, (dims, values) in framed.items()
+    }
+    for name in ("length", "base_radius", "tip_radius"):
+        values = np.array([getattr(w, name) for w in them])
+        variables[name] = xr.Variable("whisker", values, attributes(name))
+    labels = {
+        "whisker": [w.name for w in them],
+        "side": ("whisker", [one.side for one in which]),
+        "row": ("whisker", [one.row for one in which]),
+        "column": ("whisker", [one.column for one in which]),
+        "space": list("xyz"),
+        "whisker_axis": list("xyz"),
+    }
+    groups: dict[str, xr.Dataset] = {
+        "/": xr.Dataset(variables, labels, {"kind": WhiskerArray.kind})
+    }
+    for i, whisker in enumerate(them):
+        groups[f"/whiskers/{i}"] = whisker.to_dataset().drop_dims("node")
+    return xr.DataTree.from_dict(groups)
+
+
+def whiskers_of(tree: xr.DataTree) -> list[Whisker]:
+    """Make the whiskers of a tree again."""
+    kind = tree.attrs.get("kind")
+    if kind != WhiskerArray.kind or "whiskers" not in tree.children:
+        raise ValueError(f"this holds {kind or 'data of another kind'}, not an array of whiskers")
+    own = tree.children["whiskers"].children
+    return [Whisker.from_dataset(own[i].to_dataset(inherit=False)) for i in sorted(own, key=int)]

@@ -9,11 +9,10 @@ from typing import Any, Literal, Unpack
 
 from vibrissa.whisker import morphology
 from vibrissa.whisker.array import WhiskerArray, sides
-from vibrissa.whisker.emergence import base_rotation, mirrored
 from vibrissa.whisker.identity import ROWS, Identity
 from vibrissa.whisker.model import Whisker
-from vibrissa.whisker.pose import Pose
-from vibrissa.whisker.published import published_radii
+from vibrissa.whisker.morphology import published_radii
+from vibrissa.whisker.pose import Pose, base_rotation, mirrored
 from vibrissa.whisker.section import Properties
 
 

@@ -1,4 +1,4 @@
-"""A whisker as a labelled dataset, without loss.
+"""A whisker as a labelled dataset, without loss; the model, which writes itself so, is above.
 
 Curvature and radius are stored as their polynomials, Σ c_k τ^k with τ ∈ [−1, 1] on each interval,
 so that what is read back equals what was written to the last bit. Centreline and radius at 101
@@ -7,7 +7,7 @@ of them is not there, or they are those of another whisker, was changed by someb
 """
 
 import json
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -16,17 +16,15 @@ from vibrissa.quantities import attributes
 from vibrissa.whisker.pose import Pose
 from vibrissa.whisker.profile import Profile
 
-if TYPE_CHECKING:
-    from vibrissa.whisker.model import Whisker
-
 NODES = 101
 """Points of the centreline that comes along."""
+
 
 Row = tuple[str, tuple[str, ...], object, str, str]
 """Name, dimensions, values, units and long name of a variable."""
 
 
-def whisker_dataset(whisker: "Whisker") -> xr.Dataset:
+def whisker_dataset(whisker: Any) -> xr.Dataset:
     """Write a whisker as a dataset."""
     bending, twist = whisker.base_stiffness or (np.inf, np.inf)
     s = np.linspace(0.0, whisker.length, NODES)
@@ -96,7 +94,7 @@ def _profile_rows(name: str, profile: Profile, units: str, long_name: str) -> li
     ]
 
 
-def check_drawn(dataset: xr.Dataset, whisker: "Whisker") -> None:
+def check_drawn(dataset: xr.Dataset, whisker: Any) -> None:
     """Raise if a file draws another whisker than its polynomials make."""
     if dataset.variables.keys().isdisjoint(_DRAWN):
         return

@@ -22,8 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from vibrissa.quantities import quantity
 from vibrissa.sketch import BENT, Mark, card, shown, views
 from vibrissa.whisker.dataset import check_drawn, whisker_dataset, whisker_fields
-from vibrissa.whisker.digitized import digitize
-from vibrissa.whisker.parabola import parabola_curvature
+from vibrissa.whisker.digitise import digitize
 from vibrissa.whisker.pose import Pose, least_turn, roll
 from vibrissa.whisker.profile import (
     UNRESOLVED,
@@ -33,7 +32,7 @@ from vibrissa.whisker.profile import (
     array_function,
     constant,
 )
-from vibrissa.whisker.rest import Path, proximal_roll
+from vibrissa.whisker.rest import Path, parabola_curvature, proximal_roll
 from vibrissa.whisker.section import (
     ASSUMED,
     POISSON_RATIO,

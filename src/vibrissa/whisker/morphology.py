@@ -39,6 +39,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vibrissa.whisker.identity import ROWS, Identity
+
 Array = NDArray[np.float64]
 
 MEASURED = {"A": range(5), "B": range(6), "C": range(7), "D": range(7), "E": range(1, 7)}
@@ -175,3 +177,66 @@ def _belli(row: ArrayLike, column: ArrayLike) -> tuple[Array, Array]:
 
 def _numbers(value: ArrayLike) -> Array:
     return np.asarray(value, dtype=np.float64)
+
+
+ANY = "any"
+"""Name of a whisker of unknown row and column, of which only the length tells."""
+
+_ALIKE = 5e-3
+"""Difference of length within which whiskers count as alike, m: about half a column."""
+
+
+def published_radii(name: str, length: float) -> tuple[float, float]:
+    """Radii of a rat's whisker by row, column and length (Belli et al. 2017).
+
+    Parameters
+    ----------
+    name : str
+        Which whisker, such as ``C2`` or ``left gamma``; `ANY` takes the mean of those that were
+        measured, weighted by how near their published lengths (Towal et al. 2011) are.
+    length : float
+        Arc length, m.
+
+    Returns
+    -------
+    base_radius, tip_radius : float
+        m.
+
+    Raises
+    ------
+    ValueError
+        If the name is no whisker's.
+    """
+    if name != ANY:
+        identity = Identity.of(name)
+        which = np.array([[identity.row_number, identity.column]])
+        weight = np.ones(1)
+    else:
+        which = np.array(
+            [(1 + i, column) for i, row in enumerate(ROWS) for column in MEASURED[row]]
+        )
+        away = (length - arc_length(*which.T)) / _ALIKE
+        weight = np.exp(-0.5 * (away**2 - (away**2).min()))
+    row, column = which.T
+    base = np.average(base_radius(row, column, length), weights=weight)
+    tip = np.average(tip_radius(row, column, length), weights=weight)
+    return float(base), float(tip)
+
+
+def published_note(name: str) -> str:
+    """Say where such radii come from.
+
+    Parameters
+    ----------
+    name : str
+        As for `published_radii`.
+
+    Returns
+    -------
+    str
+    """
+    if name == ANY:
+        which = "its length, of a rat's whisker of unknown row and column"
+    else:
+        which = f"its length, of a rat's whisker {Identity.of(name).name}"
+    return f"radius by published regressions (Belli et al. 2017) from {which}; not measured"

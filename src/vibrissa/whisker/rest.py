@@ -7,6 +7,13 @@ R' e₁ = R (0, u_z, −u_y). Both together are one motion g = (R, r) with g' = 
 se(3), integrated by the sixth-order Magnus method (Blanes, Casas & Ros 2000) on three Gauss
 points a step, with the exponential in closed form. Points in between are reached by one shorter
 step of the same kind, so they are as accurate as the nodes.
+
+The planar parabola, the usual picture of a whisker's intrinsic shape.
+
+    y = A x²,    s = (sinh w cosh w + w) / (4 A),    κ(s) = 2 A / cosh³ w,    sinh w = 2 A x
+
+It is given by its arc length, not by its extent along x. w(s) is found by Newton's method; the
+left side is convex and increasing in w, so that it converges from anywhere.
 """
 
 from collections.abc import Callable
@@ -15,6 +22,8 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+
+from vibrissa.whisker.profile import Profile, approximate, constant
 
 Array = NDArray[np.float64]
 Rate = Callable[[Array], Array]
@@ -145,3 +154,40 @@ def proximal_roll(points: Array, weights: Array) -> float:
     if weights @ (across @ axes[:, 1]) < 0.0:
         y, z = -y, -z
     return float(np.arctan2(z, y))
+
+
+def parabola_curvature(length: float, coefficient: float) -> Profile:
+    """Intrinsic curvature of y = A x², bending toward +y.
+
+    Parameters
+    ----------
+    length : float
+        Arc length, m.
+    coefficient : float
+        A, 1/m, not negative.
+
+    Returns
+    -------
+    Profile
+        Values (3,): (0, 0, κ), 1/m.
+    """
+    if coefficient == 0.0:
+        return constant(np.zeros(3), length)
+
+    def curvature(s: Array) -> Array:
+        w = _parameter(4.0 * coefficient * s)
+        kappa = 2.0 * coefficient / np.cosh(w) ** 3
+        return np.stack([np.zeros_like(s), np.zeros_like(s), kappa], axis=-1)
+
+    return approximate(curvature, np.array([0.0, length]))
+
+
+def _parameter(arc: Array) -> Array:
+    """Solve sinh w cosh w + w = arc ≥ 0."""
+    w = np.arcsinh(0.5 * arc)
+    for _ in range(60):
+        change = (0.5 * np.sinh(2.0 * w) + w - arc) / (2.0 * np.cosh(w) ** 2)
+        w = w - change
+        if np.abs(change).max(initial=0.0) < 1e-15 * (1.0 + np.abs(w).max(initial=0.0)):
+            break
+    return w

@@ -5,7 +5,7 @@ A circular section of radius r(s), of one isotropic material:
     B(s) = diag(GJ, EI, EI),    I = π r⁴ / 4,    J = 2 I,    G = E / (2 (1 + ν))
 
 By default r falls linearly from base to tip. Sampled radii are joined by monotone cubics between
-the jumps and kinks found in them (`vibrissa.whisker.sampled`).
+the jumps and kinks found in them (`vibrissa.whisker.sampled_radius`).
 """
 
 from collections.abc import Callable, Sequence
@@ -14,6 +14,7 @@ from typing import TypedDict, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vibrissa.whisker.morphology import published_note, published_radii
 from vibrissa.whisker.profile import (
     JUMP,
     UNRESOLVED,
@@ -22,8 +23,7 @@ from vibrissa.whisker.profile import (
     array_function,
     linear,
 )
-from vibrissa.whisker.published import published_note, published_radii
-from vibrissa.whisker.sampled import sampled_radius, scatter
+from vibrissa.whisker.sampled_radius import sampled_radius, scatter
 
 Array = NDArray[np.float64]
 
@@ -220,7 +220,19 @@ def material_faults(
 
 
 def length_faults(length: float, any_length: bool | None = False) -> list[str]:
-    """Say what is wrong with a length; empty if nothing is."""
+    """Say what is wrong with a length; empty if nothing is.
+
+    Parameters
+    ----------
+    length : float
+        Arc length, m.
+    any_length : bool, optional
+        Whether a length that no animal's whisker has is meant.
+
+    Returns
+    -------
+    list of str
+    """
     if not (np.isfinite(length) and length > 0.0):
         return [f"length is {length!r} m; it must be positive"]
     if any_length or SHORTEST <= length <= LONGEST:

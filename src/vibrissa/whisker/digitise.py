@@ -8,22 +8,53 @@
 3. In that frame u₀ = (0, −κ·d2, κ·d1).
 
 The base is the point of the curve nearest the first point, the tip that nearest the last.
+
+Arc length along a parametric curve, and the nearest points on it.
+
+    s(t) = ∫ |X′| dt
+
+is integrated by Gauss's rule between the knots of the spline X and inverted by Newton's method.
+
+Smoothing splines whose strength follows from the noise.
+
+Through points y_i at parameters t_i ∈ [0, 1] goes the curve f that minimises
+
+    Σ |y_i − f(t_i)|² + λ ∫ |f‴|² dt,
+
+a quintic spline with f‴ = f⁗ = 0 at both ends. Penalising the third derivative leaves the curvature
+at the base free (a cubic smoothing spline would make it zero there) and keeps a parabola, the usual
+whisker, whatever λ is. The spline is written by its values at sites, f = Σ N_j(t) v_j, with natural
+cardinal splines N_j. With A_ij = N_j(t_i), K = ∫ N‴ N‴ᵀ and the hat matrix H = A (AᵀA + λK)⁻¹ Aᵀ,
+λ follows from
+
+- the noise, where it is stated: the least RSS + 2 ρ σ² c tr H, an unbiased estimate of the squared
+  distance to the true curve (Mallows; the discrepancy principle RSS = σ² c (n − tr H) has the same
+  aim, but hangs on how much the noise of one sample happens to differ from σ);
+- else generalised cross-validation: the least RSS / (n − ρ tr H)². Plain cross-validation, ρ = 1,
+  follows the noise of short data at times; counting each degree of freedom as ρ = 1.2 to 1.4 of
+  them ends that (Kim & Gu 2004).
+
+Points are free to slide along the curve, so that residuals have c = d − 1 components in d
+dimensions.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import BSpline
+from scipy.interpolate import BSpline, make_interp_spline
+from scipy.linalg import eigh, qr, solve_triangular, svd
 from scipy.stats import chi2
 from scipy.stats import f as fisher
 
-from vibrissa.whisker.curve import ArcLength, nearest_parameters
 from vibrissa.whisker.pose import Pose, least_turn
 from vibrissa.whisker.profile import Profile, approximate, constant
 from vibrissa.whisker.rest import Path
 from vibrissa.whisker.section import LONGEST, length_faults
-from vibrissa.whisker.smoothing import Smoothed, natural_spline, smooth
 
 Array = NDArray[np.float64]
 
@@ -164,7 +195,7 @@ class _Line:
     rss: float
 
     @classmethod
-    def fitted(cls, points: Array) -> "_Line":
+    def fitted(cls, points: Array) -> _Line:
         middle = points.mean(axis=0)
         direction = np.linalg.svd(points - middle, full_matrices=False)[2][0]
         if (points[-1] - points[0]) @ direction < 0.0:
@@ -329,3 +360,156 @@ def _measured(curve: BSpline, start: float, end: float, noise: float) -> Digitiz
 def _total_turning(spin: Profile) -> float:
     s = np.linspace(spin.knots[0], spin.knots[-1], 2001)
     return float(np.linalg.norm(spin(s), axis=1).mean() * (s[-1] - s[0]))
+
+
+_POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(12)
+
+
+class ArcLength:
+    """Arc length of a spline curve between two parameters."""
+
+    def __init__(
+        self, curve: BSpline, start: float | None = None, end: float | None = None
+    ) -> None:
+        knots = np.unique(curve.t)
+        start = float(knots[0]) if start is None else start
+        end = float(knots[-1]) if end is None else end
+        slack = 1e-6 * (end - start)
+        inside = knots[(knots > start + slack) & (knots < end - slack)]
+        self._velocity = curve.derivative(1)
+        self._knots = np.concatenate([[start], inside, [end]])
+        pieces = self._between(self._knots[:-1], self._knots[1:])
+        self.ends: Array = np.append(0.0, np.cumsum(pieces))
+        self.total = float(self.ends[-1])
+
+    def _speed(self, t: Array) -> Array:
+        return np.asarray(np.linalg.norm(self._velocity(t), axis=-1))
+
+    def _between(self, start: Array, end: Array) -> Array:
+        half = 0.5 * (end - start)
+        t = 0.5 * (start + end)[..., np.newaxis] + half[..., np.newaxis] * _POINTS
+        lengths: Array = half * (self._speed(t) @ _WEIGHTS)
+        return lengths
+
+    def length(self, t: Array) -> Array:
+        """Arc lengths (...) at parameters (...)."""
+        k = np.clip(np.searchsorted(self._knots, t, side="right") - 1, 0, self._knots.size - 2)
+        lengths: Array = self.ends[k] + self._between(self._knots[k], t)
+        return lengths
+
+    def parameter(self, s: Array) -> Array:
+        """Parameters (...) at arc lengths (...)."""
+        t = np.interp(s, self.ends, self._knots)
+        for _ in range(30):
+            change = (self.length(t) - s) / self._speed(t)
+            t = t - change
+            if np.abs(change).max(initial=0.0) < 1e-14 * (self._knots[-1] - self._knots[0]):
+                break
+        return np.asarray(t)
+
+
+def nearest_parameters(curve: BSpline, points: Array, guesses: Array, window: float) -> Array:
+    """Find the nearest points on a curve, each within a window of parameters."""
+    grid = np.linspace(-0.02, 1.02, 521)
+    apart = np.sum((points[:, np.newaxis] - np.asarray(curve(grid))) ** 2, axis=-1)
+    apart[np.abs(grid - guesses[:, np.newaxis]) > window] = np.inf
+    t: Array = grid[apart.argmin(axis=1)]
+    first, second = curve.derivative(1), curve.derivative(2)
+    for _ in range(8):
+        gap, velocity = np.asarray(curve(t)) - points, np.asarray(first(t))
+        slope = np.sum(gap * velocity, axis=1)
+        speed2 = np.sum(velocity**2, axis=1)
+        bend = speed2 + np.sum(gap * np.asarray(second(t)), axis=1)
+        change = -slope / np.maximum(bend, 0.3 * speed2)
+        t = np.clip(t + np.clip(change, -0.01, 0.01), grid[0], grid[-1])
+        if np.abs(change).max() < 1e-12:
+            break
+    return t
+
+
+SITES = 48
+"""Values that a smoothing spline has at most, per coordinate."""
+
+COST = 1.3
+"""ρ, what a degree of freedom counts."""
+
+LEVELS = 90
+"""Values of λ that are compared."""
+
+
+def natural_spline(t: Array, values: Array) -> BSpline:
+    """Interpolate with a quintic spline that has no third and fourth derivative at the ends."""
+    zero = np.zeros(values.shape[1:])
+    # The stubs know conditions by name only.
+    ends: Any = ([(3, zero), (4, zero)], [(3, zero), (4, zero)])
+    return make_interp_spline(t, values, k=5, bc_type=ends)
+
+
+@dataclass(frozen=True, eq=False)
+class Smoothed:
+    """A smoothing spline and what is known about it."""
+
+    curve: BSpline
+    residuals: Array
+    freedom: float
+
+    def noise(self, components: int) -> float:
+        """Standard deviation per coordinate that the residuals tell of."""
+        left = max(len(self.residuals) - self.freedom, 1e-3)
+        return float(np.sqrt(np.sum(self.residuals**2) / (components * left)))
+
+
+def smooth(t: Array, points: Array, noise: float | None, components: int) -> Smoothed:
+    """Fit a smoothing spline."""
+    n = len(t)
+    cardinal, roughness = _cardinal()
+    # The least λ does nothing to what n points can show, and makes the system regular where there
+    # are fewer points than sites.
+    least = 1e-6 * n / (np.pi * min(n, SITES)) ** 6
+    design = np.asarray(cardinal(t))
+    weights, axes = eigh(design.T @ design)
+    shown_part = np.sqrt(np.clip(weights, 0.0, None))[:, np.newaxis] * axes.T
+    rough_part = np.sqrt(least) * roughness
+    # Modes that are orthogonal in both AᵀA and K. K itself is not formed: squared, the roughness of
+    # a smooth curve would drown in the rounding of the rough ones.
+    basis, triangle = qr(np.vstack([shown_part, rough_part]), mode="economic")
+    _, rough, turned = svd(basis[SITES:], full_matrices=False)
+    modes = solve_triangular(triangle, turned.T)
+    shown = design @ modes
+    rates = rough**2 / least
+    loads = shown.T @ points
+
+    def fit(level: float) -> tuple[Array, Array, Array]:
+        damping = 1.0 / (1.0 + (level - least) * rates)
+        weights = damping[:, np.newaxis] * loads
+        return weights, points - shown @ weights, damping * (1.0 - rough**2)
+
+    levels = np.geomspace(least, 10.0 * n, LEVELS)
+    rss, freedom = np.empty((2, LEVELS))
+    for k, level in enumerate(levels):
+        _, residuals, hat = fit(level)
+        rss[k], freedom[k] = np.sum(residuals**2), hat.sum()
+    if noise is None:
+        left = n - COST * freedom
+        allowed = left > 0.0
+        level = float(levels[allowed][(rss[allowed] / left[allowed] ** 2).argmin()])
+    else:
+        level = float(levels[(rss + 2.0 * COST * noise**2 * components * freedom).argmin()])
+    weights, residuals, hat = fit(level)
+    return Smoothed(
+        BSpline(cardinal.t, cardinal.c @ (modes @ weights), 5), residuals, float(hat.sum())
+    )
+
+
+@cache
+def _cardinal() -> tuple[BSpline, Array]:
+    """Give N and the triangle D with DᵀD = ∫ N‴ N‴ᵀ dt, on equally spaced sites."""
+    sites = np.linspace(0.0, 1.0, SITES)
+    cardinal = natural_spline(sites, np.eye(SITES))
+    # Three Gauss points are exact where N‴ is a parabola.
+    points, weights = np.polynomial.legendre.leggauss(3)
+    halves = 0.5 * np.diff(sites)[:, np.newaxis]
+    middles = 0.5 * (sites[1:] + sites[:-1])[:, np.newaxis]
+    thirds = np.asarray(cardinal.derivative(3)((middles + halves * points).ravel()))
+    rough = np.sqrt((halves * weights).ravel())[:, np.newaxis] * thirds
+    return cardinal, np.asarray(qr(rough, mode="r")[0][:SITES])

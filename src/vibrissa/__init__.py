@@ -10,6 +10,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
+from vibrissa._version import __version__
+
 if TYPE_CHECKING:
     from vibrissa import (
         cameras,
@@ -56,7 +58,6 @@ if TYPE_CHECKING:
     from vibrissa.status import Status
     from vibrissa.whisker import Whisker, WhiskerArray, whisker_array
 
-__version__ = "0.1.0"
 
 __all__ = [
     "ContactFilter",

@@ -73,7 +73,7 @@ for _name, _verb in VERBS.items():
 
 def _version(asked: bool) -> None:
     if asked:
-        from vibrissa import __version__
+        from vibrissa._version import __version__
 
         output.print(f"vibrissa {__version__}", highlight=False)
         raise typer.Exit

@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from vibrissa import __version__
+from vibrissa._version import __version__
 from vibrissa.report.page import Section, table
 
 _PACKAGES = ("numpy", "scipy", "numba", "xarray", "h5netcdf", "matplotlib", "av", "plotly")

@@ -7,7 +7,7 @@ from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
-from vibrissa import __version__
+from vibrissa._version import __version__
 
 COMPUTING = (
     "quantities.py",

@@ -31,8 +31,7 @@ from vibrissa.evaluation import (
     truth_of,
     with_truth,
 )
-from vibrissa.io import load_recording, save_contacts, save_recording
-from vibrissa.io.paths import replacing
+from vibrissa.io import load_recording, replacing, save_contacts, save_recording
 from vibrissa.objects import Peg
 from vibrissa.pipeline import (
     contact_columns,

@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 
 from vibrissa.identifiability import verdict_rows, verdict_table
-from vibrissa.io.recording import KIND
+from vibrissa.io import RECORDING_KIND
 from vibrissa.recording import Recording
 from vibrissa.sketch import BENT, CONTACT, MOST_CURVES, REST, Mark, card, table, thinned, views
 
@@ -64,7 +64,7 @@ def show(result: Any) -> Shown:
         return Shown(
             f"<div>{table(rows[1:], rows[0])}<small>{told}</small></div>", verdict_table(result)
         )
-    if isinstance(result, xr.DataTree) and result.attrs.get("kind") == KIND:
+    if isinstance(result, xr.DataTree) and result.attrs.get("kind") == RECORDING_KIND:
         facts = _facts(result)
         width = max(len(name) for name, _ in facts)
         text = "\n".join(f"{name:{width}}  {value}" for name, value in facts)

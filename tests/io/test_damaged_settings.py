@@ -11,9 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from vibrissa.cameras import Camera, load_cameras, orthogonal_views, save_cameras
 from vibrissa.cli.app import app
-from vibrissa.io import write_video
-from vibrissa.io.table import read_text
-from vibrissa.io.toml import in_file
+from vibrissa.io import in_file, read_text, write_video
 from vibrissa.sensors import Sensor, SensorFrame, load_sensor, save_sensor
 from vibrissa.simulation import EXAMPLE, read_objects, read_script
 from vibrissa.whisker import Whisker

@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 import vibrissa as vb
 from vibrissa import io, samples
-from vibrissa.io.netcdf import write_netcdf
+from vibrissa.io import write_netcdf
 
 folder, limit = Path(sys.argv[1]), int(sys.argv[2])
 trial = io.load_recording(sys.argv[3])

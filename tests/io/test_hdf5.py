@@ -16,10 +16,13 @@ from vibrissa.io import (
     load_signals,
     load_tracks,
     netcdf,
+    netcdf_image,
+    read_dataset,
+    read_tree,
     recognise,
     save_recording,
+    write_netcdf,
 )
-from vibrissa.io.netcdf import netcdf_image, read_dataset, read_tree, write_netcdf
 from vibrissa.simulation import facing_peg, measure, simulate, whisking
 
 WHISKER = samples.gamma()

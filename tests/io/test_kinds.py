@@ -7,8 +7,16 @@ from typer.testing import CliRunner
 
 from vibrissa import samples
 from vibrissa.cli.app import app
-from vibrissa.io import Kind, load_tracks, recognise, save_centerline, save_tracks, write_video
-from vibrissa.io.tracks import RawTracks, labelled
+from vibrissa.io import (
+    Kind,
+    RawTracks,
+    labelled,
+    load_tracks,
+    recognise,
+    save_centerline,
+    save_tracks,
+    write_video,
+)
 
 
 def info(path):

@@ -9,15 +9,16 @@ import xarray as xr
 from scipy.spatial.transform import Rotation
 
 from vibrissa.io import (
+    RawTracks,
     Session,
     join_views,
+    labelled,
     load_nwb,
     load_nwb_series,
     load_tracks,
     recognise,
     save_nwb,
 )
-from vibrissa.io.tracks import RawTracks, labelled
 from vibrissa.quantities import attributes
 
 pynwb = pytest.importorskip("pynwb")

@@ -7,9 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from vibrissa.io import check_folder, check_readable, check_writable, is_netcdf
-from vibrissa.io.paths import CSV, NETCDF, replacing
-from vibrissa.io.table import read_text
+from vibrissa.io import (
+    CSV,
+    NETCDF,
+    check_folder,
+    check_readable,
+    check_writable,
+    is_netcdf,
+    read_text,
+    replacing,
+)
 
 
 def test_where_a_file_can_be_written(tmp_path):

@@ -7,8 +7,7 @@ import pytest
 import xarray as xr
 
 from vibrissa import samples
-from vibrissa.io.netcdf import kind_of
-from vibrissa.io.recording import load_recording, save_recording
+from vibrissa.io import kind_of, load_recording, save_recording
 from vibrissa.recording import Recording
 from vibrissa.simulation import facing_peg, measure, simulate, whisking
 

@@ -7,11 +7,11 @@ import sys
 
 import pytest
 
-from vibrissa.io.paths import replacing
+from vibrissa.io import replacing
 
 WRITES = """
 import sys
-from vibrissa.io.paths import replacing
+from vibrissa.io import replacing
 with replacing(sys.argv[1]) as part:
     part.write_text("half")
     print("begun", flush=True)

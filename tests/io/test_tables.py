@@ -5,8 +5,7 @@ import pytest
 import xarray as xr
 
 from vibrissa import PointContact, Status, Whisker, deflect, samples
-from vibrissa.io.contacts_table import load_contacts, save_contacts
-from vibrissa.io.signals_table import check_scale, load_signals, save_signals
+from vibrissa.io import check_scale, load_contacts, load_signals, save_contacts, save_signals
 
 HEADER = "time,Fx,Fy,Fz,Mx,My,Mz"
 

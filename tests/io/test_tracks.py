@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from vibrissa.io import join_views, load_tracks, save_tracks
-from vibrissa.io.tracks import RawTracks, labelled
+from vibrissa.io import RawTracks, join_views, labelled, load_tracks, save_tracks
 
 generator = np.random.default_rng(0)
 IMAGE = generator.uniform(10, 1000, (6, 2, 1, 4, 2))

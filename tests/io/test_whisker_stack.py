@@ -6,13 +6,8 @@ import pytest
 import xarray as xr
 
 import vibrissa as vb
-from vibrissa.io.recording import (
-    KIND,
-    load_recording,
-    save_recording,
-    separate_whiskers,
-    stacked_whiskers,
-)
+from vibrissa.io import RECORDING_KIND, load_recording, save_recording
+from vibrissa.io.recording import separate_whiskers, stacked_whiskers
 
 WHISKERS = [
     vb.Whisker.parabola(40e-3, 10.0, name="β"),
@@ -24,7 +19,9 @@ WHISKERS = [
 
 
 def tree(whiskers, **other):
-    groups = {"/": xr.Dataset({"kept": ("whisker", np.arange(3.0))}, attrs={"kind": KIND})}
+    groups = {
+        "/": xr.Dataset({"kept": ("whisker", np.arange(3.0))}, attrs={"kind": RECORDING_KIND})
+    }
     groups["/truth"] = xr.Dataset({"flag": ("whisker", [True, False, True])})
     for i, whisker in enumerate(whiskers):
         groups[f"/whiskers/{i}"] = whisker.to_dataset().drop_dims("node")

@@ -7,7 +7,7 @@ import xarray as xr
 import vibrissa as vb
 from vibrissa.cameras import orthogonal_views
 from vibrissa.cameras.files import cameras_dataset
-from vibrissa.io.recording import KIND
+from vibrissa.io import RECORDING_KIND
 from vibrissa.objects import Peg, objects_datasets
 from vibrissa.quantities import attributes
 
@@ -58,7 +58,7 @@ class KnownTrial:
                 "whisker": ["w"],
                 "space": list("xyz"),
             },
-            {"kind": KIND},
+            {"kind": RECORDING_KIND},
         )
         truth = contact(self.radius) | {
             "centerline": (("time", "whisker", "node", "space"), line[:, None]),

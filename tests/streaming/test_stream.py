@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 import vibrissa as vb
 from vibrissa.cli.app import app
 from vibrissa.contacts import ContactFilter, Estimator
-from vibrissa.io.rosbag import bag_wrenches
+from vibrissa.io import bag_wrenches
 from vibrissa.sensors import Sensor, SensorFrame, save_sensor
 from vibrissa.streaming import ContactStream, Lines, NewestLines, Poses, advice, file_lines
 from vibrissa.streaming.contacts import COMPONENTS, as_json

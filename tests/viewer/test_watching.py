@@ -10,8 +10,7 @@ import xarray as xr
 
 import vibrissa as vb
 from vibrissa.contour import fit_free, fit_shape
-from vibrissa.io import write_video
-from vibrissa.io.video import Footage
+from vibrissa.io import Footage, write_video
 from vibrissa.recording import Recording
 from vibrissa.viewer.signal_chart import chart, cursor
 from vibrissa.viewer.trial_drawing import fitted_body, moment_drawing, surroundings, touched

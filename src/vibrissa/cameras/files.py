@@ -10,8 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa.cameras.camera import Camera
-from vibrissa.io.anipose import read_calibration, write_calibration
-from vibrissa.io.toml import in_file
+from vibrissa.io import in_file, read_calibration, write_calibration
 
 Array = NDArray[np.float64]
 

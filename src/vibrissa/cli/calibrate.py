@@ -50,8 +50,7 @@ def calibrate(
     """
     from vibrissa.cameras import calibrate as calibrated
     from vibrissa.cameras import save_cameras
-    from vibrissa.io import Kind, load_series, recognise
-    from vibrissa.io.paths import check_readable, check_writable
+    from vibrissa.io import Kind, check_readable, check_writable, load_series, recognise
 
     corners = _corners(pattern)
     if not _SMALLEST < square < _LARGEST:

@@ -31,8 +31,13 @@ def correct(
     Click points from base to tip; arrows go to other frames, s saves, q saves and closes; all keys
     are shown in the window. Example: `vibrissa correct top.mp4 -o corrections.csv --trace trial.nc`
     """
-    from vibrissa.io import FrameReader, load_corrections, save_corrections, video_info
-    from vibrissa.io.paths import check_writable
+    from vibrissa.io import (
+        FrameReader,
+        check_writable,
+        load_corrections,
+        save_corrections,
+        video_info,
+    )
     from vibrissa.plots.correcting import correct as corrected
 
     if view < 0:

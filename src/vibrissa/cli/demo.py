@@ -53,7 +53,7 @@ def demo(
     Example: `vibrissa demo --output try --seed 1`
     """
     from vibrissa.demo import DURATION, FULL_DURATION, run_demo
-    from vibrissa.io.paths import check_folder
+    from vibrissa.io import check_folder
 
     if duration is not None and full is not None:
         raise ValueError("give either --duration or one of --full and --quick")

@@ -142,7 +142,7 @@ def estimate(
     table goes to a table.
     Example: `vibrissa estimate signals.csv --map map.nc --using Fx,FT,MB,MD -o contacts.csv`
     """
-    from vibrissa.io.paths import CSV, NETCDF, check_readable, check_writable
+    from vibrissa.io import CSV, NETCDF, check_readable, check_writable
 
     if how.noise.covariance is not None:
         how.noise.matrix()
@@ -189,8 +189,7 @@ def _from_table(signals: Path, target: Path, how: EstimateOptions) -> None:
 
 def _from_recording(signals: Path, target: Path, how: EstimateOptions) -> None:
     """Contacts added to a recording, or as a table."""
-    from vibrissa.io import save_contacts, save_recording
-    from vibrissa.io.paths import CSV
+    from vibrissa.io import CSV, save_contacts, save_recording
     from vibrissa.pipeline import contact_columns, due_stages, with_signals
 
     tree = recording_from(signals)
@@ -247,7 +246,7 @@ def estimated(
 
 
 def _check_scale(path: Path | str, wrench: xr.Dataset, whisker: Whisker) -> None:
-    from vibrissa.io.signals_table import check_scale
+    from vibrissa.io import check_scale
 
     try:
         check_scale(wrench, whisker)

@@ -62,8 +62,7 @@ def figures(
     face, the whiskers, and what they touch.
     Example: `vibrissa figures map.nc -o figures --width single`
     """
-    from vibrissa.io import Kind, recognise
-    from vibrissa.io.paths import check_folder
+    from vibrissa.io import Kind, check_folder, recognise
 
     endings = tuple(dict.fromkeys(map(str, format_ or ("png", "pdf"))))
     check_folder(folder)
@@ -101,9 +100,7 @@ def saved(
 
 def dataset_with(path: Path, needed: str) -> xr.Dataset:
     """Read a dataset that holds a variable."""
-    from vibrissa.io import kind_of
-    from vibrissa.io.netcdf import read_dataset
-    from vibrissa.io.paths import CSV
+    from vibrissa.io import CSV, kind_of, read_dataset
 
     if path.suffix.lower() in CSV:
         raise ValueError(f"{path} is a table; the same saved as NetCDF (-o FILE.nc) is needed")

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from xarray import Dataset
 
-    from vibrissa.io.tracks import RawTracks
+    from vibrissa.io import RawTracks
 
 _SHOWN = 12
 _TABLES = """\
@@ -62,8 +62,7 @@ def _installation() -> Iterator[tuple[str, str]]:
 
 
 def _file(path: Path) -> Iterator[tuple[str, str]]:
-    from vibrissa.io import Kind, check_readable, recognise
-    from vibrissa.io.kinds import READERS
+    from vibrissa.io import READERS, Kind, check_readable, recognise
 
     if path.is_dir():
         yield from _array(path, "folder of centrelines")
@@ -97,7 +96,7 @@ def _file(path: Path) -> Iterator[tuple[str, str]]:
 
 def _settings(path: Path) -> Iterator[tuple[str, str]]:
     """What other settings are for; they are checked by the verb that takes them."""
-    from vibrissa.io.toml import read_toml
+    from vibrissa.io import read_toml
 
     settings = read_toml(path)
     study = {"whiskers", "tasks"} & set(settings)
@@ -106,7 +105,7 @@ def _settings(path: Path) -> Iterator[tuple[str, str]]:
 
 
 def _is_sensor(path: Path) -> bool:
-    from vibrissa.io.toml import read_toml
+    from vibrissa.io import read_toml
 
     if path.suffix != ".toml":
         return False
@@ -176,7 +175,7 @@ def _calibration(path: Path) -> Iterator[tuple[str, str]]:
 
 
 def _is_text(path: Path) -> bool:
-    from vibrissa.io.table import read_text
+    from vibrissa.io import read_text
 
     try:
         read_text(path)
@@ -187,8 +186,7 @@ def _is_text(path: Path) -> bool:
 
 def _tracks(path: Path, kind: str) -> Iterator[tuple[str, str]]:
     """Sizes, times and how much is missing of tracks; also where their unit is not stated."""
-    from vibrissa.io import Kind, load_tracks
-    from vibrissa.io.kinds import READERS
+    from vibrissa.io import READERS, Kind, load_tracks
 
     yield "kind", kind
     note = ""
@@ -219,7 +217,7 @@ def _tracks(path: Path, kind: str) -> Iterator[tuple[str, str]]:
 
 def _without_unit(raw: RawTracks, path: Path) -> tuple[Dataset, str]:
     """Label tracks even if the unit of their points is not stated, with a note on it."""
-    from vibrissa.io.tracks import labelled
+    from vibrissa.io import labelled
 
     if raw.space is None or raw.unit:
         return labelled(raw, path), ""
@@ -239,8 +237,7 @@ def _groups(path: Path) -> Iterator[tuple[str, str]]:
     """Kind, groups and variables of a NetCDF file; of its values only names are read."""
     import h5netcdf
 
-    from vibrissa.io import kind_of
-    from vibrissa.io.netcdf import opened
+    from vibrissa.io import kind_of, opened
 
     yield "kind", kind_of(path) or "unknown"
     with opened(path, "NetCDF-4", soft_links=False), h5netcdf.File(path, "r") as file:
@@ -311,7 +308,7 @@ def _compared(path: Path) -> Iterator[tuple[str, str]]:
     """How contact points that do not come from the rod compare with those that do."""
     import xarray as xr
 
-    from vibrissa.io.netcdf import opened, read_dataset
+    from vibrissa.io import opened, read_dataset
 
     with opened(path, "a recording") as file:
         if "measured/contact_difference" not in file:
@@ -367,7 +364,7 @@ def _table(path: Path) -> Iterator[tuple[str, str]]:
 
 def _header(path: Path) -> str:
     """What a table begins with."""
-    from vibrissa.io.table import read_text, table_rows
+    from vibrissa.io import read_text, table_rows
 
     cells = next(table_rows(read_text(path)), (0, []))[1]
     shown = ", ".join(cells[:_SHOWN]) + (", …" if len(cells) > _SHOWN else "")

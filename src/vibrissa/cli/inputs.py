@@ -118,7 +118,7 @@ class NoiseOptions:
         """Covariance of force and moment, (6, 6), SI units."""
         import numpy as np
 
-        from vibrissa.io.table import read_text, table_rows
+        from vibrissa.io import read_text, table_rows
         from vibrissa.pipeline import component_noise
 
         if self.covariance is None:
@@ -257,8 +257,7 @@ def _whisker_in(path: Path) -> Whisker:
 
 def recording_from(path: Path) -> xr.DataTree:
     """Read a recording."""
-    from vibrissa.io import load_recording
-    from vibrissa.io.paths import check_readable
+    from vibrissa.io import check_readable, load_recording
     from vibrissa.pipeline.frames import check_recording
 
     recording = load_recording(check_readable(path))
@@ -308,10 +307,7 @@ def wrench_from(path: Path) -> xr.Dataset:
 
 def objects_from(path: Path) -> tuple[Surface, ...]:
     """Read known objects from a recording, or from TOML with ``[[object]]``."""
-    from vibrissa.io import load_recording
-    from vibrissa.io.paths import NETCDF
-    from vibrissa.io.table import read_text
-    from vibrissa.io.toml import in_file
+    from vibrissa.io import NETCDF, in_file, load_recording, read_text
     from vibrissa.recording import Recording
     from vibrissa.simulation import read_objects
 

@@ -87,7 +87,7 @@ def simulate_map(
     Example: `vibrissa map --whisker C1.csv -o map.nc`; steel wire:
     `vibrissa map --length 300 --base-radius 0.5 --tip-radius 0.25 --modulus 200 --poisson 0.29`
     """
-    from vibrissa.io.paths import NETCDF, check_writable
+    from vibrissa.io import NETCDF, check_writable
 
     check_writable(path, NETCDF)
     free([path], force)

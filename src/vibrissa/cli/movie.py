@@ -125,7 +125,7 @@ def make_movies(
 
 def _files(target: Path, trial: Path, kinds: Sequence[str]) -> dict[str, Path]:
     """Where each movie goes."""
-    from vibrissa.io.paths import check_folder, check_writable
+    from vibrissa.io import check_folder, check_writable
 
     if target.suffix.lower() == ".mp4":
         if len(kinds) > 1:

@@ -103,8 +103,7 @@ def reconstruct(
     The contacts are compared with --objects, by default those of the recording.
     Example: `vibrissa reconstruct trial.nc --shape cylinder`
     """
-    from vibrissa.io import save_contour, save_recording
-    from vibrissa.io.paths import CSV, NETCDF, check_writable
+    from vibrissa.io import CSV, NETCDF, check_writable, save_contour, save_recording
     from vibrissa.pipeline import contour_points
     from vibrissa.recording import Recording
 
@@ -180,7 +179,7 @@ def _as_made(about: Any) -> SourceOptions:
 
 def _of_contour(points: Path, recording: Path, own: WhiskerOptions) -> bool:
     """Whether a table holds what the recording does: replaced with it, nothing else is lost."""
-    from vibrissa.io.contacts_table import holds_contour
+    from vibrissa.io import holds_contour
     from vibrissa.pipeline import contour_points
 
     if not points.is_file() or kind_in(recording) != RECORDING:

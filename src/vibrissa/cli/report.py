@@ -71,8 +71,7 @@ def report(
     draws behind what is predicted. With SOURCE_DATE_EPOCH set, the same command gives the same
     page. Example: `vibrissa report trial.nc --video top.mp4 --video front.mp4 -o report.html`
     """
-    from vibrissa.io import load_recording
-    from vibrissa.io.paths import check_readable, check_writable
+    from vibrissa.io import check_readable, check_writable, load_recording
     from vibrissa.report import (
         contacts_by_whisker,
         document,
@@ -124,7 +123,7 @@ def report(
 
 
 def _write(target: Path, page: str) -> None:
-    from vibrissa.io.paths import replacing
+    from vibrissa.io import replacing
 
     with replacing(target) as part:
         part.write_text(page, encoding="utf-8")
@@ -132,7 +131,7 @@ def _write(target: Path, page: str) -> None:
 
 
 def _is_trial(path: Path) -> bool:
-    from vibrissa.io.paths import refuse_whisk
+    from vibrissa.io import refuse_whisk
 
     refuse_whisk(path)
     kind = kind_in(path)

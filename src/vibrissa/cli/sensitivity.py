@@ -46,7 +46,7 @@ def sensitivity(
     """
     from vibrissa.identifiability import best_triplet
     from vibrissa.identifiability import sensitivity as derivatives
-    from vibrissa.io.paths import NETCDF, check_writable
+    from vibrissa.io import NETCDF, check_writable
     from vibrissa.numerics import contact_weights
     from vibrissa.paper import sensitivity_findings
     from vibrissa.signals import selection
@@ -166,7 +166,7 @@ def _error(value: float) -> str:
 
 
 def _save(path: Path, found: Dataset) -> None:
-    from vibrissa.io.netcdf import COMPRESSED, write_netcdf
+    from vibrissa.io import COMPRESSED, write_netcdf
 
     floats = [str(name) for name, v in found.data_vars.items() if v.dtype.kind == "f"]
     about = found.assign_attrs(kind="vibrissa sensitivity")

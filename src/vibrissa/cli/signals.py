@@ -77,8 +77,7 @@ def signals(
     They are added to the recording as a group `signals`; what it already holds stays, but estimates
     and a contour that were made of other signals are left out. Example: `vibrissa signals trial.nc`
     """
-    from vibrissa.io import save_recording, save_signals
-    from vibrissa.io.paths import CSV, NETCDF, check_writable
+    from vibrissa.io import CSV, NETCDF, check_writable, save_recording, save_signals
     from vibrissa.pipeline import with_signals
 
     target = recording if path is None else path

@@ -97,10 +97,7 @@ def simulate(
     0.5 s). Options count more than the file. Example: `vibrissa simulate --duration 0.5
     --friction 0.3 -o trial.nc`; `vibrissa simulate --array average --object sphere -o face.nc`
     """
-    from vibrissa.io import save_recording
-    from vibrissa.io.paths import NETCDF, check_writable
-    from vibrissa.io.table import read_text
-    from vibrissa.io.toml import in_file
+    from vibrissa.io import NETCDF, check_writable, in_file, read_text, save_recording
     from vibrissa.simulation import EXAMPLE, measure, read_script
     from vibrissa.simulation import simulate as simulated
     from vibrissa.whisker import Whisker

@@ -95,7 +95,7 @@ class LineOptions:
 
     def __post_init__(self) -> None:
         """Refuse what does not go together."""
-        from vibrissa.io.paths import refuse_whisk
+        from vibrissa.io import refuse_whisk
 
         if self.source is not None and self.udp is not None:
             raise ValueError("give either a source or --udp")
@@ -114,13 +114,13 @@ class LineOptions:
     @property
     def bag(self) -> bool:
         """Whether the source is a ROS bag."""
-        from vibrissa.io.rosbag import is_bag
+        from vibrissa.io import is_bag
 
         return self.source is not None and is_bag(self.source)
 
     def lines(self, heard: socket.socket | None) -> Iterator[str]:
         """Return lines as they come."""
-        from vibrissa.io.paths import check_readable
+        from vibrissa.io import check_readable
         from vibrissa.streaming.bag import bag_lines
         from vibrissa.streaming.sources import bounded_lines, file_lines, udp_lines
 
@@ -295,7 +295,7 @@ def stream(
     Ctrl-C or any signal.
     Example: `vibrissa stream --udp 127.0.0.1:5005 --map wire.nc --sensor sensor.toml`
     """
-    from vibrissa.io.rosbag import ContactBag
+    from vibrissa.io import ContactBag
     from vibrissa.streaming.bag import ContactRecorder
 
     sensor, poses = measured.described(), follow.poses()

@@ -94,8 +94,7 @@ def sweep(
 
 
 def _plan(path: Path) -> Study:
-    from vibrissa.io.paths import check_readable
-    from vibrissa.io.table import read_text
+    from vibrissa.io import check_readable, read_text
     from vibrissa.sweeps import read_study
 
     text = read_text(check_readable(path))

@@ -222,7 +222,7 @@ def track(
     continues when it is called again.
     Example: `vibrissa track top.mp4 front.mp4 --pixel-size 0.058 --rate 1000 -o trial.nc`
     """
-    from vibrissa.io.paths import check_readable
+    from vibrissa.io import check_readable
     from vibrissa.tracking import TrackOptions
 
     for video in videos:
@@ -324,8 +324,7 @@ def _found(
 def _calibrated(path: Path, videos: Sequence[Path]) -> tuple[Camera, ...]:
     """Cameras of a file, each for videos of its size."""
     from vibrissa.cameras import load_cameras
-    from vibrissa.io import load_recording, video_info
-    from vibrissa.io.paths import NETCDF
+    from vibrissa.io import NETCDF, load_recording, video_info
     from vibrissa.recording import Recording
 
     if path.suffix.lower() in NETCDF:
@@ -354,7 +353,7 @@ def _trials(
     videos: Sequence[Path], count: int, recording: Path, alone: Mapping[str, Path | None]
 ) -> dict[Path, Sequence[Path]]:
     """Videos of each trial, by the recording that they give."""
-    from vibrissa.io.paths import NETCDF, check_writable
+    from vibrissa.io import NETCDF, check_writable
 
     trials = [videos[i : i + count] for i in range(0, len(videos), count)]
     files = [recording]
@@ -376,8 +375,7 @@ def _trials(
 
 def _head(path: Path, video: Path, rate: float) -> xr.Dataset:
     """The head's pose; whether it is known in all frames is found out before the work."""
-    from vibrissa.io import load_head, load_recording, video_info
-    from vibrissa.io.paths import NETCDF
+    from vibrissa.io import NETCDF, load_head, load_recording, video_info
     from vibrissa.tracking import HeadPose
 
     if path.suffix.lower() in NETCDF:

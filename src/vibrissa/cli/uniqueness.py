@@ -66,7 +66,7 @@ def uniqueness(
     """
     from vibrissa.identifiability import ENDINGS, save_uniqueness, verdict_table
     from vibrissa.identifiability import uniqueness as judge
-    from vibrissa.io.paths import check_writable
+    from vibrissa.io import check_writable
     from vibrissa.paper import with_network_errors
 
     if target is not None:

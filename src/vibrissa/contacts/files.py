@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
-from vibrissa.io.netcdf import COMPRESSED, kind_of, naming, read_tree, write_netcdf
+from vibrissa.io import COMPRESSED, kind_of, naming, read_tree, write_netcdf
 from vibrissa.rod import Fold, StableSet, discretize
 from vibrissa.whisker import Whisker
 

@@ -9,8 +9,7 @@ import numpy as np
 import xarray as xr
 
 from vibrissa.identifiability.evidence import NOT_UNIQUE, OFF_SURFACE, UNIQUE
-from vibrissa.io.netcdf import write_netcdf
-from vibrissa.io.paths import check_writable, replacing
+from vibrissa.io import check_writable, replacing, write_netcdf
 
 # Parts of each region.
 _PARTS = {

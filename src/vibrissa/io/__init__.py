@@ -1,25 +1,63 @@
-"""Files and nothing else: one module a format."""
+"""Files and nothing else: one module a format.
 
-from vibrissa.io.anipose import load_anipose
+Every reader raises FileNotFoundError where there is no such file, and ValueError, in one line that
+names the file and what is wrong with it, where it is of another kind, empty, cut short or damaged.
+Nothing in a file is run or unpickled, and no file leads to another.
+"""
+
+from vibrissa.io.anipose import load_anipose, read_calibration, write_calibration
 from vibrissa.io.array import load_array, save_array
 from vibrissa.io.centerline import load_centerline, load_whisker, save_centerline
-from vibrissa.io.contacts_table import load_contacts, save_contacts, save_contour
+from vibrissa.io.contacts_table import holds_contour, load_contacts, save_contacts, save_contour
 from vibrissa.io.deeplabcut import load_deeplabcut
-from vibrissa.io.kinds import Kind, load_tracks, recognise
+from vibrissa.io.kinds import READERS, Kind, load_tracks, recognise
 from vibrissa.io.matlab import load_matlab
 from vibrissa.io.movement import load_movement
 from vibrissa.io.movie import write_movie, write_video
-from vibrissa.io.netcdf import is_netcdf, kind_of
+from vibrissa.io.netcdf import (
+    COMPRESSED,
+    is_netcdf,
+    kind_of,
+    naming,
+    netcdf_image,
+    opened,
+    read_dataset,
+    read_tree,
+    write_netcdf,
+)
 from vibrissa.io.nwb import load_nwb, load_nwb_series
 from vibrissa.io.nwb_writing import Session, save_nwb
-from vibrissa.io.paths import check_folder, check_readable, check_writable
-from vibrissa.io.recording import load_recording, save_recording
-from vibrissa.io.signals_table import load_signals, save_signals
+from vibrissa.io.paths import (
+    CSV,
+    NETCDF,
+    check_folder,
+    check_readable,
+    check_writable,
+    refuse_whisk,
+    replacing,
+)
+from vibrissa.io.recording import RECORDING_KIND, load_recording, save_recording
+from vibrissa.io.rosbag import BagMessage, ContactBag, bag_poses, bag_wrenches, is_bag
+from vibrissa.io.signals_table import check_scale, load_signals, save_signals
 from vibrissa.io.sleap import load_sleap
+from vibrissa.io.table import (
+    cells_of,
+    delimiter_of,
+    is_number,
+    number,
+    read_text,
+    signal_column,
+    signal_columns,
+    table_rows,
+    with_point,
+)
+from vibrissa.io.toml import in_file, number_array, parsed_toml, quoted, read_toml
 from vibrissa.io.traces import load_corrections, load_traces, save_corrections, save_traces
-from vibrissa.io.tracks import join_views
+from vibrissa.io.tracks import RawTracks, join_views, labelled
 from vibrissa.io.tracks_file import load_tracks_table, save_tracks
 from vibrissa.io.video import (
+    Footage,
+    Frame,
     FrameReader,
     VideoInfo,
     load_series,
@@ -31,16 +69,36 @@ from vibrissa.io.video_tables import load_contact_points, load_head
 from vibrissa.io.whisk import load_measurements, load_whiskers
 
 __all__ = [
+    "COMPRESSED",
+    "CSV",
+    "NETCDF",
+    "READERS",
+    "RECORDING_KIND",
+    "BagMessage",
+    "ContactBag",
+    "Footage",
+    "Frame",
     "FrameReader",
     "Kind",
+    "RawTracks",
     "Session",
     "VideoInfo",
+    "bag_poses",
+    "bag_wrenches",
+    "cells_of",
     "check_folder",
     "check_readable",
+    "check_scale",
     "check_writable",
+    "delimiter_of",
+    "holds_contour",
+    "in_file",
+    "is_bag",
     "is_netcdf",
+    "is_number",
     "join_views",
     "kind_of",
+    "labelled",
     "load_anipose",
     "load_array",
     "load_centerline",
@@ -63,8 +121,22 @@ __all__ = [
     "load_tracks_table",
     "load_whisker",
     "load_whiskers",
+    "naming",
+    "netcdf_image",
+    "number",
+    "number_array",
+    "opened",
+    "parsed_toml",
+    "quoted",
+    "read_calibration",
+    "read_dataset",
+    "read_text",
+    "read_toml",
+    "read_tree",
     "read_video",
     "recognise",
+    "refuse_whisk",
+    "replacing",
     "save_array",
     "save_centerline",
     "save_contacts",
@@ -75,8 +147,14 @@ __all__ = [
     "save_signals",
     "save_traces",
     "save_tracks",
+    "signal_column",
+    "signal_columns",
+    "table_rows",
     "video_frames",
     "video_info",
+    "with_point",
+    "write_calibration",
     "write_movie",
+    "write_netcdf",
     "write_video",
 ]

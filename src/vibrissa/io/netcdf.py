@@ -40,7 +40,22 @@ _HEAP = b"GCOL\1\0\0\0"
 
 @contextmanager
 def opened(path: str | PathLike[str], what: str, *, soft_links: bool = True) -> Iterator[h5py.File]:
-    """Open a file in HDF5 for reading, once it has been found harmless."""
+    """Open a file in HDF5 for reading, once it has been found harmless.
+
+    Parameters
+    ----------
+    path : str or path
+        File to open.
+    what : str
+        Name of what it should hold, for messages.
+    soft_links : bool
+        Whether links within the file are allowed.
+
+    Yields
+    ------
+    h5py.File
+        Open file.
+    """
     path = check_readable(path)
     with naming(path, what):
         _check_heaps(path)
@@ -51,7 +66,15 @@ def opened(path: str | PathLike[str], what: str, *, soft_links: bool = True) -> 
 
 @contextmanager
 def naming(path: Path, what: str) -> Iterator[None]:
-    """Turn whatever is raised while a file is read into one error that names it."""
+    """Turn whatever is raised while a file is read into one error that names it.
+
+    Parameters
+    ----------
+    path : Path
+        File that is read.
+    what : str
+        Name of what it should hold, for messages.
+    """
     try:
         yield
     except (OSError, RuntimeError) as error:
@@ -212,7 +235,22 @@ def kind_of(path: str | PathLike[str]) -> str:
 def read_dataset(
     path: str | PathLike[str], group: str | None = None, names: Sequence[str] | None = None
 ) -> xr.Dataset:
-    """Read the dataset of one group."""
+    """Read the dataset of one group.
+
+    Parameters
+    ----------
+    path : str or path
+        NetCDF-4 file.
+    group : str, optional
+        Path of the group; by default the top.
+    names : sequence of str, optional
+        Names of the variables to read, as far as they are there; by default all.
+
+    Returns
+    -------
+    xarray.Dataset
+        Dataset in memory, without the encoding of the file.
+    """
     with (
         opened(path, "NetCDF-4", soft_links=False),
         xr.open_dataset(path, engine="h5netcdf", group=group) as data,
@@ -223,7 +261,18 @@ def read_dataset(
 
 
 def read_tree(path: str | PathLike[str]) -> xr.DataTree:
-    """Read the datasets of all groups; see `read_dataset`."""
+    """Read the datasets of all groups; see `read_dataset`.
+
+    Parameters
+    ----------
+    path : str or path
+        NetCDF-4 file.
+
+    Returns
+    -------
+    xarray.DataTree
+        Tree in memory, without the encoding of the file.
+    """
     with (
         opened(path, "NetCDF-4", soft_links=False),
         xr.open_datatree(path, engine="h5netcdf") as tree,
@@ -237,7 +286,17 @@ def write_netcdf(
     data: xr.Dataset | xr.DataTree,
     encoding: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> None:
-    """Write a dataset, or a tree with a group for each dataset."""
+    """Write a dataset, or a tree with a group for each dataset.
+
+    Parameters
+    ----------
+    path : str or path
+        File to write; an existing file is replaced once the new one is complete.
+    data : xarray.Dataset or xarray.DataTree
+        Content of the file.
+    encoding : mapping, optional
+        Encoding of variables, such as `COMPRESSED`, by group and name.
+    """
     with replacing(path) as part:
         part.write_bytes(netcdf_image(data, encoding))
 
@@ -245,7 +304,20 @@ def write_netcdf(
 def netcdf_image(
     data: xr.Dataset | xr.DataTree, encoding: Mapping[str, Mapping[str, Any]] | None = None
 ) -> memoryview:
-    """Give the bytes of the file that `write_netcdf` writes."""
+    """Give the bytes of the file that `write_netcdf` writes.
+
+    Parameters
+    ----------
+    data : xarray.Dataset or xarray.DataTree
+        Content of the file.
+    encoding : mapping, optional
+        Encoding of variables by group and name.
+
+    Returns
+    -------
+    memoryview
+        Bytes of the file.
+    """
     import h5netcdf
     from xarray.backends import H5NetCDFStore
 

@@ -36,7 +36,13 @@ _WHISK = {b"bwhiskbin": "traces of whisk (.whiskers)", b"measv": "measurements o
 
 
 def refuse_whisk(path: str | PathLike[str]) -> None:
-    """Raise where a file is whisk's and something else is needed."""
+    """Raise where a file is whisk's and something else is needed.
+
+    Parameters
+    ----------
+    path : str or path
+        File, which need not exist.
+    """
     path = Path(path)
     if not path.is_file():
         return
@@ -158,7 +164,18 @@ _PART = re.compile(rf"\..+{re.escape(_MARK)}[a-z0-9_]{{8}}(\.[^.]*)?")
 
 @contextmanager
 def replacing(path: str | PathLike[str]) -> Iterator[Path]:
-    """Give a place to write to, and put what was written in place of the file at the end."""
+    """Give a place to write to, and put what was written in place of the file at the end.
+
+    Parameters
+    ----------
+    path : str or path
+        File to write; what is there stays as it is if writing fails.
+
+    Yields
+    ------
+    Path
+        Temporary file in the same folder, with the same ending.
+    """
     path = check_writable(path)
     _remove_left(path.parent)
     with _failing(path):

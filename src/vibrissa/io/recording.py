@@ -30,7 +30,7 @@ import xarray as xr
 
 from vibrissa.io.netcdf import COMPRESSED, kind_of, naming, read_tree, write_netcdf
 
-KIND = "vibrissa recording"
+RECORDING_KIND = "vibrissa recording"
 """What the attribute ``kind`` of a recording says."""
 
 _SMALLEST = 1000
@@ -54,9 +54,11 @@ def save_recording(path: str | PathLike[str], recording: xr.DataTree) -> None:
     ValueError
         If the tree is no recording.
     """
-    if recording.attrs.get("kind") != KIND:
+    if recording.attrs.get("kind") != RECORDING_KIND:
         kind = recording.attrs.get("kind", "nothing")
-        raise ValueError(f"this is no recording: its attribute kind says {kind!r}, not {KIND!r}")
+        raise ValueError(
+            f"this is no recording: its attribute kind says {kind!r}, not {RECORDING_KIND!r}"
+        )
     written = stacked_whiskers(recording)
     encoding = {
         group.path: {
@@ -91,7 +93,7 @@ def load_recording(path: str | PathLike[str]) -> xr.DataTree:
     """
     path = Path(path)
     kind = kind_of(path)
-    if kind != KIND:
+    if kind != RECORDING_KIND:
         raise ValueError(f"{path} holds {kind or 'data of another kind'}, not a recording")
     tree = read_tree(path)
     with naming(path, "a recording"):

@@ -18,7 +18,18 @@ _QUOTED = 60
 
 
 def read_toml(path: str | PathLike[str]) -> dict[str, Any]:
-    """Read a TOML file."""
+    """Read a TOML file.
+
+    Parameters
+    ----------
+    path : str or path
+        File in UTF-8.
+
+    Returns
+    -------
+    dict
+        Values by key.
+    """
     path = check_readable(path)
     try:
         text = path.read_bytes().decode("utf-8-sig")
@@ -30,7 +41,18 @@ def read_toml(path: str | PathLike[str]) -> dict[str, Any]:
 
 
 def parsed_toml(text: str) -> dict[str, Any]:
-    """Read TOML."""
+    """Read TOML.
+
+    Parameters
+    ----------
+    text : str
+        Text of a TOML file.
+
+    Returns
+    -------
+    dict
+        Values by key.
+    """
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -41,7 +63,13 @@ def parsed_toml(text: str) -> dict[str, Any]:
 
 @contextmanager
 def in_file(path: object) -> Iterator[None]:
-    """Name the file in what is raised because of its content."""
+    """Name the file in what is raised because of its content.
+
+    Parameters
+    ----------
+    path : object
+        File, or the part of it that is read.
+    """
     try:
         yield
     except ValueError as error:
@@ -53,7 +81,22 @@ def in_file(path: object) -> Iterator[None]:
 def number_array(
     value: Any, name: str, needed: str = "numbers, or lists of as many each, are needed"
 ) -> NDArray[np.float64]:
-    """Take a number, or lists of them, from what TOML says."""
+    """Read a number, or lists of them, from a value of TOML.
+
+    Parameters
+    ----------
+    value : object
+        Value as TOML has it.
+    name : str
+        Name of the value, for messages.
+    needed : str
+        Sentence on what is needed, for messages.
+
+    Returns
+    -------
+    array
+        Numbers in as many dimensions as the lists have.
+    """
     try:
         if _numeric(value):
             return np.array(value, dtype=np.float64)
@@ -63,7 +106,18 @@ def number_array(
 
 
 def quoted(value: object) -> str:
-    """Quote the beginning of a value."""
+    """Quote the beginning of a value.
+
+    Parameters
+    ----------
+    value : object
+        Value of any type.
+
+    Returns
+    -------
+    str
+        Text of at most some sixty characters.
+    """
     try:
         text = repr(value)
     except ValueError:  # a whole number of more digits than Python writes

@@ -59,7 +59,37 @@ class Labels(TypedDict, total=False):
 
 @dataclass(frozen=True, eq=False)
 class RawTracks:
-    """What a reader found in a file."""
+    """What a reader found in a file.
+
+    Parameters
+    ----------
+    software : str
+        Name of the program that wrote the file.
+    whiskers : sequence of str
+        Names of the whiskers.
+    image : array (time, whisker, view, node, 2), optional
+        Column and row of points in images, pixels.
+    space : array (time, whisker, node, 3), optional
+        Points in space, in ``unit``.
+    image_confidence, space_confidence : array, optional
+        Confidence of each of these points, 0 to 1.
+    nodes : sequence of str, optional
+        Names of the points along a whisker.
+    views : sequence of str
+        Names of the views.
+    frames : array (time,) of int, optional
+        Numbers of the frames.
+    time : array (time,), optional
+        Times, s.
+    fps : float, optional
+        Frames per second.
+    unit, reference_frame : str
+        Unit and frame of points in space; empty where the file does not state them.
+    extra : mapping of str to xarray.Variable
+        Further variables of the format.
+    about : mapping
+        Further attributes of the format.
+    """
 
     software: str
     whiskers: Sequence[str]
@@ -79,7 +109,22 @@ class RawTracks:
 
 
 def labelled(raw: RawTracks, path: str | PathLike[str], **labels: Unpack[Labels]) -> xr.Dataset:
-    """Check tracks, bring them to our units and name everything."""
+    """Check tracks, bring them to SI units and name everything.
+
+    Parameters
+    ----------
+    raw : RawTracks
+        Tracks as a reader found them.
+    path : str or path
+        File they were read from.
+    **labels
+        What the file may not say; see `Labels`.
+
+    Returns
+    -------
+    xarray.Dataset
+        Tracks; see the module.
+    """
     path = Path(path)
     _check_size(raw, path)
     data: dict[str, xr.Variable] = {}

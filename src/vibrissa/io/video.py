@@ -222,7 +222,13 @@ AHEAD = 60
 
 
 class Footage:
-    """A video to look at frame by frame; keeps the file open until it is closed."""
+    """A video to look at frame by frame, which jumps to a frame by its time.
+
+    Parameters
+    ----------
+    path : str or path
+        Video, which is kept open until `close`.
+    """
 
     def __init__(self, path: str | PathLike[str]) -> None:
         self.info = video_info(path)
@@ -236,7 +242,18 @@ class Footage:
         self._last: Frame | None = None
 
     def frame(self, number: int) -> Frame:
-        """Give one frame."""
+        """Give one frame.
+
+        Parameters
+        ----------
+        number : int
+            Number of the frame, from 0.
+
+        Returns
+        -------
+        array (height, width)
+            Grey values.
+        """
         import av
 
         if number < 0:

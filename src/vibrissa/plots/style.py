@@ -23,7 +23,7 @@ from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.io.paths import replacing
+from vibrissa.io import replacing
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

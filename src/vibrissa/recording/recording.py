@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from vibrissa.cameras.camera import Camera
 from vibrissa.cameras.files import cameras_dataset, cameras_from_dataset
-from vibrissa.io.recording import KIND
+from vibrissa.io import RECORDING_KIND
 from vibrissa.objects import Peg, Surface, object_from_dataset, objects_datasets
 from vibrissa.recording.schema import ordered
 from vibrissa.whisker import Whisker
@@ -316,7 +316,7 @@ def recording_tree(
     xarray.DataTree
         Recording.
     """
-    tree = {"/": root.assign_attrs(kind=KIND, origin=origin)}
+    tree = {"/": root.assign_attrs(kind=RECORDING_KIND, origin=origin)}
     tree |= {f"/{name}": data for name, data in (groups or {}).items()}
     if cameras:
         tree["/cameras"] = cameras_dataset(cameras).drop_vars("view")

@@ -31,8 +31,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.io.paths import replacing
-from vibrissa.io.toml import number_array, quoted, read_toml
+from vibrissa.io import number_array, quoted, read_toml, replacing
 from vibrissa.sensors.frame import SensorFrame
 from vibrissa.sensors.sensor import Sensor
 

@@ -35,8 +35,7 @@ from scipy.interpolate import CubicSpline
 
 from vibrissa.cameras.camera import PIXEL_SIZE, Camera, orthogonal_views
 from vibrissa.cameras.files import cameras_dataset
-from vibrissa.io import write_video
-from vibrissa.io.video import Frame
+from vibrissa.io import Frame, write_video
 from vibrissa.numerics import kernel
 from vibrissa.objects import Surface
 from vibrissa.recording import Group, Recording, recorded

@@ -14,9 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.io.array import load_array
-from vibrissa.io.table import read_text, table_rows
-from vibrissa.io.toml import number_array, parsed_toml, quoted
+from vibrissa.io import load_array, number_array, parsed_toml, quoted, read_text, table_rows
 from vibrissa.objects import Box, Mesh, Peg, Plane, Sphere, Surface
 from vibrissa.sensors import COMPONENTS, Sensor
 from vibrissa.simulation.dynamics import Dynamics

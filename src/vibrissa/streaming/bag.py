@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from vibrissa.io.rosbag import BagMessage, ContactBag, bag_poses, bag_wrenches
+from vibrissa.io import BagMessage, ContactBag, bag_poses, bag_wrenches
 from vibrissa.sensors import Sensor
 from vibrissa.streaming.contacts import COMPONENTS, ContactStream
 from vibrissa.streaming.lines import FRAME, POSITION, QUATERNION, RECORDED, STAMP

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.io.table import (
+from vibrissa.io import (
     cells_of,
     delimiter_of,
     is_number,

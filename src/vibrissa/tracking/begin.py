@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.cameras.camera import Camera
 from vibrissa.cameras.triangulation import triangulate
-from vibrissa.io.video import Frame
+from vibrissa.io import Frame
 from vibrissa.tracking import ridge
 from vibrissa.tracking.curves import Curve, find_curves
 from vibrissa.tracking.follow import start_at

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.io.video import Frame
+from vibrissa.io import Frame
 from vibrissa.tracking.lines import Segment, segments
 from vibrissa.tracking.scene import Bodies, Scene
 from vibrissa.tracking.trace import TraceOptions

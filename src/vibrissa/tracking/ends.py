@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.io.video import Frame
+from vibrissa.io import Frame
 from vibrissa.tracking import ridge
 from vibrissa.tracking.middle import Fit, smoothed
 from vibrissa.tracking.trace import STEP, Trace, TraceOptions, even

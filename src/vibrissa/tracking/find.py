@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.io.video import Frame
+from vibrissa.io import Frame
 from vibrissa.tracking import ridge
 from vibrissa.tracking.curves import find_curves
 from vibrissa.tracking.ends import traced

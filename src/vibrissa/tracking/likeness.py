@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.io.video import Frame
+from vibrissa.io import Frame
 from vibrissa.tracking import ridge
 from vibrissa.tracking.trace import Trace
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.io.video import Frame
+from vibrissa.io import Frame
 from vibrissa.tracking import ridge
 from vibrissa.tracking.find import find_whiskers, overlap
 from vibrissa.tracking.follow import Follower

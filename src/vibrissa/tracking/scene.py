@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.io.video import Frame
+from vibrissa.io import Frame
 from vibrissa.numerics import kernel
 
 Array = NDArray[np.float64]

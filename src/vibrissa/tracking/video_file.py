@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vibrissa.io import load_traces, read_video, save_traces, video_frames, video_info
-from vibrissa.io.video import Frame
+from vibrissa.io import Frame, load_traces, read_video, save_traces, video_frames, video_info
 from vibrissa.tracking.begin import FRAMES
 from vibrissa.tracking.trace import Trace, TraceOptions
 from vibrissa.tracking.view import trace_video

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.io.video import Frame
+from vibrissa.io import Frame
 from vibrissa.tracking.begin import is_bright, negative
 from vibrissa.tracking.find import find_whiskers, overlap
 from vibrissa.tracking.follow import Follower, start_at

@@ -11,8 +11,7 @@ import numpy as np
 import xarray as xr
 
 from vibrissa.contacts import ContactMap
-from vibrissa.io import save_centerline, save_recording
-from vibrissa.io.netcdf import netcdf_image
+from vibrissa.io import netcdf_image, save_centerline, save_recording
 from vibrissa.quantities import attributes
 from vibrissa.rod import Deflection
 from vibrissa.signals import base_signals

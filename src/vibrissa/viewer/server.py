@@ -19,7 +19,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from vibrissa.contacts import ContactMap
-from vibrissa.io.video import Footage
+from vibrissa.io import Footage
 from vibrissa.viewer.bend_panel import BendMode
 from vibrissa.viewer.bending import loaded, moved
 from vibrissa.viewer.guard import guarded

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import viser
 
-from vibrissa.io.video import Footage
+from vibrissa.io import Footage
 from vibrissa.viewer.page import Page, asked, put
 from vibrissa.viewer.player import Player
 from vibrissa.viewer.readout import table

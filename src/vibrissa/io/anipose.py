@@ -52,13 +52,6 @@ def load_anipose(path: str | PathLike[str], **labels: Unpack[Labels]) -> xr.Data
     xarray.Dataset
         Tracks of one whisker with a ``centerline``; with ``reprojection_error``, pixels, and
         ``cameras``, how many saw each point.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is of another kind, cut short or empty, or the unit is not given.
     """
     return labelled(read_anipose(path), path, **labels)
 

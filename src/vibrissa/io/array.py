@@ -75,13 +75,6 @@ def load_array(
     WhiskerArray
         Poses lead to the frame of the file.
 
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file or folder.
-    ValueError
-        If it holds no whiskers, a name is no whisker's, a column is missing or a cell no number.
-
     Warns
     -----
     UserWarning

@@ -51,14 +51,6 @@ def load_centerline(path: str | PathLike[str]) -> Array:
     -------
     array (n, 3)
         Points, m, in the file's frame and order.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If the file is empty, has no header, lacks columns or has cells that are no numbers; all
-        bad cells are named with their lines.
     """
     return _table(Path(path))[0]
 
@@ -174,13 +166,6 @@ def load_whisker(
     -------
     Whisker
         Named after the file unless a name is given.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it cannot be read or holds no centreline.
     """
     points, radii, unit = _table(Path(path))
     properties.setdefault("name", Path(path).stem)

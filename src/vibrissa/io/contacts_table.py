@@ -75,13 +75,6 @@ def load_contacts(path: str | PathLike[str]) -> xr.Dataset:
     -------
     xarray.Dataset
         Dim time; a variable for each column, ``status`` as its number.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it has another header, a row that cannot be read or a status that does not exist.
     """
     path = Path(path)
     rows = table_rows(read_text(path))

@@ -53,13 +53,6 @@ def load_deeplabcut(path: str | PathLike[str], **labels: Unpack[Labels]) -> xr.D
     -------
     xarray.Dataset
         Tracks.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is of another kind, cut short or empty.
     """
     return labelled(read_deeplabcut(path), path, **labels)
 

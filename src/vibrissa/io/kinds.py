@@ -193,14 +193,6 @@ def load_tracks(path: str | PathLike[str], **labels: Unpack[Labels]) -> xr.Datas
         ``trace`` (time, whisker, view, node, image_axis) in pixels for points in images,
         ``centerline`` (time, whisker, node, space) in m for points in space, and ``confidence``.
         Missing is NaN. Attributes say the source.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is of no known kind, cut short or empty, if a unit is needed and not given, or if
-        what it says is contradicted.
     """
     path = Path(path)
     kind = recognise(path)

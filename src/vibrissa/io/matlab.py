@@ -68,14 +68,6 @@ def load_matlab(
     -------
     xarray.Dataset
         Tracks.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is of another kind, cut short or empty, or has no whiskers in a known layout, or more
-        than one such variable.
     """
     return labelled(read_matlab(path, variable), path, **labels)
 

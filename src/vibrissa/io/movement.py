@@ -39,13 +39,6 @@ def load_movement(path: str | PathLike[str], **labels: Unpack[Labels]) -> xr.Dat
     -------
     xarray.Dataset
         Tracks.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is of another kind, cut short or empty.
     """
     return labelled(read_movement(path), path, **labels)
 

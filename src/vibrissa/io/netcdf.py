@@ -74,6 +74,11 @@ def naming(path: Path, what: str) -> Iterator[None]:
         File that is read.
     what : str
         Name of what it should hold, for messages.
+
+    Yields
+    ------
+    None
+        The context in which it is read.
     """
     try:
         yield

@@ -66,13 +66,6 @@ def load_nwb(path: str | PathLike[str], **labels: Unpack[Labels]) -> xr.Dataset:
     -------
     xarray.Dataset
         Tracks: ``trace`` for what is in pixels, ``centerline`` for what is in space.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is of another kind, cut short, has no poses, or their times differ.
     """
     return labelled(read_nwb(path), path, **labels)
 
@@ -318,13 +311,6 @@ def load_nwb_series(path: str | PathLike[str]) -> xr.Dataset:
         Dims time, whisker, space, as at the top of a recording: of ``base_position``,
         ``base_rotation``, ``contact_point``, ``contact_point_whisker``, ``force``, ``moment``,
         ``head_position`` and ``head_rotation`` what the file has; SI units.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is of another kind, cut short, has no such series, or their times differ.
     """
     path = Path(path)
     with opened(path, "an NWB file") as file:

@@ -83,13 +83,6 @@ def load_recording(path: str | PathLike[str]) -> xr.DataTree:
     -------
     xarray.DataTree
         All of it, in memory.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is empty, cut off, no NetCDF-4 file, or holds something else.
     """
     path = Path(path)
     kind = kind_of(path)

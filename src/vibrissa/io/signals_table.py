@@ -59,14 +59,6 @@ def load_signals(path: str | PathLike[str]) -> xr.Dataset:
     xarray.Dataset
         Dims time, space: ``force``, N, and ``moment``, N·m, in the whisker's frame at its base.
         The attribute ``notes`` says where time does not rise, if there.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is empty, lacks columns, or has cells that are no numbers; or if the numbers cannot be
-        in the units that they are said to be.
     """
     path = Path(path)
     table = _netcdf(path) if is_netcdf(path) else _csv(path)

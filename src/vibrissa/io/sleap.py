@@ -40,15 +40,6 @@ def load_sleap(path: str | PathLike[str], **labels: Unpack[Labels]) -> xr.Datase
     -------
     xarray.Dataset
         Tracks.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ModuleNotFoundError
-        If sleap-io is needed and not installed.
-    ValueError
-        If the file is of another kind, cut short or empty, or has labels of several videos.
     """
     path = check_readable(path)
     raw = read_sleap_labels(path) if path.suffix.lower() == ".slp" else read_sleap_analysis(path)

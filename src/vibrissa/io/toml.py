@@ -69,6 +69,11 @@ def in_file(path: object) -> Iterator[None]:
     ----------
     path : object
         File, or the part of it that is read.
+
+    Yields
+    ------
+    None
+        The context in which it is read.
     """
     try:
         yield

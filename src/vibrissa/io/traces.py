@@ -107,13 +107,6 @@ def load_corrections(path: str | PathLike[str]) -> dict[int, dict[tuple[int, int
     -------
     dict
         By view: by frame and whisker the points (n, 2) from base to tip, column and row.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it has other columns, a row that cannot be read, or a trace of one point.
     """
     path = Path(path)
     rows = table_rows(read_text(path))

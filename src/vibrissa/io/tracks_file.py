@@ -92,13 +92,6 @@ def load_tracks_table(path: str | PathLike[str], **labels: Unpack[Labels]) -> xr
     -------
     xarray.Dataset
         Tracks.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If columns lack, a cell is no number, or a point is given twice.
     """
     return labelled(read_tracks_table(path), path, **labels)
 

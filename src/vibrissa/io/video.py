@@ -65,13 +65,6 @@ def video_info(path: str | PathLike[str]) -> VideoInfo:
     Returns
     -------
     VideoInfo
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is no video, or a damaged one.
     """
     with opened_video(path) as container:
         stream = container.streams.video[0]
@@ -100,13 +93,6 @@ def read_video(path: str | PathLike[str]) -> Iterator[Frame]:
     ------
     array (height, width)
         Grey values, 0 is black and 255 white.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is no video, or damaged from some frame on.
     """
     import av
 
@@ -366,14 +352,6 @@ def load_series(paths: Sequence[str | PathLike[str]], most: int = 40) -> dict[st
     -------
     dict
         By name of the camera its grey images, moment by moment.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If one is neither image nor video, both are mixed, or the cameras' images do not belong
-        together.
     """
     files = [Path(path) for path in paths]
     videos = [recognise(path) == Kind.VIDEO for path in files]

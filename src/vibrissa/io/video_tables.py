@@ -103,13 +103,6 @@ def load_contact_points(path: str | PathLike[str]) -> xr.Dataset:
     xarray.Dataset
         Dims ``time`` or ``frame``, and whisker: ``contact_point`` (…, space), laboratory frame, m;
         or ``contact_pixel`` (frame, whisker, view, image_axis). NaN where there is none.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it has other columns, or two lines of the same moment, whisker and view.
     """
     path = Path(path)
     key, columns = read_over_time(path)
@@ -180,13 +173,6 @@ def load_head(path: str | PathLike[str]) -> xr.Dataset:
     xarray.Dataset
         Dim ``time`` or ``frame``: ``head_position`` (…, space), m, and ``head_rotation``
         (…, space, head_axis), from the head's to the laboratory frame.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If columns or numbers are missing, rows are not in order, or an orientation is none.
     """
     path = Path(path)
     key, columns = read_over_time(path)

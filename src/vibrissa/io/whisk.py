@@ -65,13 +65,6 @@ def load_whiskers(
     -------
     xarray.Dataset
         Tracks with a ``trace``; with ``thickness`` in pixels and the tracker's ``score``.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is of another kind or cut short, or if the two files do not belong together.
     """
     return labelled(read_whiskers(path, measurements, nodes), path, **labels)
 
@@ -135,13 +128,6 @@ def load_measurements(path: str | PathLike[str], **labels: Unpack[Labels]) -> xr
         Tracks whose ``trace`` has the two nodes ``follicle`` and ``tip``; and each trace's
         ``trace_length``, ``angle``, ``trace_curvature`` (1/pixel), ``score`` and ``segment`` (its
         id in the whiskers file, −1 where there is none).
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is of another kind or cut short.
     """
     return labelled(read_measurements(path), path, **labels)
 

@@ -10,8 +10,7 @@ import vibrissa as vb
 from honest.conditions import RATE, Recorded
 from honest.ways import TRIPLET, Pose, Truth, chart, located, poses_of, scored, truth_of
 from vibrissa.recording import Recording
-from vibrissa.tracking.pose import base_pose
-from vibrissa.tracking.rest import rest_shape
+from vibrissa.tracking import base_pose, rest_shape
 from vibrissa.whisker import Whisker
 
 CUTOFFS = (30.0, 50.0, 85.0, 120.0, 200.0, None)

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from looks.cases import Case, Filmed, filmed
 from vibrissa.recording import Recording
 from vibrissa.tracking import (
+    FRAMES,
     Start,
     Trace,
     TraceOptions,
@@ -22,7 +23,6 @@ from vibrissa.tracking import (
     trace_video,
     track,
 )
-from vibrissa.tracking.begin import FRAMES
 
 Array = NDArray[np.float64]
 

@@ -4,8 +4,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vibrissa.cameras import Camera, load_cameras, orthogonal_views, save_cameras, triangulate
-from vibrissa.cameras.files import cameras_dataset, cameras_from_dataset
+from vibrissa.cameras import (
+    Camera,
+    cameras_dataset,
+    cameras_from_dataset,
+    load_cameras,
+    orthogonal_views,
+    save_cameras,
+    triangulate,
+)
 
 
 def perspective(turn, distance=0.3, name="camera"):

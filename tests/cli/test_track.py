@@ -93,7 +93,7 @@ def test_several_trials_go_to_a_folder(videos, tmp_path):
 
 def test_what_is_traced_is_not_traced_again(videos, tmp_path, monkeypatch):
     """Stopped in the second video, the first is not looked at again."""
-    import vibrissa.tracking.view as view
+    import vibrissa.tracking.trace.video as view
 
     out = tmp_path / "trial.nc"
     follow, calls = view.follow_all, []

@@ -16,7 +16,7 @@ from vibrissa.sensors import Sensor
 from vibrissa.signals import SIGNALS, base_signals
 from vibrissa.simulation import measure
 from vibrissa.status import Status
-from vibrissa.tracking.filtering import low_pass
+from vibrissa.tracking import low_pass
 
 
 def exact(tracked, trial):
@@ -122,7 +122,8 @@ def test_the_pose_is_filtered_as_asked(tracked, cutoff):
 
 def measured(tracked, unfiltered=True):
     """With the pose of before the rod was fitted in its group."""
-    from vibrissa.tracking.pose import BasePose, angles_of
+    from vibrissa.tracking import BasePose
+    from vibrissa.whisker import angles_of
 
     root = tracked.to_dataset()
     pose = BasePose(

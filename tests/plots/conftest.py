@@ -5,8 +5,7 @@ import pytest
 import xarray as xr
 
 import vibrissa as vb
-from vibrissa.cameras import orthogonal_views
-from vibrissa.cameras.files import cameras_dataset
+from vibrissa.cameras import cameras_dataset, orthogonal_views
 from vibrissa.io import RECORDING_KIND
 from vibrissa.objects import Peg, objects_datasets
 from vibrissa.quantities import attributes

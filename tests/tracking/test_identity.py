@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from vibrissa.tracking.identity import Seen, decided, sideways
-from vibrissa.tracking.likeness import FEATURES, look_of, unlikeness, usual_look
-from vibrissa.tracking.trace import Trace
+from vibrissa.tracking import Trace
+from vibrissa.tracking.trace.follower import FEATURES, Appearance, features_of
+from vibrissa.tracking.trace.identity import Seen, decided, sideways
 
 BASES = np.array([[20.0, 60.0], [20.0, 72.0]])
 FRAMES = 24
@@ -16,7 +16,7 @@ def straight(base, angle, length):
     return Trace(base + along, np.full(len(along), 0.1), np.ones(len(along), dtype=bool), 1.0)
 
 
-def look(length, darkness):
+def features(length, darkness):
     return np.array([np.log(length), *[np.log(darkness)] * 3, 0.0, 0.0, 0.0])
 
 
@@ -26,8 +26,8 @@ def row(length=(100.0, 160.0), darkness=(0.3, 0.5)):
     for i in range(FRAMES):
         angle = 0.8 * np.sin(0.6 * i)
         lines = [straight(base, angle, long) for base, long in zip(BASES, length, strict=True)]
-        looks = [look(long, dark) for long, dark in zip(length, darkness, strict=True)]
-        seen.append(Seen(lines, looks, [0, 1], clear=i < 8))
+        each = [features(long, dark) for long, dark in zip(length, darkness, strict=True)]
+        seen.append(Seen(lines, each, [0, 1], clear=i < 8))
     return seen
 
 
@@ -44,7 +44,8 @@ def test_a_stranger_is_not_taken_for_a_whisker_that_is_hidden():
     seen = row()
     for frame in seen[12:17]:
         other = straight(BASES[1] + [0.0, 4.0], 0.0, 60.0)
-        frame.lines, frame.looks = [frame.lines[0], other], [frame.looks[0], look(60.0, 0.1)]
+        frame.lines = [frame.lines[0], other]
+        frame.features = [frame.features[0], features(60.0, 0.1)]
     found = decided(seen, BASES)
     assert [way[1] for way in found[12:17]] == [-1] * 5
     assert all(way[0] == 0 for way in found)
@@ -73,27 +74,27 @@ def test_who_cannot_be_told_is_lost_rather_than_guessed():
     assert found[-1] == [-1, -1]
 
 
-def test_looks():
+def test_the_appearance_of_a_line():
     """Length, contrast and turns of a bent line of a known grey value."""
     y, x = np.mgrid[:120, :200]
     place = 30.0 + 0.002 * (x - 10.0) ** 2
     frame = (200.0 - 100.0 * np.exp(-0.5 * ((y - place) / 1.4) ** 2)).astype(np.uint8)
     column = np.arange(10.0, 170.0, 1.9)
     line = np.stack([column, 30.0 + 0.002 * (column - 10.0) ** 2], axis=1)
-    seen = look_of(frame, Trace(line, np.ones(len(line)), np.ones(len(line), dtype=bool), 1.0))
+    seen = features_of(frame, Trace(line, np.ones(len(line)), np.ones(len(line), dtype=bool), 1.0))
     assert seen[0] == pytest.approx(np.log(2.0 * len(line)))
     np.testing.assert_allclose(seen[1:3], np.log(0.5), atol=0.2)
     slopes = [np.arctan(0.004 * 1.9 * at) for at in (7.0, 24.0, 44.0, 64.0)]
     np.testing.assert_allclose(seen[4:], np.diff(slopes), atol=0.01)
-    assert np.isnan(look_of(frame, Trace.lost())).all()
-    middle, spread = usual_look([seen] * 5)
-    assert unlikeness(seen, middle, spread) == 0.0
+    assert np.isnan(features_of(frame, Trace.lost())).all()
+    usual = Appearance.of([seen] * 5)
+    assert usual.unlikeness(seen) == 0.0
     shorter, longer = seen.copy(), seen.copy()
     shorter[0] -= 0.3
     longer[0] += 0.3
-    assert 0.0 < unlikeness(shorter, middle, spread) < unlikeness(longer, middle, spread)
-    assert unlikeness(seen, *usual_look([])) == 0.0
-    assert middle.shape == (FEATURES,)
+    assert 0.0 < usual.unlikeness(shorter) < usual.unlikeness(longer)
+    assert Appearance.of([]).unlikeness(seen) == 0.0
+    assert usual.middle.shape == (FEATURES,)
 
 
 def test_sideways_of_lines_that_stand_still():

@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 
-from vibrissa.tracking import Sight, TraceOptions, find_bases, is_bright, trace_video
-from vibrissa.tracking.length import Length, lengthened, likeliest_length
-from vibrissa.tracking.remarks import remarks_on
-from vibrissa.tracking.rest import RestShape
-from vibrissa.tracking.timing import better_offset
-from vibrissa.tracking.trust import trace_variance
+from vibrissa.tracking import TraceOptions, TraceSeries, find_bases, is_bright, trace_video
+from vibrissa.tracking.refine.least_squares import trace_variance
+from vibrissa.tracking.space.frame_pairs import better_offset
+from vibrissa.tracking.space.rest_shape import Length, RestShape, lengthened, likeliest_length
+from vibrissa.tracking.track import remarks_on
 
 
 def image(begin, end, fade=False, noise=2.0, seed=0, size=(120, 200)):
@@ -106,14 +105,14 @@ def test_traces_are_trusted_as_far_as_their_residuals_allow():
 
 def test_frames_that_the_rod_does_not_explain_are_noted(filmed):
     nothing = np.full((20, 2, 101, 2), np.nan)
-    sight = Sight(
+    series = TraceSeries(
         nothing, nothing[..., 0], nothing[..., 0], np.zeros((20, 2)), np.zeros((20, 2, 2))
     )
     misfit = np.where(np.arange(20) < 3, 5.0, 0.3)
     length = Length(10e-3, 0.0)
-    (said,) = remarks_on(filmed.cameras, sight, length, misfit, "C2")
+    (said,) = remarks_on(filmed.cameras, series, length, misfit, "C2")
     assert said.startswith("C2: in 3 frames the bent rod does not explain")
-    assert remarks_on(filmed.cameras, sight, length, np.full(20, 0.3), "C2") == []
+    assert remarks_on(filmed.cameras, series, length, np.full(20, 0.3), "C2") == []
 
 
 def test_cameras_out_of_step_are_noticed(filmed):

@@ -8,8 +8,10 @@ from scipy.spatial import cKDTree
 from vibrissa import Whisker
 from vibrissa.cameras import orthogonal_views
 from vibrissa.simulation import ImageConditions, Motion, film_frames, simulate, with_true_traces
-from vibrissa.tracking import Trace, ridge, start_at, trace_video
-from vibrissa.tracking.row import follow_row
+from vibrissa.tracking import Trace, trace_video
+from vibrissa.tracking.trace import ridge
+from vibrissa.tracking.trace.follower import start_at
+from vibrissa.tracking.trace.identity import follow_row
 
 COUNT = 6
 FRAMES = 50

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from vibrissa.cameras import Camera, orthogonal_views
 from vibrissa.tracking import Trace, low_pass, merge, paired_frames
-from vibrissa.tracking.trace import even
+from vibrissa.tracking.trace.trace import even
 
 LENGTH = 30e-3
 

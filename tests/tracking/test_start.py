@@ -6,10 +6,9 @@ from furry import Film, Setup
 
 from vibrissa.io import VideoInfo, write_video
 from vibrissa.tracking import TraceOptions, find_bases, find_start, start_frames, trace_video
-from vibrissa.tracking.begin import negative
-from vibrissa.tracking.curves import joined
-from vibrissa.tracking.lines import Segment, segments
-from vibrissa.tracking.scene import Scene, nth_largest
+from vibrissa.tracking.trace.curves import Segment, joined, segments
+from vibrissa.tracking.trace.scene import Scene, nth_largest
+from vibrissa.tracking.trace.start import negative
 
 SMALL = {"size": (320, 320), "frames": 16, "rate": 40.0}
 
@@ -131,7 +130,7 @@ def test_frames_of_the_same_moments_are_read(tmp_path, monkeypatch, claimed, off
         write_video(video, [np.full((32, 32), 5 * i, np.uint8) for i in range(40)])
     if claimed is not None:
         info = VideoInfo(32, 32, claimed, 50.0, "ffv1")
-        monkeypatch.setattr("vibrissa.tracking.video_file.video_info", lambda video: info)
+        monkeypatch.setattr("vibrissa.tracking.trace.video.video_info", lambda video: info)
     numbers, (first, second) = start_frames(videos, offset)
     assert len(numbers) >= 25
     assert [int(f[0, 0]) // 5 for f in first] == numbers
@@ -163,8 +162,8 @@ def test_a_line_of_any_direction_is_one_segment_in_its_middle(angle):
     frame = dark_line(angle)
     scene = Scene.of([frame])
     found = segments(scene.difference(frame), scene.bodies(frame))
-    (line,) = [one for one in found if len(one.places) > 60]
-    x, y = (line.places - 0.5 * (frame.shape[0] - 1)).T
+    (line,) = [one for one in found if len(one.points) > 60]
+    x, y = (line.points - 0.5 * (frame.shape[0] - 1)).T
     across = y * np.cos(angle) - x * np.sin(angle)
     assert np.abs(across[4:-4]).max() < 0.3  # ends are drawn aside by noise
     assert np.hypot(np.ptp(x), np.ptp(y)) == pytest.approx(120.0, abs=6.0)
@@ -176,8 +175,8 @@ def test_parts_of_one_line_are_joined_and_parallel_lines_are_not(angle):
     scene = Scene.of([frame])
     bodies = scene.bodies(frame)
     found = segments(scene.difference(frame), bodies)
-    assert max(len(one.places) for one in found) < 60
-    assert max(np.ptp(one.places, axis=0).max() for one in joined(found, bodies)) > 80
+    assert max(len(one.points) for one in found) < 60
+    assert max(np.ptp(one.points, axis=0).max() for one in joined(found, bodies)) > 80
     x = np.arange(50.0)
     beside = [
         Segment(np.stack([x + 55.0 * k, 40.0 + 9.0 * k + 0.0 * x], axis=1), np.full(50, 20.0))

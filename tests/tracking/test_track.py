@@ -7,14 +7,14 @@ import xarray as xr
 from vibrissa.recording import Recording
 from vibrissa.status import Status
 from vibrissa.tracking import (
-    RefineOptions,
+    FitOptions,
     TrackOptions,
     rest_shape,
     trace_video,
     track,
     whisker_at_rest,
 )
-from vibrissa.tracking.banded import Smoother
+from vibrissa.tracking.refine.least_squares import Smoother
 from vibrissa.whisker import angles_of, base_rotation
 
 
@@ -91,8 +91,8 @@ def test_friction_is_found_in_the_shape(share):
     """A rod bent by a known force with friction, seen without noise: the force comes out."""
     from vibrissa import PointForce, Whisker, deflect
     from vibrissa.cameras import orthogonal_views
-    from vibrissa.tracking import BasePose, Sight, Trace, refine
-    from vibrissa.tracking.trace import even
+    from vibrissa.tracking import BasePose, Trace, TraceSeries, fit_rod
+    from vibrissa.tracking.trace.trace import even
 
     whisker = Whisker.parabola(length=30e-3, coefficient=10.0)
     across = np.array([60e-6, 20e-6])
@@ -111,7 +111,7 @@ def test_friction_is_found_in_the_shape(share):
     still = np.zeros(9)
     pose = BasePose(np.zeros((9, 3)), still, still, still)
     touching = np.ones(9, dtype=bool)
-    found = refine(pair, Sight.of(traces), whisker, pose, touching, curves, 1000.0)
+    found = fit_rod(pair, TraceSeries.of(traces), whisker, pose, touching, curves, 1000.0)
     np.testing.assert_allclose(found.arc_length, s, atol=100e-6)
     # Friction along a hardly bent whisker hardly shows, and the covariance says so.
     error = found.force - bent.force
@@ -127,26 +127,25 @@ def test_a_step_to_a_contact_that_no_rod_withstands_is_not_taken():
     from vibrissa import samples
     from vibrissa.cameras import orthogonal_views
     from vibrissa.rod import discretize
-    from vibrissa.tracking import RefineOptions, Sight, Trace
-    from vibrissa.tracking.head import HeadPose
-    from vibrissa.tracking.refine import _Problem
-    from vibrissa.tracking.rods import State
-    from vibrissa.tracking.trace import even
+    from vibrissa.tracking import FitOptions, HeadPose, Trace, TraceSeries
+    from vibrissa.tracking.refine.fit import Problem
+    from vibrissa.tracking.refine.rods import State
+    from vibrissa.tracking.trace.trace import even
 
     whisker = samples.gamma()
     pair = orthogonal_views(center=(0.012, 0.005, 0.0))
     lines = [even(camera.project(whisker.centerline(101))) for camera in pair]
     seen = [Trace(one, np.full(len(one), 0.02), np.ones(len(one), bool), 1.0) for one in lines]
-    sight = Sight.of([[one, one] for one in seen])
+    sight = TraceSeries.of([[one, one] for one in seen])
     # Near the thin tip this force is far beyond what any rod is in balance with.
     contact = np.array([[0.5, 0.0, 0.1, 0.0], [0.93, 1.4, -40.0, -40.0]])
     state = State(np.array([np.eye(3)] * 2), np.zeros((2, 3)), contact)
     touching, frames = np.ones(2, dtype=bool), np.arange(2)
     still = HeadPose.still(2)
-    problem = _Problem(
-        discretize(whisker), pair, sight, touching, frames, state, 1000.0, RefineOptions(), still
+    problem = Problem(
+        discretize(whisker), pair, sight, touching, frames, state, 1000.0, FitOptions(), still
     )
-    fit = problem._linear(state)
+    fit = problem.linear(state)
     assert fit.wild.tolist() == [False, True]
     assert fit.cost == np.inf
     assert np.isfinite(fit.smoother.solved(1.0)).all()
@@ -232,7 +231,7 @@ def test_a_tip_that_is_not_seen_is_found_by_how_the_whisker_bends(filmed, traces
                 for t, n in zip(row, ends, strict=True)
             ]
         )
-    how = TrackOptions(refine=RefineOptions(rounds=6))
+    how = TrackOptions(fit=FitOptions(rounds=6))
     recording = track(filmed.cameras, [[row] for row in cut], 500.0, how)
     true = Recording(filmed.recording).whisker().length
     assert Recording(recording).whisker().length == pytest.approx(true, rel=0.03)

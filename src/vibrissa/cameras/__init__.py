@@ -1,13 +1,21 @@
 """Cameras: projection, calibration, triangulation, files."""
 
 from vibrissa.cameras.calibration import calibrate
-from vibrissa.cameras.camera import Camera, orthogonal_views
-from vibrissa.cameras.files import load_cameras, save_cameras
+from vibrissa.cameras.camera import PIXEL_SIZE, Camera, orthogonal_views
+from vibrissa.cameras.files import (
+    cameras_dataset,
+    cameras_from_dataset,
+    load_cameras,
+    save_cameras,
+)
 from vibrissa.cameras.triangulation import triangulate
 
 __all__ = [
+    "PIXEL_SIZE",
     "Camera",
     "calibrate",
+    "cameras_dataset",
+    "cameras_from_dataset",
     "load_cameras",
     "orthogonal_views",
     "save_cameras",

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vibrissa.cameras.camera import Camera
+from vibrissa.cameras.triangulation import triangulate
 
 Image = NDArray[np.uint8]
 Board = NDArray[np.float32]
 
 _FEWEST = 4
+"""Smallest number of moments in which all cameras see the board."""
 
 
 def calibrate(
@@ -24,17 +27,17 @@ def calibrate(
     Parameters
     ----------
     images : mapping of str to sequence of array (height, width)
-        By name of the camera its grey images, moment by moment; the board need not be seen in all.
+        Grey images of each camera by its name, moment by moment; the board need not be seen in all.
     corners : tuple of int
-        Inner corners along the longer and along the shorter side of the board.
+        Numbers of inner corners along the longer and along the shorter side of the board.
     square : float
         Side of a square, m.
 
     Returns
     -------
     cameras : tuple of Camera
-        The laboratory frame is that of the board in the first moment in which all cameras see it:
-        origin at its first inner corner, x along its rows, y along its columns.
+        Cameras in the laboratory frame that is that of the board in the first moment in which all
+        cameras see it: origin at its first inner corner, x along its rows, y along its columns.
     error : float
         Root mean square distance of the corners from where the cameras see them, pixels.
 
@@ -110,7 +113,7 @@ def _camera(
 def _together(
     cameras: tuple[Camera, ...], seen: Mapping[str, Sequence[Any]], board: Board, shared: list[int]
 ) -> tuple[Camera, ...]:
-    """Place every camera relative to the first by all shared moments, not by one."""
+    """Pose of every camera relative to the first from all shared moments, not from one."""
     cv2 = _opencv()
     main = cameras[0]
     placed = [main]
@@ -127,25 +130,15 @@ def _together(
             flags=cv2.CALIB_FIX_INTRINSIC,
         )
         turn, shift = answer[5], answer[6].reshape(3)
-        placed.append(
-            Camera(
-                matrix=camera.matrix,
-                rotation=turn @ main.rotation,
-                translation=turn @ main.translation + shift,
-                distortion=camera.distortion,
-                size=camera.size,
-                name=camera.name,
-            )
-        )
+        rotation, translation = turn @ main.rotation, turn @ main.translation + shift
+        placed.append(replace(camera, rotation=rotation, translation=translation))
     return tuple(placed)
 
 
 def _error(
     cameras: Sequence[Camera], seen: Mapping[str, Sequence[Any]], board: Board, shared: list[int]
 ) -> float:
-    """How far the corners are from where the cameras see the points that they see together."""
-    from vibrissa.cameras.triangulation import triangulate
-
+    """Root mean square distance of the corners from the images of the points they give."""
     squares = []
     for i in shared:
         pixels = np.stack([seen[camera.name][i] for camera in cameras]).astype(np.float64)

@@ -18,14 +18,19 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 PIXEL_SIZE = 58e-6
-"""What a pixel of the paper's cameras sees, m."""
+"""Size of a pixel of the paper's cameras in the scene, m."""
 
 SIZE = (1024, 1024)
 """Width and height of the paper's frames, pixels."""
 
 _COEFFICIENTS = 8
+"""Number of OpenCV's distortion coefficients that are used."""
+
 _ROUNDS = 20
+"""Largest number of Newton steps that remove the distortion."""
+
 _SINGULAR = 1e-9
+"""Determinant of the directions of the image's axes below which they are parallel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,25 +40,26 @@ class Camera:
     Parameters
     ----------
     matrix : array (3, 3)
-        K: focal lengths and middle of the image; pixels per m for an orthographic camera.
+        Focal lengths and middle of the image, K; pixels per m for an orthographic camera.
     rotation : array (3, 3)
-        R, from the laboratory's to the camera's axes (right, down, forward).
+        Rotation R from the laboratory's to the camera's axes (right, down, forward).
     translation : array (3,)
-        t, m.
+        Shift t, m.
     distortion : array (n,), optional
-        OpenCV's (k1, k2, p1, p2, k3, k4, k5, k6), or the first 4 or 5 of them; perspective only.
+        Distortion coefficients of OpenCV (k1, k2, p1, p2, k3, k4, k5, k6), or the first 4 or 5 of
+        them; perspective only.
     size : tuple of int
         Width and height, pixels.
     projection : {"perspective", "orthographic"}
-        Which kind.
+        Kind of projection.
     name : str
-        Of the view.
+        Name of the view.
 
     Raises
     ------
     ValueError
         If a shape is wrong, a number is not finite, a focal length is zero, the last row of K is
-        not (0, 0, 1), or R is no rotation.
+        not (0, 0, 1), or R is not a rotation.
     """
 
     matrix: Array
@@ -93,12 +99,12 @@ class Camera:
             raise ValueError(f"no camera {self.name!r}: " + "; ".join(faults))
 
     def project(self, points: ArrayLike) -> Array:
-        """Say where points are seen.
+        """Project points into the image.
 
         Parameters
         ----------
         points : array_like (..., 3)
-            Laboratory frame, m.
+            Points in the laboratory frame, m.
 
         Returns
         -------
@@ -108,19 +114,19 @@ class Camera:
         return self.project_with_slopes(points)[0]
 
     def project_with_slopes(self, points: ArrayLike) -> tuple[Array, Array]:
-        """Say where points are seen and how that changes with the points.
+        """Project points into the image, with derivatives.
 
         Parameters
         ----------
         points : array_like (..., 3)
-            Laboratory frame, m.
+            Points in the laboratory frame, m.
 
         Returns
         -------
         pixels : array (..., 2)
             Column and row.
         slopes : array (..., 2, 3)
-            Their derivatives, pixels per m.
+            Derivatives of these by the points, pixels per m.
         """
         seen = np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation
         if self.projection == "orthographic":
@@ -139,7 +145,7 @@ class Camera:
         return pixels, slopes
 
     def rays(self, pixels: ArrayLike) -> tuple[Array, Array]:
-        """Say which lines pixels look along.
+        """Find the lines that are seen in pixels.
 
         Parameters
         ----------
@@ -149,7 +155,7 @@ class Camera:
         Returns
         -------
         origin, direction : array (..., 3)
-            A point of each line, m, and its unit direction away from the camera, laboratory frame.
+            Point of each line, m, and its unit direction away from the camera, laboratory frame.
         """
         pixels = np.asarray(pixels, dtype=np.float64)
         flat = (pixels - self.matrix[:2, 2]) @ np.linalg.inv(self.matrix[:2, :2]).T
@@ -164,7 +170,7 @@ class Camera:
 
 
 def _faults_of_matrix(matrix: Array) -> list[str]:
-    """What makes that a matrix has no rays."""
+    """Faults of a matrix that leave pixels without rays."""
     if not np.array_equal(matrix[2], (0.0, 0.0, 1.0)):
         row = ", ".join(f"{value:g}" for value in matrix[2])
         return [f"the last row of matrix is ({row}), not (0, 0, 1): is it transposed?"]
@@ -185,18 +191,18 @@ def orthogonal_views(
     Parameters
     ----------
     pixel_size : float
-        What a pixel sees, m.
+        Size of a pixel in the scene, m.
     size : tuple of int
         Width and height, pixels.
     center : array_like (3,)
-        What is in the middle of both images, laboratory frame, m.
+        Point in the middle of both images, laboratory frame, m.
 
     Returns
     -------
     top : Camera
-        Shows x to the right and y upward.
+        View of x to the right and y upward.
     front : Camera
-        Shows x to the right and z upward: the view from +y, mirrored so that both images have the
+        View of x to the right and z upward: that from +y, mirrored so that both images have the
         same x in the same column.
 
     Raises

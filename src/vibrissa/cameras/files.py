@@ -7,12 +7,39 @@ from os import PathLike
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from vibrissa.cameras.camera import Camera
 from vibrissa.io import in_file, read_calibration, write_calibration
 
-Array = NDArray[np.float64]
+_VARIABLES = {
+    "camera_matrix": (
+        "matrix",
+        ("row", "column"),
+        "1",
+        "K: pixels per m if orthographic, else focal lengths in pixels",
+    ),
+    "camera_rotation": (
+        "rotation",
+        ("row", "column"),
+        "1",
+        "from the laboratory's to the camera's axes (right, down, forward)",
+    ),
+    "camera_translation": (
+        "translation",
+        ("row",),
+        "m",
+        "x_camera = rotation x_laboratory + translation",
+    ),
+    "camera_distortion": (
+        "distortion",
+        ("coefficient",),
+        "1",
+        "OpenCV's k1, k2, p1, p2, k3, k4, k5, k6",
+    ),
+    "image_size": ("size", ("side",), "pixel", "width and height"),
+    "projection": ("projection", (), "1", "orthographic or perspective"),
+}
+"""By variable: attribute of a camera, dimensions, unit and description."""
 
 
 def load_cameras(path: str | PathLike[str], unit: float = 1e-3) -> tuple[Camera, ...]:
@@ -21,21 +48,21 @@ def load_cameras(path: str | PathLike[str], unit: float = 1e-3) -> tuple[Camera,
     Parameters
     ----------
     path : str or path
-        TOML of Anipose (`vibrissa.io.anipose`).
+        File in Anipose's TOML (`vibrissa.io.anipose`).
     unit : float
-        Of the file's lengths, m; that of the board that calibrated the cameras, usually mm.
+        Unit of the file's lengths, m; that of the board that calibrated the cameras, usually mm.
 
     Returns
     -------
     tuple of Camera
-        In the file's order.
+        Cameras in the file's order.
 
     Raises
     ------
     FileNotFoundError
         If there is no such file.
     ValueError
-        If it is no calibration, or one with faults.
+        If it is not a calibration, or one with faults.
     """
     from scipy.spatial.transform import Rotation
 
@@ -63,11 +90,11 @@ def save_cameras(path: str | PathLike[str], cameras: Sequence[Camera], unit: flo
     Parameters
     ----------
     path : str or path
-        Where to write, usually with the ending ``.toml``.
+        File to write, usually with the ending ``.toml``.
     cameras : sequence of Camera
-        The views.
+        Cameras of the views.
     unit : float
-        Of the file's lengths, m.
+        Unit of the file's lengths, m.
 
     Raises
     ------
@@ -93,40 +120,45 @@ def save_cameras(path: str | PathLike[str], cameras: Sequence[Camera], unit: flo
 
 
 def cameras_dataset(cameras: Sequence[Camera]) -> xr.Dataset:
-    """Write cameras as a dataset, the group ``cameras`` of a recording."""
-    about = {
-        "camera_matrix": "K: pixels per m if orthographic, else focal lengths in pixels",
-        "camera_rotation": "from the laboratory's to the camera's axes (right, down, forward)",
-        "camera_translation": "x_camera = rotation x_laboratory + translation",
-        "camera_distortion": "OpenCV's k1, k2, p1, p2, k3, k4, k5, k6",
-        "image_size": "width and height",
-        "projection": "orthographic or perspective",
-    }
-    units = {"camera_translation": "m", "image_size": "pixel"}
-    rows: dict[str, tuple[tuple[str, ...], list[object]]] = {
-        "camera_matrix": (("view", "row", "column"), [c.matrix for c in cameras]),
-        "camera_rotation": (("view", "row", "column"), [c.rotation for c in cameras]),
-        "camera_translation": (("view", "row"), [c.translation for c in cameras]),
-        "camera_distortion": (("view", "coefficient"), [c.distortion for c in cameras]),
-        "image_size": (("view", "side"), [c.size for c in cameras]),
-        "projection": (("view",), [c.projection for c in cameras]),
-    }
+    """Write cameras as a dataset, the group ``cameras`` of a recording.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        Cameras of the views.
+
+    Returns
+    -------
+    xarray.Dataset
+        Variables of all cameras over the dimension ``view``.
+    """
     return xr.Dataset(
         {
             name: (
-                dims,
-                np.array(values),
-                {"units": units.get(name, "1"), "long_name": about[name]},
+                ("view", *axes),
+                np.array([getattr(camera, part) for camera in cameras]),
+                {"units": unit, "long_name": about},
             )
-            for name, (dims, values) in rows.items()
+            for name, (part, axes, unit, about) in _VARIABLES.items()
         },
-        {"view": [c.name for c in cameras]},
+        {"view": [camera.name for camera in cameras]},
         {"reference_frame": "laboratory"},
     )
 
 
 def cameras_from_dataset(dataset: xr.Dataset) -> tuple[Camera, ...]:
-    """Read the cameras that `cameras_dataset` wrote."""
+    """Read the cameras that `cameras_dataset` wrote.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        Variables of all cameras over the dimension ``view``.
+
+    Returns
+    -------
+    tuple of Camera
+        Cameras in the dataset's order.
+    """
     return tuple(
         Camera(
             matrix=row["camera_matrix"].values,

@@ -20,18 +20,18 @@ def triangulate(
     Parameters
     ----------
     cameras : sequence of Camera
-        At least two views.
+        Cameras of at least two views.
     pixels : array_like (camera, ..., 2)
-        Where each camera sees each point; NaN gives NaN.
+        Column and row at which each camera sees each point; NaN gives NaN.
     sigma : array_like
         Standard deviation of a pixel coordinate, broadcast to (camera, ...).
 
     Returns
     -------
     points : array (..., 3)
-        Those that are seen nearest to the pixels, each weighted by its sigma, m.
+        Points that are seen nearest to the pixels, each weighted by its sigma, m.
     covariance : array (..., 3, 3)
-        Of the points, m².
+        Covariance of the points, m².
 
     Raises
     ------
@@ -64,7 +64,7 @@ def triangulate(
 
 
 def _regular(hessian: Array) -> Array:
-    """The same; NaN stays NaN, and rays that are parallel leave a finite, huge uncertainty."""
+    """Hessian of which parallel rays leave a finite, huge uncertainty; NaN stays NaN."""
     scale = np.trace(hessian, axis1=-2, axis2=-1)[..., None, None]
     floored: Array = hessian + 1e-12 * scale * np.eye(3)
     return floored

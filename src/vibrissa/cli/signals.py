@@ -43,7 +43,7 @@ class SourceOptions:
     ) -> dict[str, Any]:
         """Turn options into those of `signals_of`."""
         from vibrissa.pipeline import default_source
-        from vibrissa.tracking.filtering import CUTOFF
+        from vibrissa.tracking import CUTOFF
 
         source = default_source(recording) if self.source is None else self.source.replace("-", " ")
         if source != "contact point":

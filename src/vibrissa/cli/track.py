@@ -68,8 +68,7 @@ class FilmOptions:
 
     def views(self, videos: Sequence[Path]) -> tuple[Camera, ...]:
         """Return the cameras of the views: those that are calibrated, or orthogonal ones."""
-        from vibrissa.cameras import orthogonal_views
-        from vibrissa.cameras.camera import PIXEL_SIZE
+        from vibrissa.cameras import PIXEL_SIZE, orthogonal_views
         from vibrissa.io import video_info
 
         if self.cameras is not None:

@@ -35,7 +35,7 @@ from vibrissa.recording import Group, Recording, recorded
 from vibrissa.rod import PROXIMAL
 from vibrissa.sensors import Sensor
 from vibrissa.status import Status
-from vibrissa.tracking.filtering import CUTOFF
+from vibrissa.tracking import CUTOFF
 from vibrissa.whisker import Whisker
 
 Array = NDArray[np.float64]

@@ -18,9 +18,7 @@ from vibrissa.pipeline.slopes import wrench_slopes
 from vibrissa.recording import Group, Recording, recorded
 from vibrissa.rod import PointContact, deflect
 from vibrissa.status import Status
-from vibrissa.tracking.filtering import CUTOFF
-from vibrissa.tracking.head import HeadPose
-from vibrissa.tracking.pose import BasePose
+from vibrissa.tracking import CUTOFF, BasePose, HeadPose
 from vibrissa.whisker import Whisker, angles_of
 
 Array = NDArray[np.float64]

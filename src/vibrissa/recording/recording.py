@@ -10,8 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from vibrissa.cameras.camera import Camera
-from vibrissa.cameras.files import cameras_dataset, cameras_from_dataset
+from vibrissa.cameras import Camera, cameras_dataset, cameras_from_dataset
 from vibrissa.io import RECORDING_KIND
 from vibrissa.objects import Peg, Surface, object_from_dataset, objects_datasets
 from vibrissa.recording.schema import ordered

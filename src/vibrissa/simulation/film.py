@@ -33,8 +33,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from vibrissa.cameras.camera import PIXEL_SIZE, Camera, orthogonal_views
-from vibrissa.cameras.files import cameras_dataset
+from vibrissa.cameras import PIXEL_SIZE, Camera, cameras_dataset, orthogonal_views
 from vibrissa.io import Frame, write_video
 from vibrissa.numerics import kernel
 from vibrissa.objects import Surface

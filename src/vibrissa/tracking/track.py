@@ -1,4 +1,8 @@
-"""From traces in two views to a recording: shape, pose, contact and wrench of every frame."""
+"""From traces in two views to a recording: shape, pose, contact and wrench of every frame.
+
+What makes results wrong without any sign in them is searched, and reported in a sentence each, with
+what to do: views that do not show the same, cameras out of step, ends that are not seen.
+"""
 
 from __future__ import annotations
 
@@ -11,42 +15,52 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from vibrissa.cameras.camera import Camera
+from vibrissa.cameras import Camera
 from vibrissa.objects import Surface
-from vibrissa.tracking.contact import Contacts, contacts_at, given_contacts
-from vibrissa.tracking.dataset import tracked_recording
-from vibrissa.tracking.filtering import CUTOFF
-from vibrissa.tracking.head import HeadPose
-from vibrissa.tracking.length import (
+from vibrissa.tracking.contact_points import contacts_at, given_contacts
+from vibrissa.tracking.recording import Tracked, tracked_recording
+from vibrissa.tracking.refine.fit import FitOptions, Fitter, with_length_unsure
+from vibrissa.tracking.refine.rods import rolled
+from vibrissa.tracking.refine.trace_series import TraceSeries
+from vibrissa.tracking.space.curve import merge
+from vibrissa.tracking.space.frame_pairs import better_offset, paired_frames
+from vibrissa.tracking.space.pose import CUTOFF, BasePose, HeadPose, base_pose
+from vibrissa.tracking.space.rest_shape import (
     Length,
+    RestShape,
+    known_rest,
     lengthened,
     likeliest_length,
-    with_length_unsure,
+    rest_shape,
+    whisker_at_rest,
 )
-from vibrissa.tracking.pose import BasePose, base_pose
-from vibrissa.tracking.refine import Refined, RefineOptions, cost_of, refine
-from vibrissa.tracking.remarks import check_views, remarks_on, remarks_on_time
-from vibrissa.tracking.rest import RestShape, known_rest, rest_shape, whisker_at_rest
-from vibrissa.tracking.roll import rolled
-from vibrissa.tracking.sight import Sight
-from vibrissa.tracking.space import merge
-from vibrissa.tracking.timing import paired_frames
-from vibrissa.tracking.trace import Trace
+from vibrissa.tracking.trace.start import base_gap
+from vibrissa.tracking.trace.trace import Trace
 from vibrissa.whisker import Whisker
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 Progress = Callable[[str, int, int], None]
-"""Called with what is being done, and how much of how much is."""
+"""Function that is called with the name of a stage, and how much of how much is done."""
 
 _ANY_ROLL = np.radians(10.0)
+"""Standard deviation of the roll if only bent shapes show it, rad."""
 
 _FEWEST, _FRAMES = 8, 24
-"""Frames in contact from which a length is taken: at least, at most."""
+"""Smallest and largest number of frames in contact from which a length is taken."""
 
 _LONGER = 2.0
-"""By how many standard deviations another length differs, to see what hangs on it."""
+"""Standard deviations by which another length differs, to see what depends on it."""
+
+_NEAR, _FAR = 2.0, 10.0
+"""Distances, in pixels, between bases in several views: more than usual; not the same base."""
+
+_STRANGE, _OFTEN = 2.0, 0.05
+"""Misfit that is not usual, and the share of the frames with it that is worth a remark."""
+
+_SHARE = 0.03
+"""Distance between bases that are not the same, as a share of the whisker's length."""
 
 
 @dataclass(frozen=True)
@@ -56,72 +70,27 @@ class TrackOptions:
     Parameters
     ----------
     cutoff : float, optional
-        Of the zero-phase low pass on the base's pose, Hz; None filters nothing.
+        Cut-off frequency of the zero-phase low pass on the base's pose, Hz; None filters nothing.
     offset : int, optional
-        Frames by which the other cameras began before the first; None finds it, and dropped frames.
+        Number of frames by which the other cameras began before the first; None: it is found, and
+        dropped frames too.
     free : float
-        Share of the frames that are free of contact, at least.
-    refine : RefineOptions
-        Of the fit of the rod.
+        Smallest share of the frames that are free of contact.
+    fit : FitOptions
+        Settings of the fit of the rod.
     properties : mapping
         Radius and material of the whisker; see `vibrissa.Whisker`.
     whisker : Whisker, optional
-        The whisker at rest, where it is known: its base is where it leaves the face. By default it
-        is taken from the frames that are free of contact.
+        Whisker at rest, where it is known: its base is where it leaves the face. By default it is
+        taken from the frames that are free of contact.
     """
 
     cutoff: float | None = CUTOFF
     offset: int | None = 0
     free: float = 0.1
-    refine: RefineOptions = field(default_factory=RefineOptions)
+    fit: FitOptions = field(default_factory=FitOptions)
     properties: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
     whisker: Whisker | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Tracked:
-    """One whisker, tracked.
-
-    Parameters
-    ----------
-    whisker : Whisker
-        At rest.
-    sight : Sight
-        Its traces.
-    curves : array (time, node, 3)
-        Merged from the views, laboratory frame, m.
-    covariance : array (time, node, 3, 3)
-        Of the curves, m².
-    shape : RestShape
-        What it was taken from.
-    pose : BasePose
-        How it is held relative to the head, filtered, the paper's way.
-    unfiltered : BasePose
-        The same before filtering.
-    touching : array (time,)
-        Frames in contact.
-    refined : Refined
-        The rod that fits the traces.
-    head : HeadPose
-        The head in these frames.
-    length : Length
-        Of the whisker; its standard deviation is 0 where its tip is seen or it is given.
-    contacts : Contacts, optional
-        Contact points that do not come from the rod.
-    """
-
-    whisker: Whisker
-    sight: Sight
-    curves: Array
-    covariance: Array
-    shape: RestShape
-    pose: BasePose
-    unfiltered: BasePose
-    touching: Mask
-    refined: Refined
-    head: HeadPose
-    length: Length
-    contacts: Contacts | None = None
 
 
 def track(
@@ -141,36 +110,36 @@ def track(
     Parameters
     ----------
     cameras : sequence of Camera
-        The views.
+        Cameras of the views.
     traces : sequence of sequence of sequence of Trace
-        View by view, whisker by whisker, frame by frame; the same whiskers in every view.
+        Traces view by view, whisker by whisker, frame by frame; the same whiskers in every view.
     rate : float
         Frames per second.
     options : TrackOptions, optional
-        How.
+        Settings of tracking.
     names : sequence of str, optional
-        Of the whiskers.
+        Names of the whiskers.
     head : xarray.Dataset, optional
-        How the head moves; see `vibrissa.io.load_head`. The motion of the base is then smoothed,
+        Pose of the head; see `vibrissa.io.load_head`. The motion of the base is then smoothed,
         filtered and given as angles relative to the head.
     contacts : xarray.Dataset, optional
         Contact points that were tracked otherwise; see `vibrissa.io.load_contact_points`.
     objects : sequence of Surface, optional
-        What stands there, laboratory frame. Without ``contacts``, the point of the whisker nearest
-        to any of them is where the contact is.
+        Objects in the laboratory frame. Without ``contacts``, the point of the whisker nearest to
+        any of them is where the contact is.
     progress : callable, optional
-        Called as ``progress(stage, done, total)``.
+        Function that is called as ``progress(stage, done, total)``.
 
     Returns
     -------
     xarray.DataTree
-        A recording. Its base pose, contact and wrench are those of the rod that fits the traces;
-        the group ``measured`` holds what was measured before: the whisker merged from the views
-        with its uncertainty, the pose the paper's way, and the contact points of ``contacts`` or
-        ``objects`` beside those of the rod. The attribute ``remarks``, if there is one, says what
-        is to be known before it is believed, a sentence a line. Of several whiskers, one that
+        Recording. Its base pose, contact and wrench are those of the rod that fits the traces; the
+        group ``measured`` holds what was measured before: the whisker merged from the views with
+        its uncertainty, the pose by the paper's method, and the contact points of ``contacts`` or
+        ``objects`` next to those of the rod. The attribute ``remarks``, if there is one, states
+        what is to be known before it is believed, a sentence a line. Of several whiskers, one that
         cannot be tracked (it is seen in too few frames, or the views show different ones) is left
-        out, and a remark says why.
+        out, and a remark gives the reason.
 
     Raises
     ------
@@ -189,20 +158,20 @@ def track(
     timed = _best_seen(traces)
     pairs = paired_frames(cameras, timed, options.offset)
     moving = None if head is None else HeadPose.of(head, pairs[:, 0], rate)
-    found, remarks = [], remarks_on_time(cameras, timed, options.offset)
+    found, remarks = [], _remarks_on_time(cameras, timed, options.offset)
     count = counts.pop()
     for k in range(count):
         rows = [[view[k][i] for i in pairs[:, v]] for v, view in enumerate(traces)]
         name = names[k] if names is not None else f"whisker {k}"
         try:
             one = track_whisker(cameras, rows, rate, options, name, progress, moving)
-            other = None
             if contacts is not None:
-                other = given_contacts(contacts, cameras, pairs, rate, k, one.refined)
+                other = given_contacts(contacts, cameras, pairs, rate, k, one.fit)
+                one = replace(one, contacts=other)
             elif objects:
-                other = contacts_at(objects, one.curves, one.touching, one.refined)
-            found.append(replace(one, contacts=other))
-            remarks += remarks_on(cameras, one.sight, one.length, one.refined.misfit, name)
+                one = replace(one, contacts=contacts_at(objects, one.curves, one.touching, one.fit))
+            found.append(one)
+            remarks += remarks_on(cameras, one.traces, one.length, one.fit.misfit, name)
         except Exception as fault:  # whatever it is, it must not cost the others
             if count == 1:
                 raise
@@ -237,121 +206,73 @@ def track_whisker(
     Parameters
     ----------
     cameras : sequence of Camera
-        The views.
+        Cameras of the views.
     traces : sequence of sequence of Trace
-        View by view, frame by frame, frames that belong together.
+        Traces view by view, frame by frame, of frames that belong together.
     rate : float
         Frames per second.
     options : TrackOptions
-        How.
+        Settings of tracking.
     name : str
-        Of the whisker.
+        Name of the whisker.
     progress : callable, optional
-        Called as ``progress(stage, done, total)``.
+        Function that is called as ``progress(stage, done, total)``.
     head : HeadPose, optional
-        The head in these frames; by default it does not move.
+        Pose of the head in these frames; by default it does not move.
 
     Returns
     -------
     Tracked
+        Whisker with its pose, contact and wrench.
 
     Raises
     ------
     ValueError
         If it is seen in too few frames, or the views show different whiskers.
     """
-    tell = progress or _silent
+    report = progress or _silent
     count = len(traces[0])
-    sight = Sight.of(traces)
-    check_views(cameras, sight, name)
+    series = TraceSeries.of(traces)
+    _check_views(cameras, series, name)
     curves = []
     for i, views in enumerate(zip(*traces, strict=True)):
         curves.append(merge(cameras, views))
-        tell(f"{name} in space", i + 1, count)
+        report(f"{name} in space", i + 1, count)
     points = np.array([curve.points for curve in curves])
-    tell(f"contact of {name}", 0, 2)
+    report(f"contact of {name}", 0, 2)
     head = head or HeadPose.still(count)
     on_head = head.seen_from(points)
-    tips: Mask = np.all(sight.ends[:, :, 1] > 0.5, axis=1)
+    tips: Mask = np.all(series.ends[:, :, 1] > 0.5, axis=1)
     shape, whisker = _at_rest(on_head, options, name, tips)
-    tell(f"contact of {name}", 1, 2)
-    known = np.isfinite(points).all(axis=(1, 2))
-    touching = known & ~shape.free
-    how = options.refine
+    report(f"contact of {name}", 1, 2)
+    touching = np.isfinite(points).all(axis=(1, 2)) & ~shape.free
+    smoothness = options.fit
     if not shape.free.any():
         # Nothing but the bent shapes shows how the whisker is rolled.
-        how = replace(how, roll=max(how.roll, _ANY_ROLL))
-    fit = _Fit(cameras, sight, on_head, touching, rate, options, how, head)
+        smoothness = replace(smoothness, roll=max(smoothness.roll, _ANY_ROLL))
+    fitter = Fitter(cameras, series, touching, on_head, rate, smoothness, head)
     length = Length(whisker.length, 0.0)
     if options.whisker is None and not shape.whole:
-        length = fit.length(shape)
+        length = _length(fitter, shape, options)
         shape = lengthened(shape, length.value)
         whisker = whisker_at_rest(shape, name, **options.properties)
-    unfiltered, pose = fit.pose(shape, whisker)
-    refined = fit.refined(whisker, pose)
+    unfiltered, pose = _poses(fitter, shape, whisker, options)
+    fit = fitter.fit(whisker, pose, on_head.shape[1])
     if length.sigma > 0.0:
         longer = lengthened(shape, length.value + _LONGER * length.sigma)
         other = whisker_at_rest(longer, name, **options.properties)
-        further = fit.refined(other, fit.pose(longer, other)[1])
-        refined = with_length_unsure(refined, further, 1.0 / _LONGER)
-    tell(f"contact of {name}", 2, 2)
+        posed = _poses(fitter, longer, other, options)[1]
+        further = fitter.fit(other, posed, on_head.shape[1])
+        fit = with_length_unsure(fit, further, 1.0 / _LONGER)
+    report(f"contact of {name}", 2, 2)
     covariance = np.array([curve.covariance for curve in curves])
     return Tracked(
-        whisker, sight, points, covariance, shape, pose, unfiltered, touching, refined, head, length
+        whisker, series, points, covariance, shape, pose, unfiltered, touching, fit, head, length
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    """Rods that are fitted to the same traces."""
-
-    cameras: Sequence[Camera]
-    sight: Sight
-    curves: Array
-    touching: Mask
-    rate: float
-    options: TrackOptions
-    how: RefineOptions
-    head: HeadPose
-
-    def pose(self, shape: RestShape, whisker: Whisker) -> tuple[BasePose, BasePose]:
-        """How it is held, unfiltered and filtered."""
-        unfiltered = base_pose(self.curves, shape, whisker)
-        pose = unfiltered.filtered(self.rate, self.options.cutoff)
-        return unfiltered, pose if shape.free.any() else rolled(pose, self.curves, whisker)
-
-    def refined(self, whisker: Whisker, pose: BasePose) -> Refined:
-        return refine(
-            self.cameras,
-            self.sight,
-            whisker,
-            pose,
-            self.touching,
-            self.curves,
-            self.rate,
-            self.how,
-            self.curves.shape[1],
-            self.head,
-        )
-
-    def length(self, shape: RestShape) -> Length:
-        """Of a whisker whose tip is not seen, from some of the frames in contact."""
-        rows = np.flatnonzero(self.touching)
-        if len(rows) < _FEWEST:
-            return Length(shape.length, np.nan)
-        rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _FRAMES)).astype(int)]
-        curves = np.full_like(self.curves, np.nan)
-        curves[rows] = self.curves[rows]
-        cost = cost_of(
-            self.cameras, self.sight, self.touching, curves, self.rate, self.how, self.head
-        )
-
-        def of(length: float) -> float:
-            longer = lengthened(shape, length)
-            whisker = whisker_at_rest(longer, **self.options.properties)
-            return cost(whisker, self.pose(longer, whisker)[1])
-
-        return likeliest_length(shape.length, of)
+def _silent(stage: str, done: int, total: int) -> None:
+    pass
 
 
 def _at_rest(
@@ -365,5 +286,110 @@ def _at_rest(
     return shape, whisker_at_rest(shape, name, **options.properties)
 
 
-def _silent(stage: str, done: int, total: int) -> None:
-    pass
+def _poses(
+    fitter: Fitter, shape: RestShape, whisker: Whisker, options: TrackOptions
+) -> tuple[BasePose, BasePose]:
+    """Pose of the base, unfiltered and filtered."""
+    unfiltered = base_pose(fitter.curves, shape, whisker)
+    pose = unfiltered.filtered(fitter.rate, options.cutoff)
+    return unfiltered, pose if shape.free.any() else rolled(pose, fitter.curves, whisker)
+
+
+def _length(fitter: Fitter, shape: RestShape, options: TrackOptions) -> Length:
+    """Length of a whisker whose tip is not seen, from some of the frames in contact."""
+    rows = np.flatnonzero(fitter.touching)
+    if len(rows) < _FEWEST:
+        return Length(shape.length, np.nan)
+    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _FRAMES)).astype(int)]
+    curves = np.full_like(fitter.curves, np.nan)
+    curves[rows] = fitter.curves[rows]
+    some = replace(fitter, curves=curves)
+    cost = some.costs()
+
+    def of(length: float) -> float:
+        longer = lengthened(shape, length)
+        whisker = whisker_at_rest(longer, **options.properties)
+        return cost(whisker, _poses(fitter, longer, whisker, options)[1])
+
+    return likeliest_length(shape.length, of)
+
+
+# What is to be known before results are believed.
+
+
+def _check_views(cameras: Sequence[Camera], series: TraceSeries, name: str) -> None:
+    """Make sure that views show one whisker."""
+    gap = _gap(cameras, series)
+    lengths = np.linalg.norm(np.diff(series.line, axis=2), axis=3).sum(axis=2)
+    allowed = max(_FAR, _SHARE * float(np.nanmax(lengths, initial=0.0)))
+    if gap > allowed:
+        raise ValueError(
+            f"the views do not show one whisker: where they see the base of {name}, their lines of "
+            f"sight pass each other by {gap:.0f} pixels (median). Give where it begins in each "
+            "view (--base), and check the order of the videos and the cameras' calibration."
+        )
+
+
+def remarks_on(
+    cameras: Sequence[Camera], series: TraceSeries, length: Length, misfit: Array, name: str
+) -> list[str]:
+    """What is unusual about a tracked whisker."""
+    found = []
+    gap = _gap(cameras, series)
+    if gap > _NEAR:
+        found.append(
+            f"{name}: its base is seen {gap:.1f} pixels from where the other view shows it "
+            "(median); with a good calibration it is less than one."
+        )
+    seen = np.isfinite(series.line[:, :, 0, 0])
+    outside = int((seen & (series.ends[:, :, 0] < 0.5)).any(axis=1).sum())
+    if outside:
+        found.append(
+            f"{name}: in {outside} frames a view does not show its base; they are left out."
+        )
+    strange = int((np.nan_to_num(misfit) > _STRANGE).sum())
+    if strange > _OFTEN * len(misfit):
+        found.append(
+            f"{name}: in {strange} frames the bent rod does not explain the traces (trace_misfit "
+            f"above {_STRANGE:g}): they are on something else, or its own inertia or a second "
+            "contact bends it. The results of these frames are not to be believed."
+        )
+    if np.isnan(length.sigma):
+        found.append(
+            f"{name}: its tip is not seen, nor is it bent enough to show its length; it is "
+            f"{1e3 * length.value:.1f} mm at least, and contacts are wrong if it is more: give "
+            "--whisker."
+        )
+    elif length.sigma > 0.0:
+        found.append(
+            f"{name}: its tip is too faint to be seen, or outside of the image; as it bends it is "
+            f"{1e3 * length.value:.1f} ± {1e3 * length.sigma:.1f} mm long, which is counted in all "
+            "covariances."
+        )
+    return found
+
+
+def _remarks_on_time(
+    cameras: Sequence[Camera], traces: Sequence[Sequence[Trace]], offset: int | None
+) -> list[str]:
+    """Whether cameras seem to be out of step."""
+    if offset is None:
+        return []
+    found = []
+    for camera, row in zip(cameras[1:], traces[1:], strict=True):
+        shifts = better_offset(cameras[0], camera, traces[0], row, offset)
+        if shifts.size:
+            listed = ", ".join(map(str, shifts))
+            found.append(
+                f"{cameras[0].name} and {camera.name} are out of step: with an offset of {listed} "
+                f"frames instead of {offset} they agree better. Track with --offset auto."
+            )
+    return found
+
+
+def _gap(cameras: Sequence[Camera], series: TraceSeries) -> float:
+    """Usual distance of the base from where the views together see it, pixels."""
+    rows = (series.ends[:, :, 0] > 0.5).all(axis=1)
+    if not rows.any():
+        return 0.0
+    return float(np.median(base_gap(cameras, np.swapaxes(series.line[rows, :, 0], 0, 1))))

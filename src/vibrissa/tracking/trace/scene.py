@@ -1,9 +1,9 @@
-"""What stands still in a view: its light, its background, and how dark a body is.
+"""What does not move in a view: its light, its background, and how dark a body is.
 
-A whisker is thin and moves. A grey closing (the largest values nearby, then the smallest of these)
-removes what is thin, so that light and bodies (the face, objects) stay; the value that a pixel
-exceeds in a sixth of the frames is its background, on which moving whiskers leave no mark, so that
-wires, glints and scale bars do not show in the difference from it.
+A whisker is thin and moves. A grey closing removes what is thin, so that light and bodies (the
+face, objects) stay; the value that a pixel exceeds in a sixth of the frames is its background, on
+which moving whiskers leave no mark, so that wires, glints and scale bars do not show in the
+difference from it.
 """
 
 from __future__ import annotations
@@ -23,36 +23,37 @@ Image = NDArray[np.float32]
 Labels = NDArray[np.int32]
 
 _HALF = 2
-"""Bodies are looked for in images of half the size."""
+"""Factor by which images are made smaller before bodies are searched in them."""
 
 _THIN = 7
 """Width of what a closing removes, pixels of half the size, for a whisker of usual width."""
 
-_SOFT = 4.0
-"""Smoothing of the light, pixels of half the size."""
+_SOFT, _EDGE = 4.0, 0.75
+"""Smoothing of the light, and of bodies before their edge is taken, pixels of half the size."""
 
 _SPARSE = 8
+"""Distance of the pixels from which the brightness of a frame is taken."""
 
 _RANK = 0.15
 """Share of the frames in which a pixel is brighter than its background."""
 
 _FEWEST = 6
-"""Frames from which a background can be taken."""
+"""Number of frames from which a background can be taken."""
 
 _DARK, _LIT = 0.75, 0.85
-"""How dark bodies are in the mean at most, and at their edges, relative to the light."""
+"""Largest brightness of bodies, in the mean and at their edges, relative to the light."""
 
 _EVEN = 0.01
-"""How much it counts that light is even, compared with what is seen of it."""
+"""Weight of the light being even, relative to that of the pixels."""
 
 _SMALLEST = 40
-"""Smallest body, pixels of half the size."""
+"""Area of the smallest body, pixels of half the size."""
 
 _LARGE = 0.02
-"""Share of the image that a face covers at least."""
+"""Smallest share of the image that a face covers."""
 
 _RANGE = (-20.0, 80.0)
-"""Differences that count, grey values."""
+"""Differences that count, grey values: what is darker or brighter counts as these."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +63,9 @@ class Bodies:
     label: Labels
     face: NDArray[np.bool_]
 
-    def at(self, places: Array) -> Labels:
-        """Say which body covers pixels of the frame."""
-        at = np.asarray(places / _HALF, dtype=np.int64)
+    def at(self, points: Array) -> Labels:
+        """Number of the body that covers each point of the frame; 0 where there is none."""
+        at = np.asarray(points / _HALF, dtype=np.int64)
         rows, columns = self.label.shape
         row, column = at[:, 1].clip(0, rows - 1), at[:, 0].clip(0, columns - 1)
         return np.asarray(self.label[row, column])
@@ -93,25 +94,19 @@ class Scene:
             rank = max(1, int(_RANK * len(frames)))
             nth_largest(np.stack(frames), gains, rank, background)
             background -= np.median(background[::_SPARSE, ::_SPARSE] - usual)
-        still = halved(frames[0] if background is None else background)
-        light = smoothed(closed(still, thin + 2), _SOFT)
-        return cls(
-            doubled(light, frames[0].shape),
-            _level(closed(still, thin + 2)),
-            background,
-            np.asarray(usual, dtype=np.float32),
-            thin,
-        )
+        still = _closed(_halved(frames[0] if background is None else background), thin + 2)
+        light = _doubled(_smoothed(still, _SOFT), frames[0].shape)
+        return cls(light, _level(still), background, np.asarray(usual, dtype=np.float32), thin)
 
     def gain(self, frame: Frame) -> float:
-        """Say how much brighter a frame is than the scene."""
+        """Brightness of a frame relative to the scene."""
         return _gain(frame[::_SPARSE, ::_SPARSE], self.sample)
 
     def bodies(self, frame: Frame) -> Bodies:
         """Find what is dark and not thin in a frame."""
         from scipy.ndimage import label
 
-        dark = smoothed(closed(halved(frame), self.thin), 0.75) < self.level * self.gain(frame)
+        dark = _smoothed(_closed(_halved(frame), self.thin), _EDGE) < self.level * self.gain(frame)
         labels, count = label(dark)
         area = np.bincount(labels.ravel(), minlength=count + 1)
         area[0] = 0
@@ -122,19 +117,19 @@ class Scene:
         return Bodies(number[labels].astype(np.int32), border & (area > _LARGE * labels.size))
 
     def difference(self, frame: Frame) -> Image:
-        """Say how much darker a frame is than the light."""
+        """How much darker a frame is than the light, pixel by pixel."""
         out = np.empty(frame.shape, dtype=np.float32)
         darker(frame, self.light, self.gain(frame), *_RANGE, out)
         return out
 
-    def moved(self, frame: Frame, places: Array) -> NDArray[np.bool_]:
-        """Say where what is dark in a frame is usually not."""
+    def moved(self, frame: Frame, points: Array, gain: float) -> float:
+        """Share of dark points of a frame, of known brightness, that are usually not dark."""
         if self.background is None:
-            return np.ones(len(places), dtype=bool)
-        column, row = np.rint(places).astype(np.int64).T
-        gain, grey = self.gain(frame), frame[row, column].astype(np.float64)
+            return 1.0
+        column, row = np.rint(points).astype(np.int64).T
+        grey = frame[row, column].astype(np.float64)
         whole = gain * self.light[row, column] - grey
-        return np.asarray(gain * self.background[row, column] - grey > 0.5 * whole)
+        return float((gain * self.background[row, column] - grey > 0.5 * whole).mean())
 
 
 def _gain(sparse: Any, usual: Any) -> float:
@@ -142,31 +137,28 @@ def _gain(sparse: Any, usual: Any) -> float:
     return float(np.median((sparse + np.float32(1.0)) / (usual + np.float32(1.0))))
 
 
-def halved(image: Any) -> Image:
-    """Bring an image to half its size; of four pixels the brightest stays."""
+def _halved(image: Any) -> Image:
+    """Image of half the size; of four pixels the brightest stays."""
     rows, columns = (n - n % _HALF for n in image.shape)
     image = image[:rows, :columns]
     rowwise = np.maximum(image[::2], image[1::2])
     return np.asarray(np.maximum(rowwise[:, ::2], rowwise[:, 1::2]), dtype=np.float32)
 
 
-def doubled(image: Image, shape: tuple[int, ...]) -> Image:
-    """Bring an image back to a size twice as large."""
+def _doubled(image: Image, shape: tuple[int, ...]) -> Image:
+    """Image of twice the size, or one pixel more."""
     large = np.repeat(np.repeat(image, _HALF, axis=0), _HALF, axis=1)
     return np.pad(large, [(0, n - m) for n, m in zip(shape, large.shape, strict=True)], mode="edge")
 
 
-def closed(image: Image, width: int) -> Image:
+def _closed(image: Image, width: int) -> Image:
     """Grey closing with a square: what is dark and thinner than it vanishes."""
-    from scipy.ndimage import maximum_filter1d, minimum_filter1d
+    from scipy.ndimage import grey_closing
 
-    for extreme in (maximum_filter1d, minimum_filter1d):
-        for axis in (0, 1):
-            image = extreme(image, width, axis=axis, mode="nearest")
-    return image
+    return np.asarray(grey_closing(image, (width, width), mode="nearest"))
 
 
-def smoothed(image: Image, sigma: float) -> Image:
+def _smoothed(image: Image, sigma: float) -> Image:
     """Smooth an image with a Gaussian."""
     from scipy.ndimage import gaussian_filter
 
@@ -188,7 +180,7 @@ def _level(still: Image) -> Image:
     coefficients = np.zeros(design.shape[1])
     coefficients[0] = np.quantile(value, 0.9)
     for _ in range(30):
-        # What is darker than the rest counts ever less: the fit rises to the open ground.
+        # What is darker than the rest is weighted down: the fit rises to the open ground.
         low = np.minimum(value - design @ coefficients, 0.0)
         weight = 1.0 / (1.0 + (low / 0.1) ** 2)
         coefficients = np.linalg.lstsq(
@@ -201,7 +193,7 @@ def _level(still: Image) -> Image:
 
 
 def _threshold(share: Array) -> float:
-    """Otsu's threshold between dark and bright; 0 if they do not differ enough."""
+    """Threshold between dark and bright by Otsu; 0 if they do not differ enough."""
     counts, edges = np.histogram(share, bins=128, range=(0.0, 1.5))
     middle = 0.5 * (edges[1:] + edges[:-1])
     below = np.cumsum(counts).astype(np.float64)

@@ -1,17 +1,25 @@
-"""The whisker at rest, and where it is held, from its shapes in space over time.
+"""The whisker at rest, from its shapes in space over time, and its length.
 
 Whatever bends the whisker changes its shape; how it is held only moves it. Frames whose shapes are
 the same but for a rigid motion are therefore taken for frames without contact, if there are enough
-of them: the largest such group. Their mean, each moved to where it fits best, is the rest shape.
+of them: the largest such group. Their median, each moved to where it fits best, is the rest shape.
+
+A whisker tapers to its tip, so that its length determines how thick it is everywhere, and so how it
+bends where. If its tip is too faint to be seen, or not in the image, then of all lengths that are
+not shorter than what is seen, the one is chosen with which the rod explains the traces in contact
+best; how much worse others do gives its standard deviation.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vibrissa.tracking.trace.trace import arc_lengths, interpolated
 from vibrissa.whisker import Whisker
 
 Array = NDArray[np.float64]
@@ -22,16 +30,38 @@ _COMMON = 0.85
 """Share of the usual length over which shapes are compared: tips are uncertain."""
 
 _LEAST = 0.4
-"""Share of that which must be seen to say whether the whisker is bent."""
+"""Share of that which must be seen to decide whether the whisker is bent."""
+
+_FEWEST = 3
+"""Smallest number of frames from which a shape is taken."""
 
 _NEAR = 4.0
+"""Deviation of a free frame at most, in units of the usual one."""
+
 _LONGER = 1.1
+"""Length over which a known whisker may be seen, in units of its own."""
+
 _STILL = 0.01
+"""Usual deviation of free frames at most, as a share of a known whisker's length."""
+
 _ENDS = 3
-"""Frames at rest that show the tip, from which the length is taken."""
+"""Number of frames at rest that show the tip, from which the length is taken."""
 
 _SMOOTH = 4.0
+"""Factor of the noise of a shape: errors of neighbouring points are correlated, so that they seem
+smoother than they are right."""
+
 _ROUNDS = 4
+"""Number of rounds in which the free frames are selected."""
+
+_STEP, _LONGEST = 0.03, 1.45
+"""Step and largest value of the lengths that are tried, as a share of what is seen."""
+
+_CERTAIN = 0.005
+"""Smallest standard deviation of a length, as a share: the taper is not quite that of the rod."""
+
+_OUTER = 0.4
+"""Share of the shape that determines how it continues."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +73,7 @@ class RestShape:
     points : array (n, 3)
         The mean shape, of unit spacing in arc length, in the frame of the best free frame, m.
     free : array (time,)
-        Frames without contact.
+        Whether each frame is free of contact.
     deviation : array (time,)
         Root mean square distance of each shape from the rest shape put on it, m; NaN where the
         whisker is missing.
@@ -61,12 +91,12 @@ class RestShape:
 
     @property
     def spacing(self) -> float:
-        """Of the points, m."""
+        """Distance of the points, m."""
         return float(np.median(np.linalg.norm(np.diff(self.points, axis=0), axis=1)))
 
     @property
     def length(self) -> float:
-        """Along the points, m."""
+        """Length along the points, m."""
         return float(np.linalg.norm(np.diff(self.points, axis=0), axis=1).sum())
 
 
@@ -78,34 +108,32 @@ def rest_shape(curves: Array, least: float = 0.1, tips: Mask | None = None) -> R
     curves : array (time, node, 3)
         The whisker in every frame, equally spaced from base to tip, m; NaN where it is missing.
     least : float
-        Share of the frames that are free of contact, at least.
+        Smallest share of the frames that are free of contact.
     tips : array (time,), optional
-        Frames in which the curve ends at the whisker's tip; by default all.
+        Whether the curve ends at the whisker's tip in each frame; by default in all.
 
     Returns
     -------
     RestShape
-        Points, free frames and deviations.
+        Shape with its free frames and deviations.
 
     Raises
     ------
     ValueError
         If the whisker is seen in less than three frames.
     """
-    seen = np.isfinite(curves).all(axis=(1, 2))
-    if seen.sum() < 3:
-        raise ValueError(
-            f"the whisker is seen in {int(seen.sum())} frames; at least 3 are needed for its shape"
-        )
-    shapes, known, compared, whole = _compared(curves[seen])
+    seen = _seen(curves)
+    _, shapes, known, compared = _compared(curves[seen])
+    whole = _whole(known, compared)
     part = shapes[whole, :compared]
     chords = np.linalg.norm(part[:, ::4, None, :] - part[:, None, ::4, :], axis=-1)
     best, near = _largest_group(chords.reshape(len(part), -1), least)
     group = np.flatnonzero(seen)[whole][near]
     length, ends = _length(curves[group], None if tips is None else tips[group])
-    # The same once more, at places that divide this length evenly.
+    # The same once more, at arc lengths that divide this length evenly.
     first = np.flatnonzero(whole)[best]
-    shapes, known, compared, whole = _compared(curves[seen], length / (curves.shape[1] - 1))
+    _, shapes, known, compared = _compared(curves[seen], length / (curves.shape[1] - 1))
+    whole = _whole(known, compared)
     near = np.isin(np.flatnonzero(seen)[whole], group)
     if not near.any():
         raise ValueError("no frame free of contact shows nearly the whole length of the whisker")
@@ -118,10 +146,9 @@ def rest_shape(curves: Array, least: float = 0.1, tips: Mask | None = None) -> R
         deviation[whole] = _deviations(part, mean)
         usual = float(np.median(deviation[whole][near]))
         near = deviation[whole] < max(_NEAR * usual, 1e-9)
-    rotation, shift = motions(part[near], mean)
-    moved = np.einsum("tij,tnj->tni", rotation, shapes[whole][near]) + shift[:, None]
+    moved = _moved(shapes[whole][near], *motions(part[near], mean))
     points = np.nanmedian(moved[:, : curves.shape[1]], axis=0)
-    # Where less of the whisker is seen, what is seen says whether it is bent.
+    # Where less of the whisker is seen, what is seen shows whether it is bent.
     for i in np.flatnonzero(~whole & (known >= _LEAST * compared)):
         n = min(int(known[i]), len(points))
         deviation[i] = _deviations(shapes[i : i + 1, :n], points[:n])[0]
@@ -133,15 +160,30 @@ def rest_shape(curves: Array, least: float = 0.1, tips: Mask | None = None) -> R
     return RestShape(points, free, out, noise, ends)
 
 
-def _compared(curves: Array, spacing: float | None = None) -> tuple[Array, Counts, int, Mask]:
-    """Shapes at equal lengths, how far each goes, how much is compared, and which show that."""
-    _, shapes = aligned_lengths(curves, spacing)
+def _seen(curves: Array) -> Mask:
+    """Frames that show the whisker, of which there must be some."""
+    seen: Mask = np.all(np.isfinite(curves), axis=(1, 2))
+    if seen.sum() < _FEWEST:
+        raise ValueError(
+            f"the whisker is seen in {int(seen.sum())} frames; at least {_FEWEST} are needed for "
+            "its shape"
+        )
+    return seen
+
+
+def _compared(curves: Array, spacing: float | None = None) -> tuple[float, Array, Counts, int]:
+    """Spacing and shapes at equal lengths, points that each shows, and number of those compared."""
+    spacing, shapes = aligned_lengths(curves, spacing)
     known = np.isfinite(shapes[:, :, 0]).sum(axis=1)
-    compared = int(_COMMON * (curves.shape[1] - 1)) + 1
-    whole = known >= compared
-    if whole.sum() < 3:
+    return spacing, shapes, known, int(_COMMON * (curves.shape[1] - 1)) + 1
+
+
+def _whole(known: Counts, compared: int) -> Mask:
+    """Shapes that show all points that are compared."""
+    whole: Mask = np.asarray(known >= compared, dtype=np.bool_)
+    if whole.sum() < _FEWEST:
         raise ValueError("hardly any two frames show the whisker over the same length")
-    return shapes, known, compared, whole
+    return whole
 
 
 def _length(curves: Array, tips: Mask | None) -> tuple[float, bool]:
@@ -155,10 +197,8 @@ def _length(curves: Array, tips: Mask | None) -> tuple[float, bool]:
 
 def known_rest(curves: Array, whisker: Whisker, least: float = 0.1) -> RestShape:
     """Find the frames in which a known whisker is at rest."""
-    seen = np.isfinite(curves).all(axis=(1, 2))
-    if seen.sum() < 3:
-        raise ValueError(f"the whisker is seen in {int(seen.sum())} frames; 3 are needed at least")
-    spacing, shapes = aligned_lengths(curves[seen])
+    seen = _seen(curves)
+    spacing, shapes, known, compared = _compared(curves[seen])
     shown = spacing * (curves.shape[1] - 1)
     if shown > _LONGER * whisker.length:
         raise ValueError(
@@ -167,15 +207,13 @@ def known_rest(curves: Array, whisker: Whisker, least: float = 0.1) -> RestShape
         )
     s = np.arange(int(whisker.length / spacing) + 1) * spacing
     points = whisker.pose.to_source(whisker.position(np.minimum(s, whisker.length)))
-    compared = int(_COMMON * (curves.shape[1] - 1)) + 1
-    known = np.isfinite(shapes[:, :, 0]).sum(axis=1)
     out = np.full(len(curves), np.nan)
     for row, shape, count in zip(np.flatnonzero(seen), shapes, known, strict=True):
         n = min(int(count), len(points), compared)
         if n >= _LEAST * compared:
             out[row] = _deviations(shape[None, :n], points[:n])[0]
     lowest = np.sort(out[np.isfinite(out)])
-    noise = float(np.median(lowest[: max(3, round(least * len(lowest)))]))
+    noise = float(np.median(lowest[: max(_FEWEST, round(least * len(lowest)))]))
     free = np.zeros(len(curves), dtype=bool)
     if noise < _STILL * whisker.length:
         with np.errstate(invalid="ignore"):
@@ -194,50 +232,40 @@ def whisker_at_rest(shape: RestShape, name: str = "tracked", **properties: float
     Parameters
     ----------
     shape : RestShape
-        Of the tracked frames.
+        Rest shape of the tracked frames.
     name : str
-        Of the whisker.
+        Name of the whisker.
     **properties
         Radius and material; see `vibrissa.Whisker`.
 
     Returns
     -------
     Whisker
-        Its pose leads to the frame of the shape's points.
+        Whisker whose pose leads to the frame of the shape's points.
     """
-    # Errors of neighbouring points go together, so that they look smoother than they are right.
     noise = _SMOOTH * shape.noise
     return Whisker.from_points(shape.points, noise=noise, name=name, **properties)  # type: ignore[arg-type]
 
 
 def aligned_lengths(curves: Array, spacing: float | None = None) -> tuple[float, Array]:
-    """Cut curves at the same arc lengths."""
-    steps = np.linalg.norm(np.diff(curves, axis=1), axis=2)
-    lengths = steps.sum(axis=1)
+    """Cut curves at the same arc lengths; their spacing, m, and points (t, n, 3)."""
     count = curves.shape[1]
+    lengths = [arc_lengths(curve) for curve in curves]
     # Some frames may show less of the whisker, hardly any more.
     if spacing is None:
-        spacing = float(np.percentile(lengths, 75.0)) / (count - 1)
+        spacing = float(np.percentile([each[-1] for each in lengths], 75.0)) / (count - 1)
     s = np.arange(int(1.05 * count)) * spacing
-    shapes = np.full((len(curves), len(s), 3), np.nan)
-    for i, (curve, step) in enumerate(zip(curves, steps, strict=True)):
-        at = np.concatenate([[0.0], np.cumsum(step)])
-        at[-1] *= 1.0 + 1e-9
-        for k in range(3):
-            shapes[i, :, k] = np.interp(s, at, curve[:, k], right=np.nan)
-    return spacing, shapes
+    for each in lengths:
+        each[-1] *= 1.0 + 1e-9
+    pairs = zip(lengths, curves, strict=True)
+    return spacing, np.stack([interpolated(s, at, curve, np.nan) for at, curve in pairs])
 
 
 def _largest_group(signatures: Array, least: float) -> tuple[int, Mask]:
     """Frame that has the nearest neighbours, and which frames are near it."""
-    distance = np.sqrt(
-        np.maximum(
-            (signatures**2).sum(1)[:, None]
-            + (signatures**2).sum(1)[None, :]
-            - 2.0 * signatures @ signatures.T,
-            0.0,
-        )
-    )
+    square = (signatures**2).sum(axis=1)
+    away = square[:, None] + square[None] - 2.0 * signatures @ signatures.T
+    distance = np.sqrt(np.maximum(away, 0.0))
     rank = max(2, round(least * len(signatures)))
     radius = np.sort(distance, axis=1)[:, min(rank, len(signatures) - 1)]
     best = int(np.argmin(radius))
@@ -257,6 +285,55 @@ def motions(shapes: Array, target: Array) -> tuple[Array, Array]:
 
 
 def _onto(shapes: Array, target: Array) -> Array:
-    rotation, shift = motions(shapes, target)
-    moved: Array = np.einsum("tij,tnj->tni", rotation, shapes) + shift[:, None]
-    return moved
+    """Shapes moved to where they are nearest to a target."""
+    return _moved(shapes, *motions(shapes, target))
+
+
+def _moved(shapes: Array, rotation: Array, shift: Array) -> Array:
+    return np.asarray(np.einsum("tij,tnj->tni", rotation, shapes) + shift[:, None])
+
+
+class Length(NamedTuple):
+    """Length of a whisker, m, and its standard deviation: 0 if it is seen, NaN if unknown."""
+
+    value: float
+    sigma: float
+
+
+def lengthened(shape: RestShape, length: float) -> RestShape:
+    """Prolong a shape as it ends."""
+    points, spacing = shape.points, shape.spacing
+    more = round((length - shape.length) / spacing)
+    if more < 1:
+        return shape
+    s = np.arange(1 - len(points), 1) * spacing
+    outer = s > -_OUTER * shape.length
+    bend = np.polynomial.polynomial.polyfit(s[outer], points[outer], 2)
+    ahead = (length - shape.length) / more * np.arange(1, more + 1)
+    there = np.polynomial.polynomial.polyval(ahead, bend).T + points[-1] - bend[0]
+    return replace(shape, points=np.concatenate([points, there]))
+
+
+def likeliest_length(seen: float, cost: Callable[[float], float]) -> Length:
+    """Find the length with which the rod explains the traces best."""
+    lengths = [seen, (1.0 + _STEP) * seen]
+    costs = [cost(length) for length in lengths]
+    while costs[-1] <= min(costs) and lengths[-1] < _LONGEST * seen:
+        lengths.append(lengths[-1] + _STEP * seen)
+        costs.append(cost(lengths[-1]))
+    k = int(np.argmin(costs))
+    if k == len(costs) - 1:
+        return Length(seen, np.nan)
+    if k == 0:
+        lengths.insert(1, (1.0 + 0.5 * _STEP) * seen)
+        costs.insert(1, cost(lengths[1]))
+        k = int(np.argmin(costs[:2]))
+    first = max(k - 1, 0)
+    # A parabola about the lowest of three.
+    a, b, _ = np.polyfit(lengths[first : first + 3], costs[first : first + 3], 2)
+    if not a > 0.0:
+        # It rises, though not as a parabola: one from here to the next.
+        a = (costs[k + 1] - costs[k]) / (lengths[k + 1] - lengths[k]) ** 2
+        return Length(lengths[k], float(np.hypot(a**-0.5, _CERTAIN * seen)))
+    value = float(np.clip(-0.5 * b / a, seen, lengths[-1]))
+    return Length(value, float(np.hypot(a**-0.5, _CERTAIN * seen)))

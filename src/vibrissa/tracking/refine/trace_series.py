@@ -1,4 +1,4 @@
-"""The traces of one whisker over a trial as arrays, and how curves lie beside them."""
+"""The traces of one whisker over a trial as arrays, and the distances of curves from them."""
 
 from __future__ import annotations
 
@@ -8,22 +8,26 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.tracking.trace import Trace
+from vibrissa.tracking.trace.trace import Trace, interpolated
 
 Array = NDArray[np.float64]
 
 NODES = 101
-"""Points of a stored trace."""
+"""Number of points of a stored trace."""
 
 _FLOOR = 0.05
-"""What a trace is never better than, pixels."""
+"""Smallest standard deviation of a trace, pixels."""
 
 _END = 1.0
+"""Standard deviation of a trace's ends along it, pixels."""
+
 _FAR = 6.0
+"""Distance, in pixels, from which the end of a trace is not the tip, and in standard deviations,
+from which an error shows that something else is wrong and is weighted down."""
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class TraceSeries:
     """Traces of one whisker.
 
     Parameters
@@ -35,7 +39,7 @@ class Sight:
     seen : array (time, view, NODES)
         1 where the whisker is seen, 0 where it is bridged.
     confidence : array (time, view)
-        Between 0 and 1.
+        Confidence between 0 and 1.
     ends : array (time, view, 2)
         1 where the whisker is seen to begin and to end there, else 0.
     """
@@ -47,17 +51,18 @@ class Sight:
     ends: Array
 
     @classmethod
-    def of(cls, traces: Sequence[Sequence[Trace]]) -> Sight:
+    def of(cls, traces: Sequence[Sequence[Trace]]) -> TraceSeries:
         """Resample traces.
 
         Parameters
         ----------
         traces : sequence of sequence of Trace
-            View by view, frame by frame.
+            Traces of the whisker, view by view, frame by frame.
 
         Returns
         -------
-        Sight
+        TraceSeries
+            Traces as arrays.
         """
         shape = (len(traces[0]), len(traces), NODES)
         line, sigma, seen = np.full((*shape, 2), np.nan), np.full(shape, np.nan), np.zeros(shape)
@@ -67,75 +72,50 @@ class Sight:
                 n = len(trace.line)
                 if n < 2:
                     continue
-                place = np.linspace(0.0, n - 1.0, NODES)
-                for k in range(2):
-                    line[i, view, :, k] = np.interp(place, np.arange(n), trace.line[:, k])
-                sigma[i, view] = np.interp(place, np.arange(n), trace.sigma)
-                seen[i, view] = np.interp(place, np.arange(n), trace.seen) > 0.5
+                columns = np.column_stack([trace.line, trace.sigma, trace.seen])
+                even = interpolated(np.linspace(0.0, n - 1.0, NODES), np.arange(n), columns)
+                line[i, view], sigma[i, view], seen[i, view] = (
+                    even[:, :2],
+                    even[:, 2],
+                    even[:, 3] > 0.5,
+                )
                 confidence[i, view] = trace.confidence
                 ends[i, view] = trace.base_seen, trace.tip_seen
         return cls(line, sigma, seen, confidence, ends)
 
-    def traces(self, frame: int) -> list[Trace]:
-        """Give one frame's traces.
-
-        Parameters
-        ----------
-        frame : int
-            Which.
-
-        Returns
-        -------
-        list of Trace
-            View by view.
-        """
-        return [
-            Trace(line, sigma, seen > 0.5, float(confidence), *(ends > 0.5).tolist())
-            if np.isfinite(line).all()
-            else Trace.lost()
-            for line, sigma, seen, confidence, ends in zip(
-                self.line[frame],
-                self.sigma[frame],
-                self.seen[frame],
-                self.confidence[frame],
-                self.ends[frame],
-                strict=True,
-            )
-        ]
-
-    def rows(self, frames: NDArray[np.intp]) -> Sight:
-        """Choose frames.
+    def rows(self, frames: NDArray[np.intp]) -> TraceSeries:
+        """Select frames.
 
         Parameters
         ----------
         frames : array (n,)
-            Which.
+            Indices of the frames.
 
         Returns
         -------
-        Sight
-            Of those.
+        TraceSeries
+            Traces in those frames.
         """
-        return Sight(*(getattr(self, name)[frames] for name in vars(self)))
+        return TraceSeries(*(getattr(self, name)[frames] for name in vars(self)))
 
     def equations(self, view: int, pixels: Array, slopes: Array) -> tuple[Array, Array]:
-        """Say by how much points miss the traces of a view.
+        """Distances of points from the traces of a view, and their derivatives.
 
         Parameters
         ----------
         view : int
-            Which.
+            Number of the view.
         pixels : array (time, n, 2)
-            Where the points of a curve from base to tip are seen.
+            Column and row at which the points of a curve from base to tip are seen.
         slopes : array (time, n, 2, 3)
-            How that changes with the points.
+            Derivatives of these by the points, pixels per m.
 
         Returns
         -------
         rows : array (time, n + 2, 3)
-            Gradient of each equation by the place of its point, the last two those of base and tip.
+            Gradient of each equation by its point, the last two those of base and tip.
         misses : array (time, n + 2)
-            In standard deviations; 0 where the trace says nothing.
+            Distances in standard deviations; 0 where the trace shows nothing.
         """
         line, sigma = self.line[:, view], self.sigma[:, view]
         tangent = np.gradient(line, axis=1)
@@ -161,9 +141,9 @@ class Sight:
         deviation = np.sqrt(sigma[row, near] ** 2 + _FLOOR**2)
         beyond = (np.abs(along) > 1.5 * spacing[:, None] + 1.0) | ~np.isfinite(miss)
         weight = np.where(beyond, 0.0, 1.0 / deviation)
-        # An error far beyond what is usual says that something else is wrong.
+        # An error far beyond what is usual shows that something else is wrong.
         scaled = np.abs(miss) * weight
-        weight = weight / np.sqrt(np.maximum(scaled / 6.0, 1.0))
+        weight = weight / np.sqrt(np.maximum(scaled / _FAR, 1.0))
         rows = np.einsum("tni,tnij->tnj", across, slopes) * weight[..., None]
         misses = miss * weight
         ends, gaps = [], []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,7 +12,13 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 STEP = 2.0
-"""Between points of a trace, pixels."""
+"""Distance between points of a trace, pixels."""
+
+_DIRECTION = 4
+"""Points over which the direction is taken in which a line is prolonged before its start."""
+
+_GIVEN = 0.5
+"""Standard deviation of points that a person gives, pixels."""
 
 
 @dataclass(frozen=True)
@@ -24,20 +30,20 @@ class TraceOptions:
     bridge : float
         Longest piece that may be hidden, pixels.
     stiffness : float
-        Of the smoothing, which lets through waves along the whisker longer than about
-        6 · stiffness^(1/6) steps where it is seen to 0.1 pixel.
+        Weight of third differences in the smoothing, which lets through waves along the whisker
+        longer than about 6 · stiffness^(1/6) steps where it is seen to 0.1 pixel.
     scale : float
         Distance of samples across the whisker, pixels: about a third of its width at the base, but
         not below 1.
     shortest : float
-        Shortest whisker that counts, pixels.
+        Length of the shortest whisker that counts, pixels.
     jump : float
-        How far the whisker's first 60 pixels may be from where they are expected, pixels. What is
-        farther away is another whisker. Each frame in which it is lost adds a pixel.
+        Largest distance of the whisker's first 60 pixels from where they are expected, pixels. What
+        is farther away is another whisker. Each frame in which it is lost adds a pixel.
     memory : int
-        Frames over which the usual length is remembered.
+        Number of frames over which the usual length is remembered.
     bright : bool, optional
-        Whether whiskers are bright on dark; by default the first frame tells.
+        Whether whiskers are bright on dark; by default the first frame decides.
     """
 
     bridge: float = 90.0
@@ -61,7 +67,7 @@ class Trace(NamedTuple):
     seen : array (n,)
         Whether each point is seen, not bridged.
     confidence : float
-        Between 0 and 1.
+        Confidence between 0 and 1.
     base_seen, tip_seen : bool
         Whether the whisker is seen to begin and to end there. If not it goes on outside of the
         image, or fades into the noise.
@@ -81,13 +87,13 @@ class Trace(NamedTuple):
         Returns
         -------
         Trace
-            Without points.
+            Trace without points.
         """
         return cls(np.empty((0, 2)), np.empty(0), np.empty(0, dtype=bool), 0.0)
 
     @property
     def length(self) -> float:
-        """Along the line, pixels."""
+        """Length of the line, pixels."""
         return STEP * max(len(self.line) - 1, 0)
 
     @property
@@ -97,26 +103,50 @@ class Trace(NamedTuple):
 
 
 def given(points: ArrayLike) -> Trace:
-    """Make a trace of points that a person says are right."""
+    """Make a trace of points that a person gives."""
     from scipy.interpolate import make_interp_spline
 
     array = np.asarray(points, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != 2 or len(array) < 2 or not np.isfinite(array).all():
-        raise ValueError(f"points of shape {array.shape} are no trace; (n, 2), n ≥ 2, is needed")
-    s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(array, axis=0), axis=1))])
+        raise ValueError(f"points have shape {array.shape}; finite (n, 2), n ≥ 2, are needed")
+    s = arc_lengths(array)
     if not (np.diff(s) > 0.0).all():
         raise ValueError("two points of a trace are the same")
     spline = make_interp_spline(s, array, k=min(3, len(array) - 1))
     line = even(np.asarray(spline(np.linspace(0.0, s[-1], int(s[-1]) + 2))))
-    return Trace(line, np.full(len(line), 0.5), np.ones(len(line), dtype=bool), 1.0)
+    return Trace(line, np.full(len(line), _GIVEN), np.ones(len(line), dtype=bool), 1.0)
+
+
+def arc_lengths(points: Array) -> Array:
+    """Arc length (n,) of the points (n, d) of a polyline."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+
+
+def interpolated(
+    wanted: Array, s: NDArray[Any], points: Array, right: float | None = None
+) -> Array:
+    """Points (m, d) of a polyline at arc lengths, linearly; ``right`` beyond its end."""
+    columns = [np.interp(wanted, s, column, right=right) for column in points.T]
+    return np.stack(columns, axis=1)
 
 
 def even(line: Array, start: float = 0.0) -> Array:
     """Put points `STEP` apart along a line (n, 2), from an arc length on; below zero: before it."""
-    s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    s = arc_lengths(line)
     wanted = np.arange(start, s[-1] + 1e-9, STEP)
     if start < 0.0:
-        direction = (line[min(4, len(line) - 1)] - line[0]) / s[min(4, len(line) - 1)]
+        ahead = min(_DIRECTION, len(line) - 1)
+        direction = (line[ahead] - line[0]) / s[ahead]
         s = np.concatenate([[start], s])
         line = np.concatenate([[line[0] + start * direction], line])
-    return np.stack([np.interp(wanted, s, line[:, k]) for k in range(2)], axis=1)
+    return interpolated(wanted, s, line)
+
+
+def overlap(line: Array, other: Array, near: float = 3.0) -> float:
+    """Share of a line that runs along another, nearer than some pixels."""
+    from scipy.spatial import cKDTree
+
+    if not len(line) or not len(other):
+        return 0.0
+    distance, _ = cKDTree(other).query(line, distance_upper_bound=near)
+    return float(np.isfinite(distance).mean())

@@ -1,9 +1,9 @@
-"""Where to begin: what several frames of all views show together.
+"""Where a whisker begins: what several frames of all views show together.
 
 In one view or one frame a hair may be more like a whisker than the whisker is, or the glint of a
 peg. In each of some frames, lines that may be whiskers are combined, one of each view. A
-combination counts the more, the more its lines are like whiskers and the better the views agree
-about its base and its tip. The bases that outweigh all others over all frames are taken.
+combination has the more weight, the more its lines are like whiskers and the better the views agree
+about its base and its tip. The bases that outweigh all others over all frames are chosen.
 
 What does not move is left out unless nothing moves. Where a view shows the whisker before the
 animal itself, that view does not show where it begins; the other views do.
@@ -19,60 +19,59 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.cameras.camera import Camera
-from vibrissa.cameras.triangulation import triangulate
+from vibrissa.cameras import Camera, triangulate
 from vibrissa.io import Frame
-from vibrissa.tracking import ridge
-from vibrissa.tracking.curves import Curve, find_curves
-from vibrissa.tracking.follow import start_at
-from vibrissa.tracking.scene import Scene
-from vibrissa.tracking.trace import TraceOptions
+from vibrissa.tracking.trace.curves import Curve, find_curves
+from vibrissa.tracking.trace.follower import start_at
+from vibrissa.tracking.trace.ridge import noise_level
+from vibrissa.tracking.trace.scene import Scene
+from vibrissa.tracking.trace.trace import TraceOptions
 
 Array = NDArray[np.float64]
 
 FRAMES = 30
-"""How many frames a start is best found in."""
+"""Number of frames in which a start is best found."""
 
 _VOTES = 10
-"""In how many of them whiskers are looked for."""
+"""Number of those in which whiskers are searched."""
 
 _LINES = 8
-"""How many lines of a view are looked at."""
+"""Largest number of lines of a view that are combined."""
 
 _GAP = 6.0
-"""How far bases are from where the other views say: standard deviation, pixels."""
+"""Standard deviation of bases about where the other views show them, pixels."""
 
 _TIP = 0.15
 """The same of tips, which are cut where they are faint or hidden: as a share of the length."""
 
 _TOGETHER, _SELDOM = 3.0, 0.2
-"""How near tips of one whisker are where both views show them, pixels, and in how many frames that
-is so at least: fewer than half where they are faint."""
+"""Distance within which tips of one whisker agree where both views show them, pixels, and the
+smallest share of frames in which they do: less than half, for they may be faint."""
 
 _SAME = 25.0
-"""How far the base of one whisker moves from frame to frame at most, pixels."""
+"""Largest distance between bases of one whisker in two frames, pixels."""
 
 _LONGER = 30.0
-"""How much longer a line is if it goes on before a body than if it began there, pixels."""
+"""Length by which a line is longer if it goes on before a body than if it began there, pixels."""
 
 _BEFORE = 30.0
-"""How far a line may be followed into a body beyond where it begins, pixels."""
+"""Length over which a line may be followed into a body beyond where it begins, pixels."""
 
 _MOVED = 0.4
-"""Share of a whisker that moves, from which on more is no more."""
+"""Share of a whisker that moves, above which it counts as moving wholly."""
 
 _BETTER = 1.5
-"""By how much more must be seen of a bright whisker than of a dark one."""
+"""Factor by which more must be seen of a bright whisker than of a dark one."""
 
 _LONG = 80.0
-"""Score of what is a whisker rather than a hair."""
+"""Score above which a line is a whisker rather than a hair."""
 
-_HALF_SEEN, _HALF = 0.6, 0.5
-"""How much the confidence is worth if one view alone shows where the whisker begins, and if what
-does not move begins at no face."""
+_ONE_VIEW, _NO_FACE = 0.6, 0.5
+"""Factors of the confidence if one view alone shows where the whisker begins, and if what does not
+move begins at no face."""
 
 _POLARITY = 3
-"""Frames in which that is looked at."""
+"""Number of frames in which bright and dark whiskers are compared."""
 
 _SURE, _GUESS = 0.5, 0.2
 """Confidence below which there is doubt, and below which nothing is found."""
@@ -88,18 +87,18 @@ class Start:
         Column and row of its base in each view, in the first frame that shows it; None if views
         show no line in common.
     lines : list of array (n, 2)
-        View by view, what is taken for the whisker in the frame in which it is seen best; without
-        points where there is nothing.
+        Lines that are taken for the whisker, view by view, in the frame in which it is seen best;
+        without points where there is nothing.
     frame : int
-        Which of the frames that is.
+        Number of that frame.
     bright : bool
         Whether whiskers are bright on a dark background.
     confidence : float
-        Between 0 and 1: how much more frames say so than anything else.
+        Confidence between 0 and 1: how much more frames show this than anything else.
     agreed : tuple of int
-        In how many frames nothing else is likelier, and of how many frames.
+        Number of frames in which nothing else is likelier, and number of frames.
     doubts : tuple of str
-        Why it may be wrong, a sentence each.
+        Reasons why it may be wrong, a sentence each.
     """
 
     bases: list[Array] | None
@@ -131,16 +130,16 @@ def negative(frame: Frame) -> Frame:
 def is_bright(
     frame: Frame, bases: Sequence[ArrayLike] | None = None, options: TraceOptions | None = None
 ) -> bool:
-    """Say whether whiskers are bright on a dark background.
+    """Decide whether whiskers are bright on a dark background.
 
     Parameters
     ----------
     frame : array (height, width)
         Grey values.
     bases : sequence of array_like (2,), optional
-        Where whiskers begin.
+        Columns and rows where whiskers begin.
     options : TraceOptions, optional
-        How they are traced; ``bright``, unless None, is the answer.
+        Settings of tracing; ``bright``, unless None, is the answer.
 
     Returns
     -------
@@ -155,11 +154,11 @@ def is_bright(
 
 
 def _seen(frame: Frame, bases: Sequence[ArrayLike] | None, options: TraceOptions) -> float:
-    """Length that is seen, pixels, the less the less it is like a whisker."""
+    """Length that is seen, pixels, less for what is less like a whisker."""
     if bases is None:
         curves = find_curves(frame, Scene.of([frame], options.scale), options)
         return max((curve.score for curve in curves), default=0.0)
-    noise = ridge.noise_level(frame)
+    noise = noise_level(frame)
     return sum(
         max((t.support for t in start_at(base, options).from_base(frame, noise)), default=0.0)
         for base in bases
@@ -176,9 +175,9 @@ def find_bases(
     cameras : sequence of Camera
         The views.
     frames : sequence of array (height, width)
-        One of each view, of the same moment. Several moments say more: see `find_start`.
+        Frame of each view, of the same moment. Several moments show more: see `find_start`.
     options : TraceOptions, optional
-        How whiskers are traced.
+        Settings of tracing.
 
     Returns
     -------
@@ -200,15 +199,15 @@ def find_start(
     cameras : sequence of Camera
         The views.
     frames : sequence of sequence of array (height, width)
-        View by view, frames of the same moments, the first frame of the film first. Some `FRAMES`
-        that are spread over a whisk or more tell the whisker from what does not move.
+        Frames of the same moments, view by view, the first of the film first. Some 30 that are
+        spread over a whisk or more distinguish the whisker from what does not move.
     options : TraceOptions, optional
-        How whiskers are traced; ``bright``, unless None, is not asked.
+        Settings of tracing; ``bright``, unless None, is not asked.
 
     Returns
     -------
     Start
-        What was found, with its confidence and what there is to doubt.
+        Bases and lines that were found, with their confidence and what there is to doubt.
 
     Raises
     ------
@@ -256,7 +255,7 @@ class _Search:
         return sorted({int(i) for i in np.linspace(0, whole - 1, min(count, whole))})
 
     def vote(self) -> _Vote:
-        """What most frames say: of what moves, or if nothing does, of all that is there."""
+        """What most frames show: of what moves, or if nothing does, of all that is there."""
         moments = self.moments(_VOTES)
         vote = _voted([self._combined(m, self.curves(m, moving=True)) for m in moments])
         if vote.confidence >= _SURE:
@@ -269,17 +268,17 @@ class _Search:
         for view in range(len(self.cameras)):
             if any(shown for other, shown in enumerate(moving) if other != view):
                 other = _voted([self._combined(m, self._before(m, view)) for m in moments])
-                name, confidence = self.cameras[view].name, _HALF_SEEN * other.confidence
+                name, confidence = self.cameras[view].name, _ONE_VIEW * other.confidence
                 other = other._replace(hidden=name, confidence=confidence)
                 vote = max(vote, other, key=lambda one: one.confidence)
         return vote
 
     def _resting(self, vote: _Vote) -> _Vote:
-        """What is said of what does not move, though it could have been seen to."""
+        """The vote for what does not move, though it could have been seen to."""
         if all(scene.background is None for scene in self.scenes):
             return vote
         from_face = all(curve.from_face for one in vote.winners for curve in one.curves)
-        confidence = vote.confidence * (1.0 if from_face else _HALF)
+        confidence = vote.confidence * (1.0 if from_face else _NO_FACE)
         return vote._replace(moves=False, confidence=confidence)
 
     def curves(self, moment: int, moving: bool) -> list[list[Curve]]:
@@ -307,7 +306,7 @@ class _Search:
         return self.scenes[view].background is not None and float(np.median(best)) > _LONG
 
     def _before(self, moment: int, view: int) -> list[list[Curve]]:
-        """Curves of which those of one view may run before a body: they begin where others say."""
+        """Curves of which those of one view may run before a body: they begin where others show."""
         found = self.curves(moment, moving=True)
         first = next(other for other in range(len(found)) if other != view)
         # Where it is seen to begin at a body, hardly more is to be seen before that body.
@@ -363,7 +362,7 @@ class _Search:
 
 
 class _Vote(NamedTuple):
-    """What most frames say."""
+    """What most frames show."""
 
     winners: list[_Combination]  # of the frames that show it
     confidence: float
@@ -402,7 +401,7 @@ def _near(one: _Combination, other: _Combination) -> bool:
 
 
 def _start(search: _Search, vote: _Vote, bright: bool) -> Start:
-    """Say what was found, and what there is to doubt."""
+    """What was found, and what there is to doubt."""
     if not vote.winners or vote.confidence < _GUESS:
         moment = search.moments(_VOTES)[0]
         alone = [
@@ -438,7 +437,7 @@ def _start(search: _Search, vote: _Vote, bright: bool) -> Start:
 
 
 def base_gap(cameras: Sequence[Camera], pixels: Array) -> Array:
-    """Say how far points are from where the views together see them."""
-    place, _ = triangulate(cameras, pixels)
-    seen = np.stack([camera.project(place) for camera in cameras])
+    """Distance of points from where the views together see them, pixels."""
+    point, _ = triangulate(cameras, pixels)
+    seen = np.stack([camera.project(point) for camera in cameras])
     return np.asarray(np.linalg.norm(seen - pixels, axis=-1).max(axis=0))

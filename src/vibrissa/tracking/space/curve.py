@@ -1,11 +1,11 @@
 """One whisker in space from its traces in two or more calibrated views.
 
-A point of one trace lies in another view on its epipolar line (with the paper's orthogonal views:
-in the column of the shared axis). First the traces are matched point by point, both from base to
-tip, so that the distances from those lines are least in sum; this gives a curve in space. Then a
-cubic spline is moved until its images lie on the traces, each trace counting across itself only and
-by its own uncertainty. Where the whisker runs so that no view sees it move in some direction, the
-spline's covariance is large in that direction.
+A point of one trace is in another view on its epipolar line (with the paper's orthogonal views: in
+the column of the shared axis). First the traces are matched point by point, both from base to tip,
+so that the distances from those lines are least in sum; this gives a curve in space. Then a cubic
+spline is moved until its images are on the traces, each trace being weighted by its uncertainty
+across itself. Where the whisker is such that no view sees it move in some direction, the spline's
+covariance is large in that direction.
 """
 
 from __future__ import annotations
@@ -18,30 +18,44 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
-from vibrissa.cameras.camera import Camera
-from vibrissa.cameras.triangulation import triangulate
+from vibrissa.cameras import Camera, triangulate
 from vibrissa.numerics import kernel
-from vibrissa.tracking.trace import Trace
+from vibrissa.tracking.trace.trace import Trace, arc_lengths, interpolated
 
 Array = NDArray[np.float64]
 
 NODES = 101
-"""Points of a whisker in space, equally spaced."""
+"""Number of points of a whisker in space, equally spaced."""
 
 _SAMPLES = 51
+"""Number of points of the spline that are compared with the traces."""
 
-_KNOTS = 14
+_CONTROLS = 14
+"""Number of the spline's control points."""
+
 _ROUNDS = 5
+"""Largest number of Gauss–Newton steps."""
+
 _SPARSE = 2
+"""Distance of the points of traces that are matched, in points."""
+
+_FARTHEST = 30.0
+"""Distance from an epipolar line beyond which more counts no more, pixels."""
 
 _FLOOR = 0.05
-"""What a trace is never better than, pixels: the cameras' calibration and the spline's freedom."""
+"""Smallest standard deviation of a trace, pixels: calibration and the spline's freedom."""
 
 _LOOSE = 0.05
-"""How far third differences of the spline's control points go, as a share of the length."""
+"""Standard deviation of third differences of the control points, as a share of the length."""
 
 _END = 1.0
-"""How well a trace's ends are known along it, pixels."""
+"""Standard deviation of a trace's ends along it, pixels."""
+
+_BEYOND = 6.0
+"""Distance of a tip from the end of a trace from which it is another, pixels."""
+
+_SLIDING = 0.3
+"""Standard deviation of a point's motion along the curve in a round, in units of their distance."""
 
 
 class SpaceCurve(NamedTuple):
@@ -50,9 +64,10 @@ class SpaceCurve(NamedTuple):
     Attributes
     ----------
     points : array (NODES, 3)
-        From base to where the first of the views ends, laboratory frame, m; NaN if there is none.
+        Points from the base to where the first of the views ends, laboratory frame, m; NaN if
+        there is none.
     covariance : array (NODES, 3, 3)
-        Of each point, m².
+        Covariance of each point, m².
     misfit : float
         Root mean square distance of its images from the traces, in their standard deviations.
     """
@@ -68,13 +83,13 @@ class SpaceCurve(NamedTuple):
         Returns
         -------
         SpaceCurve
-            All NaN.
+            Curve of NaN.
         """
         return cls(np.full((NODES, 3), np.nan), np.full((NODES, 3, 3), np.nan), np.nan)
 
     @property
     def length(self) -> float:
-        """Along the points, m."""
+        """Length along the points, m."""
         return float(np.linalg.norm(np.diff(self.points, axis=0), axis=1).sum())
 
 
@@ -84,14 +99,14 @@ def merge(cameras: Sequence[Camera], traces: Sequence[Trace]) -> SpaceCurve:
     Parameters
     ----------
     cameras : sequence of Camera
-        The views.
+        Cameras of the views.
     traces : sequence of Trace
-        Of one whisker in one frame, view by view.
+        Traces of one whisker in one frame, view by view.
 
     Returns
     -------
     SpaceCurve
-        NaN if a trace is missing, or does not show the whisker's base.
+        The whisker; NaN if a trace is missing, or does not show the whisker's base.
 
     Raises
     ------
@@ -105,7 +120,7 @@ def merge(cameras: Sequence[Camera], traces: Sequence[Trace]) -> SpaceCurve:
     start = _matched(cameras, traces)
     if len(start) < 8 or not np.isfinite(start).all():
         return SpaceCurve.none()
-    return _fitted(cameras, traces, _resampled(start, _SAMPLES))
+    return _fitted(cameras, traces, _evenly_spaced(start, _SAMPLES))
 
 
 def _matched(cameras: Sequence[Camera], traces: Sequence[Trace]) -> Array:
@@ -114,7 +129,7 @@ def _matched(cameras: Sequence[Camera], traces: Sequence[Trace]) -> Array:
     partners = [np.zeros(len(first))]
     base = triangulate(cameras, np.stack([trace.line[0] for trace in traces]))[0]
     origin, direction = cameras[0].rays(first)
-    # Two points of each ray beside the base: their images make the epipolar line.
+    # Two points of each ray near the base: their images make the epipolar line.
     depth = ((base - origin) * direction).sum(axis=1)
     scale = 1.0 / np.linalg.norm(cameras[0].project_with_slopes(base)[1], axis=0).max()
     ends = [origin + (depth + 100.0 * sign * scale)[:, None] * direction for sign in (-1.0, 1.0)]
@@ -124,21 +139,20 @@ def _matched(cameras: Sequence[Camera], traces: Sequence[Trace]) -> Array:
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         other = trace.line[::_SPARSE]
         miss = np.abs(other @ normal.T - (a * normal).sum(axis=1)).T
-        partners.append(_partners(np.minimum(miss, 30.0) ** 2))
+        partners.append(_partners(np.minimum(miss, _FARTHEST) ** 2))
     known = np.all([np.isfinite(p) for p in partners], axis=0)
     pixels = [first[known]]
     for p, trace in zip(partners[1:], traces[1:], strict=True):
         other = trace.line[::_SPARSE]
-        place = np.arange(len(other))
-        pixels.append(np.stack([np.interp(p[known], place, other[:, k]) for k in (0, 1)], axis=1))
+        pixels.append(interpolated(p[known], np.arange(len(other)), other))
     return triangulate(cameras, np.stack(pixels))[0]
 
 
 def _partners(cost: Array) -> Array:
-    """For each row the mean column of the cheapest monotone way through; NaN after its end."""
+    """For each row the mean column of the cheapest monotone path; NaN after its end."""
     rows = np.empty(sum(cost.shape), np.int64)
     columns = np.empty_like(rows)
-    count = cheapest(np.ascontiguousarray(cost), rows, columns)
+    count = cheapest_path(np.ascontiguousarray(cost), rows, columns)
     total = np.bincount(rows[:count], columns[:count], cost.shape[0])
     number = np.bincount(rows[:count], minlength=cost.shape[0])
     mean: Array = np.where(number > 0, total / np.maximum(number, 1), np.nan)
@@ -146,8 +160,8 @@ def _partners(cost: Array) -> Array:
 
 
 @kernel
-def cheapest(cost: Any, rows: Any, columns: Any) -> int:
-    """Cheapest way from the first corner to the last row or column, never going back."""
+def cheapest_path(cost: Any, rows: Any, columns: Any) -> int:
+    """Cheapest path from the first corner to the last row or column, never going back."""
     n, m = cost.shape
     total = np.empty((n, m))
     for i in range(n):
@@ -162,7 +176,7 @@ def cheapest(cost: Any, rows: Any, columns: Any) -> int:
                 best = min(best, total[i, j - 1] + 0.05)
             total[i, j] = best + cost[i, j]
     i, j, least = n - 1, m - 1, np.inf
-    # Per place of the way, so that a short one has no advantage.
+    # Per step of the path, so that a short one has no advantage.
     for k in range(m):
         mean = total[n - 1, k] / (n + k)
         if mean <= least:
@@ -191,34 +205,32 @@ def cheapest(cost: Any, rows: Any, columns: Any) -> int:
                 j -= 1
 
 
-def _resampled(points: Array, count: int) -> Array:
-    """Points equally spaced along a polyline; places of no movement are left out."""
+def _evenly_spaced(points: Array, count: int) -> Array:
+    """Points equally spaced along a polyline, without those that hardly move."""
     step = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    kept = np.concatenate([[True], step > 1e-3 * np.median(step)])
-    points = points[kept]
-    s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    wanted = np.linspace(0.0, s[-1], count)
-    return np.stack([np.interp(wanted, s, points[:, k]) for k in range(3)], axis=1)
+    points = points[np.concatenate([[True], step > 1e-3 * np.median(step)])]
+    s = arc_lengths(points)
+    return interpolated(np.linspace(0.0, s[-1], count), s, points)
 
 
-def _knots() -> Array:
-    return np.concatenate([[0.0] * 3, np.linspace(0.0, 1.0, _KNOTS - 2), [1.0] * 3])
+_KNOTS = np.concatenate([[0.0] * 3, np.linspace(0.0, 1.0, _CONTROLS - 2), [1.0] * 3])
+_THIRD = np.diff(np.eye(_CONTROLS), n=3, axis=0)
 
 
 @cache
-def _basis(count: int) -> tuple[Array, Array]:
-    """Spline basis (count, _KNOTS) and its third differences (_KNOTS − 3, _KNOTS)."""
-    basis = BSpline.design_matrix(np.linspace(0.0, 1.0, count), _knots(), 3).toarray()
-    return np.asarray(basis), np.diff(np.eye(_KNOTS), n=3, axis=0)
+def _basis(count: int) -> Array:
+    """Spline basis (count, _CONTROLS) at equal distances."""
+    places = np.linspace(0.0, 1.0, count)
+    return np.asarray(BSpline.design_matrix(places, _KNOTS, 3).toarray())
 
 
 def _fitted(cameras: Sequence[Camera], traces: Sequence[Trace], start: Array) -> SpaceCurve:
     """Gauss–Newton on the distances of the spline's images from the traces."""
-    basis, third = _basis(_SAMPLES)
+    basis = _basis(_SAMPLES)
     control = np.linalg.lstsq(basis, start)[0]
     size = float(np.linalg.norm(np.diff(start, axis=0), axis=1).sum())
-    # Loose: only where nothing is seen does it say how the whisker goes on.
-    stiff = np.kron(third.T @ third, np.eye(3)) / (_LOOSE * size) ** 2
+    # Loose: only where nothing is seen does it matter how the whisker continues.
+    stiff = np.kron(_THIRD.T @ _THIRD, np.eye(3)) / (_LOOSE * size) ** 2
     hessian, misfit = stiff, np.nan
     for _ in range(_ROUNDS):
         node, rows, misses = _equations(cameras, traces, basis @ control)
@@ -230,11 +242,11 @@ def _fitted(cameras: Sequence[Camera], traces: Sequence[Trace], start: Array) ->
         misfit = float(np.sqrt(np.mean((misses - design @ step.reshape(-1)) ** 2)))
         if np.abs(step).max() < 1e-8:
             break
-    spread = np.linalg.inv(hessian).reshape(_KNOTS, 3, _KNOTS, 3)
-    basis, _ = _basis(NODES)
+    spread = np.linalg.inv(hessian).reshape(_CONTROLS, 3, _CONTROLS, 3)
+    basis = _basis(NODES)
     covariance = np.einsum("ik,kalb,il->iab", basis, spread, basis) * max(1.0, misfit**2)
-    points = _resampled(BSpline(_knots(), control, 3)(np.linspace(0.0, 1.0, 8 * NODES)), NODES)
-    return SpaceCurve(points, covariance, misfit)
+    dense = BSpline(_KNOTS, control, 3)(np.linspace(0.0, 1.0, 8 * NODES))
+    return SpaceCurve(_evenly_spaced(dense, NODES), covariance, misfit)
 
 
 def _equations(
@@ -244,11 +256,9 @@ def _equations(
     along = np.gradient(points, axis=0)
     spacing = np.linalg.norm(along, axis=1, keepdims=True)
     # Points may slide along the curve by a part of their distance a round, no more.
-    nodes, rows, misses = (
-        [np.arange(_SAMPLES)],
-        [along / spacing / (0.3 * spacing.mean())],
-        [np.zeros(_SAMPLES)],
-    )
+    nodes = [np.arange(_SAMPLES)]
+    rows = [along / spacing / (_SLIDING * spacing.mean())]
+    misses = [np.zeros(_SAMPLES)]
     for camera, trace in zip(cameras, traces, strict=True):
         pixels, slopes = camera.project_with_slopes(points)
         line = trace.line
@@ -265,8 +275,8 @@ def _equations(
         misses.append(((away * across).sum(axis=1) / sigma)[used])
         for node, end in ((0, 0), (_SAMPLES - 1, -1)):
             gap = float((line[end] - pixels[node]) @ tangent[end])
-            # The whisker may go on in another view where this one no longer shows it.
-            if node == 0 or (trace.tip_seen and abs(gap) < 6.0):
+            # The whisker may continue in another view where this one no longer shows it.
+            if node == 0 or (trace.tip_seen and abs(gap) < _BEYOND):
                 nodes.append(np.array([node]))
                 rows.append(tangent[end][None, :] @ slopes[node] / _END)
                 misses.append(np.array([gap / _END]))

@@ -1,7 +1,7 @@
 """Contact points that do not come from the rod: seen by a person, or nearest to a known object.
 
-They are compared with the contact points of the fitted rod, which knows nothing of them: where both
-agree, each is right.
+They are compared with the contact points of the fitted rod, which does not depend on them: where
+both agree, each is right.
 """
 
 from __future__ import annotations
@@ -13,19 +13,18 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from vibrissa.cameras.camera import Camera
-from vibrissa.cameras.triangulation import triangulate
+from vibrissa.cameras import Camera, triangulate
 from vibrissa.objects import Surface
-from vibrissa.tracking.refine import Refined
+from vibrissa.tracking.refine.fit import RodFit
 
 Array = NDArray[np.float64]
 
 _NEAR = 0.5
-"""How near to a frame's time a row of a table must be to tell of it, frames."""
+"""Largest difference between the time of a frame and that of its row in a table, frames."""
 
 
-class Contacts(NamedTuple):
-    """Contact points of one whisker."""
+class ContactPoints(NamedTuple):
+    """Contact points of one whisker, and their distances from those of the rod."""
 
     points: Array
     arc_length: Array
@@ -34,8 +33,8 @@ class Contacts(NamedTuple):
 
 
 def contacts_at(
-    objects: Sequence[Surface], curves: Array, touching: NDArray[np.bool_], rod: Refined
-) -> Contacts:
+    objects: Sequence[Surface], curves: Array, touching: NDArray[np.bool_], rod: RodFit
+) -> ContactPoints:
     """Take the point of the whisker that is nearest to an object for the contact point."""
     points = np.full((len(curves), 3), np.nan)
     rows = np.flatnonzero(touching & np.isfinite(curves).all(axis=(1, 2)))
@@ -51,8 +50,8 @@ def given_contacts(
     pairs: NDArray[np.int64],
     rate: float,
     whisker: int,
-    rod: Refined,
-) -> Contacts:
+    rod: RodFit,
+) -> ContactPoints:
     """Take contact points from a table."""
     points = np.full((len(pairs), 3), np.nan)
     number = table["whisker"].values
@@ -77,14 +76,14 @@ def given_contacts(
         rows, known = _rows(one["frame"].values, pairs[:, 0], 0.0)
         points[rows] = one["contact_point"].values[known]
     if not np.isfinite(points).any():
-        raise ValueError("the table of contact points tells of no frame of the videos")
+        raise ValueError("the table of contact points has no frame of the videos")
     return _compared(points, rod, "table")
 
 
 def _rows(
     known: NDArray[np.generic], wanted: NDArray[np.generic], within: float
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Places of wanted moments that are known, and of what is known of them."""
+    """Indices of wanted moments that are known, and of the rows that are nearest to them."""
     order = np.argsort(known, kind="stable")
     sorted_ = np.asarray(known, dtype=np.float64)[order]
     target = np.asarray(wanted, dtype=np.float64)
@@ -97,7 +96,7 @@ def _rows(
 
 
 def _lowest(distance: Array) -> Array:
-    """Place (t,) of the least of rows (t, n), between the samples by a parabola."""
+    """Index (t,) of the least of rows (t, n), between the samples by a parabola."""
     n = distance.shape[1]
     row = np.arange(len(distance))
     k = np.clip(np.argmin(distance, axis=1), 1, n - 2)
@@ -107,19 +106,19 @@ def _lowest(distance: Array) -> Array:
     return np.asarray(np.clip(k + np.clip(shift, -1.0, 1.0), 0.0, n - 1.0))
 
 
-def _at(curves: Array, place: Array) -> Array:
-    """Points (t, 3) of curves (t, n, 3) at places between their nodes."""
+def _at(curves: Array, index: Array) -> Array:
+    """Points (t, 3) of curves (t, n, 3) at indices between their nodes."""
     row = np.arange(len(curves))
-    low = np.minimum(place.astype(int), curves.shape[1] - 2)
-    share = (place - low)[:, None]
+    low = np.minimum(index.astype(int), curves.shape[1] - 2)
+    share = (index - low)[:, None]
     return np.asarray((1.0 - share) * curves[row, low] + share * curves[row, low + 1])
 
 
-def _compared(points: Array, rod: Refined, source: str) -> Contacts:
+def _compared(points: Array, rod: RodFit, source: str) -> ContactPoints:
     away = np.linalg.norm(rod.centerline - points[:, None], axis=2)
     known = np.isfinite(away).all(axis=1)
     arc = np.full(len(points), np.nan)
     steps = np.linalg.norm(np.diff(rod.centerline[known], axis=1), axis=2)
     arc[known] = _lowest(away[known] ** 2) * steps.mean(axis=1)
     difference = np.linalg.norm(points - rod.contact_point, axis=1)
-    return Contacts(points, arc, difference, source)
+    return ContactPoints(points, arc, difference, source)

@@ -1,62 +1,87 @@
-"""What touches the whisker, from its shape: contact and wrench that make the rod fit the traces.
+"""The rod that fits the traces: contact and wrench of a whole trial, from the whisker's shape.
 
 Per frame the unknowns are where the base is and how it is turned (six numbers) and, in contact,
 the contact's arc length and force (s_c, f_x, f_y, f_z); they give the bent rod exactly. They are
-chosen such that its images in all views lie on the traces, by least squares over all frames at
+chosen such that its images in all views are on the traces, by least squares over all frames at
 once: from frame to frame the base moves smoothly, and so does the contact as long as it lasts.
 Friction, the force along the whisker, shows in its shape; it is only kept from being much larger
-than the force across. The contact is found this way even where it is hidden, and so are force and
-moment at the base; the covariance says how well.
+than the force across. The contact is found by this even where it is hidden, and so are force and
+moment at the base, with their covariance.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from vibrissa.cameras.camera import Camera
+from vibrissa.cameras import Camera
 from vibrissa.rod import Discretization, discretize, solve_forces
-from vibrissa.tracking.banded import Smoother
-from vibrissa.tracking.head import HeadPose
-from vibrissa.tracking.pose import BasePose
-from vibrissa.tracking.rods import UNKNOWNS, State, bent, first_contacts, rods, tangents
-from vibrissa.tracking.sight import Sight
-from vibrissa.tracking.trust import trace_variance
+from vibrissa.tracking.refine.least_squares import Smoother, trace_variance
+from vibrissa.tracking.refine.rods import (
+    UNKNOWNS,
+    State,
+    bent,
+    first_contacts,
+    pose_slopes,
+    rods,
+    tangents,
+)
+from vibrissa.tracking.refine.trace_series import TraceSeries
+from vibrissa.tracking.space.pose import BasePose, HeadPose
 from vibrissa.whisker import Whisker
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-8, 1e6
+"""Levenberg's damping at the start, at least, and that at which no step helps."""
+
+_SMALL = 1e-4
+"""Share by which the cost must fall for another round."""
+
+_HELD = 1e8
+"""Weight with which frames without contact keep the contact at rest."""
+
+_REST = np.array([0.5, 0.0, 0.0, 0.0])
+"""Contact of a frame that has none: no force, half-way along the whisker."""
+
+_RUBBING = 1e-4
+"""Standard deviation of the force along the whisker if there is none across, in units of EI/L²."""
+
+_WILD = 1e6
+"""Slopes of points of a rod, in units of L, from which it is not in balance."""
+
 
 @dataclass(frozen=True)
-class RefineOptions:
+class FitOptions:
     """How smooth motion and contact are over time, and when the fit ends.
 
-    Standard deviations of second differences at 1,000 frames/s; at other rates they scale with the
-    square of the time between frames.
+    Standard deviations of second differences are those at 1,000 frames/s; at other rates they scale
+    with the square of the time between frames.
 
     Parameters
     ----------
     turning : float
-        Of the base's orientation, rad.
+        Standard deviation of second differences of the base's orientation, rad.
     moving : float
-        Of the base's position, m.
+        Standard deviation of second differences of the base's position, m.
     sliding : float
-        Of the contact's arc length, m.
+        Standard deviation of second differences of the contact's arc length, m.
     pressing : float
-        Of the contact force, in units of EI/L² at the base.
+        Standard deviation of second differences of the contact force, in units of EI/L² at the
+        base.
     friction : float
         Standard deviation of the force along the whisker, as a share of that across it; 0 is a
         contact without friction.
     roll : float
-        How far the roll may be from what it is expected to be, rad.
+        Standard deviation of the roll about what it is expected to be, rad.
     rounds : int
-        Of Gauss–Newton, at most.
+        Largest number of Gauss–Newton steps.
     """
 
     turning: float = 2e-3
@@ -69,31 +94,31 @@ class RefineOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class Refined:
+class RodFit:
     """Pose, contact and wrench of every frame.
 
     Parameters
     ----------
     rotation : array (time, 3, 3)
-        From the whisker's to the laboratory frame; NaN where nothing is known.
+        Rotation from the whisker's to the laboratory frame; NaN where nothing is known.
     position : array (time, 3)
-        Of the base, m.
+        Base point, laboratory frame, m.
     arc_length : array (time,)
-        Of the contact, m; NaN without contact.
+        Arc length of the contact, m; NaN without contact.
     contact_point_whisker, contact_point : array (time, 3)
-        In the whisker's and the laboratory frame, m.
+        Contact point in the whisker's and in the laboratory frame, m.
     contact_covariance : array (time, 3, 3)
-        Of the contact point in the laboratory, m².
+        Covariance of the contact point in the laboratory, m².
     force, moment : array (time, 3)
-        At the base, whisker's frame, N and N·m; 0 without contact.
+        Force and moment at the base, whisker's frame, N and N·m; 0 without contact.
     wrench_covariance : array (time, 6, 6)
-        Of both.
+        Covariance of both.
     pose_covariance : array (time, 6, 6)
-        Of the base's position, m, and of a small turn about the laboratory's axes, rad.
+        Covariance of the base's position, m, and of a small turn about the laboratory's axes, rad.
     pose_wrench_covariance : array (time, 6, 6)
-        Of these with force and moment: both come from the same traces.
+        Covariance of these with force and moment: both come from the same traces.
     centerline : array (time, node, 3)
-        The fitted rod, laboratory frame, m.
+        Points of the fitted rod, laboratory frame, m.
     misfit : array (time,)
         Root mean square distance from the traces, in their standard deviations.
     """
@@ -113,105 +138,110 @@ class Refined:
     misfit: Array
 
 
-def refine(
+def fit_rod(
     cameras: Sequence[Camera],
-    sight: Sight,
+    traces: TraceSeries,
     whisker: Whisker,
     pose: BasePose,
     touching: NDArray[np.bool_],
     curves: Array,
     rate: float,
-    options: RefineOptions | None = None,
+    options: FitOptions | None = None,
     nodes: int = 65,
     head: HeadPose | None = None,
-) -> Refined:
+) -> RodFit:
     """Fit the rod to the traces of a whole trial.
 
     Parameters
     ----------
     cameras : sequence of Camera
-        The views.
-    sight : Sight
-        The traces of one whisker, all frames and views.
+        Cameras of the views.
+    traces : TraceSeries
+        Traces of one whisker, all frames and views.
     whisker : Whisker
-        The whisker at rest.
+        Whisker at rest.
     pose : BasePose
-        How it is held, about, relative to the head.
+        Approximate pose of its base, relative to the head.
     touching : array (time,)
-        Frames in contact.
+        Whether the whisker is in contact in each frame.
     curves : array (time, node, 3)
-        The whisker, about, relative to the head, m; to start from.
+        Approximate points of the whisker, relative to the head, m, from which the fit starts.
     rate : float
         Frames per second.
-    options : RefineOptions, optional
-        How smooth.
+    options : FitOptions, optional
+        Smoothness over time.
     nodes : int
-        Points of the fitted centrelines.
+        Number of points of the fitted centrelines.
     head : HeadPose, optional
-        The head in these frames, relative to which the base moves smoothly; by default it does not
-        move, and its frame is that of the laboratory.
+        Pose of the head in these frames, relative to which the base moves smoothly; by default it
+        does not move, and its frame is that of the laboratory.
 
     Returns
     -------
-    Refined
-        NaN in frames that show nothing.
+    RodFit
+        Pose, contact and wrench; NaN in frames that show nothing.
     """
-    problem, frames = _problem(
-        cameras, sight, whisker, pose, touching, curves, rate, options or RefineOptions(), head
-    )
-    _, state, fit = problem.trusted()
-    found = _answer(problem.d, state, fit, problem.touching, nodes)
-    return _whole(_in_laboratory(found, problem.head), frames, len(curves))
+    options, head = options or FitOptions(), head or HeadPose.still(len(curves))
+    return Fitter(cameras, traces, touching, curves, rate, options, head).fit(whisker, pose, nodes)
 
 
-def cost_of(
-    cameras: Sequence[Camera],
-    sight: Sight,
-    touching: NDArray[np.bool_],
-    curves: Array,
-    rate: float,
-    options: RefineOptions,
-    head: HeadPose,
-) -> Callable[[Whisker, BasePose], float]:
-    """Say how whiskers are compared: by how well they explain the same traces."""
-    variance: Array | None = None
+@dataclass(frozen=True, eq=False)
+class Fitter:
+    """What is common to rods that are fitted to the same traces."""
 
-    def cost(whisker: Whisker, pose: BasePose) -> float:
-        nonlocal variance
-        problem, _ = _problem(cameras, sight, whisker, pose, touching, curves, rate, options, head)
-        if variance is None:
-            # The first says how far the traces are to be trusted.
-            trusted, _, fit = problem.trusted()
-            variance = trusted.variance
-            return fit.cost
-        return replace(problem, variance=variance).solved()[1].cost
+    cameras: Sequence[Camera]
+    traces: TraceSeries
+    touching: Mask
+    curves: Array
+    rate: float
+    options: FitOptions
+    head: HeadPose
 
-    return cost
+    def fit(self, whisker: Whisker, pose: BasePose, nodes: int) -> RodFit:
+        """Fit a whisker of an approximate pose."""
+        problem = self._problem(whisker, pose)
+        _, state, linear = problem.trusted()
+        found = _answer(problem.d, state, linear, problem.touching, nodes)
+        return _whole(_in_laboratory(found, problem.head), problem.frames, len(self.curves))
 
+    def costs(self) -> Callable[[Whisker, BasePose], float]:
+        """Give the function that compares whiskers by how well they explain the traces."""
+        variance: Array | None = None
 
-def _problem(
-    cameras: Sequence[Camera],
-    sight: Sight,
-    whisker: Whisker,
-    pose: BasePose,
-    touching: Mask,
-    curves: Array,
-    rate: float,
-    options: RefineOptions,
-    head: HeadPose | None,
-) -> tuple[_Problem, NDArray[np.intp]]:
-    """Equations of the frames that show something, and which these are."""
-    d = discretize(whisker)
-    known = np.isfinite(pose.rotation).all(axis=(1, 2)) & np.isfinite(curves).all(axis=(1, 2))
-    frames = np.flatnonzero(known)
-    sight, touching = sight.rows(frames), touching[frames]
-    head = (head or HeadPose.still(len(curves))).rows(frames)
-    start = State(
-        pose.rotation[frames], pose.position[frames] / d.length, np.zeros((len(frames), 4))
-    )
-    start.contact[:, 0] = 0.5
-    start.contact[touching] = first_contacts(d, start, curves[frames], touching)[0]
-    return _Problem(d, cameras, sight, touching, frames, start, rate, options, head), frames
+        def cost(whisker: Whisker, pose: BasePose) -> float:
+            nonlocal variance
+            problem = self._problem(whisker, pose)
+            if variance is None:
+                # The first decides how far the traces are to be trusted.
+                trusted, _, linear = problem.trusted()
+                variance = trusted.variance
+                return linear.cost
+            return replace(problem, variance=variance).solved()[1].cost
+
+        return cost
+
+    def _problem(self, whisker: Whisker, pose: BasePose) -> Problem:
+        """Equations of the frames that show something."""
+        d = discretize(whisker)
+        known = np.isfinite(pose.rotation).all(axis=(1, 2))
+        frames = np.flatnonzero(known & np.isfinite(self.curves).all(axis=(1, 2)))
+        touching = self.touching[frames]
+        start = State(
+            pose.rotation[frames], pose.position[frames] / d.length, np.zeros((len(frames), 4))
+        )
+        start.contact[:, 0] = _REST[0]
+        start.contact[touching] = first_contacts(d, start, self.curves[frames], touching)[0]
+        return Problem(
+            d,
+            self.cameras,
+            self.traces.rows(frames),
+            touching,
+            frames,
+            start,
+            self.rate,
+            self.options,
+            self.head.rows(frames),
+        )
 
 
 class _Linear(NamedTuple):
@@ -226,20 +256,22 @@ class _Linear(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class _Problem:
+class Problem:
+    """The equations of a fit: traces, motion over time, and the state from which it starts."""
+
     d: Discretization
     cameras: Sequence[Camera]
-    sight: Sight
+    traces: TraceSeries
     touching: Mask
     frames: NDArray[np.intp]
     start: State
     rate: float
-    options: RefineOptions
+    options: FitOptions
     head: HeadPose
     begun: State | None = None
     variance: Array | None = None
 
-    def trusted(self) -> tuple[_Problem, State, _Linear]:
+    def trusted(self) -> tuple[Problem, State, _Linear]:
         """The problem with traces that are trusted as far as they deserve, and its solution."""
         state, fit = self.solved()
         fitted = np.einsum("tij,tji->t", fit.smoother.covariances(), fit.data)
@@ -249,31 +281,31 @@ class _Problem:
 
     def solved(self) -> tuple[State, _Linear]:
         """Gauss–Newton with Levenberg's damping."""
-        state, damping = self.begun or self.start, 1e-3
-        fit = self._linear(state)
+        state, damping = self.begun or self.start, _DAMPING
+        fit = self.linear(state)
         for _ in range(self.options.rounds):
             step = fit.smoother.solved(damping)
             trial = state.moved(step)
-            tried = self._linear(trial)
+            tried = self.linear(trial)
             if tried.wild.any():
                 # A contact near the thin tip soon has a force under which no rod is in balance.
                 contact = np.where(tried.wild[:, None], state.contact, trial.contact)
                 trial = replace(trial, contact=contact)
-                tried = self._linear(trial)
+                tried = self.linear(trial)
             if tried.cost < fit.cost:
-                small = fit.cost - tried.cost < 1e-4 * fit.cost
+                small = fit.cost - tried.cost < _SMALL * fit.cost
                 state, fit = trial, tried
-                damping = max(damping / 5.0, 1e-8)
+                damping = max(damping / 5.0, _LEAST_DAMPING)
                 if small:
                     break
             else:
                 damping *= 10.0
-                if damping > 1e6:
+                if damping > _MOST_DAMPING:
                     break
         return state, fit
 
-    def _linear(self, state: State) -> _Linear:
-        """Linearise at a state; rods that blow up count as infinitely far away."""
+    def linear(self, state: State) -> _Linear:
+        """Linearise at a state; rods that are not in balance count as infinitely far away."""
         points, slopes = bent(self.d, state, self.touching)
         wild = ~(np.abs(slopes).max(axis=(1, 2, 3)) < _WILD)
         points[wild], slopes[wild] = state.position[wild, None], 0.0
@@ -287,13 +319,13 @@ class _Problem:
         along = []
         for view, camera in enumerate(self.cameras):
             pixels, by_point = camera.project_with_slopes(points)
-            rows, misses = self.sight.equations(view, pixels, by_point * self.d.length)
+            rows, misses = self.traces.equations(view, pixels, by_point * self.d.length)
             design = np.einsum("tni,tnij->tnj", rows, with_ends)
             hessian += np.einsum("tni,tnj->tij", design, design)
             gradient += np.einsum("tni,tn->ti", design, misses)
             total += (misses**2).sum(axis=1)
             count += (misses != 0.0).sum(axis=1)
-            # The last two are how far the ends are off along the trace.
+            # The last two are errors of the ends along the trace.
             along.append(np.where(wild[:, None], 0.0, misses[:, :-2]))
         misfit = np.sqrt(total / np.maximum(count, 1.0))
         total[wild] = np.inf
@@ -312,7 +344,8 @@ class _Problem:
         place = np.concatenate([state.position, turn, state.contact], axis=1)
         # Second differences of the whole motion, of which the start is a part.
         begun = _turning(self.start.rotation)
-        cost = smoother.add_at(place[:, 6:], np.where(self.touching, 0.0, 1e8)[:, None], 6, _REST)
+        held = np.where(self.touching, 0.0, _HELD)[:, None]
+        cost = smoother.add_at(place[:, 6:], held, 6, _REST)
         across = np.linalg.norm(state.contact[:, 2:], axis=1)
         rubbing = 1.0 / (o.friction * across + _RUBBING) ** 2
         cost += smoother.add_at(place[:, 7:8], rubbing[:, None], 7, np.zeros(1))
@@ -335,49 +368,24 @@ class _Problem:
         return cost
 
 
-_RUBBING = 1e-4
-_WILD = 1e6
-"""Slopes of points of a rod, in units of L, from which it is none."""
-
-_REST = np.array([0.5, 0.0, 0.0, 0.0])
-
-
 def _turning(rotation: Array) -> Array:
     """Rotation vectors (t − 1, 3) from each frame to the next, laboratory axes."""
     step = rotation[1:] @ np.swapaxes(rotation[:-1], 1, 2)
     return np.asarray(Rotation.from_matrix(step).as_rotvec())
 
 
-def _answer(d: Discretization, state: State, fit: _Linear, touching: Mask, nodes: int) -> Refined:
+def _answer(d: Discretization, state: State, fit: _Linear, touching: Mask, nodes: int) -> RodFit:
     """Results in SI units, relative to the head."""
     covariance, misfit = fit.smoother.covariances(), fit.misfit
     values, _ = solve_forces(d, state.contact)
     slope = tangents(d, state.contact)
-    n = len(touching)
     force, point = values[:, :3], values[:, 3:]
     wrench = np.concatenate([force * d.force, np.cross(point, force) * d.moment], axis=1)
-    by_contact = np.concatenate(
-        [
-            slope[:, :3] * d.force,
-            np.stack(
-                [
-                    np.cross(slope[:, 3:, k], force) + np.cross(point, slope[:, :3, k])
-                    for k in range(4)
-                ],
-                axis=-1,
-            )
-            * d.moment,
-        ],
-        axis=1,
-    )
+    moment_slope = np.cross(slope[:, 3:], force[:, :, None], axis=1)
+    moment_slope += np.cross(point[:, :, None], slope[:, :3], axis=1)
+    by_contact = np.concatenate([slope[:, :3] * d.force, moment_slope * d.moment], axis=1)
     turned = np.einsum("tij,tj->ti", state.rotation, point)
-    slopes = np.zeros((n, 3, UNKNOWNS))
-    slopes[:, :, :3] = np.eye(3)
-    x, y, z = turned.T
-    slopes[:, 0, 4], slopes[:, 0, 5] = z, -y
-    slopes[:, 1, 3], slopes[:, 1, 5] = -z, x
-    slopes[:, 2, 3], slopes[:, 2, 4] = y, -x
-    slopes[:, :, 6:] = state.rotation @ slope[:, 3:]
+    slopes = np.concatenate([pose_slopes(turned), state.rotation @ slope[:, 3:]], axis=-1)
     inside = covariance[:, 6:, 6:]
     size = np.repeat([d.length, 1.0], 3)
     held = covariance[:, :6, :6] * np.outer(size, size)
@@ -385,22 +393,18 @@ def _answer(d: Discretization, state: State, fit: _Linear, touching: Mask, nodes
     line = rods(d, state.contact, np.linspace(0.0, 1.0, nodes))
     line = np.einsum("tij,tnj->tni", state.rotation, line) + state.position[:, None]
     none = np.where(touching, 1.0, np.nan)
-    return Refined(
+    spread = slopes @ covariance @ np.swapaxes(slopes, 1, 2)
+    wrench_spread = by_contact @ inside @ np.swapaxes(by_contact, 1, 2)
+    return RodFit(
         rotation=state.rotation,
         position=state.position * d.length,
         arc_length=state.contact[:, 0] * d.length * none,
         contact_point_whisker=point * d.length * none[:, None],
         contact_point=(turned + state.position) * d.length * none[:, None],
-        contact_covariance=slopes
-        @ covariance
-        @ np.swapaxes(slopes, 1, 2)
-        * (d.length**2 * none[:, None, None]),
+        contact_covariance=spread * (d.length**2 * none[:, None, None]),
         force=wrench[:, :3] * touching[:, None],
         moment=wrench[:, 3:] * touching[:, None],
-        wrench_covariance=by_contact
-        @ inside
-        @ np.swapaxes(by_contact, 1, 2)
-        * touching[:, None, None],
+        wrench_covariance=wrench_spread * touching[:, None, None],
         pose_covariance=held,
         pose_wrench_covariance=both * touching[:, None, None],
         centerline=line * d.length,
@@ -408,8 +412,8 @@ def _answer(d: Discretization, state: State, fit: _Linear, touching: Mask, nodes
     )
 
 
-def _in_laboratory(found: Refined, head: HeadPose) -> Refined:
-    """Take poses and points from the head's frame to the laboratory's."""
+def _in_laboratory(found: RodFit, head: HeadPose) -> RodFit:
+    """Transform poses and points from the head's frame to the laboratory's."""
     turn = head.rotation
     both = np.zeros((len(turn), 6, 6))
     both[:, :3, :3] = both[:, 3:, 3:] = turn
@@ -425,11 +429,31 @@ def _in_laboratory(found: Refined, head: HeadPose) -> Refined:
     )
 
 
-def _whole(found: Refined, frames: NDArray[np.intp], count: int) -> Refined:
-    """Put the frames in their places among all."""
+def _whole(found: RodFit, frames: NDArray[np.intp], count: int) -> RodFit:
+    """Put the frames among all; NaN in the others."""
     whole = {}
-    for name, values in vars(found).items():
-        out = np.full((count, *values.shape[1:]), np.nan)
-        out[frames] = values
-        whole[name] = out
-    return Refined(**whole)
+    for name in (each.name for each in fields(found)):
+        values = getattr(found, name)
+        whole[name] = np.full((count, *values.shape[1:]), np.nan)
+        whole[name][frames] = values
+    return RodFit(**whole)
+
+
+def with_length_unsure(found: RodFit, other: RodFit, share: float) -> RodFit:
+    """Add to all covariances that of the length, a share of which another fit differs by."""
+    point = share * (other.contact_point - found.contact_point)
+    turn = np.full_like(found.position, np.nan)
+    known = np.isfinite(found.rotation).all(axis=(1, 2)) & np.isfinite(other.rotation).all((1, 2))
+    apart = other.rotation[known] @ np.swapaxes(found.rotation[known], 1, 2)
+    turn[known] = Rotation.from_matrix(apart).as_rotvec()
+    pose = share * np.concatenate([other.position - found.position, turn], axis=1)
+    wrench = share * np.concatenate(
+        [other.force - found.force, other.moment - found.moment], axis=1
+    )
+    return replace(
+        found,
+        contact_covariance=found.contact_covariance + point[:, :, None] * point[:, None],
+        pose_covariance=found.pose_covariance + pose[:, :, None] * pose[:, None],
+        wrench_covariance=found.wrench_covariance + wrench[:, :, None] * wrench[:, None],
+        pose_wrench_covariance=found.pose_wrench_covariance + pose[:, :, None] * wrench[:, None],
+    )

@@ -1,0 +1,1 @@
+"""The rod that fits the traces: contact, force and moment."""

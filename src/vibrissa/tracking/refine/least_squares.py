@@ -1,0 +1,149 @@
+"""Least squares over time, and how far traces are to be trusted.
+
+Each frame has its unknowns, and second differences tie frames together. The normal equations are
+block banded, two blocks wide on each side; they are solved by a banded Cholesky factorisation, and
+the covariance of each frame comes from a forward and a backward recursion over pairs of frames.
+
+The standard deviations of a trace come from the noise of its image. What compression, blur or a
+pattern of the background add is not in them, and the residuals are correlated from point to point,
+for traces are smooth. So the variance of traces, in units of what they claim, is taken from the
+residuals m of the fit,
+
+    v = τ Σ m² / (N − τ p),    τ = 1 + 2 Σ ρ_k,
+
+with N residuals and p numbers that were fitted to them; τ, the sum of their correlations over the
+points of the rod, is the number of neighbours that count as one. A frame that fits worse than is
+usual is trusted less.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solveh_banded
+
+Array = NDArray[np.float64]
+
+_REGULAR = 1e-12
+"""Share of the largest element that is added to diagonals, so that they can be factorised."""
+
+_LEAST = 0.05
+"""Correlation that counts as none."""
+
+_FREE = 0.25
+"""Smallest share of the residuals that are free, however many numbers are fitted."""
+
+
+class Smoother:
+    """Normal equations of a trial."""
+
+    def __init__(self, hessian: Array, gradient: Array) -> None:
+        self.diagonal = hessian.copy()
+        self.first = np.zeros_like(hessian)  # frame i with i + 1; all ties are diagonal
+        self.second = np.zeros_like(hessian)
+        self.gradient = gradient.copy()
+
+    def add_at(self, values: Array, weight: Array, begin: int, target: Array) -> float:
+        """Pull unknowns, from number ``begin`` on, to a target; what that costs."""
+        places = np.arange(begin, begin + values.shape[1])
+        self.diagonal[:, places, places] += weight
+        self.gradient[:, places] += weight * (target - values)
+        return float((weight * (values - target) ** 2).sum())
+
+    def add_along(self, axis: Array, value: Array, begin: int, weight: float) -> float:
+        """Pull one direction of three unknowns to zero; what that costs."""
+        part = slice(begin, begin + 3)
+        self.diagonal[:, part, part] += weight**2 * axis[:, :, None] * axis[:, None, :]
+        self.gradient[:, part] -= weight**2 * axis * value[:, None]
+        return float(((weight * value) ** 2).sum())
+
+    def add_second(self, i: int, value: Array, weight: Array) -> float:
+        """Pull the second difference at a frame to zero; what that costs."""
+        square = weight**2
+        n = np.arange(len(square))
+        pull = square * value
+        for j, factor in ((i - 1, 1.0), (i, -2.0), (i + 1, 1.0)):
+            self.diagonal[j, n, n] += factor**2 * square
+            self.gradient[j] -= factor * pull
+        self.first[i - 1 : i + 1, n, n] -= 2.0 * square
+        self.second[i - 1, n, n] += square
+        return float((pull * value).sum())
+
+    def solved(self, damping: float = 0.0) -> Array:
+        """Solve for the step (time, unknown)."""
+        count, n, _ = self.diagonal.shape
+        band = np.zeros((3 * n, count * n))
+        rows, columns = np.indices((n, n))
+        lower = rows >= columns
+        for i in range(count):
+            start = i * n
+            band[(rows - columns)[lower], start + columns[lower]] = self.diagonal[i][lower]
+            if i + 1 < count:
+                band[n + rows - columns, start + columns] = self.first[i].T
+            if i + 2 < count:
+                band[2 * n + rows - columns, start + columns] = self.second[i].T
+        band[0] += damping * band[0] + _REGULAR * band[0].max()
+        step = solveh_banded(band, self.gradient.reshape(-1), lower=True)
+        return np.asarray(step).reshape(count, n)
+
+    def covariances(self) -> Array:
+        """Blocks (time, unknown, unknown) on the diagonal of the inverse."""
+        count, n, _ = self.diagonal.shape
+        pairs = (count + 1) // 2
+        size = 2 * n
+        middle = np.zeros((pairs, size, size))
+        tie = np.zeros((pairs, size, size))
+        for p in range(pairs):
+            i = 2 * p
+            middle[p, :n, :n] = self.diagonal[i]
+            if i + 1 < count:
+                middle[p, n:, n:] = self.diagonal[i + 1]
+                middle[p, :n, n:] = self.first[i]
+                middle[p, n:, :n] = self.first[i].T
+            else:
+                middle[p, n:, n:] = np.eye(n)
+            if i + 2 < count:
+                tie[p, :n, :n] = self.second[i]
+                tie[p, n:, :n] = self.first[i + 1]
+            if i + 3 < count:
+                tie[p, n:, n:] = self.second[i + 1]
+        middle += _REGULAR * middle.max() * np.eye(size)
+        ahead, back = middle.copy(), middle.copy()
+        for p in range(1, pairs):
+            ahead[p] -= tie[p - 1].T @ np.linalg.solve(ahead[p - 1], tie[p - 1])
+        for p in range(pairs - 2, -1, -1):
+            back[p] -= tie[p] @ np.linalg.solve(back[p + 1], tie[p].T)
+        inverse = np.linalg.inv(ahead + back - middle)
+        blocks = np.stack([inverse[:, :n, :n], inverse[:, n:, n:]], axis=1)
+        return blocks.reshape(2 * pairs, n, n)[:count]
+
+
+def trace_variance(misses: Sequence[Array], fitted: Array) -> Array:
+    """Variance of the traces of each frame, in units of what they claim."""
+    square = np.sum([(one**2).sum(axis=1) for one in misses], axis=0)
+    count = np.sum([(one != 0.0).sum(axis=1) for one in misses], axis=0)
+    shown = count > 0
+    if not square[shown].any():
+        return np.ones(len(square))
+    correlated = _correlated(misses)
+    # Most frames are right, so that the median of them is.
+    usual = float(np.median(square[shown] / count[shown]))
+    spent = correlated * float(fitted[shown].sum()) / float(count[shown].sum())
+    each = np.where(shown, square / np.maximum(count, 1), usual)
+    variance = correlated * np.maximum(each, usual) / max(1.0 - spent, _FREE)
+    # An error of the whisker's shape is common to all frames: none is better than it claims.
+    return np.asarray(np.maximum(variance, 1.0))
+
+
+def _correlated(misses: Sequence[Array]) -> float:
+    """Number of neighbouring residuals that count as one."""
+    total, most = 1.0, min(one.shape[1] for one in misses) // 2
+    size = sum(float((one**2).mean()) for one in misses)
+    for lag in range(1, most):
+        both = sum(float((one[:, lag:] * one[:, :-lag]).mean()) for one in misses)
+        if both < _LEAST * size:
+            break
+        total += 2.0 * both / size
+    return total

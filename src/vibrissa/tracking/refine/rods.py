@@ -1,0 +1,160 @@
+"""Bent rods of many frames at once: their points, how these change, and the roll that they show.
+
+What carries no load keeps its curvature: a whisker that is bent in every frame is rolled, of all
+rolls about the tangent at the base, by the one with which bent rods come nearest to the shapes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from vibrissa.rod import Discretization, discretize, shapes, solve_forces
+from vibrissa.tracking.space.pose import BasePose
+from vibrissa.tracking.trace.trace import arc_lengths, interpolated
+from vibrissa.whisker import Whisker
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+UNKNOWNS = 10
+"""Of a frame: shift (3), turn (3), s_c, f_x, f_y, f_z."""
+
+_SAMPLES = 48
+"""Number of points of a rod that are compared with the traces."""
+
+_STARTS = np.array([0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9])
+"""Arc lengths of contacts from which the fit may start, in units of L."""
+
+_LIMITS = (0.1, 0.995)
+"""Smallest and largest arc length of a contact, in units of L."""
+
+_STEPS = (1e-5, 1e-4, 1e-4, 1e-4)
+"""Steps of differences by arc length and force, in units of L and EI/L²."""
+
+_FRAMES, _TURNS = 9, 24
+"""Numbers of frames and of rolls from which that of a bent whisker is found."""
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Pose and contact of some frames."""
+
+    rotation: Array
+    position: Array
+    contact: Array
+
+    def moved(self, step: Array) -> State:
+        """Change by (t, 10): shift, turn about the axes in which it is held, contact."""
+        turn = Rotation.from_rotvec(step[:, 3:6]).as_matrix()
+        contact = self.contact + step[:, 6:]
+        contact[:, 0] = np.clip(contact[:, 0], *_LIMITS)
+        return State(turn @ self.rotation, self.position + step[:, :3], contact)
+
+
+def bent(d: Discretization, state: State, touching: Mask) -> tuple[Array, Array]:
+    """Points of the bent rods and their derivatives."""
+    s = np.linspace(0.0, 1.0, _SAMPLES)
+    turned = np.einsum("tij,tnj->tni", state.rotation, rods(d, state.contact, s))
+    slopes = np.zeros((*turned.shape, UNKNOWNS))
+    slopes[..., :6] = pose_slopes(turned)
+    rows = np.flatnonzero(touching)
+    change = _differences(lambda contact: rods(d, contact, s), state.contact[rows])
+    slopes[rows, ..., 6:] = np.einsum("tij,tnjk->tnik", state.rotation[rows], change)
+    return turned + state.position[:, None], slopes
+
+
+def pose_slopes(turned: Array) -> Array:
+    """Derivatives (..., 3, 6) of points, relative to the base, by its shift and its turn."""
+    slopes = np.zeros((*turned.shape, 6))
+    slopes[..., :3] = np.eye(3)
+    x, y, z = np.moveaxis(turned, -1, 0)
+    slopes[..., 0, 4], slopes[..., 0, 5] = z, -y
+    slopes[..., 1, 3], slopes[..., 1, 5] = -z, x
+    slopes[..., 2, 3], slopes[..., 2, 4] = y, -x
+    return slopes
+
+
+def _differences(values: Callable[[Array], Array], contact: Array) -> Array:
+    """Central differences of values (t, ...) by the contact (t, 4); (t, ..., 4)."""
+    columns = []
+    for step, axis in zip(_STEPS, np.eye(4), strict=True):
+        ahead, back = values(contact + step * axis), values(contact - step * axis)
+        columns.append((ahead - back) / (2.0 * step))
+    return np.stack(columns, axis=-1)
+
+
+def rods(d: Discretization, contact: Array, s: Array) -> Array:
+    """Points (t, n, 3) of rods with contacts (t, 4), whisker frame, units of L."""
+    values, _ = solve_forces(d, contact)
+    return shapes(d, values, np.ascontiguousarray(contact[:, 0]), s)
+
+
+def tangents(d: Discretization, contact: Array) -> Array:
+    """Derivatives (t, 6, 4) of base force and contact point by the contact."""
+    return _differences(lambda each: solve_forces(d, each)[0], contact)
+
+
+def first_contacts(
+    d: Discretization, state: State, curves: Array, touching: Mask
+) -> tuple[Array, Array]:
+    """Contacts (n, 4) of the touching frames that make the rod look most like the curves."""
+    rows = np.flatnonzero(touching)
+    if not rows.size:
+        return np.empty((0, 4)), np.empty(0)
+    s = np.linspace(0.0, 0.95, 25)
+    cut = [interpolated(s * d.length, arc_lengths(curve), curve, np.nan) for curve in curves[rows]]
+    target = np.stack(cut) / d.length
+    away = target - state.position[rows, None]
+    wanted = np.einsum("tji,tnj->tni", state.rotation[rows], away).reshape(len(rows), -1)
+    known = np.isfinite(wanted)
+    wanted = np.where(known, wanted, 0.0)
+    best, least = np.zeros((len(rows), 4)), np.full(len(rows), np.inf)
+    for place in _STARTS:
+        contact = np.zeros((len(rows), 4))
+        contact[:, 0] = place
+        for _ in range(5):
+            now = rods(d, contact, s).reshape(len(rows), -1) * known
+            columns = []
+            for k in (2, 3):
+                ahead = contact.copy()
+                ahead[:, k] += 1e-4
+                columns.append((rods(d, ahead, s).reshape(len(rows), -1) * known - now) / 1e-4)
+            design = np.stack(columns, axis=-1)
+            square = np.swapaxes(design, 1, 2) @ design
+            right = (np.swapaxes(design, 1, 2) @ (wanted - now)[..., None])[..., 0]
+            step = np.linalg.solve(square + 1e-9 * np.eye(2), right[..., None])[..., 0]
+            size = np.linalg.norm(step, axis=1, keepdims=True)
+            limit = 2.0 / place**2
+            contact[:, 2:] += step * np.minimum(1.0, limit / np.maximum(size, 1e-12))
+        missed = rods(d, contact, s).reshape(len(rows), -1) * known - wanted
+        cost = (missed**2).sum(axis=1)
+        better = cost < least
+        best[better], least[better] = contact[better], cost[better]
+    return best, least
+
+
+def rolled(pose: BasePose, curves: Array, whisker: Whisker) -> BasePose:
+    """Pose with the roll that the bent shapes show."""
+    known = np.flatnonzero(np.isfinite(pose.azimuth) & np.isfinite(curves).all(axis=(1, 2)))
+    frames = known[np.linspace(0, len(known) - 1, min(_FRAMES, len(known))).astype(int)]
+    d = discretize(whisker)
+
+    def cost(roll: float) -> float:
+        turned = replace(pose, roll=np.full(len(pose.azimuth), roll)).rotation[frames]
+        state = State(turned, pose.position[frames] / d.length, np.zeros((len(frames), 4)))
+        all_ = np.ones(len(frames), dtype=bool)
+        return float(first_contacts(d, state, curves[frames], all_)[1].sum())
+
+    best, step = 0.0, 2.0 * np.pi / _TURNS
+    tries = best + step * np.arange(_TURNS)
+    while step > np.radians(1.0):
+        best = float(tries[np.argmin([cost(roll) for roll in tries])])
+        step /= 3.0
+        tries = best + step * np.arange(-2, 3)
+    roll = np.where(np.isfinite(pose.roll), best, np.nan)
+    return replace(pose, roll=roll)

@@ -1,0 +1,172 @@
+"""Which frames of two cameras belong together.
+
+Two views of one point are along lines that meet. In frames of different times the lines to the
+whisker's base and tip pass each other at a distance; the shift between the videos is the one for
+which they pass nearest. Frames that a camera dropped change the shift from there on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vibrissa.cameras import Camera, triangulate
+from vibrissa.tracking.trace.trace import Trace
+
+Array = NDArray[np.float64]
+Pairs = NDArray[np.int64]
+
+_LARGEST = 30
+"""Largest shift that is considered, frames."""
+
+_SHIFTS = np.arange(-_LARGEST, _LARGEST + 1)
+
+_SWITCH = 40.0
+"""Cost of a change of the shift."""
+
+_WORST = 6.0
+"""Largest cost of a frame: square of the distance at which lines pass, pixels²."""
+
+_CLEARLY = 20.0
+"""Cost by which another shift must fit better than the given one."""
+
+_KNOWN = 10
+"""Number of frames that must show an end of the whisker."""
+
+
+def paired_frames(
+    cameras: Sequence[Camera],
+    traces: Sequence[Sequence[Trace]],
+    offset: int | None = 0,
+) -> Pairs:
+    """Find which frames of two or more videos show the same moment.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        Cameras of the views.
+    traces : sequence of sequence of Trace
+        Traces of one whisker, view by view, frame by frame.
+    offset : int, optional
+        Number of frames by which the other videos began earlier than the first: its frame 0 is
+        their frame ``offset``. None: it is found, and dropped frames too.
+
+    Returns
+    -------
+    array (time, view)
+        Frame numbers that belong together.
+
+    Raises
+    ------
+    ValueError
+        If no frames belong together, or the whisker is seen in too few to find the offset.
+    """
+    columns = [np.arange(len(traces[0]))]
+    for camera, row in zip(cameras[1:], traces[1:], strict=True):
+        if offset is not None:
+            shift = np.full(len(traces[0]), offset)
+        else:
+            shift = _shifts(cameras[0], camera, traces[0], row)
+        columns.append(columns[0] + shift)
+    pairs = np.stack(columns, axis=1)
+    # A frame that one camera dropped has no partner; of those that share one the first keeps it.
+    usable = np.ones(len(pairs), dtype=bool)
+    for k, row in enumerate(traces):
+        usable &= (pairs[:, k] >= 0) & (pairs[:, k] < len(row))
+        usable[1:] &= np.diff(pairs[:, k]) > 0
+    if not usable.any():
+        raise ValueError(f"no frames belong together: an offset of {offset} frames is too large")
+    return pairs[usable]
+
+
+def better_offset(
+    first: Camera, second: Camera, a: Sequence[Trace], b: Sequence[Trace], offset: int
+) -> Pairs:
+    """Shifts with which two videos fit clearly better, one after the other; none if none do.
+
+    An error of the calibration is common to all shifts, and does not count.
+    """
+    cost = np.zeros((len(a), len(_SHIFTS)))
+    for end in (0, -1):
+        rows, other = (_shown(row, end) for row in (a, b))
+        if min(len(rows), len(other)) < _KNOWN or abs(offset) > _LARGEST:
+            continue
+        passing = _passing(first, second, a, b, end)
+        passing[~np.isin(np.arange(len(a)), rows)] = np.nan
+        partner = np.arange(len(a))[:, None] + _SHIFTS
+        passing[~np.isin(partner, other)] = np.nan
+        given = passing[:, offset + _LARGEST]
+        if np.isfinite(given).sum() < _KNOWN:
+            continue
+        away = passing - np.nanmedian(given)
+        cost += np.where(np.isfinite(away), np.minimum(away**2, _WORST), 0.5 * _WORST)
+    path = _cheapest(cost)
+    switched = np.concatenate([[True], np.diff(path) != 0])
+    changed = _SWITCH * int(switched[1:].sum()) + _CLEARLY
+    if cost[np.arange(len(a)), path].sum() + changed >= cost[:, offset + _LARGEST].sum():
+        return np.empty(0, dtype=np.int64)
+    return np.asarray(_SHIFTS[path[switched]])
+
+
+def _shown(traces: Sequence[Trace], end: int) -> NDArray[np.intp]:
+    """Frames in which an end of the whisker is seen."""
+    seen = [len(t.line) > 0 and (t.base_seen, t.tip_seen)[end] for t in traces]
+    return np.flatnonzero(seen)
+
+
+def _shifts(first: Camera, second: Camera, a: Sequence[Trace], b: Sequence[Trace]) -> Pairs:
+    """Shift of each frame of the first view, by the cheapest path through all shifts."""
+    few = "the whisker is seen in too few frames to find the cameras' offset"
+    if not all(any(len(trace.line) for trace in row) for row in (a, b)):
+        raise ValueError(few)
+    cost, seen = np.full((len(a), len(_SHIFTS)), _WORST), 0
+    for end in (0, -1):
+        passing = _passing(first, second, a, b, end)
+        known = np.isfinite(passing)
+        seen += int(known.sum())
+        cost[known] += np.minimum(passing[known] ** 2, _WORST) - 0.5 * _WORST
+    if seen < _KNOWN * len(_SHIFTS):
+        raise ValueError(few)
+    return _SHIFTS[_cheapest(cost)]
+
+
+def _passing(
+    first: Camera, second: Camera, a: Sequence[Trace], b: Sequence[Trace], end: int
+) -> Array:
+    """Distance (frame, shift), pixels, at which lines to one end pass; NaN where one is not seen.
+
+    Its sign is the side on which they pass.
+    """
+    ends = [
+        np.array([t.line[end] if len(t.line) else (np.nan, np.nan) for t in row]) for row in (a, b)
+    ]
+    (here, ahead), (there, toward) = first.rays(ends[0]), second.rays(ends[1])
+    passing = np.full((len(a), len(_SHIFTS)), np.nan)
+    for k, shift in enumerate(_SHIFTS.tolist()):
+        rows = np.arange(max(0, -shift), max(0, min(len(a), len(b) - shift)))
+        normal = np.cross(ahead[rows], toward[rows + shift])
+        away = ((there[rows + shift] - here[rows]) * normal).sum(axis=1)
+        passing[rows, k] = away / np.maximum(np.linalg.norm(normal, axis=1), 1e-12)
+    # The scale of the first view where the whisker is; moments do not matter for that.
+    pixels = [row[np.flatnonzero(np.isfinite(row[:, 0]))[0]] for row in ends]
+    place, _ = triangulate((first, second), np.stack(pixels))
+    scale = float(np.linalg.norm(first.project_with_slopes(place)[1], axis=0).max())
+    return passing * scale
+
+
+def _cheapest(cost: Array) -> NDArray[np.intp]:
+    """Path through (time, shift) that seldom changes its shift."""
+    count, width = cost.shape
+    total, came = cost[0].copy(), np.zeros(cost.shape, dtype=np.intp)
+    for i in range(1, count):
+        best = int(np.argmin(total))
+        jump = total[best] + _SWITCH
+        came[i] = np.where(total <= jump, np.arange(width), best)
+        total = np.minimum(total, jump) + cost[i]
+    path = np.empty(count, dtype=np.intp)
+    path[-1] = int(np.argmin(total))
+    for i in range(count - 1, 0, -1):
+        path[i - 1] = came[i, path[i]]
+    return path

@@ -1,0 +1,364 @@
+"""Pose of the head and of the whisker's base in every frame, and low-pass filtering over time.
+
+Base point and emergence angles are found by the paper's method. Without contact the rest shape, put
+on the whisker, gives all. In contact the direction of the base is that of the tangent there; the
+roll, which a bent whisker does not show, follows the azimuth and the elevation as it does in the
+frames without contact. At the end all is filtered over time without phase shift. A straight whisker
+shows no roll at all; then its y axis is taken as level.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+from scipy.signal import butter, sosfiltfilt
+from scipy.spatial.transform import Rotation, Slerp
+
+from vibrissa.tracking.space.rest_shape import RestShape, aligned_lengths, motions
+from vibrissa.tracking.trace.trace import interpolated
+from vibrissa.whisker import Whisker, angles_of, base_rotation
+
+Array = NDArray[np.float64]
+
+CUTOFF = 85.0
+"""The paper's cut-off, Hz."""
+
+_ORDER = 2
+"""Order of the Butterworth filter, which is applied forward and backward."""
+
+_LATE = 1e-6
+"""Share of a frame by which a table of times may be too short."""
+
+_TANGENT = 0.2
+"""Share of the whisker over which the tangent at the base is fitted."""
+
+_WHOLE = 0.85
+"""Share of the whisker over which the rest shape is put on a frame's shape: tips are uncertain."""
+
+
+def low_pass(values: ArrayLike, rate: float, cutoff: float | None = CUTOFF) -> Array:
+    """Filter a signal forward and backward, so that nothing is shifted in time.
+
+    Parameters
+    ----------
+    values : array_like (time, ...)
+        Signal; NaN where it is missing.
+    rate : float
+        Frames per second.
+    cutoff : float, optional
+        Frequency at which half of the power of a wave is left by each of both passes, Hz; None
+        filters nothing.
+
+    Returns
+    -------
+    array (time, ...)
+        Filtered signal, missing where it was missing. Gaps are bridged by straight lines for the
+        filter only.
+
+    Raises
+    ------
+    ValueError
+        If the cut-off is not below half the rate.
+    """
+    array = np.array(values, dtype=np.float64)
+    if cutoff is None:
+        return array
+    if not 0.0 < cutoff < 0.5 * rate:
+        raise ValueError(
+            f"cutoff is {cutoff!r} Hz; it must be positive and below half of {rate} frames/s"
+        )
+    flat = array.reshape(len(array), -1)
+    known = np.isfinite(flat)
+    sections = butter(_ORDER, cutoff, fs=rate, output="sos")
+    pad = min(len(flat) - 1, round(3.0 * rate / cutoff))
+    frames = np.arange(len(flat))
+    for k in range(flat.shape[1]):
+        if known[:, k].sum() < 2:
+            continue
+        whole = np.interp(frames, frames[known[:, k]], flat[known[:, k], k])
+        filtered = sosfiltfilt(sections, whole, padlen=pad)
+        flat[:, k] = np.where(known[:, k], filtered, np.nan)
+    return flat.reshape(array.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class HeadPose:
+    """Position and orientation of the head in every frame.
+
+    Parameters
+    ----------
+    position : array (time, 3)
+        Origin of the head's frame in the laboratory frame, m.
+    rotation : array (time, 3, 3)
+        Rotation from the head's to the laboratory frame.
+    """
+
+    position: Array
+    rotation: Array
+
+    @classmethod
+    def still(cls, count: int) -> HeadPose:
+        """Make a head whose frame is that of the laboratory.
+
+        Parameters
+        ----------
+        count : int
+            Number of frames.
+
+        Returns
+        -------
+        HeadPose
+            Poses without rotation and shift.
+        """
+        return cls(np.zeros((count, 3)), np.broadcast_to(np.eye(3), (count, 3, 3)))
+
+    @classmethod
+    def of(cls, table: xr.Dataset, frames: NDArray[np.int64], rate: float) -> HeadPose:
+        """Find the head's pose in some frames.
+
+        Parameters
+        ----------
+        table : xarray.Dataset
+            ``head_position`` and ``head_rotation`` over time or frame, as `vibrissa.io.load_head`
+            gives them, or those of a recording.
+        frames : array (n,)
+            Numbers of frames of the first video.
+        rate : float
+            Frames per second.
+
+        Returns
+        -------
+        HeadPose
+            Poses frame by frame; between rows of a table over time the head moves straight and
+            turns steadily.
+
+        Raises
+        ------
+        ValueError
+            If the table does not cover all frames.
+        """
+        place = np.asarray(table["head_position"].values, dtype=np.float64)
+        turn = np.asarray(table["head_rotation"].values, dtype=np.float64)
+        if "frame" in table["head_position"].dims:
+            known = table["frame"].values
+            rows = np.clip(np.searchsorted(known, frames), 0, len(known) - 1)
+            missing = frames[known[rows] != frames]
+            if missing.size:
+                raise ValueError(
+                    f"the head's pose is given for {len(known)} frames, {known[0]} to "
+                    f"{known[-1]}; it is missing for {missing.size} frames of the video, the first "
+                    f"of which is {missing[0]}"
+                )
+            return cls(place[rows], turn[rows])
+        known, wanted = table["time"].values, frames / rate
+        late = _LATE / rate
+        if len(known) < 2 or wanted[0] < known[0] - late or wanted[-1] > known[-1] + late:
+            raise ValueError(
+                f"the head's pose is given from {known[0]:g} to {known[-1]:g} s in {len(known)} "
+                f"rows; the video lasts from {wanted[0]:g} to {wanted[-1]:g} s"
+            )
+        at = np.clip(wanted, known[0], known[-1])
+        turned = Slerp(known, Rotation.from_matrix(turn))(at).as_matrix()
+        return cls(interpolated(at, known, place), turned)
+
+    def rows(self, frames: NDArray[np.intp]) -> HeadPose:
+        """Select frames.
+
+        Parameters
+        ----------
+        frames : array (n,)
+            Indices of the frames.
+
+        Returns
+        -------
+        HeadPose
+            Poses in those frames.
+        """
+        return HeadPose(self.position[frames], self.rotation[frames])
+
+    def seen_from(self, points: Array) -> Array:
+        """Transform points from the laboratory's frame to the head's.
+
+        Parameters
+        ----------
+        points : array (time, ..., 3)
+            Points in the laboratory's frame, m.
+
+        Returns
+        -------
+        array (time, ..., 3)
+            Points in the head's frame, m.
+        """
+        away = points - self.position.reshape(-1, *[1] * (points.ndim - 2), 3)
+        return np.asarray(np.einsum("tji,t...j->t...i", self.rotation, away))
+
+    def put_in(self, points: Array) -> Array:
+        """Transform points from the head's frame to the laboratory's.
+
+        Parameters
+        ----------
+        points : array (time, ..., 3)
+            Points in the head's frame, m.
+
+        Returns
+        -------
+        array (time, ..., 3)
+            Points in the laboratory's frame, m.
+        """
+        turned = np.einsum("tij,t...j->t...i", self.rotation, points)
+        return np.asarray(turned + self.position.reshape(-1, *[1] * (points.ndim - 2), 3))
+
+
+@dataclass(frozen=True, eq=False)
+class BasePose:
+    """Pose of a whisker's base in every frame.
+
+    Parameters
+    ----------
+    position : array (time, 3)
+        Base point, laboratory frame, m; NaN where it is not known.
+    azimuth, elevation, roll : array (time,)
+        Emergence angles, rad.
+    """
+
+    position: Array
+    azimuth: Array
+    elevation: Array
+    roll: Array
+
+    @property
+    def rotation(self) -> Array:
+        """Rotation from the whisker's to the laboratory frame, (time, 3, 3)."""
+        return base_rotation(self.azimuth, self.elevation, self.roll)
+
+    def filtered(self, rate: float, cutoff: float | None = CUTOFF) -> BasePose:
+        """Filter everything over time.
+
+        Parameters
+        ----------
+        rate : float
+            Frames per second.
+        cutoff : float, optional
+            Cut-off frequency, Hz; None filters nothing.
+
+        Returns
+        -------
+        BasePose
+            Pose without what is faster.
+        """
+        angles = np.stack([self.azimuth, self.elevation, self.roll], axis=1)
+        known = np.isfinite(angles).all(axis=1)
+        angles[known] = np.unwrap(angles[known], axis=0)
+        smooth = low_pass(angles, rate, cutoff)
+        return BasePose(low_pass(self.position, rate, cutoff), *smooth.T)
+
+
+def base_pose(curves: Array, shape: RestShape, whisker: Whisker) -> BasePose:
+    """Find the pose of the whisker's base, frame by frame.
+
+    Parameters
+    ----------
+    curves : array (time, node, 3)
+        Points of the whisker in the laboratory, equally spaced from base to tip, m; NaN where it is
+        missing.
+    shape : RestShape
+        Rest shape, with the frames that are free of contact.
+    whisker : Whisker
+        Whisker made of it.
+
+    Returns
+    -------
+    BasePose
+        Pose before it is filtered.
+    """
+    n = len(curves)
+    rotation, position = np.full((n, 3, 3), np.nan), np.full((n, 3), np.nan)
+    seen = np.isfinite(curves).all(axis=(1, 2))
+    spacing, shapes = aligned_lengths(curves[seen], shape.spacing)
+    most = int(_WHOLE * min(curves.shape[1], len(shape.points)))
+    known = np.minimum(np.isfinite(shapes[:, :, 0]).sum(axis=1), most)
+    free = shape.free[seen]
+    back = [
+        motions(shape.points[None, :n], part[:n]) for n, part in zip(known, shapes, strict=True)
+    ]
+    turn = np.concatenate([b[0] for b in back])
+    shift = np.concatenate([b[1] for b in back])
+    rotation[seen] = turn @ whisker.pose.rotation
+    position[seen] = turn @ whisker.pose.origin + shift
+    angles = angles_of(rotation)
+    if whisker.is_straight:
+        # Nothing shows its roll; its y axis is taken as level.
+        angles[:, 2] = np.where(np.isfinite(angles[:, 2]), 0.0, np.nan)
+        rotation = base_rotation(*angles.T)
+    touching = np.flatnonzero(seen)[~free]
+    if touching.size and not free.any():
+        angles[seen], position[seen] = _always_bent(shapes, spacing, angles[seen], shape, whisker)
+    elif touching.size:
+        local, start = _tangents(shapes, spacing, whisker.length)
+        # The fitted tangent differs from the whisker's by what it differs without contact.
+        bias = np.median(np.einsum("tji,tj->ti", rotation[seen][free], local[free]), axis=0)
+        offset = np.median(
+            np.einsum("tji,tj->ti", rotation[seen][free], (start - position[seen])[free]), axis=0
+        )
+        guess = angles.copy()
+        direction = local[~free]
+        for _ in range(3):
+            guess[touching, 2] = _roll_like(angles, guess, shape.free)[touching]
+            turned = base_rotation(*guess[touching].T)
+            corrected = direction - (turned @ bias - turned[:, :, 0])
+            guess[touching, :2] = _azimuth_elevation(corrected)
+        angles = guess
+        position[touching] = start[~free] - base_rotation(*angles[touching].T) @ offset
+    return BasePose(position, *angles.T)
+
+
+def _always_bent(
+    shapes: Array, spacing: float, angles: Array, shape: RestShape, whisker: Whisker
+) -> tuple[Array, Array]:
+    """Angles (time, 3) and base points (time, 3) if no frame is free; the roll stays as it is."""
+    local, start = _tangents(shapes, spacing, whisker.length)
+    # The known shape gives the difference of the fitted tangent and its start from the whisker's.
+    unit, begin = _tangents(shape.points[None], spacing, whisker.length)
+    upright = whisker.pose.rotation.T
+    angles = angles.copy()
+    for _ in range(3):
+        turned = base_rotation(*angles.T)
+        direction = local - (turned @ (upright @ unit[0]) - turned[:, :, 0])
+        angles[:, :2] = _azimuth_elevation(direction)
+    turned = base_rotation(*angles.T)
+    return angles, start - turned @ (upright @ (begin[0] - whisker.pose.origin))
+
+
+def _azimuth_elevation(direction: Array) -> Array:
+    """Azimuth and elevation (time, 2) of directions of the base tangent, rad."""
+    x, y, z = direction.T
+    return np.stack([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))], axis=1)
+
+
+def _tangents(shapes: Array, spacing: float, length: float) -> tuple[Array, Array]:
+    """Unit tangents (time, 3) and points (time, 3) at the base, from a cubic over its beginning."""
+    count = max(6, int(_TANGENT * length / spacing))
+    s = np.arange(count) * spacing
+    fit: Array = np.linalg.pinv(np.vander(s, 4, increasing=True))
+    coefficients = np.einsum("kn,tni->tki", fit, shapes[:, :count])
+    tangent = coefficients[:, 1]
+    unit: Array = tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
+    return unit, coefficients[:, 0]
+
+
+def _roll_like(known: Array, guess: Array, free: NDArray[np.bool_]) -> Array:
+    """Roll as a linear function of azimuth and elevation, as without contact; plus slow changes."""
+    usable = free & np.isfinite(known).all(axis=1)
+    design = np.column_stack([np.ones(usable.sum()), known[usable, :2]])
+    middle = design.mean(axis=0)
+    # With little movement a slope is not known, and then none is used.
+    pull = np.diag([0.0, 1e-3, 1e-3]) * usable.sum()
+    center = design - np.array([0.0, *middle[1:]])
+    slope = np.linalg.solve(center.T @ center + pull, center.T @ known[usable, 2])
+    line: Array = slope[0] + (guess[:, :2] - middle[1:]) @ slope[1:]
+    frames = np.arange(len(known))
+    left = np.interp(frames, frames[usable], known[usable, 2] - line[usable])
+    return np.asarray(line + left, dtype=np.float64)

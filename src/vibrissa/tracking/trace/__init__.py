@@ -1,0 +1,1 @@
+"""One image: lines, whiskers in them, and one whisker followed from frame to frame."""

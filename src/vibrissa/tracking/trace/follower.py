@@ -1,0 +1,375 @@
+"""One whisker of one view, followed from frame to frame, and known by its appearance.
+
+Each frame is expected to show what the two before it lead to: from the expected base a Kalman
+filter goes outward along the expected curve (`vibrissa.tracking.trace.ridge.march`), past whatever
+hides the whisker; the curve found is then measured across and smoothed. If less of it is supported
+than was lately, the frame is searched with fewer expectations: no movement, any curvature, any
+direction.
+
+The appearance of a whisker, by which it is recognised where its position does not decide, is the
+length that is seen, how dark the whisker is compared with its surroundings, from its base outward,
+and by how much it turns from one piece to the next. The first two are logarithms, so that
+differences are relative. What it does not show, because the whisker is too short there, is NaN.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vibrissa.io import Frame
+from vibrissa.tracking.trace.ridge import (
+    FEWEST,
+    OUTSIDE,
+    grey_flanks,
+    march,
+    measure,
+    noise_level,
+    smooth,
+    traced,
+)
+from vibrissa.tracking.trace.trace import STEP, Trace, TraceOptions
+
+Array = NDArray[np.float64]
+
+_DARK = ((5, 25), (25, 50), (50, 80))
+_ALONG = ((3, 11), (20, 28), (40, 48), (60, 68))
+"""Points of a trace over which darkness and direction are taken."""
+
+FEATURES = 1 + len(_DARK) + len(_ALONG) - 1
+
+_SPREAD = np.array([0.12, *[0.15] * len(_DARK), *[0.03] * (len(_ALONG) - 1)])
+"""Smallest standard deviation of a whisker's appearance between frames."""
+
+_SHORTER = 3.0
+"""Factor of the spread toward shorter lengths: a whisker may be hidden, but is never longer."""
+
+_MOST = 3.0
+"""Standard deviations beyond which a difference counts no more: contact bends, blur pales."""
+
+_HIDDEN = 2.0
+"""Standard deviations that count where a line does not show what is usual."""
+
+_WEIGHT = 0.5
+"""Weight of the sum of squares: pieces of one whisker do not change independently."""
+
+ENOUGH = 5
+"""Number of frames after which the appearance of a whisker is known."""
+
+_REMEMBERED = 200
+"""Number of frames over which its appearance is remembered."""
+
+_PROXIMAL = 30
+"""Points at the beginning of a line by which it is compared with the expected one."""
+
+_COLD = 6
+"""Number of lines near a base that are traced without expectations."""
+
+_SEARCHED = 5
+"""Number of frames after which a whisker that is seen shorter is searched without expectations."""
+
+_WANTED, _LEAST = 0.85, 0.4
+"""Share of the usual length with which a whisker is found without doubt, and at least."""
+
+_CLICK = 20.0
+"""Standard deviation of a click from the base of its whisker, pixels."""
+
+_BRIGHT = 0.35
+"""Smallest brightness on both sides of a whisker, relative to the bright parts of the image."""
+
+_TURNS = np.radians([-6.0, 6.0, -12.0, 12.0, -18.0, 18.0])
+
+_AROUND = 36.0
+"""How far inside the face the base is searched where it is known by a click only, pixels."""
+
+_SPREADS = {
+    "tight": (np.array([1.0, 0.03, 2e-4]), 4e-5),
+    "loose": (np.array([1.5, 0.10, 2e-3]), 3e-4),
+    "cold": (np.array([2.0, 0.20, 4e-3]), 4e-4),
+}
+"""Standard deviations of offset, direction and curvature at the start, and drift of the last."""
+
+
+class Appearance(NamedTuple):
+    """How a whisker usually looks, and by how much that varies."""
+
+    middle: Array
+    spread: Array
+
+    @classmethod
+    def of(cls, features: Sequence[Array]) -> Appearance:
+        """Take it from the features in some frames."""
+        if len(features) < ENOUGH:
+            return cls(np.full(FEATURES, np.nan), _SPREAD)
+        known = np.array(features)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # of what no frame shows
+            middle = np.nanmedian(known, axis=0)
+            spread = 1.4826 * np.nanmedian(np.abs(known - middle), axis=0)
+        return cls(middle, np.hypot(_SPREAD, np.nan_to_num(spread)))
+
+    def unlikeness(self, features: Array) -> float:
+        """Negative log-likelihood that a line of these features is this whisker."""
+        away = (features - self.middle) / self.spread
+        if away[0] < 0.0:
+            away[0] /= _SHORTER
+        if np.isfinite(features[0]):
+            away[np.isnan(features) & np.isfinite(self.middle)] = _HIDDEN
+        return float(0.5 * _WEIGHT * np.minimum(np.nan_to_num(away) ** 2, _MOST**2).sum())
+
+
+def features_of(frame: Frame, trace: Trace) -> Array:
+    """Features of a traced whisker: length, darkness and turns."""
+    features = np.full(FEATURES, np.nan)
+    n = len(trace.line)
+    if n < 2 or not trace.seen.any():
+        return features
+    offset, amplitude, flank, support = (np.empty(n) for _ in range(4))
+    line = np.ascontiguousarray(trace.line)
+    measure(frame, line, 1, 1.0, 1.0, offset, amplitude, flank, support)
+    contrast = amplitude / np.maximum(flank, 1.0)
+    features[0] = np.log(trace.support)
+    for i, (a, b) in enumerate(_DARK):
+        seen = contrast[a:b][trace.seen[a:b]]
+        if 2 * len(seen) >= b - a:
+            features[1 + i] = np.log(max(float(np.median(seen)), 1e-3))
+    steps = np.diff(line, axis=0)
+    angle = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
+    along = [float(angle[a:b].mean()) if len(angle) >= b else np.nan for a, b in _ALONG]
+    features[1 + len(_DARK) :] = np.diff(along)
+    return features
+
+
+@dataclass
+class Follower:
+    """One whisker in one view, from frame to frame; its base is where about it leaves the face."""
+
+    base: Array
+    options: TraceOptions = field(default_factory=TraceOptions)
+    _before: Trace | None = None
+    _last: Trace | None = None
+    _missing: int = 0
+    _supports: list[float] = field(default_factory=list)
+    _unsearched: int = 0
+    _features: list[Array] = field(default_factory=list)
+    appearance: Appearance = field(default_factory=lambda: Appearance.of(()))
+
+    def restart(self, trace: Trace) -> None:
+        """Continue from a trace of the last frame that is known to be right."""
+        self._before, self._last, self._missing = None, trace, 0
+        self.base = trace.line[0]
+        self._supports = [trace.support]
+
+    def follow(self, frame: Frame) -> Trace:
+        """Find the whisker in the next frame, without regard to others; empty if it is lost."""
+        noise, best = noise_level(frame), Trace.lost()
+        for trace in self.along_expected(frame, noise):
+            if trace.support > best.support:
+                best = trace
+        # A whisker may be seen shorter because it turns toward the camera, frame after frame.
+        steady = best.support >= _WANTED * float(np.median(self._supports[-3:] or [np.inf]))
+        self._unsearched += 1
+        if best.support < self.wanted and not (steady and self._unsearched < _SEARCHED):
+            self._unsearched = 0
+            cold = max(self.from_base(frame, noise), key=self._worth, default=Trace.lost())
+            # What is as good without expectations as with them is no better.
+            if cold.support > 1.1 * best.support:
+                best = cold
+        return self.accept(best) if self._belongs(best) else self.lose()
+
+    @property
+    def usual(self) -> float:
+        """Length that is usually seen, pixels; 0 before anything was."""
+        return float(np.median(self._supports)) if self._supports else 0.0
+
+    @property
+    def wanted(self) -> float:
+        """Length with which it is found without doubt, pixels."""
+        return _WANTED * self.usual if self._supports else np.inf
+
+    @property
+    def expected(self) -> Array | None:
+        """Where the next frame is expected to show it, (n, 2); None before it was ever seen."""
+        moving = self._moving
+        return self.last if moving is None else moving
+
+    @property
+    def last(self) -> Array | None:
+        """Where it was seen last, (n, 2)."""
+        return None if self._last is None else self._last.line
+
+    @property
+    def _moving(self) -> Array | None:
+        """Where the last line will be if it moves on; None if that is not known."""
+        if self._last is None or self._before is None or self._missing:
+            return None
+        before, last = self._before.line, self._last.line
+        n = min(len(before), len(last))
+        velocity = last[:n] - before[:n]
+        beyond = np.repeat(velocity[-1:], len(last) - n, axis=0)
+        return np.asarray(last + np.concatenate([velocity, beyond]))
+
+    @property
+    def reach(self) -> float:
+        """How far from there it may be, pixels: the farther, the longer it is lost."""
+        return self.options.jump + min(self._missing, 60)
+
+    def long_enough(self, trace: Trace) -> bool:
+        """Whether a trace is long enough to be this whisker."""
+        return trace.support >= max(self.options.shortest, _LEAST * self.usual)
+
+    def _belongs(self, trace: Trace) -> bool:
+        """Whether a trace is long enough, and where the whisker may be."""
+        expected = self.expected
+        if expected is None or not self.long_enough(trace):
+            return self.long_enough(trace)
+        n = min(len(expected), len(trace.line), _PROXIMAL)
+        away = np.linalg.norm(expected[4:n] - trace.line[4:n], axis=1)
+        return float(np.median(away)) <= self.reach
+
+    def accept(self, trace: Trace) -> Trace:
+        """Take a trace for the whisker in the next frame; less confident if it is short."""
+        usual = self.usual or trace.support
+        self._before = self._last if self._missing == 0 else None
+        self._last, self._missing = trace, 0
+        self.base = trace.line[0]
+        self._supports = [*self._supports[-self.options.memory :], trace.support]
+        confidence = min(1.0, trace.confidence * min(1.0, trace.support / max(usual, 1.0)))
+        return trace._replace(confidence=confidence)
+
+    def remember(self, features: Array) -> None:
+        """Learn its appearance from a frame in which it was found."""
+        self._features = [*self._features[-_REMEMBERED + 1 :], features]
+        self.appearance = Appearance.of(self._features)
+
+    def lose(self) -> Trace:
+        """Continue without the whisker in the next frame; an empty trace."""
+        self._missing += 1
+        return Trace.lost()
+
+    def carry(self, angle: float, shift: Array) -> None:
+        """Let the whisker, while it is lost, turn about its base and shift as others do."""
+        if self._last is not None:
+            line = _turned(self._last.line, angle) + shift
+            self._last = self._last._replace(line=line)
+            self.base = line[0]
+
+    def along_expected(self, frame: Frame, noise: float) -> Iterator[Trace]:
+        """Trace along where it is expected, with fewer and fewer expectations, until found."""
+        if self.last is None:
+            return
+        moving = self._moving
+        guesses = [(self.last, "tight"), (self.last, "loose")]
+        if moving is not None:
+            guesses = [(moving, "tight"), (moving, "loose"), *guesses]
+        for guess in guesses:
+            trace = self._along(frame, noise, *guess)
+            yield trace
+            if trace.support >= self.wanted:
+                return
+
+    def along_turned(self, frame: Frame, noise: float) -> Iterator[Trace]:
+        """Trace along where it would be had it turned about its base, turn by turn."""
+        expected = self.expected
+        if expected is not None:
+            for angle in _TURNS:
+                yield self._along(frame, noise, _turned(expected, angle), "loose")
+
+    def _along(self, frame: Frame, noise: float, guess: Array, manner: str) -> Trace:
+        """Trace along an expected curve."""
+        tangent = np.arctan2(*np.diff(guess, axis=0).T[::-1])
+        bend = np.diff(np.unwrap(tangent)) / STEP
+        wide = min(9, len(bend) | 1)
+        padded = np.pad(bend, wide // 2, mode="edge")
+        bend = np.convolve(padded, np.ones(wide) / wide, mode="valid")
+        extra = int(self.options.bridge / STEP) + 20
+        bend = np.concatenate([bend, np.full(extra, bend[-20:].mean())])
+        chord = guess[min(6, len(guess) - 1)] - guess[0]
+        start = np.array([*guess[0], np.arctan2(chord[1], chord[0]) - 3.0 * STEP * bend[:6].mean()])
+        return self._finished(frame, noise, *self._march(frame, noise, start, bend, manner))
+
+    def from_base(self, frame: Frame, noise: float, apart: float = np.inf) -> list[Trace]:
+        """Trace in all directions from the base, which is so far from other whiskers' bases.
+
+        Traces are different ones, on bright ground: what is seen on the face is fur.
+        """
+        bend = np.zeros(int(np.hypot(*frame.shape) / STEP))
+        tries = []
+        for angle in np.radians(np.arange(0.0, 360.0, 6.0)):
+            away = 4.0 * self.options.scale * np.array([np.cos(angle), np.sin(angle)])
+            start = np.array([*(self.base + away), angle])
+            tries.append(self._march(frame, noise, start, bend, "cold", apart / 6.0))
+        tries.sort(key=lambda t: -float(np.minimum(t[1], 8.0).sum()))
+        bright = _BRIGHT * float(np.percentile(frame[::8, ::8], 90.0))
+        kept: list[Array] = []
+        found: list[Trace] = []
+        for line, support in tries:
+            if len(found) == _COLD:
+                break
+            if len(line) < FEWEST or any(_alike(line, other) for other in kept):
+                continue
+            kept.append(line)
+            trace = self._finished(frame, noise, line, support, _AROUND)
+            part = trace.line[3:23]
+            if len(part) and float(np.median(grey_flanks(frame, part, 8.0))) > bright:
+                found.append(trace)
+        return found
+
+    def _worth(self, trace: Trace) -> float:
+        """Length that is seen, less the farther from where it is to begin."""
+        away = float(np.linalg.norm(trace.line[0] - self.base)) / _CLICK
+        return trace.support * float(np.exp(-0.5 * away**2))
+
+    def _march(
+        self,
+        frame: Frame,
+        noise: float,
+        start: Array,
+        bend: Array,
+        manner: str,
+        widest: float = np.inf,
+    ) -> tuple[Array, Array]:
+        """Line and support of a march; its offset at the start is at most so uncertain."""
+        spread, drift = _SPREADS[manner]
+        spread = np.array([min(spread[0], widest), *spread[1:]])
+        line, support = np.empty((len(bend) + 1, 2)), np.empty(len(bend) + 1)
+        o = self.options
+        count = march(
+            frame, start, bend, spread, drift, STEP, o.bridge, noise, o.scale, line, support
+        )
+        return line[:count], support[:count]
+
+    def _finished(
+        self, frame: Frame, noise: float, line: Array, support: Array, before: float = OUTSIDE
+    ) -> Trace:
+        """Smooth a marched line over what is hidden, then measure it."""
+        if len(line) < FEWEST:
+            return Trace.lost()
+        line = smooth(line, np.where(support > 0.0, 4.0, 0.0), self.options.stiffness)
+        return traced(frame, noise, line, self.options, before)[0]
+
+
+def _turned(line: Array, angle: float) -> Array:
+    """Turn a line about its first point, from the columns toward the rows."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.asarray(line[0] + (line - line[0]) @ np.array([[c, s], [-s, c]]))
+
+
+def _alike(line: Array, other: Array) -> bool:
+    """Whether two lines begin in the same way."""
+    n = min(len(line), len(other), 2 * _PROXIMAL)
+    distance = np.linalg.norm(line[n // 3 : n, None] - other[None, : n + 5], axis=2).min(axis=1)
+    return bool(np.median(distance) < 2.0)
+
+
+def start_at(base: ArrayLike, options: TraceOptions | None = None) -> Follower:
+    """Begin to follow the whisker that starts about at a column and row."""
+    point = np.asarray(base, dtype=np.float64)
+    if point.shape != (2,) or not np.isfinite(point).all():
+        raise ValueError(f"base is {point.tolist()}; a column and a row are needed")
+    return Follower(point, options or TraceOptions())

@@ -1,0 +1,512 @@
+"""A thin dark line in a grey image: followed, measured across, smoothed, and cut at its ends.
+
+Across the line, at whole steps, the image is sampled bilinearly. A point is *supported* if it is
+darker than both of its sides: the edge of a dark object is darker than one side only. Where it is
+supported, the line's middle is found to a fraction of a pixel by least squares,
+
+    p(x) = b + c x − A g(x − δ) ≈ b + c x − A g(x) + A δ g'(x),
+
+g being a Gaussian about as wide as the blurred line. The smoothing is least squares with a penalty
+on third differences, each point weighted by its own uncertainty, so that what is hidden is bridged
+by a curve of even bend. A whisker begins where it leaves the dark face, and ends where it fades.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg.lapack import dpbsv
+
+from vibrissa.io import Frame
+from vibrissa.numerics import inlined, kernel
+from vibrissa.tracking.trace.trace import STEP, Trace, TraceOptions, even
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+HALF = 4
+"""The fit takes samples from −HALF to HALF."""
+
+WIDTH = 1.4
+"""Standard deviation of g, in steps."""
+
+TURNING = 2.8
+"""Largest turn of a whisker from base to tip, rad: what goes round is not one."""
+
+_CLEARLY_DARK = 3.0
+"""Depth at which a point is supported while a line is followed, standard deviations."""
+
+
+def _fit_rows() -> tuple[Array, float, float]:
+    """Rows that give −A and A δ, and their variances for unit noise."""
+    x = np.arange(-HALF, HALF + 1.0)
+    g = np.exp(-0.5 * (x / WIDTH) ** 2)
+    basis = np.column_stack([np.ones_like(x), x, g, -x / WIDTH**2 * g])
+    inverse = np.linalg.inv(basis.T @ basis)
+    rows = inverse @ basis.T
+    return np.ascontiguousarray(rows[2:]), float(inverse[2, 2]), float(inverse[3, 3])
+
+
+ROWS, DEPTH_VARIANCE, SLOPE_VARIANCE = _fit_rows()
+
+
+@inlined
+def sample(frame: Any, x: float, y: float) -> Any:
+    """Grey value between pixels; the border goes on outside."""
+    rows, columns = frame.shape
+    x = min(max(x, 0.0), columns - 1.001)
+    y = min(max(y, 0.0), rows - 1.001)
+    i, j = int(y), int(x)
+    u, v = x - j, y - i
+    top = (1.0 - u) * frame[i, j] + u * frame[i, j + 1]
+    low = (1.0 - u) * frame[i + 1, j] + u * frame[i + 1, j + 1]
+    return (1.0 - v) * top + v * low
+
+
+@inlined
+def normal(line: Any, k: int) -> Any:
+    """Unit vector to the left (−dy, dx) of a line at one of its points."""
+    a, b = max(k - 1, 0), min(k + 1, line.shape[0] - 1)
+    tx, ty = line[b, 0] - line[a, 0], line[b, 1] - line[a, 1]
+    size = math.sqrt(tx * tx + ty * ty) + 1e-12
+    return -ty / size, tx / size
+
+
+@inlined
+def sample_across(
+    frame: Any, x: float, y: float, nx: float, ny: float, reach: int, scale: float, profile: Any
+) -> None:
+    """Grey values at whole steps along a normal, from −reach to reach."""
+    for i in range(2 * reach + 1):
+        o = (i - reach) * scale
+        profile[i] = sample(frame, x + o * nx, y + o * ny)
+
+
+@inlined
+def depth(p: Any, j: int) -> Any:
+    """How much darker sample j is than the darker one of its two sides."""
+    left = (p[j - 5] + p[j - 4] + p[j - 3]) / 3.0
+    right = (p[j + 3] + p[j + 4] + p[j + 5]) / 3.0
+    return min(left, right) - 0.25 * (p[j - 1] + 2.0 * p[j] + p[j + 1])
+
+
+@inlined
+def fit(p: Any, j: int, rows: Any, out: Any) -> None:
+    """Amplitude A and place δ relative to sample j."""
+    amplitude, product = 0.0, 0.0
+    for i in range(9):
+        amplitude -= rows[0, i] * p[j - 4 + i]
+        product += rows[1, i] * p[j - 4 + i]
+    out[0] = amplitude
+    out[1] = product / amplitude if amplitude > 1e-9 else 0.0
+
+
+@inlined
+def middle_of(histogram: Any, count: int, width: int) -> Any:
+    """Median of numbers that lie at multiples of a width, each being anywhere within it."""
+    seen = 0
+    for d in range(0, histogram.size, width):
+        if 2 * (seen + histogram[d]) >= count:
+            return d - 0.5 * width + width * (0.5 * count - seen) / max(histogram[d], 1)
+        seen += histogram[d]
+    return 0.0
+
+
+@kernel
+def noise_level(frame: Any) -> float:
+    """Standard deviation of the noise, from second differences on a sparse grid.
+
+    Compression removes fine noise and leaves coarse: of differences of single pixels and those that
+    `depth` takes, the larger noise counts.
+    """
+    rows, columns = frame.shape
+    fine, coarse = np.zeros(4096, np.int64), np.zeros(4096, np.int64)
+    count = 0
+    for row in range(3, rows - 3, 9):
+        for column in range(5, columns - 5, 7):
+            p = frame[row, column - 5 : column + 6]
+            d = abs(2 * int(p[5]) - int(p[3]) - int(p[7]))
+            left = int(p[0]) + int(p[1]) + int(p[2])
+            right = int(p[8]) + int(p[9]) + int(p[10])
+            middle = int(p[4]) + 2 * int(p[5]) + int(p[6])
+            fine[min(12 * d, 4095)] += 1
+            coarse[min(abs(4 * (left + right) - 6 * middle), 4095)] += 1
+            count += 1
+    # Variances of both for unit noise; the median of |x| is 0.6745 standard deviations.
+    a = middle_of(fine, count, 12) / (12.0 * 0.6745 * math.sqrt(6.0))
+    b = middle_of(coarse, count, 2) / (12.0 * 0.6745 * math.sqrt(13.0 / 6.0))
+    return float(max(a, b, 0.3))
+
+
+@inlined
+def darkest_expected(profile: Any, gate: int, scale: float, sd: float, variance: float) -> Any:
+    """Depth, in standard deviations, and number of the likeliest sample; depth 0: none is likely.
+
+    Far from where the line is expected only a darker sample counts.
+    """
+    reach = gate + 5
+    best, value, at = 0.0, 0.0, -1
+    for j in range(5, 2 * gate + 6):
+        o = (j - reach) * scale
+        d = depth(profile, j) / sd
+        likely = min(d, 12.0) - 0.5 * o * o / (variance + 0.5 * scale * scale)
+        if likely > best:
+            best, value, at = likely, d, j
+    return value, at
+
+
+@kernel
+def march(
+    frame: Any,
+    start: Any,
+    curvature: Any,
+    spread: Any,
+    drift: float,
+    step: float,
+    bridge: float,
+    noise: float,
+    scale: float,
+    line: Any,
+    support: Any,
+) -> int:
+    """Follow a line outward from a point, as a Kalman filter along arc length.
+
+    Its state is the sideways offset, the direction and the curvature; what it measures is where
+    across the line the image is darkest. Where nothing is seen it continues with the curvature it
+    had, and the gate widens with its variance.
+    """
+    rows, columns = frame.shape
+    x, y, angle, bend = start[0], start[1], start[2], 0.0
+    p00, p11, p22 = spread[0] ** 2, spread[1] ** 2, spread[2] ** 2
+    p01, p02, p12 = 0.0, 0.0, 0.0
+    profile = np.empty(2 * (12 + 5) + 1)
+    found = np.empty(2)
+    sd = 0.8 * noise
+    last, steps = 0, line.shape[0]
+    turned = 0.0
+    for k in range(steps):
+        if k > 0:
+            h = step
+            kappa = curvature[k - 1] + bend
+            x += h * math.cos(angle + 0.5 * kappa * h)
+            y += h * math.sin(angle + 0.5 * kappa * h)
+            angle += kappa * h
+            turned += kappa * h
+            if abs(turned) > TURNING:
+                break
+            # P ← F P Fᵀ + Q with F = [[1, h, h²/2], [0, 1, h], [0, 0, 1]]
+            a01 = p01 + h * p11 + 0.5 * h * h * p12
+            a02 = p02 + h * p12 + 0.5 * h * h * p22
+            p00 = p00 + h * p01 + 0.5 * h * h * p02 + h * a01 + 0.5 * h * h * a02
+            p01 = a01 + h * a02
+            p02 = a02
+            p11 = p11 + 2.0 * h * p12 + h * h * p22
+            p12 = p12 + h * p22
+            p22 += drift * drift * h
+        line[k, 0], line[k, 1] = x, y
+        support[k] = 0.0
+        if x < 2.0 or y < 2.0 or x > columns - 3.0 or y > rows - 3.0:
+            break
+        nx, ny = -math.sin(angle), math.cos(angle)
+        gate = min(12, math.ceil(3.0 * math.sqrt(p00) / scale + 0.7))
+        reach = gate + 5
+        sample_across(frame, x, y, nx, ny, reach, scale, profile)
+        value, at = darkest_expected(profile, gate, scale, sd, p00)
+        if value > _CLEARLY_DARK:
+            fit(profile, at, ROWS, found)
+            if found[0] > 0.0:
+                offset = (at - reach + min(max(found[1], -1.5), 1.5)) * scale
+                r = (noise * scale / found[0]) ** 2 * SLOPE_VARIANCE + 0.01 * scale * scale
+                total = p00 + r
+                k0, k1, k2 = p00 / total, p01 / total, p02 / total
+                x += k0 * offset * nx
+                y += k0 * offset * ny
+                angle += k1 * offset
+                turned += k1 * offset
+                bend += k2 * offset
+                p22 -= k2 * p02
+                p12 -= k1 * p02
+                p11 -= k1 * p01
+                p02 -= k0 * p02
+                p01 -= k0 * p01
+                p00 -= k0 * p00
+                line[k, 0], line[k, 1] = x, y
+                support[k] = value
+                last = k + 1
+        if (k - last + 1) * step > bridge:
+            break
+    return last
+
+
+@kernel
+def measure(
+    frame: Any,
+    line: Any,
+    gate: int,
+    noise: float,
+    scale: float,
+    offset: Any,
+    amplitude: Any,
+    flank: Any,
+    support: Any,
+) -> None:
+    """Measure a line across a curve near it."""
+    n = line.shape[0]
+    rows, columns = frame.shape
+    reach = gate + 5
+    profile = np.empty(2 * reach + 1)
+    found = np.empty(2)
+    for k in range(n):
+        nx, ny = normal(line, k)
+        x, y = line[k, 0], line[k, 1]
+        offset[k], amplitude[k], support[k], flank[k] = 0.0, 0.0, 0.0, 0.0
+        if x < 1.0 or y < 1.0 or x > columns - 2.0 or y > rows - 2.0:
+            continue
+        sample_across(frame, x, y, nx, ny, reach, scale, profile)
+        best, at = -1e9, reach
+        for j in range(5, 2 * gate + 6):
+            d = depth(profile, j) - 0.02 * noise * (j - reach) ** 2
+            if d > best:
+                best, at = d, j
+        fit(profile, at, ROWS, found)
+        offset[k] = (at - reach + min(max(found[1], -1.0), 1.0)) * scale
+        amplitude[k] = found[0]
+        support[k] = depth(profile, at) / (0.8 * noise)
+        flank[k] = (
+            0.5 * (profile[at - 5] + profile[at + 5] + profile[at - 4] + profile[at + 4]) / 2.0
+        )
+
+
+@kernel
+def flanks(frame: Any, line: Any, distance: float, out: Any) -> None:
+    """Grey values at a distance from a curve, to its left (−dy, dx) and to its right."""
+    for k in range(line.shape[0]):
+        nx, ny = normal(line, k)
+        out[k, 0] = sample(frame, line[k, 0] + distance * nx, line[k, 1] + distance * ny)
+        out[k, 1] = sample(frame, line[k, 0] - distance * nx, line[k, 1] - distance * ny)
+
+
+_SUPPORTED = 2.5
+"""Depth at which a point of a line that is about known is supported, standard deviations."""
+
+_MEDIAN = 0.455
+"""Median of the square of a standard normal number."""
+
+OUTSIDE = 12.0
+"""How far inside the face the base is searched, pixels."""
+
+FEWEST = 12
+"""Number of points of the shortest line that is considered."""
+
+_FUR = 3
+"""Number of points next to the face that are not measured: fur is dark too."""
+
+_BEYOND = 12
+"""Number of points beyond the last supported one in which the tip is searched."""
+
+_BORDER = 8.0
+"""Distance from the image's border within which a line may end because the image does, pixels."""
+
+_CLEAR = 3.0
+"""Standard deviations by which each of a line's last points must be darker than what is beyond for
+its end to be seen: then it is known to a point."""
+
+_SMOOTHED = 0.6
+"""Noise below which an image is not as a sensor gives it, grey values: twice that of rounding."""
+
+_LAST = 10
+"""Number of points before the end, and twice that of points beyond, that decide this."""
+
+_FLANKS = (4.0, 7.0)
+"""Distances from the whisker at which the face's edge is searched, pixels."""
+
+_TAPERED = 0.6
+"""Darkness of a whisker relative to the twenty points before, at least: it tapers."""
+
+
+class Measured(NamedTuple):
+    """What was measured along a line, point by point."""
+
+    amplitude: Array
+    sigma: Array
+    seen: Mask
+    open: Mask
+    noise: float
+
+    def part(self, rows: slice) -> Measured:
+        """Select points."""
+        return Measured(
+            self.amplitude[rows], self.sigma[rows], self.seen[rows], self.open[rows], self.noise
+        )
+
+
+def measured(
+    frame: Frame, line: Array, gate: int, noise: float, options: TraceOptions, skipped: int = 0
+) -> tuple[Array, Measured]:
+    """Measure across a line and smooth it."""
+    n = len(line)
+    offset, amplitude, flank, support = (np.empty(n) for _ in range(4))
+    measure(frame, line, gate, noise, options.scale, offset, amplitude, flank, support)
+    seen = (support > _SUPPORTED) & (amplitude > 0.0)
+    variance = SLOPE_VARIANCE * (noise * options.scale / np.maximum(amplitude, 1e-3)) ** 2
+    seen[:skipped] = False
+    weight = np.where(seen, 1.0 / (variance + 0.03**2), 0.0)
+    tangent = np.gradient(line, axis=0)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    points = line + offset[:, None] * np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+    better = smooth(points, weight, options.stiffness)
+    # What is far from its neighbours counts less, the second time.
+    miss = ((points - better) ** 2).sum(axis=1) * weight
+    # Compression removes noise where nothing is, and adds it where something is.
+    excess = max(1.0, float(np.median(miss[seen])) / _MEDIAN) if seen.any() else 1.0
+    weight, miss = weight / excess, miss / excess
+    weight = np.where(miss > 9.0, weight * 9.0 / np.maximum(miss, 9.0), weight)
+    better = smooth(points, weight, options.stiffness)
+    information = np.convolve(weight, np.ones(min(9, n)), mode="same")
+    sigma = 1.0 / np.sqrt(np.maximum(information, 1.0))
+    sigma += 0.05 * (0.1 * STEP * _distance_to_seen(seen)) ** 1.5
+    open_ = flank > 0.6 * np.median(flank)
+    return better, Measured(amplitude, sigma, seen, open_, noise * float(np.sqrt(excess)))
+
+
+def _distance_to_seen(seen: Mask) -> Array:
+    """Number of points between each and the nearest that is seen; 1000 if none is."""
+    known, points = np.flatnonzero(seen), np.arange(len(seen))
+    if not known.size:
+        return np.full(len(seen), 1e3)
+    after = np.clip(np.searchsorted(known, points), 0, len(known) - 1)
+    before = np.maximum(after - 1, 0)
+    nearest = np.minimum(np.abs(known[after] - points), np.abs(points - known[before]))
+    return np.asarray(nearest, dtype=np.float64)
+
+
+def smooth(line: Array, weight: Array, stiffness: float) -> Array:
+    """Smooth a line (n, 2): weighted least squares with a penalty on third differences."""
+    band = stiffness * _third_differences(len(line))
+    # A little pull to the first point, so that lines without any measurement have an answer.
+    band[0] += weight + 1e-6
+    # Not solveh_banded, whose checks take longer than the solution.
+    return np.asarray(dpbsv(band, weight[:, None] * (line - line[0]), lower=1)[1] + line[0])
+
+
+@cache
+def _third_differences(n: int) -> Array:
+    """Lower bands (4, n) of Dᵀ D, where D takes the third differences of n numbers."""
+    row, band = np.array([-1.0, 3.0, -3.0, 1.0]), np.zeros((4, n))
+    for k in range(4):
+        band[k, : n - k] = np.convolve(np.ones(n - 3), row[: 4 - k] * row[k:])
+    return band
+
+
+def traced(
+    frame: Frame, noise: float, line: Array, options: TraceOptions, before: float = OUTSIDE
+) -> tuple[Trace, bool]:
+    """Trace a whisker that is about known, and find its ends; whether it begins at the face."""
+    line = _lengthened(even(line))
+    for gate in (3, 2):
+        line = even(measured(frame, line, gate, noise, options)[0])
+        if len(line) < FEWEST:
+            # Where nothing is seen, nothing holds the line apart.
+            return Trace.lost(), False
+    line, from_face = _with_base(frame, line, before)
+    if before > OUTSIDE and len(line) >= FEWEST:
+        # What was only guessed is measured before it counts.
+        line = even(measured(frame, line, 3, noise, options, _FUR if from_face else 0)[0])
+    if len(line) < FEWEST:
+        return Trace.lost(), False
+    if not from_face:
+        # Without a face it begins as it ends: where the line does.
+        line = _lengthened(line[::-1])[::-1]
+    line, along = measured(frame, line, 1, noise, options, _FUR if from_face else 0)
+    first = 0 if from_face else len(line) - _tip(along.part(slice(None, None, -1)))
+    last = _tip(along)
+    if last - first < FEWEST:
+        return Trace.lost(), False
+    # An image without noise was smoothed, as by compression, and what is faint went with it.
+    tip_seen = noise > _SMOOTHED and _inside(frame, line[last - 1])
+    tip_seen = tip_seen and _stops(frame, line, along, last)
+    line, along = line[first:last], along.part(slice(first, last))
+    trusted = min(1.0, float(along.seen.sum() / max(along.open.sum(), 1)))
+    base_seen = _inside(frame, line[0])
+    return Trace(line, along.sigma, along.seen, trusted, base_seen, tip_seen), from_face
+
+
+def _with_base(frame: Frame, line: Array, before: float) -> tuple[Array, bool]:
+    """Let a line begin where the whisker leaves the face."""
+    longer = even(line, -before)
+    near, far = (_edge(frame, longer[:40], distance) for distance in _FLANKS)
+    if near is None:
+        return line, False
+    at = near
+    if far is not None and abs(far - near) < 2.0:
+        # The face is round: to second order in the distance, its edge on the whisker itself.
+        a, b = _FLANKS
+        at = near + (near - far) * a * a / (b * b - a * a)
+    return even(longer, max(at, 0.0) * STEP), True
+
+
+def _edge(frame: Frame, line: Array, distance: float) -> float | None:
+    """Point number at which both sides of a line come out of the dark, on average."""
+    numbers = []
+    for level in grey_flanks(frame, line, distance).T:
+        bright, dark = float(np.median(level[len(level) // 2 :])), float(level.min())
+        half = 0.5 * (bright + dark)
+        last = int(np.flatnonzero(level <= half)[-1])
+        if dark > 0.6 * bright or last + 1 >= len(level):
+            return None
+        numbers.append(last + (half - level[last]) / (level[last + 1] - level[last]))
+    return float(np.mean(numbers))
+
+
+def grey_flanks(frame: Frame, line: Array, distance: float) -> Array:
+    """Grey values (n, 2) at a distance to the left and to the right of a line, pixels."""
+    levels = np.empty((len(line), 2))
+    flanks(frame, np.ascontiguousarray(line), distance, levels)
+    return levels
+
+
+def _tip(along: Measured) -> int:
+    """Count the points of a line that belong to the whisker.
+
+    Beyond the tip the line is as light as its surroundings; before it, it stays about as dark as it
+    was. The end is where that is most likely, by the sum of log-likelihood ratios.
+    """
+    sigma = along.noise * np.sqrt(DEPTH_VARIANCE)
+    amplitude = np.where(along.open, along.amplitude, 0.0)
+    count = np.convolve(along.open.astype(float), np.ones(20))[: len(amplitude)]
+    recent = np.convolve(np.maximum(amplitude, 0.0), np.ones(20))[: len(amplitude)]
+    usual = _TAPERED * np.concatenate([[0.0], (recent / np.maximum(count, 1.0))[:-1]])
+    gain = np.where(along.open, (amplitude * usual - 0.5 * usual**2) / sigma**2, 0.0)
+    return int(np.argmax(np.cumsum(np.clip(gain, -8.0, 8.0)))) + 1
+
+
+def _stops(frame: Frame, line: Array, along: Measured, count: int) -> bool:
+    """Whether a line of so many points is seen to end, not to fade or to run behind something."""
+    before, after = slice(max(count - _LAST, 0), count), slice(count, count + _LAST // 2)
+    shown = along.open
+    if not shown[after].any() or min(shown[before].mean(), shown[after].mean()) < 0.5:
+        return False
+    if np.median(grey_flanks(frame, line[before], _FLANKS[0])) >= np.iinfo(frame.dtype).max:
+        # Where the light is more than the image holds, what is faint does not show.
+        return False
+    sigma = along.noise * np.sqrt(DEPTH_VARIANCE)
+    return bool(along.amplitude[before][shown[before]].mean() > _CLEAR * sigma)
+
+
+def _inside(frame: Frame, point: Array) -> bool:
+    """Whether a point is not at the border of the image."""
+    far = np.array(frame.shape[::-1]) - 1.0 - _BORDER
+    return bool((point > _BORDER).all() and (point < far).all())
+
+
+def _lengthened(line: Array) -> Array:
+    """Prolong a line beyond its tip, as a parabola, so that the tip can be seen to end."""
+    t = np.arange(min(len(line), 30))
+    ahead = len(t) + np.arange(_BEYOND)
+    shape = np.polynomial.polynomial.polyfit(t, line[-len(t) :], 2)
+    more = np.polynomial.polynomial.polyval(ahead, shape).T
+    return np.concatenate([line, more])

@@ -1,0 +1,335 @@
+"""The traces of one video: its whiskers followed from frame to frame, stopped and continued."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import islice
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vibrissa.io import Frame, load_traces, read_video, save_traces, video_frames, video_info
+from vibrissa.tracking.trace.curves import find_whiskers
+from vibrissa.tracking.trace.follower import Follower, features_of, start_at
+from vibrissa.tracking.trace.identity import Seen, decided, follow_row
+from vibrissa.tracking.trace.start import FRAMES, is_bright, negative
+from vibrissa.tracking.trace.trace import Trace, TraceOptions, given, overlap
+
+Array = NDArray[np.float64]
+
+Corrections = Mapping[tuple[int, int], ArrayLike]
+"""By frame and whisker: points (n, 2) along it from base to tip, column and row."""
+
+_BACK = 64
+"""Largest number of frames before its own that a correction can change."""
+
+_AGREES = 0.9
+"""Share of a line along another one from which both are the same."""
+
+_SPAN = 400
+"""Number of frames at the beginning of a film from which those for its start are taken."""
+
+
+def trace_video(
+    frames: Iterable[Frame],
+    bases: Sequence[ArrayLike] | None = None,
+    options: TraceOptions | None = None,
+    *,
+    corrections: Corrections | None = None,
+    begun: Sequence[Sequence[Trace]] = (),
+    kept: list[list[Trace]] | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> list[list[Trace]]:
+    """Trace whiskers from frame to frame.
+
+    Parameters
+    ----------
+    frames : iterable of array (height, width)
+        Grey values.
+    bases : sequence of array_like (2,), optional
+        Column and row where each whisker leaves the face in the first frame, to about 10 pixels.
+        By default one whisker, the one that is best seen.
+    options : TraceOptions, optional
+        Settings of tracing.
+    corrections : mapping, optional
+        Points (n, 2) along whiskers that are right in some frames, by frame and whisker: taken as
+        they are, and followed from there forward, and backward as far as that changes anything, at
+        most 64 frames.
+    begun : sequence of sequence of Trace
+        Traces of the first frames, made before: taken as they are.
+    kept : list, optional
+        List that is filled with the result while it is made, for the case of an interruption.
+    progress : callable, optional
+        Function that is called after every frame with the number of frames done.
+
+    Returns
+    -------
+    list of list of Trace
+        Traces of each whisker, frame by frame; empty ones where it was not found.
+
+    Raises
+    ------
+    ValueError
+        If no whisker is found in the first frame, frames differ in size, or a correction is for
+        none of the whiskers.
+    """
+    options = options or TraceOptions()
+    corrections = corrections or {}
+    followers: list[Follower] = []
+    traces: list[list[Trace]] = [] if kept is None else kept
+    done = len(begun[0]) if begun else 0
+    recent: deque[Frame] = deque(maxlen=_BACK)
+    seen: list[Seen] = []
+    starts, bright, shape = np.empty((0, 2)), False, (0, 0)
+    for i, frame in enumerate(frames):
+        if i == 0:
+            bright, shape = is_bright(frame, bases, options), frame.shape
+        if frame.shape != shape:
+            raise ValueError(
+                f"frame {i} has {frame.shape[1]} × {frame.shape[0]} pixels and those before it "
+                f"{shape[1]} × {shape[0]}: a video is needed whose frames are of one size"
+            )
+        frame = negative(frame) if bright else frame
+        if i == 0:
+            followers = _begun(frame, bases, begun if done else (), options)
+            begins = [follower.base for follower in followers] if bases is None else bases
+            starts = np.array(begins, dtype=np.float64)
+            traces[:] = [list(row) for row in begun] or [[] for _ in followers]
+            _check(corrections, len(followers))
+        if i < done:
+            recent.append(frame)
+            if len(followers) > 1:
+                seen.append(_seen_before(frame, [row[i] for row in traces], followers))
+            continue
+        known = {k: points for (j, k), points in corrections.items() if j == i}
+        for trace, row in zip(follow_all(followers, frame, known, seen), traces, strict=True):
+            row.append(trace)
+        for k in range(len(followers)):
+            if k in known:
+                _backward(traces[k], recent, k, corrections, options, seen)
+        recent.append(frame)
+        if progress is not None:
+            progress(i + 1)
+    if len(followers) > 1 and done < len(traces[0]):
+        for i, way in enumerate(decided(seen, starts)):
+            for row, c in zip(traces, way, strict=True):
+                row[i] = seen[i].lines[c] if c >= 0 else Trace.lost()
+    return traces
+
+
+def _begun(
+    frame: Frame,
+    bases: Sequence[ArrayLike] | None,
+    begun: Sequence[Sequence[Trace]],
+    options: TraceOptions,
+) -> list[Follower]:
+    """Followers of whiskers that begin in the first frame, or that were traced before."""
+    if begun:
+        starts = bases if bases is not None else [None] * len(begun)
+        return [_resumed(row, base, options) for row, base in zip(begun, starts, strict=True)]
+    if bases is None:
+        found = find_whiskers(frame, options)
+        if not found:
+            raise ValueError("no whisker was found in the first frame: give where one begins")
+        bases = [found[0].trace.line[0]]
+    return [start_at(base, options) for base in bases]
+
+
+def _resumed(row: Sequence[Trace], base: ArrayLike | None, options: TraceOptions) -> Follower:
+    """Continue after traces that are done, as if they had just been made."""
+    if base is None:
+        base = next((trace.line[0] for trace in row if len(trace.line)), None)
+    if base is None:
+        raise ValueError("the frames that were traced before show no whisker")
+    follower = start_at(base, options)
+    for trace in row:
+        if len(trace.line):
+            follower.accept(trace)
+        else:
+            follower.lose()
+    return follower
+
+
+def _seen_before(frame: Frame, found: Sequence[Trace], followers: Sequence[Follower]) -> Seen:
+    """What a frame showed that is not traced again."""
+    lines = [trace for trace in found if len(trace.line)]
+    features = [features_of(frame, trace) for trace in lines]
+    chosen, rest = [], iter(range(len(lines)))
+    for follower, trace in zip(followers, found, strict=True):
+        chosen.append(next(rest) if len(trace.line) else -1)
+        if chosen[-1] >= 0:
+            follower.remember(features[chosen[-1]])
+    return Seen(lines, features, chosen, clear=min(chosen) >= 0)
+
+
+def _check(corrections: Corrections, count: int) -> None:
+    wrong = sorted({k for _, k in corrections if not 0 <= k < count})
+    if wrong:
+        raise ValueError(f"corrections are for whiskers {wrong}; there are {count}, from 0")
+
+
+def follow_all(
+    followers: Sequence[Follower], frame: Frame, known: Mapping[int, ArrayLike], seen: list[Seen]
+) -> list[Trace]:
+    """Find every whisker in the next frame."""
+    if len(followers) > 1:
+        return follow_row(followers, frame, known, seen)
+    (follower,) = followers
+    if not known:
+        return [follower.follow(frame)]
+    trace = given(known[0])
+    follower.restart(trace)
+    return [trace]
+
+
+def _backward(
+    row: list[Trace],
+    recent: Sequence[Frame],
+    whisker: int,
+    corrections: Corrections,
+    options: TraceOptions,
+    seen: Sequence[Seen],
+) -> None:
+    """Trace back from a corrected frame, the last of the row, until nothing changes."""
+    follower = Follower(row[-1].line[0], options)
+    follower.restart(row[-1])
+    for back, frame in enumerate(reversed(recent)):
+        i = len(row) - 2 - back
+        if (i, whisker) in corrections:
+            return
+        trace = follower.follow(frame)
+        if overlap(trace.line, row[i].line, 1.0) > _AGREES:
+            return
+        # The line that shows more is right; what was lost before is found now.
+        if trace.support > 0.9 * row[i].support:
+            row[i] = trace
+            if seen:
+                seen[i].settle(whisker, trace)
+
+
+def partial_traces(recording: str | PathLike[str], view: int) -> Path:
+    """Give the file that keeps the traces of a view until their recording is written.
+
+    Parameters
+    ----------
+    recording : str or path
+        File of the recording.
+    view : int
+        Number of the view.
+
+    Returns
+    -------
+    Path
+        Hidden file next to the recording.
+    """
+    recording = Path(recording)
+    return recording.with_name(f".{recording.name}.view{view}.npz")
+
+
+def start_frames(
+    videos: Sequence[str | PathLike[str]], offset: int = 0
+) -> tuple[list[int], list[list[Frame]]]:
+    """Read frames of the beginning of a film, from which its whisker can be found.
+
+    Parameters
+    ----------
+    videos : sequence of str or path
+        Video of each view.
+    offset : int
+        Number of frames by which the other cameras began before the first.
+
+    Returns
+    -------
+    numbers : list of int
+        Numbers of the frames in the first video.
+    frames : list of list of array (height, width)
+        Frames of the same moments, view by view.
+
+    Raises
+    ------
+    ValueError
+        If a video has no frames of these moments.
+    """
+    firsts = [max(-offset, 0), *(max(offset, 0) for _ in videos[1:])]
+    pairs = list(zip(videos, firsts, strict=True))
+    left = [(video_info(video).frames or _SPAN + first) - first for video, first in pairs]
+    span = max(1, min(_SPAN, *left))
+    rows = np.unique(np.linspace(0, span - 1, min(FRAMES, span)).astype(int))
+    try:
+        frames = [list(video_frames(video, first + rows)) for video, first in pairs]
+    except ValueError:
+        # The number of frames that a file states may be wrong.
+        rows = np.arange(FRAMES)
+        frames = [list(islice(read_video(v), first, first + FRAMES)) for v, first in pairs]
+    count = min(len(view) for view in frames)
+    if not count:
+        raise ValueError(f"{', '.join(map(str, videos))}: there is no frame of all views")
+    return (firsts[0] + rows[:count]).tolist(), [view[:count] for view in frames]
+
+
+def trace_file(
+    video: str | PathLike[str],
+    partial: str | PathLike[str],
+    bases: Any = None,
+    options: TraceOptions | None = None,
+    *,
+    corrections: Corrections | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[list[Trace]]:
+    """Trace the whiskers of a video file, or continue where this was stopped.
+
+    Parameters
+    ----------
+    video : str or path
+        File of the video.
+    partial : str or path
+        File that keeps the traces, also when the work is stopped by an exception such as
+        ``KeyboardInterrupt``; the caller removes it at the end. Traces of another video, or made
+        with other settings, are not used.
+    bases : sequence of (column, row), optional
+        Column and row where each whisker begins, as in `trace_video`.
+    options : TraceOptions, optional
+        Settings of tracing.
+    corrections : mapping, optional
+        Points along whiskers, as in `trace_video`.
+    progress : callable, optional
+        Function that is called as ``progress(done, total)`` with numbers of frames.
+
+    Returns
+    -------
+    list of list of Trace
+        Traces of each whisker, frame by frame.
+    """
+    video, partial = Path(video), Path(partial)
+    about = video.stat()
+    fixed = sorted((key, np.asarray(at).tolist()) for key, at in (corrections or {}).items())
+    key = f"{video.resolve()} {about.st_size} {about.st_mtime_ns} {bases} {fixed} {options}"
+    begun = [[Trace(*row) for row in whisker] for whisker in load_traces(partial, key) or []]
+    kept: list[list[Trace]] = []
+    total = max(video_info(video).frames, 1)
+
+    def report(done: int) -> None:
+        if progress is not None:
+            progress(done, max(total, done))
+
+    try:
+        traces = trace_video(
+            read_video(video),
+            bases,
+            options,
+            corrections=corrections,
+            begun=begun,
+            kept=kept,
+            progress=report,
+        )
+    finally:
+        if kept and kept[0]:
+            done = min(len(row) for row in kept)
+            save_traces(partial, key, [[(*t,) for t in row[:done]] for row in kept])
+    total = len(traces[0])
+    report(total)
+    return traces

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from vibrissa.cli.options import ForceOption, free, refuse, written
+from vibrissa.cli.options import free, refuse, with_options
 from vibrissa.cli.terminal import say
 
 _POOR = 1.0
@@ -20,6 +20,7 @@ _FRAMES = 40
 """Frames that are used of a video, by default."""
 
 
+@with_options("the cameras, TOML of Anipose")
 def calibrate(
     images: Annotated[
         list[Path],
@@ -28,19 +29,11 @@ def calibrate(
             metavar="IMAGE...",
         ),
     ],
-    pattern: Annotated[
-        str,
-        typer.Option(
-            help="Inner corners of the board, along its longer side first: 9x6.", metavar="NxM"
-        ),
-    ],
-    square: Annotated[float, typer.Option(help="Side of a square, mm.", metavar="MM")],
-    path: Annotated[Path, written("the cameras, TOML of Anipose")],
-    frames: Annotated[
-        int | None,
-        typer.Option(help="Frames that are used of a video, evenly spread; 40 by default."),
-    ] = None,
-    force: ForceOption = False,
+    pattern: str,
+    square: float,
+    target: Path,
+    frames: int | None = None,
+    force: bool = False,
 ) -> None:
     """Calibrate cameras by a checkerboard that they see at the same moments (extra cameras).
 
@@ -57,12 +50,12 @@ def calibrate(
         raise ValueError(f"--square is {square:g}; the side of a square in mm is needed, as 5")
     if frames is not None and frames < 2:
         raise ValueError(f"--frames is {frames}; a few dozen are needed")
-    check_writable(path, (".toml",))
-    free([path], force)
+    check_writable(target, (".toml",))
+    free([target], force)
     if not any(recognise(check_readable(image)) == Kind.VIDEO for image in images):
         refuse({"--frames": frames}, "it is of videos, and these are images")
     cameras, error = calibrated(load_series(images, frames or _FRAMES), corners, 1e-3 * square)
-    save_cameras(path, cameras)
+    save_cameras(target, cameras)
     for camera in cameras:
         say(
             f"{camera.name}: {camera.size[0]} × {camera.size[1]} pixels, focal length "
@@ -74,7 +67,7 @@ def calibrate(
             "  That is much: perhaps the images do not belong together, are blurred, or the "
             "pattern has other corners."
         )
-    say(f"wrote {path}")
+    say(f"wrote {target}")
 
 
 def _corners(text: str) -> tuple[int, int]:

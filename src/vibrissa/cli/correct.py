@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vibrissa.cli.options import TraceOption, written
+from vibrissa.cli.options import with_options
 from vibrissa.cli.terminal import say
 
 if TYPE_CHECKING:
@@ -18,13 +18,12 @@ _ENDLESS = 1 << 31
 """Number of frames of a video that does not state it."""
 
 
+@with_options("corrections, .csv, which are added to those that it holds already")
 def correct(
     video: Annotated[Path, typer.Argument(help="The video of one view.", metavar="VIDEO")],
-    path: Annotated[
-        Path, written("corrections, .csv, which are added to those that it holds already")
-    ],
-    trace: TraceOption = None,
-    view: Annotated[int, typer.Option(help="Number of the view in the video, from 0.")] = 0,
+    target: Path,
+    trace: Path | None = None,
+    view: int = 0,
 ) -> None:
     """Click the right trace of a whisker in some frames, for `vibrissa track --corrections`.
 
@@ -42,17 +41,17 @@ def correct(
 
     if view < 0:
         raise ValueError(f"--view is {view}; views are counted from 0")
-    check_writable(path, (".csv",))
-    all_ = load_corrections(path) if path.exists() else {}
+    check_writable(target, (".csv",))
+    all_ = load_corrections(target) if target.exists() else {}
     traces = {} if trace is None else _traces(trace, view)
 
     def save(found: dict[tuple[int, int], NDArray[np.float64]]) -> None:
-        save_corrections(path, {**all_, view: found})
+        save_corrections(target, {**all_, view: found})
 
     count = video_info(video).frames or _ENDLESS
     found = corrected(FrameReader(video), count, all_.get(view), traces, save)
     say(f"{len(found)} corrected traces of view {view}")
-    say(f"use them: vibrissa track … --corrections {path}")
+    say(f"use them: vibrissa track … --corrections {target}")
 
 
 def _traces(path: Path, view: int) -> dict[tuple[int, int], Any]:

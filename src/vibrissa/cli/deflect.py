@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
 from vibrissa.cli.inputs import WhiskerOptions, print_notes, smallest_arc
-from vibrissa.cli.options import AxisOption, ProximalOption, numbers, refuse, with_bundles
+from vibrissa.cli.options import numbers, refuse, with_options
 from vibrissa.cli.tables import print_table
 from vibrissa.cli.terminal import fixed, remark, say
 
@@ -23,32 +23,15 @@ _NEXT_TO_BASE = 0.02
 _XYZ = ("X", "Y", "Z")
 
 
-@with_bundles
+@with_options()
 def deflect(
     own: WhiskerOptions,
-    point: Annotated[str | None, typer.Option(help="Contact point, mm.", metavar="X,Y,Z")] = None,
-    point_force: Annotated[
-        str | None,
-        typer.Option(
-            help="Arc length of a force, mm, its size, µN, and its angle from d1 to d2, degrees.",
-            metavar="S,F,ANGLE",
-        ),
-    ] = None,
-    peg: Annotated[
-        str | None,
-        typer.Option(
-            help="A point of a peg's axis and its diameter, mm; 0 for a line.", metavar="X,Y,Z,D"
-        ),
-    ] = None,
-    axis: AxisOption = None,
-    push: Annotated[
-        str | None,
-        typer.Option(
-            help="Approximate direction in which the peg pushes; by default from its nearest side.",
-            metavar="X,Y,Z",
-        ),
-    ] = None,
-    proximal: ProximalOption = None,
+    point: str | None = None,
+    point_force: str | None = None,
+    peg: str | None = None,
+    axis: str | None = None,
+    push: str | None = None,
+    proximal: float | None = None,
 ) -> None:
     """Bend a whisker by a point, a force or a peg, and print force and moment at its base.
 

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import typer
-
-from vibrissa.cli import options
 from vibrissa.cli.drawings import NODES, TrialOptions, trial_drawings
 from vibrissa.cli.figures import saved
 from vibrissa.cli.inputs import WhiskerOptions, print_notes
-from vibrissa.cli.options import with_bundles, written
+from vibrissa.cli.options import with_options
 from vibrissa.cli.tables import Row, print_table
 from vibrissa.cli.terminal import Tell, progress_bars, say, shown
 
@@ -24,26 +21,16 @@ _SENSED = "measured by a sensor"
 _SEEN = "the paper's method"
 
 
-@with_bundles
+@with_options("all files, in a folder")
 def demo(
     own: WhiskerOptions,
-    folder: Annotated[Path, written("all files, in a folder", "DIR")] = Path("vibrissa-demo"),
-    full: Annotated[
-        bool | None,
-        typer.Option(
-            "--full/--quick",
-            help="3.5 s of video, as in the paper, or half a second.",
-            show_default="quick",
-        ),
-    ] = None,
-    seed: options.SeedOption = None,
-    noise: options.NoiseOption = True,
-    tracking: Annotated[
-        bool,
-        typer.Option(help="Whether the trial is filmed and tracked, or the true pose is taken."),
-    ] = True,
-    duration: options.DurationOption = None,
-    rate: options.RateOption = None,
+    target: Path = Path("vibrissa-demo"),
+    full: bool | None = None,
+    seed: int | None = None,
+    noise: bool = True,
+    tracking: bool = True,
+    duration: float | None = None,
+    rate: float | None = None,
 ) -> None:
     """Whisk against a peg, film it, measure at the whisker's base, and find the peg again.
 
@@ -57,7 +44,7 @@ def demo(
 
     if duration is not None and full is not None:
         raise ValueError("give either --duration or one of --full and --quick")
-    check_folder(folder)
+    check_folder(target)
     whisker = own.read()
     say(repr(whisker))
     print_notes(whisker)
@@ -66,7 +53,7 @@ def demo(
     with progress_bars() as tell:
         result = run_demo(
             whisker,
-            folder,
+            target,
             seed=seed or 0,
             noise=noise,
             duration=duration,
@@ -74,7 +61,7 @@ def demo(
             video=tracking,
             progress=tell,
         )
-        pictures = _pictures(result, folder, tell)
+        pictures = _pictures(result, target, tell)
     _report(result, noise)
     for file in (*result.files, *pictures):
         say(f"wrote {file}")

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vibrissa.cli import options
 from vibrissa.cli.inputs import map_from, map_of
 from vibrissa.cli.terminal import Tell, say
 
@@ -45,9 +44,9 @@ _CONTACTS = ("estimates", "truth")
 class TrialOptions:
     """What a picture of a trial is drawn with, and of which whisker."""
 
-    videos: options.VideosOption = None
-    map: options.MapOption = None
-    which: options.WhichOption = None
+    videos: list[Path] | None = None
+    map: Path | None = None
+    which: int | None = None
 
     def given(self) -> dict[str, object]:
         """Return the options by their names."""

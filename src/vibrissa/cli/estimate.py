@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vibrissa.cli import options
 from vibrissa.cli.inputs import (
     RECORDING,
     AssumptionOptions,
@@ -26,7 +25,7 @@ from vibrissa.cli.inputs import (
     smallest_arc,
     wrench_from,
 )
-from vibrissa.cli.options import ForceOption, refuse, with_bundles, written
+from vibrissa.cli.options import Method, refuse, with_options
 from vibrissa.cli.signals import SourceOptions, described
 from vibrissa.cli.terminal import Tell, progress_bars, remark, shown
 
@@ -42,10 +41,10 @@ WRENCH = "wrench"
 class EstimateOptions:
     """From which signals contacts are estimated, and how."""
 
-    maps: options.MapsOption = None
-    using: options.UsingOption = None
-    method: options.MethodOption = "exact"
-    proximal: options.ProximalOption = None
+    map: list[Path] | None = None
+    using: str | None = None
+    method: Method = "exact"
+    proximal: float | None = None
     noise: NoiseOptions
     assumed: AssumptionOptions
     own: WhiskerOptions
@@ -61,11 +60,11 @@ class EstimateOptions:
             raise ValueError(
                 f"--method {self.method} needs three signals; got {len(names)}: {', '.join(names)}"
             )
-        if self.maps and self.own.whisker is not None:
+        if self.map and self.own.whisker is not None:
             raise ValueError("give either --map or --whisker: a map already has its whisker")
         if self.whole:
             refuse({"--proximal": self.proximal}, "it is of a map, and --using wrench needs none")
-        if self.maps:
+        if self.map:
             refuse({"--proximal": self.proximal}, "it is of maps that are simulated")
         _ = self.assumed.prior
 
@@ -89,15 +88,15 @@ class EstimateOptions:
     @property
     def given(self) -> bool:
         """Whether anything is stated, so that contacts are to be estimated anew."""
-        stated = (self.maps, self.using, self.own.whisker, self.noise.given)
+        stated = (self.map, self.using, self.own.whisker, self.noise.given)
         other = (self.method != "exact", self.proximal is not None, self.assumed.described())
         return any(bool(one) for one in (*stated, *other))
 
     @property
     def known(self) -> WhiskerOptions:
         """The one whisker that is stated, perhaps by its map."""
-        one = self.maps is not None and len(self.maps) == 1
-        return WhiskerOptions(self.maps[0]) if self.maps and one else self.own
+        one = self.map is not None and len(self.map) == 1
+        return WhiskerOptions(self.map[0]) if self.map and one else self.own
 
     def keywords(self) -> dict[str, Any]:
         """Options of all functions that estimate."""
@@ -113,7 +112,10 @@ class EstimateOptions:
         )
 
 
-@with_bundles
+@with_options(
+    "the recording with the contacts added, .nc, by default where it is; or the contacts as a "
+    "table, .csv, by default contacts.csv"
+)
 def estimate(
     signals: Annotated[
         Path,
@@ -123,14 +125,8 @@ def estimate(
         ),
     ],
     how: EstimateOptions,
-    path: Annotated[
-        Path | None,
-        written(
-            "the recording with the contacts added, .nc, by default where it is; or the contacts "
-            "as a table, .csv, by default contacts.csv"
-        ),
-    ] = None,
-    force: ForceOption = False,
+    target: Path | None = None,
+    force: bool = False,
 ) -> None:
     """Find the contact point in each frame or row of signals, with its uncertainty.
 
@@ -147,7 +143,7 @@ def estimate(
     if how.noise.covariance is not None:
         how.noise.matrix()
     recorded = kind_in(check_readable(signals)) == RECORDING
-    target = path or (signals if recorded else Path("contacts.csv"))
+    target = target or (signals if recorded else Path("contacts.csv"))
     check_writable(target, (*NETCDF, *CSV) if recorded else CSV)
     free_beside(signals, [target], force)
     if recorded:
@@ -165,7 +161,7 @@ def _from_table(signals: Path, target: Path, how: EstimateOptions) -> None:
     wrench = wrench_from(signals)
     for note in wrench.attrs.get("notes", ()):
         remark(f"{signals}: {note}")
-    maps = maps_from(how.maps, 1, how.grid) if how.maps else []
+    maps = maps_from(how.map, 1, how.grid) if how.map else []
     known = maps[0].whisker if maps else how.own.read()
     print_notes(known)
     _check_scale(signals, wrench, known)
@@ -220,7 +216,7 @@ def estimated(
     source = signals.attrs.get("source")
     # A sensor that does not state its noise is a usual one.
     noisy = how.noise.given or (source == "sensor" and sensor_noise(signals) is None)
-    maps = maps_from(how.maps, tree.sizes["whisker"], how.grid) if how.maps else []
+    maps = maps_from(how.map, tree.sizes["whisker"], how.grid) if how.map else []
     whiskers = [one.whisker for one in maps] if maps else how.own.in_recording(tree)
     print_notes(*whiskers)
     for k, whisker in enumerate(whiskers):

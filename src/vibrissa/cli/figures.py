@@ -10,23 +10,14 @@ import typer
 
 from vibrissa.cli.drawings import Draw, TrialOptions, array_drawings, map_drawings, trial_drawings
 from vibrissa.cli.inputs import map_from
-from vibrissa.cli.options import (
-    ConesOption,
-    ForceOption,
-    Format,
-    UniquenessOption,
-    free,
-    refuse,
-    with_bundles,
-    written,
-)
+from vibrissa.cli.options import Format, free, refuse, with_options
 from vibrissa.cli.terminal import Tell, progress_bars, say
 
 if TYPE_CHECKING:
     import xarray as xr
 
 
-@with_bundles
+@with_options("figures, in a folder")
 def figures(
     path: Annotated[
         Path,
@@ -36,22 +27,13 @@ def figures(
         ),
     ],
     of_trial: TrialOptions,
-    folder: Annotated[Path, written("figures, in a folder", "DIR")] = Path("figures"),
-    format_: Annotated[
-        list[Format] | None,
-        typer.Option("--format", help="May be repeated; png and pdf by default."),
-    ] = None,
-    width: Annotated[
-        Literal["single", "double"],
-        typer.Option(help="For one column of a journal, 85 mm, or two, 178 mm."),
-    ] = "double",
-    uniqueness: UniquenessOption = None,
-    cones: ConesOption = None,
-    colour: Annotated[
-        Literal["time", "deflection"] | None,
-        typer.Option(help="Colour of a trial's contacts in both frames: time by default."),
-    ] = None,
-    force: ForceOption = False,
+    target: Path = Path("figures"),
+    format_: list[Format] | None = None,
+    width: Literal["single", "double"] = "double",
+    uniqueness: Path | None = None,
+    cones: Path | None = None,
+    colour: Literal["time", "deflection"] | None = None,
+    force: bool = False,
 ) -> None:
     """Draw the figures that a map or a trial allows.
 
@@ -65,7 +47,7 @@ def figures(
     from vibrissa.io import Kind, check_folder, recognise
 
     endings = tuple(dict.fromkeys(map(str, format_ or ("png", "pdf"))))
-    check_folder(folder)
+    check_folder(target)
     verdicts = None if uniqueness is None else dataset_with(uniqueness, "verdict")
     sweep = None if cones is None else dataset_with(cones, "critical_cone")
     with progress_bars() as tell:
@@ -77,9 +59,9 @@ def figures(
             refuse(of_trial.given() | {"--colour": colour}, f"{path} is not a recording")
         if not drawings:
             drawings = dict(map_drawings(map_from(path), width, verdicts, sweep))
-        free([folder / f"{name}.{ending}" for name in drawings for ending in endings], force)
-        folder.mkdir(parents=True, exist_ok=True)
-        files = saved(drawings, folder, endings, tell)
+        free([target / f"{name}.{ending}" for name in drawings for ending in endings], force)
+        target.mkdir(parents=True, exist_ok=True)
+        files = saved(drawings, target, endings, tell)
     for file in files:
         say(f"wrote {file}")
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
+from vibrissa.cli.options import with_options
 from vibrissa.cli.tables import print_properties
 from vibrissa.cli.track import compared_contacts
 
@@ -32,6 +33,7 @@ _TABLES = """\
 _PACKAGES = ("numpy", "scipy", "numba", "xarray", "h5netcdf", "matplotlib")
 
 
+@with_options()
 def info(
     path: Annotated[
         Path | None, typer.Argument(help="A file to look into.", metavar="FILE")

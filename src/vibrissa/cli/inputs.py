@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vibrissa.cli import options
 from vibrissa.cli.options import free, refuse
 from vibrissa.cli.terminal import Tell, remark, say
 
@@ -34,9 +33,9 @@ _UNITS = {"r": 1e-3, "theta": math.pi / 180.0, "phi": math.pi / 180.0}
 class WhiskerOptions:
     """A whisker, and what its file does not state."""
 
-    whisker: options.WhiskerOption = None
-    rat: options.RatOption = None
-    any_length: options.AnyLengthOption = False
+    whisker: Path | None = None
+    rat: str | None = None
+    any_length: bool = False
 
     def __post_init__(self) -> None:
         """Refuse statements about no whisker."""
@@ -81,9 +80,9 @@ class WhiskerOptions:
 class NoiseOptions:
     """Noise of the sensor: that of each component, or their covariance."""
 
-    force_noise: options.ForceNoiseOption = None
-    moment_noise: options.MomentNoiseOption = None
-    covariance: options.CovarianceOption = None
+    force_noise: float | None = None
+    moment_noise: float | None = None
+    covariance: Path | None = None
 
     def __post_init__(self) -> None:
         """Refuse two statements about the same."""
@@ -145,12 +144,12 @@ class NoiseOptions:
 class AssumptionOptions:
     """What is known beforehand: errors that all samples share, and which contacts are possible."""
 
-    stiffness_sigma: options.StiffnessSigmaOption = 0.0
-    gain_sigma: options.GainSigmaOption = 0.0
-    mixing_sigma: options.MixingSigmaOption = 0.0
-    region: options.RegionOption = None
-    least_force: options.LeastForceOption = None
-    greatest_force: options.GreatestForceOption = None
+    stiffness_sigma: float = 0.0
+    gain_sigma: float = 0.0
+    mixing_sigma: float = 0.0
+    region: str | None = None
+    least_force: float | None = None
+    greatest_force: float | None = None
 
     @property
     def errors(self) -> dict[str, float]:

@@ -4,20 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING, Any
 
 from vibrissa.cli.inputs import WhiskerOptions, map_of, metres_of, print_notes, smallest_arc
-from vibrissa.cli.options import (
-    BaseRadiusOption,
-    ForceOption,
-    GridOption,
-    ProximalOption,
-    free,
-    with_bundles,
-    written,
-)
+from vibrissa.cli.options import free, with_options
 from vibrissa.cli.terminal import progress_bars, say
 
 if TYPE_CHECKING:
@@ -28,21 +18,11 @@ if TYPE_CHECKING:
 class MadeOptions(WhiskerOptions):
     """A whisker of a file or a straight one, of any thickness and material."""
 
-    length: Annotated[
-        float | None,
-        typer.Option(help="Length of a straight whisker, mm, instead.", min=0.0, metavar="MM"),
-    ] = None
-    base_radius: BaseRadiusOption = None
-    tip_radius: Annotated[
-        float | None,
-        typer.Option(
-            help="Radius at the tip, mm; by default 1/15 of the base's.", min=0.0, metavar="MM"
-        ),
-    ] = None
-    modulus: Annotated[
-        float | None, typer.Option(help="Young's modulus, GPa.", min=0.0, metavar="GPA")
-    ] = None
-    poisson: Annotated[float | None, typer.Option(help="Poisson's ratio.", metavar="RATIO")] = None
+    length: float | None = None
+    base_radius: float | None = None
+    tip_radius: float | None = None
+    modulus: float | None = None
+    poisson: float | None = None
 
     def __post_init__(self) -> None:
         """Refuse what does not go together."""
@@ -73,13 +53,13 @@ class MadeOptions(WhiskerOptions):
         return whisker.with_properties(**changes) if changes else whisker
 
 
-@with_bundles
+@with_options("the map, .nc")
 def simulate_map(
     own: MadeOptions,
-    proximal: ProximalOption = None,
-    path: Annotated[Path, written("the map, .nc")] = Path("map.nc"),
-    grid: GridOption = True,
-    force: ForceOption = False,
+    proximal: float | None = None,
+    target: Path = Path("map.nc"),
+    grid: bool = True,
+    force: bool = False,
 ) -> None:
     """Find all stable contacts of a whisker, and the paper's grid of them.
 
@@ -89,12 +69,12 @@ def simulate_map(
     """
     from vibrissa.io import NETCDF, check_writable
 
-    check_writable(path, NETCDF)
-    free([path], force)
+    check_writable(target, NETCDF)
+    free([target], force)
     whisker = own.read()
     print_notes(whisker)
     with progress_bars() as tell:
         contact_map = map_of(whisker, tell, grid=grid, proximal=smallest_arc(proximal))
-        contact_map.save(path)
+        contact_map.save(target)
     say(repr(contact_map))
-    say(f"wrote {path}")
+    say(f"wrote {target}")

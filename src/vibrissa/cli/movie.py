@@ -5,20 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import typer
 
 from vibrissa.cli.drawings import NODES, TrialOptions, fits_of, sights_of
-from vibrissa.cli.options import (
-    ForceOption,
-    RecordingArgument,
-    free,
-    refuse,
-    with_bundles,
-    written,
-)
+from vibrissa.cli.options import RecordingArgument, free, refuse, with_options
 from vibrissa.cli.terminal import Tell, progress_bars, say, stoppable
 
 if TYPE_CHECKING:
@@ -36,20 +29,10 @@ _LASTS = 45.0
 class FrameOptions:
     """Which frames a movie shows, and how fast."""
 
-    fps: Annotated[float, typer.Option(help="Frames per second at which it is shown.")] = 25.0
-    step: Annotated[
-        int | None,
-        typer.Option(
-            help="Number of frames of the trial from one that is shown to the next; by default "
-            "such that the movie lasts up to 45 s."
-        ),
-    ] = None
-    start: Annotated[
-        float | None, typer.Option("--from", help="Time of the first frame, s.", metavar="S")
-    ] = None
-    stop: Annotated[
-        float | None, typer.Option("--to", help="Time of the last frame, s.", metavar="S")
-    ] = None
+    fps: float = 25.0
+    step: int | None = None
+    start: float | None = None
+    stop: float | None = None
 
     def rows(self, time: NDArray[np.float64]) -> NDArray[np.intp]:
         """Choose frames of a trial."""
@@ -68,18 +51,14 @@ class FrameOptions:
         return rows[:: self.step or int(np.ceil(rows.size / (_LASTS * self.fps)))]
 
 
-@with_bundles
+@with_options("the movies, in a folder, or one kind as a file .mp4")
 def movie(
     path: RecordingArgument,
     of_trial: TrialOptions,
     frames: FrameOptions,
-    kind: Annotated[
-        Literal["signals", "contour", "both"], typer.Option(help="What the movies show.")
-    ] = "both",
-    target: Annotated[
-        Path, written("the movies, in a folder, or one kind as a file .mp4", "DIR")
-    ] = Path("movies"),
-    force: ForceOption = False,
+    kind: Literal["signals", "contour", "both"] = "both",
+    target: Path = Path("movies"),
+    force: bool = False,
 ) -> None:
     """Make movies of a trial: its signals in the solids of all contacts; the contour as it grows.
 

@@ -6,10 +6,9 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import typer
 
 from vibrissa.cli.estimate import EstimateOptions, estimated
 from vibrissa.cli.inputs import (
@@ -22,16 +21,7 @@ from vibrissa.cli.inputs import (
     print_written,
     recording_from,
 )
-from vibrissa.cli.options import (
-    AxisOption,
-    ForceOption,
-    ObjectsOption,
-    RecordingArgument,
-    TableOption,
-    numbers,
-    with_bundles,
-    written,
-)
+from vibrissa.cli.options import RecordingArgument, numbers, with_options
 from vibrissa.cli.signals import SourceOptions, described
 from vibrissa.cli.tables import print_table
 from vibrissa.cli.terminal import Tell, fixed, progress_bars, remark, say
@@ -54,18 +44,9 @@ _TURNED = ("axis", "normal")
 class ShapeOptions:
     """The object that is looked for."""
 
-    shape: Annotated[
-        Literal["cylinder", "sphere", "plane", "free"],
-        typer.Option(help="Shape of the object that was touched."),
-    ] = "cylinder"
-    axis: AxisOption = None
-    lean: Annotated[
-        float | None,
-        typer.Option(
-            help="Standard deviation of the angle between normals and forces, degrees; by default "
-            "5.7 for contacts from --using wrench, which allows for friction, and else 0."
-        ),
-    ] = None
+    shape: Literal["cylinder", "sphere", "plane", "free"] = "cylinder"
+    axis: str | None = None
+    lean: float | None = None
 
     def __post_init__(self) -> None:
         """Refuse what does not go together."""
@@ -81,18 +62,16 @@ class ShapeOptions:
         return {"axis": axis, "lean": None if self.lean is None else math.radians(self.lean)}
 
 
-@with_bundles
+@with_options("the recording with all that was found added, by default where it is")
 def reconstruct(
     recording: RecordingArgument,
     wanted: ShapeOptions,
     source: SourceOptions,
     how: EstimateOptions,
-    objects: ObjectsOption = None,
-    path: Annotated[
-        Path | None, written("the recording with all that was found added, by default where it is")
-    ] = None,
-    csv: TableOption = None,
-    force: ForceOption = False,
+    objects: Path | None = None,
+    target: Path | None = None,
+    csv: Path | None = None,
+    force: bool = False,
 ) -> None:
     """Find the object that was touched from a recording alone.
 
@@ -107,7 +86,7 @@ def reconstruct(
     from vibrissa.pipeline import contour_points
     from vibrissa.recording import Recording
 
-    target = recording if path is None else path
+    target = target or recording
     points = target.with_name(f"{target.stem}_contour.csv") if csv is None else csv
     check_writable(target, NETCDF)
     check_writable(points, CSV)

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import numpy as np
 import typer
 
-from vibrissa.cli import options
 from vibrissa.cli.drawings import (
     NODES,
     Draw,
@@ -24,7 +23,7 @@ from vibrissa.cli.drawings import (
 from vibrissa.cli.figures import dataset_with
 from vibrissa.cli.inputs import MAP, RECORDING, kind_in, map_from
 from vibrissa.cli.movie import FrameOptions, make_movies
-from vibrissa.cli.options import ForceOption, free, refuse, with_bundles, written
+from vibrissa.cli.options import free, refuse, with_options
 from vibrissa.cli.terminal import Tell, progress_bars, say
 
 if TYPE_CHECKING:
@@ -48,22 +47,19 @@ class _Content(NamedTuple):
     drawings: Mapping[str, Draw]
 
 
-@with_bundles
+@with_options("the page, .html")
 def report(
     path: Annotated[
         Path,
         typer.Argument(help="The recording of a trial, or a map, NetCDF.", metavar="TRIAL | MAP"),
     ],
     of_trial: TrialOptions,
-    target: Annotated[Path, written("the page, .html")] = Path("report.html"),
-    uniqueness: options.UniquenessOption = None,
-    movie: options.MoviesOption = None,
-    make: Annotated[
-        bool,
-        typer.Option("--make-movies", help="Make the movies of the trial first, next to the page."),
-    ] = False,
-    seed: options.SeedOption = None,
-    force: ForceOption = False,
+    target: Path = Path("report.html"),
+    uniqueness: Path | None = None,
+    movie: list[Path] | None = None,
+    make: bool = False,
+    seed: int | None = None,
+    force: bool = False,
 ) -> None:
     """Write a page that opens offline: what was done, how well, figures, a contour to turn.
 

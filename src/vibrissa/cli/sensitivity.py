@@ -3,20 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vibrissa.cli.inputs import RECORDING, NoiseOptions, kind_in, map_from, wrench_from
-from vibrissa.cli.options import (
-    ForceOption,
-    MapArgument,
-    TrialOption,
-    TripletOption,
-    free,
-    with_bundles,
-    written,
-)
+from vibrissa.cli.options import MapArgument, free, with_options
 from vibrissa.cli.tables import Row, print_table
 from vibrissa.cli.terminal import progress_bars, say, shown
 
@@ -27,16 +19,14 @@ _SHOWN = 5
 """Number of the best triplets that are shown."""
 
 
-@with_bundles
+@with_options("everything, NetCDF (.nc), SI units; by default nowhere")
 def sensitivity(
     path: MapArgument,
     noise: NoiseOptions,
-    using: TripletOption = "Fx,MB,MD",
-    trial: TrialOption = None,
-    target: Annotated[
-        Path | None, written("everything, NetCDF (.nc), SI units; by default nowhere")
-    ] = None,
-    force: ForceOption = False,
+    using: str = "Fx,MB,MD",
+    trial: Path | None = None,
+    target: Path | None = None,
+    force: bool = False,
 ) -> None:
     """Find how the contact point depends on three signals, and which three would be the best.
 

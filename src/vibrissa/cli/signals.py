@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vibrissa.cli import options
 from vibrissa.cli.inputs import (
     WhiskerOptions,
     check_one_whisker,
@@ -19,7 +18,7 @@ from vibrissa.cli.inputs import (
     recording_from,
     smallest_arc,
 )
-from vibrissa.cli.options import ForceOption, RecordingArgument, refuse, with_bundles, written
+from vibrissa.cli.options import RecordingArgument, Source, refuse, with_options
 from vibrissa.cli.terminal import progress_bars, remark, say, shown
 
 if TYPE_CHECKING:
@@ -30,8 +29,8 @@ if TYPE_CHECKING:
 class SourceOptions:
     """What signals come from."""
 
-    source: options.SourceOption = None
-    cutoff: options.CutoffOption = None
+    source: Source | None = None
+    cutoff: float | None = None
 
     @property
     def given(self) -> bool:
@@ -57,20 +56,17 @@ class SourceOptions:
         }
 
 
-@with_bundles
+@with_options(
+    "the recording with the signals added, .nc, by default where it is; or the signals of its "
+    "one whisker as a table, .csv"
+)
 def signals(
     recording: RecordingArgument,
     how: SourceOptions,
     own: WhiskerOptions,
-    proximal: options.ProximalOption = None,
-    path: Annotated[
-        Path | None,
-        written(
-            "the recording with the signals added, .nc, by default where it is; or the signals of "
-            "its one whisker as a table, .csv"
-        ),
-    ] = None,
-    force: ForceOption = False,
+    proximal: float | None = None,
+    target: Path | None = None,
+    force: bool = False,
 ) -> None:
     """Find force, moment and the six signals at the base in every frame.
 
@@ -80,7 +76,7 @@ def signals(
     from vibrissa.io import CSV, NETCDF, check_writable, save_recording, save_signals
     from vibrissa.pipeline import with_signals
 
-    target = recording if path is None else path
+    target = target or recording
     check_writable(target, (*NETCDF, *CSV))
     free_beside(recording, [target], force)
     tree = recording_from(recording)

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import typer
 
-from vibrissa.cli import options
 from vibrissa.cli.inputs import WhiskerOptions, print_notes, print_statuses
-from vibrissa.cli.options import ExampleOption, FilmOption, ForceOption, free, with_bundles, written
+from vibrissa.cli.options import free, with_options
 from vibrissa.cli.terminal import output, progress_bars, say, shown
 
 if TYPE_CHECKING:
@@ -23,52 +22,19 @@ if TYPE_CHECKING:
 class PlanOptions:
     """What is simulated; it counts more than the file. Names are those of `read_script`."""
 
-    array: Annotated[
-        str | None,
-        typer.Option(
-            help="All whiskers of a face: `average` for an average rat's, or a file or folder.",
-            metavar="FILE|average",
-        ),
-    ] = None
-    side: Annotated[
-        Literal["both", "left", "right"] | None,
-        typer.Option(help="Side of the array; both by default."),
-    ] = None
-    names: Annotated[
-        str | None,
-        typer.Option(help="Names of whiskers of the array: `C1,C2,gamma`.", metavar="NAMES"),
-    ] = None
-    object: Annotated[
-        Literal["peg", "sphere", "box", "plane"] | None,
-        typer.Option(help="Kind of an object that is put within reach."),
-    ] = None
-    duration: options.DurationOption = None
-    rate: options.RateOption = None
-    frequency: Annotated[
-        float | None, typer.Option(help="Whisks per second; 5 by default.", metavar="HZ")
-    ] = None
-    protraction: Annotated[
-        float | None,
-        typer.Option(help="Share of a whisk that is protraction, 0.3 to 0.7.", metavar="SHARE"),
-    ] = None
-    row: Annotated[
-        Literal["A", "B", "C", "D", "E"] | None,
-        typer.Option(
-            help="Row of the one whisker, which determines how elevation and roll depend on the "
-            "azimuth; C by default."
-        ),
-    ] = None
-    friction: Annotated[
-        float | None, typer.Option(help="Coefficient of Coulomb friction; 0 by default.")
-    ] = None
-    dynamic: Annotated[
-        bool,
-        typer.Option(
-            "--dynamic", help="With inertia and damping: takes half a minute a second or so."
-        ),
-    ] = False
-    noise: options.NoiseOption = True
-    seed: options.SeedOption = None
+    array: str | None = None
+    side: Literal["both", "left", "right"] | None = None
+    names: str | None = None
+    object: Literal["peg", "sphere", "box", "plane"] | None = None
+    duration: float | None = None
+    rate: float | None = None
+    frequency: float | None = None
+    protraction: float | None = None
+    row: Literal["A", "B", "C", "D", "E"] | None = None
+    friction: float | None = None
+    dynamic: bool = False
+    noise: bool = True
+    seed: int | None = None
 
     def changes(self) -> dict[str, Any]:
         """Return them by the names that a trial has."""
@@ -78,7 +44,7 @@ class PlanOptions:
         }
 
 
-@with_bundles
+@with_options("the recording, .nc")
 def simulate(
     own: WhiskerOptions,
     wanted: PlanOptions,
@@ -86,10 +52,10 @@ def simulate(
         Path | None,
         typer.Argument(help="The trial as TOML; `--example` prints one.", metavar="TRIAL.toml"),
     ] = None,
-    path: Annotated[Path, written("the recording, .nc")] = Path("trial.nc"),
-    film: FilmOption = None,
-    example: ExampleOption = False,
-    force: ForceOption = False,
+    target: Path = Path("trial.nc"),
+    film: Path | None = None,
+    example: bool = False,
+    force: bool = False,
 ) -> None:
     """Simulate a whisking trial among objects, with its truth.
 
@@ -105,8 +71,8 @@ def simulate(
     if example:
         output.out(EXAMPLE, highlight=False, end="")
         return
-    check_writable(path, NETCDF)
-    free([path, *(() if film is None else _films(film))], force)
+    check_writable(target, NETCDF)
+    free([target, *(() if film is None else _films(film))], force)
     with progress_bars() as tell:
         tell("how far to whisk", 0, 1)
         text, folder = ("", Path()) if script is None else (read_text(script), script.parent)
@@ -122,16 +88,16 @@ def simulate(
             progress=lambda done, total: tell("whisking trial", done, total),
         )
         trial = measure(trial, seed=plan.seed, sensor=plan.sensor)
-        save_recording(path, trial)
+        save_recording(target, trial)
     say(repr(plan.whisker))
     if isinstance(plan.whisker, Whisker):
         print_notes(plan.whisker)
     for solid in plan.objects:
         say(repr(solid))
     _report(trial)
-    say(f"wrote {path}")
+    say(f"wrote {target}")
     if film is not None:
-        _film(trial, path, film, plan.seed)
+        _film(trial, target, film, plan.seed)
 
 
 def _report(trial: xr.DataTree) -> None:

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vibrissa.cli import options
 from vibrissa.cli.inputs import (
     AssumptionOptions,
     NoiseOptions,
@@ -24,7 +23,7 @@ from vibrissa.cli.inputs import (
     print_notes,
     smallest_arc,
 )
-from vibrissa.cli.options import numbers, refuse, with_bundles
+from vibrissa.cli.options import numbers, refuse, with_options
 from vibrissa.cli.terminal import Ended, ending_in_order, remark
 
 if TYPE_CHECKING:
@@ -56,42 +55,12 @@ class LineOptions:
             metavar="SOURCE",
         ),
     ] = None
-    udp: Annotated[
-        str | None,
-        typer.Option(help="Receive lines as UDP datagrams here instead.", metavar="HOST:PORT"),
-    ] = None
-    every: Annotated[
-        bool,
-        typer.Option(
-            "--every",
-            help="Answer every sample that comes by UDP, however late; by default the newest, and "
-            "those before it that wait are dropped and counted.",
-        ),
-    ] = False
-    reconnect: Annotated[
-        bool,
-        typer.Option(
-            "--reconnect",
-            help="Wait for a named pipe or serial device that closes to open again.",
-        ),
-    ] = False
-    topic: Annotated[
-        str | None,
-        typer.Option(
-            help="Topic of WrenchStamped in a bag, where there are several.", metavar="NAME"
-        ),
-    ] = None
-    pose_topic: Annotated[
-        str | None,
-        typer.Option(
-            help="Topic of PoseStamped or TransformStamped in a bag: poses of the base, or of the "
-            "flange.",
-            metavar="NAME",
-        ),
-    ] = None
-    count: Annotated[
-        int | None, typer.Option(help="Number of lines after which to stop.", min=1, metavar="N")
-    ] = None
+    udp: str | None = None
+    every: bool = False
+    reconnect: bool = False
+    topic: str | None = None
+    pose_topic: str | None = None
+    count: int | None = None
 
     def __post_init__(self) -> None:
         """Refuse what does not go together."""
@@ -146,22 +115,15 @@ class LineOptions:
 class MeasurementOptions:
     """The whisker and what is measured at its base."""
 
-    map: options.MapOption = None
-    proximal: options.ProximalOption = None
+    map: Path | None = None
+    proximal: float | None = None
     own: WhiskerOptions
-    sensor: options.SensorOption = None
-    using: options.UsingOption = None
+    sensor: Path | None = None
+    using: str | None = None
     noise: NoiseOptions
     assumed: AssumptionOptions
-    threshold: options.ThresholdOption = 5.0
-    tare: Annotated[
-        int | None,
-        typer.Option(
-            help="Number of first samples, of a free whisker, that give the sensor's offset anew.",
-            min=1,
-            metavar="N",
-        ),
-    ] = None
+    threshold: float = 5.0
+    tare: int | None = None
 
     def __post_init__(self) -> None:
         """Refuse what does not go together."""
@@ -220,30 +182,9 @@ class MeasurementOptions:
 class FollowOptions:
     """How contacts are followed over time, and where the whisker is mounted."""
 
-    filter: Annotated[
-        bool,
-        typer.Option(
-            "--filter",
-            help="Follow contacts over time, with the pose of the base: base_x, base_y, base_z (m) "
-            "and base_qw, base_qx, base_qy, base_qz, in each line or in lines of their own.",
-        ),
-    ] = False
-    speed: Annotated[
-        float | None,
-        typer.Option(
-            help="Speed of contacts in the laboratory, for the filter, mm/s; by default a quarter "
-            "of the whisker's length a second.",
-            metavar="MM/S",
-        ),
-    ] = None
-    mount: Annotated[
-        str | None,
-        typer.Option(
-            help="Position of the whisker's base on a robot's flange, whose poses come: mm, and a "
-            "quaternion from the whisker's to the flange's frame.",
-            metavar=",".join(_MOUNT),
-        ),
-    ] = None
+    filter: bool = False
+    speed: float | None = None
+    mount: str | None = None
 
     def __post_init__(self) -> None:
         """Refuse what does not go together."""
@@ -279,12 +220,12 @@ class FollowOptions:
         return ContactStream(estimator, names, filtered, poses, tare)
 
 
-@with_bundles
+@with_options()
 def stream(
     source: LineOptions,
     measured: MeasurementOptions,
     follow: FollowOptions,
-    bag: options.BagOption = None,
+    bag: Path | None = None,
 ) -> None:
     """Find contacts while signals come in, one line of JSON each.
 

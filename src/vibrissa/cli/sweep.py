@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vibrissa.cli.options import ExampleOption, ForceOption, free, refuse, written
+from vibrissa.cli.options import free, refuse, with_options
 from vibrissa.cli.terminal import output, progress_bars, remark, say
 
 if TYPE_CHECKING:
@@ -18,6 +18,7 @@ _LISTED = 3
 """Number of failures that are listed."""
 
 
+@with_options("the results, a Zarr folder; with `show`, a folder for the figures")
 def sweep(
     study: Annotated[
         str | None,
@@ -29,32 +30,14 @@ def sweep(
     store: Annotated[
         Path | None, typer.Argument(help="After `show`: the results.", metavar="[STORE]")
     ] = None,
-    path: Annotated[
-        Path | None,
-        written("the results, a Zarr folder; with `show`, a folder for the figures", "FOLDER"),
-    ] = None,
-    workers: Annotated[
-        int | None,
-        typer.Option(help="Processes on this machine, 1 by default; 0: none but this one.", min=0),
-    ] = None,
-    scheduler: Annotated[
-        str | None,
-        typer.Option(
-            help="Address of a Dask scheduler instead, or `local` for a cluster of `--workers` "
-            "processes.",
-            metavar="ADDRESS",
-        ),
-    ] = None,
-    again: Annotated[bool, typer.Option("--again", help="Try again what failed before.")] = False,
-    any_version: Annotated[
-        bool,
-        typer.Option("--any-version", help="Go on though another version of vibrissa began."),
-    ] = False,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Print number of cells, time and size, and stop.")
-    ] = False,
-    example: ExampleOption = False,
-    force: ForceOption = False,
+    target: Path | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    again: bool = False,
+    any_version: bool = False,
+    dry_run: bool = False,
+    example: bool = False,
+    force: bool = False,
 ) -> None:
     """Ask the same of many whiskers, here or on a cluster; stopped, it continues where it was.
 
@@ -75,7 +58,7 @@ def sweep(
     elif study == _SHOW:
         options = {"--workers": workers, "--scheduler": scheduler, "--again": again}
         refuse(options | {"--dry-run": dry_run}, "results are only shown")
-        _show(store, path or Path(), force)
+        _show(store, target or Path(), force)
     elif store is not None:
         raise ValueError(f"{store} is one word too many; the store is stated with -o")
     elif force:
@@ -88,7 +71,7 @@ def sweep(
         if dry_run:
             _cost(plan, max(workers, 1))
             return
-        target = path or Path(study).with_suffix(".zarr")
+        target = target or Path(study).with_suffix(".zarr")
         how = {"scheduler": scheduler, "again": again, "any_version": any_version}
         _run(plan, target, workers=workers, **how)
 

@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from vibrissa.cli import options
 from vibrissa.cli.inputs import WhiskerOptions, metres_of, objects_from, print_notes
-from vibrissa.cli.options import ForceOption, free, numbers, refuse, with_bundles, written
+from vibrissa.cli.options import free, numbers, refuse, with_options
 from vibrissa.cli.terminal import progress_bars, say, shown
 
 if TYPE_CHECKING:
@@ -39,18 +38,10 @@ _RATE, _CUTOFF = 1000.0, 85.0
 class FilmOptions:
     """How the videos were filmed."""
 
-    pixel_size: Annotated[
-        float | None,
-        typer.Option(
-            help="Size of a pixel of both views in space, mm, without --cameras; 0.058 by default.",
-            metavar="MM",
-        ),
-    ] = None
-    rate: options.RateOption = None
-    cameras: options.CamerasOption = None
-    offset: Annotated[
-        str, typer.Option(help="Frames by which the second camera began earlier, or auto.")
-    ] = "0"
+    pixel_size: float | None = None
+    rate: float | None = None
+    cameras: Path | None = None
+    offset: str = "0"
 
     def __post_init__(self) -> None:
         """Refuse what cannot be."""
@@ -92,33 +83,10 @@ class FilmOptions:
 class TraceStatements:
     """How whiskers look in the images, and where they begin."""
 
-    base: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Column and row where a whisker leaves the face in the first frame, view by view "
-            "and then whisker by whisker; by default the whisker is traced that all views show: "
-            "start.png, next to the recording, shows which.",
-            metavar="X,Y",
-        ),
-    ] = None
-    base_width: Annotated[
-        float,
-        typer.Option(help="Width of the whisker's base in the images, pixels, at least 3."),
-    ] = _FINEST
-    jump: Annotated[
-        float,
-        typer.Option(
-            help="Largest distance of a whisker from where the frames before predict it, pixels; "
-            "what is farther away is another whisker."
-        ),
-    ] = 5.0
-    bright: Annotated[
-        bool | None,
-        typer.Option(
-            "--bright/--dark",
-            help="Whether whiskers are bright on dark; by default the first frame decides.",
-        ),
-    ] = None
+    base: list[str] | None = None
+    base_width: float = _FINEST
+    jump: float = 5.0
+    bright: bool | None = None
 
     def __post_init__(self) -> None:
         """Refuse what cannot be."""
@@ -158,10 +126,10 @@ class TraceStatements:
 class KnownOptions:
     """What is known besides the videos."""
 
-    corrections: options.CorrectionsOption = None
-    head: options.HeadOption = None
-    contact: options.ContactOption = None
-    objects: options.ObjectsOption = None
+    corrections: Path | None = None
+    head: Path | None = None
+    contact: Path | None = None
+    objects: Path | None = None
 
     def alone(self) -> dict[str, Path | None]:
         """Return the options that are for one trial only."""
@@ -194,7 +162,7 @@ class KnownOptions:
         return known
 
 
-@with_bundles
+@with_options("the recording, .nc; of several trials a folder for them")
 def track(
     videos: Annotated[
         list[Path],
@@ -204,14 +172,14 @@ def track(
             metavar="VIDEO...",
         ),
     ],
-    path: Annotated[Path, written("the recording, .nc; of several trials a folder for them")],
+    target: Path,
     filmed: FilmOptions,
     traced: TraceStatements,
     known: KnownOptions,
     own: WhiskerOptions,
-    base_radius: options.BaseRadiusOption = None,
-    cutoff: options.CutoffOption = None,
-    force: ForceOption = False,
+    base_radius: float | None = None,
+    cutoff: float | None = None,
+    force: bool = False,
 ) -> None:
     """Track a whisker in two videos: its shape, pose, contact, and force and moment at its base.
 
@@ -227,7 +195,7 @@ def track(
     for video in videos:
         check_readable(video)
     views = filmed.views(videos)
-    trials = _trials(videos, len(views), path, known.alone())
+    trials = _trials(videos, len(views), target, known.alone())
     free(trials, force)
     rate = filmed.frames_per_second
     low_pass = _CUTOFF if cutoff is None else cutoff

@@ -3,20 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-import typer
 
 from vibrissa.cli.inputs import map_from
-from vibrissa.cli.options import (
-    ForceOption,
-    MapArgument,
-    RegionsOption,
-    TripletsOption,
-    free,
-    written,
-)
+from vibrissa.cli.options import MapArgument, Region, free, with_options
 from vibrissa.cli.terminal import output, progress_bars, say, shown
 
 if TYPE_CHECKING:
@@ -29,36 +21,19 @@ _ASKED = "Fx MB MD"
 """The triplet whose witness is printed, if it has one: that of the paper."""
 
 
+@with_options("all evidence, .nc or .csv; by default nowhere")
 def uniqueness(
     path: MapArgument,
-    using: TripletsOption = None,
-    region: RegionsOption = None,
-    domain: Annotated[
-        Literal["reachable", "paper"],
-        typer.Option(help="All contacts, or those within the paper's grid."),
-    ] = "reachable",
-    cone: Annotated[
-        float,
-        typer.Option(help="Contacts within this angle about rest are left out, degrees.", min=0.0),
-    ] = 2.0,
-    min_separation: Annotated[
-        float,
-        typer.Option(
-            help="Distance within which two contacts count as one, share of the whisker's length."
-        ),
-    ] = 0.025,
-    samples: Annotated[int, typer.Option(help="Number of contacts that are tried.", min=16)] = 4096,
-    resolution: Annotated[
-        bool, typer.Option(help="Whether to find how finely signals must be measured.")
-    ] = True,
-    network: Annotated[
-        bool,
-        typer.Option(
-            "--network", help="Also train a network for each triplet, as the paper did; slow."
-        ),
-    ] = False,
-    target: Annotated[Path | None, written("all evidence, .nc or .csv; by default nowhere")] = None,
-    force: ForceOption = False,
+    using: list[str] | None = None,
+    region: list[Region] | None = None,
+    domain: Literal["reachable", "paper"] = "reachable",
+    cone: float = 2.0,
+    min_separation: float = 0.025,
+    samples: int = 4096,
+    resolution: bool = True,
+    network: bool = False,
+    target: Path | None = None,
+    force: bool = False,
 ) -> None:
     """Find which triplets of signals locate the contact uniquely, with witnesses where not.
 

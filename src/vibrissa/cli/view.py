@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from vibrissa.cli.inputs import MAP, RECORDING, WhiskerOptions, kind_in, map_from, print_notes
-from vibrissa.cli.options import AnyLengthOption, RatOption, VideosOption
+from vibrissa.cli.options import with_options
 from vibrissa.cli.terminal import say
 
 if TYPE_CHECKING:
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
 
 
+@with_options()
 def view(
     path: Annotated[
         Path | None,
@@ -27,18 +28,12 @@ def view(
             metavar="[WHISKER | MAP | TRIAL]",
         ),
     ] = None,
-    videos: VideosOption = None,
-    host: Annotated[
-        str,
-        typer.Option(help="Address to listen on; 0.0.0.0 lets other machines in.", metavar="HOST"),
-    ] = "127.0.0.1",
-    port: Annotated[
-        int | None,
-        typer.Option(help="Port to listen on; by default the first free one from 8080."),
-    ] = None,
-    browser: Annotated[bool, typer.Option(help="Whether the browser is opened.")] = True,
-    rat: RatOption = None,
-    any_length: AnyLengthOption = False,
+    videos: list[Path] | None = None,
+    host: str = "127.0.0.1",
+    port: int | None = None,
+    browser: bool = True,
+    rat: str | None = None,
+    any_length: bool = False,
 ) -> None:
     """Bend a whisker with the mouse and see its signals; look at a map; watch a trial.
 

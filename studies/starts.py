@@ -1,4 +1,4 @@
-"""Where tracking begins without a click, in films with all that looks like a whisker.
+"""Where tracking begins without a click, in films with all that resembles a whisker.
 
 `python studies/starts.py`: films of `tests/tracking/furry.py`, 24 frames spread over 0.4 s each,
 whose seeds set no number of the method; some minutes on a free core. `--page` writes the table into

@@ -1,8 +1,9 @@
-"""Tracking of videos that look otherwise, one thing changed at a time, against the truth.
+"""Tracking under other image conditions, one thing changed at a time, against the truth.
 
-`python studies/other_looks.py [WORD ...]`: of the cases of `looks/cases.py` those whose name has
-one of the words in it, by default all, some ten minutes on a free core. Results are kept in the
-folder `output/other_looks`, case by case: stopped, it goes on from there; `--again` does all anew.
+`python studies/image_conditions.py [WORD ...]`: of the cases of `imaging/cases.py` those whose name
+has one of the words in it, by default all, some ten minutes on a free core. Results are kept in the
+folder `output/image_conditions`, case by case: stopped, it continues from there; `--again` repeats
+all.
 `--page` writes the table into `docs/tracking.md`, else it is printed.
 """
 
@@ -13,19 +14,19 @@ import re
 from pathlib import Path
 from typing import Any
 
-from looks.cases import CASES, Case
-from looks.scores import tracked
+from imaging.cases import CASES, Case
+from imaging.scores import tracked
 from pages import few, put, table
 
 ROOT = Path(__file__).parents[1]
-FOLDER = ROOT / "output" / "other_looks"
+FOLDER = ROOT / "output" / "image_conditions"
 HEAD = (
     "what is different",
     "images lost, wrong",
     "trace, px",
-    "contact told, %",
+    "contact right, %",
     "contact point, µm",
-    "its covariance says, µm",
+    "its covariance states, µm",
     "errors, in sigmas",
     "length, %",
     "",
@@ -33,12 +34,12 @@ HEAD = (
 
 
 def kept(case: Case) -> Path:
-    """Where the result of a case is."""
+    """File of the result of a case."""
     return FOLDER / f"{re.sub(r'[^a-zA-Z0-9]+', '-', case.name).strip('-')}.json"
 
 
 def result(case: Case, again: bool) -> dict[str, Any]:
-    """Of one case, as it is kept or anew."""
+    """Result of one case, as it is kept or anew."""
     path = kept(case)
     if path.exists() and not again:
         return dict(json.loads(path.read_text(encoding="utf-8")))
@@ -60,7 +61,7 @@ def row(found: dict[str, Any]) -> list[str]:
         found["name"],
         f"{found['lost']}, {found['wrong']} of {found['frames']}",
         spread(found["trace"], 1.0),
-        few(100.0 * found["told"], 3),
+        few(100.0 * found["right"], 3),
         spread(found["contact"], 1e6),
         spread(found["claimed"], 1e6),
         few(found["over"]) if math.isfinite(found["over"]) else "–",
@@ -107,7 +108,7 @@ def main() -> None:
         rows.append(row(result(case, chosen.again)))
         print(" | ".join(rows[-1]), flush=True)
     if chosen.page:
-        put(ROOT / "docs" / "tracking.md", {"other looks": table(HEAD, rows)})
+        put(ROOT / "docs" / "tracking.md", {"image conditions": table(HEAD, rows)})
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
-from looks.cases import Case, Filmed, filmed
+from imaging.cases import Case, Filmed, filmed
 from vibrissa.recording import Recording
 from vibrissa.tracking import (
     FRAMES,
@@ -39,7 +39,7 @@ def tracked(case: Case, seed: int = 0) -> dict[str, Any]:
         name: getattr(case.whisker, name)
         for name in ("base_radius", "tip_radius", "youngs_modulus", "poisson_ratio")
     }
-    with warnings.catch_warnings(record=True) as said:
+    with warnings.catch_warnings(record=True) as found_contact:
         warnings.simplefilter("always")
         try:
             start = started(film)
@@ -54,7 +54,7 @@ def tracked(case: Case, seed: int = 0) -> dict[str, Any]:
             out["remarks"] = found.attrs.get("remarks", "").splitlines()
         except Exception as error:  # what a user would read
             out["error"] = f"{type(error).__name__}: {error}"
-    out["said"] = sorted({str(one.message) for one in said})
+    out["found_contact"] = sorted({str(one.message) for one in found_contact})
     out["cpu"] = time.process_time() - begun
     return out
 
@@ -118,9 +118,9 @@ def rod_scores(film: Filmed, found: Any) -> dict[str, Any]:
     rows = film.shown[0][data["frame"].values[:, 0]]
     truth = film.trial["truth"].to_dataset().isel(whisker=0, time=rows)
     known = data["confidence"].values > 0.0
-    truly, said = truth["in_contact"].values > 0, data["in_contact"].values > 0
+    truly, found_contact = truth["in_contact"].values > 0, data["in_contact"].values > 0
     whisker, true = Recording(found).whisker(), Recording(film.trial).whisker()
-    both = truly & said
+    both = truly & found_contact
     gap = data["contact_point"].values - truth["contact_point"].values
     size = np.linalg.norm(gap, axis=1)[both]
     spread = data["contact_covariance"].values[both]
@@ -139,8 +139,8 @@ def rod_scores(film: Filmed, found: Any) -> dict[str, Any]:
     return {
         "rows": len(rows),
         "missing": int((~known).sum()),
-        "told": float((truly == said)[known].mean()) if known.any() else np.nan,
-        "touching": [int(truly.sum()), int(said.sum())],
+        "right": float((truly == found_contact)[known].mean()) if known.any() else np.nan,
+        "touching": [int(truly.sum()), int(found_contact.sum())],
         "contact": two(size[np.isfinite(size)]),
         "claimed": two(claimed),
         # 2.37 is the median of the square of three standard normal numbers.

@@ -54,12 +54,12 @@ class Case:
     size : tuple of int
         Of a frame, pixels.
     shift : tuple of float
-        By how much the cameras look beside the middle of where the whisker goes, m.
+        Shift of the middle of the images from the middle of where the whisker goes, m.
     angle : float, optional
         Between the views, rad; by default the paper's two.
     distance : float, optional
         Of perspective cameras, m.
-    look : ImageConditions
+    conditions : ImageConditions
         Light and blur.
     change : callable
         Makes of the frames of a view what is tracked: ``change(frames, view)``.
@@ -82,7 +82,7 @@ class Case:
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
     angle: float | None = None
     distance: float | None = None
-    look: ImageConditions = field(default_factory=ImageConditions)
+    conditions: ImageConditions = field(default_factory=ImageConditions)
     change: Callable[[Frames, int], Frames] = lambda frames, view: frames
     shown: Callable[[int, int], NDArray[np.intp]] = lambda count, view: np.arange(count)
     peg: float = 1.0
@@ -111,7 +111,7 @@ def filmed(case: Case, seed: int = 0) -> Filmed:
     trial = with_true_traces(trial, cameras)
     frames, shown = [], []
     for view, camera in enumerate(cameras):
-        film = list(film_frames(trial, camera, case.look, seed=seed + view))
+        film = list(film_frames(trial, camera, case.conditions, seed=seed + view))
         rows = case.shown(len(film), view)
         frames.append(case.change([film[i] for i in rows], view))
         shown.append(rows)
@@ -300,9 +300,9 @@ CASES = (
     Case("as it is", "ordinary"),
     Case("lens out of focus, 2 pixels", "blur", change=defocus(2.0)),
     Case("lens out of focus, 3 pixels", "blur", change=defocus(3.0)),
-    Case("shutter open for 1 ms", "blur", look=ImageConditions(exposure=1e-3)),
-    Case("contrast a quarter", "light", look=ImageConditions(contrast=0.85 / 4.0)),
-    Case("a third of the light", "light", look=ImageConditions(light=65.0, dark=6.0)),
+    Case("shutter open for 1 ms", "blur", conditions=ImageConditions(exposure=1e-3)),
+    Case("contrast a quarter", "light", conditions=ImageConditions(contrast=0.85 / 4.0)),
+    Case("a third of the light", "light", conditions=ImageConditions(light=65.0, dark=6.0)),
     Case("light falls by half", "light", change=drift(0.5)),
     Case("lamp at 60 Hz, 60 %", "light", change=flicker(60.0, 0.6)),
     Case("overexposed, background white", "light", change=each(lambda f: 1.6 * f)),
@@ -311,8 +311,8 @@ CASES = (
     ),
     Case("bright whisker on dark", "light", change=inverted),
     Case("light falls across the image by 80 %", "light", change=shaded(0.8)),
-    Case("no face", "background", look=ImageConditions(face=(0.0, 0.0, 0.0))),
-    Case("bright face", "background", look=ImageConditions(dark=150.0)),
+    Case("no face", "background", conditions=ImageConditions(face=(0.0, 0.0, 0.0))),
+    Case("bright face", "background", conditions=ImageConditions(dark=150.0)),
     Case("noise of 6 grey values", "noise", change=noisy(6.0)),
     Case("noise of 12 grey values", "noise", change=noisy(12.0)),
     Case("cloth, 8 grey values over 3 pixels", "background", change=textured(3.0, 8.0)),
@@ -337,7 +337,7 @@ CASES = (
         pixel=1e-3,
         rate=250.0,
         duration=0.6,
-        look=_ARM,
+        conditions=_ARM,
     ),
     Case("tip leaves the image", "frame", size=(380, 512), shift=(-2.8e-3, 0.0, 0.0)),
     Case(
@@ -347,10 +347,10 @@ CASES = (
         shift=(2.6e-3, 0.0, 0.0),
     ),
     Case("thick peg", "hidden", peg=2.5),
-    Case("one frame dropped, not told", "frames", shown=without(1, 70)),
+    Case("one frame dropped, not given", "frames", shown=without(1, 70)),
     Case("one frame dropped, offset auto", "frames", shown=without(1, 70), offset=None),
     Case("one view 30 frames shorter", "frames", shown=shorter(1, 30)),
-    Case("one frame out of step, not told", "frames", shown=late(1, 1)),
+    Case("one frame out of step, not given", "frames", shown=late(1, 1)),
     Case("one frame out of step, offset auto", "frames", shown=late(1, 1), offset=None),
     Case("γ whisker, 0.3 s", "ordinary", whisker=gamma(), duration=0.3, pixel=95e-6),
 )

@@ -25,6 +25,7 @@ from vibrissa.identifiability import critical_cones, witness_pairs
 from vibrissa.paper import error_solid, signal_slice
 from vibrissa.pipeline import with_contour, with_estimates
 from vibrissa.recording import Recording
+from vibrissa.scene import course_of, deflection_angles
 from vibrissa.signals import nearest_on_rest
 from vibrissa.simulation import (
     array_whisking,
@@ -115,12 +116,12 @@ def long_trial() -> xr.DataTree:
 
 def contour() -> Figure:
     """Its contacts and the peg that was fitted to them."""
-    course, (peg,) = plots.course_of(long_trial()), Recording(long_trial()).objects
+    course, (peg,) = course_of(long_trial()), Recording(long_trial()).objects
     return plots.contour_views(
         course.places,
         peg,
         shape_from_dataset(long_trial()["contour"].to_dataset()),
-        colour=plots.deflection_angles(course, line()),
+        colour=deflection_angles(course, line()),
     )
 
 
@@ -132,28 +133,28 @@ def filmed(rows: Sequence[int]) -> list[plots.Sight]:
 
 def overview() -> Figure:
     """The trial at a glance."""
-    course = plots.course_of(trial())
-    rows = plots.telling_rows(course)
+    course = course_of(trial())
+    rows = plots.key_frames(course)
     return plots.trial_overview(course, chart().to_dataset(), line(), filmed(rows), rows)
 
 
 def places() -> Figure:
     """Its contacts about the whisker and in the laboratory."""
-    course, fit = plots.course_of(trial()), shape_from_dataset(trial()["contour"].to_dataset())
+    course, fit = course_of(trial()), shape_from_dataset(trial()["contour"].to_dataset())
     return plots.contact_places(course, line(), Recording(trial()).objects, [fit])
 
 
 def signal_movie() -> np.ndarray:
     """A frame of the movie of signals."""
-    course = plots.course_of(trial())
-    rows = [0, plots.telling_rows(course)[-1] - 4, len(course.time) - 1]
+    course = course_of(trial())
+    rows = [0, plots.key_frames(course)[-1] - 4, len(course.time) - 1]
     return list(plots.signal_frames(course, chart().to_dataset(), line(), rows))[1]
 
 
 def contour_movie() -> np.ndarray:
     """A frame of the movie of the contour."""
-    course = plots.course_of(trial())
-    rows = [0, plots.telling_rows(course)[-1] - 4]
+    course = course_of(trial())
+    rows = [0, plots.key_frames(course)[-1] - 4]
     return list(
         plots.contour_frames(course, line(), filmed(rows), rows, Recording(trial()).objects)
     )[-1]

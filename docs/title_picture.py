@@ -12,18 +12,42 @@ from matplotlib.ticker import MaxNLocator
 import vibrissa as vb
 from vibrissa.contour import CylinderFit, shape_from_dataset
 from vibrissa.objects import Peg
-from vibrissa.plots import Course, course_of, telling_rows
-from vibrissa.plots.chart import column, fine_chart, values_of
-from vibrissa.plots.colours import sequential
-from vibrissa.plots.course import TRIPLET
-from vibrissa.plots.cylinder import felt, signal_axes, signal_limits, signal_places
-from vibrissa.plots.sections import outline
-from vibrissa.plots.solids import solid
-from vibrissa.plots.space import bounds, name_axes, paint, painted, space_axes
-from vibrissa.plots.style import BLUE, INK, MUTED, ORANGE, Array, box_axes, looking, sized_figure
-from vibrissa.plots.surfaces import coordinate_bar, levels
+from vibrissa.plots import key_frames
+from vibrissa.plots.contact_surfaces import coordinate_bar, levels
+from vibrissa.plots.objects import outline
+from vibrissa.plots.space import (
+    bounds,
+    felt,
+    name_axes,
+    paint,
+    painted,
+    signal_axes,
+    signal_limits,
+    signal_places,
+    space_axes,
+)
+from vibrissa.plots.style import (
+    BLUE,
+    INK,
+    MUTED,
+    ORANGE,
+    box_axes,
+    looking,
+    sequential,
+    sized_figure,
+)
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.recording import Recording
+from vibrissa.scene import (
+    TRIPLET,
+    Array,
+    Course,
+    column,
+    course_of,
+    sample_contacts,
+    solid_surface,
+    values_of,
+)
 from vibrissa.signals import SIGNALS
 
 WIDTH, HEIGHT = 182.0, 119.0
@@ -60,7 +84,7 @@ def title_picture(trial: xr.DataTree, contact_map: vb.ContactMap) -> Figure:
     course = course_of(trial)
     assert course.signals is not None
     # Shortly before the whisker, bent most, slips off.
-    moment = max(telling_rows(course), key=lambda row: course.signals["MB"][row]) - 3
+    moment = max(key_frames(course), key=lambda row: course.signals["MB"][row]) - 3
     (peg,) = Recording(trial).objects
     fit = shape_from_dataset(trial["contour"].to_dataset())
     assert isinstance(peg, Peg)
@@ -93,7 +117,7 @@ def bent(
     force: Array,
 ) -> None:
     """The whisker at that moment in the space that its contacts can reach, whisker frame."""
-    shell = solid(fine_chart(samples, line), True, column("deflection"))
+    shell = solid_surface(sample_contacts(samples, line), True, column("deflection"))
     places = to_display("contact_point", shell[..., :3])
     assert course.centerline is not None
     assert course.known is not None
@@ -162,12 +186,12 @@ def solids(figure: Figure, course: Course, samples: xr.Dataset, line: Array, mom
     way = np.stack([course.signals[name] for name in TRIPLET], axis=1)
     way[~course.touching] = np.nan
     strongest = ROOM * np.nanmax(np.abs(way[:, :2]), axis=0)
-    nodes = fine_chart(samples, line, tuple(OPEN))
+    nodes = sample_contacts(samples, line, tuple(OPEN))
     pairs = zip(TRIPLET[:2], strongest, strict=True)
     within = [1.0 - np.abs(values_of(name, nodes)) / most for name, most in pairs]
     count = nodes.shape[-1]
     nodes = np.concatenate([nodes, np.stack(within, axis=-1)], axis=-1)
-    body = solid(nodes, False, column("deflection"), count, count + 1)
+    body = solid_surface(nodes, False, column("deflection"), count, count + 1)
     limits = signal_limits(felt(body))
     course_way = signal_places(*way.T)
     for i, name in enumerate(("r", "theta", "phi")):

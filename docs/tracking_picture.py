@@ -11,8 +11,9 @@ from matplotlib.figure import Figure
 import vibrissa as vb
 from vibrissa.cameras import orthogonal_views
 from vibrissa.io import read_video
-from vibrissa.plots.style import MUTED, ORANGE, RED, Array, box_axes, head, looking, new_figure
+from vibrissa.plots.style import MUTED, ORANGE, RED, box_axes, head, looking, new_figure
 from vibrissa.quantities import axis_label, to_display
+from vibrissa.scene import Array
 from vibrissa.simulation import facing_peg, film, simulate, sweep_past, with_true_traces
 from vibrissa.tracking import TrackOptions, trace_video, track
 

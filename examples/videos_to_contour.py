@@ -18,6 +18,7 @@ from vibrissa.contour import shape_from_dataset
 from vibrissa.io import read_video
 from vibrissa.pipeline import with_contour
 from vibrissa.recording import Recording
+from vibrissa.scene import course_of
 from vibrissa.simulation import facing_peg, film, simulate, sweep_past
 from vibrissa.tracking import TrackOptions, trace_video, track
 
@@ -52,7 +53,7 @@ fit = shape_from_dataset(contour["contour"].to_dataset())
 print(f"peg: diameter {2e3 * fit.radius:.2f} mm, truly {2e3 * peg.radius:.2f} mm")
 
 # %% What the cameras saw, and where the contacts are
-course = plots.course_of(contour)
+course = course_of(contour)
 line = whisker.centerline(101)
 figure = plots.contact_places(course, line, Recording(trial).objects, [fit])
 plots.save(figure, folder / "videos_to_contour", ["png"])

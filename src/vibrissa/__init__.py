@@ -97,6 +97,7 @@ __all__ = [
     "report",
     "rod",
     "samples",
+    "scene",
     "sensitivity",
     "sensitivity_findings",
     "sensors",

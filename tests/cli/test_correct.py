@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-import vibrissa.plots.correcting as correcting
+from vibrissa import plots
 from vibrissa.cli.app import app
 from vibrissa.io import load_corrections, save_corrections, write_video
 
@@ -35,7 +35,7 @@ def test_corrections_of_other_views_are_kept(video, tmp_path, monkeypatch):
         save(found)
         return found
 
-    monkeypatch.setattr(correcting, "correct", person)
+    monkeypatch.setattr(plots, "correct", person)
     done = run("correct", video, "-o", path, "--view", "1")
     assert done.exit_code == 0, done.exception
     assert "2 corrected traces of view 1" in done.stdout

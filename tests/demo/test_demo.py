@@ -16,7 +16,7 @@ from vibrissa.io import load_contacts, load_recording
 from vibrissa.pipeline import fit_contacts
 from vibrissa.recording import Recording
 from vibrissa.report import trial_sections
-from vibrissa.report.values import shown_value
+from vibrissa.report.page import shown_value
 
 SHORT = {"duration": 0.6, "rate": 300.0, "video": False}
 FILMED = {"duration": 0.4, "rate": 250.0, "seed": 2}

@@ -8,7 +8,7 @@ import vibrissa as vb
 from vibrissa.objects import Box, Mesh, Peg, Plane, Sphere, objects_datasets
 from vibrissa.plots import array_views
 from vibrissa.plots.array import ROW_COLOURS
-from vibrissa.plots.things import head_triangles, object_triangles
+from vibrissa.scene import head_surfaces, object_surface
 from vibrissa.simulation import array_whisking, simulate
 
 ARRAY = vb.whisker_array(rows="BC", columns=[1, 2])
@@ -90,17 +90,17 @@ def test_objects_as_triangles_lie_on_their_surfaces(tmp_path):
         Mesh.load(tmp_path / "ball.ply", 1e-3),
     ]
     for thing, dataset in zip(things, objects_datasets(things).values(), strict=True):
-        corners = object_triangles(dataset, limits).reshape(-1, 3) * 1e-3
+        corners = object_surface(dataset, limits)[0] * 1e-3
         loose = 2e-4 if isinstance(thing, Mesh) else 1e-12
         np.testing.assert_allclose(thing.signed_distance(corners), 0.0, atol=loose)
     with pytest.raises(ValueError, match="of kind 'torus'"):
-        object_triangles(xr.Dataset(attrs={"kind": "torus"}), limits)
+        object_surface(xr.Dataset(attrs={"kind": "torus"}), limits)
 
 
 def test_the_sketched_head_holds_the_bases_and_moves():
-    skin = head_triangles(np.eye(3), np.zeros(3)).reshape(-1, 3)
+    skin = head_surfaces(np.eye(3), np.zeros(3))[0].reshape(-1, 3)
     for whisker in vb.whisker_array().values():
         away = np.linalg.norm(skin - whisker.pose.origin * 1e3, axis=1).min()
         assert away < 2.0
-    moved = head_triangles(np.eye(3), np.array([0.0, 0.0, 5e-3])).reshape(-1, 3)
+    moved = head_surfaces(np.eye(3), np.array([0.0, 0.0, 5e-3]))[0].reshape(-1, 3)
     np.testing.assert_allclose(moved - skin, np.tile([0.0, 0.0, 5.0], (len(skin), 1)), atol=1e-12)

@@ -17,11 +17,10 @@ from vibrissa.plots import (
     signals_over_time,
     whisker_views,
 )
-from vibrissa.plots.chart import SIGNALS
-from vibrissa.plots.colours import cyclic
 from vibrissa.plots.signals import intervals
-from vibrissa.plots.style import robust_limits
+from vibrissa.plots.style import cyclic
 from vibrissa.quantities import axis_label
+from vibrissa.scene import SIGNALS, robust_limits
 
 LINE = np.stack([np.linspace(0, 40e-3, 60), 10.0 * np.linspace(0, 40e-3, 60) ** 2, np.zeros(60)], 1)
 RADIUS = np.linspace(100e-6, 7e-6, 60)

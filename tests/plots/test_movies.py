@@ -16,10 +16,10 @@ from vibrissa.cli.app import app, main
 from vibrissa.cli.drawings import sights_of
 from vibrissa.cli.movie import FrameOptions
 from vibrissa.io import save_recording, video_frames, video_info, write_movie, write_video
-from vibrissa.plots import Sight, contour_frames, course_of, signal_frames
-from vibrissa.plots.contour_movie import _SIDE_BOXES, _SIGHT_BOXES
-from vibrissa.plots.screen import HEIGHT, SIZE, WIDTH
-from vibrissa.plots.sights import Window, part_of
+from vibrissa.plots import Sight, contour_frames, signal_frames
+from vibrissa.plots.cameras import Window, part_of
+from vibrissa.plots.movies import _SIDE_BOXES, _SIGHT_BOXES, HEIGHT, SIZE, WIDTH
+from vibrissa.scene import course_of
 
 RED = np.array([232, 0, 11])
 ORANGE = np.array([213, 94, 0])
@@ -45,7 +45,7 @@ def samples():
 @pytest.fixture
 def coarse(monkeypatch):
     """Solids that are quicker to make."""
-    monkeypatch.setattr("vibrissa.plots.chart._SHAPE", (12, 24, 8))
+    monkeypatch.setattr("vibrissa.scene.solids._SHAPE", (12, 24, 8))
 
 
 def line():

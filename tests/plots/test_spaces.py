@@ -6,9 +6,18 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from vibrissa.plots import contact_surfaces, signal_clouds
-from vibrissa.plots.chart import SIGNALS, column, fine_chart, values_of
-from vibrissa.plots.solids import clipped, level, refined, skin, solid
 from vibrissa.quantities import axis_label
+from vibrissa.scene.solids import (
+    SIGNALS,
+    clip,
+    column,
+    level_surface,
+    sample_contacts,
+    skin,
+    solid_surface,
+    subdivide,
+    values_of,
+)
 
 LENGTH, WIDEST, CONE = 40e-3, 0.8, np.deg2rad(2.0)
 LINE = np.stack([np.linspace(0.0, LENGTH, 50), np.zeros(50), np.zeros(50)], axis=1)
@@ -18,7 +27,7 @@ OUTSIDE = column("deflection")
 @pytest.fixture
 def coarse(monkeypatch):
     """Surfaces that are quicker to make, where only what is written matters."""
-    monkeypatch.setattr("vibrissa.plots.chart._SHAPE", (12, 24, 8))
+    monkeypatch.setattr("vibrissa.scene.solids._SHAPE", (12, 24, 8))
 
 
 def around(turn: np.ndarray) -> np.ndarray:
@@ -65,7 +74,7 @@ def area(triangles: np.ndarray) -> float:
 
 
 def test_between_nodes_the_chart_goes_on() -> None:
-    nodes = fine_chart(chart(), LINE, shape=(20, 40, 20))
+    nodes = sample_contacts(chart(), LINE, shape=(20, 40, 20))
     point = nodes[..., :3]
     r = np.linalg.norm(point, axis=-1)
     np.testing.assert_allclose(values_of("r", nodes), r, rtol=1e-12)
@@ -88,11 +97,11 @@ def test_a_solid_has_the_surface_of_the_ball_it_is_cut_from() -> None:
     low, high = 0.3 * LENGTH, LENGTH
     caps = 2.0 * np.pi * (low**2 + high**2) * (np.cos(CONE) - np.cos(WIDEST))
     sides = np.pi * (high**2 - low**2) * (np.sin(CONE) + np.sin(WIDEST))
-    whole = fine_chart(chart(), LINE)
-    assert area(solid(whole, True, OUTSIDE)) == pytest.approx(caps + sides, rel=5e-3)
-    quarter = fine_chart(chart(), LINE, (0.0, 0.5 * np.pi))
+    whole = sample_contacts(chart(), LINE)
+    assert area(solid_surface(whole, True, OUTSIDE)) == pytest.approx(caps + sides, rel=5e-3)
+    quarter = sample_contacts(chart(), LINE, (0.0, 0.5 * np.pi))
     cuts = (high**2 - low**2) * (WIDEST - CONE)
-    assert area(solid(quarter, False, OUTSIDE)) == pytest.approx(
+    assert area(solid_surface(quarter, False, OUTSIDE)) == pytest.approx(
         0.25 * (caps + sides) + cuts, rel=5e-3
     )
 
@@ -106,23 +115,23 @@ def test_a_solid_has_the_surface_of_the_ball_it_is_cut_from() -> None:
     ],
 )
 def test_surfaces_of_equal_coordinates_have_their_area(name, value, expected) -> None:
-    surface = clipped(level(fine_chart(chart(), LINE), column(name), value), OUTSIDE)
+    surface = clip(level_surface(sample_contacts(chart(), LINE), column(name), value), OUTSIDE)
     assert area(surface) == pytest.approx(expected, rel=0.01)
     np.testing.assert_allclose(values_of(name, surface), value, atol=1e-12 + 1e-9 * value)
 
 
 def test_clipping_parts_triangles_in_two() -> None:
     triangles = np.random.default_rng(3).normal(size=(200, 3, 4))
-    over = clipped(triangles, 3)
+    over = clip(triangles, 3)
     mirrored = triangles * np.array([1.0, 1.0, 1.0, -1.0])
-    under = clipped(mirrored, 3)
+    under = clip(mirrored, 3)
     assert over[..., 3].min() > -1e-12
     assert area(over) + area(under) == pytest.approx(area(triangles), rel=1e-12)
 
 
 def test_refining_keeps_the_surface() -> None:
     triangles = np.random.default_rng(4).normal(size=(20, 3, 4))
-    finer = refined(triangles, np.arange(20) < 5, times=2)
+    finer = subdivide(triangles, np.arange(20) < 5, times=2)
     assert len(finer) == 15 + 5 * 16
     assert area(finer) == pytest.approx(area(triangles), rel=1e-12)
     np.testing.assert_allclose(finer.max(axis=(0, 1)), triangles.max(axis=(0, 1)))

@@ -14,17 +14,10 @@ import vibrissa as vb
 from vibrissa.cli.app import app
 from vibrissa.io import save_recording
 from vibrissa.objects import Peg, Plane, Sphere
-from vibrissa.plots import (
-    Sight,
-    contact_places,
-    course_of,
-    deflection_angles,
-    telling_rows,
-    trial_overview,
-)
-from vibrissa.plots.head import draw_head, head_of
-from vibrissa.plots.outlines import draw_body, one_scale, room_for
+from vibrissa.plots import Sight, contact_places, key_frames, trial_overview
+from vibrissa.plots.objects import draw_body, draw_head, head_of, one_scale, room_for
 from vibrissa.plots.style import RED
+from vibrissa.scene import course_of, deflection_angles
 
 GREY = np.full((300, 300), 200, np.uint8)
 LINE = np.linspace([0.0, 0.0, 0.0], [40e-3, 0.0, 0.0], 20)
@@ -39,7 +32,7 @@ def samples():
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch):
     """Solids that are quicker to make."""
-    monkeypatch.setattr("vibrissa.plots.chart._SHAPE", (12, 24, 8))
+    monkeypatch.setattr("vibrissa.scene.solids._SHAPE", (12, 24, 8))
 
 
 def texts(figure: Figure) -> set[str]:
@@ -55,7 +48,7 @@ def dots(axes) -> np.ndarray:
 @pytest.mark.parametrize(("width", "images"), [("double", 4), ("single", 2)])
 def test_an_overview_shows_whisker_signals_and_contacts(known, samples, width, images):
     course = course_of(known.recording())
-    rows = telling_rows(course)
+    rows = key_frames(course)
     sights = [Sight(view, repeat(GREY)) for view in known.views]
     figure = trial_overview(course, samples, LINE, sights, rows, width=width)
     figure.draw_without_rendering()
@@ -96,9 +89,9 @@ def test_telling_frames_are_those_bent_most_to_either_side(known):
     trial["signals"] = signals.assign(
         MB=(("time", "whisker"), 1e-7 * bent[:, None]), MD=(("time", "whisker"), turn[:, None])
     )
-    np.testing.assert_array_equal(telling_rows(course_of(trial)), [9, 10])
+    np.testing.assert_array_equal(key_frames(course_of(trial)), [9, 10])
     without = course_of(known.recording(signals=False))
-    assert without.touching[telling_rows(without)].all()
+    assert without.touching[key_frames(without)].all()
 
 
 def test_contacts_lie_where_they_are_in_both_frames(known):

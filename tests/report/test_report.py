@@ -21,10 +21,14 @@ from vibrissa.io import load_recording, save_recording, video_info
 from vibrissa.quantities import quantity
 from vibrissa.recording import Recording
 from vibrissa.report import document, figure_sections, movies_section, table, trial_sections
-from vibrissa.report.page import Section
-from vibrissa.report.tracked import contacts_by_whisker, tracked_table, whiskers_table
-from vibrissa.report.trial import _settings, tracking_tables
-from vibrissa.report.values import shown_value
+from vibrissa.report.page import Section, shown_value
+from vibrissa.report.trial import (
+    _settings,
+    contacts_by_whisker,
+    tracked_table,
+    tracking_tables,
+    whiskers_table,
+)
 from vibrissa.signals import SIGNALS
 from vibrissa.status import describe
 

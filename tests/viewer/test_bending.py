@@ -4,11 +4,22 @@ import numpy as np
 import pytest
 
 import vibrissa as vb
-from vibrissa.viewer.bend_drawing import bend_drawing
-from vibrissa.viewer.bending import begin, loaded, moved, with_force, with_radius, with_whisker
-from vibrissa.viewer.charting import charted, envelope, places
+from vibrissa.viewer.bend import bend_drawing
 from vibrissa.viewer.readout import number, of_deflection, symbol
-from vibrissa.viewer.shaping import Shape, shape_of, shaped
+from vibrissa.viewer.state import (
+    Shape,
+    begin,
+    charted,
+    envelope,
+    loaded,
+    moved,
+    places,
+    shape_of,
+    shaped,
+    with_force,
+    with_radius,
+    with_whisker,
+)
 
 MM = 1e3
 

@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("viser", reason="viser is not installed", exc_type=ImportError)
 
-from vibrissa.viewer.framing import PANEL, Shot, framed
+from vibrissa.viewer.page import PANEL, Shot, framed
 
 FOV = np.deg2rad(75.0)
 

@@ -6,7 +6,7 @@ import struct
 import numpy as np
 import pytest
 
-from vibrissa.viewer.glb import before_tone_mapping, glb
+from vibrissa.viewer.stage import before_tone_mapping, glb
 
 
 def filmic(light):

@@ -9,9 +9,8 @@ pytest.importorskip("viser", reason="viser is not installed", exc_type=ImportErr
 
 import vibrissa as vb
 from vibrissa.viewer import view
-from vibrissa.viewer.guard import from_own_page
 from vibrissa.viewer.page_script import SCRIPT, with_script
-from vibrissa.viewer.server import free_port
+from vibrissa.viewer.server import free_port, from_own_page
 
 
 @pytest.mark.parametrize(

@@ -4,11 +4,17 @@ import numpy as np
 import pytest
 
 import vibrissa as vb
-from vibrissa.viewer.bending import begin, moved
-from vibrissa.viewer.charting import charted
-from vibrissa.viewer.locate_drawing import locate_drawing, of_located
-from vibrissa.viewer.locating import COLOURS, Sensor, coloured, located, usual_sensor
-from vibrissa.viewer.shading import counted, shaded
+from vibrissa.viewer.colours import counted, shaded
+from vibrissa.viewer.locate import (
+    COLOURS,
+    Sensor,
+    coloured,
+    locate_drawing,
+    located,
+    of_located,
+    usual_sensor,
+)
+from vibrissa.viewer.state import begin, charted, moved
 
 
 @pytest.fixture(scope="module")

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from vibrissa.objects import Box, Peg, Plane, Sphere
-from vibrissa.viewer.meshes import cylinder, ellipsoid, error_ellipsoid, tube
-from vibrissa.viewer.trial_drawing import object_body
+from vibrissa.scene import cylinder, ellipsoid, error_ellipsoid, tube
+from vibrissa.viewer.trial import object_body
 
 
 def volume(vertices, faces):

@@ -5,8 +5,7 @@ import xarray as xr
 
 import vibrissa as vb
 from vibrissa.io import load_recording
-from vibrissa.viewer.bending import begin
-from vibrissa.viewer.saving import (
+from vibrissa.viewer.save import (
     deflection_dataset,
     map_netcdf,
     netcdf,
@@ -16,6 +15,7 @@ from vibrissa.viewer.saving import (
     whisker_csv,
     whisker_netcdf,
 )
+from vibrissa.viewer.state import begin
 
 
 def test_a_whisker_comes_back(tmp_path):

@@ -4,11 +4,19 @@ import numpy as np
 import pytest
 
 import vibrissa as vb
-from vibrissa.plots.chart import values_of
-from vibrissa.viewer.charting import charted
-from vibrissa.viewer.map_drawing import frame_drawing, picked_drawing, solids_drawing
+from vibrissa.scene import values_of
+from vibrissa.viewer.map import (
+    COORDINATES,
+    SLICES,
+    TURN,
+    frame_drawing,
+    picked,
+    picked_drawing,
+    solids,
+    solids_drawing,
+)
 from vibrissa.viewer.readout import number
-from vibrissa.viewer.solids import COORDINATES, SLICES, TURN, picked, solids
+from vibrissa.viewer.state import charted
 
 
 @pytest.fixture(scope="module")

@@ -12,10 +12,9 @@ import vibrissa as vb
 from vibrissa.contour import fit_free, fit_shape
 from vibrissa.io import Footage, write_video
 from vibrissa.recording import Recording
-from vibrissa.viewer.signal_chart import chart, cursor
-from vibrissa.viewer.trial_drawing import fitted_body, moment_drawing, surroundings, touched
-from vibrissa.viewer.views import picture, views
-from vibrissa.viewer.watching import watched
+from vibrissa.viewer.readout import chart, cursor
+from vibrissa.viewer.recorded import picture, views, watched
+from vibrissa.viewer.trial import fitted_body, moment_drawing, surroundings, touched
 
 MM = 1e3
 

@@ -37,7 +37,7 @@ def correct(
         save_corrections,
         video_info,
     )
-    from vibrissa.plots.correcting import correct as corrected
+    from vibrissa.plots import correct as corrected
 
     if view < 0:
         raise ValueError(f"--view is {view}; views are counted from 0")

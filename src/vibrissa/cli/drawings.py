@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from vibrissa.cameras import Camera
     from vibrissa.contacts import ContactMap
     from vibrissa.contour import FittedShape
-    from vibrissa.plots import Course, Sight
+    from vibrissa.plots import Sight
+    from vibrissa.scene import Course
     from vibrissa.whisker import Whisker
 
 Draw = Callable[[], Any]
@@ -176,7 +177,7 @@ def map_drawings(
     from vibrissa import plots
     from vibrissa.identifiability import sensitivity, witness_pairs
     from vibrissa.paper import error_solid, signal_slice
-    from vibrissa.plots.evidence import HIGHLIGHTED
+    from vibrissa.plots import HIGHLIGHTED
 
     whisker, samples = contact_map.whisker, contact_map.to_dataset()
     line = whisker.centerline(NODES)
@@ -227,8 +228,8 @@ def trial_drawings(
 ) -> dict[str, Draw]:
     """Return the figures of a trial; what it lacks is printed, with the verb that makes it."""
     from vibrissa.io import load_recording
-    from vibrissa.plots import course_of
     from vibrissa.recording import Recording
+    from vibrissa.scene import course_of
 
     trial = load_recording(path)
     course = course_of(trial, given.whisker)
@@ -262,10 +263,11 @@ def _contact_drawings(
     from vibrissa.contour import CylinderFit
     from vibrissa.objects import Peg
     from vibrissa.recording import Recording
+    from vibrissa.scene import deflection_angles
 
     by: Any = "time" if colour == "time" else "deflection_angle"
     line = whisker.centerline(NODES)
-    angles = plots.deflection_angles(course, line)
+    angles = deflection_angles(course, line)
     bodies, fits = list(Recording(trial).objects), fits_of(trial)
     points, known, estimated = course.places, course.known, course.estimated
     drawings: dict[str, Draw] = {}
@@ -301,7 +303,7 @@ def _signal_drawings(
     from vibrissa import plots
 
     samples = given.contact_map(trial, tell).to_dataset()
-    rows = plots.telling_rows(course)
+    rows = plots.key_frames(course)
     if width == "single":
         rows = rows[-1:]
     sights = sights_of(trial, course, given.videos or (), rows)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import NDArray
 
-    from vibrissa.plots import Course
+    from vibrissa.scene import Course
 
 _KINDS = ("signals", "contour")
 _LASTS = 45.0
@@ -84,7 +84,7 @@ def make_movies(
 ) -> list[Path]:
     """Make the movies that a trial allows."""
     from vibrissa.io import load_recording
-    from vibrissa.plots import course_of
+    from vibrissa.scene import course_of
 
     files = _files(target, path, kinds)
     free(files.values(), force)

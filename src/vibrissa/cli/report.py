@@ -143,9 +143,9 @@ def _of_trial(
     path: Path, trial: DataTree, of_trial: TrialOptions, seed: int, tell: Tell
 ) -> _Content:
     """The page of a trial."""
-    from vibrissa.plots import course_of
     from vibrissa.recording import Recording
     from vibrissa.report import contacts_in_space, space_section, trial_sections
+    from vibrissa.scene import course_of
 
     course = course_of(trial, of_trial.whisker)
     sections, script = trial_sections(trial, of_trial.whisker, seed), ""
@@ -183,10 +183,10 @@ def _of_map(path: Path, uniqueness: Path | None) -> _Content:
 
 def _can_draw() -> bool:
     """Whether there can be a picture in 3D; prints so if not."""
-    from vibrissa.report.space import MISSING, can_draw
+    from vibrissa.report import NO_SPACE, can_draw
 
     if not can_draw():
-        say(MISSING)
+        say(NO_SPACE)
     return can_draw()
 
 

@@ -20,21 +20,10 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
 from vibrissa.plots.space import paint, space_axes
-from vibrissa.plots.style import (
-    INK,
-    MUTED,
-    Array,
-    Mask,
-    Width,
-    head,
-    looking,
-    new_figure,
-    page_width,
-    say,
-)
-from vibrissa.plots.things import ends_nearby, eye_triangles, head_triangles, object_triangles
+from vibrissa.plots.style import INK, MUTED, Width, head, looking, new_figure, page_width, say
 from vibrissa.quantities import axis_label, to_display
 from vibrissa.recording import Group
+from vibrissa.scene import Array, Mask, head_surfaces, is_bounded, object_surface
 from vibrissa.whisker import Identity
 
 ROW_COLOURS: Mapping[str, str] = MappingProxyType(
@@ -83,11 +72,9 @@ class _Scene:
     @property
     def limits(self) -> Array:
         """Limits (3, 2) that hold whiskers, head and objects with an end."""
-        parts = [self.lines.reshape(-1, 3), head_triangles(*self.head).reshape(-1, 3)]
+        parts = [self.lines.reshape(-1, 3), head_surfaces(*self.head)[0].reshape(-1, 3)]
         everywhere = np.zeros((3, 2))
-        parts += [
-            object_triangles(o, everywhere).reshape(-1, 3) for o in self.objects if ends_nearby(o)
-        ]
+        parts += [object_surface(o, everywhere)[0] for o in self.objects if is_bounded(o)]
         parts += self.points
         places = np.concatenate(parts)
         places = places[np.isfinite(places).all(axis=1)]
@@ -167,10 +154,10 @@ def _drawn(scene: _Scene, width: Width) -> Figure:
 
 def _panel(axes: Axes, scene: _Scene, limits: Array, view: tuple[int, int], toward: int) -> None:
     """Draw one view, what is farther away first."""
-    skull, eyes = head_triangles(*scene.head), eye_triangles(*scene.head)
+    skull, eyes = head_surfaces(*scene.head)
     middle = scene.head[1] * 1e3
     for thing in scene.objects:
-        _flat(axes, object_triangles(thing, limits)[..., view], _THING, "#9aa3ad", 1.0)
+        _flat(axes, _triangles(thing, limits)[..., view], _THING, "#9aa3ad", 1.0)
     _flat(axes, skull[..., view], _HEAD, _EDGE, 2.0)
     if toward != 1:
         near = eyes[eyes[..., toward].mean(axis=1) > skull[..., toward].mean()]
@@ -194,6 +181,11 @@ def _flat(axes: Axes, triangles: Array, colour: str, edge: str, order: float) ->
     axes.add_collection(PolyCollection(list(triangles), **fill, zorder=order), autolim=False)
 
 
+def _triangles(thing: xr.Dataset, limits: Array) -> Array:
+    vertices, faces = object_surface(thing, limits)
+    return vertices[faces]
+
+
 def _space(figure: Figure, box: Box, scene: _Scene, limits: Array) -> None:
     """Draw all of it in space, what is farther away first."""
     view = _AT_REST if not scene.moment else _IN_A_TRIAL
@@ -207,7 +199,7 @@ def _space(figure: Figure, box: Box, scene: _Scene, limits: Array) -> None:
         axes.collections[-1].set_zorder(order)
 
     def skull(order: float) -> None:
-        triangles, eyes = head_triangles(*scene.head), eye_triangles(*scene.head)
+        triangles, eyes = sketch
         solid(triangles, _HEAD, order)
         solid(eyes[(eyes @ eye).mean(axis=1) > (triangles @ eye).mean()], INK, order + 0.5)
 
@@ -216,8 +208,9 @@ def _space(figure: Figure, box: Box, scene: _Scene, limits: Array) -> None:
         axes.plot(*scene.lines[i].T, linewidth=1.1 if scene.touching[i] else 0.7, **look)
         axes.plot(*scene.points[i].T, ".", markersize=1.6, **look)
 
-    things = [object_triangles(thing, limits) for thing in scene.objects]
-    items = [(float((head_triangles(*scene.head) @ eye).mean()), skull)]
+    sketch = head_surfaces(*scene.head)
+    things = [_triangles(thing, limits) for thing in scene.objects]
+    items = [(float((sketch[0] @ eye).mean()), skull)]
     items += [(float((t @ eye).mean()), partial(solid, t, _THING)) for t in things]
     # A whisker's base counts as well: it grows out of its side of the head.
     sides = 0.5 * (scene.lines[:, 0] + scene.lines.mean(axis=1)) @ eye

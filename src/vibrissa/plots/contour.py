@@ -1,16 +1,18 @@
-"""Contact points and the object that they outline, from three sides (the paper's Fig. 6C).
+"""Contact points and the object that they outline (Fig. 6C), and their distances from it.
 
-Contact points lie on the whisker's centreline, one whisker radius (some 50 µm) off the surface.
-Pegs and fitted cylinders are drawn in outline. Of other objects the section at the median place of
-the contacts is, from the side the silhouette where they are known; a fitted surface has its 95 %
-band about it, and ends where it is not known.
+Contact points are on the whisker's centreline, one whisker radius (some 50 µm) off the surface.
+Pegs and fitted cylinders are drawn in outline. Other objects appear as their section at the
+median position of the contacts, from the side as a silhouette where they are known; a fitted
+surface has its 95 % band about it, and ends where it is not known.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
@@ -18,23 +20,31 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.plots.colours import shading
-from vibrissa.plots.outlines import Body, draw_body
-from vibrissa.plots.sections import BAND, draw_section, has_band, is_cylinder, lies_flat, outline
+from vibrissa.plots.objects import (
+    BAND,
+    Body,
+    draw_body,
+    draw_section,
+    has_band,
+    is_cylinder,
+    lies_flat,
+    outline,
+)
 from vibrissa.plots.style import (
+    INK,
     MUTED,
     ORANGE,
-    Array,
     Width,
     head,
     looking,
     new_figure,
     page_width,
     plain,
-    robust_limits,
     say,
+    shading,
 )
-from vibrissa.quantities import axis_label, to_display
+from vibrissa.quantities import axis_label, quantity, to_display
+from vibrissa.scene import Array, robust_limits
 
 _VIEWS = ((0, 1), (0, 2), (1, 2))
 _NAMES = "xyz"
@@ -281,3 +291,76 @@ def _across(body: Body) -> str:
     """Its diameter, where it has one."""
     radius = getattr(body, "radius", None)
     return "" if radius is None else f", {2.0 * float(to_display('object_radius', radius)):.2f} mm"
+
+
+_HEIGHT = 52.0
+
+
+def distances_by_class(summaries: Sequence[xr.Dataset], *, width: Width = "double") -> Figure:
+    """Draw distances from the surface by classes, beside what the covariance predicts.
+
+    Parameters
+    ----------
+    summaries : sequence of xarray.Dataset
+        Of `vibrissa.contour.distances_by`: one panel each.
+    width : {"single", "double"}
+        Columns of the page.
+
+    Returns
+    -------
+    Figure
+        Median and 95 % of the sizes of the distances, µm, on a logarithmic scale: filled as
+        measured, open as predicted. The number of contacts stands below each class. Or the
+        sentence "no contacts".
+    """
+    shown = [s for s in summaries if int(s["contacts"].sum())]
+    with looking():
+        if not shown:
+            figure = new_figure(width, 40.0, None)
+            say(figure, "no contacts")
+            return figure
+        figure = new_figure(width, _HEIGHT, "constrained")
+        panels = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
+        for i, (axes, summary) in enumerate(zip(panels, shown, strict=True)):
+            _panel(axes, summary)
+            name = quantity(summary.attrs["quantity"]).long_name
+            head(axes, "abc"[i] if i < 3 else "", f"by {name}")
+        panels[0].set_ylabel(axis_label("surface_distance").replace("d", "|d|", 1))
+        panels[0].set_yscale("log")
+        handles, labels = panels[0].get_legend_handles_labels()
+        panels[0].yaxis.set_major_formatter("{x:g}")
+        figure.legend(handles, labels, loc="outside upper right", ncols=len(labels))
+        return figure
+
+
+def _panel(axes: Axes, summary: xr.Dataset) -> None:
+    place = np.arange(summary.sizes["class"])
+    for name, label, colour, beside in (
+        ("median", "median", INK, -0.12),
+        ("largest_95", "95 %", ORANGE, 0.12),
+    ):
+        measured = to_display("surface_distance", summary[name])
+        predicted = to_display("surface_distance", summary[f"{name}_predicted"])
+        axes.plot(place + beside, measured, "o", color=colour, markersize=4.0, label=label)
+        if np.isfinite(predicted).any():
+            axes.plot(
+                place + beside,
+                predicted,
+                "o",
+                color=colour,
+                markersize=7.0,
+                markerfacecolor="none",
+                markeredgewidth=0.8,
+                label=f"{label}, predicted",
+            )
+    name = summary.attrs["quantity"]
+    ends = [summary[end].values for end in ("lower", "upper")]
+    lower, upper = (to_display(name, v) for v in ends)
+    marks = [
+        f"{a:.3g}–\n{b:.3g}\n({int(n)})"
+        for a, b, n in zip(lower, upper, summary["contacts"].values, strict=True)
+    ]
+    axes.set_xticks(place, marks, fontsize=6.0)
+    axes.set_xlim(-0.5, len(place) - 0.5)
+    axes.set_xlabel(axis_label(name))
+    axes.grid(axis="y", color=MUTED, alpha=0.25, linewidth=0.4)

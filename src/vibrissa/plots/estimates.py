@@ -10,18 +10,9 @@ from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from vibrissa.plots.colours import shading
-from vibrissa.plots.style import (
-    MUTED,
-    Array,
-    head,
-    looking,
-    new_figure,
-    plain,
-    robust_limits,
-    say,
-)
+from vibrissa.plots.style import MUTED, head, looking, new_figure, plain, say, shading
 from vibrissa.quantities import axis_label, quantity, to_display
+from vibrissa.scene import Array, robust_limits
 
 _COORDINATES = ("r", "theta", "phi")
 

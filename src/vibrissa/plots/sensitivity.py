@@ -17,16 +17,14 @@ from vibrissa.plots.style import (
     INK,
     MUTED,
     ORANGE,
-    Array,
-    Mask,
     Width,
     looking,
     new_figure,
-    robust_limits,
     say,
     scale_near_zero,
 )
 from vibrissa.quantities import axis_label, quantity, to_display
+from vibrissa.scene import Array, Mask, robust_limits
 
 COORDINATES = ("r", "theta", "phi")
 BINS = 50

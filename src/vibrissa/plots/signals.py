@@ -11,20 +11,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from vibrissa.plots.style import (
-    BLUE,
-    INK,
-    SHADE,
-    Array,
-    Mask,
-    Width,
-    head,
-    looking,
-    new_figure,
-    say,
-)
+from vibrissa.plots.style import BLUE, INK, SHADE, Width, head, looking, new_figure, say
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.recording import Group
+from vibrissa.scene import Array, Mask
 
 _COLUMNS = (("Fx", "FT", "FD"), ("Mx", "MB", "MD"))
 _DIRECTIONS = ("FD", "MD")

@@ -17,21 +17,21 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import MaxNLocator
 
-from vibrissa.plots.colours import diverging, sequential
 from vibrissa.plots.style import (
     INK,
     MUTED,
-    Array,
     Width,
+    diverging,
     head,
     looking,
     new_figure,
     plain,
-    robust_limits,
     say,
     scale_near_zero,
+    sequential,
 )
 from vibrissa.quantities import axis_label, quantity, to_display
+from vibrissa.scene import Array, robust_limits
 
 _PANELS = ("r", "theta", "phi", "error_distance")
 _CIRCLES = {"MD": ("MB", "My", "Mz"), "FD": ("FT", "Fy", "Fz")}

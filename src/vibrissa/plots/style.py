@@ -1,9 +1,13 @@
-"""One look for all figures: sizes, fonts, colours, labels, files.
+"""One look for all figures: sizes, fonts, colours, colormaps, labels, files.
 
 Figures are made for print at the width of one or two columns (85 and 178 mm), with lettering of 6
 to 8 points at that size. Only Matplotlib's object-oriented interface is used: no window opens, no
 global state changes, and a figure is freed with its last name. Colours are told apart with any
 colour vision (Okabe & Ito 2008, https://jfly.uni-koeln.de/color/), and colormaps are perceptual.
+The cyclic one is a circle in the plane of lightness and of blue against yellow in OKLab
+(B. Ottosson 2020, https://bottosson.github.io/posts/oklab/), the plane that every common kind of
+colour vision sees; green against red is added for those who see it. Equal turns are therefore about
+equal steps in colour, and nothing is so pale that it is lost on white paper.
 """
 
 from __future__ import annotations
@@ -20,13 +24,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backend_bases import RendererBase
 from matplotlib.colorbar import Colorbar
+from matplotlib.colors import Colormap, ListedColormap
 from matplotlib.figure import Figure
-from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.io import replacing
+from vibrissa.scene import Array, robust_limits
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Width = Literal["single", "double"]
 
 WIDTHS: Mapping[str, float] = MappingProxyType({"single": 85.0, "double": 178.0})
@@ -161,28 +164,6 @@ def plain(bar: Colorbar) -> None:
     outline.set_visible(False)
 
 
-def robust_limits(values: ArrayLike, share: float = 0.98, symmetric: bool = False) -> Array:
-    """Limits between which most of the finite values lie."""
-    finite = np.asarray(values, dtype=np.float64)
-    finite = finite[np.isfinite(finite)]
-    if finite.size == 0:
-        return np.array([-1.0 if symmetric else 0.0, 1.0])
-    low, high = np.quantile(finite, [(1.0 - share) / 2.0, (1.0 + share) / 2.0])
-    if symmetric:
-        high = max(abs(low), abs(high))
-        low = -high
-    if not high - low > 1e-12 * max(abs(high), abs(low)):
-        room = 0.05 * abs(high) or 1.0
-        low, high = low - room, high + room
-    return np.array([low, high])
-
-
-def root(values: ArrayLike) -> Array:
-    """Take square roots of sizes and keep signs, for scales on which small values are seen."""
-    x = np.asarray(values, dtype=np.float64)
-    return np.asarray(np.sign(x) * np.sqrt(np.abs(x)))
-
-
 def scale_near_zero(axes: Axes, axis: str, limits: Array, width: float | None) -> None:
     """Scale an axis linearly near zero and logarithmically beyond, ticks at powers of ten."""
     panel: Any = axes  # what is chosen by name has no type
@@ -252,3 +233,83 @@ def _drawn(figure: Figure, **how: Any) -> bytes:
     with looking():
         figure.savefig(file, **how)
     return file.getvalue()
+
+
+_LIGHTNESS, _RADIUS, _YELLOW, _RED = 0.62, 0.20, 0.115, 0.06
+"""Centre and radius in lightness, radii in b (yellow) and a (red), within the gamut of sRGB."""
+
+_LMS_FROM_LAB = np.array(
+    [
+        [1.0, 0.3963377774, 0.2158037573],
+        [1.0, -0.1055613458, -0.0638541728],
+        [1.0, -0.0894841775, -1.2914855480],
+    ]
+)
+_RGB_FROM_LMS = np.array(
+    [
+        [4.0767416621, -3.3077115913, 0.2309699292],
+        [-1.2684380046, 2.6097574011, -0.3413193965],
+        [-0.0041960863, -0.7034186147, 1.7076147010],
+    ]
+)
+
+
+def _srgb(lab: Array) -> Array:
+    """SRGB (..., 3) in [0, 1] of OKLab (..., 3)."""
+    linear = np.clip((lab @ _LMS_FROM_LAB.T) ** 3 @ _RGB_FROM_LMS.T, 0.0, 1.0)
+    encoded: Array = np.where(
+        linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055
+    )
+    return encoded
+
+
+def cyclic() -> Colormap:
+    """Make a colormap for directions over one turn, from −π to π.
+
+    Returns
+    -------
+    Colormap
+        Colours from the lowest to the highest value.
+    """
+    turn = np.linspace(-np.pi, np.pi, 512, endpoint=False)
+    lab = np.stack(
+        [
+            _LIGHTNESS + _RADIUS * np.cos(turn),
+            -_RED * np.cos(turn),
+            _YELLOW * np.sin(turn),
+        ],
+        axis=-1,
+    )
+    return ListedColormap(_srgb(lab), name="vibrissa_cyclic")
+
+
+def sequential() -> Colormap:
+    """Make a colormap for what grows from one end, without the pale end lost on white paper.
+
+    Returns
+    -------
+    Colormap
+        Colours from the lowest to the highest value.
+    """
+    return ListedColormap(
+        mpl.colormaps["viridis"](np.linspace(0.0, 0.93, 256)), name="vibrissa_sequential"
+    )
+
+
+def diverging() -> Colormap:
+    """Make a colormap for what has a sign.
+
+    Returns
+    -------
+    Colormap
+        Colours from the lowest to the highest value.
+    """
+    return mpl.colormaps["coolwarm"]
+
+
+def shading(values: Array | None) -> dict[str, Any]:
+    """What tells a scatter plot how to colour its points."""
+    if values is None:
+        return {"color": INK, "linewidths": 0.0}
+    low, high = robust_limits(values)
+    return {"c": values, "cmap": sequential(), "vmin": low, "vmax": high, "linewidths": 0.0}

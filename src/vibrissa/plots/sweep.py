@@ -10,7 +10,6 @@ from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from vibrissa.plots.colours import sequential
 from vibrissa.plots.style import (
     BLUE,
     GREEN,
@@ -18,14 +17,15 @@ from vibrissa.plots.style import (
     MUTED,
     ORANGE,
     SHADE,
-    Array,
     Width,
     head,
     looking,
     new_figure,
     plain,
+    sequential,
 )
 from vibrissa.plots.verdicts import VERDICTS, triplet_label
+from vibrissa.scene import Array, root, squared
 
 _MARKS = dict(zip(VERDICTS, ("o", "D", "X"), strict=True))
 _INKS = dict(zip(VERDICTS, (BLUE, GREEN, ORANGE), strict=True))
@@ -252,13 +252,5 @@ def _label(value: object, dim: str) -> str:
     return text if text == "wrench" else triplet_label(text)
 
 
-def _root(x: Array) -> Array:
-    return np.sign(x) * np.sqrt(np.abs(x))
-
-
-def _square(x: Array) -> Array:
-    return np.sign(x) * np.square(x)
-
-
-_ROOT = (_root, _square)
+_ROOT = (root, squared)
 """Room for the small without losing the large."""

@@ -12,8 +12,9 @@ from matplotlib.path import Path
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
-from vibrissa.plots.style import INK, MUTED, Array, Width, looking, new_figure, page_width, say
+from vibrissa.plots.style import INK, MUTED, Width, looking, new_figure, page_width, say
 from vibrissa.quantities import axis_label, to_display
+from vibrissa.scene import Array
 
 _MAGNIFICATIONS = (1, 2, 3, 5, 10, 20, 50, 100)
 _WIDE = 0.02

@@ -4,17 +4,23 @@ Sections are made by pure functions of datasets; figures are drawn elsewhere and
 loads nothing: pictures, movies and scripts are in the file, and its security policy forbids more.
 """
 
-from vibrissa.report.chart import chart_sections
-from vibrissa.report.media import figure_sections, movies_section
-from vibrissa.report.page import Section, document, table
+from vibrissa.report.contact_map import chart_sections
+from vibrissa.report.page import Section, document, figure_sections, movies_section, table
 from vibrissa.report.provenance import Provenance, provenance, provenance_section
-from vibrissa.report.space import contacts_in_space, reachable_space, space_section
-from vibrissa.report.tracked import contacts_by_whisker
-from vibrissa.report.trial import trial_sections
+from vibrissa.report.space import (
+    NO_SPACE,
+    can_draw,
+    contacts_in_space,
+    reachable_space,
+    space_section,
+)
+from vibrissa.report.trial import contacts_by_whisker, trial_sections
 
 __all__ = [
+    "NO_SPACE",
     "Provenance",
     "Section",
+    "can_draw",
     "chart_sections",
     "contacts_by_whisker",
     "contacts_in_space",

@@ -13,17 +13,14 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from vibrissa.contour import FittedShape, surface_grid
-from vibrissa.plots import Course, object_triangles
 from vibrissa.quantities import quantity, shown_unit
 from vibrissa.report.page import Section, paragraph
+from vibrissa.scene import Array, Course, Ints, object_surface
 from vibrissa.sketch import BENT, REST, thinned
 
-Array = NDArray[np.float64]
-
-MISSING = "No 3D picture: `pip install 'vibrissa[report]'` makes it possible."
+NO_SPACE = "No 3D picture: `pip install 'vibrissa[report]'` makes it possible."
 """What is said where the drawing library is not installed."""
 
 _MOST_POINTS = 4000
@@ -35,7 +32,13 @@ _CAMERA = {"eye": {"x": 1.65, "y": -1.8, "z": 1.05}, "center": {"x": 0.0, "y": 0
 
 
 def can_draw() -> bool:
-    """Tell whether the drawing library is installed."""
+    """Check whether the drawing library is installed.
+
+    Returns
+    -------
+    bool
+        Whether there can be a picture in 3D.
+    """
     return find_spec("plotly") is not None
 
 
@@ -72,9 +75,10 @@ def contacts_in_space(
     points = 1e3 * places[known]
     drawn = [_points(points, "time", course.time[known], f"{course.places_as} contacts")]
     limits = _limits(points)
-    for thing in objects:
-        corners = object_triangles(thing, limits).reshape(-1, 3)
-        drawn.append(_triangles(corners, f"{thing.attrs['kind']}, as known"))
+    drawn += [
+        _triangles(*object_surface(thing, limits), f"{thing.attrs['kind']}, as known")
+        for thing in objects
+    ]
     for fit in fits:
         grid = 1e3 * surface_grid(fit, places[known])["surface_grid_point"].values
         x, y, z = np.moveaxis(grid, -1, 0)
@@ -172,12 +176,11 @@ def _points(points: Array, name: str, values: Array, label: str) -> Any:
     return go.Scatter3d(x=x, y=y, z=z, mode="markers", marker={**look, "colorbar": bar}, name=label)
 
 
-def _triangles(corners: Array, label: str) -> Any:
-    """Triangles whose corners (3n, 3) follow each other, mm."""
+def _triangles(vertices: Array, faces: Ints, label: str) -> Any:
+    """A surface, mm."""
     import plotly.graph_objects as go
 
-    x, y, z = corners.T
-    i, j, k = np.arange(len(corners)).reshape(-1, 3).T
+    (x, y, z), (i, j, k) = vertices.T, faces.T
     return go.Mesh3d(
         x=x, y=y, z=z, i=i, j=j, k=k, color=REST, opacity=0.35, name=label, showlegend=True
     )

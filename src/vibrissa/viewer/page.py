@@ -1,6 +1,6 @@
 """The page: one scene, one panel, and the modes between which one chooses.
 
-Everything that happens on the page ends in one thread (:class:`~vibrissa.viewer.latest.Latest`),
+Everything that happens on the page ends in one thread (:class:`~vibrissa.viewer.threads.Latest`),
 which changes the state and draws it, so that no state is ever changed by two at a time.
 """
 
@@ -9,21 +9,30 @@ from __future__ import annotations
 import time
 import traceback
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 import viser
+from numpy.typing import ArrayLike
+from viser import transforms
 
 from vibrissa.contacts import ContactMap
-from vibrissa.quantities import to_display
-from vibrissa.viewer.bending import Bend, begin, loaded, moved, with_whisker
-from vibrissa.viewer.charting import Chart, charted
-from vibrissa.viewer.drawing import Array
-from vibrissa.viewer.framing import Framing, Shot
-from vibrissa.viewer.grip import Grip
-from vibrissa.viewer.latest import Latest
-from vibrissa.viewer.shaping import shape_of, shaped
+from vibrissa.quantities import quantity, to_display
+from vibrissa.scene import Array, across
 from vibrissa.viewer.stage import Stage
+from vibrissa.viewer.state import (
+    Bend,
+    Chart,
+    begin,
+    charted,
+    loaded,
+    moved,
+    shape_of,
+    shaped,
+    with_whisker,
+)
+from vibrissa.viewer.threads import Latest
 from vibrissa.whisker import Whisker
 
 EXAGGERATION = 8.0
@@ -247,3 +256,149 @@ def show(handle: viser.GuiHtmlHandle, content: str) -> None:
     """Write something in the panel, unless it is there already."""
     if handle.content != content:
         handle.content = content
+
+
+_MM = quantity("length").display_factor
+
+Moved = Callable[[Array, Array], None]
+"""Called with the place (3,), m, and the orientation (3, 3) to which it was dragged."""
+
+
+class Grip:
+    """A ball and a gizmo at one place of the scene."""
+
+    def __init__(self, server: viser.ViserServer, size: float, moved: Moved) -> None:
+        self._moved = moved
+        self._gizmo = server.scene.add_transform_controls(
+            "/grip",
+            scale=size,
+            line_width=2.5,
+            disable_rotations=True,
+            depth_test=False,
+            opacity=0.75,
+            visible=False,
+        )
+        self._ball = server.scene.add_icosphere(
+            "/grip ball",
+            radius=0.096 * size,
+            color=(213, 94, 0),
+            subdivisions=2,
+            opacity=0.35,
+            side="front",
+            cast_shadow=False,
+            receive_shadow=False,
+            visible=False,
+        )
+        self._turning = False
+        self._by_ball = False
+
+        # Coroutines run one after the other, so that no older place can overtake a newer one.
+        @self._gizmo.on_update
+        async def _(event: viser.TransformControlsEvent) -> None:
+            if event.phase == "update":
+                self._by_ball = False
+                self._tell(event.target.position)
+
+        @self._ball.on_drag
+        async def _(event: viser.SceneNodeDragEvent[viser.IcosphereHandle]) -> None:
+            # What is not held would only be drawn in vain.
+            self._gizmo.visible = event.phase == "end" and self._ball.visible
+            if event.phase == "update":
+                self._by_ball = True
+                self._tell(event.end_position)
+
+    def _tell(self, place: ArrayLike) -> None:
+        turn = np.array(transforms.SO3(self._gizmo.wxyz).as_matrix(), dtype=np.float64)
+        self._moved(np.array(place, dtype=np.float64) / _MM, turn)
+
+    def follow(self, place: Array) -> None:
+        """Be where it was dragged to, (3,), m, as far as the mouse does not do that itself."""
+        x, y, z = (_MM * place).tolist()
+        self._ball.position = (x, y, z)
+        if self._by_ball:
+            self._gizmo.position = (x, y, z)
+
+    def show(self, place: Array | None, axis: Array | None = None) -> None:
+        """Stand at a place (3,), m; with arcs that turn an axis, if there is one; None hides it."""
+        if place is not None:
+            x, y, z = (_MM * place).tolist()
+            self._gizmo.position = self._ball.position = (x, y, z)
+        if axis is not None:
+            first, second = across(axis)
+            turn = np.stack([first, second, axis / np.linalg.norm(axis)], axis=1)
+            self._gizmo.wxyz = transforms.SO3.from_matrix(turn).wxyz
+        elif self._turning:
+            self._gizmo.wxyz = (1.0, 0.0, 0.0, 0.0)
+        if (axis is not None) != self._turning:
+            self._turning = axis is not None
+            self._gizmo.disable_rotations = not self._turning
+        self._gizmo.visible = self._ball.visible = place is not None
+
+    def remove(self) -> None:
+        """Take it away."""
+        self._gizmo.remove()
+        self._ball.remove()
+
+
+PANEL = 0.52
+"""Width of the panel and its margin, over the height of a usual window; in a narrow one at most
+half of the width counts. How many pixels it has is not known: screens have one or more to each of
+the page's."""
+
+_WIDTH = 1.25
+"""How wide what is shown is, over the distance from which it is looked at."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """A place to be looked at."""
+
+    centre: Array
+    distance: float
+    way: Array
+
+
+def framed(shot: Shot, width: float, height: float, fov: float) -> tuple[Array, Array]:
+    """Where someone stands and looks, mm, whose window is so large."""
+    free = max(width - PANEL * height, 0.5 * width)
+    across = 2.0 * np.tan(0.5 * fov) / height  # of a pixel, over the distance
+    distance = shot.distance * max(1.0, _WIDTH / (free * across))
+    direction = shot.way / np.linalg.norm(shot.way)
+    right = np.cross([0.0, 0.0, 1.0], direction)
+    right /= np.linalg.norm(right)
+    middle = shot.centre + 0.5 * (width - free) * across * distance * right
+    return middle + distance * direction, middle
+
+
+class Framing:
+    """Lets everyone look at a shot, now and when they come."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        self._shot: Shot | None = None
+        server.on_client_connect(self._came)
+
+    def show(self, shot: Shot) -> None:
+        """Let everyone look at this."""
+        self._shot = shot
+        camera = self._server.initial_camera
+        place, target = framed(shot, 1280.0, 720.0, camera.fov)
+        camera.position, camera.look_at = _triple(place), _triple(target)
+        for client in self._server.get_clients().values():
+            self._turn(client, shot)
+
+    def _came(self, client: viser.ClientHandle) -> None:
+        if self._shot is not None:
+            self._turn(client, self._shot)
+
+    def _turn(self, client: viser.ClientHandle, shot: Shot) -> None:
+        camera = client.camera
+        place, target = framed(shot, camera.image_width, camera.image_height, camera.fov)
+        with client.atomic():
+            camera.position = _triple(place)
+            camera.look_at = _triple(target)
+
+
+def _triple(values: Array) -> tuple[float, float, float]:
+    x, y, z = values.tolist()
+    return x, y, z

@@ -1,17 +1,23 @@
-"""Serve the page on this machine."""
+"""Serve the page on this machine, to the page itself and to programs that are not browsers."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
 import io
+import ipaddress
 import os
 import socket
+import threading
 import time
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from http import HTTPStatus
 from os import PathLike
 from types import TracebackType
 from typing import Any, Self
+from urllib.parse import urlsplit
 
 import numpy as np
 import viser
@@ -20,19 +26,19 @@ from numpy.typing import ArrayLike
 
 from vibrissa.contacts import ContactMap
 from vibrissa.io import Footage
-from vibrissa.viewer.bend_panel import BendMode
-from vibrissa.viewer.bending import loaded, moved
-from vibrissa.viewer.guard import guarded
-from vibrissa.viewer.locate_panel import LocateMode
-from vibrissa.viewer.map_panel import MapMode
+from vibrissa.viewer.bend import BendMode
+from vibrissa.viewer.locate import LocateMode, coloured, located, usual_sensor
+from vibrissa.viewer.map import MapMode
 from vibrissa.viewer.page import Mode, Page
+from vibrissa.viewer.page_script import amended
 from vibrissa.viewer.readout import note
-from vibrissa.viewer.save_panel import SaveControls
+from vibrissa.viewer.recorded import Watched, watched
+from vibrissa.viewer.save import SaveControls
 from vibrissa.viewer.stage import lit
-from vibrissa.viewer.trial_panel import TrialMode
-from vibrissa.viewer.warming import Warming, rehearsal
-from vibrissa.viewer.watching import Watched, watched
-from vibrissa.viewer.whisker_panel import WhiskerControls
+from vibrissa.viewer.state import loaded, moved, with_radius
+from vibrissa.viewer.threads import CompileNotice, Rehearsal
+from vibrissa.viewer.trial import TrialMode
+from vibrissa.viewer.whisker import WhiskerControls
 from vibrissa.whisker import Whisker
 
 HOST = "127.0.0.1"
@@ -216,9 +222,28 @@ def _furnished(
     def told(busy: bool) -> None:
         notice.visible = busy
 
-    warming = Warming(told)
+    warming = CompileNotice(told)
     page.closing.append(warming.close)
     warming.start(rehearsal(page))
+
+
+def rehearsal(page: Page) -> list[Rehearsal]:
+    """What someone may ask of a page, as jobs that change nothing."""
+    bend = page.bend
+
+    def locate() -> None:
+        page.settle(600.0)
+        if (chart := page.chart) is not None:
+            sensor = usual_sensor(chart.whisker)
+            located(chart, page.bend_by_point(), sensor)
+            coloured(chart, "sensitivity", sensor)
+
+    return [
+        lambda: loaded(bend, "peg"),
+        lambda: with_radius(loaded(bend, "peg"), 0.01 * bend.whisker.length),
+        lambda: loaded(bend, "force"),
+        locate,
+    ]
 
 
 def _footage(
@@ -273,3 +298,69 @@ def is_free(host: str, port: int) -> bool:
                 return False
             raise ValueError(f"no page can be served at port {port} of {host}: {error}") from error
     return True
+
+
+_ONE_AT_A_TIME = threading.Lock()
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address or name is that of this machine, for this machine alone."""
+    if host.lower() == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def from_own_page(origin: str | None, asked: str | None, host: str) -> bool:
+    """Tell whether a request comes from a page of this server, or from no browser."""
+    if origin is None:
+        return True
+    try:
+        page = urlsplit(origin)
+        name = page.hostname
+    except ValueError:
+        return False
+    if not name or asked is None or page.netloc.lower() != asked.lower():
+        return False
+    return is_loopback(name) or not is_loopback(host)
+
+
+@contextmanager
+def guarded(host: str) -> Iterator[None]:
+    """Let servers that start meanwhile refuse pages from elsewhere.
+
+    viser has no place for such a check, so what it calls to listen is wrapped while it starts.
+    """
+    from websockets.asyncio import server
+
+    module: Any = server
+    plain = module.serve
+    used = []
+
+    def serve(*args: Any, process_request: Any = None, **options: Any) -> Any:
+        used.append(True)
+
+        def checked(connection: Any, request: Any) -> Any:
+            headers = request.headers
+            if not from_own_page(headers.get("Origin"), headers.get("Host"), host):
+                return connection.respond(HTTPStatus.FORBIDDEN, "This is for its own page only.\n")
+            if process_request is None:
+                return None
+            return amended(process_request(connection, request))
+
+        return plain(*args, process_request=checked, **options)
+
+    with _ONE_AT_A_TIME:
+        module.serve = serve
+        try:
+            yield
+        finally:
+            module.serve = plain
+    if not used:
+        warnings.warn(
+            "with this version of viser, other web pages in this browser can talk to this one",
+            UserWarning,
+            stacklevel=2,
+        )

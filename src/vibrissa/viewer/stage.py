@@ -1,14 +1,37 @@
-"""Drawings onto the page: things are added, changed or taken away by name."""
+"""Drawings onto the page: things are added, changed or taken away by name.
+
+A surface of many colours goes to the browser as a GLB file (binary glTF 2.0), whose colours are
+shown as they are: a surface that is lit in the browser costs many times what it costs to fill it
+with the colours of its corners, and a colour that stands for a number must not depend on the light.
+So a little shade, by which one sees the shape, is in the colours here, and the material is
+`KHR_materials_unlit`. The page's tone mapping (ACES, as three.js has it), which would make all
+colours paler than those of the legend, is undone beforehand.
+"""
 
 from __future__ import annotations
 
+import json
+import struct
 from typing import Any, cast
 
 import numpy as np
 import viser
+from numpy.typing import NDArray
 
-from vibrissa.viewer.drawing import Arrows, Body, Cloud, Drawing, Label, Line, Painted, Thing
-from vibrissa.viewer.glb import glb
+from vibrissa.scene import (
+    Array,
+    Arrows,
+    Body,
+    Bytes,
+    Cloud,
+    Drawing,
+    Ints,
+    Label,
+    Line,
+    Mark,
+    Painted,
+    Side,
+)
 
 
 def lit(scene: viser.SceneApi) -> None:
@@ -33,12 +56,12 @@ class Stage:
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
-        self._shown: dict[str, dict[str, tuple[Thing, viser.SceneNodeHandle]]] = {}
+        self._shown: dict[str, dict[str, tuple[Mark, viser.SceneNodeHandle]]] = {}
 
     def show(self, layer: str, drawing: Drawing) -> None:
         """Make a layer look like a drawing; all changes come into sight together."""
         before = self._shown.get(layer, {})
-        after: dict[str, tuple[Thing, viser.SceneNodeHandle]] = {}
+        after: dict[str, tuple[Mark, viser.SceneNodeHandle]] = {}
         with self._server.atomic():
             for name in before.keys() - drawing.keys():
                 before[name][1].remove()
@@ -55,7 +78,7 @@ class Stage:
         found = self._shown.get(layer, {}).get(name)
         return None if found is None else found[1]
 
-    def _added(self, path: str, thing: Thing) -> viser.SceneNodeHandle:
+    def _added(self, path: str, thing: Mark) -> viser.SceneNodeHandle:
         scene = self._server.scene
         match thing:
             case Body():
@@ -66,7 +89,7 @@ class Stage:
                     color=thing.colour,
                     opacity=thing.opacity,
                     side=thing.side,
-                    position=thing.place,
+                    position=thing.position,
                     cast_shadow=False,
                     receive_shadow=False,
                 )
@@ -105,7 +128,7 @@ class Stage:
                 )
 
 
-def _changed(handle: viser.SceneNodeHandle, old: Thing, new: Thing) -> bool:
+def _changed(handle: viser.SceneNodeHandle, old: Mark, new: Mark) -> bool:
     """Change what is on the page into a new thing, if it is near enough to the old one."""
     node = cast(Any, handle)  # every kind has attributes of its own
     match old, new:
@@ -113,8 +136,8 @@ def _changed(handle: viser.SceneNodeHandle, old: Thing, new: Thing) -> bool:
             if new.vertices is not old.vertices:
                 node.vertices = new.vertices.astype(np.float32)
             node.color, node.opacity = new.colour, new.opacity
-            if new.place != old.place:
-                node.position = new.place
+            if new.position != old.position:
+                node.position = new.position
         case Cloud(), Cloud() if old.size == new.size:
             node.points, node.colors = new.points.astype(np.float32), new.colours
         case Arrows(), Arrows() if _like(old, new):
@@ -144,3 +167,116 @@ def _alike(old: Line, new: Line) -> bool:
 def _vector(values: Any) -> tuple[float, float, float]:
     x, y, z = np.asarray(values, dtype=np.float64).tolist()
     return x, y, z
+
+
+_TO_LIGHT = np.array([-0.25, -0.55, 0.8]) / np.linalg.norm([-0.25, -0.55, 0.8])
+_SHADE = 0.75
+"""Brightness of what is seen by a grazing light, as a share of the full one."""
+
+# ACES filmic tone mapping of three.js: in, a curve per channel, out; and its exposure.
+_IN = np.array(
+    [[0.59719, 0.35458, 0.04823], [0.07600, 0.90834, 0.01566], [0.02840, 0.13383, 0.83777]]
+)
+_OUT = np.array(
+    [[1.60475, -0.53108, -0.07367], [-0.10208, 1.10813, -0.00605], [-0.00327, -0.07276, 1.07602]]
+)
+_EXPOSURE = 1.0 / 0.6
+_WELD = 1e-6
+
+
+def glb(
+    triangles: Array,
+    colours: Bytes,
+    opacity: float | None = None,
+    side: Side = "double",
+) -> bytes:
+    """Write triangles with coloured corners as a GLB file."""
+    shades = np.repeat(_shade(triangles), 3)
+    vertices, first, which = _welded(triangles.reshape(-1, 3))
+    shade = np.bincount(which, shades) / np.bincount(which)
+    seen = colours.reshape(-1, 3)[first] * (shade[:, None] / 255.0)
+    faces = which.reshape(-1, 3)
+    if side == "back":
+        faces = faces[:, ::-1]
+    material: dict[str, Any] = {
+        "extensions": {"KHR_materials_unlit": {}},
+        "doubleSided": side == "double",
+        "pbrMetallicRoughness": {"baseColorFactor": [1.0, 1.0, 1.0, 1.0]},
+    }
+    if opacity is not None:
+        material["alphaMode"] = "BLEND"
+        material["pbrMetallicRoughness"]["baseColorFactor"][3] = opacity
+    return _file(vertices, before_tone_mapping(_linear(seen)), faces, material)
+
+
+def before_tone_mapping(light: Array) -> Array:
+    """Light (..., 3) that the page's tone mapping turns into the light that is given."""
+    y = np.clip(light, 0.0, 1.0) @ np.linalg.inv(_OUT).T
+    a, b, c = 1.0 - 0.983729 * y, 0.0245786 - 0.432951 * y, -(0.000090537 + 0.238081 * y)
+    curve = (-b + np.sqrt(np.maximum(b * b - 4.0 * a * c, 0.0))) / (2.0 * a)
+    return np.asarray(np.maximum(curve @ np.linalg.inv(_IN).T, 0.0) / _EXPOSURE)
+
+
+def _linear(share: Array) -> Array:
+    """Light of what the screen shows (sRGB, 0 to 1)."""
+    return np.asarray(np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4))
+
+
+def _shade(triangles: Array) -> Array:
+    """Brightness of each triangle (n,), the same from both sides."""
+    across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    size = np.linalg.norm(across, axis=1)
+    facing = np.abs(across @ _TO_LIGHT) / np.where(size > 0.0, size, 1.0)
+    return np.asarray(_SHADE + (1.0 - _SHADE) * facing)
+
+
+def _welded(corners: Array) -> tuple[Array, Ints, Ints]:
+    """Places that differ (m, 3), the first corner at each (m,), and the place of each corner."""
+    size = float(np.ptp(corners)) or 1.0
+    cells = np.round(corners / (_WELD * size)).astype(np.int64)
+    key = cells.view([("", np.int64)] * 3).ravel()
+    _, first, which = np.unique(key, return_index=True, return_inverse=True)
+    return corners[first], first, which.ravel()
+
+
+def _file(vertices: Array, colours: Array, faces: Ints, material: dict[str, Any]) -> bytes:
+    parts: list[NDArray[Any]] = [
+        np.asarray(vertices, dtype="<f4"),
+        np.asarray(colours, dtype="<f4"),
+        np.asarray(faces, dtype="<u4").ravel(),
+    ]
+    views: list[dict[str, int]] = []
+    accessors: list[dict[str, Any]] = []
+    start = 0
+    for part, kind in zip(parts, ("VEC3", "VEC3", "SCALAR"), strict=True):
+        views.append({"buffer": 0, "byteOffset": start, "byteLength": part.nbytes})
+        number = 5126 if part.dtype.kind == "f" else 5125
+        accessors.append(
+            {
+                "bufferView": len(accessors),
+                "componentType": number,
+                "count": len(part),
+                "type": kind,
+            }
+        )
+        start += part.nbytes
+    accessors[0] |= {"min": parts[0].min(axis=0).tolist(), "max": parts[0].max(axis=0).tolist()}
+    mesh = {"attributes": {"POSITION": 0, "COLOR_0": 1}, "indices": 2, "material": 0}
+    tree = {
+        "asset": {"version": "2.0"},
+        "extensionsUsed": ["KHR_materials_unlit"],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [mesh]}],
+        "materials": [material],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": start}],
+    }
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    body = b"".join(part.tobytes() for part in parts)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text
+    chunks += struct.pack("<I4s", len(body), b"BIN\0") + body
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks

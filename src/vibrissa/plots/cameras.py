@@ -1,0 +1,210 @@
+"""What cameras see: a part of an image with the traced whisker and the contact point."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike, NDArray
+
+from vibrissa.plots.space import Box
+from vibrissa.plots.style import GREEN, INK, ORANGE, RED, box_axes, looking, new_figure, page_width
+from vibrissa.scene import Array, Course
+
+Grey = NDArray[np.uint8]
+
+_ROOM = 0.08
+_LIGHT = 235
+"""Grey value beyond the edge of an image."""
+
+
+class _View(Protocol):
+    """A camera."""
+
+    @property
+    def name(self) -> str:
+        """Of the view."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of its images, pixels."""
+
+    def project(self, points: ArrayLike) -> Array:
+        """Column and row (..., 2), pixels, of points (..., 3), laboratory frame, m."""
+
+
+class Sight(NamedTuple):
+    """One view of a trial.
+
+    Attributes
+    ----------
+    view : _View
+        The camera.
+    images : iterable of array (height, width)
+        8 bit grey images, one for each frame that is drawn.
+    """
+
+    view: _View
+    images: Iterable[Grey]
+
+
+def seen(course: Course, views: Sequence[_View], number: int) -> tuple[Array, Array]:
+    """Tell where whisker and contact are in the images of a view."""
+    count = len(course.time)
+    if number < len(course.traces):
+        line = course.traces[number]
+    elif course.centerline is not None:
+        line = views[number].project(course.centerline)
+    else:
+        line = np.full((count, 2, 2), np.nan)
+    if course.places is None:
+        return line, np.full((count, 2), np.nan)
+    return line, views[number].project(course.places)
+
+
+def part_of(lines: Array, shape: tuple[float, float], size: tuple[int, int]) -> tuple[Array, Array]:
+    """Choose the part of images in which a whisker moves."""
+    places = lines.reshape(-1, 2)
+    places = places[np.isfinite(places).all(axis=1)]
+    whole = np.asarray(size, dtype=np.float64)
+    if len(places):
+        low, high = np.quantile(places, [0.002, 0.998], axis=0)
+    else:
+        low, high = np.zeros(2), whole
+    span = (1.0 + 2.0 * _ROOM) * np.maximum(high - low, 16.0)
+    extent = max(span / np.asarray(shape)) * np.asarray(shape)
+    low = 0.5 * (low + high - extent)
+    inside = np.clip(low, 0.0, whole - extent)
+    low = np.where(extent <= whole, inside, 0.5 * (whole - extent))
+    return low - 0.5, low + extent - 0.5
+
+
+class Window:
+    """A part of images, brought to the size of a panel by averaging over areas."""
+
+    def __init__(
+        self, low: Array, high: Array, size: tuple[int, int], panel: tuple[int, int]
+    ) -> None:
+        across, down = (_averaging(low[n], high[n], size[n], panel[n]) for n in (0, 1))
+        self._size = size
+        self._down, self._across = down, across.T.tocsr()
+        covered = np.outer(down.sum(axis=1), across.sum(axis=1))
+        self._beyond = np.float32(_LIGHT) * (1.0 - covered.astype(np.float32))
+
+    def of(self, image: Grey) -> Grey:
+        """Show the part."""
+        if image.shape != self._size[::-1]:
+            raise ValueError(
+                f"an image has {image.shape[1]} × {image.shape[0]} pixels; the camera has "
+                f"{self._size[0]} × {self._size[1]}"
+            )
+        part = self._down @ image.astype(np.float32) @ self._across + self._beyond
+        return np.asarray(part + 0.5, dtype=np.uint8)
+
+
+def _averaging(low: float, high: float, size: int, count: int) -> Any:
+    """Matrix (count, size) of the share of each pixel of an image in each of a panel."""
+    from scipy.sparse import csr_matrix
+
+    ends = np.linspace(low, high, count + 1) + 0.5
+    pixels = np.arange(size)
+    first, last = ends[:-1, None], ends[1:, None]
+    shares = np.clip(np.minimum(last, pixels + 1.0) - np.maximum(first, pixels), 0.0, None)
+    return csr_matrix((shares / (last - first)).astype(np.float32))
+
+
+def sight_axes(figure: Figure, box: Box, low: Array, high: Array) -> Axes:
+    """Add a panel for a part of an image."""
+    axes = box_axes(figure, box, xlim=(low[0], high[0]), ylim=(high[1], low[1]))
+    axes.set_axis_off()
+    return axes
+
+
+def scale_bar(axes: Axes, course: Course, view: _View, length: float = 5e-3) -> None:
+    """Draw a bar as long as some millimetres below the right end of an image."""
+    base = np.nanmean(course.position, axis=0)
+    ends = view.project(base + 0.5e-3 * np.concatenate([np.eye(3), -np.eye(3)]))
+    pixels = 1e3 * length * float(np.linalg.norm(ends[:3] - ends[3:], axis=1).max())
+    left, right = axes.get_xlim()
+    share = pixels / (right - left)
+    if not 0.0 < share < 1.0:
+        return
+    place: dict[str, Any] = {"transform": axes.transAxes, "clip_on": False}
+    axes.plot([1.0 - share, 1.0], [-0.035, -0.035], color=INK, linewidth=1.2, **place)
+    axes.annotate(
+        f"{1e3 * length:g} mm",
+        (1.0 - share, -0.035),
+        xycoords="axes fraction",
+        xytext=(-3.0, 0.0),
+        textcoords="offset points",
+        ha="right",
+        va="center",
+        fontsize=6.0,
+    )
+
+
+_GAP = 2.0
+_TITLE = 6.0
+_LINE = 4.0
+
+
+def start_views(
+    images: Sequence[Grey],
+    lines: Sequence[ArrayLike],
+    names: Sequence[str],
+    confidence: float,
+    remarks: Sequence[str] = (),
+) -> Figure:
+    """Draw the line that is taken for the whisker into an image of each view.
+
+    Parameters
+    ----------
+    images : sequence of array (height, width)
+        8 bit grey images, one for each view, of the same moment.
+    lines : sequence of array_like (n, 2)
+        Column and row from base to tip in each view; empty where nothing was found.
+    names : sequence of str
+        Names of the views.
+    confidence : float
+        Confidence in the line, 0 to 1.
+    remarks : sequence of str
+        Sentences that are written below the images, such as what there is to doubt.
+
+    Returns
+    -------
+    Figure
+        One panel for each view, in pixels of the image; the line is green if nothing is in doubt,
+        else orange, and its base is circled.
+    """
+    wide = (page_width("double") - _GAP * (len(images) - 1)) / len(images)
+    heights = [wide * image.shape[0] / image.shape[1] for image in images]
+    below = _LINE * len(remarks) + _GAP
+    colour = ORANGE if remarks else GREEN
+    with looking():
+        figure = new_figure("double", max(heights) + _TITLE + below, None)
+        for view, (image, line, name) in enumerate(zip(images, lines, names, strict=True)):
+            box = (view * (wide + _GAP), below, wide, heights[view])
+            rows, columns = image.shape
+            axes = box_axes(figure, box, xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5))
+            axes.set_axis_off()
+            axes.imshow(image, cmap="gray", vmin=0, vmax=255, aspect="auto")
+            places = np.asarray(line, dtype=np.float64).reshape(-1, 2)
+            axes.plot(*places.T, color=colour, linewidth=0.8, alpha=0.8)
+            axes.scatter(
+                places[:1, 0], places[:1, 1], 60.0, facecolor="none", edgecolor=RED, linewidths=1.0
+            )
+            if len(places):
+                said = f"confidence {confidence:.2f}"
+                column, row = places[0]
+                said = f"base at {column:.0f}, {row:.0f}, {said}"
+            else:
+                said = "no whisker"
+            axes.set_title(f"{name}: {said}", loc="left", fontsize=7.0, pad=2.0)
+        height = max(heights) + _TITLE + below
+        for count, remark in enumerate(remarks):
+            at = (below - _LINE * (count + 1)) / height
+            figure.text(0.01, at, remark, fontsize=6.5, color=RED)
+    return figure

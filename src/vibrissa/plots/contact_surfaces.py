@@ -1,0 +1,262 @@
+"""Surfaces of equal r, θ and φ, and what they become in the space of (F_x, M_B, M_D) (Fig. 3)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import ArrayLike
+
+from vibrissa.plots.space import (
+    Box,
+    bounds,
+    felt,
+    name_axes,
+    paint,
+    painted,
+    signal_axes,
+    signal_limits,
+    space_axes,
+    square,
+)
+from vibrissa.plots.style import Width, looking, new_figure, plain, sequential
+from vibrissa.quantities import axis_label, quantity, to_display
+from vibrissa.scene import (
+    Array,
+    clip,
+    column,
+    level_surface,
+    robust_limits,
+    sample_contacts,
+    solid_surface,
+    values_of,
+)
+
+_COORDINATES = ("r", "theta", "phi")
+_LEVELS = 3
+_OPEN = (np.pi, 2.5 * np.pi)
+"""Bearings drawn where solids and surfaces are cut open: all but a quarter."""
+
+
+class _Panel(NamedTuple):
+    """One of nine."""
+
+    letter: str
+    title: str
+    box: Box
+
+
+def contact_surfaces(
+    samples: xr.Dataset, centerline: ArrayLike, *, width: Width = "double"
+) -> Figure:
+    """Draw surfaces of equal r, θ and φ among contacts, and in the space of three signals.
+
+    For each of r, θ and φ: three surfaces on which it is the same, in the space of contact points;
+    the same three in the space of (F_x, M_B, M_D); and the solid of all signals that contacts make,
+    coloured by it. It is cut open where the force's bearing at the contact is
+    between 90° and 180°, as are the signals of equal r. Contacts within
+    2° of rest are left out. Where two colours meet in the solid, a contact cannot be told from its
+    signals.
+
+    Parameters
+    ----------
+    samples : Dataset
+        ``ContactMap.to_dataset()``: all of the reachable space.
+    centerline : array_like (k, 3)
+        Of the resting whisker from base to tip, whisker frame, m.
+    width : {"single", "double"}
+        Columns of the page.
+
+    Returns
+    -------
+    Figure
+        Nine 3D axes and three colour bars.
+
+    Raises
+    ------
+    ValueError
+        If the dataset lacks something, or if there is no such width.
+    """
+    whole = sample_contacts(samples, centerline)
+    opened = sample_contacts(samples, centerline, _OPEN)
+    outside = column("deflection")
+    body = solid_surface(opened, False, outside)
+    line = to_display("centerline", centerline)
+    contacts = bounds(np.concatenate([_places(body).reshape(-1, 3), line]))
+    shell = solid_surface(whole, True, outside)
+    signals = signal_limits(felt(shell))
+    with looking():
+        height, panels, rails = _sheet(width)
+        figure = new_figure(width, height, None)
+        for i, name in enumerate(_COORDINATES):
+            norm, marks = levels(name, shell)
+            among, into, inside = panels[3 * i : 3 * i + 3]
+            axes = _contact_axes(figure, among, contacts)
+            surface, hues = _level_sets(whole, name, norm, marks)
+            paint(axes, _places(surface), hues)
+            axes.plot(*line.T, color="black", linewidth=1.2, zorder=10)
+            axes = _cylinder(figure, into, signals)
+            if name == "r":  # its surfaces lie one within the other
+                surface, hues = _level_sets(opened, name, norm, marks)
+            paint(axes, felt(surface), hues)
+            axes = _cylinder(figure, inside, signals)
+            values = to_display(name, values_of(name, body))
+            paint(axes, felt(body), painted(values, norm, sequential()), flat=0.8)
+            coordinate_bar(figure, rails[i], name, norm, marks)
+        return figure
+
+
+def _level_sets(
+    nodes: Array, name: str, norm: Normalize, marks: list[float]
+) -> tuple[Array, Array]:
+    """Surfaces on which a coordinate has certain values, and their colours."""
+    surfaces, hues = [], []
+    for mark in marks:
+        value = mark / quantity(name).display_factor
+        surfaces.append(clip(level_surface(nodes, column(name), value), column("deflection")))
+        hues.append(np.tile(sequential()(norm(mark)), (len(surfaces[-1]), 1)))
+    return np.concatenate(surfaces), np.concatenate(hues)
+
+
+def _places(triangles: Array) -> Array:
+    return to_display("contact_point", triangles[..., :3])
+
+
+def levels(name: str, shell: Array) -> tuple[Normalize, list[float]]:
+    """Limits of the colours, and round values for surfaces."""
+    values = to_display(name, values_of(name, shell))
+    low, high = robust_limits(values)
+    locator = MaxNLocator(12, steps=[1, 2, 2.5, 5, 10])
+    ticks = np.asarray(locator.tick_values(low, high))
+    step = float(ticks[1] - ticks[0])
+    middle = float(ticks[np.argmin(np.abs(ticks - 0.5 * (low + high)))])
+    apart = max(1, round((high - low) / (_LEVELS + 1) / step)) * step
+    marks = [middle + apart * i for i in (-1.0, 0.0, 1.0)]
+    return Normalize(float(low), float(high)), marks
+
+
+def _sheet(width: Width) -> tuple[float, list[_Panel], list[Box]]:
+    """Height of the figure, panels (contacts, signals, solid of r, of θ, of φ), colour bars."""
+    kinds = ("contacts of equal {}", "their signals", "all signals, coloured by {}")
+    titles = [kind.format(f"${quantity(n).symbol}$") for n in _COORDINATES for kind in kinds]
+    cells = [(row, side) for row in range(3) for side in range(3)]
+    if width == "double":
+        height, wide, tall = 141.0, 56.0, 46.5
+        rails = [(169.5, height - 36.0 - tall * row, 1.6, 25.0) for row in range(3)]
+    else:
+        height, wide, tall = 191.0, 42.5, 38.0
+        rails = [(48.0, 30.0 - 12.0 * row, 32.0, 1.6) for row in range(3)]
+        # Contacts and signals side by side, the solids below.
+        cells = [(row, k) if k < 2 else (3 + row // 2, row % 2) for row, k in cells]
+    order = sorted(cells)
+    panels = [
+        _Panel(
+            "abcdefghi"[order.index((row, side))],
+            title,
+            (wide * side, height - 1.0 - tall * (row + 1), wide, tall),
+        )
+        for (row, side), title in zip(cells, titles, strict=True)
+    ]
+    return height, panels, rails
+
+
+def _head(figure: Figure, panel: _Panel) -> None:
+    wide, tall = 25.4 * figure.get_size_inches()
+    left, bottom, _, height = panel.box
+    for text, right, weight in ((panel.letter, 1.5, "bold"), (panel.title, 5.5, "normal")):
+        figure.text(
+            (left + right) / wide,
+            (bottom + height) / tall,
+            text,
+            fontsize=8.0 if weight == "bold" else 6.5,
+            fontweight=weight,
+            va="top",
+        )
+
+
+def _contact_axes(figure: Figure, panel: _Panel, limits: Array) -> Any:
+    _head(figure, panel)
+    left, bottom, width, height = square(panel.box)
+    zoom = 0.87 if width > 50.0 else 0.82
+    axes = space_axes(figure, (left - 2.0, bottom + 1.5, width, height), limits, zoom=zoom)
+    name_axes(axes, (-8.0, -9.0, -10.5))
+    return axes
+
+
+def _cylinder(figure: Figure, panel: _Panel, limits: Array) -> Any:
+    _head(figure, panel)
+    return signal_axes(figure, panel.box, limits)
+
+
+def coordinate_bar(
+    figure: Figure, place: Box, name: str, norm: Normalize, marks: list[float]
+) -> None:
+    """Draw a colour bar for a coordinate."""
+    wide, tall = 25.4 * figure.get_size_inches()
+    left, bottom, width, height = place
+    rail = figure.add_axes((left / wide, bottom / tall, width / wide, height / tall))
+    upright = height > width
+    bar = figure.colorbar(
+        ScalarMappable(norm, sequential()),
+        cax=rail,
+        orientation="vertical" if upright else "horizontal",
+    )
+    plain(bar)
+    bar.set_ticks(marks)
+    rail.tick_params(length=2.0, pad=1.5)
+    for mark in marks:
+        (rail.axhline if upright else rail.axvline)(mark, color="white", linewidth=0.8)
+    if upright:
+        rail.set_title(axis_label(name), fontsize=6.5, pad=4.0)
+    else:
+        rail.set_xlabel(axis_label(name), fontsize=6.5, labelpad=1.0)
+
+
+COORDINATES = ("r", "theta", "phi")
+
+_OPACITY = 0.22
+_ROOM = 1.5
+
+
+def solid_panels(
+    figure: Figure,
+    samples: xr.Dataset,
+    centerline: ArrayLike,
+    panels: Sequence[Box],
+    rails: Sequence[Box],
+    way: Array | None = None,
+) -> list[Any]:
+    """Draw the signals of all contacts three times, coloured by r, θ and φ."""
+    nodes = sample_contacts(samples, centerline)
+    within: list[int] = []
+    if way is not None and np.isfinite(way).all(axis=1).any():
+        gentle = _gentle(nodes, way)
+        within = [nodes.shape[-1] + i for i in range(gentle.shape[-1])]
+        nodes = np.concatenate([nodes, gentle], axis=-1)
+    body = solid_surface(nodes, True, column("deflection"), *within)
+    places = felt(body)
+    limits = signal_limits(places)
+    found = []
+    for name, panel, rail in zip(COORDINATES, panels, rails, strict=True):
+        norm, marks = levels(name, body)
+        axes = signal_axes(figure, panel, limits)
+        values = to_display(name, values_of(name, body))
+        colours = painted(values, norm, sequential())
+        paint(axes, places, colours, opacity=_OPACITY, flat=0.9)
+        coordinate_bar(figure, rail, name, norm, marks)
+        found.append(axes)
+    return found
+
+
+def _gentle(nodes: Array, way: Array) -> Array:
+    """How far signals are within what a trial reaches, and half as much again; negative beyond."""
+    force, moment = _ROOM * np.nanmax(np.abs(way[:, :2]), axis=0)
+    tension = 1.0 - np.abs(values_of("Fx", nodes)) / max(force, 1e-12)
+    bending = 1.0 - values_of("MB", nodes) / max(moment, 1e-15)
+    return np.stack([tension, bending], axis=-1)

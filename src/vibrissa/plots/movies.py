@@ -1,0 +1,471 @@
+"""Trials as movies: what stays is drawn once, what moves is drawn on top of it.
+
+A figure of three solids takes seconds to draw, a dot in it no time at all. So the figure is drawn
+once and kept as a picture; for every frame the picture is put back and only moving artists are
+drawn, and now and then one of them is drawn into the picture for good.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import xarray as xr
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import CircleCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from numpy.typing import ArrayLike, NDArray
+
+from vibrissa.plots.cameras import Sight, Window, part_of, scale_bar, seen, sight_axes
+from vibrissa.plots.contact_surfaces import solid_panels
+from vibrissa.plots.objects import Body, draw_body, one_scale, room_for
+from vibrissa.plots.overview import Curve, curve_legend, curves_over_time
+from vibrissa.plots.space import bounds, name_axes, signal_places, space_axes
+from vibrissa.plots.style import (
+    INK,
+    ORANGE,
+    RED,
+    box_axes,
+    looking,
+    plain,
+    sequential,
+    sized_figure,
+)
+from vibrissa.quantities import axis_label, to_display
+from vibrissa.scene import TRIPLET, Array, Course
+
+Picture = NDArray[np.uint8]
+
+WIDTH, HEIGHT = 203.2, 114.3
+"""Of a movie's figure, mm: lettering is as large in it as on a page of two columns."""
+
+SIZE = (1280, 720)
+"""Of a movie, pixels."""
+
+_DPI = 160.0
+
+
+def screen_figure() -> Figure:
+    """Make the empty figure of a movie."""
+    figure = sized_figure(WIDTH, HEIGHT)
+    figure.set_dpi(_DPI)
+    return figure
+
+
+class Screen:
+    """A figure of which only some artists move."""
+
+    def __init__(self, figure: Figure) -> None:
+        self._figure = figure
+        # Matplotlib gives this canvas no types.
+        self._agg = cast("Any", FigureCanvasAgg(figure))
+        with looking():
+            self._agg.draw()
+        self._background = self._agg.copy_from_bbox(figure.bbox)
+
+    def keep(self, artists: Iterable[Artist]) -> None:
+        """Draw artists into all frames from now on."""
+        self._agg.restore_region(self._background)
+        self._draw(artists)
+        self._background = self._agg.copy_from_bbox(self._figure.bbox)
+
+    def frame(
+        self, artists: Iterable[Artist], images: Iterable[tuple[Axes, Picture]] = ()
+    ) -> Picture:
+        """Draw one frame."""
+        self._agg.restore_region(self._background)
+        buffer = np.asarray(self._agg.buffer_rgba())
+        for axes, image in images:
+            left, top, width, height = self._place(axes)
+            buffer[top : top + height, left : left + width, :3] = image[..., None]
+        self._draw(artists)
+        return buffer.copy()
+
+    def pixels(self, axes: Axes) -> tuple[int, int]:
+        """Tell how large a panel is."""
+        return self._place(axes)[2:]
+
+    def _place(self, axes: Axes) -> tuple[int, int, int, int]:
+        """Left, top, width and height, pixels from the upper left."""
+        (left, bottom), (right, top) = np.round(axes.bbox.get_points()).astype(int)
+        return left, SIZE[1] - top, right - left, top - bottom
+
+    def _draw(self, artists: Iterable[Artist]) -> None:
+        renderer = self._agg.get_renderer()
+        for artist in artists:
+            artist.draw(renderer)
+
+
+def moving_line(axes: Any, **look: Any) -> Line2D:
+    """Add a line that moves."""
+    (line,) = axes.plot([], [], animated=True, **look)
+    assert isinstance(line, Line2D)
+    return line
+
+
+def flat_line(axes: Any, **look: Any) -> Line2D:
+    """Add a line to axes in space that lies on the paper, see :func:`flattened`."""
+    line = Line2D([], [], transform=axes.transData, **look)
+    line.set_clip_on(False)
+    axes.figure.add_artist(line)
+    return line
+
+
+def flattened(axes: Any, places: Array) -> Array:
+    """Say where places in space lie on the paper."""
+    from mpl_toolkits.mplot3d import proj3d  # type: ignore[import-untyped]
+
+    # Matplotlib sets the size of the box of space only while it draws.
+    axes.apply_aspect()
+    flat = places.reshape(-1, 3)
+    x, y, _ = proj3d.proj_transform(*flat.T, axes.get_proj())
+    return np.stack([np.asarray(x), np.asarray(y)], axis=-1).reshape(*places.shape[:-1], 2)
+
+
+_SIDES = ((0, 1), (0, 2), (1, 2))
+_SIDE_BOXES = ((13.0, 9.5, 48.0, 40.0), (76.0, 9.5, 48.0, 40.0), (139.0, 9.5, 48.0, 40.0))
+_SIGHT_BOXES = ((2.5, 57.0, 64.0, 48.0), (69.0, 57.0, 64.0, 48.0))
+_SPACE_BOX = (131.5, 46.0, 66.0, 66.0)
+_RAIL = (191.5, 9.5, 1.8, 30.0)
+_CONTACT: dict[str, Any] = {
+    "marker": "o",
+    "markersize": 4.5,
+    "color": "#f0e442",
+    "markeredgecolor": "black",
+    "markeredgewidth": 0.6,
+    "linestyle": "none",
+}
+
+
+class _Part(NamedTuple):
+    """A panel: what moves in it, and where that is in each frame of the trial."""
+
+    line: Line2D
+    lines: Array
+    dot: Line2D
+    dots: Array
+
+
+class _Cloud(NamedTuple):
+    """Points that stay, and where they lie in a panel."""
+
+    points: CircleCollection
+    places: Array
+
+
+class _Sight(NamedTuple):
+    """A panel for what a camera sees, and which part of its images is shown there."""
+
+    axes: Axes
+    low: Array
+    high: Array
+    size: tuple[int, int]
+
+
+def contour_frames(
+    course: Course,
+    centerline: ArrayLike,
+    sights: Sequence[Sight],
+    rows: ArrayLike,
+    bodies: Sequence[Body] = (),
+    fitted: Sequence[Body] = (),
+) -> Iterator[Picture]:
+    """Draw the frames of a movie: what cameras see, and contacts as they come.
+
+    Above both views with the traced whisker and the contact point, and contacts about the resting
+    whisker; below contacts in the laboratory from above, from the front and from the side, with
+    the objects if these are known. Colours of contacts tell their time.
+
+    Parameters
+    ----------
+    course : Course
+        Of the trial, with contact points.
+    centerline : array_like (k, 3)
+        Of the resting whisker, whisker frame, m.
+    sights : sequence of Sight
+        One or two views, each with an image for each row.
+    rows : array_like (m,) of int
+        Which frames of the trial, rising. Contacts in between are shown too.
+    bodies, fitted : sequence of object
+        Objects as they are, filled grey, and as they were fitted to contacts, dashed: with
+        ``signed_distance``, laboratory frame, m.
+
+    Returns
+    -------
+    iterator of array (720, 1280, 4)
+        8 bit red, green, blue and opacity, one for each row.
+
+    Raises
+    ------
+    ValueError
+        If the trial has no contact points in these rows, there are no rows, or more than two views.
+    """
+    chosen = np.asarray(rows, dtype=np.intp)
+    if chosen.size == 0:
+        raise ValueError("no frames of the trial are chosen")
+    if len(sights) > len(_SIGHT_BOXES):
+        raise ValueError(f"there are {len(sights)} views; one or two can be shown")
+    span = slice(chosen[0], chosen[-1] + 1)
+    if course.places is None or not np.isfinite(course.places[span]).any():
+        raise ValueError("the trial has no contact points from the first to the last chosen frame")
+    return _contour_frames(course, course.places, centerline, sights, chosen, (bodies, fitted))
+
+
+def _contour_frames(
+    course: Course,
+    places: Array,
+    centerline: ArrayLike,
+    sights: Sequence[Sight],
+    rows: Any,
+    bodies: tuple[Sequence[Body], Sequence[Body]],
+) -> Iterator[Picture]:
+    first, last = int(rows[0]), int(rows[-1])
+    time = to_display("time", course.time)
+    norm = Normalize(time[first], max(time[last], time[first] + 1e-3))
+    with looking():
+        figure = screen_figure()
+        panels, parts = _views(figure, course, sights, slice(first, last + 1))
+        clouds = []
+        part, cloud = _about_whisker(figure, course, places, centerline, slice(first, last + 1))
+        parts.append(part)
+        clouds.append(cloud)
+        for part, cloud in _sides(figure, course, places, bodies, slice(first, last + 1)):
+            parts.append(part)
+            clouds.append(cloud)
+        _bar(figure, norm)
+        clock = figure.text(0.0125, 0.985, "", va="top", fontsize=8.0, animated=True)
+        screen = Screen(figure)
+    windows = [Window(low, high, size, screen.pixels(axes)) for axes, low, high, size in panels]
+    streams = [iter(sight.images) for sight in sights]
+    colours = sequential()(norm(time))
+    before = first - 1
+    for row in rows:
+        new = np.arange(before + 1, row + 1)
+        new = new[np.isfinite(places[new]).all(axis=1)]
+        before = int(row)
+        if new.size:
+            for points, there in clouds:
+                points.set_offsets(there[new])
+                points.set_facecolor(colours[new])
+            screen.keep([points for points, _ in clouds])
+        images = [
+            (panel.axes, window.of(next(stream)))
+            for panel, window, stream in zip(panels, windows, streams, strict=True)
+        ]
+        for line, lines, dot, dots in parts:
+            line.set_data(*lines[row].T)
+            dot.set_data(*dots[row : row + 1].T)
+        clock.set_text(f"{time[row]:.3f} s" + (", in contact" if course.touching[row] else ""))
+        drawn: list[Artist] = [artist for part in parts for artist in (part.line, part.dot)]
+        yield screen.frame([*drawn, clock], images)
+
+
+def _views(
+    figure: Figure, course: Course, sights: Sequence[Sight], span: slice
+) -> tuple[list[_Sight], list[_Part]]:
+    """Panels for what the cameras see."""
+    panels, parts = [], []
+    views = [sight.view for sight in sights]
+    for number, (view, box) in enumerate(zip(views, _SIGHT_BOXES, strict=False)):
+        lines, dots = seen(course, views, number)
+        low, high = part_of(lines[span], box[2:], view.size)
+        axes = sight_axes(figure, box, low, high)
+        axes.set_title(view.name, loc="right", pad=2.0)
+        scale_bar(axes, course, view)
+        line = moving_line(axes, color=RED, linewidth=0.8)
+        dot = moving_line(axes, **_CONTACT)
+        panels.append(_Sight(axes, low, high, view.size))
+        parts.append(_Part(line, lines, dot, dots))
+    return panels, parts
+
+
+def _about_whisker(
+    figure: Figure, course: Course, places: Array, centerline: ArrayLike, span: slice
+) -> tuple[_Part, _Cloud]:
+    """Contacts in the whisker's frame, with the resting and the deflected whisker."""
+    rest = to_display("centerline", centerline)
+    points = to_display("contact_point", course.at_base(places))
+    count = len(course.time)
+    lines = np.full((count, 2, 3), np.nan)
+    if course.centerline is not None:
+        lines = to_display("centerline", course.at_base(course.centerline))
+    shown = [rest, points[span].reshape(-1, 3), lines[span][course.touching[span]].reshape(-1, 3)]
+    axes = space_axes(figure, _SPACE_BOX, bounds(np.concatenate(shown)), zoom=0.9)
+    name_axes(axes, (-7.0, -8.0, -9.0))
+    axes.plot(*rest.T, color="black", linewidth=1.2)
+    figure.text(0.72, 0.958, "contacts about the resting whisker", va="top", fontsize=7.0)
+    cloud = CircleCollection(
+        [0.7 * _dot_size(int(np.isfinite(points[span]).all(axis=1).sum()))],
+        offsets=np.empty((0, 2)),
+        offset_transform=axes.transData,
+        animated=True,
+    )
+    figure.add_artist(cloud)
+    line = flat_line(axes, color=RED, linewidth=0.8, animated=True)
+    dot = flat_line(axes, animated=True, **_CONTACT)
+    there = flattened(axes, points)
+    return _Part(line, flattened(axes, lines), dot, there), _Cloud(cloud, there)
+
+
+def _sides(
+    figure: Figure,
+    course: Course,
+    places: Array,
+    bodies: tuple[Sequence[Body], Sequence[Body]],
+    span: slice,
+) -> Iterator[tuple[_Part, _Cloud]]:
+    """Contacts in the laboratory from three sides."""
+    points = to_display("contact_point", places)
+    known = points[span][np.isfinite(points[span]).all(axis=1)]
+    limits = room_for(known, [*bodies[0], *bodies[1]])
+    sizes = [box[2:] for box in _SIDE_BOXES]
+    count = len(course.time)
+    line = np.full((count, 2, 3), np.nan)
+    if course.centerline is not None:
+        line = to_display("centerline", course.centerline)
+    ends = one_scale(limits, _SIDES, sizes)
+    for view, both, box, title in zip(
+        _SIDES, ends, _SIDE_BOXES, ("from above", "from the front", "from the side"), strict=True
+    ):
+        i, j = view
+        axes = box_axes(figure, box, xlim=both[0], ylim=both[1])
+        axes.set(xlabel=axis_label("xyz"[i]), ylabel=axis_label("xyz"[j]))
+        axes.set_title(title, loc="left", pad=3.0)
+        for group, look in zip(bodies, ("true", "fitted"), strict=True):
+            for body in group:
+                draw_body(axes, body, view, _window(limits, view, both), look)
+        cloud = CircleCollection(
+            [_dot_size(len(known))],
+            offsets=np.empty((0, 2)),
+            offset_transform=axes.transData,
+            animated=True,
+            zorder=3,
+        )
+        axes.add_collection(cloud, autolim=False)
+        moving = moving_line(axes, color=RED, linewidth=0.8)
+        dot = moving_line(axes, **_CONTACT)
+        there = points[:, list(view)]
+        yield _Part(moving, line[..., list(view)], dot, there), _Cloud(cloud, there)
+
+
+def _dot_size(count: int) -> float:
+    """Area of the dots for so many contacts, square points: many are drawn small."""
+    return float(np.clip(7.0 * (300.0 / max(count, 1)) ** 0.7, 1.5, 7.0))
+
+
+def _window(limits: Array, view: tuple[int, int], both: Array) -> Array:
+    """Limits of a panel, and along the line of sight those of the contacts."""
+    window = limits.copy()
+    window[list(view)] = both
+    return window
+
+
+def _bar(figure: Figure, norm: Normalize) -> None:
+    rail = box_axes(figure, _RAIL)
+    bar = figure.colorbar(ScalarMappable(norm, sequential()), cax=rail)
+    plain(bar)
+    rail.set_title(axis_label("time"), fontsize=6.5, pad=4.0)
+    rail.tick_params(length=2.0, pad=1.5)
+
+
+_TRAIL = 0.05
+"""How long the way just gone stays bold, s."""
+
+_BOXES = tuple(
+    (left, bottom, wide, 12.0)
+    for left, wide in ((14.0, 83.0), (115.0, 86.0))
+    for bottom in (35.0, 21.5, 8.0)
+)
+
+
+def signal_frames(
+    course: Course, samples: xr.Dataset, centerline: ArrayLike, rows: ArrayLike
+) -> Iterator[Picture]:
+    """Draw the frames of a movie: signals, a dot in the three solids, r, θ and φ over time.
+
+    Parameters
+    ----------
+    course : Course
+        Of the trial, with signals.
+    samples : Dataset
+        ``ContactMap.to_dataset()`` of the whisker.
+    centerline : array_like (k, 3)
+        Of the resting whisker, whisker frame, m.
+    rows : array_like (m,) of int
+        Which frames of the trial, rising; time axes reach from the first to the last.
+
+    Returns
+    -------
+    iterator of array (720, 1280, 4)
+        8 bit red, green, blue and opacity, one for each row.
+
+    Raises
+    ------
+    ValueError
+        If the trial has no signals, or there are no rows.
+    """
+    if course.signals is None:
+        raise ValueError("the trial has no signals: F_x, M_B and M_D are needed")
+    chosen = np.asarray(rows, dtype=np.intp)
+    if chosen.size == 0:
+        raise ValueError("no frames of the trial are chosen")
+    return _signal_frames(course, course.signals, samples, centerline, chosen)
+
+
+def _signal_frames(
+    course: Course,
+    signals: dict[str, Array],
+    samples: xr.Dataset,
+    centerline: ArrayLike,
+    rows: Any,
+) -> Iterator[Picture]:
+    first, last = int(rows[0]), int(rows[-1])
+    time = to_display("time", course.time)
+    with looking():
+        figure = screen_figure()
+        panels = [(66.5 * i + 0.5, 52.5, 66.5, 58.0) for i in range(3)]
+        rails = [(66.5 * i + 59.7, 66.0, 1.6, 24.0) for i in range(3)]
+        felt = np.stack([signals[name] for name in TRIPLET], axis=1)
+        felt[~course.touching] = np.nan
+        solids = solid_panels(figure, samples, centerline, panels, rails, felt[first : last + 1])
+        places = signal_places(*felt.T)
+        ways = [flattened(axes, places) for axes in solids]
+        for axes, way in zip(solids, ways, strict=True):
+            path = flat_line(axes, color=INK, linewidth=0.3, alpha=0.4)
+            path.set_data(*way[first : last + 1].T)
+        curves = curves_over_time(figure, _BOXES, course, signals, slice(first, last + 1))
+        curve_legend(figure, course, (1.0 - 2.0 / WIDTH, 48.0 / HEIGHT))
+        marks = [_mark(curve, time[first]) for curve in curves]
+        clock = figure.text(0.5, 0.985, "", ha="center", va="top", fontsize=8.0, animated=True)
+        trails = [flat_line(a, color=ORANGE, linewidth=1.6, animated=True) for a in solids]
+        look = {"markeredgecolor": "white", "markeredgewidth": 0.6, "linestyle": "none"}
+        dots = [
+            flat_line(a, marker="o", markersize=5.5, color=ORANGE, animated=True, **look)
+            for a in solids
+        ]
+        screen = Screen(figure)
+    moving = [cursor for cursor, _ in marks] + [dot for _, dot in marks]
+    for row in rows:
+        begin = int(np.searchsorted(course.time, course.time[row] - _TRAIL))
+        begin = max(begin, first)
+        for way, trail, dot in zip(ways, trails, dots, strict=True):
+            trail.set_data(*way[begin : row + 1].T)
+            dot.set_data(*way[row : row + 1].T)
+        for curve, (cursor, point) in zip(curves, marks, strict=True):
+            cursor.set_xdata([time[row], time[row]])
+            point.set_data([time[row]], curve.values[row : row + 1])
+        clock.set_text(f"{time[row]:.3f} s" + (", in contact" if course.touching[row] else ""))
+        yield screen.frame([*trails, *dots, *moving, clock])
+
+
+def _mark(curve: Curve, time: float) -> tuple[Line2D, Line2D]:
+    """A cursor and a dot that move over a curve."""
+    cursor = curve.axes.axvline(time, color=ORANGE, linewidth=0.8, animated=True)
+    dot = moving_line(curve.axes, marker="o", markersize=3.5, color=ORANGE, zorder=5)
+    return cursor, dot

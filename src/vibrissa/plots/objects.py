@@ -1,0 +1,284 @@
+"""Objects and a rat's head as they are seen from a side: silhouettes and sections."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.patches import Polygon
+from numpy.typing import ArrayLike
+
+from vibrissa.plots.style import MUTED, ORANGE
+from vibrissa.quantities import to_display
+from vibrissa.scene import Array, Course, head_surfaces
+
+_CELLS, _COARSE = 121, 4
+_FULL = 0.97
+"""Share of a panel from which an object is taken to fill it, so that it is no use drawing it."""
+
+
+class Body(Protocol):
+    """An object in the laboratory, m."""
+
+    def signed_distance(self, points: ArrayLike) -> Array:
+        """Distances (...) of points (..., 3) from its surface, negative inside."""
+
+
+def draw_body(axes: Axes, body: Body, view: tuple[int, int], limits: Array, look: str) -> None:
+    """Draw the outline of an object, or rather of what of it lies within limits."""
+    i, j = view
+    right, up = (np.linspace(limits[n, 0], limits[n, 1], _CELLS) for n in view)
+    points: Array = np.zeros((_CELLS, _CELLS, 3))
+    points[..., i], points[..., j] = right, up[:, None]
+    nearest = _nearest(body, points, limits, 3 - i - j)
+    if not 0.0 < np.mean(nearest < 0.0) < _FULL:
+        return
+    if look == "true":
+        axes.contourf(right, up, nearest, [-np.inf, 0.0], colors=["#ececec"], zorder=1)
+        axes.contour(right, up, nearest, [0.0], colors=[MUTED], linewidths=0.8, zorder=1.5)
+        return
+    dashes: Any = [(0, (4, 2))]
+    lines: dict[str, Any] = {"linewidths": 1.0, "linestyles": dashes, "zorder": 4}
+    axes.contour(right, up, nearest, [0.0], colors=[ORANGE], **lines)
+
+
+def _nearest(body: Body, points: Array, limits: Array, depth: int) -> Array:
+    """Least distance from a body along lines of sight through points (m, m, 3), mm.
+
+    Finely only where the outline is near: some bodies take their time to tell distances.
+    """
+    from scipy.interpolate import RegularGridInterpolator
+
+    rough = np.arange(0, _CELLS, _COARSE)
+    corners = points[np.ix_(rough, rough)]
+    cell = float(np.ptp(corners[:2, :2].reshape(-1, 3), axis=0).max())
+    coarse = _marched(body, corners.reshape(-1, 3), limits, depth, 2.0 * cell)
+    table = RegularGridInterpolator((rough, rough), coarse.reshape(rough.size, rough.size))
+    rows, columns = np.indices((_CELLS, _CELLS))
+    nearest = np.asarray(table((rows, columns)), dtype=np.float64)
+    # Within a cell a distance changes by no more than the way.
+    near = np.abs(nearest) < 1.5 * cell
+    nearest[near] = _marched(body, points[near], limits, depth, 2.0 * cell)
+    return nearest
+
+
+def _marched(body: Body, points: Array, limits: Array, depth: int, deep: float) -> Array:
+    """Least distance from a body along lines of sight through points (n, 3), mm.
+
+    Lines that go as deep into the body as ``deep`` are followed no farther. The distance to a body
+    is also how far one may go without meeting it, so few steps lead past it.
+    """
+    start, end = limits[depth]
+    least_step = 0.25 * deep
+    points = points.copy()
+    at = np.full(len(points), start)
+    least = np.full(len(points), np.inf)
+    active = np.arange(len(points))
+    while active.size:
+        points[active, depth] = at[active]
+        distance = 1e3 * body.signed_distance(1e-3 * points[active])
+        least[active] = np.minimum(least[active], distance)
+        at[active] += np.maximum(np.abs(distance), least_step)
+        active = active[(at[active] <= end) & (least[active] > -deep)]
+    return least
+
+
+def room_for(places: Array, bodies: Sequence[Body], least: float = 1.0) -> Array:
+    """Limits that hold most places, and the objects there as far as they end nearby."""
+    low, high = np.quantile(places, [0.04, 0.96], axis=0)
+    half = 0.5 * (high - low)
+    near = np.array([[-1.0], [1.0]]) * (2.0 * half.max() + 3.0 * least)
+    lines = 0.5 * (low + high) + near  # lower and upper ends of a cube
+    steps = np.linspace(lines[0], lines[1], 25)
+    grid = np.stack(np.meshgrid(*steps.T, indexing="ij"), axis=-1)
+    for body in bodies:
+        inside = grid[body.signed_distance(1e-3 * grid) < 0.0]
+        for n in range(3):
+            if (
+                inside.size
+                and inside[:, n].min() > lines[0, n]
+                and inside[:, n].max() < lines[1, n]
+            ):
+                low[n], high[n] = min(low[n], inside[:, n].min()), max(high[n], inside[:, n].max())
+    margin = np.maximum(0.15 * (high - low), least)
+    return np.stack([low - margin, high + margin], axis=1)
+
+
+def one_scale(limits: Array, views: Sequence[tuple[int, int]], sizes: Sequence[Any]) -> Array:
+    """Widen limits so that panels of given sizes show all of them to one scale."""
+    middle, span = limits.mean(axis=1), np.ptp(limits, axis=1)
+    scale = max(
+        max(span[i] / wide, span[j] / tall)
+        for (i, j), (wide, tall) in zip(views, sizes, strict=True)
+    )
+    return np.array(
+        [
+            [
+                [middle[n] - 0.5 * scale * size, middle[n] + 0.5 * scale * size]
+                for n, size in zip(view, both, strict=True)
+            ]
+            for view, both in zip(views, sizes, strict=True)
+        ]
+    )
+
+
+BAND: dict[str, Any] = {"facecolor": ORANGE, "alpha": 0.25, "linewidth": 0.0, "zorder": 2}
+"""Look of a band."""
+
+_SECTION_CELLS = 91
+_NORMAL_95 = 1.959963984540054
+_FLAT = 0.8
+_UNKNOWN = 0.05
+"""Standard deviation, as a share of the view's width, from which a surface is not drawn."""
+
+
+def is_cylinder(body: Body) -> bool:
+    """Tell whether a body is a cylinder."""
+    return hasattr(body, "axis") and hasattr(body, "radius")
+
+
+def has_band(body: Body) -> bool:
+    """Tell whether a body is drawn with a band."""
+    return hasattr(body, "distance_sigma") and not is_cylinder(body)
+
+
+def lies_flat(body: Body, view: tuple[int, int], places: Array) -> bool:
+    """Tell whether one looks straight at a surface, so that a section would lie in it."""
+    normals = getattr(body, "outward_normals", None)
+    if normals is None:
+        return False
+    toward = np.abs(normals(1e-3 * places)[:, 3 - sum(view)])
+    return bool(np.nanmedian(toward) > _FLAT)
+
+
+def outline(cylinder: Any, view: tuple[int, int], height: float, limits: Array) -> Array:
+    """Give the outline of a cylinder: from above its section, from the side its silhouette."""
+    origin = to_display("peg_position", cylinder.origin)
+    radius = float(to_display("peg_radius", cylinder.radius))
+    axis = np.asarray(cylinder.axis, dtype=np.float64)
+    axis = axis / np.linalg.norm(axis)
+    if view == (0, 1) and abs(axis[2]) > 0.2:
+        first = np.cross(axis, [0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0])
+        first /= np.linalg.norm(first)
+        turn = np.linspace(0.0, 2.0 * np.pi, 181)[:, None]
+        circle = origin + radius * (np.cos(turn) * first + np.sin(turn) * np.cross(axis, first))
+        # Along the axis, until all of the circle is at this height.
+        circle += (height - circle[:, 2:]) / axis[2] * axis
+        return np.asarray(circle[:, :2])
+    i, j = view
+    along = np.array([axis[i], axis[j]])
+    along = along / max(float(np.linalg.norm(along)), 1e-12)
+    across = radius * np.array([-along[1], along[0]])
+    far = 2.0 * float(np.ptp(limits, axis=1).max()) * along
+    middle = origin[[i, j]]
+    # From where the axis passes nearest to the middle of the view.
+    middle = middle + ((limits[[i, j]].mean(axis=1) - middle) @ along) * along
+    return np.array(
+        [middle - far + across, middle + far + across, middle + far - across, middle - far - across]
+    )
+
+
+def draw_section(
+    axes: Axes, body: Body, view: tuple[int, int], depth: float, limits: Array, look: str
+) -> None:
+    """Draw a section through an object, with its 95 % band where it has one."""
+    i, j = view
+    right, up = (np.linspace(limits[n, 0], limits[n, 1], _SECTION_CELLS) for n in view)
+    points: Array = np.empty((_SECTION_CELLS, _SECTION_CELLS, 3))
+    points[..., i], points[..., j], points[..., 3 - i - j] = right, up[:, None], depth
+    distance = 1e3 * np.asarray(body.signed_distance(1e-3 * points))
+    if not distance.min() < 0.0 < distance.max():
+        return
+    if look == "true":
+        axes.contourf(right, up, distance, [-np.inf, 0.0], colors=["#ececec"], zorder=1)
+        axes.contour(right, up, distance, [0.0], colors=[MUTED], linewidths=0.8, zorder=1.5)
+        return
+    if has_band(body):
+        sigma = 1e3 * np.asarray(getattr(body, "distance_sigma")(1e-3 * points))  # noqa: B009
+        sure = sigma < _UNKNOWN * np.ptp(limits[i])
+        if not sure.any():
+            return
+        distance = np.where(sure, distance, np.nan)
+        within = np.abs(distance) - _NORMAL_95 * sigma
+        shade: dict[str, Any] = {"colors": [ORANGE], "alpha": 0.25, "zorder": 2}
+        if not (np.nanmin(distance) < 0.0 < np.nanmax(distance)):
+            return
+        axes.contourf(right, up, within, [-np.inf, 0.0], **shade)
+    dashes: Any = [(0, (4, 2))]
+    lines: dict[str, Any] = {"linewidths": 1.0, "linestyles": dashes, "zorder": 4}
+    axes.contour(right, up, distance, [0.0], colors=[ORANGE], **lines)
+
+
+_PAD = np.array([7.7e-3, -9.0e-3, -4.9e-3])
+"""Where a whisker at the right begins if nothing else is known: right, forward, up of the snout."""
+
+_FAR = 2e-3
+"""From how far a base lies from the head's origin, m, this is the snout."""
+
+_SKIN, _EDGE, _EYE = "#efe6dc", "#a89a8c", "#5a4f45"
+
+
+class Head(NamedTuple):
+    """Where a head is."""
+
+    snout: Array
+    axes: Array
+
+
+def head_of(course: Course) -> Head:
+    """Say where the head must be, on the average of a trial.
+
+    Where the recording does not tell, the head is level, the whisker points away from it sideways
+    and curves forward, and its base is on the snout.
+    """
+    base = np.nanmean(course.position, axis=0)
+    if course.head is not None:
+        position, rotation = course.head
+        axes = _nearest_rotation(np.nanmean(rotation, axis=0))
+        snout = np.nanmean(position, axis=0)
+        if np.linalg.norm(base - snout) > _FAR:
+            return Head(snout, axes)
+    else:
+        axes = _level(np.nanmean(course.rotation, axis=0))
+    mean = np.nanmean(course.rotation, axis=0)
+    side = np.sign(mean[:, 0] @ axes[:, 0]) or 1.0
+    return Head(base - axes @ (_PAD * np.array([side, 1.0, 1.0])), axes)
+
+
+def _level(mean: Array) -> Array:
+    """Right, forward and up of a level head, from the mean of the base's axes."""
+    sideways, forward = mean[:2, 0], mean[:2, 1]
+    n = int(np.argmax(np.abs(sideways)))
+    way = np.zeros(3)
+    # A whisker that points more or less along x or y belongs to a head that stands straight.
+    way[n] = np.sign(sideways[n]) or 1.0
+    ahead = np.cross([0.0, 0.0, 1.0], way)
+    if forward @ ahead[:2] < 0.0:
+        ahead = -ahead
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    return np.stack([right, ahead, [0.0, 0.0, 1.0]], axis=1)
+
+
+def _nearest_rotation(mean: Array) -> Array:
+    left, _, right = np.linalg.svd(mean)
+    return np.asarray(left @ right)
+
+
+def draw_head(axes: Axes, head: Head, view: tuple[int, int]) -> None:
+    """Draw the outline of a head, filled."""
+    skin, eyes = head_surfaces(head.axes, head.snout)
+    axes.add_patch(
+        Polygon(_outline(skin, view), facecolor=_SKIN, edgecolor=_EDGE, linewidth=0.8, zorder=0.5)
+    )
+    for eye in np.split(eyes, 2):
+        axes.add_patch(Polygon(_outline(eye, view), facecolor=_EYE, edgecolor="none", zorder=0.6))
+
+
+def _outline(triangles: Array, view: tuple[int, int]) -> Array:
+    """Hull (n, 2) of what is seen: a head has no hollows."""
+    from scipy.spatial import ConvexHull
+
+    points = triangles.reshape(-1, 3)[:, list(view)]
+    return np.asarray(points[ConvexHull(points).vertices])

@@ -1,0 +1,327 @@
+"""The space that a whisker can reach, and the six signals there (the paper's Fig. 2)."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from matplotlib.cm import ScalarMappable
+from matplotlib.colorbar import Colorbar
+from matplotlib.colors import Colormap, FuncNorm, Normalize
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
+
+from vibrissa.plots.space import AZIMUTH, ELEVATION, bounds, name_axes, paint, painted, space_axes
+from vibrissa.plots.style import (
+    INK,
+    Width,
+    cyclic,
+    diverging,
+    looking,
+    new_figure,
+    plain,
+    sequential,
+)
+from vibrissa.quantities import axis_label, quantity, to_display
+from vibrissa.scene import (
+    DIRECTIONS,
+    SIGNALS,
+    Array,
+    Mask,
+    column,
+    robust_limits,
+    root,
+    sample_contacts,
+    solid_surface,
+    squared,
+    subdivide,
+    values_of,
+)
+
+_SKIN = (0.80, 0.85, 0.90, 1.0)
+"""Colour of the reachable space where it stands for no signal."""
+
+
+_TITLES = {"FD": "direction of $F_T$", "MD": "direction of $M_B$"}
+
+Box = tuple[float, float, float, float]
+"""Left, bottom, width and height, mm."""
+
+
+class _Sheet(NamedTuple):
+    """Where panels lie."""
+
+    height: float
+    space: Box
+    front: Box
+    signals: tuple[Box, ...]
+
+
+def _sheet(width: Width) -> _Sheet:
+    if width == "single":
+        cells = [(42.5 * (i % 2), 78.0 - 39.0 * (i // 2), 42.5, 38.0) for i in range(6)]
+        return _Sheet(167.0, (0.0, 117.0, 56.0, 49.0), (57.0, 117.0, 28.0, 49.0), tuple(cells))
+    cells = [(58.0 + 40.0 * (i % 3), 39.5 - 39.0 * (i // 3), 40.0, 38.0) for i in range(6)]
+    return _Sheet(78.5, (0.0, 30.5, 58.0, 47.0), (0.0, -2.0, 58.0, 32.5), tuple(cells))
+
+
+def signal_clouds(
+    samples: xr.Dataset,
+    centerline: ArrayLike,
+    *,
+    width: Width = "double",
+    cutaway: bool = True,
+    elevation: float = ELEVATION,
+    azimuth: float = AZIMUTH,
+) -> Figure:
+    """Draw the space that a whisker can reach, and the six signals over it.
+
+    The reachable space is seen from aside and from before the tip, and then once for each signal,
+    which gives the colour: forces above, moments below. Small deflections (2° about rest) are left
+    out as in the paper. Colours of forces and moments go with the square root of the signal; they
+    leave out the outermost 2 % of its values, and the colour bar then has a pointed end. An inset
+    shows where the whisker is pulled (F_x > 0), which only happens if it is curved.
+
+    Parameters
+    ----------
+    samples : Dataset
+        ``ContactMap.to_dataset()``: all of the reachable space.
+    centerline : array_like (k, 3)
+        Of the resting whisker from base to tip, whisker frame, m; drawn in black.
+    width : {"single", "double"}
+        Columns of the page.
+    cutaway : bool
+        Whether the quarter that faces the viewer is taken away, along the resting whisker, so that
+        the whisker and what lies about it are seen.
+    elevation, azimuth : float
+        From where the space is seen, degrees.
+
+    Returns
+    -------
+    Figure
+        3D axes, all to one scale but for the inset, and six colour bars.
+
+    Raises
+    ------
+    ValueError
+        If the dataset lacks something, or if there is no such width.
+    """
+    nodes = sample_contacts(samples, centerline, _kept(elevation, azimuth) if cutaway else None)
+    whole = nodes if not cutaway else sample_contacts(samples, centerline)
+    outside = column("deflection")
+    triangles = solid_surface(nodes, not cutaway, outside)
+    line = to_display("centerline", centerline)
+    limits = bounds(np.concatenate([_mm(triangles).reshape(-1, 3), line]))
+    view = elevation, azimuth
+    sheet = _sheet(width)
+    with looking():
+        figure = new_figure(width, sheet.height, None)
+        _reach(figure, sheet, triangles, line, limits, view)
+        for i, (name, cell) in enumerate(zip(SIGNALS, sheet.signals, strict=True)):
+            _label(figure, cell, "cdefgh"[i], _TITLES.get(name, quantity(name).long_name))
+            norm, colours, ends = _scale(name, to_display(name, values_of(name, whole)))
+            axes = space_axes(figure, _square(cell), limits, view, zoom=0.97, frame=False)
+            body = (
+                subdivide(triangles, _turning(name, triangles)) if name in DIRECTIONS else triangles
+            )
+            shown = to_display(name, values_of(name, body))
+            if name == "Mx" and _vanishes(whole):
+                _body(axes, triangles, np.array(_SKIN), line)
+                _say_zero(figure, cell)
+                continue
+            _body(axes, body, _mean(name, shown, norm, colours), line)
+            _bar(figure, _rail(figure, cell), norm, colours, ends, name)
+        _pulled(figure, sheet.signals[0], nodes, not cutaway, line, view)
+        return figure
+
+
+def _kept(elevation: float, azimuth: float) -> tuple[float, float]:
+    """Bearings that remain when the quarter toward the viewer is taken away."""
+    toward = np.arctan2(np.sign(elevation), np.sign(np.sin(np.radians(azimuth))))
+    return float(toward + np.pi / 4.0), float(toward + 7.0 * np.pi / 4.0)
+
+
+def _mm(triangles: Array) -> Array:
+    return to_display("contact_point", triangles[..., :3])
+
+
+def _turning(name: str, triangles: Array) -> Mask:
+    """Where a direction differs by more than 45° within a triangle, as where a force reverses."""
+    turn = values_of(name, triangles)
+    gap = np.abs(np.angle(np.exp(1j * (turn - np.roll(turn, 1, axis=1)))))
+    return np.asarray(gap.max(axis=1) > np.pi / 4.0)
+
+
+def _mean(name: str, values: Array, norm: Normalize, colours: Colormap) -> Array:
+    """Colours of triangles; directions are averaged on the circle."""
+    if name not in DIRECTIONS:
+        return painted(values, norm, colours)
+    turn = np.radians(values)
+    mean = np.degrees(np.arctan2(np.sin(turn).sum(axis=1), np.cos(turn).sum(axis=1)))
+    return painted(mean[:, None], norm, colours)
+
+
+def _reach(
+    figure: Figure,
+    sheet: _Sheet,
+    triangles: Array,
+    line: Array,
+    limits: Array,
+    view: tuple[float, float],
+) -> None:
+    """The reachable space from aside, and from before the tip."""
+    colours = np.broadcast_to(np.array(_SKIN), (len(triangles), 4))
+    left, bottom, width, height = sheet.space
+    box = left - 0.03 * width, bottom + 0.5 * (height - width), width, width
+    axes = space_axes(figure, box, limits, view, zoom=0.88)
+    name_axes(axes, (-8.0, -9.0, -10.5))
+    _body(axes, triangles, colours, line, 0.55)
+    _label(figure, sheet.space, "a", "reachable contacts")
+    left, bottom, width, height = sheet.front
+    side = min(width, height)
+    box = left + 0.5 * (width - side), bottom + 0.45 * (height - side), side, side
+    front = space_axes(figure, box, limits, (0.0, 0.0), zoom=1.35, frame=False)
+    front.set_proj_type("ortho")
+    _body(front, triangles, colours, line, 0.55)
+    _cross(front, limits)
+    _label(figure, sheet.front, "b", "from the tip")
+
+
+def _body(axes: Any, triangles: Array, colours: Array, line: Array, flat: float = 0.75) -> None:
+    paint(axes, _mm(triangles), colours, flat=flat)
+    axes.plot(*line.T, color="black", linewidth=1.2, zorder=10, solid_capstyle="round")
+
+
+def _cross(axes: Any, limits: Array) -> None:
+    """Bars of 5 mm along y and z at the lower left of the view from the tip."""
+    corner = np.array([limits[0, 1], limits[1, 0] - 1.0, limits[2, 0]])
+    for i, name in ((1, "y"), (2, "z")):
+        end = corner.copy()
+        end[i] += 5.0
+        axes.plot(*np.stack([corner, end]).T, color=INK, linewidth=0.8, zorder=11)
+        end[i] += 1.6
+        axes.text(*end, f"${name}$", fontsize=6.0, ha="center", va="center")
+    corner += np.array([0.0, 2.0, -2.6])
+    axes.text(*corner, "5 mm", fontsize=5.5, ha="center", va="center")
+
+
+def _vanishes(nodes: Array) -> bool:
+    """Whether there is no twisting moment, as for a straight whisker."""
+    twist, bend = (np.abs(values_of(name, nodes)).max() for name in ("Mx", "MB"))
+    return bool(twist < 1e-9 * bend)
+
+
+def _say_zero(figure: Figure, cell: Box) -> None:
+    wide, tall = 25.4 * figure.get_size_inches()
+    left, bottom, width, _ = cell
+    place = (left + 0.5 * width) / wide, (bottom + 6.0) / tall
+    figure.text(*place, "$M_x = 0$ everywhere", fontsize=6.5, ha="center", va="center")
+
+
+def _pulled(
+    figure: Figure,
+    cell: Box,
+    nodes: Array,
+    closed: bool,
+    line: Array,
+    view: tuple[float, float],
+) -> None:
+    """Inset with only the contacts at which the whisker is pulled, with colours of its own."""
+    triangles = solid_surface(nodes, closed, column("deflection"), column("Fx"))
+    if not len(triangles):
+        return
+    left, bottom, width, height = cell
+    limits = bounds(np.concatenate([_mm(triangles).reshape(-1, 3), line]))
+    side = 0.42 * width
+    box = left + width - 1.03 * side, bottom + 0.845 * height - 0.5 * side, side, side
+    axes = space_axes(figure, box, limits, view, zoom=1.1, frame=False)
+    values = to_display("Fx", values_of("Fx", triangles))
+    norm, colours = Normalize(0.0, float(values.max())), sequential()
+    _body(axes, triangles, painted(values, norm, colours), line, 1.0)
+    axes.lines[0].set_linewidth(0.7)
+    wide, tall = 25.4 * figure.get_size_inches()
+    start, end = left + 0.66 * width, bottom + 0.91 * height
+    rail = figure.add_axes((start / wide, end / tall, 0.22 * width / wide, 1.0 / tall))
+    bar = figure.colorbar(ScalarMappable(norm, colours), cax=rail, orientation="horizontal")
+    plain(bar)
+    rail.xaxis.set_ticks_position("top")
+    bar.set_ticks([0.0, values.max()], labels=["$F_x$ > 0", f"{values.max():.2g} µN"])
+    rail.tick_params(length=0.0, pad=1.0, labelsize=5.0)
+
+
+def _scale(name: str, values: Array) -> tuple[Normalize, Colormap, str]:
+    """Limits and map of the colours of a signal, and which ends of the map are exceeded."""
+    if name in DIRECTIONS:
+        return Normalize(-180.0, 180.0), cyclic(), "neither"
+    signed = name == "Mx"
+    low, high = robust_limits(values, symmetric=signed)
+    if name in ("FT", "MB"):
+        low = 0.0
+    below, above = bool(values.min() < low), bool(values.max() > high)
+    ends = ("neither", "max", "min", "both")[2 * below + above]
+    norm = FuncNorm((root, squared), vmin=low, vmax=high)
+    return norm, diverging() if signed else sequential(), ends
+
+
+def _label(figure: Figure, cell: Box, letter: str, title: str) -> None:
+    """A bold letter and a few words at the upper left of a panel."""
+    wide, tall = 25.4 * figure.get_size_inches()
+    left, bottom, _, height = cell
+    for text, right, weight in ((letter, 1.5, "bold"), (title, 5.5, "normal")):
+        figure.text(
+            (left + right) / wide,
+            (bottom + height) / tall,
+            text,
+            fontsize=8.0 if weight == "bold" else 6.5,
+            fontweight=weight,
+            ha="left",
+            va="top",
+        )
+
+
+def _square(cell: Box) -> Box:
+    """The room of a panel for its 3D axes, which are square and reach beyond it."""
+    left, bottom, width, height = cell
+    side = 1.1 * width
+    return left - 0.07 * width, bottom + 0.50 * height - 0.5 * side, side, side
+
+
+def _rail(figure: Figure, cell: Box) -> Any:
+    """Axes for a colour bar at the lower end of a panel."""
+    wide, tall = 25.4 * figure.get_size_inches()
+    left, bottom, width, _ = cell
+    place = ((left + 0.2 * width) / wide, (bottom + 6.8) / tall, 0.6 * width / wide, 1.5 / tall)
+    return figure.add_axes(place)
+
+
+def _bar(
+    figure: Figure, rail: Any, norm: Normalize, colours: Colormap, ends: str, name: str
+) -> Colorbar:
+    bar = figure.colorbar(
+        ScalarMappable(norm, colours), cax=rail, extend=ends, orientation="horizontal"
+    )
+    plain(bar)
+    bar.ax.tick_params(length=2.0, pad=1.5, labelsize=5.5)
+    bar.ax.set_xlabel(axis_label(name), fontsize=6.5, labelpad=1.0)
+    assert norm.vmin is not None
+    assert norm.vmax is not None
+    if name in DIRECTIONS:
+        bar.set_ticks([-180.0, -90.0, 0.0, 90.0, 180.0])
+    else:
+        marks = _round_roots(norm.vmin, norm.vmax)
+        bar.set_ticks(marks, labels=[f"{mark:g}".replace("-", "−") for mark in marks])
+    bar.minorticks_off()
+    return bar
+
+
+def _round_roots(low: float, high: float) -> list[float]:
+    """Round numbers that lie about evenly on a square-root scale."""
+    largest = max(abs(low), abs(high))
+    step = 10.0 ** np.floor(np.log10(largest))
+    step *= max(f for f in (1.0, 2.0, 5.0) if f * step <= largest)
+    marks = [0.0]
+    for sign, end, other in ((-1.0, -low, high), (1.0, high, -low)):
+        shares = (1.0,) if other > 0.1 * largest else (1.0, 0.25)
+        marks += [sign * f * step for f in shares if f * step <= end and end > 0.1 * largest]
+    return sorted(float(f"{mark:.3g}") for mark in marks)

@@ -1,0 +1,88 @@
+"""Sections about a map of contacts: whisker, signals and, if they are known, verdicts."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+
+from vibrissa.contacts import ContactMap
+from vibrissa.identifiability import verdict_rows
+from vibrissa.quantities import quantity, shown_unit, to_display
+from vibrissa.report.page import Section, paragraph, table
+from vibrissa.signals import SIGNALS
+from vibrissa.status import describe
+
+
+def chart_sections(contact_map: ContactMap, verdicts: xr.Dataset | None = None) -> list[Section]:
+    """Tell what a map holds, and which signals locate its contacts.
+
+    Parameters
+    ----------
+    contact_map : ContactMap
+        The map.
+    verdicts : Dataset, optional
+        Of :func:`vibrissa.uniqueness` for it.
+
+    Returns
+    -------
+    list of Section
+        The map; verdicts, or how to have them.
+    """
+    about = Section("map", "The map", contact_map._repr_html_() + _ranges(contact_map.to_dataset()))
+    if verdicts is None:
+        told = paragraph(
+            "Which signals locate a contact was not judged: `vibrissa uniqueness MAP -o FILE.nc` "
+            "does it, and `--uniqueness FILE.nc` shows it here."
+        )
+        return [about, Section("verdicts", "Verdicts", told)]
+    body = _verdicts(verdicts) + _witnesses(verdicts)
+    return [about, Section("verdicts", "Which triplets are unique", body)]
+
+
+def _ranges(samples: xr.Dataset) -> str:
+    """Ranges of signals over all contacts, and how these ended."""
+    rows = []
+    for name in (*SIGNALS, "r", "theta", "phi"):
+        factor, unit = shown_unit(name, samples[name].values)
+        values = factor * samples[name].values
+        ends = (f"{end:.4g}".replace("-", "−") for end in (np.nanmin(values), np.nanmax(values)))
+        rows.append((f"{quantity(name).long_name} ({unit})", *ends))
+    ranges = table(rows, ("quantity", "least", "largest"), "Over all contacts of the map")
+    counts = describe(samples["status"].values).most_common()
+    ended = [(sentence, str(count)) for sentence, count in counts]
+    return ranges + table(ended, ("status", "contacts"), "How contacts ended")
+
+
+def _verdicts(verdicts: xr.Dataset) -> str:
+    if "critical_cone" not in verdicts or "notation" not in verdicts:
+        rows = [
+            (str(triplet), *(str(v) for v in verdicts["verdict"].sel(triplet=triplet).values))
+            for triplet in verdicts["triplet"].values
+        ]
+        return table(rows, ("triplet", *map(str, verdicts["region"].values)), "Verdicts")
+    (heading, *cells), notes = verdict_rows(verdicts)
+    return table(cells, heading, "Verdicts by region") + "".join(
+        paragraph(note, "note") for note in notes
+    )
+
+
+def _witnesses(verdicts: xr.Dataset) -> str:
+    """The farthest pair of contacts that feel the same, by triplet."""
+    if "witness_separation" not in verdicts:
+        return ""
+    apart = verdicts["witness_separation"].transpose("triplet", "region", "witness").values
+    rows = []
+    for triplet, cells in zip(verdicts["triplet"].values, apart, strict=True):
+        if np.isfinite(cells).any():
+            region, _ = np.unravel_index(int(np.nanargmax(cells)), cells.shape)
+            farthest = float(to_display("contact_point", np.nanmax(cells)))
+            name = str(verdicts["region"].values[region])
+            rows.append((str(triplet), name, f"{farthest:.3f} mm"))
+    if not rows:
+        return paragraph("No two contacts were found that feel the same.")
+    return table(
+        rows,
+        ("triplet", "region", "apart"),
+        "Farthest contacts that feel the same",
+        "Each pair is proof that the triplet does not locate contacts uniquely in the region.",
+    )

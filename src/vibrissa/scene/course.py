@@ -1,0 +1,219 @@
+"""One whisker of a recorded trial as plain arrays, frame by frame, and where the head must be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike
+
+from vibrissa.recording import Group, Recording
+from vibrissa.scene.marks import Array, Mask
+from vibrissa.scene.solids import nearest_at_rest
+
+TRIPLET = ("Fx", "MB", "MD")
+"""The signals that are drawn, those of the paper."""
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """One whisker of a trial, frame by frame; None or NaN where the recording lacks it.
+
+    Parameters
+    ----------
+    time : array (n,)
+        Time of each frame, s.
+    touching : array (n,) of bool
+        Frames in contact.
+    signals : dict of str to array (n,), optional
+        F_x, M_B, M_D, SI units; NaN out of contact where they are only known there.
+    known : array (n, 3), optional
+        Contact points to compare with, whisker frame, m.
+    known_as : str
+        Kind of these: "true" or "tracked".
+    estimated : array (n, 3), optional
+        Contact points estimated from signals, whisker frame, m.
+    places : array (n, 3), optional
+        Contact points, laboratory frame, m: estimated ones if there are any, else known ones.
+    places_as : str
+        Kind of these: "estimated", "tracked" or "true".
+    centerline : array (n, k, 3), optional
+        Deflected whisker from base to tip, laboratory frame, m.
+    traces : tuple of array (n, k, 2)
+        Deflected whisker in the images, view by view, pixels, as far as it was traced.
+    position : array (n, 3)
+        Position of the base, laboratory frame, m.
+    rotation : array (n, 3, 3)
+        Rotation from the whisker's to the laboratory frame.
+    frames : array (n, views) of int, optional
+        Frame of each view's video at each time.
+    head : tuple of array (n, 3) and array (n, 3, 3), optional
+        Position of the head, laboratory frame, m, and rotation from its frame to the laboratory's.
+    """
+
+    time: Array
+    touching: Mask
+    signals: dict[str, Array] | None
+    known: Array | None
+    known_as: str
+    estimated: Array | None
+    places: Array | None
+    places_as: str
+    centerline: Array | None
+    traces: tuple[Array, ...]
+    position: Array
+    rotation: Array
+    frames: Array | None
+    head: tuple[Array, Array] | None
+
+    def at_base(self, points: Array) -> Array:
+        """Take points of the laboratory to the whisker's frame, frame by frame.
+
+        Parameters
+        ----------
+        points : array (n, ..., 3)
+            Points, laboratory frame, m.
+
+        Returns
+        -------
+        array (n, ..., 3)
+            The points, whisker frame, m.
+        """
+        shape = (len(self.time),) + (1,) * (points.ndim - 2) + (3,)
+        moved = points - self.position.reshape(shape)
+        return np.asarray(np.einsum("n...i,nij->n...j", moved, self.rotation))
+
+
+def course_of(trial: xr.DataTree, whisker: int = 0) -> Course:
+    """Take what is drawn out of a recording.
+
+    The groups ``signals``, ``estimates`` and ``truth`` are used as far as they are there. What
+    contacts are compared with is the truth, or else the tracked contacts.
+
+    Parameters
+    ----------
+    trial : DataTree
+        A recording, dims time, whisker, ...; SI units.
+    whisker : int
+        Number of the whisker, from 0.
+
+    Returns
+    -------
+    Course
+        What is known of that whisker.
+
+    Raises
+    ------
+    ValueError
+        If there is no such whisker, or the recording has no times or lacks the pose of the
+        base.
+    """
+    lacking = [n for n in ("time", "base_position", "base_rotation") if n not in trial.variables]
+    if lacking:
+        raise ValueError(f"the recording lacks {', '.join(lacking)}")
+    found = (Recording(trial).find(name) for name in ("", "signals", "estimates", "truth"))
+    nothing = Group(xr.Dataset())
+    root, signals, estimates, truth = ((each or nothing).whisker(whisker) for each in found)
+    tracked = "measured" in trial.children
+    known = truth.known("contact_point_whisker")
+    known_as = "true"
+    if known is None and tracked:
+        known, known_as = root.known("contact_point_whisker"), "tracked"
+    estimated = estimates.known("contact_point_whisker")
+    if estimated is None and not tracked:
+        estimated = root.known("contact_point_whisker")
+    places, places_as = estimates.known("contact_point"), "estimated"
+    if places is None:
+        places, places_as = root.known("contact_point"), "tracked" if tracked else "estimated"
+    if places is None:
+        places, places_as = truth.known("contact_point"), "true"
+    line = root.known("centerline")
+    order = (signals, estimates, root, truth)
+    return Course(
+        time=np.asarray(root.data["time"].values, dtype=np.float64),
+        touching=_touching(order, root.data.sizes["time"]),
+        signals=_signals(signals),
+        known=known,
+        known_as=known_as,
+        estimated=estimated,
+        places=places,
+        places_as=places_as,
+        centerline=truth.known("centerline") if line is None else line,
+        traces=_traces(root, truth),
+        position=root["base_position"],
+        rotation=root["base_rotation"],
+        frames=root.get("frame"),
+        head=_head(root),
+    )
+
+
+def _signals(data: Group) -> dict[str, Array] | None:
+    found = {name: data.known(name) for name in TRIPLET}
+    known = {name: values for name, values in found.items() if values is not None}
+    return known if len(known) == len(TRIPLET) else None
+
+
+def _touching(order: tuple[Group, ...], count: int) -> Mask:
+    """In contact by the first group that has it."""
+    for group in order:
+        if "in_contact" in group:
+            return group["in_contact"]
+    return np.zeros(count, dtype=bool)
+
+
+def _head(root: Group) -> tuple[Array, Array] | None:
+    position, rotation = (root.known(name) for name in ("head_position", "head_rotation"))
+    return None if position is None or rotation is None else (position, rotation)
+
+
+def _traces(root: Group, truth: Group) -> tuple[Array, ...]:
+    """Traces in each view: tracked ones, or else true ones."""
+    for data in (root, truth):
+        if "trace" in data:
+            return tuple(np.swapaxes(data["trace"], 0, 1))
+    return ()
+
+
+def deflection_angles(course: Course, centerline: ArrayLike) -> Array:
+    """Give the angle at the base between contacts and the resting whisker.
+
+    Parameters
+    ----------
+    course : Course
+        The trial.
+    centerline : array_like (k, 3)
+        Resting whisker, whisker frame, m.
+
+    Returns
+    -------
+    array (n,)
+        Angle in each frame, rad: its tangent is the distance of the contact from the
+        resting whisker over the arc length of its nearest point; NaN without contact.
+    """
+    angles = np.full(len(course.time), np.nan)
+    if course.places is None:
+        return angles
+    own = course.at_base(course.places)
+    rows = np.isfinite(own).all(axis=1)
+    if rows.any():
+        angles[rows] = np.arctan2(*nearest_at_rest(own[rows], np.asarray(centerline, np.float64)))
+    return angles
+
+
+def spherical(points: Array) -> Array:
+    """Give the spherical coordinates of contact points.
+
+    Parameters
+    ----------
+    points : array (..., 3)
+        Contact points, whisker frame, m.
+
+    Returns
+    -------
+    array (..., 3)
+        (r, θ, φ), m and rad.
+    """
+    x, y, z = np.moveaxis(points, -1, 0)
+    away = np.hypot(x, y)
+    return np.stack([np.hypot(away, z), np.arctan2(y, x), np.arctan2(z, away)], axis=-1)

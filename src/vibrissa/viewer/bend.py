@@ -1,0 +1,271 @@
+"""Mode Bend: drag the contact, turn the peg, push with a force."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+
+from vibrissa.quantities import quantity, to_display
+from vibrissa.scene import (
+    Array,
+    Arrows,
+    Body,
+    Colour,
+    Drawing,
+    Label,
+    Line,
+    Mark,
+    cylinder,
+    ellipsoid,
+    tube,
+)
+from vibrissa.viewer.colours import CONTACT, FORCE, GHOST, OBJECT, REST, WHISKER
+from vibrissa.viewer.page import Page, asked, put, show
+from vibrissa.viewer.readout import number, numbers, sentence
+from vibrissa.viewer.state import (
+    KINDS,
+    Bend,
+    Chart,
+    Kind,
+    envelope,
+    force_scale,
+    loaded,
+    moved,
+    with_force,
+    with_radius,
+)
+from vibrissa.whisker import Whisker
+
+NODES = 48
+_AXES = np.array([(190, 60, 60), (70, 140, 70), (70, 90, 190)], dtype=np.uint8)
+_ARROW = 0.3
+"""Length of the arrow of a force of EI/L², over L; others go with the square root."""
+
+
+def whisker_body(
+    whisker: Whisker,
+    line: Array,
+    exaggeration: float,
+    colour: Colour = WHISKER,
+    opacity: float | None = None,
+) -> Body:
+    """A whisker along a centreline (n, 3), m, so many times as thick as it is."""
+    radius = whisker.radius(np.linspace(0.0, whisker.length, len(line)))
+    vertices, faces = tube(_mm(line), exaggeration * _mm(radius))
+    return Body(vertices, faces, colour, opacity)
+
+
+def follicle(whisker: Whisker, exaggeration: float) -> Body:
+    """A sleeve in which the base is clamped, so that one sees where it is."""
+    radius = 1.9 * exaggeration * whisker.base_radius
+    depth = 0.06 * whisker.length
+    middle = np.array([-0.5 * depth, 0.0, 0.0])
+    vertices, faces = cylinder(_mm(middle), np.array([1.0, 0.0, 0.0]), _size(radius), _size(depth))
+    return Body(vertices, faces, (196, 152, 132))
+
+
+def axes(whisker: Whisker) -> dict[str, Mark]:
+    """The whisker frame at the base: x red, y green, z blue."""
+    size = _size(0.14 * whisker.length)
+    ends = size * np.eye(3)
+    out: dict[str, Mark] = {"axes": Arrows(np.zeros((3, 3)), ends, _AXES, 0.05 * size)}
+    return out | {f"axis {name}": Label(1.12 * ends[i], name) for i, name in enumerate("xyz")}
+
+
+def arrow(start: Array, end: Array, thickness: float) -> Arrows:
+    """The arrow of a force between two places (3,), m; so many mm thick."""
+    return Arrows(_mm(start)[None], _mm(end)[None], np.array([FORCE], dtype=np.uint8), thickness)
+
+
+def force_arrow(whisker: Whisker, force: Array, at: Array) -> dict[str, Mark]:
+    """The force on a whisker as an arrow that ends where it acts, with its size."""
+    size = float(np.linalg.norm(force))
+    if not (np.isfinite(at).all() and size > 0.0):
+        return {}
+    reach = _ARROW * whisker.length * np.sqrt(size / force_scale(whisker))
+    start = at - reach * force / size
+    thickness = _size(0.006 * whisker.length)
+    return {
+        "force": arrow(start, at, thickness),
+        "force size": Label(_mm(start), number("force", size, 3)),
+    }
+
+
+def bend_drawing(bend: Bend, exaggeration: float) -> Drawing:
+    """Draw whisker, load and force; without an answer the last shape as a ghost."""
+    whisker, held, ok = bend.whisker, bend.held, bend.status.ok
+    out = dict(_resting(whisker, exaggeration))
+    line = held.centerline(NODES)
+    if ok:
+        out["whisker"] = whisker_body(whisker, line, exaggeration)
+        out |= force_arrow(whisker, np.asarray(held.force), np.asarray(held.contact_point))
+    else:
+        out["ghost"] = whisker_body(whisker, line, exaggeration, GHOST, 0.4)
+        out |= _missed(bend)
+    if bend.kind == "peg":
+        out["peg"] = _peg(bend)
+    elif ok:
+        x, y, z = _mm(held.contact_point).tolist()
+        out["contact"] = replace(_ball(whisker, exaggeration), position=(x, y, z))
+    return out
+
+
+@lru_cache(maxsize=4)
+def _resting(whisker: Whisker, exaggeration: float) -> dict[str, Mark]:
+    """What stays as it is while a whisker is bent."""
+    return {
+        "follicle": follicle(whisker, exaggeration),
+        **axes(whisker),
+        "rest": whisker_body(whisker, whisker.centerline(NODES), 0.7 * exaggeration, REST, 0.35),
+    }
+
+
+def _peg(bend: Bend) -> Body:
+    """The peg; a line is drawn a little thick, so that it is seen."""
+    length = bend.whisker.length
+    radius = max(bend.radius, 0.004 * length)
+    vertices, faces = cylinder(_mm(bend.origin), bend.axis, _size(radius), _size(0.8 * length))
+    return Body(vertices, faces, OBJECT, 0.8)
+
+
+@lru_cache(maxsize=4)
+def _ball(whisker: Whisker, exaggeration: float) -> Body:
+    """What marks the contact: it sticks out of the whisker where this can touch."""
+    own = float(whisker.radius(0.5 * whisker.length))
+    radius = max(1.7 * exaggeration * own, 0.006 * whisker.length)
+    vertices, faces = ellipsoid(np.zeros(3), _size(radius) * np.eye(3), 12)
+    return Body(vertices, faces, CONTACT)
+
+
+def _missed(bend: Bend) -> dict[str, Mark]:
+    """A line from the last contact to where it was wanted, and why it did not go there."""
+    last = np.asarray(bend.held.contact_point)
+    out: dict[str, Mark] = {}
+    if np.isfinite(last).all() and bend.kind == "point":
+        out["missed"] = Line(_mm(np.stack([last, bend.point])[None]), GHOST)
+    words = bend.status.explanation.split(":")[0].rstrip(".")
+    lift = np.array([0.0, 0.0, 0.05 * bend.whisker.length])
+    return {**out, "reason": Label(_mm(bend.target + lift), words)}
+
+
+def _mm(values: object) -> Array:
+    return to_display("length", np.asarray(values, dtype=np.float64))
+
+
+def _size(length: float) -> float:
+    return float(to_display("length", length))
+
+
+_MM = quantity("length").display_factor
+_UN = quantity("force").display_factor
+_HELD = "The whisker holds this force."
+
+
+class BendMode:
+    """The controls of a load, and the whisker that it bends."""
+
+    name = "Bend"
+
+    def __init__(self, page: Page) -> None:
+        self._page = page
+        self._clouded: Chart | None = None
+        self._told: Kind | None = None
+        gui = page.server.gui
+        bend = page.bend
+        length = page.original.length
+        x, y, z = (_MM * bend.point).tolist()
+        self._folder = gui.add_folder("Load", visible=False)
+        with self._folder:
+            self._kind = gui.add_dropdown(
+                "Load", KINDS, hint="What bends the whisker: a point, a straight peg, or a force"
+            )
+            self._target = gui.add_vector3(
+                "Place (mm)", (x, y, z), step=0.05, hint="Drag the ball, or type"
+            )
+            self._radius = gui.add_slider(
+                "Radius (mm)", 0.0, _MM * 0.08 * length, 0.01, bend.radius, visible=False
+            )
+            self._place = gui.add_slider(
+                "At s / L", 0.05, 1.0, 0.005, bend.place, visible=False, hint="Along the whisker"
+            )
+            self._size = gui.add_slider(
+                "Force (µN)",
+                0.0,
+                round(3.0 * _UN * force_scale(page.original), 1),
+                0.1,
+                round(_UN * bend.magnitude, 1),
+                visible=False,
+            )
+            self._way = gui.add_slider(
+                "Direction (°)",
+                -180.0,
+                180.0,
+                1.0,
+                0.0,
+                visible=False,
+                hint="Round the whisker: 0° along what is y at its base, 90° along z",
+            )
+            self._state = gui.add_html("")
+            self._numbers = gui.add_html("")
+        asked(self._kind, self._chosen)
+        asked(self._target, self._typed)
+        asked(self._radius, self._widened)
+        for slider in (self._place, self._size, self._way):
+            asked(slider, lambda _: self._pushed())
+
+    def enter(self) -> None:
+        """Show controls."""
+        self._folder.visible = True
+        self._page.face_whisker()
+
+    def leave(self) -> None:
+        """Hide controls and things."""
+        self._folder.visible = False
+        self._clouded = None
+        self._page.stage.show("bend", {})
+        self._page.stage.show("reachable", {})
+
+    def redraw(self) -> None:
+        """Draw the whisker, and what it can reach."""
+        page, bend = self._page, self._page.bend
+        page.stage.show("bend", bend_drawing(bend, page.exaggeration))
+        if page.chart is not self._clouded:
+            self._clouded = page.chart
+            cloud = {} if page.chart is None else {"envelope": envelope(page.chart)}
+            page.stage.show("reachable", cloud)
+
+    def write(self, brief: bool = False) -> None:
+        """Write signals and contact, and where the load is."""
+        bend = self._page.bend
+        show(self._state, sentence(bend.status, _HELD if bend.kind == "force" else None))
+        show(self._numbers, numbers(bend.deflection))
+        if brief:
+            return
+        self._target.visible = bend.kind != "force"
+        self._radius.visible = bend.kind == "peg"
+        self._place.visible = self._size.visible = self._way.visible = bend.kind == "force"
+        if bend.kind != "force":
+            x, y, z = np.round(_MM * bend.target, 3).tolist()
+            put(self._target, (x, y, z))
+        if bend.kind != self._told:  # not while someone moves the sliders
+            self._told = bend.kind
+            put(self._kind, bend.kind)
+            put(self._radius, round(_MM * bend.radius, 2))
+            put(self._place, round(bend.place, 3))
+            put(self._size, round(_UN * bend.magnitude, 1))
+            put(self._way, round(np.rad2deg(bend.direction)))
+
+    def _chosen(self, kind: Kind) -> None:
+        self._page.change("kind", lambda bend: loaded(bend, kind))
+
+    def _typed(self, place: tuple[float, float, float]) -> None:
+        self._page.change("drag", lambda bend: moved(bend, np.array(place) / _MM))
+
+    def _widened(self, radius: float) -> None:
+        self._page.change("radius", lambda bend: with_radius(bend, radius / _MM))
+
+    def _pushed(self) -> None:
+        place, size, way = self._place.value, self._size.value / _UN, np.deg2rad(self._way.value)
+        self._page.change("force", lambda bend: with_force(bend, place, size, way))

@@ -1,0 +1,309 @@
+"""Mode Locate: which contacts have the same signals, and how exactly they are located."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+
+from vibrissa.contacts import Estimate
+from vibrissa.identifiability import sensitivity
+from vibrissa.quantities import quantity, to_display
+from vibrissa.rod import PointContact, deflect
+from vibrissa.scene import (
+    Array,
+    Body,
+    Bytes,
+    Drawing,
+    Ints,
+    Label,
+    Mark,
+    ellipsoid,
+    error_ellipsoid,
+)
+from vibrissa.signals import SIGNALS, TRIPLETS, base_signals
+from vibrissa.status import Status
+from vibrissa.viewer.bend import NODES, bend_drawing, whisker_body
+from vibrissa.viewer.colours import FIT, GHOST, Legend, counted, shaded
+from vibrissa.viewer.page import Page, asked
+from vibrissa.viewer.readout import note, number, sentence, table
+from vibrissa.viewer.state import Bend, Chart, coloured_cloud, places
+from vibrissa.whisker import Whisker
+
+_RAT = (1.5e-4, 6e-6)
+"""EI/L², N, and EI/L, N·m, of a rat's whisker."""
+
+COLOURS = ("uniqueness", "ambiguity", "sensitivity", *SIGNALS)
+_APART = 0.005
+"""Candidates nearer to the contact than this share of the length are the contact itself."""
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """What locates the contact."""
+
+    triplet: tuple[str, ...] = ("Fx", "MB", "MD")
+    force_noise: float = 1e-6
+    moment_noise: float = 2e-8
+
+    @property
+    def covariance(self) -> Array | None:
+        """Of force and moment (6, 6); None where there is no noise."""
+        sigma = np.repeat([self.force_noise, self.moment_noise], 3)
+        return np.diag(sigma**2) if (sigma > 0.0).all() else None
+
+
+def usual_sensor(whisker: Whisker) -> Sensor:
+    """A sensor that suits a whisker: as exact for a rod as 1 µN and 0.02 µN·m are for a rat's."""
+    moment = whisker.base_bending_stiffness / whisker.length
+    powers = np.log10([moment / whisker.length / _RAT[0], moment / _RAT[1]])
+    force, turning = 10.0 ** np.round(powers)
+    usual = Sensor()
+    return Sensor(
+        force_noise=float(force * usual.force_noise),
+        moment_noise=float(turning * usual.moment_noise),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Located:
+    """What three signals of a bent whisker tell."""
+
+    sensor: Sensor
+    signals: xr.Dataset
+    contact: Array
+    estimate: Estimate
+    lines: Array
+
+    @property
+    def points(self) -> Array:
+        """Contact points of the candidates (k, 3), m."""
+        points = self.estimate.candidates
+        return np.asarray(points[np.isfinite(points).all(axis=-1)])
+
+    @property
+    def distances(self) -> Array:
+        """How far each candidate is from the true contact (k,), m."""
+        return np.asarray(np.linalg.norm(self.points - self.contact, axis=-1))
+
+    def others(self, length: float) -> Ints:
+        """Numbers of the candidates that are not the contact itself."""
+        return np.flatnonzero(self.distances > _APART * length)
+
+
+def located(chart: Chart, bend: Bend, sensor: Sensor) -> Located | None:
+    """Find every contact that feels the same in three signals; None where there is no contact."""
+    bent = bend.deflection
+    if not bend.status.ok or bend.status is Status.NO_CONTACT:
+        return None
+    signals = base_signals(np.asarray(bent.force), np.asarray(bent.moment))
+    estimate = chart.contact_map.estimate(signals, sensor.triplet, noise=sensor.covariance)
+    points = estimate.candidates[np.isfinite(estimate.candidates).all(axis=-1)]
+    lines = deflect(chart.whisker, PointContact(points.reshape(-1, 3))).centerline(NODES)
+    return Located(sensor, signals, np.asarray(bent.contact_point), estimate, lines)
+
+
+def coloured(chart: Chart, what: str, sensor: Sensor) -> tuple[Bytes, Legend]:
+    """Colours (n, 3) of the cloud: how many contacts feel the same there, or how far apart."""
+    if what in SIGNALS:
+        return shaded(what, chart.signals[what])
+    if what == "sensitivity":
+        return shaded("predicted_error", _predicted_error(chart, sensor))
+    felt = {name: chart.signals[name] for name in sensor.triplet}
+    estimate = chart.contact_map.estimate(felt, sensor.triplet)
+    if what == "uniqueness":
+        return counted(estimate.n_candidates)
+    if what == "ambiguity":
+        return shaded("separation", _separation(estimate, chart.points))
+    raise ValueError(f"colours are one of {', '.join(COLOURS)}; got {what!r}")
+
+
+def _predicted_error(chart: Chart, sensor: Sensor) -> Array:
+    """RMS 3D error (n,), m, of the contacts of the cloud."""
+    if sensor.covariance is None:
+        return np.full(len(chart.points), np.nan)
+    found = sensitivity(chart.contact_map, sensor.triplet, chart.points, noise=sensor.covariance)
+    return np.asarray(found["predicted_error"].to_numpy(), dtype=np.float64)
+
+
+def _separation(estimate: Estimate, points: Array) -> Array:
+    """How far (n,), m, the farthest other candidate of each contact is; NaN without candidates."""
+    away = np.linalg.norm(estimate.candidates - points[:, None], axis=-1)
+    farthest = np.nanmax(np.nan_to_num(away), axis=1)
+    farthest[farthest < 1e-9] = 0.0  # the contact itself, found again
+    return np.where(estimate.status == Status.DEGENERATE, np.nan, farthest)
+
+
+SIGMAS = 2.0
+"""Standard deviations of the ellipsoids."""
+
+MOST = 0.3
+"""Longest semi-axis that is drawn, over the length: what is longer is as good as unknown."""
+
+
+def locate_drawing(whisker: Whisker, found: Located, exaggeration: float) -> Drawing:
+    """Draw the whisker in every other contact that feels the same, and the errors of all."""
+    out: dict[str, Mark] = {}
+    covariances = found.estimate.candidate_covariances
+    others = set(found.others(whisker.length).tolist())
+    for i, point in enumerate(found.points):
+        if i in others:
+            out[f"ghost {i}"] = whisker_body(whisker, found.lines[i], exaggeration, GHOST, 0.55)
+            radius = float(to_display("length", 0.008 * whisker.length))
+            ball = ellipsoid(_mm(point), radius * np.eye(3))
+            out[f"ball {i}"] = Body(*ball, GHOST)
+            apart = number("separation", float(found.distances[i]), 3)
+            out[f"apart {i}"] = Label(_mm(point), f"feels the same, {apart} away")
+        if np.isfinite(covariances[i]).all():
+            most = MOST * whisker.length
+            vertices, faces = error_ellipsoid(point, covariances[i], SIGMAS, most)
+            out[f"error {i}"] = Body(_mm(vertices), faces, FIT, 0.45)
+    return out
+
+
+def of_located(whisker: Whisker, found: Located | None, status: Status) -> str:
+    """What three signals tell: how many contacts, how far apart, how exact."""
+    if found is None:
+        return sentence(status)
+    names = found.sensor.triplet
+    felt = {name: float(found.signals[name]) for name in SIGNALS}
+    chosen = {name: felt[name] for name in names}
+    parts = [sentence(Status(int(found.estimate.status))), table(chosen, "Felt")]
+    others = found.others(whisker.length)
+    if others.size:
+        farthest = number("separation", float(found.distances[others].max()), 3)
+        parts.append(note(f"The farthest contact that feels the same is {farthest} away."))
+    own = int(np.argmin(found.distances)) if found.points.size else -1
+    if own >= 0 and np.isfinite(found.estimate.candidate_covariances[own]).all():
+        spread = np.sqrt(np.diagonal(found.estimate.candidate_covariances[own]))
+        errors = dict(zip(("sigma_x", "sigma_y", "sigma_z"), spread.tolist(), strict=True))
+        parts.append(table(errors, f"Error of the contact point ({SIGMAS:.0f}σ drawn)"))
+        if SIGMAS * spread.max() > MOST * whisker.length:
+            parts.append(note("The ellipsoid is cut short: along it the place is unknown."))
+    rest = {name: value for name, value in felt.items() if name not in names}
+    parts.append(table(rest, "Not used"))
+    return "".join(parts)
+
+
+def _mm(values: Array) -> Array:
+    return to_display("length", values)
+
+
+_UN = quantity("force").display_factor
+_UNM = quantity("moment").display_factor
+
+
+class LocateMode:
+    """The controls of a sensor, and what it cannot tell apart."""
+
+    name = "Locate"
+
+    def __init__(self, page: Page) -> None:
+        self._page = page
+        self._sensor = usual_sensor(page.original)
+        self._what = "uniqueness"
+        self._cut = True
+        self._drawn: tuple[object, ...] | None = None
+        self._cloud: tuple[Chart, Bytes] | None = None
+        self.found: Located | None = None
+        gui = page.server.gui
+        self._folder = gui.add_folder("Three signals", visible=False)
+        with self._folder:
+            triplet = gui.add_dropdown(
+                "Signals",
+                tuple(" ".join(names) for names in TRIPLETS),
+                initial_value=" ".join(self._sensor.triplet),
+            )
+            noise, turning = _UN * self._sensor.force_noise, _UNM * self._sensor.moment_noise
+            force = gui.add_slider("F noise (µN)", 0.0, 10.0 * noise, 0.1 * noise, noise)
+            moment = gui.add_slider("M noise (µN·m)", 0.0, 10.0 * turning, 0.1 * turning, turning)
+            colour = gui.add_dropdown("Colours", COLOURS, initial_value=self._what)
+            cut = gui.add_checkbox("Cut open", self._cut, hint="Only contacts with z < 0")
+            self._legend = gui.add_html("")
+            self._words = gui.add_html("")
+        asked(triplet, lambda value: self._sense(triplet=tuple(value.split())))
+        asked(force, lambda value: self._sense(force_noise=value / _UN))
+        asked(moment, lambda value: self._sense(moment_noise=value / _UNM))
+        asked(colour, self._colour)
+        asked(cut, self._open)
+
+    def enter(self) -> None:
+        """Show controls."""
+        self._folder.visible = True
+        self._page.face_whisker()
+        self._drawn = None
+        if self._page.bend.kind != "point":
+            self._page.bend = self._page.bend_by_point()
+
+    def leave(self) -> None:
+        """Hide controls and things."""
+        self._folder.visible = False
+        for layer in ("bend", "candidates", "cloud"):
+            self._page.stage.show(layer, {})
+
+    def redraw(self) -> None:
+        """Draw whisker, candidates and errors; colour the cloud if it is another."""
+        page, bend, chart = self._page, self._page.bend, self._page.chart
+        page.stage.show("bend", bend_drawing(bend, page.exaggeration))
+        if chart is None:
+            self.found = None
+            page.stage.show("candidates", {})
+            return
+        self.found = located(chart, bend, self._sensor)
+        drawing = (
+            {}
+            if self.found is None
+            else locate_drawing(bend.whisker, self.found, page.exaggeration)
+        )
+        page.stage.show("candidates", drawing)
+        self._paint(chart)
+
+    def write(self, brief: bool = False) -> None:
+        """Write what the three signals tell."""
+        bend = self._page.bend
+        if self._page.chart is None:
+            self._words.content = note("Charting all contacts of this whisker …")
+        else:
+            self._words.content = of_located(bend.whisker, self.found, bend.status)
+
+    def _paint(self, chart: Chart) -> None:
+        """Colour the cloud beside everything else."""
+        key = (chart, self._sensor, self._what)
+        if self._drawn == key:
+            return
+        self._drawn = key
+        sensor, what = self._sensor, self._what
+
+        def ready(colours: Bytes, legend: Legend) -> None:
+            if self._drawn == key:
+                self._legend.content = legend.html()
+                self._cloud = (chart, colours)
+                self._show_cloud()
+
+        def job() -> None:
+            colours, legend = coloured(chart, what, sensor)
+            self._page.work.put("colours", lambda: ready(colours, legend))
+
+        self._page.slow_work.put("colours", job)
+
+    def _show_cloud(self) -> None:
+        if self._cloud is None or self._page.mode is not self:
+            return
+        chart, colours = self._cloud
+        points = places(chart)
+        keep = points[:, 2] <= 0.0 if self._cut else slice(None)
+        cloud = coloured_cloud(chart, points[keep], colours[keep])
+        self._page.stage.show("cloud", {"contacts": cloud})
+
+    def _sense(self, **changes: object) -> None:
+        self._sensor = Sensor(**{**vars(self._sensor), **changes})
+        self._page.work.put("sensor", self._page.redraw)
+
+    def _colour(self, what: str) -> None:
+        self._what = what
+        self._page.work.put("sensor", self._page.redraw)
+
+    def _open(self, cut: bool) -> None:
+        self._cut = cut
+        self._page.work.put("cut", self._show_cloud)

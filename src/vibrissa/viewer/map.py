@@ -1,0 +1,354 @@
+"""Mode Map: all contacts, and all their signals, side by side as solids (the paper's Fig. 3).
+
+Signals are laid out in a cylinder: M_B is the distance from its axis, M_D the angle about it, F_x
+the height; M_B and F_x by their square roots, as most contacts are gentle. Four spaces are
+side by side: that of contacts, and three times that of signals, coloured by r, θ and φ. What is
+picked in one is shown in all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import viser
+
+from vibrissa.quantities import to_display
+from vibrissa.rod import PointContact, deflect
+from vibrissa.scene import (
+    Array,
+    Body,
+    Drawing,
+    Label,
+    Line,
+    Mark,
+    Painted,
+    clip,
+    column,
+    ellipsoid,
+    level_surface,
+    pieces,
+    root,
+    sample_contacts,
+    solid_surface,
+    values_of,
+)
+from vibrissa.signals import SIGNALS
+from vibrissa.status import Status
+from vibrissa.viewer.bend import NODES, follicle, whisker_body
+from vibrissa.viewer.colours import CONTACT, REST, WHISKER, Legend, shaded
+from vibrissa.viewer.page import Page, asked
+from vibrissa.viewer.readout import note, number, of_deflection, table
+from vibrissa.viewer.state import Chart
+
+COORDINATES = ("r", "theta", "phi")
+SLICES = ("x", "y", "z", "r", "theta", "phi", "Fx", "Mx", "arc_length")
+"""What can be held fixed in a slice."""
+
+_SHAPE = (24, 48, 12)
+_OPEN = (np.pi, 2.5 * np.pi)
+"""Bearings of the force that are kept where solids are cut open."""
+
+_HEIGHT = 0.85
+_PLACES = ((1.75, 0.62), (0.4, -0.78), (1.75, -0.78))
+_CONTACTS = (0.0, 0.62)
+"""Where spaces stand in the plane that faces the viewer: two above, two below, in L."""
+
+TURN = float(np.deg2rad(62.0))
+"""By how much signals are turned about their axis, so that one looks into what is cut open."""
+
+
+@dataclass(frozen=True, eq=False)
+class Solids:
+    """The contacts of a whisker, ready to be laid out."""
+
+    chart: Chart
+    nodes: Array
+    cut: bool
+
+    @property
+    def length(self) -> float:
+        """Of the whisker, mm."""
+        return float(to_display("length", self.chart.whisker.length))
+
+    def skin(self) -> Array:
+        """Triangles (n, 3, columns) around all contacts outside 2° of rest."""
+        return solid_surface(self.nodes, not self.cut, column("deflection"))
+
+    def slice(self, name: str, share: float) -> Array:
+        """Triangles (n, 3, columns) of contacts with one value, at a share of its range."""
+        height = self.value(name, share)
+        return clip(level_surface(self.nodes, column(name), height), column("deflection"))
+
+    def value(self, name: str, share: float) -> float:
+        """The value at a share of a range, SI units; of signals by square roots, as in space."""
+        low, high = self.range(name)
+        if name not in SIGNALS:
+            return low + share * (high - low)
+        start, end = root(np.array([low, high]))
+        middle = start + share * (end - start)
+        return float(np.sign(middle) * middle**2)
+
+    def range(self, name: str) -> tuple[float, float]:
+        """Least and largest value of what a slice can hold fixed, SI units."""
+        values = self.nodes[..., column(name)]
+        return float(values.min()), float(values.max())
+
+    def felt(self, rows: Array) -> Array:
+        """Places (..., 3), mm, of rows in the space of signals, its axis at the origin."""
+        reach, low, high = self._limits
+        size = np.sqrt(values_of("MB", rows)) / reach
+        turn = values_of("MD", rows) + TURN
+        height = (root(values_of("Fx", rows)) - low) / (high - low)
+        flat = [0.5 * size * np.cos(turn), 0.5 * size * np.sin(turn)]
+        return self.length * np.stack([*flat, _HEIGHT * (height - 0.5)], axis=-1)
+
+    @property
+    def _limits(self) -> tuple[float, float, float]:
+        """Largest √M_B, least and largest root of F_x."""
+        heights = root(values_of("Fx", self.nodes))
+        reach = float(np.sqrt(values_of("MB", self.nodes).max()))
+        return reach, float(heights.min()), float(heights.max())
+
+    def axis_height(self) -> float:
+        """Where F_x = 0 is on the axis of the signals, mm."""
+        _, low, high = self._limits
+        return self.length * _HEIGHT * (-low / (high - low) - 0.5)
+
+    def place(self, number: int | None) -> Array:
+        """Where a space stands, mm: contacts (None), or signals coloured by r, θ, φ (0, 1, 2)."""
+        x, z = _CONTACTS if number is None else _PLACES[number]
+        return self.length * np.array([x, 0.0, z])
+
+    def seen(self, rows: Array, number: int | None) -> Array:
+        """Places (..., 3), mm, of rows: as contacts (None) or as signals of a coordinate."""
+        if number is None:
+            return to_display("contact_point", rows[..., :3]) + self.place(None)
+        return self.felt(rows) + self.place(number)
+
+
+def solids(chart: Chart, cut: bool) -> Solids:
+    """Sample a chart for solids, whole or cut open."""
+    nodes = sample_contacts(chart.samples, chart.line, _OPEN if cut else None, _SHAPE)
+    return Solids(chart, nodes, cut)
+
+
+def picked(triangles: Array, places: Array, origin: Array, direction: Array) -> Array | None:
+    """The contact that a ray meets first."""
+    a, b, c = places.transpose(1, 0, 2)
+    first, second = b - a, c - a
+    across = np.cross(direction, second)
+    volume = np.einsum("ij,ij->i", first, across)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        away = (origin - a) / volume[:, None]
+        u = np.einsum("ij,ij->i", away, across)
+        turned = np.cross(away, first)
+        v = turned @ direction
+        distance = np.einsum("ij,ij->i", turned, second)
+        met = (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (distance > 0.0)
+    if not met.any():
+        return None
+    hit = int(np.flatnonzero(met)[np.argmin(distance[met])])
+    weights = np.array([1.0 - u[hit] - v[hit], u[hit], v[hit]])
+    return np.asarray(weights @ triangles[hit])
+
+
+_NAMES = {"r": "r", "theta": "θ", "phi": "φ"}
+_RINGS = 2
+
+
+def frame_drawing(solids: Solids, exaggeration: float) -> Drawing:
+    """What does not change: the resting whisker, and rings, rays and axes of the signals."""
+    whisker, length = solids.chart.whisker, solids.length
+    here = solids.place(None)
+    line = whisker.centerline(NODES)
+    out: dict[str, Mark] = {
+        "rest": _moved(whisker_body(whisker, line, exaggeration, REST), here),
+        "follicle": _moved(follicle(whisker, exaggeration), here),
+        "title": Label(here + length * np.array([0.05, 0.0, 0.62]), "contacts"),
+    }
+    turn = np.linspace(0.0, 2.0 * np.pi, 73)
+    floor = -0.5 * 0.85 * length
+    for i, name in enumerate(COORDINATES):
+        centre = solids.place(i)
+        bottom = centre + np.array([0.0, 0.0, floor])
+        rings = []
+        for k in range(1, _RINGS + 1):
+            radius = 0.5 * length * np.sqrt(k / _RINGS)
+            flat = np.stack([radius * np.cos(turn), radius * np.sin(turn), 0.0 * turn], axis=1)
+            rings.append(pieces(flat + bottom))
+        for angle in TURN + np.arange(4) * np.pi / 2.0:
+            ray = 0.5 * length * np.array([[0.0, 0.0, 0.0], [np.cos(angle), np.sin(angle), 0.0]])
+            rings.append(pieces(ray + bottom))
+        out[f"floor {name}"] = Line(np.concatenate(rings), (205, 209, 214), 1.0)
+        pole = np.array([[0.0, 0.0, floor], [0.0, 0.0, -floor]]) + centre
+        out[f"axis {name}"] = Line(pieces(pole), (120, 126, 134), 1.0)
+        above = np.array([0.0, 0.0, 0.07 * length])  # where Fx is never positive, 0 is at the top
+        out[f"axis {name} name"] = Label(pole[1] + above, "Fx")
+        out[f"zero {name}"] = Label(centre + np.array([0.0, 0.0, solids.axis_height()]), "0")
+        edge = 0.5 * length * np.array([np.cos(TURN), np.sin(TURN), 0.0])
+        out[f"rim {name}"] = Label(bottom + edge, "MD = 0°")
+        out[f"title {name}"] = Label(
+            centre + length * np.array([-0.45, 0.0, 0.62]), f"signals, coloured by {_NAMES[name]}"
+        )
+    return out
+
+
+def _moved(body: Body, by: Array) -> Body:
+    return replace(body, vertices=body.vertices + by)
+
+
+def solids_drawing(
+    solids: Solids, triangles: Array, by: str
+) -> tuple[dict[str, Painted], dict[str, Legend]]:
+    """Paint contacts where they are, coloured by a coordinate, and where their signals are."""
+    painted: dict[str, Painted] = {}
+    legends: dict[str, Legend] = {}
+    for i, name in enumerate(COORDINATES):
+        colours, legends[name] = shaded(name, values_of(name, triangles))
+        painted[name] = Painted(solids.seen(triangles, i), colours)
+        if name == by:
+            painted["contacts"] = Painted(solids.seen(triangles, None), colours)
+    return painted, legends
+
+
+def picked_drawing(solids: Solids, row: Array, exaggeration: float) -> tuple[Drawing, str]:
+    """Mark a contact in all spaces, bend the whisker there, and say what it feels."""
+    whisker = solids.chart.whisker
+    radius = 0.016 * solids.length
+    out: dict[str, Mark] = {}
+    for space in (None, 0, 1, 2):
+        vertices, faces = ellipsoid(solids.seen(row, space), radius * np.eye(3))
+        out[f"mark {space}"] = Body(vertices, faces, CONTACT)
+    # On the surface a whisker is about to slip off; a little inside it holds.
+    inside = np.asarray(whisker.position(values_of("arc_length", row))) - row[:3]
+    for share in (0.0, 0.01, 0.05):
+        bent = deflect(whisker, PointContact(row[:3] + share * inside))
+        if Status(int(bent.status)).ok:
+            line = np.asarray(bent.centerline(NODES))
+            body = whisker_body(whisker, line, exaggeration, WHISKER)
+            out["bent"] = _moved(body, solids.place(None))
+            if share == 0.0:
+                return out, of_deflection(bent)
+            break
+    felt = {name: float(values_of(name, row)) for name in SIGNALS}
+    where = {name: float(values_of(name, row)) for name in ("arc_length", *COORDINATES)}
+    edge = note("On the edge of what the whisker can reach: it is about to slip off.")
+    return out, edge + table(felt, "At the base") + table(where, "Contact")
+
+
+_WHOLE = "none"
+_SPACES = (None, 0, 1, 2)
+_HINT = "Click on a solid: the same contact is marked in all four spaces."
+
+
+class MapMode:
+    """The controls of solids and slices, and what was picked."""
+
+    name = "Map"
+
+    def __init__(self, page: Page) -> None:
+        self._page = page
+        self._solids: Solids | None = None
+        self._triangles: Array = np.empty((0, 3, 0))
+        self.row: Array | None = None
+        self._drawn: tuple[Any, ...] | None = None
+        gui = page.server.gui
+        self._folder = gui.add_folder("Contacts and signals", visible=False)
+        with self._folder:
+            self._by = gui.add_dropdown("Colours", COORDINATES, hint="Of the contacts")
+            self._cut = gui.add_checkbox("Cut open", True)
+            self._slice = gui.add_dropdown(
+                "Slice", (_WHOLE, *SLICES), hint="Only contacts with one value of this"
+            )
+            self._share = gui.add_slider("At", 0.0, 1.0, 0.01, 0.5, visible=False)
+            self._value = gui.add_html("")
+            self._legends = gui.add_html("")
+            self._words = gui.add_html(note(_HINT))
+        scene: Any = page.server.scene  # coroutines may be given, and run one after the other
+        scene.on_click()(self._clicked)
+        for control in (self._by, self._cut, self._slice, self._share):
+            asked(control, lambda _: page.work.put("map", self.redraw))
+
+    def enter(self) -> None:
+        """Show controls, and look at all four spaces."""
+        self._folder.visible = True
+        self._drawn = None
+        length = float(to_display("length", self._page.bend.whisker.length))
+        middle = np.array([1.0, 0.0, 0.0]) * length
+        self._page.look_at(middle, 2.2 * length, (0.0, -0.95, 0.33))
+
+    def leave(self) -> None:
+        """Hide controls and things."""
+        self._folder.visible = False
+        self._solids = None
+        for layer in ("frame", "solids", "picked"):
+            self._page.stage.show(layer, {})
+
+    def redraw(self) -> None:
+        """Draw what is not yet drawn."""
+        page, chart = self._page, self._page.chart
+        if chart is None:
+            self._words.content = note("Charting all contacts of this whisker …")
+            return
+        cut = bool(self._cut.value)
+        if self._solids is None or (self._solids.chart, self._solids.cut) != (chart, cut):
+            if self._solids is None or self._solids.chart is not chart:
+                self.row = None
+            self._solids = solids(chart, cut)
+        page.stage.show("frame", frame_drawing(self._solids, page.exaggeration))
+        self._paint(self._solids)
+        self._mark()
+
+    def write(self, brief: bool = False) -> None:
+        """Nothing: all is written as it is drawn."""
+
+    def _paint(self, found: Solids) -> None:
+        what, share, by = str(self._slice.value), float(self._share.value), str(self._by.value)
+        key = (found, what, share, by)
+        if key == self._drawn:
+            return
+        self._drawn = key
+        self._share.visible = what != _WHOLE
+        if what == _WHOLE:
+            self._triangles = found.skin()
+            self._value.content = ""
+        else:
+            self._triangles = found.slice(what, share)
+            value = number(what, found.value(what, share))
+            self._value.content = note(f"Contacts with {what} = {value}")
+        painted, legends = solids_drawing(found, self._triangles, by)
+        if not len(self._triangles):
+            painted = {}
+        self._page.stage.show("solids", painted)
+        self._legends.content = "".join(legends[name].html() for name in COORDINATES)
+
+    async def _clicked(self, event: viser.SceneClickEvent) -> None:
+        """Pick where a solid is clicked."""
+        origin = np.asarray(event.ray_origin, dtype=np.float64)
+        direction = np.asarray(event.ray_direction, dtype=np.float64)
+        self._page.work.put("pick", lambda: self.pick(origin, direction))
+
+    def pick(self, origin: Array, direction: Array) -> None:
+        """Mark the contact that a ray, mm, meets first in any space."""
+        found = self._solids
+        if found is None:
+            return
+        places = np.concatenate([found.seen(self._triangles, space) for space in _SPACES])
+        rows = np.tile(self._triangles, (len(_SPACES), 1, 1))
+        row = picked(rows, places, origin, direction)
+        if row is not None:
+            self.row = row
+            self._mark()
+
+    def _mark(self) -> None:
+        if self._solids is None:
+            return
+        if self.row is None:
+            self._page.stage.show("picked", {})
+            self._words.content = note(_HINT)
+            return
+        drawing, words = picked_drawing(self._solids, self.row, self._page.exaggeration)
+        self._page.stage.show("picked", drawing)
+        self._words.content = words

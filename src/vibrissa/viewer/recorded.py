@@ -1,0 +1,215 @@
+"""A recording as arrays for the page, and its camera images; missing parts are found or left out.
+
+Lines, contacts and forces are in the laboratory frame. Of what is recorded several times the first
+counts of: the groups of the stages, the recording itself, the truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from vibrissa.cameras import Camera
+from vibrissa.objects import Surface
+from vibrissa.recording import Recording
+from vibrissa.scene import Array, Bytes
+from vibrissa.signals import SIGNALS, base_signals
+from vibrissa.simulation import silhouette
+from vibrissa.viewer.bend import NODES
+from vibrissa.whisker import Whisker
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Watched:
+    """A trial of n frames, w whiskers and v views."""
+
+    time: Array
+    whiskers: tuple[Whisker, ...]
+    names: tuple[str, ...]
+    lines: Array
+    contacts: Array
+    felt: Mask
+    forces: Array
+    signals: dict[str, Array]
+    objects: tuple[Surface, ...]
+    contour: xr.Dataset | None
+    cameras: tuple[Camera, ...]
+    traces: Array | None
+
+    @property
+    def frames(self) -> int:
+        """How many."""
+        return int(self.time.size)
+
+    def at(self, time: float) -> int:
+        """The frame at a time, s."""
+        return int(np.clip(np.searchsorted(self.time, time + 1e-9) - 1, 0, self.frames - 1))
+
+    @property
+    def busiest(self) -> int:
+        """The whisker that touches most of the time; the first of equals."""
+        return int(np.argmax(self.felt.sum(axis=0)))
+
+    def onsets(self) -> NDArray[np.int64]:
+        """Frames in which a whisker begins to touch."""
+        before = np.concatenate([np.zeros((1, self.felt.shape[1]), bool), self.felt[:-1]])
+        return np.flatnonzero((self.felt & ~before).any(axis=1))
+
+    def next_contact(self, frame: int) -> int:
+        """The frame in which the next contact begins; the first after the last, else the same."""
+        onsets = self.onsets()
+        after = onsets[onsets > frame]
+        return int(after[0] if after.size else onsets[0] if onsets.size else frame)
+
+
+def watched(recording: xr.DataTree) -> Watched:
+    """Take from a recording what can be looked at."""
+    root = recording.to_dataset()
+    if not root.sizes.get("time") or not root.sizes.get("whisker"):
+        raise ValueError("the recording has no frames of a whisker to look at")
+    trial = Recording(recording)
+    shape = (root.sizes["time"], root.sizes["whisker"])
+    whiskers = tuple(trial.whiskers)
+    contacts = trial.known("contact_point", ("estimates", "", "truth"))
+    if contacts is None:
+        contacts = np.full((*shape, 3), np.nan)
+    felt = trial.known("in_contact", ("estimates", "", "truth"))
+    touching: Mask = np.asarray(np.isfinite(contacts).all(axis=-1))
+    if felt is not None:
+        touching = touching & felt
+    forces, signals = _felt(trial, shape)
+    cameras = trial.cameras if "cameras" in trial else ()
+    contour = trial.find("contour")
+    return Watched(
+        time=np.asarray(root["time"].to_numpy(), dtype=np.float64),
+        whiskers=whiskers,
+        names=tuple(trial.names),
+        lines=_lines(trial, whiskers),
+        contacts=np.where(touching[..., None], contacts, np.nan),
+        felt=touching,
+        forces=forces,
+        signals=signals,
+        objects=trial.objects,
+        contour=contour.data if contour else None,
+        cameras=cameras,
+        traces=trial.known("trace", ("", "truth")) if cameras else None,
+    )
+
+
+def _lines(trial: Recording, whiskers: Sequence[Whisker]) -> Array:
+    """Centrelines as recorded, else the resting whisker where its base is."""
+    lines = trial.known("centerline", ("", "truth"))
+    if lines is not None:
+        return lines
+    place = trial.known("base_position", ("", "truth"))
+    turn = trial.known("base_rotation", ("", "truth"))
+    if place is None or turn is None:
+        raise ValueError("the recording has neither centrelines nor poses of the whisker's base")
+    rest = np.stack([whisker.centerline(NODES) for whisker in whiskers])
+    return np.asarray(np.einsum("twij,wkj->twki", turn, rest) + place[:, :, None])
+
+
+def _felt(trial: Recording, shape: tuple[int, int]) -> tuple[Array, dict[str, Array]]:
+    """Forces in the laboratory and the six signals; NaN where nothing is known."""
+    missing = np.full((*shape, 3), np.nan)
+    force = trial.known("force", ("signals", "", "truth"))
+    moment = trial.known("moment", ("signals", "", "truth"))
+    if force is None or moment is None:
+        force, moment = missing, missing
+    turn = trial.known("base_rotation", ("signals", "", "truth"))
+    in_lab = missing if turn is None else np.einsum("twij,twj->twi", turn, force)
+    signals = base_signals(force, moment)
+    return in_lab, {name: np.asarray(signals[name].to_numpy()) for name in SIGNALS}
+
+
+Frame = NDArray[np.uint8]
+
+WIDTH = 420
+"""Of a picture, pixels."""
+
+_MARGIN = 40.0
+_TRACE = np.array([255, 96, 0], dtype=np.uint8)
+_CONTACT = np.array([0, 150, 255], dtype=np.uint8)
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One camera's window onto a trial."""
+
+    name: str
+    number: int
+    box: tuple[int, int, int, int]
+    empty: Frame
+
+    @property
+    def scale(self) -> float:
+        """Pixels of the picture per pixel of the image."""
+        return min(1.0, WIDTH / (self.box[2] - self.box[0]))
+
+
+def views(trial: Watched) -> tuple[View, ...]:
+    """One window per camera: where its traces go, with some room."""
+    if trial.traces is None:
+        return ()
+    out = []
+    middle = np.nanmean(trial.lines.reshape(-1, 3), axis=0)
+    for i, camera in enumerate(trial.cameras):
+        width, height = camera.size
+        places = trial.traces[:, :, i].reshape(-1, 2)
+        if not np.isfinite(places).any():
+            continue
+        low = np.maximum(np.nanmin(places, axis=0) - _MARGIN, 0.0).astype(int).tolist()
+        high = np.minimum(np.nanmax(places, axis=0) + _MARGIN, camera.size).astype(int).tolist()
+        covered = silhouette(camera, trial.objects, middle, 1.0)
+        empty = np.round(236.0 - 130.0 * covered).astype(np.uint8)
+        box = (low[0], low[1], max(high[0], low[0] + 8), max(high[1], low[1] + 8))
+        assert empty.shape == (height, width)
+        out.append(View(camera.name, i, box, empty))
+    return tuple(out)
+
+
+def picture(view: View, trial: Watched, frame: int, image: Frame | None = None) -> Bytes:
+    """Show one frame of one camera."""
+    left, top, right, bottom = view.box
+    source = view.empty if image is None else image
+    rows = np.arange(top, bottom, 1.0 / view.scale).astype(int)
+    columns = np.arange(left, right, 1.0 / view.scale).astype(int)
+    rows = rows[rows < source.shape[0]]
+    columns = columns[columns < source.shape[1]]
+    out = np.repeat(source[np.ix_(rows, columns)][..., None], 3, axis=2)
+    assert trial.traces is not None  # else there are no views
+    for trace in trial.traces[frame, :, view.number]:
+        _mark(out, (_dense(trace, view.scale) - [left, top]) * view.scale, _TRACE, 1)
+    touching = trial.contacts[frame][trial.felt[frame]]
+    if touching.size:
+        seen = trial.cameras[view.number].project(touching)
+        _mark(out, (seen - [left, top]) * view.scale, _CONTACT, 4)
+    return out
+
+
+def _dense(trace: Array, scale: float) -> Array:
+    """Points of a trace (k, 2), half a pixel of the picture apart; none where it is lost."""
+    known = trace[np.isfinite(trace).all(axis=1)]
+    if len(known) < 2:
+        return np.empty((0, 2))
+    steps = np.linalg.norm(np.diff(known, axis=0), axis=1) * scale
+    along = np.concatenate([[0.0], np.cumsum(steps)])
+    at = np.arange(0.0, along[-1], 0.5)
+    return np.stack([np.interp(at, along, known[:, i]) for i in range(2)], axis=1)
+
+
+def _mark(picture: Bytes, places: Array, colour: Bytes, size: int) -> None:
+    """Paint squares at places (n, 2): column, row."""
+    height, width = picture.shape[:2]
+    corner = np.round(places - 0.5 * (size - 1)).astype(int)
+    for i in range(size):
+        for j in range(size):
+            x, y = corner[:, 0] + i, corner[:, 1] + j
+            inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+            picture[y[inside], x[inside]] = colour

@@ -1,0 +1,169 @@
+"""What is on the page as files, and the buttons that hand them over."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import viser
+import xarray as xr
+
+from vibrissa.contacts import ContactMap
+from vibrissa.io import netcdf_image, save_centerline, save_recording
+from vibrissa.quantities import attributes
+from vibrissa.rod import Deflection
+from vibrissa.signals import base_signals
+from vibrissa.status import flag_attributes
+from vibrissa.viewer.page import Page
+from vibrissa.whisker import Whisker
+
+NODES = 200
+_MARGIN = 24
+"""White around a picture, pixels."""
+
+
+def whisker_csv(whisker: Whisker) -> bytes:
+    """The resting centreline as a table, which `vibrissa.load_whisker` reads."""
+    return _written("whisker.csv", lambda path: save_centerline(path, whisker.centerline(NODES)))
+
+
+def whisker_netcdf(whisker: Whisker) -> bytes:
+    """The whisker without loss: shape, radius, material."""
+    return netcdf(whisker.to_dataset())
+
+
+def map_netcdf(contact_map: ContactMap) -> bytes:
+    """A map without loss, which `ContactMap.load` reads."""
+    return _written("map.nc", contact_map.save)
+
+
+def recording_netcdf(recording: xr.DataTree) -> bytes:
+    """A trial with all its groups, which every verb reads."""
+    return _written("trial.nc", lambda path: save_recording(path, recording))
+
+
+def netcdf(data: xr.Dataset) -> bytes:
+    """A dataset as a file."""
+    return bytes(netcdf_image(data))
+
+
+def deflection_dataset(bent: Deflection) -> xr.Dataset:
+    """One bent whisker as a labelled dataset."""
+    values: dict[str, Any] = {
+        "centerline": (("node", "space"), bent.centerline(NODES), attributes("centerline")),
+        "force": ("space", np.asarray(bent.force), attributes("force")),
+        "moment": ("space", np.asarray(bent.moment), attributes("moment")),
+        "contact_point": (
+            "space",
+            np.asarray(bent.contact_point),
+            attributes("contact_point_whisker"),
+        ),
+        "arc_length": ((), float(bent.arc_length), attributes("arc_length")),
+        "status": ((), int(bent.status), {**attributes("status"), **flag_attributes()}),
+    }
+    out = xr.Dataset(values, {"space": list("xyz")}, {"reference_frame": "whisker"})
+    return out.merge(base_signals(out["force"], out["moment"]))
+
+
+def png(image: np.ndarray[Any, np.dtype[np.uint8]]) -> bytes:
+    """A picture (height, width, 3 or 4) as PNG."""
+    import imageio.v3 as imageio
+
+    encoded: bytes = imageio.imwrite("<bytes>", image, extension=".png")
+    return encoded
+
+
+def on_paper(image: np.ndarray[Any, np.dtype[np.uint8]]) -> np.ndarray[Any, np.dtype[np.uint8]]:
+    """A picture (height, width, 4) on white (height, width, 3), without its empty margins."""
+    share = image[..., 3:] / 255.0
+    out = np.round(image[..., :3] * share + 255.0 * (1.0 - share)).astype(np.uint8)
+    rows, columns = np.nonzero((out != 255).any(axis=-1))
+    if not rows.size:
+        return out
+    top, left = (max(int(at.min()) - _MARGIN, 0) for at in (rows, columns))
+    return out[top : rows.max() + _MARGIN + 1, left : columns.max() + _MARGIN + 1]
+
+
+def _written(name: str, write: Callable[[Path], object]) -> bytes:
+    """What a writer of files writes."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / name
+        write(path)
+        return path.read_bytes()
+
+
+_TIMEOUT = 20.0
+
+
+class SaveControls:
+    """Whisker, picture and data, downloaded by whoever asks."""
+
+    def __init__(self, page: Page, recording: xr.DataTree | None = None) -> None:
+        self._page = page
+        self._recording = recording
+        gui = page.server.gui
+        self.folder = gui.add_folder("Save", expand_by_default=False)
+        with self.folder:
+            files = gui.add_button_group("Whisker", ("CSV", "NetCDF"))
+            picture = gui.add_button_group("Picture", ("PNG",))
+            data = gui.add_button_group(
+                "Data", ("NetCDF",), hint="The bent whisker, the map or the trial that is seen"
+            )
+        files.on_click(self._whisker)
+        picture.on_click(self._picture)
+        data.on_click(lambda event: self._send(event, *self._data()))
+
+    def _whisker(self, event: viser.GuiEvent[Any]) -> None:
+        whisker = self._page.bend.whisker
+        if event.target.value == "CSV":
+            self._send(event, "whisker.csv", lambda: whisker_csv(whisker))
+        else:
+            self._send(event, "whisker.nc", lambda: whisker_netcdf(whisker))
+
+    def _data(self) -> tuple[str, Callable[[], bytes]]:
+        page, recording = self._page, self._recording
+        mode = "" if page.mode is None else page.mode.name
+        if mode == "Trial" and recording is not None:
+            return "trial.nc", lambda: recording_netcdf(recording)
+        chart = page.chart
+        if mode == "Map" and chart is not None:
+            return "map.nc", lambda: map_netcdf(chart.contact_map)
+        bent = page.bend.deflection
+        return "bent.nc", lambda: netcdf(deflection_dataset(bent))
+
+    def _picture(self, event: viser.GuiEvent[Any]) -> None:
+        """What the one who asks sees, without the panel."""
+        client = event.client
+        if client is None:
+            return
+        camera = client.camera
+
+        def drawn() -> bytes:
+            grip = self._page.grip
+            grip.show(None)  # nobody takes hold of a picture
+            try:
+                image = client.get_render(
+                    camera.image_height,
+                    camera.image_width,
+                    transport_format="png",
+                    timeout=_TIMEOUT,
+                )
+            finally:
+                self._page.place_grip()
+            return png(on_paper(image))
+
+        self._send(event, "vibrissa.png", drawn)
+
+    def _send(self, event: viser.GuiEvent[Any], name: str, made: Callable[[], bytes]) -> None:
+        client = event.client
+        if client is None:
+            return
+        try:
+            content = made()
+        except (OSError, RuntimeError, TimeoutError, ValueError) as error:
+            self._page.say("Not saved", str(error), "red")
+            return
+        client.send_file_download(name, content, save_immediately=True)

@@ -1,0 +1,270 @@
+"""What the page shows, as states and their transitions: whisker, load, deflection, contacts.
+
+Nothing here needs a browser. A load without an equilibrium leaves the last shape that had one,
+so that there is something to look at along with the reason.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike
+
+from vibrissa.contacts import ContactMap
+from vibrissa.quantities import to_display
+from vibrissa.rod import Deflection, PegContact, PointContact, PointForce, deflect
+from vibrissa.scene import Array, Bytes, Cloud, Painted, sample_contacts, sheet
+from vibrissa.signals import SIGNALS
+from vibrissa.status import Status
+from vibrissa.viewer.colours import CLOUD
+from vibrissa.whisker import Whisker, constant
+
+Kind = Literal["point", "peg", "force"]
+KINDS: tuple[Kind, ...] = ("point", "peg", "force")
+
+
+@dataclass(frozen=True, eq=False)
+class Bend:
+    """A whisker, a load, and the deflection by it."""
+
+    whisker: Whisker
+    kind: Kind
+    point: Array
+    origin: Array
+    axis: Array
+    radius: float
+    place: float
+    magnitude: float
+    direction: float
+    deflection: Deflection
+    held: Deflection
+
+    @property
+    def status(self) -> Status:
+        """What became of the load."""
+        return Status(int(self.deflection.status))
+
+    @property
+    def target(self) -> Array:
+        """What is dragged: the wanted contact point, the peg's origin, or where the force acts."""
+        if self.kind == "point":
+            return self.point
+        if self.kind == "peg":
+            return self.origin
+        return np.asarray(self.held.contact_point)
+
+
+def force_scale(whisker: Whisker) -> float:
+    """EI / L² at the base, N: about the force that bends a whisker a lot near its base."""
+    return whisker.base_bending_stiffness / whisker.length**2
+
+
+def begin(whisker: Whisker) -> Bend:
+    """Bend a whisker by a point a little aside of where it rests."""
+    place = whisker.position(0.65 * whisker.length)
+    frame = whisker.frame(0.65 * whisker.length)
+    point = place + 0.12 * whisker.length * frame[:, 1]
+    first = deflect(whisker, PointContact(point))
+    return _solved(
+        Bend(
+            whisker=whisker,
+            kind="point",
+            point=point,
+            origin=point,
+            axis=np.array([0.0, 0.0, 1.0]),
+            radius=0.0,
+            place=0.65,
+            magnitude=0.3 * force_scale(whisker),
+            direction=0.0,
+            deflection=first,
+            held=first,
+        )
+    )
+
+
+def moved(bend: Bend, to: ArrayLike, axis: ArrayLike | None = None) -> Bend:
+    """Put the contact point or the peg elsewhere, m, and perhaps turn the peg."""
+    place = np.array(to, dtype=np.float64)
+    if bend.kind == "peg":
+        turned = bend.axis if axis is None else np.array(axis, dtype=np.float64)
+        return _solved(replace(bend, origin=place, axis=turned))
+    return _solved(replace(bend, point=place)) if bend.kind == "point" else bend
+
+
+def loaded(bend: Bend, kind: Kind) -> Bend:
+    """Take another load, which begins where the one before acts."""
+    at = np.asarray(bend.held.contact_point)
+    if not np.isfinite(at).all():
+        at = bend.target
+    if kind == "peg":
+        bend = replace(bend, kind=kind, origin=at, deflection=bend.held)
+    elif kind == "point":
+        bend = replace(bend, kind=kind, point=at)
+    else:
+        bend = _as_force(replace(bend, kind=kind))
+    return _solved(bend)
+
+
+def _as_force(bend: Bend) -> Bend:
+    """Take place, size and direction of the force that now acts."""
+    _, fy, fz = np.asarray(bend.held.contact_force)
+    arc_length = float(bend.held.arc_length)
+    if not np.isfinite([fy, fz, arc_length]).all() or arc_length <= 0.0:
+        return bend
+    return replace(
+        bend,
+        place=arc_length / bend.whisker.length,
+        magnitude=float(np.hypot(fy, fz)),
+        direction=float(np.arctan2(fz, fy)),
+    )
+
+
+def with_radius(bend: Bend, radius: float) -> Bend:
+    """Give the peg a radius, m."""
+    return _solved(replace(bend, radius=radius))
+
+
+def with_force(bend: Bend, place: float, magnitude: float, direction: float) -> Bend:
+    """Say where (share of the length) a force acts, how large it is, N, and its direction, rad."""
+    return _solved(replace(bend, place=place, magnitude=magnitude, direction=direction))
+
+
+def with_whisker(bend: Bend, whisker: Whisker) -> Bend:
+    """Bend another whisker by the same load; points and pegs move along with its length."""
+    scale = whisker.length / bend.whisker.length
+    rest = deflect(whisker, PointForce(0.5 * whisker.length, 0.0, 0.0))
+    stretched = replace(
+        bend,
+        whisker=whisker,
+        point=scale * bend.point,
+        origin=scale * bend.origin,
+        deflection=rest,
+        held=rest,
+    )
+    return _solved(stretched)
+
+
+def _solved(bend: Bend) -> Bend:
+    """Deflect; what has no answer leaves the last shape."""
+    bent = deflect(bend.whisker, _load(bend))
+    return replace(bend, deflection=bent, held=bent if Status(int(bent.status)).ok else bend.held)
+
+
+def _load(bend: Bend) -> PointContact | PegContact | PointForce:
+    if bend.kind == "point":
+        return PointContact(bend.point)
+    if bend.kind == "force":
+        return PointForce(bend.place * bend.whisker.length, bend.magnitude, bend.direction)
+    before = bend.deflection
+    goes_on = (
+        isinstance(before.load, PegContact)
+        and before.whisker is bend.whisker
+        and (float(before.load.radius) > 0.0) == (bend.radius > 0.0)
+    )
+    if goes_on:
+        return PegContact(bend.origin, bend.axis, bend.radius, start=before)
+    # The side on which the whisker is pushed now is the side on which it stays.
+    side = np.asarray(bend.held.force)
+    sideways = np.linalg.norm(np.cross(side, bend.axis)) > 1e-6 * np.linalg.norm(side) > 0.0
+    return PegContact(bend.origin, bend.axis, bend.radius, side=side if sideways else None)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """What the sliders say."""
+
+    length: float
+    turn: float
+    taper: float
+    modulus: float
+
+
+def whole_turn(whisker: Whisker) -> float:
+    """By how much a whisker turns from base to tip, ∫|κ| ds, rad."""
+    s = (np.arange(400) + 0.5) / 400.0 * whisker.length
+    bending = np.linalg.norm(whisker.curvature(s)[:, 1:], axis=1)
+    return float(bending.mean() * whisker.length)
+
+
+def shape_of(whisker: Whisker) -> Shape:
+    """What the sliders say for a whisker as it is."""
+    taper = whisker.base_radius / whisker.tip_radius
+    return Shape(whisker.length, whole_turn(whisker), taper, whisker.youngs_modulus)
+
+
+def shaped(whisker: Whisker, asked: Shape) -> Whisker:
+    """Change a whisker to a shape that is asked for.
+
+    The base radius stays. A taper other than its own is linear; a straight whisker that is to turn
+    gets the same curvature everywhere.
+    """
+    own = shape_of(whisker)
+    if asked == own:
+        return whisker
+    out = whisker.scaled(asked.length / own.length)
+    if whisker.is_straight and asked.turn > 0.0:
+        bend = np.array([0.0, 0.0, asked.turn / asked.length])
+        out = replace(out, intrinsic_curvature=constant(bend, out.length))
+    elif not np.isclose(asked.turn, own.turn):
+        out = replace(
+            out, intrinsic_curvature=out.intrinsic_curvature.scaled(1.0, asked.turn / own.turn)
+        )
+    if not np.isclose(asked.taper, own.taper):
+        out = out.with_properties(tip_radius=whisker.base_radius / asked.taper)
+    return out.with_properties(youngs_modulus=asked.modulus)
+
+
+_SKIN = (12, 48, 6)
+_POINT = 0.008
+"""Width of a point of the cloud, over L."""
+
+
+@dataclass(frozen=True, eq=False)
+class Chart:
+    """A whisker's map with the samples that are drawn."""
+
+    contact_map: ContactMap
+    samples: xr.Dataset
+    line: Array
+    points: Array
+    signals: dict[str, Array]
+
+    @property
+    def whisker(self) -> Whisker:
+        """Whose contacts."""
+        return self.contact_map.whisker
+
+
+def charted(whisker: Whisker, contact_map: ContactMap | None = None) -> Chart:
+    """Sample all stable contacts of a whisker; its map is made unless it is given."""
+    contact_map = contact_map or ContactMap.simulate(whisker, grid=False)
+    samples, line = contact_map.to_dataset(), whisker.centerline()
+    # The last bearing is the first again, and no load is no contact.
+    kept = samples.isel(bearing=slice(0, -1), load=slice(2, None, 2))
+    aside = ~kept["small_deflection"].to_numpy().astype(bool)
+    signals = {name: kept[name].to_numpy()[aside] for name in SIGNALS}
+    return Chart(contact_map, samples, line, kept["contact_point"].to_numpy()[aside], signals)
+
+
+def places(chart: Chart) -> Array:
+    """Contact points (n, 3) of the cloud, mm."""
+    return to_display("contact_point", chart.points)
+
+
+def envelope(chart: Chart) -> Painted:
+    """The surface at which the whisker slips off, seen from inside, so that it hides nothing."""
+    nodes = sample_contacts(chart.samples, chart.line, shape=_SKIN)[..., :3]
+    # The end near the base stays open.
+    skin = np.concatenate([nodes[:, :, -1], nodes[-1, :, -2::-1].swapaxes(0, 1)])
+    vertices, faces = sheet(to_display("contact_point", skin))
+    triangles = vertices[faces]
+    colours = np.broadcast_to(np.array(CLOUD, dtype=np.uint8), triangles.shape)
+    return Painted(triangles, colours, 0.45, "back")
+
+
+def coloured_cloud(chart: Chart, points: Array, colours: Bytes) -> Cloud:
+    """Contacts (n, 3), mm, in their colours (n, 3)."""
+    return Cloud(points, colours, float(to_display("length", _POINT * chart.whisker.length)))

@@ -1,0 +1,308 @@
+"""Mode Trial: a recording over time, in space, in both cameras, in signals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import viser
+import xarray as xr
+
+from vibrissa.contour import CylinderFit, SphereFit, shape_from_dataset, surface_grid
+from vibrissa.io import Footage
+from vibrissa.objects import Surface, objects_datasets
+from vibrissa.quantities import to_display
+from vibrissa.scene import (
+    Array,
+    Body,
+    Bytes,
+    Cloud,
+    Drawing,
+    Ints,
+    Mark,
+    cylinder,
+    ellipsoid,
+    object_surface,
+    sheet,
+)
+from vibrissa.viewer.bend import arrow, whisker_body
+from vibrissa.viewer.colours import CONTACT, FIT, OBJECT
+from vibrissa.viewer.page import Page, asked, put
+from vibrissa.viewer.readout import chart, cursor, table
+from vibrissa.viewer.recorded import View, Watched, picture, views
+from vibrissa.viewer.state import force_scale
+from vibrissa.viewer.threads import Player
+
+POINTS = 4000
+"""Most contact points that are drawn."""
+
+_COLOURS = np.array(
+    [CONTACT, (0, 114, 178), (204, 121, 167), (0, 158, 115), (230, 159, 0), (86, 180, 233)]
+)
+
+
+def extent(trial: Watched) -> tuple[Array, float]:
+    """Middle, mm, and size, mm, of where whiskers go."""
+    points = trial.lines.reshape(-1, 3)
+    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
+    return _mm(0.5 * (low + high)), float(_mm(np.linalg.norm(high - low)))
+
+
+def moment_drawing(trial: Watched, frame: int, exaggeration: float) -> Drawing:
+    """Draw whiskers, forces and contacts of one frame."""
+    out: dict[str, Mark] = {}
+    for i, whisker in enumerate(trial.whiskers):
+        line = trial.lines[frame, i]
+        if not np.isfinite(line).all():
+            continue
+        out[f"whisker {i}"] = whisker_body(whisker, line, exaggeration)
+        at, force = trial.contacts[frame, i], trial.forces[frame, i]
+        if not np.isfinite(at).all():
+            continue
+        radius = float(_mm(0.012 * whisker.length))
+        vertices, faces = ellipsoid(_mm(at), radius * np.eye(3))
+        out[f"contact {i}"] = Body(vertices, faces, CONTACT)
+        size = float(np.linalg.norm(force))
+        if np.isfinite(size) and size > 0.0:
+            reach = 0.3 * whisker.length * np.sqrt(size / force_scale(whisker))
+            start, thickness = at - reach * force / size, float(_mm(0.006 * whisker.length))
+            out[f"force {i}"] = arrow(start, at, thickness)
+    return out
+
+
+def touched(trial: Watched, frame: int) -> Drawing:
+    """All contact points up to a frame, each whisker's in its own colour."""
+    points, colours = trial.contacts[: frame + 1], _whisker_colours(trial)
+    known = np.isfinite(points).all(axis=-1)
+    which = np.nonzero(known)[1]
+    chosen = points[known]
+    step = max(1, int(np.ceil(trial.felt.sum() / POINTS)))
+    if not chosen.size:
+        return {}
+    size = float(_mm(0.011 * trial.whiskers[0].length))
+    return {"contacts": Cloud(_mm(chosen[::step]), colours[which[::step]], size)}
+
+
+def _whisker_colours(trial: Watched) -> Bytes:
+    count = np.arange(len(trial.whiskers)) % len(_COLOURS)
+    return np.asarray(_COLOURS[count], dtype=np.uint8)
+
+
+def surroundings(trial: Watched, objects: bool = True, fit: bool = True) -> Drawing:
+    """What stands still: objects and the shape fitted to the contacts."""
+    middle, size = extent(trial)
+    near = _known(trial)
+    centre = np.mean(near, axis=0) if near.size else middle / to_display("length", 1.0)
+    out: dict[str, Mark] = {}
+    if objects:
+        for i, thing in enumerate(trial.objects):
+            out[f"object {i}"] = object_body(thing, 0.6 * size, _mm(centre))
+    if fit and trial.contour is not None:
+        body = fitted_body(trial.contour, near)
+        if body is not None:
+            out["fit"] = Body(_mm(body[0]), body[1], FIT, 0.4, "double")
+    return out
+
+
+def object_body(thing: Surface, extent: float, near: Array) -> Body:
+    """An object; what has no end is shown within a cube, mm wide, about a place (3,), mm."""
+    half = 0.5 * extent
+    (held,) = objects_datasets([thing]).values()
+    vertices, faces = object_surface(held, np.stack([near - half, near + half], axis=1))
+    return Body(vertices, faces, OBJECT, 0.55, "double")
+
+
+def _known(trial: Watched) -> Array:
+    points = trial.contacts.reshape(-1, 3)
+    return np.asarray(points[np.isfinite(points).all(axis=1)])
+
+
+def fitted_body(contour: xr.Dataset, near: Array) -> tuple[Array, Ints] | None:
+    """Vertices, m, and triangles of a fitted shape; None for what has no picture."""
+    try:
+        shape = shape_from_dataset(contour)
+    except ValueError:
+        return None
+    if isinstance(shape, SphereFit):
+        return ellipsoid(shape.origin, shape.radius * np.eye(3), 48)
+    if not near.size:
+        return None
+    if isinstance(shape, CylinderFit):
+        along = (near - shape.origin) @ shape.axis
+        middle = shape.origin + 0.5 * (along.min() + along.max()) * shape.axis
+        length = 1.3 * float(np.ptp(along)) + 2.0 * shape.radius
+        return cylinder(middle, shape.axis, shape.radius, length)
+    grid = surface_grid(shape, near)["surface_grid_point"].to_numpy()
+    return sheet(grid)
+
+
+def _mm(values: object) -> Array:
+    return to_display("length", np.asarray(values, dtype=np.float64))
+
+
+_MS = 1e3
+SPEEDS = {"real time": 1.0, "1 : 2": 0.5, "1 : 5": 0.2, "1 : 10": 0.1, "1 : 50": 0.02}
+_USUAL = "1 : 10"
+
+
+class TrialMode:
+    """Time, and all that goes with it."""
+
+    name = "Trial"
+
+    def __init__(self, page: Page, trial: Watched, videos: Sequence[Footage] = ()) -> None:
+        self.trial = trial
+        self.frame = 0
+        self._page = page
+        self._videos = tuple(videos)
+        self._now = float(trial.time[0])
+        self._speed = SPEEDS[_USUAL]
+        self._whisker = trial.busiest
+        self._still: tuple[bool, bool] | None = None
+        self._objects = self._fit = True
+        self._views = views(trial)
+        self._player = Player(self._tick)
+        page.closing.append(self._player.close)
+        self._controls(page.server)
+
+    def _controls(self, server: viser.ViserServer) -> None:
+        gui, trial = server.gui, self.trial
+        self._folder = gui.add_folder("Trial", visible=False)
+        end = round(_MS * float(trial.time[-1] - trial.time[0]), 3)
+        step = max(round(end / max(trial.frames - 1, 1), 3), 1e-3)
+        with self._folder:
+            self._time = gui.add_slider("Time (ms)", 0.0, max(end, step), step, 0.0)
+            self._play = gui.add_button("Play", color="blue")
+            jump = gui.add_button("Next contact", color="blue")
+            speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value=_USUAL)
+            if len(trial.names) > 1:
+                which = gui.add_dropdown(
+                    "Signals of", trial.names, initial_value=trial.names[self._whisker]
+                )
+                asked(which, self._choose)
+            objects = gui.add_checkbox("Objects", True, visible=bool(trial.objects))
+            fit = gui.add_checkbox("Fitted shape", True, visible=trial.contour is not None)
+            self._words = gui.add_html("")
+            self._chart = gui.add_html("")
+            self._cursor = gui.add_html("")
+        self._window = gui.add_panel(visible=False) if self._views else None
+        self._pictures: list[tuple[View, viser.GuiImageHandle]] = []
+        if self._window is not None:
+            with self._window.add_tab("Cameras"):
+                for view in self._views:
+                    blank = picture(view, trial, 0)
+                    self._pictures.append((view, gui.add_image(blank, label=view.name)))
+            self._window.dock_left()
+            self._window.set_width(330.0)
+        asked(self._time, lambda value: self.go(float(trial.time[0]) + value / _MS))
+        asked(speed, self.hurry)
+        asked(objects, lambda on: self._see(objects=on))
+        asked(fit, lambda on: self._see(fit=on))
+        self._play.on_click(lambda _: self.toggle())
+        jump.on_click(lambda _: self.jump())
+
+    def enter(self) -> None:
+        """Show controls, and look at where whiskers go."""
+        self._folder.visible = True
+        if self._window is not None:
+            self._window.visible = True
+        middle, size = extent(self.trial)
+        self._page.look_at(middle, 0.9 * size, (0.25, -0.75, 0.65))
+        self._draw_chart()
+
+    def leave(self) -> None:
+        """Stop, and hide controls and things."""
+        self.pause()
+        self._folder.visible = False
+        if self._window is not None:
+            self._window.visible = False
+        self._still = None
+        for layer in ("moment", "touched", "surroundings"):
+            self._page.stage.show(layer, {})
+
+    def redraw(self) -> None:
+        """Draw the frame of now."""
+        trial, stage, frame = self.trial, self._page.stage, self.frame
+        stage.show("moment", moment_drawing(trial, frame, self._page.exaggeration))
+        stage.show("touched", touched(trial, frame))
+        if self._still != (self._objects, self._fit):
+            self._still = (self._objects, self._fit)
+            stage.show("surroundings", surroundings(trial, *self._still))
+        for view, shown in self._pictures:
+            image = self._videos[view.number].frame(frame) if self._videos else None
+            shown.image = picture(view, trial, frame, image)
+
+    def write(self, brief: bool = False) -> None:
+        """Write the signals of now, and where now is."""
+        trial, frame = self.trial, self.frame
+        passed = float(trial.time[frame] - trial.time[0])
+        put(self._time, _MS * passed)
+        self._cursor.content = cursor(passed / max(float(np.ptp(trial.time)), 1e-12))
+        self._words.content = self._said(frame)
+
+    def go(self, time: float) -> None:
+        """Show the frame at a time, s."""
+
+        def job() -> None:
+            self._now = time
+            self.frame = self.trial.at(time)
+            if self._page.mode is self:
+                self._page.redraw()
+
+        self._page.work.put("time", job)
+
+    def toggle(self) -> None:
+        """Play or pause; from the end it begins anew."""
+        if self._player.playing:
+            self._player.pause()
+        else:
+            if self.frame >= self.trial.frames - 1:
+                self._now = float(self.trial.time[0])
+            self._player.play()
+        self._play.label = "Pause" if self._player.playing else "Play"
+
+    def pause(self) -> None:
+        """Let time stand still."""
+        self._player.pause()
+        self._play.label = "Play"
+
+    def hurry(self, words: str) -> None:
+        """Play as fast as one of :data:`SPEEDS` says."""
+        self._speed = SPEEDS[words]
+
+    def jump(self) -> None:
+        """Go to where the next contact begins."""
+        self.go(float(self.trial.time[self.trial.next_contact(self.frame)]))
+
+    def _tick(self, passed: float) -> None:
+        time = self._now + self._speed * passed
+        if time >= self.trial.time[-1]:
+            self.pause()
+        self._now = time
+        self.go(time)
+
+    def _choose(self, name: str) -> None:
+        self._whisker = self.trial.names.index(name)
+        self._page.work.put("chart", self._draw_chart)
+        self._page.work.put("time", self._page.redraw)
+
+    def _see(self, objects: bool | None = None, fit: bool | None = None) -> None:
+        self._objects = self._objects if objects is None else objects
+        self._fit = self._fit if fit is None else fit
+        self._page.work.put("time", self._page.redraw)
+
+    def _draw_chart(self) -> None:
+        trial, i = self.trial, self._whisker
+        signals = {name: values[:, i] for name, values in trial.signals.items()}
+        for name in ("FD", "MD"):  # without contact a direction is noise
+            signals[name] = np.where(trial.felt[:, i], signals[name], np.nan)
+        self._chart.content = chart(trial.time, signals, trial.felt[:, i])
+
+    def _said(self, frame: int) -> str:
+        trial, i = self.trial, self._whisker
+        rows = {name: float(values[frame, i]) for name, values in trial.signals.items()}
+        touching = "in contact" if trial.felt[frame, i] else "free"
+        passed = f"{_MS * float(trial.time[frame] - trial.time[0]):.1f} ms"
+        count = int(trial.felt[: frame + 1].sum())
+        so_far = f"{count} contact{'' if count == 1 else 's'} so far"
+        return table(rows, f"{passed}: {touching}, {so_far}")

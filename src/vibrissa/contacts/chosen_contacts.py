@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.rod import (
     PointContact,
-    contact_frames,
+    contact_forces,
     contact_tangents,
     deflect,
     determinant,
@@ -173,8 +173,7 @@ def _of_signals(
     d = contact_map.chart.discretization
     force, point = found.force.reshape(-1, 3) / d.force, found.point.reshape(-1, 3) / d.length
     arc = found.arc_length.ravel() / d.length
-    frames = contact_frames(d, np.concatenate([force, point], axis=1), arc)
-    normal = np.einsum("nij,ni->nj", frames, force)[:, 1:]
+    normal = contact_forces(d, np.concatenate([force, point], axis=1), arc)[:, 1:]
     contacts = np.concatenate([arc[:, None], normal], axis=1)
     shape, dims = found.status.shape, found.dims
     return _solved(contact_map, contacts, found.status.ravel(), shape, dims, coords)

@@ -35,6 +35,7 @@ from vibrissa.rod import (
     set_lane,
     stable,
 )
+from vibrissa.signals import signal_equations
 
 # Some valleys of χ² are narrow and bent: most fits take 5 rounds, but a few a hundred. What is not
 # at rest after so many goes on only if it may still count.
@@ -71,72 +72,11 @@ def channel_equations(
     jacobian: Array,
 ) -> None:
     """Channels of x and (F, p) minus targets (k,), and their derivatives by x (k, 4)."""
-    fx, fy, fz = v[0], v[1], v[2]
-    px, py, pz = v[3], v[4], v[5]
-    mx, my, mz = py * fz - pz * fy, pz * fx - px * fz, px * fy - py * fx
-    ft, mb = np.sqrt(fy * fy + fz * fz), np.sqrt(my * my + mz * mz)
+    signal_equations(x[0], v, t, True, codes, residual, jacobian)
     for k in range(codes.shape[0]):
-        w = codes[k]
-        if w == 0:
-            value = fx
-        elif w == 1:
-            value = ft
-        elif w == 2:
-            value = np.arctan2(fz, fy)
-        elif w == 3:
-            value = mx
-        elif w == 4:
-            value = mb
-        elif w == 5:
-            value = np.arctan2(mz, my)
-        elif w == 6:
-            value = fy
-        elif w == 7:
-            value = fz
-        elif w == 8:
-            value = my
-        elif w == 9:
-            value = mz
-        elif w == 10:
-            value = x[0]
-        else:
-            value = v[w - 8]
-        residual[k] = value - targets[k]
-        if w == 2 or w == 5:
+        residual[k] -= targets[k]
+        if codes[k] == 2 or codes[k] == 5:
             residual[k] = wrapped(residual[k])
-    for c in range(4):
-        dfx, dfy, dfz = t[0, c], t[1, c], t[2, c]
-        dpx, dpy, dpz = t[3, c], t[4, c], t[5, c]
-        dmx = dpy * fz + py * dfz - dpz * fy - pz * dfy
-        dmy = dpz * fx + pz * dfx - dpx * fz - px * dfz
-        dmz = dpx * fy + px * dfy - dpy * fx - py * dfx
-        for k in range(codes.shape[0]):
-            w = codes[k]
-            if w == 0:
-                d = dfx
-            elif w == 1:
-                d = (fy * dfy + fz * dfz) / ft
-            elif w == 2:
-                d = (fy * dfz - fz * dfy) / (ft * ft)
-            elif w == 3:
-                d = dmx
-            elif w == 4:
-                d = (my * dmy + mz * dmz) / mb
-            elif w == 5:
-                d = (my * dmz - mz * dmy) / (mb * mb)
-            elif w == 6:
-                d = dfy
-            elif w == 7:
-                d = dfz
-            elif w == 8:
-                d = dmy
-            elif w == 9:
-                d = dmz
-            elif w == 10:
-                d = 1.0 if c == 0 else 0.0
-            else:
-                d = t[w - 8, c]
-            jacobian[k, c] = d
 
 
 @inlined

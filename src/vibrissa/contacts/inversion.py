@@ -154,7 +154,7 @@ def _match(
     which = np.empty(3, np.int64)
     for k in range(3):
         which[k] = int(target[3 + k])
-    signal_equations(value, tangents, wanted, which, residual, jacobian)
+    signal_equations(0.0, value, tangents, wanted, which, residual, jacobian)
     fx, fy, fz = value[0], value[1], value[2]
     px, py, pz = value[3], value[4], value[5]
     mx, my, mz = py * fz - pz * fy, pz * fx - px * fz, px * fy - py * fx

@@ -2,7 +2,7 @@
 
 A contact has four unknowns, arc length and three components of force, and a wrench has six numbers.
 Two are left over for checking: the force is normal to the moment (M · F = 0), and its line meets
-the whisker. The rod equations integrated from the base outward (:mod:`vibrissa.rod.wrench`) tell
+the whisker. The rod equations integrated from the base outward (:mod:`vibrissa.rod.outward`) tell
 where the moment vanishes, or nearly; from there the contact that explains the measured wrench best
 is found by weighted least squares, integrating from the contact to the base, which does not
 magnify noise at a thin tip as the way out does.

@@ -20,12 +20,12 @@ from vibrissa.rod.chart import (
     stable_set,
     with_normal_force,
 )
-from vibrissa.rod.contact_state import contact_state
-from vibrissa.rod.deflection import Deflection, deflect
+from vibrissa.rod.deflection import Deflection, Load, PegContact, PointContact, PointForce
 from vibrissa.rod.discretization import STEPS, Discretization, Rod, discretize
 from vibrissa.rod.kernels import (
     BUFFER_SIZE,
     LANES,
+    contact_state,
     contact_tangents,
     evaluate,
     integrate,
@@ -36,7 +36,6 @@ from vibrissa.rod.kernels import (
     set_lane,
     solve_forces,
 )
-from vibrissa.rod.loads import Load, PegContact, PointContact, PointForce
 from vibrissa.rod.newton import (
     ROUNDING,
     TOLERANCE,
@@ -45,12 +44,12 @@ from vibrissa.rod.newton import (
     stable,
     start_from,
 )
+from vibrissa.rod.outward import contact_forces, shapes, vanishing_moments
 from vibrissa.rod.points import PointSolver, point_solver
 from vibrissa.rod.search import MOST_SEEDS, seeds
-from vibrissa.rod.shape import contact_frames, shapes
+from vibrissa.rod.statics import deflect
 from vibrissa.rod.surfaces import SurfaceDeflection, follow_surfaces
 from vibrissa.rod.tree import PlaneVector, SearchTree, search_tree
-from vibrissa.rod.wrench import vanishing_moments
 
 __all__ = [
     "BUFFER_SIZE",
@@ -78,7 +77,7 @@ __all__ = [
     "along",
     "chart_of",
     "chart_to_contact",
-    "contact_frames",
+    "contact_forces",
     "contact_state",
     "contact_tangents",
     "contacts_at",

@@ -1,6 +1,6 @@
 """Loads followed from a known state to the one asked for, on the stable branch all the way.
 
-A problem is a set of three equations G(x; p) = 0 (:mod:`vibrissa.rod.equations`). The parameters p
+A problem is a set of three equations G(x; p) = 0. The parameters p
 move along a straight line from where the solution is known to where it is wanted; Newton's method
 corrects each step, the step is halved where it struggles and doubled where it does not. A solution
 counts only while det ∂G/∂x keeps the sign it started with: the zero is that load's fold, where the
@@ -8,6 +8,17 @@ whisker slips off. Where no step succeeds, the state reached tells why.
 
 A side contact that slides to the tip goes on as a tip contact; a tip contact whose force turns
 normal to the whisker goes on along the side.
+
+The equations of each load have three unknowns x and parameters p (7):
+
+- ``POINT``: the contact is at a point. x = (s, f_y, f_z); p: the point.
+- ``SIDE``: the whisker's side on a peg. x = (s, λ, ψ) with f = λ (0, cos ψ, sin ψ); p: a point of
+  the peg's axis, its direction, and its radius (negative: a line without thickness). With d the
+  part of p - origin normal to the axis and F̂ = F/λ the force's direction: d = D F̂ and F̂·axis = 0,
+  D the peg's radius plus the whisker's at s, or 0 for a line. Polar unknowns keep F̂ regular down to
+  zero force.
+- ``TIP``: the whisker's tip on a peg, the same equations at s = 1 with the force free to lean back:
+  x = (λ, α, ψ), f = λ (sin α, cos α cos ψ, cos α sin ψ), α ≤ 0.
 """
 
 from __future__ import annotations
@@ -15,20 +26,21 @@ from __future__ import annotations
 import numpy as np
 
 from vibrissa.numerics import Array, IntArray, copy, inlined, kernel, norm3, solve3
-from vibrissa.rod.chart import LEAST_ARC, Fold
+from vibrissa.rod.chart import LEAST_ARC, Fold, fold_force
 from vibrissa.rod.discretization import Rod
-from vibrissa.rod.equations import (
-    POINT,
-    SIDE,
-    TIP,
-    by_unknowns,
-    contact_of,
-    equations,
-    longest_step,
+from vibrissa.rod.kernels import (
+    BUFFER_SIZE,
+    LANES,
+    integrate,
+    lane_tangents,
+    lane_value,
+    set_lane,
+    whisker_radius,
 )
-from vibrissa.rod.kernels import BUFFER_SIZE, LANES, integrate, lane_tangents, lane_value, set_lane
 from vibrissa.rod.newton import ROUNDING, TOLERANCE
 from vibrissa.status import Status
+
+POINT, SIDE, TIP = 0, 1, 2
 
 #: A force this small (EI/L²) only says where an object touches.
 LEAST_FORCE = 1e-7
@@ -58,6 +70,8 @@ _PROXIMAL = int(Status.TOO_PROXIMAL)
 _FAILED = int(Status.NOT_CONVERGED)
 _ON_THE_WAY = -1
 
+_UNSTABLE, _STABLE, _SOLVED = 0, 1, 2
+
 # What a path remembers: the share of it that is done and the step being tried; det ∂G/∂x at the
 # start, and relative to it at the last solution; rounds of Newton's method and the last one's size;
 # the speed now and the least; the best residual at the end; whether the tip was passed, or contact
@@ -65,6 +79,122 @@ _ON_THE_WAY = -1
 _DONE, _STRIDE, _START, _RATIO, _ROUNDS, _SIZE = 0, 1, 2, 3, 4, 5
 _SPEED, _SLOWEST, _BEST, _PAST_TIP, _LOST, _SWITCHES = 6, 7, 8, 9, 10, 11
 _COLUMNS = 12
+
+
+@inlined
+def _contact_of(kind: int, x: Array, contact: Array) -> None:
+    """Turn unknowns into (s, f_x, f_y, f_z)."""
+    if kind == POINT:
+        contact[0], contact[1], contact[2], contact[3] = x[0], 0.0, x[1], x[2]
+    elif kind == SIDE:
+        contact[0], contact[1] = x[0], 0.0
+        contact[2], contact[3] = x[1] * np.cos(x[2]), x[1] * np.sin(x[2])
+    else:
+        normal = x[0] * np.cos(x[1])
+        contact[0], contact[1] = 1.0, x[0] * np.sin(x[1])
+        contact[2], contact[3] = normal * np.cos(x[2]), normal * np.sin(x[2])
+
+
+@inlined
+def _by_unknowns(kind: int, x: Array, t: Array) -> None:
+    """Turn derivatives with respect to (s, f_y, f_z) or (f_x, f_y, f_z) into ones by unknowns."""
+    if kind == POINT:
+        return
+    for row in range(6):
+        a, b, c = t[row, 0], t[row, 1], t[row, 2]
+        if kind == SIDE:
+            cos, sin = np.cos(x[2]), np.sin(x[2])
+            t[row, 1] = cos * b + sin * c
+            t[row, 2] = x[1] * (cos * c - sin * b)
+        else:
+            cos, sin, up, out = np.cos(x[2]), np.sin(x[2]), np.sin(x[1]), np.cos(x[1])
+            normal = cos * b + sin * c
+            t[row, 0] = up * a + out * normal
+            t[row, 1] = x[0] * (out * a - up * normal)
+            t[row, 2] = x[0] * out * (cos * c - sin * b)
+
+
+@inlined
+def _across(p: Array, e: Array) -> None:
+    """Fill e (3, 3) with two directions normal to the peg's axis, and the axis itself."""
+    ax, ay, az = p[3], p[4], p[5]
+    if abs(ax) <= abs(ay) and abs(ax) <= abs(az):
+        n = 1.0 / np.sqrt(ay * ay + az * az)
+        e[0, 0], e[0, 1], e[0, 2] = 0.0, az * n, -ay * n
+    elif abs(ay) <= abs(az):
+        n = 1.0 / np.sqrt(ax * ax + az * az)
+        e[0, 0], e[0, 1], e[0, 2] = -az * n, 0.0, ax * n
+    else:
+        n = 1.0 / np.sqrt(ax * ax + ay * ay)
+        e[0, 0], e[0, 1], e[0, 2] = ay * n, -ax * n, 0.0
+    e[1, 0] = ay * e[0, 2] - az * e[0, 1]
+    e[1, 1] = az * e[0, 0] - ax * e[0, 2]
+    e[1, 2] = ax * e[0, 1] - ay * e[0, 0]
+    e[2, 0], e[2, 1], e[2, 2] = ax, ay, az
+
+
+@inlined
+def _equations(
+    kind: int,
+    rod: Rod,
+    radius: float,
+    x: Array,
+    p: Array,
+    value: Array,
+    t: Array,
+    g: Array,
+    j: Array,
+) -> None:
+    """G and ∂G/∂x from (F, p) and their derivatives with respect to x."""
+    if kind == POINT:
+        for a in range(3):
+            g[a] = value[3 + a] - p[a]
+            for c in range(3):
+                j[a, c] = t[3 + a, c]
+        return
+    force = x[1] if kind == SIDE else x[0]
+    which = 1 if kind == SIDE else 0  # the unknown that is the force's size
+    e = np.empty((3, 3))
+    _across(p, e)
+    distance, slope = 0.0, 0.0
+    if p[6] >= 0.0:
+        r, dr = whisker_radius(rod, x[0] if kind == SIDE else 1.0)
+        distance = p[6] + radius * r
+        slope = radius * dr if kind == SIDE else 0.0
+    for a in range(3):
+        d, push = 0.0, 0.0
+        for i in range(3):
+            w = e[a, i]
+            push += w * value[i] / force
+            if a < 2:
+                d += w * (value[3 + i] - p[i])
+        g[a] = push if a == 2 else d - distance * push
+        for c in range(3):
+            dd, dpush = 0.0, 0.0
+            for i in range(3):
+                w = e[a, i]
+                dpush += w * t[i, c] / force
+                if a < 2:
+                    dd += w * t[3 + i, c]
+            if c == which:
+                dpush -= push / force
+            j[a, c] = dpush if a == 2 else dd - distance * dpush
+        if a < 2 and kind == SIDE:
+            j[a, 0] -= slope * push
+
+
+@inlined
+def _longest_step(kind: int, fold: Fold, x: Array) -> Array:
+    """How far each unknown may go in one step."""
+    most = np.empty(3)
+    if kind == POINT:
+        most[0] = 0.15
+        most[1] = most[2] = 0.4 * fold_force(fold, x[0], float(np.arctan2(x[2], x[1])))
+    elif kind == SIDE:
+        most[0], most[1], most[2] = 0.15, 0.4 * fold_force(fold, x[0], x[2]), 0.6
+    else:
+        most[0], most[1], most[2] = 0.6 * fold_force(fold, 1.0, x[2]), 0.6, 0.6
+    return most
 
 
 @inlined
@@ -148,6 +278,96 @@ def _arrived(kind: int, s: float, proximal: float) -> int:
     return _AT_TIP if kind == TIP else _OK
 
 
+@inlined
+def _load_lanes(
+    b: Array,
+    waiting: int,
+    last: int,
+    running: int,
+    row: IntArray,
+    kinds: IntArray,
+    unknowns: Array,
+    paths: Array,
+    x: Array,
+    x_ok: Array,
+    contact: Array,
+) -> tuple[int, int]:
+    """Load all lanes; one whose path has ended takes the next."""
+    for i in range(LANES):
+        if row[i] < 0 and waiting < last:
+            row[i] = waiting
+            waiting += 1
+            running += 1
+            copy(unknowns[row[i]], x[i])
+            copy(x[i], x_ok[i])
+            _begin(paths[i])
+        if row[i] >= 0:
+            _contact_of(kinds[row[i]], x[i], contact)
+            tip = kinds[row[i]] == TIP
+            set_lane(b, i, contact[0], contact[1], contact[2], contact[3], tip)
+        else:
+            set_lane(b, i, LEAST_ARC, 0.0, 0.0, 0.0, False)
+    return waiting, running
+
+
+@inlined
+def _outcome(misfit: float, size: float, relative: float) -> int:
+    """Whether the unknowns are stable, and solve the equations."""
+    if not (misfit < np.inf and relative > 0.0):
+        return _UNSTABLE
+    # Near zero force the direction is loose: solved means the step is small as well.
+    small = (misfit <= TOLERANCE and size < 1e-6) or misfit <= 1e-3 * TOLERANCE
+    return _SOLVED if small else _STABLE
+
+
+@inlined
+def _go_on(
+    kind: int,
+    path: Array,
+    progress: float,
+    relative: float,
+    outcome: int,
+    size: float,
+    step: Array,
+    x: Array,
+    x_ok: Array,
+    x_best: Array,
+    arc: float,
+    proximal: float,
+) -> tuple[int, int]:
+    """Choose what follows a round of Newton's method; return the status and the kind of contact."""
+    smallest = _SMALLEST_POINT_STEP if kind == POINT else _SMALLEST_STEP
+    may_switch = path[_SWITCHES] < _MOST_SWITCHES
+    if outcome == _SOLVED:
+        path[_DONE], path[_RATIO] = progress, relative
+        copy(x, x_ok)
+        path[_ROUNDS] = path[_PAST_TIP] = path[_LOST] = 0.0
+        left = 1.0 - progress
+        if kind == TIP and x[1] > 0.0 and may_switch:
+            # The force leans outward, which a tip cannot give: on along the side.
+            path[_BEST] = np.inf
+            return _ON_THE_WAY, _switch(kind, path, min(path[_STRIDE], left), x, x_ok)
+        if progress >= 1.0:
+            return _arrived(kind, arc, proximal), kind
+        path[_STRIDE] = min(2.0 * path[_STRIDE], left)
+        return _ON_THE_WAY, kind
+    if outcome == _STABLE and not _struggles(path, size, smallest):
+        path[_SIZE] = size
+        _correct(kind, path, step, x)
+        return _ON_THE_WAY, kind
+    if path[_STRIDE] > smallest:
+        path[_STRIDE] *= 0.5
+        path[_ROUNDS] = 0.0
+        copy(x_ok, x)
+        return _ON_THE_WAY, kind
+    if path[_BEST] <= _AT_FOLD:
+        copy(x_best, x_ok)
+        return _arrived(kind, arc, proximal), kind
+    if kind == SIDE and path[_PAST_TIP] > 0.0 and may_switch:
+        return _ON_THE_WAY, _switch(kind, path, min(0.01, 1.0 - path[_DONE]), x, x_ok)
+    return _reason(kind, path, x_ok, proximal), kind
+
+
 @kernel
 def follow(
     rod: Rod,
@@ -173,21 +393,9 @@ def follow(
     x, x_ok, x_best = np.empty((LANES, 3)), np.empty((LANES, 3)), np.empty((LANES, 3))
     waiting, running = first, 0
     while True:
-        # A lane whose path has ended takes the next one.
-        for i in range(LANES):
-            if row[i] < 0 and waiting < last:
-                row[i] = waiting
-                waiting += 1
-                running += 1
-                copy(unknowns[row[i]], x[i])
-                copy(x[i], x_ok[i])
-                _begin(paths[i])
-            if row[i] >= 0:
-                contact_of(kinds[row[i]], x[i], contact)
-                tip = kinds[row[i]] == TIP
-                set_lane(b, i, contact[0], contact[1], contact[2], contact[3], tip)
-            else:
-                set_lane(b, i, LEAST_ARC, 0.0, 0.0, 0.0, False)
+        waiting, running = _load_lanes(
+            b, waiting, last, running, row, kinds, unknowns, paths, x, x_ok, contact
+        )
         if running == 0:
             return
         integrate(rod, b, 3)
@@ -196,57 +404,39 @@ def follow(
             if m < 0:
                 continue
             kind, path = kinds[m], paths[i]
-            smallest = _SMALLEST_POINT_STEP if kind == POINT else _SMALLEST_STEP
             progress = path[_DONE] + path[_STRIDE]
             lane_value(b, i, value)
             lane_tangents(b, i, t)
-            by_unknowns(kind, x[i], t)
+            _by_unknowns(kind, x[i], t)
             _parameters(kind, begins[m], ends[m], progress, p)
-            equations(kind, rod, radius, x[i], p, value, t, g, jacobian)
+            _equations(kind, rod, radius, x[i], p, value, t, g, jacobian)
             misfit, det = norm3(g), solve3(jacobian, g, step)
             if path[_START] == 0.0:
                 path[_START] = det
             relative = det / path[_START]
-            stable = misfit < np.inf and relative > 0.0
-            most = longest_step(kind, fold, x[i])
+            most = _longest_step(kind, fold, x[i])
             size = max(abs(step[0]) / most[0], abs(step[1]) / most[1], abs(step[2]) / most[2])
-            if stable and progress >= 1.0 and misfit < path[_BEST]:
+            outcome = _outcome(misfit, size, relative)
+            if outcome != _UNSTABLE and progress >= 1.0 and misfit < path[_BEST]:
                 path[_BEST] = misfits[m] = misfit
-                contact_of(kind, x[i], contacts[m])
+                _contact_of(kind, x[i], contacts[m])
                 copy(value, values[m])
                 copy(x[i], x_best[i])
-
-            # Near zero force the direction is loose: solved means the step is small as well.
-            solved = (misfit <= TOLERANCE and size < 1e-6) or misfit <= 1e-3 * TOLERANCE
-            status = _ON_THE_WAY
-            if stable and solved:
-                path[_DONE], path[_RATIO] = progress, relative
-                copy(x[i], x_ok[i])
-                path[_ROUNDS] = path[_PAST_TIP] = path[_LOST] = 0.0
-                left = 1.0 - progress
-                if kind == TIP and x[i, 1] > 0.0 and path[_SWITCHES] < _MOST_SWITCHES:
-                    # The force leans outward, which a tip cannot give: on along the side.
-                    path[_BEST] = np.inf
-                    kinds[m] = _switch(kind, path, min(path[_STRIDE], left), x[i], x_ok[i])
-                elif progress >= 1.0:
-                    status = _arrived(kind, contacts[m, 0], proximal)
-                else:
-                    path[_STRIDE] = min(2.0 * path[_STRIDE], left)
-            elif stable and not _struggles(path, size, smallest):
-                path[_SIZE] = size
-                _correct(kind, path, step, x[i])
-            elif path[_STRIDE] > smallest:
-                path[_STRIDE] *= 0.5
-                path[_ROUNDS] = 0.0
-                copy(x_ok[i], x[i])
-            elif path[_BEST] <= _AT_FOLD:
-                copy(x_best[i], x_ok[i])
-                status = _arrived(kind, contacts[m, 0], proximal)
-            elif kind == SIDE and path[_PAST_TIP] > 0.0 and path[_SWITCHES] < _MOST_SWITCHES:
-                left = 1.0 - path[_DONE]
-                kinds[m] = _switch(kind, path, min(0.01, left), x[i], x_ok[i])
-            else:
-                status = _reason(kind, path, x_ok[i], proximal)
+            status, kinds[m] = _go_on(
+                kind,
+                path,
+                progress,
+                relative,
+                outcome,
+                size,
+                step,
+                x[i],
+                x_ok[i],
+                x_best[i],
+                contacts[m, 0],
+                proximal,
+            )
+            if status != _ON_THE_WAY and not (outcome == _SOLVED or path[_BEST] <= _AT_FOLD):
                 misfits[m] = misfit
             if status != _ON_THE_WAY:
                 statuses[m] = status

@@ -1,20 +1,16 @@
-"""Bend a whisker: a load in, base force and moment, contact point and shape out."""
+"""What bends a whisker, any number of loads at once, and the deflection that results."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from vibrissa.numerics import AnyArray, Array, IntArray
-from vibrissa.rod.chart import PROXIMAL
-from vibrissa.rod.discretization import STEPS, Discretization, discretize
-from vibrissa.rod.forces import solve_known_forces
-from vibrissa.rod.loads import Load, PegContact, PointContact, PointForce
-from vibrissa.rod.pegs import Pegs, Rest, nearest_side, solve_from_contact, solve_from_rest
-from vibrissa.rod.points import Solutions, point_solver
-from vibrissa.rod.shape import shapes
+from vibrissa.numerics import Array, IntArray
+from vibrissa.rod.discretization import STEPS, discretize
+from vibrissa.rod.outward import shapes
 from vibrissa.sketch import (
     BENT,
     CONTACT,
@@ -32,8 +28,226 @@ from vibrissa.status import Status, counted, describe
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
 
-# Lengths beyond this (over L) are as good as this: their squares would overflow.
-_FARTHEST = 1e100
+
+def _numbers(name: str, value: ArrayLike, vector: bool) -> Array:
+    """Return float64, (..., 3) for vectors; raise a ValueError that says what is wrong.
+
+    What is masked becomes NaN: it is missing.
+    """
+    kind = type(value).__name__
+    if hasattr(value, "dtype"):
+        kind += f" of {value.dtype}"
+    try:
+        if np.asarray(value).dtype.kind not in "iufO":
+            raise TypeError
+        if isinstance(value, np.ma.MaskedArray):
+            value = np.ma.filled(value.astype(np.float64), np.nan)
+        array = np.array(value, dtype=np.float64)  # a copy: the caller may go on using theirs
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"{name} must be numbers; got {kind}") from error
+    if vector and (array.ndim == 0 or array.shape[-1] != 3):
+        raise ValueError(f"{name} must have shape (..., 3); got {array.shape}")
+    if np.isinf(array).any():
+        raise ValueError(
+            f"{name} has {int(np.isinf(array).sum())} infinite values; NaN means missing"
+        )
+    return array
+
+
+def _directions(vectors: Array) -> Array:
+    """Unit vectors; (0, 0, 0) stays as it is. No square overflows or vanishes."""
+    largest = np.abs(vectors).max(axis=-1, keepdims=True)
+    scaled = vectors / np.where(largest > 0.0, largest, 1.0)
+    length = np.linalg.norm(scaled, axis=-1, keepdims=True)
+    return np.asarray(scaled / np.where(length > 0.0, length, 1.0))
+
+
+def _broadcast(**shapes: tuple[int, ...]) -> tuple[int, ...]:
+    try:
+        return np.broadcast_shapes(*shapes.values())
+    except ValueError as error:
+        said = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
+        raise ValueError(f"leading shapes do not broadcast: {said}") from error
+
+
+@dataclass(frozen=True, eq=False)
+class PointForce:
+    """A known force at a known place of the whisker.
+
+    Any such force has exactly one equilibrium that grows from rest with the force, and that is what
+    is given; whether an object there could hold it, or the whisker would slip off, is not asked.
+    Only a force that winds the whisker up in waves too short to compute gets a status instead.
+
+    Parameters
+    ----------
+    arc_length : array_like
+        s_c from the base, m, shape (...).
+    magnitude : array_like, optional
+        Size of a force normal to the whisker, N, shape (...).
+    direction : array_like, optional
+        Its angle from d1 toward d2 in the deflected material frame at the contact, rad, shape
+        (...).
+    components : tuple of array_like or array_like, optional
+        Instead: (fx, fy, fz) in that frame, N, a tuple of three or shape (..., 3); fx along the
+        tangent.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not broadcast, if arc lengths are not positive, or if neither or both ways of
+        giving the force are used.
+    """
+
+    arc_length: Any
+    magnitude: Any = None
+    direction: Any = None
+    components: Any = None
+
+    def __post_init__(self) -> None:
+        polar = self.magnitude is not None and self.direction is not None
+        if polar == (self.components is not None) or (self.magnitude is None) != (
+            self.direction is None
+        ):
+            raise ValueError(
+                "give a PointForce either magnitude and direction, or components=(fx, fy, fz)"
+            )
+        s = _numbers("arc_length", self.arc_length, vector=False)
+        if polar:
+            size = _numbers("magnitude", self.magnitude, vector=False)
+            angle = _numbers("direction", self.direction, vector=False)
+            _broadcast(arc_length=s.shape, magnitude=size.shape, direction=angle.shape)
+            across = size * np.cos(angle), size * np.sin(angle)
+            force = np.stack(np.broadcast_arrays(0.0 * across[0], *across), axis=-1)
+        else:
+            parts = self.components
+            if isinstance(parts, tuple):
+                if len(parts) != 3:
+                    raise ValueError(f"components must be (fx, fy, fz); got {len(parts)} of them")
+                parts = np.stack(
+                    np.broadcast_arrays(*(_numbers("components", p, vector=False) for p in parts)),
+                    axis=-1,
+                )
+            force = _numbers("components", parts, vector=True)
+        shape = _broadcast(arc_length=s.shape, force=force.shape[:-1])
+        if (s <= 0.0).any():
+            raise ValueError(
+                f"arc_length must be positive (m from the base); the smallest is {np.nanmin(s)}"
+            )
+        object.__setattr__(self, "arc_length", np.broadcast_to(s, shape))
+        object.__setattr__(self, "components", np.broadcast_to(force, (*shape, 3)))
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Leading shape: how many loads."""
+        return tuple(np.shape(self.arc_length))
+
+
+@dataclass(frozen=True, eq=False)
+class PointContact:
+    """The whisker's centreline passes through a point, without friction.
+
+    Parameters
+    ----------
+    points : array_like
+        Contact points in the whisker frame, m, shape (..., 3); NaN or masked means missing.
+
+    Raises
+    ------
+    ValueError
+        If the shape is wrong, or a coordinate is infinite or not a number.
+    """
+
+    points: Any
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "points", _numbers("points", self.points, vector=True))
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Leading shape: how many loads."""
+        return tuple(np.shape(self.points)[:-1])
+
+
+@dataclass(frozen=True, eq=False)
+class PegContact:
+    """The whisker lies against a straight peg, without friction.
+
+    Without a radius the peg is a line that the whisker's centreline meets. With one it is a solid
+    cylinder and the surfaces touch: the centreline passes the axis at the peg's radius plus the
+    whisker's there.
+
+    Parameters
+    ----------
+    origin : array_like
+        A point of the peg's axis in the whisker frame, m, shape (..., 3).
+    axis : array_like
+        Direction of the axis, any length but zero, shape (..., 3).
+    radius : array_like
+        Radius, m, shape (...); 0 for a line.
+    side : array_like, optional
+        Approximate direction of the force on the whisker, which tells on which side of the peg the
+        whisker lies, shape (..., 3). By default a line pushes from where the resting whisker is
+        nearest to it, and a cylinder pushes the whisker out on the side that is nearest.
+    start : Deflection, optional
+        An earlier deflection by a peg (the same one, elsewhere) to go on from: the contact stays on
+        its side, slides and slips as the peg moves. Where it had no contact, the whisker is on the
+        side of the peg where it was.
+
+    Raises
+    ------
+    ValueError
+        If shapes are wrong or do not broadcast, an axis is zero, a radius is negative, lines and
+        cylinders are mixed, or both ``side`` and ``start`` are given.
+    """
+
+    origin: Any
+    axis: Any
+    radius: Any = 0.0
+    side: Any = None
+    start: Deflection | None = None
+
+    def __post_init__(self) -> None:
+        origin = _numbers("origin", self.origin, vector=True)
+        axis = _numbers("axis", self.axis, vector=True)
+        radius = _numbers("radius", self.radius, vector=False)
+        shapes = {"origin": origin.shape[:-1], "axis": axis.shape[:-1], "radius": radius.shape}
+        if (radius < 0.0).any():
+            raise ValueError(
+                f"a peg's radius must not be negative; the smallest is {np.nanmin(radius)} m"
+            )
+        if (radius == 0.0).any() != (radius == 0.0).all():
+            raise ValueError("lines (radius 0) and cylinders do not mix in one load: give two")
+        axis = _directions(axis)
+        if (axis == 0.0).all(axis=-1).any():
+            raise ValueError("a peg's axis must not be (0, 0, 0)")
+        if self.side is not None and self.start is not None:
+            raise ValueError("give a PegContact either side or start: start already tells the side")
+        if self.side is not None:
+            side = _directions(_numbers("side", self.side, vector=True))
+            shapes["side"] = side.shape[:-1]
+            toward, along = np.broadcast_arrays(side, axis)
+            across = np.cross(toward, along)
+            if (np.linalg.norm(across, axis=-1) <= 1e-9).any():
+                raise ValueError("side must not be (0, 0, 0) or along the peg's axis")
+        if self.start is not None:
+            if not isinstance(getattr(self.start, "load", None), PegContact):
+                got = type(getattr(self.start, "load", self.start)).__name__
+                raise ValueError(f"start must be a deflection by a PegContact; got one by {got}")
+            shapes["start"] = self.start.status.shape
+        shape = _broadcast(**shapes)
+        object.__setattr__(self, "origin", np.broadcast_to(origin, (*shape, 3)))
+        object.__setattr__(self, "axis", np.broadcast_to(axis, (*shape, 3)))
+        object.__setattr__(self, "radius", np.broadcast_to(radius, shape))
+        if self.side is not None:
+            object.__setattr__(self, "side", np.broadcast_to(side, (*shape, 3)))
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Leading shape: how many loads."""
+        return tuple(np.shape(self.radius))
+
+
+Load = PointForce | PointContact | PegContact
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,160 +365,3 @@ class Deflection:
             ("force", shown("force", size(self.force, axis=-1))),
             ("moment", shown("moment", size(self.moment, axis=-1))),
         ]
-
-
-def deflect(
-    whisker: Whisker, load: Load, *, proximal: float = PROXIMAL, steps: int = STEPS
-) -> Deflection:
-    """Bend a whisker quasi-statically.
-
-    Parameters
-    ----------
-    whisker : Whisker
-        What is bent.
-    load : PointForce, PointContact or PegContact
-        What bends it; arrays of any leading shape.
-    proximal : float
-        Contacts at less than this fraction of the length from the base get a status instead of an
-        answer (not for a ``PointForce``).
-    steps : int
-        Integration steps along the whisker. The default is good to 1e-6 while the tangent turns by
-        less than about 65°, and to 1e-4 up to slip-off; the error falls with the sixth power. A
-        ``PointForce`` that bends the whisker further gets as many more as it needs for 1e-4.
-
-    Returns
-    -------
-    Deflection
-        The stable equilibrium that is connected to rest, for each contact, or the reason why there
-        is none; the one equilibrium of each ``PointForce``.
-
-    Raises
-    ------
-    ValueError
-        If the load does not fit (see the loads), not if it has no equilibrium.
-
-    Examples
-    --------
-    >>> import vibrissa as vb
-    >>> whisker = vb.Whisker.parabola(length=39.4e-3, coefficient=10.0)
-    >>> bent = vb.deflect(whisker, vb.PointContact([25e-3, 12e-3, 1e-3]))
-    >>> vb.Status(bent.status).name
-    'OK'
-    """
-    d = discretize(whisker, steps)
-    if isinstance(load, PointForce):
-        solved, needed = _by_force(whisker, d, load, steps)
-        return replace(dimensional(whisker, load, d, solved, steps), _needed=needed)
-    if isinstance(load, PointContact):
-        solver = point_solver(whisker, proximal, steps)
-        with np.errstate(over="ignore"):
-            points = np.asarray(load.points).reshape(-1, 3) / d.length
-        solved = solver.solve(points)
-    elif isinstance(load, PegContact):
-        solved = _by_peg(whisker, d, load, proximal, steps)
-    else:
-        raise ValueError(
-            f"a load is a PointForce, a PointContact or a PegContact; got {type(load).__name__}"
-        )
-    return dimensional(whisker, load, d, solved, steps)
-
-
-def _by_force(
-    whisker: Whisker, d: Discretization, load: PointForce, steps: int
-) -> tuple[Solutions, IntArray]:
-    s = np.asarray(load.arc_length).reshape(-1) / d.length
-    with np.errstate(over="ignore"):
-        forces = np.asarray(load.components).reshape(-1, 3) / d.force
-    contacts = np.concatenate([s[:, None], forces], axis=1)
-    contacts[(s > 1.0) & (s <= 1.0 + 1e-9), 0] = 1.0
-    statuses = np.full(s.size, int(Status.OK))
-    statuses[contacts[:, 0] > 1.0] = Status.BEYOND_TIP
-    statuses[np.isnan(contacts).any(axis=1)] = Status.MISSING
-    rows = np.flatnonzero(statuses == Status.OK)
-    values = np.full((s.size, 6), np.nan)
-    needed = np.full(s.size, steps)
-    values[rows], needed[rows], settled = solve_known_forces(whisker, contacts[rows], steps)
-    statuses[rows[~settled]] = Status.TOO_STRONG
-    lost = statuses != Status.OK
-    contacts[lost], values[lost], needed[lost] = np.nan, np.nan, steps
-    return Solutions(contacts, values, np.where(lost, np.nan, 0.0), statuses), needed
-
-
-def _rows(load: PegContact, length: float) -> Pegs:
-    with np.errstate(over="ignore"):
-        radius = np.minimum(np.asarray(load.radius).reshape(-1) / length, _FARTHEST)
-        origin = np.asarray(load.origin).reshape(-1, 3) / length
-    return Pegs(
-        np.clip(origin, -_FARTHEST, _FARTHEST),
-        np.array(load.axis, dtype=np.float64).reshape(-1, 3),
-        np.where(radius == 0.0, -1.0, radius),
-    )
-
-
-def _by_peg(
-    whisker: Whisker, d: Discretization, load: PegContact, proximal: float, steps: int
-) -> Solutions:
-    pegs = _rows(load, d.length)
-    start = load.start
-    if start is None:
-        if load.side is not None:
-            side = np.asarray(load.side).reshape(-1, 3)
-        else:
-            side = nearest_side(Rest.of(whisker), pegs, outward=bool((pegs.radius >= 0.0).any()))
-        return solve_from_rest(whisker, pegs, side, proximal, steps)
-    if start.whisker is not whisker:
-        raise ValueError("start is a deflection of another whisker")
-    shape = load.shape
-    contacts = np.concatenate(
-        [
-            np.broadcast_to(start.arc_length / d.length, shape).reshape(-1, 1),
-            np.broadcast_to(start.contact_force / d.force, (*shape, 3)).reshape(-1, 3),
-        ],
-        axis=1,
-    )
-    status: AnyArray = np.broadcast_to(start.status, shape).reshape(-1)
-    assert isinstance(start.load, PegContact)  # checked when the load was made
-    earlier = PegContact(
-        np.broadcast_to(start.load.origin, (*shape, 3)),
-        np.broadcast_to(start.load.axis, (*shape, 3)),
-        np.broadcast_to(start.load.radius, shape),
-    )
-    before = _rows(earlier, d.length)
-    touching = np.isin(status, (Status.OK, Status.TIP_CONTACT))
-    out = Solutions.empty(status.size)
-    rows = np.flatnonzero(touching)
-    if rows.size:
-        tip = status[rows] == Status.TIP_CONTACT
-        moved = solve_from_contact(
-            whisker, before.rows(rows), contacts[rows], tip, pegs.rows(rows), proximal, steps
-        )
-        out.put(rows, moved)
-    # A whisker that was free lies on the side of the peg where it then rested.
-    rows = np.flatnonzero(~touching)
-    if rows.size:
-        side = nearest_side(Rest.of(whisker), before.rows(rows), outward=True)
-        out.put(rows, solve_from_rest(whisker, pegs.rows(rows), side, proximal, steps))
-    return out
-
-
-def dimensional(
-    whisker: Whisker, load: Load, d: Discretization, solved: Solutions, steps: int
-) -> Deflection:
-    """Give solved rows their units and the shape of their load."""
-    shape = load.shape
-    force = solved.values[:, :3] * d.force
-    point = solved.values[:, 3:] * d.length
-    moment = np.cross(point, force)
-    moment[solved.statuses == Status.NO_CONTACT] = 0.0
-    return Deflection(
-        whisker=whisker,
-        load=load,
-        force=force.reshape(*shape, 3),
-        moment=moment.reshape(*shape, 3),
-        contact_point=point.reshape(*shape, 3),
-        arc_length=(solved.contacts[:, 0] * d.length).reshape(shape),
-        contact_force=(solved.contacts[:, 1:] * d.force).reshape(*shape, 3),
-        residual=solved.misfits.reshape(shape),
-        status=solved.statuses.reshape(shape),
-        steps=steps,
-    )

@@ -22,32 +22,46 @@ All lanes share the same steps; the step that holds a lane's contact is shortene
 steps beyond it have length zero, so there are no branches and no gathers, and the loop over lanes
 vectorises. That needs the lane buffer to be one flat array with offsets known to the compiler.
 
-The integrator is Butcher's explicit Runge-Kutta method of order 6 with 7 stages (J. C. Butcher, *On
-Runge-Kutta processes of high order*, J. Austral. Math. Soc. 4 (1964) 179-194). A base of finite
-stiffness is a piece of rod without length (``extent`` 0) ahead of the first step.
+The integrator, for this and for all else that follows the rod, is Butcher's explicit Runge-Kutta
+method of order 6 with 7 stages (J. C. Butcher, *On Runge-Kutta processes of high order*, J.
+Austral. Math. Soc. 4 (1964) 179-194): :func:`runge_kutta_step`, for two vectors at a time. A vector
+that is fixed in space is carried along by v' = v × u. A base of finite stiffness is a piece of rod
+without length (``extent`` 0) ahead of the first step.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from vibrissa.numerics import Array, Vector, inlined, kernel, share_out
 from vibrissa.rod.discretization import Discretization, Rod
 
+#: A step of the rod: cubics of curvature and radius, compliances in twist and bending, extent.
+Cubic: TypeAlias = tuple[float, float, float, float]
+Piece: TypeAlias = tuple[tuple[Cubic, Cubic, Cubic, Cubic], float, float, float]
+Pair: TypeAlias = tuple[Vector, Vector]
+
 LANES = 4
-_STAGE = 11 * LANES  # a stage keeps n, q, u (3 each) and the two compliances, for the tangents
-_ARC = 7 * _STAGE  # s_c
+STAGE = 14 * LANES  # a stage keeps n, q, u (3 each), the two compliances and δu (3)
+TURN = 6 * LANES  # u in a stage
+_SOFT = 9 * LANES
+_D_TURN = 11 * LANES
+_ARC = 7 * STAGE  # s_c
 _N = _ARC + LANES
 _Q = _N + 3 * LANES
-_TANGENT = _Q + 3 * LANES  # three tangents of (n, q)
-_H = _TANGENT + 18 * LANES  # the step, negative: from the contact to the base
+_TANGENT = _Q + 3 * LANES  # three tangents of (n, q), or vectors that are carried along
+_H = _TANGENT + 18 * LANES  # the step, negative from the contact to the base
 _TIP = _H + LANES  # 1 where the first unknown is f_x instead of s_c
 _MOVING = _TIP + LANES  # the tangent that takes a step
 BUFFER_SIZE = _MOVING + 6 * LANES
 
 
 @inlined
-def _cross(a: Vector, b: Vector) -> Vector:
+def cross(a: Vector, b: Vector) -> Vector:
+    """Vector product."""
     return (
         a[1] * b[2] - a[2] * b[1],
         a[2] * b[0] - a[0] * b[2],
@@ -66,12 +80,14 @@ def _axpy(y: Vector, a: float, x: Vector) -> Vector:
 
 
 @inlined
-def _get(b: Array, row: int, i: int) -> Vector:
+def get(b: Array, row: int, i: int) -> Vector:
+    """Vector of lane i at a row of the buffer."""
     return (b[row + i], b[row + LANES + i], b[row + 2 * LANES + i])
 
 
 @inlined
-def _put(b: Array, row: int, i: int, v: Vector) -> None:
+def put(b: Array, row: int, i: int, v: Vector) -> None:
+    """Put a vector of lane i in its place in the buffer."""
     b[row + i] = v[0]
     b[row + LANES + i] = v[1]
     b[row + 2 * LANES + i] = v[2]
@@ -124,52 +140,46 @@ def _advance(
 
 
 @inlined
-def _horner(c: tuple[float, float, float, float], t: float) -> float:
-    return c[0] + t * (c[1] + t * (c[2] + t * c[3]))
+def runge_kutta_step(
+    rates: Callable[..., Pair], data: Any, i: int, h: float, x: Vector, y: Vector
+) -> Pair:
+    """Take a step of length h with two vectors of lane i.
+
+    ``rates(data, stage, left, i, x, y)`` gives their slopes in a stage (from 0), of which the
+    fraction ``left`` of the step is left to go.
+    """
+    x1, y1 = rates(data, 0, 1.0, i, x, y)
+    x2, y2 = rates(data, 1, 2.0 / 3.0, i, _y2(x, h, x1), _y2(y, h, y1))
+    x3, y3 = rates(data, 2, 1.0 / 3.0, i, _y3(x, h, x2), _y3(y, h, y2))
+    x4, y4 = rates(data, 3, 2.0 / 3.0, i, _y4(x, h, x1, x2, x3), _y4(y, h, y1, y2, y3))
+    x5, y5 = rates(data, 4, 0.5, i, _y5(x, h, x1, x2, x3, x4), _y5(y, h, y1, y2, y3, y4))
+    x6, y6 = rates(data, 5, 0.5, i, _y6(x, h, x2, x3, x4, x5), _y6(y, h, y2, y3, y4, y5))
+    x7, y7 = rates(data, 6, 0.0, i, _y7(x, h, x1, x2, x3, x4, x6), _y7(y, h, y1, y2, y3, y4, y6))
+    return _advance(x, h, x1, x3, x4, x5, x6, x7), _advance(y, h, y1, y3, y4, y5, y6, y7)
 
 
 @inlined
-def _polynomial(shape: Array, k: int, j: int) -> tuple[float, float, float, float]:
+def _cubic(shape: Array, k: int, j: int) -> Cubic:
     return (shape[k, j, 0], shape[k, j, 1], shape[k, j, 2], shape[k, j, 3])
 
 
 @inlined
-def _rate(
-    n: Vector, q: Vector, u0: Vector, c: Vector, extent: float
-) -> tuple[Vector, Vector, Vector]:
-    m = _cross(q, n)
-    u = (u0[0] + c[0] * m[0], u0[1] + c[1] * m[1], u0[2] + c[2] * m[2])
-    dq = _cross(q, u)
-    return u, _cross(n, u), (dq[0] - extent, dq[1], dq[2])
+def _horner(c: Cubic, t: float) -> float:
+    return c[0] + t * (c[1] + t * (c[2] + t * c[3]))
 
 
 @inlined
-def _keep(b: Array, stage: int, i: int, n: Vector, q: Vector, u: Vector, c: Vector) -> None:
-    row = stage * _STAGE
-    _put(b, row, i, n)
-    _put(b, row + 3 * LANES, i, q)
-    _put(b, row + 6 * LANES, i, u)
-    b[row + 9 * LANES + i] = c[0]
-    b[row + 10 * LANES + i] = c[1]
+def piece_of(rod: Rod, k: int) -> Piece:
+    """Step k of the rod."""
+    shape = rod.shape
+    cubics = (_cubic(shape, k, 0), _cubic(shape, k, 1), _cubic(shape, k, 2), _cubic(shape, k, 3))
+    return cubics, rod.twist[k], rod.bending[k], rod.extent[k]
 
 
 @inlined
-def _tangent_rate(b: Array, stage: int, i: int, dn: Vector, dq: Vector) -> tuple[Vector, Vector]:
-    row = stage * _STAGE
-    n = _get(b, row, i)
-    q = _get(b, row + 3 * LANES, i)
-    u = _get(b, row + 6 * LANES, i)
-    twist, bend = b[row + 9 * LANES + i], b[row + 10 * LANES + i]
-    m = _add(_cross(dq, n), _cross(q, dn))
-    du = (twist * m[0], bend * m[1], bend * m[2])
-    return _add(_cross(dn, u), _cross(n, du)), _add(_cross(dq, u), _cross(q, du))
-
-
-@inlined
-def _section(
-    shape: tuple[tuple[float, float, float, float], ...], twist: float, bend: float, t: float
-) -> tuple[Vector, Vector]:
+def section(piece: Piece, t: float) -> Pair:
     """Intrinsic curvature and compliance at the fraction t of a step."""
+    shape, twist, bend, _ = piece
     r2 = _horner(shape[3], t)
     r2 = r2 * r2
     inverse = 1.0 / (r2 * r2)
@@ -178,106 +188,131 @@ def _section(
 
 
 @inlined
+def turning(u0: Vector, c: Vector, m: Vector) -> Vector:
+    """Curvature under a moment."""
+    return (u0[0] + c[0] * m[0], u0[1] + c[1] * m[1], u0[2] + c[2] * m[2])
+
+
+@inlined
+def _value_rates(
+    data: tuple[Array, Piece, float, bool], stage: int, left: float, i: int, n: Vector, q: Vector
+) -> Pair:
+    """Slopes of (n, q); the stage is kept if tangents follow."""
+    b, piece, t, keep = data
+    u0, c = section(piece, t * left)
+    u = turning(u0, c, cross(q, n))
+    if keep:
+        row = stage * STAGE
+        put(b, row, i, n)
+        put(b, row + 3 * LANES, i, q)
+        put(b, row + TURN, i, u)
+        b[row + _SOFT + i] = c[0]
+        b[row + _SOFT + LANES + i] = c[1]
+    dq = cross(q, u)
+    return cross(n, u), (dq[0] - piece[3], dq[1], dq[2])
+
+
+@inlined
+def _tangent_rates(
+    data: tuple[Array, bool], stage: int, left: float, i: int, dn: Vector, dq: Vector
+) -> Pair:
+    """Slopes of a tangent on the stages that the values left; δu is kept if asked for."""
+    b, keep = data
+    row = stage * STAGE
+    n, q, u = get(b, row, i), get(b, row + 3 * LANES, i), get(b, row + TURN, i)
+    c0, c1 = b[row + _SOFT + i], b[row + _SOFT + LANES + i]
+    dm = _add(cross(dq, n), cross(q, dn))
+    du = (c0 * dm[0], c1 * dm[1], c1 * dm[2])
+    if keep:
+        put(b, row + _D_TURN, i, du)
+    return _add(cross(dn, u), cross(n, du)), _add(cross(dq, u), cross(q, du))
+
+
+@inlined
+def carried_rates(
+    data: tuple[Array, float], stage: int, left: float, i: int, v: Vector, w: Vector
+) -> Pair:
+    """Slopes of a vector that is fixed in space, and of one whose end moves along the rod."""
+    b, extent = data
+    u = get(b, stage * STAGE + TURN, i)
+    dw = cross(w, u)
+    return cross(v, u), (dw[0] + extent, dw[1], dw[2])
+
+
+@inlined
+def _d_carried_rates(
+    data: tuple[Array], stage: int, left: float, i: int, v: Vector, dv: Vector
+) -> Pair:
+    """Slopes of a vector that is fixed in space and of its tangent."""
+    b, row = data[0], stage * STAGE
+    u, du = get(b, row + TURN, i), get(b, row + _D_TURN, i)
+    return cross(v, u), _add(cross(dv, u), cross(v, du))
+
+
+@inlined
 def _value_step(rod: Rod, b: Array, k: int, tangents: bool) -> None:
     """Take step k with (n, q) of every lane; keep the stages if tangents follow."""
-    start, width, extent, twist, bend = (
-        rod.start[k],
-        rod.width[k],
-        rod.extent[k],
-        rod.twist[k],
-        rod.bending[k],
-    )
-    shape = (
-        _polynomial(rod.shape, k, 0),
-        _polynomial(rod.shape, k, 1),
-        _polynomial(rod.shape, k, 2),
-        _polynomial(rod.shape, k, 3),
-    )
+    start, width, piece = rod.start[k], rod.width[k], piece_of(rod, k)
     inverse_width = 1.0 / width
     for i in range(LANES):
         s = b[_ARC + i]
         h = min(max(s - start, 0.0), width)
-        t = h * inverse_width
-        n, q = _get(b, _N, i), _get(b, _Q, i)
-
-        u0, c = _section(shape, twist, bend, t)
-        u, n1, q1 = _rate(n, q, u0, c, extent)
+        data = (b, piece, h * inverse_width, tangents)
+        n, q = get(b, _N, i), get(b, _Q, i)
         if tangents:
             b[_H + i] = -h
-            _keep(b, 0, i, n, q, u, c)
             # The lane's contact lies in this step: its s-tangent starts here.
             if s > start and s <= start + width and b[_TIP + i] == 0.0:
-                _put(b, _TANGENT, i, (-n1[0], -n1[1], -n1[2]))
-                _put(b, _TANGENT + 3 * LANES, i, (-q1[0], -q1[1], -q1[2]))
-        h = -h
-
-        u0, c = _section(shape, twist, bend, t * (2.0 / 3.0))
-        nn, qq = _y2(n, h, n1), _y2(q, h, q1)
-        u, n2, q2 = _rate(nn, qq, u0, c, extent)
-        if tangents:
-            _keep(b, 1, i, nn, qq, u, c)
-
-        v0, d = _section(shape, twist, bend, t * (1.0 / 3.0))
-        nn, qq = _y3(n, h, n2), _y3(q, h, q2)
-        u, n3, q3 = _rate(nn, qq, v0, d, extent)
-        if tangents:
-            _keep(b, 2, i, nn, qq, u, d)
-
-        nn, qq = _y4(n, h, n1, n2, n3), _y4(q, h, q1, q2, q3)
-        u, n4, q4 = _rate(nn, qq, u0, c, extent)
-        if tangents:
-            _keep(b, 3, i, nn, qq, u, c)
-
-        u0, c = _section(shape, twist, bend, t * 0.5)
-        nn, qq = _y5(n, h, n1, n2, n3, n4), _y5(q, h, q1, q2, q3, q4)
-        u, n5, q5 = _rate(nn, qq, u0, c, extent)
-        if tangents:
-            _keep(b, 4, i, nn, qq, u, c)
-
-        nn, qq = _y6(n, h, n2, n3, n4, n5), _y6(q, h, q2, q3, q4, q5)
-        u, n6, q6 = _rate(nn, qq, u0, c, extent)
-        if tangents:
-            _keep(b, 5, i, nn, qq, u, c)
-
-        u0, c = _section(shape, twist, bend, 0.0)
-        nn, qq = _y7(n, h, n1, n2, n3, n4, n6), _y7(q, h, q1, q2, q3, q4, q6)
-        u, n7, q7 = _rate(nn, qq, u0, c, extent)
-        if tangents:
-            _keep(b, 6, i, nn, qq, u, c)
-
-        _put(b, _N, i, _advance(n, h, n1, n3, n4, n5, n6, n7))
-        _put(b, _Q, i, _advance(q, h, q1, q3, q4, q5, q6, q7))
+                dn, dq = _value_rates(data, 0, 1.0, i, n, q)
+                put(b, _TANGENT, i, (-dn[0], -dn[1], -dn[2]))
+                put(b, _TANGENT + 3 * LANES, i, (-dq[0], -dq[1], -dq[2]))
+        n, q = runge_kutta_step(_value_rates, data, i, -h, n, q)
+        put(b, _N, i, n)
+        put(b, _Q, i, q)
 
 
 @inlined
-def _tangent_step(b: Array, row: int) -> None:
+def _tangent_step(b: Array, row: int, keep: bool) -> None:
     """Take the same step with the tangent at ``row``, on the stages that the values left."""
     for i in range(6 * LANES):
         b[_MOVING + i] = b[row + i]
     for i in range(LANES):
-        h = b[_H + i]
-        n, q = _get(b, _MOVING, i), _get(b, _MOVING + 3 * LANES, i)
-        n1, q1 = _tangent_rate(b, 0, i, n, q)
-        n2, q2 = _tangent_rate(b, 1, i, _y2(n, h, n1), _y2(q, h, q1))
-        n3, q3 = _tangent_rate(b, 2, i, _y3(n, h, n2), _y3(q, h, q2))
-        n4, q4 = _tangent_rate(b, 3, i, _y4(n, h, n1, n2, n3), _y4(q, h, q1, q2, q3))
-        n5, q5 = _tangent_rate(b, 4, i, _y5(n, h, n1, n2, n3, n4), _y5(q, h, q1, q2, q3, q4))
-        n6, q6 = _tangent_rate(b, 5, i, _y6(n, h, n2, n3, n4, n5), _y6(q, h, q2, q3, q4, q5))
-        n7, q7 = _tangent_rate(
-            b, 6, i, _y7(n, h, n1, n2, n3, n4, n6), _y7(q, h, q1, q2, q3, q4, q6)
-        )
-        _put(b, _MOVING, i, _advance(n, h, n1, n3, n4, n5, n6, n7))
-        _put(b, _MOVING + 3 * LANES, i, _advance(q, h, q1, q3, q4, q5, q6, q7))
+        n, q = get(b, _MOVING, i), get(b, _MOVING + 3 * LANES, i)
+        n, q = runge_kutta_step(_tangent_rates, (b, keep), i, b[_H + i], n, q)
+        put(b, _MOVING, i, n)
+        put(b, _MOVING + 3 * LANES, i, q)
     for i in range(6 * LANES):
         b[row + i] = b[_MOVING + i]
+
+
+@inlined
+def _carry_step(b: Array, row: int) -> None:
+    """Take the same step with a vector that is fixed in space."""
+    for i in range(LANES):
+        v = get(b, row, i)
+        v, _ = runge_kutta_step(carried_rates, (b, 0.0), i, b[_H + i], v, v)
+        put(b, row, i, v)
+
+
+@inlined
+def whisker_radius(rod: Rod, s: float) -> tuple[float, float]:
+    """Radius relative to the base radius at s, and its derivative."""
+    start, width, shape = rod.start, rod.width, rod.shape
+    k = start.shape[0] - 1
+    while k > 0 and start[k] > s:
+        k -= 1
+    t = (s - start[k]) / width[k]
+    c = shape[k, 3]
+    value = c[0] + t * (c[1] + t * (c[2] + t * c[3]))
+    return value, (c[1] + t * (2.0 * c[2] + 3.0 * t * c[3])) / width[k]
 
 
 @inlined
 def set_lane(b: Array, i: int, s: float, fx: float, fy: float, fz: float, tip: bool) -> None:
     """Load lane i with a contact at s and its force; ``tip`` makes f_x the first unknown."""
     b[_ARC + i] = s
-    _put(b, _N, i, (fx, fy, fz))
-    _put(b, _Q, i, (0.0, 0.0, 0.0))
+    put(b, _N, i, (fx, fy, fz))
+    put(b, _Q, i, (0.0, 0.0, 0.0))
     b[_TIP + i] = 1.0 if tip else 0.0
     for row in range(_TANGENT, _TANGENT + 18 * LANES, LANES):
         b[row + i] = 0.0
@@ -319,22 +354,6 @@ def lane_tangents(b: Array, i: int, tangents: Array) -> None:
             tangents[row, j] = b[_TANGENT + (6 * j + row) * LANES + i]
 
 
-@inlined
-def _carry_step(b: Array, row: int) -> None:
-    """Take the same step with a vector that is fixed in space: v' = v × u in the material frame."""
-    for i in range(LANES):
-        h, v = b[_H + i], _get(b, row, i)
-        u = 6 * LANES
-        v1 = _cross(v, _get(b, u, i))
-        v2 = _cross(_y2(v, h, v1), _get(b, _STAGE + u, i))
-        v3 = _cross(_y3(v, h, v2), _get(b, 2 * _STAGE + u, i))
-        v4 = _cross(_y4(v, h, v1, v2, v3), _get(b, 3 * _STAGE + u, i))
-        v5 = _cross(_y5(v, h, v1, v2, v3, v4), _get(b, 4 * _STAGE + u, i))
-        v6 = _cross(_y6(v, h, v2, v3, v4, v5), _get(b, 5 * _STAGE + u, i))
-        v7 = _cross(_y7(v, h, v1, v2, v3, v4, v6), _get(b, 6 * _STAGE + u, i))
-        _put(b, row, i, _advance(v, h, v1, v3, v4, v5, v6, v7))
-
-
 @kernel
 def integrate(rod: Rod, b: Array, tangents: int) -> None:
     """Integrate every lane from its contact to the base, with its first so many tangents."""
@@ -347,7 +366,7 @@ def integrate(rod: Rod, b: Array, tangents: int) -> None:
             if tangents > 0:
                 _value_step(rod, b, k, True)
                 for j in range(tangents):
-                    _tangent_step(b, _TANGENT + 6 * LANES * j)
+                    _tangent_step(b, _TANGENT + 6 * LANES * j, False)
             else:
                 _value_step(rod, b, k, False)
 
@@ -382,19 +401,63 @@ def evaluate(
 
 @kernel
 def _carry_tangents(rod: Rod, contacts: Array, tangents: Array, first: int, last: int) -> None:
-    """Unit tangents of the deflected whisker at its contacts, in the base frame."""
     b = np.zeros(BUFFER_SIZE)
     for row in range(first, last, LANES):
         for i in range(LANES):
             j = min(row + i, last - 1)
             set_lane(b, i, contacts[j, 0], contacts[j, 1], contacts[j, 2], contacts[j, 3], True)
-            _put(b, _TANGENT, i, (1.0, 0.0, 0.0))
+            put(b, _TANGENT, i, (1.0, 0.0, 0.0))
         for k in range(rod.start.shape[0] - 1, -1, -1):
             _value_step(rod, b, k, True)
             _carry_step(b, _TANGENT)
         for i in range(min(LANES, last - row)):
             for j in range(3):
                 tangents[row + i, j] = b[_TANGENT + j * LANES + i]
+
+
+@kernel
+def relative_radius(rod: Rod, s: float) -> tuple[float, float]:
+    """Radius of the whisker relative to that of the base at s, and its derivative."""
+    return whisker_radius(rod, s)
+
+
+@kernel
+def contact_state(rod: Rod, contact: Array, state: Array) -> None:
+    """One contact (s, f) with its tangent t, and all derivatives by (s, f_x, f_y, f_z).
+
+    ``state`` (9, 5) is filled: (F, p, t) in column 0, its derivatives in the others.
+    """
+    b = np.zeros(BUFFER_SIZE)
+    s = contact[0]
+    set_all_lanes(b, s, contact[1], contact[2], contact[3])
+    carried = _TANGENT + 6 * LANES  # t and δt take the place of the tangents that are not used
+    for i in range(LANES):
+        put(b, carried, i, (1.0, 0.0, 0.0))
+        put(b, carried + 3 * LANES, i, (0.0, 0.0, 0.0))
+    at_contact = True
+    for k in range(rod.start.shape[0] - 1, -1, -1):
+        if rod.start[k] >= s:
+            continue
+        _value_step(rod, b, k, True)
+        if at_contact:  # where t' = e₁ × u
+            b[carried + 4 * LANES] = b[TURN + 2 * LANES]
+            b[carried + 5 * LANES] = -b[TURN + LANES]
+            at_contact = False
+        _tangent_step(b, _TANGENT, True)
+        for i in range(LANES):
+            t, dt = get(b, carried, i), get(b, carried + 3 * LANES, i)
+            t, dt = runge_kutta_step(_d_carried_rates, (b,), i, b[_H + i], t, dt)
+            put(b, carried, i, t)
+            put(b, carried + 3 * LANES, i, dt)
+    for a in range(6):
+        state[a, 0] = b[_N + a * LANES]
+    for a in range(3):
+        state[6 + a, 0] = b[carried + a * LANES]
+    for i in range(LANES):
+        for a in range(6):
+            state[a, 1 + i] = b[_TANGENT + a * LANES + i]
+        for a in range(3):
+            state[6 + a, 1 + i] = b[carried + (3 + a) * LANES + i]
 
 
 def solve_forces(

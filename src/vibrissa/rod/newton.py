@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from vibrissa.numerics import Array, copy, inlined, solve3
+from vibrissa.numerics import AnyArray, Array, copy, inlined, solve3
 from vibrissa.rod.chart import LEAST_ARC, Fold, chart_to_contact, fold_force
 from vibrissa.rod.discretization import Rod
 from vibrissa.rod.kernels import (
@@ -112,6 +112,38 @@ def _chord_rounds(
 
 
 @inlined
+def _integrate_rows(
+    rod: Rod, b: Array, count: int, xi: Array, active: AnyArray, stale: AnyArray
+) -> tuple[bool, bool]:
+    """Integrate all rows; return whether with tangents, and whether those of one row alone."""
+    wanted, number, only = False, 0, 0
+    for i in range(count):
+        if active[i]:
+            wanted = wanted or stale[i]
+            number, only = number + 1, i
+    alone = wanted and number == 1  # its tangents side by side
+    if alone:
+        set_all_lanes(b, xi[only, 0], 0.0, xi[only, 1], xi[only, 2])
+    else:
+        for i in range(LANES):
+            j = i if i < count else 0
+            set_lane(b, i, xi[j, 0], 0.0, xi[j, 1], xi[j, 2], False)
+    integrate(rod, b, 1 if alone else (3 if wanted else 0))
+    return wanted, alone
+
+
+@inlined
+def _row_tangents(b: Array, i: int, alone: bool, tangents: Array) -> None:
+    if not alone:
+        lane_tangents(b, i, tangents)
+        return
+    four = np.empty((6, 4))
+    lanes_tangents(b, four)
+    for a in range(6):
+        tangents[a, 0], tangents[a, 1], tangents[a, 2] = four[a, 0], four[a, 2], four[a, 3]
+
+
+@inlined
 def newton_group(
     equation: Callable[..., Any],
     rod: Rod,
@@ -127,7 +159,7 @@ def newton_group(
     signs: Array,
 ) -> None:
     """Solve up to four problems side by side, in place."""
-    value, tangents, four = np.empty(6), np.empty((6, 3)), np.empty((6, 4))
+    value, tangents = np.empty(6), np.empty((6, 3))
     residual, step = np.empty(3), np.empty(3)
     jacobians = np.empty((LANES, 3, 3))
     active, stale = np.zeros(LANES, np.bool_), np.ones(LANES, np.bool_)
@@ -146,35 +178,14 @@ def newton_group(
     if not busy:
         return
     for _ in range(_ROUNDS):
-        wanted, number, only = False, 0, 0
-        for i in range(count):
-            if active[i]:
-                wanted = wanted or stale[i]
-                number, only = number + 1, i
-        alone = wanted and number == 1  # its tangents side by side
-        if alone:
-            set_all_lanes(b, xi[only, 0], 0.0, xi[only, 1], xi[only, 2])
-        else:
-            for i in range(LANES):
-                j = i if i < count else 0
-                set_lane(b, i, xi[j, 0], 0.0, xi[j, 1], xi[j, 2], False)
-        integrate(rod, b, 1 if alone else (3 if wanted else 0))
+        wanted, alone = _integrate_rows(rod, b, count, xi, active, stale)
         busy = False
         for i in range(count):
             if not active[i]:
                 continue
             lane_value(b, i, value)
-            if alone:
-                lanes_tangents(b, four)
-                for a in range(6):
-                    tangents[a, 0], tangents[a, 1], tangents[a, 2] = (
-                        four[a, 0],
-                        four[a, 2],
-                        four[a, 3],
-                    )
-            elif wanted:
-                lane_tangents(b, i, tangents)
             if wanted:
+                _row_tangents(b, i, alone, tangents)
                 signs[i] = point_determinant(tangents)
             misfit = equation(value, tangents, wanted, targets[i], residual, jacobians[i])
             stale[i] = not misfit < 0.1 * misfits[i]

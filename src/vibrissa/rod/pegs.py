@@ -16,8 +16,7 @@ import numpy as np
 
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.rod.chart import LEAST_ARC, stable_set
-from vibrissa.rod.continuation import LEAST_FORCE
-from vibrissa.rod.equations import SIDE, TIP
+from vibrissa.rod.continuation import LEAST_FORCE, SIDE, TIP
 from vibrissa.rod.points import Solutions, follow_all
 from vibrissa.status import Status
 

@@ -29,9 +29,8 @@ from vibrissa.rod.chart import (
     stable_set,
     with_normal_force,
 )
-from vibrissa.rod.continuation import follow
+from vibrissa.rod.continuation import POINT, follow
 from vibrissa.rod.discretization import Rod
-from vibrissa.rod.equations import POINT
 from vibrissa.rod.kernels import BUFFER_SIZE, LANES, solve_forces
 from vibrissa.rod.newton import ABOVE_FOLD, TOLERANCE, newton_group, stable, start_from
 from vibrissa.rod.search import MOST_SEEDS, seeds

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibrissa.numerics import Array, IntArray, copy, inlined, kernel, solve3, wrapped
+from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel, solve3, wrapped
 from vibrissa.rod.tree import EVEN, FOLDED, SearchTree
 
 #: At most so many contacts are found for one target.
@@ -400,17 +400,60 @@ def _keep(
     return max(count, row + 1)
 
 
+@inlined
+def _boxes_around(turns: Array, box: Array, target: Array, inside: AnyArray) -> None:
+    """Which of eight sibling boxes contain the target."""
+    t0, t1, t2 = target[0], target[1], target[2]
+    for c in range(8):
+        d0, d1, d2 = t0 - box[0, c], t1 - box[1, c], t2 - box[2, c]
+        d0 -= 2.0 * np.pi * np.rint(d0 * turns[0])
+        d1 -= 2.0 * np.pi * np.rint(d1 * turns[1])
+        d2 -= 2.0 * np.pi * np.rint(d2 * turns[2])
+        inside[c] = (abs(d0) <= box[3, c]) & (abs(d1) <= box[4, c]) & (abs(d2) <= box[5, c])
+
+
+@inlined
+def _begin_cell(
+    tree: SearchTree,
+    cell: int,
+    box: Array,
+    c: int,
+    target: Array,
+    relative: Array,
+    b: Array,
+    work: Array,
+    half: Array,
+    x: Array,
+) -> int:
+    """Bring a cell into the buffer; return the starts that it needs (see `SearchTree.care`).
+
+    -1 if the target cannot be in it.
+    """
+    row = tree.polar[cell]
+    if row >= 0:
+        _begin_polar(tree, row, target, b)
+        if not _locate_polar(tree, row, b, work, x):
+            return -1
+        careful, edge = _polar_care(tree, row, b), tree.polar_edges[row]
+        b[_TARGET + 3] = tree.polar_frame[row, 7]
+        for a in range(3):
+            half[a] = tree.polar_frame[row, 4 + a]
+    else:
+        if not _locate(tree, cell, target, relative, x):
+            return -1
+        careful, edge = tree.care[cell], tree.edges[cell]
+        b[_TARGET + 3] = b[_RELATIVE + 3] = 0.0
+        for a in range(3):
+            half[a], b[_RELATIVE + a] = box[3 + a, c], relative[a]
+    for k in range(_MISFIT):
+        b[k] = edge[k]
+    return int(careful)
+
+
 @kernel
 def seeds(tree: SearchTree, target: Array, found: Array, inverses: Array, quality: IntArray) -> int:
     """All contacts that may have the target's values, as chart coordinates."""
-    grid, turns, offsets, boxes, place = (
-        tree.grid,
-        tree.turns,
-        tree.offsets,
-        tree.boxes,
-        tree.place,
-    )
-    edges, care, polar = tree.edges, tree.care, tree.polar
+    grid, offsets, boxes, place = tree.grid, tree.offsets, tree.boxes, tree.place
     levels = offsets.shape[0] - 1
     stack = np.empty((_STACK, 2), np.int64)
     inside = np.empty(8, np.bool_)
@@ -419,18 +462,12 @@ def seeds(tree: SearchTree, target: Array, found: Array, inverses: Array, qualit
     nearest, sides, half = np.empty(3), np.empty((3, 3)), np.empty(3)
     count, top = 0, 1
     stack[0, 0], stack[0, 1] = 0, 0
-    t0, t1, t2 = target[0], target[1], target[2]
     _aim(tree, target, b)
     while top > 0:
         top -= 1
         level, node = stack[top, 0], stack[top, 1]
         box = boxes[offsets[level] + node]
-        for c in range(8):
-            d0, d1, d2 = t0 - box[0, c], t1 - box[1, c], t2 - box[2, c]
-            d0 -= 2.0 * np.pi * np.rint(d0 * turns[0])
-            d1 -= 2.0 * np.pi * np.rint(d1 * turns[1])
-            d2 -= 2.0 * np.pi * np.rint(d2 * turns[2])
-            inside[c] = (abs(d0) <= box[3, c]) & (abs(d1) <= box[4, c]) & (abs(d2) <= box[5, c])
+        _boxes_around(tree.turns, box, target, inside)
         for c in range(8):
             if not inside[c]:
                 continue
@@ -440,24 +477,9 @@ def seeds(tree: SearchTree, target: Array, found: Array, inverses: Array, qualit
                     stack[top, 0], stack[top, 1] = level + 1, child
                     top += 1
                 continue
-            row = polar[child]
-            if row >= 0:
-                _begin_polar(tree, row, target, b)
-                if not _locate_polar(tree, row, b, work, x):
-                    continue
-                careful, edge = _polar_care(tree, row, b), tree.polar_edges[row]
-                b[_TARGET + 3] = tree.polar_frame[row, 7]
-                for a in range(3):
-                    half[a] = tree.polar_frame[row, 4 + a]
-            else:
-                if not _locate(tree, child, target, relative, x):
-                    continue
-                careful, edge = care[child], edges[child]
-                b[_TARGET + 3] = b[_RELATIVE + 3] = 0.0
-                for a in range(3):
-                    half[a], b[_RELATIVE + a] = box[3 + a, c], relative[a]
-            for k in range(_MISFIT):
-                b[k] = edge[k]
+            careful = _begin_cell(tree, child, box, c, target, relative, b, work, half, x)
+            if careful < 0:
+                continue
             least = np.inf
             missed = careful == 2 and place[child, 2] >= _RESTING
             for start in range(9 if careful > 0 else 1):  # the place itself, then the corners

@@ -1,4 +1,27 @@
-"""One contact of a whisker with a surface, solved by Newton's method from one that is near."""
+"""One contact of a whisker with a surface, with or without friction, by Newton's method.
+
+With t the whisker's tangent at the contact (:func:`vibrissa.rod.kernels.contact_state`), d the
+surface's signed distance at p, n its outward normal there, N = F·n the pressing force and T = F - N
+n the friction, four equations fix (s_c, f_x, f_y, f_z):
+
+- the surfaces touch, one whisker radius away from the centreline: d - a(s_c) + N/k = 0, with k the
+  object's stiffness (1/k = 0: rigid);
+- on the whisker's side it lies along the surface, t·n = 0; at its tip s_c = 1 instead;
+- two for the friction, in the tangent plane: T = Π(T - c Δ), Π the projection onto the disc of
+  radius µN and c > 0 any number. They say |T| ≤ µN, and either no sliding (Δ = 0) or T = -µN Δ/|Δ|.
+
+Δ is how far the whisker's material has slid over the surface since the contact was last known, at
+(p₁, t₁, s₁): the contact's way in space less its way along the whisker,
+
+    Δ = p - p₁ - ½ (t + t₁)(s_c - s₁),
+
+so a contact that rolls along both without slip has none. Friction acts on the centreline.
+
+At zero force det of the four rows in the order above is negative wherever a surface first touches
+(n, e₁, e₂ being right-handed): the whisker curves away from the surface and yields to a push. It
+stays so along the branch that is stable and connected to rest, sticking or sliding, and vanishes at
+its end, where the whisker slips off.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +30,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vibrissa.numerics import Array
+from vibrissa.numerics import Array, inlined, kernel, solve
 from vibrissa.objects import Placement, Surface
 from vibrissa.rod.chart import LEAST_ARC
-from vibrissa.rod.contact_state import STATES, contact_state
 from vibrissa.rod.discretization import Discretization
-from vibrissa.rod.surface_equations import EITHER, SLIDING, STICKING, surface_equations
+from vibrissa.rod.kernels import contact_state, relative_radius
 
+EITHER, STICKING, SLIDING = 0, 1, 2
+# Numbers that an integration gives: (F, p, t).
+_STATES = 9
 _TOLERANCE = 1e-12
 # So near a branch's end that rounding moves the solution, this is as good as it gets.
 _AT_FOLD = 1e-9
@@ -21,10 +46,126 @@ _ROUNDS = 40
 _SWITCHES = 6
 # The longest Newton steps that a linearisation is trusted for: in s, in the contact's place (both
 # over L), in the whisker's direction there, and in the surface's normal.
-_LONGEST = np.array([0.15, 0.15, 0.4, 0.5])
+_LONGEST = (0.15, 0.15, 0.4, 0.5)
 _MOST_TURNED = 0.5  # cosine of the normal's turn in one step of the path
 # A tip contact whose tangent points away from the surface by more than this is one of the side.
 _OUTWARD = 1e-10
+
+
+@inlined
+def _tangent_plane(n: Array, e: Array) -> None:
+    """Fill e (2, 3) with two unit vectors such that n, e₁, e₂ are right-handed."""
+    least = 0
+    for i in range(1, 3):
+        if abs(n[i]) < abs(n[least]):
+            least = i
+    a, b = (least + 1) % 3, (least + 2) % 3
+    size = 1.0 / np.sqrt(n[a] * n[a] + n[b] * n[b])
+    e[0, least], e[0, a], e[0, b] = 0.0, n[b] * size, -n[a] * size
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        e[1, i] = n[j] * e[0, k] - n[k] * e[0, j]
+
+
+@inlined
+def _give(n: Array, state: Array) -> float:
+    """Compliance of the contact along the normal, the number c of the friction's equations."""
+    give = 0.0
+    for j in range(2, 5):
+        part = 0.0
+        for i in range(3):
+            part += n[i] * state[3 + i, j]
+        give += part * part
+    return float(np.sqrt(give))
+
+
+@kernel
+def _surface_equations(
+    contact: Array,
+    state: Array,
+    whisker_radius: float,
+    whisker_slope: float,
+    geometry: Array,
+    lean: Array,
+    softness: float,
+    friction: float,
+    earlier: Array,
+    tip: bool,
+    mode: int,
+    step: Array,
+) -> tuple[float, float, float, bool, bool]:
+    """Residual and its derivatives, solved for Newton's step; lengths over L, forces over EI/L²."""
+    n, e = geometry[1:4], np.empty((2, 3))
+    _tangent_plane(n, e)
+    pressing, along, away = 0.0, 0.0, contact[0] - earlier[6]
+    for i in range(3):
+        pressing += (n[i] + lean[i]) * state[i, 0]
+        along += (n[i] + lean[i]) * state[6 + i, 0]
+    # The tangent plane's share of friction, way slid, and what is projected.
+    push, way, wanted = np.empty(2), np.empty(2), np.empty(2)
+    give = _give(n, state)
+    limit = friction * max(pressing, 0.0)
+    for r in range(2):
+        push[r] = way[r] = 0.0
+        for i in range(3):
+            mean = 0.5 * (state[6 + i, 0] + earlier[3 + i])
+            push[r] += e[r, i] * (state[i, 0] - pressing * lean[i])
+            way[r] += e[r, i] * (state[3 + i, 0] - earlier[i] - away * mean)
+        wanted[r] = push[r] - way[r] / give
+    strength = np.hypot(wanted[0], wanted[1])
+    beyond = bool(strength >= limit)
+    sliding = beyond if mode == EITHER else mode == SLIDING
+    if strength > 0.0:
+        toward0, toward1 = wanted[0] / strength, wanted[1] / strength
+    else:
+        toward0, toward1 = 0.0, 0.0
+
+    step[0] = -(geometry[0] - whisker_radius + softness * pressing)
+    step[1] = -((contact[0] - 1.0) if tip else along)
+    if sliding:
+        step[2] = -give * (push[0] - limit * toward0)
+        step[3] = -give * (push[1] - limit * toward1)
+    else:
+        step[2], step[3] = -way[0], -way[1]
+    misfit = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2 + step[3] ** 2)
+
+    turn, jacobian = np.empty(3), np.empty((4, 4))
+    d_push, d_way = np.empty(2), np.empty(2)
+    for j in range(4):
+        closer, d_along, d_pressing = 0.0, 0.0, 0.0
+        for i in range(3):
+            turn[i] = 0.0
+            for k in range(3):
+                turn[i] += geometry[4 + 3 * i + k] * state[3 + k, 1 + j]
+            closer += n[i] * state[3 + i, 1 + j]
+            d_along += n[i] * state[6 + i, 1 + j] + turn[i] * state[6 + i, 0]
+            d_pressing += n[i] * state[i, 1 + j] + turn[i] * state[i, 0]
+        jacobian[0, j] = closer + softness * d_pressing
+        jacobian[1, j] = d_along
+        for r in range(2):
+            d_push[r] = d_way[r] = 0.0
+            for i in range(3):
+                d_push[r] += e[r, i] * (state[i, 1 + j] - pressing * turn[i])
+                slid = state[3 + i, 1 + j] - 0.5 * away * state[6 + i, 1 + j]
+                if j == 0:
+                    slid -= 0.5 * (state[6 + i, 0] + earlier[3 + i])
+                d_way[r] += e[r, i] * slid
+        if j == 0:
+            jacobian[0, j] -= whisker_slope
+        if sliding:
+            d0 = d_push[0] - d_way[0] / give
+            d1 = d_push[1] - d_way[1] / give
+            # Across the direction of sliding the projection turns what comes in.
+            across = -toward1 * d0 + toward0 * d1
+            turned = limit * across / strength if strength > 0.0 else 0.0
+            d_limit = friction * d_pressing if pressing > 0.0 else 0.0
+            jacobian[2, j] = give * (d_push[0] - d_limit * toward0 + turned * toward1)
+            jacobian[3, j] = give * (d_push[1] - d_limit * toward1 - turned * toward0)
+        else:
+            jacobian[2, j], jacobian[3, j] = d_way[0], d_way[1]
+    if tip:
+        jacobian[1, 0], jacobian[1, 1], jacobian[1, 2], jacobian[1, 3] = 1.0, 0.0, 0.0, 0.0
+    return misfit, solve(jacobian, step), pressing, sliding, sliding == beyond
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +196,7 @@ class TouchSolver:
 
     def start(self, surface: int, place: Placement, contact: Array) -> Touch:
         """Begin with a contact that only about meets the equations."""
-        state = np.empty((STATES, 5))
+        state = np.empty((_STATES, 5))
         contact_state(self.discretization.rod, contact, state)
         point = place.outside(state[3:6, 0] * self.discretization.length)
         distance, normal, _ = self._surfaces[surface].local_geometry(point)
@@ -87,89 +228,44 @@ class TouchSolver:
         return found
 
     def _newton(self, last: Touch, place: Placement, friction: float, mode: int) -> Touch | None:
-        d = self.discretization
-        surface, softness = self._surfaces[last.surface], self._softness[last.surface]
-        earlier = np.empty(7)
-        earlier[:3] = (last.point - place.position) @ place.rotation / d.length
-        earlier[3:6] = last.tangent @ place.rotation
-        earlier[6] = last.contact[0]
-        x, tip = last.contact.copy(), last.tip
-        state, jacobian, step = np.empty((STATES, 5)), np.empty((4, 4)), np.empty(4)
-        geometry, lean = np.empty(13), np.zeros(3)
+        length = self.discretization.length
+        earlier = np.concatenate(
+            [
+                (last.point - place.position) @ place.rotation / length,
+                last.tangent @ place.rotation,
+                last.contact[:1],
+            ]
+        )
+        x, tip, step = last.contact.copy(), last.tip, np.empty(4)
         best: Touch | None = None
         size, past_tip, switches = np.inf, 0, 0
         settled = friction == 0.0 or mode != EITHER
         for rounds in range(_ROUNDS):
-            radius, slope = contact_state(d.rod, x, state)
-            point = place.outside(state[3:6, 0] * d.length)
-            if not np.isfinite(point).all():
-                return None
             # The surface as it was where it last was touched predicts, to first order, where it is
             # touched now; then it counts as it is.
             predicting = rounds == 0
-            distance, normal, turn = surface.local_geometry(last.point if predicting else point)
-            geometry[0] = distance / d.length
-            geometry[1:4] = normal @ place.rotation
-            turn = place.rotation.T @ turn @ place.rotation * d.length
-            geometry[4:] = turn.ravel()
-            lean[:] = 0.0
-            if predicting:
-                moved = state[3:6, 0] - earlier[:3]
-                geometry[0] += geometry[1:4] @ moved
-                lean[:] = turn @ moved
-            misfit, determinant, pressing, sliding, right = surface_equations(
-                x,
-                state,
-                radius * d.radius,
-                slope * d.radius,
-                geometry,
-                lean,
-                softness,
-                friction,
-                earlier,
-                tip,
-                mode,
-                jacobian,
-                step,
+            linear = self._linearised(
+                last, place, x, tip, earlier, friction, mode, predicting, step
             )
-            stable = determinant < 0.0
+            if linear is None:
+                return None
+            found, right, now = linear
+            stable = found.determinant < 0.0
             if not (stable or friction > 0.0) or not np.isfinite(step).all():
                 return best
-            if predicting:
-                misfit = np.inf
-            elif normal @ last.normal < _MOST_TURNED:
+            if not predicting and found.normal @ last.normal < _MOST_TURNED:
                 return None
-            if right and stable and misfit <= _AT_FOLD and (best is None or misfit < best.misfit):
-                best = Touch(
-                    last.surface,
-                    tip,
-                    x.copy(),
-                    state[:, 0].copy(),
-                    point,
-                    place.rotation @ state[6:, 0],
-                    normal,
-                    distance,
-                    misfit,
-                    determinant,
-                    pressing,
-                    sliding,
-                )
-            if misfit <= _TOLERANCE:
-                if tip and state[6:, 0] @ geometry[1:4] > _OUTWARD and switches < _SWITCHES:
-                    tip, best, size = False, None, np.inf
-                    switches += 1
-                    continue
-                return best
-            change = state[3:, 1:] @ step
-            now = float(
-                max(
-                    abs(step[0]) / _LONGEST[0],
-                    np.linalg.norm(change[:3]) / _LONGEST[1],
-                    np.linalg.norm(change[3:]) / _LONGEST[2],
-                    np.linalg.norm(lean + turn @ change[:3]) / _LONGEST[3],
-                )
-            )
-            if rounds == 0 and now > 2.0:
+            good = right and stable and found.misfit <= _AT_FOLD
+            if good and (best is None or found.misfit < best.misfit):
+                best = found
+            if found.misfit <= _TOLERANCE:
+                outward = found.tangent @ found.normal > _OUTWARD
+                if not (tip and outward and switches < _SWITCHES):
+                    return best
+                tip, best, size = False, None, np.inf
+                switches += 1
+                continue
+            if predicting and now > 2.0:
                 return None
             if rounds >= 3 + switches and now > 0.95 * size + 1e-9 and settled:
                 return best
@@ -182,3 +278,70 @@ class TouchSolver:
                     switches += 1
             x[0] = min(max(x[0], LEAST_ARC), 1.0)
         return best
+
+    def _linearised(
+        self,
+        last: Touch,
+        place: Placement,
+        x: Array,
+        tip: bool,
+        earlier: Array,
+        friction: float,
+        mode: int,
+        predicting: bool,
+        step: Array,
+    ) -> tuple[Touch, bool, float] | None:
+        """The contact x, whether its friction is right, and the size of the step in longest ones.
+
+        Newton's ``step`` is filled. None where the whisker cannot be integrated.
+        """
+        d = self.discretization
+        surface, rotation = self._surfaces[last.surface], place.rotation
+        state, geometry, lean = np.empty((_STATES, 5)), np.empty(13), np.zeros(3)
+        contact_state(d.rod, x, state)
+        radius, slope = relative_radius(d.rod, x[0])
+        point = place.outside(state[3:6, 0] * d.length)
+        if not np.isfinite(point).all():
+            return None
+        distance, normal, turn = surface.local_geometry(last.point if predicting else point)
+        turn = rotation.T @ turn @ rotation * d.length
+        geometry[0], geometry[1:4], geometry[4:] = distance / d.length, normal @ rotation, turn.flat
+        if predicting:
+            moved = state[3:6, 0] - earlier[:3]
+            geometry[0] += geometry[1:4] @ moved
+            lean = turn @ moved
+        misfit, determinant, pressing, sliding, right = _surface_equations(
+            x,
+            state,
+            radius * d.radius,
+            slope * d.radius,
+            geometry,
+            lean,
+            self._softness[last.surface],
+            friction,
+            earlier,
+            tip,
+            mode,
+            step,
+        )
+        change = state[3:, 1:] @ step
+        parts = (step[:1], change[:3], change[3:], lean + turn @ change[:3])
+        size = max(
+            float(np.linalg.norm(part)) / longest
+            for part, longest in zip(parts, _LONGEST, strict=True)
+        )
+        found = Touch(
+            surface=last.surface,
+            tip=tip,
+            contact=x.copy(),
+            state=state[:, 0].copy(),
+            point=point,
+            tangent=rotation @ state[6:, 0],
+            normal=normal,
+            distance=distance,
+            misfit=np.inf if predicting else misfit,
+            determinant=determinant,
+            pressing=pressing,
+            sliding=sliding,
+        )
+        return found, right, size

@@ -19,7 +19,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from vibrissa.numerics import AnyArray, Array, IntArray, inlined
+from vibrissa.numerics import AnyArray, Array, IntArray, Vector, inlined
 from vibrissa.quantities import attributes
 
 # Of a DataArray, by name.
@@ -300,12 +300,40 @@ def signal_scales(names: tuple[str, ...], force: float, moment: float) -> Array:
 
 
 @inlined
-def signal_equations(
-    value: Array, tangents: Array, wanted: bool, which: IntArray, signal: Array, jacobian: Array
-) -> None:
-    """Chosen signals of (F, p) and, if ``wanted``, their derivatives by ξ from the tangents.
+def _linear_channel(w: int, s: float, force: Vector, moment: Vector, point: Vector) -> float:
+    """A channel that is linear in s, F, M and p, or its derivative from theirs."""
+    if w == 0:
+        return force[0]
+    if w == 3:
+        return moment[0]
+    if w == 6:
+        return force[1]
+    if w == 7:
+        return force[2]
+    if w == 8:
+        return moment[1]
+    if w == 9:
+        return moment[2]
+    if w == 10:
+        return s
+    return point[0] if w == 11 else (point[1] if w == 12 else point[2])
 
-    Lengths are over L and forces over EI/L². ``signal`` (k,) and ``jacobian`` (k, 3) are filled.
+
+@inlined
+def signal_equations(
+    s: float,
+    value: Array,
+    tangents: Array,
+    wanted: bool,
+    which: IntArray,
+    signal: Array,
+    jacobian: Array,
+) -> None:
+    """Chosen channels of a contact and, if ``wanted``, their derivatives by the unknowns.
+
+    Channels 0 to 5 are the six signals, 6 to 9 (F_y, F_z, M_y, M_z), 10 the arc length s (the first
+    unknown), 11 to 13 the contact point. ``value`` is (F, p) and ``tangents`` its derivatives; both
+    non-dimensional. ``signal`` (k,) and ``jacobian`` (k, unknowns) are filled.
     """
     fx, fy, fz = value[0], value[1], value[2]
     px, py, pz = value[3], value[4], value[5]
@@ -313,40 +341,39 @@ def signal_equations(
     ft, mb = np.sqrt(fy * fy + fz * fz), np.sqrt(my * my + mz * mz)
     for k in range(which.shape[0]):
         w = which[k]
-        if w == 0:
-            signal[k] = fx
-        elif w == 1:
+        if w == 1:
             signal[k] = ft
         elif w == 2:
             signal[k] = np.arctan2(fz, fy)
-        elif w == 3:
-            signal[k] = mx
         elif w == 4:
             signal[k] = mb
-        else:
+        elif w == 5:
             signal[k] = np.arctan2(mz, my)
+        else:
+            signal[k] = _linear_channel(w, s, (fx, fy, fz), (mx, my, mz), (px, py, pz))
     if not wanted:
         return
-    for c in range(3):
+    for c in range(jacobian.shape[1]):
         dfx, dfy, dfz = tangents[0, c], tangents[1, c], tangents[2, c]
         dpx, dpy, dpz = tangents[3, c], tangents[4, c], tangents[5, c]
         dmx = dpy * fz + py * dfz - dpz * fy - pz * dfy
         dmy = dpz * fx + pz * dfx - dpx * fz - px * dfz
         dmz = dpx * fy + px * dfy - dpy * fx - py * dfx
+        ds = 1.0 if c == 0 else 0.0
         for k in range(which.shape[0]):
             w = which[k]
-            if w == 0:
-                jacobian[k, c] = dfx
-            elif w == 1:
-                jacobian[k, c] = (fy * dfy + fz * dfz) / ft
+            if w == 1:
+                d = (fy * dfy + fz * dfz) / ft
             elif w == 2:
-                jacobian[k, c] = (fy * dfz - fz * dfy) / (ft * ft)
-            elif w == 3:
-                jacobian[k, c] = dmx
+                d = (fy * dfz - fz * dfy) / (ft * ft)
             elif w == 4:
-                jacobian[k, c] = (my * dmy + mz * dmz) / mb
+                d = (my * dmy + mz * dmz) / mb
+            elif w == 5:
+                d = (my * dmz - mz * dmy) / (mb * mb)
             else:
-                jacobian[k, c] = (my * dmz - mz * dmy) / (mb * mb)
+                d_force, d_point = (dfx, dfy, dfz), (dpx, dpy, dpz)
+                d = _linear_channel(w, ds, d_force, (dmx, dmy, dmz), d_point)
+            jacobian[k, c] = d
 
 
 def signal_derivatives(values: Array, tangents: Array) -> Array:

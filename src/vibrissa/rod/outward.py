@@ -1,0 +1,331 @@
+"""The rod equations from the base outward, with the base wrench known.
+
+With n = RᵀF the force and m the moment that the whisker carries, both in the material frame,
+
+    n' = n × u,   m' = m × u + n × e₁,   u = u₀(s) + c(s) ∘ m,   n(0) = F,   m(0) = M
+
+up to the contact, and u = u₀ beyond it. Vectors that are fixed in space are carried along by
+v' = v × u; the frame's axes seen from the material frame, and r likewise with r' = r × u + e₁, give
+the place r of the whisker. The steps are those of the contact problem, cut at the contact and at
+the places that are asked for.
+
+The only external force acts where the moment has vanished: at the contact, m(s_c) = 0, whatever the
+direction of the force. A measured wrench never meets that exactly. Since
+
+    d|m|²/ds = 2 m · (n × e₁),
+
+the places where the moment comes nearest to zero are the zeros of m · (n × e₁) with rising sign.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vibrissa.numerics import Array, IntArray, Vector, inlined, kernel, share_out
+from vibrissa.rod.discretization import Discretization, Rod
+from vibrissa.rod.kernels import (
+    LANES,
+    STAGE,
+    TURN,
+    Pair,
+    Piece,
+    carried_rates,
+    cross,
+    get,
+    piece_of,
+    put,
+    runge_kutta_step,
+    section,
+    turning,
+)
+
+#: At most so many places are kept for one wrench.
+MOST_PLACES = 6
+# What is bent more than this (rad) in one step is no rod any more, but what lies beyond a contact.
+_MOST_TURN = 1.5
+# Rounds of false position for the zero inside a step.
+_ROUNDS = 30
+# What is left of a step is nothing below this (over L).
+_NOTHING = 1e-14
+
+# A buffer for four whiskers: the stages' curvatures, force and moment, the axes x, y, z and r as
+# the material frame sees them, and the step.
+_N = 7 * STAGE
+_X = _N + 6 * LANES
+_Z = _X + 6 * LANES
+_H = _Z + 6 * LANES
+_SIZE = _H + LANES
+
+
+@inlined
+def _rates(
+    data: tuple[Array, Piece, float, float, float, bool],
+    stage: int,
+    left: float,
+    i: int,
+    n: Vector,
+    m: Vector,
+) -> Pair:
+    """Slopes of (n, m); the stage's curvature is kept if vectors are to be carried along."""
+    b, piece, begin, share, loaded, keep = data
+    u0, c = section(piece, begin + (1.0 - left) * share)
+    u = turning(u0, c, (loaded * m[0], loaded * m[1], loaded * m[2]))
+    if keep:
+        put(b, stage * STAGE + TURN, i, u)
+    dm, extent = cross(m, u), piece[3]
+    return cross(n, u), (dm[0], dm[1] + extent * n[2], dm[2] - extent * n[1])
+
+
+@inlined
+def _step(b: Array, piece: Piece, width: float, begin: float, loaded: bool, keep: bool) -> None:
+    """Take each lane's step, which begins at a distance ``begin`` in a step of the rod."""
+    load = 1.0 if loaded else 0.0
+    for i in range(LANES):
+        h = b[_H + i]
+        at = begin if loaded else begin - h
+        data = (b, piece, at / width, h / width, load, keep)
+        n, m = runge_kutta_step(_rates, data, i, h, get(b, _N, i), get(b, _N + 3 * LANES, i))
+        put(b, _N, i, n)
+        put(b, _N + 3 * LANES, i, m)
+    if keep:
+        for i in range(LANES):
+            v, w = get(b, _X, i), get(b, _X + 3 * LANES, i)
+            v, w = runge_kutta_step(carried_rates, (b, 0.0), i, b[_H + i], v, w)
+            put(b, _X, i, v)
+            put(b, _X + 3 * LANES, i, w)
+        for i in range(LANES):
+            v, w = get(b, _Z, i), get(b, _Z + 3 * LANES, i)
+            v, w = runge_kutta_step(carried_rates, (b, piece[3]), i, b[_H + i], v, w)
+            put(b, _Z, i, v)
+            put(b, _Z + 3 * LANES, i, w)
+
+
+@inlined
+def _begin(b: Array, i: int, value: Array) -> None:
+    """Load lane i with (F, p), the frame at the base, and r = 0."""
+    force, point = (value[0], value[1], value[2]), (value[3], value[4], value[5])
+    put(b, _N, i, force)
+    put(b, _N + 3 * LANES, i, cross(point, force))
+    put(b, _X, i, (1.0, 0.0, 0.0))
+    put(b, _X + 3 * LANES, i, (0.0, 1.0, 0.0))
+    put(b, _Z, i, (0.0, 0.0, 1.0))
+    put(b, _Z + 3 * LANES, i, (0.0, 0.0, 0.0))
+
+
+@inlined
+def _place(b: Array, i: int, place: Array) -> None:
+    """Copy r of lane i, in the whisker frame."""
+    r = get(b, _Z + 3 * LANES, i)
+    for a in range(3):
+        axis = get(b, _X + 3 * a * LANES, i)
+        place[a] = axis[0] * r[0] + axis[1] * r[1] + axis[2] * r[2]
+
+
+@kernel
+def _shapes(
+    rod: Rod, values: Array, arc: Array, s: Array, places: Array, first: int, last: int
+) -> None:
+    """Places (n, m, 3) at increasing arc lengths s (m,), for values (F, p) and contacts at arc."""
+    b = np.zeros(_SIZE)
+    for row in range(first, last, LANES):
+        lanes, wanted = min(LANES, last - row), 0
+        for i in range(LANES):
+            _begin(b, i, values[min(row + i, last - 1)])
+        for k in range(rod.start.shape[0]):
+            here, end, extent = rod.start[k], rod.start[k] + rod.width[k], rod.extent[k]
+            piece = piece_of(rod, k)
+            while True:
+                while wanted < s.shape[0] and s[wanted] <= here + 1e-12 and extent > 0.0:
+                    for i in range(lanes):
+                        _place(b, i, places[row + i, wanted])
+                    wanted += 1
+                if here >= end - 1e-15:
+                    break
+                to = min(end, s[wanted]) if extent > 0.0 and wanted < s.shape[0] else end
+                most = least = 0.0
+                for i in range(LANES):
+                    h = min(max(arc[min(row + i, last - 1)] - here, 0.0), to - here)
+                    b[_H + i] = h
+                    most, least = max(most, h), max(least, to - here - h)
+                if most > _NOTHING:
+                    _step(b, piece, rod.width[k], here - rod.start[k], True, True)
+                if least > _NOTHING:
+                    for i in range(LANES):
+                        b[_H + i] = to - here - b[_H + i]
+                    _step(b, piece, rod.width[k], to - rod.start[k], False, True)
+                here = to
+        while wanted < s.shape[0]:
+            for i in range(lanes):
+                _place(b, i, places[row + i, wanted])
+            wanted += 1
+
+
+@kernel
+def _contact_forces(rod: Rod, values: Array, arc: Array, forces: Array) -> None:
+    b = np.zeros(_SIZE)
+    for row in range(0, forces.shape[0], LANES):
+        for i in range(LANES):
+            _begin(b, i, values[min(row + i, forces.shape[0] - 1)])
+        for k in range(rod.start.shape[0]):
+            for i in range(LANES):
+                left = arc[min(row + i, forces.shape[0] - 1)] - rod.start[k]
+                b[_H + i] = min(max(left, 0.0), rod.width[k])
+            _step(b, piece_of(rod, k), rod.width[k], 0.0, True, False)
+        for i in range(min(LANES, forces.shape[0] - row)):
+            n = get(b, _N, i)
+            forces[row + i, 0], forces[row + i, 1], forces[row + i, 2] = n[0], n[1], n[2]
+
+
+@inlined
+def _slope(n: Vector, m: Vector) -> float:
+    """Half of d|m|²/ds, m · (n × e₁)."""
+    return float(m[1] * n[2] - m[2] * n[1])
+
+
+@inlined
+def _inside(
+    b: Array, piece: Piece, width: float, n: Vector, m: Vector, before: float, after: float
+) -> tuple[float, Vector]:
+    """Where in a step the slope vanishes, by false position (Illinois), and the force there."""
+    low, high, at_low, at_high = 0.0, width, before, after
+    here, force = width, n
+    for _ in range(_ROUNDS):
+        if not at_high - at_low > 0.0:
+            break
+        here = low - at_low * (high - low) / (at_high - at_low)
+        data = (b, piece, 0.0, here / width, 1.0, False)
+        force, moment = runge_kutta_step(_rates, data, 0, here, n, m)
+        at = _slope(force, moment)
+        if abs(at) <= 1e-15 * (abs(before) + abs(after)) or high - low < _NOTHING:
+            break
+        if at < 0.0:
+            low, at_low, at_high = here, at, 0.5 * at_high
+        else:
+            high, at_high, at_low = here, at, 0.5 * at_low
+    return here, force
+
+
+@inlined
+def _add(contacts: Array, count: int, s: float, force: Vector) -> int:
+    if count < contacts.shape[0]:
+        contacts[count, 0] = s
+        contacts[count, 1], contacts[count, 2], contacts[count, 3] = force[0], force[1], force[2]
+        return count + 1
+    return count
+
+
+@kernel
+def _vanishing_moments(
+    rod: Rod, wrenches: Array, least: float, count: IntArray, contacts: Array, first: int, last: int
+) -> None:
+    b = np.zeros(_SIZE)
+    steps = rod.start.shape[0]
+    for row in range(first, last):
+        w, found = wrenches[row], 0
+        n, m = (w[0], w[1], w[2]), (w[3], w[4], w[5])
+        for k in range(steps):
+            h, piece = rod.width[k], piece_of(rod, k)
+            data = (b, piece, 0.0, 1.0, 1.0, False)
+            rate, _ = _rates(data, 0, 1.0, 0, n, m)
+            end, moment = runge_kutta_step(_rates, data, 0, h, n, m)
+            turn = h * (abs(rate[0]) + abs(rate[1]) + abs(rate[2]))
+            lost = not turn < _MOST_TURN * (abs(n[0]) + abs(n[1]) + abs(n[2]))
+            before, after = _slope(n, m), _slope(end, moment)
+            last_step = lost or k == steps - 1
+            if not lost and rod.extent[k] > 0.0 and before < 0.0 <= after:
+                here, force = _inside(b, piece, h, n, m, before, after)
+                if rod.start[k] + here >= least:
+                    found = _add(contacts[row], found, rod.start[k] + here, force)
+            elif last_step and before < 0.0:
+                # Still falling where the whisker, or the sense of going on, ends.
+                s = rod.start[k] + (0.0 if lost else h)
+                found = _add(contacts[row], found, s, n if lost else end)
+            if last_step:
+                break
+            n, m = end, moment
+        count[row] = found
+
+
+def shapes(discretization: Discretization, values: Array, arc: Array, s: Array) -> Array:
+    """Centrelines of deflected whiskers, non-dimensional.
+
+    Parameters
+    ----------
+    discretization : Discretization
+        Rod.
+    values : (n, 6) array
+        Base force and contact point (F, p) of each whisker.
+    arc : (n,) array
+        Arc length of each contact, over L.
+    s : (m,) array
+        Arc lengths of the wanted points, over L, increasing.
+
+    Returns
+    -------
+    (n, m, 3) array
+        Points over L, whisker frame; NaN where a row has no values.
+    """
+    places = np.full((len(values), s.size, 3), np.nan)
+    rows = np.flatnonzero(np.isfinite(values).all(axis=1) & np.isfinite(arc))
+    kept, where = np.ascontiguousarray(values[rows]), np.ascontiguousarray(arc[rows])
+    found = np.empty((rows.size, s.size, 3))
+    rod, s = discretization.rod, np.ascontiguousarray(s)
+    share_out(rows.size, lambda first, last: _shapes(rod, kept, where, s, found, first, last))
+    places[rows] = found
+    return places
+
+
+def contact_forces(discretization: Discretization, values: Array, arc: Array) -> Array:
+    """Forces in the material frame at contacts whose base force and contact point are known.
+
+    Parameters
+    ----------
+    discretization : Discretization
+        Rod.
+    values : (n, 6) array
+        Base force and contact point (F, p), non-dimensional.
+    arc : (n,) array
+        Arc length of each contact, over L.
+
+    Returns
+    -------
+    (n, 3) array
+        Forces (f_x, f_y, f_z), non-dimensional; NaN where a row has no values.
+    """
+    forces = np.full((len(values), 3), np.nan)
+    rows = np.flatnonzero(np.isfinite(values).all(axis=1) & np.isfinite(arc))
+    at_contact = np.empty((rows.size, 3))
+    _contact_forces(discretization.rod, values[rows], arc[rows], at_contact)
+    forces[rows] = at_contact
+    return forces
+
+
+def vanishing_moments(
+    discretization: Discretization, wrenches: Array, least: float
+) -> tuple[IntArray, Array]:
+    """Find where the moment in the whisker comes nearest to zero, for known base wrenches.
+
+    Parameters
+    ----------
+    discretization : Discretization
+        Rod.
+    wrenches : (n, 6) array
+        Base force and moment, non-dimensional.
+    least : float
+        Smallest arc length of a contact, over L.
+
+    Returns
+    -------
+    count : (n,) int array
+        Number of contacts found.
+    contacts : (n, MOST_PLACES, 4) array
+        Arc length and force in the material frame of each; NaN beyond the count.
+    """
+    count = np.zeros(len(wrenches), np.int64)
+    contacts = np.full((len(wrenches), MOST_PLACES, 4), np.nan)
+    rod, wrenches = discretization.rod, np.ascontiguousarray(wrenches)
+    share_out(
+        len(wrenches),
+        lambda first, last: _vanishing_moments(rod, wrenches, least, count, contacts, first, last),
+    )
+    return count, contacts

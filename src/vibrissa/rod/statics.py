@@ -1,0 +1,217 @@
+"""Equilibria of all loads: force, point and peg.
+
+A known force, given in the deflected frame at the contact, has one equilibrium whatever its size,
+which grows from rest with the force; nothing is iterated. A strong force winds the whisker up,
+however, in waves as short as √(EI / force), and steps that are good up to slip-off do not follow
+them. The size of the force is an invariant of the equations, and its error is the sign that steps
+are too long. Where it shows, the steps are halved until that changes nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vibrissa.numerics import AnyArray, Array, IntArray
+from vibrissa.rod.chart import PROXIMAL
+from vibrissa.rod.deflection import Deflection, Load, PegContact, PointContact, PointForce
+from vibrissa.rod.discretization import MOST_STEPS, STEPS, Discretization, discretize
+from vibrissa.rod.kernels import solve_forces
+from vibrissa.rod.pegs import Pegs, Rest, nearest_side, solve_from_contact, solve_from_rest
+from vibrissa.rod.points import Solutions, point_solver
+from vibrissa.status import Status
+
+if TYPE_CHECKING:
+    from vibrissa.whisker import Whisker
+
+# Lengths beyond this (over L) are as good as this: their squares would overflow.
+_FARTHEST = 1e100
+# Relative error of the force's size up to which the steps are not in question; base force and
+# contact point are then good to some 1e-5 (relative to the force and to L).
+_KEPT = 1e-6
+# What shorter steps may change, relative to the force and to L.
+_SETTLED = 1e-4
+
+
+def deflect(
+    whisker: Whisker, load: Load, *, proximal: float = PROXIMAL, steps: int = STEPS
+) -> Deflection:
+    """Bend a whisker quasi-statically.
+
+    Parameters
+    ----------
+    whisker : Whisker
+        What is bent.
+    load : PointForce, PointContact or PegContact
+        What bends it; arrays of any leading shape.
+    proximal : float
+        Contacts at less than this fraction of the length from the base get a status instead of an
+        answer (not for a ``PointForce``).
+    steps : int
+        Integration steps along the whisker. The default is good to 1e-6 while the tangent turns by
+        less than about 65°, and to 1e-4 up to slip-off; the error falls with the sixth power. A
+        ``PointForce`` that bends the whisker further gets as many more as it needs for 1e-4.
+
+    Returns
+    -------
+    Deflection
+        The stable equilibrium that is connected to rest, for each contact, or the reason why there
+        is none; the one equilibrium of each ``PointForce``.
+
+    Raises
+    ------
+    ValueError
+        If the load does not fit (see the loads), not if it has no equilibrium.
+
+    Examples
+    --------
+    >>> import vibrissa as vb
+    >>> whisker = vb.Whisker.parabola(length=39.4e-3, coefficient=10.0)
+    >>> bent = vb.deflect(whisker, vb.PointContact([25e-3, 12e-3, 1e-3]))
+    >>> vb.Status(bent.status).name
+    'OK'
+    """
+    d = discretize(whisker, steps)
+    if isinstance(load, PointForce):
+        solved, needed = _by_force(whisker, d, load, steps)
+        return replace(dimensional(whisker, load, d, solved, steps), _needed=needed)
+    if isinstance(load, PointContact):
+        solver = point_solver(whisker, proximal, steps)
+        with np.errstate(over="ignore"):
+            points = np.asarray(load.points).reshape(-1, 3) / d.length
+        solved = solver.solve(points)
+    elif isinstance(load, PegContact):
+        solved = _by_peg(whisker, d, load, proximal, steps)
+    else:
+        raise ValueError(
+            f"a load is a PointForce, a PointContact or a PegContact; got {type(load).__name__}"
+        )
+    return dimensional(whisker, load, d, solved, steps)
+
+
+def _by_force(
+    whisker: Whisker, d: Discretization, load: PointForce, steps: int
+) -> tuple[Solutions, IntArray]:
+    s = np.asarray(load.arc_length).reshape(-1) / d.length
+    with np.errstate(over="ignore"):
+        forces = np.asarray(load.components).reshape(-1, 3) / d.force
+    contacts = np.concatenate([s[:, None], forces], axis=1)
+    contacts[(s > 1.0) & (s <= 1.0 + 1e-9), 0] = 1.0
+    statuses = np.full(s.size, int(Status.OK))
+    statuses[contacts[:, 0] > 1.0] = Status.BEYOND_TIP
+    statuses[np.isnan(contacts).any(axis=1)] = Status.MISSING
+    rows = np.flatnonzero(statuses == Status.OK)
+    values = np.full((s.size, 6), np.nan)
+    needed = np.full(s.size, steps)
+    values[rows], needed[rows], settled = _solve_known_forces(whisker, contacts[rows], steps)
+    statuses[rows[~settled]] = Status.TOO_STRONG
+    lost = statuses != Status.OK
+    contacts[lost], values[lost], needed[lost] = np.nan, np.nan, steps
+    return Solutions(contacts, values, np.where(lost, np.nan, 0.0), statuses), needed
+
+
+def _solve_known_forces(
+    whisker: Whisker, contacts: Array, steps: int
+) -> tuple[Array, IntArray, AnyArray]:
+    """Base force and contact point of known forces of any size, non-dimensional."""
+    values = solve_forces(discretize(whisker, steps), contacts)[0]
+    needed = np.full(len(contacts), steps)
+    with np.errstate(over="ignore", invalid="ignore"):
+        size = np.linalg.norm(contacts[:, 1:], axis=1)
+        kept = np.abs(np.linalg.norm(values[:, :3], axis=1) - size) <= _KEPT * size
+        scale = np.where(np.arange(6) < 3, size[:, None], 1.0)
+        rows = np.flatnonzero(~kept)
+        while rows.size and 2 * steps <= MOST_STEPS:
+            steps *= 2
+            finer = solve_forces(discretize(whisker, steps), contacts[rows])[0]
+            settled = (np.abs(finer - values[rows]) <= _SETTLED * scale[rows]).all(axis=1)
+            # Halving changes nothing while the whole contact is within the first step.
+            error = np.abs(np.linalg.norm(finer[:, :3], axis=1) - size[rows])
+            settled &= error <= _SETTLED * size[rows]
+            rows, finer = rows[~settled], finer[~settled]
+            values[rows], needed[rows] = finer, min(2 * steps, MOST_STEPS)
+    good = np.ones(len(contacts), dtype=bool)
+    good[rows] = False
+    return values, needed, good
+
+
+def _pegs(load: PegContact, length: float) -> Pegs:
+    with np.errstate(over="ignore"):
+        radius = np.minimum(np.asarray(load.radius).reshape(-1) / length, _FARTHEST)
+        origin = np.asarray(load.origin).reshape(-1, 3) / length
+    return Pegs(
+        np.clip(origin, -_FARTHEST, _FARTHEST),
+        np.array(load.axis, dtype=np.float64).reshape(-1, 3),
+        np.where(radius == 0.0, -1.0, radius),
+    )
+
+
+def _by_peg(
+    whisker: Whisker, d: Discretization, load: PegContact, proximal: float, steps: int
+) -> Solutions:
+    pegs = _pegs(load, d.length)
+    start = load.start
+    if start is None:
+        if load.side is not None:
+            side = np.asarray(load.side).reshape(-1, 3)
+        else:
+            side = nearest_side(Rest.of(whisker), pegs, outward=bool((pegs.radius >= 0.0).any()))
+        return solve_from_rest(whisker, pegs, side, proximal, steps)
+    if start.whisker is not whisker:
+        raise ValueError("start is a deflection of another whisker")
+    shape = load.shape
+    contacts = np.concatenate(
+        [
+            np.broadcast_to(start.arc_length / d.length, shape).reshape(-1, 1),
+            np.broadcast_to(start.contact_force / d.force, (*shape, 3)).reshape(-1, 3),
+        ],
+        axis=1,
+    )
+    status: AnyArray = np.broadcast_to(start.status, shape).reshape(-1)
+    assert isinstance(start.load, PegContact)  # checked when the load was made
+    earlier = PegContact(
+        np.broadcast_to(start.load.origin, (*shape, 3)),
+        np.broadcast_to(start.load.axis, (*shape, 3)),
+        np.broadcast_to(start.load.radius, shape),
+    )
+    before = _pegs(earlier, d.length)
+    touching = np.isin(status, (Status.OK, Status.TIP_CONTACT))
+    out = Solutions.empty(status.size)
+    rows = np.flatnonzero(touching)
+    if rows.size:
+        tip = status[rows] == Status.TIP_CONTACT
+        moved = solve_from_contact(
+            whisker, before.rows(rows), contacts[rows], tip, pegs.rows(rows), proximal, steps
+        )
+        out.put(rows, moved)
+    # A whisker that was free lies on the side of the peg where it then rested.
+    rows = np.flatnonzero(~touching)
+    if rows.size:
+        side = nearest_side(Rest.of(whisker), before.rows(rows), outward=True)
+        out.put(rows, solve_from_rest(whisker, pegs.rows(rows), side, proximal, steps))
+    return out
+
+
+def dimensional(
+    whisker: Whisker, load: Load, d: Discretization, solved: Solutions, steps: int
+) -> Deflection:
+    """Give solved rows their units and the shape of their load."""
+    shape = load.shape
+    force = solved.values[:, :3] * d.force
+    point = solved.values[:, 3:] * d.length
+    moment = np.cross(point, force)
+    moment[solved.statuses == Status.NO_CONTACT] = 0.0
+    return Deflection(
+        whisker=whisker,
+        load=load,
+        force=force.reshape(*shape, 3),
+        moment=moment.reshape(*shape, 3),
+        contact_point=point.reshape(*shape, 3),
+        arc_length=(solved.contacts[:, 0] * d.length).reshape(shape),
+        contact_force=(solved.contacts[:, 1:] * d.force).reshape(*shape, 3),
+        residual=solved.misfits.reshape(shape),
+        status=solved.statuses.reshape(shape),
+        steps=steps,
+    )

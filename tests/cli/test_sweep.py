@@ -91,8 +91,8 @@ def test_ctrl_c_stops_and_says_how_to_go_on(study, tmp_path):
         start_new_session=True,
     ) as client:
         end = time.monotonic() + 120.0
-        status = store / "cells" / "status" / "0.0"
-        while not (status.exists() and 1 in status.read_bytes()):
+        records = store / "map.cells"
+        while not (records.exists() and records.stat().st_size):
             assert client.poll() is None
             assert time.monotonic() < end
             time.sleep(0.05)
@@ -121,9 +121,9 @@ def test_a_full_disk_is_named_in_one_line(study, tmp_path, monkeypatch):
 def test_what_is_wrong_is_told(study, tmp_path):
     for words, said in (
         (["sweep"], "a study is needed"),
-        (["sweep", "show"], "say what to show"),
+        (["sweep", "show"], "what to show"),
         (["sweep", str(study), "more"], "one word too many"),
-        (["sweep", "show", str(tmp_path)], "no store of a sweep"),
+        (["sweep", "show", str(tmp_path)], "not a store of a sweep"),
     ):
         result = RUN.invoke(app, words)
         assert isinstance(result.exception, ValueError)

@@ -150,4 +150,4 @@ def _print_failures(faults: dict[str, str]) -> None:
         lines = text.strip().splitlines()
         say(f"failed: {cell.rpartition('-')[0]} of {lines[0]}: {lines[-1]}")
     if len(faults) > _LISTED:
-        say(f"and {len(faults) - _LISTED} more, in .failures of the store")
+        say(f"and {len(faults) - _LISTED} more, in failures.jsonl of the store")

@@ -1,10 +1,9 @@
 """Studies of many whiskers: plain data in, one labelled store out, on one machine or many."""
 
-from vibrissa.sweeps.results import failures, open_sweep
+from vibrissa.sweeps.results import failures, open_sweep, sweep_summary
 from vibrissa.sweeps.run import Outcome, run_sweep
 from vibrissa.sweeps.store import Busy, Store
 from vibrissa.sweeps.study import EXAMPLE, Cell, Study, read_study
-from vibrissa.sweeps.summary import sweep_summary
 
 __all__ = [
     "EXAMPLE",

@@ -32,7 +32,7 @@ PARAMETERS: Mapping[str, tuple[float, float, float]] = {
     "youngs_modulus": (3.0, 1e9, 0.0),
     "trim": (1.0, 1.0, 0.0),
 }
-"""Of a grid or a random population: by default, to SI units, and what each must exceed.
+"""Parameters of a grid or a random population: default, factor to SI units, exclusive minimum.
 
 ``curvature`` is A·L of the parabola y = A x². ``bend`` instead turns the tangent at a constant
 rate by so many degrees from base to tip, and ``corkscrew`` turns the plane of bending by so many.
@@ -41,7 +41,7 @@ rate by so many degrees from base to tip, and ``corkscrew`` turns the plane of b
 
 
 _MOST = 10_000_000
-"""Whiskers of a study: the calling process holds them all, 2.5 kB each."""
+"""Largest number of whiskers: the calling process holds them all, 2.5 kB each."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Specimen:
     """A whisker that can be made."""
 
     name: str
-    said: Mapping[str, float]
+    parameters: Mapping[str, float]
     identity: str
     make: Callable[[], Whisker]
     group: str = ""
@@ -65,10 +65,10 @@ def population(tables: Sequence[Any], folder: Path, seed: int) -> list[Specimen]
         kind = table.get("kind", "grid")
         if not isinstance(kind, str) or kind not in _KINDS:
             raise ValueError(f"{where}: kind is {kind!r}; one of {', '.join(_KINDS)} is needed")
-        said = {key: value for key, value in table.items() if key not in ("kind", "group")}
+        stated = {key: value for key, value in table.items() if key not in ("kind", "group")}
         group = str(table.get("group", kind))
         try:
-            some = _KINDS[kind](said, folder, [seed, number])
+            some = _KINDS[kind](stated, folder, [seed, number])
             found += [replace(specimen, group=group) for specimen in some]
         except (TypeError, ValueError, OverflowError, OSError) as fault:
             raise ValueError(f"{where}: {fault}") from None
@@ -80,34 +80,34 @@ def population(tables: Sequence[Any], folder: Path, seed: int) -> list[Specimen]
     return found
 
 
-def _grid(said: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iterator[Specimen]:
+def _grid(stated: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iterator[Specimen]:
     """All combinations of values."""
-    only(said, {"prefix", *PARAMETERS}, "a grid")
-    names = [name for name in PARAMETERS if name in said]
-    values = [_numbers(name, said[name]) for name in names]
+    only(stated, {"prefix", *PARAMETERS}, "a grid")
+    names = [name for name in PARAMETERS if name in stated]
+    values = [_numbers(name, stated[name]) for name in names]
     _check_count(math.prod(map(len, values)))
     for row in itertools.product(*values):
-        yield _formula(dict(zip(names, row, strict=True)), str(said.get("prefix", "")))
+        yield _formula(dict(zip(names, row, strict=True)), str(stated.get("prefix", "")))
 
 
-def _random(said: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iterator[Specimen]:
+def _random(stated: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iterator[Specimen]:
     """Values drawn between bounds."""
-    only(said, {"prefix", "count", "logarithmic", *PARAMETERS}, "a random population")
-    count = said.get("count")
+    only(stated, {"prefix", "count", "logarithmic", *PARAMETERS}, "a random population")
+    count = stated.get("count")
     if not isinstance(count, int) or isinstance(count, bool) or count < 1:
         raise ValueError(f"count is {count!r}; a whole number from 1 is needed")
     _check_count(count)
-    logarithmic = _words("logarithmic", said.get("logarithmic", []))
+    logarithmic = _words("logarithmic", stated.get("logarithmic", []))
     if unknown := sorted(set(logarithmic) - set(PARAMETERS)):
         raise ValueError(f"logarithmic names {', '.join(unknown)}; known: {', '.join(PARAMETERS)}")
     generator = np.random.default_rng(list(seed))
     columns = {}
     for name in PARAMETERS:
-        if name not in said:
+        if name not in stated:
             continue
-        bounds = _numbers(name, said[name])
+        bounds = _numbers(name, stated[name])
         if len(bounds) > 2 or bounds[0] > bounds[-1]:
-            raise ValueError(f"{name} is {said[name]!r}; a number or [least, largest] is needed")
+            raise ValueError(f"{name} is {stated[name]!r}; a number or [least, largest] is needed")
         low, high = bounds[0], bounds[-1]
         share = generator.random(count)
         if name in logarithmic:
@@ -117,16 +117,16 @@ def _random(said: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Itera
         else:
             columns[name] = low + (high - low) * share
     digits = len(str(count - 1))
-    prefix = str(said.get("prefix", "random "))
+    prefix = str(stated.get("prefix", "random "))
     for i in range(count):
         row = {name: float(column[i]) for name, column in columns.items()}
         yield _formula(row, "", f"{prefix}{i:0{digits}d}")
 
 
-def _files(said: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iterator[Specimen]:
+def _files(stated: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iterator[Specimen]:
     """Digitised whiskers, one a file."""
-    only(said, {"prefix", "files", "base_radius", "youngs_modulus"}, "files")
-    pattern = said.get("files")
+    only(stated, {"prefix", "files", "base_radius", "youngs_modulus"}, "files")
+    pattern = stated.get("files")
     if not isinstance(pattern, str):
         raise ValueError(f"files is {pattern!r}; a pattern such as 'whiskers/*.csv' is needed")
     path = folder / pattern
@@ -135,21 +135,21 @@ def _files(said: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iterat
     paths = sorted(path for path in root.glob(rest) if path.is_file())
     if not paths:
         raise ValueError(f"no file is called {path}")
-    prefix = str(said.get("prefix", ""))
+    prefix = str(stated.get("prefix", ""))
     changes = {
-        name: _numbers(name, said[name])[0] * PARAMETERS[name][1]
+        name: _numbers(name, stated[name])[0] * PARAMETERS[name][1]
         for name in ("base_radius", "youngs_modulus")
-        if name in said
+        if name in stated
     }
     for path in paths:
         identity = _hash([hashlib.sha256(path.read_bytes()).hexdigest(), changes])
         yield Specimen(f"{prefix}{path.stem}", {}, identity, _FromFile(path.resolve(), changes))
 
 
-def _array(said: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iterator[Specimen]:
+def _array(stated: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iterator[Specimen]:
     """Whiskers of an average rat's face."""
-    only(said, {"prefix", "side", "rows", "columns", "names"}, "an array")
-    choice = {key: value for key, value in said.items() if key != "prefix"}
+    only(stated, {"prefix", "side", "rows", "columns", "names"}, "an array")
+    choice = {key: value for key, value in stated.items() if key != "prefix"}
     choice.setdefault("side", "right")
     for name in ("rows", "names"):
         if not isinstance(choice.get(name, ""), str):
@@ -159,7 +159,7 @@ def _array(said: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iterat
     columns = choice.get("columns", [])
     if not isinstance(columns, list) or not all(type(one) is int for one in columns):
         raise ValueError(f"columns is {columns!r}; a list of whole numbers is needed")
-    prefix = str(said.get("prefix", ""))
+    prefix = str(stated.get("prefix", ""))
     for name, whisker in whisker_array(**choice).items():
         identity = _hash(["array", choice["side"], name])
         yield Specimen(f"{prefix}{name}", {}, identity, _Made(whisker))
@@ -173,12 +173,14 @@ _KINDS: Mapping[str, Callable[..., Iterator[Specimen]]] = {
 }
 
 
-def _formula(said: dict[str, float], prefix: str, name: str | None = None) -> Specimen:
-    if said.get("curvature", 0.0) and (said.get("bend", 0.0) or said.get("corkscrew", 0.0)):
-        raise ValueError("curvature is that of a parabola; it does not go with bend or corkscrew")
-    whole = {key: said.get(key, PARAMETERS[key][0]) for key in PARAMETERS}
+def _formula(stated: dict[str, float], prefix: str, name: str | None = None) -> Specimen:
+    if stated.get("curvature", 0.0) and (stated.get("bend", 0.0) or stated.get("corkscrew", 0.0)):
+        raise ValueError(
+            "curvature is that of a parabola; it cannot be combined with bend or corkscrew"
+        )
+    whole = {key: stated.get(key, PARAMETERS[key][0]) for key in PARAMETERS}
     if name is None:
-        varied = [f"{key.replace('_', ' ')} {value:g}" for key, value in said.items()]
+        varied = [f"{key.replace('_', ' ')} {value:g}" for key, value in stated.items()]
         name = prefix + (", ".join(varied) or "default")
     return Specimen(name, whole, _hash(["formula", whole]), _Formula(name, whole))
 
@@ -188,10 +190,10 @@ class _Formula:
     """Makes a parabola or an arc."""
 
     name: str
-    said: Mapping[str, float]
+    stated: Mapping[str, float]
 
     def __call__(self) -> Whisker:
-        value = {key: self.said[key] * PARAMETERS[key][1] for key in PARAMETERS}
+        value = {key: self.stated[key] * PARAMETERS[key][1] for key in PARAMETERS}
         length, bend, corkscrew = value["length"], value["bend"], value["corkscrew"]
         properties: dict[str, Any] = {
             "base_radius": value["base_radius"],
@@ -231,7 +233,7 @@ class _FromFile:
 
 @dataclass(frozen=True)
 class _Made:
-    """Gives a whisker that is there."""
+    """Returns a whisker that is made already."""
 
     whisker: Whisker
 

@@ -1,93 +1,108 @@
-"""Opening what a study has found so far."""
+"""What a study has found so far: as one dataset, its failures, and a summary in a few lines."""
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Mapping
+from collections.abc import Iterator
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
-from vibrissa.sweeps.checksums import DONE, damaged
-from vibrissa.sweeps.found import Found
-from vibrissa.sweeps.rows import Rows
-from vibrissa.sweeps.store import DAMAGED, DESCRIBED, FAILURES, noted
+from vibrissa.sweeps.store import (
+    DAMAGED,
+    DESCRIBED,
+    DONE,
+    FAILED,
+    NOT_ASKED,
+    TO_DO,
+    Cells,
+    described,
+    read_failures,
+)
+
+_MM = 1e3
 
 
 def open_sweep(path: str | PathLike[str]) -> xr.Dataset:
-    """Open the results of a study as one dataset.
+    """Read the results of a study as one dataset.
 
     Parameters
     ----------
     path : str or path
-        Of the store; it may be written to meanwhile.
+        Store of the study; it may be written to meanwhile.
 
     Returns
     -------
     Dataset
-        Over ``whisker`` and the dimensions of the tasks. Variables are called after their task and
+        Over ``whisker`` and the dimensions of the tasks. Variables are named after their task and
         their name, ``uniqueness_verdict``; verdicts are words. A dimension along which a task has
-        other values than one before it has the task's name before its own. With them what is told
-        of every whisker, and over ``task`` ``seconds``, ``status``: 0 not done, 1 done, 2 failed,
-        3 damaged, −1 not asked, and ``origin``, which of the codes in the attribute ``origins``
-        found it. NaN, or an empty word, where nothing is known.
+        other values than one before it has the task's name before its own. With them the numbers
+        that describe every whisker, and over ``task`` ``seconds``, ``status``: 0 not done, 1 done,
+        2 failed, 3 damaged, −1 not asked, and ``origin``, the number of the code, in the attribute
+        ``origins``, that found it. NaN, or an empty word, where nothing is known.
 
     Raises
     ------
     ValueError
-        If it is no store, or so damaged that it cannot be read.
+        If it is not a store, or so damaged that it cannot be read.
     """
     path = Path(path)
-    kept = noted(path)
+    kept = described(path)
     tasks = list(kept["tasks"])
-    told = Found(path / "cells")
-    # First, for what is done then is whole.
-    cells = {name: rows.read() for name, rows in told.rows.items()}
-    whiskers = Found(path / "whiskers")
-    results = {task: Found(path / task) for task in tasks if (path / task).exists()}
-    status = cells["status"]
-    if "checksum" in cells:
-        each = [results[task].ordered if task in results else [] for task in tasks]
-        status = np.where(damaged(cells, whiskers.ordered, each), np.int8(DAMAGED), status)
-    out = _specimens(kept, whiskers, (status == DONE).any(axis=1))
-    over = ("whisker", "task")
-    out = out.assign_coords(task=tasks).assign(
-        status=(over, status), seconds=(over, cells["seconds"]), origin=(over, cells["origin"])
-    )
-    for task, numbers in results.items():
-        found = _group(path / task)
-        known = xr.DataArray(status[:, tasks.index(task)] == DONE, dims="whisker")
-        if not known.all() or not all(rows.whole() for rows in numbers.ordered):
-            found = found.map(_known, rows=numbers.rows, done=known)
-        found = _worded(found)
-        found = found.rename({name: f"{task}_{name}" for name in found.data_vars})
-        out = out.merge(found.rename(_differing(out, found, task)))
-    return out.assign_attrs(study=kept["name"], origins=kept["origins"])
-
-
-def _specimens(kept: dict[str, Any], whiskers: Found, known: NDArray[np.bool_]) -> xr.Dataset:
-    """What each whisker is: its name and group as the study has them, and what describes it."""
     names, groups, _ = (list(words) for words in zip(*kept["whiskers"], strict=True))
+    shape = len(names), len(tasks)
+    asked = np.array(
+        [[t not in kept["groups"] or g in kept["groups"][t] for t in tasks] for g in groups]
+    )
+    status = np.where(asked, TO_DO, NOT_ASKED).astype(np.int8)
+    seconds, origin = np.full(shape, np.nan), np.full(shape, -1, dtype=np.int16)
+    numbers = {name: np.full(len(names), np.nan) for name in DESCRIBED}
+    found = {}
+    # First, for a cell may be done while this is read.
+    failed = list(read_failures(path))
+    for k, task in enumerate(tasks):
+        if (cells := Cells.read(path, task, len(names))) is None:
+            continue
+        found[task] = cells
+        status[cells.done, k], status[cells.damaged, k] = DONE, DAMAGED
+        seconds[:, k] = cells.column("seconds", fill=np.nan)
+        origin[:, k] = cells.column("origin", fill=-1)
+        for name, values in numbers.items():
+            values[cells.done] = cells.column("whisker", name, fill=np.nan)[cells.done]
+    for failure in failed:
+        at = failure["index"], tasks.index(failure["task"])
+        if status[at] != DONE:
+            status[at], seconds[at], origin[at] = FAILED, failure["seconds"], failure["origin"]
     about = {
-        name: (
-            "whisker",
-            np.where(known, whiskers.rows[name].read(), np.nan),
-            {"units": unit, "long_name": name.replace("_", " ")},
-        )
-        for name, unit in DESCRIBED.items()
+        name: ("whisker", values, {"units": DESCRIBED[name], "long_name": name.replace("_", " ")})
+        for name, values in numbers.items()
     }
-    return xr.Dataset(coords={"whisker": names, "group": ("whisker", groups), **about})
+    over = ("whisker", "task")
+    out = xr.Dataset(
+        {"status": (over, status), "seconds": (over, seconds), "origin": (over, origin)},
+        {"whisker": names, "group": ("whisker", groups), **about, "task": tasks},
+        {"study": kept["name"], "origins": kept["origins"]},
+    )
+    for task, cells in found.items():
+        data = _results(cells).rename({name: f"{task}_{name}" for name in cells.layout.variables})
+        out = out.merge(data.rename(_differing(out, data, task)), combine_attrs="override")
+    return out
 
 
-def _known(data: xr.DataArray, rows: Mapping[str, Rows], done: xr.DataArray) -> xr.DataArray:
-    """Read an array without what was damaged, or begun by a run that was killed."""
-    read = data.copy(data=rows[str(data.name)].read())
-    nothing = np.array(-1 if data.dtype.kind == "i" else np.nan, dtype=data.dtype)
-    return read.where(done, nothing)
+def _results(cells: Cells) -> xr.Dataset:
+    """Results of one task, of all whiskers; words in place of flags."""
+    data: dict[str, Any] = {}
+    for name, (dims, _, kind, attributes) in cells.layout.variables.items():
+        values = cells.column("result", name, fill=-1 if kind == "<i1" else np.nan)
+        about = {key: one for key, one in attributes.items() if not key.startswith("flag_")}
+        if meanings := attributes.get("flag_meanings"):
+            words = [word.replace("_", " ") for word in meanings.split()]
+            values = np.array([*words, ""])[values]
+        data[name] = (("whisker", *dims), values, about)
+    coords = {name: (name, *one) for name, one in cells.layout.coordinates.items()}
+    return xr.Dataset(data, coords)
 
 
 def _differing(out: xr.Dataset, found: xr.Dataset, task: str) -> dict[str, str]:
@@ -99,41 +114,101 @@ def _differing(out: xr.Dataset, found: xr.Dataset, task: str) -> dict[str, str]:
     }
 
 
-def _group(path: Path) -> xr.Dataset:
-    data: xr.Dataset = xr.open_zarr(path, chunks=None, decode_cf=False)
-    data = data.drop_attrs(deep=False)
-    for each in data.variables.values():
-        each.attrs.pop("_FillValue", None)
-    return data
-
-
-def _worded(data: xr.Dataset) -> xr.Dataset:
-    """Put words in place of flags."""
-    for name, variable in data.data_vars.items():
-        meanings = variable.attrs.get("flag_meanings")
-        if meanings:
-            words = np.array([*(word.replace("_", " ") for word in meanings.split()), ""])
-            about = {k: v for k, v in variable.attrs.items() if not k.startswith("flag_")}
-            data[name] = (variable.dims, words[variable.values], about)
-    return data
-
-
 def failures(path: str | PathLike[str]) -> dict[str, str]:
-    """Read what went wrong.
+    """Read which cells failed, and why.
 
     Parameters
     ----------
     path : str or path
-        Of the store.
+        Store of the study.
 
     Returns
     -------
     dict
-        By task and number of the whisker, such as ``uniqueness-12``: the whisker's name and the
-        traceback.
+        Whisker's name and traceback by task and number of the whisker, such as ``uniqueness-12``;
+        of cells that have not been done since.
     """
-    found = {}
-    for file in sorted((Path(path) / FAILURES).glob("*.txt")):
-        with contextlib.suppress(FileNotFoundError):
-            found[file.stem] = file.read_text(encoding="utf-8")
-    return found
+    path = Path(path)
+    kept = described(path)
+    last = {(one["task"], one["index"]): one["failure"] for one in read_failures(path)}
+    done = {task: Cells.read(path, task, len(kept["whiskers"])) for task in kept["tasks"]}
+    return {
+        f"{task}-{index}": text
+        for (task, index), text in sorted(last.items())
+        if (cells := done.get(task)) is None or not cells.done[index]
+    }
+
+
+def sweep_summary(found: xr.Dataset) -> str:
+    """Summarise how far a study is, and what it found.
+
+    Parameters
+    ----------
+    found : Dataset
+        Results of `open_sweep`.
+
+    Returns
+    -------
+    str
+        Lines of text: which versions computed; by task, how many cells are done; by group of
+        whiskers and triplet, for how many it is unique, with the median and the largest critical
+        cone; and the medians of errors.
+    """
+    return "\n".join(_lines(found))
+
+
+def _lines(found: xr.Dataset) -> Iterator[str]:
+    yield f"study {found.attrs.get('study', '')!r}: {found.sizes['whisker']} whiskers"
+    for number, origin in enumerate(np.atleast_1d(found.attrs["origins"])):
+        yield f"  {int((found['origin'] == number).sum())} cells by {origin}"
+    for task in found["task"].values:
+        status = found["status"].sel(task=task).values
+        counts = [int((status == code).sum()) for code in (1, 2, 0)]
+        seconds = float(np.nansum(found["seconds"].sel(task=task).values))
+        spoilt = int((status == 3).sum())
+        again = f", {spoilt} damaged (`vibrissa sweep` does them again)" if spoilt else ""
+        yield "  {}: {} done, {} failed, {} to do{}; {:.0f} s of CPU".format(
+            task, *counts, again, seconds
+        )
+    groups = list(dict.fromkeys(map(str, found["group"].values)))
+    for task in map(str, found["task"].values):
+        for group in groups:
+            rows = found.isel(whisker=found["group"].values == group)
+            yield from _verdicts(rows, task, group)
+            yield from _errors(rows, task, group)
+
+
+def _verdicts(rows: xr.Dataset, task: str, group: str) -> Iterator[str]:
+    name = f"{task}_verdict"
+    if name not in rows or not (rows[name] != "").any():
+        return
+    yield f"{task}, {group}: unique | off a surface | not; critical cone: median, largest"
+    verdict, cone = rows[name], rows[f"{task}_critical_cone"]
+    _, first, second = verdict.dims
+    for a in rows[first].values:
+        for b in rows[second].values:
+            at = {first: a, second: b}
+            words = verdict.sel(at).values
+            counts = [
+                int((words == one).sum())
+                for one in ("unique", "unique off a surface", "not unique")
+            ]
+            degrees = np.degrees(cone.sel(at).values[words != ""])
+            if degrees.size:
+                label = str(a) if rows.sizes[second] == 1 else f"{a}, {b}"
+                middle, high = np.nanmedian(degrees), np.nanmax(degrees)
+                tally = "{:4d} | {:4d} | {:4d}".format(*counts)
+                yield f"  {label:10s} {tally};  {middle:5.2f}°, {high:5.2f}°"
+
+
+def _errors(rows: xr.Dataset, task: str, group: str) -> Iterator[str]:
+    name = f"{task}_median_error"
+    if name not in rows or not np.isfinite(rows[name].values).any():
+        return
+    yield f"{task}, {group}: error of the contact point, mm: median of whiskers, largest"
+    error = rows[name]
+    dim = error.dims[1]
+    for label in rows[dim].values:
+        values = error.sel({dim: label}).values * _MM
+        if np.isfinite(values).any():
+            yield f"  {label!s:10s} {np.nanmedian(values):.3g}, {np.nanmax(values):.3g}"

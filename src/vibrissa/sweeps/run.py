@@ -1,26 +1,25 @@
-"""Doing the cells of a study, on this machine or on a cluster.
+"""A run of a study, on this machine or on a cluster.
 
-One process, the one that calls, writes; others only compute. So results do not hang on how many
+One process, the one that calls, writes; others only compute. So results do not depend on how many
 there are, nor on which of them did what. At any time only as many cells are under way as keep the
 workers busy, and nothing is kept of those that are written: memory does not grow with the study.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Iterable
 from contextlib import closing
 from dataclasses import dataclass
 from os import PathLike
-from typing import Any
 
 import numpy as np
 
-from vibrissa.sweeps.checksums import DONE, FAILED
-from vibrissa.sweeps.store import DAMAGED, Store
+from vibrissa.sweeps.executors import Answers, answers_by_dask, answers_by_processes
+from vibrissa.sweeps.results import open_sweep
+from vibrissa.sweeps.store import DAMAGED, DONE, FAILED, RESULTS, Store
 from vibrissa.sweeps.study import Cell, Study, answer
 
 Progress = Callable[[int, int], None]
-Answers = Generator[tuple[Cell, dict[str, Any]], None, None]
 
 
 @dataclass(frozen=True)
@@ -30,13 +29,15 @@ class Outcome:
     Parameters
     ----------
     done, failed, skipped : int
-        Cells done now, those of them that failed, and those that were there before.
+        Numbers of cells done now, of those of them that failed, and of those that were there
+        before.
     failed_before : int
-        Of those that were there before, the ones that had failed.
+        Number of cells that were there before and had failed.
     damaged : int
-        Cells that were there before, but not as they had been written; they were done again.
+        Number of cells that were there before, but not as they had been written; they were done
+        again.
     faults : tuple of str
-        What of the store was so damaged that it was made anew.
+        Parts of the store that were damaged and made anew.
     """
 
     done: int
@@ -57,31 +58,31 @@ def run_sweep(
     any_version: bool = False,
     progress: Progress | None = None,
 ) -> Outcome:
-    """Do what is not done yet of a study, and again what was damaged since.
+    """Do the cells of a study that are not done yet, and those that were damaged since.
 
     Parameters
     ----------
     study : Study
-        What to do.
+        The study.
     path : str or path
-        Of the store.
+        Store for its results; it also gets all of them as a Zarr group ``results`` at the end.
     workers : int
-        Processes on this machine; 0 does everything in this one. A script that asks for any calls
-        this under ``if __name__ == "__main__"``.
+        Number of processes on this machine; 0 does everything in this one. A script that asks
+        for any calls this under ``if __name__ == "__main__"``.
     scheduler : str, optional
         Address of a Dask scheduler, or "local" for a Dask cluster with ``workers`` processes on
         this machine (extra ``cluster``).
     again : bool
         Whether cells that failed before are tried again.
     any_version : bool
-        Whether a store that another version of vibrissa began is gone on with.
+        Whether a store that another version of vibrissa began is continued.
     progress : callable, optional
-        Called as ``progress(done, total)``, cells that were there before included.
+        Function called as ``progress(done, total)``, cells that were there before included.
 
     Returns
     -------
     Outcome
-        How many cells.
+        Numbers of cells.
 
     Raises
     ------
@@ -101,13 +102,15 @@ def run_sweep(
         todo = (cell for cell in study.cells() if not skip[cell.index, columns[cell.task]])
         skipped, done, failed = int(skip.sum()), 0, 0
         before = 0 if again else int((status == FAILED).sum())
-        tell = progress or _silent
-        tell(skipped, study.size)
+        report = progress or _silent
+        report(skipped, study.size)
         with closing(_answers(todo, workers, scheduler)) as answers:
             for cell, found in answers:
                 failed += not store.write(cell, found)
                 done += 1
-                tell(skipped + done, study.size)
+                report(skipped + done, study.size)
+        if done or not (store.path / RESULTS).exists():
+            store.publish(open_sweep(path))
     return Outcome(
         done, failed, skipped, before, int((status == DAMAGED).sum()), tuple(store.faults)
     )
@@ -119,11 +122,7 @@ def _silent(done: int, total: int) -> None:
 
 def _answers(cells: Iterable[Cell], workers: int, scheduler: str | None) -> Answers:
     if scheduler is not None:
-        from vibrissa.sweeps.cluster import answers_by_dask
-
         return answers_by_dask(cells, scheduler, workers)
     if workers:
-        from vibrissa.sweeps.workers import answers_by_processes
-
         return answers_by_processes(cells, workers)
     return ((cell, answer(cell)) for cell in cells)

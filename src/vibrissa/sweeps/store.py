@@ -1,39 +1,44 @@
-"""Where a study's results are kept: Zarr, in which each cell's numbers have their place.
+"""Where a study's results are kept: one record a cell, appended to the file of its task.
 
-    /whiskers   what each whisker is
-    /cells      per whisker and task: status, seconds of CPU, which code found it, the hash of what
-                was asked, and a checksum of all that is kept of it
-    /TASK       the task's result for every whisker
+    .study.json      what the study is, and which codes computed
+    TASK.json        what a result of the task looks like: variables, dimensions, coordinates
+    TASK.cells       records of the cells that are done, all of one size
+    failures.jsonl   a line for each cell that failed
+    results/         what :func:`~vibrissa.sweeps.open_sweep` gives, as Zarr, after each run
 
-A cell's numbers are written once, in place (`vibrissa.sweeps.rows`), and its status, one byte,
-after everything else: a cell that is done is whole, whenever the run was killed, and of others
-nothing counts. Groups and files are made aside and renamed. What was damaged since is found by
-checksums (`vibrissa.sweeps.checksums`) when the store is opened, and done again.
+A record or line is appended whole and carries a CRC-32 of itself. The part of one that a killed run
+left at the end of a file is ignored, and cut off by the next run; one that was damaged since is
+found by its checksum, and its cell is done again. Descriptions are written aside and renamed.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
+import hashlib
 import json
+import re
 import shutil
-from collections.abc import Callable
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import version
 from os import PathLike
 from pathlib import Path
 from typing import IO, Any
+from zlib import crc32
 
 import numpy as np
 import xarray as xr
-import zarr
 from numpy.typing import NDArray
 
-from vibrissa.sweeps.checksums import DONE, FAILED, TOLD, checksum, damaged
-from vibrissa.sweeps.found import Found, lay_out, seal
-from vibrissa.sweeps.lock import hold
-from vibrissa.sweeps.origin import origin, own
-from vibrissa.sweeps.rows import make_rows
-from vibrissa.sweeps.study import TAKEN, Cell, Study
+from vibrissa._version import __version__
+from vibrissa.sweeps.study import Cell, Study
 
-NOT_ASKED, DAMAGED = -1, 3
+NOT_ASKED, TO_DO, DONE, FAILED, DAMAGED = -1, 0, 1, 2, 3
+"""Statuses of cells."""
+
 DESCRIBED = {
     "length": "m",
     "base_radius": "m",
@@ -42,28 +47,162 @@ DESCRIBED = {
     "youngs_modulus": "Pa",
     "turn": "rad",
 }
-"""What is told of every whisker, and its unit."""
+"""Numbers that describe every whisker, and their units."""
 
-FAILURES = ".failures"
-_STUDY, _LOCK, _ALL = ".study.json", ".sweep.lock", ".zmetadata"
-_LAYOUT, _UNCHECKED = 3, 2
-_HASH, _SUM = 16, "checksum"
-_CELLS: dict[str, tuple[str, Any]] = {
-    "status": ("int8", 0),
-    "seconds": ("float64", np.nan),
-    "origin": ("int16", -1),
-    "identity": (f"S{_HASH}", b""),
-    "checksum": ("uint32", 0),
-}
-"""What is told of every cell: type, and what means that nothing is known."""
+_STUDY, _LOCK, _FAILURES, RESULTS = ".study.json", ".sweep.lock", "failures.jsonl", "results"
+_LAYOUT = 4
+_SUM = "checksum"
+_LIBRARIES = ("numpy", "scipy", "numba")
+# Modules that compute a cell; results depend on them and on the packages that they import.
+_COMPUTING = ("population", "study", "tasks")
+_SOURCES = {".csv", ".py", ".toml"}
+_IMPORTED = re.compile(r"(?:from|import) vibrissa\.(\w+)")
 
 
 class Busy(ValueError):
     """Another run writes to the store."""
 
 
-class _Damaged(Exception):
-    """A group of the store cannot be read."""
+@cache
+def origin() -> str:
+    """Version and sources that this process computes with, and versions of libraries."""
+    digest = hashlib.sha256()
+    for source in computing_sources():
+        digest.update(source.read_bytes())
+    libraries = ", ".join(f"{name} {version(name)}" for name in _LIBRARIES)
+    return f"vibrissa {__version__} (sources {digest.hexdigest()[:12]}), {libraries}"
+
+
+def computing_sources() -> list[Path]:
+    """Sources that results depend on: of a cell's modules, and all packages that these import."""
+    package = Path(__file__).parents[1]
+    sources = {package / "sweeps" / f"{name}.py" for name in _COMPUTING}
+    left = set(sources)
+    while left:
+        for name in {*_IMPORTED.findall(left.pop().read_text(encoding="utf-8"))} - {"sweeps"}:
+            files = {*package.glob(f"{name}.*"), *(package / name).rglob("*")}
+            more = {file for file in files if file.suffix in _SOURCES}
+            left |= more - sources
+            sources |= more
+    return sorted(sources)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What a result of a task looks like: (dims, shape, dtype, attributes) of each variable."""
+
+    variables: Mapping[str, tuple[list[str], list[int], str, dict[str, Any]]]
+    coordinates: Mapping[str, tuple[list[Any], dict[str, Any]]]
+
+    @classmethod
+    def of(cls, result: xr.Dataset) -> Layout:
+        """Layout of a result; words are numbers of flags."""
+        return cls(
+            {
+                str(name): (
+                    list(map(str, one.dims)),
+                    list(one.shape),
+                    "<i1" if one.dtype.kind in "ib" else "<f8",
+                    _plain(one.attrs),
+                )
+                for name, one in result.data_vars.items()
+            },
+            {
+                str(name): (one.values.tolist(), _plain(one.attrs))
+                for name, one in result.coords.items()
+            },
+        )
+
+    @classmethod
+    def read(cls, folder: Path, task: str) -> Layout | None:
+        """Read the layout of a task, if there is one."""
+        path = folder / f"{task}.json"
+        if not path.exists():
+            return None
+        kept = _read_json(path)
+        if kept is None:
+            raise ValueError(
+                f"{path} is damaged: `vibrissa sweep` with the same study does its task again"
+            )
+        return cls(kept["variables"], kept["coordinates"])
+
+    @property
+    def record(self) -> np.dtype[np.void]:
+        """Type of a cell's record."""
+        values = [
+            (name, kind, tuple(shape)) for name, (_, shape, kind, _) in self.variables.items()
+        ]
+        head = [("index", "<i4"), ("origin", "<i2"), ("seconds", "<f8"), ("identity", "S16")]
+        whisker = [(name, "<f8") for name in DESCRIBED]
+        return np.dtype([(_SUM, "<u4"), *head, ("whisker", whisker), ("result", values)])
+
+    def misfit(self, result: xr.Dataset) -> str:
+        """Why a result cannot be kept together with those of other whiskers; empty if it can."""
+        names = {*map(str, result.variables)}
+        for name in sorted(names ^ {*self.variables, *self.coordinates}):
+            return f"{name} is a result of this whisker or of others, and not of both\n"
+        for name, (values, _) in self.coordinates.items():
+            own = result.variables[name].values
+            if not _same(np.asarray(values), own):
+                return f"{name} is {own}, that of other whiskers {values}\n"
+        for name, (_, shape, _, _) in self.variables.items():
+            own_shape = result.variables[name].shape
+            if list(own_shape) != shape:
+                return f"{name} has shape {own_shape}, that of other whiskers has {tuple(shape)}\n"
+        return ""
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Records of one task: those of whiskers that are done, and which are damaged."""
+
+    layout: Layout
+    records: NDArray[np.void]
+    rows: NDArray[np.int64]
+    damaged: NDArray[np.bool_]
+
+    @classmethod
+    def read(cls, folder: Path, task: str, count: int) -> Cells | None:
+        """Read the records of a task, if there are any, of so many whiskers."""
+        if (layout := Layout.read(folder, task)) is None:
+            return None
+        content = b""
+        with contextlib.suppress(FileNotFoundError):
+            content = _cells(folder, task).read_bytes()
+        size = layout.record.itemsize
+        records = np.frombuffer(content, layout.record, len(content) // size)
+        whole = np.fromiter(
+            (
+                crc32(content[start + 4 : start + size])
+                for start in range(0, len(records) * size, size)
+            ),
+            np.uint32,
+            len(records),
+        )
+        index = records["index"]
+        known = (index >= 0) & (index < count)
+        good = known & (whole == records[_SUM])
+        rows = np.full(count, -1)
+        rows[index[good]] = np.flatnonzero(good)
+        damaged = np.zeros(count, dtype=bool)
+        damaged[index[known & ~good]] = True
+        return cls(layout, records, rows, damaged & (rows < 0))
+
+    @property
+    def done(self) -> NDArray[np.bool_]:
+        """Which whiskers are done."""
+        return self.rows >= 0
+
+    def column(self, *names: str, fill: Any) -> NDArray[Any]:
+        """A field of every whisker's record; ``fill`` where there is none."""
+        values: NDArray[Any] = self.records
+        for name in names:
+            values = values[name]
+        out = np.full(
+            (len(self.rows), *values.shape[1:]), fill, dtype=values.dtype.newbyteorder("=")
+        )
+        out[self.done] = values[self.rows[self.done]]
+        return out
 
 
 class Store:
@@ -72,23 +211,23 @@ class Store:
     Parameters
     ----------
     path : str or path
-        A folder, made if need be.
+        Folder, made if need be.
     study : Study
-        Whose results.
+        The study whose results are kept.
     any_version : bool
-        Whether it is gone on with though another version of vibrissa began it.
+        Whether a store that another version of vibrissa began is continued.
 
     Attributes
     ----------
     faults : list of str
-        What of the store was so damaged that it was made anew.
+        Parts of the store that were damaged and made anew.
 
     Raises
     ------
     Busy
         If another run has it open.
     ValueError
-        If it holds the results of another study or of another version, or is no store.
+        If it holds the results of another study or of another version, or is not a store.
     """
 
     def __init__(
@@ -96,21 +235,20 @@ class Store:
     ) -> None:
         self.path = Path(path)
         self.study = study
+        self.faults: list[str] = []
         self._any_version = any_version
         self._lock: IO[str] | None = None
-        self._found: dict[str, Found] = {}
-        self.faults: list[str] = []
-        self._columns = {name: k for k, name in enumerate(study.tasks)}
+        self._layouts: dict[str, Layout] = {}
 
     def __enter__(self) -> Store:
         """Take the store, and make it if it is not there."""
         if self.path.exists() and not self.path.is_dir():
             raise ValueError(f"{self.path} is a file; the folder of a store is needed")
-        if self.path.exists() and any(self.path.iterdir()) and not self._known(_LOCK):
-            raise ValueError(f"{self.path} is a folder with other things in it, and no store")
+        if self.path.exists() and any(self.path.iterdir()) and not (self.path / _LOCK).exists():
+            raise ValueError(f"{self.path} is a folder with other things in it, and not a store")
         self.path.mkdir(parents=True, exist_ok=True)
         try:
-            self._lock = hold(self.path / _LOCK)
+            self._lock = _hold(self.path / _LOCK)
         except BlockingIOError:
             raise Busy(f"another run is writing to {self.path}; wait until it has ended") from None
         try:
@@ -126,66 +264,40 @@ class Store:
             self._lock.close()
             self._lock = None
 
-    def _known(self, name: str) -> bool:
-        return (self.path / name).exists()
-
     def _begin(self) -> None:
-        for left in self.path.glob(".new-*"):
-            shutil.rmtree(left)
-        if not self._known(_STUDY):
-            for begun in TAKEN:  # perhaps for another study
-                shutil.rmtree(self.path / begun, ignore_errors=True)
-            self._make("whiskers", self._lay_out_whiskers)
-            self._make("cells", self._lay_out_cells)
-            self._note(_STUDY, {**_described(self.study), "origins": []})
-        self._origin = self._admitted(noted(self.path))
-        self._note(".zgroup", {"zarr_format": 2})
-        self._note(".zattrs", {"kind": "vibrissa sweep", "study": self.study.name})
-        self._whiskers = self._opened("whiskers", self._lay_out_whiskers)
-        self._cells = self._opened("cells", self._lay_out_cells).rows
+        if not (self.path / _STUDY).exists():
+            for left in (*self.path.glob("*.json"), *self.path.glob("*.cells")):
+                left.unlink()  # perhaps of another study
+            (self.path / _FAILURES).unlink(missing_ok=True)
+            _write_json(self.path / _STUDY, {**_described(self.study), "origins": []})
+        self._origin = self._admitted(described(self.path))
         for task in self.study.tasks:
-            if self._known(task):
-                with contextlib.suppress(_Damaged):
-                    self._found[task] = self._checked(task)
-        self._consolidate()
+            records = _cells(self.path, task)
+            try:
+                layout = Layout.read(self.path, task)
+            except ValueError as fault:
+                self._remove(task, str(fault))
+                continue
+            if layout is None and records.exists():
+                self._remove(task, f"{self.path / task}.json is gone: its task is done again")
+            elif layout is not None:
+                self._layouts[task] = layout
+                if records.exists():
+                    _cut(records, records.stat().st_size % layout.record.itemsize)
+        lines = self.path / _FAILURES
+        if lines.exists():
+            content = lines.read_bytes()
+            _cut(lines, len(content) - content.rfind(b"\n") - 1)
 
-    def _opened(self, name: str, fill: Callable[[zarr.Group], None]) -> Found:
-        """Open a group, or make it anew."""
-        with contextlib.suppress(_Damaged):
-            return self._checked(name)
-        self._make(name, fill)
-        return Found(self.path / name)
-
-    def _checked(self, name: str) -> Found:
-        """Open a group; one that cannot be read is removed, and what was in it is done again."""
-        try:
-            return Found(self.path / name)
-        except ValueError as fault:
-            self.faults.append(str(fault))
-            shutil.rmtree(self.path / name, ignore_errors=True)
-            raise _Damaged from fault
-
-    def _note(self, name: str, content: dict[str, Any]) -> None:
-        if name == _STUDY:
-            content = {**content, _SUM: _sum(content)}
-        part = self.path / f"{name}.part"
-        part.write_text(json.dumps(content), encoding="utf-8")
-        part.replace(self.path / name)
-
-    def _consolidate(self) -> None:
-        """Tell Zarr of all groups in one file, so that it looks at nothing else that is here."""
-        metadata = {}
-        for path in sorted(self.path.glob(f"*/{_ALL}")):
-            known = json.loads(path.read_text(encoding="utf-8"))["metadata"]
-            metadata.update({f"{path.parent.name}/{key}": known[key] for key in known})
-        for name in (".zgroup", ".zattrs"):
-            metadata[name] = json.loads((self.path / name).read_text(encoding="utf-8"))
-        self._note(_ALL, {"zarr_consolidated_format": 1, "metadata": metadata})
+    def _remove(self, task: str, fault: str) -> None:
+        self.faults.append(fault)
+        _cells(self.path, task).unlink(missing_ok=True)
+        (self.path / f"{task}.json").unlink(missing_ok=True)
 
     def _admitted(self, kept: dict[str, Any]) -> int:
-        """Check that this study, done by this code, goes with what is there; number of the code."""
-        said = _described(self.study)
-        differing = [name for name in said if kept.get(name) != said[name]]
+        """Check that this study, done by this code, belongs to the store; number of the code."""
+        own = _described(self.study)
+        differing = [name for name in own if kept.get(name) != own[name]]
         if differing:
             raise ValueError(
                 f"{self.path} holds the results of a study with other {' and '.join(differing)}: "
@@ -194,51 +306,19 @@ class Store:
         origins: list[str] = kept["origins"]
         mine = origin()
         if mine not in origins:
-            if origins and own(mine) not in map(own, origins) and not self._any_version:
+            this, known = _version(mine), [*map(_version, origins)]
+            if origins and this not in known and not self._any_version:
                 raise ValueError(
-                    f"the results in {self.path} are of {own(origins[-1])}, this is {own(mine)}, "
-                    "which may find others: give another store, or allow any version "
-                    "(--any-version) and the store tells which cell is of which"
+                    f"the results in {self.path} are of {known[-1]}, this is {this}, which may "
+                    "find others: give another store, or allow any version (--any-version) and "
+                    "the store keeps which cell is of which"
                 )
             origins.append(mine)
-            self._note(_STUDY, kept)
+            _write_json(self.path / _STUDY, kept)
         return origins.index(mine)
 
-    def _make(self, name: str, fill: Callable[[zarr.Group], None]) -> None:
-        """Make a group aside, and put it in place whole."""
-        if self._known(name):
-            return
-        aside = self.path / f".new-{name}"
-        group = zarr.open_group(aside, mode="w", zarr_format=2)
-        fill(group)
-        seal(group)
-        zarr.consolidate_metadata(aside, zarr_format=2)
-        aside.rename(self.path / name)
-
-    def _lay_out_whiskers(self, group: zarr.Group) -> None:
-        specimens = self.study.specimens
-        for name, words in (
-            ("whisker", [one.name for one in specimens]),
-            ("group", [one.group for one in specimens]),
-        ):
-            dims = {"_ARRAY_DIMENSIONS": ["whisker"]}
-            group.create_array(name, data=np.array(words), chunks=(len(words),), attributes=dims)
-        for name, unit in DESCRIBED.items():
-            about = {"units": unit, "long_name": name.replace("_", " ")}
-            make_rows(group, name, (len(specimens),), "float64", np.nan, ["whisker"], about)
-
-    def _lay_out_cells(self, group: zarr.Group) -> None:
-        study = self.study
-        tasks = np.array(list(study.tasks))
-        about = {"_ARRAY_DIMENSIONS": ["task"]}
-        group.create_array("task", data=tasks, chunks=tasks.shape, attributes=about)
-        asked = [[study.asks(task, one) for task in study.tasks] for one in study.specimens]
-        for name, (kind, fill) in _CELLS.items():
-            make_rows(group, name, np.shape(asked), kind, fill, ["whisker", "task"])
-        group["status"][...] = np.where(asked, 0, NOT_ASKED)
-
     def statuses(self) -> NDArray[np.int8]:
-        """Say what is there.
+        """Read what is there.
 
         Returns
         -------
@@ -246,31 +326,37 @@ class Store:
             0 where nothing is, 1 where a cell is done, 2 where it failed, 3 where what is there is
             not what was written.
         """
-        told = {name: rows.read() for name, rows in self._cells.items()}
-        identity = np.zeros((len(self.study.specimens), len(self._columns)), dtype=f"S{_HASH}")
+        columns = {name: k for k, name in enumerate(self.study.tasks)}
+        count = len(self.study.specimens)
+        asked = np.zeros((count, len(columns)), dtype="S16")
         for cell in self.study.cells():
-            identity[cell.index, self._columns[cell.task]] = cell.identity.encode()
-        known = (told["identity"] == identity) & (identity != b"")
-        found = [self._found.get(task) for task in self._columns]
-        results = [[] if one is None else one.ordered for one in found]
-        bad = damaged(told, self._whiskers.ordered, results)
-        return np.where(bad, np.int8(DAMAGED), np.where(known, told["status"], np.int8(0)))
+            asked[cell.index, columns[cell.task]] = cell.identity.encode()
+        out = np.zeros(asked.shape, dtype=np.int8)
+        for task, k in columns.items():
+            if (cells := Cells.read(self.path, task, count)) is not None:
+                same = cells.column("identity", fill=b"") == asked[:, k]
+                out[:, k] = np.where(cells.done & same, DONE, np.where(cells.damaged, DAMAGED, 0))
+        for failure in read_failures(self.path):
+            at = failure["index"], columns.get(failure["task"], -1)
+            if failure["identity"].encode() == asked[at] and out[at] != DONE:
+                out[at] = FAILED
+        return out
 
-    def write(self, cell: Cell, answer: dict[str, Any]) -> bool:
-        """Keep what became of a cell.
+    def write(self, cell: Cell, answer: Mapping[str, Any]) -> bool:
+        """Keep the outcome of a cell.
 
         Parameters
         ----------
         cell : Cell
-            What was asked.
-        answer : dict
-            Of `vibrissa.sweeps.study.answer`.
+            The cell.
+        answer : mapping
+            Its outcome, of `vibrissa.sweeps.study.answer`.
 
         Returns
         -------
         bool
-            Whether it is done; false if it failed, also where its result does not go with those
-            of other whiskers.
+            Whether it is done; false if it failed, also where its result cannot be kept together
+            with those of other whiskers.
 
         Raises
         ------
@@ -278,93 +364,195 @@ class Store:
             If it cannot be written; it is then as if it had not been done, and what was written
             before is whole.
         """
-        try:
-            failure, numbers = answer.get("failure") or "", b""
-            if not failure:
-                failure, numbers = self._write_result(cell, answer)
-            said = self.path / FAILURES / f"{cell.task}-{cell.index}.txt"
-            if failure:
-                said.parent.mkdir(exist_ok=True)
-                part = said.with_suffix(".part")
-                part.write_text(f"{cell.specimen.name}\n{failure}", encoding="utf-8")
-                part.replace(said)
-            at = cell.index, self._columns[cell.task]
-            told = {
-                "seconds": answer["seconds"],
+        failure = answer.get("failure") or self._kept(cell, answer)
+        if failure:
+            line = {
+                "task": cell.task,
+                "index": cell.index,
+                "identity": cell.identity,
                 "origin": self._origin,
-                "identity": cell.identity.encode(),
-                "status": FAILED if failure else DONE,
+                "seconds": answer["seconds"],
+                "failure": f"{cell.specimen.name}\n{failure}",
             }
-            own = b"".join(self._cells[name].encoded(told[name]) for name in TOLD)
-            told = {"checksum": checksum(own, numbers), **told}
-            # The status last: one byte, of which no half can be written. With it all counts.
-            for name, value in told.items():
-                self._cells[name].write(value, *at)
-            if not failure:
-                said.unlink(missing_ok=True)
-        except OSError as fault:
-            raise OSError(
-                fault.errno,
-                f"{fault.strerror or fault}: nothing more can be written to {self.path}. What is "
-                "there is whole; the same call goes on from it",
-            ) from fault
+            text = json.dumps(line).encode()
+            _append(self.path / _FAILURES, b"%08x %s\n" % (crc32(text), text))
         return not failure
 
-    def _write_result(self, cell: Cell, answer: dict[str, Any]) -> tuple[str, bytes]:
-        """Write a result: its numbers as bytes, or why it cannot be kept beside others."""
+    def _kept(self, cell: Cell, answer: Mapping[str, Any]) -> str:
+        """Append a result; why it cannot be kept together with others, if so."""
         result: xr.Dataset = answer["result"]
-        if cell.task not in self._found:
-            count = len(self.study.specimens)
-            self._make(cell.task, lambda group: lay_out(group, result, count))
-            self._consolidate()
-            self._found[cell.task] = Found(self.path / cell.task)
-        found = self._found[cell.task]
-        if misfit := found.misfit(result):
-            return misfit, b""
-        numbers = found.write(result, cell.index)
-        described = b""
-        for name, rows in sorted(self._whiskers.rows.items()):
-            described += rows.encoded(answer["whisker"][name])
-            rows.write(answer["whisker"][name], cell.index)
-        return "", described + numbers
+        layout = self._layouts.get(cell.task)
+        if layout is None:
+            layout = Layout.of(result)
+            content = {"variables": layout.variables, "coordinates": layout.coordinates}
+            _write_json(self.path / f"{cell.task}.json", content)
+            self._layouts[cell.task] = layout
+        elif misfit := layout.misfit(result):
+            return misfit
+        record = np.zeros(1, layout.record)
+        head = (cell.index, self._origin, answer["seconds"], cell.identity.encode())
+        whisker = tuple(answer["whisker"][name] for name in DESCRIBED)
+        values = tuple(result.variables[name].values for name in layout.variables)
+        record[0] = (0, *head, whisker, values)
+        record[_SUM] = crc32(record.tobytes()[4:])
+        _append(_cells(self.path, cell.task), record.tobytes())
+        return ""
+
+    def publish(self, results: xr.Dataset) -> None:
+        """Write all results as Zarr.
+
+        Parameters
+        ----------
+        results : Dataset
+            Results of `open_sweep`.
+        """
+        aside = self.path / f".new-{RESULTS}"
+        with _naming(aside):
+            shutil.rmtree(aside, ignore_errors=True)
+            results.to_zarr(aside, mode="w", zarr_format=2, consolidated=True)
+            shutil.rmtree(self.path / RESULTS, ignore_errors=True)
+            aside.rename(self.path / RESULTS)
 
 
-def noted(path: Path) -> dict[str, Any]:
-    """Read what a store says of itself."""
-    if not (path / _STUDY).exists():
-        raise ValueError(f"{path} is no store of a sweep")
-    try:
-        kept = json.loads((path / _STUDY).read_bytes())
-    except ValueError:
-        kept = None
-    if isinstance(kept, dict) and kept.get("layout") not in (_LAYOUT, _UNCHECKED):
+def described(path: Path) -> dict[str, Any]:
+    """Read what the study of a store is, and by which codes it was done."""
+    file = path / _STUDY
+    if not file.exists():
+        raise ValueError(f"{path} is not a store of a sweep")
+    kept: Any = None
+    with contextlib.suppress(ValueError):
+        kept = json.loads(file.read_bytes())
+    if isinstance(kept, dict) and kept.get("layout") != _LAYOUT:
         raise ValueError(
-            f"{path} is laid out as another version of vibrissa does: open it with that one, or "
-            "give another store"
+            f"{path} is laid out as by another version of vibrissa: open it with that one (or its "
+            f"tables with xarray.open_zarr, {path}/TASK), or do the study again in another store"
         )
-    if not isinstance(kept, dict) or (kept["layout"] == _LAYOUT and kept.get(_SUM) != _sum(kept)):
+    if not isinstance(kept, dict) or kept.pop(_SUM, None) != _sum(kept):
         raise ValueError(
-            f"{path / _STUDY} is damaged, which says what the store holds: put back a copy of it, "
+            f"{file} is damaged, which describes what the store holds: put back a copy of it, "
             "or remove it, and the study is begun anew"
         )
     return kept
 
 
-def _sum(kept: dict[str, Any]) -> int:
-    """Checksum of what a store says of itself."""
-    own = {name: value for name, value in kept.items() if name != _SUM}
-    return checksum(json.dumps(own, sort_keys=True).encode())
+def read_failures(path: Path) -> Iterator[dict[str, Any]]:
+    """Read the cells that failed; a damaged line counts as a cell that is to be done."""
+    with contextlib.suppress(FileNotFoundError):
+        for line in (path / _FAILURES).read_bytes().splitlines():
+            total, _, text = line.partition(b" ")
+            if total == b"%08x" % crc32(text):
+                yield json.loads(text)
 
 
 def _described(study: Study) -> dict[str, Any]:
     """What two studies must have in common to share a store."""
-    return {
+    content = {
         "layout": _LAYOUT,
         "name": study.name,
         "seed": study.seed,
         "whiskers": [[one.name, one.group, one.identity] for one in study.specimens],
-        "tasks": json.loads(
-            json.dumps({name: [kind, dict(how)] for name, (kind, how) in study.tasks.items()})
-        ),
+        "tasks": {name: [kind, dict(how)] for name, (kind, how) in study.tasks.items()},
         "groups": {name: list(some) for name, some in study.groups.items()},
     }
+    as_read: dict[str, Any] = json.loads(json.dumps(content))
+    return as_read
+
+
+def _version(name: str) -> str:
+    """The part of an origin that is vibrissa's."""
+    return name.partition(",")[0]
+
+
+def _cells(folder: Path, task: str) -> Path:
+    return folder / f"{task}.cells"
+
+
+def _sum(content: Mapping[str, Any]) -> int:
+    return crc32(json.dumps(content, sort_keys=True).encode())
+
+
+def _read_json(path: Path) -> dict[str, Any] | None:
+    """Content of a file of `_write_json`; None if it is damaged."""
+    with contextlib.suppress(ValueError):
+        kept = json.loads(path.read_bytes())
+        if isinstance(kept, dict) and kept.pop(_SUM, None) == _sum(kept):
+            return kept
+    return None
+
+
+def _write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a description with its checksum, aside, and put it in place whole."""
+    part = path.with_name(f"{path.name}.part")
+    with _naming(path):
+        part.write_text(json.dumps({**content, _SUM: _sum(content)}), encoding="utf-8")
+        part.replace(path)
+
+
+def _append(path: Path, content: bytes) -> None:
+    """Append to a file; what cannot be written whole is cut off again."""
+    with _naming(path), path.open("ab", buffering=0) as file:
+        before, left = file.tell(), memoryview(content)
+        try:
+            while left:
+                left = left[file.write(left) :]
+        except OSError:
+            with contextlib.suppress(OSError):
+                file.truncate(before)
+            raise
+
+
+def _cut(path: Path, size: int) -> None:
+    """Cut off so many bytes that a run that was killed left at the end of a file."""
+    if size:
+        with path.open("r+b") as file:
+            file.truncate(path.stat().st_size - size)
+
+
+@contextlib.contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """State which file cannot be written, and that nothing is lost."""
+    try:
+        yield
+    except OSError as fault:
+        raise OSError(
+            fault.errno,
+            f"{fault.strerror or fault}: {path} cannot be written. What is there is whole; the "
+            "same call goes on from it",
+        ) from fault
+
+
+def _hold(path: Path) -> IO[str]:
+    """Take a lock that the system releases when its holder ends, however it ends."""
+    file = path.open("a", encoding="utf-8")
+    try:
+        if sys.platform == "win32":
+            import msvcrt
+
+            file.seek(0)
+            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+        else:
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as fault:
+        file.close()
+        if fault.errno in (errno.EAGAIN, errno.EACCES):
+            raise BlockingIOError(fault.errno, f"{path} is locked") from fault
+        raise
+    return file
+
+
+def _plain(attributes: Mapping[Any, Any]) -> dict[str, Any]:
+    return {
+        str(key): value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+        for key, value in attributes.items()
+    }
+
+
+def _same(first: NDArray[Any], second: NDArray[Any]) -> bool:
+    """Whether coordinates agree, but for what another machine's rounding may change."""
+    if first.shape != second.shape:
+        return False
+    if first.dtype.kind == "f":
+        return bool(np.allclose(first, second, rtol=1e-12, atol=0.0))
+    return bool(np.array_equal(first, second))

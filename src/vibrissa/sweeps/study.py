@@ -1,4 +1,4 @@
-"""A study as plain data: which whiskers, and what is asked of each."""
+"""A study as plain data: whiskers, and the tasks of each."""
 
 from __future__ import annotations
 
@@ -79,11 +79,9 @@ moment_noise = 0.02              # µN·m
 """
 
 _KEPT = (discretize, stable_set, point_solver, resting, seen, seeding_triplet)
-"""Functions that keep what they found of the last whiskers; a study does not come back to any."""
+"""Functions that cache results of the last whiskers; a study does not return to any."""
 _OF_WHISKER, _OF_CELL = 16, 4
-"""Numbers kept of each whisker, with its name, and of each cell."""
-TAKEN = ("cells", "whiskers")
-"""Names that no task can have: a store keeps other things under them."""
+"""Numbers stored for each whisker, with its name, and for each cell."""
 
 
 @dataclass(frozen=True)
@@ -95,17 +93,17 @@ class Cell:
     task : str
         Name of the task in the study.
     kind : str
-        Which one of `vibrissa.sweeps.tasks`.
+        Kind of task, such as "map".
     settings : mapping
-        Of the task.
+        Settings of the task.
     index : int
         Number of the whisker.
     specimen : Specimen
         The whisker.
     seed : int
-        The same for the same whisker in any study with the same seed.
+        Seed of the cell: the same for the same whisker in any study with the same seed.
     identity : str
-        Of what is asked of what, as a hash.
+        Hash of whisker, task, settings and seed.
     """
 
     task: str
@@ -124,15 +122,15 @@ class Study:
     Parameters
     ----------
     name : str
-        Its name.
+        Name of the study.
     seed : int
-        Of all that is random.
+        Seed of all that is random.
     specimens : tuple of Specimen
         The whiskers.
     tasks : mapping
         Kind and settings of each task by its name.
     groups : mapping
-        By the task's name, the groups of whiskers that it is asked of; by default of all.
+        Groups of whiskers that a task is asked of, by its name; by default all.
     """
 
     name: str
@@ -142,12 +140,12 @@ class Study:
     groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def asks(self, task: str, specimen: Specimen) -> bool:
-        """Tell whether a task is asked of a whisker.
+        """Decide whether a task is asked of a whisker.
 
         Parameters
         ----------
         task : str
-            Its name.
+            Name of the task.
         specimen : Specimen
             The whisker.
 
@@ -184,12 +182,12 @@ class Study:
         Parameters
         ----------
         task : str
-            Its name.
+            Name of the task.
 
         Returns
         -------
         int
-            How many.
+            Number of whiskers.
         """
         return sum(self.asks(task, specimen) for specimen in self.specimens)
 
@@ -200,7 +198,7 @@ class Study:
 
     @property
     def seconds(self) -> float:
-        """What it takes on one core, roughly, s."""
+        """Approximate time on one core, s."""
         return sum(
             TASKS[kind].seconds(settings) * self.count(task)
             for task, (kind, settings) in self.tasks.items()
@@ -208,7 +206,7 @@ class Study:
 
     @property
     def bytes(self) -> int:
-        """What its results take on disk, roughly: eight bytes a number."""
+        """Approximate size of its results on disk: eight bytes a number."""
         each = sum(TASKS[kind].numbers(settings) for kind, settings in self.tasks.values())
         return 8 * len(self.specimens) * (each + _OF_WHISKER + _OF_CELL * len(self.tasks))
 
@@ -219,9 +217,9 @@ def read_study(text: str, folder: Path) -> Study:
     Parameters
     ----------
     text : str
-        TOML, as `EXAMPLE`.
+        Study in TOML, as `EXAMPLE`.
     folder : Path
-        That file names are relative to.
+        Folder that file names are relative to.
 
     Returns
     -------
@@ -231,21 +229,21 @@ def read_study(text: str, folder: Path) -> Study:
     Raises
     ------
     ValueError
-        If it is no TOML, or says what is not known or out of range.
+        If it is not TOML, or has keys that are not known or values out of range.
     """
     try:
-        said = tomllib.loads(text)
+        content = tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError) as fault:
-        raise ValueError(f"this is no TOML: {fault}") from None
+        raise ValueError(f"this is not TOML: {fault}") from None
     known = {"name", "seed", "whiskers", "tasks"}
-    if unknown := sorted(set(said) - known):
+    if unknown := sorted(set(content) - known):
         raise ValueError(
             f"the study has {', '.join(unknown)}; known are {', '.join(sorted(known))}"
         )
-    seed = said.get("seed", 0)
+    seed = content.get("seed", 0)
     if not isinstance(seed, int) or isinstance(seed, bool) or seed < 0:
         raise ValueError(f"seed is {seed!r}; a whole number from 0 is needed")
-    tables = {name: said.get(name, []) for name in ("whiskers", "tasks")}
+    tables = {name: content.get(name, []) for name in ("whiskers", "tasks")}
     for name, table in tables.items():
         if not isinstance(table, list) or not table:
             raise ValueError(f"the study has no {name}: at least one [[{name}]] is needed")
@@ -258,10 +256,10 @@ def read_study(text: str, folder: Path) -> Study:
         asked = {key: value for key, value in table.items() if key != "groups"}
         kind, settings = settings_of(asked, where)
         name = str(table.get("name", kind))
-        if name in tasks or name in TAKEN or not name.replace("_", "").isalnum():
+        if name in tasks or not name.replace("_", "").isalnum():
             raise ValueError(
-                f"{where} is called {name!r}; letters and digits are needed, for each task "
-                f"another name (name = ...), and not {' or '.join(TAKEN)}"
+                f"{where} is called {name!r}; letters and digits are needed, and another name for "
+                "each task (name = ...)"
             )
         tasks[name] = (kind, settings)
         if "groups" in table:
@@ -274,7 +272,7 @@ def read_study(text: str, folder: Path) -> Study:
                 f"task {name} is asked of the groups {', '.join(unknown)}; there are "
                 f"{', '.join(sorted(known_groups))}"
             )
-    return Study(str(said.get("name", "study")), seed, specimens, tasks, groups)
+    return Study(str(content.get("name", "study")), seed, specimens, tasks, groups)
 
 
 def _groups(value: Any, where: str) -> tuple[str, ...]:

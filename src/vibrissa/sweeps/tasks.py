@@ -1,6 +1,6 @@
-"""What a study asks of every whisker: each task gives the same few numbers for any whisker.
+"""The tasks of a study: each gives the same few numbers for any whisker.
 
-A task is a function from a whisker's map, its settings and a seed to a dataset whose dimensions and
+A task is a function from a whisker, settings and a seed to a dataset whose dimensions and
 coordinates follow from the settings alone. Words are written as numbers of CF flags.
 """
 
@@ -52,17 +52,17 @@ class Task:
     numbers: Callable[[Settings], int]
 
 
-def settings_of(said: Mapping[str, Any], where: str) -> tuple[str, Settings]:
-    """Read what a study says of a task."""
-    kind = said.get("kind")
+def settings_of(stated: Mapping[str, Any], where: str) -> tuple[str, Settings]:
+    """Kind and settings of a task, checked."""
+    kind = stated.get("kind")
     if not isinstance(kind, str) or kind not in TASKS:
         raise ValueError(f"{where}: kind is {kind!r}; one of {', '.join(TASKS)} is needed")
     task = TASKS[kind]
-    given = {key: value for key, value in said.items() if key not in ("kind", "name")}
-    if unknown := sorted(set(given) - set(task.defaults)):
+    own = {key: value for key, value in stated.items() if key not in ("kind", "name")}
+    if unknown := sorted(set(own) - set(task.defaults)):
         allowed = ", ".join(task.defaults) or "nothing"
         raise ValueError(f"{where} sets {', '.join(unknown)}; of {kind} can be set: {allowed}")
-    settings = {**task.defaults, **given}
+    settings = {**task.defaults, **own}
     try:
         task.check(settings)
     except (TypeError, ValueError, AttributeError, OverflowError) as fault:
@@ -78,7 +78,7 @@ def _map_summary(whisker: Whisker, settings: Settings, seed: int) -> xr.Dataset:
     for name in names:
         for end, value in (("least", data[name].min()), ("largest", data[name].max())):
             out[f"{name}_{end}"] = ((), float(value), attributes(name))
-    # Its stations are the map's own; smooth between them is the logarithm of the force.
+    # The logarithm of the force is smooth between the stations of the map.
     least = np.log(np.nanmin(_fold_forces(data), axis=1))
     slip = np.exp(CubicSpline(data["station"].values, least)(_STATIONS))
     about = {"units": "N", "long_name": "least force at which the whisker slips off"}
@@ -156,7 +156,7 @@ def _estimation(whisker: Whisker, settings: Settings, seed: int) -> xr.Dataset:
 
 
 def _friction(whisker: Whisker, settings: Settings, seed: int) -> xr.Dataset:
-    """Errors where friction, fully mobilised along the whisker, is not looked for."""
+    """Errors where friction, fully mobilised along the whisker, is not allowed for."""
     contact_map = ContactMap.simulate(whisker, grid=False)
     s, (_, fy, fz) = _some_contacts(contact_map, int(settings["contacts"]), seed)
     across = np.hypot(fy, fz)

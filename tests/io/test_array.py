@@ -86,11 +86,11 @@ def test_a_table_with_rotations(tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("# none", "columns none"),
-        ("name,length_mm\n", "and 0 rows"),
+        ("# none", "is empty"),
+        ("name,length_mm\n", "no rows"),
         ("x_mm,y_mm\n1,2\n", "name, x_mm"),
         ("name,x_mm,y_mm,z_mm\nC2,1,2,3\n", "no column length_"),
-        (f"{HEADER}\nC2,6,-4,1,10,5,-90,30\n", "line 2 has 8 cells, not 9"),
+        (f"{HEADER}\nC2,6,-4,1,10,5,-90,30\n", "9 columns, but line 2 has 8 cells"),
         (f"{HEADER}\nC2,6,-4,1,ten,5,-90,30,0.02\n", "no number for azimuth"),
         (f"{HEADER}\nC2,6,-4,1,10,5,-90,3000,0.02\n", "line 2: .*length is 3 m"),
         (f"{HEADER}\nF2,6,-4,1,10,5,-90,30,0.02\n", "line 2: 'F2' is no whisker's name"),

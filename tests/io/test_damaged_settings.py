@@ -225,7 +225,7 @@ def test_cameras_that_do_not_fit_the_videos_are_refused(tmp_path):
         return str(result.exception)
 
     said = fault(orthogonal_views(size=(64, 64))[:1])
-    assert "cameras.toml tells of one camera, 'top'" in said
+    assert "cameras.toml holds one camera, 'top'" in said
     said = fault(orthogonal_views(size=(64, 48)))
     assert f"{videos[0]} is 64 × 64 pixels" in said
     assert "calibrates camera 'top' for 64 × 48" in said

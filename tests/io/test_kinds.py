@@ -81,7 +81,7 @@ def test_nothing_there(tmp_path):
 
 def test_info_of_tracks(tmp_path):
     said = info(anipose(tmp_path / "trial.csv"))
-    for part in ("table of Anipose", "frames 2, from 0 to 1 frame", "unit not told", "100.0 %"):
+    for part in ("table of Anipose", "frames 2, from 0 to 1 frame", "unit not stated", "100.0 %"):
         assert part in said
     image = np.ones((4, 2, 1, 3, 2))
     image[2:, 1] = np.nan
@@ -122,7 +122,7 @@ def test_info_of_other_files(tmp_path):
     with pytest.raises(ValueError, match=r"a.csv is of no kind that is known.*SLEAP"):
         info(path)
     path.write_text("name,age\nC2,3\n")
-    with pytest.raises(ValueError, match="no table that is known"):
+    with pytest.raises(ValueError, match="not a table that is known"):
         info(path)
 
 

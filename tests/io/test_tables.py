@@ -248,7 +248,7 @@ def test_bad_contacts(tmp_path):
         ("", "is empty"),
         (text.replace("theta", "azimuth"), "azimuth"),
         (text.replace("ambiguous", "perhaps"), "line 3 reads"),
-        (text + "1,2,3\n", "line 7 reads '1,2,3'"),
+        (text + "1,2,3\n", "11 columns, but line 7 has 3 cells"),
     ):
         path.write_text(spoilt)
         with pytest.raises(ValueError, match=message):

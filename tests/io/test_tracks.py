@@ -184,8 +184,8 @@ def test_somebody_elses_table(tmp_path):
     [
         ("frame,x,y\n0,1,2\n", r"columns frame, x, y; column, row .pixels. or x, y, z"),
         ("frame,x,y,z\n", "no rows"),
-        ("frame,x,y,z\n0,1,2\n", "line 2 has 3 cells, not 4"),
-        ("frame,x,y,z\n0,1,2,b\n", "column z has a cell that is no number"),
+        ("frame,x,y,z\n0,1,2\n", "4 columns, but line 2 has 3 cells"),
+        ("frame,x,y,z\n0,1,2,b\n", "column z has cells that are no numbers: line 2"),
         ("frame,whisker,node,x,y,z\n0,a,0,1,2,3\n0,a,0,1,2,3\n", "same point of a whisker twice"),
         ("a,b\n1,2\n", "no tracks that are known"),
     ],

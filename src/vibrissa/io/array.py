@@ -38,9 +38,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.io.centerline import UNITS, check_slender, load_whisker, tells_radius
 from vibrissa.io.netcdf import is_netcdf, kind_of, naming, read_tree, write_netcdf
-from vibrissa.io.paths import replacing
 from vibrissa.io.recording import separate_whiskers, stacked_whiskers
-from vibrissa.io.table import read_text, table_rows
+from vibrissa.io.table import Table, few_faults, write_table
 from vibrissa.whisker import (
     Identity,
     Pose,
@@ -112,8 +111,7 @@ def save_array(path: str | PathLike[str], array: WhiskerArray) -> None:
     if path.suffix.lower() != ".csv":
         write_netcdf(path, stacked_whiskers(array.to_tree()))
         return
-    with replacing(path) as part:
-        part.write_text("\n".join(table_lines(array)) + "\n", encoding="utf-8")
+    write_table(path, *_as_table(array))
 
 
 def _netcdf(path: Path) -> WhiskerArray:
@@ -142,7 +140,7 @@ def _folder(path: Path, base: Any, noise: float | None) -> WhiskerArray:
             whisker = whisker.with_properties(rat=identity.name)
         whiskers.append(whisker)
     if faults:
-        raise ValueError(f"{path}: {_few(faults)}")
+        raise ValueError(f"{path}: {few_faults(faults)}")
     return _array(path, whiskers)
 
 
@@ -151,7 +149,7 @@ def _of_folder(path: Path) -> str:
     names = sorted(file.name for file in path.iterdir())
     if {".zgroup", ".zarray", "zarr.json"}.intersection(names):
         return "is a Zarr folder, as NWB can be kept in; save it as HDF5, in one file .nwb"
-    held = _few(names) if names else "nothing"
+    held = few_faults(names) if names else "nothing"
     return f"is a folder of {held}; one of centrelines, such as C2.csv, or a file is needed"
 
 
@@ -220,42 +218,28 @@ def _whisker(
     return replace(whisker, pose=Pose(pose.rotation @ whisker.pose.rotation, pose.origin))
 
 
-def _few(faults: Sequence[str]) -> str:
-    """Join faults, and count those after the fifth."""
-    more = "" if len(faults) <= 5 else f"; and {len(faults) - 5} more"
-    return "; ".join(faults[:5]) + more
-
-
 class _Columns:
     """Numbers of a table by name, in SI units, and what is wrong with it."""
 
     def __init__(self, path: Path) -> None:
         self.faults: list[str] = []
-        self._path = path
-        rows = list(table_rows(read_text(path)))
-        header = rows[0][1] if rows else []
-        self._names = [name.lower() for name in header]
-        self._cells = [cells for _, cells in rows[1:]]
-        self.lines = [line for line, _ in rows[1:]]
-        if "name" not in self._names or not self._cells:
+        self._table = Table(path)
+        self.lines = self._table.lines
+        self._names = [name.lower() for name in self._table.names]
+        if "name" not in self._names:
             raise ValueError(
-                f"{path} has the columns {', '.join(header) or 'none'} and {len(self._cells)} "
-                f"rows; {_NEEDED}, and at least one whisker, are needed"
+                f"{path} has the columns {', '.join(self._table.names)}; {_NEEDED} are needed"
             )
-        for line, cells in rows[1:]:
-            if len(cells) != len(header):
-                self.faults.append(f"line {line} has {len(cells)} cells, not {len(header)}")
-        self.tell()
 
     def tell(self) -> None:
         """Raise a ValueError with all faults, if there are any."""
         if self.faults:
-            raise ValueError(f"{self._path}: {_few(self.faults)}")
+            raise ValueError(f"{self._table.path}: {few_faults(self.faults)}")
 
     def text(self, name: str) -> list[str]:
         """Cells as they are."""
         at = self._names.index(name)
-        return [cells[at] for cells in self._cells]
+        return [cells[at] for cells in self._table.rows]
 
     def has(self, name: str, units: Mapping[str, float]) -> bool:
         """Whether there is such a quantity, in any of the units."""
@@ -263,7 +247,7 @@ class _Columns:
 
     def numbers(self, name: str, units: Mapping[str, float]) -> Array:
         """Values of a quantity; NaN, and a fault, where there is none."""
-        values = np.full(len(self._cells), np.nan)
+        values = np.full(len(self.lines), np.nan)
         suffix = next((suffix for suffix in units if name + suffix in self._names), None)
         if suffix is None:
             allowed = " or ".join(name + suffix for suffix in units if suffix) or name
@@ -298,18 +282,18 @@ def _rotations(columns: _Columns) -> Array:
     return np.asarray(left @ right)
 
 
-def table_lines(array: WhiskerArray) -> list[str]:
-    """Write whiskers as the lines of a table."""
+def _as_table(array: WhiskerArray) -> tuple[list[str], list[list[str]]]:
+    """Write whiskers as the header and the rows of a table."""
     header = ["name", "x_mm", "y_mm", "z_mm", *(f"{name}_deg" for name in _ANGLES)]
     header += ["length_mm", "coefficient_per_mm", "base_radius_um", "tip_radius_um"]
-    lines = [",".join(header)]
+    rows = []
     for name, whisker in array.items():
         angles = np.degrees(angles_of(whisker.pose.rotation))
         numbers = [*(1e3 * whisker.pose.origin), *angles, 1e3 * whisker.length]
         numbers += [1e-3 * _coefficient(whisker), 1e6 * whisker.base_radius]
         numbers += [1e6 * whisker.tip_radius]
-        lines.append(",".join([name, *(f"{value:.12g}" for value in numbers)]))
-    return lines
+        rows.append([name, *(f"{value:.12g}" for value in numbers)])
+    return header, rows
 
 
 def _coefficient(whisker: Whisker) -> float:

@@ -18,8 +18,15 @@ from typing import Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.io.paths import replacing
-from vibrissa.io.table import LENGTHS, is_number, read_rows, read_text, table_rows, unit_factor
+from vibrissa.io.table import (
+    LENGTHS,
+    is_number,
+    read_rows,
+    read_text,
+    table_rows,
+    unit_factor,
+    write_table,
+)
 from vibrissa.whisker import Properties, Whisker
 
 Array = NDArray[np.float64]
@@ -136,9 +143,8 @@ def save_centerline(path: str | PathLike[str], points: ArrayLike) -> None:
     array = np.asarray(points, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != 3:
         raise ValueError(f"points have shape {array.shape}; (n, 3) is needed")
-    lines = ["x_mm,y_mm,z_mm", *(",".join(f"{x * 1e3:.6f}" for x in row) for row in array)]
-    with replacing(path) as part:
-        part.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    rows = ([f"{x * 1e3:.6f}" for x in row] for row in array)
+    write_table(path, ("x_mm", "y_mm", "z_mm"), rows)
 
 
 def load_whisker(

@@ -19,7 +19,7 @@ import numpy as np
 import xarray as xr
 
 from vibrissa.io.paths import replacing
-from vibrissa.io.table import read_text, table_rows
+from vibrissa.io.table import Table, table_text, write_table
 from vibrissa.quantities import attributes
 from vibrissa.status import Status, flag_attributes
 
@@ -54,13 +54,8 @@ def save_contacts(path: str | PathLike[str], contacts: xr.Dataset) -> None:
         [contacts[name].values if name in contacts else np.full(n, np.nan) for name in NUMBERS]
     )
     names = [Status(int(code)).name.lower() for code in contacts["status"].values]
-    lines = [",".join((*NUMBERS, "status"))]
-    lines += [
-        ",".join((*(repr(float(x)) for x in row), name))
-        for row, name in zip(table, names, strict=True)
-    ]
-    with replacing(path) as part:
-        part.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    rows = ([*row, name] for row, name in zip(table.tolist(), names, strict=True))
+    write_table(path, (*NUMBERS, "status"), rows)
 
 
 def load_contacts(path: str | PathLike[str]) -> xr.Dataset:
@@ -76,29 +71,10 @@ def load_contacts(path: str | PathLike[str]) -> xr.Dataset:
     xarray.Dataset
         Dim time; a variable for each column, ``status`` as its number.
     """
-    path = Path(path)
-    rows = table_rows(read_text(path))
-    header = next(rows, None)
-    expected = [*NUMBERS, "status"]
-    if header is None or header[1] != expected:
-        got = "is empty" if header is None else f"has the columns {', '.join(header[1])}"
-        raise ValueError(f"{path} {got}; {', '.join(expected)} are needed")
-    values, codes = [], []
-    for line, cells in rows:
-        try:
-            *numbers, name = cells
-            values.append([float(cell) for cell in numbers])
-            codes.append(int(Status[name.upper()]))
-            if len(numbers) != len(NUMBERS):
-                raise ValueError
-        except (ValueError, KeyError):
-            raise ValueError(
-                f"{path}: line {line} reads {','.join(cells)!r}, which is no contact"
-            ) from None
-    table = np.array(values, dtype=np.float64).reshape(-1, len(NUMBERS))
-    columns = {
-        name: xr.Variable("time", table[:, i], attributes(name)) for i, name in enumerate(NUMBERS)
-    }
+    table = Table(path, (*NUMBERS, "status"))
+    codes = [Status.__members__.get(name.upper()) for name in table.text("status")]
+    table.refuse(np.array([code is None for code in codes], dtype=bool), "no contact")
+    columns = {name: xr.Variable("time", table.numbers(name), attributes(name)) for name in NUMBERS}
     about = {**attributes("status"), **flag_attributes()}
     columns["status"] = xr.Variable("time", np.array(codes, dtype=np.int8), about)
     return xr.Dataset({k: v for k, v in columns.items() if k != "time"}, {"time": columns["time"]})
@@ -163,16 +139,5 @@ def _contour_text(contour: xr.Dataset) -> str:
         contour[name].values if name in contour.variables else np.full(n, np.nan)
         for name in CONTOUR
     ]
-    lines = [",".join(CONTOUR)]
-    lines += [",".join(map(_contour_cell, row)) for row in zip(*columns, strict=True)]
-    return "\n".join(lines) + "\n"
-
-
-def _contour_cell(value: object) -> str:
-    if isinstance(value, np.bool_):
-        return str(int(value))
-    if isinstance(value, np.floating):
-        return repr(float(value))
-    # A name with a comma or a quotation mark would tear the line.
-    text = str(value)
-    return '"' + text.replace('"', '""') + '"' if any(c in text for c in ',"\n') else text
+    plain = [(one.astype(int) if one.dtype == bool else one).tolist() for one in columns]
+    return table_text(CONTOUR, zip(*plain, strict=True))

@@ -18,7 +18,6 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa.io.netcdf import is_netcdf, naming, read_dataset
-from vibrissa.io.paths import replacing
 from vibrissa.io.table import (
     is_number,
     read_rows,
@@ -27,6 +26,7 @@ from vibrissa.io.table import (
     table_rows,
     unit_factor,
     units_of,
+    write_table,
 )
 from vibrissa.quantities import attributes
 from vibrissa.whisker import Whisker
@@ -142,10 +142,8 @@ def save_signals(path: str | PathLike[str], signals: xr.Dataset) -> None:
     for variable in wrench:
         if variable.dims != ("time", "space"):
             raise ValueError(f"{variable.name} has dims {variable.dims}; time, space are needed")
-    array = np.column_stack([signals["time"].values, *(v.values for v in wrench)])
-    lines = [",".join(COLUMNS), *(",".join(repr(float(x)) for x in row) for row in array)]
-    with replacing(path) as part:
-        part.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    array = np.column_stack([signals["time"].values, *(v.values for v in wrench)]).astype(float)
+    write_table(path, COLUMNS, array.tolist())
 
 
 def _csv(path: Path) -> Array:

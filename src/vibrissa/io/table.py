@@ -14,16 +14,18 @@ from __future__ import annotations
 
 import codecs
 import csv
+import io
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import product
 from os import PathLike
+from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.io.paths import check_readable, refuse_whisk
+from vibrissa.io.paths import check_readable, refuse_whisk, replacing
 
 _MISSING = frozenset({"", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--"})
 _COMMA = re.compile(r"[+-]?(?:\d+,\d*|,\d+)(?:[eE][+-]?\d+)?")
@@ -204,51 +206,92 @@ def read_rows(
         advice = "; decimal commas need semicolons or tabs between cells, and no points elsewhere"
         raise ValueError(
             f"{path} has cells that are no numbers, or not one for each of the {width} columns: "
-            f"{_few(faults)}{advice if commas else ''}"
+            f"{few_faults(faults)}{advice if commas else ''}"
         )
     return np.array(values, dtype=np.float64).reshape(-1, len(columns))
 
 
+class Table:
+    """A table under one line of names; what is wrong with it names the file and the lines."""
+
+    def __init__(self, path: str | PathLike[str], expected: Sequence[str] = ()) -> None:
+        self.path = Path(path)
+        rows = list(table_rows(read_text(path)))
+        self.names = rows[0][1] if rows else []
+        self.lines = [line for line, _ in rows[1:]]
+        self.rows = [cells for _, cells in rows[1:]]
+        if not rows or (expected and tuple(self.names) != tuple(expected)):
+            got = f"has the columns {', '.join(self.names)}" if rows else "is empty"
+            needed = f"; {', '.join(expected)} are needed" if expected else ""
+            raise ValueError(f"{path} {got}{needed}")
+        if len(set(self.names)) != len(self.names):
+            raise ValueError(f"{path} has two columns of the same name: {', '.join(self.names)}")
+        if not self.rows and not expected:
+            raise ValueError(f"{path} has a header but no rows")
+        faults = [
+            f"line {line} has {len(cells)} cells"
+            for line, cells in zip(self.lines, self.rows, strict=True)
+            if len(cells) != len(self.names)
+        ]
+        if faults:
+            raise ValueError(
+                f"{path} has {len(self.names)} columns, but {few_faults(faults)}; the file may be "
+                "cut short"
+            )
+
+    def text(self, name: str) -> list[str]:
+        """Cells of a column as they are."""
+        at = self.names.index(name)
+        return [cells[at] for cells in self.rows]
+
+    def numbers(self, name: str, *, labels: bool = False) -> NDArray[np.float64]:
+        """Numbers of a column; NaN where they are missing, and in a column of labels if allowed."""
+        values, faults = np.full(len(self.rows), np.nan), []
+        for i, cell in enumerate(self.text(name)):
+            try:
+                values[i] = number(cell)
+            except ValueError:
+                faults.append(f"line {self.lines[i]} reads {cell!r}")
+        if faults and not (labels and np.isnan(values).all()):
+            raise ValueError(
+                f"{self.path}: column {name} has cells that are no numbers: {few_faults(faults)}"
+            )
+        return values
+
+    def refuse(self, wrong: NDArray[np.bool_], what: str) -> None:
+        """Raise if some rows are wrong, with the first of them."""
+        for i in np.flatnonzero(wrong):
+            cells = ",".join(self.rows[i])
+            raise ValueError(f"{self.path}: line {self.lines[i]} reads {cells!r}, which is {what}")
+
+
 def read_numbers(path: str | PathLike[str]) -> tuple[list[str], NDArray[np.float64]]:
-    """Read a table of numbers under one line of names."""
-    rows = table_rows(read_text(path))
-    header = next(rows, None)
-    if header is None:
-        raise ValueError(f"{path} is empty")
-    names = header[1]
-    if len(set(names)) != len(names):
-        raise ValueError(f"{path} has two columns of the same name: {', '.join(names)}")
-    lines = list(rows)
-    if not lines:
-        raise ValueError(f"{path} has a header but no rows")
-    faults = [f"line {line} has {len(c)} cells" for line, c in lines if len(c) != len(names)]
-    if faults:
-        raise ValueError(
-            f"{path} has {len(names)} columns, but {_few(faults)}; the file may be cut short"
-        )
-    columns = [
-        _numbers(path, name, [(line, cells[i]) for line, cells in lines])
-        for i, name in enumerate(names)
-    ]
-    return names, np.stack(columns, axis=1)
+    """Read a table of numbers under one line of names; columns of labels are NaN."""
+    table = Table(path)
+    columns = [table.numbers(name, labels=True) for name in table.names]
+    return table.names, np.stack(columns, axis=1)
 
 
-def _numbers(
-    path: str | PathLike[str], name: str, cells: list[tuple[int, str]]
-) -> NDArray[np.float64]:
-    """Read one column; labels are NaN."""
-    values, faults = np.full(len(cells), np.nan), []
-    for i, (line, cell) in enumerate(cells):
-        try:
-            values[i] = number(cell)
-        except ValueError:
-            faults.append(f"line {line} reads {cell!r}")
-    if faults and np.isfinite(values).any():
-        raise ValueError(f"{path}: column {name} has cells that are no numbers: {_few(faults)}")
-    return values
+def table_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Write a table as text, numbers in full."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+    return out.getvalue()
 
 
-def _few(faults: list[str]) -> str:
+def write_table(
+    path: str | PathLike[str], header: Sequence[str], rows: Iterable[Sequence[object]]
+) -> None:
+    """Write a table as CSV; an existing file is replaced once the new one is complete."""
+    text = table_text(header, rows)
+    with replacing(path) as part:
+        part.write_bytes(text.encode("utf-8"))
+
+
+def few_faults(faults: Sequence[str]) -> str:
+    """Join faults, and count those after the fifth."""
     more = "" if len(faults) <= 5 else f"; and {len(faults) - 5} more lines"
     return "; ".join(faults[:5]) + more
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.io.paths import replacing
-from vibrissa.io.table import read_text, table_rows
+from vibrissa.io.table import Table, write_table
 
 Array = NDArray[np.float64]
 Row = tuple[Array, Array, NDArray[np.bool_], float, bool, bool]
@@ -108,24 +108,16 @@ def load_corrections(path: str | PathLike[str]) -> dict[int, dict[tuple[int, int
     dict
         By view: by frame and whisker the points (n, 2) from base to tip, column and row.
     """
-    path = Path(path)
-    rows = table_rows(read_text(path))
-    header = next(rows, None)
-    if header is None or tuple(header[1]) != CORRECTION_COLUMNS:
-        got = "is empty" if header is None else f"has the columns {', '.join(header[1])}"
-        raise ValueError(f"{path} {got}; {', '.join(CORRECTION_COLUMNS)} are needed")
-    points: dict[int, dict[tuple[int, int], list[tuple[float, float]]]] = {}
-    for line, cells in rows:
-        try:
-            view, frame, whisker = (int(cell) for cell in cells[:3])
-            x, y = (float(cell) for cell in cells[3:])
-            if min(view, frame, whisker) < 0 or not np.isfinite([x, y]).all():
-                raise ValueError
-        except ValueError:
-            raise ValueError(
-                f"{path}: line {line} reads {','.join(cells)!r}, which is no point of a trace"
-            ) from None
-        points.setdefault(view, {}).setdefault((frame, whisker), []).append((x, y))
+    table = Table(path, CORRECTION_COLUMNS)
+    values = np.stack([table.numbers(name) for name in CORRECTION_COLUMNS], axis=1)
+    numbers = values[:, :3]
+    wrong = ~np.isfinite(values).all(axis=1) | (numbers < 0.0).any(axis=1)
+    table.refuse(wrong | (numbers != np.round(numbers)).any(axis=1), "no point of a trace")
+    points: dict[int, dict[tuple[int, int], list[Array]]] = {}
+    for (view, frame, whisker), place in zip(
+        numbers.astype(int).tolist(), values[:, 3:], strict=True
+    ):
+        points.setdefault(view, {}).setdefault((frame, whisker), []).append(place)
     short = [(v, *key) for v, each in points.items() for key, p in each.items() if len(p) < 2]
     if short:
         view, frame, whisker = short[0]
@@ -153,7 +145,7 @@ def save_corrections(
     ValueError
         If a trace has less than two points, or one that is not finite.
     """
-    lines = [",".join(CORRECTION_COLUMNS)]
+    rows: list[list[float]] = []
     for view, each in sorted(corrections.items()):
         for (frame, whisker), points in sorted(each.items()):
             array = np.asarray(points, dtype=np.float64)
@@ -167,6 +159,5 @@ def save_corrections(
                     f"whisker {whisker} in frame {frame} of view {view} has points that are not "
                     "finite"
                 )
-            lines += [f"{view},{frame},{whisker},{x!r},{y!r}" for x, y in array.tolist()]
-    with replacing(path) as part:
-        part.write_text("\n".join(lines) + "\n", encoding="utf-8")
+            rows += [[view, frame, whisker, *place] for place in array.tolist()]
+    write_table(path, CORRECTION_COLUMNS, rows)

@@ -9,8 +9,6 @@ the base.
 
 from __future__ import annotations
 
-import csv
-import io
 import itertools
 from collections.abc import Sequence
 from os import PathLike
@@ -23,7 +21,7 @@ from numpy.typing import NDArray
 
 from vibrissa.io.netcdf import COMPRESSED, kind_of, read_dataset, write_netcdf
 from vibrissa.io.paths import CSV, NETCDF, check_writable, replacing
-from vibrissa.io.table import read_text, table_rows
+from vibrissa.io.table import Table, table_text
 from vibrissa.io.tracks import KIND, UNITS, Labels, RawTracks, labelled
 
 Array = NDArray[np.float64]
@@ -99,19 +97,12 @@ def load_tracks_table(path: str | PathLike[str], **labels: Unpack[Labels]) -> xr
 def read_tracks_table(path: str | PathLike[str]) -> RawTracks:
     """Read a table of points as raw tracks; see `load_tracks_table`."""
     path = Path(path)
-    rows = table_rows(read_text(path))
-    header = next(rows, None)
-    if header is None:
-        raise ValueError(f"{path} is empty")
-    names = [name.lower() for name in header[1]]
-    axes, unit = _coordinates(path, names)
-    cells = [_cells(path, line, one, len(names)) for line, one in rows]
-    if not cells:
-        raise ValueError(f"{path} has a header but no rows")
-    table = list(zip(*cells, strict=True))
+    table = Table(path)
+    table.names = [name.lower() for name in table.names]
+    axes, unit = _coordinates(path, table.names)
 
     def numbers(name: str) -> Array | None:
-        return _numbers(path, name, table[names.index(name)]) if name in names else None
+        return table.numbers(name) if name in table.names else None
 
     frame, time = numbers("frame"), numbers("time")
     if frame is None and time is None:
@@ -119,9 +110,7 @@ def read_tracks_table(path: str | PathLike[str]) -> RawTracks:
     clock = frame if frame is not None else time
     assert clock is not None
     moments, first, row = np.unique(clock, return_index=True, return_inverse=True)
-    labels = {
-        name: [str(cell) for cell in table[names.index(name)]] for name in _LABELS if name in names
-    }
+    labels = {name: table.text(name) for name in _LABELS if name in table.names}
     whisker, who = _ordered(labels.get("whisker", ["whisker"] * len(row)))
     view, seen = _ordered(labels.get("view", [""] * len(row)))
     node, part = _ordered(labels.get("node") or _counted(row, who, seen))
@@ -168,21 +157,6 @@ def _coordinates(path: Path, names: Sequence[str]) -> tuple[list[str], str]:
     )
 
 
-def _cells(path: Path, line: int, cells: list[str], count: int) -> list[str]:
-    if len(cells) != count:
-        raise ValueError(
-            f"{path}: line {line} has {len(cells)} cells, not {count}; is it cut short?"
-        )
-    return cells
-
-
-def _numbers(path: Path, name: str, cells: Sequence[str]) -> Array:
-    try:
-        return np.array([float(cell) if cell else np.nan for cell in cells])
-    except ValueError as error:
-        raise ValueError(f"{path}: column {name} has a cell that is no number ({error})") from None
-
-
 def _ordered(names: Sequence[Any]) -> tuple[list[str], NDArray[np.int64]]:
     """Names in the order they appear in, and which of them each row has."""
     order = {name: i for i, name in enumerate(dict.fromkeys(names))}
@@ -222,13 +196,12 @@ def _text(tracks: xr.Dataset) -> str:
     sure = tracks["confidence"].transpose(*dims).values
     numbers = np.concatenate([array.values, sure[..., None]], axis=-1)
     table = numbers.reshape(len(moments), len(places), -1).tolist()
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow([*head, *dims[1:], *axes, "confidence"])
-    for moment, rows in zip(moments, table, strict=True):
-        for place, row in zip(places, rows, strict=True):
-            writer.writerow([*moment, *place, *map(repr, row)])
-    return out.getvalue()
+    rows = (
+        [*moment, *place, *row]
+        for moment, each in zip(moments, table, strict=True)
+        for place, row in zip(places, each, strict=True)
+    )
+    return table_text([*head, *dims[1:], *axes, "confidence"], rows)
 
 
 def _names(tracks: xr.Dataset, dim: str) -> list[str]:

@@ -89,9 +89,13 @@ def test_choices_are_those_that_the_functions_take():
 def test_a_word_that_is_misspelt_suggests_the_near_one():
     assert "Did you mean 'estimate'" in run("estimat").output
     assert "--using" in run("estimate", "a.csv", "--usin", "Fx,MB,MD").output
-    done = run("reconstruct", "a.nc", "--shape", "cilinder")
-    assert done.exit_code == 2
-    assert "cylinder" in done.output
+    for words in (
+        ("reconstruct", "a", "--shape", "cilinder"),
+        ("signals", "a", "--source", "rood"),
+    ):
+        done = run(*words)
+        assert done.exit_code == 2
+        assert "is not one of" in done.output
 
 
 @pytest.mark.parametrize(

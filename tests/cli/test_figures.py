@@ -11,7 +11,7 @@ import vibrissa as vb
 from vibrissa import plots
 from vibrissa.cli.app import app, main
 from vibrissa.identifiability import witness_pairs
-from vibrissa.plots import HIGHLIGHTED
+from vibrissa.plots.evidence import HIGHLIGHTED
 
 # The known pair of contacts that feel the same by (F_x, M_B, M_D): parabola with A·L = 0.82,
 # arc length in L and force in EI/L² (the second found by Newton from (0.645, 0.440)).
@@ -85,10 +85,7 @@ def fault(monkeypatch, capsys, *arguments):
     return " ".join(capsys.readouterr().err.split())
 
 
-def test_a_map_gives_three_figures_and_verdicts_three_more(
-    chart, verdicts, tmp_path, monkeypatch
-) -> None:
-    monkeypatch.setattr("vibrissa.scene.solids._SHAPE", (12, 24, 8))  # quicker to draw
+def test_a_map_gives_three_figures_and_verdicts_three_more(chart, verdicts, tmp_path) -> None:
     saved = tmp_path / "uniqueness.nc"
     verdicts.to_netcdf(saved, engine="h5netcdf")
     folder = tmp_path / "new" / "folder"

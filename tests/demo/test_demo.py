@@ -211,8 +211,16 @@ def test_signals_are_better_known_the_more_the_whisker_is_bent(from_video):
             assert medians[-1] < medians[0]
 
 
-def test_the_command_reports_every_stage_from_video(from_video, folder, tmp_path):
-    """Of the trial that lies there, which it takes up."""
+def test_the_command_reports_every_stage_from_video(from_video, folder, tmp_path, monkeypatch):
+    """Of a trial that is there; that it is taken up is tested below."""
+    asked = {}
+
+    def there(*arguments, **options):
+        asked.update(options)
+        return from_video
+
+    monkeypatch.setattr("vibrissa.demo.run_demo", there)
+    monkeypatch.setattr("vibrissa.scene.solids._SHAPE", (12, 24, 8))  # quicker to draw
 
     def run(*words):
         done = CliRunner().invoke(app, [str(word) for word in words])
@@ -228,6 +236,7 @@ def test_the_command_reports_every_stage_from_video(from_video, folder, tmp_path
         "paper's method",
     ):
         assert words in text
+    assert asked.items() >= (FILMED | {"noise": True, "video": True}).items()
     assert {"top.mp4", "front.mp4", "tracked.nc"} <= {file.name for file in folder.iterdir()}
     assert "cylinder" in run("reconstruct", folder / "tracked.nc", "-o", tmp_path / "contour.nc")
 

@@ -12,6 +12,7 @@ from vibrissa import Whisker
 from vibrissa.cameras import orthogonal_views
 from vibrissa.objects import Peg
 from vibrissa.simulation import Motion, film_frames, simulate, with_true_traces
+from vibrissa.tracking import trace_video
 
 sys.path.append(str(Path(__file__).parent))  # tests and studies share the maker of films, furry.py
 
@@ -22,11 +23,11 @@ CAMERAS = orthogonal_views(size=(256, 256), center=(5e-3, 0.0, 0.0))
 class Filmed:
     """A trial, its cameras and its frames, view by view."""
 
-    def __init__(self, recording, cameras=CAMERAS, look=None):
+    def __init__(self, recording, cameras=CAMERAS):
         self.recording = with_true_traces(recording, cameras)
         self.cameras = cameras
         self.frames = [
-            list(film_frames(recording, camera, look, seed=i)) for i, camera in enumerate(cameras)
+            list(film_frames(recording, camera, seed=i)) for i, camera in enumerate(cameras)
         ]
         self.truth = self.recording["truth"].to_dataset().isel(whisker=0)
 
@@ -78,6 +79,12 @@ def whisk(whisker, peg, frames=FRAMES):
 def filmed():
     whisker = Whisker.parabola(length=10e-3, coefficient=15.0)
     return Filmed(whisk(whisker, Peg([6e-3, 1.2e-3, 0.0], [0.0, 0.0, 1.0], 0.5e-3)))
+
+
+@pytest.fixture(scope="session")
+def traced(filmed):
+    """Traces of that trial, view by view, without a click."""
+    return [trace_video(frames) for frames in filmed.frames]
 
 
 @pytest.fixture(scope="session")

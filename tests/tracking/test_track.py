@@ -10,7 +10,6 @@ from vibrissa.tracking import (
     FitOptions,
     TrackOptions,
     rest_shape,
-    trace_video,
     track,
     whisker_at_rest,
 )
@@ -19,8 +18,8 @@ from vibrissa.whisker import angles_of, base_rotation
 
 
 @pytest.fixture(scope="module")
-def traces(filmed):
-    return [trace_video(frames) for frames in filmed.frames]
+def traces(traced):
+    return traced
 
 
 @pytest.fixture(scope="module")

@@ -115,8 +115,8 @@ def test_frames_that_the_rod_does_not_explain_are_noted(filmed):
     assert remarks_on(filmed.cameras, series, length, np.full(20, 0.3), "C2") == []
 
 
-def test_cameras_out_of_step_are_noticed(filmed):
-    rows = [trace_video(frames)[0] for frames in filmed.frames]
+def test_cameras_out_of_step_are_noticed(filmed, traced):
+    rows = [view[0] for view in traced]
     in_step = better_offset(*filmed.cameras, rows[0], rows[1], 0)
     assert not in_step.size
     assert better_offset(*filmed.cameras, rows[0], rows[1][3:], 0).tolist() == [-3]

@@ -119,8 +119,8 @@ def test_a_known_whisker_needs_no_free_frames(filmed):
     rows = touching[len(touching) // 2 :]
     cut = [[view[i] for i in rows] for view in filmed.frames]
     traces = [trace_video(frames) for frames in cut]
-    known = track(filmed.cameras, traces, RATE, TrackOptions(whisker=whisker)).to_dataset()
-    known = known.isel(whisker=0)
+    recording = track(filmed.cameras, traces, RATE, TrackOptions(whisker=whisker))
+    known = recording.to_dataset().isel(whisker=0)
     assert (known["in_contact"].values > 0).all()
     away = known["contact_point"].values - filmed.truth["contact_point"].values[rows]
     assert np.median(np.linalg.norm(away, axis=1)) < 150e-6
@@ -128,18 +128,16 @@ def test_a_known_whisker_needs_no_free_frames(filmed):
         true = filmed.truth[name].values[rows]
         error = np.linalg.norm(known[name].values - true, axis=1) / np.linalg.norm(true, axis=1)
         assert np.median(error) < 0.1
-    again = track(filmed.cameras, traces, RATE, TrackOptions(whisker=whisker))
-    assert Recording(again).whisker().length == pytest.approx(whisker.length)
+    assert Recording(recording).whisker().length == pytest.approx(whisker.length)
 
 
-def test_a_known_whisker_tells_contact_from_none(filmed):
+def test_a_known_whisker_distinguishes_contact_from_none(filmed, traced):
     whisker = Recording(filmed.recording).whisker()
-    traces = [trace_video(frames) for frames in filmed.frames]
-    found = track(filmed.cameras, traces, RATE, TrackOptions(whisker=whisker)).to_dataset()
+    found = track(filmed.cameras, traced, RATE, TrackOptions(whisker=whisker)).to_dataset()
     truly = filmed.truth["in_contact"].values > 0
     assert (truly == (found["in_contact"].values[:, 0] > 0)).mean() > 0.9
     with pytest.raises(ValueError, match="another, or the scale is wrong"):
-        track(filmed.cameras, traces, RATE, TrackOptions(whisker=Whisker.straight(length=5e-3)))
+        track(filmed.cameras, traced, RATE, TrackOptions(whisker=Whisker.straight(length=5e-3)))
 
 
 def head_table(dim, values, turns=None):

@@ -1,0 +1,98 @@
+"""What is declared of a recording holds of those that are made, and the accessor keeps to it."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from vibrissa import samples
+from vibrissa.quantities import attributes
+from vibrissa.recording import VARIABLES, Group, Recording, faults_in, recorded
+from vibrissa.simulation import facing_peg, measure, simulate, whisking
+
+WHISKER = samples.gamma()
+FRAMES, SPACE = 4, 3
+PLAIN = {"float": np.float64, "bool": bool, "int": np.int64}
+
+
+@pytest.fixture(scope="module")
+def trial():
+    return measure(simulate(WHISKER, whisking(duration=0.05, rate=100.0), facing_peg(WHISKER)))
+
+
+def test_a_simulated_recording_is_as_declared(trial):
+    for name in ("", "truth"):
+        group = Recording(trial)[name]
+        assert not faults_in(group.data)
+        for variable in map(str, group.data.data_vars):
+            about = VARIABLES[variable]
+            assert name in about.groups, variable
+            assert group.data[variable].dims == about.dims
+            assert group.data[variable].attrs["units"] == attributes(variable)["units"]
+
+
+@pytest.mark.parametrize("name", sorted(VARIABLES))
+def test_values_come_back_in_the_declared_order(name):
+    """Whatever the order of dimensions in the dataset, and of one whisker as of all."""
+    about = VARIABLES[name]
+    three = {"space", "space_", "whisker_axis", "head_axis"}
+    sizes = [SPACE if dim in three else 2 + i for i, dim in enumerate(about.dims)]
+    values = np.arange(np.prod(sizes)).reshape(sizes).astype(PLAIN[about.kind])
+    data = xr.Dataset({name: recorded(name, values).transpose(*reversed(about.dims))})
+    np.testing.assert_array_equal(Group(data)[name], values)
+    assert Group(data)[name].dtype.kind == np.dtype(PLAIN[about.kind]).kind
+    if "whisker" in about.dims:
+        one = Group(data).whisker(1)[name]
+        np.testing.assert_array_equal(one, values[:, 1])
+        again = recorded(name, one)
+        assert again.sizes["whisker"] == 1
+        np.testing.assert_array_equal(again.values[:, 0], one)
+
+
+def test_missing_truth_is_false_and_other_names_of_dimensions_are_known():
+    touching = recorded("in_contact", np.array([[1.0], [np.nan], [0.0]]))
+    group = Group(xr.Dataset({"in_contact": touching}))
+    assert group["in_contact"].tolist() == [[True], [False], [False]]
+    spread = recorded("contact_covariance", np.ones((FRAMES, 1, 3, 3)))
+    data = xr.Dataset({"contact_covariance": spread}).rename(space_="space_2")
+    assert Group(data)["contact_covariance"].shape == (FRAMES, 1, 3, 3)
+    assert Group(data).known("arc_length") is None
+
+
+@pytest.mark.parametrize(
+    ("variable", "reason"),
+    [
+        (xr.Variable(("time", "space"), np.zeros((2, 2))), "space has 3 dimensions"),
+        (xr.Variable(("time", "place"), np.zeros((2, 3))), "has the dimensions"),
+        (xr.Variable(("time", "space"), np.array([["a"] * 3])), "not numbers"),
+    ],
+)
+def test_what_is_of_another_shape_or_type_is_refused(variable, reason):
+    with pytest.raises(ValueError, match=reason):
+        Group(xr.Dataset({"force": variable}))["force"]
+
+
+def test_what_is_missing_is_named(trial):
+    recording = Recording(trial)
+    with pytest.raises(ValueError, match=r"lacks trace; it has .*force"):
+        recording.root["trace"]
+    with pytest.raises(ValueError, match=r"no group signals .*truth"):
+        recording["signals"]
+    with pytest.raises(ValueError, match="whisker 3 was asked for"):
+        recording.root.whisker(3)
+    with pytest.raises(ValueError, match="the recording carries 1"):
+        recording.whisker(1)
+    with pytest.raises(ValueError, match="no cameras"):
+        _ = recording.cameras
+    with pytest.raises(ValueError, match="not a variable of a recording"):
+        recorded("colour", np.zeros(3))
+    with pytest.raises(ValueError, match="are needed"):
+        recorded("force", np.zeros(3))
+
+
+def test_whiskers_and_objects_come_back(trial):
+    recording = Recording(trial)
+    assert recording.names == [WHISKER.name]
+    assert recording.whisker().length == WHISKER.length
+    assert len(recording.pegs) == len(recording.objects) == 1
+    known = recording.known("contact_point", ("estimates", "", "truth"))
+    np.testing.assert_array_equal(known, recording["truth"]["contact_point"])

@@ -272,7 +272,7 @@ def test_what_is_lacking_is_said_with_the_verb_that_makes_it(
     said = fault(monkeypatch, capsys, bare, "--kind", "signals", "-o", tmp_path / "none")
     assert f"no signals: `vibrissa signals {bare}` makes them" in said
     nowhere = (trial, "-o", tmp_path / "none")
-    assert "one of signals, contour, both" in fault(monkeypatch, capsys, *nowhere, "--kind", "x")
+    assert "is not one of" in fault(monkeypatch, capsys, *nowhere, "--kind", "x")
     assert "choose one --kind" in fault(monkeypatch, capsys, trial, "-o", tmp_path / "a.mp4")
     video = tmp_path / "small.mkv"
     write_video(video, [np.zeros((20, 20), np.uint8)] * 12)

@@ -77,13 +77,18 @@ def pytest_collection_modifyitems(config, items):
 
 @pytest.fixture
 def interruptible():
-    """Children start with the default action of SIGINT, also where the tests run with it ignored.
+    """Children start with the default action of signals that the tests themselves may ignore.
 
-    A shell without job control starts what runs in its background so, and children inherit it.
+    A shell without job control starts a command in its background with SIGINT ignored, `nohup` one
+    with SIGHUP ignored, and children inherit it.
     """
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    default = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+    if hasattr(signal, "SIGHUP"):
+        default[signal.SIGHUP] = signal.SIG_DFL
+    before = {number: signal.signal(number, action) for number, action in default.items()}
     yield
-    signal.signal(signal.SIGINT, before)
+    for number, action in before.items():
+        signal.signal(number, action)
 
 
 _BROWSER = [

@@ -430,6 +430,7 @@ def test_what_the_system_throws_away_is_counted():
             assert came + udp_lost(heard) == 1000
 
 
+@pytest.mark.usefixtures("interruptible")
 def test_over_udp_stale_samples_are_dropped_and_counted(map_file, wrench):
     """More come than can be answered: the last is answered, and the others are accounted for."""
     lines = list(csv_lines(wrench))
@@ -610,6 +611,7 @@ def bag_messages(path):
     return found
 
 
+@pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGALRM", "SIGKILL"])
 def test_a_bag_is_whole_however_the_stream_ends(map_file, wrench, tmp_path, name):
     """All samples after a signal that can be taken; after SIGKILL those of a second before it."""

@@ -41,12 +41,12 @@ if TYPE_CHECKING:
         whisker,
     )
     from vibrissa.contacts import (
+        Contact,
         ContactFilter,
         ContactMap,
-        Estimate,
+        Contacts,
         Estimator,
         Prior,
-        WrenchEstimate,
         estimate_from_wrench,
     )
     from vibrissa.display import show
@@ -60,10 +60,11 @@ if TYPE_CHECKING:
 
 
 __all__ = [
+    "Contact",
     "ContactFilter",
     "ContactMap",
+    "Contacts",
     "Deflection",
-    "Estimate",
     "Estimator",
     "PegContact",
     "PointContact",
@@ -72,7 +73,6 @@ __all__ = [
     "Status",
     "Whisker",
     "WhiskerArray",
-    "WrenchEstimate",
     "__version__",
     "base_signals",
     "best_triplet",
@@ -116,12 +116,12 @@ __all__ = [
 
 _HOMES = {
     "contacts": (
+        "Contact",
         "ContactFilter",
         "ContactMap",
-        "Estimate",
+        "Contacts",
         "Estimator",
         "Prior",
-        "WrenchEstimate",
         "estimate_from_wrench",
     ),
     "display": ("show",),

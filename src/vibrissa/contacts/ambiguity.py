@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from vibrissa.contacts.channels import CIRCULAR, channels_of
-from vibrissa.contacts.fitting import channel_equations
-from vibrissa.contacts.locating import COLUMNS, tell
+from vibrissa.contacts.contacts import Candidates
+from vibrissa.contacts.least_squares import channel_equations
 from vibrissa.contacts.readout import Measurement, Mixed, Named
 from vibrissa.contacts.weighing import Weighing, weigh
 from vibrissa.numerics import AnyArray, Array, copy, inlined, kernel
@@ -32,6 +32,7 @@ from vibrissa.rod import (
     point_determinant,
     set_lane,
     stable,
+    with_normal_force,
 )
 
 # Every so many of the chart's stations is a sample of arc length, of a surface also of bearings.
@@ -68,20 +69,18 @@ class Sections(NamedTuple):
     loads: Array
     seen: Array
     turns: AnyArray
-    length: float
-    force: float
 
 
 class Ambiguity:
     """Samples of the contacts that explain one or two signals."""
 
     def __init__(self, chart: StableSet, readout: Named | Mixed) -> None:
-        how, d = readout.how, chart.discretization
+        how = readout.how
         codes = how.codes.tolist()
         named = isinstance(readout, Named)
         self._how = how
         self._sections = Sections(
-            d.rod,
+            chart.discretization.rod,
             chart.fold,
             chart.proximal,
             np.linspace(0.0, 1.0, len(chart.stations))[::_STATIONS],
@@ -89,22 +88,26 @@ class Ambiguity:
             chart.loads,
             np.ascontiguousarray(channels_of(chart.values)[::_STATIONS][..., codes] @ how.mixing.T),
             np.array([named and CIRCULAR[code] for code in codes])[: len(how.mixing)],
-            d.length,
-            d.force,
         )
 
-    def samples(self, measurement: Measurement) -> tuple[Array, int, Array]:
-        """Sample the set."""
-        found, covariance = np.empty((_MOST, COLUMNS)), np.empty((3, 3))
+    def samples(self, measurement: Measurement) -> tuple[Candidates, int, Array]:
+        """Sample the set: candidates, which one is in their middle, their covariance about it."""
+        xi, values = np.empty((_MOST, 3)), np.empty((_MOST, 6))
+        across, covariance = np.zeros((_MOST, 3, 3)), np.empty((3, 3))
         n, middle = sample(
             self._sections,
             self._how,
             measurement.target,
             measurement.measured,
-            found,
+            xi,
+            values,
+            across,
             covariance,
         )
-        return found[:n].copy(), middle, covariance
+        out = Candidates.room(1, n)
+        out.number[0], out.x[0], out.values[0] = n, with_normal_force(xi[:n]), values[:n]
+        out.covariances[0] = across[:n]
+        return out, middle, covariance
 
 
 @kernel
@@ -113,40 +116,39 @@ def sample(
     how: Weighing,
     target: Array,
     measured: Array,
-    found: Array,
+    xi: Array,
+    values: Array,
+    across: Array,
     covariance: Array,
 ) -> tuple[int, int]:
     """Sample the contacts that explain one or two signals."""
-    starts, values = np.empty((_MOST, 3)), np.empty((_MOST, 6))
     tangents = np.empty((_MOST, 6, 3))
-    n = _starts(of, how, target, starts)
-    n = _met(of, how, target, n, starts, values, tangents)
-    across = np.zeros((n, 3, 3))
+    n = _starts(of, how, target, xi)
+    n = _met(of, how, target, n, xi, values, tangents)
     for row in range(n):
-        _across(how, measured, starts[row], values[row], tangents[row], across[row])
-    tell(of.length, of.force, starts[:n], values[:n], across, found)
-    return n, _middle(found, n, covariance)
+        _across(how, measured, xi[row], values[row], tangents[row], across[row])
+    return n, _middle(values[:n, 3:], across, covariance)
 
 
 @inlined
-def _middle(found: Array, n: int, covariance: Array) -> int:
+def _middle(points: Array, across: Array, covariance: Array) -> int:
     """Which sample is nearest to their mean; fill their covariance about it, and its own."""
-    mean, chosen, least = np.zeros(3), 0, np.inf
+    n, mean, chosen, least = points.shape[0], np.zeros(3), 0, np.inf
     for row in range(n):
         for a in range(3):
-            mean[a] += found[row, a] / n
+            mean[a] += points[row, a] / n
     for row in range(n):
         away = 0.0
         for a in range(3):
-            away += (found[row, a] - mean[a]) ** 2
+            away += (points[row, a] - mean[a]) ** 2
         if away < least:
             chosen, least = row, away
     for a in range(3):
         for c in range(3):
             total = 0.0
             for row in range(n):
-                total += (found[row, a] - found[chosen, a]) * (found[row, c] - found[chosen, c])
-                total += found[row, COLUMNS - 9 + 3 * a + c]
+                total += (points[row, a] - points[chosen, a]) * (points[row, c] - points[chosen, c])
+                total += across[row, a, c]
             covariance[a, c] = total / max(n, 1)
     return chosen
 

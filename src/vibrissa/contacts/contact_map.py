@@ -9,27 +9,37 @@ also holds the paper's grid of contact points: 15 radii from 0.3 L to L, azimuth
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
+from vibrissa.contacts.contacts import Contacts, spherical
+from vibrissa.contacts.estimator import estimate
+from vibrissa.contacts.inversion import triplet_tree
+from vibrissa.contacts.jacobian import determining
+from vibrissa.contacts.noise import common_errors
+from vibrissa.contacts.prior import Prior
+from vibrissa.contacts.wrench import estimate_components
+from vibrissa.io import COMPRESSED, kind_of, read_tree, write_netcdf
 from vibrissa.numerics import AnyArray, Array
 from vibrissa.quantities import attributes
 from vibrissa.rod import (
     CELLS,
     PROXIMAL,
     STEPS,
+    Fold,
     PointContact,
     SearchTree,
     StableSet,
     contact_tangents,
     deflect,
+    discretize,
     stable_set,
     with_normal_force,
 )
@@ -38,14 +48,13 @@ from vibrissa.sketch import CONTACT, REST, Mark, card, lines, shown, symbol, vie
 from vibrissa.status import Status, flag_attributes
 from vibrissa.whisker import Whisker
 
-if TYPE_CHECKING:
-    from vibrissa.contacts.estimate import Estimate
-    from vibrissa.contacts.prior import Prior
-
 #: The paper's grid: radii over L, azimuth and elevation in rad.
 GRID_RADII = np.linspace(0.3, 1.0, 15)
 GRID_AZIMUTHS = np.deg2rad(np.arange(-65.0, 66.0))
 GRID_ELEVATIONS = np.deg2rad(np.arange(-60.0, 61.0))
+
+_KIND = "vibrissa contact map"
+_NODE = ("station", "bearing", "load")
 
 Progress = Callable[[int, int], None]
 Domain = Literal["reachable", "paper"]
@@ -116,54 +125,48 @@ class ContactMap:
     def estimate(
         self,
         signals: xr.Dataset | Mapping[str, ArrayLike],
-        triplet: str | tuple[str, ...] = ("Fx", "MB", "MD"),
+        using: str | Sequence[str] = ("Fx", "MB", "MD"),
         noise: Mapping[str, float] | ArrayLike | None = None,
         stiffness_sigma: float = 0.0,
         gain_sigma: float | ArrayLike = 0.0,
         mixing_sigma: float | ArrayLike = 0.0,
         prior: Prior | None = None,
-    ) -> Estimate:
+    ) -> Contacts:
         """Find the contacts that explain measured signals.
 
         Parameters
         ----------
         signals : Dataset or mapping
-            Measured signals by name, SI units, any shape.
-        triplet : str or tuple of str
-            The signals to use, three or more.
+            Measured signals by name, SI units, any shape; for the wrench ``force`` and ``moment``,
+            (..., 3), or the six components.
+        using : str or sequence of str
+            Signals to use, three or more of the six; or "wrench": all six components of force and
+            moment, with or without friction, as `estimate_from_wrench` does.
         noise : mapping or (6, 6) array_like, optional
             Standard deviation of each signal, or covariance of (F, M), SI units; gives each
-            estimate's covariance, and weighs more than three signals.
+            contact's covariance and probability, and weighs more than three signals.
         stiffness_sigma : float
             Relative standard deviation of the whisker's bending stiffness E r⁴, such as
-            ``fit_stiffness`` tells or √(σ_E² + 16 σ_r²) of those of modulus and radius; it adds to
+            ``fit_stiffness`` finds or √(σ_E² + 16 σ_r²) of those of modulus and radius; it adds to
             the covariances, and needs noise.
         gain_sigma : float or (6,) array_like
             Relative standard deviation of the sensor's gains, of all or each of Fx, Fy, Fz, Mx, My
-            and Mz; likewise.
+            and Mz; it needs noise.
         mixing_sigma : float or (6, 6) array_like
             Standard deviations of what each of these reads of all six; or one number, relative: of
-            the cross-talk among forces, and among moments. Likewise.
+            the cross-talk among forces, and among moments. It needs noise.
         prior : Prior, optional
-            Which contacts are possible; others are left out of the candidates.
+            Possible contacts; others are left out of the candidates.
 
         Returns
         -------
-        Estimate
-            One for each measurement, with all candidates.
+        Contacts
+            One contact for each measurement, with all candidates.
         """
-        from vibrissa.contacts.estimate import estimate  # it knows this class
-
-        return estimate(
-            self,
-            signals,
-            triplet,
-            noise,
-            stiffness_sigma,
-            gain_sigma,
-            mixing_sigma,
-            prior,
-        )
+        errors = common_errors(stiffness_sigma, gain_sigma, mixing_sigma)
+        if using == "wrench":
+            return estimate_components(self.whisker, signals, noise, errors, prior)
+        return estimate(self, signals, using, noise, errors, prior)
 
     def tree(self, triplet: tuple[str, ...]) -> SearchTree:
         """Return the search tree of three signals, made on first use.
@@ -171,26 +174,24 @@ class ContactMap:
         Parameters
         ----------
         triplet : tuple of str
-            The signals, in canonical order.
+            Three signals, in canonical order.
 
         Returns
         -------
         SearchTree
             The tree.
         """
-        from vibrissa.contacts.inversion import triplet_tree
-
         if triplet not in self._trees:
             self._trees[triplet] = triplet_tree(self.chart, selection(triplet))
         return self._trees[triplet]
 
-    def determines(self, signals: str | tuple[str, ...]) -> bool:
-        """Tell whether signals determine contacts on this whisker, but for single ones.
+    def determines(self, using: str | tuple[str, ...]) -> bool:
+        """Check whether signals determine contacts on this whisker, but for single ones.
 
         Parameters
         ----------
-        signals : str or tuple of str
-            Three or more.
+        using : str or tuple of str
+            Three signals or more.
 
         Returns
         -------
@@ -198,9 +199,7 @@ class ContactMap:
             False if almost everywhere the contact can move without changing them, as on a straight
             whisker, which never twists, for any three with Mx. Found out on first use.
         """
-        from vibrissa.identifiability.fibres import determining
-
-        names = selection(signals)
+        names = selection(using)
         if names not in self._determining:
             self._determining[names] = determining(self, names)
         return self._determining[names]
@@ -244,9 +243,7 @@ class ContactMap:
         path : str or Path
             The file, ``.nc``; replaced if it exists.
         """
-        from vibrissa.contacts.files import save_map
-
-        save_map(self, Path(path))
+        _save(self, Path(path))
 
     @classmethod
     def load(cls, path: str | Path) -> ContactMap:
@@ -262,9 +259,7 @@ class ContactMap:
         ContactMap
             The same map.
         """
-        from vibrissa.contacts.files import load_map
-
-        return load_map(Path(path))
+        return _load(Path(path))
 
     def __repr__(self) -> str:
         """Say whose map it is and what it holds."""
@@ -307,14 +302,6 @@ def within_paper_bounds(whisker: Whisker, points: Array) -> AnyArray:
     inside = (r >= 0.3 * whisker.length) & (r <= whisker.length)
     inside &= np.abs(theta) <= GRID_AZIMUTHS[-1]
     return np.asarray(inside & (np.abs(phi) <= GRID_ELEVATIONS[-1]))
-
-
-def spherical(points: Array) -> Array:
-    """(r, θ, φ) of points (..., 3): distance, azimuth atan2(y, x), elevation asin(z / r)."""
-    r = np.linalg.norm(points, axis=-1)
-    theta = np.arctan2(points[..., 1], points[..., 0])
-    phi = np.arctan2(points[..., 2], np.hypot(points[..., 0], points[..., 1]))
-    return np.stack([r, theta, phi], axis=-1)
 
 
 def _solve_grid(
@@ -424,3 +411,70 @@ def _dataset(whisker: Whisker, chart: StableSet) -> xr.Dataset:
 
 def _label(long_name: str) -> dict[str, str]:
     return {"units": "1", "long_name": long_name}
+
+
+def _save(contact_map: ContactMap, path: Path) -> None:
+    """Write a map; a file that exists is replaced only when the new one is complete."""
+    chart = contact_map.chart
+    raw = xr.Dataset(
+        {
+            "stations": ("station", chart.stations),
+            "bearings": ("bearing", chart.bearings),
+            "loads": ("load", chart.loads),
+            "bounds": ("bound", chart.fold.bounds),
+            "fold": (("station", "bearing", "derivative"), chart.fold.log_force),
+            "folded": (("station", "bearing"), chart.folded),
+            "contacts": ((*_NODE, "unknown"), chart.contacts),
+            "values": ((*_NODE, "value"), chart.values),
+            "tangents": ((*_NODE, "value", "unknown"), chart.tangents),
+            "frames": ((*_NODE, "unknown", "coordinate"), chart.frames),
+        },
+        attrs={"description": "non-dimensional: lengths over L, forces over EI/L²"},
+    )
+    for name, variable in raw.data_vars.items():
+        variable.attrs |= {"units": "1", "long_name": f"chart: {name}, non-dimensional"}
+    root = contact_map.to_dataset()
+    root.attrs |= {"kind": _KIND, "steps": contact_map.steps}
+    groups = {"/": root, "whisker": contact_map.whisker.to_dataset(), "chart": raw}
+    if contact_map.grid is not None:
+        groups["grid"] = contact_map.grid
+    tree = xr.DataTree.from_dict(groups)
+    grid = [] if contact_map.grid is None else list(map(str, contact_map.grid.data_vars))
+    write_netcdf(path, tree, {"/grid": dict.fromkeys(grid, COMPRESSED)})
+
+
+def _load(path: Path) -> ContactMap:
+    """Read a map; raise a ValueError if the file is not one."""
+    kind = kind_of(path)
+    if kind != _KIND:
+        raise ValueError(f"{path} holds {kind or 'data of another kind'}, not a contact map")
+    tree = read_tree(path)
+    missing = [name for name in ("whisker", "chart") if name not in tree.children]
+    if missing:
+        raise ValueError(f"{path} lacks the group {' and '.join(missing)} of a contact map")
+    with naming(path, "a contact map"):
+        return _from_tree(tree)
+
+
+def _from_tree(tree: xr.DataTree) -> ContactMap:
+    whisker = Whisker.from_dataset(tree["whisker"].to_dataset())
+    steps = int(tree.attrs["steps"])
+    raw = {str(name): np.asarray(v) for name, v in tree["chart"].to_dataset().variables.items()}
+    chart = StableSet(
+        discretization=discretize(whisker, steps),
+        stations=raw["stations"],
+        bearings=raw["bearings"],
+        loads=raw["loads"],
+        fold=Fold(raw["bounds"], np.ascontiguousarray(raw["fold"])),
+        contacts=raw["contacts"],
+        values=raw["values"],
+        tangents=raw["tangents"],
+        frames=raw["frames"],
+        folded=raw["folded"].astype(bool),
+    )
+    grid = None
+    if "grid" in tree.children:
+        # Files keep a coordinate of the root only there.
+        grid = tree.children["grid"].to_dataset(inherit=False)
+        grid = grid.assign_coords(space=["x", "y", "z"])
+    return ContactMap(whisker, chart, steps, grid)

@@ -1,32 +1,59 @@
-"""One measurement at a time, in microseconds: for streams, without labelled datasets around it.
+"""Measured signals in, contacts out: all that explain them, each with its covariance.
 
-Each measurement is searched for in the whole map, so that no candidate is lost by looking only near
-the last one; the search tree leads to the contacts in the time that a fit from the last one takes.
-The contact that was followed so far is one more place to start from, and it tells which candidate
-goes on from it.
-
-Fewer than three signals leave a curve or a surface of contacts: see
+Three signals T have as many unknowns ξ: every contact with T(ξ) = T is a candidate. More signals
+are explained by weighted least squares, χ² = |T(ξ) - T|² in standard deviations. With noise three
+are treated so too: contacts on the boundary of T(Ω) explain what noise has carried out of it. For
+noise of covariance Σ the covariance is ∂p/∂ξ (JᵀΣ⁻¹J)⁻¹ ∂p/∂ξᵀ with J = ∂T/∂ξ to first order, see
+:mod:`~vibrissa.contacts.posterior`. For a covariance of force and moment, Σ is carried over to the
+signals by their derivatives. Fewer than three signals leave a curve or a surface of contacts, see
 :mod:`~vibrissa.contacts.ambiguity`.
+
+Many measurements at once and one at a time go through the same compiled rows
+(:mod:`~vibrissa.contacts.candidates`). Each is searched for in the whole map, so that no candidate
+is lost by looking only near the last one.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
+import xarray as xr
 from numpy.typing import ArrayLike
+from scipy.spatial import cKDTree
 
-from vibrissa.contacts.located import Located, nowhere
-from vibrissa.contacts.noise import by_stiffness, common_errors, sensor_noise
-from vibrissa.contacts.prior import Prior, located_where_allowed
-from vibrissa.contacts.readout import Measurement, Mixed, Named
-from vibrissa.contacts.sensor_readout import ByName, readout_of
-from vibrissa.contacts.single_search import ExactSearch, LeastSquaresSearch, SetSearch
+from vibrissa.contacts.ambiguity import Ambiguity
+from vibrissa.contacts.candidates import UNEXPLAINED, Problem, estimate_rows
+from vibrissa.contacts.contacts import Candidates, Contact, Contacts, nowhere
+from vibrissa.contacts.inversion import polish
+from vibrissa.contacts.noise import by_stiffness, common_errors, explained, sensor_noise
+from vibrissa.contacts.prior import Prior, among_allowed
+from vibrissa.contacts.readout import (
+    Bounds,
+    ByName,
+    Measurement,
+    Mixed,
+    Named,
+    check_signals,
+    independent,
+    readout_of,
+)
+from vibrissa.numerics import AnyArray, Array, IntArray, share_out
+from vibrissa.rod import TOLERANCE
 from vibrissa.sensors import Sensor
 from vibrissa.sensors.sensor import GRAVITY
-from vibrissa.signals import selection
+from vibrissa.signals import (
+    SIGNALS,
+    circular_among,
+    measured,
+    selection,
+    signal_scales,
+    signals_of,
+    within_turn,
+)
 from vibrissa.status import Status
 
 if TYPE_CHECKING:
@@ -35,18 +62,160 @@ if TYPE_CHECKING:
 _UNKNOWNS = 3
 # What is larger is brought to this: no less absurd, in any unit, and its square is still a number.
 _LARGEST = 1e100
+_STATUSES = {int(status): status for status in Status}
+
+
+class Search:
+    """Finds the contacts that explain measurements of three or more signals."""
+
+    def __init__(self, contact_map: ContactMap, readout: Named | Mixed) -> None:
+        self.contact_map, self.readout = contact_map, readout
+        exact = isinstance(readout, Named) and len(readout.names) == _UNKNOWNS
+        limit = explained(independent(contact_map, readout) - _UNKNOWNS)
+        self._problem = Problem(exact, readout.noisy, readout.passes, limit)
+
+    def batch(self, values: Array, targets: Array) -> tuple[Candidates, IntArray, Array]:
+        """Candidates of measurements (n, k), with statuses and χ² of the first (n,)."""
+        readout = self.readout
+        assert isinstance(readout, Named)
+        known = np.isfinite(values).all(axis=1)
+        status = np.where(known, int(Status.UNIQUE), int(Status.MISSING))
+        nothing = known & readout.bounds.nothing(values)
+        beyond = known & readout.bounds.exceeded(values)
+        status[beyond], status[nothing] = self._beyond, self._nothing
+        aims = np.where((status == Status.UNIQUE)[:, None], targets, np.nan)
+        return self._rows(np.ascontiguousarray(values), aims, status)
+
+    def one(self, measurement: Measurement) -> tuple[Candidates, Status, float]:
+        """Candidates of one measurement, with its status and χ² of the first."""
+        readout = self.readout
+        values, targets = measurement.measured[None], measurement.target[None]
+        status = np.array([int(Status.UNIQUE)])
+        if readout.nothing(measurement):
+            status[0], targets = self._nothing, np.full(targets.shape, np.nan)
+        elif readout.beyond(measurement):
+            status[0], targets = self._beyond, np.full(targets.shape, np.nan)
+        found, status, chi_squared = self._rows(values, targets, status)
+        return found, _STATUSES[int(status[0])], float(chi_squared[0])
+
+    @property
+    def _nothing(self) -> int:
+        return UNEXPLAINED if self._problem.exact else int(Status.DEGENERATE)
+
+    @property
+    def _beyond(self) -> int:
+        return UNEXPLAINED if self._problem.exact else int(Status.OUTSIDE_MAP)
+
+    def _rows(
+        self, values: Array, targets: Array, status: IntArray
+    ) -> tuple[Candidates, IntArray, Array]:
+        readout, out = self.readout, Candidates.room(len(values))
+        share_out(
+            len(values),
+            lambda first, last: estimate_rows(
+                readout.searched,
+                readout.how,
+                self._problem,
+                targets,
+                values,
+                out,
+                status,
+                first,
+                last,
+            ),
+        )
+        chi_squared = out.chi_squared[:, 0].copy()
+        rows = np.flatnonzero(status == UNEXPLAINED)
+        if rows.size:
+            assert isinstance(readout, Named)
+            status[rows], away = why_none(self.contact_map, readout.names, values[rows])
+            none = out.number[rows] == 0
+            chi_squared[rows[none]] = away[none]
+        return out, status, chi_squared
+
+
+def why_none(
+    contact_map: ContactMap, names: tuple[str, ...], targets: Array
+) -> tuple[IntArray, Array]:
+    """Why three signals have no contact, and how far the nearest are that have one."""
+    chart, turned = contact_map.chart, circular_among(names)
+    known, size, tree, bounds = seen(contact_map, names)
+    _, nearest = tree.query(_on_circle(targets, turned, size))
+    away = within_turn(known[nearest] - targets, turned)
+    span = np.where(turned, 2.0 * np.pi, size)
+    misfit = np.abs(away / span).max(axis=1)
+    # Perhaps a contact nearer to the base than the map goes explains them.
+    start = chart.contacts.reshape(-1, 3)[nearest]
+    xi, _, residual, sign = polish(chart, names, targets, start)
+    nearer = (residual <= TOLERANCE) & (sign > 0.0) & (xi[:, 0] < chart.proximal)
+    nearer |= bounds.exceeded(targets)
+    status = np.where(nearer, int(Status.OUTSIDE_MAP), int(Status.NOT_FRICTIONLESS))
+    status[bounds.nothing(targets)] = int(Status.DEGENERATE)
+    return status, misfit
+
+
+@lru_cache(maxsize=16)
+def seen(contact_map: ContactMap, names: tuple[str, ...]) -> tuple[Array, Array, cKDTree, Bounds]:
+    """Signals (n, k) at the chart's nodes, their ranges, the same as a tree, and their bounds."""
+    values = contact_map.chart.values.reshape(-1, 6)
+    which = [SIGNALS.index(name) for name in names]
+    known = signals_of(values[:, :3], np.cross(values[:, 3:], values[:, :3]))[:, which]
+    turned = circular_among(names)
+    size = np.where(turned, 1.0, np.ptp(known, axis=0))
+    tree = cKDTree(_on_circle(known, turned, size))
+    return known, size, tree, Bounds.of(contact_map, names)
+
+
+def _on_circle(values: Array, turned: AnyArray, size: Array) -> Array:
+    """Signals as points of a space where distance means difference: angles on the unit circle."""
+    parts = []
+    for k, turns in enumerate(turned.tolist()):
+        v = values[:, k]
+        parts += [np.cos(v), np.sin(v)] if turns else [np.clip(v / size[k], -_LARGEST, _LARGEST)]
+    return np.stack(parts, axis=1)
+
+
+def estimate(
+    contact_map: ContactMap,
+    signals: xr.Dataset | Mapping[str, ArrayLike],
+    using: str | Sequence[str],
+    noise: Mapping[str, float] | ArrayLike | None,
+    errors: Array,
+    prior: Prior | None,
+) -> Contacts:
+    """Find all frictionless contacts of a whisker that explain measured signals."""
+    names = selection(using)
+    sensor = sensor_noise(noise, names, errors)
+    values, dims, coords = measured(signals, names)
+    check_signals(values, names)
+    d = contact_map.chart.discretization
+    flat = values.reshape(-1, len(names)) / signal_scales(names, d.force, d.moment)
+    if contact_map.determines(names):
+        readout = Named(contact_map, names, sensor)
+        search = Search(contact_map, readout)
+        targets = readout.channels.targets(flat)
+        found, status, chi_squared = search.batch(flat, targets)
+        if prior is not None:
+            found, status, chi_squared = among_allowed(
+                prior, contact_map, readout, (flat, targets), found, status, chi_squared
+            )
+    else:
+        found, chi_squared = Candidates.room(len(flat), 1), np.full(len(flat), np.nan)
+        known = np.isfinite(flat).all(axis=1)
+        status = np.where(known, int(Status.DEGENERATE), int(Status.MISSING))
+    return Contacts.of(found, status, chi_squared, d, names, values.shape[:-1], dims, coords)
 
 
 class Estimator:
-    """Locate contacts from a stream of signals.
+    """Locate contacts one measurement at a time, in microseconds.
 
     Parameters
     ----------
     contact_map : ContactMap
-        The whisker's map.
-    triplet : str or sequence of str
-        The signals that the stream carries, in this order; fewer than three do not determine a
-        contact, but leave a curve or surface of them.
+        Map of the whisker's contacts.
+    using : str or sequence of str
+        Signals that a measurement has, in this order; fewer than three do not determine a contact,
+        but leave a curve or surface of them.
     noise : mapping or (6, 6) array_like, optional
         Standard deviation of each signal, or covariance of (F, M), SI units: gives covariances, and
         weighs more than three signals.
@@ -54,15 +223,15 @@ class Estimator:
         Relative standard deviation of the whisker's bending stiffness E r⁴, in the covariances:
         √(σ_E² + 16 σ_r²) of those of modulus and radius. It needs noise.
     felt_above : float
-        Signals within so many standard deviations of zero are ``NOT_FELT``; 0, the default,
-        locates all. It needs noise.
+        Number of standard deviations within which signals count as zero, ``NOT_FELT``; 0, the
+        default, locates all. It needs noise.
     gain_sigma : float or (6,) array_like
         Relative standard deviation of the sensor's gains, of all or each of Fx, Fy, Fz, Mx, My, Mz.
     mixing_sigma : float or (6, 6) array_like
         Standard deviations of what each of these reads of all six; or one number, relative: of the
         cross-talk among forces, and among moments.
     prior : Prior, optional
-        Which contacts are possible; others are left out of the candidates.
+        Possible contacts; others are left out of the candidates.
 
     See Also
     --------
@@ -72,7 +241,7 @@ class Estimator:
     def __init__(
         self,
         contact_map: ContactMap,
-        triplet: str | Sequence[str] = ("Fx", "MB", "MD"),
+        using: str | Sequence[str] = ("Fx", "MB", "MD"),
         noise: Mapping[str, float] | ArrayLike | None = None,
         stiffness_sigma: float = 0.0,
         felt_above: float = 0.0,
@@ -80,8 +249,8 @@ class Estimator:
         mixing_sigma: float | ArrayLike = 0.0,
         prior: Prior | None = None,
     ) -> None:
-        names = selection(triplet, least=1)
-        order = triplet.replace(",", " ").split() if isinstance(triplet, str) else list(triplet)
+        names = selection(using, least=1)
+        order = using.replace(",", " ").split() if isinstance(using, str) else list(using)
         errors = common_errors(stiffness_sigma, gain_sigma, mixing_sigma)
         sensor = sensor_noise(noise, names, errors)
         self._order: list[int] | None = [order.index(name) for name in names]
@@ -103,16 +272,17 @@ class Estimator:
         Parameters
         ----------
         contact_map : ContactMap
-            The whisker's map.
+            Map of the whisker's contacts.
         sensor : Sensor
-            What it reads, how it is mounted, its noise and the errors of its gain, mixing and
+            Sensor with its channels, mounting, noise and the errors of its gain, mixing and
             calibration, all in the covariances; offset and weight are taken away.
         stiffness_sigma : float
             Relative standard deviation of the whisker's bending stiffness.
         felt_above : float
-            Readings within so many standard deviations of zero are ``NOT_FELT``; 0 locates all.
+            Number of standard deviations within which readings count as zero, ``NOT_FELT``; 0
+            locates all.
         prior : Prior, optional
-            Which contacts are possible.
+            Possible contacts.
 
         Returns
         -------
@@ -156,16 +326,11 @@ class Estimator:
         self.contact_map = contact_map
         told, named = self.readout.told, isinstance(self.readout, Named)
         self._determining = told < _UNKNOWNS or not named or contact_map.determines(self.names)
-        self._search = self._chosen_search()
-
-    def _chosen_search(self) -> ExactSearch | LeastSquaresSearch | SetSearch:
-        """How contacts are looked for, by how many independent numbers a measurement tells."""
-        contact_map, readout = self.contact_map, self.readout
-        if readout.told < _UNKNOWNS:
-            return SetSearch(contact_map, readout)
-        if isinstance(readout, Named) and len(readout.names) == _UNKNOWNS:
-            return ExactSearch(contact_map, readout)
-        return LeastSquaresSearch(contact_map, readout)
+        self._search = Search(contact_map, self.readout) if told >= _UNKNOWNS else None
+        self._ambiguity = None
+        if told < _UNKNOWNS:
+            self._ambiguity = Ambiguity(contact_map.chart, self.readout)
+        self._last: Array | None = None
 
     @property
     def noisy(self) -> bool:
@@ -192,14 +357,14 @@ class Estimator:
 
     def reset(self) -> None:
         """Forget the measurement before, as when the whisker has lost touch."""
-        self._search.forget()
+        self._last = None
 
     def __call__(
         self,
         signals: ArrayLike,
         rotation: ArrayLike | None = None,
         gravity: ArrayLike = GRAVITY,
-    ) -> Located:
+    ) -> Contact:
         """Locate one measurement."""
         return self.locate(self.measurement(signals, rotation, gravity))
 
@@ -214,11 +379,11 @@ class Estimator:
         Parameters
         ----------
         signals : (k,) array_like
-            The signals or readings.
+            Signals or readings, SI units.
         rotation : (3, 3) array_like, optional
-            From the whisker's to the laboratory frame.
+            Rotation from the whisker's to the laboratory frame.
         gravity : (3,) array_like
-            In the laboratory frame, m/s².
+            Gravity in the laboratory frame, m/s².
 
         Returns
         -------
@@ -243,7 +408,7 @@ class Estimator:
             values = values[self._order]
         return self.readout.scaled(values)
 
-    def locate(self, measurement: Measurement) -> Located:
+    def locate(self, measurement: Measurement) -> Contact:
         """Locate one measurement.
 
         Parameters
@@ -253,35 +418,57 @@ class Estimator:
 
         Returns
         -------
-        Located
+        Contact
             The contact, all candidates, and the status.
         """
+        d = self.contact_map.chart.discretization
         nothing = self.nothing_in(measurement)
-        if nothing is None:
-            found = self._search(measurement)
-            if self.prior is None:
-                return found
-            return located_where_allowed(
-                self.prior, self.contact_map, self.readout, measurement, found
+        if nothing is not None:
+            self._last = None
+            return nowhere(nothing, math.nan, d)
+        if self._search is None:
+            return self._sampled(measurement)
+        found, status, chi_squared = self._search.one(measurement)
+        if self.prior is not None:
+            pair = measurement.measured[None], measurement.target[None]
+            found, codes, chi = among_allowed(
+                self.prior,
+                self.contact_map,
+                self.readout,
+                pair,
+                found,
+                np.array([int(status)]),
+                np.array([chi_squared]),
             )
-        self._search.forget()
-        return nowhere(nothing)
+            status, chi_squared = _STATUSES[int(codes[0])], float(chi[0])
+        number, continuing = int(found.number[0]), 0
+        if number > 1 and self._last is not None:
+            away = found.values[0, :number, 3:] - self._last
+            continuing = int((away * away).sum(axis=1).argmin())
+        self._last = found.values[0, continuing, 3:] if number else None
+        return Contact.of(found, status, chi_squared, d, self.names, continuing)
 
-    def nothing_in(self, measurement: Measurement) -> Status | None:
-        """Why a measurement is not worth a search: ``MISSING``, ``NOT_FELT``, ``DEGENERATE``.
-
-        Parameters
-        ----------
-        measurement : Measurement
-            Of `measurement`.
-
-        Returns
-        -------
-        Status or None
-            None where it is worth one.
-        """
-        if not all(map(math.isfinite, measurement.measured.tolist())):
-            return Status.MISSING
-        if self.felt_above > 0.0 and not self.readout.felt(measurement, self.felt_above):
-            return Status.NOT_FELT
-        return None if self._determining else Status.DEGENERATE
+    def _sampled(self, measurement: Measurement) -> Contact:
+        """Samples of the curve or surface of contacts that explain fewer than three signals."""
+        assert self._ambiguity is not None
+        d, readout = self.contact_map.chart.discretization, self.readout
+        if readout.nothing(measurement):
+            return nowhere(Status.DEGENERATE, math.nan, d)
+        found, middle, covariance = self._ambiguity.samples(measurement)
+        if not found.number[0]:
+            beyond = readout.beyond(measurement)
+            return nowhere(Status.OUTSIDE_MAP if beyond else Status.NOT_FRICTIONLESS, math.nan, d)
+        if self.prior is not None:
+            kept = np.flatnonzero(self.prior.allows_candidates(self.contact_map, found)[0])
+            if not kept.size:
+                return nowhere(Status.OUTSIDE_PRIOR, 0.0, d)
+            if kept.size < found.number[0]:
+                found = Candidates(np.array([kept.size]), *(part[:, kept] for part in found[1:]))
+                points = found.values[0, :, 3:]
+                middle = int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmin())
+                away = points - points[middle]
+                covariance = away.T @ away / kept.size + found.covariances[0].mean(axis=0)
+        if not readout.noisy:
+            covariance[:], found.covariances[:] = np.nan, np.nan
+        status, size = Status.UNDERDETERMINED, d.length**2
+        return Contact.of(found, status, 0.0, d, self.names, middle, middle, covariance * size)

@@ -7,10 +7,15 @@ rad.
 
 from __future__ import annotations
 
+from functools import lru_cache
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 
+from vibrissa.contacts.channels import CHANNELS, channels_of
+from vibrissa.contacts.channels import CIRCULAR as CIRCULAR_CHANNELS
+from vibrissa.contacts.contacts import MOST_CANDIDATES
 from vibrissa.numerics import Array, IntArray, copy, inlined, kernel, share_out, wrapped
 from vibrissa.rod import (
     BUFFER_SIZE,
@@ -31,8 +36,8 @@ from vibrissa.rod import (
 )
 from vibrissa.signals import CIRCULAR, SIGNALS, signal_derivatives, signal_equations, signals_of
 
-#: At most so many contacts are kept for one measurement, those with the least force.
-MOST_CANDIDATES = 8
+#: Parts of the chart in each of which the nearest node is a start.
+PARTS = 16
 # Two solutions this near (relative to L and to the force) are one.
 _SAME = 1e-7
 # More targets than this are brought into an order in which the tree's nodes stay at hand.
@@ -40,7 +45,7 @@ _MANY = 1000
 _RANK_BITS = 5
 
 
-class Contacts(NamedTuple):
+class Solutions(NamedTuple):
     """Contacts that explain measurements, non-dimensional, sorted by force.
 
     number (n,); contacts ξ (n, MOST_CANDIDATES, 3) and (F, p) (n, MOST_CANDIDATES, 6), NaN-padded.
@@ -81,14 +86,14 @@ def _plane(chart: StableSet, triplet: tuple[str, ...]) -> PlaneVector | None:
 
 def invert(
     chart: StableSet, tree: SearchTree, triplet: tuple[str, ...], targets: Array
-) -> Contacts:
+) -> Solutions:
     """Find all stable contacts for each measured triplet."""
     if len(targets) > _MANY:
         order = _by_neighbourhood(targets)
         found = _inverted(chart, tree, triplet, targets[order])
         place = np.empty_like(order)
         place[order] = np.arange(len(order))
-        return Contacts(found.number[place], found.contacts[place], found.values[place])
+        return Solutions(found.number[place], found.contacts[place], found.values[place])
     return _inverted(chart, tree, triplet, targets)
 
 
@@ -107,9 +112,9 @@ def _by_neighbourhood(targets: Array) -> IntArray:
 
 def _inverted(
     chart: StableSet, tree: SearchTree, triplet: tuple[str, ...], targets: Array
-) -> Contacts:
+) -> Solutions:
     n = len(targets)
-    out = Contacts(
+    out = Solutions(
         np.zeros(n, np.int64),
         np.full((n, MOST_CANDIDATES, 3), np.nan),
         np.full((n, MOST_CANDIDATES, 6), np.nan),
@@ -118,7 +123,7 @@ def _inverted(
     rod = chart.discretization.rod
     share_out(
         n,
-        lambda first, last: _invert(
+        lambda first, last: invert_rows(
             rod, chart.fold, tree, chart.proximal, targets, *out, first, last
         ),
     )
@@ -136,7 +141,9 @@ def polish(
     rod, fold = chart.discretization.rod, chart.fold
     share_out(
         n,
-        lambda first, last: _polish(rod, fold, targets, xi, values, misfits, signs, first, last),
+        lambda first, last: polish_rows(
+            rod, fold, targets, xi, values, misfits, signs, first, last
+        ),
     )
     return xi, values, misfits, signs
 
@@ -198,7 +205,7 @@ def _add(
 
 
 @kernel
-def _invert(
+def invert_rows(
     rod: Rod,
     fold: Fold,
     tree: SearchTree,
@@ -210,6 +217,7 @@ def _invert(
     first: int,
     last: int,
 ) -> None:
+    """Find all stable contacts that give three signals, by rising force, for some rows."""
     b = np.zeros(BUFFER_SIZE)
     found, quality = np.empty((MOST_SEEDS, 3)), np.empty(MOST_SEEDS, np.int64)
     slopes = np.empty((MOST_SEEDS, 3, 3))
@@ -256,7 +264,7 @@ def _invert(
 
 
 @kernel
-def _polish(
+def polish_rows(
     rod: Rod,
     fold: Fold,
     targets: Array,
@@ -267,6 +275,7 @@ def _polish(
     first: int,
     last: int,
 ) -> None:
+    """Newton's method on T(ξ) = target for some rows, four side by side."""
     b = np.zeros(BUFFER_SIZE)
     charts, inverses = np.zeros((LANES, 3)), np.full((LANES, 3, 3), np.nan)
     for row in range(first, last, LANES):
@@ -285,3 +294,109 @@ def _polish(
             misfits[row:end],
             signs[row:end],
         )
+
+
+@lru_cache(maxsize=64)
+def seeding_triplet(chart: StableSet, names: tuple[str, ...]) -> tuple[str, ...]:
+    """The three signals among these that determine contacts best, as seen over the chart.
+
+    Judged by the median volume of the error ellipsoid, with forces and moments known to a share of
+    their size.
+    """
+    values = chart.values[::2, ::4, 1::2].reshape(-1, 6)
+    tangents = chart.tangents[::2, ::4, 1::2].reshape(-1, 6, 3)
+    force, moment = values[:, :3], np.cross(values[:, 3:], values[:, :3])
+    known = signals_of(force, moment)
+    f, m = np.linalg.norm(force, axis=1), np.linalg.norm(moment, axis=1)
+    with np.errstate(all="ignore"):
+        sigma = np.stack([f, f, f / known[:, 1], m, m, m / known[:, 4]], axis=1)
+        slopes = signal_derivatives(values, tangents) / sigma[:, :, None]
+        size = np.linalg.norm(slopes, axis=1, keepdims=True)
+        slopes = np.nan_to_num(slopes / size)
+
+        def volume(triplet: tuple[str, ...]) -> float:
+            which = [SIGNALS.index(name) for name in triplet]
+            return float(np.median(np.abs(np.linalg.det(slopes[:, which]))))
+
+        return max(combinations(names, 3), key=volume)
+
+
+@lru_cache(maxsize=64)
+def at_nodes(chart: StableSet, names: tuple[str, ...]) -> tuple[Array, Array, IntArray]:
+    """Channels (k, nodes) at the chart's nodes, 1/2π for those that are angles, and each's part."""
+    which = [CHANNELS.index(name) for name in names]
+    known = np.ascontiguousarray(channels_of(chart.values.reshape(-1, 6))[:, which].T)
+    turns = np.array([0.5 / np.pi if CIRCULAR_CHANNELS[w] else 0.0 for w in which])
+    return known, turns, parts(chart)
+
+
+def parts(chart: StableSet) -> IntArray:
+    """To which of sixteen parts of the chart each of its nodes belongs, flat."""
+    n, m, k = chart.values.shape[:3]
+    i, j, _ = np.meshgrid(np.arange(n), np.arange(m), np.arange(k), indexing="ij")
+    return np.asarray((4 * (4 * i // n) + (4 * j // m) % 4).reshape(-1))
+
+
+@lru_cache(maxsize=16)
+def volumes(chart: StableSet) -> Array:
+    """Volumes of contact points that the chart's nodes stand for, flat."""
+    size = np.abs(np.linalg.det(chart.tangents[..., 3:, :] @ chart.frames))
+    for axis in range(3):  # nodes on its faces stand for half a cell
+        ends = np.ones(size.shape[axis])
+        ends[[0, -1]] = 0.5
+        size = size * np.expand_dims(ends, [i for i in range(3) if i != axis])
+    return np.asarray(np.maximum(size, np.finfo(float).tiny).reshape(-1))
+
+
+@kernel
+def _nearest(
+    known: Array,
+    turns: Array,
+    part: IntArray,
+    targets: Array,
+    scale: Array,
+    out: IntArray,
+    first: int,
+    last: int,
+) -> None:
+    nodes = known.shape[1]
+    least, total = np.empty(out.shape[1]), np.empty(nodes)
+    for row in range(first, last):
+        least[:], total[:] = np.inf, 0.0
+        for k in range(known.shape[0]):
+            target, size, turn = targets[row, k], scale[row, k], turns[k]
+            seen = known[k]
+            for node in range(nodes):
+                away = seen[node] - target
+                away -= np.rint(away * turn) * 2.0 * np.pi
+                total[node] += (away * size) ** 2
+        for node in range(nodes):
+            p = part[node]
+            if total[node] < least[p]:
+                least[p] = total[node]
+                out[row, p] = node
+
+
+@kernel
+def nearest_of(
+    known: Array,
+    turns: Array,
+    part: IntArray,
+    kinds: IntArray,
+    mixing: Array,
+    target: Array,
+    out: IntArray,
+) -> None:
+    """Fill the nodes of all parts of the chart that come nearest to one measurement."""
+    q, k = known.shape[0], target.shape[0]
+    wanted, scale = np.zeros((1, q)), np.ones((1, q))
+    sizes = np.zeros(2)
+    for i in range(q):
+        for c in range(k):
+            wanted[0, i] += mixing[i, c] * target[c]
+        if kinds[i] < 2:
+            sizes[kinds[i]] += wanted[0, i] ** 2
+    for i in range(q):
+        if kinds[i] < 2 and sizes[kinds[i]] > 0.0:
+            scale[0, i] = 1.0 / np.sqrt(sizes[kinds[i]])
+    _nearest(known, turns, part, wanted, scale, out, 0, 1)

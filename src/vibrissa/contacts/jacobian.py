@@ -11,14 +11,40 @@ rounding, or a direction has no meaning, the derivatives are NaN.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from vibrissa.numerics import Array
-from vibrissa.rod import Discretization
-from vibrissa.signals import SIGNALS, signal_derivatives, signal_scales
+from vibrissa.rod import (
+    Discretization,
+    discretize,
+    fold_forces,
+    solve_forces,
+    with_normal_force,
+)
+from vibrissa.signals import (
+    SIGNALS,
+    circular_among,
+    signal_derivatives,
+    signal_scales,
+    signals_of,
+)
+
+if TYPE_CHECKING:
+    from vibrissa.contacts.contact_map import ContactMap
 
 #: A determinant smaller than this, rows and columns being of size one, is zero to rounding.
 SINGULAR = 1e-11
+# Singular values smaller than this share of the largest count as zero.
+RANK = 1e-8
+# A triplet has lost a dimension if it has at all but this share of the contacts.
+_LOST = 0.99
+# Where the equations make signals depend on each other, the integration does so to its own error.
+# With so many times the steps that is below ``RANK``.
+_FINER = 8
+# How many contacts show whether signals determine contacts at all.
+_TRIED = 256
 
 
 def contact_signal_derivatives(
@@ -69,3 +95,51 @@ def spherical_derivatives(points: Array) -> Array:
     out = np.stack(rows, axis=-2)
     out[~np.isfinite(out).all(axis=(-1, -2))] = np.nan
     return out
+
+
+def determining(contact_map: ContactMap, names: tuple[str, ...]) -> bool:
+    """Whether signals determine contacts, but for single ones."""
+    chart = contact_map.chart
+    nodes = np.random.default_rng(0).choice(chart.values[..., 0].size, _TRIED, replace=False)
+    xi, values = chart.contacts.reshape(-1, 3)[nodes], chart.values.reshape(-1, 6)[nodes]
+    signals = signals_of(values[:, :3], np.cross(values[:, 3:], values[:, :3]))
+    which = [SIGNALS.index(name) for name in names]
+    span = np.where(circular_among(names), 2.0 * np.pi, np.ptp(signals[:, which], axis=0))
+    return deficient(contact_map, names, xi, span) is None
+
+
+def deficient(
+    contact_map: ContactMap, names: tuple[str, ...], xi: Array, span: Array
+) -> int | None:
+    """Steps along the whisker with which signals have lost a dimension at contacts; None if not.
+
+    Parameters
+    ----------
+    contact_map : ContactMap
+        Map of the whisker's contacts; more integration steps are tried where rounding hides a loss.
+    names : tuple of str
+        Signals, three or more.
+    xi : (n, 3) array
+        Contacts (s, f_y, f_z), non-dimensional.
+    span : (k,) array
+        Range of each signal, which derivatives are compared with; a turn for directions.
+
+    Returns
+    -------
+    int or None
+        Number of steps, or None where the signals keep three dimensions.
+    """
+    # A signal without a range is zero everywhere, but for rounding.
+    weight = np.where(span > RANK, 1.0 / np.maximum(span, RANK), 0.0)
+    strength = fold_forces(contact_map.chart.fold, xi)
+    unit = np.stack([np.ones(len(xi)), strength, strength], axis=1)
+    which = [SIGNALS.index(name) for name in names]
+    for number in (contact_map.steps, _FINER * contact_map.steps):
+        values, tangents = solve_forces(
+            discretize(contact_map.whisker, number), with_normal_force(xi), tangents=True
+        )
+        slope = np.nan_to_num(signal_derivatives(values, tangents)[:, which]) * unit[:, None, :]
+        singular = np.linalg.svd(slope * weight[:, None], compute_uv=False)
+        if (singular[:, 2] <= RANK * singular[:, 0]).mean() > _LOST:
+            return number
+    return None

@@ -1,270 +1,565 @@
-"""Contacts from more signals than unknowns: all minima of χ² among the stable contacts.
+"""Contacts that explain measured signals best: weighted least squares, four contacts side by side.
 
-A contact that explains k > 3 signals also explains any three of them, nearly. So the contacts that
-give the best determined three exactly are where the search starts; from each of them, χ² of all
-signals is minimised. What has no such start, or no minimum that explains the signals, starts again
-from the nodes of the chart that come nearest, one for each of sixteen parts of it.
+A contact has the unknowns x = (s, f_x, f_y, f_z), or without friction (s, f_y, f_z), and gives
+channels c(x): signals, or components of force and moment. Measured channels c̃ with covariance
+Σ = (WᵀW)⁻¹ are explained best where
+
+    χ²(x) = |W (c(x) - c̃)|²
+
+is least: Gauss-Newton steps with the exact Jacobian of the rod, damped as Levenberg and Marquardt
+do where one fails. The contact may not leave the whisker: at the tip (and at the smallest arc
+length considered) only the force is free. Everything is non-dimensional.
+
+Without friction a fit may also be kept within Ω, on its boundary where noise has carried the
+measurement out of it. In z = (s, ψ, λ), with bearing ψ and λ the force over the fold force
+f*(s, ψ),
+
+    ξ = (s, λ f* cos ψ, λ f* sin ψ),   proximal ≤ s ≤ 1,   λ ≤ 1,
+
+Ω is a box, to which steps can be confined: what would leave it stays on its face as long as χ²
+falls outward there. Where three signals fold, det ∂T/∂ξ = 0, the damping leads to the fold itself.
 """
 
 from __future__ import annotations
 
-from functools import lru_cache
-from itertools import combinations
-from typing import TYPE_CHECKING
+import math
+from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.channels import CHANNELS, CIRCULAR, Channels, channels_of
-from vibrissa.contacts.fitting import Fits, charted, fit
-from vibrissa.contacts.inversion import invert
-from vibrissa.contacts.minima import Candidates, candidates
-from vibrissa.contacts.noise import SensorNoise
-from vibrissa.contacts.whitening import INDISTINCT, explained, rank, whitening
-from vibrissa.numerics import Array, IntArray, kernel, share_out
-from vibrissa.rod import LEAST_ARC, ROUNDING, StableSet, solve_forces, with_normal_force
-from vibrissa.signals import SIGNALS, signal_derivatives, signals_of
-from vibrissa.status import Status
+from vibrissa.contacts.channels import FITTED, channel_derivatives
+from vibrissa.numerics import (
+    AnyArray,
+    Array,
+    IntArray,
+    copy,
+    inlined,
+    kernel,
+    share_out,
+    solve3,
+    wrapped,
+)
+from vibrissa.rod import (
+    BUFFER_SIZE,
+    LANES,
+    Discretization,
+    Fold,
+    Rod,
+    StableSet,
+    fold_force,
+    integrate,
+    lane_tangents,
+    lane_value,
+    lanes_tangents,
+    point_determinant,
+    set_all_lanes,
+    set_lane,
+    stable,
+)
+from vibrissa.signals import signal_equations
 
-if TYPE_CHECKING:
-    from vibrissa.contacts.contact_map import ContactMap
-
-#: At most so many candidates are kept.
-MOST = 8
-_UNKNOWNS = 3
-PARTS = 16
-# Of candidates that explain signals equally well the one with less force comes first.
-_FORCE = 1e-6
-
-
-@lru_cache(maxsize=64)
-def seeding_triplet(chart: StableSet, names: tuple[str, ...]) -> tuple[str, ...]:
-    """The three signals among these that determine contacts best, as seen over the chart.
-
-    Judged by the median volume of the error ellipsoid, with forces and moments known to a share of
-    their size.
-    """
-    values = chart.values[::2, ::4, 1::2].reshape(-1, 6)
-    tangents = chart.tangents[::2, ::4, 1::2].reshape(-1, 6, 3)
-    force, moment = values[:, :3], np.cross(values[:, 3:], values[:, :3])
-    known = signals_of(force, moment)
-    f, m = np.linalg.norm(force, axis=1), np.linalg.norm(moment, axis=1)
-    with np.errstate(all="ignore"):
-        sigma = np.stack([f, f, f / known[:, 1], m, m, m / known[:, 4]], axis=1)
-        slopes = signal_derivatives(values, tangents) / sigma[:, :, None]
-        size = np.linalg.norm(slopes, axis=1, keepdims=True)
-        slopes = np.nan_to_num(slopes / size)
-
-        def volume(triplet: tuple[str, ...]) -> float:
-            which = [SIGNALS.index(name) for name in triplet]
-            return float(np.median(np.abs(np.linalg.det(slopes[:, which]))))
-
-        return max(combinations(names, 3), key=volume)
-
-
-def least_squares(
-    contact_map: ContactMap,
-    names: tuple[str, ...],
-    measured: Array,
-    sensor: SensorNoise | None,
-    starts: Array | None = None,
-) -> tuple[Candidates, IntArray]:
-    """Find the contacts that explain more than three signals best."""
-    chart, channels = contact_map.chart, Channels.of(names)
-    triplet = seeding_triplet(chart, names)
-    three = measured[:, [names.index(name) for name in triplet]]
-    exact = invert(chart, contact_map.tree(triplet), triplet, three)
-    row, place = np.nonzero(np.arange(exact.contacts.shape[1]) < exact.number[:, None])
-    seeds = exact.contacts[row, place]
-    if starts is not None:
-        more = np.flatnonzero(np.isfinite(starts).all(axis=1))
-        row, seeds = np.concatenate([row, more]), np.concatenate([seeds, starts[more]])
-    limit = largest_misfit(channels, sensor, contact_map)
-    fits = nearby(chart, channels, sensor, measured[row], seeds, limit)
-    inside = charted(chart, fits, chart.proximal)
-    lost = np.ones(len(measured), np.bool_)
-    lost[row[inside & (fits.misfits <= limit)]] = False
-    again = np.flatnonzero(lost)
-    if again.size:
-        nodes = nearest_nodes(chart, channels, measured[again])
-        there = nodes >= 0
-        more = np.repeat(again, PARTS).reshape(-1, PARTS)[there]
-        seeds = chart.contacts.reshape(-1, 3)[nodes[there]]
-        others = nearby(chart, channels, sensor, measured[more], seeds, limit)
-        row = np.concatenate([row, more])
-        fits = Fits(*(np.concatenate(pair) for pair in zip(fits, others, strict=True)))
-        inside = charted(chart, fits, chart.proximal)
-    doubt = by_doubt(fits)
-    kept = np.flatnonzero(inside)
-    found = candidates(
-        len(measured), row[kept], Fits(*(a[kept] for a in fits)), doubt[kept], limit, MOST
-    )
-    status = np.where(found.number > 1, int(Status.AMBIGUOUS), int(Status.UNIQUE))
-    status[~(found.misfits[:, 0] <= limit)] = int(Status.NOT_FRICTIONLESS)
-    # Perhaps a contact nearer to the base than the map goes explains them.
-    nearer = charted(chart, fits, LEAST_ARC + ROUNDING) & ~inside & (fits.misfits <= limit)
-    outside = np.zeros(len(measured), np.bool_)
-    outside[row[nearer]] = True
-    status[outside & (status == Status.NOT_FRICTIONLESS)] = int(Status.OUTSIDE_MAP)
-    return found, status
+# Some valleys of χ² are narrow and bent: most fits take 5 rounds, but a few a hundred. What is not
+# at rest after so many goes on only if it may still count.
+_ROUNDS = 15
+_TIMES = 8
+# A step this small, relative to the length and to the force, is the last, and taken to first order;
+# a damped one only if it is smaller still.
+_LAST = 1e-6
+_SMALL = 1e-9
+# So is one that promises to lower χ² by no more than this share of it.
+_IDLE = 1e-8
+_LONGEST = 0.1
+_MOST_DAMPING = 1e8
+_ROUNDS_WITHIN = 40
+# A step that promises less of χ² (as a share of it, and by itself) is not taken.
+_IDLE_WITHIN, _LITTLE = 1e-7, 1e-10
+# The longest steps of s, ψ and λ.
+_LONGEST_WITHIN = (0.1, 0.5, 0.25)
+# The chart knows the fold to a part in a million: as near to it contacts are still stable.
+_MOST_LOAD = 1.0 - 1e-5
+# Steps for derivatives of the fold force, which is smooth.
+_NUDGE = 1e-5
 
 
-def by_doubt(fits: Fits) -> Array:
-    """What fits are sorted by: χ², and where that is the same the force."""
-    force = np.hypot(fits.contacts[:, 2], fits.contacts[:, 3])
-    return np.asarray(fits.misfits + _FORCE * (1.0 + fits.misfits) * force / (1.0 + force))
+class Fits(NamedTuple):
+    """Row by row: x (n, 4), (F, p) (n, 6), ∂(F, p)/∂x (n, 6, 4), χ² (n,), whether at rest (n,)."""
+
+    contacts: Array
+    values: Array
+    tangents: Array
+    misfits: Array
+    converged: AnyArray
 
 
-def largest_misfit(
-    channels: Channels, sensor: SensorNoise | None, contact_map: ContactMap
+@inlined
+def channel_equations(
+    x: Array,
+    v: Array,
+    t: Array,
+    codes: IntArray,
+    targets: Array,
+    residual: Array,
+    jacobian: Array,
+) -> None:
+    """Channels of x and (F, p) minus targets (k,), and their derivatives by x (k, 4)."""
+    signal_equations(x[0], v, t, True, codes, residual, jacobian)
+    for k in range(codes.shape[0]):
+        residual[k] -= targets[k]
+        if codes[k] == 2 or codes[k] == 5:
+            residual[k] = wrapped(residual[k])
+
+
+@inlined
+def whiten(w: Array, residual: Array, jacobian: Array, k: int, r: Array, j: Array) -> float:
+    """Fill r = W residual, j = W jacobian; return |r|²."""
+    total = 0.0
+    for a in range(k):
+        r[a] = 0.0
+        for c in range(4):
+            j[a, c] = 0.0
+        for b in range(k):
+            r[a] += w[a, b] * residual[b]
+            for c in range(4):
+                j[a, c] += w[a, b] * jacobian[b, c]
+        total += r[a] * r[a]
+    return float(total)
+
+
+@inlined
+def _damped_step(
+    r: Array, j: Array, k: int, damping: float, fixed: Array, a: Array, step: Array
+) -> bool:
+    """Solve (jᵀj + damping diag) step = -jᵀr over the unknowns that are not fixed, by Cholesky."""
+    for p in range(4):
+        for q in range(p + 1):
+            total = 0.0
+            for i in range(k):
+                total += j[i, p] * j[i, q]
+            a[p, q] = 0.0 if fixed[p] + fixed[q] > 0.0 else total
+        if fixed[p] > 0.0:
+            a[p, p] = 1.0
+        else:
+            a[p, p] *= 1.0 + damping
+        total = 0.0
+        for i in range(k):
+            total -= j[i, p] * r[i]
+        step[p] = 0.0 if fixed[p] > 0.0 else total
+    for p in range(4):
+        for q in range(p + 1):
+            total = a[p, q]
+            for i in range(q):
+                total -= a[p, i] * a[q, i]
+            if p > q:
+                a[p, q] = total / a[q, q]
+            elif total > 1e-14 * a[p, p]:
+                a[p, p] = np.sqrt(total)
+            else:
+                return False
+    for p in range(4):
+        for i in range(p):
+            step[p] -= a[p, i] * step[i]
+        step[p] /= a[p, p]
+    for p in range(3, -1, -1):
+        for i in range(p + 1, 4):
+            step[p] -= a[i, p] * step[i]
+        step[p] /= a[p, p]
+    return True
+
+
+@inlined
+def _next(
+    x: Array, r: Array, j: Array, k: int, damping: float, least: float, free: bool, work: Array
 ) -> float:
-    """Largest χ² of what counts as explained."""
-    degrees = len(channels.names)
-    if sensor is not None and sensor.wrench is not None:
-        node = contact_map.chart.values[-1, :1, -1]
-        d = contact_map.chart.discretization
-        covariance = channels.covariance(sensor, np.ones((1, degrees)), node, d)
-        degrees = rank(covariance[0])
-    return explained(degrees - _UNKNOWNS)
+    """Fill row 6 of the work with x after a damped step; return its relative size, or -1.
+
+    The size is 0 where the step would gain nothing.
+    """
+    a, fixed, step, to = work[:4], work[4], work[5], work[6]
+    for p in range(4):
+        fixed[p] = 0.0
+    if not free:
+        fixed[1] = 1.0
+    if not _damped_step(r, j, k, damping, fixed, a, step):
+        return -1.0
+    if (x[0] >= 1.0 and step[0] > 0.0) or (x[0] <= least and step[0] < 0.0):
+        fixed[0] = 1.0
+        if not _damped_step(r, j, k, damping, fixed, a, step):
+            return -1.0
+    force = np.sqrt(x[1] * x[1] + x[2] * x[2] + x[3] * x[3])
+    change = np.sqrt(step[1] * step[1] + step[2] * step[2] + step[3] * step[3])
+    size = max(abs(step[0]), change / force)
+    shorten = 1.0 / max(abs(step[0]) / _LONGEST, change / (0.5 * force), 1.0)
+    for p in range(4):
+        to[p] = x[p] + shorten * step[p]
+    to[0] = min(max(to[0], least), 1.0)
+    total, gain = 0.0, 0.0
+    for i in range(k):
+        total += r[i] * r[i]
+        for p in range(4):
+            gain -= r[i] * j[i, p] * step[p]
+    return 0.0 if gain <= _IDLE * total else float(size)
 
 
-def constant_weights(channels: Channels, sensor: SensorNoise | None) -> bool:
-    """Whether the weights of channels are the same for all contacts."""
-    if sensor is None or sensor.errors[..., :6].any():
-        return False
-    return sensor.deviations is not None or not set(channels.names) & {"FT", "FD", "MB", "MD"}
-
-
-def _weights(
-    chart: StableSet, channels: Channels, sensor: SensorNoise | None, measured: Array, values: Array
-) -> Array:
-    return whitening(channels.covariance(sensor, measured, values, chart.discretization))
-
-
-def nearby(
-    chart: StableSet,
-    channels: Channels,
-    sensor: SensorNoise | None,
-    measured: Array,
-    seeds: Array,
-    limit: float,
-    values: Array | None = None,
-) -> Fits:
-    """Find the minima of χ² next to seeds, with the weights that hold there."""
-    d = chart.discretization
-    contacts = with_normal_force(seeds)
-    if values is None:
-        values, _ = solve_forces(d, contacts)
-    targets = channels.targets(measured)
-    # Weights that depend on the contact are taken there once it is nearly known.
-    settled = constant_weights(channels, sensor)
-    for _ in range(1 if settled else 2):
-        weights = _weights(chart, channels, sensor, measured, values)
-        fits = fit(
-            d,
-            channels.names,
-            targets,
-            weights,
-            contacts,
-            friction=False,
-            least=LEAST_ARC,
-            worth=limit + INDISTINCT,
-        )
-        contacts, values = fits.contacts, np.where(np.isfinite(fits.values), fits.values, values)
-    return fits
-
-
-def nearest_nodes(chart: StableSet, channels: Channels, measured: Array) -> IntArray:
-    """The chart's nodes that come nearest to measured signals, in each part of the chart."""
-    known = at_nodes(chart, channels.names)
-    targets = channels.targets(measured)
-    which = [CHANNELS.index(name) for name in channels.names]
-    # Forces are compared relative to the force, moments to the moment, and directions in rad.
-    scale = np.ones_like(targets)
-    for kind in ("F", "M"):
-        same = [k for k, w in enumerate(which) if CHANNELS[w][0] == kind and not CIRCULAR[w]]
-        size = np.linalg.norm(targets[:, same], axis=1, keepdims=True)
-        scale[:, same] = 1.0 / np.where(size > 0.0, size, 1.0)
-    out = np.full((len(targets), PARTS), -1)
-    share_out(len(targets), lambda first, last: _nearest(*known, targets, scale, out, first, last))
-    return out
-
-
-@lru_cache(maxsize=64)
-def at_nodes(chart: StableSet, names: tuple[str, ...]) -> tuple[Array, Array, IntArray]:
-    """Channels (k, nodes) at the chart's nodes, 1/2π for those that are angles, and each's part."""
-    which = [CHANNELS.index(name) for name in names]
-    known = np.ascontiguousarray(channels_of(chart.values.reshape(-1, 6))[:, which].T)
-    turns = np.array([0.5 / np.pi if CIRCULAR[w] else 0.0 for w in which])
-    return known, turns, parts(chart)
-
-
-def parts(chart: StableSet) -> IntArray:
-    """To which of sixteen parts of the chart each of its nodes belongs, flat."""
-    n, m, k = chart.values.shape[:3]
-    i, j, _ = np.meshgrid(np.arange(n), np.arange(m), np.arange(k), indexing="ij")
-    return np.asarray((4 * (4 * i // n) + (4 * j // m) % 4).reshape(-1))
-
-
-@lru_cache(maxsize=16)
-def volumes(chart: StableSet) -> Array:
-    """Volumes of contact points that the chart's nodes stand for, flat."""
-    size = np.abs(np.linalg.det(chart.tangents[..., 3:, :] @ chart.frames))
-    for axis in range(3):  # nodes on its faces stand for half a cell
-        ends = np.ones(size.shape[axis])
-        ends[[0, -1]] = 0.5
-        size = size * np.expand_dims(ends, [i for i in range(3) if i != axis])
-    return np.asarray(np.maximum(size, np.finfo(float).tiny).reshape(-1))
+@inlined
+def _finish(
+    x: Array, value: Array, t: Array, r: Array, j: Array, k: int, step: Array, to: Array
+) -> float:
+    """Take a step to first order: x becomes ``to``; return χ² there."""
+    for p in range(4):
+        step[p] = to[p] - x[p]
+        x[p] = to[p]
+    for a in range(6):
+        for p in range(4):
+            value[a] += t[a, p] * step[p]
+    total = 0.0
+    for i in range(k):
+        away = r[i]
+        for p in range(4):
+            away += j[i, p] * step[p]
+        total += away * away
+    return float(total)
 
 
 @kernel
-def _nearest(
-    known: Array,
-    turns: Array,
-    part: IntArray,
+def fit_rows(
+    rod: Rod,
+    free: bool,
+    least: float,
+    codes: IntArray,
     targets: Array,
-    scale: Array,
-    out: IntArray,
+    weights: Array,
+    contacts: Array,
+    values: Array,
+    tangents: Array,
+    misfits: Array,
+    converged: AnyArray,
     first: int,
     last: int,
 ) -> None:
-    nodes = known.shape[1]
-    least, total = np.empty(out.shape[1]), np.empty(nodes)
-    for row in range(first, last):
-        least[:], total[:] = np.inf, 0.0
-        for k in range(known.shape[0]):
-            target, size, turn = targets[row, k], scale[row, k], turns[k]
-            seen = known[k]
-            for node in range(nodes):
-                away = seen[node] - target
-                away -= np.rint(away * turn) * 2.0 * np.pi
-                total[node] += (away * size) ** 2
-        for node in range(nodes):
-            p = part[node]
-            if total[node] < least[p]:
-                least[p] = total[node]
-                out[row, p] = node
+    """Fit contacts for some rows, four side by side (two with friction)."""
+    b = np.zeros(BUFFER_SIZE)
+    k = codes.shape[0]
+    value, t, third = np.empty(6), np.zeros((6, 4)), np.empty((6, 3))
+    residual, jacobian = np.empty(k), np.empty((k, 4))
+    trial_r, trial_j = np.empty(k), np.empty((k, 4))
+    r, j = np.empty((LANES, k)), np.empty((LANES, k, 4))
+    x, to, work = np.empty((LANES, 4)), np.empty((LANES, 4)), np.empty((7, 4))
+    damping = np.empty(LANES)
+    active = np.zeros(LANES, np.bool_)
+    # With friction a contact takes two lanes: their tangents differ in the first unknown.
+    lanes = 2 if free else 1
+    together = LANES // lanes
+    for row in range(first, last, together):
+        n = min(together, last - row)
+        for i in range(n):
+            copy(contacts[row + i], to[i])
+            damping[i], active[i] = 0.0, True
+            misfits[row + i], converged[row + i] = np.inf, False
+        for _ in range(_ROUNDS):
+            number, only = 0, 0
+            for i in range(n):
+                if active[i]:
+                    number, only = number + 1, i
+            if number == 0:
+                break
+            alone = number == 1  # its tangents side by side
+            if alone:
+                set_all_lanes(b, to[only, 0], to[only, 1], to[only, 2], to[only, 3])
+            else:
+                for i in range(LANES):
+                    c = to[min(i // lanes, n - 1)]
+                    set_lane(b, i, c[0], c[1], c[2], c[3], i % lanes == 1)
+            integrate(rod, b, 1 if alone else 3)
+            for i in range(n):
+                if not active[i]:
+                    continue
+                lane_value(b, lanes * i, value)
+                if alone:
+                    lanes_tangents(b, t)
+                else:
+                    lane_tangents(b, lanes * i, third)
+                    for a in range(6):
+                        t[a, 0], t[a, 2], t[a, 3] = third[a, 0], third[a, 1], third[a, 2]
+                    if free:
+                        lane_tangents(b, lanes * i + 1, third)
+                        for a in range(6):
+                            t[a, 1] = third[a, 0]
+                if not free:
+                    for a in range(6):
+                        t[a, 1] = 0.0
+                at = row + i
+                channel_equations(to[i], value, t, codes, targets[at], residual, jacobian)
+                misfit = whiten(weights[at], residual, jacobian, k, trial_r, trial_j)
+                if misfit < misfits[at]:
+                    damping[i] = 0.0 if damping[i] < 1e-5 else 0.1 * damping[i]
+                    misfits[at] = misfit
+                    copy(to[i], contacts[at])
+                    copy(to[i], x[i])
+                    copy(value, values[at])
+                    for a in range(6):
+                        copy(t[a], tangents[at, a])
+                    for a in range(k):
+                        r[i, a] = trial_r[a]
+                        copy(trial_j[a], j[i, a])
+                elif misfits[at] == np.inf:
+                    active[i] = False
+                    continue
+                else:
+                    damping[i] = max(10.0 * damping[i], 1e-2)
+                size = _next(x[i], r[i], j[i], k, damping[i], least, free, work)
+                while size < 0.0 and damping[i] <= _MOST_DAMPING:
+                    damping[i] = max(10.0 * damping[i], 1e-8)
+                    size = _next(x[i], r[i], j[i], k, damping[i], least, free, work)
+                active[i] = size >= 0.0
+                if size > (_LAST if damping[i] == 0.0 else _SMALL):
+                    copy(work[6], to[i])
+                elif active[i]:
+                    misfits[at] = _finish(
+                        contacts[at], values[at], tangents[at], r[i], j[i], k, work[5], work[6]
+                    )
+                    converged[at], active[i] = True, False
 
 
 @kernel
-def nearest_of(
-    known: Array,
-    turns: Array,
-    part: IntArray,
-    kinds: IntArray,
-    mixing: Array,
-    target: Array,
-    out: IntArray,
+def _charted(
+    fold: Fold,
+    proximal: float,
+    contacts: Array,
+    tangents: Array,
+    found: AnyArray,
+    first: int,
+    last: int,
 ) -> None:
-    """Fill the nodes of all parts of the chart that come nearest to one measurement."""
-    q, k = known.shape[0], target.shape[0]
-    wanted, scale = np.zeros((1, q)), np.ones((1, q))
-    sizes = np.zeros(2)
-    for i in range(q):
-        for c in range(k):
-            wanted[0, i] += mixing[i, c] * target[c]
-        if kinds[i] < 2:
-            sizes[kinds[i]] += wanted[0, i] ** 2
-    for i in range(q):
-        if kinds[i] < 2 and sizes[kinds[i]] > 0.0:
-            scale[0, i] = 1.0 / np.sqrt(sizes[kinds[i]])
-    _nearest(known, turns, part, wanted, scale, out, 0, 1)
+    xi, by_xi = np.empty(3), np.empty((6, 3))
+    for row in range(first, last):
+        xi[0], xi[1], xi[2] = contacts[row, 0], contacts[row, 2], contacts[row, 3]
+        for a in range(6):
+            t = tangents[row, a]
+            by_xi[a, 0], by_xi[a, 1], by_xi[a, 2] = t[0], t[2], t[3]
+        found[row] = stable(fold, proximal, xi, point_determinant(by_xi))
+
+
+def charted(chart: StableSet, fits: Fits, proximal: float) -> AnyArray:
+    """Whether fits without friction are stable contacts beyond an arc length, (n,)."""
+    found = np.zeros(len(fits.contacts), np.bool_)
+    share_out(
+        len(found),
+        lambda first, last: _charted(
+            chart.fold, proximal, fits.contacts, fits.tangents, found, first, last
+        ),
+    )
+    return found
+
+
+def fit(
+    discretization: Discretization,
+    channels: tuple[str, ...],
+    targets: Array,
+    weights: Array,
+    contacts: Array,
+    *,
+    friction: bool,
+    least: float,
+    worth: float = np.inf,
+) -> Fits:
+    """Fit contacts to measured channels."""
+    out = _once(discretization, channels, targets, weights, contacts, friction, least)
+    for _ in range(_TIMES):
+        slow = np.flatnonzero(~out.converged & (out.misfits <= worth))
+        if not slow.size:
+            break
+        further = _once(
+            discretization,
+            channels,
+            targets[slow],
+            weights[slow],
+            out.contacts[slow],
+            friction,
+            least,
+        )
+        for mine, theirs in zip(out, further, strict=True):
+            mine[slow] = theirs
+    return out
+
+
+def _once(
+    discretization: Discretization,
+    channels: tuple[str, ...],
+    targets: Array,
+    weights: Array,
+    contacts: Array,
+    friction: bool,
+    least: float,
+) -> Fits:
+    n = len(targets)
+    out = Fits(
+        np.array(contacts, dtype=np.float64),
+        np.full((n, 6), np.nan),
+        np.zeros((n, 6, 4)),
+        np.full(n, np.inf),
+        np.zeros(n, np.bool_),
+    )
+    codes = np.array([FITTED.index(name) for name in channels])
+    rod = discretization.rod
+    targets, weights = np.ascontiguousarray(targets), np.ascontiguousarray(weights)
+    share_out(
+        n,
+        lambda first, last: fit_rows(
+            rod, friction, least, codes, targets, weights, *out, first, last
+        ),
+    )
+    return out
+
+
+@inlined
+def _contact(fold: Fold, z: Array, x: Array, frame: Array) -> None:
+    """Fill the contact x (4,) at z, and ∂x/∂z (4, 3)."""
+    s, psi, load = z[0], z[1], z[2]
+    cos, sin, force = math.cos(psi), math.sin(psi), fold_force(fold, s, psi)
+    by_s = fold_force(fold, s + _NUDGE, psi) - fold_force(fold, s - _NUDGE, psi)
+    by_psi = fold_force(fold, s, psi + _NUDGE) - fold_force(fold, s, psi - _NUDGE)
+    by_s, by_psi = by_s / (2.0 * _NUDGE), by_psi / (2.0 * _NUDGE)
+    x[0], x[1], x[2], x[3] = s, 0.0, load * force * cos, load * force * sin
+    for a in range(4):
+        for p in range(3):
+            frame[a, p] = 0.0
+    frame[0, 0] = 1.0
+    frame[2, 0], frame[3, 0] = load * by_s * cos, load * by_s * sin
+    frame[2, 1], frame[3, 1] = (
+        load * (by_psi * cos - force * sin),
+        load * (by_psi * sin + force * cos),
+    )
+    frame[2, 2], frame[3, 2] = force * cos, force * sin
+
+
+@inlined
+def _confine(fold: Fold, proximal: float, z: Array) -> None:
+    """Bring z into the box; a force that has turned round has the opposite bearing."""
+    z[0] = min(max(z[0], proximal), 1.0)
+    if z[2] < 0.0:
+        force = fold_force(fold, z[0], z[1])
+        z[1] += math.pi
+        z[2] *= -force / fold_force(fold, z[0], z[1])
+    z[2] = min(z[2], _MOST_LOAD)
+
+
+@inlined
+def _next_within(
+    r: Array, j: Array, k: int, proximal: float, z: Array, damping: float, work: Array, step: Array
+) -> float:
+    """Fill a damped step within the box; χ² that it promises to gain, negative for no step."""
+    a, right, back = work[:3], work[3], work[4]
+    fixed = np.zeros(3, np.bool_)
+    for _ in range(3):
+        for p in range(3):
+            right[p] = 0.0
+            for i in range(k):
+                right[p] -= j[i, p] * r[i]
+            for q in range(3):
+                a[p, q] = 0.0
+                for i in range(k):
+                    a[p, q] += j[i, p] * j[i, q]
+            a[p, p] *= 1.0 + damping
+            back[p] = right[p]
+        for p in range(3):
+            if fixed[p] or a[p, p] == 0.0:
+                for q in range(3):
+                    a[p, q] = a[q, p] = 0.0
+                a[p, p], right[p] = 1.0, 0.0
+        size = a[0, 0] * a[1, 1] * a[2, 2]
+        if not abs(solve3(a, right, step)) > 1e-14 * size:
+            return -1.0
+        leaves_s = (z[0] >= 1.0 and step[0] > 0.0) or (z[0] <= proximal and step[0] < 0.0)
+        leaves_load = z[2] >= _MOST_LOAD and step[2] > 0.0
+        if not (leaves_s or leaves_load):
+            break
+        fixed[0] = fixed[0] or leaves_s
+        fixed[2] = fixed[2] or leaves_load
+    gain = 0.0
+    for p in range(3):
+        gain += back[p] * step[p]
+    return gain
+
+
+@kernel
+def fit_within(
+    rod: Rod,
+    fold: Fold,
+    proximal: float,
+    codes: IntArray,
+    target: Array,
+    weights: Array,
+    x: Array,
+    value: Array,
+    tangents: Array,
+) -> float:
+    """Find the contact of least χ² in Ω, downhill from another."""
+    b, k = np.zeros(BUFFER_SIZE), codes.shape[0]
+    z, to, step = np.empty(3), np.empty(3), np.zeros(3)
+    at, frame, work = np.empty(4), np.empty((4, 3)), np.empty((5, 3))
+    v, t = np.empty(6), np.zeros((6, 4))
+    residual, jacobian = np.empty(k), np.empty((k, 4))
+    trial_r, trial_j, r, j = np.empty(k), np.empty((k, 4)), np.empty(k), np.empty((k, 3))
+    to[0], to[1] = x[0], math.atan2(x[3], x[2])
+    to[2] = math.hypot(x[2], x[3]) / fold_force(fold, to[0], to[1])
+    best, damping = np.inf, 0.0
+    for _ in range(_ROUNDS_WITHIN):
+        _confine(fold, proximal, to)
+        _contact(fold, to, at, frame)
+        set_all_lanes(b, at[0], at[1], at[2], at[3])
+        integrate(rod, b, 1)
+        lane_value(b, 0, v)
+        lanes_tangents(b, t)
+        channel_equations(at, v, t, codes, target, residual, jacobian)
+        misfit = whiten(weights, residual, jacobian, k, trial_r, trial_j)
+        if misfit < best:
+            best, damping = misfit, 0.0 if damping < 1e-5 else 0.1 * damping
+            copy(to, z)
+            copy(at, x)
+            copy(v, value)
+            copy(trial_r, r)
+            for a in range(6):
+                copy(t[a], tangents[a])
+            for i in range(k):
+                for p in range(3):
+                    j[i, p] = 0.0
+                    for a in range(4):
+                        j[i, p] += trial_j[i, a] * frame[a, p]
+        elif best == np.inf:
+            return best
+        else:
+            damping = max(10.0 * damping, 1e-2)
+        gain = _next_within(r, j, k, proximal, z, damping, work, step)
+        while gain < 0.0 and damping <= _MOST_DAMPING:
+            damping = max(10.0 * damping, 1e-8)
+            gain = _next_within(r, j, k, proximal, z, damping, work, step)
+        if gain <= _IDLE_WITHIN * best + _LITTLE or damping > _MOST_DAMPING:
+            break
+        shorten = 1.0
+        for p in range(3):
+            shorten = min(shorten, _LONGEST_WITHIN[p] / max(abs(step[p]), 1e-300))
+        for p in range(3):
+            to[p] = z[p] + shorten * step[p]
+    return best
+
+
+def unknowns_covariance(
+    names: tuple[str, ...], values: Array, tangents: Array, weights: Array, *, friction: bool
+) -> Array:
+    """Covariances of x, (n, 4, 4): (JᵀΣ⁻¹J)⁻¹; NaN where the channels do not determine x."""
+    free = [0, 1, 2, 3] if friction else [0, 2, 3]
+    j = weights @ channel_derivatives(values, tangents[..., free], names)
+    out = np.zeros((len(values), 4, 4))
+    usable: AnyArray = np.asarray(np.isfinite(j).all(axis=(1, 2)))
+    size = np.where(
+        usable[:, None], np.linalg.norm(np.where(usable[:, None, None], j, 1.0), axis=1), 1.0
+    )
+    usable &= (size > 0.0).all(axis=1)
+    scaled = np.where(usable[:, None, None], j / np.where(size > 0.0, size, 1.0)[:, None, :], 0.0)
+    _, singular, v = np.linalg.svd(scaled, full_matrices=False)
+    usable &= singular[:, -1] > 1e-10
+    with np.errstate(divide="ignore", invalid="ignore"):
+        root = np.swapaxes(v, -1, -2) / singular[:, None, :] / size[:, :, None]
+    out[np.ix_(range(len(out)), free, free)] = root @ np.swapaxes(root, -1, -2)
+    out[~usable] = np.nan
+    return out

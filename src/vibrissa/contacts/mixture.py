@@ -1,4 +1,21 @@
-"""Hypotheses of a filter: a sum of Gaussians, kept small; compiled."""
+"""Hypotheses about a contact, a sum of Gaussians, and what they learn from one measurement.
+
+Each hypothesis is a Gaussian over (p, v). A measurement moves p to where χ² of the signals and of
+p - p_predicted together is least, with the exact rod in between. There may be several such places:
+two contacts that give the same signals part where they met, and a Gaussian that covers both becomes
+two. So the least is looked for from where the hypothesis was and from each contact that gives the
+signals exactly and is not far from the prediction. Each is weighed by Laplace's approximation,
+
+    log w ← log w - χ²/2 + ½ log(det P_after / det P_before) + log det W,
+
+with the weights W of the signals, which differ from contact to contact where noise of force and
+moment makes that of a direction.
+
+An uncertain stiffness, and errors of a sensor's gain and mixing, are the same in all samples, and
+no averaging removes them: how the state depends on each, b = ∂(p, v)/∂ε for an error ε of standard
+deviation one, is carried along, and Σ bbᵀ is part of the covariance ("consider" parameters, as
+Schmidt had it).
+"""
 
 from __future__ import annotations
 
@@ -6,7 +23,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.numerics import AnyArray, Array, copy, kernel
+from vibrissa.contacts.least_squares import channel_equations, fit_rows
+from vibrissa.contacts.weighing import Weighing, gradients, weigh, wrong_by
+from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel
+from vibrissa.rod import Fold, Rod, point_determinant, stable
+
+_TIMES = 8
+# A contact that gives the signals is a place to look from if it is no farther (Mahalanobis distance
+# squared) from the prediction.
+_GATE = 50.0
+# With one this near it is not looked for from where the hypothesis was as well.
+_NEAR = 4.0
+# Two places within this (over L, and ten times that relative to the force) are one.
+_SAME = 1e-3
+# Codes of px, py and pz among the channels.
+_PLACE = 11
 
 
 class Mixture(NamedTuple):
@@ -138,3 +169,292 @@ def unaccounted(
             if not away @ np.linalg.solve(both, away) > far:
                 out[i] = False
                 break
+
+
+@inlined
+def _log_determinant(a: Array) -> float:
+    """Of a positive matrix (3, 3); -inf where it is not."""
+    d = (
+        a[0, 0] * (a[1, 1] * a[2, 2] - a[1, 2] * a[2, 1])
+        - a[0, 1] * (a[1, 0] * a[2, 2] - a[1, 2] * a[2, 0])
+        + a[0, 2] * (a[1, 0] * a[2, 1] - a[1, 1] * a[2, 0])
+    )
+    return float(np.log(d)) if d > 0.0 else -np.inf
+
+
+@kernel
+def log_weights(w: Array, q: int) -> float:
+    """Half the log determinant of W Wᵀ over its first q rows, for W (k, k)."""
+    low = np.zeros((q, q))
+    total = 0.0
+    for i in range(q):
+        for j in range(i + 1):
+            s = 0.0
+            for a in range(w.shape[1]):
+                s += w[i, a] * w[j, a]
+            for a in range(j):
+                s -= low[i, a] * low[j, a]
+            if i > j:
+                low[i, j] = s / low[j, j]
+            elif s > 0.0:
+                low[i, i] = np.sqrt(s)
+                total += np.log(low[i, i])
+            else:
+                return -np.inf
+    return total
+
+
+@inlined
+def _moment(value: Array) -> Array:
+    """P × F."""
+    out = np.empty(3)
+    out[0] = value[4] * value[2] - value[5] * value[1]
+    out[1] = value[5] * value[0] - value[3] * value[2]
+    out[2] = value[3] * value[1] - value[4] * value[0]
+    return out
+
+
+@kernel
+def _predictions(
+    mixture: Mixture,
+    turn: Array,
+    base: Array,
+    pose: float,
+    prior: Array,
+    before: Array,
+    root: Array,
+) -> None:
+    """Fill where hypotheses expect p in the whisker's frame, the covariance P, and P^(-1/2)."""
+    for i in range(len(mixture.weight)):
+        away = mixture.mean[i, :3] - base
+        for a in range(3):
+            prior[i, a] = turn[0, a] * away[0] + turn[1, a] * away[1] + turn[2, a] * away[2]
+        spread = mixture.spread[i, :3, :3].copy()
+        for a in range(3):
+            spread[a, a] += pose
+        before[i] = turn.T @ spread @ turn
+        root[i] = np.linalg.inv(np.linalg.cholesky(before[i]))
+
+
+@kernel
+def _starts(
+    mixture: Mixture,
+    prior: Array,
+    root: Array,
+    contacts: Array,
+    values: Array,
+    of: IntArray,
+    x: Array,
+    v: Array,
+) -> int:
+    """Fill from where the least is looked for, and of which hypothesis; how many."""
+    n, c = len(mixture.weight), len(contacts)
+    away, rows = np.empty(3), 0
+    for i in range(n):
+        near = False
+        for j in range(c):
+            for a in range(3):
+                away[a] = values[j, 3 + a] - prior[i, a]
+            far = 0.0
+            for a in range(3):
+                total = 0.0
+                for b in range(a + 1):
+                    total += root[i, a, b] * away[b]
+                far += total * total
+            if far > _GATE:
+                continue
+            near = near or far < _NEAR
+            copy(contacts[j], x[rows])
+            copy(values[j], v[rows])
+            of[rows] = i
+            rows += 1
+        if not near:
+            copy(mixture.contact[i], x[rows])
+            copy(mixture.value[i], v[rows])
+            of[rows] = i
+            rows += 1
+    return rows
+
+
+@kernel
+def _fits(
+    rod: Rod,
+    proximal: float,
+    how: Weighing,
+    target: Array,
+    measured: Array,
+    passes: int,
+    prior: Array,
+    root: Array,
+    of: IntArray,
+    rows: int,
+    x: Array,
+    v: Array,
+    t: Array,
+    chi: Array,
+) -> None:
+    """Move x to where χ² of measurement and prediction is least; fill the rest."""
+    k = how.codes.shape[0]
+    targets, weights = np.empty((rows, k + 3)), np.zeros((rows, k + 3, k + 3))
+    rest, own = np.zeros(rows, np.bool_), np.empty((k, k))
+    codes = np.empty(k + 3, np.int64)
+    codes[:k] = how.codes
+    for a in range(3):
+        codes[k + a] = _PLACE + a
+    for row in range(rows):
+        targets[row, :k], targets[row, k:] = target, prior[of[row]]
+        weights[row, k:, k:] = root[of[row]]
+    for _ in range(passes):
+        for row in range(rows):
+            if not weigh(how, v[row], measured, own):
+                own[:] = 0.0
+            weights[row, :k, :k] = own
+        fit_rows(rod, False, proximal, codes, targets, weights, x, v, t, chi, rest, 0, rows)
+        for row in range(rows):
+            for _ in range(_TIMES):
+                if rest[row] or not chi[row] < np.inf:
+                    break
+                fit_rows(
+                    rod, False, proximal, codes, targets, weights, x, v, t, chi, rest, row, row + 1
+                )
+
+
+@inlined
+def _known(x: Array, out: Mixture, first: int, found: int) -> bool:
+    """Whether a contact is one of those found before."""
+    force = np.hypot(x[2], x[3])
+    for other in range(first, found):
+        y = out.contact[other]
+        apart = np.hypot(y[2] - x[2], y[3] - x[3])
+        if abs(y[0] - x[0]) < _SAME and apart < 10.0 * _SAME * force:
+            return True
+    return False
+
+
+@kernel
+def _moved(
+    how: Weighing,
+    target: Array,
+    own: Array,
+    turn: Array,
+    pose: float,
+    mixture: Mixture,
+    i: int,
+    prior: Array,
+    before: Array,
+    root: Array,
+    x: Array,
+    v: Array,
+    t: Array,
+    chi: float,
+    out: Mixture,
+    row: int,
+) -> bool:
+    """Fill a row with what hypothesis i becomes at a least; False where that is no Gaussian."""
+    k = how.codes.shape[0]
+    residual, jacobian, slope = np.empty(k), np.empty((k, 4)), np.empty((k, 3))
+    by_xi = np.empty((3, 3))
+    for a in range(3):
+        by_xi[a, 0], by_xi[a, 1], by_xi[a, 2] = t[3 + a, 0], t[3 + a, 2], t[3 + a, 3]
+    channel_equations(x, v, t, how.codes, target, residual, jacobian)
+    for a in range(k):
+        slope[a, 0], slope[a, 1], slope[a, 2] = jacobian[a, 0], jacobian[a, 2], jacobian[a, 3]
+    seen = own @ slope @ np.linalg.inv(by_xi)
+    inverse = root.T @ root
+    after = np.linalg.inv(inverse + seen.T @ seen)
+    weight = 0.5 * (_log_determinant(after) - _log_determinant(before)) - 0.5 * chi
+    weight += log_weights(own, how.mixing.shape[0])
+    if not np.isfinite(weight):
+        return False
+    # In the laboratory; G carries what p learns over to v.
+    after, inverse = turn @ after @ turn.T, turn @ inverse @ turn.T
+    spread = mixture.spread[i]
+    gain = np.ascontiguousarray(spread[:, :3]) @ inverse
+    through = gain @ (np.eye(3) - after @ inverse)
+    keep = np.eye(6)
+    keep[:, :3] -= through
+    noise = after - after @ inverse @ after
+    b, g, wrong = mixture.by_errors[i].copy(), np.empty((k, 6)), np.empty(6)
+    gradients(how.codes, v[:3], _moment(v), g)
+    for e in range(b.shape[1]):
+        wrong_by(how.errors[e], v[:3], _moment(v), wrong)
+        pushed = after @ (turn @ (seen.T @ (own @ (g @ wrong))))
+        for a in range(3):
+            for c in range(3):
+                noise[a, c] -= pushed[a] * pushed[c]
+        b[:, e] = keep @ np.ascontiguousarray(b[:, e]) + gain @ pushed
+    # What the base's own error adds passes through the same gain.
+    whole = keep @ spread @ keep.T + gain @ noise @ gain.T + pose * (through @ through.T)
+    step = gain @ (turn @ (v[3:] - prior))
+    for a in range(6):
+        out.mean[row, a] = mixture.mean[i, a] + step[a]
+        copy(b[a], out.by_errors[row, a])
+        out.value[row, a] = v[a]
+        for e in range(6):
+            out.spread[row, a, e] = 0.5 * (whole[a, e] + whole[e, a])
+    copy(x, out.contact[row])
+    out.weight[row] = mixture.weight[i] + weight
+    return True
+
+
+@kernel
+def learn(
+    rod: Rod,
+    fold: Fold,
+    proximal: float,
+    how: Weighing,
+    target: Array,
+    measured: Array,
+    passes: int,
+    turn: Array,
+    base: Array,
+    pose: float,
+    mixture: Mixture,
+    contacts: Array,
+    values: Array,
+    out: Mixture,
+    misfits: Array,
+) -> int:
+    """Update hypotheses."""
+    n, c, k = len(mixture.weight), len(contacts), how.codes.shape[0]
+    most = n * (1 + c)
+    prior, before, root = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3, 3))
+    _predictions(mixture, turn, base, pose, prior, before, root)
+    x, v, t = np.zeros((most, 4)), np.empty((most, 6)), np.zeros((most, 6, 4))
+    chi, of = np.full(most, np.inf), np.empty(most, np.int64)
+    rows = _starts(mixture, prior, root, contacts, values, of, x, v)
+    _fits(rod, proximal, how, target, measured, passes, prior, root, of, rows, x, v, t, chi)
+    found, first = 0, 0
+    xi, by_xi, own = np.empty(3), np.empty((6, 3)), np.empty((k, k))
+    for row in range(rows):
+        i = of[row]
+        if row > 0 and of[row - 1] != i:
+            first = found
+        xi[0], xi[1], xi[2] = x[row, 0], x[row, 2], x[row, 3]
+        for a in range(6):
+            by_xi[a, 0], by_xi[a, 1], by_xi[a, 2] = t[row, a, 0], t[row, a, 2], t[row, a, 3]
+        if not (chi[row] < np.inf and stable(fold, proximal, xi, point_determinant(by_xi))):
+            continue
+        if _known(x[row], out, first, found) or not weigh(how, v[row], measured, own):
+            continue
+        if _moved(
+            how,
+            target,
+            own,
+            turn,
+            pose,
+            mixture,
+            i,
+            prior[i],
+            before[i],
+            root[i],
+            x[row],
+            v[row],
+            t[row],
+            chi[row],
+            out,
+            found,
+        ):
+            misfits[found] = chi[row]
+            found += 1
+    return found

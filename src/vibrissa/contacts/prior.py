@@ -7,23 +7,19 @@ needs a force that the object could not stand.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vibrissa.contacts.channels import CIRCULAR, channels_of
-from vibrissa.contacts.contact_map import spherical
-from vibrissa.contacts.explanation import Explanation
-from vibrissa.contacts.located import Located, nowhere
+from vibrissa.contacts.candidates import chi_squared_of
+from vibrissa.contacts.contacts import Candidates, spherical
 from vibrissa.contacts.posterior import CERTAIN
-from vibrissa.contacts.readout import Measurement, Mixed, Named
-from vibrissa.contacts.weighing import weigh
-from vibrissa.numerics import AnyArray, Array
-from vibrissa.rod import contact_tangents, discretize
-from vibrissa.signals import REGIONS, concave_backward, in_region, within_turn
+from vibrissa.contacts.readout import Mixed, Named
+from vibrissa.numerics import AnyArray, Array, IntArray
+from vibrissa.rod import Discretization, contact_tangents, discretize
+from vibrissa.signals import REGIONS, concave_backward, in_region
 from vibrissa.status import Status
 
 if TYPE_CHECKING:
@@ -129,6 +125,19 @@ class Prior:
                 allowed &= _between(name, value, *self.region[name])
         return np.asarray(allowed)
 
+    def allows_candidates(self, contact_map: ContactMap, found: Candidates) -> AnyArray:
+        """Which candidates (n, k) are possible."""
+        d = contact_map.chart.discretization
+        return self.possible(contact_map.whisker, d, found)
+
+    def possible(self, whisker: Whisker, d: Discretization, found: Candidates) -> AnyArray:
+        """Which candidates (n, k) of a whisker are possible; padding is not."""
+        there = np.arange(found.x.shape[1]) < found.number[:, None]
+        allowed, x = np.zeros_like(there), found.x[there]
+        points = found.values[there][:, 3:] * d.length
+        allowed[there] = self.allows(whisker, points, x[:, 0] * d.length, x[:, 1:] * d.force)
+        return allowed
+
 
 def _between(name: str, value: Array, least: float, greatest: float) -> AnyArray:
     if name != "theta" or greatest - least >= _TURN:
@@ -136,93 +145,34 @@ def _between(name: str, value: Array, least: float, greatest: float) -> AnyArray
     return np.asarray((value - least) % _TURN <= (greatest - least) % _TURN)
 
 
-def allowed_first(allowed: AnyArray, values: Array) -> Array:
-    """Bring what belongs to allowed candidates to the front of their rows."""
-    order = np.argsort(~allowed, axis=1, kind="stable")
-    out = np.take_along_axis(values, order.reshape(*order.shape, *[1] * (values.ndim - 2)), axis=1)
-    out[np.arange(allowed.shape[1]) >= allowed.sum(axis=1)[:, None]] = np.nan
-    return out
-
-
 def among_allowed(
-    prior: Prior, contact_map: ContactMap, readout: Named, measured: Array, found: Explanation
-) -> Explanation:
-    """Leave out candidates of a batch that a prior does not allow."""
-    d, most = contact_map.chart.discretization, found.contacts.shape[1]
-    there = np.arange(most) < found.number[:, None]
-    allowed = np.zeros_like(there)
-    x = found.contacts[there]
-    allowed[there] = prior.allows(
-        contact_map.whisker,
-        found.values[there][:, 3:] * d.length,
-        x[:, 0] * d.length,
-        x[:, 1:] * d.force,
-    )
-    number, sorted_out = allowed.sum(axis=1), found._asdict()
-    for name, values in sorted_out.items():
-        if values.ndim > 1:
-            sorted_out[name] = allowed_first(allowed, values)
-    changed = there[:, 0] & ~allowed[:, 0]
-    misfit = found.misfit.copy()
-    targets = readout.channels.targets(measured)
-    for row in np.flatnonzero(changed & (number > 0) & (misfit > 0.0)):
-        value = sorted_out["values"][row, 0]
-        misfit[row] = _misfit(readout, Measurement(measured[row], targets[row]), value)
-    probability = _renormalised(sorted_out["probability"])
-    status = found.status.copy()
-    for row in np.flatnonzero(number < found.number):
-        status[row] = _left(Status(int(status[row])), int(number[row]), probability[row, 0])
-    sorted_out |= {
-        "number": number,
-        "misfit": misfit,
-        "status": status,
-        "probability": probability,
-    }
-    return Explanation(**sorted_out | {"linear": found.linear & ~changed})
-
-
-def located_where_allowed(
     prior: Prior,
     contact_map: ContactMap,
     readout: Named | Mixed,
-    measurement: Measurement,
-    located: Located,
-) -> Located:
-    """Leave out candidates of one measurement that a prior does not allow."""
-    whisker, d = contact_map.whisker, contact_map.chart.discretization
-    points, forces = located.candidates, located.contact_forces
-    kept = np.flatnonzero(prior.allows(whisker, points, located.arc_lengths, forces))
-    if len(kept) == len(points):
-        return located
-    probabilities = _renormalised(located.probabilities[kept])
-    status = _left(located.status, len(kept), probabilities[0] if len(kept) else math.nan)
-    if not len(kept):
-        return nowhere(status, located.misfit)
-    covariances, base = located.covariances[kept], located.forces[kept]
-    first, covariance, misfit = 0, covariances[0], located.misfit
-    if status == Status.UNDERDETERMINED:  # samples of a set: the one in the middle stands for all
-        mean = points[kept].mean(axis=0)
-        first = int(np.linalg.norm(points[kept] - mean, axis=1).argmin())
-        away = points[kept] - points[kept][first]
-        covariance = away.T @ away / len(kept) + covariances.mean(axis=0)
-    elif kept[0] > 0 and misfit > 0.0:
-        value = np.concatenate([base[0] / d.force, points[kept[0]] / d.length])
-        misfit = _misfit(readout, measurement, value)
-    going_on = np.flatnonzero(kept == located.continuing)
-    return Located(
-        points[kept][first],
-        status,
-        points[kept],
-        located.arc_lengths[kept],
-        covariance,
-        misfit,
-        int(going_on[0]) if going_on.size else first,
-        base,
-        covariances,
-        forces[kept],
-        probabilities,
-        bool(located.linear and kept[0] == 0),
-    )
+    measured: tuple[Array, Array],
+    found: Candidates,
+    status: IntArray,
+    chi_squared: Array,
+) -> tuple[Candidates, IntArray, Array]:
+    """Leave out candidates that a prior does not allow.
+
+    ``measured`` has the measurements (n, k) and the channels that they should be.
+    """
+    allowed = prior.allows_candidates(contact_map, found)
+    number, before = allowed.sum(axis=1), found.number
+    if (number == before).all():
+        return found, status, chi_squared
+    changed = (before > 0) & ~allowed[:, 0]
+    found = found.allowed_first(allowed)
+    found.probability[:] = _renormalised(found.probability)
+    status, chi_squared = status.copy(), chi_squared.copy()
+    for row in np.flatnonzero(changed & (number > 0) & (chi_squared > 0.0)):
+        x, value = found.x[row, 0], found.values[row, 0]
+        chi_squared[row] = chi_squared_of(readout.how, x, value, measured[1][row], measured[0][row])
+    for row in np.flatnonzero(number < before):
+        chance = found.probability[row, 0]
+        status[row] = _left(Status(int(status[row])), int(number[row]), chance)
+    return found, status, chi_squared
 
 
 def _renormalised(probability: Array) -> Array:
@@ -244,14 +194,3 @@ def _left(status: Status, number: int, probability: float) -> Status:
         if status == Status.AMBIGUOUS and (number == 1 or probability > CERTAIN):
             return Status.UNIQUE
     return status
-
-
-def _misfit(readout: Named | Mixed, measurement: Measurement, value: Array) -> float:
-    """χ² of a contact with (F, p), non-dimensional."""
-    how = readout.how
-    away = channels_of(value)[how.codes] - measurement.target
-    away = within_turn(away, [CIRCULAR[code] for code in how.codes])
-    weights = np.zeros((len(away), len(away)))
-    if not weigh(how, value, measurement.measured, weights):
-        return float("nan")
-    return float(((weights @ away) ** 2).sum())

@@ -9,26 +9,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from vibrissa.contacts.candidates import Searched
 from vibrissa.contacts.channels import CHANNELS, FITTED, WRENCH, Channels
-from vibrissa.contacts.explanation import Bounds, check_signals
-from vibrissa.contacts.least_squares import (
-    at_nodes,
-    constant_weights,
-    parts,
-    seeding_triplet,
-    volumes,
-)
-from vibrissa.contacts.locating import Searched
-from vibrissa.contacts.noise import SensorNoise, scaled_errors
+from vibrissa.contacts.inversion import at_nodes, parts, seeding_triplet, volumes
+from vibrissa.contacts.noise import TRUSTED, SensorNoise, rank, scaled_errors
 from vibrissa.contacts.weighing import Weighing
-from vibrissa.contacts.whitening import TRUSTED, rank
-from vibrissa.numerics import Array
+from vibrissa.numerics import AnyArray, Array
 from vibrissa.rod import SearchTree, StableSet, search_tree
-from vibrissa.signals import CIRCULAR, SIGNALS, signal_scales
+from vibrissa.sensors import COMPONENTS
+from vibrissa.signals import CIRCULAR, SIGNALS, signal_scales, signals_of
 
 if TYPE_CHECKING:
     from vibrissa.contacts.contact_map import ContactMap
@@ -36,6 +29,55 @@ if TYPE_CHECKING:
 # A direction of the readings in which contacts of the map vary so much less than the noise and the
 # others tells nothing.
 _UNTOLD = 1e-9
+# Signals this many times larger than any on the map are in another unit.
+_FAR_BEYOND = 10.0
+_UNKNOWNS = 3
+# Components that together are signals; a sensor that reads these reads signals by name.
+_BY_NAME = (("Fx",), ("Fy", "Fz"), ("Mx",), ("My", "Mz"))
+
+
+class Bounds(NamedTuple):
+    """How large forces and moments are that contacts of a map give."""
+
+    sizes: list[int]
+    largest: Array
+
+    @classmethod
+    def of(cls, contact_map: ContactMap, names: tuple[str, ...]) -> Bounds:
+        """Find them for signals of a map."""
+        sizes = [k for k, name in enumerate(names) if not CIRCULAR[SIGNALS.index(name)]]
+        values = contact_map.chart.values.reshape(-1, 6)
+        known = signals_of(values[:, :3], np.cross(values[:, 3:], values[:, :3]))
+        largest = np.abs(known[:, [SIGNALS.index(names[k]) for k in sizes]]).max(axis=0)
+        # M_x is next to nothing on a planar whisker, but for that noise in it is not out of bounds.
+        of_kind = {"F": np.abs(values[:, :3]).max(), "M": np.abs(known[:, 3:5]).max()}
+        return cls(sizes, np.maximum(largest, [0.1 * of_kind[names[k][0]] for k in sizes]))
+
+    def nothing(self, targets: Array) -> AnyArray:
+        """Whether signals (n, k) come from a whisker that touches nothing, shape (n,)."""
+        return np.asarray((targets[:, self.sizes] == 0.0).all(axis=1) & bool(self.sizes))
+
+    def exceeded(self, targets: Array) -> AnyArray:
+        """Whether signals (n, k) are far larger than any on the map, shape (n,)."""
+        return np.asarray((np.abs(targets[:, self.sizes]) > _FAR_BEYOND * self.largest).any(axis=1))
+
+    def most(self) -> list[tuple[int, float]]:
+        """For each of these signals, what it can be at most."""
+        return list(zip(self.sizes, (_FAR_BEYOND * self.largest).tolist(), strict=True))
+
+
+def check_signals(values: Array, names: tuple[str, ...]) -> None:
+    """Refuse what no sensor in SI units can say."""
+    for k, name in enumerate(names):
+        if name in ("FT", "MB") and (values[..., k] < 0.0).any():
+            raise ValueError(
+                f"{name} is a size and cannot be negative; got {np.nanmin(values[..., k])}"
+            )
+        if CIRCULAR[SIGNALS.index(name)] and (np.abs(values[..., k]) > 2.0 * np.pi).any():
+            largest = np.nanmax(np.abs(values[..., k]))
+            raise ValueError(
+                f"{name} is an angle in rad; got {largest:g}, which looks like degrees"
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,9 +278,7 @@ def _searched(
         turns,
         np.array(kinds),
         parts(chart),
-        volumes(chart),
-        d.length,
-        d.force,
+        np.log(volumes(chart)),
     )
 
 
@@ -273,3 +313,62 @@ def independent(contact_map: ContactMap, readout: Named | Mixed) -> int:
     node = contact_map.chart.values[-1, :1, -1]
     ones = np.ones((1, len(channels.names)))
     return rank(channels.covariance(sensor, ones, node, contact_map.chart.discretization)[0])
+
+
+def constant_weights(channels: Channels, sensor: SensorNoise | None) -> bool:
+    """Whether the weights of channels are the same for all contacts."""
+    if sensor is None or sensor.errors[..., :6].any():
+        return False
+    return sensor.deviations is not None or not set(channels.names) & {"FT", "FD", "MB", "MD"}
+
+
+class ByName:
+    """A sensor whose channels tell whole signals: its readings as those."""
+
+    def __init__(self, named: Named, back: Array, places: list[int]) -> None:
+        self.named, self._back, self._places = named, back, places
+        self._wrench = np.zeros(6)
+
+    def signals(self, values: Array) -> Array:
+        """Turn readings (k,) into the signals."""
+        w = self._wrench
+        w[self._places] = self._back @ values
+        fx, fy, fz, mx, my, mz = w.tolist()
+        known = {
+            "Fx": fx,
+            "FT": float(np.hypot(fy, fz)),
+            "FD": float(np.arctan2(fz, fy)),
+            "Mx": mx,
+            "MB": float(np.hypot(my, mz)),
+            "MD": float(np.arctan2(mz, my)),
+        }
+        return np.array([known[name] for name in self.named.names])
+
+
+def readout_of(
+    contact_map: ContactMap, h: Array, covariance: Array, errors: Array
+) -> ByName | Mixed:
+    """Signals by name if the channels tell these and nothing else, or a mix."""
+    read = [name for name, column in zip(COMPONENTS, h.T, strict=True) if column.any()]
+    whole = [group for group in _BY_NAME if set(group) <= set(read)]
+    places = [COMPONENTS.index(name) for name in read]
+    own = h[:, places]
+    complete = sum(map(len, whole)) == len(read) and len(read) >= _UNKNOWNS
+    if not complete or np.linalg.matrix_rank(own / np.linalg.norm(own, axis=0)) < len(read):
+        return Mixed(contact_map, h, covariance, errors)
+    root = np.linalg.inv(np.linalg.cholesky(covariance))
+    back = np.linalg.pinv(root @ own) @ root
+    wrench = np.zeros((6, 6))
+    wrench[np.ix_(places, places)] = back @ covariance @ back.T
+    names = {
+        ("Fx",): ("Fx",),
+        ("Fy", "Fz"): ("FT", "FD"),
+        ("Mx",): ("Mx",),
+        ("My", "Mz"): ("MB", "MD"),
+    }
+    chosen = [name for group in whole for name in names[group]]
+    signals = tuple(name for name in SIGNALS if name in chosen)
+    wrong = np.zeros((len(errors), 6, 7))
+    wrong[:, places] = back @ errors
+    noise = SensorNoise.of(0.5 * (wrench + wrench.T), signals, wrong)
+    return ByName(Named(contact_map, signals, noise), np.asarray(back, dtype=np.float64), places)

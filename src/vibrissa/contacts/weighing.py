@@ -8,6 +8,7 @@ by name.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,8 @@ from vibrissa.numerics import Array, IntArray, copy, inlined, kernel
 
 # Of a channel's variance, what others do not explain; below this the covariance is singular.
 _SINGULAR = 1e-10
+# What counts as exact, relative to the other deviations.
+_EXACT = 1e-6
 
 
 class Weighing(NamedTuple):
@@ -63,7 +66,7 @@ def wrong_by(error: Array, force: Array, moment: Array, out: Array) -> None:
 
 
 @inlined
-def _covariance(how: Weighing, value: Array, measured: Array, sigma: Array) -> None:
+def channel_covariance(how: Weighing, value: Array, measured: Array, sigma: Array) -> None:
     """Covariance (k, k) of the channels at a contact with (F, p)."""
     codes, deviations = how.codes, how.deviations
     k = codes.shape[0]
@@ -112,7 +115,7 @@ def weigh(how: Weighing, value: Array, measured: Array, out: Array) -> bool:
     mixing = how.mixing
     q, k = mixing.shape
     sigma, mixed, low = np.empty((k, k)), np.zeros((q, k)), np.zeros((q, q))
-    _covariance(how, value, measured, sigma)
+    channel_covariance(how, value, measured, sigma)
     for i in range(q):
         for j in range(k):
             for a in range(k):
@@ -139,4 +142,35 @@ def weigh(how: Weighing, value: Array, measured: Array, out: Array) -> bool:
                     total -= low[i, a] * out[a, j]
                 total /= low[i, i]
             out[i, j] = total
+    return True
+
+
+@kernel
+def weigh_any(how: Weighing, value: Array, measured: Array, out: Array) -> bool:
+    """Fill weights W (k, k) as `weigh`, also for singular noise; False where there is none."""
+    if weigh(how, value, measured, out):
+        return True
+    k = how.codes.shape[0]
+    sigma, size = np.empty((k, k)), np.empty(k)
+    channel_covariance(how, value, measured, sigma)
+    typical, noisy = 0.0, 0
+    for i in range(k):
+        for j in range(k):
+            if not abs(sigma[i, j]) < np.inf:
+                return False
+        if sigma[i, i] > 0.0:
+            typical, noisy = typical + 0.5 * math.log(sigma[i, i]), noisy + 1
+    for i in range(k):
+        exact = _EXACT * math.exp(typical / max(noisy, 1))
+        size[i] = math.sqrt(sigma[i, i]) if sigma[i, i] > 0.0 else exact
+    for i in range(k):
+        for j in range(k):
+            sigma[i, j] /= size[i] * size[j]
+        if sigma[i, i] == 0.0:
+            sigma[i, i] = 1.0
+    least, vectors = np.linalg.eigh(sigma)
+    for i in range(k):
+        root = 1.0 / math.sqrt(least[i]) if least[i] > _SINGULAR else 0.0
+        for j in range(k):
+            out[i, j] = root * vectors[j, i] / size[j]
     return True

@@ -13,8 +13,8 @@ then one of them can only be told from the other by the friction that it takes.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -22,26 +22,26 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from vibrissa.contacts.channels import WRENCH
-from vibrissa.contacts.contact_map import spherical
-from vibrissa.contacts.fitting import Fits, fit
-from vibrissa.contacts.minima import Candidates, candidates, unknowns_covariance
+from vibrissa.contacts.contacts import Candidates, Contacts
+from vibrissa.contacts.least_squares import Fits, fit, unknowns_covariance
 from vibrissa.contacts.noise import (
+    INDISTINCT,
     SensorNoise,
     common_covariance,
     common_errors,
+    explained,
+    rank,
     scaled_errors,
     sensor_noise,
+    trusted,
+    whitening,
 )
 from vibrissa.contacts.posterior import CERTAIN, judged, ranked
-from vibrissa.contacts.prior import Prior, allowed_first
-from vibrissa.contacts.showing import estimate_card, estimate_rows
-from vibrissa.contacts.whitening import INDISTINCT, explained, rank, trusted, whitening
+from vibrissa.contacts.prior import Prior
 from vibrissa.numerics import AnyArray, Array, IntArray
-from vibrissa.quantities import attributes
 from vibrissa.rod import Discretization, discretize, solve_forces, vanishing_moments
-from vibrissa.signals import Coordinates, labelled_wrench
-from vibrissa.sketch import lines, shown
-from vibrissa.status import Status, counted, flag_attributes
+from vibrissa.signals import Coordinates, labelled_wrench, measured
+from vibrissa.status import Status
 
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
@@ -63,159 +63,34 @@ _ELSEWHERE = (0.25, 0.5, 0.75, 0.95)
 _FAR = 100.0
 # A contact that may lie this far away (over L, one standard deviation) is not known.
 _UNKNOWN = 0.5
+# Contacts within this (over L, and ten times that relative to the force) are one.
+_SAME = 1e-3
 
 
-@dataclass(frozen=True, eq=False)
-class WrenchEstimate:
-    """Contacts that explain force and moment at the base; whisker frame, SI units.
+class Fitted(NamedTuple):
+    """Rows × candidates, NaN-padded.
 
-    Attributes
-    ----------
-    point : (..., 3) array
-        Contact point, m; NaN where there is none.
-    covariance : (..., 3, 3) array
-        Its covariance, m², widened where the contact does not move with the wrench as derivatives
-        say; NaN without ``noise``.
-    arc_length : (...) array
-        Arc length of the contact, m.
-    contact_force : (..., 3) array
-        Force in the material frame at the contact (tangent, d1, d2), N.
-    friction_angle : (...) array
-        Angle between the force and the plane normal to the whisker, rad: positive where the object
-        pulls toward the tip; its tangent is the least coefficient of friction that holds it.
-    friction_angle_sigma : (...) array
-        Standard deviation of that, rad; NaN without ``noise``.
-    force, moment : (..., 3) arrays
-        Base force and moment of that contact, N and N·m.
-    misfit : (...) array
-        χ², of two degrees of freedom: sum of squares of what is left of the six components, in
-        standard deviations. Without ``noise`` components of F count as known to 1 % of |F|, and
-        those of M to 1 % of |M|.
-    linear : (...) bool array
-        Whether the covariance can be relied on: contacts scatter as it says. False without
-        ``noise``.
-    status : (...) int array
-        :class:`~vibrissa.Status`: ``UNIQUE`` (with ``noise``: all other candidates together are
-        less than 5 % probable); ``AMBIGUOUS``; ``NOT_ONE_CONTACT`` where χ² is
-        larger than one measurement in a thousand would have it, ``BEYOND_TIP`` where moreover the
-        nearest contact is the tip, ``TOO_PROXIMAL`` where it is at 0.05 L (the nearest contact is
-        given in all three); ``OUTSIDE_PRIOR`` where the prior allows none of the candidates;
-        ``DEGENERATE`` for a force or a moment of zero, and where with this
-        noise the contact may be anywhere; ``MISSING``.
-    candidates : (..., k, 3) array
-        Contact points of all contacts that cannot be told apart (χ² within 10.8 of the least), m,
-        padded with NaN: by falling probability, or without ``noise`` by rising χ² + (friction
-        angle / 20°)².
-    candidate_arc_lengths : (..., k) array
-        Their arc lengths, m.
-    candidate_forces : (..., k, 3) array
-        Their base forces, N.
-    candidate_contact_forces : (..., k, 3) array
-        Their forces in the material frame at the contact, N.
-    candidate_probabilities : (..., k) array
-        Their posterior probabilities, where contact points are as probable beforehand, and friction
-        angles scatter by 20°; NaN without ``noise``.
-    n_candidates : (...) int array
-        How many.
-    dims : tuple of str
-        Names of the leading dimensions.
-    coords : dict
-        Coordinates along them.
+    Their number (n,), x (n, k, 4), (F, p) (n, k, 6), ∂(F, p)/∂x (n, k, 6, 4) and χ² (n, k).
     """
 
-    point: Array
-    covariance: Array
-    arc_length: Array
-    contact_force: Array
-    friction_angle: Array
-    friction_angle_sigma: Array
-    force: Array
-    moment: Array
-    misfit: Array
-    linear: AnyArray
-    status: IntArray
-    candidates: Array
-    candidate_arc_lengths: Array
-    candidate_forces: Array
-    candidate_contact_forces: Array
-    candidate_probabilities: Array
-    n_candidates: IntArray
-    dims: tuple[str, ...]
-    coords: Coordinates
+    number: IntArray
+    contacts: Array
+    values: Array
+    tangents: Array
+    misfits: Array
 
-    @property
-    def spherical(self) -> Array:
-        """(r, θ, φ) of the contact point: m and rad, shape (..., 3)."""
-        return spherical(self.point)
+    def replaced(self, row: IntArray, place: IntArray, fits: Fits) -> Fitted:
+        """Put better fits in their places."""
+        out = Fitted(self.number, *(a.copy() for a in self[1:]))
+        for mine, theirs in zip(out[1:], fits[:4], strict=True):
+            mine[row, place] = theirs
+        return out
 
-    @property
-    def probability(self) -> Array:
-        """Posterior probability of the contact given, shape (...); NaN without ``noise``."""
-        return self.candidate_probabilities[..., 0]
-
-    def to_dataset(self) -> xr.Dataset:
-        """Return everything as a labelled dataset.
-
-        Returns
-        -------
-        Dataset
-            Over the measurements' dimensions, ``space`` and ``candidate``.
-        """
-        dims, space = self.dims, (*self.dims, "space")
-        r, theta, phi = np.moveaxis(self.spherical, -1, 0)
-        frame = (*dims, "material")
-        data = {
-            "contact_point": (space, self.point, attributes("contact_point_whisker")),
-            "r": (dims, r, attributes("r")),
-            "theta": (dims, theta, attributes("theta")),
-            "phi": (dims, phi, attributes("phi")),
-            "covariance": ((*space, "space_2"), self.covariance, attributes("covariance")),
-            "arc_length": (dims, self.arc_length, attributes("arc_length")),
-            "contact_force": (frame, self.contact_force, attributes("contact_force")),
-            "friction_angle": (dims, self.friction_angle, attributes("friction_angle")),
-            "friction_angle_sigma": (
-                dims,
-                self.friction_angle_sigma,
-                attributes("friction_angle_sigma"),
-            ),
-            "force": (space, self.force, attributes("force")),
-            "moment": (space, self.moment, attributes("moment")),
-            "misfit": (dims, self.misfit, attributes("misfit")),
-            "linear": (dims, self.linear, attributes("linear")),
-            "candidates": (
-                (*dims, "candidate", "space"),
-                self.candidates,
-                attributes("contact_point_whisker"),
-            ),
-            "probability": (dims, self.probability, attributes("probability")),
-            "candidate_probabilities": (
-                (*dims, "candidate"),
-                self.candidate_probabilities,
-                attributes("probability"),
-            ),
-            "n_candidates": (dims, self.n_candidates, attributes("candidates")),
-            "status": (dims, self.status, {**attributes("status"), **flag_attributes()}),
-        }
-        axes = {"space": ["x", "y", "z"], "space_2": ["x", "y", "z"], "material": ["t", "d1", "d2"]}
-        return xr.Dataset(data, coords={**self.coords, **axes})
-
-    def __repr__(self) -> str:
-        """Say how many there are and what became of them."""
-        return f"<{self._title()}: {counted(self.status)}>"
-
-    def _repr_html_(self) -> str:
-        """Show the contact points about the base, with the numbers."""
-        return estimate_card(self._title(), self, self._friction())
-
-    def __str__(self) -> str:
-        """Tell the numbers as well."""
-        return lines(self._title(), estimate_rows(self, self._friction()))
-
-    def _friction(self) -> list[tuple[str, str]]:
-        return [("friction angle", shown("friction_angle", self.friction_angle))]
-
-    def _title(self) -> str:
-        return f"WrenchEstimate of {self.status.shape or 'one'}"
+    def allowed_first(self, allowed: AnyArray) -> Fitted:
+        """Leave out candidates that are not allowed; the others keep their order."""
+        order = np.argsort(~allowed, axis=1, kind="stable")
+        line = np.arange(len(order))[:, None]
+        return Fitted(allowed.sum(axis=1), *(a[line, order] for a in self[1:]))
 
 
 def estimate_from_wrench(
@@ -229,7 +104,7 @@ def estimate_from_wrench(
     mixing_sigma: float | ArrayLike = 0.0,
     prior: Prior | None = None,
     steps: int = STEPS,
-) -> WrenchEstimate:
+) -> Contacts:
     """Locate contacts from force and moment at the base, with or without friction.
 
     Parameters
@@ -258,7 +133,7 @@ def estimate_from_wrench(
 
     Returns
     -------
-    WrenchEstimate
+    Contacts
         For each wrench the contact, its force and friction angle, and their uncertainty.
 
     Raises
@@ -275,8 +150,37 @@ def estimate_from_wrench(
     >>> float(found.arc_length.round(6))
     0.025
     """
-    sensor = sensor_noise(noise, WRENCH, common_errors(stiffness_sigma, gain_sigma, mixing_sigma))
-    f, m, dims, coords = labelled_wrench(force, moment)
+    errors = common_errors(stiffness_sigma, gain_sigma, mixing_sigma)
+    labelled = labelled_wrench(force, moment)
+    return _located(whisker, labelled, noise, errors, prior, steps)
+
+
+def estimate_components(
+    whisker: Whisker,
+    signals: xr.Dataset | Mapping[str, ArrayLike],
+    noise: Mapping[str, float] | ArrayLike | None,
+    errors: Array,
+    prior: Prior | None,
+) -> Contacts:
+    """Locate contacts from signals that have ``force`` and ``moment``, or the six components."""
+    if "force" in signals and "moment" in signals:
+        labelled = labelled_wrench(signals["force"], signals["moment"])
+    else:
+        values, dims, coords = measured(signals, WRENCH)
+        labelled = values[..., :3], values[..., 3:], dims, coords
+    return _located(whisker, labelled, noise, errors, prior, STEPS)
+
+
+def _located(
+    whisker: Whisker,
+    labelled: tuple[Array, Array, tuple[str, ...], Coordinates],
+    noise: Mapping[str, float] | ArrayLike | None,
+    errors: Array,
+    prior: Prior | None,
+    steps: int,
+) -> Contacts:
+    sensor = sensor_noise(noise, WRENCH, errors)
+    f, m, dims, coords = labelled
     d = discretize(whisker, steps)
     scale = np.repeat([d.force, d.moment], 3)
     wrenches = np.concatenate([f, m], axis=-1).reshape(-1, 6) / scale
@@ -288,19 +192,23 @@ def estimate_from_wrench(
         weights = whitening(trusted(wrenches[rows]))
     else:
         covariance = _covariance(sensor) / np.outer(scale, scale)
-        errors = scaled_errors(sensor.errors, d.force, d.moment)
-        weights = whitening(covariance + common_covariance(errors, np.eye(6), wrenches[rows]))
+        scaled = scaled_errors(sensor.errors, d.force, d.moment)
+        weights = whitening(covariance + common_covariance(scaled, np.eye(6), wrenches[rows]))
         degrees = rank(covariance) - _UNKNOWNS
-    solved = _solve(discretize(whisker, _COARSE), d, wrenches[rows], weights, explained(degrees))
+    limit = explained(degrees)
+    solved = _solve(discretize(whisker, _COARSE), d, wrenches[rows], weights, limit)
+    found, lost = _candidates(solved), np.zeros(rows.size, np.bool_)
     if prior is not None:
-        solved = _possible(prior, whisker, d, solved)
-    status = np.where(known, int(Status.DEGENERATE), int(Status.MISSING))
-    found = _without_noise(solved)
+        allowed = prior.possible(whisker, d, found)
+        found = found.allowed_first(allowed)
+        solved = solved.allowed_first(allowed)
     if sensor is not None:
-        solved, found = _uncertain(d, solved, wrenches[rows], weights)
-    status[rows] = _statuses(solved, found.probability, explained(degrees))
-    status[rows[found.lost]] = int(Status.DEGENERATE)
-    return _estimate(d, solved, found, felt, status, f.shape[:-1], dims, coords)
+        found, lost = _judged(d, solved, found, wrenches[rows], weights)
+    status = np.where(known, int(Status.DEGENERATE), int(Status.MISSING))
+    status[rows] = np.where(lost, int(Status.DEGENERATE), _statuses(found, limit))
+    whole = found.spread_out(rows, len(wrenches))
+    chi_squared = whole.chi_squared[:, 0]
+    return Contacts.of(whole, status, chi_squared, d, WRENCH, f.shape[:-1], dims, coords)
 
 
 def _covariance(sensor: SensorNoise) -> Array:
@@ -313,7 +221,7 @@ def _covariance(sensor: SensorNoise) -> Array:
 
 def _solve(
     coarse: Discretization, fine: Discretization, wrenches: Array, weights: Array, limit: float
-) -> Candidates:
+) -> Fitted:
     """Contacts that explain wrenches, or the one that comes nearest."""
     number, places = vanishing_moments(coarse, wrenches, PROXIMAL)
     row, place = np.nonzero(np.arange(places.shape[1]) < number[:, None])
@@ -336,19 +244,18 @@ def _solve(
     else:
         near = row[near]
     doubt = found.misfits + (_friction_angle(found.contacts) / _LIKELY) ** 2
-    kept = candidates(len(wrenches), near, found, doubt, limit, _MOST)
+    kept = chosen(len(wrenches), near, found, doubt, limit, _MOST)
     row, place = np.nonzero(np.arange(kept.contacts.shape[1]) < kept.number[:, None])
     final = _fit(fine, wrenches, weights, row, kept.contacts[row, place], limit)
     return kept.replaced(row, place, final)
 
 
-def _possible(prior: Prior, whisker: Whisker, d: Discretization, solved: Candidates) -> Candidates:
-    """Candidates that a prior allows."""
-    there = np.arange(solved.contacts.shape[1]) < solved.number[:, None]
-    x, points = solved.contacts[there], solved.values[there][:, 3:] * d.length
-    allowed = np.zeros_like(there)
-    allowed[there] = prior.allows(whisker, points, x[:, 0] * d.length, x[:, 1:] * d.force)
-    return Candidates(allowed.sum(axis=1), *(allowed_first(allowed, a) for a in solved[1:]))
+def _candidates(solved: Fitted) -> Candidates:
+    """Fits as candidates, without what noise leaves open."""
+    out = Candidates.room(len(solved.number), solved.contacts.shape[1])
+    return out._replace(
+        number=solved.number, x=solved.contacts, values=solved.values, chi_squared=solved.misfits
+    )
 
 
 def _fit(
@@ -386,47 +293,26 @@ def _friction_angle(contacts: Array) -> Array:
     return np.arctan2(contacts[..., 1], np.hypot(contacts[..., 2], contacts[..., 3]))
 
 
-def _statuses(solved: Candidates, probability: Array, limit: float) -> IntArray:
-    first = probability[:, 0]
-    sure = np.where(np.isfinite(first), first > CERTAIN, solved.number == 1)
+def _statuses(found: Candidates, limit: float) -> IntArray:
+    first = found.probability[:, 0]
+    sure = np.where(np.isfinite(first), first > CERTAIN, found.number == 1)
     status = np.where(sure, int(Status.UNIQUE), int(Status.AMBIGUOUS))
-    s, misfit = solved.contacts[:, 0, 0], solved.misfits[:, 0]
+    s, misfit = found.x[:, 0, 0], found.chi_squared[:, 0]
     explains = misfit <= limit
     status[~explains] = int(Status.NOT_ONE_CONTACT)
     status[~explains & (s >= 1.0)] = int(Status.BEYOND_TIP)
     status[s <= PROXIMAL] = int(Status.TOO_PROXIMAL)
-    status[solved.number == 0] = int(Status.OUTSIDE_PRIOR)
+    status[found.number == 0] = int(Status.OUTSIDE_PRIOR)
     return status
 
 
-class _Uncertain(NamedTuple):
-    """Of the first candidates: the point's covariance, m², and the friction angle's deviation, rad.
-
-    And whether they can be relied on, and whether the contact is not known at all; and the
-    posterior probabilities of all candidates.
-    """
-
-    covariance: Array
-    angle: Array
-    linear: AnyArray
-    lost: AnyArray
-    probability: Array
-
-
-def _without_noise(solved: Candidates) -> _Uncertain:
-    n = len(solved.number)
-    nothing = np.zeros(n, np.bool_)
-    unknown = np.full(solved.misfits.shape, np.nan)
-    return _Uncertain(np.full((n, 3, 3), np.nan), np.full(n, np.nan), nothing, nothing, unknown)
-
-
-def _uncertain(
-    d: Discretization, solved: Candidates, wrenches: Array, weights: Array
-) -> tuple[Candidates, _Uncertain]:
-    """Put the most probable candidate first, and tell what noise leaves open."""
-    n, most = solved.misfits.shape
-    row, place = np.nonzero(np.arange(most) < solved.number[:, None])
-    x, values, tangents = (a[row, place] for a in solved[1:4])
+def _judged(
+    d: Discretization, solved: Fitted, found: Candidates, wrenches: Array, weights: Array
+) -> tuple[Candidates, AnyArray]:
+    """Candidates by probability with what noise leaves open, and whether the first is not known."""
+    n, most = found.chi_squared.shape
+    row, place = np.nonzero(np.arange(most) < found.number[:, None])
+    x, values, tangents = (a[row, place] for a in (found.x, found.values, solved.tangents))
     judgement = judged(
         d,
         WRENCH,
@@ -439,26 +325,19 @@ def _uncertain(
         least=PROXIMAL,
         proximal=PROXIMAL,
     )
-    weight, covariance = np.full((n, most), -np.inf), np.full((n, most, 3, 3), np.nan)
-    linear = np.zeros((n, most), np.bool_)
-    weight[row, place] = judgement.weight - 0.5 * (_friction_angle(x) / _LIKELY) ** 2
-    covariance[row, place], linear[row, place] = judgement.covariances, judgement.valid
-    probability, order = ranked(weight, solved.number)
-    line = np.arange(n)[:, None]
-    solved = Candidates(solved.number, *(a[line, order] for a in solved[1:]))
-    first = np.arange(n), order[:, 0]
-    x, values, tangents = solved.contacts[:, 0], solved.values[:, 0], solved.tangents[:, 0]
-    spread = unknowns_covariance(WRENCH, values, tangents, weights, friction=True)
+    spread = unknowns_covariance(WRENCH, values, tangents, weights[row], friction=True)
     size = np.einsum("nai,nij,naj->n", tangents[:, 3:], spread, tangents[:, 3:])
+    weight, far = np.full((n, most), -np.inf), np.full((n, most), np.nan)
+    weight[row, place] = judgement.weight - 0.5 * (_friction_angle(x) / _LIKELY) ** 2
+    far[row, place] = size
+    found.covariances[row, place], found.valid[row, place] = judgement.covariances, judgement.valid
+    found.angle_sigma[row, place] = _angle_deviation(x, spread)
+    probability, order = ranked(weight, found.number)
+    line = np.arange(n)[:, None]
+    found = Candidates(found.number, *(a[line, order] for a in found[1:]))
     with np.errstate(invalid="ignore"):
-        lost = np.isfinite(x[:, 0]) & ~(size <= _UNKNOWN**2)
-    return solved, _Uncertain(
-        d.length**2 * covariance[first],
-        _angle_deviation(x, spread),
-        linear[first],
-        lost,
-        probability,
-    )
+        lost = (found.number > 0) & ~(far[line, order][:, 0] <= _UNKNOWN**2)
+    return found._replace(probability=probability), lost
 
 
 def _angle_deviation(x: Array, spread: Array) -> Array:
@@ -472,44 +351,37 @@ def _angle_deviation(x: Array, spread: Array) -> Array:
     return np.asarray(np.sqrt(np.einsum("na,nab,nb->n", slope, spread, slope)))
 
 
-def _estimate(
-    d: Discretization,
-    solved: Candidates,
-    found: _Uncertain,
-    felt: AnyArray,
-    status: IntArray,
-    shape: tuple[int, ...],
-    dims: tuple[str, ...],
-    coords: Coordinates,
-) -> WrenchEstimate:
-    """Everything in SI units and in the shape of the measurements."""
-
-    def whole(values: AnyArray, missing: float = np.nan) -> AnyArray:
-        out = np.full((felt.size, *values.shape[1:]), missing, values.dtype)
-        out[felt] = values
-        return out.reshape((*shape, *values.shape[1:]))
-
-    best = solved.values[:, 0]
-    force, point = best[:, :3] * d.force, best[:, 3:] * d.length
-    most = max(1, int(solved.number.max(initial=0)))
-    return WrenchEstimate(
-        point=whole(point),
-        covariance=whole(found.covariance),
-        arc_length=whole(solved.contacts[:, 0, 0] * d.length),
-        contact_force=whole(solved.contacts[:, 0, 1:] * d.force),
-        friction_angle=whole(_friction_angle(solved.contacts[:, 0])),
-        friction_angle_sigma=whole(found.angle),
-        force=whole(force),
-        moment=whole(np.cross(point, force)),
-        misfit=whole(solved.misfits[:, 0]),
-        linear=whole(found.linear, missing=False),
-        status=status.reshape(shape),
-        candidates=whole(solved.values[:, :most, 3:] * d.length),
-        candidate_arc_lengths=whole(solved.contacts[:, :most, 0] * d.length),
-        candidate_forces=whole(solved.values[:, :most, :3] * d.force),
-        candidate_contact_forces=whole(solved.contacts[:, :most, 1:] * d.force),
-        candidate_probabilities=whole(found.probability[:, :most]),
-        n_candidates=whole(solved.number, missing=0),
-        dims=dims,
-        coords=coords,
+def chosen(rows: int, row: IntArray, fits: Fits, doubt: Array, limit: float, most: int) -> Fitted:
+    """Choose among fits those that explain their measurement and cannot be told apart."""
+    misfit = np.where(np.isfinite(fits.values).all(axis=1), fits.misfits, np.inf)
+    best = np.full(rows, np.inf)
+    np.minimum.at(best, row, misfit)
+    kept = (misfit <= np.minimum(best[row] + INDISTINCT, np.maximum(best[row], limit))) & (
+        misfit < np.inf
     )
+    kept &= (best[row] <= limit) | (misfit == best[row])
+    order = np.flatnonzero(kept)
+    order = order[np.lexsort((doubt[order], row[order]))]
+    number = np.zeros(rows, np.int64)
+    where = np.full((rows, most), -1)
+    for fit in order:
+        i = row[fit]
+        known = any(_same(fits.contacts[fit], fits.contacts[j]) for j in where[i, : number[i]])
+        if not known and number[i] < most:
+            where[i, number[i]] = fit
+            number[i] += 1
+    there = where >= 0
+
+    def padded(values: Array) -> Array:
+        out = np.full((rows, most, *values.shape[1:]), np.nan)
+        out[there] = values[where[there]]
+        return out
+
+    return Fitted(number, *(padded(a) for a in fits[:4]))
+
+
+def _same(a: Array, b: Array) -> bool:
+    """Whether two contacts x (4,) are one."""
+    s, *force = (a - b).tolist()
+    size = math.hypot(*a[1:].tolist())
+    return abs(s) < _SAME and math.hypot(*force) < 10.0 * _SAME * size

@@ -13,19 +13,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vibrissa.contacts.contact_map import Domain
-from vibrissa.identifiability.regions import ContactSet, contact_set, sample, spread
+from vibrissa.contacts.jacobian import RANK
+from vibrissa.identifiability.regions import ContactSet, contact_set
 from vibrissa.identifiability.twins import (
     AGREEMENT,
     Pairs,
     corrected,
     equations,
     signal_columns,
-    triplet_derivatives,
     units,
 )
 from vibrissa.numerics import AnyArray, Array
 from vibrissa.rod import discretize, solve_forces, with_normal_force
-from vibrissa.signals import circular_among
 
 if TYPE_CHECKING:
     from vibrissa.contacts import ContactMap
@@ -33,41 +32,6 @@ if TYPE_CHECKING:
 # Length of a step in units in which the chart is about one wide, and how many each way.
 _STRIDE = 0.02
 _STRIDES = 60
-# Singular values smaller than this share of the largest count as zero.
-_RANK = 1e-8
-# A triplet has lost a dimension if it has at all but this share of the contacts.
-_LOST = 0.99
-# Where the equations relate signals to each other, the integration does so to its own error, which
-# with so many times the steps is below ``_RANK``.
-_FINER = 8
-# Contacts that decide whether signals determine contacts at all.
-_TRIED = 256
-
-
-def determining(contact_map: ContactMap, names: tuple[str, ...]) -> bool:
-    """Whether signals determine contacts, but for single ones."""
-    contacts = sample(contact_map, spread(_TRIED, seed=0), "reachable").contacts
-    which = signal_columns(names)
-    circular = circular_among(names)
-    span = np.where(circular, 2.0 * np.pi, np.ptp(contacts.signals[:, which], axis=0))
-    return deficient(contact_map, names, contacts.xi, span) is None
-
-
-def deficient(
-    contact_map: ContactMap, names: tuple[str, ...], xi: Array, span: Array
-) -> int | None:
-    """Number of steps with which a triplet has lost a dimension at contacts; None if it has not."""
-    # A signal without a range is zero everywhere, but for rounding.
-    weight = np.where(span > _RANK, 1.0 / np.maximum(span, _RANK), 0.0)
-    unit = units(contact_map, xi)
-    for steps in (contact_map.steps, _FINER * contact_map.steps):
-        d = discretize(contact_map.whisker, steps)
-        values, tangents = solve_forces(d, with_normal_force(xi), tangents=True)
-        slope = triplet_derivatives(values, tangents, names) * unit[:, None, :]
-        singular = np.linalg.svd(slope * weight[:, None], compute_uv=False)
-        if (singular[:, 2] <= _RANK * singular[:, 0]).mean() > _LOST:
-            return steps
-    return None
 
 
 def fibres(
@@ -109,7 +73,7 @@ def fibres(
 def _along(slope: Array, before: Array, sense: float) -> Array:
     """Unit vectors (n, 3) in which T does not change, as near to those before as there are."""
     _, singular, rows = np.linalg.svd(slope)
-    null = singular <= _RANK * singular[:, :1]
+    null = singular <= RANK * singular[:, :1]
     null[:, 2] = True
     onto = np.einsum("nk,nki,ni->nk", null, rows, before)
     turned = np.einsum("nk,nki->ni", onto, rows)

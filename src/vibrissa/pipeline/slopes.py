@@ -29,8 +29,7 @@ from vibrissa.contacts.channels import (
     channel_derivatives,
     channel_gradients,
 )
-from vibrissa.contacts.noise import SensorNoise
-from vibrissa.contacts.whitening import whitening
+from vibrissa.contacts.noise import SensorNoise, whitening
 from vibrissa.rod import Discretization, contact_tangents, discretize, solve_forces
 from vibrissa.signals import signals_of
 from vibrissa.whisker import Whisker

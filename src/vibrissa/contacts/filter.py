@@ -2,11 +2,13 @@
 
 What a whisker touches mostly stands still, so in the laboratory the contact point moves smoothly
 while the base turns and travels. A hypothesis is a Gaussian over contact point p and velocity v,
-whose velocity forgets itself (:mod:`~vibrissa.contacts.drift`).
+whose velocity forgets itself (Ornstein and Uhlenbeck):
 
-The first sample of a contact is taken apart into Gaussians (:mod:`~vibrissa.contacts.beginning`).
+    dp = v dt,    dv = -v dt / τ + σ √(2 / τ) dW.
+
+The first sample of a contact is taken apart into Gaussians (:mod:`~vibrissa.contacts.onset`).
 Each further one moves them and weighs them by how well they predicted it
-(:mod:`~vibrissa.contacts.learning`); of two signals it moves p only across the curve of contacts
+(:mod:`~vibrissa.contacts.mixture`); of two signals it moves p only across the curve of contacts
 that explains them (:mod:`~vibrissa.contacts.ambiguity`), and as the base moves, the curves of
 successive samples cross where the contact is. A candidate that no hypothesis accounts for starts
 another, as improbable as new contacts are.
@@ -15,21 +17,19 @@ another, as improbable as new contacts are.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.contacts.beginning import Beginning, Gaussians
-from vibrissa.contacts.drift import Drift
+from vibrissa.contacts.contacts import Contact
 from vibrissa.contacts.estimator import Estimator
-from vibrissa.contacts.hypotheses import Followed, told
-from vibrissa.contacts.learning import learn
-from vibrissa.contacts.located import Located
-from vibrissa.contacts.mixture import Mixture, predict, room, tidy, unaccounted
+from vibrissa.contacts.mixture import Mixture, learn, predict, room, tidy, unaccounted
+from vibrissa.contacts.noise import explained
+from vibrissa.contacts.onset import Beginning, Gaussians
 from vibrissa.contacts.prior import Prior
 from vibrissa.contacts.readout import Measurement
-from vibrissa.contacts.whitening import explained
-from vibrissa.numerics import AnyArray, Array
+from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.sensors.sensor import GRAVITY
 from vibrissa.status import Status
 
@@ -51,6 +51,78 @@ _LEAST_REACH = 0.01
 # After a gap in which a contact may have gone so far (over L) all begins anew if nothing is known
 # better than this (RMS error).
 _GAP, _FORGOTTEN = 0.1, 0.5
+
+
+# What is surer than this is no longer ambiguous.
+_SURE = 0.99
+# Hypotheses nearer to each other (Mahalanobis distance squared, by the sum of both covariances) run
+# together: there is no gap between them.
+_TOGETHER = 4.0
+_EXPLAINED = (Status.UNIQUE, Status.AMBIGUOUS, Status.UNDERDETERMINED)
+
+
+class Followed(NamedTuple):
+    """What a filter knows after a sample.
+
+    Attributes
+    ----------
+    point : (3,) array
+        Most probable contact point, laboratory frame, m; NaN if there is none. Where hypotheses run
+        together, as along the valley that a light touch leaves, it is their mean.
+    covariance : (3, 3) array
+        Of the contact point about it, m²: of all hypotheses, weighed by their probabilities.
+    velocity : (3,) array
+        Of the contact point in the laboratory, m/s.
+    probability : float
+        That the contact is there, within the spread of the hypotheses that run together; 0 if there
+        is none.
+    status : Status
+        ``UNIQUE`` where that is above 0.99, else ``AMBIGUOUS``. ``MISSING``, ``NOT_FRICTIONLESS``
+        and other reasons are of this sample, which neither a hypothesis nor any contact explains:
+        the point then is what was known before.
+    points : (k, 3) array
+        Contact points of all hypotheses, the most probable first, laboratory frame, m.
+    probabilities : (k,) array
+        Theirs.
+    point_whisker : (3,) array
+        ``point`` in the whisker's frame, m.
+    located : Contact or None
+        What this sample alone tells, where it was looked for: not of fewer than three signals that
+        a hypothesis explains.
+    """
+
+    point: Array
+    covariance: Array
+    velocity: Array
+    probability: float
+    status: Status
+    points: Array
+    probabilities: Array
+    point_whisker: Array
+    located: Contact | None
+
+
+class Drift:
+    """The law of motion of (p, v)."""
+
+    def __init__(self, speed: float, persistence: float) -> None:
+        self.speed, self._tau = speed, persistence
+
+    def over(self, step: float) -> tuple[float, float, Array]:
+        """What happens in some time."""
+        tau, speed = self._tau, self.speed
+        x = step / tau
+        a = math.exp(-x)
+        # 2x - 3 + 4a - a² loses its digits where x is small.
+        walked = 2.0 * x - 3.0 + 4.0 * a - a * a if x > 0.01 else x**3 * (2.0 / 3.0 - 0.5 * x)
+        grown = np.array(
+            [
+                (speed * tau) ** 2 * walked,
+                speed**2 * tau * (1.0 - a) ** 2,
+                speed**2 * (1.0 - a * a),
+            ]
+        )
+        return tau * (1.0 - a), a, grown
 
 
 class ContactFilter:
@@ -149,7 +221,7 @@ class ContactFilter:
 
     def _learned(
         self, measurement: Measurement, turn: Array, base: Array
-    ) -> tuple[Status, Located | None]:
+    ) -> tuple[Status, Contact | None]:
         """Take a measurement that is not empty: what it alone tells."""
         three = self.estimator.readout.told >= _UNKNOWNS
         located = self.estimator.locate(measurement) if three else None
@@ -211,9 +283,9 @@ class ContactFilter:
         self._mixture = _tidied(out, n)
         return explains
 
-    def _unaccounted(self, values: Array, located: Located, turn: Array, base: Array) -> AnyArray:
+    def _unaccounted(self, values: Array, located: Contact, turn: Array, base: Array) -> AnyArray:
         """Which candidates (n,) no hypothesis accounts for."""
-        own = turn @ (located.covariances / self._length**2) @ turn.T
+        own = turn @ (located.candidates.covariance / self._length**2) @ turn.T
         if not math.isfinite(float(own.sum())):  # a place that the signals do not determine
             unknown = ~np.isfinite(own).all(axis=(1, 2))
             own[unknown] = _FORGOTTEN**2 * np.eye(3)
@@ -266,10 +338,84 @@ class ContactFilter:
         if (variance > _FORGOTTEN**2).all():
             self._mixture = room(0, self._errors)
 
-    def _known(self, status: Status, located: Located | None, turn: Array, base: Array) -> Followed:
+    def _known(self, status: Status, located: Contact | None, turn: Array, base: Array) -> Followed:
         return told(self._mixture, status, located, turn, base, self._length)
 
 
 def _tidied(mixture: Mixture, number: int) -> Mixture:
     kept = tidy(mixture, number, _LEAST, _MOST, _ONE)
     return Mixture(*(part[:kept] for part in mixture))
+
+
+def nothing_known(status: Status, located: Contact | None) -> Followed:
+    """Tell that there is no hypothesis, and why."""
+    none = np.full(3, np.nan)
+    empty = np.empty((0, 3))
+    return Followed(
+        none, np.full((3, 3), np.nan), none, 0.0, status, empty, np.empty(0), none, located
+    )
+
+
+def told(
+    mixture: Mixture,
+    status: Status,
+    located: Contact | None,
+    turn: Array,
+    base: Array,
+    length: float,
+) -> Followed:
+    """What hypotheses tell, in SI units."""
+    n = len(mixture.weight)
+    if not n:
+        return nothing_known(status, located)
+    weights = np.exp(mixture.weight)
+    points, spreads = mixture.mean[:, :3], mixture.spread[:, :3, :3]
+    b = mixture.by_errors[:, :3]
+    spreads = spreads + b @ np.swapaxes(b, 1, 2)
+    if n == 1:
+        mean, probability, covariance = mixture.mean[0], 1.0, spreads[0]
+    else:
+        group = _groups(points, spreads)
+        shares = np.bincount(group, weights)
+        best = group == shares.argmax()
+        mean = weights[best] @ mixture.mean[best] / weights[best].sum()
+        probability = float(min(shares.max(), 1.0))
+        away = points - mean[:3]
+        covariance = np.tensordot(weights, spreads, axes=1) + (away.T * weights) @ away
+    if status in _EXPLAINED:
+        status = Status.UNIQUE if probability > _SURE else Status.AMBIGUOUS
+    return Followed(
+        mean[:3] * length,
+        covariance * length**2,
+        mean[3:] * length,
+        probability,
+        status,
+        points * length,
+        weights,
+        turn.T @ (mean[:3] - base) * length,
+        located,
+    )
+
+
+def _groups(points: Array, spreads: Array) -> IntArray:
+    """Number of the group (n,) that each hypothesis belongs to: those that run together."""
+    n = len(points)
+    apart = points[:, None] - points[None]
+    both = spreads[:, None] + spreads[None]
+    far = (apart * np.linalg.solve(both, apart[..., None])[..., 0]).sum(axis=-1)
+    near = far < _TOGETHER
+    group = np.full(n, -1)
+    number = 0
+    for i in range(n):
+        if group[i] >= 0:
+            continue
+        reached = np.zeros(n, np.bool_)
+        reached[i] = True
+        while True:
+            more = near[reached].any(axis=0) | reached
+            if (more == reached).all():
+                break
+            reached = more
+        group[reached] = number
+        number += 1
+    return group

@@ -33,16 +33,16 @@ from vibrissa.contacts.channels import (
     channel_gradients,
     channels_of,
 )
+from vibrissa.contacts.contacts import Contact
 from vibrissa.contacts.estimator import Estimator
-from vibrissa.contacts.fitting import charted, fit
-from vibrissa.contacts.learning import log_weights
-from vibrissa.contacts.located import Located
-from vibrissa.contacts.minima import reliable, unknowns_covariance
+from vibrissa.contacts.least_squares import charted, fit, unknowns_covariance
+from vibrissa.contacts.mixture import log_weights
 from vibrissa.contacts.noise import common_channels
 from vibrissa.contacts.readout import Measurement, Named
 from vibrissa.contacts.weighing import Weighing, weigh
-from vibrissa.numerics import Array, IntArray
-from vibrissa.rod import LEAST_ARC, solve_forces
+from vibrissa.numerics import AnyArray, Array, IntArray
+from vibrissa.rod import LEAST_ARC, Discretization, solve_forces
+from vibrissa.signals import within_turn
 
 # Windows along the whisker, and in each of them so many sectors of bearings to start from.
 _WINDOWS = 16
@@ -59,6 +59,9 @@ _VAGUE = 0.2
 # Smallest standard deviation of a starting hypothesis, over L, so that matrices stay regular.
 _FINEST = 1e-7
 _FREE = [0, 2, 3]
+# How far along each axis of a covariance its linearisation is checked, in standard deviations, and
+# by how much it may err there, as a share of that.
+_REACH, _BENT = 2.0, 0.25
 
 
 class Gaussians(NamedTuple):
@@ -103,7 +106,7 @@ class Beginning:
         self._rest_places = places
 
     def all_that_may_be(
-        self, measurement: Measurement, located: Located, reach: float
+        self, measurement: Measurement, located: Contact, reach: float
     ) -> Gaussians:
         """Take the likelihood of all places apart."""
         nodes, values, window = self._starts(measurement)
@@ -148,27 +151,27 @@ class Beginning:
         slope = np.insert(solve_forces(d, x, tangents=True)[1], 1, 0.0, axis=2)
         with np.errstate(over="ignore", invalid="ignore"):
             own = unknowns_covariance(self._names, values, slope, w, friction=False)
-            linear = reliable(d, self._names, w, x, values, slope, own, LEAST_ARC)
+            linear = _linear(d, self._names, w, x, values, slope, own, LEAST_ARC)
             narrow = own[:, 0, 0] < (_SHARP * self._width) ** 2
         return np.flatnonzero(linear & narrow)
 
-    def candidates(self, measurement: Measurement, located: Located, reach: float) -> Gaussians:
+    def candidates(self, measurement: Measurement, located: Contact, reach: float) -> Gaussians:
         """Take the candidates of one sample, which lie apart, as they are."""
         x, values = self.exact(located)
         _, slope = solve_forces(self._chart.discretization, x, tangents=True)
         tangents = np.insert(slope, 1, 0.0, axis=2)
-        weights = np.full(len(x), -0.5 * located.misfit)
+        weights = np.full(len(x), -0.5 * located.chi_squared)
         return self._gaussians(measurement, x, values, tangents, weights, reach, windowed=False)
 
-    def samples(self, measurement: Measurement, located: Located, reach: float) -> Gaussians:
+    def samples(self, measurement: Measurement, located: Contact, reach: float) -> Gaussians:
         """Take samples of a curve or surface of contacts, that between them leave no gap."""
-        number = len(located.candidates)
+        number = located.n_candidates
         some = np.linspace(0, number - 1, min(number, _MOST)).astype(int)
         x, values = (part[some] for part in self.exact(located))
         _, slope = solve_forces(self._chart.discretization, x, tangents=True)
         across, by_errors = self._across(measurement, values, slope)
         covariance = across + _gaps_between(values[:, 3:]) + _FINEST**2 * np.eye(3)
-        weights = 0.5 * np.linalg.slogdet(covariance)[1] - 0.5 * located.misfit
+        weights = 0.5 * np.linalg.slogdet(covariance)[1] - 0.5 * located.chi_squared
         return Gaussians(
             x, values, covariance, by_errors, weights + self._log_prior(x, values, reach)
         )
@@ -188,12 +191,12 @@ class Beginning:
         g = channel_gradients(values, self._names)
         return common_channels(self._readout.how.errors, g, wrench)
 
-    def exact(self, located: Located) -> tuple[Array, Array]:
+    def exact(self, located: Contact) -> tuple[Array, Array]:
         """The candidates of one sample as x (n, 4) and (F, p) (n, 6), non-dimensional."""
-        d, n = self._chart.discretization, len(located.candidates)
+        d, n, found = self._chart.discretization, located.n_candidates, located.candidates
         x, values = np.empty((n, 4)), np.empty((n, 6))
-        x[:, 0], x[:, 1:] = located.arc_lengths / d.length, located.contact_forces / d.force
-        values[:, :3], values[:, 3:] = located.forces / d.force, located.candidates / d.length
+        x[:, 0], x[:, 1:] = found.arc_length / d.length, found.contact_force / d.force
+        values[:, :3], values[:, 3:] = found.force / d.force, found.point / d.length
         return x, values
 
     def _starts(self, measurement: Measurement) -> tuple[Array, Array, IntArray]:
@@ -319,3 +322,61 @@ def _distinct(x: Array, window: IntArray, rows: IntArray) -> list[int]:
         if not same.any():
             kept.append(row)
     return kept
+
+
+def _linear(
+    discretization: Discretization,
+    names: tuple[str, ...],
+    weights: Array,
+    contacts: Array,
+    values: Array,
+    tangents: Array,
+    covariance: Array,
+    least: float,
+) -> AnyArray:
+    """Whether a covariance describes how the contact scatters: the map from x is tried out.
+
+    From the contact, two standard deviations to both sides along each principal axis of the
+    covariance of x, the rod is solved. There, channels (in standard deviations) and contact point
+    (relative to its own scatter) must lie where the derivatives say, to a quarter of the way, and
+    the contact must still lie on the whisker.
+    """
+    finite = np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(values).all(axis=1)
+    good: AnyArray = np.asarray(finite)
+    rows = np.flatnonzero(good)
+    if not rows.size:
+        return good
+    x, value, slope, w = contacts[rows], values[rows], tangents[rows], weights[rows]
+    axes = _principal_axes(covariance[rows], x)
+    if not covariance[rows, 1, 1].any():
+        axes = axes[:, :, 1:]  # without friction the first axis has no length
+    steps = _REACH * np.concatenate([axes, -axes], axis=2)  # (n, 4, 2 axes)
+    places = x[:, None, :] + np.swapaxes(steps, 1, 2)
+    on = (places[..., 0] >= least) & (places[..., 0] <= 1.0)
+    places[..., 0] = np.clip(places[..., 0], least, 1.0)
+    moved, _ = solve_forces(discretization, places.reshape(-1, 4))
+    moved = moved.reshape(*places.shape[:2], 6)
+    which = [CHANNELS.index(name) for name in names]
+    away = (channels_of(moved) - channels_of(value)[:, None])[..., which]
+    away = within_turn(away, [CIRCULAR[w] for w in which])
+    told = np.swapaxes(channel_derivatives(value, slope, names) @ steps, 1, 2)
+    bent = np.linalg.norm(np.einsum("nij,nmj->nmi", w, away - told), axis=2)
+    point_told = np.swapaxes(slope[:, 3:] @ steps, 1, 2)
+    off = np.linalg.norm(moved[..., 3:] - value[:, None, 3:] - point_told, axis=2)
+    scatter = np.sqrt(np.einsum("nij,njk,nik->n", slope[:, 3:], covariance[rows], slope[:, 3:]))
+    with np.errstate(divide="ignore", invalid="ignore"):  # without noise nothing scatters
+        bent = np.maximum(bent, off / scatter[:, None])
+    still = (steps == 0.0).all(axis=1)
+    good[rows] = (on & (bent <= _BENT * _REACH) | still).all(axis=1)
+    return good
+
+
+def _principal_axes(covariance: Array, x: Array) -> Array:
+    """Square roots of covariances along their principal axes (in columns), scaled by x."""
+    force = np.linalg.norm(x[:, 1:], axis=1)
+    size = np.stack([np.ones_like(force), force, force, force], axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scaled = np.nan_to_num(covariance / (size[:, :, None] * size[:, None, :]))
+    values, vectors = np.linalg.eigh(scaled)
+    values = np.where(values > 1e-14 * values[:, -1:], values, 0.0)
+    return np.asarray(size[:, :, None] * vectors * np.sqrt(values)[:, None, :])

@@ -1,0 +1,514 @@
+"""Contacts found from measurements: the result of every way of estimating them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from vibrissa.numerics import AnyArray, Array, IntArray
+from vibrissa.quantities import attributes
+from vibrissa.rod import Discretization
+from vibrissa.signals import Coordinates
+from vibrissa.sketch import CONTACT, REST, Mark, card, lines, shown, views
+from vibrissa.status import Status, counted, describe, flag_attributes
+
+#: At most so many candidates are kept for one measurement.
+MOST_CANDIDATES = 8
+_SPACE = ["x", "y", "z"]
+
+
+def spherical(points: Array) -> Array:
+    """Spherical form of points: distance, azimuth atan2(y, x), elevation asin(z / r).
+
+    Parameters
+    ----------
+    points : (..., 3) array
+        Points, whisker frame, m.
+
+    Returns
+    -------
+    (..., 3) array
+        Distance r, m, azimuth θ and elevation φ, rad.
+    """
+    r = np.linalg.norm(points, axis=-1)
+    theta = np.arctan2(points[..., 1], points[..., 0])
+    phi = np.arctan2(points[..., 2], np.hypot(points[..., 0], points[..., 1]))
+    return np.stack([r, theta, phi], axis=-1)
+
+
+class Candidates(NamedTuple):
+    """Candidates of n measurements, non-dimensional, in arrays (n, k, ...) padded with NaN.
+
+    Their number (n,), x = (s, f_x, f_y, f_z) (n, k, 4), (F, p) (n, k, 6), covariances of p
+    (n, k, 3, 3), χ² (n, k), posterior probabilities (n, k), whether covariances are valid (n, k),
+    and standard deviations of the friction angle (n, k).
+    """
+
+    number: IntArray
+    x: Array
+    values: Array
+    covariances: Array
+    chi_squared: Array
+    probability: Array
+    valid: AnyArray
+    angle_sigma: Array
+
+    @classmethod
+    def room(cls, n: int, most: int = MOST_CANDIDATES) -> Candidates:
+        """Make room for candidates of n measurements."""
+        return cls(
+            np.zeros(n, np.int64),
+            np.full((n, most, 4), np.nan),
+            np.full((n, most, 6), np.nan),
+            np.full((n, most, 3, 3), np.nan),
+            np.full((n, most), np.nan),
+            np.full((n, most), np.nan),
+            np.zeros((n, most), np.bool_),
+            np.full((n, most), np.nan),
+        )
+
+    def allowed_first(self, allowed: AnyArray) -> Candidates:
+        """Leave out candidates (n, k) that are not allowed; the others keep their order."""
+        order = np.argsort(~allowed, axis=1, kind="stable")
+        gone = np.arange(allowed.shape[1]) >= allowed.sum(axis=1)[:, None]
+        parts = []
+        for values in self[1:]:
+            places = order.reshape(*order.shape, *[1] * (values.ndim - 2))
+            part = np.take_along_axis(values, places, axis=1)
+            part[gone] = False if part.dtype == np.bool_ else np.nan
+            parts.append(part)
+        return Candidates(allowed.sum(axis=1), *parts)
+
+    def spread_out(self, rows: IntArray, n: int) -> Candidates:
+        """Put candidates of some measurements to those of n."""
+        out = Candidates.room(n, self.x.shape[1])
+        for mine, theirs in zip(out, self, strict=True):
+            mine[rows] = theirs
+        return out
+
+
+class _Located:
+    """Properties that follow from what contacts are stored as."""
+
+    point: Array
+    force: Array
+    contact_force: Array
+
+    @property
+    def spherical(self) -> Array:
+        """Spherical form (r, θ, φ) of the contact point, m and rad, shape (..., 3)."""
+        return spherical(self.point)
+
+    @property
+    def moment(self) -> Array:
+        """Base moment p × F, N·m, shape (..., 3)."""
+        return np.asarray(np.cross(self.point, self.force))
+
+    @property
+    def friction_angle(self) -> Array:
+        """Angle between the force and the plane normal to the whisker, rad, shape (...).
+
+        Positive where the object pulls toward the tip; its tangent is the least coefficient of
+        friction that holds the contact. Zero where the contact was taken to be frictionless.
+        """
+        normal = np.hypot(self.contact_force[..., 1], self.contact_force[..., 2])
+        return np.asarray(np.arctan2(self.contact_force[..., 0], normal))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Contacts(_Located):
+    """Contacts that explain measurements, whisker frame, SI units.
+
+    The fields are those of the most plausible contact of each measurement; `candidates` has all.
+
+    Attributes
+    ----------
+    point : (..., 3) array
+        Contact point, m; NaN where there is none.
+    covariance : (..., 3, 3) array
+        Covariance of the contact point, m²: second moment of the posterior probability about it, to
+        first order where the contact moves with the signals as derivatives say, and widened where
+        it does not, as near slip-off and where the deflection is small; NaN without ``noise``.
+    covariance_valid : (...) bool array
+        Whether regions stated from the covariance hold what they state: the status is ``UNIQUE``
+        and the second-order change of the contact point is small in the metric of the covariance.
+        Of a candidate it is the latter alone. False without ``noise``.
+    chi_squared : (...) array
+        χ² of the contact: sum of squares of the part of the signals that it leaves unexplained, in
+        standard deviations. Without ``noise``, components of force and moment count as known to
+        1 % of |F| and |M|; three signals then have 0 where they are explained, and else the
+        distance to the nearest signals that are, as a share of each signal's range, and no contact.
+    probability : (...) array
+        Posterior probability of the contact, where any contact point of Ω is as probable
+        beforehand (and, of the wrench, friction angles scatter by 20°); NaN without ``noise``.
+    status : (...) int array
+        Value of :class:`~vibrissa.Status` for each measurement: ``UNIQUE`` (with ``noise``: all
+        other candidates together are less than 5 % probable); ``AMBIGUOUS``; ``NOT_FRICTIONLESS``
+        where no contact explains the signals (with ``noise``, and of more than three signals: χ² is
+        larger than in one measurement of a thousand; the contact nearest is given);
+        ``OUTSIDE_MAP`` where one nearer to the base would, or where signals are ten times larger
+        than any on the map; ``OUTSIDE_PRIOR`` where the prior allows none of the candidates;
+        ``DEGENERATE`` where forces and moments are zero, where the signals do not determine
+        contacts (:meth:`ContactMap.determines`), or where with this noise the contact may be
+        anywhere; ``MISSING``. Of the wrench also ``NOT_ONE_CONTACT`` where χ² is too large,
+        ``BEYOND_TIP`` where moreover the nearest contact is the tip, ``TOO_PROXIMAL`` where it is
+        at 0.05 L. Of fewer than three signals ``UNDERDETERMINED``: candidates are samples of the
+        curve or surface of contacts that explain them. Of the paper's methods, which cannot see
+        whether contacts are ambiguous: ``APPROXIMATE``, ``OUTSIDE_MAP`` or ``MISSING``.
+    arc_length : (...) array
+        Arc length of the contact, m.
+    force : (..., 3) array
+        Base force, N.
+    contact_force : (..., 3) array
+        Force in the material frame at the contact (tangent, d1, d2), N.
+    friction_angle_sigma : (...) array
+        Standard deviation of the friction angle, rad; NaN without ``noise`` and without friction.
+    n_candidates : (...) int array
+        Number of candidates.
+    candidates : Contacts or None
+        All candidates, with one dimension more, padded with NaN (and the status ``MISSING``): with
+        ``noise`` by falling probability; without, by rising force, or for more than three signals
+        by rising χ² and then force. Their χ² is within 10.8 of the least (the likelihood ratio that
+        one pair in a thousand exceeds by chance). None for candidates themselves.
+    using : tuple of str
+        Signals used.
+    dims : tuple of str
+        Names of the leading dimensions.
+    coords : dict
+        Coordinates along them.
+    """
+
+    point: Array
+    covariance: Array
+    covariance_valid: AnyArray
+    chi_squared: Array
+    probability: Array
+    status: IntArray
+    arc_length: Array
+    force: Array
+    contact_force: Array
+    friction_angle_sigma: Array
+    n_candidates: IntArray
+    candidates: Contacts | None
+    using: tuple[str, ...]
+    dims: tuple[str, ...] = ()
+    coords: Coordinates = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        found: Candidates,
+        status: IntArray,
+        chi_squared: Array,
+        discretization: Discretization,
+        using: tuple[str, ...],
+        shape: tuple[int, ...],
+        dims: tuple[str, ...],
+        coords: Coordinates,
+    ) -> Contacts:
+        """Give candidates of flat measurements their units and the shape of the measurements."""
+        d, most = discretization, max(1, int(found.number.max(initial=0)))
+
+        def whole(values: AnyArray) -> AnyArray:
+            return values.reshape((*shape, *values.shape[1:]))
+
+        there = np.arange(most) < found.number[:, None]
+        every = cls(
+            point=whole(found.values[:, :most, 3:] * d.length),
+            covariance=whole(found.covariances[:, :most] * d.length**2),
+            covariance_valid=whole(found.valid[:, :most] & there),
+            chi_squared=whole(found.chi_squared[:, :most]),
+            probability=whole(found.probability[:, :most]),
+            status=whole(np.where(there, status[:, None], int(Status.MISSING))),
+            arc_length=whole(found.x[:, :most, 0] * d.length),
+            force=whole(found.values[:, :most, :3] * d.force),
+            contact_force=whole(found.x[:, :most, 1:] * d.force),
+            friction_angle_sigma=whole(found.angle_sigma[:, :most]),
+            n_candidates=whole(there.astype(np.int64)),
+            candidates=None,
+            using=using,
+            dims=(*dims, "candidate"),
+            coords=coords,
+        )
+        first = (..., 0)
+        return cls(
+            point=every.point[..., 0, :],
+            covariance=every.covariance[..., 0, :, :],
+            covariance_valid=every.covariance_valid[first] & (whole(status) == Status.UNIQUE),
+            chi_squared=whole(chi_squared),
+            probability=every.probability[first],
+            status=whole(status),
+            arc_length=every.arc_length[first],
+            force=every.force[..., 0, :],
+            contact_force=every.contact_force[..., 0, :],
+            friction_angle_sigma=every.friction_angle_sigma[first],
+            n_candidates=whole(found.number),
+            candidates=every,
+            using=using,
+            dims=dims,
+            coords=coords,
+        )
+
+    def to_dataset(self) -> xr.Dataset:
+        """Return everything as a labelled dataset.
+
+        Returns
+        -------
+        Dataset
+            Fields of the contacts over the measurements' dimensions, ``space`` and ``material``,
+            and those of the candidates, their names led by ``candidate_``, over ``candidate`` too.
+        """
+        data = self._variables("")
+        if self.candidates is not None:
+            data |= self.candidates._variables("candidate_")
+        coords = {**self.coords, "space": _SPACE, "space_2": _SPACE, "material": ["t", "d1", "d2"]}
+        return xr.Dataset(data, coords=coords, attrs={"using": " ".join(self.using)})
+
+    def _variables(self, prefix: str) -> dict[str, Any]:
+        r, theta, phi = np.moveaxis(self.spherical, -1, 0)
+        named: list[tuple[str, str, AnyArray, tuple[str, ...]]] = [
+            ("contact_point", "contact_point_whisker", self.point, ("space",)),
+            ("r", "r", r, ()),
+            ("theta", "theta", theta, ()),
+            ("phi", "phi", phi, ()),
+            ("covariance", "covariance", self.covariance, ("space", "space_2")),
+            ("covariance_valid", "covariance_valid", self.covariance_valid, ()),
+            ("chi_squared", "chi_squared", self.chi_squared, ()),
+            ("probability", "probability", self.probability, ()),
+            ("arc_length", "arc_length", self.arc_length, ()),
+            ("force", "force", self.force, ("space",)),
+            ("moment", "moment", self.moment, ("space",)),
+            ("contact_force", "contact_force", self.contact_force, ("material",)),
+            ("friction_angle", "friction_angle", self.friction_angle, ()),
+            ("friction_angle_sigma", "friction_angle_sigma", self.friction_angle_sigma, ()),
+        ]
+        out: dict[str, Any] = {
+            prefix + name: ((*self.dims, *axes), values, attributes(quantity))
+            for name, quantity, values, axes in named
+        }
+        if not prefix:
+            out["n_candidates"] = (self.dims, self.n_candidates, attributes("candidates"))
+            flags = {**attributes("status"), **flag_attributes()}
+            out["status"] = (self.dims, self.status, flags)
+        return out
+
+    def plot(self) -> str:
+        """Draw the contact points and all candidates about the base.
+
+        Returns
+        -------
+        str
+            An SVG element: the x-y and the x-z plane of the whisker's frame.
+        """
+        every = self.point if self.candidates is None else self.candidates.point
+        return _picture(self.point, every)
+
+    def __repr__(self) -> str:
+        """Show how many there are and their statuses."""
+        return f"<{self._title()}: {counted(self.status)}>"
+
+    def _repr_html_(self) -> str:
+        """Show the contact points about the base, with the numbers."""
+        return card(self._title(), self._rows(), self.plot())
+
+    def __str__(self) -> str:
+        """Show the numbers as well."""
+        return lines(self._title(), self._rows())
+
+    def _title(self) -> str:
+        return f"Contacts of {self.status.shape or 'one'} from ({', '.join(self.using)})"
+
+    def _rows(self) -> list[tuple[str, str]]:
+        r, theta, phi = np.moveaxis(self.spherical, -1, 0)
+        sigma = np.sqrt(np.einsum("...ii->...i", self.covariance).max(axis=-1))
+        one = np.size(self.status) == 1
+        rows = [
+            ("status", next(iter(describe(self.status))) if one else counted(self.status)),
+            ("r", shown("r", r)),
+            ("θ", shown("theta", theta)),
+            ("φ", shown("phi", phi)),
+            ("largest standard deviation of x, y, z", shown("r", sigma)),
+            ("candidates", shown("candidates", self.n_candidates)),
+        ]
+        if np.nan_to_num(self.contact_force[..., 0]).any():
+            rows.append(("friction angle", shown("friction_angle", self.friction_angle)))
+        return rows
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Contact(_Located):
+    """The contact that explains one measurement; whisker frame, SI units.
+
+    The fields are those of :class:`Contacts`, for one measurement.
+
+    Attributes
+    ----------
+    point : (3,) array
+        Contact point of the most plausible candidate, m; NaN if there is none. Of fewer than three
+        signals the sample in the middle of all.
+    covariance : (3, 3) array
+        Covariance of the contact point, m²; NaN without noise. Of fewer than three signals that of
+        the samples about it.
+    covariance_valid : bool
+        Whether regions stated from the covariance hold what they state.
+    chi_squared : float
+        χ² of the contact.
+    probability : float
+        Posterior probability of the contact; NaN without noise.
+    status : Status
+        Outcome, as of :class:`Contacts`; with a threshold also ``NOT_FELT``.
+    arc_length : float
+        Arc length of the contact, m.
+    force : (3,) array
+        Base force, N.
+    contact_force : (3,) array
+        Force in the material frame at the contact (tangent, d1, d2), N.
+    candidates : Contacts
+        All candidates, shape (k,).
+    continuing : int
+        Number of the candidate that goes on from the measurement before; 0 where there was none.
+    """
+
+    point: Array
+    covariance: Array
+    covariance_valid: bool
+    chi_squared: float
+    probability: float
+    status: Status
+    arc_length: float
+    force: Array
+    contact_force: Array
+    candidates: Contacts
+    continuing: int = 0
+
+    @property
+    def n_candidates(self) -> int:
+        """Number of candidates."""
+        return len(self.candidates.point)
+
+    @classmethod
+    def of(
+        cls,
+        found: Candidates,
+        status: Status,
+        chi_squared: float,
+        discretization: Discretization,
+        using: tuple[str, ...],
+        continuing: int = 0,
+        first: int = 0,
+        covariance: Array | None = None,
+    ) -> Contact:
+        """Give the candidates of one measurement their units; ``first`` stands for all."""
+        d, n = discretization, int(found.number[0])
+        points, forces = found.values[0, :n, 3:] * d.length, found.values[0, :n, :3] * d.force
+        arcs, contact_forces = found.x[0, :n, 0] * d.length, found.x[0, :n, 1:] * d.force
+        covariances, chances = found.covariances[0, :n] * d.length**2, found.probability[0, :n]
+        valid = found.valid[0, :n]
+        every = Contacts(
+            points,
+            covariances,
+            valid,
+            found.chi_squared[0, :n],
+            chances,
+            np.full(n, int(status)),
+            arcs,
+            forces,
+            contact_forces,
+            found.angle_sigma[0, :n],
+            np.ones(n, np.int64),
+            None,
+            using,
+            ("candidate",),
+        )
+        if not n:
+            none = np.full(3, np.nan)
+            away = np.full((3, 3), np.nan)
+            return cls(none, away, False, chi_squared, np.nan, status, np.nan, none, none, every, 0)
+        return cls(
+            points[first],
+            covariances[first] if covariance is None else covariance,
+            bool(valid[first]) and status == Status.UNIQUE,
+            chi_squared,
+            float(chances[first]),
+            status,
+            float(arcs[first]),
+            forces[first],
+            contact_forces[first],
+            every,
+            continuing,
+        )
+
+    def to_dataset(self) -> xr.Dataset:
+        """Return everything as a labelled dataset without dimensions but the candidates'.
+
+        Returns
+        -------
+        Dataset
+            As :meth:`Contacts.to_dataset` gives it.
+        """
+        return self._as_contacts().to_dataset()
+
+    def plot(self) -> str:
+        """Draw the contact point and all candidates about the base.
+
+        Returns
+        -------
+        str
+            An SVG element: the x-y and the x-z plane of the whisker's frame.
+        """
+        return _picture(self.point, self.candidates.point)
+
+    def _as_contacts(self) -> Contacts:
+        every = self.candidates
+        sigma = every.friction_angle_sigma
+        return Contacts(
+            self.point,
+            self.covariance,
+            np.asarray(self.covariance_valid),
+            np.asarray(self.chi_squared),
+            np.asarray(self.probability),
+            np.asarray(int(self.status)),
+            np.asarray(self.arc_length),
+            self.force,
+            self.contact_force,
+            sigma[0] if len(sigma) else np.asarray(np.nan),
+            np.asarray(self.n_candidates),
+            every,
+            every.using,
+        )
+
+    def __repr__(self) -> str:
+        """Show the status and the contact point."""
+        where = ", ".join(f"{1e3 * value:.4g}" for value in self.point.tolist())
+        return f"<Contact {self.status.name} at ({where}) mm, {self.n_candidates} candidates>"
+
+    def _repr_html_(self) -> str:
+        """Show the contact point about the base, with the numbers."""
+        return self._as_contacts()._repr_html_()
+
+    def __str__(self) -> str:
+        """Show the numbers as well."""
+        return str(self._as_contacts())
+
+
+def nowhere(status: Status, chi_squared: float, discretization: Discretization) -> Contact:
+    """A measurement without a contact."""
+    return Contact.of(Candidates.room(1, 0), status, chi_squared, discretization, ())
+
+
+def _picture(points: Array, candidates: Array) -> str:
+    marks = [
+        Mark(np.zeros((1, 3)), REST, dots=True, width=7.0, label="base"),
+        Mark(np.reshape(candidates, (-1, 3)), REST, dots=True, width=3.0),
+        Mark(
+            np.reshape(points, (-1, 3)),
+            CONTACT,
+            dots=True,
+            width=4.0,
+            label="contact (candidates: grey)",
+        ),
+    ]
+    return views(marks)

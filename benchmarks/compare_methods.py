@@ -57,7 +57,7 @@ def by_estimate(contacts, drawn, rows, triplet, method, name) -> Result:
     few = {key: column[:1] for key, column in signals.items()}
     _, first = timed(lambda: estimate(contacts, few, triplet, method))
     found, all_of_them = timed(lambda: estimate(contacts, signals, triplet, method))
-    away = np.linalg.norm(found.candidates - drawn.point[rows, None], axis=-1)
+    away = np.linalg.norm(found.candidates.point - drawn.point[rows, None], axis=-1)
     errors = np.where(np.isnan(away), np.inf, away).min(axis=1)
     errors[np.isinf(errors)] = np.nan
     if method == "exact":

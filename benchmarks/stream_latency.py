@@ -106,7 +106,7 @@ def main(samples, path=None):
         if "filter" not in what and "no contact" not in what:
             points = bent.contact_point[: len(answers)]
             near = [
-                np.linalg.norm(one.candidates - point, axis=1).min(initial=np.inf)
+                np.linalg.norm(one.candidates.point - point, axis=1).min(initial=np.inf)
                 for one, point in zip(answers, points, strict=True)
             ]
             assert np.median(near) < 0.1 * whisker.length

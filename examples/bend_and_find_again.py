@@ -33,7 +33,7 @@ print(signals)
 # %% Back to the contact from axial force, bending moment and its direction, with a sensor's noise
 contact_map = vb.ContactMap.simulate(whisker, grid=False)
 noise = np.diag([1e-6] * 3 + [0.02e-6] * 3) ** 2  # 1 µN, 0.02 µN·m
-found = contact_map.estimate(signals, triplet=("Fx", "MB", "MD"), noise=noise)
+found = contact_map.estimate(signals, using=("Fx", "MB", "MD"), noise=noise)
 for true, guess, covariance, n in zip(
     points, found.point, found.covariance, found.n_candidates, strict=True
 ):

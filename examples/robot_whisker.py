@@ -101,7 +101,9 @@ estimator = vb.Estimator.of_sensor(contacts, sensor, stiffness_sigma=0.004, felt
 rest = vb.deflect(wire, vb.PointContact(point))
 one = estimator(true.read([0.0], np.concatenate([rest.force, rest.moment])[None])[0])
 print(one.status)
-print(f"arc lengths of the samples, mm: {np.sort(one.arc_lengths * 1e3).round().tolist()}")
+print(
+    f"arc lengths of the samples, mm: {np.sort(one.candidates.arc_length * 1e3).round().tolist()}"
+)
 
 # %% The base turns by ± 6° and travels by ± 20 mm: the filter finds the contact
 time = np.arange(0.0, 1.0, 0.005)
@@ -127,8 +129,8 @@ for i in (0, 20, 60, len(time) - 1):
 figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.2), layout="constrained")
 rest_line = wire.centerline(60) * 1e3
 left.plot(rest_line[:, 0], rest_line[:, 1], color="0.6", label="wire at rest")
-order = np.argsort(one.arc_lengths)
-left.plot(*(one.candidates[order, :2] * 1e3).T, "o-", ms=3, label="give the same two moments")
+order = np.argsort(one.candidates.arc_length)
+left.plot(*(one.candidates.point[order, :2] * 1e3).T, "o-", ms=3, label="give the same two moments")
 left.plot(*(point[:2] * 1e3), "k*", ms=10, label="true contact")
 left.set(xlabel="x (mm)", ylabel="y (mm)", title="one sample")
 left.legend(frameon=False)

@@ -40,7 +40,7 @@ for name in felt:
 # %% An estimator that is asked gives both, and says so
 estimate = contact_map.estimate(felt.isel(sample=0), tuple(triplet.split()))
 print(vb.Status(int(estimate.status)).explanation)
-print("candidates, mm:", (1e3 * estimate.candidates).round(2).tolist())
+print("candidates, mm:", (1e3 * estimate.candidates.point).round(2).tolist())
 
 # %% Both of them, and all six signals
 witness = xr.Dataset(

@@ -63,14 +63,14 @@ def followed(contacts, trial, names, sigma, seed):
         known = follow(time[i], rows[i], turn[i], base[i])
         if known.located is None or not np.isfinite(point[i]).all():
             continue
-        candidates = known.located.candidates @ turn[i].T + base[i]
+        candidates = known.located.candidates.point @ turn[i].T + base[i]
         away = known.point - point[i]
         chi, own = chi_squared(away, known.covariance), np.nan
         first = ours = alone = np.nan
         if len(candidates):
             far = np.linalg.norm(candidates - point[i], axis=1)
             alone = far[0] / length
-            spreads = turn[i] @ known.located.covariances @ turn[i].T
+            spreads = turn[i] @ known.located.candidates.covariance @ turn[i].T
             own = chi_squared(candidates[0] - point[i], spreads[0])
             if len(candidates) > 1:
                 best = far.argmin()

@@ -66,7 +66,7 @@ def located(force_noise, moment_noise):
 def errors(point, found):
     """3D errors in mm of the candidate named first and of the nearest one; infinite without any."""
     first = 1e3 * np.linalg.norm(found.point - point, axis=1)
-    nearest = 1e3 * np.linalg.norm(found.candidates - point[:, None], axis=2)
+    nearest = 1e3 * np.linalg.norm(found.candidates.point - point[:, None], axis=2)
     return np.where(np.isfinite(first), first, np.inf), np.where(
         np.isfinite(nearest), nearest, np.inf
     ).min(axis=1)

@@ -56,7 +56,7 @@ def drawn(whisker, n, rng, load=(0.0, 0.99), friction=0.0, steps=36):
 
 def away(found, bent, whisker):
     """Distance/L of the nearest candidate."""
-    gap = np.linalg.norm(found.candidates - bent.contact_point[:, None], axis=-1)
+    gap = np.linalg.norm(found.candidates.point - bent.contact_point[:, None], axis=-1)
     return np.where(np.isnan(gap), np.inf, gap).min(axis=1) / whisker.length
 
 
@@ -140,7 +140,7 @@ def noise(contacts, n) -> str:
 
 def judged(found, true):
     """How many covariances call themselves reliable, and how many errors lie within them."""
-    kept = found.linear & (found.status == vb.Status.UNIQUE)
+    kept = found.covariance_valid & (found.status == vb.Status.UNIQUE)
     error = (found.point - true)[kept]
     squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariance[kept]), error)
     inside = [f"{100 * (squared < limit).mean():.1f} %" for limit in CHI2]

@@ -6,7 +6,8 @@ import pytest
 import xarray as xr
 
 import vibrissa as vb
-from vibrissa.contacts.contact_map import spherical, within_paper_bounds
+from vibrissa.contacts import spherical
+from vibrissa.contacts.contact_map import within_paper_bounds
 
 
 def test_samples_are_equilibria_of_their_contact_points(gamma_map):
@@ -59,7 +60,7 @@ def test_files_keep_the_map_whole(gamma_map, tmp_path):
     np.testing.assert_array_equal(again.chart.values, gamma_map.chart.values)
     signals = {"Fx": 2e-5, "MB": 1.5e-6, "MD": 1.4}
     np.testing.assert_array_equal(
-        again.estimate(signals).candidates, gamma_map.estimate(signals).candidates
+        again.estimate(signals).candidates.point, gamma_map.estimate(signals).candidates.point
     )
 
 

@@ -49,8 +49,10 @@ def recovered(contacts, triplet, n, rng):
 def found_again(contacts, triplet, touched):
     point, force, arc_length = touched
     signals = vb.base_signals(force, np.cross(point, force))
-    found = contacts.estimate(signals, triplet=triplet)
-    away = np.linalg.norm(found.candidates - point[:, None], axis=-1) / contacts.whisker.length
+    found = contacts.estimate(signals, using=triplet)
+    away = (
+        np.linalg.norm(found.candidates.point - point[:, None], axis=-1) / contacts.whisker.length
+    )
     hit = np.nanmin(np.where(np.isnan(away), np.inf, away), axis=1) <= 1e-6
     return hit, within_cone(contacts.whisker, point), found, point, arc_length
 
@@ -128,8 +130,10 @@ def test_contacts_next_to_a_fold_of_the_triplet_are_found(gamma_map, sample, tri
     values, _ = solve_forces(chart.discretization, np.insert(xi, 1, 0.0, axis=1))
     point = values[:, 3:] * chart.discretization.length
     force = values[:, :3] * chart.discretization.force
-    found = contacts.estimate(vb.base_signals(force, np.cross(point, force)), triplet=triplet)
-    away = np.linalg.norm(found.candidates - point[:, None], axis=-1) / contacts.whisker.length
+    found = contacts.estimate(vb.base_signals(force, np.cross(point, force)), using=triplet)
+    away = (
+        np.linalg.norm(found.candidates.point - point[:, None], axis=-1) / contacts.whisker.length
+    )
     hit = (away <= 1e-6).any(axis=1)
     assert hit.mean() >= least
 
@@ -139,7 +143,7 @@ def test_candidates_explain_the_signals_and_rise_in_force(gamma_map, rng):
     several = found.n_candidates > 1
     assert several.any()
     for row in np.flatnonzero(several)[:20]:
-        points = found.candidates[row, : found.n_candidates[row]]
+        points = found.candidates.point[row, : found.n_candidates[row]]
         bent = vb.deflect(gamma_map.whisker, vb.PointContact(points))
         again = vb.base_signals(bent.force, bent.moment)
         for name in ("Fx", "FT", "MB"):
@@ -159,7 +163,7 @@ def test_covariance_predicts_the_scatter(gamma_map, rng):
     np.testing.assert_allclose(
         np.sqrt(np.diag(exact.covariance)), np.sqrt(np.diag(scatter)), rtol=0.06
     )
-    np.testing.assert_array_equal(exact.candidate_covariances[0], exact.covariance)
+    np.testing.assert_array_equal(exact.candidates.covariance[0], exact.covariance)
     by_signal = {
         "Fx": sigma[0],
         "MB": sigma[3],
@@ -178,7 +182,7 @@ def test_statuses(gamma_map):
 
     impossible = gamma_map.estimate({"Fx": 5e-3, "MB": 1e-8, "MD": 1.0})
     assert impossible.status == vb.Status.NOT_FRICTIONLESS
-    assert impossible.misfit > 0.1
+    assert impossible.chi_squared > 0.1
     assert np.isnan(impossible.point).all()
 
     resting = gamma_map.estimate({"Fx": 0.0, "MB": 0.0, "MD": 0.0})
@@ -196,7 +200,7 @@ def test_bad_input_says_what_is_allowed(gamma_map):
     with pytest.raises(ValueError, match="signals lack MB, MD"):
         gamma_map.estimate({"Fx": 1e-5})
     with pytest.raises(ValueError, match="expected at least 3 different signals"):
-        gamma_map.estimate(signals, triplet="MB MD")
+        gamma_map.estimate(signals, using="MB MD")
     with pytest.raises(ValueError, match="MB is a size and cannot be negative"):
         gamma_map.estimate({**signals, "MB": -1e-7})
     with pytest.raises(ValueError, match="looks like degrees"):

@@ -37,9 +37,9 @@ def noisy_signals(bent, n, rng, sigma=SIGMA):
 def test_every_larger_set_finds_the_contact_again(gamma_map, rng, names):
     bent = touched(gamma_map, 60, rng)
     found = gamma_map.estimate(vb.base_signals(bent.force, bent.moment), names)
-    away = np.linalg.norm(found.candidates - bent.contact_point[:, None], axis=-1)
+    away = np.linalg.norm(found.candidates.point - bent.contact_point[:, None], axis=-1)
     assert (np.nanmin(away, axis=1) <= 1e-9).mean() >= 0.98
-    assert (found.misfit < 1e-12).mean() >= 0.98
+    assert (found.chi_squared < 1e-12).mean() >= 0.98
     assert np.isin(found.status, (vb.Status.UNIQUE, vb.Status.AMBIGUOUS)).all()
 
 
@@ -49,14 +49,14 @@ def test_covariance_predicts_the_scatter(gamma_map, rng, names):
     sigma = 0.2 * SIGMA
     noise = np.diag(sigma**2)
     exact = gamma_map.estimate(vb.base_signals(bent.force, bent.moment), names, noise)
-    assert exact.linear
+    assert exact.covariance_valid
     found = gamma_map.estimate(noisy_signals(bent, 2000, rng, sigma), names, noise)
     assert (found.status == vb.Status.UNIQUE).mean() > 0.99
     np.testing.assert_allclose(
         np.sqrt(np.diag(exact.covariance)), found.point.std(axis=0), rtol=0.08
     )
     # χ² of as many degrees of freedom as signals are left over.
-    assert found.misfit.mean() == pytest.approx(len(names.split()) - 3, rel=0.15)
+    assert found.chi_squared.mean() == pytest.approx(len(names.split()) - 3, rel=0.15)
 
 
 def test_more_signals_locate_better(gamma_map, rng):
@@ -109,7 +109,7 @@ def test_friction_shows_in_the_misfit(gamma_map, rng):
     assert shares[0] == 0.0
     assert shares[1] > 0.7  # near the tip forces are lost in noise
     assert np.isfinite(found.point[there]).any()  # the frictionless contact that comes nearest
-    assert (found.misfit[there] > 16.0).all()
+    assert (found.chi_squared[there] > 16.0).all()
 
 
 def test_candidates_have_everything(gamma_map, rng):
@@ -118,15 +118,15 @@ def test_candidates_have_everything(gamma_map, rng):
     for names in ("Fx FT MB", "Fx FT Mx MB"):
         found = gamma_map.estimate(signals, names, noise=np.diag(SIGMA**2))
         assert (found.n_candidates > 1).any()
-        there = np.arange(found.candidates.shape[1]) < found.n_candidates[:, None]
-        s, force = found.candidate_arc_lengths[there], found.candidate_forces[there]
-        assert np.isfinite(found.candidate_covariances[there]).all(axis=(1, 2)).mean() > 0.99
-        assert np.isnan(found.candidates[~there]).all()
-        np.testing.assert_array_equal(found.arc_length, found.candidate_arc_lengths[:, 0])
+        there = np.arange(found.candidates.point.shape[1]) < found.n_candidates[:, None]
+        s, force = found.candidates.arc_length[there], found.candidates.force[there]
+        assert np.isfinite(found.candidates.covariance[there]).all(axis=(1, 2)).mean() > 0.99
+        assert np.isnan(found.candidates.point[~there]).all()
+        np.testing.assert_array_equal(found.arc_length, found.candidates.arc_length[:, 0])
         np.testing.assert_allclose(
-            found.candidate_moments[there], np.cross(found.candidates[there], force)
+            found.candidates.moment[there], np.cross(found.candidates.point[there], force)
         )
-        again = vb.estimate_from_wrench(gamma_map.whisker, force, found.candidate_moments[there])
+        again = vb.estimate_from_wrench(gamma_map.whisker, force, found.candidates.moment[there])
         np.testing.assert_allclose(again.arc_length, s, atol=1e-5 * gamma_map.whisker.length)
 
 
@@ -141,11 +141,11 @@ def test_linear_is_where_the_prediction_holds(gamma_map, rng):
             wrench = np.concatenate([bent.force[row], bent.moment[row]])
             noisy = wrench + SIGMA * rng.normal(size=(300, 6))
             found = gamma_map.estimate(vb.base_signals(noisy[:, :3], noisy[:, 3:]), names, noise)
-            away = np.linalg.norm(found.candidates - exact.point[row], axis=-1)
+            away = np.linalg.norm(found.candidates.point - exact.point[row], axis=-1)
             near = np.nanargmin(np.where(np.isnan(away), np.inf, away), axis=1)
-            scatter = np.nanvar(found.candidates[np.arange(300), near], axis=0).sum()
+            scatter = np.nanvar(found.candidates.point[np.arange(300), near], axis=0).sum()
             ratios.append(np.sqrt(scatter / np.trace(exact.covariance[row])))
-        ratios, linear = np.array(ratios), exact.linear
+        ratios, linear = np.array(ratios), exact.covariance_valid
         assert 5 <= linear.sum() <= 36
         assert (np.abs(np.log(ratios[linear])) < np.log(1.3)).mean() >= 0.95, ratios[linear]
         assert (np.abs(np.log(ratios[~linear])) > np.log(1.3)).mean() > 0.4, ratios[~linear]
@@ -156,7 +156,7 @@ def test_statuses(gamma_map):
     good = vb.base_signals(bent.force, bent.moment)
     names = "Fx FT MB MD"
 
-    def status(signals, triplet=names):
+    def status(signals, using=names):
         return gamma_map.estimate(signals, triplet).status
 
     assert status(good) == vb.Status.UNIQUE
@@ -199,7 +199,7 @@ def test_without_noise_nothing_scatters(gamma_map):
         assert found.status == vb.Status.UNIQUE
         # What is exact counts as a millionth of a unit of force and moment: some ten nanometres.
         assert np.sqrt(np.trace(found.covariance)) < 1e-7
-        assert found.linear
+        assert found.covariance_valid
     # A signal known exactly next to others that are not.
     exact = dict.fromkeys(("Fx", "FD", "MB", "MD"), 0.0) | {"FT": 1e-6, "Mx": 2e-8}
     found = gamma_map.estimate(signals, SIGNALS, exact)

@@ -33,10 +33,10 @@ def test_a_stream_is_the_same_as_a_batch(gamma_map, sweep, names, noise):
     for i, one in enumerate(locate(row) for row in rows):
         assert int(one.status) == batch.status[i]
         np.testing.assert_allclose(one.point, batch.point[i], atol=1e-9)
-        np.testing.assert_allclose(one.arc_lengths[0], batch.arc_length[i], atol=1e-9)
+        np.testing.assert_allclose(one.candidates.arc_length[0], batch.arc_length[i], atol=1e-9)
         np.testing.assert_allclose(one.covariance, batch.covariance[i], rtol=1e-5, atol=1e-15)
-        followed.append(one.candidates[one.continuing])
-        away = np.linalg.norm(one.candidates - bent.contact_point[i], axis=-1)
+        followed.append(one.candidates.point[one.continuing])
+        away = np.linalg.norm(one.candidates.point - bent.contact_point[i], axis=-1)
         assert away.min() < 1e-8
     # One branch, after one taken first (of Fx, FT and MB alone) has come to its end.
     path = np.linalg.norm(np.diff(bent.contact_point, axis=0), axis=1).max()
@@ -67,7 +67,7 @@ def test_what_is_not_there_is_said(gamma_map, sweep):
     lost = locate([np.nan, *good[1:]])
     assert lost.status == vb.Status.MISSING
     assert np.isnan(lost.point).all()
-    assert lost.candidates.shape == (0, 3)
+    assert lost.candidates.point.shape == (0, 3)
     again = locate(good)
     assert again.status == vb.Status.UNIQUE
     assert locate([good[0], 0.2 * good[1], *good[2:]]).status == vb.Status.NOT_FRICTIONLESS
@@ -136,7 +136,7 @@ def test_a_stream_says_as_a_batch_why_nothing_explains_signals(gamma_map):
         for i, row in enumerate(rows):
             one = locate(row)
             assert one.status == batch.status[i]
-            np.testing.assert_allclose(one.misfit, batch.misfit[i], rtol=1e-6)
+            np.testing.assert_allclose(one.chi_squared, batch.chi_squared[i], rtol=1e-6)
 
 
 @pytest.mark.parametrize("row", [[-1e-5, 1e-6, 200.0], [-1e-5, -1e-6, 2.0]])

@@ -43,7 +43,7 @@ def followed(contacts, trial, names, seed):
         away = known.point - point[i]
         squares.append(away @ np.linalg.solve(known.covariance, away))
         surely_wrong += known.probability > 0.99 and squares[-1] > 30.0
-        candidates = known.located.candidates @ turn[i].T + base[i]
+        candidates = known.located.candidates.point @ turn[i].T + base[i]
         if len(candidates) > 1:
             right = np.linalg.norm(candidates - point[i], axis=1).argmin()
             first.append(right == 0)

@@ -54,7 +54,7 @@ def test_regions_hold_what_they_state_up_to_slip_off(gamma_map, beside_slip_off,
         found = vb.estimate_from_wrench(gamma_map.whisker, force, moment, noise=covariance)
     else:
         found = gamma_map.estimate(vb.base_signals(force, moment), using, covariance)
-    rows = (found.status == vb.Status.UNIQUE) & found.linear
+    rows = (found.status == vb.Status.UNIQUE) & found.covariance_valid
     assert rows.mean() > (0.7 if using == "wrench" else 0.97)
     squares = distances(found, point, rows)
     error = 3.0 / np.sqrt(rows.sum())
@@ -67,7 +67,7 @@ def test_where_it_cannot_be_relied_on_a_covariance_is_wide(gamma_map, rng):
     force, moment, point = contacts_of(gamma_map, 0.0, 0.2, 1500, rng)
     noisy = noisy_wrenches(force, moment, rng)
     found = vb.estimate_from_wrench(gamma_map.whisker, *noisy, noise=np.diag(SIGMA**2))
-    rows = (found.status == vb.Status.UNIQUE) & ~found.linear
+    rows = (found.status == vb.Status.UNIQUE) & ~found.covariance_valid
     assert rows.sum() > 100
     assert (distances(found, point, rows) <= HELD).mean() > 0.86
 
@@ -93,7 +93,7 @@ def test_with_noise_there_is_an_answer(wire, rng, using):
     answered = np.isin(found.status, [vb.Status.UNIQUE, vb.Status.AMBIGUOUS])
     assert answered.mean() > 0.99
     assert np.isfinite(found.covariance[answered]).all()
-    moved = found.misfit > 1e-6
+    moved = found.chi_squared > 1e-6
     assert moved.mean() > 0.02  # those had no answer without noise
     without = wire.estimate(signals, using)
     assert (without.n_candidates[moved] == 0).mean() > 0.95
@@ -106,7 +106,7 @@ def test_an_answer_beside_the_map_is_the_contact_of_least_misfit(gamma_map, besi
     measured = vb.base_signals(force, moment)
     sigma = {"Fx": 1e-6, "MB": 2.5e-8, "MD": 0.01}
     found = gamma_map.estimate(measured, tuple(sigma), sigma)
-    moved = np.flatnonzero(found.misfit > 1e-3)
+    moved = np.flatnonzero(found.chi_squared > 1e-3)
     assert moved.size > 20
     true = vb.deflect(gamma_map.whisker, vb.PointContact(point[moved]))
 
@@ -117,7 +117,7 @@ def test_an_answer_beside_the_map_is_the_contact_of_least_misfit(gamma_map, besi
 
     own = misfit(vb.base_signals(found.force[moved], found.moment[moved]))
     # Size and direction of M are fitted as components: the same to second order in the noise.
-    np.testing.assert_allclose(own, found.misfit[moved], rtol=1e-2)
+    np.testing.assert_allclose(own, found.chi_squared[moved], rtol=1e-2)
     assert (own <= 1.01 * misfit(vb.base_signals(true.force, true.moment)) + 1e-3).all()
 
 
@@ -128,11 +128,11 @@ def test_probabilities_are_how_often_candidates_are_true(gamma_map, rng):
     found = gamma_map.estimate(vb.base_signals(*noisy), "Fx FT MB", np.diag(SIGMA**2))
     several = found.n_candidates > 1
     assert several.sum() > 100
-    chance = found.candidate_probabilities[several]
+    chance = found.candidates.probability[several]
     np.testing.assert_allclose(np.nansum(chance, axis=1), 1.0)
     assert (np.diff(chance, axis=1)[np.isfinite(chance[:, 1:])] <= 0.0).all()
     assert ((found.probability > 0.95) == (found.status == vb.Status.UNIQUE))[several].all()
-    away = found.candidates[several] - point[several, None]
+    away = found.candidates.point[several] - point[several, None]
     away = np.linalg.norm(away, axis=2)
     true = away == np.nanmin(away, axis=1, keepdims=True)
     for low, high in ((0.05, 0.35), (0.35, 0.65)):
@@ -162,7 +162,7 @@ def test_a_stream_answers_as_a_batch_beside_the_map(gamma_map, beside_slip_off, 
         locate.reset()
         one = locate(rows[i])
         assert one.status == batch.status[i]
-        assert one.linear == batch.linear[i]
+        assert one.covariance_valid == batch.covariance_valid[i]
         np.testing.assert_allclose(one.point, batch.point[i], atol=2e-3 * SIGMA[3] / SIGMA[0])
         np.testing.assert_allclose(one.probability, batch.probability[i], atol=0.02)
 
@@ -171,7 +171,7 @@ def test_without_noise_nothing_is_probable(gamma_map, beside_slip_off):
     signals = vb.base_signals(beside_slip_off[0][:20], beside_slip_off[1][:20])
     found = gamma_map.estimate(signals)
     assert np.isnan(found.probability).all()
-    assert not found.linear.any()
+    assert not found.covariance_valid.any()
     assert set(found.to_dataset().probability.dims) == set(found.dims)
 
 

@@ -66,15 +66,15 @@ def test_candidates_are_those_that_are_possible(gamma_map, bent, names, noise, p
     fewer = 0
     for i in range(len(rows)):
         n = whole.n_candidates[i]
-        points, forces = whole.candidates[i, :n], whole.candidate_forces[i, :n]
+        points, forces = whole.candidates.point[i, :n], whole.candidates.force[i, :n]
         good = reference(prior, gamma_map.whisker, points, forces)
         fewer += good.sum() < n
         assert some.n_candidates[i] == good.sum()
-        np.testing.assert_array_equal(some.candidates[i, : good.sum()], points[good])
-        assert np.isnan(some.candidates[i, good.sum() :]).all()
+        np.testing.assert_array_equal(some.candidates.point[i, : good.sum()], points[good])
+        assert np.isnan(some.candidates.point[i, good.sum() :]).all()
         expected = {0: Status.OUTSIDE_PRIOR, 1: Status.UNIQUE}.get(good.sum(), Status.AMBIGUOUS)
         if noise is not None and good.any():
-            left = whole.candidate_probabilities[i, :n][good]
+            left = whole.candidates.probability[i, :n][good]
             sure = len(left) == 1 or left[0] > 0.95 * left.sum() > 0.0
             expected = Status.UNIQUE if sure else Status.AMBIGUOUS
         answered = whole.status[i] in (Status.UNIQUE, Status.AMBIGUOUS)
@@ -83,13 +83,13 @@ def test_candidates_are_those_that_are_possible(gamma_map, bent, names, noise, p
             locate.reset()
             one = locate(rows[i])
             assert one.status == some.status[i]
-            np.testing.assert_allclose(one.candidates, points[good], atol=1e-8)
+            np.testing.assert_allclose(one.candidates.point, points[good], atol=1e-8)
     assert 0 < fewer < len(rows)
     kept = some.n_candidates > 0
-    np.testing.assert_array_equal(some.point[kept], some.candidates[kept, 0])
+    np.testing.assert_array_equal(some.point[kept], some.candidates.point[kept, 0])
     same = kept & (some.point == whole.point).all(axis=-1)
-    np.testing.assert_array_equal(some.linear[same], whole.linear[same])
-    assert not some.linear[~same].any()
+    np.testing.assert_array_equal(some.covariance_valid[same], whole.covariance_valid[same])
+    assert not some.covariance_valid[~same].any()
 
 
 def test_misfits_are_those_of_the_contact_that_is_left(gamma_map, bent):
@@ -108,16 +108,18 @@ def test_misfits_are_those_of_the_contact_that_is_left(gamma_map, bent):
     assert several.size >= 20
     alike = 0
     for i in several[:20]:
-        first, second = np.linalg.norm(whole.candidate_forces[i, :2], axis=-1)
+        first, second = np.linalg.norm(whole.candidates.force[i, :2], axis=-1)
         limits = {"greatest_force" if first > second else "least_force": 0.5 * (first + second)}
         one, prior = {name: values[i] for name, values in signals.items()}, vb.Prior(**limits)
         some = gamma_map.estimate(one, tuple(noise), noise, prior=prior)
-        assert some.misfit == pytest.approx(misfit_of(some.force, some.point, one, noise), abs=1e-5)
+        assert some.chi_squared == pytest.approx(
+            misfit_of(some.force, some.point, one, noise), abs=1e-5
+        )
         located = vb.Estimator(gamma_map, tuple(noise), noise, prior=prior)(list(one.values()))
-        if len(located.candidates):
+        if located.n_candidates:
             alike += 1
-            own = misfit_of(located.forces[0], located.point, one, noise)
-            assert located.misfit == pytest.approx(own, abs=1e-5)
+            own = misfit_of(located.candidates.force[0], located.point, one, noise)
+            assert located.chi_squared == pytest.approx(own, abs=1e-5)
     assert alike > 15
 
 
@@ -137,14 +139,14 @@ def test_samples_of_a_curve_are_those_that_are_possible(gamma_map, bent):
     for i in range(0, len(bent[0]), 10):
         row = [float(signals[name][i]) for name in ("FT", "MB")]
         known, free = some(row), whole(row)
-        good = concave_backward(gamma_map.whisker, free.candidates)
+        good = concave_backward(gamma_map.whisker, free.candidates.point)
         if not good.any():
             assert known.status in (Status.OUTSIDE_PRIOR, free.status)
             continue
         partly += not good.all()
-        np.testing.assert_array_equal(known.candidates, free.candidates[good])
-        assert (known.point == known.candidates).all(axis=1).any()
-        away = known.candidates - known.point
+        np.testing.assert_array_equal(known.candidates.point, free.candidates.point[good])
+        assert (known.point == known.candidates.point).all(axis=1).any()
+        away = known.candidates.point - known.point
         scatter = away.T @ away / len(away)
         assert np.linalg.eigvalsh(known.covariance - scatter).min() > -1e-12
     assert partly > 5

@@ -49,7 +49,7 @@ def is_three(values):
 
 def located(estimator, reading, truth):
     found = estimator(reading)
-    return nees(found.candidates, found.covariances, truth)
+    return nees(found.candidates.point, found.candidates.covariance, truth)
 
 
 @pytest.mark.parametrize("channels", [3, 6, 8])
@@ -90,9 +90,9 @@ def test_stated_errors_of_components_are_in_the_covariance(gamma_map, bent, wren
     measured = wrench + wrong + 0.1 * NOISE * rng.normal(size=(TRIALS, 6))
     signals = vb.base_signals(measured[:, :3], measured[:, 3:])
     found = gamma_map.estimate(signals, names, noise, **stated)
-    assert is_three(nees(found.candidates, found.candidate_covariances, bent.contact_point))
+    assert is_three(nees(found.candidates.point, found.candidates.covariance, bent.contact_point))
     unaware = gamma_map.estimate(signals, names, noise)
-    narrow = nees(unaware.candidates, unaware.candidate_covariances, bent.contact_point)
+    narrow = nees(unaware.candidates.point, unaware.candidates.covariance, bent.contact_point)
     assert np.median(narrow) > 5.0
     locate = vb.Estimator(gamma_map, names, noise, **stated)
     rows = np.stack([signals[name] for name in names.split()], axis=-1)

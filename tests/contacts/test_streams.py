@@ -35,7 +35,7 @@ def test_a_stream_finds_the_same_as_a_cold_start(gamma_map, bent, names):
         cold.reset()
         warm, anew = stream(row), cold(row)
         assert warm.status == anew.status
-        np.testing.assert_allclose(warm.candidates, anew.candidates, atol=1e-9)
+        np.testing.assert_allclose(warm.candidates.point, anew.candidates.point, atol=1e-9)
         np.testing.assert_allclose(warm.covariance, anew.covariance, rtol=1e-5, atol=1e-18)
 
 
@@ -79,11 +79,11 @@ def test_any_mix_of_components_locates_contacts(gamma_map, bent, channels):
     for i, reading in enumerate(readings):
         found = locate(reading)
         assert found.status in (vb.Status.UNIQUE, vb.Status.AMBIGUOUS)
-        away = np.linalg.norm(found.candidates - bent.contact_point[i], axis=1)
+        away = np.linalg.norm(found.candidates.point - bent.contact_point[i], axis=1)
         assert away.min() < 1e-8
         # Each candidate does give these readings.
-        moment = np.cross(found.candidates, found.forces)
-        seen = np.concatenate([found.forces, moment], axis=1) @ mixing.T
+        moment = np.cross(found.candidates.point, found.candidates.force)
+        seen = np.concatenate([found.candidates.force, moment], axis=1) @ mixing.T
         assert np.abs((seen - reading) / noise).max() < 4.0
         np.testing.assert_allclose(seen[away.argmin()], reading, rtol=1e-4)
 
@@ -97,9 +97,9 @@ def test_scatter_of_a_mix_is_as_stated(gamma_map, bent):
     away = []
     for noise in rng.normal(size=(300, 4)) * 2e-3:
         found = locate(reading + noise)
-        i = np.linalg.norm(found.candidates - bent.contact_point[40], axis=1).argmin()
-        e = found.candidates[i] - bent.contact_point[40]
-        away.append(e @ np.linalg.solve(found.covariances[i], e))
+        i = np.linalg.norm(found.candidates.point - bent.contact_point[40], axis=1).argmin()
+        e = found.candidates.point[i] - bent.contact_point[40]
+        away.append(e @ np.linalg.solve(found.candidates.covariance[i], e))
     assert np.mean(away) == pytest.approx(3.0, rel=0.2)
 
 
@@ -125,20 +125,20 @@ def test_two_signals_leave_a_curve_that_passes_through_the_contact(gamma_map, be
     for i in range(5, 60, 9):
         found = locate(rows[i])
         assert found.status == vb.Status.UNDERDETERMINED
-        assert len(found.candidates) >= 4
-        moment = np.cross(found.candidates, found.forces)
-        seen = np.concatenate([found.forces, moment], axis=1)
+        assert found.n_candidates >= 4
+        moment = np.cross(found.candidates.point, found.candidates.force)
+        seen = np.concatenate([found.candidates.force, moment], axis=1)
         if names[0] == "My":
             back = seen[:, 4:]
         else:
-            known = vb.base_signals(found.forces, moment)
+            known = vb.base_signals(found.candidates.force, moment)
             back = np.stack([known[name] for name in names], axis=-1)
         np.testing.assert_allclose(
             back, np.broadcast_to(rows[i], back.shape), rtol=1e-5, atol=1e-14
         )
         # The true contact lies between neighbours along the curve.
-        away = np.linalg.norm(found.candidates - bent.contact_point[i], axis=1)
-        along = found.candidates[np.argsort(found.arc_lengths)]
+        away = np.linalg.norm(found.candidates.point - bent.contact_point[i], axis=1)
+        along = found.candidates.point[np.argsort(found.candidates.arc_length)]
         assert away.min() < np.linalg.norm(np.diff(along, axis=0), axis=1).max()
         e = bent.contact_point[i] - found.point
         assert e @ np.linalg.solve(found.covariance, e) < 20.0
@@ -149,12 +149,12 @@ def test_one_signal_leaves_a_surface(gamma_map, bent):
     size = np.hypot(bent.moment[30, 1], bent.moment[30, 2])
     found = locate([size])
     assert found.status == vb.Status.UNDERDETERMINED
-    assert len(found.candidates) > 30
-    moment = np.cross(found.candidates, found.forces)
+    assert found.n_candidates > 30
+    moment = np.cross(found.candidates.point, found.candidates.force)
     np.testing.assert_allclose(np.hypot(moment[:, 1], moment[:, 2]), size, rtol=1e-5)
     # All around the whisker, and all along it.
-    assert np.ptp(found.arc_lengths) > 0.5 * gamma_map.whisker.length
-    assert np.abs(found.candidates[:, 1:].mean(axis=0)).max() < 0.4 * gamma_map.whisker.length
+    assert np.ptp(found.candidates.arc_length) > 0.5 * gamma_map.whisker.length
+    assert np.abs(found.candidates.point[:, 1:].mean(axis=0)).max() < 0.4 * gamma_map.whisker.length
 
 
 def test_a_mix_that_tells_two_numbers_only_says_so(gamma_map, bent):

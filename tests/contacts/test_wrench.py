@@ -36,7 +36,7 @@ def frictional_load(whisker, n, rng, most=0.5):
 
 
 def worst(whisker, found, bent):
-    away = np.linalg.norm(found.candidates - bent.contact_point[:, None], axis=-1)
+    away = np.linalg.norm(found.candidates.point - bent.contact_point[:, None], axis=-1)
     return np.nanmin(away, axis=1).max() / whisker.length
 
 
@@ -100,7 +100,7 @@ def test_covariance_predicts_the_scatter(place, force, rng):
     wrench = np.concatenate([bent.force, bent.moment])
     covariance = np.diag(SIGMA**2)
     exact = vb.estimate_from_wrench(whisker, bent.force, bent.moment, noise=covariance)
-    assert exact.linear
+    assert exact.covariance_valid
     noisy = wrench + SIGMA * rng.normal(size=(3000, 6))
     found = vb.estimate_from_wrench(whisker, noisy[:, :3], noisy[:, 3:], noise=covariance)
     assert (found.status == vb.Status.UNIQUE).mean() > 0.99
@@ -108,7 +108,7 @@ def test_covariance_predicts_the_scatter(place, force, rng):
         np.sqrt(np.diag(exact.covariance)), found.point.std(axis=0), rtol=0.08
     )
     np.testing.assert_allclose(exact.friction_angle_sigma, found.friction_angle.std(), rtol=0.08)
-    assert found.misfit.mean() == pytest.approx(2.0, rel=0.1)  # χ² of two degrees of freedom
+    assert found.chi_squared.mean() == pytest.approx(2.0, rel=0.1)  # χ² of two degrees of freedom
     by_name = dict(zip(("Fx", "Fy", "Fz", "Mx", "My", "Mz"), SIGMA, strict=True))
     same = vb.estimate_from_wrench(whisker, bent.force, bent.moment, noise=by_name)
     np.testing.assert_allclose(same.covariance, exact.covariance, rtol=1e-9)
@@ -131,7 +131,7 @@ def test_small_deflections_are_flagged(rng):
         found = vb.estimate_from_wrench(whisker, noisy[:, :3], noisy[:, 3:], noise=covariance)
         scatter = np.sqrt(np.nansum(np.nanvar(found.point, axis=0)))
         ratios.append(scatter / np.sqrt(np.trace(one)))
-    ratios, linear = np.array(ratios), exact.linear
+    ratios, linear = np.array(ratios), exact.covariance_valid
     assert 8 <= linear.sum() <= 32
     assert (ratios[linear] < 1.25).all(), ratios[linear]
     assert (np.abs(np.log(ratios[linear])) < np.log(1.25)).mean() > 0.9, ratios[linear]
@@ -154,7 +154,7 @@ def test_statuses():
     along = m + 0.5 * np.linalg.norm(m) * f / np.linalg.norm(f)
     wrong = vb.estimate_from_wrench(whisker, f, along)
     assert wrong.status == vb.Status.NOT_ONE_CONTACT
-    assert wrong.misfit > 100.0
+    assert wrong.chi_squared > 100.0
     noise = np.diag(SIGMA**2)
     assert vb.estimate_from_wrench(whisker, f, along, noise=noise).status == wrong.status
 
@@ -173,7 +173,7 @@ def test_statuses():
     # Noise as large as the force itself.
     lost = vb.estimate_from_wrench(whisker, 1e-2 * f, 1e-2 * m, noise=np.diag(SIGMA**2))
     assert lost.status == degenerate
-    assert not lost.linear
+    assert not lost.covariance_valid
 
 
 def test_shapes_and_labels(rng):

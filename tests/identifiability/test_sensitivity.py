@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 
 import vibrissa as vb
-from vibrissa.contacts.contact_map import spherical
+from vibrissa.contacts import spherical
 from vibrissa.numerics import weighted_quantile
 from vibrissa.signals import TRIPLETS
 
@@ -42,9 +42,9 @@ def some(nodes, rng, n=30):
 
 def nearest(estimate, points):
     """Of each measurement's candidates the one nearest to a point."""
-    away = np.linalg.norm(estimate.candidates - points[:, None], axis=-1)
+    away = np.linalg.norm(estimate.candidates.point - points[:, None], axis=-1)
     away = np.where(np.isfinite(away), away, np.inf)
-    return estimate.candidates[np.arange(len(points)), np.argmin(away, axis=1)]
+    return estimate.candidates.point[np.arange(len(points)), np.argmin(away, axis=1)]
 
 
 @pytest.mark.parametrize("triplet", ["Fx MB MD", "Fx FT FD", "FT Mx MB", "FD Mx MD"])

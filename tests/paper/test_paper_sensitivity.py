@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import vibrissa as vb
-from vibrissa.contacts.contact_map import spherical
+from vibrissa.contacts import spherical
 from vibrissa.numerics import contact_weights, weighted_quantile
 from vibrissa.paper import central_differences, error_solid, interpolation_errors, signal_slice
 from vibrissa.signals import within_turn

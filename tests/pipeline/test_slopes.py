@@ -49,7 +49,7 @@ def test_contacts_move_with_the_wrench_as_the_gain_says(names):
     def found(force, moment):
         e = contact_map.estimate(base_signals(force, moment), names, noise)
         return point_and_normal(
-            e.candidate_arc_lengths[:, 0], e.candidate_contact_forces[:, 0], e.point
+            e.candidates.arc_length[:, 0], e.candidates.contact_force[:, 0], e.point
         )
 
     gain = gains(WHISKER, names, bent.arc_length, bent.contact_force, noise)
@@ -84,8 +84,8 @@ def test_the_covariance_is_that_of_the_map():
         gain = gains(
             WHISKER,
             names,
-            found.candidate_arc_lengths[:, 0],
-            found.candidate_contact_forces[:, 0],
+            found.candidates.arc_length[:, 0],
+            found.candidates.contact_force[:, 0],
             noise,
         )[:, :3]
         np.testing.assert_allclose(

@@ -26,7 +26,14 @@ from vibrissa.contacts.contacts import MOST_CANDIDATES, Candidates
 from vibrissa.contacts.inversion import PARTS, invert_rows, nearest_of
 from vibrissa.contacts.least_squares import channel_equations, fit_rows, fit_within, whiten
 from vibrissa.contacts.noise import INDISTINCT
-from vibrissa.contacts.posterior import CERTAIN, NORMAL_KURTOSIS, judge, rank, second_moment
+from vibrissa.contacts.posterior import (
+    CERTAIN,
+    NORMAL_KURTOSIS,
+    cholesky3,
+    judge,
+    rank,
+    second_moment,
+)
 from vibrissa.contacts.weighing import Weighing, channel_covariance, weigh, weigh_any
 from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel, wrapped
 from vibrissa.rod import (
@@ -73,6 +80,11 @@ _NEAR, _ON_THE_WAY = 0.04, 0.5
 _MOST_STARTS = 6
 # So many of the chart's nodes must count for their moments to replace those about one contact.
 _MANY = 30.0
+# Squared Mahalanobis distance of three standard deviations of a point in space (99.73 %).
+_OUTSIDE_REGION = 14.16
+# Logarithm of the volume of a normal distribution of three coordinates, over its peak.
+_LOG_NORMAL = 1.5 * math.log(2.0 * math.pi)
+_MOST_LOG = 700.0
 
 # Row by row: x (n, 4), (F, p) (n, 6), ∂(F, p)/∂x (n, 6, 4), χ² (n,), and where a fit ended (n,):
 # 2 on the map, 1 nearer to the base, 0 nowhere.
@@ -670,15 +682,25 @@ def _kept(limit: float, number: int, x: Array, values: Array, misfits: Array) ->
 
 @kernel
 def _over_the_map(
-    of: Searched, how: Weighing, weights: Array, target: Array, point: Array, covariance: Array
-) -> None:
-    """Replace a covariance by the second moment of the posterior over the chart's nodes.
+    of: Searched,
+    how: Weighing,
+    weights: Array,
+    target: Array,
+    point: Array,
+    chi: float,
+    log_mass: float,
+    covariance: Array,
+) -> float:
+    """Share of the probability that the chart's nodes leave to other regions than a candidate's.
 
-    That is where noise leaves more open than the second order about one contact can describe, so
-    that many nodes count; otherwise the covariance stays.
+    Where noise leaves more open than the second order about one contact can describe, so that many
+    nodes count, the covariance is replaced by the second moment of the posterior over them. The
+    share outside three standard deviations is that of contact points or of the chart, whichever is
+    larger: contact points of little volume, as near slip-off, are not left out.
     """
     q, nodes = of.seen.shape
-    white, points, log = how.own[0, 0] > 0.0, np.empty((nodes, 3)), np.empty(nodes)
+    white, points, likelihood = how.own[0, 0] > 0.0, np.empty((nodes, 3)), np.empty(nodes)
+    density = np.empty(nodes)
     away, largest, total, squares = np.empty(q), -np.inf, 0.0, 0.0
     for node in range(nodes):
         for i in range(q):
@@ -692,20 +714,44 @@ def _over_the_map(
                 for c in range(q):
                     r += weights[i, c] * away[c]
             misfit += r * r
-        log[node] = of.log_volume[node] - 0.5 * misfit
-        largest = max(largest, log[node])
+        likelihood[node] = math.exp(-0.5 * max(misfit - chi, 0.0))
+        density[node] = of.log_volume[node] - 0.5 * misfit
+        largest = max(largest, density[node])
     for node in range(nodes):
-        log[node] = math.exp(log[node] - largest)
-        total += log[node]
-        squares += log[node] * log[node]
+        density[node] = math.exp(density[node] - largest)
+        total += density[node]
+        squares += density[node] * density[node]
         for a in range(3):
             points[node, a] = of.values[node, 3 + a] - point[a]
     if total * total > _MANY * squares:
-        second_moment(points, log, total, NORMAL_KURTOSIS, covariance)
+        second_moment(points, density, total, NORMAL_KURTOSIS, covariance)
+    root, back = np.zeros((3, 3)), np.empty(3)
+    if not cholesky3(covariance, root):
+        return 0.0
+    mass, mass_out, like, like_out = 0.0, 0.0, 0.0, 0.0
+    for node in range(nodes):
+        far = 0.0
+        for a in range(3):
+            back[a] = points[node, a]
+            for c in range(a):
+                back[a] -= root[a, c] * back[c]
+            back[a] /= root[a, a]
+            far += back[a] * back[a]
+        if far > _OUTSIDE_REGION:
+            mass_out += density[node]
+            like_out += likelihood[node]
+        else:
+            mass += density[node]
+            like += likelihood[node]
+    # The nodes may be too far apart to see all of the candidate itself.
+    mass = max(mass, math.exp(min(log_mass - largest, _MOST_LOG)))
+    like = max(like, 1.0)
+    return max(mass_out / (mass + mass_out), like_out / (like + like_out))
 
 
-# Working memory of `settle`: aims, weights, tangents, covariances, log weights, probabilities,
-# whether covariances are valid, order, and copies of x, (F, p) and χ².
+# Working memory of `settle`: aims, weights, tangents (n, 6, 4) and (n, 6, 3), covariances, log
+# weights (as they count, and with volumes), probabilities, whether covariances are valid, order,
+# and copies of x, (F, p) and χ².
 Room = tuple[
     Array, Array, Array, Array, Array, Array, Array, AnyArray, IntArray, Array, Array, Array
 ]
@@ -720,7 +766,7 @@ def _judging(most: int, k: int) -> Room:
         np.zeros((most, 6, 4)),
         np.empty((most, 6, 3)),
         np.empty((most, 3, 3)),
-        np.empty((1, most)),
+        np.empty((2, most)),
         np.empty((1, most)),
         np.zeros(most, np.bool_),
         np.zeros((1, most), np.int64),
@@ -780,6 +826,7 @@ def settle(
     sound = True
     for c in range(n):
         sound = sound and fine[c]
+        weight[1, c] = weight[0, c]
     for c in range(n):  # volumes that mean little are left out
         if not sound and weight[0, c] > -np.inf:
             weight[0, c] = -0.5 * chi[c]
@@ -800,6 +847,9 @@ def settle(
         for a in range(3):
             copy(spread[old, a], out.covariances[row, c, a])
     if out.probability[row, 0] > CERTAIN and not out.valid[row, 0]:
-        seen = measured if how.own[0, 0] > 0.0 else target
-        best = weights[order[0, 0]]
-        _over_the_map(of, how, best, seen, values[0, 3:], out.covariances[row, 0])
+        seen, best = measured if how.own[0, 0] > 0.0 else target, order[0, 0]
+        log_mass = weight[1, best] + _LOG_NORMAL
+        outside = _over_the_map(
+            of, how, weights[best], seen, values[0, 3:], chi[0], log_mass, out.covariances[row, 0]
+        )
+        out.probability[row, 0] *= 1.0 - outside

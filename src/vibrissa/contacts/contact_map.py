@@ -26,7 +26,7 @@ from vibrissa.contacts.jacobian import determining
 from vibrissa.contacts.noise import common_errors
 from vibrissa.contacts.prior import Prior
 from vibrissa.contacts.wrench import estimate_components
-from vibrissa.io import COMPRESSED, kind_of, read_tree, write_netcdf
+from vibrissa.io import COMPRESSED, kind_of, naming, read_tree, write_netcdf
 from vibrissa.numerics import AnyArray, Array
 from vibrissa.quantities import attributes
 from vibrissa.rod import (

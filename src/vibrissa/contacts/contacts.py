@@ -168,11 +168,11 @@ class Contacts(_Located):
         Standard deviation of the friction angle, rad; NaN without ``noise`` and without friction.
     n_candidates : (...) int array
         Number of candidates.
-    candidates : Contacts or None
+    candidates : Contacts
         All candidates, with one dimension more, padded with NaN (and the status ``MISSING``): with
         ``noise`` by falling probability; without, by rising force, or for more than three signals
         by rising χ² and then force. Their χ² is within 10.8 of the least (the likelihood ratio that
-        one pair in a thousand exceeds by chance). None for candidates themselves.
+        one pair in a thousand exceeds by chance).
     using : tuple of str
         Signals used.
     dims : tuple of str
@@ -192,10 +192,17 @@ class Contacts(_Located):
     contact_force: Array
     friction_angle_sigma: Array
     n_candidates: IntArray
-    candidates: Contacts | None
     using: tuple[str, ...]
     dims: tuple[str, ...] = ()
     coords: Coordinates = field(default_factory=dict)
+    _candidates: Contacts | None = None
+
+    @property
+    def candidates(self) -> Contacts:
+        """All candidates, with one dimension more; see the class."""
+        if self._candidates is None:
+            raise ValueError("candidates have no candidates of their own")
+        return self._candidates
 
     @classmethod
     def of(
@@ -228,7 +235,6 @@ class Contacts(_Located):
             contact_force=whole(found.x[:, :most, 1:] * d.force),
             friction_angle_sigma=whole(found.angle_sigma[:, :most]),
             n_candidates=whole(there.astype(np.int64)),
-            candidates=None,
             using=using,
             dims=(*dims, "candidate"),
             coords=coords,
@@ -246,10 +252,10 @@ class Contacts(_Located):
             contact_force=every.contact_force[..., 0, :],
             friction_angle_sigma=every.friction_angle_sigma[first],
             n_candidates=whole(found.number),
-            candidates=every,
             using=using,
             dims=dims,
             coords=coords,
+            _candidates=every,
         )
 
     def to_dataset(self) -> xr.Dataset:
@@ -262,8 +268,8 @@ class Contacts(_Located):
             and those of the candidates, their names led by ``candidate_``, over ``candidate`` too.
         """
         data = self._variables("")
-        if self.candidates is not None:
-            data |= self.candidates._variables("candidate_")
+        if self._candidates is not None:
+            data |= self._candidates._variables("candidate_")
         coords = {**self.coords, "space": _SPACE, "space_2": _SPACE, "material": ["t", "d1", "d2"]}
         return xr.Dataset(data, coords=coords, attrs={"using": " ".join(self.using)})
 
@@ -303,7 +309,7 @@ class Contacts(_Located):
         str
             An SVG element: the x-y and the x-z plane of the whisker's frame.
         """
-        every = self.point if self.candidates is None else self.candidates.point
+        every = self.point if self._candidates is None else self._candidates.point
         return _picture(self.point, every)
 
     def __repr__(self) -> str:
@@ -419,7 +425,6 @@ class Contact(_Located):
             contact_forces,
             found.angle_sigma[0, :n],
             np.ones(n, np.int64),
-            None,
             using,
             ("candidate",),
         )
@@ -476,8 +481,8 @@ class Contact(_Located):
             self.contact_force,
             sigma[0] if len(sigma) else np.asarray(np.nan),
             np.asarray(self.n_candidates),
-            every,
             every.using,
+            _candidates=every,
         )
 
     def __repr__(self) -> str:

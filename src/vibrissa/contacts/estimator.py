@@ -448,6 +448,25 @@ class Estimator:
         self._last = found.values[0, continuing, 3:] if number else None
         return Contact.of(found, status, chi_squared, d, self.names, continuing)
 
+    def nothing_in(self, measurement: Measurement) -> Status | None:
+        """Why a measurement is not worth a search: ``MISSING``, ``NOT_FELT``, ``DEGENERATE``.
+
+        Parameters
+        ----------
+        measurement : Measurement
+            Of `measurement`.
+
+        Returns
+        -------
+        Status or None
+            None where it is worth one.
+        """
+        if not all(map(math.isfinite, measurement.measured.tolist())):
+            return Status.MISSING
+        if self.felt_above > 0.0 and not self.readout.felt(measurement, self.felt_above):
+            return Status.NOT_FELT
+        return None if self._determining else Status.DEGENERATE
+
     def _sampled(self, measurement: Measurement) -> Contact:
         """Samples of the curve or surface of contacts that explain fewer than three signals."""
         assert self._ambiguity is not None

@@ -341,6 +341,8 @@ def parts(chart: StableSet) -> IntArray:
 def volumes(chart: StableSet) -> Array:
     """Volumes of contact points that the chart's nodes stand for, flat."""
     size = np.abs(np.linalg.det(chart.tangents[..., 3:, :] @ chart.frames))
+    n, m, k = (number - 1 for number in size.shape)
+    size *= 2.0 * np.pi / (n * m * k)  # the chart is 1 × 2π × 1
     for axis in range(3):  # nodes on its faces stand for half a cell
         ends = np.ones(size.shape[axis])
         ends[[0, -1]] = 0.5

@@ -26,7 +26,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from vibrissa.contacts.channels import FITTED
-from vibrissa.contacts.fitting import channel_equations, whiten
+from vibrissa.contacts.least_squares import channel_equations, whiten
 from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel, share_out
 from vibrissa.rod import (
     BUFFER_SIZE,
@@ -296,7 +296,7 @@ def _even(model: Model, n: int) -> float:
             v[a, c] = 0.0
             for i in range(n):
                 v[a, c] += by_y[a, i] * by_y[c, i]
-    if not _cholesky(v, root):
+    if not cholesky3(v, root):
         return np.inf
     largest = 0.0
     for i in range(n):
@@ -315,7 +315,7 @@ def _even(model: Model, n: int) -> float:
 
 
 @inlined
-def _cholesky(v: Array, root: Array) -> bool:
+def cholesky3(v: Array, root: Array) -> bool:
     """Fill the lower root (3, 3) of a covariance; False where it is singular."""
     for a in range(3):
         for c in range(a + 1):
@@ -412,7 +412,7 @@ def second_moment(
             covariance[a, c] = 0.0
             for k in range(points.shape[0]):
                 covariance[a, c] += density[k] / total * points[k, a] * points[k, c]
-    if not _cholesky(covariance, root):
+    if not cholesky3(covariance, root):
         return np.inf
     fourth = 0.0
     for k in range(points.shape[0]):

@@ -1,9 +1,6 @@
-"""What one measurement weighs; compiled.
+"""Weights of one measurement, by the noise of the sensor; compiled.
 
-What batches do with arrays (:mod:`~vibrissa.contacts.whitening`,
-:mod:`~vibrissa.contacts.channels`), here for one row at a time, where NumPy's overhead would be ten
-times the work. A measurement is z = A c(x) + noise: a mix A of channels c, the identity for signals
-by name.
+A measurement is z = A c(x) + noise: a mix A of channels c, the identity for signals by name.
 """
 
 from __future__ import annotations

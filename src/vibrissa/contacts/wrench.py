@@ -364,11 +364,11 @@ def chosen(rows: int, row: IntArray, fits: Fits, doubt: Array, limit: float, mos
     order = order[np.lexsort((doubt[order], row[order]))]
     number = np.zeros(rows, np.int64)
     where = np.full((rows, most), -1)
-    for fit in order:
-        i = row[fit]
-        known = any(_same(fits.contacts[fit], fits.contacts[j]) for j in where[i, : number[i]])
+    for one in order:
+        i = row[one]
+        known = any(_same(fits.contacts[one], fits.contacts[j]) for j in where[i, : number[i]])
         if not known and number[i] < most:
-            where[i, number[i]] = fit
+            where[i, number[i]] = one
             number[i] += 1
     there = where >= 0
 

@@ -14,7 +14,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from vibrissa.contacts.contact_map import spherical
+from vibrissa.contacts import spherical
 from vibrissa.contour import CylinderFit, axis_offset
 from vibrissa.objects import Peg
 from vibrissa.pipeline.comparison import ANGLE_CLASSES

@@ -16,7 +16,8 @@ import numpy as np
 
 from vibrissa.contacts.contact_map import Domain
 from vibrissa.contacts.inversion import invert
-from vibrissa.identifiability.fibres import deficient, fibres
+from vibrissa.contacts.jacobian import deficient
+from vibrissa.identifiability.fibres import fibres
 from vibrissa.identifiability.regions import ContactSet, Samples, contact_set, sample, spread
 from vibrissa.identifiability.twins import (
     Pairs,

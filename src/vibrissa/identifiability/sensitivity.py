@@ -22,13 +22,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from vibrissa.contacts import spherical
 from vibrissa.contacts.chosen_contacts import (
     At,
     ChosenContacts,
     chosen_contacts,
     large_deflection,
 )
-from vibrissa.contacts.contact_map import spherical, within_paper_bounds
+from vibrissa.contacts.contact_map import within_paper_bounds
 from vibrissa.contacts.jacobian import contact_signal_derivatives, spherical_derivatives
 from vibrissa.contacts.noise import Noise, SensorNoise, ellipsoids, rms_error
 from vibrissa.numerics import Array, contact_weights, weighted_quantile

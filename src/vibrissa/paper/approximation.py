@@ -15,10 +15,11 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from vibrissa.contacts import ContactMap, Estimate, Prior
-from vibrissa.contacts.explanation import check_signals
+from vibrissa.contacts import ContactMap, Contacts, Prior
+from vibrissa.contacts.contacts import Candidates
 from vibrissa.contacts.noise import SensorNoise
-from vibrissa.numerics import AnyArray, Array
+from vibrissa.contacts.readout import check_signals
+from vibrissa.numerics import Array
 from vibrissa.paper.lookup import STEP, LookupTable
 from vibrissa.paper.network import NetworkSolver, train_network
 from vibrissa.rod import PointContact, deflect
@@ -54,7 +55,7 @@ def estimate(
     method: str = "lookup",
     noise: Mapping[str, float] | ArrayLike | None = None,
     prior: Prior | None = None,
-) -> Estimate:
+) -> Contacts:
     """Estimate contacts from three signals by the paper's look-up table or network.
 
     Parameters
@@ -75,11 +76,11 @@ def estimate(
 
     Returns
     -------
-    Estimate
+    Contacts
         At most one candidate for each measurement. The status is ``APPROXIMATE``, as neither table
         nor network shows whether contacts are ambiguous; ``OUTSIDE_MAP`` outside the table;
-        ``OUTSIDE_PRIOR``; or ``MISSING``. The misfit is the largest difference between the signals
-        of the contact given and those measured, in shares of their ranges.
+        ``OUTSIDE_PRIOR``; or ``MISSING``. ``chi_squared`` is the largest difference between the
+        signals of the contact given and those measured, in shares of their ranges.
 
     Raises
     ------
@@ -118,35 +119,16 @@ def estimate(
         sigma = sensor.covariance(names, bent.force, bent.moment)
         slope = _differences(solve, rows, ranges)
         covariance = slope @ sigma @ np.swapaxes(slope, -1, -2)
-    shape = values.shape[:-1]
-
-    def answer(array: AnyArray) -> AnyArray:
-        only = np.where(found.reshape(-1, *[1] * (array.ndim - 1)), array, np.nan)
-        return only.reshape(*shape, *array.shape[1:])
-
-    def candidate(array: AnyArray) -> AnyArray:
-        return np.expand_dims(answer(array), len(shape))
-
-    return Estimate(
-        point=answer(point),
-        covariance=answer(covariance),
-        linear=np.zeros(shape, dtype=bool),
-        status=status.reshape(shape),
-        misfit=_misfit(rows, bent.force, bent.moment, names, ranges).reshape(shape),
-        arc_length=answer(bent.arc_length),
-        force=answer(bent.force),
-        moment=answer(bent.moment),
-        candidates=candidate(point),
-        candidate_covariances=candidate(covariance),
-        candidate_arc_lengths=candidate(bent.arc_length),
-        candidate_forces=candidate(bent.force),
-        candidate_contact_forces=candidate(bent.contact_force),
-        candidate_probabilities=np.full((*shape, 1), np.nan),
-        n_candidates=found.astype(np.int64).reshape(shape),
-        triplet=names,
-        dims=dims,
-        coords=coords,
-    )
+    d, most = chart.discretization, Candidates.room(len(rows), 1)
+    most.number[found] = 1
+    most.x[found, 0, 0] = bent.arc_length[found] / d.length
+    most.x[found, 0, 1:] = bent.contact_force[found] / d.force
+    most.values[found, 0, :3] = bent.force[found] / d.force
+    most.values[found, 0, 3:] = point[found] / d.length
+    most.covariances[found, 0] = covariance[found] / d.length**2
+    misfit = _misfit(rows, bent.force, bent.moment, names, ranges)
+    most.chi_squared[found, 0] = misfit[found]
+    return Contacts.of(most, status, misfit, d, names, values.shape[:-1], dims, coords)
 
 
 def _solver(contact_map: ContactMap, method: str, names: tuple[str, ...]) -> Solver:

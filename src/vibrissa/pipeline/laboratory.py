@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.contacts.contact_map import spherical
+from vibrissa.contacts import spherical
 from vibrissa.contour import continuing_candidates, to_laboratory
 from vibrissa.quantities import attributes
 

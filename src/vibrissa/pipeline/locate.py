@@ -120,15 +120,16 @@ def locate(
         from vibrissa.paper import estimate  # it loads what only comparisons need
 
         found = estimate(contact_map, signals, names, method=method, prior=prior)
+    every = found.candidates
     candidates = _Candidates(
-        found.candidates,
-        found.candidate_arc_lengths,
-        found.candidate_forces,
-        found.candidate_contact_forces,
+        every.point,
+        every.arc_length,
+        every.force,
+        every.contact_force,
         found.n_candidates,
         found.status,
     )
-    stated = found.candidate_covariances if method == "exact" else None
+    stated = every.covariance if method == "exact" else None
     return _located(contact_map.whisker, names, felt, candidates, stated)
 
 
@@ -184,15 +185,16 @@ def locate_from_wrench(
         prior=prior,
         **(errors or {}),
     )
+    every = found.candidates
     candidates = _Candidates(
-        found.candidates,
-        found.candidate_arc_lengths,
-        found.candidate_forces,
-        found.candidate_contact_forces,
+        every.point,
+        every.arc_length,
+        every.force,
+        every.contact_force,
         found.n_candidates,
         found.status,
     )
-    return _located(whisker, WRENCH, felt, candidates, found.covariance[:, None])
+    return _located(whisker, WRENCH, felt, candidates, every.covariance)
 
 
 class _Felt(NamedTuple):

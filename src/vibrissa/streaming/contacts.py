@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.contacts import ContactFilter, Estimator, Followed, Located
-from vibrissa.contacts.contact_map import spherical
+from vibrissa.contacts import Contact, ContactFilter, Estimator, Followed, spherical
 from vibrissa.rod import PointForce, deflect
 from vibrissa.signals import SIGNALS, signals_of
 from vibrissa.streaming.lines import FRAME, Lines, Sample
@@ -227,19 +226,18 @@ def _components(signals: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(name for name in COMPONENTS if name in needed)
 
 
-def located_record(found: Located) -> dict[str, Any]:
+def located_record(found: Contact) -> dict[str, Any]:
     """What a single sample tells, in the whisker's frame and SI units."""
     record: dict[str, Any] = {"status": found.status.name.lower()}
-    if not len(found.candidates):
+    if not found.n_candidates:
         return record
     record |= _place(found.point)
-    which = int(np.argmin(((found.candidates - found.point) ** 2).sum(axis=1)))
-    record["arc_length"] = float(found.arc_lengths[which])
-    record["force"] = found.forces[which].tolist()
+    record["arc_length"] = found.arc_length
+    record["force"] = found.force.tolist()
     record |= _sigma(found.covariance)
-    record["misfit"] = float(found.misfit)
+    record["chi_squared"] = found.chi_squared
     record["continuing"] = found.continuing
-    record["candidates"] = found.candidates.tolist()
+    record["candidates"] = found.candidates.point.tolist()
     return record
 
 

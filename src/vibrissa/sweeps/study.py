@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from vibrissa.contacts.explanation import seen
-from vibrissa.contacts.least_squares import seeding_triplet
+from vibrissa.contacts.estimator import seen
+from vibrissa.contacts.inversion import seeding_triplet
 from vibrissa.rod import discretize, point_solver, stable_set
 from vibrissa.signals import resting
 from vibrissa.sweeps.population import Specimen, population

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import vibrissa as vb
-from vibrissa.contacts.contact_map import within_paper_bounds
+from vibrissa.contacts import within_paper_bounds
 from vibrissa.evaluation import ANGLES
 from vibrissa.paper import DrawnContacts, LookupTable, draw_contacts
 from vibrissa.signals import SIGNALS, nearest_on_rest, selection

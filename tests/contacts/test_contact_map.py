@@ -6,8 +6,7 @@ import pytest
 import xarray as xr
 
 import vibrissa as vb
-from vibrissa.contacts import spherical
-from vibrissa.contacts.contact_map import within_paper_bounds
+from vibrissa.contacts import spherical, within_paper_bounds
 
 
 def test_samples_are_equilibria_of_their_contact_points(gamma_map):

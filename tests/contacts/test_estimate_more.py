@@ -145,7 +145,7 @@ def test_linear_is_where_the_prediction_holds(gamma_map, rng):
             near = np.nanargmin(np.where(np.isnan(away), np.inf, away), axis=1)
             scatter = np.nanvar(found.candidates.point[np.arange(300), near], axis=0).sum()
             ratios.append(np.sqrt(scatter / np.trace(exact.covariance[row])))
-        ratios, linear = np.array(ratios), exact.covariance_valid
+        ratios, linear = np.array(ratios), exact.candidates.covariance_valid[..., 0]
         assert 5 <= linear.sum() <= 36
         assert (np.abs(np.log(ratios[linear])) < np.log(1.3)).mean() >= 0.95, ratios[linear]
         assert (np.abs(np.log(ratios[~linear])) > np.log(1.3)).mean() > 0.4, ratios[~linear]

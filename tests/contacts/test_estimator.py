@@ -176,3 +176,30 @@ def test_other_signals_determine_contacts(straight_map, gamma_map):
         assert straight_map.determines(names)
     for names in ("Fx FD MD", "FD MB MD", "Fx Mx MB"):
         assert gamma_map.determines(names)
+
+
+@pytest.mark.parametrize("using", ["Fx MB MD", "FT MB MD", "Fx FT MB MD", "Fx FT FD Mx MB MD"])
+@pytest.mark.parametrize("noisy", [False, True])
+def test_many_at_once_and_one_at_a_time_have_the_same_answers(gamma_map, using, noisy):
+    """Light and heavy contacts, with signals carried out of what contacts give by noise."""
+    rng = np.random.default_rng(12)
+    nodes = gamma_map.to_dataset()
+    which = rng.integers(0, nodes.status.size, 60)
+    force, moment = (nodes[name].to_numpy().reshape(-1, 3)[which] for name in ("force", "moment"))
+    force = force + rng.normal(0.0, SIGMA[:3], force.shape)
+    moment = moment + rng.normal(0.0, SIGMA[3:], moment.shape)
+    signals = vb.base_signals(force, moment)
+    noise = np.diag(SIGMA**2) if noisy else None
+    many = gamma_map.estimate(signals, using, noise)
+    locate = vb.Estimator(gamma_map, using, noise)
+    rows = np.stack([signals[name].to_numpy() for name in using.split()], axis=-1)
+    for i, row in enumerate(rows):
+        one = locate(row)
+        assert one.status == many.status[i]
+        assert one.n_candidates == many.n_candidates[i]
+        assert one.covariance_valid == many.covariance_valid[i]
+        n, length = one.n_candidates, gamma_map.whisker.length
+        np.testing.assert_allclose(
+            one.candidates.point, many.candidates.point[i, :n], atol=1e-7 * length
+        )
+        np.testing.assert_allclose(one.probability, many.probability[i], atol=1e-6)

@@ -1,5 +1,7 @@
 """A contact followed over time: right among candidates, as sure as stated, from few signals too."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -142,7 +144,8 @@ def test_a_filter_forgets_a_contact_that_is_lost_and_waits_for_what_is_missing(w
     np.testing.assert_allclose(
         turn[0] @ good.point_whisker + base[0], good.point, rtol=1e-12, atol=1e-15
     )
-    nowhere = good.located._replace(covariances=np.full((1, 3, 3), np.nan))
+    unknown = replace(good.located.candidates, covariance=np.full((1, 3, 3), np.nan))
+    nowhere = replace(good.located, candidates=unknown)
     there = np.r_[np.zeros(3), good.located.point / 0.3][None]
     assert follow._unaccounted(there, nowhere, turn[0], base[0] / 0.3).tolist() == [False]
     wrong = vb.ContactFilter(estimator, speed=0.01)  # a reaction: all signs are the others

@@ -131,7 +131,7 @@ def test_small_deflections_are_flagged(rng):
         found = vb.estimate_from_wrench(whisker, noisy[:, :3], noisy[:, 3:], noise=covariance)
         scatter = np.sqrt(np.nansum(np.nanvar(found.point, axis=0)))
         ratios.append(scatter / np.sqrt(np.trace(one)))
-    ratios, linear = np.array(ratios), exact.covariance_valid
+    ratios, linear = np.array(ratios), exact.candidates.covariance_valid[..., 0]
     assert 8 <= linear.sum() <= 32
     assert (ratios[linear] < 1.25).all(), ratios[linear]
     assert (np.abs(np.log(ratios[linear])) < np.log(1.25)).mean() > 0.9, ratios[linear]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import vibrissa as vb
-from vibrissa.contacts.channels import WRENCH
+from vibrissa.contacts import WRENCH
 from vibrissa.pipeline.slopes import contact_normals, gains, wrench_slopes
 from vibrissa.signals import base_signals
 

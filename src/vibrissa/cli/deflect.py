@@ -103,7 +103,7 @@ def _load(
 
 
 def _print(bent: Deflection) -> None:
-    from vibrissa.contacts.contact_map import spherical
+    from vibrissa.contacts import spherical
     from vibrissa.quantities import quantity
     from vibrissa.signals import SIGNALS, base_signals
 

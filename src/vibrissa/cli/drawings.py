@@ -259,7 +259,7 @@ def _contact_drawings(
 ) -> dict[str, Draw]:
     """Figures of contact points."""
     from vibrissa import plots
-    from vibrissa.contacts.contact_map import spherical
+    from vibrissa.contacts import spherical
     from vibrissa.contour import CylinderFit
     from vibrissa.objects import Peg
     from vibrissa.recording import Recording

@@ -1,20 +1,61 @@
 """From base signals to contacts: the map of all contacts and its inversion."""
 
-from vibrissa.contacts.contact_map import ContactMap
+from vibrissa.contacts.channels import WRENCH, Channels, channel_derivatives, channel_gradients
+from vibrissa.contacts.chosen_contacts import At, ChosenContacts, chosen_contacts, large_deflection
+from vibrissa.contacts.contact_map import ContactMap, Domain, Progress, within_paper_bounds
 from vibrissa.contacts.contacts import Contact, Contacts, spherical
 from vibrissa.contacts.estimator import Estimator
 from vibrissa.contacts.filter import ContactFilter, Followed
+from vibrissa.contacts.jacobian import (
+    RANK,
+    contact_signal_derivatives,
+    deficient,
+    spherical_derivatives,
+)
+from vibrissa.contacts.noise import (
+    Noise,
+    SensorNoise,
+    common_covariance,
+    common_errors,
+    ellipsoids,
+    rms_error,
+    whitening,
+)
 from vibrissa.contacts.prior import Prior
+from vibrissa.contacts.readout import check_signals
 from vibrissa.contacts.wrench import estimate_from_wrench
 
 __all__ = [
+    "RANK",
+    "WRENCH",
+    "At",
+    "Channels",
+    "ChosenContacts",
     "Contact",
     "ContactFilter",
     "ContactMap",
     "Contacts",
+    "Domain",
     "Estimator",
     "Followed",
+    "Noise",
     "Prior",
+    "Progress",
+    "SensorNoise",
+    "channel_derivatives",
+    "channel_gradients",
+    "check_signals",
+    "chosen_contacts",
+    "common_covariance",
+    "common_errors",
+    "contact_signal_derivatives",
+    "deficient",
+    "ellipsoids",
     "estimate_from_wrench",
+    "large_deflection",
+    "rms_error",
     "spherical",
+    "spherical_derivatives",
+    "whitening",
+    "within_paper_bounds",
 ]

@@ -30,14 +30,33 @@ _PAIRS = {("FT", "FD"): ("Fy", "Fz"), ("MB", "MD"): ("My", "Mz")}
 
 @dataclass(frozen=True)
 class Channels:
-    """How a set of signals is fitted."""
+    """Channels that a set of signals is fitted to.
+
+    Attributes
+    ----------
+    signals : tuple of str
+        Signals, in canonical order.
+    names : tuple of str
+        Channel of each: itself, or a component where size and direction are both there.
+    """
 
     signals: tuple[str, ...]
     names: tuple[str, ...]
 
     @classmethod
     def of(cls, signals: tuple[str, ...]) -> Channels:
-        """Choose the channels of signals in canonical order."""
+        """Choose the channels of signals in canonical order.
+
+        Parameters
+        ----------
+        signals : tuple of str
+            Signals.
+
+        Returns
+        -------
+        Channels
+            Their channels.
+        """
         names = list(signals)
         for pair, components in _PAIRS.items():
             if set(pair) <= set(names):
@@ -46,11 +65,28 @@ class Channels:
         return cls(signals, tuple(names))
 
     def pairs(self) -> list[int]:
-        """Where a size is followed by its direction, and both are one vector."""
+        """Places where a size is followed by its direction, and both are one vector.
+
+        Returns
+        -------
+        list of int
+            Place of each size.
+        """
         return [i for i, name in enumerate(self.names) if name in ("Fy", "My")]
 
     def targets(self, measured: Array) -> Array:
-        """Turn measured signals (n, k) into channels (n, k)."""
+        """Turn measured signals into channels.
+
+        Parameters
+        ----------
+        measured : (n, k) array
+            Measured signals, non-dimensional.
+
+        Returns
+        -------
+        (n, k) array
+            Channels.
+        """
         out = measured.copy()
         for i in self.pairs():
             size, angle = measured[:, i], measured[:, i + 1]
@@ -64,7 +100,24 @@ class Channels:
         values: Array,
         discretization: Discretization,
     ) -> Array:
-        """Covariance of the channels."""
+        """Covariance of the channels.
+
+        Parameters
+        ----------
+        sensor : SensorNoise or None
+            Noise; without it components count as known to a share of force and moment.
+        measured : (n, k) array
+            Measured signals, non-dimensional.
+        values : (n, 6) array
+            Base force and contact point of the contacts, non-dimensional.
+        discretization : Discretization
+            Rod, with its units.
+
+        Returns
+        -------
+        (n, k, k) array
+            Covariances, non-dimensional.
+        """
         if sensor is not None and sensor.deviations is not None:
             own = self._by_deviations(sensor.deviations, measured, discretization)
             if not len(sensor.errors):
@@ -105,7 +158,20 @@ def channels_of(values: Array) -> Array:
 
 
 def channel_gradients(values: Array, names: tuple[str, ...]) -> Array:
-    """∂(channels)/∂(F, M), shape (..., k, 6)."""
+    """Derivatives of channels with respect to (F, M).
+
+    Parameters
+    ----------
+    values : (..., 6) array
+        Base force and contact point, non-dimensional.
+    names : tuple of str
+        Channels.
+
+    Returns
+    -------
+    (..., k, 6) array
+        Derivatives.
+    """
     force = values[..., :3]
     by_wrench = np.zeros((*values.shape[:-1], len(CHANNELS), 6))
     by_wrench[..., : len(SIGNALS), :] = wrench_derivatives(force, np.cross(values[..., 3:], force))
@@ -115,7 +181,22 @@ def channel_gradients(values: Array, names: tuple[str, ...]) -> Array:
 
 
 def channel_derivatives(values: Array, tangents: Array, names: tuple[str, ...]) -> Array:
-    """∂(channels)/∂x, shape (..., k, p), from (F, p) (..., 6) and ∂(F, p)/∂x (..., 6, p)."""
+    """Derivatives of channels with respect to unknowns of the contact.
+
+    Parameters
+    ----------
+    values : (..., 6) array
+        Base force and contact point, non-dimensional.
+    tangents : (..., 6, p) array
+        Derivatives of those with respect to the unknowns.
+    names : tuple of str
+        Channels.
+
+    Returns
+    -------
+    (..., k, p) array
+        Derivatives.
+    """
     force, point = values[..., :3], values[..., 3:]
     d_force, d_point = tangents[..., :3, :], tangents[..., 3:, :]
     d_moment = np.cross(d_point, force[..., None], axis=-2) + np.cross(

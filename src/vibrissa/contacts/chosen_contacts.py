@@ -32,7 +32,27 @@ At: TypeAlias = "xr.DataTree | xr.Dataset | Mapping[str, ArrayLike] | ArrayLike 
 
 @dataclass(frozen=True, eq=False)
 class ChosenContacts:
-    """Contacts in a row, non-dimensional (lengths over L, forces over EI/L²)."""
+    """Contacts in a row, non-dimensional (lengths over L, forces over EI/L²).
+
+    Attributes
+    ----------
+    contacts : (n, 3) array
+        Contacts (s, f_y, f_z).
+    values : (n, 6) array
+        Base force and contact point.
+    tangents : (n, 6, 3) array
+        Derivatives of those with respect to the contacts.
+    status : (n,) int array
+        Status of each.
+    shape : tuple of int
+        Shape that they were given in, n in all.
+    dims : tuple of str
+        Names of its dimensions.
+    coords : dict
+        Coordinates along them.
+    volume : (n,) array or None
+        Volumes of contact points that they stand for, m³.
+    """
 
     contacts: Array
     values: Array
@@ -47,7 +67,28 @@ class ChosenContacts:
 def chosen_contacts(
     contact_map: ContactMap, at: At = None, triplet: tuple[str, ...] = ("Fx", "MB", "MD")
 ) -> ChosenContacts:
-    """Find the contacts that are asked about."""
+    """Find the contacts that are asked about.
+
+    Parameters
+    ----------
+    contact_map : ContactMap
+        Map of the whisker's contacts.
+    at : optional
+        Contact points (..., 3), m; signals by name; a recording or dataset with either; "grid" for
+        the paper's grid; by default the nodes of the map.
+    triplet : tuple of str
+        Signals to locate contacts from, where ``at`` has signals.
+
+    Returns
+    -------
+    ChosenContacts
+        The contacts, non-dimensional.
+
+    Raises
+    ------
+    ValueError
+        If ``at`` is none of these, or the map has no grid.
+    """
     if at is None:
         return _nodes(contact_map)
     if isinstance(at, str):
@@ -198,7 +239,20 @@ def _solved(
 
 
 def large_deflection(contact_map: ContactMap, chosen: ChosenContacts) -> AnyArray:
-    """Whether the deflected whisker points back at each contact; False where there is none."""
+    """Whether the deflected whisker points back at each contact; False where there is none.
+
+    Parameters
+    ----------
+    contact_map : ContactMap
+        Map of the whisker's contacts.
+    chosen : ChosenContacts
+        Contacts.
+
+    Returns
+    -------
+    (n,) bool array
+        True for those.
+    """
     contacts = with_normal_force(chosen.contacts)
     tangents = contact_tangents(contact_map.chart.discretization, contacts)
     return np.asarray(tangents[:, 0] < 0.0)

@@ -50,7 +50,24 @@ _TRIED = 256
 def contact_signal_derivatives(
     discretization: Discretization, values: Array, tangents: Array, names: tuple[str, ...]
 ) -> Array:
-    """Derivatives of the contact point with respect to three signals."""
+    """Derivatives of the contact point with respect to three signals.
+
+    Parameters
+    ----------
+    discretization : Discretization
+        Rod, with its units.
+    values : (n, 6) array
+        Base force and contact point, non-dimensional.
+    tangents : (n, 6, 3) array
+        Derivatives of those with respect to (s, f_y, f_z).
+    names : tuple of str
+        Three signals.
+
+    Returns
+    -------
+    (n, 3, 3) array
+        Derivatives ∂p/∂T, SI units; NaN where they are singular.
+    """
     d = discretization
     which = [SIGNALS.index(name) for name in names]
     with np.errstate(all="ignore"):
@@ -82,7 +99,18 @@ def _row_sizes(values: Array, tangents: Array) -> Array:
 
 
 def spherical_derivatives(points: Array) -> Array:
-    """∂(r, θ, φ)/∂(x, y, z) of points (..., 3), shape (..., 3, 3); NaN on the z axis."""
+    """Derivatives ∂(r, θ, φ)/∂(x, y, z) of points; NaN on the z axis.
+
+    Parameters
+    ----------
+    points : (..., 3) array
+        Points, m.
+
+    Returns
+    -------
+    (..., 3, 3) array
+        Derivatives, 1 and rad/m.
+    """
     x, y, z = np.moveaxis(points, -1, 0)
     across = np.hypot(x, y)
     r = np.hypot(across, z)

@@ -51,7 +51,17 @@ _NONE = np.zeros((0, 6, 7))
 
 @dataclass(frozen=True, eq=False)
 class SensorNoise:
-    """Noise of a sensor; made by :meth:`of`."""
+    """Noise of a sensor; made by :meth:`of`.
+
+    Attributes
+    ----------
+    deviations : dict or None
+        Standard deviation of each signal, SI units.
+    wrench : (6, 6) array or None
+        Covariance of (F, M), SI units; the one of the two that is known.
+    errors : (n, 6, 7) array
+        Errors that all measurements share, as of `common_errors`.
+    """
 
     deviations: dict[str, float] | None
     wrench: Array | None
@@ -59,7 +69,27 @@ class SensorNoise:
 
     @classmethod
     def of(cls, noise: Noise, names: tuple[str, ...], errors: Array = _NONE) -> SensorNoise:
-        """Read noise and check it."""
+        """Read noise and check it.
+
+        Parameters
+        ----------
+        noise : mapping or (6, 6) array_like
+            Standard deviation of each signal, or covariance of (F, M), SI units.
+        names : tuple of str
+            Signals that it is needed for.
+        errors : (n, 6, 7) array
+            Errors that all measurements share.
+
+        Returns
+        -------
+        SensorNoise
+            The noise.
+
+        Raises
+        ------
+        ValueError
+            If a signal's noise is missing, or numbers are not those of noise.
+        """
         if isinstance(noise, Mapping):
             missing = [name for name in names if name not in noise]
             if missing:
@@ -98,7 +128,20 @@ class SensorNoise:
         return cls(None, wrench, errors)
 
     def covariance(self, names: tuple[str, ...], force: Array, moment: Array) -> Array:
-        """Covariance of signals."""
+        """Covariance of signals.
+
+        Parameters
+        ----------
+        names : tuple of str
+            Signals.
+        force, moment : (n, 3) arrays
+            Base force and moment, N and N·m.
+
+        Returns
+        -------
+        (n, k, k) array
+            Covariances, SI units; NaN where a direction has no meaning.
+        """
         if self.wrench is None:
             assert self.deviations is not None
             sigma = np.array([self.deviations[name] for name in names])
@@ -120,7 +163,27 @@ def common_errors(
     gain_sigma: float | ArrayLike = 0.0,
     mixing_sigma: float | ArrayLike = 0.0,
 ) -> Array:
-    """Errors that all measurements of force and moment share."""
+    """Errors that all measurements of force and moment share.
+
+    Parameters
+    ----------
+    stiffness_sigma : float
+        Relative standard deviation of the whisker's bending stiffness.
+    gain_sigma : float or (6,) array_like
+        Relative standard deviation of the sensor's gains, of all components or each.
+    mixing_sigma : float or (6, 6) array_like
+        Standard deviations of the cross-talk between components.
+
+    Returns
+    -------
+    (n, 6, 7) array
+        Matrices E; a measured wrench is off by Σ ε E (F, M, 1) with ε of standard deviation 1.
+
+    Raises
+    ------
+    ValueError
+        If a standard deviation is negative or has another shape.
+    """
     for name, sigma, shape in (("gain", gain_sigma, (6,)), ("mixing", mixing_sigma, (6, 6))):
         given = np.asarray(sigma, dtype=np.float64)
         if given.shape not in ((), shape) or not (np.isfinite(given) & (given >= 0.0)).all():
@@ -155,7 +218,22 @@ def common_channels(errors: Array, gradients: Array, wrenches: Array) -> Array:
 
 
 def common_covariance(errors: Array, gradients: Array, wrenches: Array) -> Array:
-    """Covariance (m, k, k) that errors add to channels; as for :func:`common_channels`."""
+    """Covariance that shared errors add to channels.
+
+    Parameters
+    ----------
+    errors : (n, 6, 7) array
+        Errors, as of `common_errors`.
+    gradients : (..., k, 6) array
+        Derivatives of the channels with respect to (F, M).
+    wrenches : (m, 6) array
+        Measured (F, M).
+
+    Returns
+    -------
+    (m, k, k) array
+        Covariances.
+    """
     changed = common_channels(errors, gradients, wrenches)
     return np.asarray(changed @ np.swapaxes(changed, -1, -2))
 
@@ -174,7 +252,22 @@ def sensor_noise(
 
 
 def ellipsoids(covariance: Array, dims: tuple[str, ...], shape: tuple[int, ...]) -> xr.Dataset:
-    """Covariances (n, 3, 3), m², with the ellipsoids of one standard deviation, labelled."""
+    """Covariances with the ellipsoids of one standard deviation, labelled.
+
+    Parameters
+    ----------
+    covariance : (n, 3, 3) array
+        Covariances of contact points, m².
+    dims : tuple of str
+        Names of the leading dimensions.
+    shape : tuple of int
+        Sizes of them, n in all.
+
+    Returns
+    -------
+    Dataset
+        ``covariance``, ``semi_axes``, ``axis_directions`` and ``predicted_error``.
+    """
     n = len(covariance)
     sizes, directions = np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan)
     known = np.isfinite(covariance).all(axis=(1, 2))
@@ -209,7 +302,18 @@ def ellipsoids(covariance: Array, dims: tuple[str, ...], shape: tuple[int, ...])
 
 
 def rms_error(covariance: Array) -> Array:
-    """RMS 3D error of covariances (..., 3, 3), shape (...)."""
+    """Root mean square distance that covariances predict.
+
+    Parameters
+    ----------
+    covariance : (..., 3, 3) array
+        Covariances of contact points, m².
+
+    Returns
+    -------
+    (...) array
+        Distances, m.
+    """
     return np.asarray(np.sqrt(np.trace(covariance, axis1=-2, axis2=-1)))
 
 
@@ -223,7 +327,18 @@ def trusted(wrenches: Array) -> Array:
 
 
 def whitening(covariance: Array) -> Array:
-    """Weights W with WᵀW = Σ⁻¹, shape (..., k, k), see the module; zero where Σ is not finite."""
+    """Weights W with WᵀW = Σ⁻¹, see the module; zero where Σ is not finite.
+
+    Parameters
+    ----------
+    covariance : (..., k, k) array
+        Covariances Σ.
+
+    Returns
+    -------
+    (..., k, k) array
+        Weights.
+    """
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)
     noisy = variance > 0.0
     size = np.sqrt(np.where(noisy, variance, 1.0))

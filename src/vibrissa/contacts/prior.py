@@ -164,12 +164,13 @@ def among_allowed(
         return found, status, chi_squared
     changed = (before > 0) & ~allowed[:, 0]
     found = found.allowed_first(allowed)
-    found.probability[:] = _renormalised(found.probability)
+    fewer = number < before
+    found.probability[fewer] = _renormalised(found.probability[fewer])
     status, chi_squared = status.copy(), chi_squared.copy()
     for row in np.flatnonzero(changed & (number > 0) & (chi_squared > 0.0)):
         x, value = found.x[row, 0], found.values[row, 0]
         chi_squared[row] = chi_squared_of(readout.how, x, value, measured[1][row], measured[0][row])
-    for row in np.flatnonzero(number < before):
+    for row in np.flatnonzero(fewer):
         chance = found.probability[row, 0]
         status[row] = _left(Status(int(status[row])), int(number[row]), chance)
     return found, status, chi_squared

@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from vibrissa.contacts.contact_map import ContactMap
+from vibrissa.contacts import ContactMap
 from vibrissa.identifiability.verdicts import SEPARATION, uniqueness
 from vibrissa.whisker import Whisker
 

@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.contact_map import Domain
+from vibrissa.contacts import Domain, deficient
 from vibrissa.contacts.inversion import invert
-from vibrissa.contacts.jacobian import deficient
 from vibrissa.identifiability.fibres import fibres
 from vibrissa.identifiability.regions import ContactSet, Samples, contact_set, sample, spread
 from vibrissa.identifiability.twins import (

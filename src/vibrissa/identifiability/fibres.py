@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vibrissa.contacts.contact_map import Domain
-from vibrissa.contacts.jacobian import RANK
+from vibrissa.contacts import RANK, Domain
 from vibrissa.identifiability.regions import ContactSet, contact_set
 from vibrissa.identifiability.twins import (
     AGREEMENT,

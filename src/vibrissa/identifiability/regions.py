@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.stats import qmc
 
-from vibrissa.contacts.contact_map import Domain, within_paper_bounds
+from vibrissa.contacts import Domain, within_paper_bounds
 from vibrissa.numerics import AnyArray, Array
 from vibrissa.rod import (
     Fold,

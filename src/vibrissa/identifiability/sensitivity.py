@@ -22,16 +22,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from vibrissa.contacts import spherical
-from vibrissa.contacts.chosen_contacts import (
+from vibrissa.contacts import (
     At,
     ChosenContacts,
+    Noise,
+    SensorNoise,
     chosen_contacts,
+    contact_signal_derivatives,
+    ellipsoids,
     large_deflection,
+    rms_error,
+    spherical,
+    spherical_derivatives,
+    within_paper_bounds,
 )
-from vibrissa.contacts.contact_map import within_paper_bounds
-from vibrissa.contacts.jacobian import contact_signal_derivatives, spherical_derivatives
-from vibrissa.contacts.noise import Noise, SensorNoise, ellipsoids, rms_error
 from vibrissa.numerics import Array, contact_weights, weighted_quantile
 from vibrissa.quantities import attributes, quantity
 from vibrissa.signals import (

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from vibrissa.contacts.contact_map import Domain, Progress
+from vibrissa.contacts import Domain, Progress
 from vibrissa.identifiability.evidence import (
     OFF_SURFACE,
     TOLERANCES,

@@ -15,10 +15,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from vibrissa.contacts import ContactMap, Contacts, Prior
+from vibrissa.contacts import ContactMap, Contacts, Prior, SensorNoise, check_signals
 from vibrissa.contacts.contacts import Candidates
-from vibrissa.contacts.noise import SensorNoise
-from vibrissa.contacts.readout import check_signals
 from vibrissa.numerics import Array
 from vibrissa.paper.lookup import STEP, LookupTable
 from vibrissa.paper.network import NetworkSolver, train_network

@@ -12,9 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
-from vibrissa.contacts.chosen_contacts import At
-from vibrissa.contacts.jacobian import spherical_derivatives
-from vibrissa.contacts.noise import Noise, SensorNoise, ellipsoids
+from vibrissa.contacts import At, Noise, SensorNoise, ellipsoids, spherical_derivatives
 from vibrissa.identifiability import sensitivity
 from vibrissa.numerics import Array
 from vibrissa.paper.lookup import STEP, Interpolation, LookupTable

@@ -20,8 +20,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from vibrissa.contacts import Prior
-from vibrissa.contacts.contact_map import within_paper_bounds
+from vibrissa.contacts import Prior, within_paper_bounds
 from vibrissa.numerics import AnyArray, Array
 from vibrissa.rod import contacts_at, solve_forces, with_normal_force
 from vibrissa.signals import CIRCULAR, SIGNALS, cone_angle, selection, signals_of, within_cone

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
-from vibrissa.contacts import spherical
-from vibrissa.contacts.contact_map import Domain, within_paper_bounds
+from vibrissa.contacts import Domain, spherical, within_paper_bounds
 from vibrissa.identifiability import sensitivity
 from vibrissa.numerics import Array
 from vibrissa.paper.lookup import Interpolation, LookupTable, cartesian

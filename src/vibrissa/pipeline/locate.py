@@ -14,9 +14,14 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.contacts import ContactMap, Prior, estimate_from_wrench
-from vibrissa.contacts.channels import WRENCH
-from vibrissa.contacts.noise import common_covariance, common_errors
+from vibrissa.contacts import (
+    WRENCH,
+    ContactMap,
+    Prior,
+    common_covariance,
+    common_errors,
+    estimate_from_wrench,
+)
 from vibrissa.pipeline.slopes import contact_normals, gains
 from vibrissa.quantities import attributes
 from vibrissa.recording import Group

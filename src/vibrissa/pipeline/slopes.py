@@ -23,13 +23,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.contacts.channels import (
+from vibrissa.contacts import (
     WRENCH,
     Channels,
+    SensorNoise,
     channel_derivatives,
     channel_gradients,
+    whitening,
 )
-from vibrissa.contacts.noise import SensorNoise, whitening
 from vibrissa.rod import Discretization, contact_tangents, discretize, solve_forces
 from vibrissa.signals import signals_of
 from vibrissa.whisker import Whisker

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
-from vibrissa.contacts import Estimate
+from vibrissa.contacts import Contacts
 from vibrissa.identifiability import sensitivity
 from vibrissa.quantities import quantity, to_display
 from vibrissa.rod import PointContact, deflect
@@ -73,13 +73,13 @@ class Located:
     sensor: Sensor
     signals: xr.Dataset
     contact: Array
-    estimate: Estimate
+    estimate: Contacts
     lines: Array
 
     @property
     def points(self) -> Array:
         """Contact points of the candidates (k, 3), m."""
-        points = self.estimate.candidates
+        points = self.estimate.candidates.point
         return np.asarray(points[np.isfinite(points).all(axis=-1)])
 
     @property
@@ -99,7 +99,7 @@ def located(chart: Chart, bend: Bend, sensor: Sensor) -> Located | None:
         return None
     signals = base_signals(np.asarray(bent.force), np.asarray(bent.moment))
     estimate = chart.contact_map.estimate(signals, sensor.triplet, noise=sensor.covariance)
-    points = estimate.candidates[np.isfinite(estimate.candidates).all(axis=-1)]
+    points = estimate.candidates.point[np.isfinite(estimate.candidates.point).all(axis=-1)]
     lines = deflect(chart.whisker, PointContact(points.reshape(-1, 3))).centerline(NODES)
     return Located(sensor, signals, np.asarray(bent.contact_point), estimate, lines)
 
@@ -127,9 +127,9 @@ def _predicted_error(chart: Chart, sensor: Sensor) -> Array:
     return np.asarray(found["predicted_error"].to_numpy(), dtype=np.float64)
 
 
-def _separation(estimate: Estimate, points: Array) -> Array:
+def _separation(estimate: Contacts, points: Array) -> Array:
     """How far (n,), m, the farthest other candidate of each contact is; NaN without candidates."""
-    away = np.linalg.norm(estimate.candidates - points[:, None], axis=-1)
+    away = np.linalg.norm(estimate.candidates.point - points[:, None], axis=-1)
     farthest = np.nanmax(np.nan_to_num(away), axis=1)
     farthest[farthest < 1e-9] = 0.0  # the contact itself, found again
     return np.where(estimate.status == Status.DEGENERATE, np.nan, farthest)
@@ -145,7 +145,7 @@ MOST = 0.3
 def locate_drawing(whisker: Whisker, found: Located, exaggeration: float) -> Drawing:
     """Draw the whisker in every other contact that feels the same, and the errors of all."""
     out: dict[str, Mark] = {}
-    covariances = found.estimate.candidate_covariances
+    covariances = found.estimate.candidates.covariance
     others = set(found.others(whisker.length).tolist())
     for i, point in enumerate(found.points):
         if i in others:
@@ -175,8 +175,8 @@ def of_located(whisker: Whisker, found: Located | None, status: Status) -> str:
         farthest = number("separation", float(found.distances[others].max()), 3)
         parts.append(note(f"The farthest contact that feels the same is {farthest} away."))
     own = int(np.argmin(found.distances)) if found.points.size else -1
-    if own >= 0 and np.isfinite(found.estimate.candidate_covariances[own]).all():
-        spread = np.sqrt(np.diagonal(found.estimate.candidate_covariances[own]))
+    if own >= 0 and np.isfinite(found.estimate.candidates.covariance[own]).all():
+        spread = np.sqrt(np.diagonal(found.estimate.candidates.covariance[own]))
         errors = dict(zip(("sigma_x", "sigma_y", "sigma_z"), spread.tolist(), strict=True))
         parts.append(table(errors, f"Error of the contact point ({SIGMAS:.0f}σ drawn)"))
         if SIGMAS * spread.max() > MOST * whisker.length:

@@ -85,6 +85,8 @@ _OUTSIDE_REGION = 14.16
 # Logarithm of the volume of a normal distribution of three coordinates, over its peak.
 _LOG_NORMAL = 1.5 * math.log(2.0 * math.pi)
 _MOST_LOG = 700.0
+# Nodes whose χ², or the logarithm of whose density, is so much worse than the best do not count.
+_NEGLIGIBLE = 50.0
 
 # Row by row: x (n, 4), (F, p) (n, 6), ∂(F, p)/∂x (n, 6, 4), χ² (n,), and where a fit ended (n,):
 # 2 on the map, 1 nearer to the base, 0 nowhere.
@@ -699,9 +701,8 @@ def _over_the_map(
     larger: contact points of little volume, as near slip-off, are not left out.
     """
     q, nodes = of.seen.shape
-    white, points, likelihood = how.own[0, 0] > 0.0, np.empty((nodes, 3)), np.empty(nodes)
-    density = np.empty(nodes)
-    away, largest, total, squares = np.empty(q), -np.inf, 0.0, 0.0
+    white, misfits, away = how.own[0, 0] > 0.0, np.empty(nodes), np.empty(q)
+    largest, kept = -np.inf, 0
     for node in range(nodes):
         for i in range(q):
             away[i] = of.seen[i, node] - target[i]
@@ -714,22 +715,28 @@ def _over_the_map(
                 for c in range(q):
                     r += weights[i, c] * away[c]
             misfit += r * r
-        likelihood[node] = math.exp(-0.5 * max(misfit - chi, 0.0))
-        density[node] = of.log_volume[node] - 0.5 * misfit
-        largest = max(largest, density[node])
+        misfits[node] = misfit
+        largest = max(largest, of.log_volume[node] - 0.5 * misfit)
+    points, density, likelihood = np.empty((nodes, 3)), np.empty(nodes), np.empty(nodes)
+    total, squares = 0.0, 0.0
     for node in range(nodes):
-        density[node] = math.exp(density[node] - largest)
-        total += density[node]
-        squares += density[node] * density[node]
+        log = of.log_volume[node] - 0.5 * misfits[node]
+        if log < largest - _NEGLIGIBLE and misfits[node] > chi + _NEGLIGIBLE:
+            continue
+        density[kept] = math.exp(log - largest)
+        likelihood[kept] = math.exp(-0.5 * max(misfits[node] - chi, 0.0))
+        total += density[kept]
+        squares += density[kept] * density[kept]
         for a in range(3):
-            points[node, a] = of.values[node, 3 + a] - point[a]
+            points[kept, a] = of.values[node, 3 + a] - point[a]
+        kept += 1
     if total * total > _MANY * squares:
-        second_moment(points, density, total, NORMAL_KURTOSIS, covariance)
+        second_moment(points[:kept], density[:kept], total, NORMAL_KURTOSIS, covariance)
     root, back = np.zeros((3, 3)), np.empty(3)
     if not cholesky3(covariance, root):
         return 0.0
     mass, mass_out, like, like_out = 0.0, 0.0, 0.0, 0.0
-    for node in range(nodes):
+    for node in range(kept):
         far = 0.0
         for a in range(3):
             back[a] = points[node, a]

@@ -38,9 +38,9 @@ def some_points(nodes):
 
 def nearest(estimate, points):
     """Of each measurement's candidates the one nearest to a point."""
-    away = np.linalg.norm(estimate.candidates - points[:, None], axis=-1)
+    away = np.linalg.norm(estimate.candidates.point - points[:, None], axis=-1)
     away = np.where(np.isfinite(away), away, np.inf)
-    return estimate.candidates[np.arange(len(points)), np.argmin(away, axis=1)]
+    return estimate.candidates.point[np.arange(len(points)), np.argmin(away, axis=1)]
 
 
 def test_differences_on_an_exact_table_are_the_derivatives(coarse, some_points):

@@ -232,7 +232,7 @@ def test_what_is_missing_is_said(tracked, trial):
         with_signals(without)
     with pytest.raises(ValueError, match="below half of"):
         signals_of(tracked, "contact point", 200.0)
-    with pytest.raises(ValueError, match="do not tell all six components"):
+    with pytest.raises(ValueError, match="do not determine all six components"):
         signals_of(measure(trial, sensor=Sensor(("Fx", "My", "Mz"))))
 
 

@@ -24,8 +24,7 @@ from vibrissa.contacts.prior import Prior, located_where_allowed
 from vibrissa.contacts.readout import Measurement, Mixed, Named
 from vibrissa.contacts.sensor_readout import ByName, readout_of
 from vibrissa.contacts.single_search import ExactSearch, LeastSquaresSearch, SetSearch
-from vibrissa.sensors import Sensor
-from vibrissa.sensors.sensor import GRAVITY
+from vibrissa.sensors import GRAVITY, Sensor
 from vibrissa.signals import selection
 from vibrissa.status import Status
 
@@ -236,7 +235,7 @@ class Estimator:
         if not max(map(abs, values.tolist())) < _LARGEST:
             values = np.where(np.isinf(values), np.nan, np.clip(values, -_LARGEST, _LARGEST))
         if self._sensor is not None:
-            values = self._sensor.felt(values, rotation, gravity)
+            values = self._sensor.compensated(values, rotation, gravity)
             if self._components is not None:
                 values = self._components.signals(values)
         elif self._order is not None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from vibrissa.contacts.contact_map import spherical
 from vibrissa.contour import CylinderFit, axis_offset
 from vibrissa.objects import Peg
-from vibrissa.pipeline.comparison import ANGLE_CLASSES
+from vibrissa.pipeline import ANGLE_CLASSES
 from vibrissa.signals import nearest_on_rest, within_turn
 from vibrissa.whisker import Whisker
 

@@ -211,7 +211,7 @@ class ContactStream:
         """Take one sample of a free whisker."""
         sensor = self._estimator.sensor
         assert sensor is not None
-        felt = sensor.felt(values, rotation)
+        felt = sensor.compensated(values, rotation)
         if not np.isfinite(felt).all():
             return "missing"
         self._free.append(felt)

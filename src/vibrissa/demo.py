@@ -34,6 +34,7 @@ from vibrissa.evaluation import (
 from vibrissa.io import load_recording, replacing, save_contacts, save_recording
 from vibrissa.objects import Peg
 from vibrissa.pipeline import (
+    Progress,
     contact_columns,
     placed_by,
     signals_of,
@@ -42,7 +43,6 @@ from vibrissa.pipeline import (
     with_estimates,
     with_group,
 )
-from vibrissa.pipeline.estimates import Progress
 from vibrissa.recording import Recording
 from vibrissa.sensors import FORCE_NOISE, MOMENT_NOISE
 from vibrissa.simulation import (

@@ -60,9 +60,10 @@ def show(result: Any) -> Shown:
     """
     if isinstance(result, xr.Dataset) and "verdict" in result and "critical_cone" in result:
         rows, notes = verdict_rows(result)
-        told = "".join(f"{escape(note)}<br>" for note in notes)
+        shown_notes = "".join(f"{escape(note)}<br>" for note in notes)
         return Shown(
-            f"<div>{table(rows[1:], rows[0])}<small>{told}</small></div>", verdict_table(result)
+            f"<div>{table(rows[1:], rows[0])}<small>{shown_notes}</small></div>",
+            verdict_table(result),
         )
     if isinstance(result, xr.DataTree) and result.attrs.get("kind") == RECORDING_KIND:
         facts = _facts(result)
@@ -81,7 +82,7 @@ def _facts(recording: xr.DataTree) -> list[tuple[str, str]]:
     """What a recording is of, in words."""
     root = recording.to_dataset()
     time = root["time"].values
-    facts = [("origin", str(recording.attrs.get("origin", "not told")))]
+    facts = [("origin", str(recording.attrs.get("origin", "unknown")))]
     if time.size > 1:
         rate = 1.0 / float(np.median(np.diff(time)))
         facts.append(("time", f"{time.size} frames, {np.ptp(time):.4g} s, {rate:.6g} a second"))
@@ -89,8 +90,8 @@ def _facts(recording: xr.DataTree) -> list[tuple[str, str]]:
         facts.append(("time", f"{time.size} frames"))
     if "whisker" in root.sizes:
         names = [str(name) for name in root["whisker"].values] if "whisker" in root.coords else []
-        told = f": {', '.join(names[:8])}{', …' if len(names) > 8 else ''}" if names else ""
-        facts.append(("whiskers", f"{root.sizes['whisker']}{told}"))
+        listed = f": {', '.join(names[:8])}{', …' if len(names) > 8 else ''}" if names else ""
+        facts.append(("whiskers", f"{root.sizes['whisker']}{listed}"))
     if "in_contact" in root:
         share = 100.0 * float(root["in_contact"].mean())
         facts.append(("in contact", f"{share:.3g} % of the frames"))

@@ -106,13 +106,13 @@ def views(marks: Sequence[Mark]) -> str:
 
 
 def _legend(marks: Sequence[Mark]) -> str:
-    """What is drawn in which colour, as far as it is told and there is any."""
-    told = [
+    """Labels of the marks that have one and can be seen, in their colours."""
+    labels = [
         f'<span style="color:{mark.colour}">{"●" if mark.dots else "━"}</span> {escape(mark.label)}'
         for mark in marks
         if mark.label and np.isfinite(np.asarray(mark.places, dtype=float)).any()
     ]
-    return f"<br><small>{' &emsp; '.join(told)}</small>" if told else ""
+    return f"<br><small>{' &emsp; '.join(labels)}</small>" if labels else ""
 
 
 def _drawn(mark: Mark, pixels: Array) -> str:
@@ -211,11 +211,11 @@ def lines(title: str, rows: Sequence[tuple[str, str]]) -> str:
         A line each, and more where a value is long.
     """
     width = max(len(name) for name, _ in rows) + 4
-    told = [
+    filled = [
         textwrap.fill(f"  {name:{width - 4}}  {value}", 80, subsequent_indent=" " * width)
         for name, value in rows
     ]
-    return "\n".join([title, *told])
+    return "\n".join([title, *filled])
 
 
 def table(rows: Sequence[Sequence[str]], heading: Sequence[str] = ()) -> str:

@@ -148,8 +148,8 @@ class Status(enum.IntEnum):
     NOT_FELT = (
         28,
         True,
-        "No contact is felt: force and moment are within their noise, so that nothing touches the "
-        "whisker, or too lightly to be told from nothing.",
+        "No contact is measured: force and moment are within their noise, so that nothing touches "
+        "the whisker, or too lightly to be distinguished from nothing.",
         "",
     )
     OUTSIDE_PRIOR = (
@@ -238,7 +238,7 @@ def flag_attributes() -> dict[str, NDArray[np.int8] | str]:
     Returns
     -------
     dict
-        ``flag_values`` (int8) and ``flag_meanings`` (words parted by blanks, in the same order).
+        ``flag_values`` (int8) and ``flag_meanings`` (words separated by blanks, in the same order).
     """
     return {
         "flag_values": np.array([int(status) for status in Status], dtype=np.int8),

@@ -197,7 +197,7 @@ def test_what_is_wrong_with_a_camera_is_said(originals, tmp_path, old, new, said
         ("noise = [[1], [1, 2]]", "noise is [[1], [1, 2]]; numbers"),
         ("noise = 1\n[frame]\nreaction = 'no'", "reaction is 'no'; true or false is needed"),
         ("noise = 1\nframe = 3", "frame is 3; it is written as a table, [frame]"),
-        ("noise = 1\n[weight]\nmass = [1]", "mass is [1]; one number is needed"),
+        ("noise = 1\n[weight]\nmass = [1]", "mass is [1]; a number is needed"),
         ("noise = 1\nchannels = [1, 2]", "channels is [1, 2]; a list of names is needed"),
         ("noise = 1\nrelative_noise = 1" + 400 * "0", "relative_noise is 1000"),
     ],

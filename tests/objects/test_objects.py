@@ -144,7 +144,7 @@ class TestMotion:
     def test_faults(self):
         with pytest.raises(ValueError, match=r"protraction is 0\.8"):
             whisking(protraction=0.8)
-        with pytest.raises(ValueError, match="no rotation matrix"):
+        with pytest.raises(ValueError, match="not a rotation matrix"):
             whisking(0.1).on_head(2.0 * np.eye(3), np.zeros(3))
         with pytest.raises(ValueError, match="moves already"):
             whisking(0.1).on_head(np.eye(3), np.zeros(3)).on_head(np.eye(3), np.zeros(3))

@@ -9,6 +9,8 @@ from vibrissa.contour import shape_from_dataset
 from vibrissa.io import load_recording, save_recording
 from vibrissa.objects import Sphere
 from vibrissa.pipeline import (
+    AGREES,
+    STRONG,
     compare_contacts,
     compare_shapes,
     component_noise,
@@ -25,9 +27,8 @@ from vibrissa.pipeline import (
     with_group,
     with_signals,
 )
-from vibrissa.pipeline.locate import unfelt
+from vibrissa.pipeline.locate import without_contact
 from vibrissa.pipeline.reconstruct import frames_together
-from vibrissa.pipeline.shapes import GOES, STRONG
 from vibrissa.recording import Recording
 from vibrissa.simulation import facing_peg, measure, simulate, sweep_past
 from vibrissa.status import Status
@@ -246,7 +247,7 @@ def test_shapes_are_told_apart(felt, contact_map):
     felt = estimates_of(felt, contact_maps=[contact_map])
     found = compare_shapes(felt, whiskers)
     assert found["evidence"].sel(shape="cylinder") == 0.0
-    assert found["misfit"].sel(shape="cylinder") < GOES
+    assert found["misfit"].sel(shape="cylinder") < AGREES
     for other in ("sphere", "plane"):
         assert found["evidence"].sel(shape=other) > 10.0 * STRONG
         assert found["misfit"].sel(shape=other) > 100.0
@@ -285,14 +286,14 @@ def test_where_nothing_is_felt_no_map_is_needed(trial, contact_map):
     free = ~trial["truth"]["in_contact"].values[:, 0]
     wrench = trial.to_dataset().isel(whisker=0, time=free)[["force", "moment"]]
     noise = component_noise(1e-6, 0.02e-6)
-    without = unfelt(contact_map.whisker, wrench, noise=noise)
+    without = without_contact(contact_map.whisker, wrench, noise=noise)
     found = locate(contact_map, wrench, noise=noise)
     assert without is not None
     for name in ("contact_point_whisker", "covariance", "arc_length", "status", "in_contact"):
         xr.testing.assert_identical(without[name], found[name])
     assert without.attrs == found.attrs
     felt = trial.to_dataset().isel(whisker=0)[["force", "moment"]]
-    assert unfelt(contact_map.whisker, felt, noise=noise) is None
+    assert without_contact(contact_map.whisker, felt, noise=noise) is None
 
 
 def test_two_whiskers_touch_one_peg(quiet):

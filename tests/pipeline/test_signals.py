@@ -232,7 +232,7 @@ def test_what_is_missing_is_said(tracked, trial):
         with_signals(without)
     with pytest.raises(ValueError, match="below half of"):
         signals_of(tracked, "contact point", 200.0)
-    with pytest.raises(ValueError, match="do not tell all six components"):
+    with pytest.raises(ValueError, match="do not determine all six components"):
         signals_of(measure(trial, sensor=Sensor(("Fx", "My", "Mz"))))
 
 
@@ -297,7 +297,7 @@ def test_contact_points_from_a_table_count_more(tracked, trial):
         (lambda d: d.assign(force=d["force"].isel(space=0, drop=True)), "force has the dim"),
         (
             lambda d: d.assign(base_rotation=2.0 * d["base_rotation"]),
-            "is no rotation",
+            "is not a rotation",
         ),
         (lambda d: d.assign_coords(time=d["time"].values[::-1]), "its time does not rise"),
         (lambda d: d.assign_coords(time=d["time"] * np.nan), "its time does not rise"),

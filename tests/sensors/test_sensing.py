@@ -114,7 +114,7 @@ def test_felt_and_to_wrench_undo_read(seed):
     found, _ = sensor.to_wrench(reading, turn)
     np.testing.assert_allclose(found, wrench, rtol=1e-6, atol=1e-7)
     with pytest.raises(ValueError, match="carries a mass"):
-        sensor.felt(reading)
+        sensor.compensated(reading)
 
 
 def test_the_covariance_of_a_wrench_is_that_of_its_scatter(rng):
@@ -127,7 +127,7 @@ def test_the_covariance_of_a_wrench_is_that_of_its_scatter(rng):
 
 
 def test_too_few_channels_make_no_wrench():
-    with pytest.raises(ValueError, match="do not tell all six"):
+    with pytest.raises(ValueError, match="do not determine all six"):
         Sensor(("Fx", "My", "Mz")).to_wrench(np.zeros((2, 3)))
 
 
@@ -195,7 +195,7 @@ def test_mixing_and_offset_are_found_as_surely_as_said(wire, touched, rng):
 def test_mixing_that_contacts_do_not_tell_is_refused(wire, touched, rng):
     """A straight whisker never twists; contacts in one plane leave the other open."""
     readings = rng.normal(size=(60, 2))
-    with pytest.raises(ValueError, match="say nothing about Mx"):
+    with pytest.raises(ValueError, match="do not depend on Mx"):
         calibrate_on_contacts(wire, touched.contact_point, readings)
     load = vb.PointForce(np.full(20, 0.2), np.linspace(0.01, 0.08, 20), np.zeros(20))
     planar = wrench_of(vb.deflect(wire, load))
@@ -253,9 +253,9 @@ def test_offset_and_weight_are_found_from_free_poses(rng):
         ]
     )
     assert away @ np.linalg.solve(found.covariance, away) < 25.0  # χ² of 10
-    assert np.abs(found.sensor.felt(readings, turn)).max() < 5e-3
+    assert np.abs(found.sensor.compensated(readings, turn)).max() < 5e-3
     tared = calibrate_weight(Sensor(noise=true.noise), readings[:1])
-    assert np.abs(tared.sensor.felt(readings[:1])).max() < 1e-12
+    assert np.abs(tared.sensor.compensated(readings[:1])).max() < 1e-12
     drifted = Sensor(noise=true.noise, bias=true.bias + 0.1, mass=0.03, mass_moment=(1e-4, 0, 0))
     later = drifted.read(np.arange(400.0), np.zeros((400, 6)), rotation=[turn[3]] * 400)
     again = tare(Sensor(noise=true.noise, mass=0.03, mass_moment=(1e-4, 0, 0)), later, turn[3])
@@ -274,7 +274,7 @@ def test_moments_alone_weigh_no_mass(rng):
     found = calibrate_weight(Sensor(("My", "Mz"), noise=1e-6), readings, turn)
     assert found.sensor.mass == 0.0
     np.testing.assert_allclose(found.sensor.mass_moment, true.mass_moment, atol=1e-6)
-    assert np.abs(found.sensor.felt(readings, turn)).max() < 1e-5
+    assert np.abs(found.sensor.compensated(readings, turn)).max() < 1e-5
 
 
 def test_stiffness_is_found_as_surely_as_said(wire, touched):
@@ -384,7 +384,7 @@ def test_contacts_that_leave_something_open_are_refused_by_name(wire):
     """All in one plane, all at one place, too few."""
     flat = vb.deflect(wire, vb.PointForce(np.linspace(0.1, 0.3, 20), 0.03, np.zeros(20)))
     readings = np.zeros((20, 2))
-    with pytest.raises(ValueError, match="say nothing about Fz, My: touch the whisker at other"):
+    with pytest.raises(ValueError, match="do not depend on Fz, My: touch the whisker at other"):
         calibrate_on_contacts(
             wire, flat.contact_point, readings, components=("Fy", "Fz", "My", "Mz")
         )
@@ -408,7 +408,7 @@ def test_a_saturated_reading_tells_nothing(tmp_path):
     sensor = Sensor(("My", "Mz"), noise=1e-9, bias=[0.5, 0.0], largest=[1.0, np.inf])
     readings = sensor.read(np.arange(3.0), np.outer([0.1, 0.4, 3.0], [0, 0, 0, 0, 1.0, 1.0]))
     assert readings[2, 0] == 1.0
-    felt = sensor.felt(readings)
+    felt = sensor.compensated(readings)
     np.testing.assert_allclose(felt[:2, 0], [0.1, 0.4], atol=1e-7)
     assert np.isnan(felt[2, 0])
     assert np.isfinite(felt[:, 1]).all()

@@ -458,9 +458,16 @@ def test_over_udp_stale_samples_are_dropped_and_counted(map_file, wrench):
 def test_a_pipe_that_closes_is_waited_for(tmp_path):
     path, said = tmp_path / "pipe", []
     os.mkfifo(path)
-    read = file_lines(path, reconnect=True, tell=said.append)
-    for text in ("1\n2\n3.1", "4\n"):  # the third number was to have more digits
-        writer = threading.Thread(target=path.write_text, args=(text,))
+    read = file_lines(path, reconnect=True, report=said.append)
+
+    def write(text, after):
+        # The pipe is opened again only once the reader has seen it closed.
+        while len(said) < after:
+            time.sleep(0.01)
+        path.write_text(text)
+
+    for after, text in enumerate(("1\n2\n3.1", "4\n")):  # the third number was to have more digits
+        writer = threading.Thread(target=write, args=(text, after))
         writer.start()
         assert [next(read) for _ in range(text.count("\n"))] == text.splitlines(keepends=True)[:2]
         writer.join()

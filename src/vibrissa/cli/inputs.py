@@ -257,7 +257,7 @@ def _whisker_in(path: Path) -> Whisker:
 def recording_from(path: Path) -> xr.DataTree:
     """Read a recording."""
     from vibrissa.io import check_readable, load_recording
-    from vibrissa.pipeline.frames import check_recording
+    from vibrissa.pipeline import check_recording
 
     recording = load_recording(check_readable(path))
     try:

@@ -272,9 +272,9 @@ def _agreement(fit: FittedShape, contour: xr.Dataset) -> str:
 
 def _judgement(fit: FittedShape, shapes: xr.Dataset | None) -> Iterator[str]:
     """Whether the contacts are of another shape."""
-    from vibrissa.pipeline.shapes import GOES, STRONG
+    from vibrissa.pipeline import AGREES, STRONG
 
-    if fit.misfit > GOES:
+    if fit.misfit > AGREES:
         yield (
             f"The contacts do not fit a {fit.kind}{_by(fit.misfit)}: the object has another "
             "shape (--shape), or there is more than the noise, such as friction; sigma is as much "
@@ -286,9 +286,9 @@ def _judgement(fit: FittedShape, shapes: xr.Dataset | None) -> Iterator[str]:
         return
     best = shapes.isel(shape=int(np.nanargmin(shapes["evidence"].values)))
     kind, misfit = str(best["shape"].item()), float(best["misfit"])
-    if misfit < GOES:
+    if misfit < AGREES:
         yield f"A {kind} fits them better{_by(misfit)}: --shape {kind}"
-    elif fit.misfit > GOES:
+    elif fit.misfit > AGREES:
         yield f"No simple shape fits them, a {kind} best{_by(misfit)}: --shape free"
 
 

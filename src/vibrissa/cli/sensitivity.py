@@ -71,7 +71,7 @@ def _contacts_of(path: Path, moment_noise: float) -> Dataset:
     As for estimates, there is a contact where M_B exceeds five standard deviations of its noise.
     """
     from vibrissa.io import load_recording
-    from vibrissa.pipeline import FELT
+    from vibrissa.pipeline import DETECTED
     from vibrissa.signals import base_signals
 
     if kind_in(path) == RECORDING:
@@ -79,7 +79,7 @@ def _contacts_of(path: Path, moment_noise: float) -> Dataset:
         if "contact_point_whisker" in recording:
             return recording
     wrench = wrench_from(path)
-    touching = base_signals(wrench["force"], wrench["moment"])["MB"] > FELT * moment_noise
+    touching = base_signals(wrench["force"], wrench["moment"])["MB"] > DETECTED * moment_noise
     return wrench[["force", "moment"]].where(touching)
 
 

@@ -43,8 +43,7 @@ from vibrissa.contacts.readout import (
 )
 from vibrissa.numerics import AnyArray, Array, IntArray, share_out
 from vibrissa.rod import TOLERANCE
-from vibrissa.sensors import Sensor
-from vibrissa.sensors.sensor import GRAVITY
+from vibrissa.sensors import GRAVITY, Sensor
 from vibrissa.signals import (
     SIGNALS,
     circular_among,
@@ -401,7 +400,7 @@ class Estimator:
         if not max(map(abs, values.tolist())) < _LARGEST:
             values = np.where(np.isinf(values), np.nan, np.clip(values, -_LARGEST, _LARGEST))
         if self._sensor is not None:
-            values = self._sensor.felt(values, rotation, gravity)
+            values = self._sensor.compensated(values, rotation, gravity)
             if self._components is not None:
                 values = self._components.signals(values)
         elif self._order is not None:

@@ -30,7 +30,7 @@ from vibrissa.contacts.onset import Beginning, Gaussians
 from vibrissa.contacts.prior import Prior
 from vibrissa.contacts.readout import Measurement
 from vibrissa.numerics import AnyArray, Array, IntArray
-from vibrissa.sensors.sensor import GRAVITY
+from vibrissa.sensors import GRAVITY
 from vibrissa.status import Status
 
 _UNKNOWNS = 3

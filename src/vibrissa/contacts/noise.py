@@ -6,7 +6,7 @@ or moment that it belongs to.
 
 Errors that all measurements share, of the whisker's stiffness and of the sensor's gain and mixing,
 add to that: a measured wrench is (F, M) + Σ ε E (F, M, 1), with matrices E (6, 7) and ε of standard
-deviation 1, drawn once (:mod:`vibrissa.sensors.errors`). So Σ E (F, M, 1) (F, M, 1)ᵀ Eᵀ is part of
+deviation 1, drawn once (:mod:`vibrissa.sensors.sensor`). So Σ E (F, M, 1) (F, M, 1)ᵀ Eᵀ is part of
 the covariance of each measurement, but averaging many does not make it smaller.
 
 Weights whiten: W with WᵀW = Σ⁻¹, so that W times an error has variance one in each component. A

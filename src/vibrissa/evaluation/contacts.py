@@ -1,6 +1,6 @@
-"""How far the estimates are from the truth, and how far the noise says that they should be.
+"""Errors of estimated contacts compared with the truth and with those predicted by the noise.
 
-What to expect is drawn, not linearised: the estimated covariance of every contact gives as many
+Predictions are drawn, not linearised: the estimated covariance of every contact gives as many
 errors as there are replicates, each replicate is scored like the trial itself, and the median over
 replicates is the prediction.
 """
@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from vibrissa.contacts import spherical
 from vibrissa.contour import CylinderFit, axis_offset
 from vibrissa.objects import Peg
-from vibrissa.pipeline.comparison import ANGLE_CLASSES
+from vibrissa.pipeline import ANGLE_CLASSES
 from vibrissa.signals import nearest_on_rest, within_turn
 from vibrissa.whisker import Whisker
 
 Array = NDArray[np.float64]
 
 ERRORS = ("error_r", "error_theta", "error_phi", "error_distance")
-"""Errors by name: of r, θ, φ, and in space."""
+"""Names of the errors of r, θ, φ, and of the distance in space."""
 
 REPLICATES = 25
 ANGLES = ANGLE_CLASSES
@@ -42,11 +42,11 @@ class ErrorRow:
     quantity : str
         Name of the error in the table of quantities.
     label : str
-        Which contacts.
+        Name of the class of contacts.
     contacts : int
-        How many contacts that have an estimate.
+        Number of contacts that have an estimate.
     measured, predicted : array (3,)
-        Median, 95 % and largest size of the error, SI units; what the covariance predicts.
+        Median, 95 % and largest size of the error, SI units, and as the covariance predicts.
     """
 
     quantity: str
@@ -63,23 +63,23 @@ class Scores:
     Parameters
     ----------
     touching : int
-        Frames in which the whisker truly touches.
+        Number of frames in which the whisker truly touches.
     felt : int
-        Frames in which a contact is felt.
+        Number of frames in which a contact is detected.
     false : int
-        Frames in which one is felt that is not there.
+        Number of frames in which a contact is detected without a true one.
     candidates : array (3,)
-        Felt contacts with no, one, or several candidates.
+        Numbers of detected contacts with no, one, or several candidates.
     errors : tuple of ErrorRow
-        Of r, θ, φ and in space, all contacts.
+        Errors of r, θ, φ and in space, all contacts.
     by_angle : tuple of ErrorRow
-        In space, by deflection angle.
+        Errors in space, by deflection angle.
     offset : array (3,)
-        From the peg's true axis to the fitted one, m, at the height of the contacts.
+        Vector from the peg's true axis to the fitted one, m, at the height of the contacts.
     tilt : float
         Angle between the axes, rad.
     diameter_error : float
-        Of the fitted peg, m.
+        Error of the fitted peg's diameter, m.
     surface : array (3,)
         Median, 95 % and largest distance of the contacts from the true surface, m.
     """
@@ -97,7 +97,7 @@ class Scores:
 
     @property
     def share_with_one(self) -> float:
-        """Share of felt contacts with exactly one candidate."""
+        """Share of detected contacts with exactly one candidate."""
         return float(self.candidates[1] / max(self.felt, 1))
 
 
@@ -109,20 +109,20 @@ def contact_errors(
     Parameters
     ----------
     contacts : xarray.Dataset
-        Of `vibrissa.pipeline.estimates_of`, of one whisker, dim time.
+        Dataset of `vibrissa.pipeline.estimates_of`, of one whisker, dimension time.
     truth : xarray.Dataset
-        Of the recording, dim time: ``contact_point``, ``contact_point_whisker``.
+        Truth of the recording, dimension time: ``contact_point``, ``contact_point_whisker``.
     whisker : Whisker
-        The whisker as it truly is, not as it was tracked.
+        True whisker, not as it was tracked.
     seed : int
         Seed of the draws.
 
     Returns
     -------
     xarray.Dataset
-        Dims time, replicate: the size of each error, ``…_predicted`` and ``deflection_angle``. r,
-        θ and φ are in the whisker's frame, and the error in space is in the laboratory, so that it
-        includes what places the whisker there.
+        Dataset of dimensions time, replicate: the size of each error, ``…_predicted`` and
+        ``deflection_angle``. r, θ and φ are in the whisker's frame, and the error in space is in
+        the laboratory, so that it includes that of the pose.
     """
     point, true = (d["contact_point_whisker"].values for d in (contacts, truth))
     draw = np.random.default_rng(seed).normal(size=(REPLICATES, len(point), 3))
@@ -145,9 +145,9 @@ def deflection_angle(truth: xr.Dataset, whisker: Whisker) -> Array:
     Parameters
     ----------
     truth : xarray.Dataset
-        Truth of one whisker, dim time: ``contact_point_whisker``.
+        Truth of one whisker, dimension time: ``contact_point_whisker``.
     whisker : Whisker
-        The whisker as it truly is: the shape that was tracked has other angles.
+        True whisker: the shape that was tracked has other angles.
 
     Returns
     -------
@@ -178,23 +178,24 @@ def _roots(covariance: Array) -> Array:
 
 
 def score(contacts: xr.Dataset, truth: xr.Dataset, errors: xr.Dataset, fit: CylinderFit) -> Scores:
-    """Put all errors into numbers.
+    """Scores of a trial.
 
     Parameters
     ----------
     contacts : xarray.Dataset
-        Of `vibrissa.pipeline.estimates_of`, of one whisker, dim time.
+        Dataset of `vibrissa.pipeline.estimates_of`, of one whisker, dimension time.
     truth : xarray.Dataset
-        Dim time: ``in_contact``; and the peg's ``peg_position``, ``peg_axis``, ``peg_radius``.
+        Truth of the recording, dimension time: ``in_contact``; and ``peg_position``, ``peg_axis``,
+        ``peg_radius``.
     errors : xarray.Dataset
-        Of `contact_errors`.
+        Dataset of `contact_errors`.
     fit : CylinderFit
-        The fitted peg.
+        Fitted peg.
 
     Returns
     -------
     Scores
-        The numbers.
+        Numbers and errors.
     """
     felt = contacts["in_contact"].values
     touching = truth["in_contact"].values
@@ -221,19 +222,19 @@ def score(contacts: xr.Dataset, truth: xr.Dataset, errors: xr.Dataset, fit: Cyli
 
 
 def error_rows(errors: xr.Dataset) -> tuple[tuple[ErrorRow, ...], tuple[ErrorRow, ...]]:
-    """Sum up errors of contacts.
+    """Summarise errors of contacts.
 
     Parameters
     ----------
     errors : xarray.Dataset
-        Of `contact_errors`.
+        Dataset of `contact_errors`.
 
     Returns
     -------
     of_all : tuple of ErrorRow
-        Of r, θ, φ and in space, all contacts that have an estimate.
+        Errors of r, θ, φ and in space, all contacts that have an estimate.
     by_angle : tuple of ErrorRow
-        In space, for each class of deflection angle that there is.
+        Errors in space, for each class of deflection angle with contacts.
     """
     known = np.isfinite(errors["error_distance"].values)
     angle = np.degrees(errors["deflection_angle"].values)
@@ -251,12 +252,12 @@ def angle_label(low: float, high: float) -> str:
     Parameters
     ----------
     low, high : float
-        Its bounds, degrees.
+        Bounds of the class, degrees.
 
     Returns
     -------
     str
-        Such as ``2–5°``.
+        Label such as ``2–5°``.
     """
     return f"{low:g}–{high:g}°" if high < ANGLES[-1] else f"over {low:g}°"
 

@@ -1,4 +1,4 @@
-"""The truth of a trial beside what was tracked of it, and what its numbers do not test."""
+"""The truth of a trial together with its tracks, and what its scores do not test."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ from vibrissa.whisker import Whisker
 _POSE = ("base_position", "base_rotation")
 
 _CIRCULAR = (
-    "The model gives signals for the contact that was tracked, and is asked where they come from: "
-    "this tests tracking and inversion, not what a whisker measures."
+    "The model computes signals for the contact that was tracked, and inverts them: this tests "
+    "tracking and inversion, not what a whisker measures."
 )
 
 
 def with_truth(tracked: xr.DataTree, simulated: xr.DataTree) -> xr.DataTree:
-    """Put what is known of a trial beside what was tracked of it.
+    """Tracked recording with the truth of its simulated trial.
 
     Parameters
     ----------
     tracked : xarray.DataTree
         Tracked recording.
     simulated : xarray.DataTree
-        The same trial in the same frames, as it was simulated.
+        Same trial in the same frames, as it was simulated.
 
     Returns
     -------
     xarray.DataTree
-        The tracked recording with the objects and the group ``truth``, which has the base's true
-        pose and the whiskers as they truly are.
+        Tracked recording with the objects and the group ``truth``, which has the base's true pose
+        and the true whiskers.
     """
     groups = {group.path: group.to_dataset(inherit=False) for group in tracked.subtree}
     for group in simulated.subtree:
@@ -45,7 +45,7 @@ def with_truth(tracked: xr.DataTree, simulated: xr.DataTree) -> xr.DataTree:
 
 
 def truth_of(recording: xr.DataTree, whisker: int = 0) -> tuple[xr.Dataset, Whisker]:
-    """Give what is truly known of one whisker.
+    """Truth of one whisker.
 
     Parameters
     ----------
@@ -57,10 +57,10 @@ def truth_of(recording: xr.DataTree, whisker: int = 0) -> tuple[xr.Dataset, Whis
     Returns
     -------
     truth : xarray.Dataset
-        Its truth, dim time, with the base's true ``base_position`` and ``base_rotation`` unless
+        Truth, dimension time, with the base's true ``base_position`` and ``base_rotation`` unless
         they are not known.
     whisker : Whisker
-        The whisker as it truly is; as it was tracked where nothing else is known.
+        True whisker; the tracked one where nothing else is known.
     """
     group = recording.children["truth"]
     truth = group.to_dataset()
@@ -72,7 +72,7 @@ def truth_of(recording: xr.DataTree, whisker: int = 0) -> tuple[xr.Dataset, Whis
 
 
 def caution(source: object) -> str | None:
-    """Say what errors of contacts do not test, by where their signals come from.
+    """What errors of contacts do not test, by the source of their signals.
 
     Parameters
     ----------

@@ -51,7 +51,17 @@ from vibrissa.io.table import (
     table_rows,
     with_point,
 )
-from vibrissa.io.toml import in_file, number_array, parsed_toml, quoted, read_toml
+from vibrissa.io.toml import (
+    check_keys,
+    in_file,
+    number_array,
+    one_number,
+    parsed_toml,
+    quoted,
+    read_toml,
+    subtable,
+    three_numbers,
+)
 from vibrissa.io.traces import load_corrections, load_traces, save_corrections, save_traces
 from vibrissa.io.tracks import RawTracks, join_views, labelled
 from vibrissa.io.tracks_file import load_tracks_table, save_tracks
@@ -87,6 +97,7 @@ __all__ = [
     "bag_wrenches",
     "cells_of",
     "check_folder",
+    "check_keys",
     "check_readable",
     "check_scale",
     "check_writable",
@@ -125,6 +136,7 @@ __all__ = [
     "netcdf_image",
     "number",
     "number_array",
+    "one_number",
     "opened",
     "parsed_toml",
     "quoted",
@@ -149,7 +161,9 @@ __all__ = [
     "save_tracks",
     "signal_column",
     "signal_columns",
+    "subtable",
     "table_rows",
+    "three_numbers",
     "video_frames",
     "video_info",
     "with_point",

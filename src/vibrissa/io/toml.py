@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from os import PathLike
 from typing import Any
@@ -15,6 +15,8 @@ from vibrissa.io.paths import check_readable
 
 # So much of a value that is wrong is quoted.
 _QUOTED = 60
+
+_THREE_NUMBERS = "three numbers are needed"
 
 
 def read_toml(path: str | PathLike[str]) -> dict[str, Any]:
@@ -108,6 +110,94 @@ def number_array(
     except (ValueError, OverflowError):  # lists of different lengths, or 1 with 400 zeros
         pass
     raise ValueError(f"{name} is {quoted(value)}; {needed}")
+
+
+def check_keys(table: Mapping[str, Any], allowed: set[str], where: str) -> None:
+    """Raise a ValueError if a table has an unknown key.
+
+    Parameters
+    ----------
+    table : mapping
+        Table of TOML.
+    allowed : set of str
+        Keys that are allowed.
+    where : str
+        Name of the table, for the message.
+    """
+    unknown = sorted(set(table) - allowed)
+    if unknown:
+        raise ValueError(
+            f"{where} has {', '.join(unknown)}; known are {', '.join(sorted(allowed))}"
+        )
+
+
+def subtable(table: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    """Table [name] of a table; empty by default.
+
+    Parameters
+    ----------
+    table : mapping
+        Table of TOML.
+    name : str
+        Key of the table in it.
+
+    Returns
+    -------
+    mapping
+        Table of that name.
+    """
+    value = table.get(name, {})
+    if not isinstance(value, Mapping):
+        raise ValueError(f"{name} is {quoted(value)}; it is written as a table, [{name}]")
+    return value
+
+
+def one_number(table: Mapping[str, Any], name: str, default: float) -> float:
+    """Number of a table, finite if it is there.
+
+    Parameters
+    ----------
+    table : mapping
+        Table of TOML.
+    name : str
+        Key of the number.
+    default : float
+        Number where there is none.
+
+    Returns
+    -------
+    float
+        Number of that name.
+    """
+    value = table.get(name, default)
+    array = number_array(value, name, "a number is needed")
+    if array.ndim or (name in table and not np.isfinite(array)):
+        raise ValueError(f"{name} is {quoted(value)}; a number is needed")
+    return float(array)
+
+
+def three_numbers(table: Mapping[str, Any], name: str, default: Any = None) -> NDArray[np.float64]:
+    """Three numbers of a table.
+
+    Parameters
+    ----------
+    table : mapping
+        Table of TOML.
+    name : str
+        Key of the numbers.
+    default : object, optional
+        Numbers where there are none.
+
+    Returns
+    -------
+    array (3,)
+        Numbers of that name.
+    """
+    value = table.get(name, default)
+    array = number_array(list(value) if isinstance(value, tuple) else value, name, _THREE_NUMBERS)
+    if array.shape != (3,) or not np.isfinite(array).all():
+        raise ValueError(f"{name} is {quoted(value)}; {_THREE_NUMBERS}")
+    return array
 
 
 def quoted(value: object) -> str:

@@ -1,4 +1,4 @@
-"""What is compiled is kept on disk, and a listener says so while it happens.
+"""Compiled kernels are kept on disk, and a listener reports compilation.
 
 Numba knows a cached kernel by its own file alone, and would go on using it after a function that it
 inlines from another file has changed; here all files with kernels of its own package, and of
@@ -99,7 +99,7 @@ class _FirstCompilation(event.Listener):
     """Say once for a verb, in a library once a package, that kernels are being compiled."""
 
     def __init__(self) -> None:
-        self.said: set[str] = set()
+        self.reported: set[str] = set()
 
     def on_start(self, event: event.Event) -> None:
         dispatcher = (event.data or {}).get("dispatcher")
@@ -107,8 +107,8 @@ class _FirstCompilation(event.Listener):
         package = ".".join(module.split(".")[:2])
         verb = _verb()
         what = f"for `{verb}`" if verb else f"of {package}"
-        if module.startswith("vibrissa.") and what not in self.said:
-            self.said.add(what)
+        if module.startswith("vibrissa.") and what not in self.reported:
+            self.reported.add(what)
             _say(f"compiling kernels {what} (once for this installation, under a minute) ...")
 
     def on_end(self, event: event.Event) -> None:

@@ -1,18 +1,26 @@
 """The stages between tracks and a contour, each from a recording to a dataset of its own."""
 
-from vibrissa.pipeline.comparison import compare_contacts, distances_by_class
-from vibrissa.pipeline.estimates import estimates_of
-from vibrissa.pipeline.frames import whisker_radii
-from vibrissa.pipeline.laboratory import contact_columns, in_laboratory
-from vibrissa.pipeline.locate import FELT, TRIPLET, component_noise, locate, locate_from_wrench
+from vibrissa.pipeline.estimates import (
+    Progress,
+    contact_columns,
+    estimates_of,
+    in_laboratory,
+)
+from vibrissa.pipeline.frames import check_recording, whisker_radii
+from vibrissa.pipeline.locate import DETECTED, TRIPLET, component_noise, locate, locate_from_wrench
 from vibrissa.pipeline.reconstruct import (
+    AGREES,
+    ANGLE_CLASSES,
     SOLVED_TO,
+    STRONG,
     Shape,
+    compare_contacts,
+    compare_shapes,
     contour_points,
+    distances_by_class,
     fit_contacts,
     reconstruct,
 )
-from vibrissa.pipeline.shapes import compare_shapes
 from vibrissa.pipeline.signals import (
     Source,
     default_source,
@@ -30,12 +38,17 @@ from vibrissa.pipeline.stages import (
 )
 
 __all__ = [
-    "FELT",
+    "AGREES",
+    "ANGLE_CLASSES",
+    "DETECTED",
     "SOLVED_TO",
     "STAGES",
+    "STRONG",
     "TRIPLET",
+    "Progress",
     "Shape",
     "Source",
+    "check_recording",
     "compare_contacts",
     "compare_shapes",
     "component_noise",

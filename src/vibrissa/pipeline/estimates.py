@@ -1,4 +1,7 @@
-"""Contact points of every frame and whisker from the signals of a recording."""
+"""Contact points of every frame and whisker from the signals of a recording.
+
+They are transformed to the laboratory, where continuity decides between several candidates.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +12,12 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.contacts import ContactMap, Prior
-from vibrissa.pipeline.frames import signals_in
-from vibrissa.pipeline.laboratory import in_laboratory
-from vibrissa.pipeline.locate import TRIPLET, locate, locate_from_wrench, unfelt
+from vibrissa.contacts import ContactMap, Prior, spherical
+from vibrissa.contour import continuing_candidates, to_laboratory
+from vibrissa.pipeline.frames import cross_matrices, signals_in
+from vibrissa.pipeline.locate import TRIPLET, locate, locate_from_wrench, without_contact
 from vibrissa.pipeline.signals import sensor_noise
+from vibrissa.quantities import attributes
 from vibrissa.recording import Group, Recording
 from vibrissa.rod import PROXIMAL
 from vibrissa.signals import selection
@@ -23,10 +27,13 @@ from vibrissa.whisker import Whisker
 Array = NDArray[np.float64]
 
 Progress = Callable[[str, int, int], None]
-"""Called with what is being done, and how much of how much is."""
+"""Function called with the present stage, and the numbers of steps done and of all steps."""
 
 WHOLE = "wrench"
-"""Instead of names of signals: force and moment whole."""
+"""Value of ``using`` for force and moment whole, instead of names of signals."""
+
+_LABORATORY = {"reference_frame": "laboratory"}
+_SQUARE = ("time", "space", "space_2")
 
 _KEPT = (
     "contact_point",
@@ -58,22 +65,22 @@ def estimates_of(
     proximal: float = PROXIMAL,
     progress: Progress | None = None,
 ) -> xr.Dataset:
-    """Estimate the contact point in every frame in which a contact is felt.
+    """Estimate the contact point in every frame with a contact.
 
     Parameters
     ----------
     recording : xarray.DataTree
-        With a group ``signals``; see `signals_of`.
+        Recording with a group ``signals``; see `signals_of`.
     signals : str or sequence of str, optional
-        Three or more of the six, or "wrench": force and moment whole, which allows for friction. By
-        default `TRIPLET`, but of the rod "wrench", as its wrench has some friction in it.
+        Signals, three or more of the six, or "wrench": force and moment whole, which allows for
+        friction. By default `TRIPLET`, but of the rod "wrench", whose friction is not zero.
     noise : array_like (6, 6), optional
-        Covariance of (F, M), SI units; by default what the signals say of themselves. Signals of a
-        sensor have to have one or the other; without any there are no covariances.
+        Covariance of (F, M), SI units; by default that stated with the signals. Signals of a sensor
+        need one of the two; without any there are no covariances.
     contact_maps : sequence of ContactMap, optional
-        One for each whisker; by default simulated for those that feel a contact.
+        Contact map of each whisker; by default simulated for those with a contact.
     whiskers : sequence of Whisker, optional
-        One for each, where there are no maps; by default those of the recording.
+        Whiskers, where there are no maps; by default those of the recording.
     method : {"exact", "lookup", "lookup-linear", "network"}
         Exact, or one of the paper's methods, as of :func:`vibrissa.paper.estimate`.
     errors : mapping of str to float, optional
@@ -89,14 +96,14 @@ def estimates_of(
     Returns
     -------
     xarray.Dataset
-        Dims time, whisker, space, the group ``estimates`` of a recording. In the laboratory
+        Group ``estimates`` of a recording, dimensions time, whisker, space. In the laboratory
         ``contact_point`` with ``contact_covariance``, ``contact_normal`` with
         ``normal_covariance``, and ``point_normal_covariance``; in the whisker's frame
         ``contact_point_whisker`` with ``covariance``, ``arc_length`` and ``force``; how many
-        ``candidates`` there were, of which the one that goes on from the frames around is taken;
-        ``in_contact`` (felt) and ``status``. Attributes ``signals``, ``source`` and ``felt_above``,
-        M_B from which contacts are felt, N·m. Frames whose signals have no answer keep the status
-        that says why.
+        ``candidates`` there were, of which the one that continues its neighbours in time is chosen;
+        ``in_contact`` (detected) and ``status``. Attributes ``signals``, ``source`` and
+        ``felt_above``, M_B from which contacts are detected, N·m. Frames whose signals have no
+        answer keep the status that states the reason.
 
     Raises
     ------
@@ -106,9 +113,9 @@ def estimates_of(
     Notes
     -----
     Covariances come from the noise of the signals and from that of the base's pose: of signals of
-    the rod and of the tracked contact point both, with what they have in common; of a sensor's the
-    pose's where a camera tells it (`placed_by`). So an error of the pose does not move a contact
-    point that was tracked, as the same pose leads there and back, but it turns the normal.
+    the rod and of the tracked contact point both, with their correlation; of a sensor the pose's
+    where a camera gives it (`placed_by`). So an error of the pose does not move a contact point
+    that was tracked, as the same pose transforms it there and back, but it turns the normal.
     """
     data = signals_in(recording)
     if signals is None:
@@ -116,41 +123,41 @@ def estimates_of(
     whole = signals == WHOLE
     names = TRIPLET if whole else selection(signals)
     count = data.sizes["whisker"]
-    tell = progress or _silent
+    report = progress or _silent
     if whiskers is None:
         if contact_maps is not None:
             whiskers = [one.whisker for one in contact_maps]
         else:
             whiskers = Recording(recording).whiskers
-    for given in (whiskers, contact_maps):
-        if given is not None and len(given) != count:
-            raise ValueError(f"there are signals of {count} whiskers; {len(given)} are given")
+    for things in (whiskers, contact_maps):
+        if things is not None and len(things) != count:
+            raise ValueError(f"there are signals of {count} whiskers; {len(things)} are given")
     if noise is None and data.attrs.get("source") == "sensor" and sensor_noise(data) is None:
         raise ValueError("the sensor's noise is not known: give the covariance of (F, M) as noise")
     parts = []
     for k, whisker in enumerate(whiskers):
-        tell("contact points", k, count)
+        report("contact points", k, count)
         one = Group(data).whisker(k).data
         sigma = sensor_noise(one) if noise is None else np.asarray(noise, dtype=np.float64)
         wrench = one[["force", "moment"]]
         if data.attrs.get("source") != "sensor":
             wrench = wrench.assign(in_contact=one["in_contact"])
-        found = None if whole else unfelt(whisker, wrench, names, noise=sigma)
+        found = None if whole else without_contact(whisker, wrench, names, noise=sigma)
         if whole:
             found = locate_from_wrench(whisker, wrench, sigma, errors, prior)
         elif found is None:
             if contact_maps is not None:
                 contact_map = contact_maps[k]
             else:
-                tell("map of all contacts", k, count)
+                report("map of all contacts", k, count)
                 grid = method.startswith("lookup")
                 contact_map = ContactMap.simulate(whisker, grid=grid, proximal=proximal)
-                tell("map of all contacts", k + 1, count)
+                report("map of all contacts", k + 1, count)
             found = locate(
                 contact_map, wrench, names, noise=sigma, method=method, errors=errors, prior=prior
             )
-        parts.append(_placed(one, found, given=noise is not None))
-        tell("contact points", k + 1, count)
+        parts.append(_one_whisker(one, found, other_noise=noise is not None))
+        report("contact points", k + 1, count)
     out = xr.concat(parts, "whisker").transpose("time", "whisker", ...)
     about: dict[str, Any] = {
         "signals": WHOLE if whole else " ".join(names),
@@ -170,16 +177,145 @@ def _silent(stage: str, done: int, total: int) -> None:
     pass
 
 
-def _placed(signals: xr.Dataset, found: xr.Dataset, *, given: bool) -> xr.Dataset:
-    """Contacts of one whisker in the laboratory, with what became of frames without signals."""
+def _one_whisker(signals: xr.Dataset, found: xr.Dataset, *, other_noise: bool) -> xr.Dataset:
+    """Contacts of one whisker in the laboratory, with the status of frames without signals."""
     known = Group(signals)
     names = ("pose_covariance", "pose_wrench_covariance")
     pose = {name: known[name] for name in names if name in known}
-    if given:
-        # The noise given is that of another instrument.
+    if other_noise:
+        # The noise is that of another instrument, without correlation with the pose.
         pose.pop("pose_wrench_covariance", None)
     placed = in_laboratory(found, known["base_rotation"], known["base_position"], **pose)
-    said = signals["status"].values
-    status = np.where(is_ok(said), placed["status"].values, said).astype(np.int8)
+    own = signals["status"].values
+    status = np.where(is_ok(own), placed["status"].values, own).astype(np.int8)
     placed["status"] = placed["status"].copy(data=status)
     return placed[[name for name in _KEPT if name in placed]]
+
+
+def in_laboratory(
+    contacts: xr.Dataset,
+    base_rotation: ArrayLike,
+    base_position: ArrayLike,
+    pose_covariance: ArrayLike | None = None,
+    pose_wrench_covariance: ArrayLike | None = None,
+) -> xr.Dataset:
+    """Contacts in the laboratory, chosen among candidates by continuity there.
+
+    Parameters
+    ----------
+    contacts : xarray.Dataset
+        Dataset of `locate`.
+    base_rotation : array_like (n, 3, 3)
+        Rotation from the whisker's to the laboratory frame, frame by frame.
+    base_position : array_like (n, 3)
+        Position of the base in the laboratory, m.
+    pose_covariance : array_like (n, 6, 6), optional
+        Covariance of that position, m, and of a small turn about the laboratory's axes, rad; exact
+        by default.
+    pose_wrench_covariance : array_like (n, 6, 6), optional
+        Covariance of position and turn with (F, M); none by default, as for a sensor.
+
+    Returns
+    -------
+    xarray.Dataset
+        Contacts with ``contact_point``, ``contact_covariance`` and ``contact_normal`` with
+        ``normal_covariance`` and ``point_normal_covariance``, laboratory frame; all of the
+        chosen candidate.
+    """
+    rotation, position = np.asarray(base_rotation), np.asarray(base_position)
+    points = contacts["candidate_points"].values
+    lab = to_laboratory(points, rotation[:, None], position[:, None])
+    touching = np.flatnonzero(contacts["in_contact"].values)
+    chosen = np.full(len(points), -1)
+    chosen[touching] = continuing_candidates(lab[touching], touching)
+    kept = {
+        name: _chosen(contacts[f"candidate_{source}"], chosen).assign_attrs(attributes(name))
+        for name, source in (
+            ("contact_point_whisker", "points"),
+            ("covariance", "covariance"),
+            ("arc_length", "arc_length"),
+            ("force", "force"),
+        )
+    }
+    rows = np.flatnonzero(chosen >= 0)
+    placed = np.full((len(points), 3), np.nan)
+    placed[rows] = lab[rows, chosen[rows]]
+    normal = _chosen(contacts["candidate_normal"], chosen).values
+    normal = np.einsum("tij,tj->ti", rotation, normal)
+    gain = _chosen(contacts["candidate_gain"], chosen).values
+    spread = _laboratory_covariance(
+        gain,
+        contacts["wrench_covariance"].values,
+        rotation,
+        placed - position,
+        normal,
+        None if pose_covariance is None else np.asarray(pose_covariance),
+        None if pose_wrench_covariance is None else np.asarray(pose_wrench_covariance),
+    )
+    squares = {
+        "contact_covariance": spread[:, :3, :3],
+        "normal_covariance": spread[:, 3:, 3:],
+        "point_normal_covariance": spread[:, :3, 3:],
+    }
+    vectors = {"contact_point": placed, "contact_normal": normal}
+    return contacts.assign(kept).assign(
+        {name: (_SQUARE, v, attributes(name) | _LABORATORY) for name, v in squares.items()}
+        | {name: (_SQUARE[:2], v, attributes(name) | _LABORATORY) for name, v in vectors.items()}
+    )
+
+
+def _laboratory_covariance(
+    gain: Array,
+    wrench: Array,
+    rotation: Array,
+    arm: Array,
+    normal: Array,
+    pose: Array | None,
+    pose_wrench: Array | None,
+) -> Array:
+    """Covariances (n, 6, 6) of contact point and normal in the laboratory.
+
+    An error of the wrench moves both by the gain; one of the pose, a shift and a turn, moves the
+    point by shift + turn × arm and the normal by turn × normal.
+    """
+    turned = np.zeros((len(gain), 6, 6))
+    turned[:, :3, :3] = turned[:, 3:, 3:] = rotation
+    by_wrench = turned @ gain
+    out = by_wrench @ wrench @ np.swapaxes(by_wrench, 1, 2)
+    if pose is not None:
+        held = np.zeros((len(gain), 6, 6))
+        held[:, :3, :3] = np.eye(3)
+        held[:, :3, 3:], held[:, 3:, 3:] = -cross_matrices(arm), -cross_matrices(normal)
+        out = out + held @ pose @ np.swapaxes(held, 1, 2)
+        if pose_wrench is not None:
+            both = held @ pose_wrench @ np.swapaxes(by_wrench, 1, 2)
+            out = out + both + np.swapaxes(both, 1, 2)
+    return np.asarray(out)
+
+
+def _chosen(candidates: xr.DataArray, chosen: NDArray[np.int64]) -> xr.DataArray:
+    """One candidate of each frame; NaN where the number is -1."""
+    which = xr.DataArray(np.maximum(chosen, 0), dims="time")
+    return candidates.isel(candidate=which).where(xr.DataArray(chosen >= 0, dims="time"))
+
+
+def contact_columns(contacts: xr.Dataset) -> xr.Dataset:
+    """Columns of a table of contacts, whisker's frame.
+
+    Parameters
+    ----------
+    contacts : xarray.Dataset
+        Dataset of `locate` or `in_laboratory`.
+
+    Returns
+    -------
+    xarray.Dataset
+        Dataset of dimension time: x, y, z, r, theta, phi, sigma_x, sigma_y, sigma_z and status.
+    """
+    point = contacts["contact_point_whisker"].values
+    variance = np.einsum("tii->ti", contacts["covariance"].values)
+    values = np.concatenate([point, spherical(point), np.sqrt(variance)], axis=1)
+    names = ("x", "y", "z", "r", "theta", "phi", "sigma_x", "sigma_y", "sigma_z")
+    columns = {name: ("time", values[:, i], attributes(name)) for i, name in enumerate(names)}
+    table = xr.Dataset(columns, {"time": contacts["time"]}, contacts.attrs)
+    return table.assign(status=contacts["status"])

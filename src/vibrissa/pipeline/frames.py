@@ -1,4 +1,4 @@
-"""What stages share: which variables a recording has to have, and how signals are labelled."""
+"""Variables that stages need of a recording, and labels of signals."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from vibrissa.whisker import Whisker
 Array = NDArray[np.float64]
 
 EACH = ("time", "whisker")
-"""What contacts run along."""
+"""Dimensions of contacts."""
 
 SQUARES = ("wrench_covariance", "pose_covariance", "pose_wrench_covariance")
-"""Covariances of what is measured and of the pose."""
+"""Covariances of the wrench and of the pose."""
 
 _SKEW = 1e-3
-"""How far a rotation times its transpose may be from the identity."""
+"""Largest deviation of a rotation times its transpose from the identity."""
 
-FELT_BY = ("force", "moment", "base_position", "base_rotation", "in_contact", "status")
-"""What the group ``signals`` must have."""
+MEASURED = ("force", "moment", "base_position", "base_rotation", "in_contact", "status")
+"""Variables of the group ``signals``."""
 
 ESTIMATED = (
     "contact_point",
@@ -38,11 +38,22 @@ ESTIMATED = (
     "in_contact",
     "status",
 )
-"""What the group ``estimates`` must have."""
+"""Variables of the group ``estimates``."""
 
 
 def check_recording(recording: xr.DataTree) -> None:
-    """Make sure that a recording has frames and whiskers, and variables with their dimensions."""
+    """Make sure that a recording has frames and whiskers, and variables with their dimensions.
+
+    Parameters
+    ----------
+    recording : xarray.DataTree
+        Recording to be checked.
+
+    Raises
+    ------
+    ValueError
+        If something is missing or has other dimensions.
+    """
     root = recording.to_dataset(inherit=False)
     missing = [name for name in ("time", "whisker") if name not in root.dims]
     if missing:
@@ -57,7 +68,7 @@ def check_recording(recording: xr.DataTree) -> None:
         known = turned[np.isfinite(turned).all(axis=(-2, -1))]
         away = np.abs(np.swapaxes(known, -2, -1) @ known - np.eye(3)).max(initial=0.0)
         if away > _SKEW or (np.linalg.det(known) < 0.0).any():
-            faults.append("base_rotation is no rotation in some frames")
+            faults.append("base_rotation is not a rotation in some frames")
     time = np.asarray(root["time"].values)
     if time.size == 0 or root.sizes["whisker"] == 0:
         faults.append(f"it has {time.size} frames of {root.sizes['whisker']} whiskers")
@@ -68,7 +79,7 @@ def check_recording(recording: xr.DataTree) -> None:
 
 
 def names_of(data: xr.Dataset) -> str:
-    """List the variables of a dataset, for a message."""
+    """Names of the variables of a dataset, for a message."""
     return ", ".join(sorted(map(str, data.data_vars))) or "no variables"
 
 
@@ -83,7 +94,7 @@ def needed(root: xr.Dataset, names: Sequence[str], source: str) -> None:
 
 
 def one_whisker(values: Mapping[str, Any], status: NDArray[np.int64]) -> xr.Dataset:
-    """Give signals of one whisker as a dataset with a dimension ``whisker`` of length one."""
+    """Signals of one whisker, with a dimension ``whisker`` of length one."""
     six = base_signals(values["force"], values["moment"])
     known = {
         **values,
@@ -94,7 +105,7 @@ def one_whisker(values: Mapping[str, Any], status: NDArray[np.int64]) -> xr.Data
 
 
 def with_coordinates(data: xr.Dataset, root: xr.Dataset, about: Mapping[str, Any]) -> xr.Dataset:
-    """Take coordinates from a recording."""
+    """Dataset with the coordinates of a recording."""
     names = ("time", "whisker", "space", "whisker_axis")
     coordinates = {name: root[name].variable for name in names if name in root.coords}
     return data.assign_coords({"space": list("xyz"), **coordinates}).assign_attrs(about)
@@ -107,7 +118,7 @@ def estimates_in(recording: xr.DataTree) -> xr.Dataset:
 
 def signals_in(recording: xr.DataTree) -> xr.Dataset:
     """Find the signals in a recording."""
-    return _group_in(recording, "signals", FELT_BY)
+    return _group_in(recording, "signals", MEASURED)
 
 
 _VERBS = {"signals": ("signals_of", "signals"), "estimates": ("estimates_of", "estimate")}
@@ -136,20 +147,27 @@ def _group_in(recording: xr.DataTree, name: str, needs: Sequence[str]) -> xr.Dat
     return data
 
 
+def cross_matrices(vectors: Array) -> Array:
+    """Matrices (n, 3, 3) of the cross products with vectors (n, 3)."""
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    return np.stack([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
+
+
 def whisker_radii(estimates: xr.Dataset, whiskers: Sequence[Whisker]) -> Array:
-    """Give the whiskers' radii where they touch.
+    """Radii of whiskers at their contacts.
 
     Parameters
     ----------
     estimates : xarray.Dataset
-        Dims time, whisker: ``arc_length``.
+        Dataset with ``arc_length``, dimensions time, whisker.
     whiskers : sequence of Whisker
-        One for each.
+        Whiskers along the dimension ``whisker``.
 
     Returns
     -------
     array (time, whisker)
-        m; NaN where the arc length is.
+        Radii, m; NaN where the arc length is.
     """
     arc_length = Group(estimates)["arc_length"]
     radius = np.full(arc_length.shape, np.nan)

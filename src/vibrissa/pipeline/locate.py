@@ -1,8 +1,23 @@
-"""From the measured wrench to contact points in the whisker's frame.
+"""From the measured wrench to contact points in the whisker's frame, with their derivatives.
 
-A contact is felt where the bending moment M_B exceeds five standard deviations of its noise. Where
-several contacts explain the signals, the one with the least force is taken, until their places in
-the laboratory tell which goes on from the frames around (`vibrissa.pipeline.laboratory`).
+A contact is detected where the bending moment M_B exceeds five standard deviations of its noise.
+Where several contacts explain the signals, that with the least force is the first, until continuity
+in the laboratory decides (`vibrissa.pipeline.estimates`).
+
+A contact is x = (s, f_x, f_y, f_z): arc length, and force in the material frame there. It gives
+base force and contact point (F, p), the wrench w = (F, p × F) and the direction
+
+    n = g / |g|,    g = F − (F · t) t,
+
+of the force across the whisker, t being the whisker's tangent at the contact. A whisker that is
+touched on its side is in the tangent plane of the surface, so that n is the surface's normal even
+where the contact rubs along the whisker; without friction it is the direction of the force. To
+first order an error δw of the measured wrench causes errors δ(p, n) = G δw with the gain
+
+    G = ∂(p, n)/∂x · K · ∂c/∂w,
+
+c being the signals that the contact is found from, and K the inverse of ∂c/∂x for three of them, or
+(JᵀWᵀWJ)⁻¹JᵀWᵀW for more, weighted by W.
 """
 
 from __future__ import annotations
@@ -16,32 +31,47 @@ from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.contacts import (
     WRENCH,
+    Channels,
     ContactMap,
     Prior,
+    SensorNoise,
+    channel_derivatives,
+    channel_gradients,
     common_covariance,
     common_errors,
     estimate_from_wrench,
+    whitening,
 )
-from vibrissa.pipeline.slopes import contact_normals, gains
 from vibrissa.quantities import attributes
 from vibrissa.recording import Group
-from vibrissa.signals import base_signals, selection
+from vibrissa.rod import Discretization, contact_tangents, discretize, solve_forces
+from vibrissa.signals import base_signals, selection, signals_of
 from vibrissa.status import Status, flag_attributes
 from vibrissa.whisker import Whisker
 
 Array = NDArray[np.float64]
 
 TRIPLET = ("Fx", "MB", "MD")
-"""What contacts are estimated from by default."""
+"""Signals that contacts are estimated from by default."""
 
-FELT = 5.0
-"""Bending moment from which a contact is felt, in standard deviations of its noise."""
+DETECTED = 5.0
+"""Bending moment from which a contact is detected, in standard deviations of its noise."""
 
 _WHISKER = {"reference_frame": "whisker"}
 
 
+_FREE = [0, 2, 3]
+"""Unknowns of x without friction."""
+
+_STEP = 1e-5
+"""Relative step of differences."""
+
+_SINGULAR = 1e-10
+"""Least singular value, of columns scaled to one, from which derivatives can be inverted."""
+
+
 class _Candidates(NamedTuple):
-    """Of the frames in which a contact is felt: rows × candidates, padded with NaN, SI units."""
+    """Candidates of the frames with a contact: rows × candidates, padded with NaN, SI units."""
 
     points: Array
     arc_lengths: Array
@@ -62,7 +92,7 @@ def component_noise(force_noise: float, moment_noise: float) -> Array:
     Returns
     -------
     array (6, 6)
-        Of (F, M), SI units.
+        Covariance of (F, M), SI units.
     """
     return np.diag(np.repeat([force_noise**2, moment_noise**2], 3))
 
@@ -77,20 +107,20 @@ def locate(
     errors: Mapping[str, Any] | None = None,
     prior: Prior | None = None,
 ) -> xr.Dataset:
-    """Estimate the contact point in every frame in which a contact is felt.
+    """Estimate the contact point in every frame with a contact.
 
     Parameters
     ----------
     contact_map : ContactMap
-        Of the whisker.
+        Contact map of the whisker.
     wrench : xarray.Dataset
-        Dims time, space: ``force`` and ``moment`` as measured, whisker's frame, N and N·m. Where it
-        has ``in_contact``, nothing is felt in other frames.
+        Measured ``force`` and ``moment``, whisker's frame, N and N·m, dimensions time, space. Where
+        it has ``in_contact``, other frames are without contact.
     triplet : tuple of str
-        The signals to estimate from, three or more.
+        Signals to estimate from, three or more.
     noise : array_like (6, 6) or (time, 6, 6), optional
-        Covariance of (F, M), SI units, of all frames or of each; see `component_noise`. None: not
-        known; then there are no covariances, and a contact is felt wherever M_B is not zero.
+        Covariance of (F, M), SI units, of all frames or of each; see `component_noise`. Without it
+        there are no covariances, and every frame in which M_B is not zero has a contact.
     method : {"exact", "lookup", "lookup-linear", "network"}
         Exact, or one of the paper's methods, as of :func:`vibrissa.paper.estimate`.
     errors : mapping of str to float, optional
@@ -102,14 +132,14 @@ def locate(
     Returns
     -------
     xarray.Dataset
-        Dim time, all frames of ``wrench``: ``contact_point_whisker`` with ``covariance``,
-        ``arc_length``, ``force`` at the base as the contact found would make it, the same of all
-        candidates (``candidate_points``, ``candidate_covariance``, ...), their number
-        ``candidates``, ``in_contact`` (felt) and ``status``; and of the candidates what leads from
-        an error of the wrench to one of the contact, ``candidate_gain``, with the covariance of the
-        wrench by noise and errors, ``wrench_covariance``. Covariances are those of the exact way in
-        every method. Where nothing is felt all is NaN, and the status ``NOT_FELT``, or
-        ``NO_CONTACT`` where force and moment are zero or ``in_contact`` says so.
+        Contacts of all frames of ``wrench``, dimension time: ``contact_point_whisker`` with
+        ``covariance``, ``arc_length``, ``force`` at the base by the model of the contact, the same
+        of all candidates (``candidate_points``, ``candidate_covariance``, ...), their number
+        ``candidates``, ``in_contact`` (detected) and ``status``; ``candidate_gain``, the
+        derivatives of the candidates with respect to the wrench, and ``wrench_covariance``, the
+        covariance of the wrench by noise and errors. Covariances are those of the exact method in
+        every method. Frames without detected contact are NaN, with the status ``NOT_FELT``, or
+        ``NO_CONTACT`` where force and moment are zero or ``in_contact`` is false.
 
     Raises
     ------
@@ -117,10 +147,12 @@ def locate(
         If the noise does not fit.
     """
     names = selection(triplet)
-    felt = _Felt.of(wrench, noise, errors)
-    signals = base_signals(felt.force[felt.rows], felt.moment[felt.rows])
+    measured = _Measured.of(wrench, noise, errors)
+    signals = base_signals(measured.force[measured.rows], measured.moment[measured.rows])
     if method == "exact":
-        found = contact_map.estimate(signals, names, felt.typical, prior=prior, **(errors or {}))
+        found = contact_map.estimate(
+            signals, names, measured.typical, prior=prior, **(errors or {})
+        )
     else:
         from vibrissa.paper import estimate  # it loads what only comparisons need
 
@@ -135,23 +167,23 @@ def locate(
         found.status,
     )
     stated = every.covariance if method == "exact" else None
-    return _located(contact_map.whisker, names, felt, candidates, stated)
+    return _located(contact_map.whisker, names, measured, candidates, stated)
 
 
-def unfelt(
+def without_contact(
     whisker: Whisker,
     wrench: xr.Dataset,
     triplet: tuple[str, ...] = TRIPLET,
     *,
     noise: ArrayLike | None,
 ) -> xr.Dataset | None:
-    """Say what `locate` would, without a map, where no contact is felt in any frame."""
-    felt = _Felt.of(wrench, noise)
-    if felt.rows.any():
+    """Result of `locate`, without a map, where no frame has a contact; None otherwise."""
+    measured = _Measured.of(wrench, noise)
+    if measured.rows.any():
         return None
     points, numbers = np.empty((0, 1, 3)), np.empty(0, dtype=np.int64)
     none = _Candidates(points, points[..., 0], points, points, numbers, numbers)
-    return _located(whisker, selection(triplet), felt, none)
+    return _located(whisker, selection(triplet), measured, none)
 
 
 def locate_from_wrench(
@@ -166,27 +198,27 @@ def locate_from_wrench(
     Parameters
     ----------
     whisker : Whisker
-        What is touched.
+        Whisker that touches.
     wrench : xarray.Dataset
-        As for `locate`.
+        Measured wrench, as for `locate`.
     noise : array_like (6, 6) or (time, 6, 6), optional
-        As for `locate`.
+        Covariance of (F, M), as for `locate`.
     errors : mapping of str to float, optional
-        As for `locate`.
+        Standard deviations of common errors, as for `locate`.
     prior : Prior, optional
-        As for `locate`.
+        Contacts that are possible, as for `locate`.
 
     Returns
     -------
     xarray.Dataset
-        As of `locate`, with ``friction_angle``.
+        Contacts as of `locate`, with ``friction_angle``.
     """
-    felt = _Felt.of(wrench, noise, errors)
+    measured = _Measured.of(wrench, noise, errors)
     found = estimate_from_wrench(
         whisker,
-        felt.force[felt.rows],
-        felt.moment[felt.rows],
-        noise=felt.typical,
+        measured.force[measured.rows],
+        measured.moment[measured.rows],
+        noise=measured.typical,
         prior=prior,
         **(errors or {}),
     )
@@ -199,15 +231,16 @@ def locate_from_wrench(
         found.n_candidates,
         found.status,
     )
-    return _located(whisker, WRENCH, felt, candidates, every.covariance)
+    return _located(whisker, WRENCH, measured, candidates, every.covariance)
 
 
-class _Felt(NamedTuple):
-    """What is measured: force, moment (n, 3), their covariance (n, 6, 6), NaN if not known.
+class _Measured(NamedTuple):
+    """Measured force and moment (n, 3), and their covariance (n, 6, 6), NaN if not known.
 
-    And in which frames they are known, in which a contact is felt and in which there is none, (n,);
-    the noise of all frames together, (6, 6), if there is any; errors that all frames share
-    (k, 6, 7); M_B from which contacts are felt, N·m; and whether all frames are as noisy.
+    Also the frames (n,) in which they are known, in which a contact is detected and in which there
+    is none; the typical noise (6, 6) of the frames, if there is any; errors that all frames share
+    (k, 6, 7); M_B from which contacts are detected, N·m; and whether all frames have the same
+    noise.
     """
 
     time: xr.Variable
@@ -225,8 +258,8 @@ class _Felt(NamedTuple):
     @classmethod
     def of(
         cls, wrench: xr.Dataset, noise: ArrayLike | None, errors: Mapping[str, Any] | None = None
-    ) -> _Felt:
-        """Look at a measured wrench."""
+    ) -> _Measured:
+        """Measurement of a wrench dataset."""
         force, moment = (Group(wrench)[name] for name in ("force", "moment"))
         n = len(force)
         covariance = _noise_of_frames(noise, n)
@@ -234,7 +267,7 @@ class _Felt(NamedTuple):
         size = np.hypot(moment[:, 1], moment[:, 2])
         least = 0.0 * size
         if noise is not None:
-            least = FELT * np.sqrt(0.5 * (covariance[:, 4, 4] + covariance[:, 5, 5]))
+            least = DETECTED * np.sqrt(0.5 * (covariance[:, 4, 4] + covariance[:, 5, 5]))
             least = np.nan_to_num(least)
         with np.errstate(invalid="ignore"):
             rows = known & (size > least)
@@ -268,7 +301,7 @@ def _noise_of_frames(noise: ArrayLike | None, n: int) -> Array:
 
 
 def _typical(covariance: Array) -> Array | None:
-    """Of sensors as noisy as those of the frames (n, 6, 6) usually are, equally in all axes."""
+    """Typical noise of frames (n, 6, 6), the same in all axes of force and of moment."""
     variances = np.diagonal(covariance, axis1=1, axis2=2)
     variances = variances[np.isfinite(variances).all(axis=1)]
     if not variances.size:
@@ -280,27 +313,27 @@ def _typical(covariance: Array) -> Array | None:
 def _located(
     whisker: Whisker,
     names: tuple[str, ...],
-    felt: _Felt,
+    measured: _Measured,
     found: _Candidates,
     stated: Array | None = None,
 ) -> xr.Dataset:
-    """Write candidates of the felt frames as a dataset of all frames.
+    """Dataset of all frames from candidates of those with a contact.
 
-    Covariances are those ``stated`` (n, some, 3, 3) by the estimate, which hold what they say up to
-    slip-off, where all frames are as noisy as it took them to be; otherwise of first order.
+    Covariances are those ``stated`` (n, some, 3, 3) by the estimate, which are valid up to
+    slip-off, where all frames have the noise that it used; otherwise of first order.
     """
-    rows = felt.rows
+    rows = measured.rows
     shape = found.arc_lengths.shape
     flat = (found.arc_lengths.reshape(-1), found.contact_forces.reshape(-1, 3))
-    gain = gains(whisker, names, *flat, felt.typical, felt.errors).reshape(*shape, 6, 6)
+    gain = gains(whisker, names, *flat, measured.typical, measured.errors).reshape(*shape, 6, 6)
     normals = contact_normals(whisker, *flat).reshape(*shape, 3)
     point_gain = gain[..., :3, :]
-    spread = point_gain @ felt.covariance[rows][:, None] @ np.swapaxes(point_gain, -1, -2)
-    if stated is not None and felt.steady:
+    spread = point_gain @ measured.covariance[rows][:, None] @ np.swapaxes(point_gain, -1, -2)
+    if stated is not None and measured.steady:
         first = spread[:, : stated.shape[1]]
         first[:] = np.where(np.isfinite(stated), stated, first)
-    status = np.where(felt.known, int(Status.NOT_FELT), int(Status.MISSING)).astype(np.int8)
-    status[felt.free] = int(Status.NO_CONTACT)
+    status = np.where(measured.known, int(Status.NOT_FELT), int(Status.MISSING)).astype(np.int8)
+    status[measured.free] = int(Status.NO_CONTACT)
     status[rows] = found.status
     number = np.zeros(rows.size, dtype=np.int64)
     number[rows] = found.number
@@ -333,14 +366,14 @@ def _located(
         data["friction_angle"] = ("time", _everywhere(rows, angle), attributes("friction_angle"))
     data["wrench_covariance"] = (
         ("time", "component", "component_"),
-        felt.covariance,
+        measured.covariance,
         attributes("wrench_covariance"),
     )
     data["candidates"] = ("time", number, attributes("candidates"))
     data["in_contact"] = ("time", rows, attributes("in_contact"))
     data["status"] = ("time", status, {**attributes("status"), **flag_attributes()})
-    about = {"triplet": " ".join(names), "felt_above": felt.above}
-    return xr.Dataset(data, {"time": felt.time, "space": list("xyz")}, about)
+    about = {"triplet": " ".join(names), "felt_above": measured.above}
+    return xr.Dataset(data, {"time": measured.time, "space": list("xyz")}, about)
 
 
 def _everywhere(rows: NDArray[np.bool_], values: Array) -> Array:
@@ -348,3 +381,133 @@ def _everywhere(rows: NDArray[np.bool_], values: Array) -> Array:
     out = np.full((rows.size, *values.shape[1:]), np.nan)
     out[rows] = values
     return out
+
+
+class _Touch(NamedTuple):
+    """(F, p) (n, 6), the normal (n, 3) and ∂(F, p)/∂x (n, 6, 4), ∂n/∂x (n, 3, 4)."""
+
+    values: Array
+    normal: Array
+    value_slopes: Array
+    normal_slopes: Array
+
+
+def gains(
+    whisker: Whisker,
+    signals: tuple[str, ...],
+    arc_length: Array,
+    contact_force: Array,
+    weighing: Array | None = None,
+    errors: Array | None = None,
+) -> Array:
+    """Derivatives (n, 6, 6) of contact points and normals with respect to the measured wrench."""
+    d = discretize(whisker)
+    friction = signals == WRENCH
+    x = np.concatenate([arc_length[:, None] / d.length, contact_force / d.force], axis=1)
+    out = np.full((len(x), 6, 6), np.nan)
+    rows = np.flatnonzero(np.isfinite(x).all(axis=1))
+    if not rows.size:
+        return out
+    touch = _touch(d, x[rows])
+    free = [0, 1, 2, 3] if friction else _FREE
+    three = len(signals) == 3
+    channels = Channels(signals, signals) if three or friction else Channels.of(signals)
+    slopes = channel_derivatives(touch.values, touch.value_slopes[..., free], channels.names)
+    by_wrench = channel_gradients(touch.values, channels.names)
+    if not three:
+        weights = _weights(d, channels, touch.values, weighing, errors)
+        slopes, by_wrench = weights @ slopes, weights @ by_wrench
+    moved = np.concatenate([touch.value_slopes[:, 3:], touch.normal_slopes], axis=1)[..., free]
+    inner = np.repeat([d.length, 1.0], 3)[:, None] / np.repeat([d.force, d.moment], 3)
+    out[rows] = moved @ _inverse(slopes) @ by_wrench * inner
+    return out
+
+
+def wrench_slopes(whisker: Whisker, arc_length: Array, contact_force: Array) -> Array:
+    """Derivatives (n, 6, 3) of the wrench of frictionless contacts by their points."""
+    d = discretize(whisker)
+    x = np.concatenate([arc_length[:, None] / d.length, contact_force / d.force], axis=1)
+    out = np.full((len(x), 6, 3), np.nan)
+    rows = np.flatnonzero(np.isfinite(x).all(axis=1))
+    if not rows.size:
+        return out
+    values, tangents = solve_forces(d, x[rows], tangents=True)
+    by_x = channel_derivatives(values, tangents, WRENCH)
+    scale = np.repeat([d.force, d.moment], 3)[:, None] / d.length
+    out[rows] = by_x @ _inverse(tangents[:, 3:]) * scale
+    return out
+
+
+def _touch(d: Discretization, x: Array) -> _Touch:
+    values, exact = solve_forces(d, x, tangents=True)
+    tangent = contact_tangents(d, x)
+    slopes, turning = np.empty((len(x), 6, 4)), np.empty((len(x), 3, 4))
+    size = np.maximum(np.linalg.norm(x[:, 1:], axis=1), _STEP)
+    for k in range(4):
+        step = _STEP * (np.ones(len(x)) if k == 0 else size)
+        ahead, back = x.copy(), x.copy()
+        ahead[:, k] += step
+        back[:, k] -= step
+        if k == 0:
+            # There is no whisker beyond the tip.
+            ahead[:, 0] = np.minimum(ahead[:, 0], np.maximum(1.0, x[:, 0]))
+        width = (ahead[:, k] - back[:, k])[:, None]
+        turning[..., k] = (contact_tangents(d, ahead) - contact_tangents(d, back)) / width
+        if k == 1:
+            slopes[..., 1] = (solve_forces(d, ahead)[0] - solve_forces(d, back)[0]) / width
+    slopes[..., _FREE] = exact
+    force = values[:, :3]
+    along = (force * tangent).sum(axis=1)[:, None]
+    across = force - along * tangent
+    length = np.linalg.norm(across, axis=1, keepdims=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        normal = across / length
+    change = slopes[:, :3] - along[..., None] * turning
+    grown = np.einsum("ni,nik->nk", tangent, slopes[:, :3])
+    grown += np.einsum("ni,nik->nk", force, turning)
+    change -= tangent[:, :, None] * grown[:, None, :]
+    flat = np.eye(3) - normal[:, :, None] * normal[:, None, :]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return _Touch(values, normal, slopes, flat @ change / length[..., None])
+
+
+def contact_normals(whisker: Whisker, arc_length: Array, contact_force: Array) -> Array:
+    """Directions (n, 3) of contact forces across the whisker."""
+    d = discretize(whisker)
+    x = np.concatenate([arc_length[:, None] / d.length, contact_force / d.force], axis=1)
+    out = np.full((len(x), 3), np.nan)
+    rows = np.flatnonzero(np.isfinite(x).all(axis=1))
+    if rows.size:
+        force, tangent = solve_forces(d, x[rows])[0][:, :3], contact_tangents(d, x[rows])
+        across = force - (force * tangent).sum(axis=1)[:, None] * tangent
+        with np.errstate(divide="ignore", invalid="ignore"):
+            out[rows] = across / np.linalg.norm(across, axis=1, keepdims=True)
+    return out
+
+
+def _weights(
+    d: Discretization,
+    channels: Channels,
+    values: Array,
+    weighing: Array | None,
+    errors: Array | None,
+) -> Array:
+    sensor = None
+    if weighing is not None:
+        sensor = SensorNoise(None, weighing, np.zeros((0, 6, 7)) if errors is None else errors)
+    measured = signals_of(values[:, :3], np.cross(values[:, 3:], values[:, :3]))
+    return whitening(channels.covariance(sensor, measured, values, d))
+
+
+def _inverse(slopes: Array) -> Array:
+    """Pseudo-inverses (n, m, k) of slopes (n, k, m); NaN where they are not of full rank."""
+    usable = np.asarray(np.isfinite(slopes).all(axis=(1, 2)))
+    whole = np.where(usable[:, None, None], slopes, 0.0)
+    size = np.linalg.norm(whole, axis=1)
+    usable &= (size > 0.0).all(axis=1)
+    u, s, vt = np.linalg.svd(whole / np.where(size > 0.0, size, 1.0)[:, None], full_matrices=False)
+    usable &= s[:, -1] > _SINGULAR
+    with np.errstate(divide="ignore", invalid="ignore"):
+        root = np.swapaxes(vt, 1, 2) / s[:, None, :]
+        out = root @ np.swapaxes(u, 1, 2) / size[:, :, None]
+    return np.where(usable[:, None, None], out, np.nan)

@@ -1,7 +1,11 @@
-"""The object that estimated contacts lie on, and how far it is from objects that are known.
+"""The object that estimated contacts are on, and its comparison with objects that are known.
 
-Contact points lie on the whisker's centreline, its radius off the surface, which the fit takes into
-account. All whiskers of a recording count together: they touch one object.
+Contact points are on the whisker's centreline, one whisker radius off the surface, which the fit
+takes into account. All whiskers of a recording count together: they touch one object.
+
+Shapes are compared by χ² per degree of freedom, which is 1 where shape and noise are right, and by
+the Bayesian information criterion on the contacts that all of them use. Contacts whose errors are
+correlated from frame to frame count as fewer.
 """
 
 from __future__ import annotations
@@ -20,31 +24,34 @@ from vibrissa.contour import (
     FreeFit,
     SphereFit,
     axis_offset,
+    compare_with,
+    distances_by,
+    evidence_of,
     fit_free,
     fit_shape,
 )
 from vibrissa.objects import Peg, Sphere, Surface
-from vibrissa.pipeline.comparison import nearest_object
 from vibrissa.pipeline.estimates import WHOLE
 from vibrissa.pipeline.frames import EACH, estimates_in, whisker_radii
 from vibrissa.quantities import attributes
 from vibrissa.recording import Group, Recording
+from vibrissa.signals import nearest_on_rest
 from vibrissa.whisker import Whisker
 
 Array = NDArray[np.float64]
 
 Shape = Literal["cylinder", "sphere", "plane", "free"]
-"""What can be fitted to contacts."""
+"""Shapes that can be fitted to contacts."""
 
 SOLVED_TO = 1e-6
-"""Uncertainty of every contact apart from the signals', m: what the mechanics is solved to."""
+"""Uncertainty of every contact apart from the signals', m: the tolerance of the mechanics."""
 
 LEAN = 0.1
-"""How far the normal may lean from the force across the whisker where friction is allowed for.
+"""Standard deviation of the angle between normal and force across the whisker, rad.
 
-As a standard deviation, rad. Friction along the whisker is seen in the wrench, and taken off;
-across the whisker and along the object it is not. Pegs are found best with 0.05 to 0.3 at any
-coefficient of friction up to 0.5, and hardly worse without friction (docs/honest-test.md).
+For contacts with friction: along the whisker it is measured by the wrench and removed, across the
+whisker and along the object it is not. Pegs are found best with 0.05 to 0.3 at any coefficient of
+friction up to 0.5, and hardly worse without friction (docs/validation.md).
 """
 
 
@@ -62,32 +69,32 @@ def reconstruct(
     Parameters
     ----------
     recording : xarray.DataTree
-        With a group ``estimates``; see `estimates_of`.
+        Recording with a group ``estimates``; see `estimates_of`.
     shape : {"cylinder", "sphere", "plane", "free"}
-        What the object is taken for; free: any smooth surface.
+        Shape of the object; free is any smooth surface.
     axis : array_like (3,), optional
         Direction of a cylinder's axis, laboratory frame, where it is known.
     lean : float, optional
-        See `fit_contacts`.
+        Standard deviation of the lean of normals, rad, as for `fit_contacts`.
     whiskers : sequence of Whisker, optional
-        One for each along the dimension ``whisker``; by default those of the recording.
+        Whiskers along the dimension ``whisker``; by default those of the recording.
     objects : sequence of Surface, optional
         Known objects in the laboratory to compare with; by default those of the recording.
 
     Returns
     -------
     xarray.Dataset
-        The group ``contour`` of a recording, laboratory frame: ``object_position``,
+        Group ``contour`` of a recording, laboratory frame: ``object_position``,
         ``object_axis`` and ``object_radius``, as far as the shape has them, with
         ``parameter_covariance``; dims time, whisker: ``surface_distance`` from the fitted object,
         ``inlier`` and ``chi_squared``; attributes ``shape`` and ``misfit``, χ² per degree of
-        freedom: much more than 1 says that the object has another shape.
-        `vibrissa.contour.shape_from_dataset` makes the shape again. The covariance is larger by the
-        misfit, and counts contacts of following frames as one where they err together:
-        so many of them as the attribute ``frames_together`` says. With known objects also
+        freedom: much more than 1 means that the object has another shape.
+        `vibrissa.contour.shape_from_dataset` restores the shape. The covariance is larger by the
+        misfit, and counts contacts of consecutive frames whose errors are correlated as one; the
+        attribute ``frames_together`` is their number. With known objects also
         ``object_distance`` of each contact from the one that is nearest to them (attribute
-        ``object``, its number), and for a cylinder beside a peg ``axis_offset``, ``axis_tilt`` and
-        ``diameter_error``, for spheres ``center_offset`` and ``diameter_error``.
+        ``object``, its number), and for a cylinder compared with a peg ``axis_offset``,
+        ``axis_tilt`` and ``diameter_error``, for spheres ``center_offset`` and ``diameter_error``.
 
     Raises
     ------
@@ -101,7 +108,7 @@ def reconstruct(
     known = Recording(recording).objects if objects is None else tuple(objects)
     fit = fit_contacts(estimates, whiskers, shape, axis=axis, lean=lean)
     together = frames_together(scores_of(fit, estimates))
-    fit = _less_sure(fit, together)
+    fit = _widened(fit, together)
     each = {n: estimates[n].variable for n in EACH if n in estimates.coords}
     out = fit.to_dataset(EACH, tuple(estimates.sizes[n] for n in EACH), each)
     out.attrs |= {"reference_frame": "laboratory", "frames_together": together}
@@ -113,7 +120,7 @@ def reconstruct(
 
 
 def scores_of(fit: FittedShape, estimates: xr.Dataset) -> Array:
-    """Give the distances of contacts from a fitted shape in standard deviations."""
+    """Distances (time, whisker) of contacts from a fitted shape, in standard deviations."""
     normal, spread = (_rows(estimates[n]) for n in ("contact_normal", "contact_covariance"))
     variance = np.einsum("ni,nij,nj->n", normal, spread, normal) + SOLVED_TO**2
     scores = fit.residuals / np.sqrt(np.where(np.isfinite(variance), variance, 1.0))
@@ -121,8 +128,8 @@ def scores_of(fit: FittedShape, estimates: xr.Dataset) -> Array:
     return scores.reshape(tuple(estimates.sizes[name] for name in EACH))
 
 
-def _less_sure(fit: FittedShape, together: float) -> FittedShape:
-    """The same fit with all variances larger by a factor."""
+def _widened(fit: FittedShape, together: float) -> FittedShape:
+    """Same fit with all variances larger by a factor."""
     covariance = together * fit.covariance
     if not isinstance(fit, FreeFit):
         return replace(fit, covariance=covariance)
@@ -132,10 +139,10 @@ def _less_sure(fit: FittedShape, together: float) -> FittedShape:
 
 
 def frames_together(scores: ArrayLike) -> float:
-    """Tell how many following frames err together, on average.
+    """Mean number of consecutive frames whose errors are correlated.
 
-    Contacts that were tracked err alike from frame to frame, as the whisker's shape and the base's
-    pose do, so that a hundred of them tell less than a hundred of a sensor.
+    Errors of tracked contacts are alike from frame to frame, as those of the whisker's shape and
+    the base's pose, so that a hundred of them contain less than a hundred of a sensor.
     """
     z = np.asarray(scores, dtype=np.float64)
     known = np.isfinite(z)
@@ -169,11 +176,11 @@ def fit_contacts(
     Parameters
     ----------
     estimates : xarray.Dataset
-        Of `estimates_of`, dims time, whisker.
+        Dataset of `estimates_of`, dimensions time, whisker.
     whiskers : sequence of Whisker
-        That touched it.
+        Whiskers that touched it.
     shape : {"cylinder", "sphere", "plane", "free"}
-        Which.
+        Shape of the object.
     axis : array_like (3,), optional
         Direction of a cylinder's axis where it is known.
     lean : float, optional
@@ -184,8 +191,8 @@ def fit_contacts(
     Returns
     -------
     CylinderFit, SphereFit, PlaneFit or FreeFit
-        Each contact counts by its covariance, where that is known, and tells the normal of the
-        surface by the direction of its force. Rows are frames × whiskers.
+        Shape to which each contact contributes by its covariance, where that is known, and by the
+        direction of its force as the normal of the surface. Rows are frames × whiskers.
 
     Raises
     ------
@@ -232,22 +239,22 @@ def fit_contacts(
 
 
 def contour_points(recording: xr.DataTree, whiskers: Sequence[Whisker] | None = None) -> xr.Dataset:
-    """List the contacts of all whiskers as points of a contour, laboratory frame.
+    """Contacts of all whiskers as points of a contour, laboratory frame.
 
     Parameters
     ----------
     recording : xarray.DataTree
-        With a group ``estimates``, and ``contour`` if an object was fitted.
+        Recording with a group ``estimates``, and ``contour`` if an object was fitted.
     whiskers : sequence of Whisker, optional
-        By default those of the recording.
+        Whiskers; by default those of the recording.
 
     Returns
     -------
     xarray.Dataset
-        Dim contact, by time: ``time``, ``whisker``, the contact point ``x``, ``y``, ``z`` with
-        ``sigma_x``, …, ``normal_x``, …, the point ``surface_x``, … of the object's surface, one
-        whisker radius away, and where an object was fitted ``surface_distance`` and ``inlier``;
-        the columns of `vibrissa.io.save_contour`.
+        Dataset of dimension contact, by time: ``time``, ``whisker``, the contact point ``x``,
+        ``y``, ``z`` with ``sigma_x``, …, ``normal_x``, …, the point ``surface_x``, … of the
+        object's surface, one whisker radius away, and where an object was fitted
+        ``surface_distance`` and ``inlier``; the columns of `vibrissa.io.save_contour`.
 
     Raises
     ------
@@ -307,3 +314,176 @@ def _compared(
     error = float(fit.diameter - 2.0 * true.radius)
     out["diameter_error"] = ((), error, attributes("diameter_error"))
     return out
+
+
+SIMPLE: tuple[Shape, ...] = tuple(shape for shape in get_args(Shape) if shape != "free")
+"""Shapes with few parameters."""
+
+AGREES = 4.0
+"""χ² per degree of freedom up to which contacts agree with a shape: twice their noise."""
+
+STRONG = 10.0
+"""Difference of the information criterion from which one shape is better than another."""
+
+
+def compare_shapes(
+    estimates: xr.Dataset,
+    whiskers: Sequence[Whisker],
+    *,
+    axis: ArrayLike | None = None,
+    lean: float | None = None,
+) -> xr.Dataset:
+    """Fit all simple shapes to contacts and compare them.
+
+    Parameters
+    ----------
+    estimates : xarray.Dataset
+        Dataset of `estimates_of`, dimensions time, whisker.
+    whiskers : sequence of Whisker
+        Whiskers that touched the object.
+    axis : array_like (3,), optional
+        Direction of a cylinder's axis where it is known.
+    lean : float, optional
+        Standard deviation of the lean of normals, rad, as for `fit_contacts`.
+
+    Returns
+    -------
+    xarray.Dataset
+        Dataset of dimension ``shape``: ``misfit``, χ² per degree of freedom, and ``evidence``, the
+        excess of its information criterion over that of the best, which has 0. Both are NaN for
+        shapes that cannot be fitted, and for all where the contacts' noise is not known.
+
+    Raises
+    ------
+    ValueError
+        If whiskers or lean do not fit.
+    """
+    fits: dict[str, FittedShape] = {}
+    for shape in SIMPLE:
+        known = axis if shape == "cylinder" else None
+        try:
+            fits[shape] = fit_contacts(estimates, whiskers, shape, axis=known, lean=lean)
+        except ValueError:
+            continue  # perhaps there is none of this shape
+    misfit, evidence = np.full((2, len(SIMPLE)), np.nan)
+    if fits and min(fit.equations for fit in fits.values()) > 0:
+        rows = np.all([fit.used for fit in fits.values()], axis=0)
+        for i, shape in enumerate(SIMPLE):
+            if shape in fits:
+                fit = fits[shape]
+                misfit[i] = fit.misfit
+                unknowns = int(np.linalg.matrix_rank(fit.covariance, hermitian=True))
+                evidence[i] = evidence_of(fit.chi_squared[rows], unknowns)
+        best = fits[SIMPLE[int(np.nanargmin(evidence))]]
+        together = frames_together(scores_of(best, estimates))
+        evidence = (evidence - np.nanmin(evidence)) / together
+    return xr.Dataset(
+        {
+            "misfit": ("shape", misfit, {"units": "1", "long_name": "χ² per degree of freedom"}),
+            "evidence": ("shape", evidence, {"units": "1", "long_name": "evidence against it"}),
+        },
+        {"shape": list(SIMPLE)},
+    )
+
+
+ANGLE_CLASSES = (0.0, 2.0, 5.0, 10.0, 15.0, 90.0)
+"""Edges of the classes of deflection angle, degrees."""
+
+
+def nearest_object(
+    estimates: xr.Dataset, whiskers: Sequence[Whisker], objects: Sequence[Surface]
+) -> int:
+    """Number of the object that contacts are nearest to."""
+    if not objects:
+        raise ValueError("no object is known to compare with")
+    points = Group(estimates)["contact_point"]
+    there = np.isfinite(points).all(axis=-1)
+    if not there.any():
+        raise ValueError("there are no contacts to compare with the objects")
+    radius = whisker_radii(estimates, whiskers)[there]
+    medians = [
+        np.median(np.abs(thing.signed_distance(points[there]) - radius)) for thing in objects
+    ]
+    return int(np.argmin(medians))
+
+
+def compare_contacts(
+    recording: xr.DataTree,
+    objects: Sequence[Surface] | None = None,
+    whiskers: Sequence[Whisker] | None = None,
+    seed: int = 0,
+) -> xr.Dataset:
+    """Compare the contacts of a recording with the known object that they are nearest to.
+
+    Parameters
+    ----------
+    recording : xarray.DataTree
+        Recording with a group ``estimates``.
+    objects : sequence of Surface, optional
+        Objects in the laboratory; by default those of the recording.
+    whiskers : sequence of Whisker, optional
+        Whiskers; by default those of the recording.
+    seed : int
+        Seed of the draws by the covariance.
+
+    Returns
+    -------
+    xarray.Dataset
+        Dataset of dimensions time, whisker: ``surface_distance`` and, over ``replicate`` too,
+        ``surface_distance_predicted`` (`vibrissa.contour.compare_with`), and of each contact
+        ``deflection_angle``, ``r`` and, where there are signals, ``MB``. Attribute ``object``: its
+        number.
+
+    Raises
+    ------
+    ValueError
+        If there are no estimates, no contacts or no objects.
+    """
+    estimates = estimates_in(recording)
+    trial, contacts = Recording(recording), Group(estimates)
+    known = trial.objects if objects is None else tuple(objects)
+    touching = trial.whiskers if whiskers is None else whiskers
+    number = nearest_object(estimates, touching, known)
+    spread = contacts["contact_covariance"]
+    out = compare_with(
+        known[number],
+        contacts["contact_point"],
+        spread if np.isfinite(spread).any() else None,
+        whisker_radii(estimates, touching),
+        dims=EACH,
+        coords={name: estimates[name].variable for name in EACH if name in estimates.coords},
+        seed=seed,
+    )
+    local = contacts["contact_point_whisker"]
+    angle = np.full(local.shape[:2], np.nan)
+    for k, whisker in enumerate(touching):
+        rows = np.flatnonzero(np.isfinite(local[:, k]).all(axis=1))
+        distance, arc_length = nearest_on_rest(whisker, local[rows, k])
+        angle[rows, k] = np.arctan2(distance, arc_length)
+    by = {"deflection_angle": angle, "r": np.linalg.norm(local, axis=-1)}
+    if "signals" in trial:
+        by["MB"] = trial["signals"]["MB"]
+    out = out.assign({name: (EACH, v, attributes(name)) for name, v in by.items()})
+    return out.assign_attrs(object=number)
+
+
+def distances_by_class(compared: xr.Dataset) -> dict[str, xr.Dataset]:
+    """Summarise distances from a known object by classes of deflection, distance and moment.
+
+    Parameters
+    ----------
+    compared : xarray.Dataset
+        Dataset of `compare_contacts`.
+
+    Returns
+    -------
+    dict
+        Datasets of `vibrissa.contour.distances_by`, by deflection angle, radial distance and
+        bending moment.
+    """
+    tables = {}
+    for name in ("deflection_angle", "r", "MB"):
+        if name in compared:
+            edges = np.deg2rad(ANGLE_CLASSES) if name == "deflection_angle" else None
+            tables[name] = distances_by(compared, name, compared[name].values, edges)
+    return tables

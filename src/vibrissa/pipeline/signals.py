@@ -1,50 +1,52 @@
-"""What the whisker's base feels in every frame of a recording, from whichever source there is.
+"""Base signals of every frame of a recording, from one of three sources.
 
-**The contact point** (the paper's way): the contact point that was tracked in the laboratory is
-expressed in the frame of the whisker's base, whose pose is filtered without phase shift; the
-frictionless rod that passes through it tells force and moment (`vibrissa.deflect`). Points that the
-rod cannot reach keep their frame and say why. The wrench has the covariance of the point, and of
-the pose: how far it usually is from that of the rod, where that is known.
+**The contact point** (the paper's method): the contact point that was tracked in the laboratory is
+expressed in the frame of the whisker's base, whose pose is filtered without phase shift; force and
+moment are those of the frictionless rod that passes through it (`vibrissa.deflect`). Points that
+the rod cannot reach keep their frame and have a status. A table of contact points that was given to
+the tracker has priority over the points that it found. The wrench has the covariance of the point,
+and of the pose: its usual distance from that of the rod, where that is known.
 
 **The rod**: force and moment of the rod that fits the whisker's images, with their covariance.
 
-**A sensor**: force and moment as they were read, in a simulated or a robot's recording; or what its
-channels read, if these are six or more that tell force and moment.
+**A sensor**: force and moment as they were read, in a simulated or a robot's recording; or the
+readings of its channels, if these are six or more that determine force and moment.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from vibrissa.pipeline.frames import (
     SQUARES,
     check_recording,
+    cross_matrices,
     names_of,
     needed,
     one_whisker,
     with_coordinates,
 )
-from vibrissa.pipeline.locate import FELT
-from vibrissa.pipeline.tracked_points import paper_pose, signals_by_point
+from vibrissa.pipeline.locate import DETECTED, wrench_slopes
 from vibrissa.recording import Group, Recording, recorded
-from vibrissa.rod import PROXIMAL
+from vibrissa.rod import PROXIMAL, PointContact, deflect
 from vibrissa.sensors import Sensor
 from vibrissa.status import Status
-from vibrissa.tracking import CUTOFF
-from vibrissa.whisker import Whisker
+from vibrissa.tracking import CUTOFF, BasePose, HeadPose
+from vibrissa.whisker import Whisker, angles_of
 
 Array = NDArray[np.float64]
 
 Source = Literal["contact point", "rod", "sensor"]
-"""Where signals come from."""
+"""Source of signals."""
 
 _ELSEWHERE = {"in_contact": (False,), "status": (np.int8(Status.MISSING),)}
-"""What frames without signals have instead of NaN."""
+"""Values in frames without signals where these are not NaN."""
 
 
 def signals_of(
@@ -55,33 +57,33 @@ def signals_of(
     whiskers: Sequence[Whisker] | None = None,
     proximal: float = PROXIMAL,
 ) -> xr.Dataset:
-    """Give force, moment and the six signals of every frame and whisker.
+    """Force, moment and the six signals of every frame and whisker.
 
     Parameters
     ----------
     recording : xarray.DataTree
-        Tracked, simulated or measured.
+        Recording, tracked, simulated or measured.
     source : {"contact point", "rod", "sensor"}, optional
-        See the module; by default what `default_source` finds.
+        Source of the signals; by default that of `default_source`.
     cutoff : float, optional
-        Of the low pass on the pose that the contact point is expressed in, Hz; None filters
+        Cut-off of the low pass on the pose that the contact point is expressed in, Hz; None filters
         nothing. The other sources have a pose of their own.
     whiskers : sequence of Whisker, optional
-        One for each along the dimension ``whisker``; by default those of the recording. Only the
+        Whiskers along the dimension ``whisker``; by default those of the recording. Only the
         contact point needs them.
     proximal : float
-        Contact points at less than this fraction of the length from the base get a status instead
-        of signals.
+        Smallest arc length of a contact point with signals, as a share of the length; others have a
+        status only.
 
     Returns
     -------
     xarray.Dataset
-        Dims time, whisker, space: ``force``, ``moment`` and ``Fx`` … ``MD``, whisker's frame, zero
-        without contact; ``base_position`` and ``base_rotation``, the pose that belongs to them;
-        ``in_contact`` (of a sensor whose noise is known: where M_B exceeds five standard
-        deviations), ``status``, and where known ``wrench_covariance`` and the pose's. Attributes
-        ``source``, ``cutoff`` and, of a sensor, ``noise``: standard deviations of (F, M). The group
-        ``signals`` of a recording.
+        Group ``signals`` of a recording, dimensions time, whisker, space: ``force``, ``moment`` and
+        ``Fx`` … ``MD``, whisker's frame, zero without contact; ``base_position`` and
+        ``base_rotation``, the pose that they refer to; ``in_contact`` (of a sensor whose noise is
+        known: where M_B exceeds five standard deviations), ``status``, and where known
+        ``wrench_covariance`` and the pose's. Attributes ``source``, ``cutoff`` and, of a sensor,
+        ``noise``: standard deviations of (F, M).
 
     Raises
     ------
@@ -116,21 +118,21 @@ def signals_of(
 
 
 def default_source(recording: xr.DataTree) -> Source:
-    """Say which source of signals a recording has: a sensor or else the tracked contact point.
+    """Source of signals that a recording has: a sensor or else the tracked contact point.
 
-    The rod of a tracked recording is not chosen by itself. It fits the images with a little
+    The rod of a tracked recording is never the default. It fits the images with a little
     friction, which hardly moves the contact point but is a large share of the axial force, so that
     its wrench is to be used whole, not by signals that presume no friction.
 
     Parameters
     ----------
     recording : xarray.DataTree
-        The recording.
+        Recording, tracked, simulated or measured.
 
     Returns
     -------
     str
-        The first of these that it has.
+        First of these sources that it has.
 
     Raises
     ------
@@ -138,8 +140,8 @@ def default_source(recording: xr.DataTree) -> Source:
         If it has neither.
     """
     root = recording.to_dataset()
-    felt = {"force", "moment"} <= set(root.data_vars) or "reading" in root
-    if felt and "wrench_covariance" not in root:
+    measured = {"force", "moment"} <= set(root.data_vars) or "reading" in root
+    if measured and "wrench_covariance" not in root:
         return "sensor"
     if "contact_point" in root:
         return "contact point"
@@ -168,14 +170,14 @@ def _by_sensor(root: xr.Dataset) -> xr.Dataset:
     needed(root, ("base_position", "base_rotation"), "sensor")
     if "wrench_covariance" in root:
         raise ValueError(
-            "no sensor was there: force and moment of this recording are those of the rod that "
+            "there was no sensor: force and moment of this recording are those of the rod that "
             "fits its images; take them from the source 'rod'"
         )
     force, moment = (Group(root)[name] for name in ("force", "moment"))
     known = _known(force, moment)
     least = 0.0
     if covariance is not None:
-        least = FELT * float(np.sqrt(0.5 * (covariance[4, 4] + covariance[5, 5])))
+        least = DETECTED * float(np.sqrt(0.5 * (covariance[4, 4] + covariance[5, 5])))
     touching = known & (np.hypot(moment[..., 1], moment[..., 2]) > least)
     nothing = ~force.any(axis=-1) & ~moment.any(axis=-1)
     status = np.where(nothing, int(Status.NO_CONTACT), int(Status.NOT_FELT))
@@ -191,7 +193,7 @@ def _by_sensor(root: xr.Dataset) -> xr.Dataset:
 
 
 def _own_noise(root: xr.Dataset) -> Array | None:
-    """Covariance (6, 6) of force and moment, where they say how noisy they are."""
+    """Covariance (6, 6) of force and moment, where their noise is stated."""
     deviations = np.concatenate(
         [
             np.broadcast_to(np.asarray(root[name].attrs.get("noise", np.nan), np.float64), 3)
@@ -202,7 +204,7 @@ def _own_noise(root: xr.Dataset) -> Array | None:
 
 
 def _from_channels(root: xr.Dataset) -> tuple[xr.Dataset, Array]:
-    """Force and moment, and their covariance (6, 6), from what other channels read of them."""
+    """Force and moment, and their covariance (6, 6), from readings of other channels."""
     known = Group(root)
     sensor = Sensor(
         [str(name) for name in root["channel"].values],
@@ -230,7 +232,7 @@ def _by_rod(root: xr.Dataset) -> xr.Dataset:
 
 
 def _known(force: Array, moment: Array) -> NDArray[np.bool_]:
-    """In which frames (time, whisker) force and moment are numbers."""
+    """Frames (time, whisker) in which force and moment are numbers."""
     return np.asarray(np.isfinite(force + moment).all(axis=-1))
 
 
@@ -250,12 +252,12 @@ def _labelled(
 
 
 def sensor_noise(signals: xr.Dataset) -> Array | None:
-    """Give the noise that signals say they have.
+    """Noise that is stated with signals.
 
     Parameters
     ----------
     signals : xarray.Dataset
-        Of `signals_of`, of one whisker or more.
+        Dataset of `signals_of`, of one whisker or more.
 
     Returns
     -------
@@ -270,20 +272,20 @@ def sensor_noise(signals: xr.Dataset) -> Array | None:
 
 
 def placed_by(signals: xr.Dataset, recording: xr.DataTree) -> xr.Dataset:
-    """Place what a sensor felt by the pose that was tracked in another recording of the trial.
+    """Signals of a sensor with the pose that was tracked in another recording of the trial.
 
     Parameters
     ----------
     signals : xarray.Dataset
-        Of `signals_of`, source "sensor".
+        Dataset of `signals_of`, source "sensor".
     recording : xarray.DataTree
-        Tracked, with as many whiskers in the same order.
+        Tracked recording, with as many whiskers in the same order.
 
     Returns
     -------
     xarray.Dataset
-        In the frames and with the whiskers' names of the tracked recording: of each frame the
-        signals that are nearest in time, at most half of the time between them away, with
+        Signals in the frames and with the whiskers' names of the tracked recording: of each frame
+        those that are nearest in time, at most half of the time between them away, with
         ``base_position``, ``base_rotation`` and, where known, ``pose_covariance`` as tracked.
 
     Raises
@@ -318,3 +320,139 @@ def placed_by(signals: xr.Dataset, recording: xr.DataTree) -> xr.Dataset:
     }
     pose = {name: root[name].variable for name in (*names, "pose_covariance") if name in root}
     return with_coordinates(xr.Dataset(placed).assign(pose), root, signals.attrs)
+
+
+class Pose(NamedTuple):
+    """Pose of one whisker's base, frame by frame, laboratory frame."""
+
+    rotation: Array
+    position: Array
+    covariance: Array
+
+
+def paper_pose(recording: Recording, cutoff: float | None) -> list[Pose]:
+    """Pose of each whisker's base, filtered relative to the head.
+
+    That from before the rod was fitted, or the recording's own.
+    """
+    root = recording.root
+    head = HeadPose.still(root.data.sizes["time"])
+    if "head_position" in root and "head_rotation" in root:
+        head = HeadPose(root["head_position"], root["head_rotation"])
+    rate, cutoff = _rate(root.data["time"].values, cutoff)
+    measured = recording.find("measured")
+    if measured is not None and "base_azimuth" not in measured:
+        measured = None
+    prefix = "unfiltered_"
+    if measured is None:
+        needed(root.data, ("contact_point", "base_position", "base_rotation"), "contact point")
+    elif f"{prefix}base_azimuth" not in measured:
+        if measured.data.attrs.get("cutoff", CUTOFF) != cutoff:
+            raise ValueError(
+                f"the pose of this recording is kept as it was filtered; a cut-off of {cutoff} Hz "
+                "needs the unfiltered one: track the videos again"
+            )
+        prefix, cutoff = "", None
+    poses = []
+    for k, own in enumerate(root.each_whisker()):
+        if measured is None:
+            place = own["base_position"]
+            angles = angles_of(np.swapaxes(head.rotation, 1, 2) @ own["base_rotation"]).T
+        else:
+            one = measured.whisker(k)
+            place = one[f"{prefix}base_position"]
+            names = ("azimuth", "elevation", "roll")
+            angles = np.stack([one[f"{prefix}base_{name}"] for name in names])
+        pose = BasePose(head.seen_from(place), *angles).filtered(rate, cutoff)
+        rotation, position = head.rotation @ pose.rotation, head.put_in(pose.position)
+        poses.append(Pose(rotation, position, _pose_covariance(own, rotation, position)))
+    return poses
+
+
+def _rate(time: Array, cutoff: float | None) -> tuple[float, float | None]:
+    """Frames per second, and the cut-off; a single frame is not filtered."""
+    if time.size < 2:
+        return 1.0, None
+    step = float(np.median(np.diff(time)))
+    if not step > 0.0:
+        raise ValueError(f"the times of the frames must rise; the usual step is {step} s")
+    return 1.0 / step, cutoff
+
+
+def _pose_covariance(own: Group, rotation: Array, position: Array) -> Array:
+    """Covariance (time, 6, 6) of a pose compared with that of the recording.
+
+    The recording's counts as the truth, within its own covariance: the causes of their difference
+    are hardly the same.
+    """
+    out = np.zeros((len(rotation), 6, 6))
+    if "pose_covariance" not in own:
+        return out
+    out += own["pose_covariance"]
+    turned = own["base_rotation"]
+    there = np.isfinite(turned.sum(axis=(1, 2)) + rotation.sum(axis=(1, 2)))
+    if "in_contact" in own:
+        there &= own["in_contact"]
+    if not there.any():
+        return out
+    turn = Rotation.from_matrix(rotation[there] @ np.swapaxes(turned[there], 1, 2)).as_rotvec()
+    shift = (position - own["base_position"])[there]
+    away = np.concatenate([shift, turn], axis=1)
+    return np.asarray(out + away.T @ away / len(away))
+
+
+def signals_by_point(
+    one: Group,
+    given: Array | None,
+    pose: Pose,
+    whisker: Whisker,
+    proximal: float,
+) -> xr.Dataset:
+    """Signals of the rod that passes through the tracked contact point."""
+    rotation, position = pose.rotation, pose.position
+    point = one["contact_point"]
+    tabulated = np.zeros(len(point), dtype=bool)
+    if given is not None:
+        tabulated = np.asarray(np.isfinite(given).all(axis=1))
+        point = np.where(tabulated[:, None], given, point)
+    held = np.isfinite(rotation.sum(axis=(1, 2)) + position.sum(axis=1))
+    touching = np.isfinite(point).all(axis=1)
+    if "in_contact" in one:
+        touching = tabulated | one["in_contact"]
+    local = np.einsum("tji,tj->ti", rotation, point - position)
+    bent = deflect(whisker, PointContact(local[touching]), proximal=proximal)
+    status = np.where(held, int(Status.NO_CONTACT), int(Status.MISSING))
+    status[touching] = bent.status
+    wrench = {}
+    for name, values in (("force", bent.force), ("moment", bent.moment)):
+        wrench[name] = np.where(held[:, None], 0.0, np.nan) * np.ones(3)
+        wrench[name][touching] = values
+    data = one_whisker(
+        {
+            **wrench,
+            "base_position": position,
+            "base_rotation": rotation,
+            "in_contact": touching & held,
+        },
+        status,
+    )
+    if "contact_covariance" not in one:
+        return data
+    slopes = np.zeros((len(point), 6, 3))
+    slopes[touching] = wrench_slopes(whisker, bent.arc_length, bent.contact_force)
+    slopes = slopes @ np.swapaxes(rotation, 1, 2)
+    spread = one["contact_covariance"]
+    spread = np.where(touching[:, None, None], spread, 0.0)
+    spread[tabulated] = np.nan
+    # Small errors of the base's position and rotation move the point in the whisker's frame.
+    moved = np.concatenate(
+        [-np.eye(3) + np.zeros_like(spread), cross_matrices(point - position)], 2
+    )
+    moved = np.where(touching[:, None, None], moved, 0.0)
+    both = pose.covariance @ np.swapaxes(moved, 1, 2)
+    squares = {
+        "wrench_covariance": slopes @ (spread + moved @ both) @ np.swapaxes(slopes, 1, 2),
+        "pose_covariance": pose.covariance,
+        "pose_wrench_covariance": both @ np.swapaxes(slopes, 1, 2),
+    }
+    return data.assign({name: recorded(name, square) for name, square in squares.items()})

@@ -1,7 +1,7 @@
-"""The stages one after the other: a recording in, a recording with one more group out.
+"""The stages of a recording: signals, estimates and contour, each one more group.
 
-A stage does the stages before it that are missing, and takes away what was made of the group that
-it makes anew. Nothing else of the recording is touched, and the recording given stays as it is.
+A stage makes the stages before it that are missing, and removes the later ones, which depend on it.
+Nothing else changes, and the recording that was passed stays as it is.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ STAGES = ("signals", "estimates", "contour")
 
 
 def due_stages(recording: xr.DataTree, last: str, asked: Collection[str] = ()) -> tuple[str, ...]:
-    """List the stages that have to be made so that the last one is new.
+    """Stages that have to be made so that the last one is new.
 
     Parameters
     ----------
@@ -56,21 +56,21 @@ def due_stages(recording: xr.DataTree, last: str, asked: Collection[str] = ()) -
 
 
 def with_group(recording: xr.DataTree, name: str, dataset: xr.Dataset) -> xr.DataTree:
-    """Add what a stage made to a recording.
+    """Add the group of a stage to a recording.
 
     Parameters
     ----------
     recording : xarray.DataTree
-        The recording.
+        Recording, tracked, simulated or measured.
     name : {"signals", "estimates", "contour"}
-        Of the group.
+        Name of the group.
     dataset : xarray.Dataset
-        With as many frames and whiskers as the recording.
+        Group with as many frames and whiskers as the recording.
 
     Returns
     -------
     xarray.DataTree
-        A new one; the group is replaced if there is one, and those of later stages are left out.
+        New recording; an existing group is replaced, and those of later stages are left out.
 
     Raises
     ------
@@ -103,14 +103,14 @@ def with_signals(recording: xr.DataTree, *args: Any, **options: Any) -> xr.DataT
     Parameters
     ----------
     recording : xarray.DataTree
-        Tracked, simulated or measured.
+        Recording, tracked, simulated or measured.
     *args, **options
-        Of `signals_of`.
+        Arguments of `signals_of`.
 
     Returns
     -------
     xarray.DataTree
-        With it.
+        Recording with the group.
     """
     return with_group(recording, "signals", signals_of(recording, *args, **options))
 
@@ -123,18 +123,18 @@ def with_estimates(
     Parameters
     ----------
     recording : xarray.DataTree
-        Tracked, simulated or measured.
+        Recording, tracked, simulated or measured.
     *args
-        Of `estimates_of`.
+        Arguments of `estimates_of`.
     progress : callable, optional
-        Called as ``progress(stage, done, total)``.
+        Function called as ``progress(stage, done, total)``.
     **options
-        Of `estimates_of`.
+        Arguments of `estimates_of`.
 
     Returns
     -------
     xarray.DataTree
-        With it.
+        Recording with the group.
     """
     if "signals" in due_stages(recording, "estimates"):
         recording = with_signals(recording, whiskers=options.get("whiskers"))
@@ -150,18 +150,18 @@ def with_contour(
     Parameters
     ----------
     recording : xarray.DataTree
-        Tracked, simulated or measured.
+        Recording, tracked, simulated or measured.
     *args
-        Of `reconstruct`.
+        Arguments of `reconstruct`.
     progress : callable, optional
-        Called as ``progress(stage, done, total)``.
+        Function called as ``progress(stage, done, total)``.
     **options
-        Of `reconstruct`.
+        Arguments of `reconstruct`.
 
     Returns
     -------
     xarray.DataTree
-        With it.
+        Recording with the group.
     """
     if "estimates" in due_stages(recording, "contour"):
         recording = with_estimates(recording, whiskers=options.get("whiskers"), progress=progress)

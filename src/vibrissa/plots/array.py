@@ -20,7 +20,18 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
 from vibrissa.plots.space import paint, space_axes
-from vibrissa.plots.style import INK, MUTED, Width, head, looking, new_figure, page_width, say
+from vibrissa.plots.style import (
+    INK,
+    MUTED,
+    Box,
+    Width,
+    box_axes,
+    head,
+    looking,
+    new_figure,
+    page_width,
+    sentence,
+)
 from vibrissa.quantities import axis_label, to_display
 from vibrissa.recording import Group
 from vibrissa.scene import Array, Mask, head_surfaces, is_bounded, object_surface
@@ -38,9 +49,6 @@ from behind it, where one sees the side of things that whiskers touch."""
 
 _CLEAR = 0.7
 """Opacity of objects in space, which hide what touches them from behind."""
-
-Box = tuple[float, float, float, float]
-"""Left, bottom, width and height, mm."""
 
 _PANELS = (
     # letter, title, right and up, sense of the axis to the right, axis toward the viewer
@@ -120,9 +128,7 @@ def array_views(
     scene = _scene(tree, frame, contacts)
     with looking():
         if scene is None:
-            figure = new_figure(width, 40.0, None)
-            say(figure, "no whisker")
-            return figure
+            return sentence("no whisker", width)
         return _drawn(scene, width)
 
 
@@ -137,8 +143,9 @@ def _drawn(scene: _Scene, width: Width) -> Figure:
     for letter, title, view, sense, toward in _PANELS:
         (i, j), (left, bottom) = view, places[letter]
         size = scale * np.ptp(limits, axis=1)
-        box = (left / page, bottom / height, size[i] / page, size[j] / height)
-        axes = figure.add_axes(box, xlim=limits[i][:: int(sense)], ylim=limits[j])
+        axes = box_axes(
+            figure, (left, bottom, size[i], size[j]), xlim=limits[i][:: int(sense)], ylim=limits[j]
+        )
         axes.set(xlabel=axis_label("xyz"[i]), ylabel=axis_label("xyz"[j]))
         head(axes, letter, title)
         _panel(axes, scene, limits, view, toward)

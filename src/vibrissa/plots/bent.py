@@ -22,11 +22,13 @@ from vibrissa.plots.style import (
     SHADE,
     Width,
     box_axes,
+    force_arrow,
     head,
+    limits_around,
     looking,
     new_figure,
     page_width,
-    say,
+    sentence,
 )
 from vibrissa.plots.verdicts import triplet_label
 from vibrissa.quantities import axis_label, quantity, to_display
@@ -101,9 +103,7 @@ def bent_views(
     known = np.flatnonzero(np.isfinite(lines).all(axis=(1, 2)))
     with looking():
         if not known.size:
-            figure = new_figure(width, 40.0, None)
-            say(figure, "nothing bent")
-            return figure
+            return sentence("nothing bent", width)
         extent = float(np.ptp(straight, axis=0).max())
         size = np.linalg.norm(force[known], axis=1)
         largest = float(np.nanmax(size)) if np.isfinite(size).any() else 0.0
@@ -153,10 +153,7 @@ def _limits(drawn: _Drawn, extent: float) -> Array:
     """Limits (3, 2), mm, that hold whiskers and arrows."""
     parts = (drawn.rest, drawn.lines.reshape(-1, 3), drawn.points, drawn.points - drawn.arrows)
     everything = np.concatenate(parts)
-    low, high = np.nanmin(everything, axis=0), np.nanmax(everything, axis=0)
-    middle, half = 0.5 * (low + high), 0.5 * (high - low) + 0.03 * extent
-    half = np.maximum(half, _NARROWEST * extent)
-    return np.stack([middle - half, middle + half], axis=1)
+    return limits_around(everything, 0.03 * extent, _NARROWEST * extent)
 
 
 def _views(drawn: _Drawn, limits: Array, width: Width) -> Figure:
@@ -200,18 +197,8 @@ def _draw(axes: Axes, drawn: _Drawn, j: int) -> None:
         axes.plot(line[:, 0], line[:, j], color=colour, linewidth=1.1, label=label)
         point, arrow = drawn.points[i], drawn.arrows[i]
         if np.isfinite(arrow).all():
-            axes.annotate(
-                "",
-                (point[0], point[j]),
-                (point[0] - arrow[0], point[j] - arrow[j]),
-                arrowprops={
-                    "arrowstyle": "-|>,head_width=0.16,head_length=0.35",
-                    "color": colour,
-                    "linewidth": 1.0,
-                    "shrinkA": 0.0,
-                    "shrinkB": 0.0,
-                },
-            )
+            ends = (point - arrow)[[0, j]], point[[0, j]]
+            force_arrow(axes, *ends, colour, 1.0)
         axes.plot(point[0], point[j], "o", color=colour, markersize=2.6, zorder=5)
 
 
@@ -222,9 +209,6 @@ _PAIR_ARROW = 0.22
 """Length of the longer force's arrow, as a share of the whisker's extent."""
 
 _CENTRED: dict[str, Any] = {"ha": "center", "va": "center"}
-
-_NARROW = 0.11
-"""Smallest half of an axis, as a share of the whisker's extent."""
 
 _TABLE = 70.0
 """Room of the table beside the views, mm; its height is as large where it lies below."""
@@ -269,8 +253,8 @@ def witness_pair(witness: xr.Dataset, *, width: Width = "double") -> Figure:
         figure = new_figure(width, height, None)
 
         def place(low: float, j: int) -> Axes:
-            box = (left / page, low / height, scale * span[0] / page, scale * span[j] / height)
-            axes = figure.add_axes(box, xlim=limits[0], ylim=limits[j])
+            box = (left, low, scale * span[0], scale * span[j])
+            axes = box_axes(figure, box, xlim=limits[0], ylim=limits[j])
             _draw_pair(axes, witness, j, extent)
             axes.set_ylabel(axis_label("xyz"[j]))
             few = max(3, round(scale * span[j] / 10.0))
@@ -332,10 +316,7 @@ def _pair_limits(witness: xr.Dataset, extent: float) -> Array:
     points = to_display("contact_point", witness["contact_point"].transpose(..., "space").values)
     ends = points - 1.3 * _arrows(witness, extent)  # with the letters at their tails
     everything = np.concatenate([lines.reshape(-1, 3), rest, points, ends])
-    low, high = everything.min(axis=0), everything.max(axis=0)
-    middle, half = 0.5 * (low + high), 0.5 * (high - low) + 0.03 * extent
-    half = np.maximum(half, _NARROW * extent)
-    return np.stack([middle - half, middle + half], axis=1)
+    return limits_around(everything, 0.03 * extent, _NARROWEST * extent)
 
 
 def _draw_pair(axes: Axes, witness: xr.Dataset, j: int, extent: float) -> None:
@@ -349,18 +330,7 @@ def _draw_pair(axes: Axes, witness: xr.Dataset, j: int, extent: float) -> None:
         point = to_display("contact_point", one["contact_point"].values)
         axes.plot(line[:, 0], line[:, j], color=colour, linestyle=dashes, linewidth=1.2)
         start = point - arrows[i]
-        axes.annotate(
-            "",
-            (point[0], point[j]),
-            (start[0], start[j]),
-            arrowprops={
-                "arrowstyle": "-|>,head_width=0.16,head_length=0.35",
-                "color": colour,
-                "linewidth": 1.1,
-                "shrinkA": 0.0,
-                "shrinkB": 0.0,
-            },
-        )
+        force_arrow(axes, start[[0, j]], point[[0, j]], colour, 1.1)
         axes.plot(point[0], point[j], "o", color=colour, markersize=2.6, zorder=5)
         if j == 1:
             tail = start - 0.2 * arrows[i]

@@ -10,8 +10,17 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.plots.space import Box
-from vibrissa.plots.style import GREEN, INK, ORANGE, RED, box_axes, looking, new_figure, page_width
+from vibrissa.plots.style import (
+    GREEN,
+    INK,
+    ORANGE,
+    RED,
+    Box,
+    box_axes,
+    looking,
+    new_figure,
+    page_width,
+)
 from vibrissa.scene import Array, Course
 
 Grey = NDArray[np.uint8]

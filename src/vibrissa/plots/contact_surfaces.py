@@ -14,7 +14,6 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
 from vibrissa.plots.space import (
-    Box,
     bounds,
     felt,
     name_axes,
@@ -25,7 +24,16 @@ from vibrissa.plots.space import (
     space_axes,
     square,
 )
-from vibrissa.plots.style import Width, looking, new_figure, plain, sequential
+from vibrissa.plots.style import (
+    Box,
+    Width,
+    box_axes,
+    corner_title,
+    looking,
+    new_figure,
+    plain,
+    sequential,
+)
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.scene import (
     Array,
@@ -166,22 +174,8 @@ def _sheet(width: Width) -> tuple[float, list[_Panel], list[Box]]:
     return height, panels, rails
 
 
-def _head(figure: Figure, panel: _Panel) -> None:
-    wide, tall = 25.4 * figure.get_size_inches()
-    left, bottom, _, height = panel.box
-    for text, right, weight in ((panel.letter, 1.5, "bold"), (panel.title, 5.5, "normal")):
-        figure.text(
-            (left + right) / wide,
-            (bottom + height) / tall,
-            text,
-            fontsize=8.0 if weight == "bold" else 6.5,
-            fontweight=weight,
-            va="top",
-        )
-
-
 def _contact_axes(figure: Figure, panel: _Panel, limits: Array) -> Any:
-    _head(figure, panel)
+    corner_title(figure, panel.box, panel.letter, panel.title)
     left, bottom, width, height = square(panel.box)
     zoom = 0.87 if width > 50.0 else 0.82
     axes = space_axes(figure, (left - 2.0, bottom + 1.5, width, height), limits, zoom=zoom)
@@ -190,7 +184,7 @@ def _contact_axes(figure: Figure, panel: _Panel, limits: Array) -> Any:
 
 
 def _cylinder(figure: Figure, panel: _Panel, limits: Array) -> Any:
-    _head(figure, panel)
+    corner_title(figure, panel.box, panel.letter, panel.title)
     return signal_axes(figure, panel.box, limits)
 
 
@@ -198,10 +192,8 @@ def coordinate_bar(
     figure: Figure, place: Box, name: str, norm: Normalize, marks: list[float]
 ) -> None:
     """Draw a colour bar for a coordinate."""
-    wide, tall = 25.4 * figure.get_size_inches()
-    left, bottom, width, height = place
-    rail = figure.add_axes((left / wide, bottom / tall, width / wide, height / tall))
-    upright = height > width
+    rail = box_axes(figure, place)
+    upright = place[3] > place[2]
     bar = figure.colorbar(
         ScalarMappable(norm, sequential()),
         cax=rail,

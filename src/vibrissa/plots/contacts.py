@@ -11,17 +11,17 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from vibrissa.plots.objects import Body, draw_body, draw_head, head_of, one_scale
-from vibrissa.plots.space import Box
 from vibrissa.plots.style import (
     INK,
     MUTED,
+    Box,
     Width,
     box_axes,
     head,
     looking,
     new_figure,
     plain,
-    say,
+    sentence,
     shading,
 )
 from vibrissa.quantities import axis_label, to_display
@@ -88,9 +88,7 @@ def contact_places(
     line = np.asarray(centerline, dtype=np.float64)
     with looking():
         if course.places is None or not np.isfinite(course.places).any():
-            figure = new_figure(width, 40.0, None)
-            say(figure, "no contacts")
-            return figure
+            return sentence("no contacts", width)
         rows = np.flatnonzero(np.isfinite(course.places).all(axis=1))
         own = course.at_base(course.places)[rows]
         shade = course.time[rows]

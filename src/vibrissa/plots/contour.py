@@ -35,12 +35,13 @@ from vibrissa.plots.style import (
     MUTED,
     ORANGE,
     Width,
+    box_axes,
     head,
     looking,
     new_figure,
     page_width,
     plain,
-    say,
+    sentence,
     shading,
 )
 from vibrissa.quantities import axis_label, quantity, to_display
@@ -107,9 +108,7 @@ def contour_views(
     bodies = [(body, look) for body, look in both if body is not None]
     with looking():
         if rows.size == 0:
-            figure = new_figure(width, 40.0, None)
-            say(figure, "no contacts")
-            return figure
+            return sentence("no contacts", width)
         places, shade = places[rows], None if shade is None else shade[rows]
         limits = _limits(places, bodies[0][0] if bodies else None)
         room = _BAR if shade is not None else 3.0, _TOP if bodies else 6.5
@@ -125,16 +124,11 @@ def contour_views(
         _note_outside(panels[0], places, limits)
         _legend(figure, panels, known, fitted, spread is not None)
         if shade is not None:
-            rail = figure.add_axes(_rail(figure))
+            page, height = 25.4 * figure.get_size_inches()
+            box = page - _BAR + 2.0, _BOTTOM, 2.0, 0.6 * (height - _BOTTOM - _TOP)
+            rail = box_axes(figure, box)
             plain(figure.colorbar(dots, cax=rail, label=axis_label(colour_name)))
         return figure
-
-
-def _rail(figure: Figure) -> tuple[float, float, float, float]:
-    """Where the colour bar is, as shares of the figure."""
-    page, height = figure.get_size_inches() * 25.4
-    tall = 0.6 * (height - _BOTTOM - _TOP)
-    return (page - _BAR + 2.0) / page, _BOTTOM / height, 2.0 / page, tall / height
 
 
 def _draw(
@@ -212,8 +206,8 @@ def _panels(limits: Array, width: Width, right: float, above: float) -> tuple[Fi
     panels, left = [], _LEFT
     for i, (view, title) in enumerate(zip(_VIEWS, _TITLES, strict=True)):
         wide = size * float(np.ptp(limits[view[0]]) / np.ptp(limits[view[1]]))
-        box = (left / page, _BOTTOM / height, wide / page, size / height)
-        axes = figure.add_axes(box, xlim=limits[view[0]], ylim=limits[view[1]])
+        box = (left, _BOTTOM, wide, size)
+        axes = box_axes(figure, box, xlim=limits[view[0]], ylim=limits[view[1]])
         axes.set(xlabel=axis_label(_NAMES[view[0]]), ylabel=axis_label(_NAMES[view[1]]))
         head(axes, "abc"[i], title)
         axes.locator_params(axis="x", nbins=5 if i == 0 else 3, integer=True)
@@ -316,9 +310,7 @@ def distances_by_class(summaries: Sequence[xr.Dataset], *, width: Width = "doubl
     shown = [s for s in summaries if int(s["contacts"].sum())]
     with looking():
         if not shown:
-            figure = new_figure(width, 40.0, None)
-            say(figure, "no contacts")
-            return figure
+            return sentence("no contacts", width)
         figure = new_figure(width, _HEIGHT, "constrained")
         panels = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
         for i, (axes, summary) in enumerate(zip(panels, shown, strict=True)):

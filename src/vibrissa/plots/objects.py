@@ -35,13 +35,18 @@ def draw_body(axes: Axes, body: Body, view: tuple[int, int], limits: Array, look
     nearest = _nearest(body, points, limits, 3 - i - j)
     if not 0.0 < np.mean(nearest < 0.0) < _FULL:
         return
+    _draw_zero(axes, right, up, nearest, look)
+
+
+def _draw_zero(axes: Axes, right: Array, up: Array, distance: Array, look: str) -> None:
+    """Draw where a distance is negative: filled where it is true, dashed where it is fitted."""
     if look == "true":
-        axes.contourf(right, up, nearest, [-np.inf, 0.0], colors=["#ececec"], zorder=1)
-        axes.contour(right, up, nearest, [0.0], colors=[MUTED], linewidths=0.8, zorder=1.5)
+        axes.contourf(right, up, distance, [-np.inf, 0.0], colors=["#ececec"], zorder=1)
+        axes.contour(right, up, distance, [0.0], colors=[MUTED], linewidths=0.8, zorder=1.5)
         return
     dashes: Any = [(0, (4, 2))]
     lines: dict[str, Any] = {"linewidths": 1.0, "linestyles": dashes, "zorder": 4}
-    axes.contour(right, up, nearest, [0.0], colors=[ORANGE], **lines)
+    axes.contour(right, up, distance, [0.0], colors=[ORANGE], **lines)
 
 
 def _nearest(body: Body, points: Array, limits: Array, depth: int) -> Array:
@@ -170,13 +175,13 @@ def outline(cylinder: Any, view: tuple[int, int], height: float, limits: Array) 
     i, j = view
     along = np.array([axis[i], axis[j]])
     along = along / max(float(np.linalg.norm(along)), 1e-12)
-    across = radius * np.array([-along[1], along[0]])
+    aside = radius * np.array([-along[1], along[0]])
     far = 2.0 * float(np.ptp(limits, axis=1).max()) * along
     middle = origin[[i, j]]
     # From where the axis passes nearest to the middle of the view.
     middle = middle + ((limits[[i, j]].mean(axis=1) - middle) @ along) * along
     return np.array(
-        [middle - far + across, middle + far + across, middle + far - across, middle - far - across]
+        [middle - far + aside, middle + far + aside, middle + far - aside, middle - far - aside]
     )
 
 
@@ -191,11 +196,7 @@ def draw_section(
     distance = 1e3 * np.asarray(body.signed_distance(1e-3 * points))
     if not distance.min() < 0.0 < distance.max():
         return
-    if look == "true":
-        axes.contourf(right, up, distance, [-np.inf, 0.0], colors=["#ececec"], zorder=1)
-        axes.contour(right, up, distance, [0.0], colors=[MUTED], linewidths=0.8, zorder=1.5)
-        return
-    if has_band(body):
+    if look != "true" and has_band(body):
         sigma = 1e3 * np.asarray(getattr(body, "distance_sigma")(1e-3 * points))  # noqa: B009
         sure = sigma < _UNKNOWN * np.ptp(limits[i])
         if not sure.any():
@@ -206,9 +207,7 @@ def draw_section(
         if not (np.nanmin(distance) < 0.0 < np.nanmax(distance)):
             return
         axes.contourf(right, up, within, [-np.inf, 0.0], **shade)
-    dashes: Any = [(0, (4, 2))]
-    lines: dict[str, Any] = {"linewidths": 1.0, "linestyles": dashes, "zorder": 4}
-    axes.contour(right, up, distance, [0.0], colors=[ORANGE], **lines)
+    _draw_zero(axes, right, up, distance, look)
 
 
 _PAD = np.array([7.7e-3, -9.0e-3, -4.9e-3])

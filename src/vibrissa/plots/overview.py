@@ -17,13 +17,14 @@ from vibrissa.plots.cameras import Sight, Window, part_of, scale_bar, seen, sigh
 from vibrissa.plots.contact_surfaces import COORDINATES, solid_panels
 from vibrissa.plots.estimates import against
 from vibrissa.plots.signals import intervals
-from vibrissa.plots.space import Box, signal_places
+from vibrissa.plots.space import signal_places
 from vibrissa.plots.style import (
     BLUE,
     MUTED,
     ORANGE,
     RED,
     SHADE,
+    Box,
     Width,
     box_axes,
     looking,

@@ -15,7 +15,10 @@ from numpy.typing import ArrayLike
 from vibrissa.plots.space import AZIMUTH, ELEVATION, bounds, name_axes, paint, painted, space_axes
 from vibrissa.plots.style import (
     INK,
+    Box,
     Width,
+    box_axes,
+    corner_title,
     cyclic,
     diverging,
     looking,
@@ -44,9 +47,6 @@ _SKIN = (0.80, 0.85, 0.90, 1.0)
 
 
 _TITLES = {"FD": "direction of $F_T$", "MD": "direction of $M_B$"}
-
-Box = tuple[float, float, float, float]
-"""Left, bottom, width and height, mm."""
 
 
 class _Sheet(NamedTuple):
@@ -119,7 +119,7 @@ def signal_clouds(
         figure = new_figure(width, sheet.height, None)
         _reach(figure, sheet, triangles, line, limits, view)
         for i, (name, cell) in enumerate(zip(SIGNALS, sheet.signals, strict=True)):
-            _label(figure, cell, "cdefgh"[i], _TITLES.get(name, quantity(name).long_name))
+            corner_title(figure, cell, "cdefgh"[i], _TITLES.get(name, quantity(name).long_name))
             norm, colours, ends = _scale(name, to_display(name, values_of(name, whole)))
             axes = space_axes(figure, _square(cell), limits, view, zoom=0.97, frame=False)
             body = (
@@ -177,7 +177,7 @@ def _reach(
     axes = space_axes(figure, box, limits, view, zoom=0.88)
     name_axes(axes, (-8.0, -9.0, -10.5))
     _body(axes, triangles, colours, line, 0.55)
-    _label(figure, sheet.space, "a", "reachable contacts")
+    corner_title(figure, sheet.space, "a", "reachable contacts")
     left, bottom, width, height = sheet.front
     side = min(width, height)
     box = left + 0.5 * (width - side), bottom + 0.45 * (height - side), side, side
@@ -185,7 +185,7 @@ def _reach(
     front.set_proj_type("ortho")
     _body(front, triangles, colours, line, 0.55)
     _cross(front, limits)
-    _label(figure, sheet.front, "b", "from the tip")
+    corner_title(figure, sheet.front, "b", "from the tip")
 
 
 def _body(axes: Any, triangles: Array, colours: Array, line: Array, flat: float = 0.75) -> None:
@@ -240,9 +240,8 @@ def _pulled(
     norm, colours = Normalize(0.0, float(values.max())), sequential()
     _body(axes, triangles, painted(values, norm, colours), line, 1.0)
     axes.lines[0].set_linewidth(0.7)
-    wide, tall = 25.4 * figure.get_size_inches()
     start, end = left + 0.66 * width, bottom + 0.91 * height
-    rail = figure.add_axes((start / wide, end / tall, 0.22 * width / wide, 1.0 / tall))
+    rail = box_axes(figure, (start, end, 0.22 * width, 1.0))
     bar = figure.colorbar(ScalarMappable(norm, colours), cax=rail, orientation="horizontal")
     plain(bar)
     rail.xaxis.set_ticks_position("top")
@@ -264,22 +263,6 @@ def _scale(name: str, values: Array) -> tuple[Normalize, Colormap, str]:
     return norm, diverging() if signed else sequential(), ends
 
 
-def _label(figure: Figure, cell: Box, letter: str, title: str) -> None:
-    """A bold letter and a few words at the upper left of a panel."""
-    wide, tall = 25.4 * figure.get_size_inches()
-    left, bottom, _, height = cell
-    for text, right, weight in ((letter, 1.5, "bold"), (title, 5.5, "normal")):
-        figure.text(
-            (left + right) / wide,
-            (bottom + height) / tall,
-            text,
-            fontsize=8.0 if weight == "bold" else 6.5,
-            fontweight=weight,
-            ha="left",
-            va="top",
-        )
-
-
 def _square(cell: Box) -> Box:
     """The room of a panel for its 3D axes, which are square and reach beyond it."""
     left, bottom, width, height = cell
@@ -289,10 +272,8 @@ def _square(cell: Box) -> Box:
 
 def _rail(figure: Figure, cell: Box) -> Any:
     """Axes for a colour bar at the lower end of a panel."""
-    wide, tall = 25.4 * figure.get_size_inches()
     left, bottom, width, _ = cell
-    place = ((left + 0.2 * width) / wide, (bottom + 6.8) / tall, 0.6 * width / wide, 1.5 / tall)
-    return figure.add_axes(place)
+    return box_axes(figure, (left + 0.2 * width, bottom + 6.8, 0.6 * width, 1.5))
 
 
 def _bar(

@@ -16,7 +16,7 @@ from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from vibrissa.plots.style import INK, MUTED
+from vibrissa.plots.style import INK, MUTED, Box, box_axes
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.scene import Array, root, values_of
 
@@ -29,7 +29,7 @@ _FLAT = 0.70
 
 def space_axes(
     figure: Figure,
-    box: tuple[float, float, float, float],
+    box: Box,
     limits: Array,
     view: tuple[float, float] = (ELEVATION, AZIMUTH),
     *,
@@ -38,10 +38,7 @@ def space_axes(
     aspect: tuple[float, float, float] | None = None,
 ) -> Any:
     """Add three-dimensional axes, by default to one scale."""
-    wide, tall = 25.4 * figure.get_size_inches()
-    left, bottom, width, height = box
-    place = (left / wide, bottom / tall, width / wide, height / tall)
-    axes: Any = figure.add_axes(place, projection="3d", computed_zorder=False)
+    axes: Any = box_axes(figure, box, projection="3d", computed_zorder=False)
     axes.patch.set_visible(False)
     axes.set(xlim=limits[0], ylim=limits[1], zlim=limits[2])
     axes.set_box_aspect(aspect or tuple(np.ptp(limits, axis=1)), zoom=zoom)
@@ -114,9 +111,6 @@ def _light(elevation: float, azimuth: float) -> Array:
     e, a = np.radians(elevation + 25.0), np.radians(azimuth - 30.0)
     return np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
 
-
-Box = tuple[float, float, float, float]
-"""Left, bottom, width and height, mm."""
 
 _VIEW = (16.0, -152.0)
 _ASPECT = (1.0, 1.0, 0.85)

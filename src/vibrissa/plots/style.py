@@ -31,6 +31,8 @@ from vibrissa.io import replacing
 from vibrissa.scene import Array, robust_limits
 
 Width = Literal["single", "double"]
+Box = tuple[float, float, float, float]
+"""Left, bottom, width and height, mm."""
 
 WIDTHS: Mapping[str, float] = MappingProxyType({"single": 85.0, "double": 178.0})
 """Widths of figures, mm."""
@@ -123,7 +125,7 @@ def sized_figure(
     return _StyledFigure(figsize=(width / 25.4, height / 25.4), layout=layout)
 
 
-def box_axes(figure: Figure, box: tuple[float, float, float, float], **settings: Any) -> Axes:
+def box_axes(figure: Figure, box: Box, **settings: Any) -> Axes:
     """Add a panel at a place in mm."""
     wide, tall = 25.4 * figure.get_size_inches()
     left, bottom, width, height = box
@@ -135,6 +137,13 @@ def page_width(width: Width) -> float:
     if width not in WIDTHS:
         raise ValueError(f"width is {width!r}; one of {', '.join(WIDTHS)} is needed")
     return WIDTHS[width]
+
+
+def sentence(message: str, width: Width) -> Figure:
+    """Make a figure of one sentence, where there is nothing to draw."""
+    figure = new_figure(width, 40.0, None)
+    say(figure, message)
+    return figure
 
 
 def say(figure: Figure, message: str) -> None:
@@ -156,6 +165,30 @@ def head(axes: Axes, letter: str, title: str, left: float = 0.0) -> None:
             fontsize=8.0 if look == "bold" else 7.0,
             fontweight=look,
         )
+
+
+def corner_title(figure: Figure, box: Box, letter: str, title: str) -> None:
+    """Write a bold letter and a few words at the upper left of a panel in space."""
+    wide, tall = 25.4 * figure.get_size_inches()
+    left, bottom, _, height = box
+    for text, right, size, weight in ((letter, 1.5, 8.0, "bold"), (title, 5.5, 6.5, "normal")):
+        place = (left + right) / wide, (bottom + height) / tall
+        figure.text(*place, text, fontsize=size, fontweight=weight, ha="left", va="top")
+
+
+def force_arrow(axes: Axes, start: Array, end: Array, colour: str, width: float) -> None:
+    """Draw a force (2,) as an arrow that ends where it acts."""
+    look = {"arrowstyle": "-|>,head_width=0.16,head_length=0.35", "shrinkA": 0.0, "shrinkB": 0.0}
+    axes.annotate(
+        "", tuple(end), tuple(start), arrowprops={**look, "color": colour, "linewidth": width}
+    )
+
+
+def limits_around(points: Array, margin: float, narrowest: float) -> Array:
+    """Limits (3, 2) that hold points, none so narrow that its axis could not be read."""
+    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
+    middle, half = 0.5 * (low + high), np.maximum(0.5 * (high - low) + margin, narrowest)
+    return np.stack([middle - half, middle + half], axis=1)
 
 
 def plain(bar: Colorbar) -> None:

@@ -12,7 +12,17 @@ from matplotlib.path import Path
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
-from vibrissa.plots.style import INK, MUTED, Width, looking, new_figure, page_width, say
+from vibrissa.plots.style import (
+    INK,
+    MUTED,
+    Width,
+    box_axes,
+    limits_around,
+    looking,
+    new_figure,
+    page_width,
+    sentence,
+)
 from vibrissa.quantities import axis_label, to_display
 from vibrissa.scene import Array
 
@@ -77,9 +87,7 @@ def whisker_views(
     points, radii = points[known], radii[known]
     with looking():
         if len(points) < 2:
-            figure = new_figure(width, 40.0, None)
-            say(figure, "no whisker")
-            return figure
+            return sentence("no whisker", width)
         figure, axes, magnification = _views(points, radii, magnification, width)
         _caption(axes, name, magnification, assumed)
         return figure
@@ -92,7 +100,8 @@ def _views(
     if magnification is None:
         aim = _WIDE * extent / (2.0 * max(radii.max(), 1e-9))
         magnification = max([m for m in _MAGNIFICATIONS if m <= aim], default=1)
-    limits = _limits(points, magnification * radii.max(), extent)
+    margin = magnification * radii.max() + 0.02 * extent
+    limits = limits_around(points, margin, _NARROWEST * extent)
     span = np.ptp(limits, axis=1)
     page = page_width(width)
     scale = (page - _LEFT - _RIGHT - _GAP) / (span[0] + span[2])  # mm on paper per mm
@@ -100,8 +109,8 @@ def _views(
     figure = new_figure(width, height, None)
 
     def place(left: float, bottom: float, i: int, j: int) -> Axes:
-        box = (left / page, bottom / height, scale * span[i] / page, scale * span[j] / height)
-        axes = figure.add_axes(box, xlim=limits[i], ylim=limits[j])
+        box = (left, bottom, scale * span[i], scale * span[j])
+        axes = box_axes(figure, box, xlim=limits[i], ylim=limits[j])
         outline = _tube(points[:, [i, j]], magnification * radii)
         axes.add_patch(PathPatch(outline, facecolor=INK, edgecolor="none"))
         return axes
@@ -119,14 +128,6 @@ def _views(
     for axis, ticks in ((top.yaxis, few), (end.yaxis, few), (side.yaxis, 3), (end.xaxis, 3)):
         axis.set_major_locator(MaxNLocator(ticks, integer=True))
     return figure, top, magnification
-
-
-def _limits(points: Array, margin: float, extent: float) -> Array:
-    """Limits (3, 2) of x, y and z, none so narrow that its axis could not be read."""
-    low, high = points.min(axis=0), points.max(axis=0)
-    middle, half = (low + high) / 2.0, (high - low) / 2.0 + margin + 0.02 * extent
-    half = np.maximum(half, _NARROWEST * extent)
-    return np.stack([middle - half, middle + half], axis=1)
 
 
 def _tube(places: Array, radii: Array) -> Path:

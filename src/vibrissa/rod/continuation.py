@@ -4,7 +4,7 @@ A problem is a set of three equations G(x; p) = 0. The parameters p
 move along a straight line from where the solution is known to where it is wanted; Newton's method
 corrects each step, the step is halved where it struggles and doubled where it does not. A solution
 counts only while det ∂G/∂x keeps the sign it started with: the zero is that load's fold, where the
-whisker slips off. Where no step succeeds, the state reached tells why.
+whisker slips off. Where no step succeeds, the state reached shows why.
 
 A side contact that slides to the tip goes on as a tip contact; a tip contact whose force turns
 normal to the whisker goes on along the side.
@@ -42,7 +42,7 @@ from vibrissa.status import Status
 
 POINT, SIDE, TIP = 0, 1, 2
 
-#: A force this small (EI/L²) only says where an object touches.
+#: A force this small (EI/L²) only marks where an object touches.
 LEAST_FORCE = 1e-7
 # Fractions of the path; points start within a cell of their target.
 _SMALLEST_STEP = 2.0**-12

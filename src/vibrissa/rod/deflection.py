@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 def _numbers(name: str, value: ArrayLike, vector: bool) -> Array:
-    """Return float64, (..., 3) for vectors; raise a ValueError that says what is wrong.
+    """Return float64, (..., 3) for vectors; raise a ValueError that states what is wrong.
 
     What is masked becomes NaN: it is missing.
     """
@@ -66,8 +66,8 @@ def _broadcast(**shapes: tuple[int, ...]) -> tuple[int, ...]:
     try:
         return np.broadcast_shapes(*shapes.values())
     except ValueError as error:
-        said = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
-        raise ValueError(f"leading shapes do not broadcast: {said}") from error
+        listed = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
+        raise ValueError(f"leading shapes do not broadcast: {listed}") from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,15 +81,15 @@ class PointForce:
     Parameters
     ----------
     arc_length : array_like
-        s_c from the base, m, shape (...).
+        Arc length s_c of the contact from the base, m, shape (...).
     magnitude : array_like, optional
         Size of a force normal to the whisker, N, shape (...).
     direction : array_like, optional
-        Its angle from d1 toward d2 in the deflected material frame at the contact, rad, shape
-        (...).
+        Angle of the force from d1 toward d2 in the deflected material frame at the contact, rad,
+        shape (...).
     components : tuple of array_like or array_like, optional
-        Instead: (fx, fy, fz) in that frame, N, a tuple of three or shape (..., 3); fx along the
-        tangent.
+        Force (fx, fy, fz) in that frame instead, N, a tuple of three or shape (..., 3); fx along
+        the tangent.
 
     Raises
     ------
@@ -179,17 +179,17 @@ class PegContact:
     Parameters
     ----------
     origin : array_like
-        A point of the peg's axis in the whisker frame, m, shape (..., 3).
+        Point of the peg's axis in the whisker frame, m, shape (..., 3).
     axis : array_like
         Direction of the axis, any length but zero, shape (..., 3).
     radius : array_like
         Radius, m, shape (...); 0 for a line.
     side : array_like, optional
-        Approximate direction of the force on the whisker, which tells on which side of the peg the
+        Approximate direction of the force on the whisker, which shows on which side of the peg the
         whisker lies, shape (..., 3). By default a line pushes from where the resting whisker is
         nearest to it, and a cylinder pushes the whisker out on the side that is nearest.
     start : Deflection, optional
-        An earlier deflection by a peg (the same one, elsewhere) to go on from: the contact stays on
+        Earlier deflection by a peg (the same one, elsewhere) to go on from: the contact stays on
         its side, slides and slips as the peg moves. Where it had no contact, the whisker is on the
         side of the peg where it was.
 
@@ -221,7 +221,7 @@ class PegContact:
         if (axis == 0.0).all(axis=-1).any():
             raise ValueError("a peg's axis must not be (0, 0, 0)")
         if self.side is not None and self.start is not None:
-            raise ValueError("give a PegContact either side or start: start already tells the side")
+            raise ValueError("give a PegContact either side or start: start already fixes the side")
         if self.side is not None:
             side = _directions(_numbers("side", self.side, vector=True))
             shapes["side"] = side.shape[:-1]
@@ -257,9 +257,9 @@ class Deflection:
     Attributes
     ----------
     whisker : Whisker
-        What was bent.
+        Whisker that is bent.
     load : PointForce, PointContact or PegContact
-        What bent it.
+        Load that bends it.
     force : (..., 3) array
         Force of the object on the whisker, N; zero without contact, NaN without an answer.
     moment : (..., 3) array
@@ -269,11 +269,11 @@ class Deflection:
     arc_length : (...) array
         Arc length of the contact from the base, m.
     contact_force : (..., 3) array
-        The force in the material frame at the contact (tangent, d1, d2), N.
+        Force in the material frame at the contact (tangent, d1, d2), N.
     residual : (...) array
-        How well the load's equations are met: lengths over L, directions; 0 for a PointForce.
+        Error of the load's equations: lengths over L, directions; 0 for a PointForce.
     status : (...) int array
-        A :class:`~vibrissa.Status` each.
+        :class:`~vibrissa.Status` of each load.
     steps : int
         Integration steps along the whisker.
     """
@@ -297,12 +297,12 @@ class Deflection:
         Parameters
         ----------
         n : int
-            Points along the whisker, equally spaced in arc length from base to tip.
+            Number of points along the whisker, equally spaced in arc length from base to tip.
 
         Returns
         -------
         (..., n, 3) array
-            Places, m; the resting whisker where there is no contact, NaN where there is no answer.
+            Points, m; the resting whisker where there is no contact, NaN where there is no answer.
         """
         if n < 2:
             raise ValueError(f"a centreline needs at least 2 points; got n={n}")
@@ -329,7 +329,7 @@ class Deflection:
         return places
 
     def __repr__(self) -> str:
-        """Say how many loads there are and what became of them."""
+        """Number of loads, and how many have each status."""
         return f"<{self._title()}: {counted(self.status)}>"
 
     def _repr_html_(self) -> str:
@@ -346,7 +346,7 @@ class Deflection:
         return card(self._title(), self._rows(), picture)
 
     def __str__(self) -> str:
-        """Tell the numbers as well."""
+        """Status, contact, force and moment."""
         return lines(self._title(), self._rows())
 
     def _title(self) -> str:

@@ -149,7 +149,7 @@ def _nodes(whisker: Whisker, steps: int) -> Array:
         np.interp(np.linspace(a, b, n + 1)[:-1], cumulated, s)
         for a, b, n in zip(edges[:-1], edges[1:], counts, strict=True)
     ]
-    # Kinks exactly where they are said to be, not where the table above puts them.
+    # Kinks exactly where they are stated to be, not where the table above puts them.
     for piece, kink in zip(pieces[1:], whisker.breaks, strict=True):
         piece[0] = kink / whisker.length
     return np.concatenate([*pieces, [1.0]])

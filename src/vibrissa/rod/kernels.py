@@ -258,17 +258,18 @@ def _value_step(rod: Rod, b: Array, k: int, tangents: bool) -> None:
         s = b[_ARC + i]
         h = min(max(s - start, 0.0), width)
         data = (b, piece, h * inverse_width, tangents)
-        n, q = get(b, _N, i), get(b, _Q, i)
+        n0, q0 = get(b, _N, i), get(b, _Q, i)
+        n, q = runge_kutta_step(_value_rates, data, i, -h, n0, q0)
+        put(b, _N, i, n)
+        put(b, _Q, i, q)
         if tangents:
             b[_H + i] = -h
             # The lane's contact lies in this step: its s-tangent starts here.
             if s > start and s <= start + width and b[_TIP + i] == 0.0:
-                dn, dq = _value_rates(data, 0, 1.0, i, n, q)
-                put(b, _TANGENT, i, (-dn[0], -dn[1], -dn[2]))
-                put(b, _TANGENT + 3 * LANES, i, (-dq[0], -dq[1], -dq[2]))
-        n, q = runge_kutta_step(_value_rates, data, i, -h, n, q)
-        put(b, _N, i, n)
-        put(b, _Q, i, q)
+                u = get(b, TURN, i)
+                dq = cross(u, q0)
+                put(b, _TANGENT, i, cross(u, n0))
+                put(b, _TANGENT + 3 * LANES, i, (dq[0] + piece[3], dq[1], dq[2]))
 
 
 @inlined

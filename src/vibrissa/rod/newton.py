@@ -6,7 +6,7 @@ thousand: three or four evaluations of the rod, no derivatives. What that does n
 Newton steps in ξ. The exact Jacobian costs four times the values, so it is computed again only
 where the last one has stopped serving (a chord step that reduces the residual less than tenfold).
 
-An *equation* tells what must vanish: an inlined function
+An *equation* states what must vanish: an inlined function
 
     equation(value (6,), tangents (6, 3), wanted, target, residual (3,), jacobian (3, 3)) -> misfit
 

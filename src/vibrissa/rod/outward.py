@@ -77,12 +77,13 @@ def _rates(
 
 
 @inlined
-def _step(b: Array, piece: Piece, width: float, begin: float, loaded: bool, keep: bool) -> None:
-    """Take each lane's step, which begins at a distance ``begin`` in a step of the rod."""
-    load = 1.0 if loaded else 0.0
+def _step(
+    b: Array, piece: Piece, width: float, low: float, high: float, load: float, keep: bool
+) -> None:
+    """Take each lane's step: under load from ``low`` in a step of the rod, free up to ``high``."""
     for i in range(LANES):
         h = b[_H + i]
-        at = begin if loaded else begin - h
+        at = low if load > 0.0 else high - h
         data = (b, piece, at / width, h / width, load, keep)
         n, m = runge_kutta_step(_rates, data, i, h, get(b, _N, i), get(b, _N + 3 * LANES, i))
         put(b, _N, i, n)
@@ -142,17 +143,15 @@ def _shapes(
                 if here >= end - 1e-15:
                     break
                 to = min(end, s[wanted]) if extent > 0.0 and wanted < s.shape[0] else end
-                most = least = 0.0
-                for i in range(LANES):
-                    h = min(max(arc[min(row + i, last - 1)] - here, 0.0), to - here)
-                    b[_H + i] = h
-                    most, least = max(most, h), max(least, to - here - h)
-                if most > _NOTHING:
-                    _step(b, piece, rod.width[k], here - rod.start[k], True, True)
-                if least > _NOTHING:
+                low, high = here - rod.start[k], to - rod.start[k]
+                for load in (1.0, 0.0):
+                    longest = 0.0
                     for i in range(LANES):
-                        b[_H + i] = to - here - b[_H + i]
-                    _step(b, piece, rod.width[k], to - rod.start[k], False, True)
+                        loaded = min(max(arc[min(row + i, last - 1)] - here, 0.0), to - here)
+                        b[_H + i] = loaded if load > 0.0 else to - here - loaded
+                        longest = max(longest, b[_H + i])
+                    if longest > _NOTHING:
+                        _step(b, piece, rod.width[k], low, high, load, True)
                 here = to
         while wanted < s.shape[0]:
             for i in range(lanes):
@@ -170,7 +169,7 @@ def _contact_forces(rod: Rod, values: Array, arc: Array, forces: Array) -> None:
             for i in range(LANES):
                 left = arc[min(row + i, forces.shape[0] - 1)] - rod.start[k]
                 b[_H + i] = min(max(left, 0.0), rod.width[k])
-            _step(b, piece_of(rod, k), rod.width[k], 0.0, True, False)
+            _step(b, piece_of(rod, k), rod.width[k], 0.0, 0.0, 1.0, False)
         for i in range(min(LANES, forces.shape[0] - row)):
             n = get(b, _N, i)
             forces[row + i, 0], forces[row + i, 1], forces[row + i, 2] = n[0], n[1], n[2]

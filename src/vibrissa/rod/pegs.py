@@ -80,7 +80,7 @@ def nearest_side(rest: Rest, pegs: Pegs, outward: bool) -> Array:
     direction = away[rows, nearest]
     length = np.einsum("ni,ni->n", tangent, tangent)
     along = np.einsum("ni,ni->n", direction, tangent) / np.where(length > 0.0, length, 1.0)
-    # The nearest place lies beside the nearest sample, unless the axis lies beyond an end.
+    # The nearest point is next to the nearest sample, unless the axis lies beyond an end.
     beyond_tip = (nearest == rest.s.size - 1) & (along < 0.0)
     beyond_base = (nearest == 0) & (along > 0.0)
     along = np.where(beyond_tip | beyond_base, 0.0, along)

@@ -40,7 +40,7 @@ from vibrissa.status import Status
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
 
-# A point without a seed is unreachable, and the nearest face of the chart tells why. This near to
+# A point without a seed is unreachable, and the nearest face of the chart shows why. This near to
 # a face (over L) it is approached from inside instead, in case the interpolant misjudges; and this
 # near to the resting whisker, where bearings have no meaning and there may be no seed, from there.
 _NEAR = 0.01
@@ -404,7 +404,7 @@ class PointSolver:
 
 
 def _drop_unanswered(out: Solutions, rows: IntArray) -> None:
-    """Leave no contact where the status says that there is none."""
+    """Leave no contact where the status is that of none."""
     lost = rows[out.statuses[rows] != Status.OK]
     out.contacts[lost], out.values[lost] = np.nan, np.nan
 

@@ -1,6 +1,6 @@
 """Seeds: where in the chart three quantities have given values, by the cells' interpolants.
 
-The tree (:mod:`vibrissa.rod.tree`) tells which cells may hold a target. In each the interpolant
+The tree (:mod:`vibrissa.rod.tree`) shows which cells may hold a target. In each the interpolant
 is inverted by Newton's method, which gives seeds so near the exact solution that it converges at
 once.
 
@@ -299,7 +299,7 @@ def _invert(b: Array, half: Array, work: Array, careful: bool, x: Array) -> int:
         for a in range(3):
             step[a] = (rows[a, 0] * m0 + rows[a, 1] * m1 + rows[a, 2] * m2) / det
         size = max(abs(step[0]), abs(step[1]), abs(step[2]))
-        if n == 0 and not careful:  # nearly linear: the first step tells which cell it is in
+        if n == 0 and not careful:  # nearly linear: the first step shows which cell it is in
             reach = max(
                 abs(x[0] - step[0] - 0.5), abs(x[1] - step[1] - 0.5), abs(x[2] - step[2] - 0.5)
             )

@@ -43,21 +43,22 @@ def deflect(
     Parameters
     ----------
     whisker : Whisker
-        What is bent.
+        Whisker to be bent.
     load : PointForce, PointContact or PegContact
-        What bends it; arrays of any leading shape.
+        Load that bends it; arrays of any leading shape.
     proximal : float
-        Contacts at less than this fraction of the length from the base get a status instead of an
-        answer (not for a ``PointForce``).
+        Smallest arc length of a contact, over L; nearer ones get a status instead of an answer (not
+        for a ``PointForce``).
     steps : int
-        Integration steps along the whisker. The default is good to 1e-6 while the tangent turns by
-        less than about 65°, and to 1e-4 up to slip-off; the error falls with the sixth power. A
-        ``PointForce`` that bends the whisker further gets as many more as it needs for 1e-4.
+        Number of integration steps along the whisker. The default is good to 1e-6 while the tangent
+        turns by less than about 65°, and to 1e-4 up to slip-off; the error falls with the sixth
+        power. A ``PointForce`` that bends the whisker further gets as many more as it needs for
+        1e-4.
 
     Returns
     -------
     Deflection
-        The stable equilibrium that is connected to rest, for each contact, or the reason why there
+        Stable equilibrium that is connected to rest, for each contact, or the reason why there
         is none; the one equilibrium of each ``PointForce``.
 
     Raises

@@ -6,7 +6,7 @@ to placement; between two of them the contact is followed on the stable branch o
 branch that ends (the equations' determinant vanishes) or a force that would have to pull ends the
 contact: the whisker then rests, free, or against whatever stands where it would rest. The first
 surface that a free whisker meets holds it until that contact ends; others are passed through (and
-can be told by the distance of the bent whisker from them).
+can be recognised by the distance of the bent whisker from them).
 
 Where the whisker would rest inside a surface from the very beginning, or after it slipped, it lies
 against the side of it that is nearest: it is brought there, in thought and without friction, from
@@ -37,7 +37,7 @@ from vibrissa.status import Status
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
 
-# A det below this share of that at the start says that the branch was near its end.
+# A det below this share of that at the start means that the branch was near its end.
 _NEAR_FOLD = 0.5
 # A contact that is only about right enters a surface by no more than this, over L.
 _TOUCHING = 1e-5
@@ -210,7 +210,7 @@ class _Resting:
         spacing = (self.s[1] - self.s[0]) * self._length
         if abs(least) > spacing:
             return least, at
-        # Between samples it may be nearer, beside an edge much nearer.
+        # Between samples it may be nearer, near an edge much nearer.
         inner = np.concatenate([[np.inf], gap, [np.inf]])
         dips = (inner[1:-1] <= inner[:-2]) & (inner[1:-1] <= inner[2:])
         for dip in np.flatnonzero(dips & (gap < least + 0.5 * spacing)).tolist():
@@ -413,8 +413,8 @@ class _Follower:
             allowed |= surface != touch.surface
             contact, value = touch.contact, touch.state[:6]
             gap, s, point = self._bent_gap(surface, place, contact, value, allowed)
-            beside = surface == touch.surface and abs(s - touch.contact[0]) < 1.3 * _ELSEWHERE
-            if gap > 0.0 or beside:
+            same_touch = surface == touch.surface and abs(s - touch.contact[0]) < 1.3 * _ELSEWHERE
+            if gap > 0.0 or same_touch:
                 continue
             # Held out at the point where it is deepest, and again where it then is, nearby.
             allowed = np.abs(self._rest.s - s) < _ELSEWHERE

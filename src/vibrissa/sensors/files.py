@@ -29,9 +29,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from vibrissa.io import number_array, quoted, read_toml, replacing
+from vibrissa.io import (
+    check_keys,
+    number_array,
+    one_number,
+    quoted,
+    read_toml,
+    replacing,
+    subtable,
+    three_numbers,
+)
 from vibrissa.sensors.frame import SensorFrame
 from vibrissa.sensors.sensor import Sensor
 
@@ -43,98 +51,69 @@ _WEIGHT = {"mass", "moment"}
 
 
 def load_sensor(path: str | PathLike[str]) -> Sensor:
-    """Read a sensor.
+    """Sensor of a file.
 
     Parameters
     ----------
     path : str or path
-        TOML file.
+        Path of the TOML file.
 
     Returns
     -------
     Sensor
-        As it says.
+        Sensor that the file describes.
 
     Raises
     ------
     FileNotFoundError
         If there is no such file.
     ValueError
-        If it is no TOML, has unknown keys, or describes no sensor.
+        If it is not TOML, has unknown keys, or does not describe a sensor.
     """
     path = Path(path)
-    said = read_toml(path)
+    table = read_toml(path)
     try:
-        return _described(said)
+        return _described(table)
     except ValueError as error:
         raise ValueError(f"{path} describes no sensor: {error}") from error
 
 
-def _described(said: dict[str, Any]) -> Sensor:
-    """The sensor that a file describes."""
-    frame, weight = _table(said, "frame"), _table(said, "weight")
-    _only(said, _TOP, "the file")
-    _only(frame, _FRAME, "[frame]")
-    _only(weight, _WEIGHT, "[weight]")
-    how: dict[str, Any] = {}
-    if "channels" in said:
-        names = said["channels"]
+def _described(table: dict[str, Any]) -> Sensor:
+    """Sensor that a file describes."""
+    frame, weight = subtable(table, "frame"), subtable(table, "weight")
+    check_keys(table, _TOP, "the file")
+    check_keys(frame, _FRAME, "[frame]")
+    check_keys(weight, _WEIGHT, "[weight]")
+    values: dict[str, Any] = {}
+    if "channels" in table:
+        names = table["channels"]
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise ValueError(f"channels is {quoted(names)}; a list of names is needed")
-        how["channels"] = names
+        values["channels"] = names
     for name in ("mixing", *_NUMBERS, *_OTHERS):
-        if name in said:
-            how[name] = number_array(said[name], name)
-    if "relative_noise" in said:
-        how["relative_noise"] = _one(said["relative_noise"], "relative_noise")
+        if name in table:
+            values[name] = number_array(table[name], name)
+    if "relative_noise" in table:
+        values["relative_noise"] = one_number(table, "relative_noise", 0.0)
     reaction = frame.get("reaction", False)
     if not isinstance(reaction, bool):
         raise ValueError(f"reaction is {quoted(reaction)}; true or false is needed")
     sensor = Sensor(
-        **how,
+        **values,
         frame=SensorFrame(
             axes=_axes(frame.get("axes", ["x", "y", "z"])),
-            position=_three(frame.get("position", [0.0, 0.0, 0.0]), "position"),
+            position=three_numbers(frame, "position", [0.0, 0.0, 0.0]),
             reaction=reaction,
         ),
-        mass=_one(weight.get("mass", 0.0), "mass"),
-        mass_moment=_three(weight.get("moment", [0.0, 0.0, 0.0]), "moment"),
+        mass=one_number(weight, "mass", 0.0),
+        mass_moment=three_numbers(weight, "moment", [0.0, 0.0, 0.0]),
     )
-    if "noise" not in said:
+    if "noise" not in table:
         raise ValueError(
             "noise is needed: the standard deviation of each channel, in its unit, or one "
-            "number for all; what is felt and how surely depends on it"
+            "number for all; which contacts are detected and with what uncertainty depends on it"
         )
     return sensor
-
-
-def _table(said: dict[str, Any], name: str) -> dict[str, Any]:
-    table = said.get(name, {})
-    if not isinstance(table, dict):
-        raise ValueError(f"{name} is {quoted(table)}; it is written as a table, [{name}]")
-    return table
-
-
-def _only(table: dict[str, Any], known: set[str], where: str) -> None:
-    unknown = sorted(set(table) - known)
-    if unknown:
-        raise ValueError(
-            f"{where} has {', '.join(unknown)}; it may have {', '.join(sorted(known))}"
-        )
-
-
-def _one(value: Any, name: str) -> float:
-    array = number_array(value, name)
-    if array.ndim:
-        raise ValueError(f"{name} is {quoted(value)}; one number is needed")
-    return float(array)
-
-
-def _three(value: Any, name: str) -> NDArray[np.float64]:
-    array = number_array(value, name)
-    if array.shape != (3,):
-        raise ValueError(f"{name} is {quoted(value)}; three numbers are needed")
-    return array
 
 
 def _axes(value: Any) -> Any:
@@ -154,9 +133,9 @@ def save_sensor(path: str | PathLike[str], sensor: Sensor) -> None:
     Parameters
     ----------
     path : str or path
-        Where to write; an existing file is replaced.
+        Path to write to; an existing file is replaced.
     sensor : Sensor
-        Which.
+        Sensor to write.
     """
     lines = [f"channels = [{', '.join(_text(name) for name in sensor.channels)}]"]
     lines.append(f"mixing = {_array(sensor.mixing)}")

@@ -1,4 +1,4 @@
-"""How a sensor sits at the whisker: its axes, their handedness, its origin, and what it counts.
+"""A sensor's frame at the whisker: axes, handedness, origin and sign, and its calibration.
 
 With the sensor's axes as the columns of Q, in the whisker's frame, and its origin at o,
 
@@ -7,6 +7,10 @@ With the sensor's axes as the columns of Q, in the whisker's frame, and its orig
 where σ = -1 for a sensor that reports the force with which it holds the whisker, instead of that of
 the object on the whisker. Axes that form a left hand have det Q = -1, and moments that follow the
 left hand: M_s = x_s × F_s in the sensor's own numbers.
+
+Known loads determine a frame: forces give P = σQ, by the rotation or reflection that fits them
+best; moments then follow P or -P, which distinguishes a left hand or a reaction from their
+opposites; and the rest of the moments gives the origin. All six unknowns are then fitted together.
 """
 
 from __future__ import annotations
@@ -16,28 +20,32 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from vibrissa.sensors.least_squares import solve, warn_of_misfit
 
 Array = NDArray[np.float64]
 
-# Axes that were typed with four digits are brought to right angles; worse ones are refused.
 _ORTHOGONAL = 1e-3
+"""Stretch up to which axes, typed with few digits, are brought to right angles."""
 
 
 @dataclass(frozen=True, eq=False)
 class SensorFrame:
-    """Where a sensor sits, relative to the whisker's frame at its base.
+    """A sensor's frame relative to the whisker's frame at its base.
 
     Parameters
     ----------
     axes : array_like (3, 3) or sequence of str
-        The sensor's axes as columns, in the whisker's frame; or where its x, y and z point to, as
-        signed names: ``("x", "-z", "y")``. A left hand is allowed.
+        Axes of the sensor as columns, in the whisker's frame; or the directions of its x, y and z
+        as signed names: ``("x", "-z", "y")``. A left hand is allowed.
     position : array_like (3,)
-        The point about which the sensor takes moments, whisker's frame, m.
+        Point about which the sensor's moments are, whisker's frame, m.
     reaction : bool
-        Whether the sensor reports the force that it exerts on the whisker, not the one that it
-        feels: all six components then have the other sign.
+        Whether the sensor reports the force that it exerts on the whisker, not the one on itself:
+        all six components then have the other sign.
 
     Raises
     ------
@@ -70,12 +78,12 @@ class SensorFrame:
         return 1 if np.linalg.det(self.axes) > 0.0 else -1
 
     def to_base(self) -> Array:
-        """Return the matrix (6, 6) from the sensor's (F, M) to that at the whisker's base.
+        """Matrix from the sensor's (F, M) to that at the whisker's base.
 
         Returns
         -------
         array (6, 6)
-            SI units.
+            Matrix, SI units.
         """
         sign = -1.0 if self.reaction else 1.0
         force = sign * self.axes
@@ -85,12 +93,12 @@ class SensorFrame:
         return out
 
     def from_base(self) -> Array:
-        """Return the matrix (6, 6) from (F, M) at the whisker's base to the sensor's.
+        """Matrix from (F, M) at the whisker's base to the sensor's.
 
         Returns
         -------
         array (6, 6)
-            SI units.
+            Matrix, SI units.
         """
         return np.asarray(np.linalg.inv(self.to_base()))
 
@@ -104,19 +112,19 @@ def cross_matrix(a: Array) -> Array:
     return out
 
 
-def _axes(given: Any) -> Array:
-    if isinstance(given, str):
-        given = given.replace(",", " ").split()
-    if isinstance(given, Sequence) and all(isinstance(name, str) for name in given):
-        return _named_axes(given)
-    axes = np.array(given, dtype=np.float64)
+def _axes(value: Any) -> Array:
+    if isinstance(value, str):
+        value = value.replace(",", " ").split()
+    if isinstance(value, Sequence) and all(isinstance(name, str) for name in value):
+        return _named_axes(value)
+    axes = np.array(value, dtype=np.float64)
     if axes.shape != (3, 3) or not np.isfinite(axes).all():
-        raise ValueError(f"a sensor's axes are three columns of three numbers; got {given!r}")
+        raise ValueError(f"a sensor's axes are three columns of three numbers; got {value!r}")
     u, size, v = np.linalg.svd(axes)
     if np.abs(size - 1.0).max() > _ORTHOGONAL:
         raise ValueError(
             "a sensor's axes are of unit length and at right angles to each other; the stretches "
-            f"of those given are {', '.join(f'{s:.4g}' for s in size)}, not 1"
+            f"of these are {', '.join(f'{s:.4g}' for s in size)}, not 1"
         )
     return np.asarray(u @ v)
 
@@ -131,3 +139,155 @@ def _named_axes(names: Sequence[str]) -> Array:
     for column, (name, letter) in enumerate(zip(names, letters, strict=True)):
         axes["xyz".index(letter), column] = -1.0 if name.startswith("-") else 1.0
     return axes
+
+
+_ADVICE = "apply forces in at least two directions, at two places or more"
+_CLEARLY = 2.0
+"""Ratio of the residuals of two signs of the moments from which the better one is chosen."""
+
+_GAIN = 2.0
+"""Ratio of forces to loads from which they are in another unit, or have an offset."""
+
+_ALONG, _FLAT = 1e-4, 1e-6
+"""Shares of the largest spread of forces below which they are on a line, or in a plane."""
+
+
+@dataclass(frozen=True, eq=False)
+class FrameCalibration:
+    """A sensor's frame as determined by known loads.
+
+    Attributes
+    ----------
+    frame : SensorFrame
+        Frame of the sensor.
+    covariance : (6, 6) array
+        Covariance of a small rotation of the axes (about x, y, z of the whisker's frame, rad) and
+        of the origin (m).
+    force_residual, moment_residual : float
+        Root mean square residual of a component, N and N·m.
+    misfit : float
+        χ² per degree of freedom: near 1, unless noise, loads or gain are not as stated.
+    """
+
+    frame: SensorFrame
+    covariance: Array
+    force_residual: float
+    moment_residual: float
+    misfit: float
+
+
+def calibrate_frame(
+    readings: ArrayLike,
+    wrenches: ArrayLike,
+    *,
+    force_noise: float,
+    moment_noise: float,
+) -> FrameCalibration:
+    """Find the frame of a six-component sensor from known loads.
+
+    Parameters
+    ----------
+    readings : array_like (n, 6)
+        Readings (F, M) in the sensor's frame, without offset, N and N·m.
+    wrenches : array_like (n, 6)
+        Loads: (F, M) at the whisker's base, whisker's frame.
+    force_noise, moment_noise : float
+        Standard deviations of the readings' components, N and N·m.
+
+    Returns
+    -------
+    FrameCalibration
+        Frame with its uncertainty.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit, readings are in other units, or the loads do not determine the frame.
+
+    Warns
+    -----
+    UserWarning
+        If residuals are more than five times the noise.
+    """
+    read, true = np.asarray(readings, dtype=np.float64), np.asarray(wrenches, dtype=np.float64)
+    if read.ndim != 2 or read.shape[1:] != (6,) or read.shape != true.shape:
+        raise ValueError(f"readings and wrenches (n, 6) are needed; got {read.shape}, {true.shape}")
+    if not (force_noise > 0.0 and moment_noise > 0.0):
+        raise ValueError(f"noises are positive; got {force_noise} N and {moment_noise} N·m")
+    known = np.isfinite(read).all(axis=1) & np.isfinite(true).all(axis=1)
+    read, true = read[known], true[known]
+    _check_units(read, true)
+    force = _matched(read[:, :3], true[:, :3])
+    options = [_placed(read, true, force, hand) for hand in (1, -1)]
+    left = [option[1] for option in options]
+    if max(left) < _CLEARLY * max(min(left), moment_noise):
+        raise ValueError(
+            "the moments fit a right-handed sensor as well as a left-handed one: " + _ADVICE
+        )
+    hand = 1 if left[0] < left[1] else -1
+    position = options[0 if hand == 1 else 1][0]
+    sign = hand * round(float(np.linalg.det(force)))
+    noise = np.repeat([force_noise, moment_noise], 3)
+
+    def frame(unknowns: Array) -> SensorFrame:
+        turn = Rotation.from_rotvec(unknowns[:3]).as_matrix()
+        return SensorFrame(turn @ (sign * force), unknowns[3:], reaction=sign < 0)
+
+    def residuals(unknowns: Array) -> Array:
+        return np.asarray(((read - true @ frame(unknowns).from_base().T) / noise).ravel())
+
+    # The lever arm's scale, so that both kinds of unknowns count alike.
+    scale = max(float(np.linalg.norm(position)), moment_noise / force_noise)
+    fit = least_squares(
+        residuals,
+        np.concatenate([np.zeros(3), position]),
+        x_scale=[1.0] * 3 + [scale] * 3,
+        method="lm",
+    )
+    misfit = float((fit.fun**2).sum() / max(fit.fun.size - 6, 1))
+    warn_of_misfit(misfit, "the loads and where they pull, their signs, offset and units")
+    rows = fit.fun.reshape(-1, 6) * noise
+    jacobian = np.asarray(fit.jac, dtype=np.float64)
+    spread = np.asarray(np.linalg.inv(jacobian.T @ jacobian), dtype=np.float64)
+    return FrameCalibration(
+        frame(fit.x),
+        spread,
+        float(np.sqrt((rows[:, :3] ** 2).mean())),
+        float(np.sqrt((rows[:, 3:] ** 2).mean())),
+        misfit,
+    )
+
+
+def _check_units(read: Array, true: Array) -> None:
+    """Refuse forces of another size than the loads: a frame turns and does not stretch."""
+    loads = float(np.linalg.norm(true[:, :3]))
+    gain = float(np.linalg.norm(read[:, :3])) / loads if loads > 0.0 else 1.0
+    if not 1.0 / _GAIN < gain < _GAIN:
+        raise ValueError(
+            f"the forces read are {gain:.3g} times the loads: readings are needed in N and N·m, "
+            "without offset"
+        )
+
+
+def _matched(read: Array, true: Array) -> Array:
+    """The rotation or reflection P for which P read comes nearest to true."""
+    u, size, v = np.linalg.svd(true.T @ read)
+    if not size[0] > 0.0 or size[1] < _ALONG * size[0]:
+        raise ValueError(
+            "all forces are along one line, so the turn about it is not determined: " + _ADVICE
+        )
+    if size[2] < _FLAT * size[0]:
+        raise ValueError(
+            "all forces are in one plane, so left and right hand cannot be distinguished: apply "
+            "forces in three directions"
+        )
+    return np.asarray(u @ v)
+
+
+def _placed(read: Array, true: Array, force: Array, hand: int) -> tuple[Array, float]:
+    """Origin and root mean square residual of the moments, for moments that follow ±P."""
+    arms = -cross_matrix(true[:, :3]).reshape(-1, 3)  # o × F = -F × o
+    rest = (true[:, 3:] - hand * read[:, 3:] @ force.T).reshape(-1)
+    size = np.abs(arms).max()
+    origin = solve(arms / size, rest / size, ("x", "y", "z of the origin"), _ADVICE)
+    return origin.unknowns, float(np.sqrt((origin.residuals**2).mean()) * size)

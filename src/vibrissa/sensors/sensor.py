@@ -1,8 +1,8 @@
-"""A force and torque sensor at the base: what it reads, and how wrongly.
+"""A force and torque sensor at the base: its readings and their errors.
 
 A sensor has channels, each a linear mix of the six components (F_x, F_y, F_z, M_x, M_y, M_z):
 
-    reading = round((1 + g)(1 + ε)(A w) + b + d(t) + n),    at most ± the largest it can say,
+    reading = round((1 + g)(1 + ε)(A w) + b + d(t) + n),    at most ± the largest reading,
 
 with the mixing A, an error of gain g and noise ε relative to the signal, a bias b, a drift d that
 is a random walk, white noise n, and rounding to the channel's resolution. The usual sensor has the
@@ -12,11 +12,15 @@ w is in the sensor's own frame: H = A X⁻¹ mixes the wrench at the whisker's b
 :class:`~vibrissa.sensors.SensorFrame`. To the contact's wrench comes the weight of what the sensor
 carries: (m g, m c × g) for its mass m with its centre at c, g as seen from the base.
 
-The same description serves both ways: :meth:`Sensor.read` simulates, :meth:`Sensor.felt` takes
-offset and weight away, and :meth:`Sensor.to_wrench` returns to force and moment at the base.
+The same description serves in both directions: :meth:`Sensor.read` simulates,
+:meth:`Sensor.compensated` removes offset and weight, and :meth:`Sensor.to_wrench` returns to force
+and moment at the base.
 
-Noise differs from reading to reading. Errors of gain, of the mixing and of what a calibration has
-found are the same in all of them (:mod:`~vibrissa.sensors.errors`), and averaging leaves them.
+Noise differs from reading to reading. Errors of gain, of the mixing and of a calibration are the
+same in all of them, and averaging leaves them: a channel with the stated mix a w + b and the true
+one (a + δa) w + b + δb has the error (δa, δb) (w, 1) in every reading of the wrench w. Such errors
+are written as independent ones of standard deviation one, each a matrix E (k, 7) with the errors
+ε E (w, 1) of the k channels; so the covariance of readings gets Σ E (w, 1) (w, 1)ᵀ Eᵀ.
 """
 
 from __future__ import annotations
@@ -29,13 +33,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.sensors.errors import (
-    by_calibration,
-    by_gain,
-    by_mixing,
-    checked_covariance,
-    with_offset,
-)
 from vibrissa.sensors.frame import SensorFrame
 
 Array = NDArray[np.float64]
@@ -47,28 +44,34 @@ MOMENT_NOISE = 0.02e-6
 """Standard deviation of a component of the measured moment, N·m."""
 
 COMPONENTS = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
-"""What a mix is made of, in this order."""
+"""Components that are mixed, in this order."""
 
 GRAVITY = (0.0, 0.0, -9.80665)
 """Acceleration of a falling body in the laboratory frame, m/s²."""
 
-# A combination of components that is read this much weaker than the others is not read.
 _UNREAD = 1e-9
+"""Relative size below which a combination of components is not read."""
+
+_ROUNDING = 1e-12
+"""Size below which eigenvalues of a matrix of correlations are rounding."""
+
+_INDEFINITE = 1e-9
+"""Size from which asymmetries and negative eigenvalues of correlations are faults."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """What a sensor at the base reads.
+    """A force and torque sensor at the base of a whisker.
 
     Quantities of channels are numbers for all of them or one number each, in the channel's unit:
-    that of the component it reads (N, N·m), or what the mixing makes of those.
+    that of the component it reads (N, N·m), or the unit by its mixing.
 
     Parameters
     ----------
     channels : sequence of str
-        Their names. Without a mixing, which components are read.
+        Names of the channels. Without a mixing, the components that are read.
     mixing : array_like (k, 6), optional
-        What each of the k channels reads of (Fx, Fy, Fz, Mx, My, Mz). Of channels that are
+        Weights of each of the k channels for (Fx, Fy, Fz, Mx, My, Mz). Of channels that are
         components, numbers for all or one each are enough: 1e3 for mN and mN·m (= N·mm).
     noise : array_like, optional
         Standard deviation of white noise; by default that of `FORCE_NOISE` and `MOMENT_NOISE` in
@@ -80,8 +83,8 @@ class Sensor:
     resolution : array_like
         Readings are rounded to multiples of this; 0 for none.
     largest : array_like
-        Size of the largest reading; one that has come to it is saturated, and tells nothing.
-        Infinite, the default, for none.
+        Size of the largest reading; one that has reached it is saturated and missing. Infinite,
+        the default, for none.
     relative_noise : float
         Standard deviation of white noise relative to the signal.
     gain_error : array_like
@@ -93,13 +96,13 @@ class Sensor:
         of a moment, so that cross-talk among forces and among moments is part of it.
     mixing_covariance : array_like (k, 7, 7), optional
         Covariance of each channel's mixing of the six components and, last, its offset, as a
-        calibration leaves it; besides the two stated errors.
+        calibration leaves it; in addition to the two stated errors.
     frame : SensorFrame
-        How it sits at the whisker; by default its frame is the whisker's.
+        Frame of the sensor; by default the whisker's.
     mass : float
-        Of what it carries, kg: its weight is in the readings.
+        Mass that it carries, kg, whose weight is in the readings.
     mass_moment : array_like (3,)
-        That mass times the place of its centre, in the whisker's frame, kg·m.
+        First moment of that mass, mass times centre, in the whisker's frame, kg·m.
 
     Raises
     ------
@@ -131,66 +134,35 @@ class Sensor:
 
     def __post_init__(self) -> None:
         """Check, and give every channel its numbers."""
-        faults = []
         names = tuple(self.channels)
+        faults: list[str] = []
         if not names or len(set(names)) != len(names):
             faults.append(f"channels are {names}; different names, at least one, are needed")
-        given = np.array(1.0 if self.mixing is None else self.mixing, dtype=np.float64)
-        if given.ndim < 2:
-            unknown = [name for name in names if name not in COMPONENTS]
-            if unknown:
-                known = ", ".join(COMPONENTS)
-                faults.append(f"channels {unknown} are none of {known}, so mixing (k, 6) is needed")
-            rows = [[float(name == component) for component in COMPONENTS] for name in names]
-            if given.shape not in ((), (len(names),)):
-                faults.append(f"mixing has shape {given.shape}; one number a channel is needed")
-                given = np.ones(())
-            given = given[..., None] * np.array(rows).reshape(-1, 6)
-        mixing = given
-        if mixing.shape != (len(names), 6) or not np.isfinite(mixing).all():
-            faults.append(f"mixing has shape {mixing.shape}; finite ({len(names)}, 6) is needed")
-        usual = np.repeat([FORCE_NOISE, MOMENT_NOISE], 3)
-        numbers = {"mixing": mixing, "channels": names}
-        for name in ("noise", "bias", "drift", "resolution", "largest", "gain_error"):
-            value = getattr(self, name)
-            if value is None and mixing.shape == (len(names), 6):
-                value = np.sqrt(mixing**2 @ usual**2)
-            array = np.asarray(value, dtype=np.float64)
-            finite = np.isfinite(array) | ((name == "largest") & (array == np.inf))
-            if array.shape not in ((), (len(names),)):
-                faults.append(f"{name} has shape {array.shape}; () or ({len(names)},) is needed")
-            elif not finite.all():
-                faults.append(f"{name} is {array.tolist()}; it must be finite")
-            elif name == "largest" and not (array > 0.0).all():
-                faults.append(f"{name} is {array.tolist()}; it must be positive")
-            elif name != "bias" and (array < 0.0).any():
-                faults.append(f"{name} is {array.tolist()}; it must not be negative")
-            else:
-                numbers[name] = np.broadcast_to(array, (len(names),))
-        share = float(self.relative_noise)
-        if not (np.isfinite(share) and share >= 0.0):
-            faults.append(f"relative_noise is {share!r}; it must not be negative")
-        error = np.asarray(self.mixing_error, dtype=np.float64)
+        mixing = _checked_mixing(names, self.mixing, faults)
+        values: dict[str, Any] = {"channels": names, "mixing": mixing}
+        values |= _checked_numbers(self, mixing, len(names), faults)
+        values["mixing_error"] = np.asarray(self.mixing_error, dtype=np.float64)
+        values["mixing_covariance"], fault = _checked_covariance(self.mixing_covariance, len(names))
+        faults += fault
+        error, moment = values["mixing_error"], np.asarray(self.mass_moment, dtype=np.float64)
         if error.shape not in ((), (len(names), 6)):
             faults.append(
                 f"mixing_error has shape {error.shape}; () or ({len(names)}, 6) is needed"
             )
         elif not (np.isfinite(error) & (error >= 0.0)).all():
             faults.append(f"mixing_error is {error.tolist()}; it must be finite and not negative")
-        numbers["mixing_error"] = error
-        numbers["mixing_covariance"], fault = checked_covariance(self.mixing_covariance, len(names))
-        faults += fault
-        moment = np.asarray(self.mass_moment, dtype=np.float64)
+        for name in ("relative_noise", "mass"):
+            number = getattr(self, name)
+            if not (np.isfinite(number) and number >= 0.0):
+                faults.append(f"{name} is {number!r}; it must not be negative")
         if moment.shape != (3,) or not np.isfinite(moment).all():
             faults.append(f"mass_moment is {self.mass_moment!r}; three numbers, kg·m, are needed")
-        numbers["mass_moment"] = moment
-        if not (np.isfinite(self.mass) and self.mass >= 0.0):
-            faults.append(f"mass is {self.mass!r}; it must not be negative")
+        values["mass_moment"] = moment
         if not isinstance(self.frame, SensorFrame):
             faults.append(f"frame is {self.frame!r}; a SensorFrame is needed")
         if faults:
             raise ValueError("no sensor: " + "; ".join(faults))
-        for name, value in numbers.items():
+        for name, value in values.items():
             object.__setattr__(self, name, value)
 
     @property
@@ -200,7 +172,7 @@ class Sensor:
 
     @cached_property
     def base_mixing(self) -> Array:
-        """What the channels read of (F, M) at the whisker's base, H (k, 6)."""
+        """Mixing H (k, 6) of (F, M) at the whisker's base."""
         plain = (self.frame.to_base() == np.eye(6)).all()
         return np.asarray(self.mixing if plain else self.mixing @ self.frame.from_base())
 
@@ -210,12 +182,12 @@ class Sensor:
         Parameters
         ----------
         reading : array_like (k,)
-            What the relative noise is relative to.
+            Reading that the relative noise is relative to.
 
         Returns
         -------
         array (k, k)
-            Diagonal; drift is not in it, nor are the `common_errors`.
+            Diagonal covariance; drift is not in it, nor are the `common_errors`.
         """
         relative = self.relative_noise * np.asarray(reading, dtype=np.float64)
         variance = self.noise**2 + self.resolution**2 / 12.0 + relative**2
@@ -230,9 +202,9 @@ class Sensor:
         """
         own = np.concatenate(
             [
-                by_gain(self.mixing, self.gain_error),
-                by_mixing(self.mixing, self.mixing_error),
-                by_calibration(self.mixing_covariance),
+                _by_gain(self.mixing, self.gain_error),
+                _by_mixing(self.mixing, self.mixing_error),
+                _by_calibration(self.mixing_covariance),
             ]
         )
         if len(own):
@@ -240,19 +212,19 @@ class Sensor:
         return own
 
     def with_new_offset(self, readings: int, bias: ArrayLike | None = None) -> Sensor:
-        """Give the same sensor with an offset that was found as the mean of so many readings.
+        """Same sensor with an offset that was found as the mean of so many readings.
 
         Parameters
         ----------
         readings : int
-            How many.
+            Number of readings.
         bias : array_like (k,), optional
-            The offset; by default as it is.
+            New offset; by default the present one.
 
         Returns
         -------
         Sensor
-            Whose `mixing_covariance` has the offset's new variance, by the noise.
+            Sensor whose `mixing_covariance` has the offset's new variance, by the noise.
         """
         variance = np.diag(self.covariance()) / readings
         return replace(
@@ -267,40 +239,41 @@ class Sensor:
         Parameters
         ----------
         rotation : array_like (..., 3, 3)
-            From the whisker's to the laboratory frame.
+            Rotation from the whisker's to the laboratory frame.
         gravity : array_like (3,)
-            In the laboratory frame, m/s².
+            Acceleration in the laboratory frame, m/s².
 
         Returns
         -------
         array (..., 6)
-            (F, M), whisker's frame, N and N·m.
+            Wrench (F, M), whisker's frame, N and N·m.
         """
         turned = np.asarray(rotation, dtype=np.float64)
         g = np.asarray(gravity, dtype=np.float64) @ turned
         return np.concatenate([self.mass * g, np.cross(self.mass_moment, g)], axis=-1)
 
-    def felt(
+    def compensated(
         self,
         readings: ArrayLike,
         rotation: ArrayLike | None = None,
         gravity: ArrayLike = GRAVITY,
     ) -> Array:
-        """Take offset and weight away: what is left is H (F, M) of the contact, and noise.
+        """Readings without offset and weight: H (F, M) of the contact, and noise.
 
         Parameters
         ----------
         readings : array_like (..., k)
-            The channels.
+            Readings of the channels.
         rotation : array_like (..., 3, 3), optional
-            From the whisker's to the laboratory frame; needed where the sensor carries a mass.
+            Rotation from the whisker's to the laboratory frame; needed where the sensor carries a
+            mass.
         gravity : array_like (3,)
-            In the laboratory frame, m/s².
+            Acceleration in the laboratory frame, m/s².
 
         Returns
         -------
         array (..., k)
-            In the units of the channels; NaN for what is saturated.
+            Readings in the units of the channels; NaN for what is saturated.
 
         Raises
         ------
@@ -319,7 +292,7 @@ class Sensor:
         if rotation is None:
             raise ValueError(
                 "the sensor carries a mass, so the rotation from whisker to laboratory is needed "
-                "to take its weight away"
+                "to remove its weight"
             )
         return np.asarray(values - self.weight(rotation, gravity) @ self.base_mixing.T)
 
@@ -329,39 +302,40 @@ class Sensor:
         rotation: ArrayLike | None = None,
         gravity: ArrayLike = GRAVITY,
     ) -> tuple[Array, Array]:
-        """Return to force and moment at the whisker's base, weighted by the noise.
+        """Force and moment at the whisker's base, weighted by the noise.
 
         Parameters
         ----------
         readings : array_like (..., k)
-            The channels, six or more.
+            Readings of the channels, six or more.
         rotation : array_like (..., 3, 3), optional
-            From the whisker's to the laboratory frame; needed where the sensor carries a mass.
+            Rotation from the whisker's to the laboratory frame; needed where the sensor carries a
+            mass.
         gravity : array_like (3,)
-            In the laboratory frame, m/s².
+            Acceleration in the laboratory frame, m/s².
 
         Returns
         -------
         wrench : array (..., 6)
-            (F, M), whisker's frame, N and N·m.
+            Wrench (F, M), whisker's frame, N and N·m.
         covariance : array (6, 6)
-            Of its noise; the `common_errors` are not in it.
+            Covariance of its noise; the `common_errors` are not in it.
 
         Raises
         ------
         ValueError
-            If the channels do not tell all six components.
+            If the channels do not determine all six components.
         """
         h, noise = self.base_mixing, np.sqrt(np.diag(self.covariance()))
         weight = 1.0 / np.where(noise > 0.0, noise, 1.0)
         size = np.linalg.norm(h, axis=0)
         if h.shape[0] < 6 or np.linalg.cond(h / np.where(size > 0.0, size, 1.0)) > 1.0 / _UNREAD:
             raise ValueError(
-                f"the channels {', '.join(self.channels)} do not tell all six components of force "
-                "and moment: estimate from the channels themselves"
+                f"the channels {', '.join(self.channels)} do not determine all six components of "
+                "force and moment: estimate from the channels themselves"
             )
         back = np.linalg.pinv(weight[:, None] * h) * weight
-        wrench = self.felt(readings, rotation, gravity) @ back.T
+        wrench = self.compensated(readings, rotation, gravity) @ back.T
         return np.asarray(wrench), np.asarray(back @ self.covariance() @ back.T)
 
     def read(
@@ -371,23 +345,24 @@ class Sensor:
         seed: int = 0,
         rotation: ArrayLike | None = None,
     ) -> Array:
-        """Read a wrench over time.
+        """Readings of a wrench over time.
 
         Parameters
         ----------
         time : array_like (n,)
-            Of the samples, s; it must not fall.
+            Times of the samples, s, not falling.
         wrench : array_like (n, 6)
             Force, N, and moment, N·m, at the whisker's base; NaN gives NaN.
         seed : int
-            Of all that is random.
+            Seed of all that is random.
         rotation : array_like (n, 3, 3), optional
-            From the whisker's to the laboratory frame; needed where the sensor carries a mass.
+            Rotation from the whisker's to the laboratory frame; needed where the sensor carries a
+            mass.
 
         Returns
         -------
         array (n, k)
-            The channels.
+            Readings of the channels.
 
         Raises
         ------
@@ -426,9 +401,114 @@ class Sensor:
         return np.asarray(np.clip(reading, -self.largest, self.largest))
 
 
+def _checked_mixing(names: tuple[str, ...], mixing: Any, faults: list[str]) -> Array:
+    """Mixing (k, 6) of channels; what is wrong is added to the faults."""
+    array = np.array(1.0 if mixing is None else mixing, dtype=np.float64)
+    if array.ndim < 2:
+        unknown = [name for name in names if name not in COMPONENTS]
+        if unknown:
+            known = ", ".join(COMPONENTS)
+            faults.append(f"channels {unknown} are none of {known}, so mixing (k, 6) is needed")
+        rows = [[float(name == component) for component in COMPONENTS] for name in names]
+        if array.shape not in ((), (len(names),)):
+            faults.append(f"mixing has shape {array.shape}; one number a channel is needed")
+            array = np.ones(())
+        array = array[..., None] * np.array(rows).reshape(-1, 6)
+    if array.shape != (len(names), 6) or not np.isfinite(array).all():
+        faults.append(f"mixing has shape {array.shape}; finite ({len(names)}, 6) is needed")
+    return np.asarray(array)
+
+
+def _checked_numbers(
+    sensor: Sensor, mixing: Array, channels: int, faults: list[str]
+) -> dict[str, Array]:
+    """Numbers of each channel; what is wrong is added to the faults."""
+    usual = np.repeat([FORCE_NOISE, MOMENT_NOISE], 3)
+    numbers = {}
+    for name in ("noise", "bias", "drift", "resolution", "largest", "gain_error"):
+        value = getattr(sensor, name)
+        if value is None and mixing.shape == (channels, 6):
+            value = np.sqrt(mixing**2 @ usual**2)
+        array = np.asarray(value, dtype=np.float64)
+        finite = np.isfinite(array) | ((name == "largest") & (array == np.inf))
+        if array.shape not in ((), (channels,)):
+            faults.append(f"{name} has shape {array.shape}; () or ({channels},) is needed")
+        elif not finite.all():
+            faults.append(f"{name} is {array.tolist()}; it must be finite")
+        elif name == "largest" and not (array > 0.0).all():
+            faults.append(f"{name} is {array.tolist()}; it must be positive")
+        elif name != "bias" and (array < 0.0).any():
+            faults.append(f"{name} is {array.tolist()}; it must not be negative")
+        else:
+            numbers[name] = np.broadcast_to(array, (channels,))
+    return numbers
+
+
 def _first_fault(time: Array) -> str:
-    """Say where times fall or are not finite."""
+    """Text of where times fall or are not finite."""
     bad = ~np.isfinite(time)
     bad[1:] |= np.diff(time) < 0.0
     i = int(bad.argmax())
-    return f"{time[i]} s" + (f" after {time[i - 1]} s" if i else "") + f" in place {i}"
+    return f"{time[i]} s" + (f" after {time[i - 1]} s" if i else "") + f" at index {i}"
+
+
+def _by_gain(mixing: Array, sigma: Array) -> Array:
+    """Errors of gain."""
+    which = np.flatnonzero(sigma > 0.0)
+    out = np.zeros((which.size, len(mixing), 7))
+    out[range(which.size), which, :6] = sigma[which, None] * mixing[which]
+    return out
+
+
+def _by_mixing(mixing: Array, sigma: Array) -> Array:
+    """Errors of the mixing."""
+    if sigma.ndim == 0:
+        largest = np.abs(mixing.reshape(-1, 2, 3)).max(axis=2)
+        sigma = sigma * np.repeat(largest, 3, axis=1)
+    channel, component = np.nonzero(sigma)
+    out = np.zeros((channel.size, len(mixing), 7))
+    out[range(channel.size), channel, component] = sigma[channel, component]
+    return out
+
+
+def _by_calibration(covariance: Array) -> Array:
+    """Errors of the results of a calibration."""
+    found = [np.zeros((0, len(covariance), 7))]
+    for channel, own in enumerate(covariance):
+        size = np.sqrt(np.diag(own))
+        size = np.where(size > 0.0, size, 1.0)
+        values, axes = np.linalg.eigh(own / np.outer(size, size))
+        kept = values > _ROUNDING
+        errors = np.zeros((int(kept.sum()), len(covariance), 7))
+        errors[:, channel] = (axes[:, kept] * np.sqrt(values[kept])).T * size
+        found.append(errors)
+    return np.concatenate(found)
+
+
+def with_offset(covariance: Array, variance: Array) -> Array:
+    """Covariance of mixing and offset once the offset was found anew, by itself."""
+    out = covariance.copy()
+    out[:, 6, :] = out[:, :, 6] = 0.0
+    out[:, 6, 6] = variance
+    return out
+
+
+def _checked_covariance(value: Any, channels: int) -> tuple[Array, list[str]]:
+    """Check covariances of mixing and offset."""
+    shape = (channels, 7, 7)
+    if value is None:
+        return np.zeros(shape), []
+    covariance = np.asarray(value, dtype=np.float64)
+    if covariance.shape != shape or not np.isfinite(covariance).all():
+        return covariance, [
+            f"mixing_covariance has shape {covariance.shape}; finite {shape} is needed"
+        ]
+    variances = np.diagonal(covariance, axis1=1, axis2=2)
+    size = np.sqrt(np.where(variances > 0.0, variances, 1.0))
+    correlation = covariance / (size[:, :, None] * size[:, None, :])
+    if not np.allclose(correlation, np.swapaxes(correlation, 1, 2), rtol=0.0, atol=_INDEFINITE):
+        return covariance, ["mixing_covariance is not symmetric"]
+    least = float(np.linalg.eigvalsh(correlation).min(initial=0.0))
+    if (variances < 0.0).any() or least < -_INDEFINITE:
+        return covariance, ["mixing_covariance has negative eigenvalues, so it is not a covariance"]
+    return covariance, []

@@ -1,15 +1,15 @@
-"""Modulus and base radius from measured loads, and what of them loads can tell.
+"""Modulus and base radius from measured loads, as far as loads determine them.
 
 For contacts at known points on the centreline the shape does not depend on how stiff the whisker
 is: force and moment are proportional to EI = E π r⁴ / 4 at the base (the twisting stiffness follows
-by Poisson's ratio, the others by the taper). So loads tell EI, and nothing tells E from r⁴ but
-another measurement: a radius under the microscope, or a modulus from a data sheet. Given the
+by Poisson's ratio, the others by the taper). So loads determine EI, and only another measurement
+separates E from r⁴: a radius under the microscope, or a modulus from a data sheet. Given the
 uncertainties of both before, log E and log r are moved along their line
 
     log E + 4 log r = log(4 EI / π)
 
-as Bayes' rule says. How the stiffness falls toward the tip loads do tell, if contacts lie at
-several places along the whisker: the taper can be fitted too.
+by Bayes' rule. Loads do determine how the stiffness falls toward the tip, if contacts are at
+several positions along the whisker: the taper can be fitted too.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
 
-from vibrissa.sensors.contacts import wrenches_of_contacts
-from vibrissa.sensors.misfit import warn_of_misfit, warn_of_surprise
+from vibrissa.sensors.least_squares import warn_of_misfit, warn_of_surprise
+from vibrissa.sensors.mixing import wrenches_of_contacts
 from vibrissa.sensors.sensor import Sensor
 
 if TYPE_CHECKING:
@@ -31,33 +31,38 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-# A taper whose logarithm is known no better than this is not determined.
 _OPEN = 2.0
+"""Standard deviation of the logarithm of a taper from which it is not determined."""
+
 _SLIM, _WIDE = 0.01, 2.0
+"""Bounds of a fitted taper."""
+
+_TYPICAL_NOISE = 0.01
+"""Noise of channels that state none, as a share of the size of their readings."""
 
 
 @dataclass(frozen=True, eq=False)
 class StiffnessFit:
-    """A whisker as loads make it out; standard deviations are relative.
+    """A whisker's stiffness as determined by loads; standard deviations are relative.
 
     Attributes
     ----------
     whisker : Whisker
-        With the modulus, radius and taper that were found.
+        Whisker with the modulus, radius and taper that were found.
     stiffness : float
-        EI at the base, N·m².
+        Bending stiffness EI at the base, N·m².
     stiffness_sigma : float
-        Of it.
+        Standard deviation of the stiffness.
     modulus, radius : float
-        E, Pa, and base radius, m.
+        Young's modulus, Pa, and base radius, m.
     modulus_sigma, radius_sigma : float
-        Of these; infinite prior uncertainty of both leaves both infinite.
+        Standard deviations of these; infinite if both were unknown before.
     covariance : (2, 2) array
-        Of (log E, log r): strongly correlated, as 1 log E + 4 log r is what the loads tell.
+        Covariance of (log E, log r): strongly correlated, as loads determine log E + 4 log r.
     taper, taper_sigma : float
         Tip radius over base radius; the deviation is 0 where it was not fitted.
     misfit : float
-        χ² over its degrees of freedom; where larger than 1 the deviations are scaled up by its
+        χ² per degree of freedom; where larger than 1 the deviations are scaled up by its
         root.
     """
 
@@ -89,14 +94,15 @@ def fit_stiffness(
     Parameters
     ----------
     whisker : Whisker
-        As it is thought to be: shape, modulus, radius.
+        Whisker with the stated shape, modulus and radius.
     points : array_like (n, 3)
         Contact points on the centreline, whisker's frame, m; without friction.
     readings : array_like (n, k)
-        Of the sensor's channels there, offset and weight taken away (`Sensor.felt`).
+        Readings of the sensor's channels, without offset and weight (`Sensor.compensated`).
     sensor : Sensor, optional
-        Its mixing and noise; by default (F, M) at the base with the usual noise. It must not have
-        been calibrated on contacts of this whisker: that makes the stiffness part of the mix.
+        Sensor with mixing and noise; by default (F, M) at the base with the usual noise. It must
+        not have been calibrated on contacts of this whisker: that makes the stiffness part of the
+        mix.
     modulus_sigma, radius_sigma : float
         Relative standard deviations of the whisker's modulus and radius before: ``inf`` for
         unknown, 0 for exact. At least one must be finite.
@@ -106,12 +112,12 @@ def fit_stiffness(
     Returns
     -------
     StiffnessFit
-        With uncertainties.
+        Stiffness with its uncertainty.
 
     Raises
     ------
     ValueError
-        If shapes do not fit, nothing is felt, or what is asked for is not determined.
+        If shapes do not fit, nothing is measured, or what is asked for is not determined.
 
     Warns
     -----
@@ -121,29 +127,32 @@ def fit_stiffness(
     """
     sensor = sensor or Sensor()
     y = np.asarray(readings, dtype=np.float64)
-    places = np.asarray(points, dtype=np.float64)
-    if y.shape != (len(places), len(sensor.channels)):
-        raise ValueError(f"readings are ({len(places)}, {len(sensor.channels)}); got {y.shape}")
+    contacts = np.asarray(points, dtype=np.float64)
+    if y.shape != (len(contacts), len(sensor.channels)):
+        raise ValueError(f"readings are ({len(contacts)}, {len(sensor.channels)}); got {y.shape}")
     if modulus_sigma < 0.0 or radius_sigma < 0.0 or np.isinf([modulus_sigma, radius_sigma]).all():
         raise ValueError(
-            "loads tell E r⁴ only: modulus_sigma or radius_sigma must be finite, none negative; "
+            "loads determine E r⁴ only: modulus_sigma or radius_sigma must be finite, none "
+            "negative; "
             f"got {modulus_sigma} and {radius_sigma}"
         )
-    known = np.isfinite(y).all(axis=1) & np.isfinite(places).all(axis=1)
-    y, places = y[known], places[known]
+    known = np.isfinite(y).all(axis=1) & np.isfinite(contacts).all(axis=1)
+    y, contacts = y[known], contacts[known]
     noise = np.sqrt(np.diag(sensor.covariance()))
     size = np.sqrt((y**2).mean(axis=0)) if len(y) else noise
-    noise = np.where(noise > 0.0, noise, 0.01 * np.where(size > 0.0, size, 1.0))
+    noise = np.where(noise > 0.0, noise, _TYPICAL_NOISE * np.where(size > 0.0, size, 1.0))
 
     def modelled(ratio: float) -> Array:
-        return wrenches_of_contacts(_tapered(whisker, ratio), places) @ sensor.base_mixing.T / noise
+        return (
+            wrenches_of_contacts(_tapered(whisker, ratio), contacts) @ sensor.base_mixing.T / noise
+        )
 
     ratio = whisker.tip_radius / whisker.base_radius
     scaled = y / noise
     if not len(y) or not (modelled(ratio) * scaled).sum() > 0.0:
         raise ValueError(
             "the readings do not grow with the loads: check the sensor's axes, sign (`reaction`) "
-            "and offset, or nothing is felt"
+            "and offset, or nothing is measured"
         )
     ratio, factor, spread, left = _fitted(modelled, scaled, ratio, taper)
     degrees = y.size - (2 if taper else 1)
@@ -159,7 +168,7 @@ def fit_stiffness(
             "the contacts do not determine the taper: touch the whisker nearer to the tip as well"
         )
     sigma = float(np.sqrt(spread[0, 0]))
-    shift, covariance = _told_apart(np.log(factor), sigma, modulus_sigma, radius_sigma)
+    shift, covariance = _separated(np.log(factor), sigma, modulus_sigma, radius_sigma)
     modulus = whisker.youngs_modulus * float(np.exp(shift[0]))
     growth = float(np.exp(shift[1]))
     shaped = _tapered(whisker, ratio).scaled(radius_factor=growth)
@@ -215,10 +224,10 @@ def _fitted(
     return float(np.exp(log_ratio)), float(np.exp(log_factor)), inverse, found.fun
 
 
-def _told_apart(
+def _separated(
     log_factor: float, sigma: float, modulus_sigma: float, radius_sigma: float
 ) -> tuple[Array, Array]:
-    """How far (log E, log r) move for log E + 4 log r to grow so much, and their covariance."""
+    """Shift of (log E, log r) by which log E + 4 log r grows so much, and their covariance."""
     by = np.array([1.0, 4.0])
     if np.isinf(modulus_sigma) or np.isinf(radius_sigma):
         # One is free: the other keeps its value and uncertainty, and it takes up the rest.

@@ -1,4 +1,4 @@
-"""Offset, and weight of what a sensor carries, from readings while nothing is touched.
+"""Offset of a sensor, and the weight that it carries, from readings without contact.
 
     y = b + H (m g, μ × g),
 
@@ -13,19 +13,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.sensors.errors import with_offset
 from vibrissa.sensors.frame import cross_matrix
-from vibrissa.sensors.linear import Solution, solve
-from vibrissa.sensors.misfit import warn_of_misfit
-from vibrissa.sensors.sensor import GRAVITY, Sensor
+from vibrissa.sensors.least_squares import Solution, solve, warn_of_misfit
+from vibrissa.sensors.sensor import GRAVITY, Sensor, with_offset
 
 Array = NDArray[np.float64]
-AnyArray = NDArray[np.bool_]
+Mask = NDArray[np.bool_]
 
-# No sensor of a whisker carries as much, kg.
 _HEAVY = 5.0
-# A mass so many standard deviations below zero is no noise.
+"""Mass that no sensor of a whisker carries, kg."""
+
 _SURELY = 4.0
+"""Standard deviations below zero at which a mass is not noise."""
+
+_IDLE = 1e-12
+"""Share of the largest effect on a channel below which an unknown has none."""
 
 _ADVICE = (
     "hold the whisker free in more orientations, at least three that differ in how the weight pulls"
@@ -35,19 +37,19 @@ _MASS = ("the mass", "its moment along x", "along y", "along z")
 
 @dataclass(frozen=True, eq=False)
 class WeightCalibration:
-    """What free poses tell.
+    """Offset and weight as determined by free poses.
 
     Attributes
     ----------
     sensor : Sensor
-        With offset, and where orientations were given mass and its moment.
+        Sensor with offset, and where orientations were given mass and its moment.
     covariance : (k + 4, k + 4) array
-        Of the offsets, the mass (kg) and its moment (kg·m); zero for what was not asked or has no
-        effect on these channels.
+        Covariance of the offsets, the mass (kg) and its moment (kg·m); zero for what was not asked
+        or has no effect on these channels.
     residual : (k,) array
-        RMS of what is left in each channel.
+        Root mean square residual of each channel.
     misfit : float
-        χ² over its degrees of freedom: near 1, unless the noise or something else is not as stated.
+        χ² per degree of freedom: near 1, unless the noise or something else is not as stated.
     """
 
     sensor: Sensor
@@ -67,25 +69,25 @@ def calibrate_weight(
     Parameters
     ----------
     sensor : Sensor
-        Whose mixing and frame are known; its noise weighs the channels.
+        Sensor whose mixing and frame are known; its noise weighs the channels.
     readings : array_like (n, k)
-        While nothing is touched; rows with NaN or a saturated channel are left out.
+        Readings without contact; rows with NaN or a saturated channel are left out.
     rotations : array_like (n, 3, 3), optional
-        From the whisker's to the laboratory frame. Without them only the offset is found, for this
-        one orientation: the weight is part of it.
+        Rotations from the whisker's to the laboratory frame. Without them only the offset is found,
+        for this one orientation: the weight is part of it.
     gravity : array_like (3,)
-        In the laboratory frame, m/s².
+        Acceleration in the laboratory frame, m/s².
 
     Returns
     -------
     WeightCalibration
-        The sensor with offset and weight.
+        Sensor with offset and weight.
 
     Raises
     ------
     ValueError
-        If shapes do not fit, the orientations do not tell weight from offset, or the weight comes
-        out negative.
+        If shapes do not fit, the orientations do not separate weight from offset, or the weight is
+        negative.
 
     Warns
     -----
@@ -108,13 +110,15 @@ def calibrate_weight(
     if turn.shape != (n, 3, 3):
         raise ValueError(f"{n} readings need as many rotations (3, 3); got {turn.shape}")
     design = _design(sensor, turn[known], np.asarray(gravity, dtype=np.float64))
-    # What no orientation makes felt is left at zero; what others would must be felt here.
+    # What has no effect in any orientation is left at zero; what has must be determined here.
     every = np.array([np.eye(3), *np.eye(3)[[[1, 2, 0], [2, 0, 1]]]])
     every = np.concatenate([every, -every, every[:, ::-1]])
     possible = _design(sensor, every, np.asarray(gravity, dtype=np.float64))[:, :, k:]
     effect = np.abs(possible).max(axis=(0, 1))
-    felt = np.concatenate([np.ones(k, bool), effect > 1e-12 * max(float(effect.max()), 1e-300)])
-    found, unknowns, covariance = _solved(sensor, design, y, noise, felt)
+    effective = np.concatenate(
+        [np.ones(k, bool), effect > _IDLE * max(float(effect.max()), 1e-300)]
+    )
+    found, unknowns, covariance = _solved(sensor, design, y, noise, effective)
     if unknowns[k] < 0.0:
         sigma = float(np.sqrt(covariance[k, k]))
         if unknowns[k] < -_SURELY * sigma:
@@ -123,8 +127,8 @@ def calibrate_weight(
                 "reports a reaction (`reaction` of its frame), has other axes, or gravity or the "
                 "rotations point the other way"
             )
-        felt[k] = False  # nothing that can be weighed
-        found, unknowns, covariance = _solved(sensor, design, y, noise, felt)
+        effective[k] = False  # too light to be weighed
+        found, unknowns, covariance = _solved(sensor, design, y, noise, effective)
     calibrated = replace(
         sensor,
         bias=unknowns[:k],
@@ -139,7 +143,7 @@ def calibrate_weight(
             stacklevel=2,
         )
     left = found.residuals.reshape(-1, k) * noise
-    misfit = float((found.residuals**2).sum() / max(found.residuals.size - felt.sum(), 1))
+    misfit = float((found.residuals**2).sum() / max(found.residuals.size - effective.sum(), 1))
     warn_of_misfit(
         misfit,
         "that the rotations are of the whisker's base (not of a flange), that they turn the "
@@ -154,52 +158,52 @@ def tare(
     rotations: ArrayLike | None = None,
     gravity: ArrayLike = GRAVITY,
 ) -> Sensor:
-    """Find the offset anew, as after it has drifted; mass and its moment stay as they are known.
+    """Find the offset anew, as after a drift; mass and its moment are kept.
 
     Parameters
     ----------
     sensor : Sensor
-        As calibrated.
+        Calibrated sensor.
     readings : array_like (n, k)
-        While nothing is touched; those with NaN or a saturated channel are left out.
+        Readings without contact; those with NaN or a saturated channel are left out.
     rotations : array_like (3, 3) or (n, 3, 3), optional
-        From the whisker's to the laboratory frame; needed where the sensor carries a mass.
+        Rotation from the whisker's to the laboratory frame; needed where the sensor carries a mass.
     gravity : array_like (3,)
-        In the laboratory frame, m/s².
+        Acceleration in the laboratory frame, m/s².
 
     Returns
     -------
     Sensor
-        With the new offset.
+        Sensor with the new offset.
 
     Raises
     ------
     ValueError
         If shapes do not fit, the rotation is needed but not given, or no reading is complete.
     """
-    felt = np.atleast_2d(sensor.felt(readings, rotations, gravity))
-    felt = felt[np.isfinite(felt).all(axis=1)]
-    if not len(felt):
+    free = np.atleast_2d(sensor.compensated(readings, rotations, gravity))
+    free = free[np.isfinite(free).all(axis=1)]
+    if not len(free):
         raise ValueError("there is no reading without NaN or a saturated channel")
-    return sensor.with_new_offset(len(felt), sensor.bias + felt.mean(axis=0))
+    return sensor.with_new_offset(len(free), sensor.bias + free.mean(axis=0))
 
 
 def _solved(
-    sensor: Sensor, design: Array, y: Array, noise: Array, felt: AnyArray
+    sensor: Sensor, design: Array, y: Array, noise: Array, effective: Mask
 ) -> tuple[Solution, Array, Array]:
-    """Solution for what is felt, all unknowns and their covariance."""
+    """Solution for the effective unknowns, all unknowns and their covariance."""
     k = len(sensor.channels)
     names = [f"the offset of {name}" for name in sensor.channels] + list(_MASS)
-    rows = (design / noise[:, None]).reshape(-1, k + 4)[:, felt]
+    rows = (design / noise[:, None]).reshape(-1, k + 4)[:, effective]
     found = solve(
         rows,
         (y / noise).reshape(-1),
-        [name for name, used in zip(names, felt, strict=True) if used],
+        [name for name, used in zip(names, effective, strict=True) if used],
         _ADVICE,
     )
     unknowns, covariance = np.zeros(k + 4), np.zeros((k + 4, k + 4))
-    unknowns[felt] = found.unknowns
-    covariance[np.ix_(felt, felt)] = found.spread
+    unknowns[effective] = found.unknowns
+    covariance[np.ix_(effective, effective)] = found.spread
     return found, unknowns, covariance
 
 

@@ -1,4 +1,4 @@
-"""What the follicle feels: six signals, their triplets, and regions of contact."""
+"""The six signals at the base of a whisker, their triplets, and regions of contact."""
 
 from vibrissa.signals.base import (
     CIRCULAR,

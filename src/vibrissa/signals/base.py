@@ -69,13 +69,13 @@ def labelled_wrench(
     Parameters
     ----------
     force, moment : array_like or DataArray
-        Of shape (..., 3). Two DataArrays are matched by the names of their dimensions and must
-        agree in their coordinates; other arrays are matched by position.
+        Vectors of shape (..., 3). Two DataArrays are matched by the names of their dimensions and
+        must agree in their coordinates; other arrays are matched by position.
 
     Returns
     -------
     force, moment : (..., 3) arrays
-        The numbers.
+        Components in the units given.
     dims : tuple of str
         Names of the leading dimensions.
     coords : dict
@@ -116,8 +116,8 @@ def _aligned(*arrays: xr.DataArray) -> tuple[xr.DataArray, ...]:
     try:
         return xr.align(*arrays, join="exact", copy=False)
     except ValueError as error:  # of xarray: its message names its own options
-        said = ", ".join(str(dict(a.sizes)) for a in arrays)
-        raise ValueError(f"sizes or coordinates do not agree: {said}") from error
+        sizes = ", ".join(str(dict(a.sizes)) for a in arrays)
+        raise ValueError(f"sizes or coordinates do not agree: {sizes}") from error
 
 
 def leading_dims(shape: tuple[int, ...]) -> tuple[str, ...]:
@@ -191,15 +191,15 @@ def measured(
     Parameters
     ----------
     signals : Dataset or mapping
-        Has at least the named signals, SI units; shapes must broadcast. DataArrays are matched by
-        the names of their dimensions.
+        Signals in SI units, the named ones at least; shapes must broadcast. DataArrays are matched
+        by the names of their dimensions.
     names : tuple of str
-        Which.
+        Names of the signals.
 
     Returns
     -------
     values : (..., k) array
-        In the order of ``names``; NaN means missing.
+        Values in the order of ``names``; NaN means missing.
     dims : tuple of str
         Names of the leading dimensions.
     coords : dict
@@ -247,12 +247,12 @@ def _number(value: ArrayLike, names: tuple[str, ...], given: list[ArrayLike]) ->
 
 
 def circular_among(names: tuple[str, ...]) -> AnyArray:
-    """Tell which signals are directions.
+    """Mark the signals that are directions.
 
     Parameters
     ----------
     names : tuple of str
-        The signals.
+        Names of the signals.
 
     Returns
     -------
@@ -270,30 +270,30 @@ def within_turn(signals: Array, circular: ArrayLike) -> Array:
     signals : (..., n) array
         Signals or differences; directions in rad.
     circular : (n,) bool array_like
-        Which are directions.
+        True for the directions.
 
     Returns
     -------
     (..., n) array
-        The directions within a turn, the others as they are.
+        Signals with directions within a turn, the others as they are.
     """
     return np.where(circular, np.pi - (np.pi - signals) % (2.0 * np.pi), signals)
 
 
 def signal_scales(names: tuple[str, ...], force: float, moment: float) -> Array:
-    """What to divide signals by to make them non-dimensional.
+    """Units of signals.
 
     Parameters
     ----------
     names : tuple of str
-        The signals.
+        Names of the signals.
     force, moment : float
         Unit of force, N, and of moment, N·m.
 
     Returns
     -------
     (k,) array
-        One for each signal; 1 for directions.
+        Unit of each signal; 1 for directions.
     """
     scales = {"Fx": force, "FT": force, "Mx": moment, "MB": moment}
     return np.array([scales.get(name, 1.0) for name in names])

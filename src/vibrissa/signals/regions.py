@@ -1,4 +1,4 @@
-"""Parts of the reachable space that the paper tells apart.
+"""Parts of the reachable space that the paper distinguishes.
 
 - CB, concave backward: the contact has moved toward +y of the resting whisker at the same distance
   r from the base; CF, concave forward: toward -y. Beyond the resting whisker's largest r its curve
@@ -57,14 +57,14 @@ def nearest_on_rest(whisker: Whisker, points: Array) -> tuple[Array, Array]:
     Parameters
     ----------
     whisker : Whisker
-        The whisker.
+        Whisker at rest.
     points : (..., 3) array
         Points in the whisker frame, m; NaN gives NaN.
 
     Returns
     -------
     distance, arc_length : (...) arrays
-        Both in m.
+        Distance and arc length of the nearest point, m.
     """
     points = np.asarray(points, dtype=np.float64)
     flat = points.reshape(-1, 3)
@@ -73,7 +73,7 @@ def nearest_on_rest(whisker: Whisker, points: Array) -> tuple[Array, Array]:
     if rows.size:
         s, places, tree = resting(whisker)
         _, i = tree.query(flat[rows])
-        # Between samples the curve is straight enough: the nearest place on the two chords beside
+        # Between samples the curve is straight enough: the nearest point of the two chords at
         # the sample.
         best, where = np.full(rows.size, np.inf), np.zeros(rows.size)
         for j in (np.maximum(i - 1, 0), np.minimum(i, s.size - 2)):
@@ -94,7 +94,7 @@ def in_region(region: str, backward: AnyArray, large: AnyArray) -> AnyArray:
     Parameters
     ----------
     region : str
-        One of :data:`REGIONS`.
+        Name among :data:`REGIONS`.
     backward : (...) bool array
         Whether they are concave backward; see :func:`concave_backward`.
     large : (...) bool array
@@ -123,7 +123,7 @@ def cone_angle(whisker: Whisker, points: Array) -> Array:
     Parameters
     ----------
     whisker : Whisker
-        The whisker.
+        Whisker at rest.
     points : (..., 3) array
         Contact points in the whisker frame, m.
 
@@ -142,7 +142,7 @@ def within_cone(whisker: Whisker, points: Array, angle: float = CONE) -> AnyArra
     Parameters
     ----------
     whisker : Whisker
-        The whisker.
+        Whisker at rest.
     points : (..., 3) array
         Contact points in the whisker frame, m.
     angle : float
@@ -162,7 +162,7 @@ def concave_backward(whisker: Whisker, points: Array) -> AnyArray:
     Parameters
     ----------
     whisker : Whisker
-        The whisker; of a straight one the sign of y itself decides.
+        Whisker at rest; of a straight one the sign of y itself decides.
     points : (..., 3) array
         Contact points in the whisker frame, m.
 

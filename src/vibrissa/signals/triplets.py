@@ -21,14 +21,14 @@ def selection(
     signals : str or sequence of str
         Names, or one text with names between commas or blanks: ``"Fx MB MD"``.
     least : int
-        How many are needed.
+        Number of signals that are needed.
     exactly : int, optional
-        How many there must be.
+        Number of signals that is demanded.
 
     Returns
     -------
     tuple of str
-        In canonical order.
+        Names in canonical order.
 
     Raises
     ------

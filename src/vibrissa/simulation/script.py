@@ -14,7 +14,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.io import load_array, number_array, parsed_toml, quoted, read_text, table_rows
+from vibrissa.io import (
+    check_keys,
+    load_array,
+    one_number,
+    parsed_toml,
+    quoted,
+    read_text,
+    subtable,
+    table_rows,
+    three_numbers,
+)
 from vibrissa.objects import Box, Mesh, Peg, Plane, Sphere, Surface
 from vibrissa.sensors import COMPONENTS, Sensor
 from vibrissa.simulation.dynamics import Dynamics
@@ -113,7 +123,6 @@ _ADVANCE = MappingProxyType({"to_position": [0.0, 14.0, 0.0]})
 """Motion of the head of an array by default: forward, toward the object there."""
 
 MM = 1e-3
-_THREE = "three numbers are needed"
 COLUMNS = ("time", "azimuth", "elevation", "roll", "x", "y", "z")
 """Columns of a table of motion."""
 _DEGREES = ("amplitude", "set_point", "elevation_drift")
@@ -177,7 +186,7 @@ def read_script(
     table = parsed_toml(text)
     given = {name: value for name, value in changes.items() if value is not None}
     table |= {k: given[k] for k in ("duration", "rate", "friction", "seed") if k in given}
-    only(table, _TOP, "the trial")
+    check_keys(table, _TOP, "the trial")
     moves = dict(subtable(table, "motion"))
     moves |= {k: given[k] for k in ("frequency", "row", "protraction") if k in given}
     whisker = _whisker(table, given, folder, read_whisker)
@@ -186,9 +195,9 @@ def read_script(
     if given.get("noise") is False:
         sensor = {k: v for k, v in sensor.items() if k in ("channels", "mixing")}
         sensor |= {"force_noise": 0.0, "moment_noise": 0.0}
-    seed = int(number(table, "seed", 0.0))
+    seed = int(one_number(table, "seed", 0.0))
     usual = 3.5 if isinstance(whisker, Whisker) else 0.5
-    duration, rate = number(table, "duration", usual), number(table, "rate", 1000.0)
+    duration, rate = one_number(table, "duration", usual), one_number(table, "rate", 1000.0)
     if not 0.0 < duration * rate <= _MOST_FRAMES:
         raise ValueError(
             f"duration is {duration:g} s and rate {rate:g} frames/s; both are positive, and a "
@@ -206,7 +215,7 @@ def read_script(
         whisker=whisker,
         objects=objects,
         motion=motion,
-        friction=number(table, "friction", 0.0),
+        friction=one_number(table, "friction", 0.0),
         sensor=_sensor(sensor),
         seed=seed,
         dynamics=_dynamics(table, given.get("dynamic") is True),
@@ -227,7 +236,7 @@ def _whisker(
     if together:
         return _array(subtable(table, "array"), given, folder)
     about = subtable(table, "whisker")
-    only(about, {"file"}, "[whisker]")
+    check_keys(about, {"file"}, "[whisker]")
     return read_whisker(
         given.get("whisker", folder / str(about["file"]) if "file" in about else None)
     )
@@ -235,7 +244,7 @@ def _whisker(
 
 def _array(table: Mapping[str, Any], given: Mapping[str, Any], folder: Path) -> WhiskerArray:
     """Chosen whiskers of the array."""
-    only(table, {"file", "side", "rows", "columns", "whiskers"}, "[array]")
+    check_keys(table, {"file", "side", "rows", "columns", "whiskers"}, "[array]")
     choice: dict[str, Any] = {"side": str(given.get("side", table.get("side", "both")))}
     names = given.get("whiskers", table.get("whiskers"))
     if names is None:
@@ -288,30 +297,30 @@ def _dynamics(table: Mapping[str, Any], wanted: bool) -> Dynamics | None:
     if not (wanted or "dynamics" in table):
         return None
     how = subtable(table, "dynamics")
-    only(how, {"density", "damping_ratio", "segments", "step"}, "[dynamics]")
+    check_keys(how, {"density", "damping_ratio", "segments", "step"}, "[dynamics]")
     usual = Dynamics()
     density = how.get("density", usual.density)
     if not (isinstance(density, list | tuple) and len(density) == 2):
         raise ValueError(f"density is {density!r}; those at base and tip are needed")
     return Dynamics(
         density=(float(density[0]), float(density[1])),
-        damping_ratio=number(how, "damping_ratio", usual.damping_ratio),
-        segments=int(number(how, "segments", usual.segments)),
-        step=number(how, "step", usual.step * 1e3) * 1e-3,
+        damping_ratio=one_number(how, "damping_ratio", usual.damping_ratio),
+        segments=int(one_number(how, "segments", usual.segments)),
+        step=one_number(how, "step", usual.step * 1e3) * 1e-3,
     )
 
 
 def _sensor(table: Mapping[str, Any]) -> Sensor:
     """Sensor; values of forces and moments are those of its channels' components."""
     own = {f"{part}_{name}" for part in ("force", "moment") for name in _PER_COMPONENT}
-    only(table, own | {"channels", "mixing", "relative_noise", "gain_error"}, "[sensor]")
+    check_keys(table, own | {"channels", "mixing", "relative_noise", "gain_error"}, "[sensor]")
     channels = tuple(str(name) for name in table.get("channels", COMPONENTS))
     plain = Sensor(channels, table.get("mixing"))
     numbers: dict[str, Any] = {}
     for name in _PER_COMPONENT:
         usual = (1.0, 0.02) if name == "noise" else (0.0, 0.0)
-        force = number(table, f"force_{name}", usual[0]) * _MICRO
-        moment = number(table, f"moment_{name}", usual[1]) * _MICRO
+        force = one_number(table, f"force_{name}", usual[0]) * _MICRO
+        moment = one_number(table, f"moment_{name}", usual[1]) * _MICRO
         if name != "bias" and min(force, moment) < 0.0:
             part = "force" if force < 0.0 else "moment"
             raise ValueError(f"{part}_{name} is {table[f'{part}_{name}']}; 0 or more is needed")
@@ -319,7 +328,7 @@ def _sensor(table: Mapping[str, Any]) -> Sensor:
         mix = np.asarray(plain.mixing)
         numbers[name] = mix @ each if name == "bias" else np.sqrt(mix**2 @ each**2)
     for name in ("relative_noise", "gain_error"):
-        numbers[name] = number(table, name, 0.0)
+        numbers[name] = one_number(table, name, 0.0)
     return Sensor(channels, table.get("mixing"), **numbers)
 
 
@@ -337,8 +346,8 @@ def object_of(table: Any, folder: Path) -> Surface:
     }
     if not isinstance(kind, str) or kind not in keys:
         raise ValueError(f"an object's kind is {quoted(kind)}; one of {', '.join(keys)} is needed")
-    only(table, keys[kind] | {"kind", "stiffness"}, f"an object of kind {kind}")
-    stiffness = number(table, "stiffness", np.inf)
+    check_keys(table, keys[kind] | {"kind", "stiffness"}, f"an object of kind {kind}")
+    stiffness = one_number(table, "stiffness", np.inf)
     if kind == "mesh":
         if "file" not in table:
             raise ValueError(
@@ -347,20 +356,20 @@ def object_of(table: Any, folder: Path) -> Surface:
         resolution = table.get("resolution")
         return Mesh.load(
             folder / str(table["file"]),
-            number(table, "unit", 1.0) * MM,
-            resolution=None if resolution is None else number(table, "resolution", 0.0) * MM,
+            one_number(table, "unit", 1.0) * MM,
+            resolution=None if resolution is None else one_number(table, "resolution", 0.0) * MM,
             stiffness=stiffness,
         )
-    position = three(table, "position") * MM
-    radius = 0.5 * number(table, "diameter", 2.7) * MM
+    position = three_numbers(table, "position") * MM
+    radius = 0.5 * one_number(table, "diameter", 2.7) * MM
     if kind == "peg":
-        return Peg(position, three(table, "axis", (0.0, 0.0, 1.0)), radius, stiffness)
+        return Peg(position, three_numbers(table, "axis", (0.0, 0.0, 1.0)), radius, stiffness)
     if kind == "sphere":
         return Sphere(position, radius, stiffness)
     if kind == "plane":
-        return Plane(position, three(table, "normal"), stiffness)
-    edge = number(table, "edge_radius", 0.0) * MM
-    return Box(position, three(table, "size") * MM, turned(table), edge, stiffness)
+        return Plane(position, three_numbers(table, "normal"), stiffness)
+    edge = one_number(table, "edge_radius", 0.0) * MM
+    return Box(position, three_numbers(table, "size") * MM, turned(table), edge, stiffness)
 
 
 def motion_of(
@@ -376,7 +385,7 @@ def motion_of(
     kind = table.pop("kind", "past")
     if kind == "table":
         return _tabulated(table, folder, rate)
-    only(table, {*_DEGREES, *_SHARES, "elevation", "position_drift", "row"}, "[motion]")
+    check_keys(table, {*_DEGREES, *_SHARES, "elevation", "position_drift", "row"}, "[motion]")
     how = _numbers(table, (*_DEGREES, "elevation"))
     how.setdefault("position_drift", 0.03 * whisker.length)
     row = str(table.get("row", "C"))
@@ -399,21 +408,21 @@ def array_motion_of(
         raise ValueError(
             f"the motion of an array is of kind {quoted(kind)}; whisking or table is needed"
         )
-    only(table, {*_DEGREES, *_SHARES, "position_drift"}, "[motion] of an array")
+    check_keys(table, {*_DEGREES, *_SHARES, "position_drift"}, "[motion] of an array")
     return shared_whisking(duration, rate, seed=seed, **_numbers(table, _DEGREES))
 
 
 def _numbers(table: Mapping[str, Any], degrees: tuple[str, ...]) -> dict[str, Any]:
     """Parameters of whisking, in SI units."""
-    how: dict[str, Any] = {name: number(table, name, 0.0) for name in _SHARES if name in table}
-    how |= {name: np.radians(number(table, name, 0.0)) for name in degrees if name in table}
+    how: dict[str, Any] = {name: one_number(table, name, 0.0) for name in _SHARES if name in table}
+    how |= {name: np.radians(one_number(table, name, 0.0)) for name in degrees if name in table}
     if "position_drift" in table:
-        how["position_drift"] = number(table, "position_drift", 0.0) * MM
+        how["position_drift"] = one_number(table, "position_drift", 0.0) * MM
     return how
 
 
 def _tabulated(table: Mapping[str, Any], folder: Path, rate: float) -> Motion:
-    only(table, {"file"}, "a motion of kind table")
+    check_keys(table, {"file"}, "a motion of kind table")
     columns = columns_of(folder / str(table.get("file", "")))
     place = np.stack([columns[axis] for axis in "xyz"], axis=-1)
     return tabulated(
@@ -429,9 +438,9 @@ def _tabulated(table: Mapping[str, Any], folder: Path, rate: float) -> Motion:
 def head_of(table: Mapping[str, Any], folder: Path, time: Array) -> tuple[Array, Array]:
     """Motion of the head."""
     ends = {"position", "angles", "to_position", "to_angles"}
-    only(table, {*ends, "file"}, "[head]")
+    check_keys(table, {*ends, "file"}, "[head]")
     if "file" not in table:
-        poses = {name: three(table, name) for name in ends if name in table}
+        poses = {name: three_numbers(table, name) for name in ends if name in table}
         units = {name: np.radians(1.0) if name.endswith("angles") else MM for name in poses}
         return head_path(time, **{name: units[name] * poses[name] for name in poses})
     columns = columns_of(folder / str(table["file"]))
@@ -445,44 +454,9 @@ def head_of(table: Mapping[str, Any], folder: Path, time: Array) -> tuple[Array,
     return turn, np.stack([at[axis] for axis in "xyz"], axis=-1)
 
 
-def only(table: Mapping[str, Any], allowed: set[str], where: str) -> None:
-    """Raise a ValueError if a table has an unknown key."""
-    unknown = sorted(set(table) - allowed)
-    if unknown:
-        raise ValueError(
-            f"{where} has {', '.join(unknown)}; known are {', '.join(sorted(allowed))}"
-        )
-
-
-def subtable(table: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-    """Table [name]; empty by default."""
-    value = table.get(name, {})
-    if not isinstance(value, Mapping):
-        raise ValueError(f"{name} is {quoted(value)}; it is written as a table, [{name}]")
-    return value
-
-
-def number(table: Mapping[str, Any], name: str, default: float) -> float:
-    """Number of a table, finite if it is there."""
-    value = table.get(name, default)
-    array = number_array(value, name, "a number is needed")
-    if array.ndim or (name in table and not np.isfinite(array)):
-        raise ValueError(f"{name} is {quoted(value)}; a number is needed")
-    return float(array)
-
-
-def three(table: Mapping[str, Any], name: str, default: Any = None) -> Array:
-    """Three numbers of a table."""
-    value = table.get(name, default)
-    array = number_array(list(value) if isinstance(value, tuple) else value, name, _THREE)
-    if array.shape != (3,) or not np.isfinite(array).all():
-        raise ValueError(f"{name} is {quoted(value)}; {_THREE}")
-    return array
-
-
 def turned(table: Mapping[str, Any]) -> Array:
     """Rotation by the angles of a table."""
-    return base_rotation(*np.radians(three(table, "angles", (0.0, 0.0, 0.0))))
+    return base_rotation(*np.radians(three_numbers(table, "angles", (0.0, 0.0, 0.0))))
 
 
 def columns_of(path: Path) -> dict[str, Array]:

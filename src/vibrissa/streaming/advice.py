@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from vibrissa.streaming.contacts import ContactStream
 
-# A share of samples from which on something is wrong in general.
+# Share of samples above which something is wrong in general.
 _NEARLY_ALL = 0.9
 
 
 def advice(stream: ContactStream) -> list[str]:
-    """Say what users get wrong most often, where it looks like it.
+    """Suspect what users get wrong most often.
 
     Parameters
     ----------
     stream : ContactStream
-        After some samples.
+        Stream, after some samples.
 
     Returns
     -------
@@ -25,11 +25,11 @@ def advice(stream: ContactStream) -> list[str]:
         Sentences; none where nothing is suspected.
     """
     counts, total = stream.statuses, stream.samples
-    told = total - counts["missing"] - counts["tare"]
-    felt = told - counts["not_felt"]
+    measured = total - counts["missing"] - counts["tare"]
+    touching = measured - counts["not_felt"]
     unexplained = counts["outside_map"] + counts["not_frictionless"]
     out = []
-    if felt > 0 and unexplained > _NEARLY_ALL * felt:
+    if touching > 0 and unexplained > _NEARLY_ALL * touching:
         larger = (
             "are larger than any that this whisker can give"
             if counts["outside_map"] > unexplained / 2
@@ -40,7 +40,7 @@ def advice(stream: ContactStream) -> list[str]:
             "what they are in), is the offset taken away, are the sensor's axes, sign and weight "
             "and the base's rotation right, and the whisker's stiffness?"
         )
-    if told > 0 and not felt:
+    if measured > 0 and not touching:
         out.append(
             "No signal was so far from zero that a contact is felt: are they in N and N·m, and is "
             "the noise as it was said to be?"

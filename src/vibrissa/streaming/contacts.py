@@ -28,7 +28,7 @@ _SLOW = 100.0
 _SAID = 400
 
 COMPONENTS = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
-"""What signals are computed from, where a stream carries these."""
+"""Components of force and moment that signals are computed from."""
 
 
 class ContactStream:
@@ -37,30 +37,30 @@ class ContactStream:
     Parameters
     ----------
     estimator : Estimator
-        Locates single samples.
+        Estimator of contacts from single samples.
     names : sequence of str, optional
-        What a line must carry: a sensor's channels, in their order. By default the estimator's
+        Channels of a sensor that a line must carry, in their order. By default the estimator's
         signals, or components of force and moment from which these are computed, whichever the
         first line has.
     follow : ContactFilter, optional
-        Follows contacts over time with the base's pose, if there is one; made of the same
+        Filter of contacts over time, with the base's pose if there is one; made of the same
         estimator.
     poses : Poses, optional
-        What is known of the base's pose, and where it is on what the lines' poses are of.
+        Poses of the base, with its position on what the lines' poses are of.
     tare : int
-        How many complete samples at the beginning are of a free whisker: they give the offset of
-        the sensor anew. It needs an estimator of a sensor.
+        Number of complete samples at the beginning, of a free whisker, that give the offset of the
+        sensor anew. It needs an estimator of a sensor.
 
     Attributes
     ----------
     samples, faults : int
-        Samples so far, and lines that could not be read.
+        Numbers of samples so far, and of lines that could not be read.
     statuses : Counter
-        How often each status came.
+        Numbers of samples by status.
     poses : Poses
-        Of the base.
+        Poses of the base.
     laboratory : str
-        Name of the frame that poses are in, where they say it; empty where they do not.
+        Name of the frame that poses are in, where they state it; empty where they do not.
     """
 
     def __init__(
@@ -94,13 +94,13 @@ class ContactStream:
         Parameters
         ----------
         lines : iterable of str
-            As they come.
+            Lines as they come.
 
         Yields
         ------
         dict
-            Ready for JSON: ``time``, ``status`` and what is known of the contact, with the line's
-            ``stamp_ns``, ``recorded_ns`` and ``frame_id`` as they are; or ``line`` and ``error``.
+            Record for JSON: ``time``, ``status`` and the contact, with the line's ``stamp_ns``,
+            ``recorded_ns`` and ``frame_id`` as they are; or ``line`` and ``error``.
         """
         for line in lines:
             try:
@@ -152,12 +152,12 @@ class ContactStream:
         Parameters
         ----------
         sample : Sample
-            With the values in the order of the names.
+            Sample with the values in the order of the names.
 
         Returns
         -------
         dict
-            Ready for JSON.
+            Record for JSON.
 
         Raises
         ------
@@ -210,7 +210,7 @@ class ContactStream:
         """Take one sample of a free whisker."""
         sensor = self._estimator.sensor
         assert sensor is not None
-        felt = sensor.felt(values, rotation)
+        felt = sensor.compensated(values, rotation)
         if not np.isfinite(felt).all():
             return "missing"
         self._free.append(felt)
@@ -227,7 +227,7 @@ def _components(signals: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def located_record(found: Contact) -> dict[str, Any]:
-    """What a single sample tells, in the whisker's frame and SI units."""
+    """Contact of a single sample, in the whisker's frame and SI units."""
     record: dict[str, Any] = {"status": found.status.name.lower()}
     if not found.n_candidates:
         return record
@@ -242,7 +242,7 @@ def located_record(found: Contact) -> dict[str, Any]:
 
 
 def followed_record(known: Followed, rotation: Array | None = None) -> dict[str, Any]:
-    """What a filter knows."""
+    """Contact of a filter."""
     record: dict[str, Any] = {"status": known.status.name.lower()}
     if not len(known.points):
         return record

@@ -18,14 +18,14 @@ _TOO_FAST = 50.0
 
 
 class Pose(NamedTuple):
-    """Of the whisker's base.
+    """Pose of the whisker's base.
 
     Attributes
     ----------
     rotation : (3, 3) array
-        From the whisker's to the laboratory frame.
+        Rotation from the whisker's to the laboratory frame.
     position : (3,) array
-        Of the base in the laboratory, m.
+        Position of the base in the laboratory, m.
     """
 
     rotation: Array
@@ -38,17 +38,17 @@ class Poses:
     Parameters
     ----------
     rotation : (3, 3) array_like, optional
-        Where poses are those of something that carries the whisker, such as a robot's flange: from
-        the whisker's frame to that thing's.
+        Rotation from the whisker's frame to that of what carries it, where poses are those of a
+        carrier such as a robot's flange.
     position : (3,) array_like, optional
-        Of the whisker's base in that thing's frame, m.
+        Position of the whisker's base in the carrier's frame, m.
 
     Attributes
     ----------
     number : int
-        Poses so far.
+        Number of poses so far.
     too_fast : int
-        Those that the base could only have reached at more than 50 m/s: they are in other units.
+        Number of poses at a speed of more than 50 m/s, which are in other units.
     """
 
     def __init__(
@@ -73,14 +73,14 @@ class Poses:
         Parameters
         ----------
         rotation : (3, 3) array
-            From the carrier's to the laboratory frame.
+            Rotation from the carrier's to the laboratory frame.
         position : (3,) array
-            Of the carrier in the laboratory, m.
+            Position of the carrier in the laboratory, m.
 
         Returns
         -------
         Pose
-            Of the base.
+            Pose of the base.
         """
         return Pose(rotation @ self._turn, position + rotation @ self._place)
 
@@ -90,16 +90,16 @@ class Poses:
         Parameters
         ----------
         time : float
-            Of it, s, by the clock of the samples.
+            Time of the pose, s, by the clock of the samples.
         rotation : (3, 3) array
-            From the carrier's to the laboratory frame.
+            Rotation from the carrier's to the laboratory frame.
         position : (3,) array
-            Of the carrier in the laboratory, m.
+            Position of the carrier in the laboratory, m.
 
         Returns
         -------
         Pose
-            Of the base.
+            Pose of the base.
         """
         base = self.base(rotation, position)
         if not (np.isfinite(rotation).all() and np.isfinite(position).all()):
@@ -120,14 +120,14 @@ class Poses:
         Parameters
         ----------
         time : float
-            Of a sample, s.
+            Time of a sample, s.
 
         Returns
         -------
         Pose or None
-            None before the first pose. One alone counts at all times; past the last of several the
-            motion goes on for five times the step between the last two, and then it is not known
-            (NaN).
+            Pose of the base; None before the first. One alone holds at all times; past the last of
+            several the motion continues for five times the step between the last two, and then it
+            is not known (NaN).
         """
         if not self._last:
             return None

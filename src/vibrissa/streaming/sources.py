@@ -33,19 +33,20 @@ _BACK = 0.2
 
 
 def file_lines(
-    path: Path, reconnect: bool = False, tell: Callable[[str], None] | None = None
+    path: Path, reconnect: bool = False, report: Callable[[str], None] | None = None
 ) -> Iterator[str]:
     """Read lines as they come, from a file, named pipe or device, until it ends.
 
     Parameters
     ----------
     path : Path
-        A serial device is read as it is set up (``stty``); bytes that are no UTF-8 are replaced.
+        File, named pipe or device. A serial device is read as it is set up (``stty``); bytes that
+        are not UTF-8 are replaced.
     reconnect : bool
         Whether a named pipe or device that closes is waited for and opened anew, without end. A
         line that it was in the middle of is left out.
-    tell : callable, optional
-        Called with a sentence when it closes and when it is open again.
+    report : callable, optional
+        Function called with a sentence when it closes and when it is open again.
 
     Yields
     ------
@@ -67,7 +68,7 @@ def file_lines(
         return
     if stat.S_ISREG(path.stat().st_mode):
         raise ValueError(f"{path} is a file, which ends; a named pipe or device opens anew")
-    said = tell or (lambda sentence: None)
+    remark = report or (lambda sentence: None)
     closed = False
     while True:
         reason = ""
@@ -75,14 +76,14 @@ def file_lines(
             with path.open(encoding="utf-8", errors="replace") as file:
                 for line in bounded_lines(file):
                     if closed:
-                        said(f"{path} is open again")
+                        remark(f"{path} is open again")
                         closed = False
                     if line.endswith("\n") or len(line) > LONGEST:
                         yield line
         except OSError as fault:  # a device that was unplugged
             reason = f" ({fault.strerror})"
         if not closed:
-            said(f"{path} closed{reason}; waiting until it opens again")
+            remark(f"{path} closed{reason}; waiting until it opens again")
         closed = True
         time.sleep(_BACK)
 
@@ -122,7 +123,7 @@ def udp_lines(opened: socket.socket) -> Iterator[str]:
     Parameters
     ----------
     opened : socket
-        Of `udp_socket`.
+        Socket of `udp_socket`.
 
     Yields
     ------
@@ -153,14 +154,14 @@ class NewestLines:
     Parameters
     ----------
     opened : socket
-        Of `udp_socket`.
+        Socket of `udp_socket`.
     kind : callable
-        Tells what a line is, as `Lines.kind` does.
+        Kind of a line, as of `Lines.kind`.
 
     Attributes
     ----------
     dropped : int
-        Samples so far that were not passed on because a newer one had come.
+        Number of samples so far that were not passed on because a newer one had come.
     """
 
     def __init__(self, opened: socket.socket, kind: Callable[[str], LineKind]) -> None:

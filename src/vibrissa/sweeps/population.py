@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from vibrissa.simulation.script import only
+from vibrissa.io import check_keys
 from vibrissa.whisker import Whisker, whisker_array
 
 PARAMETERS: Mapping[str, tuple[float, float, float]] = {
@@ -82,7 +82,7 @@ def population(tables: Sequence[Any], folder: Path, seed: int) -> list[Specimen]
 
 def _grid(stated: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iterator[Specimen]:
     """All combinations of values."""
-    only(stated, {"prefix", *PARAMETERS}, "a grid")
+    check_keys(stated, {"prefix", *PARAMETERS}, "a grid")
     names = [name for name in PARAMETERS if name in stated]
     values = [_numbers(name, stated[name]) for name in names]
     _check_count(math.prod(map(len, values)))
@@ -92,7 +92,7 @@ def _grid(stated: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Itera
 
 def _random(stated: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iterator[Specimen]:
     """Values drawn between bounds."""
-    only(stated, {"prefix", "count", "logarithmic", *PARAMETERS}, "a random population")
+    check_keys(stated, {"prefix", "count", "logarithmic", *PARAMETERS}, "a random population")
     count = stated.get("count")
     if not isinstance(count, int) or isinstance(count, bool) or count < 1:
         raise ValueError(f"count is {count!r}; a whole number from 1 is needed")
@@ -125,7 +125,7 @@ def _random(stated: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Ite
 
 def _files(stated: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iterator[Specimen]:
     """Digitised whiskers, one a file."""
-    only(stated, {"prefix", "files", "base_radius", "youngs_modulus"}, "files")
+    check_keys(stated, {"prefix", "files", "base_radius", "youngs_modulus"}, "files")
     pattern = stated.get("files")
     if not isinstance(pattern, str):
         raise ValueError(f"files is {pattern!r}; a pattern such as 'whiskers/*.csv' is needed")
@@ -148,7 +148,7 @@ def _files(stated: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iter
 
 def _array(stated: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iterator[Specimen]:
     """Whiskers of an average rat's face."""
-    only(stated, {"prefix", "side", "rows", "columns", "names"}, "an array")
+    check_keys(stated, {"prefix", "side", "rows", "columns", "names"}, "an array")
     choice = {key: value for key, value in stated.items() if key != "prefix"}
     choice.setdefault("side", "right")
     for name in ("rows", "names"):

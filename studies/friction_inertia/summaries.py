@@ -27,7 +27,7 @@ LABELS = tuple(
 
 
 def summary(trials: Sequence[xr.Dataset], classes: bool = True) -> dict[str, Any]:
-    """All numbers of one way in one condition; ``trials`` as of `honest.ways.scored`."""
+    """Scores of one method in one condition; ``trials`` as of `friction_inertia.methods.scored`."""
     rows = xr.concat([t.assign_attrs({}) for t in trials], "frame", combine_attrs="drop")
     felt, touching = rows["felt"].values, rows["touching"].values
     both = felt & touching

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from pages import put, table
 
-from honest.conditions import CONDITIONS, FAST
-from honest.summaries import LABELS, limit
-from honest.ways import SIX, TRIPLET, WAYS, WRENCH
+from friction_inertia.conditions import CONDITIONS, FAST
+from friction_inertia.methods import METHODS, SIX, TRIPLET, WRENCH
+from friction_inertia.summaries import LABELS, limit
 
 Results = Mapping[str, Any]
 
@@ -80,20 +80,20 @@ def trials(results: Results) -> str:
 def by_class(results: Results) -> str:
     rows = []
     for label, one in picked(results, "true"):
-        for way in WAYS:
-            parts = [part(one[way], name) for name in CLASSES]
+        for method in METHODS:
+            parts = [part(one[method], name) for name in CLASSES]
             cells = [f"{median(row)} ({mm(row['predicted'])})" for row in parts]
-            high = f"{mm(one[way]['all']['high'])} ({mm(one[way]['all']['predicted_high'])})"
-            rows.append([label, NAMES[way], *cells, high])
+            high = f"{mm(one[method]['all']['high'])} ({mm(one[method]['all']['predicted_high'])})"
+            rows.append([label, NAMES[method], *cells, high])
     return table(["trial", "from", *CLASSES, "all, 95 %"], rows, 2)
 
 
 def answers(results: Results) -> str:
     rows = [
-        [label, NAMES[way], percent(one[way]["none"]), percent(one[way]["several"])]
-        + [mm(value) for value in (one[way]["pulled"], *one[way]["bias"])]
+        [label, NAMES[method], percent(one[method]["none"]), percent(one[method]["several"])]
+        + [mm(value) for value in (one[method]["pulled"], *one[method]["bias"])]
         for label, one in picked(results, "true")
-        for way in WAYS
+        for method in METHODS
     ]
     head = ["trial", "from", "none, %", "several, %", "with friction", "along", "off", "sideways"]
     return table(head, rows, 2)
@@ -124,12 +124,12 @@ def pegs(results: Results) -> str:
     shown += [f"{kind} {name}" for kind in ("exact", "points") for name in ("offset", "diameter")]
     rows = []
     for label, one in picked(results, "true"):
-        for way in WAYS:
-            row = one[way]["peg"]
+        for method in METHODS:
+            row = one[method]["peg"]
             cells = [
                 degrees(row[name]) if name.endswith("tilt") else mm(row[name]) for name in shown
             ]
-            rows.append([label, NAMES[way], *cells])
+            rows.append([label, NAMES[method], *cells])
     head = ["trial", "from", "axis, mm", "tilt, °", "diameter, mm", "its σ, mm"]
     head += ["axis*, mm", "diameter*, mm", "axis†, mm", "diameter†, mm"]
     return table(head, rows, 2)
@@ -139,12 +139,12 @@ def tracked(results: Results) -> str:
     """Median errors against their limits; bold where above."""
     rows = []
     for label, one in picked(results, "rod"):
-        for way in WAYS:
+        for method in METHODS:
             cells = []
             for name in CLASSES:
-                row = part(one[way], name)
+                row = part(one[method], name)
                 cells.append(f"{median(row)} / {mm(limit(row))}")
-            rows.append([label, NAMES[way], *cells])
+            rows.append([label, NAMES[method], *cells])
     return table(["trial", "from", *CLASSES], rows, 2)
 
 

@@ -1,10 +1,10 @@
-"""The honest test: contacts from the true wrench with a sensor's noise, against the truth.
+"""Validation with friction and inertia: contacts from the true wrench with noise.
 
-`python studies/honest_test.py [FOLDER]`; with `--quick` one short trial of each kind, with
-`--no-video` nothing is filmed. Recordings and results are kept in the folder (`output/honest_test`
+`python studies/validation.py [FOLDER]`; with `--quick` one short trial of each kind, with
+`--no-video` nothing is filmed. Recordings and results are kept in the folder (`output/validation`
 by default), condition by condition: stopped, it goes on from there. `--again` computes the results
 anew from the recordings; remove the folder to simulate, film and track anew. `--page` writes the
-tables into `docs/honest-test.md` and the figure beside it, else they are written to the folder.
+tables into `docs/validation.md` and the figure beside it, else they are written to the folder.
 """
 
 import argparse
@@ -12,12 +12,12 @@ import json
 from pathlib import Path
 from typing import Any
 
-from honest.conditions import CONDITIONS, FAST, Condition, Recorded, recorded
-from honest.figure import draw
-from honest.summaries import summary
-from honest.tables import TABLES, write
-from honest.video import cutoffs, paper_test, tracked_scores
-from honest.ways import WAYS, chart, located, scored, truth_of
+from friction_inertia.conditions import CONDITIONS, FAST, Condition, Recorded, recorded
+from friction_inertia.figure import draw
+from friction_inertia.methods import METHODS, chart, located, scored, truth_of
+from friction_inertia.summaries import summary
+from friction_inertia.tables import TABLES, write
+from friction_inertia.video import cutoffs, paper_test, tracked_scores
 from pages import save
 
 from vibrissa.recording import Recording
@@ -27,25 +27,25 @@ ROOT = Path(__file__).parent.parent
 
 
 def from_wrench(trials: list[Recorded]) -> dict[str, Any]:
-    """All ways, placed by the true pose."""
+    """All methods, placed by the true pose."""
     out: dict[str, Any] = {}
-    for way in WAYS:
+    for method in METHODS:
         rows = []
         for trial in trials:
             truth, contacts = truth_of(trial.true), chart(Recording(trial.true).whisker())
-            found = located(way, trial.true, contacts)
+            found = located(method, trial.true, contacts)
             rows.append(scored(found, truth, truth.pose, trial.true))
-        out[way] = summary(rows)
+        out[method] = summary(rows)
     return {"true": out}
 
 
 def from_video(trials: list[Recorded]) -> dict[str, Any]:
-    """All ways, placed by tracked poses; and what video alone gives."""
+    """All methods, placed by tracked poses; and what video alone gives."""
     out: dict[str, Any] = {}
-    for way in WAYS:
-        placed = [tracked_scores(trial, way) for trial in trials]
+    for method in METHODS:
+        placed = [tracked_scores(trial, method) for trial in trials]
         for pose in placed[0]:
-            out.setdefault(pose, {})[way] = summary([one[pose] for one in placed])
+            out.setdefault(pose, {})[method] = summary([one[pose] for one in placed])
     return out | {"paper": paper_test(trials), "cutoffs": cutoffs(trials)}
 
 
@@ -72,7 +72,7 @@ def results_of(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("folder", nargs="?", type=Path, default=ROOT / "output" / "honest_test")
+    parser.add_argument("folder", nargs="?", type=Path, default=ROOT / "output" / "validation")
     parser.add_argument("--quick", action="store_true", help="one trial of 0.4 s of each kind")
     parser.add_argument("--no-video", action="store_true", help="true pose only")
     parser.add_argument("--again", action="store_true", help="new results from old recordings")
@@ -90,11 +90,11 @@ def main() -> None:
     found[FAST.name] = results(FAST, 0)
     for name, make in TABLES.items():
         print(f"\n{name}\n{make(found)}")
-    page = ROOT / "docs" / "honest-test.md" if chosen.page else None
+    page = ROOT / "docs" / "validation.md" if chosen.page else None
     if page is not None:
         write(page, found)
     images = folder if page is None else page.parent / "images"
-    save(draw(found), images / "honest_test.png")
+    save(draw(found), images / "validation.png")
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ OTHER = "Fx FT MD"
 SIX = "six signals"
 WRENCH = "wrench"
 PEG = ("offset", "tilt", "diameter", "sigma")
-WAYS = (TRIPLET, OTHER, SIX, WRENCH)
+METHODS = (TRIPLET, OTHER, SIX, WRENCH)
 
 Pose = tuple[np.ndarray, np.ndarray]
 """Rotation (n, 3, 3) and position (n, 3) of the base in every frame."""
@@ -103,11 +103,11 @@ def chart(whisker: Whisker) -> ContactMap:
     return ContactMap.simulate(whisker, grid=False)
 
 
-def located(way: str, trial: xr.DataTree, contact_map: ContactMap) -> xr.Dataset:
+def located(method: str, trial: xr.DataTree, contact_map: ContactMap) -> xr.Dataset:
     """Contacts from the sensor's wrench, whisker frame."""
     wrench = trial.to_dataset()[["force", "moment"]].isel(whisker=0)
-    if way != WRENCH:
-        names = SIGNALS if way == SIX else tuple(way.split())
+    if method != WRENCH:
+        names = SIGNALS if method == SIX else tuple(method.split())
         return locate(contact_map, wrench, names, noise=NOISE)
     found = locate_from_wrench(contact_map.whisker, wrench, NOISE)
     rows = found["in_contact"].values

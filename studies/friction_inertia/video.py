@@ -7,8 +7,17 @@ import numpy as np
 import xarray as xr
 
 import vibrissa as vb
-from honest.conditions import RATE, Recorded
-from honest.ways import TRIPLET, Pose, Truth, chart, located, poses_of, scored, truth_of
+from friction_inertia.conditions import RATE, Recorded
+from friction_inertia.methods import (
+    TRIPLET,
+    Pose,
+    Truth,
+    chart,
+    located,
+    poses_of,
+    scored,
+    truth_of,
+)
 from vibrissa.recording import Recording
 from vibrissa.tracking import base_pose, rest_shape
 from vibrissa.whisker import Whisker
@@ -66,7 +75,7 @@ def cutoffs(trials: Sequence[Recorded]) -> dict[str, Any]:
 def filtered_errors(
     trial: Recorded, found: xr.Dataset, cutoff: float | None
 ) -> dict[str, np.ndarray]:
-    """Of the pose, of the signals the paper's way, of contacts from the sensor, frame by frame."""
+    """Errors of the pose, of the paper's signals, of contacts from the sensor, frame by frame."""
     truth, whisker = truth_of(trial.true), Recording(trial.tracked).whisker()
     curves = trial.tracked["measured"].to_dataset().isel(whisker=0)["centerline"].values
     pose = base_pose(curves, rest_shape(curves), whisker).filtered(RATE, cutoff)
@@ -114,13 +123,13 @@ def middle(values: np.ndarray) -> list[float]:
     return np.quantile(known, [0.5, 0.95]).tolist() if known.size else [np.nan, np.nan]
 
 
-def tracked_scores(trial: Recorded, way: str) -> dict[str, xr.Dataset]:
-    """One way, placed by the tracked poses; with the true whisker's map and with the tracked's."""
+def tracked_scores(trial: Recorded, method: str) -> dict[str, xr.Dataset]:
+    """Scores of one method with the tracked poses, with the true and the tracked whisker's map."""
     truth, poses = truth_of(trial.true), poses_of(trial.tracked)
     true, seen = (chart(Recording(tree).whisker()) for tree in (trial.true, trial.tracked))
-    found = located(way, trial.true, true)
+    found = located(method, trial.true, true)
     # Pegs are shown of the triplet only.
-    fits = way == TRIPLET
+    fits = method == TRIPLET
     out = {name: scored(found, truth, pose, trial.true, fits) for name, pose in poses.items()}
-    found = located(way, trial.true, seen)
+    found = located(method, trial.true, seen)
     return out | {"whisker": scored(found, truth, poses["rod"], trial.true, fits=False)}

@@ -8,12 +8,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from honest.conditions import CONDITIONS
-from honest.summaries import LABELS
-from honest.ways import OTHER, SIX, TRIPLET, WAYS, WRENCH
+from friction_inertia.conditions import CONDITIONS
+from friction_inertia.methods import METHODS, OTHER, SIX, TRIPLET, WRENCH
+from friction_inertia.summaries import LABELS
 from vibrissa.plots.style import BLUE, GREEN, INK, MUTED, ORANGE, head, looking, new_figure
 
-COLOURS = dict(zip(WAYS, (BLUE, MUTED, GREEN, ORANGE), strict=True))
+COLOURS = dict(zip(METHODS, (BLUE, MUTED, GREEN, ORANGE), strict=True))
 SYMBOLS = {
     TRIPLET: "$F_x$, $M_B$, $M_D$",
     OTHER: "$F_x$, $F_T$, $M_D$",
@@ -37,7 +37,7 @@ def draw(results: Mapping[str, Any]) -> Figure:
         for axes in panels[0]:
             axes.set_ylim(limits[:, 0].min(), limits[:, 1].max())
         panels[0, 0].set_ylabel("3D error, median (mm)")
-        lines = [Line2D([], [], color=COLOURS[way], label=SYMBOLS[way]) for way in WAYS]
+        lines = [Line2D([], [], color=COLOURS[method], label=SYMBOLS[method]) for method in METHODS]
         predicted = Line2D([], [], color=INK, linestyle=":", label="predicted")
         panels[0, 0].legend(handles=[*lines, predicted], loc="upper right")
         by_friction(panels[1, 0], results)
@@ -53,11 +53,11 @@ def draw(results: Mapping[str, Any]) -> Figure:
 
 
 def errors(axes: Axes, one: Mapping[str, Any]) -> None:
-    for way in WAYS:
-        rows = [one[way]["classes"][label] for label in LABELS]
+    for method in METHODS:
+        rows = [one[method]["classes"][label] for label in LABELS]
         for name, style in (("median", "o-"), ("predicted", ":")):
             values = [row[name] * 1e3 for row in rows]
-            axes.plot(range(len(LABELS)), values, style, color=COLOURS[way], markersize=2.5)
+            axes.plot(range(len(LABELS)), values, style, color=COLOURS[method], markersize=2.5)
     axes.set_yscale("log")
     by_class(axes)
 
@@ -70,11 +70,11 @@ def by_class(axes: Axes) -> None:
 def by_friction(axes: Axes, results: Mapping[str, Any]) -> None:
     still = [c for c in CONDITIONS if not c.dynamic]
     at = [c.friction for c in still]
-    for way in WAYS:
-        rows = [results[c.name]["true"][way]["classes"][RUBBED] for c in still]
+    for method in METHODS:
+        rows = [results[c.name]["true"][method]["classes"][RUBBED] for c in still]
         for name, style in (("median", "o-"), ("predicted", ":")):
             values = [row[name] * 1e3 for row in rows]
-            axes.plot(at, values, style, color=COLOURS[way], markersize=2.5)
+            axes.plot(at, values, style, color=COLOURS[method], markersize=2.5)
     axes.set_yscale("log")
     axes.set_xticks(at)
     axes.set_xlabel("coefficient of friction")
@@ -97,7 +97,7 @@ def flags(axes: Axes, results: Mapping[str, Any], labels: Mapping[str, str]) -> 
 
 
 def cutoffs(axes: Axes, results: Mapping[str, Any]) -> None:
-    """What the pose alone adds, and what the paper's way makes of the contact."""
+    """What the pose alone adds, and what the paper's method makes of the contact."""
     shown = (("friction-0", BLUE), ("friction-03", GREEN), ("fast", ORANGE))
     said = {"friction-0": "5 whisks a second", "friction-03": "friction 0.3", "fast": "10 a second"}
     for name, colour in shown:

@@ -1,0 +1,1 @@
+"""Validation with friction and inertia, in parts: `studies/validation.py`."""

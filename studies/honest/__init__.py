@@ -1,1 +1,0 @@
-"""The honest test, in parts: `studies/honest_test.py`."""

@@ -31,8 +31,7 @@ if TYPE_CHECKING:
 
     from vibrissa.contacts import ContactMap, Estimator
     from vibrissa.sensors import Sensor
-    from vibrissa.streaming import ContactStream, NewestLines, Poses
-    from vibrissa.streaming.bag import ContactRecorder
+    from vibrissa.streaming import ContactRecorder, ContactStream, NewestLines, Poses
 
 _SOON = 500
 """Samples after which advice is given; it is given again at the end."""
@@ -90,8 +89,7 @@ class LineOptions:
     def lines(self, heard: socket.socket | None) -> Iterator[str]:
         """Return lines as they come."""
         from vibrissa.io import check_readable
-        from vibrissa.streaming.bag import bag_lines
-        from vibrissa.streaming.sources import bounded_lines, file_lines, udp_lines
+        from vibrissa.streaming import bag_lines, bounded_lines, file_lines, udp_lines
 
         if heard is not None:
             return udp_lines(heard)
@@ -193,8 +191,7 @@ class FollowOptions:
 
     def poses(self) -> Poses:
         """Return the poses of what the whisker is mounted on."""
-        from vibrissa.streaming import Poses
-        from vibrissa.streaming.lines import rotation_of
+        from vibrissa.streaming import Poses, rotation_of
 
         if self.mount is None:
             return Poses()
@@ -206,8 +203,7 @@ class FollowOptions:
     ) -> ContactStream:
         """Return what turns lines into contacts."""
         from vibrissa.contacts import ContactFilter
-        from vibrissa.streaming import ContactStream
-        from vibrissa.streaming.contacts import COMPONENTS
+        from vibrissa.streaming import COMPONENTS, ContactStream
 
         speed = None if self.speed is None else 1e-3 * self.speed
         filtered = ContactFilter(estimator, speed=speed) if self.filter else None
@@ -237,7 +233,7 @@ def stream(
     Example: `vibrissa stream --udp 127.0.0.1:5005 --map wire.nc --sensor sensor.toml`
     """
     from vibrissa.io import ContactBag
-    from vibrissa.streaming.bag import ContactRecorder
+    from vibrissa.streaming import ContactRecorder
 
     sensor, poses = measured.described(), follow.poses()
     with ending_in_order(), ExitStack() as opened:
@@ -284,7 +280,7 @@ def _advise(running: ContactStream) -> None:
 
 def _socket(udp: str, opened: ExitStack) -> socket.socket:
     """Listen before the map is made, so that nothing is lost."""
-    from vibrissa.streaming.sources import udp_address, udp_socket
+    from vibrissa.streaming import udp_address, udp_socket
 
     heard = opened.enter_context(udp_socket(*udp_address(udp)))
     host, port = heard.getsockname()[:2]
@@ -323,7 +319,7 @@ class _Losses:
         return text + (f", {lost} datagrams lost because too many waited" if lost else "")
 
     def _counts(self) -> tuple[int, int]:
-        from vibrissa.streaming.sources import udp_lost
+        from vibrissa.streaming import udp_lost
 
         return 0 if self._lines is None else self._lines.dropped, udp_lost(self._heard)
 
@@ -335,7 +331,7 @@ def _write(
     losses: _Losses | None,
 ) -> None:
     """Print records as they come, each at once; stop quietly when nobody reads any more."""
-    from vibrissa.streaming.contacts import as_json
+    from vibrissa.streaming import as_json
 
     try:
         for record in running.records(lines):

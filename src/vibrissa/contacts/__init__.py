@@ -3,9 +3,10 @@
 from vibrissa.contacts.channels import WRENCH, Channels, channel_derivatives, channel_gradients
 from vibrissa.contacts.chosen_contacts import At, ChosenContacts, chosen_contacts, large_deflection
 from vibrissa.contacts.contact_map import ContactMap, Domain, Progress, within_paper_bounds
-from vibrissa.contacts.contacts import Contact, Contacts, spherical
-from vibrissa.contacts.estimator import Estimator
+from vibrissa.contacts.contacts import Candidates, Contact, Contacts, contacts_of, spherical
+from vibrissa.contacts.estimator import Estimator, signals_at_nodes
 from vibrissa.contacts.filter import ContactFilter, Followed
+from vibrissa.contacts.inversion import invert, seeding_triplet
 from vibrissa.contacts.jacobian import (
     RANK,
     contact_signal_derivatives,
@@ -29,6 +30,7 @@ __all__ = [
     "RANK",
     "WRENCH",
     "At",
+    "Candidates",
     "Channels",
     "ChosenContacts",
     "Contact",
@@ -49,11 +51,15 @@ __all__ = [
     "common_covariance",
     "common_errors",
     "contact_signal_derivatives",
+    "contacts_of",
     "deficient",
     "ellipsoids",
     "estimate_from_wrench",
+    "invert",
     "large_deflection",
     "rms_error",
+    "seeding_triplet",
+    "signals_at_nodes",
     "spherical",
     "spherical_derivatives",
     "whitening",

@@ -40,11 +40,26 @@ def spherical(points: Array) -> Array:
 
 
 class Candidates(NamedTuple):
-    """Candidates of n measurements, non-dimensional, in arrays (n, k, ...) padded with NaN.
+    """Candidates of n measurements, non-dimensional, padded with NaN.
 
-    Their number (n,), x = (s, f_x, f_y, f_z) (n, k, 4), (F, p) (n, k, 6), covariances of p
-    (n, k, 3, 3), χ² (n, k), posterior probabilities (n, k), whether covariances are valid (n, k),
-    and standard deviations of the friction angle (n, k).
+    Parameters
+    ----------
+    number : array (n,)
+        Number of candidates.
+    x : array (n, k, 4)
+        Arc length and contact force (s, f_x, f_y, f_z).
+    values : array (n, k, 6)
+        Base force and contact point (F, p).
+    covariances : array (n, k, 3, 3)
+        Covariances of the contact point.
+    chi_squared : array (n, k)
+        χ² of each candidate.
+    probability : array (n, k)
+        Posterior probabilities.
+    valid : array (n, k)
+        Whether the covariances are valid.
+    angle_sigma : array (n, k)
+        Standard deviations of the friction angle, rad.
     """
 
     number: IntArray
@@ -58,7 +73,20 @@ class Candidates(NamedTuple):
 
     @classmethod
     def room(cls, n: int, most: int = MOST_CANDIDATES) -> Candidates:
-        """Make room for candidates of n measurements."""
+        """Make room for candidates of n measurements.
+
+        Parameters
+        ----------
+        n : int
+            Number of measurements.
+        most : int
+            Number of candidates of each, at most.
+
+        Returns
+        -------
+        Candidates
+            None yet: number zero, NaN elsewhere.
+        """
         return cls(
             np.zeros(n, np.int64),
             np.full((n, most, 4), np.nan),
@@ -71,7 +99,18 @@ class Candidates(NamedTuple):
         )
 
     def allowed_first(self, allowed: AnyArray) -> Candidates:
-        """Leave out candidates (n, k) that are not allowed; the others keep their order."""
+        """Leave out candidates that are not allowed; the others keep their order.
+
+        Parameters
+        ----------
+        allowed : array (n, k)
+            Whether each candidate is allowed.
+
+        Returns
+        -------
+        Candidates
+            Those that are.
+        """
         order = np.argsort(~allowed, axis=1, kind="stable")
         gone = np.arange(allowed.shape[1]) >= allowed.sum(axis=1)[:, None]
         parts = []
@@ -83,7 +122,20 @@ class Candidates(NamedTuple):
         return Candidates(allowed.sum(axis=1), *parts)
 
     def spread_out(self, rows: IntArray, n: int) -> Candidates:
-        """Put candidates of some measurements to those of n."""
+        """Place the candidates of some measurements among those of n.
+
+        Parameters
+        ----------
+        rows : array (m,)
+            Numbers of the measurements.
+        n : int
+            Number of all measurements.
+
+        Returns
+        -------
+        Candidates
+            Those of all; the others have none.
+        """
         out = Candidates.room(n, self.x.shape[1])
         for mine, theirs in zip(out, self, strict=True):
             mine[rows] = theirs
@@ -204,60 +256,6 @@ class Contacts(_Located):
             raise ValueError("candidates have no candidates of their own")
         return self._candidates
 
-    @classmethod
-    def of(
-        cls,
-        found: Candidates,
-        status: IntArray,
-        chi_squared: Array,
-        discretization: Discretization,
-        using: tuple[str, ...],
-        shape: tuple[int, ...],
-        dims: tuple[str, ...],
-        coords: Coordinates,
-    ) -> Contacts:
-        """Give candidates of flat measurements their units and the shape of the measurements."""
-        d, most = discretization, max(1, int(found.number.max(initial=0)))
-
-        def whole(values: AnyArray) -> AnyArray:
-            return values.reshape((*shape, *values.shape[1:]))
-
-        there = np.arange(most) < found.number[:, None]
-        every = cls(
-            point=whole(found.values[:, :most, 3:] * d.length),
-            covariance=whole(found.covariances[:, :most] * d.length**2),
-            covariance_valid=whole(found.valid[:, :most] & there),
-            chi_squared=whole(found.chi_squared[:, :most]),
-            probability=whole(found.probability[:, :most]),
-            status=whole(np.where(there, status[:, None], int(Status.MISSING))),
-            arc_length=whole(found.x[:, :most, 0] * d.length),
-            force=whole(found.values[:, :most, :3] * d.force),
-            contact_force=whole(found.x[:, :most, 1:] * d.force),
-            friction_angle_sigma=whole(found.angle_sigma[:, :most]),
-            n_candidates=whole(there.astype(np.int64)),
-            using=using,
-            dims=(*dims, "candidate"),
-            coords=coords,
-        )
-        first = (..., 0)
-        return cls(
-            point=every.point[..., 0, :],
-            covariance=every.covariance[..., 0, :, :],
-            covariance_valid=every.covariance_valid[first] & (whole(status) == Status.UNIQUE),
-            chi_squared=whole(chi_squared),
-            probability=every.probability[first],
-            status=whole(status),
-            arc_length=every.arc_length[first],
-            force=every.force[..., 0, :],
-            contact_force=every.contact_force[..., 0, :],
-            friction_angle_sigma=every.friction_angle_sigma[first],
-            n_candidates=whole(found.number),
-            using=using,
-            dims=dims,
-            coords=coords,
-            _candidates=every,
-        )
-
     def to_dataset(self) -> xr.Dataset:
         """Return everything as a labelled dataset.
 
@@ -344,6 +342,84 @@ class Contacts(_Located):
         return rows
 
 
+def contacts_of(
+    found: Candidates,
+    status: IntArray,
+    chi_squared: Array,
+    discretization: Discretization,
+    using: tuple[str, ...],
+    shape: tuple[int, ...],
+    dims: tuple[str, ...],
+    coords: Coordinates,
+) -> Contacts:
+    """Give candidates of flat measurements their units and the shape of the measurements.
+
+    Parameters
+    ----------
+    found : Candidates
+        Candidates, non-dimensional; the first of each measurement is its answer.
+    status : array (n,)
+        Status of each measurement.
+    chi_squared : array (n,)
+        χ² of each measurement.
+    discretization : Discretization
+        Rod that holds the units of length and force.
+    using : tuple of str
+        Names of the signals.
+    shape : tuple of int
+        Shape of the measurements.
+    dims : tuple of str
+        Dimensions of the measurements.
+    coords : mapping
+        Coordinates of the measurements.
+
+    Returns
+    -------
+    Contacts
+        The contacts, SI units.
+    """
+    d, most = discretization, max(1, int(found.number.max(initial=0)))
+
+    def whole(values: AnyArray) -> AnyArray:
+        return values.reshape((*shape, *values.shape[1:]))
+
+    there = np.arange(most) < found.number[:, None]
+    every = Contacts(
+        point=whole(found.values[:, :most, 3:] * d.length),
+        covariance=whole(found.covariances[:, :most] * d.length**2),
+        covariance_valid=whole(found.valid[:, :most] & there),
+        chi_squared=whole(found.chi_squared[:, :most]),
+        probability=whole(found.probability[:, :most]),
+        status=whole(np.where(there, status[:, None], int(Status.MISSING))),
+        arc_length=whole(found.x[:, :most, 0] * d.length),
+        force=whole(found.values[:, :most, :3] * d.force),
+        contact_force=whole(found.x[:, :most, 1:] * d.force),
+        friction_angle_sigma=whole(found.angle_sigma[:, :most]),
+        n_candidates=whole(there.astype(np.int64)),
+        using=using,
+        dims=(*dims, "candidate"),
+        coords=coords,
+    )
+    first = (..., 0)
+    return Contacts(
+        point=every.point[..., 0, :],
+        covariance=every.covariance[..., 0, :, :],
+        covariance_valid=every.covariance_valid[first] & (whole(status) == Status.UNIQUE),
+        chi_squared=whole(chi_squared),
+        probability=every.probability[first],
+        status=whole(status),
+        arc_length=every.arc_length[first],
+        force=every.force[..., 0, :],
+        contact_force=every.contact_force[..., 0, :],
+        friction_angle_sigma=every.friction_angle_sigma[first],
+        n_candidates=whole(found.number),
+        using=using,
+        dims=dims,
+        coords=coords,
+        _candidates=every,
+    )
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Contact(_Located):
     """The contact that explains one measurement; whisker frame, SI units.
@@ -394,57 +470,6 @@ class Contact(_Located):
     def n_candidates(self) -> int:
         """Number of candidates."""
         return len(self.candidates.point)
-
-    @classmethod
-    def of(
-        cls,
-        found: Candidates,
-        status: Status,
-        chi_squared: float,
-        discretization: Discretization,
-        using: tuple[str, ...],
-        continuing: int = 0,
-        first: int = 0,
-        covariance: Array | None = None,
-    ) -> Contact:
-        """Give the candidates of one measurement their units; ``first`` stands for all."""
-        d, n = discretization, int(found.number[0])
-        points, forces = found.values[0, :n, 3:] * d.length, found.values[0, :n, :3] * d.force
-        arcs, contact_forces = found.x[0, :n, 0] * d.length, found.x[0, :n, 1:] * d.force
-        covariances, chances = found.covariances[0, :n] * d.length**2, found.probability[0, :n]
-        valid = found.valid[0, :n]
-        every = Contacts(
-            points,
-            covariances,
-            valid,
-            found.chi_squared[0, :n],
-            chances,
-            np.full(n, int(status)),
-            arcs,
-            forces,
-            contact_forces,
-            found.angle_sigma[0, :n],
-            np.ones(n, np.int64),
-            using,
-            ("candidate",),
-        )
-        if not n:
-            none = np.full(3, np.nan)
-            away = np.full((3, 3), np.nan)
-            return cls(none, away, False, chi_squared, np.nan, status, np.nan, none, none, every, 0)
-        return cls(
-            points[first],
-            covariances[first] if covariance is None else covariance,
-            bool(valid[first]) and status == Status.UNIQUE,
-            chi_squared,
-            float(chances[first]),
-            status,
-            float(arcs[first]),
-            forces[first],
-            contact_forces[first],
-            every,
-            continuing,
-        )
 
     def to_dataset(self) -> xr.Dataset:
         """Return everything as a labelled dataset without dimensions but the candidates'.
@@ -499,9 +524,59 @@ class Contact(_Located):
         return str(self._as_contacts())
 
 
+def contact_of(
+    found: Candidates,
+    status: Status,
+    chi_squared: float,
+    discretization: Discretization,
+    using: tuple[str, ...],
+    continuing: int = 0,
+    first: int = 0,
+    covariance: Array | None = None,
+) -> Contact:
+    """Give the candidates of one measurement their units; ``first`` stands for all."""
+    d, n = discretization, int(found.number[0])
+    points, forces = found.values[0, :n, 3:] * d.length, found.values[0, :n, :3] * d.force
+    arcs, contact_forces = found.x[0, :n, 0] * d.length, found.x[0, :n, 1:] * d.force
+    covariances, chances = found.covariances[0, :n] * d.length**2, found.probability[0, :n]
+    valid = found.valid[0, :n]
+    every = Contacts(
+        points,
+        covariances,
+        valid,
+        found.chi_squared[0, :n],
+        chances,
+        np.full(n, int(status)),
+        arcs,
+        forces,
+        contact_forces,
+        found.angle_sigma[0, :n],
+        np.ones(n, np.int64),
+        using,
+        ("candidate",),
+    )
+    if not n:
+        none = np.full(3, np.nan)
+        away = np.full((3, 3), np.nan)
+        return Contact(none, away, False, chi_squared, np.nan, status, np.nan, none, none, every, 0)
+    return Contact(
+        points[first],
+        covariances[first] if covariance is None else covariance,
+        bool(valid[first]) and status == Status.UNIQUE,
+        chi_squared,
+        float(chances[first]),
+        status,
+        float(arcs[first]),
+        forces[first],
+        contact_forces[first],
+        every,
+        continuing,
+    )
+
+
 def nowhere(status: Status, chi_squared: float, discretization: Discretization) -> Contact:
     """A measurement without a contact."""
-    return Contact.of(Candidates.room(1, 0), status, chi_squared, discretization, ())
+    return contact_of(Candidates.room(1, 0), status, chi_squared, discretization, ())
 
 
 def _picture(points: Array, candidates: Array) -> str:

@@ -27,10 +27,17 @@ from scipy.spatial import cKDTree
 
 from vibrissa.contacts.ambiguity import Ambiguity
 from vibrissa.contacts.candidates import UNEXPLAINED, Problem, estimate_rows
-from vibrissa.contacts.contacts import Candidates, Contact, Contacts, nowhere
+from vibrissa.contacts.contacts import (
+    Candidates,
+    Contact,
+    Contacts,
+    contact_of,
+    contacts_of,
+    nowhere,
+)
 from vibrissa.contacts.inversion import polish
 from vibrissa.contacts.noise import by_stiffness, common_errors, explained, sensor_noise
-from vibrissa.contacts.prior import Prior, among_allowed
+from vibrissa.contacts.prior import Prior, among_allowed, possible_candidates
 from vibrissa.contacts.readout import (
     Bounds,
     ByName,
@@ -56,7 +63,7 @@ from vibrissa.signals import (
 from vibrissa.status import Status
 
 if TYPE_CHECKING:
-    from vibrissa.contacts.contact_map import ContactMap
+    from vibrissa.contacts.charted_whisker import ChartedWhisker
 
 _UNKNOWNS = 3
 # What is larger is brought to this: no less absurd, in any unit, and its square is still a number.
@@ -67,7 +74,7 @@ _STATUSES = {int(status): status for status in Status}
 class Search:
     """Finds the contacts that explain measurements of three or more signals."""
 
-    def __init__(self, contact_map: ContactMap, readout: Named | Mixed) -> None:
+    def __init__(self, contact_map: ChartedWhisker, readout: Named | Mixed) -> None:
         self.contact_map, self.readout = contact_map, readout
         exact = isinstance(readout, Named) and len(readout.names) == _UNKNOWNS
         limit = explained(independent(contact_map, readout) - _UNKNOWNS)
@@ -134,11 +141,11 @@ class Search:
 
 
 def why_none(
-    contact_map: ContactMap, names: tuple[str, ...], targets: Array
+    contact_map: ChartedWhisker, names: tuple[str, ...], targets: Array
 ) -> tuple[IntArray, Array]:
     """Why three signals have no contact, and how far the nearest are that have one."""
     chart, turned = contact_map.chart, circular_among(names)
-    known, size, tree, bounds = seen(contact_map, names)
+    known, size, tree, bounds = signals_at_nodes(contact_map, names)
     _, nearest = tree.query(_on_circle(targets, turned, size))
     away = within_turn(known[nearest] - targets, turned)
     span = np.where(turned, 2.0 * np.pi, size)
@@ -154,8 +161,29 @@ def why_none(
 
 
 @lru_cache(maxsize=16)
-def seen(contact_map: ContactMap, names: tuple[str, ...]) -> tuple[Array, Array, cKDTree, Bounds]:
-    """Signals (n, k) at the chart's nodes, their ranges, the same as a tree, and their bounds."""
+def signals_at_nodes(
+    contact_map: ChartedWhisker, names: tuple[str, ...]
+) -> tuple[Array, Array, cKDTree, Bounds]:
+    """Return the signals at the nodes of the chart, and what searches among them need.
+
+    Parameters
+    ----------
+    contact_map : ContactMap
+        Map of the whisker's contacts.
+    names : tuple of str
+        Names of the signals.
+
+    Returns
+    -------
+    signals : array (n, k)
+        Signals at the nodes, non-dimensional.
+    ranges : array (k,)
+        Range of each over the map.
+    tree : cKDTree
+        The signals over their ranges.
+    bounds : Bounds
+        Bounds of force and moment over the map.
+    """
     values = contact_map.chart.values.reshape(-1, 6)
     which = [SIGNALS.index(name) for name in names]
     known = signals_of(values[:, :3], np.cross(values[:, 3:], values[:, :3]))[:, which]
@@ -175,7 +203,7 @@ def _on_circle(values: Array, turned: AnyArray, size: Array) -> Array:
 
 
 def estimate(
-    contact_map: ContactMap,
+    contact_map: ChartedWhisker,
     signals: xr.Dataset | Mapping[str, ArrayLike],
     using: str | Sequence[str],
     noise: Mapping[str, float] | ArrayLike | None,
@@ -202,7 +230,7 @@ def estimate(
         found, chi_squared = Candidates.room(len(flat), 1), np.full(len(flat), np.nan)
         known = np.isfinite(flat).all(axis=1)
         status = np.where(known, int(Status.DEGENERATE), int(Status.MISSING))
-    return Contacts.of(found, status, chi_squared, d, names, values.shape[:-1], dims, coords)
+    return contacts_of(found, status, chi_squared, d, names, values.shape[:-1], dims, coords)
 
 
 class Estimator:
@@ -239,7 +267,7 @@ class Estimator:
 
     def __init__(
         self,
-        contact_map: ContactMap,
+        contact_map: ChartedWhisker,
         using: str | Sequence[str] = ("Fx", "MB", "MD"),
         noise: Mapping[str, float] | ArrayLike | None = None,
         stiffness_sigma: float = 0.0,
@@ -260,7 +288,7 @@ class Estimator:
     @classmethod
     def of_sensor(
         cls,
-        contact_map: ContactMap,
+        contact_map: ChartedWhisker,
         sensor: Sensor,
         stiffness_sigma: float = 0.0,
         felt_above: float = 0.0,
@@ -310,7 +338,7 @@ class Estimator:
 
     def _start(
         self,
-        contact_map: ContactMap,
+        contact_map: ChartedWhisker,
         readout: ByName | Named | Mixed,
         width: int,
         felt_above: float,
@@ -445,7 +473,7 @@ class Estimator:
             away = found.values[0, :number, 3:] - self._last
             continuing = int((away * away).sum(axis=1).argmin())
         self._last = found.values[0, continuing, 3:] if number else None
-        return Contact.of(found, status, chi_squared, d, self.names, continuing)
+        return contact_of(found, status, chi_squared, d, self.names, continuing)
 
     def nothing_in(self, measurement: Measurement) -> Status | None:
         """Why a measurement is not worth a search: ``MISSING``, ``NOT_FELT``, ``DEGENERATE``.
@@ -477,7 +505,9 @@ class Estimator:
             beyond = readout.beyond(measurement)
             return nowhere(Status.OUTSIDE_MAP if beyond else Status.NOT_FRICTIONLESS, math.nan, d)
         if self.prior is not None:
-            kept = np.flatnonzero(self.prior.allows_candidates(self.contact_map, found)[0])
+            kept = np.flatnonzero(
+                possible_candidates(self.prior, self.contact_map.whisker, d, found)[0]
+            )
             if not kept.size:
                 return nowhere(Status.OUTSIDE_PRIOR, 0.0, d)
             if kept.size < found.number[0]:
@@ -489,4 +519,4 @@ class Estimator:
         if not readout.noisy:
             covariance[:], found.covariances[:] = np.nan, np.nan
         status, size = Status.UNDERDETERMINED, d.length**2
-        return Contact.of(found, status, 0.0, d, self.names, middle, middle, covariance * size)
+        return contact_of(found, status, 0.0, d, self.names, middle, middle, covariance * size)

@@ -87,7 +87,24 @@ def _plane(chart: StableSet, triplet: tuple[str, ...]) -> PlaneVector | None:
 def invert(
     chart: StableSet, tree: SearchTree, triplet: tuple[str, ...], targets: Array
 ) -> Solutions:
-    """Find all stable contacts for each measured triplet."""
+    """Find all stable contacts for each measured triplet.
+
+    Parameters
+    ----------
+    chart : StableSet
+        Stable contacts of the whisker.
+    tree : SearchTree
+        Search tree of the triplet, from `ContactMap.tree`.
+    triplet : tuple of str
+        Names of the three signals, in canonical order.
+    targets : array (n, 3)
+        Measured signals, non-dimensional.
+
+    Returns
+    -------
+    Solutions
+        Number (n,), contacts (n, k, 4) and values (n, k, 6) of the solutions, non-dimensional.
+    """
     if len(targets) > _MANY:
         order = _by_neighbourhood(targets)
         found = _inverted(chart, tree, triplet, targets[order])
@@ -298,10 +315,22 @@ def polish_rows(
 
 @lru_cache(maxsize=64)
 def seeding_triplet(chart: StableSet, names: tuple[str, ...]) -> tuple[str, ...]:
-    """The three signals among these that determine contacts best, as seen over the chart.
+    """Choose the three signals that determine contacts best, over the chart.
 
-    Judged by the median volume of the error ellipsoid, with forces and moments known to a share of
-    their size.
+    They are judged by the median volume of the error ellipsoid, with the same relative error of
+    forces and moments.
+
+    Parameters
+    ----------
+    chart : StableSet
+        Stable contacts of the whisker.
+    names : tuple of str
+        Names of the measured signals, three or more.
+
+    Returns
+    -------
+    tuple of str
+        Names of three of them.
     """
     values = chart.values[::2, ::4, 1::2].reshape(-1, 6)
     tangents = chart.tangents[::2, ::4, 1::2].reshape(-1, 6, 3)

@@ -32,7 +32,7 @@ from vibrissa.signals import (
 )
 
 if TYPE_CHECKING:
-    from vibrissa.contacts.contact_map import ContactMap
+    from vibrissa.contacts.charted_whisker import ChartedWhisker
 
 #: A determinant smaller than this, rows and columns being of size one, is zero to rounding.
 SINGULAR = 1e-11
@@ -125,7 +125,7 @@ def spherical_derivatives(points: Array) -> Array:
     return out
 
 
-def determining(contact_map: ContactMap, names: tuple[str, ...]) -> bool:
+def determining(contact_map: ChartedWhisker, names: tuple[str, ...]) -> bool:
     """Whether signals determine contacts, but for single ones."""
     chart = contact_map.chart
     nodes = np.random.default_rng(0).choice(chart.values[..., 0].size, _TRIED, replace=False)
@@ -137,7 +137,7 @@ def determining(contact_map: ContactMap, names: tuple[str, ...]) -> bool:
 
 
 def deficient(
-    contact_map: ContactMap, names: tuple[str, ...], xi: Array, span: Array
+    contact_map: ChartedWhisker, names: tuple[str, ...], xi: Array, span: Array
 ) -> int | None:
     """Steps along the whisker with which signals have lost a dimension at contacts; None if not.
 

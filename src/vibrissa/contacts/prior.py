@@ -23,7 +23,7 @@ from vibrissa.signals import REGIONS, concave_backward, in_region
 from vibrissa.status import Status
 
 if TYPE_CHECKING:
-    from vibrissa.contacts.contact_map import ContactMap
+    from vibrissa.contacts.charted_whisker import ChartedWhisker
     from vibrissa.whisker import Whisker
 
 _COORDINATES = ("r", "theta", "phi")
@@ -125,18 +125,16 @@ class Prior:
                 allowed &= _between(name, value, *self.region[name])
         return np.asarray(allowed)
 
-    def allows_candidates(self, contact_map: ContactMap, found: Candidates) -> AnyArray:
-        """Which candidates (n, k) are possible."""
-        d = contact_map.chart.discretization
-        return self.possible(contact_map.whisker, d, found)
 
-    def possible(self, whisker: Whisker, d: Discretization, found: Candidates) -> AnyArray:
-        """Which candidates (n, k) of a whisker are possible; padding is not."""
-        there = np.arange(found.x.shape[1]) < found.number[:, None]
-        allowed, x = np.zeros_like(there), found.x[there]
-        points = found.values[there][:, 3:] * d.length
-        allowed[there] = self.allows(whisker, points, x[:, 0] * d.length, x[:, 1:] * d.force)
-        return allowed
+def possible_candidates(
+    prior: Prior, whisker: Whisker, d: Discretization, found: Candidates
+) -> AnyArray:
+    """Which candidates (n, k) of a whisker are possible; padding is not."""
+    there = np.arange(found.x.shape[1]) < found.number[:, None]
+    allowed, x = np.zeros_like(there), found.x[there]
+    points = found.values[there][:, 3:] * d.length
+    allowed[there] = prior.allows(whisker, points, x[:, 0] * d.length, x[:, 1:] * d.force)
+    return allowed
 
 
 def _between(name: str, value: Array, least: float, greatest: float) -> AnyArray:
@@ -147,7 +145,7 @@ def _between(name: str, value: Array, least: float, greatest: float) -> AnyArray
 
 def among_allowed(
     prior: Prior,
-    contact_map: ContactMap,
+    contact_map: ChartedWhisker,
     readout: Named | Mixed,
     measured: tuple[Array, Array],
     found: Candidates,
@@ -158,7 +156,9 @@ def among_allowed(
 
     ``measured`` has the measurements (n, k) and the channels that they should be.
     """
-    allowed = prior.allows_candidates(contact_map, found)
+    allowed = possible_candidates(
+        prior, contact_map.whisker, contact_map.chart.discretization, found
+    )
     number, before = allowed.sum(axis=1), found.number
     if (number == before).all():
         return found, status, chi_squared

@@ -24,7 +24,7 @@ from vibrissa.sensors import COMPONENTS
 from vibrissa.signals import CIRCULAR, SIGNALS, signal_scales, signals_of
 
 if TYPE_CHECKING:
-    from vibrissa.contacts.contact_map import ContactMap
+    from vibrissa.contacts.charted_whisker import ChartedWhisker
 
 # A direction of the readings in which contacts of the map vary so much less than the noise and the
 # others tells nothing.
@@ -43,7 +43,7 @@ class Bounds(NamedTuple):
     largest: Array
 
     @classmethod
-    def of(cls, contact_map: ContactMap, names: tuple[str, ...]) -> Bounds:
+    def of(cls, contact_map: ChartedWhisker, names: tuple[str, ...]) -> Bounds:
         """Find them for signals of a map."""
         sizes = [k for k, name in enumerate(names) if not CIRCULAR[SIGNALS.index(name)]]
         values = contact_map.chart.values.reshape(-1, 6)
@@ -105,7 +105,7 @@ class Named:
     """Signals by name, and components of force and moment."""
 
     def __init__(
-        self, contact_map: ContactMap, names: tuple[str, ...], sensor: SensorNoise | None
+        self, contact_map: ChartedWhisker, names: tuple[str, ...], sensor: SensorNoise | None
     ) -> None:
         chart = contact_map.chart
         d = chart.discretization
@@ -189,7 +189,7 @@ class Mixed:
     """A linear mix of force and moment, z = H (F, M) + noise."""
 
     def __init__(
-        self, contact_map: ContactMap, mixing: Array, covariance: Array, errors: Array
+        self, contact_map: ChartedWhisker, mixing: Array, covariance: Array, errors: Array
     ) -> None:
         chart = contact_map.chart
         d = chart.discretization
@@ -316,7 +316,7 @@ def _weighing(
     )
 
 
-def independent(contact_map: ContactMap, readout: Named | Mixed) -> int:
+def independent(contact_map: ChartedWhisker, readout: Named | Mixed) -> int:
     """How many independent numbers a measurement tells."""
     if isinstance(readout, Mixed):
         return len(readout.how.own)
@@ -359,7 +359,7 @@ class ByName:
 
 
 def readout_of(
-    contact_map: ContactMap, h: Array, covariance: Array, errors: Array
+    contact_map: ChartedWhisker, h: Array, covariance: Array, errors: Array
 ) -> ByName | Mixed:
     """Signals by name if the channels tell these and nothing else, or a mix."""
     read = [name for name, column in zip(COMPONENTS, h.T, strict=True) if column.any()]

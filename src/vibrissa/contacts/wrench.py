@@ -22,7 +22,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from vibrissa.contacts.channels import WRENCH
-from vibrissa.contacts.contacts import Candidates, Contacts
+from vibrissa.contacts.contacts import Candidates, Contacts, contacts_of
 from vibrissa.contacts.least_squares import Fits, fit, unknowns_covariance
 from vibrissa.contacts.noise import (
     INDISTINCT,
@@ -37,7 +37,7 @@ from vibrissa.contacts.noise import (
     whitening,
 )
 from vibrissa.contacts.posterior import CERTAIN, judged, ranked
-from vibrissa.contacts.prior import Prior
+from vibrissa.contacts.prior import Prior, possible_candidates
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.rod import Discretization, discretize, solve_forces, vanishing_moments
 from vibrissa.signals import Coordinates, labelled_wrench, measured
@@ -199,7 +199,7 @@ def _located(
     solved = _solve(discretize(whisker, _COARSE), d, wrenches[rows], weights, limit)
     found, lost = _candidates(solved), np.zeros(rows.size, np.bool_)
     if prior is not None:
-        allowed = prior.possible(whisker, d, found)
+        allowed = possible_candidates(prior, whisker, d, found)
         found = found.allowed_first(allowed)
         solved = solved.allowed_first(allowed)
     if sensor is not None:
@@ -208,7 +208,7 @@ def _located(
     status[rows] = np.where(lost, int(Status.DEGENERATE), _statuses(found, limit))
     whole = found.spread_out(rows, len(wrenches))
     chi_squared = whole.chi_squared[:, 0]
-    return Contacts.of(whole, status, chi_squared, d, WRENCH, f.shape[:-1], dims, coords)
+    return contacts_of(whole, status, chi_squared, d, WRENCH, f.shape[:-1], dims, coords)
 
 
 def _covariance(sensor: SensorNoise) -> Array:

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts import Domain, deficient
-from vibrissa.contacts.inversion import invert
+from vibrissa.contacts import Domain, deficient, invert
 from vibrissa.identifiability.fibres import fibres
 from vibrissa.identifiability.regions import ContactSet, Samples, contact_set, sample, spread
 from vibrissa.identifiability.twins import (

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts import Domain
-from vibrissa.contacts.inversion import invert
+from vibrissa.contacts import Domain, invert
 from vibrissa.identifiability.regions import ContactSet, contact_set, in_chart, sample
 from vibrissa.numerics import AnyArray, Array
 from vibrissa.rod import (

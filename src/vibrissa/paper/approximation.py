@@ -15,8 +15,15 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from vibrissa.contacts import ContactMap, Contacts, Prior, SensorNoise, check_signals
-from vibrissa.contacts.contacts import Candidates
+from vibrissa.contacts import (
+    Candidates,
+    ContactMap,
+    Contacts,
+    Prior,
+    SensorNoise,
+    check_signals,
+    contacts_of,
+)
 from vibrissa.numerics import Array
 from vibrissa.paper.lookup import STEP, LookupTable
 from vibrissa.paper.network import NetworkSolver, train_network
@@ -126,7 +133,7 @@ def estimate(
     most.covariances[found, 0] = covariance[found] / d.length**2
     misfit = _misfit(rows, bent.force, bent.moment, names, ranges)
     most.chi_squared[found, 0] = misfit[found]
-    return Contacts.of(most, status, misfit, d, names, values.shape[:-1], dims, coords)
+    return contacts_of(most, status, misfit, d, names, values.shape[:-1], dims, coords)
 
 
 def _solver(contact_map: ContactMap, method: str, names: tuple[str, ...]) -> Solver:

@@ -1,12 +1,23 @@
 """Signals as they come in, line by line, to contacts as they go out."""
 
 from vibrissa.streaming.advice import advice
-from vibrissa.streaming.contacts import ContactStream
-from vibrissa.streaming.lines import LineKind, Lines, Sample
+from vibrissa.streaming.bag import ContactRecorder, bag_lines
+from vibrissa.streaming.contacts import COMPONENTS, ContactStream, as_json
+from vibrissa.streaming.lines import LineKind, Lines, Sample, rotation_of
 from vibrissa.streaming.poses import Pose, Poses
-from vibrissa.streaming.sources import NewestLines, file_lines, udp_lines
+from vibrissa.streaming.sources import (
+    NewestLines,
+    bounded_lines,
+    file_lines,
+    udp_address,
+    udp_lines,
+    udp_lost,
+    udp_socket,
+)
 
 __all__ = [
+    "COMPONENTS",
+    "ContactRecorder",
     "ContactStream",
     "LineKind",
     "Lines",
@@ -15,6 +26,13 @@ __all__ = [
     "Poses",
     "Sample",
     "advice",
+    "as_json",
+    "bag_lines",
+    "bounded_lines",
     "file_lines",
+    "rotation_of",
+    "udp_address",
     "udp_lines",
+    "udp_lost",
+    "udp_socket",
 ]

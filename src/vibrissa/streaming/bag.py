@@ -17,7 +17,22 @@ from vibrissa.streaming.lines import FRAME, POSITION, QUATERNION, RECORDED, STAM
 
 
 def bag_lines(source: Path, topic: str | None, pose_topic: str | None) -> Iterator[str]:
-    """Read lines as they would have come, poses and wrenches in the order of their times."""
+    """Read lines from a bag, poses and wrenches in the order of their times.
+
+    Parameters
+    ----------
+    source : Path
+        The bag.
+    topic : str, optional
+        Topic of the wrenches; the only one by default.
+    pose_topic : str, optional
+        Topic of the poses; none are read by default.
+
+    Yields
+    ------
+    str
+        One line a message, as a stream would have received it.
+    """
 
     def named(messages: Iterator[BagMessage], names: tuple[str, ...]) -> Iterator[dict[str, Any]]:
         for stamp, recorded, frame, values in messages:
@@ -33,7 +48,21 @@ def bag_lines(source: Path, topic: str | None, pose_topic: str | None) -> Iterat
 
 
 class ContactRecorder:
-    """Puts records into a bag as long as it can be written; the stream goes on without."""
+    """Writer of records to a bag, as long as that can be written; the stream goes on without.
+
+    Parameters
+    ----------
+    bag : ContactBag
+        Open bag.
+    running : ContactStream
+        Stream whose records are written.
+    sensor : Sensor or None
+        Sensor at the base, which defines the frame of the points.
+    follow : bool
+        Whether contacts are followed in the laboratory.
+    remark : callable
+        Function that reports a sentence to the user.
+    """
 
     def __init__(
         self,
@@ -49,7 +78,13 @@ class ContactRecorder:
         self.broken = False
 
     def put(self, record: dict[str, Any]) -> None:
-        """Put a record of a sample into the bag; those of faults are left out."""
+        """Write the record of a sample; those of faults are left out.
+
+        Parameters
+        ----------
+        record : dict
+            Record of the stream.
+        """
         if self.broken or "error" in record:
             return
         points = np.reshape(record.get("hypotheses", record.get("candidates", [])), (-1, 3))

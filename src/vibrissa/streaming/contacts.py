@@ -259,7 +259,18 @@ def followed_record(known: Followed, rotation: Array | None = None) -> dict[str,
 
 
 def as_json(record: dict[str, Any]) -> str:
-    """One line of JSON; what is not finite is null."""
+    """Write a record as one line of JSON; numbers that are not finite become null.
+
+    Parameters
+    ----------
+    record : dict
+        A record of `ContactStream`.
+
+    Returns
+    -------
+    str
+        The line.
+    """
     return json.dumps(_finite(record), ensure_ascii=False)
 
 

@@ -310,7 +310,18 @@ def _number(name: str, value: object) -> float:
 
 
 def rotation_of(quaternion: Sequence[float]) -> Array:
-    """Return the matrix of a quaternion."""
+    """Return the rotation matrix of a quaternion.
+
+    Parameters
+    ----------
+    quaternion : sequence of float
+        Components (w, x, y, z) of a unit quaternion.
+
+    Returns
+    -------
+    array (3, 3)
+        The matrix; NaN where a component is not finite.
+    """
     q = np.array(quaternion)
     size = math.hypot(*quaternion)
     if not math.isfinite(size):

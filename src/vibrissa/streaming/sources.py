@@ -89,7 +89,18 @@ def file_lines(
 
 
 def bounded_lines(file: TextIO) -> Iterator[str]:
-    """Read lines, each at once, of which none fills the memory."""
+    """Read lines as they come; of longer ones only the first part is kept.
+
+    Parameters
+    ----------
+    file : text file
+        Open file.
+
+    Yields
+    ------
+    str
+        The lines.
+    """
     while line := file.readline(LONGEST + 1):
         yield line
         while len(line) > LONGEST and not line.endswith("\n"):
@@ -97,7 +108,20 @@ def bounded_lines(file: TextIO) -> Iterator[str]:
 
 
 def udp_address(text: str) -> tuple[str, int]:
-    """Read ``HOST:PORT``."""
+    """Read an address written as ``HOST:PORT``.
+
+    Parameters
+    ----------
+    text : str
+        The address, such as ``127.0.0.1:5005``.
+
+    Returns
+    -------
+    host : str
+        Name or number of the host; empty for all.
+    port : int
+        Number of the port.
+    """
     host, colon, port = text.rpartition(":")
     if not colon or not port.isdigit() or int(port) > 65535:
         raise ValueError(f"an address is HOST:PORT, such as 127.0.0.1:5005; got {text!r}")
@@ -105,7 +129,20 @@ def udp_address(text: str) -> tuple[str, int]:
 
 
 def udp_socket(host: str, port: int) -> socket.socket:
-    """Open the socket that `udp_lines` reads."""
+    """Open the socket that `udp_lines` reads.
+
+    Parameters
+    ----------
+    host : str
+        Name or number of the interface; empty for all.
+    port : int
+        Number of the port.
+
+    Returns
+    -------
+    socket
+        The bound socket.
+    """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     opened = socket.socket(family, socket.SOCK_DGRAM)
     opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _WAITING)  # or what the system allows
@@ -135,7 +172,18 @@ def udp_lines(opened: socket.socket) -> Iterator[str]:
 
 
 def udp_lost(opened: socket.socket) -> int:
-    """Count datagrams that the system threw away because too many waited."""
+    """Count the datagrams that the system discarded because too many were waiting.
+
+    Parameters
+    ----------
+    opened : socket
+        Socket of `udp_socket`.
+
+    Returns
+    -------
+    int
+        Their number since the socket was opened; 0 where the system does not report it.
+    """
     if sys.platform != "linux":
         return 0
     try:

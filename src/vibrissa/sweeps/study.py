@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from vibrissa.contacts.estimator import seen
-from vibrissa.contacts.inversion import seeding_triplet
+from vibrissa.contacts import seeding_triplet, signals_at_nodes
 from vibrissa.rod import discretize, point_solver, stable_set
 from vibrissa.signals import resting
 from vibrissa.sweeps.population import Specimen, population
@@ -78,7 +77,7 @@ moment_noise = 0.02              # µN·m
 # Others: "map"; "sensitivity" (triplets, noise); "friction" (triplet, friction, contacts).
 """
 
-_KEPT = (discretize, stable_set, point_solver, resting, seen, seeding_triplet)
+_KEPT = (discretize, stable_set, point_solver, resting, signals_at_nodes, seeding_triplet)
 """Functions that cache results of the last whiskers; a study does not return to any."""
 _OF_WHISKER, _OF_CELL = 16, 4
 """Numbers stored for each whisker, with its name, and for each cell."""

@@ -1,0 +1,33 @@
+"""A whisker with the chart of its contacts: what estimates need of a contact map."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from vibrissa.rod import SearchTree, StableSet
+from vibrissa.whisker import Whisker
+
+
+class ChartedWhisker(Protocol):
+    """A :class:`~vibrissa.contacts.ContactMap`, as the modules below it see it."""
+
+    @property
+    def whisker(self) -> Whisker:
+        """The whisker."""
+
+    @property
+    def chart(self) -> StableSet:
+        """Its stable contacts."""
+
+    @property
+    def steps(self) -> int:
+        """Number of integration steps."""
+
+    def tree(self, triplet: tuple[str, ...]) -> SearchTree:
+        """Return the search tree of three signals."""
+
+    def determines(self, using: str | tuple[str, ...]) -> bool:
+        """Check whether signals determine contacts."""
+
+    def __hash__(self) -> int:
+        """Maps are kept by identity."""

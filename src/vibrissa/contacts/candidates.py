@@ -125,6 +125,80 @@ class Problem(NamedTuple):
 
 
 @kernel
+def explain_rows(
+    of: Searched,
+    how: Weighing,
+    problem: Problem,
+    targets: Array,
+    measured: Array,
+    out: Candidates,
+    status: IntArray,
+    again: bool,
+    first: int,
+    last: int,
+) -> None:
+    """Find the candidates of measurements by least squares; NaN rows are left alone.
+
+    With noise they are completed and ranked before their status is known; ``again`` then states
+    why the rows that are UNEXPLAINED have no contact.
+    """
+    x, values, chi = (
+        np.empty(out.x.shape[1:]),
+        np.empty(out.values.shape[1:]),
+        np.empty(out.chi_squared.shape[1:]),
+    )
+    state = (
+        np.zeros((_MOST_ROWS, 4)),
+        np.zeros((_MOST_ROWS, 6)),
+        np.zeros((_MOST_ROWS, 6, 4)),
+        np.full(_MOST_ROWS, np.inf),
+        np.zeros(_MOST_ROWS, np.int64),
+    )
+    for row in range(first, last):
+        target, seen = targets[row], measured[row]
+        if not _known(target) or (again and status[row] != UNEXPLAINED):
+            continue
+        if not again:
+            x, values, chi = out.x[row], out.values[row], out.chi_squared[row]
+        most, starts = _best(of, how, problem, target, seen, state, x, values, chi)
+        if again:  # perhaps a contact nearer to the base than the map goes explains it
+            starts = _everywhere(of, how, problem, target, seen, state, starts)
+        else:
+            out.number[row] = most
+            if problem.noisy:
+                continue
+            if most > 0 and chi[0] <= problem.limit:
+                status[row] = _UNIQUE if most == 1 else _AMBIGUOUS
+                continue
+        status[row] = _FRICTION
+        for i in range(starts):
+            if state[4][i] == 1 and state[3][i] <= problem.limit:
+                status[row] = _OUTSIDE
+
+
+@kernel
+def settle_rows(
+    of: Searched,
+    how: Weighing,
+    problem: Problem,
+    targets: Array,
+    measured: Array,
+    out: Candidates,
+    status: IntArray,
+    first: int,
+    last: int,
+) -> None:
+    """Complete the candidates of noisy measurements, judge and rank them."""
+    room = _judging(MOST_CANDIDATES, targets.shape[1])
+    for row in range(first, last):
+        if not _known(targets[row]):
+            continue
+        settle(of, how, problem, targets[row], measured[row], row, out, room)
+        status[row] = UNEXPLAINED
+        if out.number[row] > 0 and out.chi_squared[row, 0] <= problem.limit:
+            status[row] = _UNIQUE if out.probability[row, 0] > CERTAIN else _AMBIGUOUS
+
+
 def estimate_rows(
     of: Searched,
     how: Weighing,
@@ -136,59 +210,63 @@ def estimate_rows(
     first: int,
     last: int,
 ) -> None:
-    """Find, complete, judge and rank the candidates of measurements; NaN rows are left alone."""
-    n = last - first
-    xi, solved = np.empty((0, 0, 3)), np.empty((0, 0, 6))
+    """Find, complete, judge and rank the candidates of measurements; NaN rows are left alone.
+
+    Each stage is compiled by itself, so that whoever needs one does not wait for the others.
+    """
     if problem.exact:
-        xi = np.full((n, MOST_CANDIDATES, 3), np.nan)
-        solved = np.full((n, MOST_CANDIDATES, 6), np.nan)
-        aims = np.empty((n, 6))
-        for i in range(n):
-            for k in range(3):
-                aims[i, k] = (
-                    measured[first + i, of.where[k]] if _known(targets[first + i]) else np.nan
-                )
-                aims[i, 3 + k] = of.codes[k]
-        invert_rows(
-            of.rod, of.fold, of.tree, of.proximal, aims, out.number[first:last], xi, solved, 0, n
-        )
-    fits = 0 if problem.exact else _MOST_ROWS
-    state = (
-        np.zeros((fits, 4)),
-        np.zeros((fits, 6)),
-        np.zeros((fits, 6, 4)),
-        np.full(fits, np.inf),
-        np.zeros(fits, np.int64),
-    )
-    room = _judging(MOST_CANDIDATES, targets.shape[1])
-    for row in range(first, last):
-        target, seen, starts = targets[row], measured[row], 0
-        if not _known(target):
+        _solve_rows(of, targets, measured, out, status, first, last)
+    else:
+        explain_rows(of, how, problem, targets, measured, out, status, False, first, last)
+    if problem.noisy:
+        settle_rows(of, how, problem, targets, measured, out, status, first, last)
+        if not problem.exact and (status[first:last] == UNEXPLAINED).any():
+            explain_rows(of, how, problem, targets, measured, out, status, True, first, last)
+
+
+def _solve_rows(
+    of: Searched,
+    targets: Array,
+    measured: Array,
+    out: Candidates,
+    status: IntArray,
+    first: int,
+    last: int,
+) -> None:
+    """Find the contacts that give three signals exactly."""
+    n = last - first
+    aims, xi = np.empty((n, 6)), np.empty((n, MOST_CANDIDATES, 3))
+    number, values = out.number[first:last], out.values[first:last]
+    _aim_rows(of.where, of.codes, targets[first:last], measured[first:last], aims)
+    invert_rows(of.rod, of.fold, of.tree, of.proximal, aims, number, xi, values, 0, n)
+    _keep_rows(number, xi, aims, out.x[first:last], out.chi_squared[first:last], status[first:last])
+
+
+@kernel
+def _aim_rows(where: IntArray, codes: Array, targets: Array, measured: Array, aims: Array) -> None:
+    """Write the three measured signals and the codes of the cells that may hold them."""
+    for i in range(len(targets)):
+        known = _known(targets[i])
+        for k in range(3):
+            aims[i, k] = measured[i, where[k]] if known else np.nan
+            aims[i, 3 + k] = codes[k]
+
+
+@kernel
+def _keep_rows(
+    number: IntArray, xi: Array, aims: Array, x: Array, chi: Array, status: IntArray
+) -> None:
+    """Write solutions as candidates that explain the signals exactly."""
+    for i in range(len(number)):
+        if aims[i, 0] != aims[i, 0]:
             continue
-        x, values, chi = out.x[row], out.values[row], out.chi_squared[row]
-        if problem.exact:
-            for c in range(out.number[row]):
-                for a in range(4):
-                    x[c, a] = 0.0 if a == 1 else xi[row - first, c, max(a - 1, 0)]
-                copy(solved[row - first, c], values[c])
-                chi[c] = 0.0
-        else:
-            out.number[row], starts = _best(of, how, problem, target, seen, state, x, values, chi)
-        if problem.noisy:
-            settle(of, how, problem, target, seen, row, out, room)
-        most = out.number[row]
-        sure = out.probability[row, 0] > CERTAIN if problem.noisy else most == 1
-        status[row] = _UNIQUE if sure else _AMBIGUOUS
-        if most > 0 and chi[0] <= problem.limit:
-            continue
-        status[row] = UNEXPLAINED
-        if not problem.exact:
-            if problem.noisy:  # perhaps a contact nearer to the base than the map goes explains it
-                starts = _everywhere(of, how, problem, target, seen, state, starts)
-            status[row] = _FRICTION
-            for i in range(starts):
-                if state[4][i] == 1 and state[3][i] <= problem.limit:
-                    status[row] = _OUTSIDE
+        for c in range(number[i]):
+            x[i, c, 0], x[i, c, 1] = xi[i, c, 0], 0.0
+            x[i, c, 2], x[i, c, 3] = xi[i, c, 1], xi[i, c, 2]
+            chi[i, c] = 0.0
+        status[i] = UNEXPLAINED
+        if number[i] > 0:
+            status[i] = _UNIQUE if number[i] == 1 else _AMBIGUOUS
 
 
 @inlined

@@ -1,12 +1,17 @@
+import ast
 import importlib.metadata
 import pkgutil
+import re
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 import vibrissa
+
+SOURCE = Path(vibrissa.__file__).parent
 
 
 @pytest.mark.parametrize("name", vibrissa.__all__)
@@ -26,6 +31,32 @@ def test_every_package_is_public():
     packages = {module.name for module in pkgutil.iter_modules(vibrissa.__path__) if module.ispkg}
     assert packages - set(vibrissa.__all__) <= {"cli", "demo"}
     assert set(dir(vibrissa)) == set(vibrissa.__all__)
+
+
+def imports_of(path):
+    """Modules of vibrissa that a file names in its imports."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("vibrissa."):
+            yield node.module
+
+
+def test_packages_are_entered_through_their_faces():
+    past = [
+        f"{path.relative_to(SOURCE)} -> {module}"
+        for path in SOURCE.rglob("*.py")
+        for module in imports_of(path)
+        if module.count(".") > 1 and module.split(".")[1] != path.relative_to(SOURCE).parts[0]
+    ]
+    assert past == []
+
+
+def test_the_architecture_page_names_files_that_exist():
+    page = SOURCE.parents[1] / "docs" / "architecture.md"
+    if not page.exists():
+        pytest.skip("the documentation is not here")
+    named = re.findall(r"`([a-z_]+/[a-z_/]+\.py)`", page.read_text())
+    assert len(named) > 40
+    assert [name for name in named if not (SOURCE / name).is_file()] == []
 
 
 def test_unknown_name_is_an_attribute_error():

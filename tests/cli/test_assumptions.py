@@ -154,7 +154,7 @@ def test_maps_begin_where_they_are_asked_to(folder, tmp_path):
     assert (distal[~same] > here[~same]).all()
     given = ("estimate", folder / "signals.csv", "--proximal", 0.5)
     assert "--proximal cannot be used" in fault(*given, "--map", folder / "map.nc")
-    assert "--proximal cannot be used" in fault(*given, "--wrench")
+    assert "--proximal cannot be used" in fault(*given, "--using", "wrench")
     assert "must be from 0.05 L" in fault("map", "--no-grid", "--proximal", 2)
 
 

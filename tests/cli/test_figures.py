@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import xarray as xr
 from typer.testing import CliRunner
-from vibrissa.plots.evidence import HIGHLIGHTED
 
 import vibrissa as vb
 from vibrissa import plots
 from vibrissa.cli.app import app, main
 from vibrissa.identifiability import witness_pairs
+from vibrissa.plots import HIGHLIGHTED
 
 # The known pair of contacts that feel the same by (F_x, M_B, M_D): parabola with A·L = 0.82,
 # arc length in L and force in EI/L² (the second found by Newton from (0.645, 0.440)).

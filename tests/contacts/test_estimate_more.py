@@ -157,7 +157,7 @@ def test_statuses(gamma_map):
     names = "Fx FT MB MD"
 
     def status(signals, using=names):
-        return gamma_map.estimate(signals, triplet).status
+        return gamma_map.estimate(signals, using).status
 
     assert status(good) == vb.Status.UNIQUE
     assert status({**good, "MB": np.nan}) == vb.Status.MISSING

@@ -129,7 +129,9 @@ def test_probabilities_are_how_often_candidates_are_true(gamma_map, rng):
     several = found.n_candidates > 1
     assert several.sum() > 100
     chance = found.candidates.probability[several]
-    np.testing.assert_allclose(np.nansum(chance, axis=1), 1.0)
+    total = np.nansum(chance, axis=1)  # the rest is that of contacts that no candidate stands for
+    assert (total <= 1.0 + 1e-9).all()
+    assert (np.isclose(total, 1.0) | ~found.candidates.covariance_valid[several, 0]).all()
     assert (np.diff(chance, axis=1)[np.isfinite(chance[:, 1:])] <= 0.0).all()
     assert ((found.probability > 0.95) == (found.status == vb.Status.UNIQUE))[several].all()
     away = found.candidates.point[several] - point[several, None]

@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
 import vibrissa as vb
-from vibrissa.cli.info import info
+from vibrissa.cli.app import app
 from vibrissa.sensors import (
     Sensor,
     SensorFrame,
@@ -453,10 +454,9 @@ def test_usual_mistakes_of_calibrations_are_said(wire, touched, rng):
         fit_stiffness(thick, points, wrench, Sensor(noise=noise), modulus_sigma=0.1)
 
 
-def test_a_sensor_file_can_be_looked_into(tmp_path, capsys):
+def test_a_sensor_file_can_be_looked_into(tmp_path):
     frame = SensorFrame(("x", "-z", "-y"), (-0.03, 0.0, 0.0))
     save_sensor(tmp_path / "s.toml", Sensor(("My",), mixing=1e3, noise=0.1, frame=frame, mass=0.01))
-    info(tmp_path / "s.toml")
-    said = capsys.readouterr().out
+    said = CliRunner().invoke(app, ["info", str(tmp_path / "s.toml")]).output
     for part in ("1000 My + 0, noise 0.1", "left-handed, origin at (-30.00", "10 g"):
         assert part in said

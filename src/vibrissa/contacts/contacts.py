@@ -42,7 +42,7 @@ def spherical(points: Array) -> Array:
 class Candidates(NamedTuple):
     """Candidates of n measurements, non-dimensional, padded with NaN.
 
-    Parameters
+    Attributes
     ----------
     number : array (n,)
         Number of candidates.

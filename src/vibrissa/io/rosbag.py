@@ -62,7 +62,7 @@ def is_bag(path: str | PathLike[str]) -> bool:
 class BagMessage(NamedTuple):
     """One message of a bag.
 
-    Parameters
+    Attributes
     ----------
     stamp, recorded : int
         Times of the measurement and of its recording, ns.

@@ -62,7 +62,7 @@ class Surface(ABC):
 class Placement(NamedTuple):
     """Placement of the whisker's base in the surfaces' frame.
 
-    Parameters
+    Attributes
     ----------
     rotation : array (3, 3)
         Rotation from the whisker's to the surfaces' frame.

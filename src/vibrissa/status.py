@@ -99,9 +99,9 @@ class Status(enum.IntEnum):
     AMBIGUOUS = (
         21,
         False,
-        "Several contacts of this whisker explain the signals.",
-        "All are among the candidates: add a signal, or choose by continuity with the frames "
-        "around.",
+        "Several contacts of this whisker explain the signals, or are probable with their noise.",
+        "The candidates are listed, with noise by their probability: add a signal, or choose by "
+        "continuity with the frames around.",
     )
     NOT_FRICTIONLESS = (
         22,

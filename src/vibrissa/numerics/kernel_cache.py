@@ -109,7 +109,7 @@ class _FirstCompilation(event.Listener):
         what = f"for `{verb}`" if verb else f"of {package}"
         if module.startswith("vibrissa.") and what not in self.reported:
             self.reported.add(what)
-            _say(f"compiling kernels {what} (once for this installation, under a minute) ...")
+            _say(f"compiling kernels {what} (once for this installation, a minute or two) ...")
 
     def on_end(self, event: event.Event) -> None:
         pass

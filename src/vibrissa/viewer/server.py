@@ -48,7 +48,7 @@ _HERE = "● "
 """Before the way to look that is chosen."""
 
 _COMPILING = (
-    "Compiling, once for this installation, for about a minute. What needs a part that is not "
+    "Compiling, once for this installation, for a minute or two. What needs a part that is not "
     "ready waits for it: pegs, candidates and their errors."
 )
 

@@ -1,7 +1,7 @@
 """What a whisker meets in the laboratory: pegs, spheres, planes, boxes (meshes: `trial.mesh`).
 
 Each is a solid with a signed distance d (negative inside), its gradient, the outward normal n, and
-∂n/∂x, in closed form; a `vibrissa.rod.surfaces.Surface`. Each may be compliant: pressed with N it
+∂n/∂x, in closed form; a `vibrissa.objects.Surface`. Each may be compliant: pressed with N it
 gives way by N over its stiffness, locally and along the normal, and keeps its shape elsewhere.
 """
 

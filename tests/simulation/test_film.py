@@ -7,7 +7,14 @@ from vibrissa import Whisker
 from vibrissa.cameras import orthogonal_views
 from vibrissa.io import read_video
 from vibrissa.objects import Peg, Sphere
-from vibrissa.simulation import ImageConditions, Motion, film, film_frames, simulate
+from vibrissa.simulation import (
+    ImageConditions,
+    Motion,
+    film,
+    film_frames,
+    simulate,
+    with_true_traces,
+)
 
 WHISKER = Whisker.parabola(length=10e-3, coefficient=15.0)
 PEG = Peg([6e-3, 2.4e-3, 0.0], [0.0, 0.0, 1.0], 1e-3)
@@ -165,3 +172,62 @@ def test_hidden_is_what_is_behind():
     )
     np.testing.assert_array_equal(hidden(points, CAMERAS[1], [sphere]), [1, 0, 0, 0])
     np.testing.assert_array_equal(hidden(points, CAMERAS[0], [sphere]), [0, 0, 0, 1])
+
+
+@pytest.fixture(scope="module")
+def plain():
+    """A short trial of one whisker, and the camera that sees it against its cheek."""
+    whisker = Whisker.parabola(length=20e-3, coefficient=5.0)
+    t = np.arange(3) / 500.0
+    motion = Motion(t, 0.05 * np.arange(3), np.zeros(3), np.zeros(3), np.zeros((3, 3)))
+    cameras = orthogonal_views(size=(320, 240), center=(8e-3, 0.0, 0.0))
+    recording = with_true_traces(simulate([whisker], [motion], []), cameras)
+    return recording, cameras
+
+
+def shots(plain, view, **conditions):
+    recording, cameras = plain
+    made = ImageConditions(read_noise=0.0, gain=1e9, **conditions)
+    frames = list(film_frames(recording, cameras[view], made, seed=3))
+    trace = recording["truth"]["trace"].values[:, 0, view]
+    return np.array(frames, dtype=float), trace
+
+
+def test_wires_stand_still_and_are_dark(plain):
+    without, _ = shots(plain, 0)
+    wired, _ = shots(plain, 0, wires=2)
+    wire = without - wired > 30.0
+    assert wire[0].sum() > 200
+    assert (wire[0] & wire[1] & wire[2]).sum() > 0.9 * wire[0].sum()
+
+
+def test_before_the_cheek_the_whisker_has_the_contrast_that_is_stated(plain):
+    """In the view along y alone; beyond the cheek it is as dark as before."""
+    free, trace = shots(plain, 1)
+    faint, _ = shots(plain, 1, cheek=15.0)
+    for at, low, high in ((6, 8.0, 24.0), (22, 40.0, 200.0)):
+        column, row = np.round(trace[0, at]).astype(int)
+        strip = faint[0, row - 12 : row + 13, column - 3 : column + 4].mean(axis=1)
+        assert low < np.median(strip) - strip[11:14].min() < high
+    np.testing.assert_array_equal(shots(plain, 0, cheek=15.0)[0], shots(plain, 0)[0])
+    assert (free != faint).any()
+
+
+def test_the_lit_flank_is_bright_and_the_other_is_not(plain):
+    dark, trace = shots(plain, 0)
+    lit, _ = shots(plain, 0, side_light=0.5)
+    column, row = np.round(trace[0, 14]).astype(int)
+    gain = (lit - dark)[0, row - 5 : row + 6, column]
+    flanks = gain[:5].max(), gain[6:].max()
+    assert max(flanks) > 15.0
+    assert min(flanks) < 5.0
+
+
+def test_fur_moves_with_the_face_and_has_the_texture_that_is_stated(plain):
+    bare, _ = shots(plain, 0)
+    furry, _ = shots(plain, 0, fur=6.0)
+    inside = bare[0] < 20.0
+    inside[:, 70:] = False
+    assert 4.0 < (furry - bare)[0][inside].std() < 9.0
+    beyond = (bare[0] > 100.0) & (bare[0] - furry[0] > 20.0)
+    assert beyond.sum() > 30  # hairs

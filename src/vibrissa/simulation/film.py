@@ -38,6 +38,7 @@ from vibrissa.io import Frame, write_video
 from vibrissa.numerics import kernel
 from vibrissa.objects import Surface
 from vibrissa.recording import Group, Recording, recorded
+from vibrissa.simulation.surroundings import Surroundings
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -101,6 +102,16 @@ class ImageConditions:
     face : tuple of float
         Half the length, width and height of the face, m, zeros for none. The base is on its
         surface; the face of several whiskers is as large as their bases need.
+    fur : float
+        Standard deviation of the texture of the face, grey values; with it, hairs stand out from
+        the face's edge and lie over the bases.
+    cheek : float
+        Contrast of a whisker before the animal's grey cheek, grey values: 0 for no cheek, 10–20 in
+        the paper's films. The cheek is behind half of the whisker in views along y.
+    wires : int
+        Number of thin dark lines in the background, which do not move.
+    side_light : float
+        Brightness of the lit flank of a whisker relative to the darkness of its middle, 0 to 1.
     """
 
     light: float = 200.0
@@ -112,13 +123,25 @@ class ImageConditions:
     gain: float = 40.0
     read_noise: float = 1.5
     face: tuple[float, float, float] = (12e-3, 5e-3, 7e-3)
+    fur: float = 0.0
+    cheek: float = 0.0
+    wires: int = 0
+    side_light: float = 0.0
 
     def __post_init__(self) -> None:
         """Check every number."""
         kinds: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] = (
-            (("unevenness", "contrast"), lambda x: 0.0 <= x <= 1.0, "a share, 0 to 1, is needed"),
+            (
+                ("unevenness", "contrast", "side_light"),
+                lambda x: 0.0 <= x <= 1.0,
+                "a share, 0 to 1, is needed",
+            ),
             (("light", "blur", "gain"), lambda x: x > 0.0, "it must be positive"),
-            (("dark", "exposure", "read_noise"), lambda x: x >= 0.0, "it must not be negative"),
+            (
+                ("dark", "exposure", "read_noise", "fur", "cheek", "wires"),
+                lambda x: x >= 0.0,
+                "it must not be negative",
+            ),
         )
         faults = [
             f"{name} is {getattr(self, name)!r}; {needed}"
@@ -253,40 +276,91 @@ def film_frames(
     generator = np.random.default_rng(seed)
     width, height = camera.size
     scene = _scene(camera, objects, conditions, np.nanmean(lines, axis=(0, 1, 2)))
+    total, covered = np.zeros_like(scene), np.zeros_like(scene)
+    around = _surroundings(camera, lines, conditions, seed)
+    for wire in around.wires:
+        cover(covered, wire[:, :2], wire[:, 2], np.ones(len(wire)), conditions.sigma, 1.0)
+    scene += (conditions.dark - scene) * covered
+    covered[:] = 0.0
     light, box = scene.copy(), np.zeros(4, np.int64)
-    total, covered = np.zeros_like(light), np.zeros_like(light)
     noise = generator.standard_normal(1 << 20).astype(np.float32)
     frame = np.empty((height, width), np.uint8)
+    furry = conditions.fur > 0.0 or around.cheek > 0.0
     for i in range(len(lines)):
+        faint, hairs = None, []
+        if furry:
+            light[:] = scene
+        if around.cheek:
+            ends = camera.project(lines[i, :, [0, -1]].mean(axis=1))
+            faint = around.before_cheek(light, ends[0], float(np.sign(ends[1, 0] - ends[0, 0])))
         if all(conditions.face):
-            light[box[0] : box[1], box[2] : box[3]] = scene[box[0] : box[1], box[2] : box[3]]
+            if not furry:
+                light[box[0] : box[1], box[2] : box[3]] = scene[box[0] : box[1], box[2] : box[3]]
             middle, inverse, box = _face(camera, lines[i, :, 0], conditions)
             shade(light, middle, inverse, conditions.dark, _FUR, box)
+            if conditions.fur > 0.0:
+                shade(covered, middle, inverse, 1.0, _FUR, box)
+                around.furred(light, middle, covered)
+                covered[:] = 0.0
+                hairs = around.hair_lines(middle, inverse)
         total[:] = 0.0
         for whisker, line, move in zip(whiskers, lines[i], moves[i], strict=True):
             radius = whisker.radius(np.linspace(0.0, whisker.length, line.shape[0]))
             smooth, wide = _fine(line, radius, camera)
             shift = _at(move, smooth, line)
-            behind = hidden(smooth, camera, objects)
+            shown = 1.0 - hidden(smooth, camera, objects)
             pixels, slopes = camera.project_with_slopes(smooth)
-            per_m = np.linalg.norm(slopes, axis=(-2, -1)) / np.sqrt(2.0)
+            wide = wide * np.linalg.norm(slopes, axis=(-2, -1)) / np.sqrt(2.0)
             drift = (slopes @ shift[..., None])[..., 0]
-            count = max(1, int(np.ceil(np.nanmax(np.linalg.norm(drift, axis=1), initial=0.0))))
-            for k in range(count):
-                at = pixels + ((k + 0.5) / count - 0.5) * drift
-                cover(
-                    covered,
-                    at,
-                    wide * per_m,
-                    1.0 - behind,
-                    conditions.sigma,
-                    conditions.contrast / count,
-                )
-                reach = float((wide * per_m).max()) + 4.0 * conditions.sigma
-                collect(covered, total, at, reach)
+            _expose_whisker(covered, total, pixels, drift, wide, shown, conditions)
+        if faint is not None:
+            total *= faint
+        for hair, half in hairs:
+            cover(covered, hair, half, np.ones(len(hair)), conditions.sigma, conditions.contrast)
+            collect(covered, total, hair, 1.0 + 4.0 * conditions.sigma, 1.0)
         starts = generator.integers(0, noise.size - width, height)
         expose(light, total, noise, starts, conditions.gain, conditions.read_noise, frame)
         yield frame.copy()
+
+
+def _expose_whisker(
+    covered: Image,
+    total: Image,
+    line: Array,
+    drift: Array,
+    wide: Array,
+    shown: Array,
+    conditions: ImageConditions,
+) -> None:
+    """Add the light that a whisker takes, which drifts while the shutter is open, to a total."""
+    sigma = conditions.sigma
+    count = max(1, int(np.ceil(np.nanmax(np.linalg.norm(drift, axis=1), initial=0.0))))
+    reach = float(wide.max()) + 4.0 * sigma
+    for k in range(count):
+        at = line + ((k + 0.5) / count - 0.5) * drift
+        cover(covered, at, wide, shown, sigma, conditions.contrast / count)
+        collect(covered, total, at, reach, 1.0)
+        if conditions.side_light > 0.0:
+            lit = at + _to_the_left(at) * (wide + sigma)[:, None]
+            share = conditions.side_light * conditions.contrast / count
+            cover(covered, lit, wide, shown, sigma, share)
+            collect(covered, total, lit, reach, -1.0)
+
+
+def _surroundings(
+    camera: Camera, lines: Array, conditions: ImageConditions, seed: int
+) -> Surroundings:
+    """Fur, cheek and wires around whiskers whose longest one decides how far they go."""
+    ends = camera.project(lines[0, :, [0, -1]])
+    extent = float(np.nanmax(np.linalg.norm(ends[1] - ends[0], axis=-1)))
+    return Surroundings.of(camera, conditions.fur, conditions.cheek, conditions.wires, extent, seed)
+
+
+def _to_the_left(line: Array) -> Array:
+    """Unit vectors to the left (−dy, dx) of a line (n, 2)."""
+    dx, dy = np.gradient(line, axis=0).T
+    left = np.stack([-dy, dx], axis=1)
+    return np.asarray(left / np.maximum(np.linalg.norm(left, axis=1, keepdims=True), 1e-9))
 
 
 def with_true_traces(recording: xr.DataTree, cameras: Sequence[Camera]) -> xr.DataTree:
@@ -529,8 +603,8 @@ def cover(image: Any, line: Any, half_width: Any, shown: Any, sigma: float, shar
 
 
 @kernel
-def collect(covered: Any, total: Any, line: Any, reach: float) -> None:
-    """Move what was covered, near a line, to the total, and clear it."""
+def collect(covered: Any, total: Any, line: Any, reach: float, sign: float) -> None:
+    """Add what was covered, near a line, to the total, and clear it."""
     rows, columns = covered.shape
     for k in range(line.shape[0] - 1):
         left = max(0, math.floor(min(line[k, 0], line[k + 1, 0]) - reach))
@@ -540,7 +614,7 @@ def collect(covered: Any, total: Any, line: Any, reach: float) -> None:
         for row in range(top, bottom + 1):
             for column in range(left, right + 1):
                 if covered[row, column] > 0.0:
-                    total[row, column] += covered[row, column]
+                    total[row, column] += sign * covered[row, column]
                     covered[row, column] = 0.0
 
 
@@ -559,7 +633,7 @@ def expose(
     for row in range(rows):
         start = starts[row]
         for column in range(columns):
-            value = light[row, column] * (1.0 - min(total[row, column], 1.0))
+            value = max(light[row, column], 0.0) * (1.0 - min(total[row, column], 1.0))
             spread = math.sqrt(value / gain + read_noise * read_noise)
             value += spread * noise[start + column] + 0.5
             frame[row, column] = np.uint8(min(max(value, 0.0), 255.0))

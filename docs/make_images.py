@@ -62,7 +62,7 @@ def verdicts() -> xr.Dataset:
 
 
 def witness(whisker: vb.Whisker, found: xr.Dataset, triplet: str) -> Figure:
-    """Two contacts that feel the same."""
+    """Two contacts with the same signals."""
     return plots.witness_pair(dict(witness_pairs(whisker, found, [triplet]))[triplet])
 
 
@@ -97,12 +97,12 @@ def up_to_the_fold() -> Figure:
 
 @cache
 def trial() -> xr.DataTree:
-    """Half a second of whisking past a peg, felt with a noisy sensor, and its contour."""
+    """Half a second of whisking past a peg, measured with a noisy sensor, and its contour."""
     whisker = chart().whisker
     peg = facing_peg(whisker)
     motion = sweep_past(whisker, peg, 0.5, seed=1)
-    felt = measure(simulate(whisker, motion, peg), seed=1)
-    return with_contour(with_true_traces(felt, views_of(felt)))
+    measured = measure(simulate(whisker, motion, peg), seed=1)
+    return with_contour(with_true_traces(measured, views_of(measured)))
 
 
 @cache
@@ -171,8 +171,8 @@ def touching_array() -> Figure:
     time = np.arange(500) / 1000
     turn, place = head_path(time, to_position=[0, 14e-3, 0])
     motions = array_whisking(rat, 0.5, 1000, head_rotation=turn, head_position=place)
-    felt = measure(simulate(rat, motions, within_reach(rat, "sphere")))
-    return plots.array_views(with_estimates(felt), contacts="estimates")
+    measured = measure(simulate(rat, motions, within_reach(rat, "sphere")))
+    return plots.array_views(with_estimates(measured), contacts="estimates")
 
 
 def free_surface() -> Figure:
@@ -182,15 +182,15 @@ def free_surface() -> Figure:
     turn, place = head_path(time, to_position=[0, 14e-3, 0])
     motions = array_whisking(rat, 0.5, 1000, head_rotation=turn, head_position=place)
     box = within_reach(rat, "box")
-    felt = with_contour(measure(simulate(rat, motions, box)), "free")
-    estimates = felt["estimates"].to_dataset()
+    measured = with_contour(measure(simulate(rat, motions, box)), "free")
+    estimates = measured["estimates"].to_dataset()
     points = estimates["contact_point"].transpose("time", "whisker", "space").values
     spread = estimates["contact_covariance"].transpose("time", "whisker", ...).values
     when = np.repeat(time, points.shape[1])
     return plots.contour_views(
         points.reshape(-1, 3),
         box,
-        shape_from_dataset(felt["contour"].to_dataset()),
+        shape_from_dataset(measured["contour"].to_dataset()),
         colour=when,
         colour_name="time",
         covariance=spread.reshape(-1, 3, 3),
@@ -214,13 +214,13 @@ def distances() -> Figure:
         radius,
         dims=("time",),
     )
-    felt = trial()["signals"].to_dataset().isel(whisker=0)
+    measured = trial()["signals"].to_dataset().isel(whisker=0)
     classes = np.radians([0.0, 5.0, 10.0, 15.0, 90.0])
     return plots.distances_by_class(
         [
             distances_by(compared, "deflection_angle", np.arctan2(away, along), classes),
             distances_by(compared, "r", np.linalg.norm(own, axis=-1)),
-            distances_by(compared, "MB", felt["MB"].values),
+            distances_by(compared, "MB", measured["MB"].values),
         ]
     )
 

@@ -1,4 +1,4 @@
-"""The picture on the first page: a whisker is bent, felt at its base, and draws what it touched."""
+"""The picture on the first page: a bent whisker, its base signals, and the contour of a peg."""
 
 from typing import Any
 
@@ -17,13 +17,13 @@ from vibrissa.plots.contact_surfaces import coordinate_bar, levels
 from vibrissa.plots.objects import outline
 from vibrissa.plots.space import (
     bounds,
-    felt,
     name_axes,
     paint,
     painted,
     signal_axes,
     signal_limits,
     signal_places,
+    signal_rows,
     space_axes,
 )
 from vibrissa.plots.style import (
@@ -53,7 +53,7 @@ from vibrissa.signals import SIGNALS
 WIDTH, HEIGHT = 182.0, 119.0
 HEADS = (
     (2.0, "A whisker is bent,"),
-    (66.0, "three signals tell where it is touched,"),
+    (66.0, "three signals locate the contacts,"),
     (130.5, "and the contacts draw the peg."),
 )
 SKIN, PEG = (0.62, 0.72, 0.82, 1.0), (0.85, 0.85, 0.85, 1.0)
@@ -167,7 +167,7 @@ def peg_triangles(course: Course, peg: Peg, moment: int) -> Array:
 
 def readings(figure: Figure, now: xr.Dataset) -> None:
     """What the sensor reads at that moment; the three that are used stand out."""
-    write(figure, 4.0, 31.0, "felt at its base:", fontsize=7.0)
+    write(figure, 4.0, 31.0, "measured at its base:", fontsize=7.0)
     for i, name in enumerate(SIGNALS):
         value, unit = float(to_display(name, now[name].values)), quantity(name).display_unit
         used = name in TRIPLET
@@ -192,13 +192,13 @@ def solids(figure: Figure, course: Course, samples: xr.Dataset, line: Array, mom
     count = nodes.shape[-1]
     nodes = np.concatenate([nodes, np.stack(within, axis=-1)], axis=-1)
     body = solid_surface(nodes, False, column("deflection"), count, count + 1)
-    limits = signal_limits(felt(body))
+    limits = signal_limits(signal_rows(body))
     course_way = signal_places(*way.T)
     for i, name in enumerate(("r", "theta", "phi")):
         axes = signal_axes(figure, (65.5, 80.0 - 37.5 * i, 51.0, 30.0), limits)
         norm, marks = levels(name, body)
         values = to_display(name, values_of(name, body))
-        paint(axes, felt(body), painted(values, norm, sequential()), flat=0.8)
+        paint(axes, signal_rows(body), painted(values, norm, sequential()), flat=0.8)
         coordinate_bar(figure, (118.0, 86.5 - 37.5 * i, 1.6, 15.0), name, norm, marks)
         axes.plot(*course_way.T, color=ORANGE, linewidth=0.7, zorder=12)
         axes.scatter(*course_way[moment], s=14.0, color=ORANGE, zorder=14, depthshade=False)

@@ -77,7 +77,9 @@ def test_labels_and_values_as_shown():
 
 
 def test_unknown_name_is_told_what_is_close():
-    with pytest.raises(ValueError, match=r"'force_x' is no quantity; did you mean one of .*force"):
+    with pytest.raises(
+        ValueError, match=r"'force_x' is not a quantity; did you mean one of .*force"
+    ):
         quantity("force_x")
     with pytest.raises(ValueError, match="Fx"):
         attributes("???")

@@ -58,7 +58,7 @@ def test_describe_takes_any_shape():
 
 
 def test_describe_names_what_it_does_not_know():
-    with pytest.raises(ValueError, match=r"\[99\] are no statuses"):
+    with pytest.raises(ValueError, match=r"\[99\] are not statuses"):
         describe([0, 99])
 
 

@@ -1,4 +1,4 @@
-"""From what a whisker feels at its base to what it touched.
+"""From the forces and moments at a whisker's base to the object that it touched.
 
 The names here are the public face of the package. Each is imported from its home when it is first
 used, so that ``import vibrissa`` takes milliseconds and Numba, SciPy, xarray and Matplotlib load

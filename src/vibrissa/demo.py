@@ -311,8 +311,8 @@ def _filmed(trial: xr.DataTree, folder: Path, seed: int, tell: Progress) -> xr.D
     for view, (camera, file) in enumerate(zip(cameras, video_files(folder), strict=True)):
         # A video is there only if it is whole.
         if not file.exists():
-            told = partial(tell, f"filming, {camera.name}")
-            film(trial, {camera.name: file}, [camera], seed=seed + view, progress=told)
+            report = partial(tell, f"filming, {camera.name}")
+            film(trial, {camera.name: file}, [camera], seed=seed + view, progress=report)
     done = with_true_traces(trial, cameras)
     save_recording(path, done)
     return done

@@ -1,7 +1,7 @@
 """What the results that are plain datasets look like in a notebook or a terminal.
 
 Whiskers, deflections, maps and estimates show themselves. Verdicts on triplets and recordings are
-xarray's own types, whose display lists variables; `show` says what they mean.
+xarray's own types, whose display lists variables; `show` explains them.
 """
 
 from __future__ import annotations

@@ -71,7 +71,7 @@ _FACTORS = {
 
 
 def _table() -> dict[str, Quantity]:
-    """Read the table beside this module."""
+    """Read the table next to this module."""
     text = Path(__file__).with_suffix(".csv").read_text(encoding="utf-8")
     rows = csv.DictReader(text.splitlines())
     return {
@@ -102,11 +102,11 @@ def quantity(name: str) -> Quantity:
     Raises
     ------
     ValueError
-        Where the table has no such name; says which are close.
+        If the table has no such name; the message lists names that are close.
     """
     if name not in QUANTITIES:
         allowed = difflib.get_close_matches(name, QUANTITIES) or list(QUANTITIES)
-        raise ValueError(f"{name!r} is no quantity; did you mean one of {', '.join(allowed)}?")
+        raise ValueError(f"{name!r} is not a quantity; did you mean one of {', '.join(allowed)}?")
     return QUANTITIES[name]
 
 

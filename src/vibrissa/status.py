@@ -210,7 +210,7 @@ def describe(codes: ArrayLike) -> Counter[str]:
     Raises
     ------
     ValueError
-        Where a number is no status.
+        Where a number is not a status.
 
     Examples
     --------
@@ -223,7 +223,7 @@ def describe(codes: ArrayLike) -> Counter[str]:
     known = {int(status) for status in Status}
     unknown = [number for number in numbers.tolist() if number not in known]
     if unknown:
-        raise ValueError(f"{unknown} are no statuses; the statuses are {sorted(known)}.")
+        raise ValueError(f"{unknown} are not statuses; the statuses are {sorted(known)}.")
     return Counter(
         {
             str(Status(int(number))): count

@@ -35,7 +35,7 @@ def tracking(result: DemoResult) -> str:
     assert found is not None
     rows = [
         ["frames, lost", f"{found.frames}, {found.lost}", ""],
-        ["contact told from none", f"{100 * found.told:.1f} %", ""],
+        ["contact classified correctly", f"{100 * found.classified:.1f} %", ""],
     ]
     for name, (median, most) in zip(("top", "front"), found.trace, strict=True):
         rows.append([f"trace, {name}", f"{median:.3f} px", f"{most:.3f} px"])

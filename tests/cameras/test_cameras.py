@@ -138,7 +138,7 @@ def test_a_file_of_anipose(tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("[cam_0\n", "no TOML"),
+        ("[cam_0\n", "not TOML"),
         ("[metadata]\nadjusted = true\n", "no camera"),
         ("[cam_0]\nsize = [1, 1]\n", "has no matrix, rotation, translation"),
     ],

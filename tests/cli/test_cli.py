@@ -224,7 +224,7 @@ def test_a_fault_is_one_message_and_status_2(monkeypatch, capsys, arguments, mes
 
 
 def test_files_of_the_wrong_kind(monkeypatch, capsys, folder, table, chart):
-    assert "no table of signals" not in run("info", table[0])
+    assert "not a table of signals" not in run("info", table[0])
     bad = folder / "bad.csv"
     bad.write_text("time,Fx\n0,1\n")
     assert "lacks Fy" in fault(monkeypatch, capsys, "estimate", bad, "--map", chart)
@@ -276,5 +276,5 @@ def test_info_says_what_settings_are_for_and_what_is_wrong_with_them(monkeypatch
     assert "vibrissa simulate" in run("info", path)
     path.write_text("channels = [", encoding="utf-8")
     said = fault(monkeypatch, capsys, "info", path)
-    assert f"{path}: it is no TOML" in said
+    assert f"{path}: it is not TOML" in said
     assert said.count("\n") == 1

@@ -46,9 +46,9 @@ def from_video(folder):
 def test_errors_are_those_that_the_noise_predicts(result):
     scores = result.sensed.scores
     assert scores.false == 0
-    assert scores.felt > 0.9 * scores.touching
+    assert scores.detected > 0.9 * scores.touching
     assert scores.share_with_one > 0.9
-    assert scores.candidates.sum() == scores.felt
+    assert scores.candidates.sum() == scores.detected
     for row in scores.errors:
         median, predicted = row.measured[0], row.predicted[0]
         assert median == pytest.approx(predicted, rel=0.4)
@@ -81,7 +81,7 @@ def test_what_the_peg_is_known_to_counts_frames_that_err_together(from_video):
 def test_without_noise_contacts_are_exact():
     result = run_demo(noise=False, **SHORT)
     scores = result.sensed.scores
-    assert scores.felt == scores.touching
+    assert scores.detected == scores.touching
     assert scores.errors[-1].measured[0] < 1e-9
     assert scores.errors[-1].measured[1] < 1e-6
     assert np.linalg.norm(scores.offset) < 1e-7
@@ -146,7 +146,7 @@ def test_from_video_the_whisker_and_its_contact_are_tracked(from_video):
     assert (tracking.frames, tracking.lost) == (100, 0)
     assert (tracking.trace[:, 0] < 0.15).all()
     assert tracking.contact[0] < 60e-6
-    assert tracking.told > 0.9
+    assert tracking.classified > 0.9
 
 
 def test_from_video_contacts_are_as_good_as_noise_and_tracking_allow(from_video):

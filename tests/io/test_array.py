@@ -42,7 +42,7 @@ def test_a_folder_of_centrelines(tmp_path):
     np.testing.assert_allclose(array.centerlines(), SOME.centerlines()[:3], rtol=0, atol=2e-6)
     assert array["LC1"].base_radius == pytest.approx(SOME["LC1"].base_radius, rel=1e-4)
     (tmp_path / "nose.csv").write_text("x_mm,y_mm,z_mm\n0,0,0\n")
-    with pytest.raises(ValueError, match=r"nose\.csv: 'nose' is no whisker's name"):
+    with pytest.raises(ValueError, match=r"nose\.csv: 'nose' is not a whisker's name"):
         load_array(tmp_path)
 
 
@@ -93,7 +93,7 @@ def test_a_table_with_rotations(tmp_path):
         (f"{HEADER}\nC2,6,-4,1,10,5,-90,30\n", "9 columns, but line 2 has 8 cells"),
         (f"{HEADER}\nC2,6,-4,1,ten,5,-90,30,0.02\n", "no number for azimuth"),
         (f"{HEADER}\nC2,6,-4,1,10,5,-90,3000,0.02\n", "line 2: .*length is 3 m"),
-        (f"{HEADER}\nF2,6,-4,1,10,5,-90,30,0.02\n", "line 2: 'F2' is no whisker's name"),
+        (f"{HEADER}\nF2,6,-4,1,10,5,-90,30,0.02\n", "line 2: 'F2' is not a whisker's name"),
         (f"{HEADER}\nLC2,6,-4,1,10,5,-90,30,0.02\n", "on the right side"),
         (f"{HEADER}\nC2,nan,-4,1,10,5,-90,30,0.02\n", "origin"),
     ],
@@ -125,8 +125,8 @@ def test_other_files_are_refused(tmp_path):
     with pytest.raises(ValueError, match="is a folder of nothing"):
         load_array(tmp_path)
     bent = vb.WhiskerArray([vb.samples.gamma().with_properties(name="Lgamma")])
-    with pytest.raises(ValueError, match="no planar parabola"):
+    with pytest.raises(ValueError, match="not a planar parabola"):
         save_array(tmp_path / "bent.csv", bent)
     assert not (tmp_path / "bent.csv").exists()
-    with pytest.raises(ValueError, match="no recording"):
+    with pytest.raises(ValueError, match="not a recording"):
         save_recording(tmp_path / "array.nc", SOME.to_tree())

@@ -115,9 +115,9 @@ def test_bad_deeplabcut(tmp_path, rng):
         (text[: text.index("coords") + 8], "different length|no rows"),
         (text[:-30], "line 8|8 has"),
         ("\n".join(text.split("\n")[:3]) + "\n", "no rows"),
-        (text.rstrip() + "abc\n", "line 8 has cells that are no numbers"),
+        (text.rstrip() + "abc\n", "line 8 has cells that are not numbers"),
         (text.replace("coords,x,y,", "coords,x,x,"), "same name"),
-        ("a,b,c\n1,2,3\n", "no table of DeepLabCut"),
+        ("a,b,c\n1,2,3\n", "not a table of DeepLabCut"),
         (text[text.index("bodyparts") :], "header rows are bodyparts, coords; it lacks scorer"),
         (text.split("\n", 1)[0] + "\n" + text, "line 2 is the header row scorer a second time"),
         (text + text, "line 9 is a header row once more"),
@@ -262,7 +262,7 @@ def test_movement(tmp_path, rng, plural):
     with pytest.raises(ValueError, match="pixels are needed"):
         load_movement(path)
     poses(rng, plural).drop_vars("position").to_netcdf(path, engine="h5netcdf")
-    with pytest.raises(ValueError, match="no poses dataset"):
+    with pytest.raises(ValueError, match="not a poses dataset"):
         load_movement(path)
 
 

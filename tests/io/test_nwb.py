@@ -279,7 +279,7 @@ def test_bad_files(tmp_path, recording):
         load_tracks(path)
     with h5py.File(path, "w") as file:
         file["a"] = 1
-    with pytest.raises(ValueError, match="no NWB file"):
+    with pytest.raises(ValueError, match="not an NWB file"):
         load_nwb(path)
 
 

@@ -119,5 +119,5 @@ def test_faults_of_contact_points_are_named(tmp_path):
         load(["view", "frame", "x", "y"], [0.0, 0.0], [1.0, 2.0], PLACES[:2, :2])
     with pytest.raises(ValueError, match="view, frame, x, y are needed"):
         load(["time", "x", "y"], [1.0, 2.0], PLACES[:2, :2])
-    with pytest.raises(ValueError, match="whisker is no number"):
+    with pytest.raises(ValueError, match="whisker is not a number"):
         load(["frame", "whisker", "x", "y", "z"], [1.0, 2.0], [-1.0, 0.0], PLACES[:2])

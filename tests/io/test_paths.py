@@ -78,8 +78,8 @@ def test_what_can_be_read(tmp_path):
     with pytest.raises(ValueError, match="is a folder"):
         check_readable(tmp_path)
     for content, message in (
-        (b"time,Fx\n\xff\xfe\x00", "a.csv is no table as text in UTF-8: byte 8 is 0xff"),
-        (b"time,Fx\n\0", "a.csv is no table as text: byte 8 is zero"),
+        (b"time,Fx\n\xff\xfe\x00", "a.csv is not a text table in UTF-8: byte 8 is 0xff"),
+        (b"time,Fx\n\0", "a.csv is not a text table: byte 8 is zero"),
     ):
         path.write_bytes(content)
         with pytest.raises(ValueError, match=message):

@@ -47,7 +47,7 @@ def test_the_file_is_replaced_whole_or_not_at_all(tmp_path, recording):
 
 
 def test_what_is_no_recording(tmp_path, recording):
-    with pytest.raises(ValueError, match="no recording"):
+    with pytest.raises(ValueError, match="not a recording"):
         save_recording(tmp_path / "a.nc", xr.DataTree(xr.Dataset()))
     with pytest.raises(FileNotFoundError, match="folder"):
         save_recording(tmp_path / "none" / "a.nc", recording)

@@ -91,7 +91,7 @@ def test_what_the_file_does_not_say_is_needed_and_what_it_says_stands():
         labelled(deep(), "a.csv", unit="m")
     with pytest.raises(ValueError, match="unit is 'mm', but 'm' is given"):
         labelled(deep(unit="mm"), "a.csv", unit="m")
-    with pytest.raises(ValueError, match="says 500 frames per second, but 1000"):
+    with pytest.raises(ValueError, match="states 500 frames per second, but 1000"):
         labelled(flat(fps=500.0), "a.csv", fps=1000.0)
     with pytest.raises(ValueError, match="must be positive"):
         labelled(flat(), "a.csv", fps=0.0)
@@ -154,7 +154,7 @@ def test_what_cannot_be_written(tmp_path):
     check_structure(both)
     for tracks, name, message in (
         (both, "a.csv", "drop trace or centerline"),
-        (xr.Dataset(), "a.csv", "no tracks"),
+        (xr.Dataset(), "a.csv", "not tracks"),
         (both, "a.txt", "ends in .txt"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -163,7 +163,7 @@ def test_what_cannot_be_written(tmp_path):
     save_tracks(tmp_path / "a.nc", both)
     again = load_tracks(tmp_path / "a.nc")
     assert again["trace_confidence"].dims == ("time", "whisker", "view", "node")
-    with pytest.raises(ValueError, match="says itself"):
+    with pytest.raises(ValueError, match="which states"):
         load_tracks(tmp_path / "a.nc", fps=3.0)
 
 
@@ -185,7 +185,7 @@ def test_somebody_elses_table(tmp_path):
         ("frame,x,y\n0,1,2\n", r"columns frame, x, y; column, row .pixels. or x, y, z"),
         ("frame,x,y,z\n", "no rows"),
         ("frame,x,y,z\n0,1,2\n", "4 columns, but line 2 has 3 cells"),
-        ("frame,x,y,z\n0,1,2,b\n", "column z has cells that are no numbers: line 2"),
+        ("frame,x,y,z\n0,1,2,b\n", "column z has cells that are not numbers: line 2"),
         ("frame,whisker,node,x,y,z\n0,a,0,1,2,3\n0,a,0,1,2,3\n", "same point of a whisker twice"),
         ("a,b\n1,2\n", "no tracks that are known"),
     ],

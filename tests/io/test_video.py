@@ -42,7 +42,7 @@ def test_what_is_no_video_says_so(tmp_path):
         video_info(tmp_path / "none.mp4")
     for content in (b"", b"no video at all" * 100):
         (tmp_path / "a.mp4").write_bytes(content)
-        with pytest.raises(ValueError, match="no video that can be read"):
+        with pytest.raises(ValueError, match="not a video that can be read"):
             list(read_video(tmp_path / "a.mp4"))
 
 

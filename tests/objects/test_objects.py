@@ -159,7 +159,7 @@ def test_faulty_objects():
         Plane([0, 0, 0], [0, 0, 0])
     with pytest.raises(ValueError, match=r"edge_radius is 0\.01; at most half"):
         Box([0, 0, 0], [1e-2, 1e-2, 1e-2], edge_radius=1e-2)
-    with pytest.raises(ValueError, match="no rotation matrix"):
+    with pytest.raises(ValueError, match="not a rotation matrix"):
         Box([0, 0, 0], [1e-2, 1e-2, 1e-2], 2 * np.eye(3))
     with pytest.raises(ValueError, match="stiffness is -1"):
         Peg([0, 0, 0], [0, 0, 1], 1e-3, stiffness=-1.0)

@@ -187,7 +187,7 @@ def test_numbers_are_those_of_the_recording(written, folder):
 
     counts = dict(tables["Contacts"])
     assert int(counts["frames in contact"]) == int(truth["in_contact"].sum())
-    assert int(counts["contacts felt"]) == int(found["in_contact"].sum())
+    assert int(counts["contacts detected"]) == int(found["in_contact"].sum())
 
     rows = {row[0]: row for row in tables[f"The fitted {fit.attrs['shape']}"]}
     sigma = np.sqrt(np.diag(fit["parameter_covariance"].values))
@@ -205,14 +205,14 @@ def test_numbers_are_those_of_the_recording(written, folder):
 
 
 @pytest.mark.parametrize("lost", ["force", "contact_point_whisker"])
-def test_errors_that_cannot_be_told_are_said_to_be(folder, lost):
+def test_errors_that_cannot_be_computed_are_named(folder, lost):
     """Of a film the truth may be known in part; sections are not left out in silence."""
     trial = load_recording(folder / "trial.nc")
     trial["truth"] = trial["truth"].to_dataset().drop_vars(lost)
     parts = {part.name: part.body for part in trial_sections(trial)}
-    said = "Errors cannot be told: the truth in this recording has no"
-    assert f"{said} {lost}" in parts["signals"]
-    assert (f"{said} {lost}" in parts["estimates"]) == (lost == "contact_point_whisker")
+    stated = "Errors cannot be computed: the truth in this recording lacks"
+    assert f"{stated} {lost}" in parts["signals"]
+    assert (f"{stated} {lost}" in parts["estimates"]) == (lost == "contact_point_whisker")
 
 
 def test_errors_of_signals_are_shares_of_the_truth(folder):
@@ -304,15 +304,15 @@ def test_whiskers_that_touch_are_listed():
     touching = xr.Dataset({"in_contact": (("whisker", "time"), [[False] * 3, [False, True, True]])})
     trial = two_whiskers(truth=touching)
     np.testing.assert_array_equal(contacts_by_whisker(trial), [0, 2])
-    told = whiskers_table(trial, 0)
-    assert "of whisker C1, number 0" in told
-    assert Page(told).tables["Whiskers that touch"][1:] == [["C2", "1", "2", "4 µN"]]
+    text = whiskers_table(trial, 0)
+    assert "of whisker C1, number 0" in text
+    assert Page(text).tables["Whiskers that touch"][1:] == [["C2", "1", "2", "4 µN"]]
     bare = two_whiskers()
     np.testing.assert_array_equal(contacts_by_whisker(bare), [0, 0])
     assert "None of the 2 whiskers" in whiskers_table(bare, 0)
 
 
-def test_what_was_tracked_is_told_without_the_truth():
+def test_tracking_is_summarised_without_the_truth():
     root = xr.Dataset(
         {
             "in_contact": ("time", [False, True, True]),
@@ -364,8 +364,8 @@ def test_the_same_command_gives_the_same_page(map_page, folder, monkeypatch):
     assert path.read_bytes() == before
     monkeypatch.setattr(reporting, "_drawn", lambda drawings, tell: {})
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "yesterday")
-    told = fault("report", folder / "map.nc", "-o", folder / "same.html")
-    assert "'yesterday'" in told
+    text = fault("report", folder / "map.nc", "-o", folder / "same.html")
+    assert "'yesterday'" in text
 
 
 def test_a_map_with_verdicts(map_page, folder):
@@ -381,7 +381,7 @@ def test_a_map_with_verdicts(map_page, folder):
         if str(cell.verdict.sel(region="all").item()) == "not unique":
             cone = np.rad2deg(float(cell.critical_cone.sel(region="all")))
             assert row[1] == f"{cone:.1f}°"
-    for row in page.tables["Farthest contacts that feel the same"][1:]:
+    for row in page.tables["Farthest pairs of contacts with the same signals"][1:]:
         apart = float(verdicts["witness_separation"].sel(triplet=row[0]).max())
         assert number(row[2]) == pytest.approx(1e3 * apart, abs=1e-3)
     samples = contact_map.to_dataset()

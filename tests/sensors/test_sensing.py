@@ -158,7 +158,7 @@ def test_a_sensor_is_read_as_it_was_written(tmp_path, rng):
     [
         ("channels = 3", "no sensor"),
         ('channels = ["Fx"]\nnois = 1.0', "has nois"),
-        ('channels = ["Fx"\n', "it is no TOML"),
+        ('channels = ["Fx"\n', "it is not TOML"),
         ('[frame]\naxes = ["x", "y", "y"]', "once each"),
     ],
 )

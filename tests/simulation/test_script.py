@@ -104,7 +104,7 @@ def test_motions_from_tables(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("duration = ", "no TOML"),
+        ("duration = ", "not TOML"),
         ("speed = 3", "the trial has speed; known are"),
         ("duration = 'long'", "duration is 'long'; a number is needed"),
         ("motion = 3", r"written as a table, \[motion\]"),

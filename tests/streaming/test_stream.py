@@ -130,10 +130,10 @@ def test_bad_lines_are_said_and_passed_over(gamma_map, wrench):
     assert set(faults) == {4, 6, 7, 8, 9, 10}
     assert running.faults == 6
     assert "2 cells" in faults[4]
-    assert "'abc', which is no number" in faults[6]
-    assert "no JSON" in faults[7]
+    assert "'abc', which is not a number" in faults[6]
+    assert "not JSON" in faults[7]
     assert "lacks MB, MD" in faults[8]
-    assert "no number" in faults[9]
+    assert "not a number" in faults[9]
     assert "cannot be negative" in faults[10]
     found = [record["status"] for record in records if "status" in record]
     assert found == ["unique", "missing", "unique"]
@@ -147,11 +147,11 @@ def test_bad_lines_are_said_and_passed_over(gamma_map, wrench):
     [
         ("0.0,1e-5\r2,0,0,0,0,0", "no CSV"),
         ('{"Fx": 1' + 400 * "0" + ', "MB": 1e-6, "MD": 0.5}', "larger than any number"),
-        ('{"Fx": ' + 60_000 * "[", "no JSON"),
+        ('{"Fx": ' + 60_000 * "[", "not JSON"),
         ('{"Fx": ' + 100_000 * "[", "a line of more than 65536 characters"),
         (",".join(30_000 * ["0"]), "30000 cells; the header has 7"),
         (",".join(f"c{i}" for i in range(9_000)), "9000 cells; the header has 7"),
-        ("0.1,1e-5\0,0,0,0,0,0", "no number"),
+        ("0.1,1e-5\0,0,0,0,0,0", "not a number"),
         (json.dumps(HELD | {"base_qw": 1e155}), "of length 1e+155, not 1"),
         (json.dumps(HELD | {"base_x": 1e308}), "its position is in m"),
         (json.dumps(HELD | {"base_x": float("inf")}), "its position is in m"),
@@ -161,7 +161,7 @@ def test_bad_lines_are_said_and_passed_over(gamma_map, wrench):
         (",0,0,0,0,0,0", "time is ''"),
         ('{"time": Infinity, "Fx": 1e-5, "MB": 1e-6, "MD": 0.5}', "time is inf"),
         ("0.1,1e-5,2e-5,0,0,3", "6 cells; the header has 7"),
-        ("0.1,1e-5,2e-5,0,0,1e-7,3.4e", "no number"),
+        ("0.1,1e-5,2e-5,0,0,1e-7,3.4e", "not a number"),
     ],
 )
 def test_no_line_ends_a_stream(gamma_map, wrench, line, error):
@@ -223,7 +223,7 @@ def test_rows_are_not_read_under_a_header_that_was_refused(gamma_map, wrench):
     assert "without units) lacks Fx, Fy" in header["error"]
     assert row == {
         "line": 4,
-        "error": "a row, and no header says what its columns are: that of line 3 was refused",
+        "error": "a row without a header that names its columns: that of line 3 was refused",
     }
     assert "lacks" in other["error"]
     assert again["status"] == "unique"

@@ -19,34 +19,34 @@ def compiling(module):
 
 @pytest.fixture
 def ahead(monkeypatch):
-    """One that has not yet warmed up, and what it has told."""
+    """One that has not yet warmed up, and what it has reports."""
     monkeypatch.setattr(threads, "_done", threading.Event())
-    told = []
-    made = CompileNotice(told.append)
-    yield made, told
+    reports = []
+    made = CompileNotice(reports.append)
+    yield made, reports
     made.close()
 
 
 def test_only_our_kernels_are_told_of_once_however_they_nest(ahead):
-    made, told = ahead
+    made, reports = ahead
     made.on_start(compiling("numpy.linalg"))
-    assert told == []
+    assert reports == []
     made.on_start(compiling("vibrissa.rod.kernels"))
     made.on_start(compiling("vibrissa.rod.points"))
     made.on_end(compiling("vibrissa.rod.points"))
-    assert told == [True]
+    assert reports == [True]
     made.on_end(compiling("vibrissa.rod.kernels"))
-    assert told == [True, False]
+    assert reports == [True, False]
 
 
 def test_it_is_over_when_all_jobs_are_and_not_between_them(ahead):
-    made, told = ahead
+    made, reports = ahead
     seen = []
 
     def job():
         made.on_start(compiling("vibrissa.rod.kernels"))
         made.on_end(compiling("vibrissa.rod.kernels"))
-        seen.append(list(told))
+        seen.append(list(reports))
 
     made.start([job, job])
     assert threads._done.wait(10.0)
@@ -54,16 +54,16 @@ def test_it_is_over_when_all_jobs_are_and_not_between_them(ahead):
         if thread.name == "warming":
             thread.join(10.0)
     assert seen == [[True], [True]]
-    assert told == [True, False]
+    assert reports == [True, False]
     made.start([lambda: seen.append("again")])  # kernels stay
     assert len(seen) == 2
 
 
 def test_a_job_that_fails_ends_the_matter(ahead):
-    made, told = ahead
-    made.start([lambda: 1 / 0, lambda: told.append("never")])
+    made, reports = ahead
+    made.start([lambda: 1 / 0, lambda: reports.append("never")])
     for thread in threading.enumerate():
         if thread.name == "warming":
             thread.join(10.0)
-    assert told == []
+    assert reports == []
     assert not threads._done.is_set()

@@ -95,8 +95,8 @@ def test_colours_follow_values():
 def test_every_contact_of_the_cloud_is_found_again(chart):
     """So that a grey point means that signals determine nothing, not that a search failed."""
     for triplet in ("Fx MB MD", "Fx FT MB"):
-        felt = {name: chart.signals[name] for name in triplet.split()}
-        assert (chart.contact_map.estimate(felt, triplet).n_candidates > 0).all()
+        signals = {name: chart.signals[name] for name in triplet.split()}
+        assert (chart.contact_map.estimate(signals, triplet).n_candidates > 0).all()
 
 
 def test_a_sensor_suits_what_stands_on_it():

@@ -26,7 +26,7 @@ def whole():
 
 def test_signals_are_laid_out_in_a_cylinder(whole):
     rows = whole.nodes.reshape(-1, whole.nodes.shape[-1])[::37]
-    places = whole.felt(rows)
+    places = whole.signal_rows(rows)
     size = np.hypot(places[:, 0], places[:, 1])
     assert size.max() <= 0.5 * whole.length + 1e-9
     moment = values_of("MB", rows)

@@ -27,7 +27,7 @@ def trial(recording):
 def test_a_trial_is_what_was_simulated(trial, recording):
     truth = recording["truth"].to_dataset()
     touching = truth["in_contact"].values.astype(bool)
-    np.testing.assert_array_equal(trial.felt, touching)
+    np.testing.assert_array_equal(trial.touching, touching)
     np.testing.assert_array_equal(trial.lines, truth["centerline"].values)
     np.testing.assert_array_equal(trial.contacts[touching], truth["contact_point"].values[touching])
     assert np.isnan(trial.contacts[~touching]).all()
@@ -59,7 +59,7 @@ def test_poses_alone_are_enough(recording):
     rest = vb.samples.gamma().length
     size = np.linalg.norm(np.diff(trial.lines, axis=2), axis=-1).sum(axis=-1)
     np.testing.assert_allclose(size, rest, rtol=1e-3)
-    assert not trial.felt.any()
+    assert not trial.touching.any()
     assert touched(trial, trial.frames - 1) == {}
     assert "whisker 0" in moment_drawing(trial, 3, 5.0)
     assert views(trial) == ()
@@ -71,30 +71,30 @@ def test_contacts_appear_one_by_one(trial):
         len(drawn["contacts"].points) if (drawn := touched(trial, frame)) else 0
         for frame in range(trial.frames)
     ]
-    np.testing.assert_array_equal(counts, np.cumsum(trial.felt[:, 0]))
+    np.testing.assert_array_equal(counts, np.cumsum(trial.touching[:, 0]))
 
 
 def test_the_next_contact_is_an_onset(trial):
     frame = trial.next_contact(0)
-    assert trial.felt[frame, 0]
-    assert not trial.felt[frame - 1, 0]
+    assert trial.touching[frame, 0]
+    assert not trial.touching[frame - 1, 0]
     onsets = trial.onsets()
     assert trial.next_contact(int(onsets[-1])) == onsets[0]
 
 
 def test_a_moment_shows_whisker_contact_and_force(trial):
-    frame = int(np.argmax(np.nan_to_num(trial.signals["MB"][:, 0]) * trial.felt[:, 0]))
+    frame = int(np.argmax(np.nan_to_num(trial.signals["MB"][:, 0]) * trial.touching[:, 0]))
     drawn = moment_drawing(trial, frame, 5.0)
     assert {"whisker 0", "contact 0", "force 0"} <= drawn.keys()
     np.testing.assert_allclose(drawn["force 0"].end[0], trial.contacts[frame, 0] * MM)
-    free = int(np.flatnonzero(~trial.felt[:, 0])[0])
+    free = int(np.flatnonzero(~trial.touching[:, 0])[0])
     assert drawn.keys() - moment_drawing(trial, free, 5.0).keys() == {"contact 0", "force 0"}
 
 
 def test_a_fitted_cylinder_lies_where_it_was_fitted(trial, recording):
     peg = Recording(recording).pegs[0]
-    near = trial.contacts[trial.felt]
-    normals = recording["truth"]["surface_normal"].values[trial.felt]
+    near = trial.contacts[trial.touching]
+    normals = recording["truth"]["surface_normal"].values[trial.touching]
     fit = fit_shape("cylinder", near, whisker_radius=np.full(len(near), 50e-6), normals=normals)
     vertices, faces = fitted_body(fit.to_dataset(), near)
     assert faces.max() < len(vertices)
@@ -119,7 +119,8 @@ def test_other_fitted_shapes_have_a_picture_too(fit):
 
 def test_an_unknown_shape_has_no_picture(trial):
     assert (
-        fitted_body(xr.Dataset(attrs={"shape": "unheard of"}), trial.contacts[trial.felt]) is None
+        fitted_body(xr.Dataset(attrs={"shape": "unheard of"}), trial.contacts[trial.touching])
+        is None
     )
 
 
@@ -163,7 +164,7 @@ def test_a_video_is_read_in_any_order(tmp_path):
 
 def test_the_chart_has_six_lines_and_shades_contacts(trial):
     signals = {name: values[:, 0] for name, values in trial.signals.items()}
-    drawn = chart(trial.time, signals, trial.felt[:, 0])
+    drawn = chart(trial.time, signals, trial.touching[:, 0])
     assert len(re.findall("<path ", drawn)) == 6
     assert len(re.findall("<rect ", drawn)) == len(trial.onsets())
     assert "nan" not in drawn
@@ -201,13 +202,13 @@ def test_several_whiskers_are_drawn_each_in_its_colour(recording):
     trial = watched(xr.DataTree.from_dict(groups))
     assert trial.names == ("left", "right")
     assert trial.busiest == 0
-    late = trial.felt & (
-        [False, True] | (trial.time > np.median(trial.time[trial.felt[:, 0]]))[:, None]
+    late = trial.touching & (
+        [False, True] | (trial.time > np.median(trial.time[trial.touching[:, 0]]))[:, None]
     )
-    assert replace(trial, felt=late).busiest == 1
+    assert replace(trial, touching=late).busiest == 1
     frame = trial.next_contact(0) + 3
     drawn = moment_drawing(trial, frame, 5.0)
     assert {"whisker 0", "whisker 1", "contact 0", "contact 1"} <= drawn.keys()
     cloud = touched(trial, frame)["contacts"]
-    assert len(cloud.points) == 2 * int(trial.felt[: frame + 1, 0].sum())
+    assert len(cloud.points) == 2 * int(trial.touching[: frame + 1, 0].sum())
     assert len(np.unique(cloud.colours, axis=0)) == 2

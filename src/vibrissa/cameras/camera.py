@@ -94,7 +94,7 @@ class Camera:
             faults += _faults_of_matrix(self.matrix)
             turn = self.rotation
             if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-5 or np.linalg.det(turn) < 0.0:
-                faults.append("rotation is no rotation; a mirror is a negative focal length")
+                faults.append("rotation is not a rotation; a mirror is a negative focal length")
         if faults:
             raise ValueError(f"no camera {self.name!r}: " + "; ".join(faults))
 

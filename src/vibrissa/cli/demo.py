@@ -90,7 +90,7 @@ def _report(result: DemoResult, noise: bool) -> None:
     least = shown("MB", sensed.contacts.attrs["felt_above"], 3)
     say()
     say(f"{sensed.contacts.sizes['time']} frames, {scores.touching} in contact")
-    say(f"{scores.felt} contacts measured (M_B over {least}), {scores.false} of them false")
+    say(f"{scores.detected} contacts measured (M_B over {least}), {scores.false} of them false")
     say(f"estimated from ({', '.join(sensed.contacts.attrs['signals'].split())}) only")
     say(
         f"{100 * scores.share_with_one:.1f} % have exactly one candidate ({one}); {none} none, as "
@@ -126,8 +126,8 @@ def _print_tracking(scores: TrackingScores) -> None:
     print_table(
         ["error of", "median", "95 %"],
         rows,
-        f"Tracking: {scores.lost} of {scores.frames} frames lost, contact distinguished from none "
-        f"in {100 * scores.told:.1f} %",
+        f"Tracking: {scores.lost} of {scores.frames} frames lost, contact classified correctly "
+        f"in {100 * scores.classified:.1f} %",
     )
 
 

@@ -214,10 +214,12 @@ def track(
         whisker=None if own.whisker is None else own.read().with_properties(**properties),
     )
     bases, fixed = traced.bases(views), known.corrected(len(views))
-    beside = known.read(videos[0], rate)
+    reference = known.read(videos[0], rate)
     for file, trial in trials.items():
         picture = file.with_name("start.png" if len(trials) == 1 else f"{file.stem}.start.png")
-        _track(trial, file, picture, views, rate, bases, fixed, traced.trace_options(), how, beside)
+        _track(
+            trial, file, picture, views, rate, bases, fixed, traced.trace_options(), how, reference
+        )
 
 
 def _track(

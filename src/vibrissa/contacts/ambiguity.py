@@ -49,7 +49,7 @@ _FAR, _SOON = 0.1, 5
 _BESIDE = 1.5
 # Where neighbouring faces say that they meet within this (in cell widths) is one place.
 _ONE = 0.1
-# Hardly any force is no place to start from; share of a cell, for one signal and for two.
+# A vanishing force is not a starting point; share of a cell, for one signal and for two.
 _REST = (0.05, 0.5)
 # Two samples of a station within this, relative to the force, are one.
 _SAME = 1e-4
@@ -194,8 +194,8 @@ def _starts(of: Sections, how: Weighing, target: Array, starts: Array) -> int:
                     u, v = j + crossings[crossing, 0], max(k + crossings[crossing, 1], rest)
                     new = True
                     for other in range(first, n):
-                        beside = max(abs(u - at[other, 0]), abs(v - at[other, 1]))
-                        new = new and (q == 1 or beside > _ONE)
+                        distance = max(abs(u - at[other, 0]), abs(v - at[other, 1]))
+                        new = new and (q == 1 or distance > _ONE)
                     if not new:
                         continue
                     if n == _MOST:
@@ -370,7 +370,7 @@ def _across(
             gram[i, c] = j[i, 0] * j[c, 0] + j[i, 1] * j[c, 1] + j[i, 2] * j[c, 2]
     det = gram[0, 0] * gram[1, 1] - gram[0, 1] * gram[1, 0]
     if q == 1 or not det > _OPEN * gram[0, 0] * gram[1, 1]:
-        more = 1 if gram[1, 1] > gram[0, 0] else 0  # the one that is told better
+        more = 1 if gram[1, 1] > gram[0, 0] else 0  # the one that is determined better
         for c in range(2):
             j[1 - more, c], gram[1 - more, c], gram[c, 1 - more] = 0.0, 0.0, 0.0
         j[1 - more, 2], gram[1 - more, 1 - more] = 0.0, 1.0

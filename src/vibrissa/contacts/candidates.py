@@ -508,7 +508,7 @@ def _everywhere(
 def _chosen(
     x: Array, misfits: Array, inside: IntArray, limit: float, n: int, kept: IntArray
 ) -> int:
-    """Fill which fits explain the measurement and cannot be told apart, the best first."""
+    """Fill which fits explain the measurement and are indistinguishable, the best first."""
     doubt, least = np.full(n, np.inf), np.inf
     for row in range(n):
         if inside[row] == 2:

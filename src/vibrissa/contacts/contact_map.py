@@ -1,4 +1,4 @@
-"""All contacts that a whisker can hold, and what each feels like at the base.
+"""All stable contacts of a whisker, and the base signals of each.
 
 A :class:`ContactMap` holds the chart of the stable, reachable contacts Ω of one whisker
 (:mod:`vibrissa.rod.chart`): contact point, force and moment with exact derivatives at its nodes.

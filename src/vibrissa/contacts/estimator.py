@@ -282,7 +282,7 @@ class Estimator:
         sensor = sensor_noise(noise, names, errors)
         self._order: list[int] | None = [order.index(name) for name in names]
         if felt_above > 0.0 and sensor is None:
-            raise ValueError("what is felt is judged by the noise, and there is none")
+            raise ValueError("contact is detected by comparison with the noise; noise is needed")
         self._start(contact_map, Named(contact_map, names, sensor), len(names), felt_above, prior)
 
     @classmethod
@@ -351,11 +351,11 @@ class Estimator:
         self.readout = readout.named if isinstance(readout, ByName) else readout
         self._width = width
         self.contact_map = contact_map
-        told, named = self.readout.told, isinstance(self.readout, Named)
-        self._determining = told < _UNKNOWNS or not named or contact_map.determines(self.names)
-        self._search = Search(contact_map, self.readout) if told >= _UNKNOWNS else None
+        rank, named = self.readout.rank, isinstance(self.readout, Named)
+        self._determining = rank < _UNKNOWNS or not named or contact_map.determines(self.names)
+        self._search = Search(contact_map, self.readout) if rank >= _UNKNOWNS else None
         self._ambiguity = None
-        if told < _UNKNOWNS:
+        if rank < _UNKNOWNS:
             self._ambiguity = Ambiguity(contact_map.chart, self.readout)
         self._last: Array | None = None
 
@@ -490,7 +490,7 @@ class Estimator:
         """
         if not all(map(math.isfinite, measurement.measured.tolist())):
             return Status.MISSING
-        if self.felt_above > 0.0 and not self.readout.felt(measurement, self.felt_above):
+        if self.felt_above > 0.0 and not self.readout.detected(measurement, self.felt_above):
             return Status.NOT_FELT
         return None if self._determining else Status.DEGENERATE
 

@@ -44,8 +44,7 @@ _MOST = 24
 _ONE = 0.1
 # A candidate so far (the same) from every hypothesis is a new one.
 _NEW = 16.0
-# How far (over L) a whisker may have been bent before it was felt: where it is not known since when
-# it touches, and at least.
+# Largest deflection (over L) before contact was detected: where the onset is unknown, and at least.
 _ANYWHERE = 0.3
 _LEAST_REACH = 0.01
 # After a gap in which a contact may have gone so far (over L) all begins anew if nothing is known
@@ -68,7 +67,7 @@ class Followed(NamedTuple):
     ----------
     point : (3,) array
         Most probable contact point, laboratory frame, m; NaN if there is none. Where hypotheses run
-        together, as along the valley that a light touch leaves, it is their mean.
+        together, as along the valley that a light contact leaves, it is their mean.
     covariance : (3, 3) array
         Of the contact point about it, m²: of all hypotheses, weighed by their probabilities.
     velocity : (3,) array
@@ -87,7 +86,7 @@ class Followed(NamedTuple):
     point_whisker : (3,) array
         ``point`` in the whisker's frame, m.
     located : Contact or None
-        What this sample alone tells, where it was looked for: not of fewer than three signals that
+        Estimate from this sample alone, where it was sought: not of fewer than three signals that
         a hypothesis explains.
     """
 
@@ -183,7 +182,9 @@ class ContactFilter:
         """Forget everything, as when the whisker has lost touch."""
         self._mixture = room(0, self._errors)
         self._time: float | None = None
-        self._free: tuple[float, Array, Array] | None = None  # when and where last nothing was felt
+        self._free: tuple[float, Array, Array] | None = (
+            None  # when and where contact was last absent
+        )
         self.estimator.reset()
 
     def __call__(
@@ -215,15 +216,15 @@ class ContactFilter:
             return self._known(*self._learned(measurement, turn, base), turn, base)
         if nothing != Status.MISSING:
             self._mixture = room(0, self._errors)
-            felt = nothing != Status.NOT_FELT or not np.isfinite(turn).all()
-            self._free = None if felt else (time, turn, base)
+            touching = nothing != Status.NOT_FELT or not np.isfinite(turn).all()
+            self._free = None if touching else (time, turn, base)
         return self._known(nothing, None, turn, base)
 
     def _learned(
         self, measurement: Measurement, turn: Array, base: Array
     ) -> tuple[Status, Contact | None]:
-        """Take a measurement that is not empty: what it alone tells."""
-        three = self.estimator.readout.told >= _UNKNOWNS
+        """Take a measurement that is not empty: the estimate from it alone."""
+        three = self.estimator.readout.rank >= _UNKNOWNS
         located = self.estimator.locate(measurement) if three else None
         x, values = np.empty((0, 4)), np.empty((0, 6))
         if located is not None and located.status in (Status.UNIQUE, Status.AMBIGUOUS):
@@ -295,7 +296,7 @@ class ContactFilter:
         return out
 
     def _reach(self, turn: Array, base: Array) -> float:
-        """How far whisker and things may have moved toward each other since nothing was felt."""
+        """Largest approach of whisker and objects since the last sample without contact."""
         if self._free is None or self._time is None:
             return _ANYWHERE
         time, *pose = self._free
@@ -339,7 +340,7 @@ class ContactFilter:
             self._mixture = room(0, self._errors)
 
     def _known(self, status: Status, located: Contact | None, turn: Array, base: Array) -> Followed:
-        return told(self._mixture, status, located, turn, base, self._length)
+        return combined(self._mixture, status, located, turn, base, self._length)
 
 
 def _tidied(mixture: Mixture, number: int) -> Mixture:
@@ -356,7 +357,7 @@ def nothing_known(status: Status, located: Contact | None) -> Followed:
     )
 
 
-def told(
+def combined(
     mixture: Mixture,
     status: Status,
     located: Contact | None,

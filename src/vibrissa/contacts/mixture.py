@@ -350,7 +350,7 @@ def _moved(
     out: Mixture,
     row: int,
 ) -> bool:
-    """Fill a row with what hypothesis i becomes at a least; False where that is no Gaussian."""
+    """Fill a row with what hypothesis i becomes at a least; False where that is not a Gaussian."""
     k = how.codes.shape[0]
     residual, jacobian, slope = np.empty(k), np.empty((k, 4)), np.empty((k, 3))
     by_xi = np.empty((3, 3))

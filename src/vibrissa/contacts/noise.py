@@ -1,8 +1,8 @@
 """What the noise of a sensor does to the signals, and to the contact point found from them.
 
-Noise is told as one standard deviation a signal, the same everywhere, or as a covariance of force
-and moment, as a force/torque sensor has it: then a direction is the noisier the smaller the force
-or moment that it belongs to.
+Noise is one standard deviation per signal, the same everywhere, or a covariance of force and
+moment, as a force/torque sensor has it: then a direction is the noisier the smaller the force or
+moment that it belongs to.
 
 Errors that all measurements share, of the whisker's stiffness and of the sensor's gain and mixing,
 add to that: a measured wrench is (F, M) + Σ ε E (F, M, 1), with matrices E (6, 7) and ε of standard
@@ -40,7 +40,7 @@ _EXACT = 1e-6
 _SINGULAR = 1e-10
 # A measurement is explained if a perfect model would fit worse in one of a thousand.
 _RARE = 1e-3
-#: Contacts whose χ² differ by less cannot be told apart (the odds are below 200 to 1).
+#: Contacts whose χ² differ by less are indistinguishable (the odds are below 200 to 1).
 INDISTINCT = float(chi2.isf(_RARE, 1))
 #: Standard deviation of each signal, or covariance (6, 6) of (F, M), SI units.
 Noise: TypeAlias = Mapping[str, float] | ArrayLike
@@ -177,7 +177,7 @@ def common_errors(
     Returns
     -------
     (n, 6, 7) array
-        Matrices E; a measured wrench is off by Σ ε E (F, M, 1) with ε of standard deviation 1.
+        Matrices E; a measured wrench has the error Σ ε E (F, M, 1) with ε of standard deviation 1.
 
     Raises
     ------
@@ -359,7 +359,7 @@ def whitening(covariance: Array) -> Array:
 
 
 def rank(covariance: Array) -> int:
-    """How many independent numbers a measurement with this covariance (k, k) tells."""
+    """Number of independent values of a measurement with this covariance (k, k)."""
     weights = whitening(covariance)
     return int((np.abs(weights).max(axis=-1) > 0.0).sum())
 

@@ -1,14 +1,14 @@
 """Hypotheses about a contact that begins: all that one measurement leaves, as a sum of Gaussians.
 
-A light touch tells where it is badly: noise leaves a long, bent valley of contacts. So the
+A light contact is poorly localised: noise leaves a long, bent valley of contacts. So the
 likelihood is taken apart along the whisker by windows N(s; s_j, h²) that together are even. Where
 likelihood and window together are largest lies a Gaussian (Laplace's approximation), of weight
 
     log w = -χ²/2 + ½ log det P + log det W + log π(p),
 
-and these are again one where the measurement tells the arc length well.
+and these are again one where the measurement determines the arc length well.
 
-A contact that was not felt a moment ago has bent the whisker no farther than it has moved since.
+A contact that was not detected a moment ago has bent the whisker no farther than its motion since.
 With u for how far the contact's place on the whisker is from where it rests, over L, the density of
 contacts beforehand is
 
@@ -79,7 +79,7 @@ class Gaussians(NamedTuple):
 
 
 class Beginning:
-    """Makes Gaussians of what one measurement tells."""
+    """Represents the information of one measurement by Gaussians."""
 
     def __init__(self, estimator: Estimator) -> None:
         self._readout, self._chart = estimator.readout, estimator.contact_map.chart
@@ -359,10 +359,10 @@ def _linear(
     which = [CHANNELS.index(name) for name in names]
     away = (channels_of(moved) - channels_of(value)[:, None])[..., which]
     away = within_turn(away, [CIRCULAR[w] for w in which])
-    told = np.swapaxes(channel_derivatives(value, slope, names) @ steps, 1, 2)
-    bent = np.linalg.norm(np.einsum("nij,nmj->nmi", w, away - told), axis=2)
-    point_told = np.swapaxes(slope[:, 3:] @ steps, 1, 2)
-    off = np.linalg.norm(moved[..., 3:] - value[:, None, 3:] - point_told, axis=2)
+    predicted = np.swapaxes(channel_derivatives(value, slope, names) @ steps, 1, 2)
+    bent = np.linalg.norm(np.einsum("nij,nmj->nmi", w, away - predicted), axis=2)
+    point_predicted = np.swapaxes(slope[:, 3:] @ steps, 1, 2)
+    off = np.linalg.norm(moved[..., 3:] - value[:, None, 3:] - point_predicted, axis=2)
     scatter = np.sqrt(np.einsum("nij,njk,nik->n", slope[:, 3:], covariance[rows], slope[:, 3:]))
     with np.errstate(divide="ignore", invalid="ignore"):  # without noise nothing scatters
         bent = np.maximum(bent, off / scatter[:, None])

@@ -47,8 +47,8 @@ _REACH = 2.0
 # be relied on, the largest kurtosis relative to a normal distribution's, and the least share of the
 # nodes that counts.
 _MISSED, _TAILED, _COUNTING = 0.03, 1.8, 0.3
-# Where the second order misses so much, densities are not to be trusted: the first order tells what
-# a candidate weighs. A node's log density gains at most so much over the first order's.
+# Where the second order misses so much, densities are not to be trusted: the first order gives the
+# weight of a candidate. A node's log density gains at most so much over the first order's.
 _BROKEN, _MOST_GAIN = 0.3, 3.0
 # With a smaller share than this moments mean nothing.
 _TOO_FEW = 0.1

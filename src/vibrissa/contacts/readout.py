@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from vibrissa.contacts.charted_whisker import ChartedWhisker
 
 # A direction of the readings in which contacts of the map vary so much less than the noise and the
-# others tells nothing.
-_UNTOLD = 1e-9
+# others carries no information.
+_UNINFORMATIVE = 1e-9
 # Signals this many times larger than any on the map are in another unit.
 _FAR_BEYOND = 10.0
 _UNKNOWNS = 3
@@ -120,7 +120,7 @@ class Named:
         self._straight = [i for i, turns in enumerate(self._circular) if not turns]
         self.how = _weighing(self.channels, sensor, d.force, d.moment, self.scale)
         self.passes = 1 if constant_weights(self.channels, sensor) else 2
-        self.told = len(names)
+        self.rank = len(names)
         self._noise = [] if sensor is None else self._deviations(sensor)
         if len(names) >= 3:
             three = names if len(names) == 3 else seeding_triplet(chart, names)
@@ -139,7 +139,7 @@ class Named:
             )
 
     def _deviations(self, sensor: SensorNoise) -> list[tuple[int, float]]:
-        """Standard deviations of signals that are no directions, where nothing is felt."""
+        """Standard deviations, without contact, of signals other than directions."""
         out = []
         for i in self._straight:
             name, scale = self.names[i], float(self.scale[i])
@@ -174,7 +174,7 @@ class Named:
         values = measurement.measured.tolist()
         return bool(self._straight) and not any(values[i] for i in self._straight)
 
-    def felt(self, measurement: Measurement, above: float) -> bool:
+    def detected(self, measurement: Measurement, above: float) -> bool:
         """Whether a signal other than a direction is so many standard deviations from zero."""
         values = measurement.measured.tolist()
         return any(abs(values[i]) > above * sigma for i, sigma in self._noise)
@@ -206,24 +206,24 @@ class Mixed:
         # Singular directions of what contacts make of whitened readings, the strongest first.
         u, strength, _ = np.linalg.svd(whiten @ (mixing * sizes) * typical)
         self.noisy = True
-        self.told = int((strength > _UNTOLD * strength[0]).sum())
-        self._reduce = (u.T @ whiten)[: self.told]
+        self.rank = int((strength > _UNINFORMATIVE * strength[0]).sum())
+        self._reduce = (u.T @ whiten)[: self.rank]
         h = self._reduce @ (mixing * sizes)
         self._back = np.linalg.pinv(h)
         self.how = Weighing(
             np.array([FITTED.index(name) for name in WRENCH]),
             np.ascontiguousarray(h),
-            np.eye(self.told),
+            np.eye(self.rank),
             np.zeros((6, 6)),
             0.0,
             np.full(6, np.nan),
-            # What is told has full rank, so that wrong readings are those of wrong wrenches.
+            # The reduced reading has full rank, so that wrong readings are those of wrong wrenches.
             np.ascontiguousarray(self._back @ (self._reduce @ errors) * np.append(sizes, 1.0)),
         )
         self.passes = 2 if errors[..., :6].any() else 1
         seen = wrenches @ h.T
         self._largest = 10.0 * np.abs(seen).max(axis=0)
-        if self.told >= 3:
+        if self.rank >= 3:
             n, m, k = chart.values.shape[:3]
             three = h[:3]
             values = seen[:, :3].reshape(n, m, k, 3)
@@ -239,14 +239,14 @@ class Mixed:
                 range(3),
                 range(3),
                 np.ascontiguousarray(seen.T),
-                np.zeros(self.told),
-                [2] * self.told,
+                np.zeros(self.rank),
+                [2] * self.rank,
             )
             size = np.linalg.norm(slopes, axis=-1, keepdims=True)
             with np.errstate(invalid="ignore", divide="ignore"):
                 volume = np.abs(np.linalg.det(slopes / size))
-            if np.nanmedian(volume) < _UNTOLD:
-                self.told = 2
+            if np.nanmedian(volume) < _UNINFORMATIVE:
+                self.rank = 2
 
     def scaled(self, values: Array) -> Measurement:
         """Make one measurement (k,) non-dimensional and white; NaN stays NaN."""
@@ -257,7 +257,7 @@ class Mixed:
         """Whether the whisker touches nothing."""
         return not measurement.measured.any()
 
-    def felt(self, measurement: Measurement, above: float) -> bool:
+    def detected(self, measurement: Measurement, above: float) -> bool:
         """Whether all readings together are so many standard deviations from zero."""
         size = float((measurement.measured**2).sum())
         return size > len(measurement.measured) - 1 + above**2
@@ -317,7 +317,7 @@ def _weighing(
 
 
 def independent(contact_map: ChartedWhisker, readout: Named | Mixed) -> int:
-    """How many independent numbers a measurement tells."""
+    """Number of independent values in a measurement."""
     if isinstance(readout, Mixed):
         return len(readout.how.own)
     sensor, channels = readout.sensor, readout.channels

@@ -8,7 +8,7 @@ is found by weighted least squares, integrating from the contact to the base, wh
 magnify noise at a thin tip as the way out does.
 
 The rod beyond such a place may carry the same force on to another, where the moment vanishes again:
-then one of them can only be told from the other by the friction that it takes.
+then only the friction that each requires distinguishes them.
 """
 
 from __future__ import annotations
@@ -185,8 +185,8 @@ def _located(
     scale = np.repeat([d.force, d.moment], 3)
     wrenches = np.concatenate([f, m], axis=-1).reshape(-1, 6) / scale
     known = np.isfinite(wrenches).all(axis=1)
-    felt = known & wrenches[:, :3].any(axis=1) & wrenches[:, 3:].any(axis=1)
-    rows = np.flatnonzero(felt)
+    loaded = known & wrenches[:, :3].any(axis=1) & wrenches[:, 3:].any(axis=1)
+    rows = np.flatnonzero(loaded)
     degrees = len(WRENCH) - _UNKNOWNS
     if sensor is None:
         weights = whitening(trusted(wrenches[rows]))
@@ -278,8 +278,8 @@ def _promising(
 ) -> AnyArray:
     """Which seeds are about as good as the best of their row."""
     values, _ = solve_forces(d, seeds)
-    felt = np.concatenate([values[:, :3], np.cross(values[:, 3:], values[:, :3])], axis=1)
-    away = np.einsum("nij,nj->ni", weights[row], felt - wrenches[row])
+    model = np.concatenate([values[:, :3], np.cross(values[:, 3:], values[:, :3])], axis=1)
+    away = np.einsum("nij,nj->ni", weights[row], model - wrenches[row])
     with np.errstate(over="ignore", invalid="ignore"):
         misfit = np.sqrt((away**2).sum(axis=1))
     misfit[~np.isfinite(misfit)] = np.inf
@@ -352,7 +352,7 @@ def _angle_deviation(x: Array, spread: Array) -> Array:
 
 
 def chosen(rows: int, row: IntArray, fits: Fits, doubt: Array, limit: float, most: int) -> Fitted:
-    """Choose among fits those that explain their measurement and cannot be told apart."""
+    """Choose among fits those that explain their measurement and are indistinguishable."""
     misfit = np.where(np.isfinite(fits.values).all(axis=1), fits.misfits, np.inf)
     best = np.full(rows, np.inf)
     np.minimum.at(best, row, misfit)

@@ -64,7 +64,7 @@ class Scores:
     ----------
     touching : int
         Number of frames in which the whisker truly touches.
-    felt : int
+    detected : int
         Number of frames in which a contact is detected.
     false : int
         Number of frames in which a contact is detected without a true one.
@@ -85,7 +85,7 @@ class Scores:
     """
 
     touching: int
-    felt: int
+    detected: int
     false: int
     candidates: NDArray[np.int64]
     errors: tuple[ErrorRow, ...]
@@ -98,7 +98,7 @@ class Scores:
     @property
     def share_with_one(self) -> float:
         """Share of detected contacts with exactly one candidate."""
-        return float(self.candidates[1] / max(self.felt, 1))
+        return float(self.candidates[1] / max(self.detected, 1))
 
 
 def contact_errors(
@@ -197,9 +197,9 @@ def score(contacts: xr.Dataset, truth: xr.Dataset, errors: xr.Dataset, fit: Cyli
     Scores
         Numbers and errors.
     """
-    felt = contacts["in_contact"].values
+    detected = contacts["in_contact"].values
     touching = truth["in_contact"].values
-    number = contacts["candidates"].values[felt]
+    number = contacts["candidates"].values[detected]
     known = np.isfinite(errors["error_distance"].values)
     of_all, by_angle = error_rows(errors)
     origin, axis = truth["peg_position"].values, truth["peg_axis"].values
@@ -209,8 +209,8 @@ def score(contacts: xr.Dataset, truth: xr.Dataset, errors: xr.Dataset, fit: Cyli
     gap = Peg(origin, axis, radius).signed_distance(points[known]) - whisker_radius[known]
     return Scores(
         touching=int(touching.sum()),
-        felt=int(felt.sum()),
-        false=int((felt & ~touching).sum()),
+        detected=int(detected.sum()),
+        false=int((detected & ~touching).sum()),
         candidates=np.array([(number == 0).sum(), (number == 1).sum(), (number > 1).sum()]),
         errors=of_all,
         by_angle=by_angle,

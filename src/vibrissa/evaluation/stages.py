@@ -35,8 +35,8 @@ class TrackingScores:
         Of the whisker's base, m.
     contact : array (2,)
         Of the contact point, m, in frames that truly are in contact and were found to be.
-    told : float
-        Share of the frames in which contact is told from none.
+    classified : float
+        Share of the frames in which contact is classified correctly.
     """
 
     frames: int
@@ -45,7 +45,7 @@ class TrackingScores:
     centerline: Array
     base: Array
     contact: Array
-    told: float
+    classified: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +101,7 @@ def tracking_scores(tracked: xr.Dataset, truth: xr.Dataset) -> TrackingScores:
         centerline=centerline,
         base=base,
         contact=spread(away),
-        told=float((touching[0] == touching[1]).mean()),
+        classified=float((touching[0] == touching[1]).mean()),
     )
 
 

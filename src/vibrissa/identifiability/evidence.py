@@ -208,7 +208,7 @@ def answer(question: Question, names: tuple[str, ...], resolution: bool) -> Answ
         _judge(question, names, pool, steps, on_surface, region) for region in question.regions
     ]
     verdict = [cell.verdict for cell in cells]
-    # What a finer rod does not confirm was no twin.
+    # What a finer rod does not confirm was not a twin.
     twin[[word != NOT_UNIQUE for word in verdict]] = False
     probed, hit = tried, twin[None, :, tried]
     if resolution and lost is None:

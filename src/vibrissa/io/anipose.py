@@ -66,7 +66,7 @@ def read_anipose(path: str | PathLike[str]) -> RawTracks:
     ]
     if not parts or missing:
         got = f"it lacks {', '.join(missing)}" if missing else "no column ends in _ncams"
-        raise ValueError(f"{path} is no table of Anipose: {got}")
+        raise ValueError(f"{path} is not a table of Anipose: {got}")
 
     def column(part: str, what: str) -> Array:
         name = f"{part}_{what}"
@@ -113,7 +113,7 @@ _NUMBERS = {
 
 
 def read_calibration(path: str | PathLike[str]) -> list[dict[str, Any]]:
-    """Read what a calibration says of each camera.
+    """Read the calibration of each camera.
 
     Parameters
     ----------
@@ -136,12 +136,12 @@ def read_calibration(path: str | PathLike[str]) -> list[dict[str, Any]]:
         with in_file(f"{path}: [{name}]"):
             cameras.append({"name": name} | table | _checked(table))
     if not cameras:
-        raise ValueError(f"{path} tells of no camera")
+        raise ValueError(f"{path} holds no camera")
     return cameras
 
 
 def _checked(table: Mapping[str, Any]) -> dict[str, Any]:
-    """What is said of a camera in numbers, each of the shape that it needs."""
+    """Numbers of a camera, each checked for its shape."""
     out: dict[str, Any] = {}
     for key, shape in _SHAPES.items():
         values = number_array(table.get(key, []), key)

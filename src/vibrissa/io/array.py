@@ -21,7 +21,7 @@ Other columns are left alone.
 **Folder**: a CSV file each with columns ``x_mm,y_mm,z_mm`` (`load_centerline`), from base to tip,
 named after the whisker: ``C2.csv``, ``left_gamma.csv``.
 
-A lab's own whiskers as a table; the columns are told in `vibrissa.io.array`.
+A lab's own whiskers as a table; the columns are listed in `vibrissa.io.array`.
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ def _folder(path: Path, base: Any, noise: float | None) -> WhiskerArray:
 
 
 def _of_folder(path: Path) -> str:
-    """Why a folder is no folder of centrelines."""
+    """Why a folder is not a folder of centrelines."""
     names = sorted(file.name for file in path.iterdir())
     if {".zgroup", ".zarray", "zarr.json"}.intersection(names):
         return "is a Zarr folder, as NWB can be kept in; save it as HDF5, in one file .nwb"
@@ -272,7 +272,7 @@ def _rotations(columns: _Columns) -> Array:
     off = np.abs(np.swapaxes(matrix, 1, 2) @ matrix - np.eye(3)).max(axis=(1, 2))
     for i in np.flatnonzero(~(off <= _NEARLY) | (np.linalg.det(matrix) < 0.0)):
         columns.faults.append(
-            f"line {columns.lines[i]}: r11 … r33 are no rotation, whose columns are a right-handed "
+            f"line {columns.lines[i]}: r11 … r33 are not a rotation, whose columns are a right-handed "
             "frame of unit vectors"
         )
     if columns.faults:
@@ -305,7 +305,7 @@ def _coefficient(whisker: Whisker) -> float:
     bent = np.abs(whisker.curvature(s) - parabola).max() * whisker.length
     if bent > 1e-6 or np.abs(whisker.radius(s) / taper - 1.0).max() > 1e-6:
         raise ValueError(
-            f"{whisker.name} is no planar parabola with a linear taper, which is all that a table "
+            f"{whisker.name} is not a planar parabola with a linear taper, which is all that a table "
             "holds; NetCDF (.nc) keeps it"
         )
     return coefficient

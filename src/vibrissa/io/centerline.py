@@ -3,7 +3,7 @@
 The first line that is neither empty nor a comment (#) is the header. It names the coordinates and
 with them the unit: `x_mm,y_mm,z_mm` (also `_um`, `_cm`, `_m`; `x (mm)`), or `x,y,z` in metres.
 Without z the points lie in the plane z = 0. A column `radius_um` or `diameter_um`, in any of these
-units or that of the coordinates, tells how thick the whisker is there; where its cells are empty,
+units or that of the coordinates, is the thickness of the whisker there; where its cells are empty,
 the radius goes on smoothly between its neighbours, and at the ends as it was. Where it jumps, one
 point may stand in two rows with two radii. Other columns are left alone, and so are rows without
 any coordinate.
@@ -63,7 +63,7 @@ def load_centerline(path: str | PathLike[str]) -> Array:
 
 
 def _table(path: Path) -> tuple[Array, Array | None, str]:
-    """Points (n, 3) and, if they are told, radii (n,), m; and the unit of the coordinates."""
+    """Points (n, 3) and, if stated, radii (n,), m; and the unit of the coordinates."""
     rows = table_rows(read_text(path))
     header = next(rows, None)
     if header is None:
@@ -117,7 +117,7 @@ def _thickness(path: Path, header: list[str], coordinates: float) -> list[tuple[
 
 
 def check_slender(radius: float, length: float) -> None:
-    """Refuse a radius in another unit than it is said to be in."""
+    """Refuse a radius whose unit is not the stated one."""
     if not _THINNEST < radius / length < _THICKEST:
         raise ValueError(
             f"the radius is {radius * 1e6:.4g} µm on a whisker of {length * 1e3:.4g} mm; its "
@@ -164,7 +164,7 @@ def load_whisker(
         Standard deviation of a coordinate, m; 0 asks for interpolation. By default it is estimated.
     base : {"first", "last"} or array (3,), optional
         Which end is the base: by name, or a point near it, m. By default the thicker one where the
-        file tells radii that differ, and otherwise the first.
+        file has radii that differ, and otherwise the first.
     **properties
         Radius and material; see `Whisker`. A radius that is given counts more than the file's.
 

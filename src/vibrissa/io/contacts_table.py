@@ -7,7 +7,7 @@ Contour points as CSV: ``time, whisker, x, y, z, sigma_x, …``, a line for each
 In SI units and the laboratory frame: the contact point on the whisker's centreline with its
 standard deviations, the surface's outward normal there, the point of the surface, one whisker
 radius away, and, where an object was fitted, how far the surface of the whisker is from it and
-whether the contact is no outlier.
+whether the contact is not an outlier.
 """
 
 from __future__ import annotations

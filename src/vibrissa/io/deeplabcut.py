@@ -8,7 +8,7 @@ Tables that pandas wrote to HDF5, read without pandas.
 
 Its two formats: "table", one compound dataset whose column names are pickled in attributes, and
 "fixed", plain arrays of values, levels and labels. Nothing is unpickled, since a pickle can run
-code and build objects of chosen bytes: names are read off its text, and blocks that are no numbers
+code and build objects of chosen bytes: names are read off its text, and blocks that are not numbers
 are refused.
 """
 
@@ -115,7 +115,7 @@ def _csv(path: Path) -> tuple[Names, Array, list[str]]:
         try:
             numbers = [float(cell) if cell else np.nan for cell in cells[first:]]
         except ValueError:
-            raise ValueError(f"{path}: line {line} has cells that are no numbers") from None
+            raise ValueError(f"{path}: line {line} has cells that are not numbers") from None
         if len(numbers) != len(names):
             raise ValueError(
                 f"{path}: line {line} has {len(cells)} cells and the header {len(names) + first}; "
@@ -144,7 +144,7 @@ def _header(path: Path, rows: Iterator[tuple[int, list[str]]]) -> dict[str, list
     missing = [name for name in ("scorer", "bodyparts", "coords") if name not in header]
     if missing:
         raise ValueError(
-            f"{path} is no table of DeepLabCut, or cut short: its header rows are "
+            f"{path} is not a table of DeepLabCut, or cut short: its header rows are "
             f"{', '.join(header) or 'none'}{other}; it lacks {', '.join(missing)}. {_NEEDED}"
         )
     return header
@@ -156,7 +156,7 @@ def _hdf5(path: Path) -> tuple[Names, Array, list[str]]:
             names, values, index = read_pandas(group)
             if names and names[0][-1] in "xyz":
                 return [_four_levels(path, name) for name in names], values, index
-    raise ValueError(f"{path} is no table of DeepLabCut. {_NEEDED}")
+    raise ValueError(f"{path} is not a table of DeepLabCut. {_NEEDED}")
 
 
 def _frames(path: Path, index: list[str], count: int) -> NDArray[np.int64]:
@@ -295,7 +295,7 @@ def _above_mark(stack: list[Any]) -> list[Any]:
 def _checked_names(stack: list[Any]) -> Names:
     """What is left of a pickle, if it is a list of text or of tuples of text."""
     if len(stack) != 1 or not isinstance(stack[0], list):
-        raise ValueError("the names of its columns are no list")
+        raise ValueError("the names of its columns are not a list")
     names: Names = [name if isinstance(name, tuple) else (name,) for name in stack[0]]
     if not all(isinstance(part, str | int | float) for name in names for part in name):
         raise ValueError("the names of its columns are more than text and numbers")

@@ -1,4 +1,4 @@
-"""What a file is, told by its content.
+"""Kind of a file, by its content.
 
 Tracks from any file that is known.
 """
@@ -71,7 +71,7 @@ def recognise(path: str | PathLike[str]) -> Kind:
     Returns
     -------
     Kind
-        As far as its beginning tells; ``UNKNOWN`` if nothing fits.
+        Kind by its beginning; ``UNKNOWN`` if nothing fits.
 
     Raises
     ------
@@ -182,7 +182,7 @@ def load_tracks(path: str | PathLike[str], **labels: Unpack[Labels]) -> xr.Datas
     Parameters
     ----------
     path : str or path
-        The file; its kind is told by its content.
+        The file; its kind follows from its content.
     **labels
         What the file may not say: fps (frames per second), view (name of the camera), and for
         points in space unit ("m", "cm", "mm" or "um") and reference_frame; see `Labels`.
@@ -198,7 +198,7 @@ def load_tracks(path: str | PathLike[str], **labels: Unpack[Labels]) -> xr.Datas
     kind = recognise(path)
     if kind in (Kind.TRACKS, Kind.RECORDING):
         if labels:
-            raise ValueError(f"{path} is a {kind}, which says itself what {', '.join(labels)} is")
+            raise ValueError(f"{path} is a {kind}, which states {', '.join(labels)} itself")
         return load_own_tracks(path)
     if kind not in READERS:
         raise ValueError(

@@ -59,7 +59,7 @@ def load_matlab(
     path : str or path
         The ``.mat`` file.
     variable : str, optional
-        Which variable holds the whiskers, or the three that hold x, y and z, parted by commas.
+        Which variable holds the whiskers, or the three that hold x, y and z, separated by commas.
         Needed only if there are several.
     **labels
         fps; unit (needed for points in space) and reference_frame, or view; see `Labels`.
@@ -160,7 +160,7 @@ def _triples(values: Mapping[str, Any]) -> Iterator[tuple[str, _Frames]]:
 
 
 def _columns(parts: Sequence[Any]) -> Array | None:
-    """Put coordinates side by side; None if they are no vectors of one length."""
+    """Put coordinates side by side; None if they are not vectors of one length."""
     if not all(isinstance(part, np.ndarray) for part in parts):
         return None
     vectors = [np.asarray(part, dtype=np.float64).reshape(-1) for part in parts]

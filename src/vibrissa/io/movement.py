@@ -1,7 +1,7 @@
 """Datasets of *movement* (NetCDF): ``position`` and ``confidence`` of keypoints.
 
 Up to its version 0.16 the dimensions are called individuals and keypoints, since 0.17 individual
-and keypoint. Positions in a plane are pixels unless its attribute ``space_unit`` says otherwise.
+and keypoint. Positions in a plane are pixels unless the attribute ``space_unit`` states another.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def _raw(path: Path, poses: xr.Dataset) -> RawTracks:
     if "position" not in poses or not {"time", "keypoint", "space"} <= set(poses["position"].dims):
         got = ", ".join(str(name) for name in poses.variables) or "nothing"
         raise ValueError(
-            f"{path} is no poses dataset of movement: it has {got}, and position along time, "
+            f"{path} is not a poses dataset of movement: it has {got}, and position along time, "
             "space, keypoint(s) and individual(s) is needed"
         )
     if "individual" not in poses.dims:

@@ -9,7 +9,7 @@ Datasets and trees of datasets as NetCDF-4 files.
 
 They are written in memory and then to the disk with ordinary calls, because HDF5 takes the whole
 interpreter down when a disk that is full lets it not close a file. So writing takes as much memory
-as the file is large, compressed, beside the data.
+as the compressed file, in addition to the data.
 """
 
 from __future__ import annotations
@@ -209,7 +209,7 @@ def is_netcdf(path: str | PathLike[str]) -> bool:
 
 
 def kind_of(path: str | PathLike[str]) -> str:
-    """Read what a NetCDF-4 file says it holds.
+    """Read the kind of content that a NetCDF-4 file states.
 
     Parameters
     ----------

@@ -5,7 +5,7 @@ A `PoseEstimation` holds a series for each node, in pixels of one camera or in s
 for each camera. Each such container is a whisker; lone PoseEstimations that differ in their camera
 only are views of one whisker.
 
-What NWB files of ours hold beside traces: how whiskers are held, what they feel and touch.
+Contents of our NWB files in addition to traces: poses, signals and contacts of whiskers.
 
 `save_nwb` writes a series for each quantity and whisker, called as the quantity and the whisker,
 such as ``force_C2``. They need no extension of NWB, so that a simulated trial, which nobody traced,
@@ -75,7 +75,7 @@ def read_nwb(path: str | PathLike[str]) -> RawTracks:
     path = Path(path)
     with opened(path, "an NWB file with poses") as file:
         if "nwb_version" not in file.attrs:
-            raise ValueError(f"{path} is no NWB file: it has no nwb_version")
+            raise ValueError(f"{path} is not an NWB file: it has no nwb_version")
         space, image = _found(file)
     if not space and not image:
         raise ValueError(
@@ -195,23 +195,23 @@ def _series(group: h5py.Group) -> _Series | None:
             )
     if len({one.shape[1] for one in points}) != 1:
         raise ValueError(f"{group.name} has nodes in the plane and others in space")
-    said = str(first["data"].attrs.get("unit", "")).lower()
+    unit = str(first["data"].attrs.get("unit", "")).lower()
     flat = points[0].shape[1] == 2
-    if said and said not in (_PIXELS if flat else _LENGTHS):
-        raise ValueError(f"{group.name} has positions in {said}; pixels or a length is needed")
+    if unit and unit not in (_PIXELS if flat else _LENGTHS):
+        raise ValueError(f"{group.name} has positions in {unit}; pixels or a length is needed")
     frame = first.get("reference_frame")
     return _Series(
         nodes,
         np.stack(points, axis=1),
         np.stack(sure, axis=1),
         time,
-        "" if flat else _LENGTHS.get(said, ""),
+        "" if flat else _LENGTHS.get(unit, ""),
         _frame(frame),
     )
 
 
 def _points(series: h5py.Group) -> Array:
-    """Positions (time, 2 or 3) in the unit that they are said to be in."""
+    """Positions (time, 2 or 3) in the stated unit."""
     values = series_values(series, "data")
     if values.ndim != 2 or values.shape[1] not in (2, 3):
         raise ValueError(
@@ -289,7 +289,7 @@ _SERIES: dict[str, tuple[str, ...]] = {
     "force": _SPACE,
     "moment": _SPACE,
 }
-"""Dimensions beside time and whisker; longer names before those that they begin with."""
+"""Dimensions in addition to time and whisker; longer names before those that they begin with."""
 
 _HEAD: dict[str, tuple[str, ...]] = {
     "head_position": _SPACE,

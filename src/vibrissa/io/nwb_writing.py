@@ -47,8 +47,8 @@ _ROTATIONS = {
     "base_rotation": "Rotation from the whisker's to the laboratory frame, of the whisker",
     "head_rotation": "Rotation from the head's to the laboratory frame",
 }
-# Files without these are found faulty, and each says no more than that nobody knows.
-_NOBODY = {"subject_id": "unknown", "sex": "U", "age": "P0D/", "description": "not told"}
+# Validators require these; each value states that it is unknown.
+_NOBODY = {"subject_id": "unknown", "sex": "U", "age": "P0D/", "description": "not stated"}
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Session:
     identifier : str
         Of the file, unique in the world; by default made up.
     subject : mapping
-        Of the animal, as in NWB: subject_id, species, sex, age, description, …. What is not told
+        Of the animal, as in NWB: subject_id, species, sex, age, description, …. What is missing
         is written as unknown: sex "U", an age of 0 days or more ("P0D/").
     about : mapping
         More fields of NWB: experimenter, institution, lab, keywords, ….
@@ -124,7 +124,7 @@ def save_nwb(
     file = _file(session)
     _fill(file, data, cameras)
     with replacing(path) as part:
-        # In memory first, as :mod:`vibrissa.io.netcdf` says why.
+        # In memory first, for the reason given in :mod:`vibrissa.io.netcdf`.
         image = io.BytesIO()
         with h5py.File(image, "w") as content, NWBHDF5IO(mode="w", file=content) as out:
             out.write(file)
@@ -273,7 +273,7 @@ def _nodes(whisker: xr.Dataset) -> list[str]:
 
 
 def _confidence(whisker: xr.Dataset, name: str, view: object) -> Array | None:
-    """Confidence (time, node), also where there is one a frame; None if nobody tells."""
+    """Confidence (time, node), also where there is one a frame; None if unknown."""
     if name not in whisker:
         return None
     sure = whisker[name]

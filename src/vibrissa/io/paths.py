@@ -4,7 +4,7 @@ Verbs ask before they compute, so that nobody waits for a result that cannot be 
 
 A file is either written whole or left as it was.
 
-What is being written has a name of its own beside the target and a lock, which ends with whoever
+What is being written has its own name next to the target and a lock, which ends with whoever
 writes. So what a killed run left behind is known by its name and by nobody holding it, and the
 next one who writes into that folder removes it.
 """

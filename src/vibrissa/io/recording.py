@@ -1,8 +1,8 @@
 """Recordings as NetCDF-4 files with groups, without loss.
 
 Every float is kept to the last bit; arrays are compressed. Any reader of NetCDF or HDF5 can open
-the file; what the groups and variables mean is told by their own attributes and in
-:mod:`vibrissa.recording.schema`. In the file several whiskers stand side by side in one group
+the file; what the groups and variables mean is stated by their own attributes and in
+:mod:`vibrissa.recording.schema`. In the file several whiskers are together in one group
 (:mod:`vibrissa.io.recording`).
 
 The whiskers of a tree, side by side in one group of its file.
@@ -12,7 +12,7 @@ the variable, not by the byte: sixty whiskers of fourteen variables each are som
 and ten seconds. So in files two whiskers or more are one group ``/whiskers`` with the dimension
 ``whisker``, and what each calls its own (name, notes) is a variable of text. Where whiskers differ
 in size along a dimension, the shorter ones are filled up with NaN, and a variable
-``size_of_DIMENSION`` tells how far each goes.
+``size_of_DIMENSION`` is the true size of each.
 
 Whiskers that do not fit together so, whatever the reason, keep a group each; so do those of files
 written before.
@@ -31,7 +31,7 @@ import xarray as xr
 from vibrissa.io.netcdf import COMPRESSED, kind_of, naming, read_tree, write_netcdf
 
 RECORDING_KIND = "vibrissa recording"
-"""What the attribute ``kind`` of a recording says."""
+"""Value of the attribute ``kind`` of a recording."""
 
 _SMALLEST = 1000
 
@@ -45,19 +45,19 @@ def save_recording(path: str | PathLike[str], recording: xr.DataTree) -> None:
         Where to write, usually with the ending ``.nc``; an existing file is replaced once the new
         one is complete.
     recording : xarray.DataTree
-        Its attribute ``kind`` says that it is one.
+        Recording, with the attribute ``kind``.
 
     Raises
     ------
     FileNotFoundError
         If the folder does not exist.
     ValueError
-        If the tree is no recording.
+        If the tree is not a recording.
     """
     if recording.attrs.get("kind") != RECORDING_KIND:
         kind = recording.attrs.get("kind", "nothing")
         raise ValueError(
-            f"this is no recording: its attribute kind says {kind!r}, not {RECORDING_KIND!r}"
+            f"this is not a recording: its attribute kind is {kind!r}, not {RECORDING_KIND!r}"
         )
     written = stacked_whiskers(recording)
     encoding = {
@@ -207,10 +207,10 @@ def _unstacked(together: xr.Dataset, index: int) -> xr.Dataset:
         for dim in together.sizes
         if _SIZE + str(dim) in together
     }
-    told = {*own, *(f"{_SIZE}{dim}" for dim in size)}
+    known = {*own, *(f"{_SIZE}{dim}" for dim in size)}
     variables = {}
     for name, variable in together.variables.items():
-        if name in told or name == _WHISKER:
+        if name in known or name == _WHISKER:
             continue
         dims = variable.dims
         values = variable.values

@@ -176,7 +176,7 @@ def _readable(path: Path) -> Iterator[None]:
         yield
     except Exception as error:
         reason = " ".join(str(error).split())[:300] or type(error).__name__
-        raise ValueError(f"{path} is no bag that can be read: {reason}") from error
+        raise ValueError(f"{path} is not a bag that can be read: {reason}") from error
 
 
 def _finish(path: Path) -> None:
@@ -435,7 +435,7 @@ class ContactBag:
 
 @contextmanager
 def _kept(path: Path) -> Iterator[None]:
-    """Say of which bag it is what the database says."""
+    """Name the bag in errors of its database."""
     try:
         yield
     except (sqlite3.Error, OSError) as fault:

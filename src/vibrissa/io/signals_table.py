@@ -2,7 +2,7 @@
 
 CSV, or a NetCDF file with variables of these names along one dimension. Lines that are empty or
 begin with # are passed over, other columns are left alone, and an empty cell or ``nan`` is missing.
-A name may carry a unit (:mod:`vibrissa.io.table`), ``Fx_mN`` or ``Mx (µN·m)``; what is no unit is
+A name may carry a unit (:mod:`vibrissa.io.table`), ``Fx_mN`` or ``Mx (µN·m)``; what is not a unit is
 refused by name, and so are numbers that cannot be what they say: too large, or with a moment too
 large or small for the force, as |M| / |F| is at most the distance of the contact.
 """
@@ -58,7 +58,7 @@ def load_signals(path: str | PathLike[str]) -> xr.Dataset:
     -------
     xarray.Dataset
         Dims time, space: ``force``, N, and ``moment``, N·m, in the whisker's frame at its base.
-        The attribute ``notes`` says where time does not rise, if there.
+        The attribute ``notes``, if there, states where time does not increase.
     """
     path = Path(path)
     table = _netcdf(path) if is_netcdf(path) else _csv(path)
@@ -73,14 +73,14 @@ def _notes(time: Array) -> list[str]:
     known = np.flatnonzero(np.isfinite(time))
     step = np.diff(time[known])
     notes = []
-    for wrong, said in ((step < 0.0, "goes back"), (step == 0.0, "stands still")):
+    for wrong, fault in ((step < 0.0, "goes back"), (step == 0.0, "stands still")):
         if wrong.any():
             first = int(np.flatnonzero(wrong)[0])
             before, after = known[first], known[first + 1]
             notes.append(
-                f"time {said} in {int(wrong.sum())} of {time.size} rows, first in row {after + 1}, "
-                f"from {time[before]:g} to {time[after]:g} s; rows are taken each on its own, in "
-                "the order of the file"
+                f"time {fault} in {int(wrong.sum())} of {time.size} rows, first in row "
+                f"{after + 1}, from {time[before]:g} to {time[after]:g} s; rows are "
+                "evaluated each on its own, in the order of the file"
             )
     return notes
 
@@ -179,7 +179,7 @@ def _columns(path: Path, header: list[str]) -> tuple[list[int], Array]:
         if all(is_number(cell) for cell in header):
             faults = ["its first line is numbers, not names (lines with # are comments)"]
         raise ValueError(
-            f"{path} is no table of signals: {'; '.join(faults)}. It has the columns {got}; "
+            f"{path} is not a table of signals: {'; '.join(faults)}. It has the columns {got}; "
             f"{', '.join(COLUMNS)} are needed, in SI units or with one as in Fx_mN"
         )
     places = [found[name] for name in COLUMNS]
@@ -196,7 +196,7 @@ def _netcdf(path: Path) -> Array:
     if missing:
         got = ", ".join(str(name) for name in data.variables)
         raise ValueError(
-            f"{path} is no table of signals: it lacks {', '.join(missing)} (it has {got})"
+            f"{path} is not a table of signals: it lacks {', '.join(missing)} (it has {got})"
         )
     with naming(path, "a table of signals"):
         columns = [_in_si(path, data[name]) for name in COLUMNS]
@@ -237,8 +237,8 @@ def _check_magnitudes(path: Path, table: Array) -> None:
             faults.append(f"{name} has infinite values")
     if faults:
         raise ValueError(
-            f"{path}: {'; '.join(faults)}. An animal's whisker feels millinewtons at most, a "
-            "robot's a hundred newtons: the table must be in N and N·m"
+            f"{path}: {'; '.join(faults)}. Forces on an animal's whisker are millinewtons at most, "
+            "on a robot's a hundred newtons: the table must be in N and N·m"
         )
 
 
@@ -248,10 +248,10 @@ def _check_lever_arm(path: Path, table: Array) -> None:
     known = np.isfinite(force + moment)
     if not known.any():
         return
-    felt = known & (force > 0.5 * np.quantile(force[known], 0.95))
-    if not felt.any():
+    loaded = known & (force > 0.5 * np.quantile(force[known], 0.95))
+    if not loaded.any():
         return
-    arm = float(np.median(moment[felt] / force[felt]))
+    arm = float(np.median(moment[loaded] / force[loaded]))
     least, most = _LEVER_ARMS
     if arm > most:
         advice = "moments look like mN·mm, µN·m or mN·m (multiply by 1e-6, 1e-6 or 1e-3)"

@@ -51,7 +51,9 @@ def read_sleap_analysis(path: str | PathLike[str]) -> RawTracks:
     path = Path(path)
     with opened(path, "an analysis file of SLEAP") as file:
         if "tracks" not in file or "node_names" not in file:
-            raise ValueError(f"{path} is no analysis file of SLEAP: it lacks tracks or node_names")
+            raise ValueError(
+                f"{path} is not an analysis file of SLEAP: it lacks tracks or node_names"
+            )
         points = _ordered(file["tracks"], ("frame", "track", "node", "xy"))
         sure = None
         if "point_scores" in file:
@@ -113,8 +115,8 @@ def read_sleap_labels(path: str | PathLike[str]) -> RawTracks:
 
 def _ordered(array: h5py.Dataset, wanted: tuple[str, ...]) -> Array:
     """Bring the dimensions of an array in order."""
-    told = array.attrs.get("dims")
-    dims = tuple(json.loads(told)) if told is not None else _OWN[array.name.strip("/")]
+    stated = array.attrs.get("dims")
+    dims = tuple(json.loads(stated)) if stated is not None else _OWN[array.name.strip("/")]
     values: Array = np.asarray(array[:], dtype=np.float64)
     if sorted(dims) != sorted(wanted) or values.ndim != len(wanted):
         raise ValueError(f"{array.name} has dimensions {dims} of sizes {values.shape}")

@@ -1,6 +1,6 @@
 """Tables as text: lines of cells.
 
-As spreadsheets and loggers write them: cells are parted by commas, semicolons, tabs or blanks,
+As spreadsheets and loggers write them: cells are separated by commas, semicolons, tabs or blanks,
 whichever the first line has most of; where it is not commas, a number may have a decimal comma.
 
 Names and units of columns as labs write them.
@@ -29,8 +29,8 @@ from vibrissa.io.paths import check_readable, refuse_whisk, replacing
 
 _MISSING = frozenset({"", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--"})
 _COMMA = re.compile(r"[+-]?(?:\d+,\d*|,\d+)(?:[eE][+-]?\d+)?")
-_SAID = re.compile(r"sep=([,;\t])", re.IGNORECASE)
-# Spreadsheets in Western Europe write µ, ° and umlauts so; anything else is no text of theirs.
+_STATED = re.compile(r"sep=([,;\t])", re.IGNORECASE)
+# Spreadsheets in Western Europe write µ, ° and umlauts so; anything else is not theirs.
 _SPREADSHEET = re.compile(rb"[\t\n\r\x20-\x7e\xa0-\xff]*")
 
 
@@ -57,11 +57,11 @@ def read_text(path: str | PathLike[str]) -> str:
         if not _SPREADSHEET.fullmatch(content):
             at = error.start
             raise ValueError(
-                f"{path} is no table as text in UTF-8: byte {at} is {content[at]:#04x}"
+                f"{path} is not a text table in UTF-8: byte {at} is {content[at]:#04x}"
             ) from None
         text = content.decode("cp1252")
     if "\0" in text:
-        raise ValueError(f"{path} is no table as text: byte {content.find(0)} is zero")
+        raise ValueError(f"{path} is not a text table: byte {content.find(0)} is zero")
     return text
 
 
@@ -83,8 +83,8 @@ def table_rows(text: str) -> Iterator[tuple[int, list[str]]]:
         for number, line in enumerate(text.splitlines(), start=1)
         if line.strip() and not line.lstrip().startswith("#")
     ]
-    if lines and (said := _SAID.fullmatch(lines[0][1].strip())):
-        delimiter = said[1]
+    if lines and (stated := _STATED.fullmatch(lines[0][1].strip())):
+        delimiter = stated[1]
         del lines[0]
     else:
         delimiter = delimiter_of(lines[0][1]) if lines else ","
@@ -205,7 +205,7 @@ def read_rows(
     if faults:
         advice = "; decimal commas need semicolons or tabs between cells, and no points elsewhere"
         raise ValueError(
-            f"{path} has cells that are no numbers, or not one for each of the {width} columns: "
+            f"{path} has cells that are not numbers, or not one for each of the {width} columns: "
             f"{few_faults(faults)}{advice if commas else ''}"
         )
     return np.array(values, dtype=np.float64).reshape(-1, len(columns))
@@ -254,7 +254,7 @@ class Table:
                 faults.append(f"line {self.lines[i]} reads {cell!r}")
         if faults and not (labels and np.isnan(values).all()):
             raise ValueError(
-                f"{self.path}: column {name} has cells that are no numbers: {few_faults(faults)}"
+                f"{self.path}: column {name} has cells that are not numbers: {few_faults(faults)}"
             )
         return values
 

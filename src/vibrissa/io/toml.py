@@ -1,4 +1,4 @@
-"""Files of settings, TOML: what is wrong with one is said in a line that names it."""
+"""Files of settings, TOML: faults are reported in a line that names the file."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def read_toml(path: str | PathLike[str]) -> dict[str, Any]:
         text = path.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as error:
         byte = f"byte {error.start} is {error.object[error.start]:#04x}"
-        raise ValueError(f"{path} is no TOML in UTF-8: {byte}") from None
+        raise ValueError(f"{path} is not TOML in UTF-8: {byte}") from None
     with in_file(path):
         return parsed_toml(text)
 
@@ -58,9 +58,11 @@ def parsed_toml(text: str) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"it is no TOML: {error}") from None
+        raise ValueError(f"it is not TOML: {error}") from None
     except RecursionError:
-        raise ValueError("it is no TOML of ours: its values are nested too deeply") from None
+        raise ValueError(
+            "it is not a settings file of vibrissa: its values are nested too deeply"
+        ) from None
 
 
 @contextmanager

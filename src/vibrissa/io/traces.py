@@ -1,9 +1,9 @@
 """Traces on their way: what is done of a video, kept while the rest is traced.
 
 A file holds the traces of some whiskers from the first frame on, as one array of points with their
-number per frame, and a key that says of which video and with which settings.
+number per frame, and a key of the video and the settings.
 
-Corrected traces as CSV: points that a person says are right.
+Corrected traces as CSV: points that a person has confirmed.
 
 Columns ``view,frame,whisker,x,y``: the points of a whisker in one frame of one view (a number from
 0), from base to tip, column and row in pixels, a line each.

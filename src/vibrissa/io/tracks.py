@@ -8,7 +8,7 @@ border where these are checked and named. Beyond it they are a dataset like a re
     confidence        (time, whisker[, view], node)             0 to 1, NaN where none is given
     trace_confidence  the same of the trace, where there is a centreline too
 
-with ``time`` in seconds, or in frames where nobody says how many there are a second. An animal,
+with ``time`` in seconds, or in frames where the frame rate is unknown. An animal,
 track or instance of other programs is a whisker, and a body part or keypoint a node of it, from
 the base to the tip. Missing is NaN: also points at exactly zero that no confidence speaks for.
 """
@@ -30,10 +30,10 @@ from vibrissa.quantities import attributes
 Array = NDArray[np.float64]
 
 KIND = "vibrissa tracks"
-"""What the attribute ``kind`` of tracks says."""
+"""Value of the attribute ``kind`` of tracks."""
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6}
-"""Units of length that can be told, and what they are, m."""
+"""Units of length that can be stated, and their size, m."""
 
 LONGEST = 1.0
 """No whisker reaches across more in one frame, m."""
@@ -45,10 +45,10 @@ SPACE = ("time", "whisker", "node", "space")
 class Labels(TypedDict, total=False):
     """What files of other programs do not say.
 
-    ``fps``: frames per second; by default as the file says, else time counts frames. ``view``: name
-    of the camera of a file with pixels; by default as the file says, or ``camera``. ``unit``: of
+    ``fps``: frames per second; by default that of the file, else time counts frames. ``view``: name
+    of the camera of a file with pixels; by default that of the file, or ``camera``. ``unit``: of
     points in space, "m", "cm", "mm" or "um", where the file does not say. ``reference_frame``: of
-    points in space; by default as the file says, or ``laboratory``.
+    points in space; by default that of the file, or ``laboratory``.
     """
 
     fps: float
@@ -143,9 +143,9 @@ def labelled(raw: RawTracks, path: str | PathLike[str], **labels: Unpack[Labels]
         data[name] = xr.Variable(IMAGE[:-1], sure, attributes("confidence"))
         coordinates |= {"view": _views(raw, path, labels), "image_axis": ["column", "row"]}
     if raw.space is not None:
-        unit = _told(path, "unit", raw.unit, labels.get("unit"))
+        unit = _stated(path, "unit", raw.unit, labels.get("unit"))
         points, sure = _without_zeros(raw.space, raw.space_confidence)
-        frame = _told(path, "reference_frame", raw.reference_frame, labels.get("reference_frame"))
+        frame = _stated(path, "reference_frame", raw.reference_frame, labels.get("reference_frame"))
         data["centerline"] = xr.Variable(
             SPACE,
             points * _factor(path, unit, points),
@@ -184,11 +184,11 @@ def _without_zeros(points: Array, sure: Array | None) -> tuple[Array, Array]:
     return points, np.where(missing, np.nan, sure)
 
 
-def _told(path: Path, name: str, said: str, given: str | None) -> str:
-    """What the file says, or what is given; they must not disagree."""
-    if said and given and said != given:
-        raise ValueError(f"{path} says that its {name} is {said!r}, but {given!r} is given")
-    return said or given or ""
+def _stated(path: Path, name: str, stated: str, given: str | None) -> str:
+    """Value in the file, or the one given; they must agree."""
+    if stated and given and stated != given:
+        raise ValueError(f"{path} states the {name} {stated!r}, but {given!r} is given")
+    return stated or given or ""
 
 
 def _factor(path: Path, unit: str, points: Array) -> float:
@@ -227,7 +227,7 @@ def _clock(raw: RawTracks, path: Path, fps: float | None) -> dict[str, Any]:
     if fps is not None and not (np.isfinite(fps) and fps > 0.0):
         raise ValueError(f"fps is {fps!r}; it must be positive")
     if raw.fps is not None and fps is not None and abs(fps / raw.fps - 1.0) > 1e-3:
-        raise ValueError(f"{path} says {raw.fps:g} frames per second, but {fps:g} is given")
+        raise ValueError(f"{path} states {raw.fps:g} frames per second, but {fps:g} is given")
     rate = raw.fps if raw.fps is not None else fps
     about = attributes("time")
     if raw.time is not None:

@@ -47,11 +47,11 @@ def save_tracks(path: str | PathLike[str], tracks: xr.Dataset) -> None:
     FileNotFoundError
         If the folder does not exist.
     ValueError
-        If these are no tracks, or a table is asked of tracks with both.
+        If these are not tracks, or a table is asked of tracks with both.
     """
     path = check_writable(path, (*NETCDF, *CSV))
     if tracks.attrs.get("kind") != KIND:
-        raise ValueError(f"these are no tracks: kind is {tracks.attrs.get('kind', 'nothing')!r}")
+        raise ValueError(f"these are not tracks: kind is {tracks.attrs.get('kind', 'nothing')!r}")
     if path.suffix.lower() in CSV:
         text = _text(tracks)
         with replacing(path) as part:
@@ -178,7 +178,7 @@ def _text(tracks: xr.Dataset) -> str:
     points = [name for name in ("trace", "centerline") if name in tracks]
     if len(points) != 1:
         raise ValueError(
-            f"tracks with {' and '.join(points) or 'no points'} are no table; drop trace or "
+            f"tracks with {' and '.join(points) or 'no points'} are not a table; drop trace or "
             "centerline, or write NetCDF"
         )
     array = tracks[points[0]]

@@ -32,14 +32,14 @@ Frame = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class VideoInfo:
-    """What a video says of itself.
+    """Properties that a video states.
 
     Parameters
     ----------
     width, height : int
         Of a frame, pixels.
     frames : int
-        How many it says it has; 0 if it does not say.
+        Stated number of frames; 0 if it is not stated.
     rate : float
         Frames per second at which it is to be shown, which for high-speed video is usually not the
         rate at which it was taken; 0 if it does not say.
@@ -176,7 +176,7 @@ def _with_next(packets: Iterable[Any]) -> Iterator[tuple[Any, Any]]:
 
 
 def opened_video(path: str | PathLike[str]) -> InputContainer:
-    """Open a file that holds a video, or raise what says why not."""
+    """Open a file that holds a video, or raise an error that states why not."""
     import av
 
     path = Path(path)
@@ -186,7 +186,7 @@ def opened_video(path: str | PathLike[str]) -> InputContainer:
     try:
         container = av.open(str(path))
     except av.FFmpegError as error:
-        raise ValueError(f"{path} is no video that can be read: {error.strerror}") from error
+        raise ValueError(f"{path} is not a video that can be read: {error.strerror}") from error
     if not container.streams.video:
         container.close()
         raise ValueError(f"{path} holds no video")

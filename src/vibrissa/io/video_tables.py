@@ -118,7 +118,7 @@ def load_contact_points(path: str | PathLike[str]) -> xr.Dataset:
     whiskers, whisker = _numbers(path, columns.get("whisker", np.zeros(count)), "whisker")
     views, view = _numbers(path, columns.get("view", np.zeros(count)), "view")
     if in_views and len(views) < 2:
-        raise ValueError(f"{path} tells of view {views[0]} only; two are needed for a place")
+        raise ValueError(f"{path} covers view {views[0]} only; two are needed for a position")
     places = np.ravel_multi_index(
         (moment, whisker, view), (len(moments), len(whiskers), len(views))
     )
@@ -146,7 +146,7 @@ def _numbers(path: Path, column: Array, name: str) -> tuple[NDArray[np.int64], N
     """Which numbers a column has, and where each of its rows is among them."""
     wrong = np.flatnonzero(~(column >= 0.0) | (column != np.round(column)))
     if wrong.size:
-        raise ValueError(f"{path}: {name} is no number from 0 on in rows {few(wrong + 1)}")
+        raise ValueError(f"{path}: {name} is not a number from 0 on in rows {few(wrong + 1)}")
     numbers, places = np.unique(column.astype(np.int64), return_inverse=True)
     return numbers, places
 
@@ -185,14 +185,16 @@ def load_head(path: str | PathLike[str]) -> xr.Dataset:
     way = ways[0]
     check_rising(path, key, columns[key])
     place = np.stack([columns[name] for name in PLACE], axis=1)
-    said = np.stack([columns[name] for name in way], axis=1)
-    holes = np.flatnonzero(~np.isfinite(np.column_stack([place, said])).all(axis=1))
+    values = np.stack([columns[name] for name in way], axis=1)
+    holes = np.flatnonzero(~np.isfinite(np.column_stack([place, values])).all(axis=1))
     if holes.size:
         raise ValueError(
             f"{path}: numbers are missing in rows {few(holes + 1)}; the head's pose is needed in "
             "every row, so leave such rows out (by time, what is between rows is interpolated)"
         )
-    turn = {QUATERNION: _of_quaternions, MATRIX: _of_matrices, ANGLES: _of_angles}[way](path, said)
+    turn = {QUATERNION: _of_quaternions, MATRIX: _of_matrices, ANGLES: _of_angles}[way](
+        path, values
+    )
     return xr.Dataset(
         {
             "head_position": (
@@ -206,14 +208,14 @@ def load_head(path: str | PathLike[str]) -> xr.Dataset:
     )
 
 
-def _of_quaternions(path: Path, said: Array) -> Array:
-    size = np.linalg.norm(said, axis=1)
+def _of_quaternions(path: Path, values: Array) -> Array:
+    size = np.linalg.norm(values, axis=1)
     _refuse(path, np.abs(size - 1.0) > _ROUNDED, "quaternions are not of unit length", size)
-    return Rotation.from_quat(said[:, [1, 2, 3, 0]]).as_matrix()
+    return Rotation.from_quat(values[:, [1, 2, 3, 0]]).as_matrix()
 
 
-def _of_matrices(path: Path, said: Array) -> Array:
-    matrix = said.reshape(-1, 3, 3)
+def _of_matrices(path: Path, values: Array) -> Array:
+    matrix = values.reshape(-1, 3, 3)
     off = np.abs(np.swapaxes(matrix, 1, 2) @ matrix - np.eye(3)).max(axis=(1, 2))
     _refuse(path, off > _ROUNDED, "matrices are not orthogonal, RᵀR − 1", off)
     sign = np.linalg.det(matrix)
@@ -221,12 +223,15 @@ def _of_matrices(path: Path, said: Array) -> Array:
     return Rotation.from_matrix(matrix).as_matrix()
 
 
-def _of_angles(path: Path, said: Array) -> Array:
-    steep = np.abs(said[:, 1])
+def _of_angles(path: Path, values: Array) -> Array:
+    steep = np.abs(values[:, 1])
     _refuse(
-        path, steep > 0.5 * np.pi + 1e-9, "elevations are above π/2; angles are in rad", said[:, 1]
+        path,
+        steep > 0.5 * np.pi + 1e-9,
+        "elevations are above π/2; angles are in rad",
+        values[:, 1],
     )
-    azimuth, elevation, roll = said.T
+    azimuth, elevation, roll = values.T
     turns = Rotation.from_euler("ZYX", np.stack([azimuth, -elevation, roll], axis=1))
     return turns.as_matrix()
 

@@ -2,7 +2,7 @@
 
 Little endian. A whiskers file is the header ``bwhiskbin1``, for each segment its id, frame and
 number of points n with n times x, y, thickness and score as float32, and at the end the number of
-segments. The id counts the segments of one frame and is no identity; points run in either
+segments. The id counts the segments of one frame and is not an identity; points run in either
 direction; traces reach beyond the tip and into the face by some pixels. A measurements file is the
 header ``measv3``, numbers of rows and of measures, and for each row its frame, segment, state and
 measures. The state is the whisker's identity once somebody has had whiskers classified (−1: none);
@@ -51,10 +51,10 @@ def load_whiskers(
     path : str or path
         The ``.whiskers`` file.
     measurements : str or path, optional
-        The ``.measurements`` file of the same video, by default that of the same name beside it
-        where there is one. It says which end is the follicle and, if classified, which segments
+        The ``.measurements`` file of the same video, by default that of the same name next to
+        it, if there is one. It states which end is the follicle and, if classified, which segments
         are whiskers and which whisker each is. Without it whisker i is the i-th segment of each
-        frame, which is no identity, and the direction of the points is left as it is.
+        frame, which is not an identity, and the direction of the points is left as it is.
     nodes : int, optional
         Points of each whisker, evenly along it; by default all that were traced, as many as the
         longest trace has, the others NaN beyond their end.
@@ -79,9 +79,9 @@ def read_whiskers(
     if nodes is not None and nodes < 2:
         raise ValueError(f"nodes is {nodes}; 2 or more are needed")
     frames, ids, segments = _segments(path)
-    beside = path.with_suffix(".measurements")
-    if measurements is None and beside.is_file():
-        measurements = beside
+    neighbour = path.with_suffix(".measurements")
+    if measurements is None and neighbour.is_file():
+        measurements = neighbour
     identity = ids
     about: dict[str, Any] = {"identity": "per frame", "direction": "either"}
     if measurements is not None:
@@ -178,7 +178,7 @@ def _segments(path: Path) -> tuple[Numbers, Numbers, list[Array]]:
     """Frame, id and points (n, 4) of every segment."""
     content = path.read_bytes()
     if not content.startswith(WHISKERS[:10]):
-        raise ValueError(f"{path} is no whiskers file: it does not begin with bwhiskbin1")
+        raise ValueError(f"{path} is not a whiskers file: it does not begin with bwhiskbin1")
     cut = f"{path} is cut short: its last segment is not whole, or the number of segments is wrong"
     if len(content) < len(WHISKERS) + 4:
         raise ValueError(cut)
@@ -206,7 +206,7 @@ def _rows(path: Path) -> NDArray[Any]:
     """Read every row of a measurements file."""
     content = check_readable(path).read_bytes()
     if not content.startswith(MEASUREMENTS[:6]):
-        raise ValueError(f"{path} is no measurements file: it does not begin with measv3")
+        raise ValueError(f"{path} is not a measurements file: it does not begin with measv3")
     if len(content) < len(MEASUREMENTS) + 8:
         raise ValueError(f"{path} is cut short: its header is not whole")
     count, n = struct.unpack_from("<2i", content, len(MEASUREMENTS))
@@ -230,7 +230,7 @@ def _rows(path: Path) -> NDArray[Any]:
     start = len(MEASUREMENTS) + 8
     if len(content) != start + count * whole.itemsize:
         have = (len(content) - start) / whole.itemsize
-        raise ValueError(f"{path} is cut short: it says {count} rows and has {have:.1f}")
+        raise ValueError(f"{path} is cut short: its header states {count} rows, it has {have:.1f}")
     rows = np.frombuffer(content, whole, count, start)
     return rows[np.lexsort((rows["segment"], rows["frame"]))]
 

@@ -24,17 +24,17 @@ class _Faults:
 
     def __init__(self, what: str) -> None:
         self._what = what
-        self._said: list[str] = []
+        self._faults: list[str] = []
 
     def vector(self, name: str, value: Any, direction: bool = False) -> Array:
         """Three finite numbers, of length one if a direction; read-only."""
         vector = np.array(value, dtype=np.float64)
         if vector.shape != (3,) or not np.isfinite(vector).all():
-            self._said.append(f"{name} is {vector.tolist()}; three finite numbers are needed")
+            self._faults.append(f"{name} is {vector.tolist()}; three finite numbers are needed")
         elif direction:
             size = float(np.linalg.norm(vector))
             if size == 0.0:
-                self._said.append(f"{name} is (0, 0, 0), which is no direction")
+                self._faults.append(f"{name} is (0, 0, 0), which is not a direction")
             # What already is a unit vector stays as it is, to the last bit, so that files keep it.
             elif abs(size - 1.0) > 4.0 * np.finfo(np.float64).eps:
                 vector = vector / size
@@ -46,19 +46,21 @@ class _Faults:
         number = float(value)
         allowed = number > 0.0 and (np.isfinite(number) or also == "infinite")
         if not (allowed or (also == "zero" and number == 0.0)):
-            said = f", or {also}" if also else ""
-            self._said.append(f"{name} is {number!r}; it must be positive{said}, in {unit}")
+            alternative = f", or {also}" if also else ""
+            self._faults.append(
+                f"{name} is {number!r}; it must be positive{alternative}, in {unit}"
+            )
         return number
 
-    def check(self, ok: bool, said: str) -> None:
+    def check(self, ok: bool, fault: str) -> None:
         """Add a fault of another kind."""
         if not ok:
-            self._said.append(said)
+            self._faults.append(fault)
 
     def tell(self) -> None:
         """Raise a ValueError with all faults, if there are any."""
-        if self._said:
-            raise ValueError(f"no {self._what}: " + "; ".join(self._said))
+        if self._faults:
+            raise ValueError(f"no {self._what}: " + "; ".join(self._faults))
 
 
 def _set(thing: Any, **values: Any) -> None:
@@ -324,7 +326,7 @@ class Box(Surface):
         rotation = np.array(self.rotation, dtype=np.float64)
         turned = rotation.shape == (3, 3) and bool(np.isfinite(rotation).all())
         turned = turned and np.abs(rotation.T @ rotation - np.eye(3)).max() <= ORTHOGONALITY
-        faults.check(turned and np.linalg.det(rotation) > 0.0, "rotation is no rotation matrix")
+        faults.check(turned and np.linalg.det(rotation) > 0.0, "rotation is not a rotation matrix")
         rotation.flags.writeable = False
         size = faults.vector("size", self.size)
         edge = faults.positive("edge_radius", self.edge_radius, "m", "zero")

@@ -170,7 +170,7 @@ def _panel(axes: Axes, scene: _Scene, limits: Array, view: tuple[int, int], towa
         near = eyes[eyes[..., toward].mean(axis=1) > skull[..., toward].mean()]
         _flat(axes, near[..., view], INK, INK, 2.2)
     for line, colour, touching in zip(scene.lines, scene.colours, scene.touching, strict=True):
-        # Whiskers of the far side are behind the head, those beside or on it before.
+        # Whiskers of the far side are drawn behind the head, all others in front of it.
         behind = toward == 0 and line[0, 0] < middle[0]
         look: dict[str, Any] = {"color": colour, "linewidth": 1.1 if touching else 0.7}
         axes.plot(*line[:, view].T, zorder=1.5 if behind else 3.0, **look)

@@ -158,19 +158,21 @@ def _limits(drawn: _Drawn, extent: float) -> Array:
 
 def _views(drawn: _Drawn, limits: Array, width: Width) -> Figure:
     page, span = page_width(width), np.ptp(limits, axis=1)
-    beside = width == "double"
+    abreast = width == "double"
     room = page - _LEFT - _RIGHT
-    scale = ((room - _GAP - _LEFT) / 2.0 if beside else room) / span[0]
+    scale = ((room - _GAP - _LEFT) / 2.0 if abreast else room) / span[0]
     tall = scale * span[1:]
-    below = 0.0 if beside else tall[1] + _GAP + _BOTTOM
-    columns = 2 if beside else 1
+    below = 0.0 if abreast else tall[1] + _GAP + _BOTTOM
+    columns = 2 if abreast else 1
     rows = -(-len(drawn.labels) // (2 * columns))
-    height = (max(tall) if beside else tall[0]) + below + _BOTTOM + _TOP + _ROW * rows
+    height = (max(tall) if abreast else tall[0]) + below + _BOTTOM + _TOP + _ROW * rows
     figure = new_figure(width, height, None)
     for number, j in enumerate((1, 2)):
-        across = beside * number
+        across = abreast * number
         left = _LEFT + across * (scale * span[0] + _GAP + _LEFT)
-        top = height - _TOP - _ROW * rows - (0.0 if beside else number * (tall[0] + _GAP + _BOTTOM))
+        top = (
+            height - _TOP - _ROW * rows - (0.0 if abreast else number * (tall[0] + _GAP + _BOTTOM))
+        )
         box = (left, top - tall[number], scale * span[0], tall[number])
         axes = box_axes(figure, box, xlim=limits[0], ylim=limits[j])
         _draw(axes, drawn, j)
@@ -211,7 +213,7 @@ _PAIR_ARROW = 0.22
 _CENTRED: dict[str, Any] = {"ha": "center", "va": "center"}
 
 _TABLE = 70.0
-"""Room of the table beside the views, mm; its height is as large where it lies below."""
+"""Width of the table next to the views, mm; its height is as large where it is below them."""
 
 
 def witness_pair(witness: xr.Dataset, *, width: Width = "double") -> Figure:
@@ -242,12 +244,12 @@ def witness_pair(witness: xr.Dataset, *, width: Width = "double") -> Figure:
     limits = _pair_limits(witness, extent)
     span = np.ptp(limits, axis=1)
     page = page_width(width)
-    beside = width == "double"
+    abreast = width == "double"
     left, gap, bottom, top = 12.0, 3.0, 9.0, 6.0
-    room = page - left - 2.0 - (_TABLE + 6.0 if beside else 0.0)
+    room = page - left - 2.0 - (_TABLE + 6.0 if abreast else 0.0)
     scale = min(room / span[0], 70.0 / (span[1] + span[2]))
     views = bottom + gap + top + scale * (span[1] + span[2])
-    height = max(views, 60.0) if beside else views + 52.0
+    height = max(views, 60.0) if abreast else views + 52.0
     shift = height - views
     with looking():
         figure = new_figure(width, height, None)
@@ -267,12 +269,12 @@ def witness_pair(witness: xr.Dataset, *, width: Width = "double") -> Figure:
         side.set_xlabel(axis_label("x"))
         title = f"the same {triplet_label(' '.join(triplet))}"
         figure.text(left / page, 1.0 - 4.0 / height, title, fontsize=7.0)
-        start = left + scale * span[0] + 8.0 if beside else 3.0
+        start = left + scale * span[0] + 8.0 if abreast else 3.0
         box = (
             start / page,
-            (height - 58.0) / height if beside else 0.0,
+            (height - 58.0) / height if abreast else 0.0,
             (page - start - 1.5) / page,
-            (57.0 if beside else 50.0) / height,
+            (57.0 if abreast else 50.0) / height,
         )
         _table(figure, box, witness, triplet)
         return figure

@@ -206,12 +206,12 @@ def start_views(
                 places[:1, 0], places[:1, 1], 60.0, facecolor="none", edgecolor=RED, linewidths=1.0
             )
             if len(places):
-                said = f"confidence {confidence:.2f}"
+                caption = f"confidence {confidence:.2f}"
                 column, row = places[0]
-                said = f"base at {column:.0f}, {row:.0f}, {said}"
+                caption = f"base at {column:.0f}, {row:.0f}, {caption}"
             else:
-                said = "no whisker"
-            axes.set_title(f"{name}: {said}", loc="left", fontsize=7.0, pad=2.0)
+                caption = "no whisker"
+            axes.set_title(f"{name}: {caption}", loc="left", fontsize=7.0, pad=2.0)
         height = max(heights) + _TITLE + below
         for count, remark in enumerate(remarks):
             at = (below - _LINE * (count + 1)) / height

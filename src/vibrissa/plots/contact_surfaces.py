@@ -15,12 +15,12 @@ from numpy.typing import ArrayLike
 
 from vibrissa.plots.space import (
     bounds,
-    felt,
     name_axes,
     paint,
     painted,
     signal_axes,
     signal_limits,
+    signal_rows,
     space_axes,
     square,
 )
@@ -69,8 +69,8 @@ def contact_surfaces(
     the same three in the space of (F_x, M_B, M_D); and the solid of all signals that contacts make,
     coloured by it. It is cut open where the force's bearing at the contact is
     between 90° and 180°, as are the signals of equal r. Contacts within
-    2° of rest are left out. Where two colours meet in the solid, a contact cannot be told from its
-    signals.
+    2° of rest are left out. Where two colours meet in the solid, the signals do
+    not determine the contact.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def contact_surfaces(
     line = to_display("centerline", centerline)
     contacts = bounds(np.concatenate([_places(body).reshape(-1, 3), line]))
     shell = solid_surface(whole, True, outside)
-    signals = signal_limits(felt(shell))
+    signals = signal_limits(signal_rows(shell))
     with looking():
         height, panels, rails = _sheet(width)
         figure = new_figure(width, height, None)
@@ -112,10 +112,10 @@ def contact_surfaces(
             axes = _cylinder(figure, into, signals)
             if name == "r":  # its surfaces lie one within the other
                 surface, hues = _level_sets(opened, name, norm, marks)
-            paint(axes, felt(surface), hues)
+            paint(axes, signal_rows(surface), hues)
             axes = _cylinder(figure, inside, signals)
             values = to_display(name, values_of(name, body))
-            paint(axes, felt(body), painted(values, norm, sequential()), flat=0.8)
+            paint(axes, signal_rows(body), painted(values, norm, sequential()), flat=0.8)
             coordinate_bar(figure, rails[i], name, norm, marks)
         return figure
 
@@ -232,7 +232,7 @@ def solid_panels(
         within = [nodes.shape[-1] + i for i in range(gentle.shape[-1])]
         nodes = np.concatenate([nodes, gentle], axis=-1)
     body = solid_surface(nodes, True, column("deflection"), *within)
-    places = felt(body)
+    places = signal_rows(body)
     limits = signal_limits(places)
     found = []
     for name, panel, rail in zip(COORDINATES, panels, rails, strict=True):

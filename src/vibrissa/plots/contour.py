@@ -197,7 +197,7 @@ def _limits(places: Array, body: Body | None) -> Array:
 
 
 def _panels(limits: Array, width: Width, right: float, above: float) -> tuple[Figure, list[Axes]]:
-    """Three axes, all as tall as the view from above, with room in mm beside and above them."""
+    """Three axes, all as tall as the view from above, with room (mm) to the right and above."""
     page = page_width(width)
     across, tall = np.ptp(limits[0]), np.ptp(limits[2])
     size = (page - _LEFT - 2.0 * _GAP - right) / (1.0 + 2.0 * across / tall)
@@ -291,7 +291,7 @@ _HEIGHT = 52.0
 
 
 def distances_by_class(summaries: Sequence[xr.Dataset], *, width: Width = "double") -> Figure:
-    """Draw distances from the surface by classes, beside what the covariance predicts.
+    """Draw distances from the surface by classes, with what the covariance predicts.
 
     Parameters
     ----------
@@ -327,16 +327,16 @@ def distances_by_class(summaries: Sequence[xr.Dataset], *, width: Width = "doubl
 
 def _panel(axes: Axes, summary: xr.Dataset) -> None:
     place = np.arange(summary.sizes["class"])
-    for name, label, colour, beside in (
+    for name, label, colour, aside in (
         ("median", "median", INK, -0.12),
         ("largest_95", "95 %", ORANGE, 0.12),
     ):
         measured = to_display("surface_distance", summary[name])
         predicted = to_display("surface_distance", summary[f"{name}_predicted"])
-        axes.plot(place + beside, measured, "o", color=colour, markersize=4.0, label=label)
+        axes.plot(place + aside, measured, "o", color=colour, markersize=4.0, label=label)
         if np.isfinite(predicted).any():
             axes.plot(
-                place + beside,
+                place + aside,
                 predicted,
                 "o",
                 color=colour,

@@ -162,7 +162,7 @@ class Correction:
         return line if np.isfinite(line).all() else np.empty((0, 2))
 
     def _shown(self) -> NDArray[np.uint8]:
-        """The frame; the last one if the video holds fewer frames than it says."""
+        """The frame; the last one if the video holds fewer frames than its header states."""
         while True:
             try:
                 return self._frames[self.frame]

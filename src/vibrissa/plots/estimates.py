@@ -74,7 +74,7 @@ def estimated_against_true(
                 _course(panels[1, i], axis, seconds, pair, look)
                 _errors(panels[2, i], axis, seconds, pair, look)
         if shade is not None:
-            # As tall as the panels of the first row, beside them.
+            # As tall as the panels of the first row, to their right.
             place: dict[str, Any] = {
                 "shrink": 0.8 if rows == 1 else 0.4,
                 "aspect": 22,

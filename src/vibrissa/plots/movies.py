@@ -431,10 +431,12 @@ def _signal_frames(
         figure = screen_figure()
         panels = [(66.5 * i + 0.5, 52.5, 66.5, 58.0) for i in range(3)]
         rails = [(66.5 * i + 59.7, 66.0, 1.6, 24.0) for i in range(3)]
-        felt = np.stack([signals[name] for name in TRIPLET], axis=1)
-        felt[~course.touching] = np.nan
-        solids = solid_panels(figure, samples, centerline, panels, rails, felt[first : last + 1])
-        places = signal_places(*felt.T)
+        measured = np.stack([signals[name] for name in TRIPLET], axis=1)
+        measured[~course.touching] = np.nan
+        solids = solid_panels(
+            figure, samples, centerline, panels, rails, measured[first : last + 1]
+        )
+        places = signal_places(*measured.T)
         ways = [flattened(axes, places) for axes in solids]
         for axes, way in zip(solids, ways, strict=True):
             path = flat_line(axes, color=INK, linewidth=0.3, alpha=0.4)

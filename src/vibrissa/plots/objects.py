@@ -16,7 +16,7 @@ from vibrissa.scene import Array, Course, head_surfaces
 
 _CELLS, _COARSE = 121, 4
 _FULL = 0.97
-"""Share of a panel from which an object is taken to fill it, so that it is no use drawing it."""
+"""Share of a panel from which an object is taken to fill it, beyond which drawing it has no use."""
 
 
 class Body(Protocol):

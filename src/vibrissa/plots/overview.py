@@ -1,4 +1,4 @@
-"""A trial at a glance: frames, signals, their way through the solids, estimates (Fig. 4)."""
+"""A trial at a glance: frames, signals, their trajectory in signal space, estimates (Fig. 4)."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class _Sheet(NamedTuple):
 
 
 def key_frames(course: Course) -> NDArray[np.intp]:
-    """Choose two frames in contact that tell most of a trial.
+    """Choose two frames in contact that show most of a trial.
 
     Parameters
     ----------
@@ -91,9 +91,8 @@ def trial_overview(
     """Draw a trial: what cameras see, signals and contacts over time, solids, estimates.
 
     Frames show the traced whisker in red and the contact point. Below the three signals and the
-    coordinates of the contact over time, with contact shaded; the trial's way through the solids of
-    all signals, coloured by r, θ and φ; and, two columns wide only, estimated against known
-    coordinates.
+    coordinates of the contact over time, with contact shaded; the trajectory in signal space,
+    coloured by r, θ and φ; and, two columns wide only, estimated against known coordinates.
 
     Parameters
     ----------
@@ -207,13 +206,13 @@ def _images(
 def _way(
     figure: Figure, sheet: _Sheet, course: Course, samples: xr.Dataset, centerline: ArrayLike
 ) -> None:
-    """Solids, and the way of the trial through them."""
+    """Solids, and the trajectory of the trial through them."""
     assert course.signals is not None
-    felt = np.stack([course.signals[name] for name in TRIPLET], axis=1)
-    felt[~course.touching] = np.nan
-    way = signal_places(*felt.T)
-    for axes in solid_panels(figure, samples, centerline, sheet.solids, sheet.rails, felt):
-        axes.plot(*way.T, color=ORANGE, linewidth=0.7, zorder=12)
+    measured = np.stack([course.signals[name] for name in TRIPLET], axis=1)
+    measured[~course.touching] = np.nan
+    trajectory = signal_places(*measured.T)
+    for axes in solid_panels(figure, samples, centerline, sheet.solids, sheet.rails, measured):
+        axes.plot(*trajectory.T, color=ORANGE, linewidth=0.7, zorder=12)
 
 
 def _compared(figure: Figure, boxes: Sequence[Box], course: Course) -> None:
@@ -290,8 +289,8 @@ def curves_over_time(
             axes.set_xlabel(axis_label("time"))
         curves.append(Curve(axes, values))
     for left in lowest:
-        beside = [c.axes for c, box in zip(curves, boxes, strict=True) if box[0] == left]
-        figure.align_ylabels(beside)
+        stacked = [c.axes for c, box in zip(curves, boxes, strict=True) if box[0] == left]
+        figure.align_ylabels(stacked)
     return curves
 
 

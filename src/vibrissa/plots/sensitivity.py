@@ -65,9 +65,9 @@ def sensitivity_panels(data: xr.Dataset, *, width: Width = "double") -> Figure:
 
     Nine panels: a row for each coordinate, a column for each signal, in each the derivative over
     the signal in 50 × 50 bins, the more opaque the more contacts (by the volume that they stand
-    for, if the dataset tells). Axes hold the central 99 % of the values; contacts within 2° of rest
-    are left out. A bin's colour tells concave forward from backward, mixed where both occur, and
-    lines are their medians. Signals that pile up near zero have an axis that is wider there.
+    for, if the dataset has it). Axes hold the central 99 % of the values; contacts within 2° of
+    rest are left out. A bin's colour distinguishes concave forward from backward, mixed where both
+    occur; lines are their medians. Signals that pile up near zero have an axis that is wider there.
 
     Parameters
     ----------

@@ -50,7 +50,7 @@ def signals_over_time(
     Raises
     ------
     ValueError
-        If the dataset has none of the signals; says how to make them.
+        If the dataset has none of the signals; the message states how to make them.
     """
     names = [name for column in _COLUMNS for name in column]
     if "time" not in signals.coords or not any(name in signals for name in names):

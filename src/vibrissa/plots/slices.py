@@ -1,8 +1,8 @@
 """The solid that the contacts fill in the space of three signals (the paper's S1 Fig. C).
 
-One signal is held: on the plane of the other two, lines of equal r, θ and φ of the contact, and how
-far a look-up table is off there. Beside it the whole solid, coloured by that error: axial force or
-whatever the third signal is upward, the moment in its plane as components M_B cos M_D, M_B sin M_D.
+One signal is held: on the plane of the other two, lines of equal r, θ and φ of the contact, and the
+error of a look-up table. Next to it the whole solid, coloured by that error: the third signal,
+such as the axial force, upward, the moment as components M_B cos M_D, M_B sin M_D.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.scene import Array, root, values_of
 
 ELEVATION, AZIMUTH = 24.0, -58.0
-"""From where space is seen, degrees, unless said otherwise."""
+"""Default direction of view, degrees."""
 
 _FLAT = 0.70
 """Brightness of a surface that the light only grazes."""
@@ -121,7 +121,7 @@ _FLOOR: dict[str, Any] = {"color": "#c8c8c8", "linewidth": 0.4, "zorder": 0}
 
 
 def signal_places(axial: ArrayLike, bending: ArrayLike, direction: ArrayLike) -> Array:
-    """Say where signals lie in the cylinder."""
+    """Positions of signals in the cylinder."""
     size = np.sqrt(to_display("MB", bending))
     turn = np.asarray(direction, dtype=np.float64)
     return np.stack(
@@ -129,8 +129,8 @@ def signal_places(axial: ArrayLike, bending: ArrayLike, direction: ArrayLike) ->
     )
 
 
-def felt(rows: Array) -> Array:
-    """Say where rows of a chart lie in the cylinder."""
+def signal_rows(rows: Array) -> Array:
+    """Positions in the cylinder of rows of a sampled surface."""
     return signal_places(*(values_of(name, rows) for name in ("Fx", "MB", "MD")))
 
 
@@ -168,8 +168,8 @@ def signal_axes(figure: Figure, panel: Box, limits: Array) -> Any:
     for angle in (0, 90, 180, -90):
         axes.plot(*np.outer(_toward(angle), [0.0, reach]), floor, **_FLOOR)
         label = f"{angle}°" if angle != 180 else f"${quantity('MD').symbol}$ = 180°"
-        # The rays to the left end beside the solid and beside the largest ring's label, which
-        # centred words would meet.
+        # The rays to the left end next to the solid and the largest ring's label, which centred
+        # words would cover.
         far = {"ha": "right"} if angle in (90, 180) else {}
         _write(axes, angle, 1.17 * reach, floor, label.replace("-", "−"), **far)
     _height_axis(axes, limits)

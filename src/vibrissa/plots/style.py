@@ -2,8 +2,8 @@
 
 Figures are made for print at the width of one or two columns (85 and 178 mm), with lettering of 6
 to 8 points at that size. Only Matplotlib's object-oriented interface is used: no window opens, no
-global state changes, and a figure is freed with its last name. Colours are told apart with any
-colour vision (Okabe & Ito 2008, https://jfly.uni-koeln.de/color/), and colormaps are perceptual.
+global state changes, and a figure is freed with its last name. Colours can be distinguished with
+any colour vision (Okabe & Ito 2008, https://jfly.uni-koeln.de/color/); colormaps are perceptual.
 The cyclic one is a circle in the plane of lightness and of blue against yellow in OKLab
 (B. Ottosson 2020, https://bottosson.github.io/posts/oklab/), the plane that every common kind of
 colour vision sees; green against red is added for those who see it. Equal turns are therefore about
@@ -133,7 +133,7 @@ def box_axes(figure: Figure, box: Box, **settings: Any) -> Axes:
 
 
 def page_width(width: Width) -> float:
-    """Tell how wide a figure is."""
+    """Width of a figure, mm."""
     if width not in WIDTHS:
         raise ValueError(f"width is {width!r}; one of {', '.join(WIDTHS)} is needed")
     return WIDTHS[width]
@@ -341,7 +341,7 @@ def diverging() -> Colormap:
 
 
 def shading(values: Array | None) -> dict[str, Any]:
-    """What tells a scatter plot how to colour its points."""
+    """Settings of a scatter plot that colour its points."""
     if values is None:
         return {"color": INK, "linewidths": 0.0}
     low, high = robust_limits(values)

@@ -37,7 +37,7 @@ _CONES = (0.0, 1.0, 2.0, 5.0, 10.0, 20.0, 40.0, 90.0)
 
 _TURNS = (0, 20, 50, 90, 180, 360)
 _ERRORS = (1e-4, 1e3)
-"""Errors that are told apart, mm: less is exact, more says nothing of where the contact is."""
+"""Range of errors drawn, mm: smaller ones are exact, larger ones do not locate the contact."""
 
 _ROW, _FRAME = 4.4, 20.0
 """Height of a row of marks, and of what is around the rows, mm."""

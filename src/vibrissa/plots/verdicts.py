@@ -45,7 +45,7 @@ _EDGES = {"single": (18.5, 7.3, 20.0), "double": (24.0, 13.5, 36.0)}
 """Widths of the triplets' names, of a region's column and of the notation, mm."""
 
 _TOLERANCE = 1e-3
-"""Of each signal's range, at which resolution is told."""
+"""Share of each signal's range at which the resolution is stated."""
 
 
 def verdict_table(verdicts: xr.Dataset, *, width: Width = "double") -> Figure:
@@ -88,8 +88,8 @@ def verdict_table(verdicts: xr.Dataset, *, width: Width = "double") -> Figure:
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(0.0, page), ylim=(height, 0.0))
         axes.set_axis_off()
         shares = verdicts.get("ambiguous_share")
-        told = shares is not None and bool(np.isfinite(shares.values).any())
-        _heads(axes, regions, width, page, told)
+        known = shares is not None and bool(np.isfinite(shares.values).any())
+        _heads(axes, regions, width, page, known)
         chosen = str(verdicts.attrs.get("chosen_triplet", ""))
         for i, triplet in enumerate(triplets):
             _row(axes, verdicts.sel(triplet=triplet), i, triplet == chosen, width, page)
@@ -314,7 +314,7 @@ def _resolution_key(figure: Figure, share: xr.DataArray) -> None:
 
 
 def critical_cones(cones: xr.Dataset, *, width: Width = "double") -> Figure:
-    """Draw outside which cone about rest contacts are told apart, by curvature and taper.
+    """Draw the critical cone of whiskers by curvature and taper.
 
     Parameters
     ----------
@@ -392,7 +392,7 @@ def _cone_map(
     axes.minorticks_off()
     none = known & (degrees == 0.0)
     where = np.argwhere(none)
-    # A dot says that no two contacts feel the same at all.
+    # A dot: no two contacts have the same signals at all.
     axes.plot(x[where[:, 1]], y[where[:, 0]], ".", color=MUTED, markersize=1.5)
 
 

@@ -59,7 +59,7 @@ def whisker_views(
         Written above.
     magnification : float, optional
         How many times too wide the whisker is drawn; chosen by default so that the base is easily
-        seen, and always said in the figure.
+        seen, and always stated in the figure.
     assumed : sequence of str
         Properties of the whisker that were not measured; written under the magnification.
     width : {"single", "double"}

@@ -14,7 +14,7 @@ from vibrissa.status import describe
 
 
 def chart_sections(contact_map: ContactMap, verdicts: xr.Dataset | None = None) -> list[Section]:
-    """Tell what a map holds, and which signals locate its contacts.
+    """Describe a contact map, and which signals locate its contacts.
 
     Parameters
     ----------
@@ -30,27 +30,27 @@ def chart_sections(contact_map: ContactMap, verdicts: xr.Dataset | None = None) 
     """
     about = Section("map", "The map", contact_map._repr_html_() + _ranges(contact_map.to_dataset()))
     if verdicts is None:
-        told = paragraph(
-            "Which signals locate a contact was not judged: `vibrissa uniqueness MAP -o FILE.nc` "
-            "does it, and `--uniqueness FILE.nc` shows it here."
+        advice = paragraph(
+            "Uniqueness has not been tested: `vibrissa uniqueness MAP -o FILE.nc` tests it, and "
+            "`--uniqueness FILE.nc` shows the verdicts here."
         )
-        return [about, Section("verdicts", "Verdicts", told)]
+        return [about, Section("verdicts", "Verdicts", advice)]
     body = _verdicts(verdicts) + _witnesses(verdicts)
     return [about, Section("verdicts", "Which triplets are unique", body)]
 
 
 def _ranges(samples: xr.Dataset) -> str:
-    """Ranges of signals over all contacts, and how these ended."""
+    """Ranges of signals over all contacts, and their statuses."""
     rows = []
     for name in (*SIGNALS, "r", "theta", "phi"):
         factor, unit = shown_unit(name, samples[name].values)
         values = factor * samples[name].values
         ends = (f"{end:.4g}".replace("-", "−") for end in (np.nanmin(values), np.nanmax(values)))
         rows.append((f"{quantity(name).long_name} ({unit})", *ends))
-    ranges = table(rows, ("quantity", "least", "largest"), "Over all contacts of the map")
+    ranges = table(rows, ("quantity", "smallest", "largest"), "Ranges over all contacts of the map")
     counts = describe(samples["status"].values).most_common()
     ended = [(sentence, str(count)) for sentence, count in counts]
-    return ranges + table(ended, ("status", "contacts"), "How contacts ended")
+    return ranges + table(ended, ("status", "contacts"), "What limits the contacts")
 
 
 def _verdicts(verdicts: xr.Dataset) -> str:
@@ -67,7 +67,7 @@ def _verdicts(verdicts: xr.Dataset) -> str:
 
 
 def _witnesses(verdicts: xr.Dataset) -> str:
-    """The farthest pair of contacts that feel the same, by triplet."""
+    """The farthest pair of contacts with the same signals, by triplet."""
     if "witness_separation" not in verdicts:
         return ""
     apart = verdicts["witness_separation"].transpose("triplet", "region", "witness").values
@@ -79,10 +79,10 @@ def _witnesses(verdicts: xr.Dataset) -> str:
             name = str(verdicts["region"].values[region])
             rows.append((str(triplet), name, f"{farthest:.3f} mm"))
     if not rows:
-        return paragraph("No two contacts were found that feel the same.")
+        return paragraph("No two contacts with the same signals were found.")
     return table(
         rows,
-        ("triplet", "region", "apart"),
-        "Farthest contacts that feel the same",
-        "Each pair is proof that the triplet does not locate contacts uniquely in the region.",
+        ("triplet", "region", "distance"),
+        "Farthest pairs of contacts with the same signals",
+        "Each pair proves that the triplet does not locate contacts in the region.",
     )

@@ -122,8 +122,8 @@ def table(
 def paragraph(text: str, kind: str = "") -> str:
     """Write a paragraph."""
     named = f' class="{kind}"' if kind else ""
-    told = _CODE.sub(r"<code>\1</code>", escape(text))
-    return f"<p{named}>{told}</p>"
+    marked_up = _CODE.sub(r"<code>\1</code>", escape(text))
+    return f"<p{named}>{marked_up}</p>"
 
 
 def document(title: str, about: str, sections: Sequence[Section], script: str = "") -> str:
@@ -199,7 +199,7 @@ def figure_sections(pictures: Mapping[str, bytes]) -> Section:
     Section
         All of them, with captions.
     """
-    # What tells most comes first.
+    # The most informative figures come first.
     known = [name for name in CAPTIONS if name in pictures]
     order = [*known, *(name for name in pictures if name not in CAPTIONS)]
     parts = [_figure(name, pictures[name]) for name in order]
@@ -207,12 +207,12 @@ def figure_sections(pictures: Mapping[str, bytes]) -> Section:
 
 
 def _figure(name: str, png: bytes) -> str:
-    said = CAPTIONS.get(name, name.replace("_", " "))
+    caption = CAPTIONS.get(name, name.replace("_", " "))
     if name.startswith(_WITNESS):
         triplet = ", ".join(name.removeprefix(_WITNESS).split("_"))
-        said = f"Two contacts that feel the same by ({triplet})."
+        caption = f"Two contacts with the same ({triplet}), which thus do not locate contacts."
     data = b64encode(png).decode("ascii")
-    text = escape(said)
+    text = escape(caption)
     return (
         f'<figure><img src="data:image/png;base64,{data}" alt="{text}">'
         f"<figcaption>{text}</figcaption></figure>"
@@ -257,8 +257,8 @@ def _link(path: Path, folder: Path) -> str:
     """A link to a movie that is too large to be in the page."""
     where = Path(os.path.relpath(path, folder)).as_posix()
     size = f"{path.stat().st_size / 1e6:.1f} MB"
-    told = paragraph(f"{size}: too large to be in the page, it lies beside it.", "note")
-    return f'<p><a href="{escape(quote(where))}">{escape(path.name)}</a></p>{told}'
+    marked_up = paragraph(f"{size}: too large for the page; the file is next to it.", "note")
+    return f'<p><a href="{escape(quote(where))}">{escape(path.name)}</a></p>{marked_up}'
 
 
 _LEAST = 1e-5

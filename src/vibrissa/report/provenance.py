@@ -70,14 +70,14 @@ def provenance(command: Sequence[str], inputs: Sequence[Path], seed: int | None)
     OSError
         If a file cannot be read.
     ValueError
-        If ``SOURCE_DATE_EPOCH`` is no whole number.
+        If ``SOURCE_DATE_EPOCH`` is not a whole number.
     """
     files = tuple((str(path), path.stat().st_size, sha256(path)) for path in inputs)
     return Provenance(shlex.join(command), files, tuple(_versions()), seed, _date())
 
 
 def sha256(path: Path) -> str:
-    """Tell a file by its content."""
+    """SHA-256 of a file's content."""
     found = hashlib.sha256()
     with path.open("rb") as file:
         while block := file.read(_BLOCK):
@@ -99,14 +99,14 @@ def _versions() -> list[tuple[str, str]]:
 
 
 def _date() -> datetime:
-    said = os.environ.get(_EPOCH)
-    if said is None:
+    seconds = os.environ.get(_EPOCH)
+    if seconds is None:
         return datetime.now(UTC)
     try:
-        return datetime.fromtimestamp(int(said), UTC)
+        return datetime.fromtimestamp(int(seconds), UTC)
     except (ValueError, OverflowError, OSError) as fault:
         raise ValueError(
-            f"{_EPOCH} is {said!r}; whole seconds since 1970 are needed, as of `date +%s`"
+            f"{_EPOCH} is {seconds!r}; whole seconds since 1970 are needed, as of `date +%s`"
         ) from fault
 
 
@@ -128,9 +128,9 @@ def provenance_section(known: Provenance) -> Section:
         ("made", known.date.strftime("%Y-%m-%d %H:%M:%S UTC")),
         (
             "seed",
-            "none: nothing is drawn by chance"
+            "none: no random numbers are used"
             if known.seed is None
-            else f"{known.seed}: of the draws behind what is predicted",
+            else f"{known.seed}, for the predicted errors",
         ),
     ]
     files = [

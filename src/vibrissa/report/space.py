@@ -20,8 +20,8 @@ from vibrissa.report.page import Section, paragraph
 from vibrissa.scene import Array, Course, Ints, object_surface
 from vibrissa.sketch import BENT, REST, thinned
 
-NO_SPACE = "No 3D picture: `pip install 'vibrissa[report]'` makes it possible."
-"""What is said where the drawing library is not installed."""
+NO_SPACE = "The 3D picture needs Plotly: `pip install 'vibrissa[report]'`."
+"""Message shown where the drawing library is not installed."""
 
 _MOST_POINTS = 4000
 _SHAPES = 7
@@ -76,7 +76,7 @@ def contacts_in_space(
     drawn = [_points(points, "time", course.time[known], f"{course.places_as} contacts")]
     limits = _limits(points)
     drawn += [
-        _triangles(*object_surface(thing, limits), f"{thing.attrs['kind']}, as known")
+        _triangles(*object_surface(thing, limits), f"{thing.attrs['kind']}, known")
         for thing in objects
     ]
     for fit in fits:
@@ -155,8 +155,8 @@ def space_section(figure: Any, about: str) -> tuple[Section, str]:
         default_height="100%",
         config={"displaylogo": False, "responsive": True, "showSendToCloud": False},
     )
-    told = paragraph(f"{about} Drag to turn, scroll to zoom, click a name to hide it.", "note")
-    body = f'<div class="space" role="img" aria-label="{escape(about)}">{drawn}</div>{told}'
+    hint = paragraph(f"{about} Drag to turn, scroll to zoom, click a name to hide it.", "note")
+    body = f'<div class="space" role="img" aria-label="{escape(about)}">{drawn}</div>{hint}'
     return Section("space", "In space", body), get_plotlyjs()
 
 

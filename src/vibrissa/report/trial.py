@@ -1,7 +1,7 @@
 """Sections about a trial: what it is, what was done with it, and how well it was done.
 
 Errors are given where the truth is part of the recording; without it there is
-still what fits report of themselves. What a recording lacks is named with the verb that makes it.
+still what the fits report. What a recording lacks is named with the verb that makes it.
 """
 
 from __future__ import annotations
@@ -46,14 +46,14 @@ _SPREADS = ("covariance", "contact_covariance", "candidates")
 
 _SPREAD = ("median", "95 %")
 
-_NOTHING = "No contact of this whisker was felt that there truly was: there is nothing to compare."
+_NOTHING = "None of this whisker's true contacts was detected, so there is nothing to compare."
 
 _SUSPECT = 1.5
-"""Misfit from which another shape may go better."""
+"""Misfit above which another shape may fit better."""
 
 
 def trial_sections(recording: xr.DataTree, whisker: int = 0, seed: int = 0) -> list[Section]:
-    """Tell what a recording is, what was done with it and how well.
+    """Sections that describe a recording, its stages and their errors.
 
     Parameters
     ----------
@@ -81,18 +81,18 @@ def trial_sections(recording: xr.DataTree, whisker: int = 0, seed: int = 0) -> l
     if "truth" in recording.children:
         truth, true_whisker = truth_of(recording, whisker)
     parts = [
-        Section("recording", "What was recorded", show(recording).html + bent._repr_html_()),
-        Section("settings", "What was done, with which settings", _settings(recording)),
+        Section("recording", "Recording", show(recording).html + bent._repr_html_()),
+        Section("settings", "Settings", _settings(recording)),
     ]
     if recording.sizes["whisker"] > 1:
         parts.append(Section("whiskers", "Whiskers", whiskers_table(recording, whisker)))
     root = groups[""]
     if "measured" in recording.children and root is not None and "in_contact" in root:
-        parts.append(Section("tracked", "What was tracked", tracked_table(root)))
+        parts.append(Section("tracked", "Tracking", tracked_table(root)))
     if truth is not None:
         parts += _against_truth(recording, groups, truth, true_whisker, seed)
     if "contour" in recording.children:
-        parts.append(Section("contour", "The contour", _contour(recording, seed)))
+        parts.append(Section("contour", "Contour", _contour(recording, seed)))
     counted = _statuses(groups)
     return [*parts, Section("statuses", "Statuses", counted)] if counted else parts
 
@@ -106,7 +106,11 @@ def _one(recording: xr.DataTree, name: str, whisker: int) -> xr.Dataset | None:
 def _settings(recording: xr.DataTree) -> str:
     """Attributes of the groups, and which stages are missing."""
     rows = [
-        (str(group.path).strip("/") or "recording", str(name).replace("_", " "), _said(name, value))
+        (
+            str(group.path).strip("/") or "recording",
+            str(name).replace("_", " "),
+            _shown_setting(name, value),
+        )
         for group in recording.subtree
         if not group.path.startswith(("/whiskers", "/objects"))
         for name, value in group.attrs.items()
@@ -116,16 +120,16 @@ def _settings(recording: xr.DataTree) -> str:
         [(f"{where}: {name}", value) for where, name, value in rows], caption="Settings by stage"
     )
     lacking = [
-        f"There is no group {group}: `vibrissa {verb}` makes it."
+        f"The stage {group} is missing: `vibrissa {verb}` adds it."
         for group, verb in STAGES.items()
         if group not in recording.children
     ]
     if "truth" not in recording.children:
-        lacking.append("There is no truth in this recording, so errors cannot be told.")
+        lacking.append("This recording holds no ground truth, so errors cannot be computed.")
     return facts + "".join(paragraph(each, "note") for each in lacking)
 
 
-def _said(name: object, value: object) -> str:
+def _shown_setting(name: object, value: object) -> str:
     """Write an attribute; what is known to be a signal's size in its unit."""
     if name == "felt_above":
         return f"M_B over {shown_value('MB', float(str(value)))}"
@@ -136,14 +140,14 @@ def _said(name: object, value: object) -> str:
     if name == "cutoff":
         return f"{float(str(value)):g} Hz"
     if isinstance(value, np.ndarray | list | tuple):
-        return ", ".join(_said("", each) for each in value)
+        return ", ".join(_shown_setting("", each) for each in value)
     return f"{value:.6g}" if isinstance(value, float | np.floating) else str(value)
 
 
 def _one_or_all(name: str, sigma: Array) -> str:
     """Standard deviations of three components."""
-    told = [shown_value(name, float(each), 3) for each in sigma]
-    return f"{told[0]} each" if len(set(told)) == 1 else ", ".join(told)
+    text = [shown_value(name, float(each), 3) for each in sigma]
+    return f"{text[0]} each" if len(set(text)) == 1 else ", ".join(text)
 
 
 def _against_truth(
@@ -164,19 +168,19 @@ def _against_truth(
         yield Section("signals", "Signals", lacking or _signal_errors(signals, truth, whisker))
     if estimates is not None:
         lacking = _lacking(_FOUND, estimates, truth, also_found=_SPREADS)
-        told = lacking or _contact_errors(estimates, truth, whisker, seed)
-        yield Section("estimates", "Estimated contacts", told)
+        text = lacking or _contact_errors(estimates, truth, whisker, seed)
+        yield Section("estimates", "Estimated contacts", text)
 
 
 def _contact_errors(estimates: xr.Dataset, truth: xr.Dataset, whisker: Whisker, seed: int) -> str:
-    """Tables of contacts felt, and of their errors."""
-    told = _felt(estimates, truth)
+    """Tables of detected contacts and of their errors."""
+    text = _detected(estimates, truth)
     if np.isfinite(estimates["contact_point"].values).any():
-        told += _errors(*error_rows(contact_errors(estimates, truth, whisker, seed)))
+        text += _errors(*error_rows(contact_errors(estimates, truth, whisker, seed)))
     else:
-        told += paragraph(_NOTHING)
+        text += paragraph(_NOTHING)
     warned = caution(estimates.attrs.get("source"))
-    return told + (paragraph(warned, "note") if warned else "")
+    return text + (paragraph(warned, "note") if warned else "")
 
 
 def _signal_errors(signals: xr.Dataset, truth: xr.Dataset, whisker: Whisker) -> str:
@@ -184,18 +188,18 @@ def _signal_errors(signals: xr.Dataset, truth: xr.Dataset, whisker: Whisker) -> 
     rows, six = signal_rows(signals, truth, whisker), six_rows(signals, truth)
     if not rows or not six:
         return paragraph(_NOTHING)
-    told = table(
+    text = table(
         rows,
         ("deflection angle", "contacts", "force", "moment", "force, 95 %", "moment, 95 %"),
         "Error of force and moment, median",
         "Size of the error over that of the true vector, in the laboratory frame.",
     )
-    return told + table(
+    return text + table(
         six,
         ("signal", "contacts", *_SPREAD, "largest", "true, median size"),
         "Error of the six signals",
-        "Felt less true, each in its own whisker frame, where the whisker touches and was felt "
-        "to; directions on the circle.",
+        "Measured minus true, each in its own whisker frame, in frames of true and detected "
+        "contact; directions on the circle.",
     )
 
 
@@ -207,15 +211,15 @@ def _lacking(
     also_true: Sequence[str] = (),
 ) -> str:
     """A note on what is not there to be compared; nothing where all is."""
-    told = []
+    text = []
     for where, data, also in (
-        ("what was found", found, also_found),
+        ("the result", found, also_found),
         ("the truth in this recording", truth, also_true),
     ):
         absent = [name for name in (*names, *also) if name not in data.data_vars]
         if absent:
-            told.append(f"{where} has no {', '.join(absent)}")
-    return paragraph(f"Errors cannot be told: {'; '.join(told)}.", "note") if told else ""
+            text.append(f"{where} lacks {', '.join(absent)}")
+    return paragraph(f"Errors cannot be computed: {'; '.join(text)}.", "note") if text else ""
 
 
 def _has(names: Sequence[str], *data: xr.Dataset | None) -> bool:
@@ -224,7 +228,7 @@ def _has(names: Sequence[str], *data: xr.Dataset | None) -> bool:
 
 
 def tracking_tables(root: xr.Dataset, truth: xr.Dataset) -> str:
-    """Tell the errors of what was tracked."""
+    """Tables of the errors of tracking."""
     scores = tracking_scores(root, truth)
     touching = [data["in_contact"].values.astype(bool) for data in (root, truth)]
     both = touching[0] & touching[1]
@@ -253,15 +257,15 @@ def tracking_tables(root: xr.Dataset, truth: xr.Dataset) -> str:
         lines,
         ("distance from the true line", *_SPREAD),
         "Tracked and true lines",
-        "Of points of the trace that were seen, of all of the centreline, and of the base from the "
-        "true one.",
+        "Distances of the visible points of the trace, of all points of the centreline, and of the "
+        "base from the true one.",
     )
     return (drawn if lines else "") + table(
         rows,
         ("error of", *_SPREAD),
         "Tracked against true",
-        f"Of {int(both.sum())} frames that are in contact and were found to be. Contact is told "
-        f"from none in {100 * scores.told:.1f} % of {both.size} frames.",
+        f"Over {int(both.sum())} frames of true and detected contact. Contact is classified "
+        f"correctly in {100 * scores.classified:.1f} % of {both.size} frames.",
     )
 
 
@@ -272,10 +276,10 @@ def _spread_cells(name: str, values: Array) -> list[str]:
 def six_rows(signals: xr.Dataset, truth: xr.Dataset) -> list[tuple[str, ...]]:
     """Sum up the errors of the six signals."""
     both = truth["in_contact"].values.astype(bool) & signals["in_contact"].values.astype(bool)
-    felt, true = (base_signals(data["force"], data["moment"]) for data in (signals, truth))
+    detected, true = (base_signals(data["force"], data["moment"]) for data in (signals, truth))
     rows = []
     for name, direction in zip(SIGNALS, CIRCULAR, strict=True):
-        away = within_turn(felt[name].values[both] - true[name].values[both], direction)
+        away = within_turn(detected[name].values[both] - true[name].values[both], direction)
         size = np.abs(away)
         size = size[np.isfinite(size)]
         if not size.size:
@@ -298,16 +302,16 @@ def signal_rows(signals: xr.Dataset, truth: xr.Dataset, whisker: Whisker) -> lis
     return rows
 
 
-def _felt(estimates: xr.Dataset, truth: xr.Dataset) -> str:
-    """How many contacts were felt and found."""
-    felt = estimates["in_contact"].values.astype(bool)
+def _detected(estimates: xr.Dataset, truth: xr.Dataset) -> str:
+    """Numbers of detected contacts and of their candidates."""
+    detected = estimates["in_contact"].values.astype(bool)
     touching = truth["in_contact"].values.astype(bool)
-    number = estimates["candidates"].values[felt]
+    number = estimates["candidates"].values[detected]
     rows = [
         ("frames in contact", str(int(touching.sum()))),
-        ("contacts felt", str(int(felt.sum()))),
-        ("of these false", str(int((felt & ~touching).sum()))),
-        ("with no candidate", str(int((number == 0).sum()))),
+        ("contacts detected", str(int(detected.sum()))),
+        ("false detections", str(int((detected & ~touching).sum()))),
+        ("without a candidate", str(int((number == 0).sum()))),
         ("with exactly one candidate", str(int((number == 1).sum()))),
         ("with several candidates", str(int((number > 1).sum()))),
     ]
@@ -320,8 +324,8 @@ def _errors(of_all: Sequence[ErrorRow], by_angle: Sequence[ErrorRow]) -> str:
     note = "* what the estimates' own covariance predicts"
     all_rows = [(quantity(row.quantity).long_name, *_cells(row)) for row in of_all]
     class_rows = [(row.label, *_cells(row)) for row in by_angle]
-    told = table(all_rows, ("of", "contacts", *names), "Error of the contact point", note)
-    return told + table(
+    text = table(all_rows, ("of", "contacts", *names), "Error of the contact point", note)
+    return text + table(
         class_rows,
         ("deflection angle", "contacts", *names),
         "Error in space by deflection angle",
@@ -352,18 +356,19 @@ def _contour(recording: xr.DataTree, seed: int) -> str:
                     shown_value(meant, sigma[parameter], 3),
                 )
             )
-    told = table(
+    text = table(
         rows,
         ("parameter", "fitted", "standard deviation"),
         f"The fitted {fit.kind}",
         f"{int(fit.inliers.sum())} contacts fit; root mean square of their distances: "
         f"{shown_value('surface_distance', fit.rms)}. Misfit {fit.misfit:.3g}: χ² per degree of "
-        "freedom, about 1 where the shape and what is said of the errors are right.",
+        "freedom, about 1 where the shape and the stated noise are right.",
     )
     if fit.kind != "free" and fit.misfit > _SUSPECT:
-        told += paragraph(
-            "Contacts lie farther from it than their covariance allows: it may be of another shape "
-            "(`vibrissa reconstruct --shape`), or the noise larger than it is said to be.",
+        text += paragraph(
+            "Contacts are farther from it than their covariance allows: the object may have "
+            "another shape (`vibrissa reconstruct --shape`), or the noise may be larger "
+            "than stated.",
             "note",
         )
     compared = [
@@ -372,8 +377,8 @@ def _contour(recording: xr.DataTree, seed: int) -> str:
         if name in data and name in QUANTITIES
     ]
     if compared:
-        told += table(compared, caption="Fitted less known object")
-    return told + _distances(recording, seed)
+        text += table(compared, caption="Fitted minus known object")
+    return text + _distances(recording, seed)
 
 
 def _component_text(name: str, values: Array) -> str:
@@ -435,7 +440,7 @@ def _statuses(groups: dict[str, xr.Dataset | None]) -> str:
 
 
 def whiskers_table(recording: xr.DataTree, chosen: int) -> str:
-    """Tell which whiskers touched for how long, and how strongly."""
+    """Table of the whiskers that touched, for how long and with which force."""
     names = [str(name) for name in recording.coords["whisker"].values]
     touching = contacts_by_whisker(recording)
     force = Recording(recording).root.get("force")
@@ -446,19 +451,19 @@ def whiskers_table(recording: xr.DataTree, chosen: int) -> str:
             size = np.linalg.norm(force[:, k], axis=1)
             largest = float(np.max(size, initial=0.0, where=np.isfinite(size)))
         rows.append((names[k], str(k), str(touching[k]), shown_value("force", largest)))
-    told = paragraph(
+    text = paragraph(
         f"Signals and estimated contacts below are of whisker {names[chosen]}, number {chosen}; "
         "`--which` chooses another. The contour is of all."
     )
     if not rows:
-        return told + paragraph(f"None of the {len(names)} whiskers is known to touch anything.")
+        return text + paragraph(f"None of the {len(names)} whiskers is known to touch an object.")
     heading = ("whisker", "number", "frames in contact", "largest force")
-    note = f"{len(names) - len(rows)} others are not known to touch anything."
-    return told + table(rows, heading, "Whiskers that touch", note)
+    note = f"{len(names) - len(rows)} others are not known to touch an object."
+    return text + table(rows, heading, "Whiskers that touch", note)
 
 
 def contacts_by_whisker(recording: xr.DataTree) -> NDArray[np.int64]:
-    """Count frames in contact by what tells of it first: estimates, signals, tracking, truth.
+    """Count frames in contact, from the first of estimates, signals, tracking and truth.
 
     Parameters
     ----------
@@ -468,7 +473,7 @@ def contacts_by_whisker(recording: xr.DataTree) -> NDArray[np.int64]:
     Returns
     -------
     array (whiskers,) of int
-        Frames; zero where nothing tells.
+        Number of frames; zero where no group states contact.
     """
     trial = Recording(recording)
     for group in map(trial.find, ("estimates", "signals", "", "truth")):
@@ -478,7 +483,7 @@ def contacts_by_whisker(recording: xr.DataTree) -> NDArray[np.int64]:
 
 
 def tracked_table(root: xr.Dataset) -> str:
-    """Tell what tracking found, and how well by its own account."""
+    """Table of what tracking found, with its own standard deviations."""
     touching = root["in_contact"].values.astype(bool)
     rows = [
         ("frames", str(touching.size)),
@@ -489,12 +494,12 @@ def tracked_table(root: xr.Dataset) -> str:
         size = np.linalg.norm(root[name].values, axis=-1)[touching] if name in root else []
         if np.isfinite(size).any():
             middle, largest = float(np.nanmedian(size)), float(np.nanmax(size))
-            told = f"{shown_value(name, middle)}, up to {shown_value(name, largest)}"
-            rows.append((f"{quantity(name).long_name}, in contact", told))
+            text = f"{shown_value(name, middle)}, up to {shown_value(name, largest)}"
+            rows.append((f"{quantity(name).long_name}, in contact", text))
     if "contact_covariance" in root:
         covariance = root["contact_covariance"].values[touching]
         sigma = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))
         if np.isfinite(sigma).any():
-            told = shown_value("contact_point", float(np.nanmedian(sigma)), 3)
-            rows.append(("standard deviation of the contact point", f"{told}, median, in space"))
+            text = shown_value("contact_point", float(np.nanmedian(sigma)), 3)
+            rows.append(("standard deviation of the contact point", f"{text}, median, in space"))
     return table(rows, caption="By the rod that fits the images")

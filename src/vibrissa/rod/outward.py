@@ -41,7 +41,7 @@ from vibrissa.rod.kernels import (
 
 #: At most so many places are kept for one wrench.
 MOST_PLACES = 6
-# What is bent more than this (rad) in one step is no rod any more, but what lies beyond a contact.
+# What is bent more than this (rad) in one step is no longer the rod, but lies beyond a contact.
 _MOST_TURN = 1.5
 # Rounds of false position for the zero inside a step.
 _ROUNDS = 30

@@ -277,7 +277,7 @@ class _Resting:
         angles = np.linspace(0.0, 2.0 * np.pi, _SIDES, endpoint=False)
         ways = np.cos(angles)[:, None] * toward + np.sin(angles)[:, None] * across
         far = [self._way_out(surface, now, way) for way in ways]
-        # What is nearer by rounding alone is no nearer: then the surface's own normal counts.
+        # What is nearer by rounding alone is not nearer: then the surface's own normal counts.
         nearest = int(np.argmin(np.array(far) * np.r_[1.0 - 1e-6, np.ones(_SIDES - 1)]))
         if not np.isfinite(far[nearest]):
             return None

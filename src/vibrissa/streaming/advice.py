@@ -42,8 +42,8 @@ def advice(stream: ContactStream) -> list[str]:
         )
     if measured > 0 and not touching:
         out.append(
-            "No signal was so far from zero that a contact is felt: are they in N and N·m, and is "
-            "the noise as it was said to be?"
+            "No signal was far enough from zero for a contact: are the signals in N and N·m, and "
+            "is the stated noise right?"
         )
     if total and counts["missing"] == total:
         out.append(

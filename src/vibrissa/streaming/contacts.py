@@ -24,8 +24,8 @@ Array = NDArray[np.float64]
 _ANEW = 1.0
 # Samples farther apart than this seem to have times in a smaller unit, s.
 _SLOW = 100.0
-# Characters of what is said of a line that cannot be read; it may quote the line.
-_SAID = 400
+# Longest message about a line that cannot be read; it may quote the line.
+_MESSAGE = 400
 
 COMPONENTS = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 """Components of force and moment that signals are computed from."""
@@ -113,10 +113,10 @@ class ContactStream:
                 record = self.record(sample)
             except ValueError as fault:
                 self.faults += 1
-                said = str(fault)
-                if len(said) > _SAID:
-                    said = f"{said[:_SAID]} …"
-                yield {"line": self.lines.number, "error": said}
+                message = str(fault)
+                if len(message) > _MESSAGE:
+                    message = f"{message[:_MESSAGE]} …"
+                yield {"line": self.lines.number, "error": message}
                 continue
             self.samples += 1
             self.statuses[record["status"]] += 1
@@ -210,10 +210,10 @@ class ContactStream:
         """Take one sample of a free whisker."""
         sensor = self._estimator.sensor
         assert sensor is not None
-        felt = sensor.compensated(values, rotation)
-        if not np.isfinite(felt).all():
+        reading = sensor.compensated(values, rotation)
+        if not np.isfinite(reading).all():
             return "missing"
-        self._free.append(felt)
+        self._free.append(reading)
         if len(self._free) == self._tare:
             self._offset = np.mean(self._free, axis=0)
         return "tare"

@@ -1,13 +1,13 @@
 """Lines of signals: CSV with a header, or one JSON object a line.
 
-Both carry numbers by name, in SI units; signals of a table may be in others if its header says so
-(:mod:`vibrissa.io.table`), and its cells may be parted by semicolons, tabs or blanks. The pose of
-the base may ride along: ``base_x``, ``base_y`` and ``base_z`` (m, laboratory), and a unit
+Both carry numbers by name, in SI units; signals of a table may be in others if its header states
+them (:mod:`vibrissa.io.table`), and its cells may be separated by semicolons, tabs or blanks. The
+pose of the base may be added: ``base_x``, ``base_y`` and ``base_z`` (m, laboratory), and a unit
 quaternion ``base_qw``, ``base_qx``, ``base_qy``, ``base_qz`` that turns the whisker's into the
-laboratory frame. A JSON object may hold a pose and its time alone. What ROS says of a message is
-passed on as it is: ``stamp_ns`` and ``recorded_ns`` (whole numbers) and ``frame_id``.
+laboratory frame. A JSON object may hold a pose and its time alone. Fields that ROS adds are passed
+on unchanged: ``stamp_ns`` and ``recorded_ns`` (whole numbers) and ``frame_id``.
 
-Rows mean what the last header says. So after a header that is refused no row is read until there is
+Rows are read by the last header. So after a header that is refused no row is read until there is
 another one.
 """
 
@@ -61,14 +61,14 @@ _SIGNALS = ("time", "Fx", "Fy", "Fz", "Mx", "My", "Mz", *SIGNALS)
 _UNIT = 0.01
 # Seconds since any epoch are fewer; what is more is in a smaller unit.
 _LATEST = 1e11
-# Farther away than this no base is, m; infinite ones are no numbers either.
+# Largest distance of a base, m; infinite ones are not numbers either.
 _FARTHEST = 1e9
 # Characters that a number in a table may begin with.
 _DIGITS = frozenset("0123456789+-.")
 
 
 class LineKind(Enum):
-    """What a line is, as far as can be told at a glance."""
+    """Kind of a line, by its first characters."""
 
     SAMPLE = auto()
     POSE = auto()
@@ -107,7 +107,7 @@ class Sample(NamedTuple):
 
 
 class Lines:
-    """Takes lines apart; the first one that is no JSON is a header, others may follow.
+    """Takes lines apart; the first one that is not JSON is a header, others may follow.
 
     Parameters
     ----------
@@ -190,7 +190,7 @@ class Lines:
             return None
         if self._header is None:
             refused = f": that of line {self._refused} was refused" if self._refused else ""
-            raise ValueError(f"a row, and no header says what its columns are{refused}")
+            raise ValueError(f"a row without a header that names its columns{refused}")
         if len(cells) > len(self._header) and not any(cells[len(self._header) :]):
             cells = cells[: len(self._header)]
         if len(cells) != len(self._header):
@@ -205,7 +205,7 @@ class Lines:
     def _heads(self, text: str) -> bool:
         """Take a line as the header if it is one.
 
-        A ValueError says that it is one, but cannot be used; rows are then not read.
+        A ValueError if it is a header that cannot be used; rows are then not read.
         """
         delimiter = delimiter_of(text)
         cells = cells_of(text, delimiter)
@@ -300,13 +300,13 @@ def _number(name: str, value: object) -> float:
     if value is None or value == "":
         return math.nan
     if isinstance(value, bool) or not isinstance(value, int | float | str):
-        raise ValueError(f"{name} is {value!r}, which is no number")
+        raise ValueError(f"{name} is {value!r}, which is not a number")
     try:
         return number(value) if isinstance(value, str) else float(value)
     except OverflowError:
         raise ValueError(f"{name} is larger than any number that can be used") from None
     except ValueError:
-        raise ValueError(f"{name} is {value!r}, which is no number") from None
+        raise ValueError(f"{name} is {value!r}, which is not a number") from None
 
 
 def rotation_of(quaternion: Sequence[float]) -> Array:

@@ -290,7 +290,7 @@ def _nothing(settings: Settings) -> None:
 
 
 def _uniqueness_seconds(settings: Settings) -> float:
-    # Measured with one core, 512 to 4096 samples: they cost little beside the search for twins.
+    # Measured with one core, 512 to 4096 samples: cheap compared with the search for twins.
     each = 0.6 + (1.0 if settings["resolution"] else 0.0)
     return 0.7 + each * len(_triplets(settings)) * math.sqrt(len(settings["regions"]))
 

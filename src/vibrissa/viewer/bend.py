@@ -160,7 +160,7 @@ def _size(length: float) -> float:
 
 _MM = quantity("length").display_factor
 _UN = quantity("force").display_factor
-_HELD = "The whisker holds this force."
+_HELD = "The whisker is in stable equilibrium."
 
 
 class BendMode:
@@ -171,7 +171,7 @@ class BendMode:
     def __init__(self, page: Page) -> None:
         self._page = page
         self._clouded: Chart | None = None
-        self._told: Kind | None = None
+        self._shown_kind: Kind | None = None
         gui = page.server.gui
         bend = page.bend
         length = page.original.length
@@ -205,7 +205,7 @@ class BendMode:
                 1.0,
                 0.0,
                 visible=False,
-                hint="Round the whisker: 0° along what is y at its base, 90° along z",
+                hint="About the whisker: 0° along its y at the base, 90° along z",
             )
             self._state = gui.add_html("")
             self._numbers = gui.add_html("")
@@ -249,8 +249,8 @@ class BendMode:
         if bend.kind != "force":
             x, y, z = np.round(_MM * bend.target, 3).tolist()
             put(self._target, (x, y, z))
-        if bend.kind != self._told:  # not while someone moves the sliders
-            self._told = bend.kind
+        if bend.kind != self._shown_kind:  # not while someone moves the sliders
+            self._shown_kind = bend.kind
             put(self._kind, bend.kind)
             put(self._radius, round(_MM * bend.radius, 2))
             put(self._place, round(bend.place, 3))

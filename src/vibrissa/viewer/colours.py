@@ -35,7 +35,7 @@ class Legend:
     smooth: bool = True
 
     def html(self) -> str:
-        """As it stands on the page."""
+        """The legend as HTML."""
         colours = [colour for colour, _ in self.steps]
         words = [word for _, word in self.steps if word or not self.smooth]
         if self.smooth:
@@ -89,7 +89,7 @@ def counted(numbers: Ints) -> tuple[Bytes, Legend]:
     rgb = np.array(_COUNTS)[np.clip(numbers, 0, 3)]
     words = ("none found", "one", "two", "more")
     steps = tuple((_css(np.array(c)), word) for c, word in zip(_COUNTS, words, strict=True))
-    return _bytes(rgb), Legend("Contacts that feel the same", steps, smooth=False)
+    return _bytes(rgb), Legend("Contacts with the same signals", steps, smooth=False)
 
 
 def _ramp(name: str, colours: Any, marks: list[float]) -> Legend:

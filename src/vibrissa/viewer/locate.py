@@ -93,7 +93,7 @@ class Located:
 
 
 def located(chart: Chart, bend: Bend, sensor: Sensor) -> Located | None:
-    """Find every contact that feels the same in three signals; None where there is no contact."""
+    """Find every contact with the same three signals; None where there is no contact."""
     bent = bend.deflection
     if not bend.status.ok or bend.status is Status.NO_CONTACT:
         return None
@@ -110,8 +110,8 @@ def coloured(chart: Chart, what: str, sensor: Sensor) -> tuple[Bytes, Legend]:
         return shaded(what, chart.signals[what])
     if what == "sensitivity":
         return shaded("predicted_error", _predicted_error(chart, sensor))
-    felt = {name: chart.signals[name] for name in sensor.triplet}
-    estimate = chart.contact_map.estimate(felt, sensor.triplet)
+    signals = {name: chart.signals[name] for name in sensor.triplet}
+    estimate = chart.contact_map.estimate(signals, sensor.triplet)
     if what == "uniqueness":
         return counted(estimate.n_candidates)
     if what == "ambiguity":
@@ -143,7 +143,7 @@ MOST = 0.3
 
 
 def locate_drawing(whisker: Whisker, found: Located, exaggeration: float) -> Drawing:
-    """Draw the whisker in every other contact that feels the same, and the errors of all."""
+    """Draw the whisker at every other contact with the same signals, and the errors of all."""
     out: dict[str, Mark] = {}
     covariances = found.estimate.candidates.covariance
     others = set(found.others(whisker.length).tolist())
@@ -154,7 +154,7 @@ def locate_drawing(whisker: Whisker, found: Located, exaggeration: float) -> Dra
             ball = ellipsoid(_mm(point), radius * np.eye(3))
             out[f"ball {i}"] = Body(*ball, GHOST)
             apart = number("separation", float(found.distances[i]), 3)
-            out[f"apart {i}"] = Label(_mm(point), f"feels the same, {apart} away")
+            out[f"apart {i}"] = Label(_mm(point), f"same signals, {apart} away")
         if np.isfinite(covariances[i]).all():
             most = MOST * whisker.length
             vertices, faces = error_ellipsoid(point, covariances[i], SIGMAS, most)
@@ -167,21 +167,21 @@ def of_located(whisker: Whisker, found: Located | None, status: Status) -> str:
     if found is None:
         return sentence(status)
     names = found.sensor.triplet
-    felt = {name: float(found.signals[name]) for name in SIGNALS}
-    chosen = {name: felt[name] for name in names}
-    parts = [sentence(Status(int(found.estimate.status))), table(chosen, "Felt")]
+    signals = {name: float(found.signals[name]) for name in SIGNALS}
+    chosen = {name: signals[name] for name in names}
+    parts = [sentence(Status(int(found.estimate.status))), table(chosen, "Measured")]
     others = found.others(whisker.length)
     if others.size:
         farthest = number("separation", float(found.distances[others].max()), 3)
-        parts.append(note(f"The farthest contact that feels the same is {farthest} away."))
+        parts.append(note(f"The farthest contact with the same signals is {farthest} away."))
     own = int(np.argmin(found.distances)) if found.points.size else -1
     if own >= 0 and np.isfinite(found.estimate.candidates.covariance[own]).all():
         spread = np.sqrt(np.diagonal(found.estimate.candidates.covariance[own]))
         errors = dict(zip(("sigma_x", "sigma_y", "sigma_z"), spread.tolist(), strict=True))
         parts.append(table(errors, f"Error of the contact point ({SIGMAS:.0f}σ drawn)"))
         if SIGMAS * spread.max() > MOST * whisker.length:
-            parts.append(note("The ellipsoid is cut short: along it the place is unknown."))
-    rest = {name: value for name, value in felt.items() if name not in names}
+            parts.append(note("The ellipsoid is truncated: along it the position is undetermined."))
+    rest = {name: value for name, value in signals.items() if name not in names}
     parts.append(table(rest, "Not used"))
     return "".join(parts)
 
@@ -195,7 +195,7 @@ _UNM = quantity("moment").display_factor
 
 
 class LocateMode:
-    """The controls of a sensor, and what it cannot tell apart."""
+    """Controls of a sensor, and the contacts that it cannot distinguish."""
 
     name = "Locate"
 
@@ -260,15 +260,15 @@ class LocateMode:
         self._paint(chart)
 
     def write(self, brief: bool = False) -> None:
-        """Write what the three signals tell."""
+        """Write what follows from the three signals."""
         bend = self._page.bend
         if self._page.chart is None:
-            self._words.content = note("Charting all contacts of this whisker …")
+            self._words.content = note("Sampling all contacts of this whisker …")
         else:
             self._words.content = of_located(bend.whisker, self.found, bend.status)
 
     def _paint(self, chart: Chart) -> None:
-        """Colour the cloud beside everything else."""
+        """Colour the cloud in the background."""
         key = (chart, self._sensor, self._what)
         if self._drawn == key:
             return

@@ -95,7 +95,7 @@ class Solids:
         values = self.nodes[..., column(name)]
         return float(values.min()), float(values.max())
 
-    def felt(self, rows: Array) -> Array:
+    def signal_rows(self, rows: Array) -> Array:
         """Places (..., 3), mm, of rows in the space of signals, its axis at the origin."""
         reach, low, high = self._limits
         size = np.sqrt(values_of("MB", rows)) / reach
@@ -125,7 +125,7 @@ class Solids:
         """Places (..., 3), mm, of rows: as contacts (None) or as signals of a coordinate."""
         if number is None:
             return to_display("contact_point", rows[..., :3]) + self.place(None)
-        return self.felt(rows) + self.place(number)
+        return self.signal_rows(rows) + self.place(number)
 
 
 def solids(chart: Chart, cut: bool) -> Solids:
@@ -214,7 +214,7 @@ def solids_drawing(
 
 
 def picked_drawing(solids: Solids, row: Array, exaggeration: float) -> tuple[Drawing, str]:
-    """Mark a contact in all spaces, bend the whisker there, and say what it feels."""
+    """Mark a contact in all spaces, bend the whisker there, and write its signals."""
     whisker = solids.chart.whisker
     radius = 0.016 * solids.length
     out: dict[str, Mark] = {}
@@ -232,10 +232,10 @@ def picked_drawing(solids: Solids, row: Array, exaggeration: float) -> tuple[Dra
             if share == 0.0:
                 return out, of_deflection(bent)
             break
-    felt = {name: float(values_of(name, row)) for name in SIGNALS}
+    measured = {name: float(values_of(name, row)) for name in SIGNALS}
     where = {name: float(values_of(name, row)) for name in ("arc_length", *COORDINATES)}
     edge = note("On the edge of what the whisker can reach: it is about to slip off.")
-    return out, edge + table(felt, "At the base") + table(where, "Contact")
+    return out, edge + table(measured, "At the base") + table(where, "Contact")
 
 
 _WHOLE = "none"

@@ -1,4 +1,4 @@
-"""The page: one scene, one panel, and the modes between which one chooses.
+"""The page: one scene, one panel, and several modes.
 
 Everything that happens on the page ends in one thread (:class:`~vibrissa.viewer.threads.Latest`),
 which changes the state and draws it, so that no state is ever changed by two at a time.
@@ -48,7 +48,7 @@ Transition = Callable[[Bend], Bend]
 
 
 class Mode(Protocol):
-    """One way to look: its own controls, its own things in the scene."""
+    """One mode of the page: its own controls and objects in the scene."""
 
     name: str
 
@@ -124,7 +124,7 @@ class Page:
         self.work.put("shape", job)
 
     def prepare(self) -> None:
-        """Chart the whisker's contacts beside everything else, and redraw when that is done."""
+        """Sample the whisker's contacts in the background, and redraw when that is done."""
         whisker = self.bend.whisker
         own = self._contact_map if whisker is self.original else None
 
@@ -140,7 +140,7 @@ class Page:
         self.slow_work.put("chart", job)
 
     def settle(self, timeout: float = 60.0) -> bool:
-        """Wait, s, until nothing is left to do; tell whether that came true."""
+        """Wait, s, until nothing is left to do; return whether that happened."""
         return self.work.wait(timeout) and self.slow_work.wait(timeout) and self.work.wait(timeout)
 
     def bend_by_point(self) -> Bend:
@@ -148,7 +148,7 @@ class Page:
         return loaded(self.bend, "point")
 
     def thicken(self, factor: float) -> None:
-        """Draw the whisker so many times as thick as it is."""
+        """Draw the whisker thicker than it is by a factor."""
 
         def job() -> None:
             self.exaggeration = factor
@@ -157,7 +157,7 @@ class Page:
         self.work.put("thickness", job)
 
     def choose(self, name: str) -> None:
-        """Go over to another mode."""
+        """Change to another mode."""
 
         def job() -> None:
             if self.mode is not None:
@@ -211,20 +211,20 @@ class Page:
         self.grip.show(bend.target, bend.axis if bend.kind == "peg" else None)
 
     def face_whisker(self) -> None:
-        """Let everyone look at the whisker."""
+        """Point all cameras at the whisker."""
         length = float(to_display("length", self.bend.whisker.length))
         self.look_at(np.array([0.45, 0.1, 0.0]) * length, 0.95 * length, (0.15, -0.8, 0.6))
 
     def look_at(self, centre: Array, distance: float, way: Sequence[float]) -> None:
-        """Let everyone look at a place, mm, from a distance, mm, and a direction."""
+        """Point all cameras at a position, mm, from a distance, mm, and a direction."""
         self._framing.show(Shot(centre, distance, np.asarray(way, dtype=np.float64)))
 
     def _fault(self, error: Exception) -> None:
         traceback.print_exception(error)
-        self.say("Something went wrong", str(error) or type(error).__name__, "red")
+        self.say("Error", str(error) or type(error).__name__, "red")
 
     def say(self, title: str, body: str, colour: Any = None, seconds: float | None = 8.0) -> None:
-        """Tell everyone who looks."""
+        """Notify all browsers."""
         for client in self.server.get_clients().values():
             client.add_notification(title, body, color=colour, auto_close_seconds=seconds)
 
@@ -297,7 +297,7 @@ class Grip:
         async def _(event: viser.TransformControlsEvent) -> None:
             if event.phase == "update":
                 self._by_ball = False
-                self._tell(event.target.position)
+                self._report(event.target.position)
 
         @self._ball.on_drag
         async def _(event: viser.SceneNodeDragEvent[viser.IcosphereHandle]) -> None:
@@ -305,9 +305,9 @@ class Grip:
             self._gizmo.visible = event.phase == "end" and self._ball.visible
             if event.phase == "update":
                 self._by_ball = True
-                self._tell(event.end_position)
+                self._report(event.end_position)
 
-    def _tell(self, place: ArrayLike) -> None:
+    def _report(self, place: ArrayLike) -> None:
         turn = np.array(transforms.SO3(self._gizmo.wxyz).as_matrix(), dtype=np.float64)
         self._moved(np.array(place, dtype=np.float64) / _MM, turn)
 
@@ -359,7 +359,7 @@ class Shot:
 
 
 def framed(shot: Shot, width: float, height: float, fov: float) -> tuple[Array, Array]:
-    """Where someone stands and looks, mm, whose window is so large."""
+    """Camera position and target, mm, for a window of this size."""
     free = max(width - PANEL * height, 0.5 * width)
     across = 2.0 * np.tan(0.5 * fov) / height  # of a pixel, over the distance
     distance = shot.distance * max(1.0, _WIDTH / (free * across))
@@ -371,7 +371,7 @@ def framed(shot: Shot, width: float, height: float, fov: float) -> tuple[Array, 
 
 
 class Framing:
-    """Lets everyone look at a shot, now and when they come."""
+    """Keeps the cameras of all browsers on a shot, also of those that connect later."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
@@ -379,7 +379,7 @@ class Framing:
         server.on_client_connect(self._came)
 
     def show(self, shot: Shot) -> None:
-        """Let everyone look at this."""
+        """Point all cameras at this."""
         self._shot = shot
         camera = self._server.initial_camera
         place, target = framed(shot, 1280.0, 720.0, camera.fov)

@@ -47,7 +47,7 @@ def number(name: str, value: float, digits: int = 4) -> str:
 
 
 def table(rows: Mapping[str, float], heading: str = "") -> str:
-    """Quantities and their values in two columns; each cell says whose it is."""
+    """Quantities and their values in two columns; each cell names its quantity."""
     cells = [
         f'<td style="padding:1px 0;opacity:.75" title="{_escape(quantity(name).long_name)}">'
         f"<i>{symbol(name)}</i></td>"
@@ -67,7 +67,7 @@ def table(rows: Mapping[str, float], heading: str = "") -> str:
 def sentence(status: Status, good: str | None = None) -> str:
     """Say what became of a load or an estimate, in the colour of good or bad news.
 
-    Good news may be told in other words than those of the status.
+    A valid status may be stated in other words.
     """
     words = good if good and status.ok else status.explanation
     colour = ("#e6f4ee", "#00614a") if status.ok else ("#fdece3", "#9c3d00")
@@ -92,14 +92,14 @@ def _framed(body: str) -> str:
 
 
 def of_deflection(bent: Deflection) -> str:
-    """What became of the load, what the base feels, and where the contact is."""
+    """Status of the load, signals at the base, and contact point."""
     return sentence(Status(int(bent.status))) + numbers(bent)
 
 
 def numbers(bent: Deflection) -> str:
-    """What the base feels, and where the contact is."""
+    """Signals at the base, and contact point."""
     signals = signals_of(np.asarray(bent.force), np.asarray(bent.moment))
-    felt = dict(zip(SIGNALS, signals.tolist(), strict=True))
+    measured = dict(zip(SIGNALS, signals.tolist(), strict=True))
     x, y, z = np.asarray(bent.contact_point)
     where = {
         "arc_length": float(bent.arc_length),
@@ -107,7 +107,7 @@ def numbers(bent: Deflection) -> str:
         "theta": float(np.arctan2(y, x)),
         "phi": float(np.arctan2(z, np.hypot(x, y))),
     }
-    return table(felt, "At the base") + table(where, "Contact")
+    return table(measured, "At the base") + table(where, "Contact")
 
 
 ROWS = (("Fx", "FT"), ("Mx", "MB"), ("FD", "MD"))
@@ -117,9 +117,9 @@ _MOST = 700
 """Points of a line; each stands for the least and the largest value around it."""
 
 
-def chart(time: Array, signals: dict[str, Array], felt: NDArray[np.bool_]) -> str:
+def chart(time: Array, signals: dict[str, Array], touching: NDArray[np.bool_]) -> str:
     """Draw the six signals over time."""
-    parts = [_shade(time, felt)]
+    parts = [_shade(time, touching)]
     for row, names in enumerate(ROWS):
         parts.append(_row(time, signals, names, row * ROW))
     end = f"{1e3 * (time[-1] - time[0]):.0f} ms"
@@ -158,8 +158,8 @@ def _x(time: Array, at: Array) -> Array:
     return np.asarray(LEFT + (WIDTH - LEFT) * (at - time[0]) / max(time[-1] - time[0], 1e-12))
 
 
-def _shade(time: Array, felt: NDArray[np.bool_]) -> str:
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], felt, [False]]).astype(int)))
+def _shade(time: Array, touching: NDArray[np.bool_]) -> str:
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], touching, [False]]).astype(int)))
     out = []
     for first, beyond in edges.reshape(-1, 2):
         x, end = _x(time, time[[first, beyond - 1]])

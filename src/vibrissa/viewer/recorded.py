@@ -34,7 +34,7 @@ class Watched:
     names: tuple[str, ...]
     lines: Array
     contacts: Array
-    felt: Mask
+    touching: Mask
     forces: Array
     signals: dict[str, Array]
     objects: tuple[Surface, ...]
@@ -54,12 +54,12 @@ class Watched:
     @property
     def busiest(self) -> int:
         """The whisker that touches most of the time; the first of equals."""
-        return int(np.argmax(self.felt.sum(axis=0)))
+        return int(np.argmax(self.touching.sum(axis=0)))
 
     def onsets(self) -> NDArray[np.int64]:
         """Frames in which a whisker begins to touch."""
-        before = np.concatenate([np.zeros((1, self.felt.shape[1]), bool), self.felt[:-1]])
-        return np.flatnonzero((self.felt & ~before).any(axis=1))
+        before = np.concatenate([np.zeros((1, self.touching.shape[1]), bool), self.touching[:-1]])
+        return np.flatnonzero((self.touching & ~before).any(axis=1))
 
     def next_contact(self, frame: int) -> int:
         """The frame in which the next contact begins; the first after the last, else the same."""
@@ -79,11 +79,11 @@ def watched(recording: xr.DataTree) -> Watched:
     contacts = trial.known("contact_point", ("estimates", "", "truth"))
     if contacts is None:
         contacts = np.full((*shape, 3), np.nan)
-    felt = trial.known("in_contact", ("estimates", "", "truth"))
+    in_contact = trial.known("in_contact", ("estimates", "", "truth"))
     touching: Mask = np.asarray(np.isfinite(contacts).all(axis=-1))
-    if felt is not None:
-        touching = touching & felt
-    forces, signals = _felt(trial, shape)
+    if in_contact is not None:
+        touching = touching & in_contact
+    forces, signals = _measured(trial, shape)
     cameras = trial.cameras if "cameras" in trial else ()
     contour = trial.find("contour")
     return Watched(
@@ -92,7 +92,7 @@ def watched(recording: xr.DataTree) -> Watched:
         names=tuple(trial.names),
         lines=_lines(trial, whiskers),
         contacts=np.where(touching[..., None], contacts, np.nan),
-        felt=touching,
+        touching=touching,
         forces=forces,
         signals=signals,
         objects=trial.objects,
@@ -115,7 +115,7 @@ def _lines(trial: Recording, whiskers: Sequence[Whisker]) -> Array:
     return np.asarray(np.einsum("twij,wkj->twki", turn, rest) + place[:, :, None])
 
 
-def _felt(trial: Recording, shape: tuple[int, int]) -> tuple[Array, dict[str, Array]]:
+def _measured(trial: Recording, shape: tuple[int, int]) -> tuple[Array, dict[str, Array]]:
     """Forces in the laboratory and the six signals; NaN where nothing is known."""
     missing = np.full((*shape, 3), np.nan)
     force = trial.known("force", ("signals", "", "truth"))
@@ -186,7 +186,7 @@ def picture(view: View, trial: Watched, frame: int, image: Frame | None = None) 
     assert trial.traces is not None  # else there are no views
     for trace in trial.traces[frame, :, view.number]:
         _mark(out, (_dense(trace, view.scale) - [left, top]) * view.scale, _TRACE, 1)
-    touching = trial.contacts[frame][trial.felt[frame]]
+    touching = trial.contacts[frame][trial.touching[frame]]
     if touching.size:
         seen = trial.cameras[view.number].project(touching)
         _mark(out, (seen - [left, top]) * view.scale, _CONTACT, 4)

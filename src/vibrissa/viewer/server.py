@@ -45,11 +45,11 @@ HOST = "127.0.0.1"
 PORT = 8080
 
 _HERE = "● "
-"""Before the way to look that is chosen."""
+"""Mark of the chosen mode."""
 
 _COMPILING = (
-    "Compiling, once for this installation, for a minute or two. What needs a part that is not "
-    "ready waits for it: pegs, candidates and their errors."
+    "Compiling, once for this installation, which takes a minute or two. Pegs, candidates and "
+    "their errors follow when their part is ready."
 )
 
 
@@ -59,7 +59,7 @@ class Viewer:
     Parameters
     ----------
     page : Page
-        What is served.
+        Page that is served.
     """
 
     def __init__(self, page: Page) -> None:
@@ -114,34 +114,34 @@ def view(
     host: str = HOST,
     port: int | None = None,
 ) -> Viewer:
-    """Serve a page on which a whisker can be bent, its map looked at, and a trial watched.
+    """Serve a page on which a whisker is bent, its contact map explored, and a trial replayed.
 
     Parameters
     ----------
     shown : Whisker, ContactMap or DataTree
-        To look at: a whisker, its map, or a recording, whose whisker is the one that touches most
-        of the time.
+        Whisker, contact map or recording to show; of a recording the whisker with the most frames
+        in contact.
     contact_map : ContactMap, optional
         The map of the whisker, if there is one already.
     recording : DataTree, optional
-        A trial to watch beside another whisker or a map.
+        A trial to watch in addition to another whisker or a map.
     videos : sequence of path
-        Of the recording, one for each of its cameras, in their order.
+        Videos of the recording, one for each of its cameras, in their order.
     host : str
         Address to listen on; the default can only be reached from this machine.
     port : int, optional
-        To listen on; by default the first free one from 8080.
+        Port to listen on; by default the first free one from 8080.
 
     Returns
     -------
     Viewer
-        Until it is closed.
+        Handle of the running server; close it to stop.
 
     Raises
     ------
     ValueError
         If it is none of these, the same is given twice, the map is that of another whisker, the
-        recording has nothing to look at, there are not as many videos as cameras, or the port is
+        recording has no frames, there are not as many videos as cameras, or the port is
         taken or not on this machine.
     """
     if isinstance(shown, xr.DataTree):
@@ -201,7 +201,7 @@ def _furnished(
 ) -> None:
     """Give a page its controls and its modes, and begin with the one that shows most."""
     names = ("Bend", "Locate", "Map") if trial is None else ("Bend", "Locate", "Map", "Trial")
-    choice = page.server.gui.add_button_group("Look at", names)
+    choice = page.server.gui.add_button_group("Mode", names)
     choice.on_click(lambda event: page.choose(event.target.value.removeprefix(_HERE)))
 
     def chosen(name: str) -> None:
@@ -219,10 +219,10 @@ def _furnished(
     page.work.wait()  # one thing is compiled at a time; this is what the page needs to be there
     page.prepare()
 
-    def told(busy: bool) -> None:
+    def report(busy: bool) -> None:
         notice.visible = busy
 
-    warming = CompileNotice(told)
+    warming = CompileNotice(report)
     page.closing.append(warming.close)
     warming.start(rehearsal(page))
 
@@ -286,7 +286,7 @@ def free_port(host: str) -> int:
 
 
 def is_free(host: str, port: int) -> bool:
-    """Tell whether a port can be listened on."""
+    """Whether a port can be listened on."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as probe:
         if os.name == "posix":  # a port that was just given back is free
@@ -314,7 +314,7 @@ def is_loopback(host: str) -> bool:
 
 
 def from_own_page(origin: str | None, asked: str | None, host: str) -> bool:
-    """Tell whether a request comes from a page of this server, or from no browser."""
+    """Whether a request comes from a page of this server, or not from a browser."""
     if origin is None:
         return True
     try:

@@ -242,7 +242,7 @@ def charted(whisker: Whisker, contact_map: ContactMap | None = None) -> Chart:
     """Sample all stable contacts of a whisker; its map is made unless it is given."""
     contact_map = contact_map or ContactMap.simulate(whisker, grid=False)
     samples, line = contact_map.to_dataset(), whisker.centerline()
-    # The last bearing is the first again, and no load is no contact.
+    # The last bearing is the first again, and no load is not a contact.
     kept = samples.isel(bearing=slice(0, -1), load=slice(2, None, 2))
     aside = ~kept["small_deflection"].to_numpy().astype(bool)
     signals = {name: kept[name].to_numpy()[aside] for name in SIGNALS}

@@ -39,7 +39,7 @@ class Latest:
             self._wake.notify_all()
 
     def wait(self, timeout: float = 30.0) -> bool:
-        """Wait until nothing is pending; tell whether that came true in time, s."""
+        """Wait until nothing is pending; return whether that happened in time, s."""
         with self._wake:
             return self._wake.wait_for(lambda: not self._jobs and not self._busy, timeout)
 
@@ -81,7 +81,7 @@ RATE = 25.0
 
 
 class Player:
-    """Tells the time that has passed while it plays, in a thread of its own."""
+    """Clock that calls back with the elapsed time while it plays, in its own thread."""
 
     def __init__(self, tick: Callable[[float], None]) -> None:
         self._tick = tick
@@ -128,13 +128,13 @@ _done = threading.Event()
 
 
 class CompileNotice(event.Listener):
-    """Goes through jobs in a thread of its own, and tells when kernels are being compiled."""
+    """Runs jobs in its own thread, and reports when kernels are being compiled."""
 
-    def __init__(self, told: Callable[[bool], None]) -> None:
-        self._told = told
+    def __init__(self, report: Callable[[bool], None]) -> None:
+        self._report = report
         self._lock = threading.Lock()
         self._depth = 0
-        self._running = self._said = self._closed = False
+        self._running = self._reported = self._closed = False
         event.register("numba:compile", self)
 
     def start(self, jobs: Sequence[Rehearsal]) -> None:
@@ -154,28 +154,28 @@ class CompileNotice(event.Listener):
             return
         finally:
             self._running = False
-            self._tell(0)
+            self._count(0)
 
     def on_start(self, event: event.Event) -> None:
         """Hear that Numba begins to compile something."""
         if _ours(event):
-            self._tell(+1)
+            self._count(+1)
 
     def on_end(self, event: event.Event) -> None:
         """Hear that it has done so."""
         if _ours(event):
-            self._tell(-1)
+            self._count(-1)
 
-    def _tell(self, step: int) -> None:
+    def _count(self, step: int) -> None:
         with self._lock:
             self._depth += step
-            busy = self._depth > 0 or (self._said and self._running)
-            if busy != self._said and not self._closed:
-                self._said = busy
-                self._told(busy)
+            busy = self._depth > 0 or (self._reported and self._running)
+            if busy != self._reported and not self._closed:
+                self._reported = busy
+                self._report(busy)
 
     def close(self) -> None:
-        """Begin no more jobs, and tell nothing."""
+        """Begin no more jobs, and report nothing."""
         self._closed = True
         event.unregister("numba:compile", self)
 

@@ -76,7 +76,7 @@ def touched(trial: Watched, frame: int) -> Drawing:
     known = np.isfinite(points).all(axis=-1)
     which = np.nonzero(known)[1]
     chosen = points[known]
-    step = max(1, int(np.ceil(trial.felt.sum() / POINTS)))
+    step = max(1, int(np.ceil(trial.touching.sum() / POINTS)))
     if not chosen.size:
         return {}
     size = float(_mm(0.011 * trial.whiskers[0].length))
@@ -89,7 +89,7 @@ def _whisker_colours(trial: Watched) -> Bytes:
 
 
 def surroundings(trial: Watched, objects: bool = True, fit: bool = True) -> Drawing:
-    """What stands still: objects and the shape fitted to the contacts."""
+    """Objects, and the shape fitted to the contacts."""
     middle, size = extent(trial)
     near = _known(trial)
     centre = np.mean(near, axis=0) if near.size else middle / to_display("length", 1.0)
@@ -146,7 +146,7 @@ _USUAL = "1 : 10"
 
 
 class TrialMode:
-    """Time, and all that goes with it."""
+    """Time, and what depends on it."""
 
     name = "Trial"
 
@@ -202,7 +202,7 @@ class TrialMode:
         jump.on_click(lambda _: self.jump())
 
     def enter(self) -> None:
-        """Show controls, and look at where whiskers go."""
+        """Show controls, and point the camera at the whiskers."""
         self._folder.visible = True
         if self._window is not None:
             self._window.visible = True
@@ -233,12 +233,12 @@ class TrialMode:
             shown.image = picture(view, trial, frame, image)
 
     def write(self, brief: bool = False) -> None:
-        """Write the signals of now, and where now is."""
+        """Write the signals and the time of the current frame."""
         trial, frame = self.trial, self.frame
         passed = float(trial.time[frame] - trial.time[0])
         put(self._time, _MS * passed)
         self._cursor.content = cursor(passed / max(float(np.ptp(trial.time)), 1e-12))
-        self._words.content = self._said(frame)
+        self._words.content = self._words_of(frame)
 
     def go(self, time: float) -> None:
         """Show the frame at a time, s."""
@@ -252,7 +252,7 @@ class TrialMode:
         self._page.work.put("time", job)
 
     def toggle(self) -> None:
-        """Play or pause; from the end it begins anew."""
+        """Play or pause; from the end it starts again."""
         if self._player.playing:
             self._player.pause()
         else:
@@ -262,12 +262,12 @@ class TrialMode:
         self._play.label = "Pause" if self._player.playing else "Play"
 
     def pause(self) -> None:
-        """Let time stand still."""
+        """Pause."""
         self._player.pause()
         self._play.label = "Play"
 
     def hurry(self, words: str) -> None:
-        """Play as fast as one of :data:`SPEEDS` says."""
+        """Play at one of :data:`SPEEDS`."""
         self._speed = SPEEDS[words]
 
     def jump(self) -> None:
@@ -295,14 +295,14 @@ class TrialMode:
         trial, i = self.trial, self._whisker
         signals = {name: values[:, i] for name, values in trial.signals.items()}
         for name in ("FD", "MD"):  # without contact a direction is noise
-            signals[name] = np.where(trial.felt[:, i], signals[name], np.nan)
-        self._chart.content = chart(trial.time, signals, trial.felt[:, i])
+            signals[name] = np.where(trial.touching[:, i], signals[name], np.nan)
+        self._chart.content = chart(trial.time, signals, trial.touching[:, i])
 
-    def _said(self, frame: int) -> str:
+    def _words_of(self, frame: int) -> str:
         trial, i = self.trial, self._whisker
         rows = {name: float(values[frame, i]) for name, values in trial.signals.items()}
-        touching = "in contact" if trial.felt[frame, i] else "free"
+        touching = "in contact" if trial.touching[frame, i] else "free"
         passed = f"{_MS * float(trial.time[frame] - trial.time[0]):.1f} ms"
-        count = int(trial.felt[: frame + 1].sum())
+        count = int(trial.touching[: frame + 1].sum())
         so_far = f"{count} contact{'' if count == 1 else 's'} so far"
         return table(rows, f"{passed}: {touching}, {so_far}")

@@ -27,28 +27,28 @@ class WhiskerControls:
                 "Length (mm)", round(0.5 * length, 2), round(1.5 * length, 2), 0.01, length
             )
             self._turn = gui.add_slider(
-                "Turns by (°)",
+                "Curvature (°)",
                 0.0,
                 max(90.0, round(2.0 * turn)),
                 0.1,
                 turn,
-                hint="Intrinsic curvature, from base to tip",
+                hint="Angle by which the tangent turns from base to tip at rest",
             )
             self._taper = gui.add_slider(
-                "Base : tip",
+                "Base / tip radius",
                 min(1.0, taper),
                 max(30.0, taper),
                 0.1,
                 taper,
-                hint="Their radii",
+                hint="Taper: base radius over tip radius",
             )
             self._modulus = gui.add_slider(
                 "Modulus (GPa)", _rounded(0.1 * modulus), _rounded(3.0 * modulus), step, modulus
             )
             self._thick = gui.add_slider(
-                "Drawn × thick", 1.0, 20.0, 0.5, EXAGGERATION, hint="Only in the picture"
+                "Drawn × thick", 1.0, 20.0, 0.5, EXAGGERATION, hint="Affects the picture only"
             )
-            self._reset = gui.add_button("Reset", hint="The whisker as it was", color="blue")
+            self._reset = gui.add_button("Reset", hint="Restore the original whisker", color="blue")
         asked(self._length, lambda value: page.reshape(length=value / _MM))
         asked(self._turn, lambda value: page.reshape(turn=float(np.deg2rad(value))))
         asked(self._taper, lambda value: page.reshape(taper=value))

@@ -36,13 +36,13 @@ class WhiskerArray(Mapping[str, Whisker]):
     Parameters
     ----------
     whiskers : iterable of Whisker
-        Their names say which they are; where one tells no side, that of its base counts.
+        Whiskers, identified by their names; where a name has no side, that of its base counts.
 
     Raises
     ------
     ValueError
-        If there are none, two are the same, a name is no whisker's, or a base is on the other side
-        than the name says.
+        If there are none, two are the same, a name is not a whisker's, or a base is on the other side
+        than the name states.
 
     Examples
     --------
@@ -192,7 +192,7 @@ class WhiskerArray(Mapping[str, Whisker]):
         Raises
         ------
         ValueError
-            If it is no such tree.
+            If the tree is not of this kind.
         """
         return cls(whiskers_of(tree))
 

@@ -69,8 +69,10 @@ def whisker_array(
     (62, ['LC1', 'Lγ'])
     """
     if names is not None:
-        told = [Identity.of(name) for name in names]
-        wanted = [one.on(s) for one in told for s in ((one.side,) if one.side else sides(side))]
+        identities = [Identity.of(name) for name in names]
+        wanted = [
+            one.on(s) for one in identities for s in ((one.side,) if one.side else sides(side))
+        ]
     else:
         wanted = [
             Identity(row.upper(), int(column), s)
@@ -85,7 +87,7 @@ def whisker_array(
 def average_whisker(identity: Identity, **properties: Unpack[Properties]) -> Whisker:
     """Make one whisker of an average rat; see `whisker_array`."""
     if identity.side is None:
-        raise ValueError(f"{identity.name} tells no side; left or right is needed")
+        raise ValueError(f"{identity.name} does not state a side; left or right is needed")
     row, column = identity.row_number, identity.column
     length = float(morphology.arc_length(row, column))
     coefficient = float(morphology.curvature_coefficient(column))

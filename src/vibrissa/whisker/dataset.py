@@ -117,7 +117,7 @@ def check_drawn(dataset: xr.Dataset, whisker: Any) -> None:
 
 _DRAWN = ("arc_length", "centerline", "radius")
 _SAME = 1e-6
-"""To which share of the largest value what a file draws agrees with what it says."""
+"""Tolerance, as a share of the largest value, between drawn and stated values of a file."""
 
 
 def whisker_fields(dataset: xr.Dataset) -> dict[str, Any]:
@@ -130,7 +130,7 @@ def whisker_fields(dataset: xr.Dataset) -> dict[str, Any]:
         needed |= set(_DRAWN)
     missing = sorted(needed - set(dataset.variables))
     if missing:
-        raise ValueError(f"this is no dataset of a whisker: it lacks {', '.join(missing)}")
+        raise ValueError(f"this is not a dataset of a whisker: it lacks {', '.join(missing)}")
     value = {name: np.asarray(dataset[name].values, dtype=np.float64) for name in needed}
     stiffness = float(value["base_bending_stiffness"]), float(value["base_twist_stiffness"])
     return {

@@ -68,7 +68,7 @@ SIGNIFICANCE = 0.01
 """Chance that straight noise passes for curvature."""
 
 HINT_MARGIN = 0.1
-"""Difference of a base hint's distances to both ends, in lengths, below which it tells nothing."""
+"""Difference of a hint's distances to both ends, in lengths, below which it is ambiguous."""
 
 
 SCATTER = 0.08
@@ -222,7 +222,7 @@ class _Line:
             return bool(self.rss <= noise**2 * limit)
         rss = float(np.sum(fit.residuals**2)) * unit**2
         left, spent = components * (n - fit.freedom), components * (fit.freedom - 2.0)
-        # A few points leave the test no power: curvature that moves them this far is no noise.
+        # A few points leave the test no power: curvature that moves them this far is not noise.
         if left <= 0.0 or rss <= 0.0 or self.noise(components) > STRAIGHT * self.extent:
             return False
         ratio = (self.rss - rss) / spent / (rss / left)

@@ -40,7 +40,7 @@ class Identity:
     column : int
         0 for the Greek whiskers, then 1 to 6 (of some animals 9) from the back to the front.
     side : {"left", "right"} or None
-        Of the animal; None where it is not told.
+        Side of the animal; None where it is not stated.
 
     Raises
     ------
@@ -82,7 +82,7 @@ class Identity:
         Raises
         ------
         ValueError
-            If it is no whisker's name.
+            If it is not a whisker's name.
 
         Examples
         --------
@@ -92,12 +92,12 @@ class Identity:
         found = _PATTERN.fullmatch(name.strip().lower())
         if found is None or (found["before"] and found["after"]):
             raise ValueError(
-                f"{name!r} is no whisker's name; row and column such as C2, or alpha, beta, gamma, "
+                f"{name!r} is not a whisker's name; row and column such as C2, or alpha, beta, gamma, "
                 "delta (α, β, γ, δ), after L or R (left or right) where both sides count, are "
                 "needed"
             )
-        said = found["before"] or found["after"]
-        side = _SIDES[said] if said else None
+        side = found["before"] or found["after"]
+        side = _SIDES[side] if side else None
         if greek := found["greek"]:
             letters = _SPELLED if greek in _SPELLED else GREEK
             return cls(ROWS[letters.index(greek)], 0, side)

@@ -58,11 +58,11 @@ STRAIGHT = 1e-9
 """Largest curvature times length of a whisker that counts as straight."""
 
 PROXIMAL = 0.7
-"""Share of the whisker, from the base, that says where y points."""
+"""Proximal share of the whisker that defines the direction of y."""
 
 STRAIGHT_NOTE = (
-    "straight: nothing says where it bends to, so the roll about its axis is the one that turns "
-    "its source frame least"
+    "straight: its curvature does not define a roll about its axis, so the roll is the one that "
+    "turns its source frame least"
 )
 
 
@@ -112,7 +112,7 @@ class Whisker:
         such a length is refused as a likely error of units.
     breaks : sequence of float
         Arc lengths, m, at which curvature or radius has a kink or a jump. Those of sampled radii
-        and, as far as they can be told from noise, of functions are found without.
+        and, as far as they exceed the noise, of functions are detected.
 
     Examples
     --------
@@ -188,7 +188,7 @@ class Whisker:
         Raises
         ------
         ValueError
-            If the points are no centreline, with all that is wrong with them.
+            If the points are not a centreline, with all that is wrong with them.
         """
         shape = digitize(points, noise, base, properties.get("any_length", False))
         notes: tuple[str, ...] = ()
@@ -213,7 +213,7 @@ class Whisker:
             Arc length, m.
         coefficient : float
             A, 1/m. A negative one bends to −y of the source frame; the whisker frame is then
-            turned by 180° about x, so that the whisker bends to +y there, and the pose says so.
+            turned by 180° about x, so that the whisker bends to +y there, as the pose records.
         **properties
             Radius and material; see `Whisker`.
 

@@ -18,7 +18,7 @@ leaves the face. Three of these are angles of projections, to be turned into a r
 - φ, in the frontal plane, from sideways (0°) to upward (90°): with the azimuth,
   tan elevation = tan φ cos azimuth.
 - ψ, in the sagittal plane, from backward (0°) over upward (90°) to forward (180°). It is redundant:
-  the three projections of a direction obey an equation. It says more than φ only where a whisker
+  the three projections of a direction obey an equation. It adds to φ only where a whisker
   lies within 45° of the midline, and none of a rat's does at rest; so it is given and not used.
 - ζ, the roll about the tangent at the base: at 0° the whisker is concave downward, at 90° forward:
   the roll is ζ − 90°.
@@ -29,7 +29,7 @@ these equations were not tested, and real whiskers leave the plane.
 **Belli et al. (2017)**, *Variations in vibrissal geometry across the rat mystacial pad*,
 J Neurophysiol 117:1807, 519 whiskers of seven studies, counts the Greek column as 0. It gives base
 diameters and radius slopes. Both are fits of their own, and put together they give tips of no or
-negative radius for most whiskers of the middle columns (`tip_radius` says what is done then).
+negative radius for most whiskers of the middle columns (`tip_radius` states what is done then).
 
 **Quist & Hartmann (2012)**, J Neurophysiol 107:2298: an upper bound of A by length.
 """
@@ -180,7 +180,7 @@ def _numbers(value: ArrayLike) -> Array:
 
 
 ANY = "any"
-"""Name of a whisker of unknown row and column, of which only the length tells."""
+"""Name of a whisker of unknown row and column, of which only the length is known."""
 
 _ALIKE = 5e-3
 """Difference of length within which whiskers count as alike, m: about half a column."""
@@ -205,7 +205,7 @@ def published_radii(name: str, length: float) -> tuple[float, float]:
     Raises
     ------
     ValueError
-        If the name is no whisker's.
+        If the name is not a whisker's.
     """
     if name != ANY:
         identity = Identity.of(name)

@@ -51,7 +51,7 @@ class Pose:
     Raises
     ------
     ValueError
-        If `rotation` is no proper rotation or `origin` no finite point.
+        If `rotation` is not a proper rotation or `origin` is not a finite point.
 
     Examples
     --------

@@ -89,7 +89,7 @@ class Profile:
     def __call__(self, s: ArrayLike, side: Side = "right") -> Array:
         """Values at arc lengths `s` (...), m, as (..., *shape); NaN gives NaN.
 
-        At a knot `side` says which interval counts; outside the knots the last polynomial goes on.
+        At a knot `side` selects the interval; outside the knots the last polynomial goes on.
         """
         s = np.asarray(s, dtype=np.float64)
         last = self.knots.size - 2

@@ -40,7 +40,7 @@ _CLOSE = 2e-3
 """Distance of two samples that state a jump, at most, in distances to the samples around them."""
 
 _MANY = 30
-"""Samples from which on noise can be told from shape."""
+"""Number of samples from which on noise can be distinguished from shape."""
 
 _PAIRED = 0.2
 """Share of close pairs among the intervals of a rod that was sampled at the ends of its steps."""

@@ -26,7 +26,7 @@ bent = vb.deflect(whisker, vb.PointContact(points))
 for point, force, status in zip(points, bent.force, bent.status, strict=True):
     print(point * 1e3, "mm:", np.round(force * 1e6, 2), "µN.", vb.Status(status).explanation)
 
-# %% What the follicle feels
+# %% Base signals
 signals = vb.base_signals(bent.force, bent.moment)
 print(signals)
 

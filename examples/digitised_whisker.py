@@ -28,7 +28,7 @@ file = folder / "digitised_whisker.csv"
 np.savetxt(file, 1e3 * points, fmt="%.4f", delimiter=",", header="x_mm,y_mm,z_mm", comments="")
 
 # %% Your own is read in the same way: columns x_mm,y_mm,z_mm or x,y,z (m), from base to tip
-# What no picture tells, radius and material, you give; base="last" if the base comes last.
+# Radius and material, which no picture shows, are given; base="last" if the base comes last.
 whisker = vb.load_whisker(file, base_radius=85e-6, tip_radius=5e-6, youngs_modulus=3e9)
 print(whisker)
 

@@ -40,12 +40,12 @@ six = vb.estimate_from_wrench(whisker, read_force, read_moment, noise=noise)
 for i, mu in enumerate(friction):
     true = bent.contact_point[i]
     off = [1e3 * np.linalg.norm(found.point[i] - true) for found in (three, six)]
-    said = 1e3 * np.sqrt(np.trace(six.covariance[i]))
+    predicted = 1e3 * np.sqrt(np.trace(six.covariance[i]))
     angle, spread = np.degrees([six.friction_angle[i], six.friction_angle_sigma[i]])
     print(
         f"friction {mu:+.1f}: three signals {off[0]:5.2f} mm off, wrench {off[1]:.2f} mm", end=" "
     )
-    print(f"(± {said:.2f}); angle {angle:.1f}° ± {spread:.1f}°, truly", end=" ")
+    print(f"(± {predicted:.2f}); angle {angle:.1f}° ± {spread:.1f}°, truly", end=" ")
     print(f"{np.degrees(np.arctan(mu)):.1f}°")
 
 # %% The three bent whiskers with the forces on them: friction is a small part of the shape

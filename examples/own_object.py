@@ -1,7 +1,7 @@
-"""Your own object: a mesh that a whisker feels its way around, and a surface of any shape.
+"""Your own object: a mesh that a whisker explores, and a free surface through its contacts.
 
 Aim: to find the shape of something of which nothing is known. Data: a rounded stone as a closed
-mesh, and a whisker that whisks while its base rises. Lesson: a surface through the contacts tells
+mesh, and a whisker that whisks while its base rises. Lesson: a surface through the contacts shows
 the stone where it was touched, and how well; beyond, it can but go on smoothly.
 """
 
@@ -42,15 +42,15 @@ motion = tabulated(time, azimuth, base_position=base, rate=300)
 trial = measure(simulate(whisker, motion, stone), 0.3e-6, 5e-9)
 
 # %% Contacts from three noisy signals, and a free surface through them
-felt = with_contour(trial, "free")
-surface = shape_from_dataset(felt["contour"].to_dataset())
-points = contour_points(felt)
+trial = with_contour(trial, "free")
+surface = shape_from_dataset(trial["contour"].to_dataset())
+points = contour_points(trial)
 places = np.stack([points[name].values for name in "xyz"], axis=1)
 skin = np.stack([points[f"surface_{name}"].values for name in "xyz"], axis=1)
 apart = stone.signed_distance(skin)
 print(f"{len(places)} contacts, {1e3 * np.median(np.abs(apart)):.2f} mm off the stone (median)")
 
-# %% How well it is known: beside the contacts, and 4 mm above the highest of them
+# %% Its uncertainty: at the contacts, and 4 mm above the highest of them
 beyond = np.vstack([places[:1], places[[np.argmax(places[:, 2])]] + [0.0, 0.0, 4e-3]])
 for name, sigma in zip(("touched", "4 mm above"), surface.distance_sigma(beyond), strict=True):
     print(f"{name}: ± {1e3 * sigma:.2f} mm")

@@ -1,4 +1,4 @@
-"""The space that a whisker can reach, and what it feels there.
+"""The space that a whisker can reach, and its signals there.
 
 Aim: to see all contacts of a whisker at once. Data: the built-in γ whisker. Lesson: a whisker
 reaches a solid around its resting shape that ends where it slips off. How far it goes, and with
@@ -33,7 +33,7 @@ for share in (0.4, 0.6, 0.8):
         force = np.linalg.norm(bent.force[held], axis=1).max()
         most, why = aside[held[-1]], vb.Status(int(bent.status[min(held[-1] + 1, 160)]))
         print(
-            f"beside {share:.1f} L, {name:8s}: {1e3 * most:4.1f} mm and {1e6 * force:5.0f} µN;",
+            f"at {share:.1f} L, {name:8s}: {1e3 * most:4.1f} mm and {1e6 * force:5.0f} µN;",
             f"then: {why.name}",
         )
 

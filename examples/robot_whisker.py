@@ -2,7 +2,7 @@
 
 Aim: from a bare sensor to contact points on a robot. Data: simulated wires and rods of 300 mm, a
 thousand times stiffer than a rat's whisker, and a sensor that reads two bending moments, mixed and
-offset. Lesson: on a cylinder the axial force tells nothing that the moment does not; loads tell
+offset. Lesson: on a cylinder the axial force adds nothing to the moment; loads determine
 E r⁴ but not E; two signals leave a curve of contacts, and the motion of the base finds the one.
 """
 
@@ -43,8 +43,8 @@ for name, rod in rods.items():
 # %% Which three signals? Along a uniform straight rod m²/2EI + F·t does not change
 # Both terms vanish at a frictionless contact, so F_x = -M_B²/2EI at the base: no third signal.
 for name, contacts in maps.items():
-    told = [text for text in ("Fx MB MD", "FT MB MD") if contacts.determines(text)]
-    print(f"{name:24s} contacts are determined by {' and by '.join(told)}")
+    locating = [text for text in ("Fx MB MD", "FT MB MD") if contacts.determines(text)]
+    print(f"{name:24s} contacts are determined by {' and by '.join(locating)}")
 
 # %% The sensor: two channels, each a mix of both moments with an offset, not known to us
 wire, contacts = rods["steel wire, tapered"], maps["steel wire, tapered"]
@@ -55,7 +55,7 @@ true = Sensor(
     bias=[0.31, -0.12],
 )
 
-# Touch it at 40 known points and read; the rod says what the moments were
+# Touch it at 40 known points and read; the rod gives the moments
 rng = np.random.default_rng(1)
 load = vb.PointForce(
     rng.uniform(0.12, 0.3, 40), rng.uniform(0.01, 0.06, 40), rng.uniform(-np.pi, np.pi, 40)
@@ -79,7 +79,7 @@ try:
 except ValueError as refusal:
     print("all six components at once:", refusal)
 
-# %% How stiff is it really? A wire from a reel, 6 % softer than the table says
+# %% How stiff is it really? A wire from a reel, 6 % softer than tabulated
 soft = wire.with_properties(youngs_modulus=0.94 * wire.youngs_modulus)
 bent = vb.deflect(soft, vb.PointContact(touched.contact_point))
 weighed = Sensor(("Fy", "Fz"), noise=0.5e-3)  # by a scale, which knows newtons
@@ -135,7 +135,7 @@ left.plot(*(point[:2] * 1e3), "k*", ms=10, label="true contact")
 left.set(xlabel="x (mm)", ylabel="y (mm)", title="one sample")
 left.legend(frameon=False)
 right.semilogy(time, error * 1e3, label="error")
-right.semilogy(time, sigma * 1e3, label="said to be")
+right.semilogy(time, sigma * 1e3, label="predicted")
 right.set(xlabel="time (s)", ylabel="contact point (mm)", title="with the motion of the base")
 right.legend(frameon=False)
 plots.save(figure, folder / "robot_whisker", ["png"])

@@ -38,14 +38,14 @@ save_contacts(folder / "contacts.csv", contact_columns(found))
 truth = trial["truth"].to_dataset()
 true, guess = truth["contact_point_whisker"].values, found["contact_point_whisker"].values
 error = np.linalg.norm(guess - true, axis=1)
-said = np.sqrt(np.einsum("tii->t", found["covariance"].values))
+predicted = np.sqrt(np.einsum("tii->t", found["covariance"].values))
 known = np.isfinite(error)
 touching = int(truth["in_contact"].sum())
 print(f"{len(error)} frames, {touching} in contact, {known.sum()} located", end="; ")
 print(f"{int((found.candidates.values > 1).sum())} with several candidates")
-for name, some in (("surest", said < 0.3e-3), ("others", said >= 0.3e-3)):
-    middle = 1e3 * np.median(error[known & some]), 1e3 * np.median(said[known & some])
-    print(f"{name}: {middle[0]:.2f} mm off, said to be {middle[1]:.2f} mm (medians)")
+for name, some in (("surest", predicted < 0.3e-3), ("others", predicted >= 0.3e-3)):
+    middle = 1e3 * np.median(error[known & some]), 1e3 * np.median(predicted[known & some])
+    print(f"{name}: error {middle[0]:.2f} mm, predicted {middle[1]:.2f} mm (medians)")
 
 # %% Estimated against true contacts, and over time
 figure = plots.estimated_against_true(spherical(true), spherical(guess), time=found["time"].values)

@@ -20,7 +20,7 @@ triplets = ["Fx MB MD", "Fx FD MD", "Mx MB MD"]
 verdicts = vb.uniqueness(contact_map, triplets, ["all", "CF", "CB"], samples=512, resolution=False)
 print(verdict_table(verdicts))
 
-# %% How surely: pairs that feel the same are proofs, found to rounding
+# %% Evidence: pairs with the same signals are proofs, found to rounding
 for triplet in triplets:
     one = verdicts.sel(triplet=triplet, region="all")
     if one.verdict == "unique":

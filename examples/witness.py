@@ -32,13 +32,13 @@ print(
 pair = found.isel(witness=int(np.nanargmax(found.witness_separation)))
 forces = np.column_stack([np.zeros(2), pair.witness_contact_force.transpose("pair", "component")])
 bent = vb.deflect(whisker, vb.PointForce(pair.witness_arc_length.values, components=forces))
-felt = vb.base_signals(bent.force, bent.moment)
-for name in felt:
-    one, other = felt[name].values
-    print(f"{name}: {one:.10g} and {other:.10g} {felt[name].attrs['units']}")
+signals = vb.base_signals(bent.force, bent.moment)
+for name in signals:
+    one, other = signals[name].values
+    print(f"{name}: {one:.10g} and {other:.10g} {signals[name].attrs['units']}")
 
-# %% An estimator that is asked gives both, and says so
-estimate = contact_map.estimate(felt.isel(sample=0), tuple(triplet.split()))
+# %% An estimator gives both, with its status
+estimate = contact_map.estimate(signals.isel(sample=0), tuple(triplet.split()))
 print(vb.Status(int(estimate.status)).explanation)
 print("candidates, mm:", (1e3 * estimate.candidates.point).round(2).tolist())
 
@@ -50,7 +50,7 @@ witness = xr.Dataset(
         "contact_point": (("pair", "space"), bent.contact_point),
         "force": (("pair", "space"), bent.force),
         "arc_length": ("pair", bent.arc_length),
-        **{name: ("pair", felt[name].values) for name in felt},
+        **{name: ("pair", signals[name].values) for name in signals},
     },
     attrs={"triplet": triplet},
 )

@@ -31,7 +31,7 @@ WHISKERS = {
     ),
 }
 DISTANCES = (0.45, 0.6, 0.7, 0.85)
-ONE = 9.0  # candidates nearer to each other (χ²) cannot be told apart
+ONE = 9.0  # candidates nearer to each other (χ²) are indistinguishable
 BEYOND = 7.81  # χ² of three degrees of freedom that one in twenty exceeds
 
 

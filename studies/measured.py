@@ -4,7 +4,7 @@
 default, within ten minutes on two cores. `--page` writes the numbers into `docs/measured.md`, else
 they are printed. `--quick` shows how it goes, in a minute or two. The part real needs digitised
 whiskers, a CSV each, which are not part of the repository: `--whiskers FOLDER`. Without them it is
-left out, and the page keeps what it says.
+left out, and the page keeps its numbers.
 """
 
 import argparse

@@ -54,12 +54,12 @@ def located(force_noise, moment_noise):
     contact_map = vb.ContactMap.simulate(whisker, grid=False)
     point, force, rng = drawn(contact_map)
     moment = np.cross(point, force)
-    felt_force = force + force_noise * rng.standard_normal(force.shape)
-    felt_moment = moment + moment_noise * rng.standard_normal(moment.shape)
+    measured_force = force + force_noise * rng.standard_normal(force.shape)
+    measured_moment = moment + moment_noise * rng.standard_normal(moment.shape)
     noise = np.diag([force_noise] * 3 + [moment_noise] * 3) ** 2
-    felt = vb.base_signals(felt_force, felt_moment)
-    found = {" ".join(names): contact_map.estimate(felt, names, noise=noise) for names in SETS}
-    found[WRENCH] = vb.estimate_from_wrench(whisker, felt_force, felt_moment, noise=noise)
+    signals = vb.base_signals(measured_force, measured_moment)
+    found = {" ".join(names): contact_map.estimate(signals, names, noise=noise) for names in SETS}
+    found[WRENCH] = vb.estimate_from_wrench(whisker, measured_force, measured_moment, noise=noise)
     return point, found
 
 

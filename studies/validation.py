@@ -4,7 +4,7 @@
 `--no-video` nothing is filmed. Recordings and results are kept in the folder (`output/validation`
 by default), condition by condition: stopped, it goes on from there. `--again` computes the results
 anew from the recordings; remove the folder to simulate, film and track anew. `--page` writes the
-tables into `docs/validation.md` and the figure beside it, else they are written to the folder.
+tables into `docs/validation.md` and the figure next to it, else they are written to the folder.
 """
 
 import argparse

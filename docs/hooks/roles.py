@@ -24,7 +24,7 @@ def on_page_content(content: str, **_: Any) -> str:
     content : str
         The page, HTML.
     **_ : Any
-        What else MkDocs tells.
+        Other arguments of the event.
 
     Returns
     -------

@@ -99,13 +99,17 @@ def flags(axes: Axes, results: Mapping[str, Any], labels: Mapping[str, str]) -> 
 def cutoffs(axes: Axes, results: Mapping[str, Any]) -> None:
     """What the pose alone adds, and what the paper's method makes of the contact."""
     shown = (("friction-0", BLUE), ("friction-03", GREEN), ("fast", ORANGE))
-    said = {"friction-0": "5 whisks a second", "friction-03": "friction 0.3", "fast": "10 a second"}
+    labels = {
+        "friction-0": "5 whisks a second",
+        "friction-03": "friction 0.3",
+        "fast": "10 a second",
+    }
     for name, colour in shown:
         rows = results.get(name, {}).get("cutoffs")
         if not rows:
             continue
         values = np.array([row["moved"][0] for row in rows.values()]) * 1e6
-        axes.plot(range(len(rows)), values, "o-", color=colour, label=said[name], markersize=2.5)
+        axes.plot(range(len(rows)), values, "o-", color=colour, label=labels[name], markersize=2.5)
         axes.set_xticks(range(len(rows)), list(rows))
     axes.set_xlabel("cut-off (Hz)")
     axes.set_ylabel("contact moved by the pose (µm)")

@@ -39,7 +39,7 @@ Pose = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class Truth:
-    """What truly happened in every frame, laboratory frame if not said otherwise."""
+    """What truly happened in every frame, laboratory frame unless stated."""
 
     touching: np.ndarray
     at_tip: np.ndarray
@@ -138,7 +138,7 @@ def scored(
     moved = np.einsum("tij,tj->ti", pose[0], truth.point_whisker) + pose[1]
     out = {
         "touching": truth.touching,
-        "felt": found["in_contact"].values,
+        "detected": found["in_contact"].values,
         "at_tip": truth.at_tip,
         "deflection": truth.deflection,
         "status": found["status"].values,
@@ -157,7 +157,7 @@ def scored(
         return xr.Dataset(data)
     touching = placed.where(xr.DataArray(truth.touching, dims="time"))
     kinds = {
-        "felt": (placed, "uncertain"),
+        "detected": (placed, "uncertain"),
         "exact": (touching, "exact"),
         "points": (touching, "no"),
     }
@@ -172,7 +172,7 @@ def scored(
 def peg_error(placed: xr.Dataset, trial: xr.DataTree, normals: str) -> dict[str, float]:
     """Of the cylinder fitted to the contacts: metres and radians; NaN where there is none.
 
-    With normals that are as uncertain as their covariance says, exact, or with no normals.
+    With normals weighted by their covariance, exact normals, or none.
     """
     (peg,), whisker = Recording(trial).pegs, Recording(trial).whisker()
     each = placed.expand_dims(whisker=1, axis=1)

@@ -29,13 +29,13 @@ LABELS = tuple(
 def summary(trials: Sequence[xr.Dataset], classes: bool = True) -> dict[str, Any]:
     """Scores of one method in one condition; ``trials`` as of `friction_inertia.methods.scored`."""
     rows = xr.concat([t.assign_attrs({}) for t in trials], "frame", combine_attrs="drop")
-    felt, touching = rows["felt"].values, rows["touching"].values
-    both = felt & touching
+    detected, touching = rows["detected"].values, rows["touching"].values
+    both = detected & touching
     here = rows.isel(frame=both)
     out: dict[str, Any] = {
         "touching": int(touching.sum()),
-        "felt": int(both.sum()),
-        "false": int((felt & ~touching).sum()),
+        "detected": int(both.sum()),
+        "false": int((detected & ~touching).sum()),
         "none": share(~np.isfinite(here["distance"].values)),
         "several": share(here["candidates"].values > 1),
         "flagged": share(np.isin(here["status"].values, FLAGS)),

@@ -70,10 +70,10 @@ def trials(results: Results) -> str:
         row, counts = one[TRIPLET], [part(one[TRIPLET], name)["contacts"] for name in CLASSES]
         angle = one[WRENCH]["friction"]["true"]
         rows.append(
-            [label, str(row["touching"]), str(row["felt"]), str(row["false"]), degrees(angle)]
+            [label, str(row["touching"]), str(row["detected"]), str(row["false"]), degrees(angle)]
             + [str(n) for n in counts[:-1]]
         )
-    head = ["trial", "touching", "felt", "felt, untouched", "friction angle", *LABELS]
+    head = ["trial", "touching", "detected", "of these false", "friction angle", *LABELS]
     return table(head, rows)
 
 
@@ -120,7 +120,7 @@ def friction(results: Results) -> str:
 
 
 def pegs(results: Results) -> str:
-    shown = [f"felt {name}" for name in ("offset", "tilt", "diameter", "sigma")]
+    shown = [f"detected {name}" for name in ("offset", "tilt", "diameter", "sigma")]
     shown += [f"{kind} {name}" for kind in ("exact", "points") for name in ("offset", "diameter")]
     rows = []
     for label, one in picked(results, "true"):

@@ -64,7 +64,7 @@ class Case:
     change : callable
         Makes of the frames of a view what is tracked: ``change(frames, view)``.
     shown : callable
-        Says of which frame of the trial the frames of a view are: ``shown(count, view)``.
+        Frame of the trial for each frame of a view: ``shown(count, view)``.
     peg : float
         Its radius, as a share of the ordinary one.
     offset : int, optional

@@ -122,12 +122,12 @@ def noise(contacts, n) -> str:
     spread = np.sqrt(np.diag(NOISE))
     wrench = np.concatenate([bent.force, bent.moment], axis=1)
     force, moment = np.split(wrench + spread * rng.normal(size=wrench.shape), 2, axis=1)
-    felt = vb.base_signals(force, moment)
+    signals = vb.base_signals(force, moment)
     rows = []
     for label, found in (
-        (name_of(BEST), contacts.estimate(felt, BEST, NOISE)),
-        ("F_x, F_T, M_B, M_D", contacts.estimate(felt, ("Fx", "FT", "MB", "MD"), NOISE)),
-        ("all six", contacts.estimate(felt, SIGNALS, NOISE)),
+        (name_of(BEST), contacts.estimate(signals, BEST, NOISE)),
+        ("F_x, F_T, M_B, M_D", contacts.estimate(signals, ("Fx", "FT", "MB", "MD"), NOISE)),
+        ("all six", contacts.estimate(signals, SIGNALS, NOISE)),
         (
             "force and moment, with friction",
             vb.estimate_from_wrench(whisker, force, moment, noise=NOISE),

@@ -10,7 +10,7 @@ from vibrissa.pipeline import with_contour, with_estimates
 from vibrissa.recording import Recording
 from vibrissa.simulation import facing_peg, measure, simulate, sweep_past
 
-WAYS = ("felt by a sensor", "the paper's way")
+WAYS = ("measured by a sensor", "the paper's method")
 
 
 def blocks(quick: bool) -> dict[str, str]:
@@ -70,7 +70,7 @@ def errors(result: DemoResult) -> str:
         other = [few(1e3 * v) for v in seen[label].measured[:2]] if label in seen else ["–", "–"]
         rows.append([label, str(row.contacts), *cells, *other])
     head = ["bent by", "contacts", "median", "95 %", "median predicted", "95 % predicted"]
-    return table([*head, "the paper's way: median", "95 %"], rows)
+    return table([*head, "the paper's method: median", "95 %"], rows)
 
 
 def peg(result: DemoResult) -> str:
@@ -93,9 +93,11 @@ def draws(duration: float, number: int) -> str:
     trial = simulate(whisker, sweep_past(whisker, thing, duration), thing)
     away = []
     for seed in range(number):
-        felt = with_contour(with_estimates(measure(trial, seed=seed), contact_maps=[contact_map]))
-        fit = shape_from_dataset(felt["contour"].to_dataset())
-        (true,) = Recording(felt).objects
+        measured = with_contour(
+            with_estimates(measure(trial, seed=seed), contact_maps=[contact_map])
+        )
+        fit = shape_from_dataset(measured["contour"].to_dataset())
+        (true,) = Recording(measured).objects
         assert isinstance(fit, CylinderFit)
         along = (true.origin[2] - fit.origin[2]) / fit.axis[2]
         place = fit.origin + along * fit.axis - true.origin

@@ -1,4 +1,4 @@
-"""Speed: the benchmarks, each beside its reference in the same run, and one sample at a time."""
+"""Speed: the benchmarks, each with its reference in the same run, and one sample at a time."""
 
 import json
 import os

@@ -79,7 +79,7 @@ def test_a_table_with_rotations(tmp_path):
     whisker = load_array(written(tmp_path, text))["C1"]
     np.testing.assert_allclose(whisker.pose.rotation, turn, atol=2e-6)
     assert whisker.base_radius == pytest.approx(80e-6)
-    with pytest.raises(ValueError, match=r"line 2: .*no rotation"):
+    with pytest.raises(ValueError, match=r"line 2: .*not a rotation"):
         load_array(written(tmp_path, text.replace(cells, ",".join("1" * 9))))
 
 

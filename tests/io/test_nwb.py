@@ -309,7 +309,7 @@ SPOILT = (
     (instead("data", np.zeros(40)), r"shape \(40,\)"),
     (instead("confidence", np.array([b"ab"] * 40)), "numbers are needed"),
     (instead("confidence", np.zeros(3)), "confidence of another size"),
-    (lambda series: series["data"].attrs.__setitem__("conversion", "mm"), "no number"),
+    (lambda series: series["data"].attrs.__setitem__("conversion", "mm"), "not a number"),
 )
 
 

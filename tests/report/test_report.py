@@ -385,7 +385,7 @@ def test_a_map_with_verdicts(map_page, folder):
         apart = float(verdicts["witness_separation"].sel(triplet=row[0]).max())
         assert number(row[2]) == pytest.approx(1e3 * apart, abs=1e-3)
     samples = contact_map.to_dataset()
-    ranges = {row[0]: row[1:] for row in page.tables["Over all contacts of the map"]}
+    ranges = {row[0]: row[1:] for row in page.tables["Ranges over all contacts of the map"]}
     most = number(ranges["bending moment (µN·m)"][1])
     assert most == pytest.approx(1e6 * float(samples["MB"].max()), rel=1e-3)
 
@@ -395,7 +395,7 @@ def test_what_is_missing_is_named_with_the_verb_that_makes_it(folder):
     assert "no signals" in text
     page = (folder / "bare.html").read_text(encoding="utf-8")
     for verb in ("signals", "estimate", "reconstruct"):
-        assert f"<code>vibrissa {verb}</code> makes it" in page
+        assert f"<code>vibrissa {verb}</code> adds it" in page
     assert "contour" not in Page(page).sections
     recording = load_recording(folder / "trial.nc")
     groups = {g.path: g.to_dataset(inherit=False) for g in recording.subtree}
@@ -403,7 +403,7 @@ def test_what_is_missing_is_named_with_the_verb_that_makes_it(folder):
     save_recording(folder / "blind.nc", xr.DataTree.from_dict(blind))
     sections = trial_sections(load_recording(folder / "blind.nc"))
     assert [part.name for part in sections] == ["recording", "settings", "contour", "statuses"]
-    assert "no truth in this recording" in sections[1].body
+    assert "no ground truth" in sections[1].body
 
 
 def test_without_the_drawing_library_the_picture_in_space_is_left_out(folder, monkeypatch):

@@ -272,8 +272,8 @@ def _rotations(columns: _Columns) -> Array:
     off = np.abs(np.swapaxes(matrix, 1, 2) @ matrix - np.eye(3)).max(axis=(1, 2))
     for i in np.flatnonzero(~(off <= _NEARLY) | (np.linalg.det(matrix) < 0.0)):
         columns.faults.append(
-            f"line {columns.lines[i]}: r11 … r33 are not a rotation, whose columns are a right-handed "
-            "frame of unit vectors"
+            f"line {columns.lines[i]}: r11 … r33 are not a rotation, whose columns are a "
+            "right-handed frame of unit vectors"
         )
     if columns.faults:
         return matrix
@@ -305,7 +305,7 @@ def _coefficient(whisker: Whisker) -> float:
     bent = np.abs(whisker.curvature(s) - parabola).max() * whisker.length
     if bent > 1e-6 or np.abs(whisker.radius(s) / taper - 1.0).max() > 1e-6:
         raise ValueError(
-            f"{whisker.name} is not a planar parabola with a linear taper, which is all that a table "
-            "holds; NetCDF (.nc) keeps it"
+            f"{whisker.name} is not a planar parabola with a linear taper, which is all that a "
+            "table holds; NetCDF (.nc) keeps it"
         )
     return coefficient

@@ -227,7 +227,7 @@ def _number(item: h5py.HLObject, attributes: Mapping[str, Any], name: str, usual
     try:
         return float(attributes.get(name, usual))
     except (TypeError, ValueError):
-        raise ValueError(f"{item.name} has the {name} {attributes[name]!r}, no number") from None
+        raise ValueError(f"{item.name} has the {name} {attributes[name]!r}, not a number") from None
 
 
 def _frame(item: Any) -> str:

@@ -2,7 +2,7 @@
 
 CSV, or a NetCDF file with variables of these names along one dimension. Lines that are empty or
 begin with # are passed over, other columns are left alone, and an empty cell or ``nan`` is missing.
-A name may carry a unit (:mod:`vibrissa.io.table`), ``Fx_mN`` or ``Mx (µN·m)``; what is not a unit is
+A name may carry a unit (:mod:`vibrissa.io.table`), ``Fx_mN`` or ``Mx (µN·m)``; other suffixes are
 refused by name, and so are numbers that cannot be what they say: too large, or with a moment too
 large or small for the force, as |M| / |F| is at most the distance of the contact.
 """

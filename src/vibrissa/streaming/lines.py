@@ -176,7 +176,7 @@ class Lines:
         try:
             known = json.loads(text)
         except (json.JSONDecodeError, RecursionError) as error:
-            raise ValueError(f"no JSON: {error}") from None
+            raise ValueError(f"not JSON: {error}") from None
         return {str(name): value for name, value in known.items()}
 
     def _row(self, text: str) -> dict[str, object] | None:

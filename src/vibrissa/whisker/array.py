@@ -41,7 +41,7 @@ class WhiskerArray(Mapping[str, Whisker]):
     Raises
     ------
     ValueError
-        If there are none, two are the same, a name is not a whisker's, or a base is on the other side
+        If there are none, two are the same, a name is not a whisker's, or a base is on another side
         than the name states.
 
     Examples

@@ -92,8 +92,8 @@ class Identity:
         found = _PATTERN.fullmatch(name.strip().lower())
         if found is None or (found["before"] and found["after"]):
             raise ValueError(
-                f"{name!r} is not a whisker's name; row and column such as C2, or alpha, beta, gamma, "
-                "delta (α, β, γ, δ), after L or R (left or right) where both sides count, are "
+                f"{name!r} is not a whisker's name; row and column such as C2, or alpha, beta, "
+                "gamma, delta (α, β, γ, δ), after L or R (left, right) where both sides count, are "
                 "needed"
             )
         side = found["before"] or found["after"]

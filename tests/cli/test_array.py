@@ -38,6 +38,7 @@ def test_simulated_looked_into_and_drawn(own, tmp_path):
     assert (tmp_path / "array.png").stat().st_size > 10_000
     told = done("info", trial)
     assert "4: LC2, LC3, RC2, RC3" in told
+    assert "whiskers" in told
     assert "curvature_knots" not in told
 
 

@@ -136,5 +136,4 @@ def test_files_of_whisk_name_what_takes_them(tmp_path, monkeypatch, words, head)
     path = tmp_path / "film.measurements"
     path.write_bytes(head + bytes(200))
     result = ran(*words.replace("M", str(path)).split())
-    assert "vibrissa info" in str(result.exception)
-    assert "load_tracks" in str(result.exception)
+    assert "vibrissa import" in str(result.exception)

@@ -177,7 +177,7 @@ def test_demo_writes_and_reports(folder):
     np.testing.assert_array_equal(first["x"].values[single], same["x"].values[single])
     assert "gamma" in run("deflect", "--whisker", out / "trial.nc", "--point", "25,12,1")
     assert "gamma" in run("deflect", "--whisker", out / "map.nc", "--point", "25,12,1")
-    text = run("info", out / "trial.nc")
+    text = run("info", out / "trial.nc", "--all")
     assert "vibrissa recording" in text
     assert "/truth" in text
 

@@ -15,6 +15,7 @@ from vibrissa.cli.deflect import deflect
 from vibrissa.cli.demo import demo
 from vibrissa.cli.estimate import estimate
 from vibrissa.cli.figures import figures
+from vibrissa.cli.import_ import import_tracks
 from vibrissa.cli.info import info
 from vibrissa.cli.map import simulate_map
 from vibrissa.cli.movie import movie
@@ -45,6 +46,7 @@ VERBS: dict[str, Callable[..., None]] = {
     "sensitivity": sensitivity,
     "simulate": simulate,
     "track": track,
+    "import": import_tracks,
     "calibrate": calibrate,
     "correct": correct,
     "signals": signals,

@@ -11,14 +11,17 @@ import typer
 
 from vibrissa.cli.options import with_options
 from vibrissa.cli.tables import print_properties
+from vibrissa.cli.terminal import shown
 from vibrissa.cli.track import compared_contacts
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    import xarray as xr
     from xarray import Dataset
 
     from vibrissa.io import RawTracks
+    from vibrissa.pipeline import TrialSummary
 
 _SHOWN = 12
 _TABLES = """\
@@ -38,12 +41,15 @@ def info(
     path: Annotated[
         Path | None, typer.Argument(help="A file to look into.", metavar="FILE")
     ] = None,
+    all_: bool = False,
 ) -> None:
     """List versions and settings of this installation, or what a file holds.
 
+    Of a recording that is what it is, its duration, contacts, stages and object; groups and
+    variables follow with --all. The last line is the command that goes on from the file.
     Example: `vibrissa info trial.nc`
     """
-    print_properties(_installation() if path is None else _file(path))
+    print_properties(_installation() if path is None else _file(path, all_))
 
 
 def _installation() -> Iterator[tuple[str, str]]:
@@ -63,24 +69,25 @@ def _installation() -> Iterator[tuple[str, str]]:
     yield "kernels", f"cached in {folder}" if folder else "compiled anew in every run"
 
 
-def _file(path: Path) -> Iterator[tuple[str, str]]:
+def _file(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
     from vibrissa.io import READERS, Kind, check_readable, recognise
 
     if path.is_dir():
         yield from _array(path, "folder of centrelines")
         return
     check_readable(path)
+    kind = recognise(path)
+    if kind == Kind.RECORDING:
+        yield from _recording(path, whole)
+        return
     yield "file", f"{path}, {path.stat().st_size / 1e6:.3g} MB"
     if _is_sensor(path):
         yield from _sensor(path)
         return
-    kind = recognise(path)
     if kind in (Kind.ARRAY, Kind.ARRAY_TABLE):
         yield from _array(path, kind)
-    elif kind in (Kind.RECORDING, Kind.NETCDF):
+    elif kind == Kind.NETCDF:
         yield from _groups(path)
-        if kind == Kind.RECORDING:
-            yield from _compared(path)
     elif kind in (Kind.TRACKS, *READERS):
         yield from _tracks(path, kind)
     elif kind == Kind.VIDEO:
@@ -94,6 +101,67 @@ def _file(path: Path) -> Iterator[tuple[str, str]]:
         raise ValueError(f"{path} is of no kind that is known. Known are: {known}")
     else:
         yield from _table(path)
+
+
+def _recording(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
+    """What a recording is and holds in five lines, what is assumed, and what comes next."""
+    from vibrissa.pipeline import STAGES, summarise
+
+    found = summarise(_summarised(path))
+    one = len(found.whiskers) == 1
+    names = ", ".join(found.whiskers[:_SHOWN]) + (", …" if len(found.whiskers) > _SHOWN else "")
+    yield (
+        "what",
+        f"vibrissa recording, {found.origin}, {path.stat().st_size / 1e6:.3g} MB; "
+        f"{'whisker' if one else f'whiskers {len(found.whiskers)}'}: {names}",
+    )
+    rate = f" at {found.frames / found.duration:g} a second" if found.duration else ""
+    yield "duration", f"{found.duration:g} s, {found.frames} frames{rate}"
+    yield "contacts", _contacts(found)
+    missing = [stage for stage in STAGES if stage not in found.stages]
+    lacking = ", ".join(missing)
+    there = ", ".join(found.stages) or "none"
+    yield "stages", f"{there}{f' (missing: {lacking})' if missing else ''}"
+    thing = f"fitted: {found.fitted}" if found.fitted else "none fitted"
+    if np.isfinite(found.distance):
+        thing += f", contacts {1e6 * found.distance:.1f} µm from it (median)"
+    yield "object", f"{thing}{f'; known: {found.known}' if found.known else ''}"
+    yield from _compared(path)
+    listed = list(_groups(path))
+    if whole:
+        yield from listed
+    else:
+        yield from (line for line in listed if line[0] == "note")
+    follows = "report" if not missing else "reconstruct"
+    yield "next", f"vibrissa {follows} {path}{'' if whole else ' (groups and variables: --all)'}"
+
+
+def _contacts(found: TrialSummary) -> str:
+    """Contacts and their forces, and how many contact points were estimated."""
+    if found.contacts is None:
+        return "not known"
+    text = f"{found.contacts}, in {found.in_contact} frames"
+    if np.isfinite(found.largest_force):
+        force, moment = found.largest_force, found.largest_moment
+        text += f", up to {shown('force', force, 3)} and {shown('moment', moment, 3)}"
+    return text + (f"; {found.estimated} contact points estimated" if found.estimated else "")
+
+
+def _summarised(path: Path) -> xr.DataTree:
+    """What a summary needs of a recording; a long one takes a while to read whole."""
+    import xarray as xr
+
+    from vibrissa.io import opened, read_dataset
+
+    with opened(path, "a recording") as file:
+        groups = [name for name in ("truth", "signals", "estimates", "contour") if name in file]
+        objects = [f"objects/{name}" for name in file["objects"]] if "objects" in file else []
+    needed = ["in_contact", "force", "moment"]
+    parts = {"/": read_dataset(path, None, needed)}
+    for group in (*groups, *objects):
+        along = needed if group in ("truth", "signals", "estimates") else None
+        parts[f"/{group}"] = read_dataset(path, group, along)
+    return xr.DataTree.from_dict(parts)
 
 
 def _settings(path: Path) -> Iterator[tuple[str, str]]:
@@ -166,6 +234,7 @@ def _video(path: Path) -> Iterator[tuple[str, str]]:
     yield "kind", f"video, {found.codec}"
     yield "size", f"{found.width} × {found.height} pixels"
     yield "frames", f"{found.frames or 'number not stated'}, shown at {found.rate:g} a second"
+    yield "next", f"vibrissa track {path} [VIDEO of the other view] -o trial.nc"
 
 
 def _calibration(path: Path) -> Iterator[tuple[str, str]]:
@@ -215,6 +284,24 @@ def _tracks(path: Path, kind: str) -> Iterator[tuple[str, str]]:
             yield name, f"{units}{f', {where} frame' if where else ''}; {there:.1f} % of points"
     others = [str(name) for name in tracks.data_vars if name not in ("trace", "centerline")]
     yield "also", ", ".join(others)
+    yield "next", _import(path, tracks, stated=not note)
+
+
+def _import(path: Path, tracks: Dataset, *, stated: bool) -> str:
+    """The command that makes a recording of tracks."""
+    words = ["vibrissa import", str(path)]
+    if "centerline" in tracks:
+        words += [] if stated else ["--unit mm"]
+        hint = ""
+    elif tracks.sizes["view"] > 1:
+        words += ["--cameras CAMERAS.toml"]
+        hint = ""
+    else:
+        words += ["[FILE of the other view]", "--pixel-size MM (or --cameras CAMERAS.toml)"]
+        hint = "; of one view alone the whisker is taken to stay in its plane"
+    if tracks["time"].attrs.get("units") != "s":
+        words += ["--rate FRAMES_A_SECOND"]
+    return f"{' '.join(words)} -o trial.nc{hint}"
 
 
 def _without_unit(raw: RawTracks, path: Path) -> tuple[Dataset, str]:

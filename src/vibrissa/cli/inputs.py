@@ -254,12 +254,25 @@ def _whisker_in(path: Path) -> Whisker:
     raise ValueError(f"{path} holds {kind or 'data of another kind'}, and no whisker")
 
 
+def refuse_tracks(path: Path) -> None:
+    """Raise, with the verb that takes it, if a file holds the tracks of another program."""
+    from vibrissa.io import READERS, Kind, recognise
+
+    kind = recognise(path)
+    if kind in (Kind.TRACKS, *READERS):
+        raise ValueError(
+            f"{path} holds tracks ({kind}): make a recording of it by `vibrissa import {path} "
+            "-o trial.nc` first"
+        )
+
+
 def recording_from(path: Path) -> xr.DataTree:
     """Read a recording."""
-    from vibrissa.io import check_readable, load_recording
+    from vibrissa.io import load_recording
     from vibrissa.pipeline import check_recording
 
-    recording = load_recording(check_readable(path))
+    refuse_tracks(path)
+    recording = load_recording(path)
     try:
         check_recording(recording)
     except ValueError as fault:

@@ -96,6 +96,7 @@ OPTIONS = {
     "film": Option("Folder for videos of the two views.", "DIR"),
     "bag": Option("New ROS 2 bag for PointStamped and PointCloud2.", "FOLDER", names="--bag-out"),
     "grid": Option("Whether the paper's 237,765 points are solved too."),
+    "all": Option("List every group and variable too."),
     "example": Option("Print a file with all that can be stated, and stop."),
     "format": Option("May be repeated; png and pdf by default."),
     "width": Option("For one column of a journal, 85 mm, or two, 178 mm."),
@@ -220,6 +221,11 @@ OPTIONS = {
     # Videos that are tracked, and cameras
     "pixel_size": Option(
         "Size of a pixel of both views in space, mm, without --cameras; 0.058 by default.", "MM"
+    ),
+    "unit": Option("Unit of points in space, where the file does not state it."),
+    "point_sigma": Option(
+        "Standard deviation of a tracked point across the whisker: pixels, by default 0.5; mm of "
+        "points in space, by default a thousandth of the whisker's length."
     ),
     "offset": Option("Frames by which the second camera began earlier, or auto."),
     "base": Option(

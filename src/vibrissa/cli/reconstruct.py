@@ -20,6 +20,7 @@ from vibrissa.cli.inputs import (
     print_statuses,
     print_written,
     recording_from,
+    refuse_tracks,
 )
 from vibrissa.cli.options import RecordingArgument, numbers, with_options
 from vibrissa.cli.signals import SourceOptions, described
@@ -86,6 +87,7 @@ def reconstruct(
     from vibrissa.pipeline import contour_points
     from vibrissa.recording import Recording
 
+    refuse_tracks(recording)
     target = target or recording
     points = target.with_name(f"{target.stem}_contour.csv") if csv is None else csv
     check_writable(target, NETCDF)

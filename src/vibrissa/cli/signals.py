@@ -16,6 +16,7 @@ from vibrissa.cli.inputs import (
     print_statuses,
     print_written,
     recording_from,
+    refuse_tracks,
     smallest_arc,
 )
 from vibrissa.cli.options import RecordingArgument, Source, refuse, with_options
@@ -76,6 +77,7 @@ def signals(
     from vibrissa.io import CSV, NETCDF, check_writable, save_recording, save_signals
     from vibrissa.pipeline import with_signals
 
+    refuse_tracks(recording)
     target = target or recording
     check_writable(target, (*NETCDF, *CSV))
     free_beside(recording, [target], force)

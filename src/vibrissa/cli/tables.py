@@ -49,6 +49,8 @@ def print_properties(rows: Iterable[tuple[str, str]]) -> None:
     from rich.table import Table
 
     table = Table(show_header=False, box=None)
+    table.add_column()
+    table.add_column(overflow="fold")
     for name, value in rows:
         table.add_row(Text(name, style="bold"), value)
     output.print(table, highlight=False)

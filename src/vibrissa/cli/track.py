@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from vibrissa.cli.inputs import WhiskerOptions, metres_of, objects_from, print_notes
+from vibrissa.cli.inputs import WhiskerOptions, metres_of, objects_from, print_notes, refuse_tracks
 from vibrissa.cli.options import free, numbers, refuse, with_options
 from vibrissa.cli.terminal import progress_bars, say, shown
 
@@ -189,11 +189,10 @@ def track(
     continues when it is called again.
     Example: `vibrissa track top.mp4 front.mp4 --pixel-size 0.058 --rate 1000 -o trial.nc`
     """
-    from vibrissa.io import check_readable
     from vibrissa.tracking import TrackOptions
 
     for video in videos:
-        check_readable(video)
+        refuse_tracks(video)
     views = filmed.views(videos)
     trials = _trials(videos, len(views), target, known.alone())
     free(trials, force)
@@ -259,7 +258,7 @@ def _track(
     save_recording(recording, result)
     for file in kept:
         file.unlink(missing_ok=True)
-    _report(result, recording)
+    print_tracked(result, recording)
 
 
 def _found(
@@ -389,7 +388,7 @@ def _report_start(start: Start, names: Sequence[str], picture: Path) -> None:
         )
 
 
-def _report(result: xr.DataTree, path: Path) -> None:
+def print_tracked(result: xr.DataTree, path: Path) -> None:
     """Report what was tracked of each whisker."""
     from vibrissa.recording import Recording
 

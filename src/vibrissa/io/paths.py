@@ -51,9 +51,8 @@ def refuse_whisk(path: str | PathLike[str]) -> None:
     for begin, kind in _WHISK.items():
         if head.startswith(begin):
             raise ValueError(
-                f"{path} holds {kind}: whiskers traced in one film, in pixels. `vibrissa info` "
-                "shows what is in it and vibrissa.io.load_tracks (Python) reads it; no other verb "
-                "takes it"
+                f"{path} holds {kind}: whiskers traced in one film, in pixels. `vibrissa import` "
+                "makes a recording of it, which the other verbs take"
             )
 
 

@@ -36,6 +36,7 @@ from vibrissa.pipeline.stages import (
     with_group,
     with_signals,
 )
+from vibrissa.pipeline.summary import TrialSummary, summarise
 
 __all__ = [
     "AGREES",
@@ -48,6 +49,7 @@ __all__ = [
     "Progress",
     "Shape",
     "Source",
+    "TrialSummary",
     "check_recording",
     "compare_contacts",
     "compare_shapes",
@@ -66,6 +68,7 @@ __all__ = [
     "reconstruct",
     "sensor_noise",
     "signals_of",
+    "summarise",
     "whisker_radii",
     "with_contour",
     "with_estimates",

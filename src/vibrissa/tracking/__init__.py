@@ -12,6 +12,7 @@ from vibrissa.tracking.trace.start import FRAMES, Start, find_bases, find_start,
 from vibrissa.tracking.trace.trace import Trace, TraceOptions
 from vibrissa.tracking.trace.video import partial_traces, start_frames, trace_file, trace_video
 from vibrissa.tracking.track import TrackOptions, track, track_whisker
+from vibrissa.tracking.tracker_points import TrackerTraces, tracker_traces
 
 __all__ = [
     "CUTOFF",
@@ -29,6 +30,7 @@ __all__ = [
     "TraceSeries",
     "TrackOptions",
     "Tracked",
+    "TrackerTraces",
     "base_pose",
     "find_bases",
     "find_start",
@@ -45,5 +47,6 @@ __all__ = [
     "trace_video",
     "track",
     "track_whisker",
+    "tracker_traces",
     "whisker_at_rest",
 ]

@@ -1,0 +1,155 @@
+"""`vibrissa import`: from the files of other trackers to a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+import typer
+
+from vibrissa.cli.inputs import WhiskerOptions, metres_of, objects_from
+from vibrissa.cli.options import free, with_options
+from vibrissa.cli.terminal import progress_bars, remark
+from vibrissa.cli.track import print_tracked
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import xarray as xr
+
+    from vibrissa.cameras import Camera
+
+_VIEWS = ("top", "front")
+"""Names of views that neither files nor cameras name."""
+
+
+@with_options("the recording, .nc")
+def import_tracks(
+    tracks: Annotated[
+        list[Path],
+        typer.Argument(
+            help="The tracker's file, or one for each view: whisk, DeepLabCut, LightningPose, "
+            "SLEAP, Anipose, movement, NWB, MATLAB or a table.",
+            metavar="TRACKS...",
+        ),
+    ],
+    target: Path,
+    own: WhiskerOptions,
+    cameras: Path | None = None,
+    pixel_size: float | None = None,
+    rate: float | None = None,
+    unit: Literal["m", "cm", "mm", "um"] | None = None,
+    names: str | None = None,
+    point_sigma: float | None = None,
+    base_radius: float | None = None,
+    cutoff: float | None = None,
+    objects: Path | None = None,
+    force: bool = False,
+) -> None:
+    """Make a recording of whiskers that another program tracked.
+
+    Two files are two views of the same whiskers; one file may hold points in space, several views,
+    or one view, in whose plane the whisker is then taken to stay. The rod is fitted to the points
+    as `vibrissa track` fits it to videos; `vibrissa reconstruct` goes on from there.
+    Example: `vibrissa import topDLC.csv frontDLC.csv --pixel-size 0.058 --rate 1000 -o trial.nc`
+    """
+    from vibrissa.cameras import load_cameras
+    from vibrissa.io import NETCDF, check_writable, load_recording, save_recording
+    from vibrissa.recording import Recording
+    from vibrissa.tracking import CUTOFF, TrackOptions, tracker_traces
+    from vibrissa.tracking import track as tracked
+
+    check_writable(target, NETCDF)
+    free([target], force)
+    views = None
+    if cameras is not None:
+        is_recording = cameras.suffix.lower() in NETCDF
+        views = (
+            Recording(load_recording(cameras)).cameras if is_recording else load_cameras(cameras)
+        )
+    found = _tracks(tracks, rate, unit, views)
+    traces = tracker_traces(
+        found,
+        views,
+        pixel_size=None if pixel_size is None else 1e-3 * pixel_size,
+        names=None if names is None else names.replace(",", " ").split(),
+        sigma=_sigma(point_sigma, found),
+    )
+    for note in traces.notes:
+        remark(f"note: {note}")
+    properties: dict[str, Any] = {}
+    if base_radius is not None:
+        properties["base_radius"] = metres_of(base_radius, "--base-radius")
+    how = TrackOptions(
+        cutoff=CUTOFF if cutoff is None else cutoff or None,
+        properties=properties,
+        whisker=None if own.whisker is None else own.read().with_properties(**properties),
+    )
+    known: dict[str, Any] = {} if objects is None else {"objects": objects_from(objects)}
+    with progress_bars() as tell:
+        result = tracked(
+            traces.cameras,
+            traces.traces,
+            1.0 / float(np.median(np.diff(found["time"].values))),
+            how,
+            names=traces.names,
+            progress=tell,
+            **known,
+        )
+    result.attrs["origin"] = (
+        f"tracked by {found.attrs['source_software']} in {found.attrs['source']}"
+    )
+    save_recording(target, result)
+    print_tracked(result, target)
+
+
+def _sigma(stated: float | None, tracks: xr.Dataset) -> float | None:
+    """Standard deviation of points: pixels as typed, mm in m."""
+    if stated is None:
+        return None
+    if not 0.0 < stated < 100.0:
+        raise ValueError(f"--point-sigma is {stated:g}; more than 0 and less than 100 are needed")
+    return 1e-3 * stated if "centerline" in tracks else stated
+
+
+def _tracks(
+    paths: Sequence[Path],
+    rate: float | None,
+    unit: str | None,
+    cameras: Sequence[Camera] | None,
+) -> xr.Dataset:
+    """Read the tracks of all views, with every frame from the first to the last."""
+    from vibrissa.io import Kind, join_views, load_tracks, recognise
+
+    given: dict[str, Any] = {"fps": rate, "unit": unit}
+    labels: Any = {name: value for name, value in given.items() if value is not None}
+    parts = []
+    for path in paths:
+        own = recognise(path) in (Kind.TRACKS, Kind.RECORDING)
+        parts.append(load_tracks(path, **({} if own else labels)))
+    if len(paths) > 1:
+        named = [camera.name for camera in cameras] if cameras else list(_VIEWS)
+        if len(paths) > len(named):
+            raise ValueError(f"{len(paths)} files of views; give the --cameras of all of them")
+        if any(part.sizes.get("view", 1) > 1 for part in parts):
+            raise ValueError("several files must hold one view each")
+        if spatial := [str(p) for p, part in zip(paths, parts, strict=True) if "trace" not in part]:
+            raise ValueError(f"{', '.join(spatial)}: points in space come as one file")
+        together = [
+            part.assign_coords(view=[name]) for part, name in zip(parts, named, strict=False)
+        ]
+        found = join_views(*together)
+        found.attrs |= {k: parts[0].attrs[k] for k in ("source_software",)}
+    else:
+        found = parts[0]
+    if found["time"].attrs.get("units") != "s":
+        raise ValueError(f"{paths[0]} does not state frames per second: give --rate")
+    frames = found["frame"].values
+    every = np.arange(frames.min(), frames.max() + 1)
+    if len(every) > len(frames):
+        # What no row holds is a whisker that is lost.
+        rows = found.swap_dims(time="frame").drop_vars("time").reindex(frame=every)
+        step = np.median(np.diff(found["time"].values) / np.diff(frames))
+        found = rows.assign_coords(time=("frame", step * every)).swap_dims(frame="time")
+    return found

@@ -1,0 +1,378 @@
+"""From the points of other trackers to traces and views, so that they are tracked like videos.
+
+Trackers give a few points along a whisker in one or more views, or points in space. Points of two
+calibrated views are traces already. Where there is one view, the whisker is taken to stay in the
+plane that the view shows: a second camera is added that looks along this plane. Points in space are
+projected into two such cameras. The added cameras see only what is stated about the points, and are
+perpendicular to the usual direction of the whisker, so that no whisker points towards one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from vibrissa.cameras import Camera, orthogonal_views
+from vibrissa.tracking.refine.trace_series import NODES
+from vibrissa.tracking.trace.trace import STEP, Trace, given
+
+Array = NDArray[np.float64]
+
+POINT_SIGMA = 0.5
+"""Usual standard deviation of a tracked point across the whisker, pixels."""
+
+_FEWEST = 3
+"""Smallest number of points that make a trace."""
+
+_CONFIDENT = 0.6
+"""Confidence below which a tracker's point is left out."""
+
+_SPACING = 8.0
+"""Distance of points along a trace below which they are averaged, pixels."""
+
+_USUAL = 0.5
+"""Share of the frames in which a whisker is seen, from which it is worth tracking."""
+
+_WIDE = 1000.0
+"""Width of the image of a camera that is added, pixels."""
+
+_MARGIN = 20.0
+"""Distance of the points from the border of such an image, pixels."""
+
+_ARC_POINTS = 12
+"""Number of points on an arc that stands for a measured curvature."""
+
+
+@dataclass(frozen=True)
+class TrackerTraces:
+    """Points of other trackers as traces in cameras.
+
+    Parameters
+    ----------
+    cameras : tuple of Camera
+        Cameras of the views, those that are added included.
+    traces : list of list of list of Trace
+        Traces view by view, whisker by whisker, frame by frame, as `track` takes them.
+    names : list of str
+        Names of the whiskers.
+    notes : tuple of str
+        What is assumed, a sentence each.
+    """
+
+    cameras: tuple[Camera, ...]
+    traces: list[list[list[Trace]]]
+    names: list[str]
+    notes: tuple[str, ...]
+
+
+def tracker_traces(
+    tracks: xr.Dataset,
+    cameras: Sequence[Camera] | None = None,
+    *,
+    pixel_size: float | None = None,
+    names: Sequence[str] | None = None,
+    sigma: float | None = None,
+) -> TrackerTraces:
+    """Make traces of the points of other trackers.
+
+    Parameters
+    ----------
+    tracks : xarray.Dataset
+        Tracks, as `vibrissa.io.load_tracks` and `vibrissa.io.join_views` return them; nodes run
+        from the base to the tip.
+    cameras : sequence of Camera, optional
+        Calibrated cameras of the views, in their order. Without them one view shows a plane, and
+        two are orthogonal, from the top and from the front.
+    pixel_size : float, optional
+        Size of a pixel in the scene, m, where there are no calibrated cameras.
+    names : sequence of str, optional
+        Names of the whiskers that are wanted; by default those seen in half of the frames, or where
+        the tracker did not identify whiskers over time the longest.
+    sigma : float, optional
+        Standard deviation of a point across the whisker, pixels, or for points in space m; by
+        default half a pixel, or a thousandth of the whisker's length.
+
+    Returns
+    -------
+    TrackerTraces
+        Cameras, traces, names, and what is assumed.
+
+    Raises
+    ------
+    ValueError
+        If there are no points, a view has no camera, or no whisker is seen often enough.
+    """
+    notes: list[str] = []
+    tracks = _arcs(tracks, notes)
+    if "centerline" in tracks:
+        points = _confident(tracks, "centerline", "confidence")
+        views = None
+    elif "trace" in tracks:
+        name = "trace_confidence" if "trace_confidence" in tracks else "confidence"
+        points = _confident(tracks, "trace", name)
+        views = _views(points, tracks, cameras, pixel_size)
+    else:
+        raise ValueError("the tracks hold neither a trace nor a centreline")
+    points, known = _identified(tracks, points, notes)
+    kept = _wanted(known, points, names, tracks.attrs.get("identity") == "per frame", notes)
+    known, points = [known[k] for k in kept], points[:, kept]
+    if views is None or len(views) == 1:
+        points, views, sigma = _with_added(points, views, pixel_size, sigma, notes)
+    scatter = POINT_SIGMA if sigma is None else sigma
+    traces = [
+        [[_trace(points[i, k, v], scatter) for i in range(len(points))] for k in range(len(known))]
+        for v in range(len(views))
+    ]
+    return TrackerTraces(tuple(views), traces, known, tuple(notes))
+
+
+def _confident(tracks: xr.Dataset, name: str, confidence: str) -> Array:
+    """Points (time, whisker[, view], node, axis), NaN where the tracker is not confident."""
+    points = np.array(tracks[name].values, dtype=np.float64)
+    if confidence in tracks:
+        points[tracks[confidence].values < _CONFIDENT] = np.nan
+    return points
+
+
+def _arcs(tracks: xr.Dataset, notes: list[str]) -> xr.Dataset:
+    """Put points on the arc of the measured curvature, where only both ends are there."""
+    if "trace_curvature" not in tracks or tracks.sizes.get("node") != 2:
+        return tracks
+    ends, curvature = tracks["trace"].values, tracks["trace_curvature"].values[..., None]
+    chord = ends[..., 1, :] - ends[..., 0, :]
+    length = np.linalg.norm(chord, axis=-1, keepdims=True)
+    half = np.arcsin(np.clip(0.5 * curvature * length, -0.9, 0.9))
+    across = np.stack([-chord[..., 1], chord[..., 0]], axis=-1)
+    # On an arc that turns by 2·half, at the angles `along` from its middle.
+    along = np.linspace(-1.0, 1.0, _ARC_POINTS) * half
+    straight = np.broadcast_to(np.linspace(0.0, 1.0, _ARC_POINTS), along.shape)
+    bent = np.abs(half) > 1e-6
+    sine = np.where(bent, np.sin(half), 1.0)
+    share = np.where(bent, 0.5 + 0.5 * np.sin(along) / sine, straight)
+    # Positive curvature turns from the columns towards the rows: the arc bulges the other way.
+    bulge = np.where(bent, -0.5 * (np.cos(along) - np.cos(half)) / sine, 0.0)
+    middle = ends[..., 0, :][..., None, :]
+    points = (
+        middle + share[..., None] * chord[..., None, :] + bulge[..., None] * across[..., None, :]
+    )
+    notes.append(
+        "the file holds follicle, tip and mean curvature: the whisker between them is taken for an "
+        "arc; the shape itself is in the .whiskers file of the same name"
+    )
+    kept = tracks.drop_dims("node")
+    return kept.assign(trace=(tracks["trace"].dims, points)).assign_attrs(tracks.attrs)
+
+
+def _views(
+    points: Array,
+    tracks: xr.Dataset,
+    cameras: Sequence[Camera] | None,
+    pixel_size: float | None,
+) -> tuple[Camera, ...]:
+    """Cameras of the views; without calibration one or two orthogonal ones."""
+    count = points.shape[2]
+    if cameras is not None:
+        if len(cameras) != count:
+            raise ValueError(
+                f"there are {len(cameras)} cameras for {count} views: "
+                f"{', '.join(map(str, tracks['view'].values))}"
+            )
+        return tuple(cameras)
+    if count > 2:
+        raise ValueError(f"{count} views need calibrated cameras")
+    if pixel_size is None:
+        raise ValueError("points in images need calibrated cameras, or the size of a pixel")
+    size = np.ceil(np.nanmax(points, axis=(0, 1, 2, 3)) + 1.0).astype(int)
+    return orthogonal_views(pixel_size, (int(size[0]), int(size[1])))[:count]
+
+
+def _identified(tracks: xr.Dataset, points: Array, notes: list[str]) -> tuple[Array, list[str]]:
+    """Points of whiskers that are the same in all frames, from base to tip, and their names."""
+    names = [str(name) for name in tracks["whisker"].values]
+    if tracks.attrs.get("identity") != "per frame":
+        return points, names
+    notes.append("the tracker did not identify whiskers over time: each is followed by its ends")
+    either = tracks.attrs.get("direction") == "either"
+    ends = _ends(points)
+    out = np.full_like(points, np.nan)
+    last = ends[0].copy()
+    out[0] = points[0]
+    for i in range(1, len(points)):
+        same = np.linalg.norm(last[:, None] - ends[i][None], axis=-1).sum(axis=-1)
+        turned = np.linalg.norm(last[:, None] - ends[i][None, :, ::-1], axis=-1).sum(axis=-1)
+        cost = np.fmin(same, turned) if either else same
+        rows, columns = linear_sum_assignment(np.where(np.isnan(cost), 1e6, cost))
+        for row, column in zip(rows, columns, strict=True):
+            if not np.isfinite(ends[i, column]).all():
+                continue
+            if np.isfinite(cost[row, column]):
+                swap = either and turned[row, column] < same[row, column]
+            elif np.isnan(last[row]).any():
+                swap = False  # a whisker that is seen for the first time
+            else:
+                continue
+            out[i, row] = _turned(points[i, column]) if swap else points[i, column]
+            last[row] = ends[i, column, ::-1] if swap else ends[i, column]
+    if either:
+        notes.append("the end that moves less is taken for the base of each whisker")
+        spread = np.nanstd(_ends(out), axis=0).sum(axis=-1)
+        for k in np.flatnonzero(spread[:, 0] > spread[:, 1]):
+            out[:, k] = [_turned(one) for one in out[:, k]]
+    return out, names
+
+
+def _ends(points: Array) -> Array:
+    """First and last known point (time, whisker, 2, axis) of the first view."""
+    first = points[:, :, 0]
+    known = np.asarray(np.isfinite(first).all(axis=-1))
+    number = known.shape[-1]
+    last = number - 1 - np.argmax(known[..., ::-1], axis=-1)
+    begin, end = (
+        np.take_along_axis(first, at[..., None, None], axis=-2)[..., 0, :]
+        for at in (np.argmax(known, axis=-1), last)
+    )
+    return np.stack([begin, end], axis=-2)
+
+
+def _turned(points: Array) -> Array:
+    """Points (view, node, axis) from the other end, the missing ones last."""
+    out = np.full_like(points, np.nan)
+    for view, one in enumerate(points):
+        known = one[np.isfinite(one).all(axis=-1)]
+        out[view, : len(known)] = known[::-1]
+    return out
+
+
+def _wanted(
+    names: list[str],
+    points: Array,
+    asked: Sequence[str] | None,
+    per_frame: bool,
+    notes: list[str],
+) -> list[int]:
+    """Numbers of the whiskers that are tracked."""
+    if asked is not None:
+        if unknown := sorted(set(asked) - set(names)):
+            raise ValueError(f"there is no whisker {', '.join(unknown)}; these are {names}")
+        return [names.index(name) for name in asked]
+    known = np.isfinite(points).all(axis=-1)
+    seen = (known.sum(axis=-1) >= _FEWEST).reshape(len(points), len(names), -1).all(axis=-1)
+    share = seen.mean(axis=0)
+    often = np.flatnonzero(share >= _USUAL)
+    if not often.size:
+        raise ValueError(
+            f"no whisker has {_FEWEST} points or more in half of the frames: "
+            f"{names[int(np.argmax(share))]} has them in {100.0 * share.max():.0f} %"
+        )
+    if not per_frame:
+        return [int(k) for k in often]
+    first = points if points.ndim == 4 else points[:, :, 0]
+    steps = np.linalg.norm(np.diff(first, axis=2), axis=-1)
+    length = np.nanmedian(np.nansum(steps, axis=-1), axis=0)
+    longest = int(often[np.argmax(length[often])])
+    notes.append(
+        f"{often.size} whiskers are seen in half of the frames; the longest, {names[longest]}, is "
+        "taken: name others"
+    )
+    return [longest]
+
+
+def _with_added(
+    points: Array,
+    views: tuple[Camera, ...] | None,
+    pixel_size: float | None,
+    sigma: float | None,
+    notes: list[str],
+) -> tuple[Array, tuple[Camera, ...], float | None]:
+    """Points in all views where cameras are added: of one view, or of points in space."""
+    if views is None:
+        space, plane = points, None
+    else:
+        if views[0].projection != "orthographic" or pixel_size is None:
+            raise ValueError("one view needs the size of a pixel, not a calibrated camera")
+        (plane,) = views
+        shown = points[:, :, 0] - plane.matrix[:2, 2]
+        flat = np.zeros(shown.shape[:-1])
+        space = np.stack([pixel_size * shown[..., 0], -pixel_size * shown[..., 1], flat], axis=-1)
+        notes.append("there is one view: the whisker is taken to stay in the plane that it shows")
+    every = space.reshape(-1, 3)
+    every = every[np.isfinite(every).all(axis=1)]
+    low, high = every.min(axis=0), every.max(axis=0)
+    direction = np.nanmean(space[:, :, -1] - space[:, :, 0], axis=(0, 1))
+    if not np.isfinite(direction).all() or not direction.any():
+        direction = high - low
+    added = _looking_across(0.5 * (low + high), float(np.linalg.norm(high - low)), direction)
+    if plane is not None:
+        cameras: tuple[Camera, ...] = (plane, added[1])
+    else:
+        cameras = added
+        lengths = np.nansum(np.linalg.norm(np.diff(space, axis=2), axis=-1), axis=-1)
+        sigma = 1e-3 * float(np.median(lengths[lengths > 0.0])) if sigma is None else sigma
+        sigma *= float(added[0].matrix[1, 1])
+        notes.append("points in space are tracked as two orthogonal views would show them")
+    return np.stack([camera.project(space) for camera in cameras], axis=2), cameras, sigma
+
+
+def _looking_across(middle: Array, extent: float, direction: Array) -> tuple[Camera, Camera]:
+    """Two orthogonal cameras whose shared axis is along a direction; the second sees z upward."""
+    along = np.array([direction[0], direction[1], 0.0])
+    if np.linalg.norm(along) < 0.3 * np.linalg.norm(direction):
+        along = direction
+    along = along / np.linalg.norm(along)
+    up = np.array([0.0, 0.0, 1.0]) if abs(along[2]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    up = up - (up @ along) * along
+    up /= np.linalg.norm(up)
+    side = np.cross(up, along)
+    pixels = (_WIDE - 2.0 * _MARGIN) / extent
+    center = 0.5 * (_WIDE - 1.0)
+    matrix = np.array([[pixels, 0.0, center], [0.0, pixels, center], [0.0, 0.0, 1.0]])
+    cameras = []
+    for name, down in (("above", -side), ("across", -up)):
+        rotation = np.array([along, down, np.cross(along, down)])
+        size = (int(_WIDE), int(_WIDE))
+        cameras.append(
+            Camera(
+                matrix,
+                rotation,
+                -rotation @ middle,
+                size=size,
+                projection="orthographic",
+                name=name,
+            )
+        )
+    return cameras[0], cameras[1]
+
+
+def _trace(points: Array, sigma: float) -> Trace:
+    """The trace through the points (n, 2) of a whisker, from its base; lost without its base."""
+    known = np.asarray(np.isfinite(points).all(axis=1))
+    if known.sum() < _FEWEST or not known[: max(1, len(points) // 4)].any():
+        return Trace.lost()
+    kept = _thinned(points[known])
+    step = np.linalg.norm(np.diff(kept, axis=0), axis=1)
+    kept = kept[np.concatenate([[True], step > 1e-3])]
+    if len(kept) < 2 or step.sum() < 2.0 * STEP:
+        return Trace.lost()
+    trace = given(kept)
+    # Points of the line between those of the tracker are no further measurements.
+    scale = max(1.0, NODES / len(kept)) ** 0.5
+    return trace._replace(
+        sigma=np.full(len(trace.line), sigma * scale),
+        base_seen=bool(known[0]),
+        tip_seen=bool(known[-1]) or known.argmin() == known.sum(),
+    )
+
+
+def _thinned(points: Array) -> Array:
+    """Points that are not much nearer to each other than `_SPACING`, by averaging; ends stay."""
+    length = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
+    groups = int(length / _SPACING)
+    if len(points) < 3 or groups >= len(points) - 2:
+        return points
+    inner = [group.mean(axis=0) for group in np.array_split(points[1:-1], max(groups, 1))]
+    return np.vstack([points[:1], *inner, points[-1:]])

@@ -1,0 +1,160 @@
+"""From the files of other trackers to a contour, by the command line alone."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import vibrissa as vb
+from vibrissa.cameras import orthogonal_views, save_cameras
+from vibrissa.cli.app import app
+from vibrissa.io import RawTracks, labelled, load_recording, save_tracks
+from vibrissa.objects import Peg
+from vibrissa.recording import Recording
+from vibrissa.simulation import Motion, simulate
+from vibrissa.tracking import tracker_traces
+
+NODES = 9
+CAMERAS = orthogonal_views(size=(400, 400), center=(5e-3, 0.0, 0.0))
+PEG = Peg([9e-3, 2.6e-3, 0.0], [0.0, 0.0, 1.0], 0.5e-3)
+
+
+@pytest.fixture(scope="module")
+def trial():
+    """A short whisk into a peg and back, and the points of its whisker in space."""
+    t = np.arange(60) / 1000.0
+    azimuth = -0.15 + 0.45 * np.sin(np.pi * t / t[-1])
+    motion = Motion(t, azimuth, 0.0 * t, 0.0 * t, np.zeros((60, 3)))
+    recording = simulate(vb.Whisker.parabola(length=15e-3, coefficient=12.0), motion, PEG)
+    truth = Recording(recording)["truth"]
+    assert 15 < truth["in_contact"].sum() < 50
+    line = truth["centerline"]
+    chosen = np.linspace(0, line.shape[2] - 1, NODES).round().astype(int)
+    return truth, line[:, :, chosen]
+
+
+def deeplabcut(path, pixels):
+    """Write points (time, node, 2) as DeepLabCut does, with some noise."""
+    noisy = pixels + np.random.default_rng(1).normal(0.0, 0.1, pixels.shape)
+    with path.open("w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(["scorer"] + ["net"] * 3 * NODES)
+        table.writerow(["bodyparts"] + [f"w{i}" for i in range(NODES) for _ in range(3)])
+        table.writerow(["coords"] + ["x", "y", "likelihood"] * NODES)
+        for i, row in enumerate(noisy):
+            table.writerow([i, *(v for x, y in row for v in (x, y, 0.99))])
+    return path
+
+
+def run(*words):
+    done = CliRunner().invoke(app, [str(word) for word in words])
+    if done.exception and not isinstance(done.exception, SystemExit):
+        raise done.exception
+    return " ".join(done.output.split())
+
+
+def errors(path, truth):
+    """Distances of contact points from the true ones, m."""
+    both = (
+        truth["in_contact"][:, 0]
+        & (recording := Recording(load_recording(path))).root["in_contact"][:, 0]
+    )
+    assert both.sum() >= 0.8 * truth["in_contact"].sum()
+    away = recording.root["contact_point"] - truth["contact_point"]
+    return np.linalg.norm(away[both, 0], axis=-1)
+
+
+def test_two_views_to_the_contour(trial, tmp_path):
+    truth, line = trial
+    save_cameras(tmp_path / "cameras.toml", CAMERAS)
+    files = [
+        deeplabcut(tmp_path / f"{camera.name}.csv", camera.project(line[:, 0]))
+        for camera in CAMERAS
+    ]
+    assert "vibrissa import" in run("info", files[0])
+    with pytest.raises(ValueError, match="vibrissa import"):
+        run("reconstruct", files[0])
+    with pytest.raises(ValueError, match="--rate"):
+        run("import", *files, "--cameras", tmp_path / "cameras.toml", "-o", tmp_path / "t.nc")
+    out = tmp_path / "t.nc"
+    run("import", *files, "--cameras", tmp_path / "cameras.toml", "--rate", 1000, "-o", out)
+    assert np.median(errors(out, truth)) < 1.5e-4
+    assert "vibrissa reconstruct" in run("info", out)
+    run("reconstruct", out, "--axis", "0,0,1")
+    fitted = load_recording(out)["contour"]
+    # The short arc that was touched leaves the radius open; the object's side is determined.
+    radius, sigma = fitted["object_radius"].item(), fitted["parameter_covariance"].values[-1, -1]
+    assert abs(radius - PEG.radius) < 4.0 * sigma**0.5
+    points = load_recording(out)["estimates"]["contact_point"].values[:, 0]
+    points = points[np.isfinite(points).all(axis=1)]
+    from_axis = np.linalg.norm(points[:, :2] - PEG.origin[:2], axis=1)
+    assert np.median(np.abs(from_axis - PEG.radius)) < 1.5e-4
+    text = run("info", out)
+    assert "signals, estimates, contour" in text
+    assert "tracked by DeepLabCut" in text
+    assert "pose_covariance" not in text
+    assert "pose_covariance" in run("info", out, "--all")
+
+
+def test_points_in_space_and_one_view_of_a_plane(trial, tmp_path):
+    truth, line = trial
+    noise = np.random.default_rng(2).normal(0.0, 5e-6, line.shape)
+    raw = RawTracks("test", ["w"], space=line + noise, unit="m", fps=1000.0)
+    save_tracks(tmp_path / "space.nc", labelled(raw, "space"))
+    run("import", tmp_path / "space.nc", "-o", tmp_path / "a.nc")
+    assert np.median(errors(tmp_path / "a.nc", truth)) < 1.5e-4
+    top = deeplabcut(tmp_path / "top.csv", CAMERAS[0].project(line[:, 0]))
+    how = ("--pixel-size", 0.058, "--rate", 1000)
+    assert "plane" in run("import", top, *how, "-o", tmp_path / "b.nc")
+    # Of one view the place of the image in the laboratory is not known: distances are.
+    found = Recording(load_recording(tmp_path / "b.nc")).root
+    both = truth["in_contact"][:, 0] & found["in_contact"][:, 0]
+    assert both.sum() > 10
+    arcs = found["arc_length"][both, 0] - truth["arc_length"][both, 0]
+    assert np.median(np.abs(arcs)) < 3e-4
+
+
+def test_ends_and_curvature_make_an_arc():
+    radius, angles = 300.0, np.linspace(0.2, 0.9, 12)
+    circle = radius * np.stack([np.sin(angles), 1.0 - np.cos(angles)], axis=-1) + 50.0
+    raw = RawTracks(
+        "whisk",
+        ["0"],
+        image=np.tile(circle[[0, -1]], (4, 1, 1, 1, 1)),
+        nodes=("follicle", "tip"),
+        fps=500.0,
+    )
+    tracks = labelled(raw, Path("a.measurements"))
+    curvature = (("time", "whisker", "view"), np.full((4, 1, 1), 1.0 / radius))
+    found = tracker_traces(tracks.assign(trace_curvature=curvature), pixel_size=6e-5)
+    trace = found.traces[0][0][0]
+    center = np.array([50.0, 50.0 + radius])
+    away = np.linalg.norm(trace.line - center, axis=1)
+    np.testing.assert_allclose(away, radius, atol=0.05)
+    assert any("arc" in note for note in found.notes)
+
+
+def test_whiskers_without_identity_are_followed_from_their_base():
+    rng = np.random.default_rng(4)
+    swing = 0.2 * np.sin(np.linspace(0.0, 6.0, 30))
+    along = np.linspace(0.0, 200.0, 40)
+    image = np.full((30, 2, 1, 40, 2), np.nan)
+    for i, angle in enumerate(swing):
+        order = rng.permutation(2)
+        for k, (base, size) in enumerate(((100.0, 1.0), (300.0, 0.5))):
+            way = size * along[:, None] * [np.cos(angle), np.sin(angle)] + [50.0, base]
+            image[i, order[k], 0] = way if rng.random() < 0.5 else way[::-1]
+    about = {"identity": "per frame", "direction": "either"}
+    tracks = labelled(RawTracks("whisk", ["0", "1"], image=image, fps=500.0, about=about), "a")
+    found = tracker_traces(tracks, pixel_size=6e-5)
+    bases = np.array([trace.line[0] for trace in found.traces[0][0]])
+    np.testing.assert_allclose(bases, np.tile([50.0, 100.0], (30, 1)), atol=1e-6)
+    both = tracker_traces(tracks, pixel_size=6e-5, names=["0", "1"])
+    rows = sorted(float(view[0].line[0, 1]) for view in both.traces[0])
+    np.testing.assert_allclose(rows, [100.0, 300.0], atol=1e-6)
+    with pytest.raises(ValueError, match="there is no whisker 7"):
+        tracker_traces(tracks, pixel_size=6e-5, names=["7"])
+    with pytest.raises(ValueError, match="size of a pixel"):
+        tracker_traces(tracks)

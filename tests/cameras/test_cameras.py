@@ -154,5 +154,5 @@ def test_what_cannot_be_a_camera_says_why():
         Camera(np.eye(3), np.diag([1.0, 1.0, -1.0]), np.zeros(3))
     with pytest.raises(ValueError, match="pixel_size"):
         orthogonal_views(pixel_size=0.0)
-    with pytest.raises(ValueError, match="two or more"):
-        triangulate(PAIRS["orthogonal"][:1], np.zeros((1, 2)))
+    with pytest.raises(ValueError, match="do not fit"):
+        triangulate(PAIRS["orthogonal"][:1], np.zeros((2, 2)))

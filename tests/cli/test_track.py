@@ -192,3 +192,43 @@ def test_traces_are_kept_for_their_own_video_only(tmp_path):
     assert load_traces(tmp_path / "none.npz", "this") is None
     (tmp_path / "t.npz").write_bytes(b"damaged")
     assert load_traces(tmp_path / "t.npz", "this") is None
+
+
+def test_one_video_is_tracked_in_its_plane_and_reconstructed(videos, tmp_path):
+    out = tmp_path / "side.nc"
+    words = ["track", videos / "top.mkv", "--pixel-size", 0.058, "-o", out]
+    done = run(*words)
+    assert done.exit_code == 0, done.exception
+    assert "note: one view:" in done.stdout
+    recording = load_recording(out)
+    assert recording["trace"].shape[:3] == (16, 1, 1)
+    assert run("signals", out).exit_code == 0
+    assert "Not measured" in run("info", out).stdout
+
+
+def test_a_mirror_gives_two_views_in_one_video(videos, tmp_path):
+    """The second view is left of the first, and its left and right are exchanged."""
+    both = [list(read_video(videos / f"{name}.mkv")) for name in ("top", "front")]
+    frames = [np.hstack([front[:, ::-1], top]) for top, front in zip(*both, strict=True)]
+    write_video(tmp_path / "mirror.mkv", frames)
+    views = ["192,0,192,192", "0,0,192,192:mirrored"]
+    for name, words in {
+        "one.nc": ["--views", *views],
+        "two.nc": ["--views", " ".join(views)],
+    }.items():
+        done = run("track", tmp_path / "mirror.mkv", *words, "-o", tmp_path / name)
+        assert done.exit_code == 0, done.exception
+    done = run("track", videos / "top.mkv", videos / "front.mkv", "-o", tmp_path / "files.nc")
+    assert done.exit_code == 0, done.exception
+    one, two, files = (
+        load_recording(tmp_path / f"{name}.nc")["trace"].values for name in ("one", "two", "files")
+    )
+    np.testing.assert_array_equal(one, files)
+    np.testing.assert_array_equal(two, files)
+
+
+@pytest.mark.parametrize("view", ["0,0,192", "0,0,192,500", "0,0,192,192:turned", "0,0,0,192"])
+def test_views_that_cannot_be_are_refused(videos, tmp_path, view):
+    done = run("track", videos / "top.mkv", "--views", view, "-o", tmp_path / "t.nc")
+    assert done.exit_code != 0
+    assert "COLUMN,ROW,WIDTH,HEIGHT" in str(done.exception)

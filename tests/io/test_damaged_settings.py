@@ -211,7 +211,7 @@ def test_what_is_wrong_with_a_sensor_is_said(tmp_path, text, said):
 
 
 def test_cameras_that_do_not_fit_the_videos_are_refused(tmp_path):
-    """One camera for two videos, and cameras that were calibrated with larger images."""
+    """One camera for two videos, two trials, and cameras calibrated with larger images."""
     for name in ("top", "front"):
         write_video(tmp_path / f"{name}.mkv", np.zeros((3, 64, 64), np.uint8), rate=25.0)
     videos = [tmp_path / "top.mkv", tmp_path / "front.mkv"]
@@ -225,7 +225,7 @@ def test_cameras_that_do_not_fit_the_videos_are_refused(tmp_path):
         return str(result.exception)
 
     said = fault(orthogonal_views(size=(64, 64))[:1])
-    assert "cameras.toml holds one camera, 'top'" in said
+    assert "2 videos, 1 a trial, are 2 trials" in said
     said = fault(orthogonal_views(size=(64, 48)))
     assert f"{videos[0]} is 64 × 64 pixels" in said
     assert "calibrates camera 'top' for 64 × 48" in said

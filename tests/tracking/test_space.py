@@ -97,7 +97,7 @@ def test_without_a_trace_there_is_no_curve():
     pair = PAIRS["orthogonal"]
     found = merge(pair, [traced(pair[0], curve(0.2)), Trace.lost()])
     assert np.isnan(found.points).all()
-    with pytest.raises(ValueError, match="two each are needed"):
+    with pytest.raises(ValueError, match="one each is needed"):
         merge(pair, [Trace.lost()])
 
 

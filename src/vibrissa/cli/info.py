@@ -337,6 +337,8 @@ def _groups(path: Path) -> Iterator[tuple[str, str]]:
         if names:
             yield "/whiskers", f"{len(names)}: {', '.join(names)}"
             yield from _notes(file.groups["whiskers"])
+        for line in _text(file.attrs.get("remarks", "")).splitlines():
+            yield "note", line
 
 
 def _many(file: Any) -> bool:

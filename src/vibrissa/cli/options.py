@@ -220,7 +220,13 @@ OPTIONS = {
     "tracking": Option("Whether the trial is filmed and tracked, or the true pose is taken."),
     # Videos that are tracked, and cameras
     "pixel_size": Option(
-        "Size of a pixel of both views in space, mm, without --cameras; 0.058 by default.", "MM"
+        "Size of a pixel of the views in space, mm, without --cameras; 0.058 by default.", "MM"
+    ),
+    "views": Option(
+        "Parts of the images of one video that show the views, as where a mirror is in the image: "
+        "COLUMN,ROW,WIDTH,HEIGHT of each, one after the other; :mirrored after it exchanges left "
+        "and right, :flipped up and down.",
+        "X,Y,W,H[:mirrored]...",
     ),
     "unit": Option("Unit of points in space, where the file does not state it."),
     "point_sigma": Option(

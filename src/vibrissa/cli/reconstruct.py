@@ -184,6 +184,7 @@ def _report(
     from vibrissa.contour import shape_from_dataset
     from vibrissa.evaluation import caution
     from vibrissa.pipeline import compare_contacts, compare_shapes, distances_by_class
+    from vibrissa.recording import Recording
 
     contour, estimates = (tree[name].to_dataset() for name in ("contour", "estimates"))
     shapes, fit = None, shape_from_dataset(contour)
@@ -196,6 +197,12 @@ def _report(
     if known:
         compared = compare_contacts(tree, known, whiskers)
         _print_distances(distances_by_class(compared)["deflection_angle"])
+    if Recording(tree).planar:
+        say(
+            "One view shows the section of the object in its plane: a cylinder is taken to be "
+            "along the line of sight; how it is tilted, and what is in front or behind, is not "
+            "measured."
+        )
     if warning := caution(contour.attrs.get("source")):
         say(warning)
 

@@ -107,6 +107,13 @@ def signals(
 
 def described(tree: xr.DataTree) -> str:
     """State what the signals of a recording come from."""
+    from vibrissa.recording import Recording
+
+    flat = "; one view: depth, Fz, Mx and My are taken for 0" if Recording(tree).planar else ""
+    return f"{_origin(tree)}{flat}"
+
+
+def _origin(tree: xr.DataTree) -> str:
     about = tree["signals"].attrs if "signals" in tree.children else {}
     source = str(about.get("source", "a source that is not known"))
     if source == "sensor":

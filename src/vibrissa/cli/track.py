@@ -1,8 +1,9 @@
-"""`vibrissa track`: from two videos to a recording."""
+"""`vibrissa track`: from one or two videos to a recording."""
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -31,6 +32,9 @@ _FINEST = 3.0
 _POOR = 2.0
 """Misfit of traces, in their standard deviation, from which the rod does not explain them."""
 
+_VIEW = re.compile(r"\d+,\d+,\d+,\d+(:[a-z]+)*")
+"""Part of the images of a video."""
+
 _RATE, _CUTOFF = 1000.0, 85.0
 
 
@@ -41,6 +45,7 @@ class FilmOptions:
     pixel_size: float | None = None
     rate: float | None = None
     cameras: Path | None = None
+    views: list[str] | None = None
     offset: str = "0"
 
     def __post_init__(self) -> None:
@@ -57,15 +62,29 @@ class FilmOptions:
         """Frames per second, 1000 by default."""
         return _RATE if self.rate is None else self.rate
 
-    def views(self, videos: Sequence[Path]) -> tuple[Camera, ...]:
+    def split(self, stated: Sequence[Path]) -> list[Path]:
+        """Return the videos of the views: files, or with --views parts of them."""
+        # The parts after the first are words without an option of their own.
+        more = [str(video) for video in stated if self.views and _VIEW.fullmatch(str(video))]
+        videos = [video for video in stated if str(video) not in more]
+        parts = [part for text in self.views or () for part in text.split()] + more
+        for part in parts:
+            if not _VIEW.fullmatch(part):
+                raise ValueError(
+                    f"--views is {part!r}; COLUMN,ROW,WIDTH,HEIGHT of each view are needed, and "
+                    "after it nothing, :mirrored or :flipped"
+                )
+        return [Path(f"{v}#{part}") for v in videos for part in parts] if parts else videos
+
+    def seen_by(self, videos: Sequence[Path]) -> tuple[Camera, ...]:
         """Return the cameras of the views: those that are calibrated, or orthogonal ones."""
         from vibrissa.cameras import PIXEL_SIZE, orthogonal_views
         from vibrissa.io import video_info
 
         if self.cameras is not None:
             return _calibrated(self.cameras, videos)
-        if len(videos) % 2:
-            raise ValueError(f"{len(videos)} videos: give two a trial, or their --cameras")
+        if len(videos) % 2 and len(videos) > 1:
+            raise ValueError(f"{len(videos)} videos: give one or two a trial, or their --cameras")
         sizes = [(info.width, info.height) for info in map(video_info, videos)]
         if len(set(sizes)) > 1:
             raise ValueError(f"the videos differ in size, {sorted(set(sizes))}: give --cameras")
@@ -76,7 +95,7 @@ class FilmOptions:
                 f"--pixel-size is {1e3 * pixel_size:g} mm, by which the views are {wide:g} m wide; "
                 "it is in mm, such as 0.058"
             )
-        return orthogonal_views(pixel_size, sizes[0])
+        return orthogonal_views(pixel_size, sizes[0])[: len(videos)]
 
 
 @dataclass(frozen=True)
@@ -167,8 +186,8 @@ def track(
     videos: Annotated[
         list[Path],
         typer.Argument(
-            help="The video of each view, top and then front; of several trials one after the "
-            "other.",
+            help="The video of the one view, or of each view, top and then front; of several "
+            "trials one after the other.",
             metavar="VIDEO...",
         ),
     ],
@@ -181,7 +200,10 @@ def track(
     cutoff: float | None = None,
     force: bool = False,
 ) -> None:
-    """Track a whisker in two videos: its shape, pose, contact, and force and moment at its base.
+    """Track a whisker in videos: its shape, pose, contact, and force and moment at its base.
+
+    Two views show it in space. Of one view it is taken to move and bend in the plane of the image;
+    what that leaves out is printed. A mirror gives two views in one video, which --views separate.
 
     The whisker at rest is that of --whisker, or is taken from the frames without contact; its base
     is 0.1 mm in radius if nothing else is stated. With --objects or --contact the contact is
@@ -191,9 +213,10 @@ def track(
     """
     from vibrissa.tracking import TrackOptions
 
+    videos = filmed.split(videos)
     for video in videos:
         refuse_tracks(video)
-    views = filmed.views(videos)
+    views = filmed.seen_by(videos)
     trials = _trials(videos, len(views), target, known.alone())
     free(trials, force)
     rate = filmed.frames_per_second
@@ -299,11 +322,6 @@ def _calibrated(path: Path, videos: Sequence[Path]) -> tuple[Camera, ...]:
         cameras = Recording(load_recording(path)).cameras
     else:
         cameras = load_cameras(path)
-    if len(cameras) < 2:
-        raise ValueError(
-            f"{path} holds one camera, {cameras[0].name!r}; a whisker in space is seen by two or "
-            "more: calibrate them together, or leave --cameras out"
-        )
     if len(videos) % len(cameras):
         raise ValueError(f"{path} holds {len(cameras)} cameras; there are {len(videos)} videos")
     for i, video in enumerate(videos):
@@ -328,7 +346,10 @@ def _trials(
     if len(trials) > 1:
         refuse(alone, "it is for one trial; track that by itself")
         if not recording.is_dir():
-            raise ValueError(f"--output is {recording}; for several trials a folder is needed")
+            raise ValueError(
+                f"--output is {recording}; {len(videos)} videos, {count} a trial, are "
+                f"{len(trials)} trials, for which a folder is needed"
+            )
         files = [recording / f"{trial[0].stem}.nc" for trial in trials]
         if len(set(files)) < len(files):
             raise ValueError("two trials would have one file: their first videos share a name")

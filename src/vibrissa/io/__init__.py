@@ -35,6 +35,7 @@ from vibrissa.io.paths import (
     check_writable,
     refuse_whisk,
     replacing,
+    without_part,
 )
 from vibrissa.io.recording import RECORDING_KIND, load_recording, save_recording
 from vibrissa.io.rosbag import BagMessage, ContactBag, bag_poses, bag_wrenches, is_bag
@@ -167,6 +168,7 @@ __all__ = [
     "video_frames",
     "video_info",
     "with_point",
+    "without_part",
     "write_calibration",
     "write_movie",
     "write_netcdf",

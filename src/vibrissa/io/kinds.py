@@ -22,7 +22,7 @@ from vibrissa.io.matlab import read_matlab
 from vibrissa.io.movement import read_movement
 from vibrissa.io.netcdf import kind_of, opened
 from vibrissa.io.nwb import read_nwb
-from vibrissa.io.paths import check_readable
+from vibrissa.io.paths import check_readable, without_part
 from vibrissa.io.sleap import read_sleap_analysis, read_sleap_labels
 from vibrissa.io.table import read_text, signal_column, table_rows
 from vibrissa.io.traces import CORRECTION_COLUMNS
@@ -80,7 +80,7 @@ def recognise(path: str | PathLike[str]) -> Kind:
     ValueError
         If it is a folder, empty, or HDF5 that is cut short.
     """
-    path = check_readable(path)
+    path, _ = without_part(check_readable(path))
     with path.open("rb") as file:
         head = file.read(128)
     for magic, kind in ((WHISKERS[:10], Kind.WHISKERS), (MEASUREMENTS[:6], Kind.MEASUREMENTS)):

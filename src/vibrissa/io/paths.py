@@ -35,6 +35,29 @@ _WHISK = {b"bwhiskbin": "traces of whisk (.whiskers)", b"measv": "measurements o
 """What whisk's binary files begin with, and what they are called."""
 
 
+_VIDEO_PART = re.compile(r"^(?P<file>.+)#(?P<part>\d+,\d+,\d+,\d+(?::[a-z]+)*)$", re.DOTALL)
+
+
+def without_part(path: str | PathLike[str]) -> tuple[Path, str]:
+    """Separate the file of a video from the part of its images that is meant.
+
+    Parameters
+    ----------
+    path : str or path
+        File, or file and part as in ``film.mp4#512,0,512,512:mirrored``.
+
+    Returns
+    -------
+    file : Path
+        The file alone.
+    part : str
+        The part; empty for whole images.
+    """
+    path = Path(path)
+    match = _VIDEO_PART.match(str(path))
+    return (path, "") if match is None or path.exists() else (Path(match["file"]), match["part"])
+
+
 def refuse_whisk(path: str | PathLike[str]) -> None:
     """Raise where a file is whisk's and something else is needed.
 
@@ -76,14 +99,14 @@ def check_readable(path: str | PathLike[str]) -> Path:
     ValueError
         If it is a folder or empty.
     """
-    path = Path(path)
-    if not path.exists():
-        raise FileNotFoundError(f"there is no file {path}")
-    if path.is_dir():
-        raise ValueError(f"{path} is a folder; the name of a file is needed")
-    if path.stat().st_size == 0:
-        raise ValueError(f"{path} is empty")
-    return path
+    file, _ = without_part(path)
+    if not file.exists():
+        raise FileNotFoundError(f"there is no file {file}")
+    if file.is_dir():
+        raise ValueError(f"{file} is a folder; the name of a file is needed")
+    if file.stat().st_size == 0:
+        raise ValueError(f"{file} is empty")
+    return Path(path)
 
 
 def check_writable(path: str | PathLike[str], endings: Sequence[str] = ()) -> Path:

@@ -5,13 +5,18 @@ several cameras took at the same moments are numbered files or a video each: ``t
 front_01.png …`` are of the cameras ``top`` and ``front``; where the names are only numbers, the
 folder is the camera. Images of one number belong together. Of videos the same frames of each are
 taken.
+
+A view may be a part of the images of a video, as where a mirror shows the other side: wherever a
+video is read its name may be followed by ``#COLUMN,ROW,WIDTH,HEIGHT``, and by ``:mirrored`` if left
+and right, ``:flipped`` if up and down are to be exchanged, as in
+``film.mp4#512,0,512,512:mirrored``.
 """
 
 from __future__ import annotations
 
 import re
 from collections import OrderedDict, deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, pairwise
 from os import PathLike
@@ -22,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vibrissa.io.kinds import Kind, recognise
-from vibrissa.io.paths import refuse_whisk
+from vibrissa.io.paths import refuse_whisk, without_part
 
 if TYPE_CHECKING:
     from av.container import InputContainer
@@ -54,6 +59,47 @@ class VideoInfo:
     codec: str
 
 
+@dataclass(frozen=True)
+class _Part:
+    """Part of the images of a video."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+    turned: tuple[str, ...]
+
+    @classmethod
+    def of(cls, path: str | PathLike[str], container: InputContainer) -> _Part | None:
+        """The part that a video's name states, if it does."""
+        file, text = without_part(path)
+        if not text:
+            return None
+        sides, *turned = text.split(":")
+        left, top, width, height = map(int, sides.split(","))
+        context = container.streams.video[0].codec_context
+        inside = left + width <= context.width and top + height <= context.height
+        if not inside or not width * height or not {*turned} <= {"mirrored", "flipped"}:
+            raise ValueError(
+                f"the part {text} of {file}, whose images are {context.width} × {context.height} "
+                "pixels, cannot be: COLUMN,ROW,WIDTH,HEIGHT within them are needed, and then "
+                "nothing, :mirrored or :flipped"
+            )
+        return cls(left, top, width, height, tuple(turned))
+
+    def cut(self, frame: Frame) -> Frame:
+        """Take the part of an image."""
+        cut = frame[self.top : self.top + self.height, self.left : self.left + self.width]
+        cut = cut[:, ::-1] if "mirrored" in self.turned else cut
+        return np.ascontiguousarray(cut[::-1] if "flipped" in self.turned else cut)
+
+
+def _grey_frames(path: str | PathLike[str], container: InputContainer) -> Callable[[Any], Frame]:
+    """The function that turns a decoded frame of a video into what its name states."""
+    part = _Part.of(path, container)
+    return grey_frame if part is None else lambda frame: part.cut(grey_frame(frame))
+
+
 def video_info(path: str | PathLike[str]) -> VideoInfo:
     """Say what a video holds.
 
@@ -72,9 +118,10 @@ def video_info(path: str | PathLike[str]) -> VideoInfo:
         frames = stream.frames
         if not frames and container.duration and stream.average_rate:
             frames = round(container.duration * 1e-6 * float(stream.average_rate))
+        part = _Part.of(path, container)
         return VideoInfo(
-            width=context.width,
-            height=context.height,
+            width=context.width if part is None else part.width,
+            height=context.height if part is None else part.height,
             frames=int(frames),
             rate=float(stream.average_rate or 0.0),
             codec=context.name,
@@ -99,10 +146,10 @@ def read_video(path: str | PathLike[str]) -> Iterator[Frame]:
     with opened_video(path) as container:
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
-        done = 0
+        done, grey = 0, _grey_frames(path, container)
         try:
             for frame in container.decode(stream):
-                yield grey_frame(frame)
+                yield grey(frame)
                 done += 1
         except av.FFmpegError as error:
             raise ValueError(f"{path} is damaged after frame {done}: {error.strerror}") from error
@@ -133,25 +180,25 @@ def video_frames(path: str | PathLike[str], numbers: Iterable[int]) -> Iterator[
     wanted = [int(number) for number in numbers]
     if any(b < a for a, b in pairwise([0, *wanted])):
         raise ValueError("numbers of frames must not be negative and must not fall")
-    found = _decoded(Path(path), set(wanted))
+    found = _decoded(path, set(wanted))
     number, image = -1, None
     for want in wanted:
         while number < want or image is None:
             number, frame = next(found, (-1, None))
-            if frame is None:
+            if number < 0:
                 raise ValueError(f"{path} has no frame {want}")
-            image = grey_frame(frame) if number == want else None
+            image = frame if number == want else None
         yield image
 
 
-def _decoded(path: Path, wanted: set[int]) -> Iterator[tuple[int, Any]]:
-    """Numbers and frames, in order: those wanted, and what decoding them takes."""
+def _decoded(path: str | PathLike[str], wanted: set[int]) -> Iterator[tuple[int, Frame | None]]:
+    """Numbers and images, in order, of all that is decoded; None of what is not wanted."""
     import av
 
     with opened_video(path) as container:
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
-        last = max(wanted, default=-1)
+        last, grey = max(wanted, default=-1), _grey_frames(path, container)
         sent: deque[int] = deque()
         try:
             for number, (packet, following) in enumerate(_with_next(container.demux(stream))):
@@ -163,7 +210,7 @@ def _decoded(path: Path, wanted: set[int]) -> Iterator[tuple[int, Any]]:
                     sent.append(number)
                 for frame in stream.decode(packet):
                     at = sent.popleft()
-                    yield at, frame
+                    yield at, grey(frame) if at in wanted else None
                     if at >= last:
                         return
         except av.FFmpegError as error:
@@ -179,7 +226,7 @@ def opened_video(path: str | PathLike[str]) -> InputContainer:
     """Open a file that holds a video, or raise an error that states why not."""
     import av
 
-    path = Path(path)
+    path, _ = without_part(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {path}")
     refuse_whisk(path)
@@ -222,6 +269,7 @@ class Footage:
         self._container = opened_video(path)
         self._stream = self._container.streams.video[0]
         self._stream.thread_type = "AUTO"
+        self._grey = _grey_frames(path, self._container)
         self._start = self._stream.start_time or 0
         self._frames: Any = self._container.decode(self._stream)
         self._shown = -1
@@ -254,7 +302,7 @@ class Footage:
                 if frame is None:
                     raise ValueError(f"{self._path} ends before frame {number}")
                 self._shown = self._number(frame)
-                self._last = grey_frame(frame)
+                self._last = self._grey(frame)
         except av.FFmpegError as error:
             raise ValueError(f"{self._path} is damaged near frame {number}") from error
         assert self._last is not None  # a frame was decoded

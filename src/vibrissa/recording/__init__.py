@@ -1,6 +1,6 @@
 """The recording: all that is known of a trial, declared once and read by one accessor."""
 
-from vibrissa.recording.recording import Group, Recording, recording_tree
+from vibrissa.recording.recording import ONE_VIEW, Group, Recording, recording_tree
 from vibrissa.recording.schema import (
     VARIABLES,
     RecordedVariable,
@@ -10,6 +10,7 @@ from vibrissa.recording.schema import (
 )
 
 __all__ = [
+    "ONE_VIEW",
     "VARIABLES",
     "Group",
     "RecordedVariable",

@@ -18,6 +18,14 @@ from vibrissa.whisker import Whisker
 
 Array = NDArray[np.float64]
 
+ONE_VIEW = (
+    "one view: the whisker is taken to move and bend in the plane of the image, z = 0. Measured "
+    "are base, azimuth, curvature, contact and, in the plane, force (Fx, Fy) and bending moment "
+    "(Mz). Not measured, and given as 0: elevation, depth, force across the plane (Fz), and the "
+    "moments Mx and My; roll is 0° or 180°. What turns out of the plane looks shorter and bent."
+)
+"""What is known of a trial that was filmed by one camera."""
+
 
 @dataclass(frozen=True, eq=False)
 class Group:
@@ -256,6 +264,17 @@ class Recording:
         if "cameras" not in self:
             raise ValueError("the recording has no cameras")
         return cameras_from_dataset(self["cameras"].data)
+
+    @property
+    def planar(self) -> bool:
+        """Whether one camera alone has seen the trial, so that it is known in a plane only.
+
+        Returns
+        -------
+        bool
+            True if there is one camera.
+        """
+        return "cameras" in self and self["cameras"].data.sizes.get("view") == 1
 
     @property
     def objects(self) -> tuple[Surface, ...]:

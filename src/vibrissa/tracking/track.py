@@ -1,4 +1,4 @@
-"""From traces in two views to a recording: shape, pose, contact and wrench of every frame.
+"""From traces in one view or more to a recording: shape, pose, contact and wrench of every frame.
 
 What makes results wrong without any sign in them is searched, and reported in a sentence each, with
 what to do: views that do not show the same, cameras out of step, ends that are not seen.
@@ -14,9 +14,11 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from vibrissa.cameras import Camera
 from vibrissa.objects import Surface
+from vibrissa.recording import ONE_VIEW
 from vibrissa.tracking.contact_points import contacts_at, given_contacts
 from vibrissa.tracking.recording import Tracked, tracked_recording
 from vibrissa.tracking.refine.fit import FitOptions, Fitter, with_length_unsure
@@ -36,13 +38,19 @@ from vibrissa.tracking.space.rest_shape import (
 )
 from vibrissa.tracking.trace.start import base_gap
 from vibrissa.tracking.trace.trace import Trace
-from vibrissa.whisker import Whisker
+from vibrissa.whisker import Pose, Whisker
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 Progress = Callable[[str, int, int], None]
 """Function that is called with the name of a stage, and how much of how much is done."""
+
+_FLAT = 0.02
+"""Distance from its plane of a known whisker at most for one view, as a share of its length."""
+
+_SHORTENED = 0.04
+"""Share by which its seen length varies from which a whisker leaves the plane of one view."""
 
 _ANY_ROLL = np.radians(10.0)
 """Standard deviation of the roll if only bent shapes show it, rad."""
@@ -157,8 +165,12 @@ def track(
         raise ValueError(f"rate is {rate!r}; it must be positive, in frames per second")
     timed = _best_seen(traces)
     pairs = paired_frames(cameras, timed, options.offset)
+    if head is not None and len(cameras) == 1:
+        raise ValueError("the head moves in space, which one view does not show: leave it out")
     moving = None if head is None else HeadPose.of(head, pairs[:, 0], rate)
     found, remarks = [], _remarks_on_time(cameras, timed, options.offset)
+    if len(cameras) == 1:
+        remarks.append(ONE_VIEW)
     count = counts.pop()
     for k in range(count):
         rows = [[view[k][i] for i in pairs[:, v]] for v, view in enumerate(traces)]
@@ -172,6 +184,8 @@ def track(
                 one = replace(one, contacts=contacts_at(objects, one.curves, one.touching, one.fit))
             found.append(one)
             remarks += remarks_on(cameras, one.traces, one.length, one.fit.misfit, name)
+            if len(cameras) == 1:
+                remarks += _remarks_on_plane(one, name)
         except Exception as fault:  # whatever it is, it must not cost the others
             if count == 1:
                 raise
@@ -243,7 +257,7 @@ def track_whisker(
     head = head or HeadPose.still(count)
     on_head = head.seen_from(points)
     tips: Mask = np.all(series.ends[:, :, 1] > 0.5, axis=1)
-    shape, whisker = _at_rest(on_head, options, name, tips)
+    shape, whisker = _at_rest(on_head, options, name, tips, flat=len(cameras) == 1)
     report(f"contact of {name}", 1, 2)
     touching = np.isfinite(points).all(axis=(1, 2)) & ~shape.free
     smoothness = options.fit
@@ -276,14 +290,31 @@ def _silent(stage: str, done: int, total: int) -> None:
 
 
 def _at_rest(
-    curves: Array, options: TrackOptions, name: str, tips: Mask
+    curves: Array, options: TrackOptions, name: str, tips: Mask, flat: bool
 ) -> tuple[RestShape, Whisker]:
     """Take the rest shape from the frames, or as it is known."""
     if options.whisker is not None:
         whisker = options.whisker.with_properties(name=name)
+        if flat:
+            return _known_flat(curves, whisker, options.free)
         return known_rest(curves, whisker, options.free), whisker
     shape = rest_shape(curves, options.free, tips)
     return shape, whisker_at_rest(shape, name, **options.properties)
+
+
+def _known_flat(curves: Array, whisker: Whisker, free: float) -> tuple[RestShape, Whisker]:
+    """Lay a known whisker into the plane of a single view, on that side on which it fits."""
+    away = float(np.abs(whisker.centerline()[:, 2]).max())
+    if away > _FLAT * whisker.length:
+        raise ValueError(
+            f"the known whisker leaves its plane by {1e3 * away:.2f} mm; for one view "
+            f"{100.0 * _FLAT:g} % of its length, {1e3 * _FLAT * whisker.length:.2f} mm, are "
+            "allowed: film it from two sides, or leave --whisker out"
+        )
+    sides = [Rotation.from_rotvec([turn, 0.0, 0.0]).as_matrix() for turn in (0.0, np.pi)]
+    laid = [replace(whisker, pose=Pose(turn, np.zeros(3))) for turn in sides]
+    shapes = [known_rest(curves, one, free) for one in laid]
+    return min(zip(shapes, laid, strict=True), key=lambda pair: pair[0].noise)
 
 
 def _poses(
@@ -367,6 +398,24 @@ def remarks_on(
             "covariances."
         )
     return found
+
+
+def _remarks_on_plane(one: Tracked, name: str) -> list[str]:
+    """Whether a whisker seems to leave the plane of the only view."""
+    tips = one.traces.ends.all(axis=(1, 2)) & np.isfinite(one.curves).all(axis=(1, 2))
+    if tips.sum() < _FEWEST:
+        return []
+    lengths = np.linalg.norm(np.diff(one.curves[tips], axis=1), axis=2).sum(axis=1)
+    short, long = np.percentile(lengths, [5.0, 95.0])
+    if short > (1.0 - _SHORTENED) * long:
+        return []
+    return [
+        f"{name}: it is seen {1e3 * short:.1f} to {1e3 * long:.1f} mm long (5 and 95 % of the "
+        "frames that show its tip), as if it turned out of the image by up to "
+        f"{np.degrees(np.arccos(short / long)):.0f}°. Contact is then not distinguished from "
+        "turning, and forces and contact points of such frames are not to be believed. A second "
+        "view (or a mirror, --views) shows it."
+    ]
 
 
 def _remarks_on_time(

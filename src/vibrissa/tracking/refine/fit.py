@@ -47,6 +47,9 @@ _SMALL = 1e-4
 _HELD = 1e8
 """Weight with which frames without contact keep the contact at rest."""
 
+_ACROSS = (slice(2, 5), slice(9, 10))
+"""Unknowns across the plane z = 0: a shift, turns about two axes; the force across it."""
+
 _REST = np.array([0.5, 0.0, 0.0, 0.0])
 """Contact of a frame that has none: no force, half-way along the whisker."""
 
@@ -346,6 +349,13 @@ class Problem:
         begun = _turning(self.start.rotation)
         held = np.where(self.touching, 0.0, _HELD)[:, None]
         cost = smoother.add_at(place[:, 6:], held, 6, _REST)
+        if len(self.cameras) == 1:
+            # One view shows what happens in its plane: no lift, no tilt, no force across it.
+            for unknowns in _ACROSS:
+                level = np.zeros(unknowns.stop - unknowns.start)
+                cost += smoother.add_at(
+                    place[:, unknowns], np.array([[_HELD]]), unknowns.start, level
+                )
         across = np.linalg.norm(state.contact[:, 2:], axis=1)
         rubbing = 1.0 / (o.friction * across + _RUBBING) ** 2
         cost += smoother.add_at(place[:, 7:8], rubbing[:, None], 7, np.zeros(1))

@@ -1,11 +1,12 @@
-"""One whisker in space from its traces in two or more calibrated views.
+"""One whisker in space from its traces in calibrated views.
 
 A point of one trace is in another view on its epipolar line (with the paper's orthogonal views: in
 the column of the shared axis). First the traces are matched point by point, both from base to tip,
 so that the distances from those lines are least in sum; this gives a curve in space. Then a cubic
 spline is moved until its images are on the traces, each trace being weighted by its uncertainty
 across itself. Where the whisker is such that no view sees it move in some direction, the spline's
-covariance is large in that direction.
+covariance is large in that direction. A single view does not
+show depth at all: its whisker is taken to be in the laboratory's plane z = 0.
 """
 
 from __future__ import annotations
@@ -54,6 +55,9 @@ _END = 1.0
 _BEYOND = 6.0
 """Distance of a tip from the end of a trace from which it is another, pixels."""
 
+_LEVEL = 1e-7
+"""Standard deviation of the distance from the plane in which a single view's whisker is, m."""
+
 _SLIDING = 0.3
 """Standard deviation of a point's motion along the curve in a round, in units of their distance."""
 
@@ -94,12 +98,12 @@ class SpaceCurve(NamedTuple):
 
 
 def merge(cameras: Sequence[Camera], traces: Sequence[Trace]) -> SpaceCurve:
-    """Find the whisker in space that two or more views see.
+    """Find the whisker in space that views show.
 
     Parameters
     ----------
     cameras : sequence of Camera
-        Cameras of the views.
+        Cameras of the views; the whisker of a single one is taken to be in the plane z = 0.
     traces : sequence of Trace
         Traces of one whisker in one frame, view by view.
 
@@ -111,10 +115,10 @@ def merge(cameras: Sequence[Camera], traces: Sequence[Trace]) -> SpaceCurve:
     Raises
     ------
     ValueError
-        If there are fewer than two views, or not a trace for each.
+        If there is not a trace for each camera.
     """
-    if len(cameras) < 2 or len(cameras) != len(traces):
-        raise ValueError(f"{len(cameras)} cameras and {len(traces)} traces: two each are needed")
+    if not cameras or len(cameras) != len(traces):
+        raise ValueError(f"{len(cameras)} cameras and {len(traces)} traces: one each is needed")
     if any(len(trace.line) < 8 or not trace.base_seen for trace in traces):
         return SpaceCurve.none()
     start = _matched(cameras, traces)
@@ -246,6 +250,8 @@ def _fitted(cameras: Sequence[Camera], traces: Sequence[Trace], start: Array) ->
     basis = _basis(NODES)
     covariance = np.einsum("ik,kalb,il->iab", basis, spread, basis) * max(1.0, misfit**2)
     dense = BSpline(_KNOTS, control, 3)(np.linspace(0.0, 1.0, 8 * NODES))
+    if len(cameras) == 1:
+        dense[:, 2] = 0.0
     return SpaceCurve(_evenly_spaced(dense, NODES), covariance, misfit)
 
 
@@ -259,6 +265,10 @@ def _equations(
     nodes = [np.arange(_SAMPLES)]
     rows = [along / spacing / (_SLIDING * spacing.mean())]
     misses = [np.zeros(_SAMPLES)]
+    if len(cameras) == 1:
+        nodes.append(np.arange(_SAMPLES))
+        rows.append(np.tile([0.0, 0.0, 1.0 / _LEVEL], (_SAMPLES, 1)))
+        misses.append(-points[:, 2] / _LEVEL)
     for camera, trace in zip(cameras, traces, strict=True):
         pixels, slopes = camera.project_with_slopes(points)
         line = trace.line

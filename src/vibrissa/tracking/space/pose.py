@@ -289,6 +289,9 @@ def base_pose(curves: Array, shape: RestShape, whisker: Whisker) -> BasePose:
     rotation[seen] = turn @ whisker.pose.rotation
     position[seen] = turn @ whisker.pose.origin + shift
     angles = angles_of(rotation)
+    # Of rolls about half a turn none is to be on the other side of it.
+    usual = float(np.angle(np.exp(1j * angles[seen, 2])[free if free.any() else ...].sum()))
+    angles[:, 2] = usual + np.angle(np.exp(1j * (angles[:, 2] - usual)))
     if whisker.is_straight:
         # Nothing shows its roll; its y axis is taken as level.
         angles[:, 2] = np.where(np.isfinite(angles[:, 2]), 0.0, np.nan)

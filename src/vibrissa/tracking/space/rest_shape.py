@@ -207,6 +207,8 @@ def known_rest(curves: Array, whisker: Whisker, least: float = 0.1) -> RestShape
         )
     s = np.arange(int(whisker.length / spacing) + 1) * spacing
     points = whisker.pose.to_source(whisker.position(np.minimum(s, whisker.length)))
+    if not np.ptp(curves[seen][..., 2]):
+        points[:, 2] = 0.0
     out = np.full(len(curves), np.nan)
     for row, shape, count in zip(np.flatnonzero(seen), shapes, known, strict=True):
         n = min(int(count), len(points), compared)
@@ -277,7 +279,11 @@ def motions(shapes: Array, target: Array) -> tuple[Array, Array]:
     n = min(shapes.shape[1], len(target))
     a, b = shapes[:, :n], target[:n]
     middle, goal = a.mean(axis=1), b.mean(axis=0)
-    u, _, vt = np.linalg.svd(np.einsum("tni,nj->tij", a - middle[:, None], b - goal))
+    cross = np.einsum("tni,nj->tij", a - middle[:, None], b - goal)
+    if not (np.ptp(a[..., 2]) or np.ptp(b[..., 2])):
+        # What is known in a plane only is turned in it, and not over.
+        cross[:, 2, 2] = np.linalg.norm(cross, axis=(1, 2)) + 1.0
+    u, _, vt = np.linalg.svd(cross)
     sign = np.linalg.det(u @ vt)
     u[:, :, 2] *= sign[:, None]
     rotation = np.swapaxes(u @ vt, 1, 2)

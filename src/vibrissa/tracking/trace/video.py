@@ -12,7 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.io import Frame, load_traces, read_video, save_traces, video_frames, video_info
+from vibrissa.io import (
+    Frame,
+    load_traces,
+    read_video,
+    save_traces,
+    video_frames,
+    video_info,
+    without_part,
+)
 from vibrissa.tracking.trace.curves import find_whiskers
 from vibrissa.tracking.trace.follower import Follower, features_of, start_at
 from vibrissa.tracking.trace.identity import Seen, decided, follow_row
@@ -305,7 +313,7 @@ def trace_file(
         Traces of each whisker, frame by frame.
     """
     video, partial = Path(video), Path(partial)
-    about = video.stat()
+    about = without_part(video)[0].stat()
     fixed = sorted((key, np.asarray(at).tolist()) for key, at in (corrections or {}).items())
     key = f"{video.resolve()} {about.st_size} {about.st_mtime_ns} {bases} {fixed} {options}"
     begun = [[Trace(*row) for row in whisker] for whisker in load_traces(partial, key) or []]

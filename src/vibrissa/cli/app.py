@@ -14,6 +14,7 @@ from vibrissa.cli.correct import correct
 from vibrissa.cli.deflect import deflect
 from vibrissa.cli.demo import demo
 from vibrissa.cli.estimate import estimate
+from vibrissa.cli.export import export
 from vibrissa.cli.figures import figures
 from vibrissa.cli.import_ import import_tracks
 from vibrissa.cli.info import info
@@ -52,6 +53,7 @@ VERBS: dict[str, Callable[..., None]] = {
     "signals": signals,
     "estimate": estimate,
     "reconstruct": reconstruct,
+    "export": export,
     "figures": figures,
     "movie": movie,
     "report": report,

@@ -96,6 +96,14 @@ OPTIONS = {
     "film": Option("Folder for videos of the two views.", "DIR"),
     "bag": Option("New ROS 2 bag for PointStamped and PointCloud2.", "FOLDER", names="--bag-out"),
     "grid": Option("Whether the paper's 237,765 points are solved too."),
+    "to": Option("Format of the table: text, Neurodata Without Borders, or MATLAB."),
+    "session_start": Option(
+        "Date and time with zone at which the session began, for NWB; by default when the "
+        "recording was made.",
+        "TIME",
+    ),
+    "subject": Option("Identifier of the animal, for NWB.", "NAME"),
+    "species": Option("Species of the animal, for NWB: `Rattus norvegicus`.", "NAME"),
     "all": Option("List every group and variable too."),
     "example": Option("Print a file with all that can be stated, and stop."),
     "format": Option("May be repeated; png and pdf by default."),

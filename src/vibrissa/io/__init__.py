@@ -37,6 +37,7 @@ from vibrissa.io.paths import (
     replacing,
     without_part,
 )
+from vibrissa.io.predictor_table import save_predictors
 from vibrissa.io.recording import RECORDING_KIND, load_recording, save_recording
 from vibrissa.io.rosbag import BagMessage, ContactBag, bag_poses, bag_wrenches, is_bag
 from vibrissa.io.signals_table import check_scale, load_signals, save_signals
@@ -156,6 +157,7 @@ __all__ = [
     "save_contour",
     "save_corrections",
     "save_nwb",
+    "save_predictors",
     "save_recording",
     "save_signals",
     "save_traces",

@@ -34,21 +34,23 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-_FORCES = {
-    "force": ("newtons", "Force of the object on the whisker"),
-    "moment": ("newton-metres", "Moment of that force about the whisker's base"),
-}
-_POINTS = {
-    "contact_point": "Where the whisker touches the object",
-    "contact_point_whisker": "Where the whisker touches the object",
-    "base_position": "Base of the whisker",
-}
-_ROTATIONS = {
-    "base_rotation": "Rotation from the whisker's to the laboratory frame, of the whisker",
-    "head_rotation": "Rotation from the head's to the laboratory frame",
+_TURN = "Rotation from the {} to the laboratory frame; its columns are the axes"
+_SERIES = {
+    "contact_point": ("meters", "Where the whisker touches the object; x, y, z"),
+    "contact_point_whisker": ("meters", "Where the whisker touches the object; x, y, z"),
+    "base_position": ("meters", "Base of the whisker; x, y, z"),
+    "base_rotation": ("n.a.", _TURN.format("whisker's")),
+    "force": ("newtons", "Force of the object on the whisker; x, y, z"),
+    "moment": ("newton-metres", "Moment of that force about the whisker's base; x, y, z"),
+    "head_position": ("meters", "Origin of the head's frame; x, y, z"),
+    "head_rotation": ("n.a.", _TURN.format("head's")),
 }
 # Validators require these; each value states that it is unknown.
 _NOBODY = {"subject_id": "unknown", "sex": "U", "age": "P0D/", "description": "not stated"}
+
+
+_VECTORS = 2
+"""Number of dimensions of vectors over time."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,10 @@ class Session:
 
 
 def save_nwb(
-    path: str | PathLike[str], recording: xr.DataTree | xr.Dataset, session: Session
+    path: str | PathLike[str],
+    recording: xr.DataTree | xr.Dataset,
+    session: Session,
+    predictors: xr.Dataset | None = None,
 ) -> None:
     """Write a recording, or tracks, as NWB.
 
@@ -97,6 +102,9 @@ def save_nwb(
         is left out.
     session : Session
         What else the file must say.
+    predictors : xarray.Dataset, optional
+        Table of `vibrissa.pipeline.predictors`, whose 16 predictors of models of spikes are written
+        as one series for each whisker.
 
     Raises
     ------
@@ -122,7 +130,7 @@ def save_nwb(
         # The names of the views may stand above.
         cameras = recording.children["cameras"].to_dataset()
     file = _file(session)
-    _fill(file, data, cameras)
+    _fill(file, data, cameras, predictors)
     with replacing(path) as part:
         # In memory first, for the reason given in :mod:`vibrissa.io.netcdf`.
         image = io.BytesIO()
@@ -136,7 +144,7 @@ def _check(data: xr.Dataset) -> None:
         raise ValueError("the time of what is to be written is not in seconds: give fps")
     if "whisker" not in data.dims:
         raise ValueError("what is to be written has no dimension whisker")
-    known = {"trace", "centerline", "base_rotation", *_FORCES, *_POINTS}
+    known = {"trace", "centerline", *_SERIES} - {"head_position", "head_rotation"}
     if not known & set(data.data_vars):
         raise ValueError(f"there is nothing to write: none of {', '.join(sorted(known))}")
 
@@ -154,7 +162,12 @@ def _file(session: Session) -> NWBFile:
     )
 
 
-def _fill(file: NWBFile, data: xr.Dataset, cameras: xr.Dataset | None) -> None:
+def _fill(
+    file: NWBFile,
+    data: xr.Dataset,
+    cameras: xr.Dataset | None,
+    predictors: xr.Dataset | None,
+) -> None:
     from ndx_pose import Skeletons
 
     behavior = file.create_processing_module("behavior", "Whiskers, what they feel, and contacts")
@@ -172,9 +185,11 @@ def _fill(file: NWBFile, data: xr.Dataset, cameras: xr.Dataset | None) -> None:
         whisker = data.isel(whisker=i)
         if poses:
             behavior.add(_pose(name, whisker, clock, devices, skeletons))
-        for series in _series(name, whisker, clock):
+        for series in _series(whisker, clock, name):
             behavior.add(series)
-    for series in _of_head(data, clock):
+        if predictors is not None:
+            behavior.add(_predictors(predictors, i, name, clock))
+    for series in _series(data, clock):
         behavior.add(series)
     if "in_contact" in data:
         _add_contacts(file, data)
@@ -319,66 +334,46 @@ def _squeezed(values: Array) -> Any:
     return H5DataIO(values, compression="gzip", compression_opts=1, shuffle=True)
 
 
-def _series(name: str, whisker: xr.Dataset, clock: dict[str, Any]) -> Iterator[Any]:
-    """Points, forces and moments of one whisker over time."""
+def _series(data: xr.Dataset, clock: dict[str, Any], whisker: str | None = None) -> Iterator[Any]:
+    """Series over time of one whisker, or of the head."""
     from pynwb import TimeSeries
     from pynwb.behavior import SpatialSeries
 
-    for variable, text in _POINTS.items():
-        if variable in whisker:
-            values = whisker[variable].transpose("time", "space")
-            yield SpatialSeries(
-                name=f"{variable}_{name}",
-                description=f"{text} {name}; x, y, z, NaN where there is none",
-                data=_squeezed(values.values),
-                unit="meters",
-                reference_frame=str(values.attrs.get("reference_frame", "laboratory")),
-                **clock,
-            )
-    if "base_rotation" in whisker:
-        rotation = whisker["base_rotation"]
-        yield _rotations(f"base_rotation_{name}", "base_rotation", rotation, clock)
-    for variable, (unit, text) in _FORCES.items():
-        if variable in whisker:
-            values = whisker[variable].transpose("time", "space")
-            frame = values.attrs.get("reference_frame", "whisker")
-            yield TimeSeries(
-                name=f"{variable}_{name}",
-                description=f"{text} {name}; x, y, z, reference_frame: {frame}",
-                data=_squeezed(values.values),
-                unit=unit,
-                **clock,
-            )
+    for variable, (unit, text) in _SERIES.items():
+        if variable not in data or variable.startswith("head_") != (whisker is None):
+            continue
+        values = data[variable].transpose("time", "space", ...)
+        frame = str(values.attrs.get("reference_frame", "laboratory"))
+        made: Any = TimeSeries
+        named = {"name": variable if whisker is None else f"{variable}_{whisker}", "unit": unit}
+        if unit == "meters":
+            made = SpatialSeries
+            named["reference_frame"] = frame
+        elif values.ndim == _VECTORS:
+            text += f", reference_frame: {frame}"
+        yield made(
+            description=f"{text}; NaN where there is none",
+            data=_squeezed(values.values),
+            **named,
+            **clock,
+        )
 
 
-def _rotations(name: str, variable: str, rotation: xr.DataArray, clock: dict[str, Any]) -> Any:
-    """Rotations over time: columns are the moving frame's axes in the laboratory."""
+def _predictors(table: xr.Dataset, whisker: int, name: str, clock: dict[str, Any]) -> Any:
+    """Predictors of models of spikes, as columns of one series."""
     from pynwb import TimeSeries
 
+    columns = table.attrs["predictors"].split()
+    one = table.isel(whisker=whisker)
+    units = ", ".join(f"{column} ({one[column].attrs['units']})" for column in columns)
     return TimeSeries(
-        name=name,
-        description=f"{_ROTATIONS[variable]}; its columns are the axes",
-        data=_squeezed(rotation.transpose("time", "space", ...).values),
+        name=f"predictors_{name}",
+        description=f"Columns: {units}; NaN where there is none",
+        comments=" ".join(columns),
+        data=_squeezed(np.stack([one[column].values for column in columns], axis=1)),
         unit="n.a.",
         **clock,
     )
-
-
-def _of_head(data: xr.Dataset, clock: dict[str, Any]) -> Iterator[Any]:
-    """How the head is held."""
-    from pynwb.behavior import SpatialSeries
-
-    if "head_position" in data:
-        yield SpatialSeries(
-            name="head_position",
-            description="Origin of the head's frame; x, y, z",
-            data=_squeezed(data["head_position"].transpose("time", "space").values),
-            unit="meters",
-            reference_frame="laboratory",
-            **clock,
-        )
-    if "head_rotation" in data:
-        yield _rotations("head_rotation", "head_rotation", data["head_rotation"], clock)
 
 
 def _add_contacts(file: NWBFile, data: xr.Dataset) -> None:

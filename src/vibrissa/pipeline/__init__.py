@@ -8,6 +8,7 @@ from vibrissa.pipeline.estimates import (
 )
 from vibrissa.pipeline.frames import check_recording, whisker_radii
 from vibrissa.pipeline.locate import DETECTED, TRIPLET, component_noise, locate, locate_from_wrench
+from vibrissa.pipeline.predictors import PREDICTORS, predictors
 from vibrissa.pipeline.reconstruct import (
     AGREES,
     ANGLE_CLASSES,
@@ -42,6 +43,7 @@ __all__ = [
     "AGREES",
     "ANGLE_CLASSES",
     "DETECTED",
+    "PREDICTORS",
     "SOLVED_TO",
     "STAGES",
     "STRONG",
@@ -65,6 +67,7 @@ __all__ = [
     "locate",
     "locate_from_wrench",
     "placed_by",
+    "predictors",
     "reconstruct",
     "sensor_noise",
     "signals_of",

@@ -1,0 +1,77 @@
+"""`vibrissa export`: a trial as a table of predictors for other programs."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Literal
+
+from vibrissa.cli.inputs import recording_from
+from vibrissa.cli.options import RecordingArgument, free, refuse, with_options
+from vibrissa.cli.terminal import remark, say
+
+
+@with_options("the table, by default next to the recording: NAME.csv, NAME.nwb or NAME.mat")
+def export(
+    recording: RecordingArgument,
+    to: Literal["csv", "nwb", "mat"] = "csv",
+    target: Path | None = None,
+    session_start: str | None = None,
+    subject: str | None = None,
+    species: str | None = None,
+    force: bool = False,
+) -> None:
+    """Write per frame and whisker what an analysis needs: forces, angles, their rates, contacts.
+
+    The table holds force and moment, the six signals, the pose of the base, rates of change,
+    contact points and flags, in SI units; every column is described in the file. Signals are made
+    first where there are none, by `vibrissa signals`. NWB holds the tracked whisker too.
+    Example: `vibrissa export trial.nc --to nwb --session-start 2026-03-01T14:30+01:00`
+    """
+    from vibrissa.io import Session, check_writable, save_nwb, save_predictors
+    from vibrissa.pipeline import predictors, with_signals
+
+    ending = f".{to}"
+    target = recording.with_suffix(ending) if target is None else target
+    check_writable(target, (ending,))
+    free([target], force)
+    if to != "nwb":
+        about = {"--session-start": session_start, "--subject": subject, "--species": species}
+        refuse(about, "only NWB states it")
+    tree = recording_from(recording)
+    if "signals" not in tree.children:
+        remark("the recording has no signals yet: they are made as `vibrissa signals` makes them")
+        tree = with_signals(tree)
+    table = predictors(tree)
+    if to == "nwb":
+        animal = {"subject_id": subject, "species": species}
+        stated = {name: value for name, value in animal.items() if value is not None}
+        session = Session(_start(session_start, recording), subject=stated)
+        save_nwb(target, tree, session, predictors=table)
+    else:
+        save_predictors(target, table)
+    touching = int(table["in_contact"].sum()) if "in_contact" in table else 0
+    say(
+        f"{table.sizes['time']} frames of {table.sizes['whisker']} whiskers, {touching} in "
+        f"contact; {len(table)} columns, {len(table.attrs['predictors'].split())} of them "
+        "predictors of models of spikes"
+    )
+    say(f"wrote {target}")
+
+
+def _start(text: str | None, recording: Path) -> datetime:
+    """When the session began; by default when the file was written."""
+    if text is None:
+        start = datetime.fromtimestamp(recording.stat().st_mtime, UTC)
+        remark(f"--session-start is not stated: {start:%Y-%m-%dT%H:%MZ}, when {recording} was made")
+        return start
+    try:
+        start = datetime.fromisoformat(text)
+    except ValueError:
+        start = datetime.min
+    if start.tzinfo is None:
+        raise ValueError(
+            f"--session-start is {text!r}; a date and time with its zone is needed, such as "
+            "2026-03-01T14:30+01:00"
+        )
+    return start

@@ -1,0 +1,138 @@
+"""A trial as a table of predictors: what a model of spikes, or any statistics, starts from.
+
+Models that relate the responses of primary sensory neurons to a whisker's mechanics take 16
+predictors: three components of force, three of moment, two angles of the whisker's base, and the
+rate of change of these eight (Bush, Solla & Hartmann 2021, doi:10.1073/pnas.2020194118). They are
+columns of this table, with the six signals, the remaining pose, contacts and flags.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from vibrissa.quantities import attributes
+from vibrissa.recording import Recording
+from vibrissa.signals import base_signals
+from vibrissa.status import flag_attributes
+from vibrissa.whisker import angles_of
+
+Array = NDArray[np.float64]
+
+_COMPONENTS = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
+_ANGLES = ("base_azimuth", "base_elevation", "base_roll")
+_RATE = "_rate"
+
+PREDICTORS = (
+    *_COMPONENTS,
+    *_ANGLES[:2],
+    *(name + _RATE for name in (*_COMPONENTS, *_ANGLES[:2])),
+)
+"""Names of the 16 columns that models of spikes use."""
+
+_GROUPS = ("signals", "", "truth")
+"""Groups that hold force, moment and pose, the first one that has them counts."""
+
+
+def predictors(recording: xr.DataTree) -> xr.Dataset:
+    """List per frame and whisker what an analysis of a trial needs.
+
+    Parameters
+    ----------
+    recording : xarray.DataTree
+        Recording with force and moment, best with the group ``signals``; contact points are those
+        of ``estimates`` or, without, of the recording.
+
+    Returns
+    -------
+    xarray.Dataset
+        Variables over (time, whisker), SI units, each with ``units``, ``long_name`` and
+        ``description``: the six components of force and moment, the signals, the angles of the
+        base and its position, the rates of change of components and angles, the contact point in
+        the laboratory and its arc length, ``in_contact``, ``status`` and ``confidence``. The
+        attribute ``predictors`` names the 16 of models of spikes. Missing is NaN.
+
+    Raises
+    ------
+    ValueError
+        If force and moment are not known.
+    """
+    record = Recording(recording)
+    force, moment = (record.known(name, _GROUPS) for name in ("force", "moment"))
+    if force is None or moment is None:
+        raise ValueError("the recording has no force and moment yet: run `vibrissa signals` first")
+    columns = dict(
+        zip(_COMPONENTS, np.moveaxis(np.concatenate([force, moment], -1), -1, 0), strict=True)
+    )
+    signals = base_signals(force, moment)
+    columns |= {name: signals[name].values for name in ("FT", "FD", "MB", "MD")}
+    rotation = record.known("base_rotation", _GROUPS)
+    if rotation is not None:
+        angles = _angles(rotation)
+        columns |= {name: angles[..., i] for i, name in enumerate(_ANGLES)}
+    time = record.root.data["time"].values
+    rates = {
+        name + _RATE: _rate(columns[name], time)
+        for name in (*_COMPONENTS, *_ANGLES)
+        if name in columns
+    }
+    position = record.known("base_position", _GROUPS)
+    point = record.known("contact_point", ("estimates", "", "truth"))
+    arc = record.known("arc_length", ("estimates", "", "truth"))
+    columns |= rates
+    for name, values in (("base_position", position), ("contact_point", point)):
+        if values is not None:
+            columns |= {f"{name}_{axis}": values[..., i] for i, axis in enumerate("xyz")}
+    others = {
+        "arc_length": arc,
+        "in_contact": record.known("in_contact", _GROUPS),
+        "status": record.known("status", ("estimates", *_GROUPS)),
+        "confidence": record.known("confidence", ("",)),
+    }
+    columns |= {name: values for name, values in others.items() if values is not None}
+    data = {
+        name: xr.Variable(("time", "whisker"), values, _about(name))
+        for name, values in columns.items()
+    }
+    coordinates = {"time": ("time", time, attributes("time")), "whisker": record.names}
+    there = [name for name in PREDICTORS if name in data]
+    return xr.Dataset(data, coordinates, {"predictors": " ".join(there)})
+
+
+def _angles(rotation: Array) -> Array:
+    """Azimuth, elevation and roll (time, whisker, 3); NaN where the pose is missing."""
+    out = np.full(rotation.shape[:-1], np.nan)
+    known = np.isfinite(rotation).all(axis=(-2, -1))
+    out[known] = angles_of(rotation[known])
+    return out
+
+
+def _rate(values: Array, time: Array) -> Array:
+    """Central difference over time; NaN next to what is missing."""
+    if len(time) < 2:
+        return np.full(values.shape, np.nan)
+    return np.asarray(np.gradient(values, time, axis=0))
+
+
+def _about(name: str) -> dict[str, object]:
+    """Unit and meaning of a column."""
+    if name == "status":
+        return {**attributes(name), **flag_attributes()}
+    plain = name.removesuffix(_RATE)
+    if plain != name:
+        known = attributes(plain)
+        return {
+            "units": f"{known['units']}/s",
+            "long_name": f"rate of change of {known['long_name']}",
+            "description": "Central difference over the frames before and after.",
+        }
+    stem, _, axis = name.rpartition("_")
+    if stem in ("base_position", "contact_point"):
+        known = attributes(stem)
+        return {
+            **known,
+            "long_name": f"{known['long_name']}, {axis}",
+            "description": "Laboratory frame.",
+        }
+    return dict(attributes(name))

@@ -1,0 +1,103 @@
+"""The table of predictors, against a trial whose every number is known in closed form."""
+
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy.io import loadmat
+from scipy.spatial.transform import Rotation
+
+import vibrissa as vb
+from vibrissa.io import Session, save_nwb, save_predictors
+from vibrissa.pipeline import PREDICTORS, predictors
+from vibrissa.recording import coordinates, recorded, recording_tree
+
+TIME = np.arange(200) / 1000.0
+
+
+@pytest.fixture(scope="module")
+def trial():
+    """Two whiskers that turn about z while their force swings; one is lost for a while."""
+    n = len(TIME)
+    swing = np.sin(2.0 * np.pi * 5.0 * TIME)
+    force = np.zeros((n, 2, 3))
+    force[:, 0, 1], force[:, 1, 0] = 1e-4 * swing, -2e-4
+    moment = np.zeros((n, 2, 3))
+    moment[:, 0, 2] = 3e-6 * swing
+    force[40:50, 1] = np.nan
+    turn = Rotation.from_rotvec(0.3 * swing[:, None] * [0.0, 0.0, 1.0]).as_matrix()
+    values = {
+        "force": force,
+        "moment": moment,
+        "base_rotation": np.stack([turn, turn], axis=1),
+        "base_position": np.zeros((n, 2, 3)),
+        "in_contact": np.abs(force).sum(axis=-1) > 5e-5,
+        "status": np.zeros((n, 2), dtype=np.int8),
+    }
+    root = xr.Dataset(
+        {name: recorded(name, array) for name, array in values.items()},
+        coordinates(TIME, ["C1", "C2"]),
+    )
+    return recording_tree(root, [vb.samples.gamma()] * 2, "made by hand")
+
+
+def test_columns_and_rates(trial):
+    table = predictors(trial)
+    assert len(PREDICTORS) == 16
+    assert table.attrs["predictors"].split() == list(PREDICTORS)
+    omega = 2.0 * np.pi * 5.0
+    inner = slice(1, -1)
+    one = table.sel(whisker="C1")
+    np.testing.assert_allclose(one["FT"], np.abs(one["Fy"]), atol=1e-18)
+    np.testing.assert_allclose(one["base_azimuth"], 0.3 * np.sin(omega * TIME), atol=1e-12)
+    for name, size in (("Fy_rate", 1e-4), ("Mz_rate", 3e-6), ("base_azimuth_rate", 0.3)):
+        expected = size * omega * np.cos(omega * TIME)
+        np.testing.assert_allclose(one[name][inner], expected[inner], atol=2e-4 * size * omega)
+    assert one["Fy_rate"].attrs["units"] == "N/s"
+    assert all(one[name].attrs["units"] and one[name].attrs["long_name"] for name in one)
+    other = table.sel(whisker="C2")
+    assert np.isnan(other["Fx_rate"].values[39:51]).all()
+    assert np.isfinite(other["Fx_rate"].values[60:]).all()
+
+
+def test_a_recording_without_forces_says_what_to_run(trial):
+    root = trial.to_dataset().drop_vars(["force", "moment"])
+    with pytest.raises(ValueError, match="vibrissa signals"):
+        predictors(recording_tree(root, [vb.samples.gamma()] * 2, "made by hand"))
+
+
+def test_read_by_pandas_and_in_matlabs_layout(trial, tmp_path):
+    pandas = pytest.importorskip("pandas")
+    table = predictors(trial)
+    save_predictors(tmp_path / "t.csv", table)
+    frame = pandas.read_csv(tmp_path / "t.csv", comment="#")
+    assert len(frame) == 2 * len(TIME)
+    assert set(PREDICTORS) <= set(frame.columns)
+    first = frame[frame.whisker == "C1"]
+    np.testing.assert_array_equal(first["Mz_rate"], table["Mz_rate"].sel(whisker="C1"))
+    assert set(first["in_contact"]) == {0, 1}
+    described = [line for line in (tmp_path / "t.csv").read_text().splitlines() if line[0] == "#"]
+    assert len(described) == len(table) + 1
+    save_predictors(tmp_path / "t.mat", table)
+    found = loadmat(tmp_path / "t.mat", squeeze_me=True, simplify_cells=True)
+    np.testing.assert_array_equal(found["Mz"], table["Mz"].values)
+    assert found["units"]["Mz_rate"] == "N m/s"
+    assert list(found["whisker"]) == ["C1", "C2"]
+    assert list(found["predictors"]) == list(PREDICTORS)
+
+
+def test_nwb_holds_them_and_is_valid(trial, tmp_path):
+    pynwb = pytest.importorskip("pynwb")
+    inspector = pytest.importorskip("nwbinspector")
+    table = predictors(trial)
+    subject = {"subject_id": "rat7", "species": "Rattus norvegicus"}
+    session = Session(datetime(2026, 3, 1, 14, 30, tzinfo=UTC), subject=subject)
+    save_nwb(tmp_path / "t.nwb", trial, session, table)
+    with pynwb.NWBHDF5IO(tmp_path / "t.nwb", "r") as file:
+        series = file.read().processing["behavior"]["predictors_C1"]
+        assert series.comments.split() == list(PREDICTORS)
+        np.testing.assert_array_equal(series.data[:, 1], table["Fy"].sel(whisker="C1"))
+    least = inspector.Importance.BEST_PRACTICE_VIOLATION
+    worst = inspector.inspect_nwbfile(nwbfile_path=tmp_path / "t.nwb")
+    assert [m.message for m in worst if m.importance.value >= least.value] == []

@@ -170,3 +170,22 @@ def test_maps_begin_where_they_are_asked_to(folder, tmp_path):
 )
 def test_what_is_no_prior_is_refused(folder, words, said):
     assert said in fault("estimate", folder / "signals.csv", *words)
+
+
+def test_friction_is_allowed_for_in_what_estimate_writes(folder, tmp_path, bent):
+    """Of contacts without friction the estimates stay, and their uncertainty grows."""
+    how = ("--map", folder / "map.nc", "--using", "Fx,FT,MB,MD")
+    table = estimated(folder, tmp_path, *how, "--friction-sigma", 0.3)
+    plain = estimated(folder, tmp_path, *how)
+    known = np.isfinite(table["sigma_x"].values) & np.isfinite(plain["sigma_x"].values)
+    assert known.sum() > 20
+    assert np.median(table["sigma_x"].values[known] / plain["sigma_x"].values[known]) > 1.2
+    error = np.stack([table[axis].values for axis in "xyz"], axis=-1) - bent[1]
+    sigma = np.stack([table[f"sigma_{axis}"].values for axis in "xyz"], axis=-1)
+    assert (np.abs(error / sigma)[known] < 3.0).mean() > 0.9
+
+
+@pytest.mark.parametrize("how", [("--using", "wrench"), ("--method", "lookup")])
+def test_friction_is_refused_where_it_has_no_effect(folder, how):
+    said = fault("estimate", folder / "signals.csv", *how, "--friction-sigma", 0.3)
+    assert "--friction-sigma" in said

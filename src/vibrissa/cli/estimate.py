@@ -45,6 +45,7 @@ class EstimateOptions:
     using: str | None = None
     method: Method = "exact"
     proximal: float | None = None
+    friction_sigma: float = 0.0
     noise: NoiseOptions
     assumed: AssumptionOptions
     own: WhiskerOptions
@@ -60,6 +61,11 @@ class EstimateOptions:
             raise ValueError(
                 f"--method {self.method} needs three signals; got {len(names)}: {', '.join(names)}"
             )
+        rubbing = {"--friction-sigma": self.friction_sigma or None}
+        if self.whole:
+            refuse(rubbing, "--using wrench finds the friction itself")
+        if self.method != "exact":
+            refuse(rubbing, f"--method {self.method} presumes that there is no friction")
         if self.map and self.own.whisker is not None:
             raise ValueError("give either --map or --whisker: a map already has its whisker")
         if self.whole:
@@ -89,7 +95,12 @@ class EstimateOptions:
     def given(self) -> bool:
         """Whether anything is stated, so that contacts are to be estimated anew."""
         stated = (self.map, self.using, self.own.whisker, self.noise.given)
-        other = (self.method != "exact", self.proximal is not None, self.assumed.described())
+        other = (
+            self.method != "exact",
+            self.proximal is not None,
+            self.friction_sigma,
+            self.assumed.described(),
+        )
         return any(bool(one) for one in (*stated, *other))
 
     @property
@@ -100,12 +111,19 @@ class EstimateOptions:
 
     def keywords(self) -> dict[str, Any]:
         """Options of all functions that estimate."""
-        return {"method": self.method, "errors": self.assumed.errors, "prior": self.assumed.prior}
+        return {
+            "method": self.method,
+            "errors": self.assumed.errors,
+            "prior": self.assumed.prior,
+            "friction": self.friction_sigma,
+        }
 
     def described(self, names: str, noise: str, least: float) -> str:
         """State from which signals contacts are found, and what is known beforehand."""
         by = "" if self.method == "exact" else f" by {self.method}"
         used = f"signals ({', '.join(names.split())}){by}"
+        if self.friction_sigma:
+            used += f", with friction along the whisker of {self.friction_sigma:g} (one sigma)"
         return (
             f"{'force and moment whole' if names == WRENCH else used}{self.assumed.described()}; "
             f"{noise}; contacts are measured where M_B exceeds {shown('MB', least)}"
@@ -221,7 +239,7 @@ def estimated(
     print_notes(*whiskers)
     for k, whisker in enumerate(whiskers):
         _check_scale(name, signals.isel(whisker=k), whisker)
-    by_default = how.using is None and how.method == "exact"
+    by_default = how.using is None and how.method == "exact" and not how.friction_sigma
     whole = how.whole or (by_default and source == "rod")
     if not maps and not whole:
         one = f"no map given; simulating that of {whiskers[0]!r}"

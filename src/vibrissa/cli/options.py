@@ -162,6 +162,11 @@ OPTIONS = {
         "%",
         least=0.0,
     ),
+    "friction_sigma": Option(
+        "Standard deviation of the ratio of the force along the whisker to that across it, such as "
+        "0.3 where coefficients of friction are up to 0.5; 0, the default: no friction.",
+        least=0.0,
+    ),
     "gain_sigma": Option(
         "Standard deviation of the gain of each component of force and moment, %; likewise.",
         "%",

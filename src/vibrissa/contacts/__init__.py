@@ -6,6 +6,7 @@ from vibrissa.contacts.contact_map import ContactMap, Domain, Progress, within_p
 from vibrissa.contacts.contacts import Candidates, Contact, Contacts, contacts_of, spherical
 from vibrissa.contacts.estimator import Estimator, signals_at_nodes
 from vibrissa.contacts.filter import ContactFilter, Followed
+from vibrissa.contacts.friction import ratio_derivatives
 from vibrissa.contacts.inversion import invert, seeding_triplet
 from vibrissa.contacts.jacobian import (
     RANK,
@@ -57,6 +58,7 @@ __all__ = [
     "estimate_from_wrench",
     "invert",
     "large_deflection",
+    "ratio_derivatives",
     "rms_error",
     "seeding_triplet",
     "signals_at_nodes",

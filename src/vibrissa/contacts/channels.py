@@ -19,8 +19,10 @@ from vibrissa.signals import SIGNALS, signal_scales, signals_of, wrench_derivati
 
 #: What can be fitted to: the signals, and the components that they are made of.
 CHANNELS = (*SIGNALS, "Fy", "Fz", "My", "Mz")
-#: What can be held on to as well: arc length and contact point, over L.
-FITTED = (*CHANNELS, "s", "px", "py", "pz")
+#: What can be held on to as well: arc length and contact point, over L, and the force along the
+#: whisker over that across it.
+FITTED = (*CHANNELS, "s", "px", "py", "pz", "ratio")
+RATIO = FITTED.index("ratio")
 #: Which of the channels are angles.
 CIRCULAR = (*CIRCULAR_SIGNALS, False, False, False, False)
 #: The six components of force and moment.

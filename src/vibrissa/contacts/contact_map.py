@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 
 from vibrissa.contacts.contacts import Contacts, spherical
 from vibrissa.contacts.estimator import estimate
+from vibrissa.contacts.friction import estimate_with_friction
 from vibrissa.contacts.inversion import triplet_tree
 from vibrissa.contacts.jacobian import determining
 from vibrissa.contacts.noise import common_errors
@@ -131,6 +132,7 @@ class ContactMap:
         gain_sigma: float | ArrayLike = 0.0,
         mixing_sigma: float | ArrayLike = 0.0,
         prior: Prior | None = None,
+        friction: float = 0.0,
     ) -> Contacts:
         """Find the contacts that explain measured signals.
 
@@ -157,6 +159,12 @@ class ContactMap:
             the cross-talk among forces, and among moments. It needs noise.
         prior : Prior, optional
             Possible contacts; others are left out of the candidates.
+        friction : float
+            Standard deviation of the ratio µ_x of the force along the whisker to that across it,
+            which is 0 in the mean, such as 0.3 where coefficients of friction are up to 0.5; 0, the
+            default, for contacts without friction. It needs noise. With F_T among four or more
+            signals, µ_x is found with the contact; with three the covariance contains what it
+            leaves open. The wrench needs none.
 
         Returns
         -------
@@ -166,6 +174,8 @@ class ContactMap:
         errors = common_errors(stiffness_sigma, gain_sigma, mixing_sigma)
         if using == "wrench":
             return estimate_components(self.whisker, signals, noise, errors, prior)
+        if friction != 0.0:
+            return estimate_with_friction(self, signals, using, noise, errors, prior, friction)
         return estimate(self, signals, using, noise, errors, prior)
 
     def tree(self, triplet: tuple[str, ...]) -> SearchTree:

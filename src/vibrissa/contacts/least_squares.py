@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.channels import FITTED, channel_derivatives
+from vibrissa.contacts.channels import FITTED, RATIO, channel_derivatives
 from vibrissa.numerics import (
     AnyArray,
     Array,
@@ -104,6 +104,11 @@ def channel_equations(
     """Channels of x and (F, p) minus targets (k,), and their derivatives by x (k, 4)."""
     signal_equations(x[0], v, t, True, codes, residual, jacobian)
     for k in range(codes.shape[0]):
+        if codes[k] == RATIO:
+            normal = np.sqrt(x[2] * x[2] + x[3] * x[3])
+            residual[k] = x[1] / normal
+            jacobian[k, 0], jacobian[k, 1] = 0.0, 1.0 / normal
+            jacobian[k, 2], jacobian[k, 3] = -x[1] * x[2] / normal**3, -x[1] * x[3] / normal**3
         residual[k] -= targets[k]
         if codes[k] == 2 or codes[k] == 5:
             residual[k] = wrapped(residual[k])

@@ -62,6 +62,7 @@ def estimates_of(
     method: str = "exact",
     errors: Mapping[str, Any] | None = None,
     prior: Prior | None = None,
+    friction: float = 0.0,
     proximal: float = PROXIMAL,
     progress: Progress | None = None,
 ) -> xr.Dataset:
@@ -88,6 +89,9 @@ def estimates_of(
         the same errors in all frames. They need noise.
     prior : Prior, optional
         Which contacts are possible; others are left out of the candidates.
+    friction : float
+        Standard deviation of the ratio of the force along the whisker to that across it, as of
+        ``ContactMap.estimate``; 0, the default, for contacts without friction.
     proximal : float
         Smallest arc length of a contact of maps that are simulated, share of the length.
     progress : callable, optional
@@ -154,7 +158,14 @@ def estimates_of(
                 contact_map = ContactMap.simulate(whisker, grid=grid, proximal=proximal)
                 report("map of all contacts", k + 1, count)
             found = locate(
-                contact_map, wrench, names, noise=sigma, method=method, errors=errors, prior=prior
+                contact_map,
+                wrench,
+                names,
+                noise=sigma,
+                method=method,
+                errors=errors,
+                prior=prior,
+                friction=friction,
             )
         parts.append(_one_whisker(one, found, other_noise=noise is not None))
         report("contact points", k + 1, count)
@@ -167,6 +178,8 @@ def estimates_of(
     if method != "exact":
         about["method"] = method
     about |= errors or {}
+    if friction > 0.0:
+        about["friction"] = friction
     if prior is not None:
         about["prior"] = repr(prior)
     out.attrs = about

@@ -40,6 +40,7 @@ from vibrissa.contacts import (
     common_covariance,
     common_errors,
     estimate_from_wrench,
+    ratio_derivatives,
     whitening,
 )
 from vibrissa.quantities import attributes
@@ -106,6 +107,7 @@ def locate(
     method: str = "exact",
     errors: Mapping[str, Any] | None = None,
     prior: Prior | None = None,
+    friction: float = 0.0,
 ) -> xr.Dataset:
     """Estimate the contact point in every frame with a contact.
 
@@ -128,6 +130,9 @@ def locate(
         the same errors in all frames. They need noise.
     prior : Prior, optional
         Which contacts are possible; others are left out of the candidates.
+    friction : float
+        Standard deviation of the ratio of the force along the whisker to that across it, as of
+        ``ContactMap.estimate``; only with the exact method.
 
     Returns
     -------
@@ -151,7 +156,7 @@ def locate(
     signals = base_signals(measured.force[measured.rows], measured.moment[measured.rows])
     if method == "exact":
         found = contact_map.estimate(
-            signals, names, measured.typical, prior=prior, **(errors or {})
+            signals, names, measured.typical, prior=prior, friction=friction, **(errors or {})
         )
     else:
         from vibrissa.paper import estimate  # it loads what only comparisons need
@@ -167,7 +172,7 @@ def locate(
         found.status,
     )
     stated = every.covariance if method == "exact" else None
-    return _located(contact_map.whisker, names, measured, candidates, stated)
+    return _located(contact_map.whisker, names, measured, candidates, stated, friction)
 
 
 def without_contact(
@@ -316,6 +321,7 @@ def _located(
     measured: _Measured,
     found: _Candidates,
     stated: Array | None = None,
+    friction: float = 0.0,
 ) -> xr.Dataset:
     """Dataset of all frames from candidates of those with a contact.
 
@@ -325,7 +331,8 @@ def _located(
     rows = measured.rows
     shape = found.arc_lengths.shape
     flat = (found.arc_lengths.reshape(-1), found.contact_forces.reshape(-1, 3))
-    gain = gains(whisker, names, *flat, measured.typical, measured.errors).reshape(*shape, 6, 6)
+    gain = gains(whisker, names, *flat, measured.typical, measured.errors, friction)
+    gain = gain.reshape(*shape, 6, 6)
     normals = contact_normals(whisker, *flat).reshape(*shape, 3)
     point_gain = gain[..., :3, :]
     spread = point_gain @ measured.covariance[rows][:, None] @ np.swapaxes(point_gain, -1, -2)
@@ -359,7 +366,7 @@ def _located(
         _everywhere(rows, gain),
         {"units": "(m, 1)/(N, N m)", "long_name": "contact point and normal by force and moment"},
     )
-    if names == WRENCH:
+    if names == WRENCH or friction > 0.0:
         angle = np.arctan2(
             found.contact_forces[:, 0, 0], np.linalg.norm(found.contact_forces[:, 0, 1:], axis=-1)
         )
@@ -399,24 +406,29 @@ def gains(
     contact_force: Array,
     weighing: Array | None = None,
     errors: Array | None = None,
+    friction: float = 0.0,
 ) -> Array:
     """Derivatives (n, 6, 6) of contact points and normals with respect to the measured wrench."""
     d = discretize(whisker)
-    friction = signals == WRENCH
+    rubbing = signals == WRENCH or friction > 0.0
     x = np.concatenate([arc_length[:, None] / d.length, contact_force / d.force], axis=1)
     out = np.full((len(x), 6, 6), np.nan)
     rows = np.flatnonzero(np.isfinite(x).all(axis=1))
     if not rows.size:
         return out
     touch = _touch(d, x[rows])
-    free = [0, 1, 2, 3] if friction else _FREE
-    three = len(signals) == 3
-    channels = Channels(signals, signals) if three or friction else Channels.of(signals)
+    free = [0, 1, 2, 3] if rubbing else _FREE
+    three = len(signals) == 3 and not friction > 0.0
+    channels = Channels(signals, signals) if three or signals == WRENCH else Channels.of(signals)
     slopes = channel_derivatives(touch.values, touch.value_slopes[..., free], channels.names)
     by_wrench = channel_gradients(touch.values, channels.names)
     if not three:
         weights = _weights(d, channels, touch.values, weighing, errors)
         slopes, by_wrench = weights @ slopes, weights @ by_wrench
+    if friction > 0.0:  # the prior is one more measurement, which the wrench does not change
+        prior = ratio_derivatives(x[rows])[:, None] / friction
+        slopes = np.concatenate([slopes, prior], axis=1)
+        by_wrench = np.concatenate([by_wrench, np.zeros_like(by_wrench[:, :1])], axis=1)
     moved = np.concatenate([touch.value_slopes[:, 3:], touch.normal_slopes], axis=1)[..., free]
     inner = np.repeat([d.length, 1.0], 3)[:, None] / np.repeat([d.force, d.moment], 3)
     out[rows] = moved @ _inverse(slopes) @ by_wrench * inner

@@ -1,0 +1,427 @@
+"""Contacts with unknown friction along the whisker, from three signals or more.
+
+Friction adds one unknown: the ratio µ_x of the force along the whisker to that across it. With the
+prior µ_x ~ N(0, σ²) as one more channel, three signals have as many equations as unknowns.
+
+What measured signals leave open is a curve: one contact for each arc length s, as the force there
+has three components. It is short where four or more signals determine µ_x, and with three it bends
+too much for an ellipsoid. So it is traced along the whisker, finer where contacts are probable. The
+forces at s that noise leaves open have, to first order, a covariance C_f; with all contact points
+as probable beforehand, and ratios as said, the density of s is
+
+    exp(-χ²/2 - µ_x²/2σ²) |∂(p, µ_x)/∂(s, f)| √det C_f,
+
+and that of the contact point a mixture along the curve. Its second moment about the most probable
+of its contacts, widened for tails as in :mod:`~vibrissa.contacts.posterior`, is the covariance.
+Where the density has several peaks with valleys between, these are several candidates.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from vibrissa.contacts.channels import Channels, channel_derivatives
+from vibrissa.contacts.contacts import MOST_CANDIDATES, Candidates, Contacts, contacts_of
+from vibrissa.contacts.estimator import estimate
+from vibrissa.contacts.least_squares import Fits, fit
+from vibrissa.contacts.noise import Noise, SensorNoise, explained, sensor_noise, whitening
+from vibrissa.contacts.posterior import CERTAIN, NORMAL_KURTOSIS, ranked
+from vibrissa.contacts.prior import Prior, possible_candidates
+from vibrissa.numerics import AnyArray, Array, IntArray
+from vibrissa.signals import measured, selection, signal_scales
+from vibrissa.status import Status
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import ArrayLike
+
+    from vibrissa.contacts.charted_whisker import ChartedWhisker
+
+_UNKNOWNS = 4
+# The least standard deviation of the prior; with less there is no friction.
+_LEAST = 0.01
+# Arc lengths that curves are traced at, and about each peak so many more, so far, in standard
+# deviations of s.
+_STATIONS = 33
+_FINE, _REACH = 17, 4.0
+# How exactly an arc length is held.
+_HELD = 1e-5
+# Of a peak this much lower than the highest (log density) nothing is kept; two peaks are two
+# candidates where the valley between them is lower than both by so much.
+_LOW, _VALLEY = 15.0, 3.0
+# Parts that each step is divided into for the moments.
+_PARTS = 8
+# Measurements whose curves are traced together: some tens of MB.
+_TOGETHER = 1000
+# The largest kurtosis, relative to a normal distribution's, at which a covariance is relied on.
+_TAILED = 3.0
+
+
+class _Nodes(NamedTuple):
+    """Contacts on curves, by curve and arc length.
+
+    ``log`` is the log density of s, ``spread`` and ``angle_spread`` are the covariance of the
+    contact point and the variance of the friction angle at this s.
+    """
+
+    curve: IntArray
+    x: Array
+    values: Array
+    log: Array
+    spread: Array
+    angle_spread: Array
+    misfit: Array
+
+    @property
+    def s(self) -> Array:
+        return self.x[:, 0]
+
+    def rows(self, kept: AnyArray) -> _Nodes:
+        """Some of them."""
+        parts: list[Any] = [part[kept] for part in self]
+        return _Nodes(*parts)
+
+
+def _joined(parts: list[_Nodes]) -> _Nodes:
+    """Nodes of the same curves in order of s, each arc length once."""
+    together = _Nodes(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+    together = together.rows(np.lexsort((together.s, together.curve)))
+    new = (np.diff(together.curve, prepend=-1) > 0) | (np.diff(together.s, prepend=-1.0) > _HELD)
+    return together.rows(new)
+
+
+class _Measurements:
+    """Measurements of some signals, and the fits of contacts with friction to them."""
+
+    def __init__(
+        self,
+        contact_map: ChartedWhisker,
+        names: tuple[str, ...],
+        sensor: SensorNoise,
+        flat: Array,
+        spread: float,
+    ) -> None:
+        self.names, self.sensor, self.flat, self.spread = names, sensor, flat, spread
+        self.d = contact_map.chart.discretization
+        self.proximal = contact_map.chart.proximal
+        self.channels = Channels.of(names)
+        self.targets = self.channels.targets(flat)
+
+    def fit(
+        self, row: IntArray, x: Array, values: Array, held: bool = True
+    ) -> tuple[Fits, Array, Array]:
+        """Fit contacts to rows from starts x with (F, p), at their arc lengths or anywhere.
+
+        Also the derivatives of the channels by (s, f), in standard deviations, and χ² of the
+        signals alone.
+        """
+        k = len(self.channels.names)
+        weights = np.zeros((len(row), k + 2, k + 2))
+        covariance = self.channels.covariance(self.sensor, self.flat[row], values, self.d)
+        weights[:, :k, :k] = whitening(covariance)
+        weights[:, k, k] = 1.0 / self.spread
+        weights[:, k + 1, k + 1] = 1.0 / _HELD if held else 0.0
+        targets = np.column_stack([self.targets[row], np.zeros(len(row)), x[:, 0]])
+        names = (*self.channels.names, "ratio", "s")
+        fits = fit(self.d, names, targets, weights, x, friction=True, least=self.proximal)
+        ratio = _ratio(fits.contacts)
+        by = channel_derivatives(fits.values, fits.tangents, self.channels.names)
+        j = weights[:, :k, :k] @ by
+        j = np.concatenate([j, ratio_derivatives(fits.contacts)[:, None] / self.spread], axis=1)
+        return fits, np.nan_to_num(j), fits.misfits - (ratio / self.spread) ** 2
+
+    def nodes(self, curve: IntArray, row: IntArray, x: Array, values: Array) -> _Nodes:
+        """Contacts at the arc lengths of x that explain measurements best, where there are any."""
+        fits, j, misfit = self.fit(row, x, values)
+        by_force = j[:, :, 1:]
+        information = np.swapaxes(by_force, 1, 2) @ by_force
+        t, f = fits.tangents[:, 3:], ratio_derivatives(fits.contacts)
+        whole = np.concatenate([t, f[:, None]], axis=1)
+        with np.errstate(all="ignore"):
+            log = np.log(np.abs(np.linalg.det(np.nan_to_num(whole))))
+            log = log - 0.5 * np.linalg.slogdet(information)[1] - 0.5 * fits.misfits
+        there = np.isfinite(log) & (np.abs(fits.contacts[:, 0] - x[:, 0]) < 10.0 * _HELD)
+        there &= np.isfinite(fits.misfits)
+        log[~_upright(fits)] = -np.inf
+        x, values, t = fits.contacts[there], fits.values[there], t[there][:, :, 1:]
+        spread = np.linalg.inv(information[there])
+        across = t @ spread @ np.swapaxes(t, 1, 2)
+        turn = f[there][:, 1:] / (1.0 + _ratio(x)[:, None] ** 2)
+        turned = np.einsum("ni,nij,nj->n", turn, spread, turn)
+        return _Nodes(curve[there], x, values, log[there], across, turned, misfit[there])
+
+    def along(self, row: IntArray, x: Array, values: Array) -> _Nodes:
+        """Trace curves through contacts x of rows, from station to station both ways."""
+        stations = np.linspace(self.proximal, 1.0, _STATIONS)
+        nearest = np.abs(stations - x[:, :1]).argmin(axis=1)
+        parts = []
+        for way in (1, -1):
+            steps = range(_STATIONS)
+            now, at, v = np.arange(len(row)), x, values
+            for step in steps if way > 0 else steps[1:]:
+                place = nearest[now] + way * step
+                inside = (place >= 0) & (place < _STATIONS)
+                guess = at[inside]
+                guess[:, 0] = stations[place[inside]]
+                guess[:, 1:] *= at[inside, :1] / guess[:, :1]  # of the same moment
+                found = self.nodes(now[inside], row[now[inside]], guess, v[inside])
+                parts.append(found)
+                now, at, v = found.curve, found.x, found.values
+        return _joined(parts)
+
+    def finer(self, row: IntArray, nodes: _Nodes, starts: _Nodes) -> tuple[_Nodes, IntArray]:
+        """Add contacts about the peaks of the density, and about where the curves began.
+
+        What is left of a curve where the whisker has not slipped off may be several: also the row
+        of each.
+        """
+        peaks = _joined([nodes.rows(_peaks(nodes)), starts])
+        curve = peaks.curve
+        fits, j, _ = self.fit(row[curve], peaks.x, peaks.values, held=False)
+        with np.errstate(all="ignore"):
+            spread = np.linalg.pinv(np.swapaxes(j, 1, 2) @ j)
+            sigma = np.sqrt(spread[:, 0, 0])
+            along = spread[:, 0] / spread[:, :1, 0]
+        usable = np.isfinite(along).all(axis=1) & np.isfinite(fits.misfits)
+        curve, x = curve[usable], fits.contacts[usable]
+        sigma, along = sigma[usable], along[usable]
+        step = np.linspace(-_REACH, _REACH, _FINE)[:, None] * np.minimum(sigma, 0.25)
+        guess = x + step[..., None] * along
+        inside = (guess[..., 0] >= self.proximal) & (guess[..., 0] <= 1.0)
+        curves = np.broadcast_to(curve, step.shape)[inside]
+        values = np.broadcast_to(fits.values[usable], (*step.shape, 6))[inside]
+        more = self.nodes(curves, row[curves], guess[inside], values)
+        every = _joined([nodes, more])
+        stable = np.isfinite(every.log)
+        gap = np.cumsum(~stable) + every.curve
+        curve, number = every.curve[stable], np.cumsum(np.diff(gap[stable], prepend=-1) > 0) - 1
+        first = np.flatnonzero(np.diff(number, prepend=-1))
+        return every.rows(stable)._replace(curve=number), row[curve[first]]
+
+
+def _ratio(x: Array) -> Array:
+    """Ratios µ_x of contacts (n, 4)."""
+    return np.asarray(x[:, 1] / np.hypot(x[:, 2], x[:, 3]))
+
+
+def ratio_derivatives(x: Array) -> Array:
+    """Differentiate the ratio of the force along the whisker to that across it.
+
+    Parameters
+    ----------
+    x : (n, 4) array
+        Contacts (s, f_x, f_y, f_z), non-dimensional.
+
+    Returns
+    -------
+    (n, 4) array
+        Derivatives by these.
+    """
+    normal = np.hypot(x[:, 2], x[:, 3])
+    by = -x[:, 1:2] * x[:, 2:] / normal[:, None] ** 3
+    return np.column_stack([np.zeros(len(x)), 1.0 / normal, by])
+
+
+def _upright(fits: Fits) -> AnyArray:
+    """Which contacts are those of a whisker that has not slipped off, while the ratio is held."""
+    x, t = fits.contacts, np.nan_to_num(fits.tangents)
+    by_normal = (_ratio(x) / np.hypot(x[:, 2], x[:, 3]))[:, None] * x[:, 2:]
+    by = t[:, 3:, [0, 2, 3]].copy()
+    by[:, :, 1:] += t[:, 3:, 1:2] * by_normal[:, None, :]
+    return np.asarray(np.linalg.det(by) > 0.0)
+
+
+def _peaks(nodes: _Nodes) -> IntArray:
+    """Places of local maxima of the density."""
+    log = np.concatenate([[-np.inf], nodes.log, [-np.inf]])
+    curve = np.concatenate([[-1], nodes.curve, [-1]])
+    left = np.where(curve[:-2] == curve[1:-1], log[:-2], -np.inf)
+    right = np.where(curve[2:] == curve[1:-1], log[2:], -np.inf)
+    return np.flatnonzero((nodes.log >= left) & (nodes.log > right) & np.isfinite(nodes.log))
+
+
+class _Parts(NamedTuple):
+    """Parts of the steps after nodes: log probability, and the rest as of nodes."""
+
+    node: IntArray
+    log: Array
+    point: Array
+    spread: Array
+    angle: Array
+    angle_spread: Array
+
+
+def _parts(nodes: _Nodes) -> _Parts:
+    """Divide the steps between nodes.
+
+    The log density is a cubic between nodes, which meets a normal density exactly, and the rest is
+    linear.
+    """
+    same = nodes.curve[1:] == nodes.curve[:-1]
+    h = np.where(same, np.diff(nodes.s), np.nan)
+    rise = np.diff(nodes.log) / h
+    before, after = np.append(np.nan, h), np.append(h, np.nan)
+    left, right = np.append(np.nan, rise), np.append(rise, np.nan)
+    slope = (left * after + right * before) / (before + after)
+    slope = np.where(np.isnan(left), right, np.where(np.isnan(right), left, slope))
+    a = np.flatnonzero(same)
+    u = ((np.arange(_PARTS) + 0.5) / _PARTS)[:, None]
+    low, high = nodes.log[a], nodes.log[a + 1]
+    log = low * (1.0 + 2.0 * u) * (1.0 - u) ** 2 + high * u**2 * (3.0 - 2.0 * u)
+    log += h[a] * (slope[a] * u * (1.0 - u) ** 2 + slope[a + 1] * u**2 * (u - 1.0))
+    log = np.clip(log, np.minimum(low, high), np.maximum(low, high) + 0.5)
+
+    def between(values: Array) -> Array:
+        along = u.reshape(-1, *[1] * values.ndim)
+        inner = values[a] * (1.0 - along) + values[a + 1] * along
+        return np.asarray(inner.reshape(-1, *values.shape[1:]))
+
+    return _Parts(
+        np.tile(a, _PARTS),
+        (log + np.log(h[a] / _PARTS)).reshape(-1),
+        between(nodes.values[:, 3:]),
+        between(nodes.spread),
+        between(np.arctan(_ratio(nodes.x))),
+        between(nodes.angle_spread),
+    )
+
+
+def _divided(nodes: _Nodes) -> IntArray:
+    """Number of the candidate that each node belongs to: curves, divided in their valleys."""
+    out, number = np.zeros(len(nodes.log), np.int64), -1
+    first = np.flatnonzero(np.diff(nodes.curve, prepend=-1))
+    for begin, end in zip(first.tolist(), [*first[1:].tolist(), len(out)], strict=True):
+        number += 1
+        peak = valley = begin
+        for i in range(begin, end):
+            rising = nodes.log[i] - nodes.log[valley]
+            if nodes.log[i] < nodes.log[valley]:
+                valley = i
+            elif rising > _VALLEY and nodes.log[peak] - nodes.log[valley] > _VALLEY:
+                number += 1
+                out[valley:i] = number
+                peak = valley = i
+            if nodes.log[i] > nodes.log[peak]:
+                peak = valley = i
+            out[i] = number
+    return out
+
+
+def _stated(nodes: _Nodes, row: IntArray, n: int) -> Candidates:
+    """Candidates of n measurements from the curves of rows."""
+    part, own = _parts(nodes), _divided(nodes)
+    of, m = own[part.node], int(own.max(initial=-1)) + 1
+    top = np.full(m, -np.inf)
+    np.maximum.at(top, of, part.log)
+    share = np.exp(part.log - top[of])
+    total = np.bincount(of, share, m)
+    with np.errstate(invalid="ignore"):
+        share /= total[of]
+
+    def mean(values: Array) -> Array:
+        out = np.zeros((m, *values.shape[1:]))
+        np.add.at(out, of, share.reshape(-1, *[1] * (values.ndim - 1)) * values)
+        return out
+
+    middle = mean(part.point)
+    away = np.linalg.norm(nodes.values[:, 3:] - middle[own], axis=1)
+    order = np.lexsort((away, own))
+    lead = order[np.flatnonzero(np.diff(own[order], prepend=-1))]
+    y = part.point - nodes.values[lead, 3:][of]
+    second = mean(part.spread + y[:, :, None] * y[:, None, :])
+    usable = total > 0.0
+    root = np.linalg.inv(np.linalg.cholesky(np.where(usable[:, None, None], second, np.eye(3))))
+    z = np.einsum("nij,nj->ni", root[of], y)
+    s = root[of] @ part.spread @ np.swapaxes(root[of], 1, 2)
+    fourth = ((z**2).sum(axis=1) + np.trace(s, axis1=1, axis2=2)) ** 2
+    fourth += 2.0 * (s**2).sum(axis=(1, 2)) + 4.0 * np.einsum("ni,nij,nj->n", z, s, z)
+    tails = mean(fourth) / NORMAL_KURTOSIS
+    second *= (np.maximum(tails, 1.0) ** 0.75)[:, None, None]
+    turned = part.angle - np.arctan(_ratio(nodes.x[lead]))[of]
+    angle_sigma = np.sqrt(mean(turned**2 + part.angle_spread))
+    misfit = np.full(m, np.inf)
+    np.minimum.at(misfit, own, nodes.misfit)
+
+    out = Candidates.room(n)
+    rank = np.full((n, MOST_CANDIDATES), -np.inf)
+    weight = np.full(m, -np.inf)
+    weight[usable] = np.log(total[usable]) + top[usable]
+    for one in np.argsort(-weight):
+        i = row[nodes.curve[lead[one]]]
+        j = out.number[i]
+        if j == MOST_CANDIDATES or not weight[one] > rank[i, 0] - _LOW:
+            continue
+        out.number[i], rank[i, j] = j + 1, weight[one]
+        out.x[i, j], out.values[i, j] = nodes.x[lead[one]], nodes.values[lead[one]]
+        out.covariances[i, j], out.chi_squared[i, j] = second[one], misfit[one]
+        out.valid[i, j] = tails[one] < _TAILED
+        out.angle_sigma[i, j] = angle_sigma[one]
+    probability, _ = ranked(rank, out.number)
+    return out._replace(probability=probability)
+
+
+def _found(measurements: _Measurements, x: Array, values: Array) -> Candidates:
+    """Candidates of measurements whose contact without friction is x with (F, p), if any."""
+    rows = np.flatnonzero(np.isfinite(x).all(axis=1))
+    if not rows.size:
+        return Candidates.room(len(x))
+    x, values = x[rows], values[rows]
+    own = np.arange(rows.size)
+    starts = measurements.nodes(own, rows, x, values)
+    nodes = measurements.along(rows, x, values)
+    return _stated(*measurements.finer(rows, nodes, starts), len(measurements.flat))
+
+
+def estimate_with_friction(
+    contact_map: ChartedWhisker,
+    signals: xr.Dataset | Mapping[str, ArrayLike],
+    using: str | Sequence[str],
+    noise: Noise | None,
+    errors: Array,
+    prior: Prior | None,
+    spread: float,
+) -> Contacts:
+    """Find contacts whose friction along the whisker is not known; see the module."""
+    names = selection(using)
+    sensor = sensor_noise(noise, names, errors)
+    if sensor is None:
+        raise ValueError("friction is weighed against the noise of the signals: give its noise")
+    if not _LEAST <= spread < np.inf:
+        raise ValueError(
+            "friction is the standard deviation of the force along the whisker over that across "
+            f"it, at least {_LEAST:g}, such as 0.3; got {spread!r}"
+        )
+    start = estimate(contact_map, signals, names, noise, errors, None)
+    d = contact_map.chart.discretization
+    values, dims, coords = measured(signals, names)
+    flat = values.reshape(-1, len(names)) / signal_scales(names, d.force, d.moment)
+    x = np.column_stack(
+        [start.arc_length.reshape(-1) / d.length, start.contact_force.reshape(-1, 3) / d.force]
+    )
+    known = np.column_stack(
+        [start.force.reshape(-1, 3) / d.force, start.point.reshape(-1, 3) / d.length]
+    )
+    parts = [
+        _found(_Measurements(contact_map, names, sensor, flat[part], spread), x[part], known[part])
+        for part in (slice(i, i + _TOGETHER) for i in range(0, max(len(flat), 1), _TOGETHER))
+    ]
+    found = Candidates(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+    status = start.status.reshape(-1).copy()
+    some = found.number > 0
+    if prior is not None:
+        found = found.allowed_first(possible_candidates(prior, contact_map.whisker, d, found))
+        with np.errstate(invalid="ignore"):
+            found.probability[:] /= np.nansum(found.probability, axis=1, keepdims=True)
+        status[some & (found.number == 0)] = int(Status.OUTSIDE_PRIOR)
+        some = found.number > 0
+    sure = found.probability[:, 0] > CERTAIN
+    status[some] = np.where(sure, int(Status.UNIQUE), int(Status.AMBIGUOUS))[some]
+    far = found.chi_squared[:, 0] > explained(len(names) - _UNKNOWNS + 1)
+    status[some & far] = int(Status.NOT_ONE_CONTACT)
+    return contacts_of(
+        found, status, found.chi_squared[:, 0], d, names, values.shape[:-1], dims, coords
+    )

@@ -1,0 +1,81 @@
+"""Contacts with friction along the whisker: the truth is in the regions that are stated."""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+import vibrissa as vb
+
+NOISE = np.diag([1e-6**2] * 3 + [2e-8**2] * 3)
+COUNT = 60
+
+
+def rubbed(gamma_map, ratio, count=COUNT, seed=3):
+    """Contacts whose force is oblique by so much, their friction angles and noisy signals."""
+    rng = np.random.default_rng(seed)
+    nodes = gamma_map.to_dataset().isel(station=slice(3, None), load=slice(3, -2))
+    picked = rng.integers(0, nodes.arc_length.size, count)
+    arc = nodes.arc_length.to_numpy().reshape(-1)[picked]
+    bearing = np.broadcast_to(nodes.bearing.to_numpy()[:, None], nodes.arc_length.shape)
+    force = np.broadcast_to(nodes.fold_force.to_numpy()[:, :, None], nodes.arc_length.shape)
+    force = (force * nodes["load"].to_numpy() ** 2).reshape(-1)[picked]
+    angle = bearing.reshape(-1)[picked]
+    along = ratio * np.cos(rng.uniform(0.0, 2.0 * np.pi, count))
+    components = force * np.stack([along, np.cos(angle), np.sin(angle)])
+    bent = vb.deflect(gamma_map.whisker, vb.PointForce(arc, components=tuple(components)))
+    noise = rng.normal(size=(count, 6)) * np.sqrt(np.diag(NOISE))
+    signals = vb.base_signals(bent.force + noise[:, :3], bent.moment + noise[:, 3:])
+    return bent.contact_point, np.arctan(along), signals
+
+
+def held(found, truth):
+    """Share of the truths in the 95 % regions."""
+    away = found.point - truth
+    size = np.einsum("ni,nij,nj->n", away, np.linalg.inv(found.covariance), away)
+    return (size < chi2.isf(0.05, 3)).mean()
+
+
+def missed(found, truth):
+    return np.median(np.linalg.norm(found.point - truth, axis=1))
+
+
+@pytest.mark.parametrize("using", ["Fx FT MB MD", "Fx FT FD Mx MB MD"])
+def test_with_the_transverse_force_friction_is_found(gamma_map, using):
+    truth, angle, signals = rubbed(gamma_map, 0.4)
+    found = gamma_map.estimate(signals, using, NOISE, friction=0.3)
+    without = gamma_map.estimate(signals, using, NOISE)
+    assert missed(found, truth) < 0.5 * missed(without, truth)
+    assert held(found, truth) > 0.88
+    assert held(without, truth) < 0.6
+    assert (np.abs(found.friction_angle - angle) < 3.0 * found.friction_angle_sigma).mean() > 0.9
+
+
+@pytest.mark.parametrize("ratio", [0.0, 0.4])
+def test_three_signals_state_what_friction_leaves_open(gamma_map, ratio):
+    truth, _, signals = rubbed(gamma_map, ratio)
+    found = gamma_map.estimate(signals, noise=NOISE, friction=0.3)
+    assert np.isfinite(found.point).all()
+    assert held(found, truth) > 0.88
+    predicted = np.sqrt(np.trace(found.covariance, axis1=1, axis2=2))
+    assert missed(found, truth) < np.median(predicted)
+
+
+def test_shapes_missing_samples_and_priors(gamma_map):
+    _, _, signals = rubbed(gamma_map, 0.3, count=4)
+    columns = {name: signals[name].to_numpy().reshape(2, 2).copy() for name in ("Fx", "MB", "MD")}
+    columns["Fx"][1, 1] = np.nan
+    far = vb.Prior({"r": (0.0, 1e-4)})
+    found = gamma_map.estimate(columns, noise=NOISE, friction=0.2)
+    assert found.point.shape == (2, 2, 3)
+    assert found.status[1, 1] == vb.Status.MISSING
+    assert np.isfinite(found.point[0]).all()
+    nothing = gamma_map.estimate(columns, noise=NOISE, friction=0.2, prior=far)
+    assert (nothing.status[0] == vb.Status.OUTSIDE_PRIOR).all()
+
+
+def test_without_noise_there_is_nothing_to_weigh_friction_against(gamma_map):
+    signals = {"Fx": [-1e-5], "MB": [1e-6], "MD": [0.2]}
+    with pytest.raises(ValueError, match="noise"):
+        gamma_map.estimate(signals, friction=0.3)
+    with pytest.raises(ValueError, match="standard deviation"):
+        gamma_map.estimate(signals, noise=NOISE, friction=-0.3)

@@ -1,8 +1,8 @@
 """What friction along the whisker does to estimates, and what its prior makes of it.
 
 `python studies/friction.py [--whisker FILE] [--count N]` prints the table of the page on choosing
-signals: contacts deflected by more than 5°, whose force has a component along the whisker of up to µ
-times that across it, in any direction of sliding; noise of 1 µN and 0.02 µN·m in each component.
+signals: contacts deflected by more than 5°, whose force has a component along the whisker of up to
+µ times that across it, in any direction of sliding; noise of 1 µN and 0.02 µN·m in each component.
 """
 
 import argparse

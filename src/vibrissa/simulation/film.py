@@ -101,7 +101,8 @@ class ImageConditions:
         Standard deviation of the read noise, grey values.
     face : tuple of float
         Half the length, width and height of the face, m, zeros for none. The base is on its
-        surface; the face of several whiskers is as large as their bases need.
+        surface; the face of several whiskers is as large as their bases need, or at least this
+        size if it has fur.
     fur : float
         Standard deviation of the texture of the face, grey values; with it, hairs stand out from
         the face's edge and lie over the bases.
@@ -459,6 +460,10 @@ def _face(
     else:
         center = bases.mean(axis=0)
         size = np.abs(bases - center).max(axis=0) + _CHEEK
+        if conditions.fur > 0.0:
+            # A furry face is as large as it is stated to be, and the foremost base on its surface.
+            size = np.maximum(size, conditions.face)
+            center[0] = bases[:, 0].max() - size[0]
     middle, slopes = camera.project_with_slopes(center)
     half = slopes * size
     square = half @ half.T

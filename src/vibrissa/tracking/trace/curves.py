@@ -322,12 +322,17 @@ class Curve(NamedTuple):
 
 
 def find_curves(
-    frame: Frame, scene: Scene, options: TraceOptions, inside: bool = False
+    frame: Frame,
+    scene: Scene,
+    options: TraceOptions,
+    inside: bool = False,
+    begins: Array | None = None,
 ) -> list[Curve]:
-    """Find what may be whiskers in a frame."""
+    """Find what may be whiskers in a frame; points (n, 2) where some begin are on the face."""
     bodies, gain = scene.bodies(frame), scene.gain(frame)
     curves = []
-    for chain in joined(segments(scene.difference(frame), bodies, options.scale, inside), bodies):
+    parts = segments(scene.difference(frame), bodies, options.scale, inside)
+    for chain in joined(parts, bodies, [] if begins is None else bodies.near(begins)):
         step = np.hypot(*np.diff(chain.points, axis=0).T)
         # What is hidden at a join is not seen.
         length = float(step[step < _STEP].sum())
@@ -338,8 +343,8 @@ def find_curves(
     return sorted(curves, key=lambda curve: -curve.score)
 
 
-def joined(found: Sequence[Segment], bodies: Bodies) -> list[Segment]:
-    """Join segments that are parts of one curve."""
+def joined(found: Sequence[Segment], bodies: Bodies, faces: Sequence[int] = ()) -> list[Segment]:
+    """Join segments that are parts of one curve, which goes on behind no face."""
     if not found:
         return []
     # End 2 k is the first of segment k, end 2 k + 1 its last; directions point outward.
@@ -355,7 +360,7 @@ def joined(found: Sequence[Segment], bodies: Bodies) -> list[Segment]:
     near = (far < _GAP) & (leaving > np.cos(_BENT)) & (arriving > np.cos(_BENT))
     joins = []
     for i, j in np.argwhere(near):
-        if i < j and i // 2 != j // 2 and _hidden(at[i], at[j], found, bodies):
+        if i < j and i // 2 != j // 2 and _hidden(at[i], at[j], bodies, faces):
             cost = _cost(_ending(found, i), _ending(found, j), float(far[i, j]))
             if cost < _COST:
                 joins.append((cost, int(i), int(j)))
@@ -378,13 +383,13 @@ def _ending(found: Sequence[Segment], end: int) -> Segment:
     return one if end % 2 else one.reversed
 
 
-def _hidden(start: Array, end: Array, found: Sequence[Segment], bodies: Bodies) -> bool:
+def _hidden(start: Array, end: Array, bodies: Bodies, faces: Sequence[int]) -> bool:
     """Whether little of the chord between two ends is open ground."""
     far = float(np.hypot(*(end - start)))
     if far <= _OPEN:
         return True
     chord = start + np.linspace(0.0, 1.0, int(far) + 1)[:, None] * (end - start)
-    return float((bodies.at(chord) == 0).sum()) <= _OPEN
+    return float(np.isin(bodies.at(chord), [0, *faces]).sum()) <= _OPEN
 
 
 def _cost(one: Segment, other: Segment, far: float) -> float:

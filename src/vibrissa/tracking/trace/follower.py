@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.io import Frame
+from vibrissa.tracking.trace.clutter import NOTHING, Clutter
 from vibrissa.tracking.trace.ridge import (
     FEWEST,
     OUTSIDE,
@@ -64,6 +65,9 @@ ENOUGH = 5
 _REMEMBERED = 200
 """Number of frames over which its appearance is remembered."""
 
+_LEARNED = 20
+"""Number of frames from which it changes too little to be learned in each frame."""
+
 _PROXIMAL = 30
 """Points at the beginning of a line by which it is compared with the expected one."""
 
@@ -81,8 +85,6 @@ _CLICK = 20.0
 
 _BRIGHT = 0.35
 """Smallest brightness on both sides of a whisker, relative to the bright parts of the image."""
-
-_TURNS = np.radians([-6.0, 6.0, -12.0, 12.0, -18.0, 18.0])
 
 _AROUND = 36.0
 """How far inside the face the base is searched where it is known by a click only, pixels."""
@@ -107,6 +109,7 @@ class Appearance(NamedTuple):
         if len(features) < ENOUGH:
             return cls(np.full(FEATURES, np.nan), _SPREAD)
         known = np.array(features)
+        known[np.isinf(known)] = np.nan
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # of what no frame shows
             middle = np.nanmedian(known, axis=0)
@@ -120,24 +123,28 @@ class Appearance(NamedTuple):
             away[0] /= _SHORTER
         if np.isfinite(features[0]):
             away[np.isnan(features) & np.isfinite(self.middle)] = _HIDDEN
+        away[np.isinf(features)] = 0.0
         return float(0.5 * _WEIGHT * np.minimum(np.nan_to_num(away) ** 2, _MOST**2).sum())
 
 
-def features_of(frame: Frame, trace: Trace) -> Array:
-    """Features of a traced whisker: length, darkness and turns."""
+def features_of(frame: Frame, trace: Trace, clutter: Clutter = NOTHING) -> Array:
+    """Features of a traced whisker: length, darkness and turns; infinite what others hide."""
     features = np.full(FEATURES, np.nan)
     n = len(trace.line)
     if n < 2 or not trace.seen.any():
         return features
     offset, amplitude, flank, support = (np.empty(n) for _ in range(4))
     line = np.ascontiguousarray(trace.line)
-    measure(frame, line, 1, 1.0, 1.0, offset, amplitude, flank, support)
+    measure(frame, line, 1, 1.0, 1.0, *NOTHING, offset, amplitude, flank, support)
     contrast = amplitude / np.maximum(flank, 1.0)
-    features[0] = np.log(trace.support)
+    hidden = clutter.hides(line) & ~trace.seen
+    features[0] = np.log(trace.support + STEP * float(hidden.sum()))
     for i, (a, b) in enumerate(_DARK):
         seen = contrast[a:b][trace.seen[a:b]]
         if 2 * len(seen) >= b - a:
             features[1 + i] = np.log(max(float(np.median(seen)), 1e-3))
+        elif 2 * (len(seen) + hidden[a:b].sum()) >= b - a:
+            features[1 + i] = np.inf
     steps = np.diff(line, axis=0)
     angle = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
     along = [float(angle[a:b].mean()) if len(angle) >= b else np.nan for a, b in _ALONG]
@@ -157,30 +164,37 @@ class Follower:
     _supports: list[float] = field(default_factory=list)
     _unsearched: int = 0
     _features: list[Array] = field(default_factory=list)
+    _learned: int = 0
     appearance: Appearance = field(default_factory=lambda: Appearance.of(()))
+    clutter: Clutter = NOTHING
 
     def restart(self, trace: Trace) -> None:
         """Continue from a trace of the last frame that is known to be right."""
         self._before, self._last, self._missing = None, trace, 0
         self.base = trace.line[0]
-        self._supports = [trace.support]
+        self._supports = [self.length_of(trace)]
 
     def follow(self, frame: Frame) -> Trace:
         """Find the whisker in the next frame, without regard to others; empty if it is lost."""
         noise, best = noise_level(frame), Trace.lost()
         for trace in self.along_expected(frame, noise):
-            if trace.support > best.support:
+            if self.length_of(trace) > self.length_of(best):
                 best = trace
         # A whisker may be seen shorter because it turns toward the camera, frame after frame.
-        steady = best.support >= _WANTED * float(np.median(self._supports[-3:] or [np.inf]))
+        steady = self.length_of(best) >= _WANTED * float(np.median(self._supports[-3:] or [np.inf]))
         self._unsearched += 1
-        if best.support < self.wanted and not (steady and self._unsearched < _SEARCHED):
+        if self.length_of(best) < self.wanted and not (steady and self._unsearched < _SEARCHED):
             self._unsearched = 0
             cold = max(self.from_base(frame, noise), key=self._worth, default=Trace.lost())
             # What is as good without expectations as with them is no better.
-            if cold.support > 1.1 * best.support:
+            if cold.support > 1.1 * self.length_of(best):
                 best = cold
         return self.accept(best) if self._belongs(best) else self.lose()
+
+    def length_of(self, trace: Trace) -> float:
+        """Length that is seen or that something else is in the way of, pixels."""
+        hidden = self.clutter.hides(trace.line) & ~trace.seen
+        return trace.support + STEP * float(hidden.sum())
 
     @property
     def usual(self) -> float:
@@ -221,7 +235,8 @@ class Follower:
 
     def long_enough(self, trace: Trace) -> bool:
         """Whether a trace is long enough to be this whisker."""
-        return trace.support >= max(self.options.shortest, _LEAST * self.usual)
+        least = max(self.options.shortest, _LEAST * self.usual)
+        return self.length_of(trace) >= least and trace.support >= 0.5 * self.options.shortest
 
     def _belongs(self, trace: Trace) -> bool:
         """Whether a trace is long enough, and where the whisker may be."""
@@ -234,18 +249,21 @@ class Follower:
 
     def accept(self, trace: Trace) -> Trace:
         """Take a trace for the whisker in the next frame; less confident if it is short."""
-        usual = self.usual or trace.support
+        length = self.length_of(trace)
+        usual = self.usual or length
         self._before = self._last if self._missing == 0 else None
         self._last, self._missing = trace, 0
         self.base = trace.line[0]
-        self._supports = [*self._supports[-self.options.memory :], trace.support]
-        confidence = min(1.0, trace.confidence * min(1.0, trace.support / max(usual, 1.0)))
+        self._supports = [*self._supports[-self.options.memory :], length]
+        confidence = min(1.0, trace.confidence * min(1.0, length / max(usual, 1.0)))
         return trace._replace(confidence=confidence)
 
     def remember(self, features: Array) -> None:
         """Learn its appearance from a frame in which it was found."""
         self._features = [*self._features[-_REMEMBERED + 1 :], features]
-        self.appearance = Appearance.of(self._features)
+        self._learned += 1
+        if self._learned <= _LEARNED or self._learned % ENOUGH == 0:
+            self.appearance = Appearance.of(self._features)
 
     def lose(self) -> Trace:
         """Continue without the whisker in the next frame; an empty trace."""
@@ -268,19 +286,12 @@ class Follower:
         if moving is not None:
             guesses = [(moving, "tight"), (moving, "loose"), *guesses]
         for guess in guesses:
-            trace = self._along(frame, noise, *guess)
+            trace = self.along(frame, noise, *guess)
             yield trace
-            if trace.support >= self.wanted:
+            if self.length_of(trace) >= self.wanted:
                 return
 
-    def along_turned(self, frame: Frame, noise: float) -> Iterator[Trace]:
-        """Trace along where it would be had it turned about its base, turn by turn."""
-        expected = self.expected
-        if expected is not None:
-            for angle in _TURNS:
-                yield self._along(frame, noise, _turned(expected, angle), "loose")
-
-    def _along(self, frame: Frame, noise: float, guess: Array, manner: str) -> Trace:
+    def along(self, frame: Frame, noise: float, guess: Array, manner: str = "loose") -> Trace:
         """Trace along an expected curve."""
         tangent = np.arctan2(*np.diff(guess, axis=0).T[::-1])
         bend = np.diff(np.unwrap(tangent)) / STEP
@@ -293,8 +304,8 @@ class Follower:
         start = np.array([*guess[0], np.arctan2(chord[1], chord[0]) - 3.0 * STEP * bend[:6].mean()])
         return self._finished(frame, noise, *self._march(frame, noise, start, bend, manner))
 
-    def from_base(self, frame: Frame, noise: float, apart: float = np.inf) -> list[Trace]:
-        """Trace in all directions from the base, which is so far from other whiskers' bases.
+    def from_base(self, frame: Frame, noise: float) -> list[Trace]:
+        """Trace in all directions from the base.
 
         Traces are different ones, on bright ground: what is seen on the face is fur.
         """
@@ -303,7 +314,7 @@ class Follower:
         for angle in np.radians(np.arange(0.0, 360.0, 6.0)):
             away = 4.0 * self.options.scale * np.array([np.cos(angle), np.sin(angle)])
             start = np.array([*(self.base + away), angle])
-            tries.append(self._march(frame, noise, start, bend, "cold", apart / 6.0))
+            tries.append(self._march(frame, noise, start, bend, "cold"))
         tries.sort(key=lambda t: -float(np.minimum(t[1], 8.0).sum()))
         bright = _BRIGHT * float(np.percentile(frame[::8, ::8], 90.0))
         kept: list[Array] = []
@@ -332,15 +343,24 @@ class Follower:
         start: Array,
         bend: Array,
         manner: str,
-        widest: float = np.inf,
     ) -> tuple[Array, Array]:
-        """Line and support of a march; its offset at the start is at most so uncertain."""
+        """Line and support of a march."""
         spread, drift = _SPREADS[manner]
-        spread = np.array([min(spread[0], widest), *spread[1:]])
         line, support = np.empty((len(bend) + 1, 2)), np.empty(len(bend) + 1)
         o = self.options
         count = march(
-            frame, start, bend, spread, drift, STEP, o.bridge, noise, o.scale, line, support
+            frame,
+            start,
+            bend,
+            spread,
+            drift,
+            STEP,
+            o.bridge,
+            noise,
+            o.scale,
+            *self.clutter,
+            line,
+            support,
         )
         return line[:count], support[:count]
 
@@ -351,7 +371,7 @@ class Follower:
         if len(line) < FEWEST:
             return Trace.lost()
         line = smooth(line, np.where(support > 0.0, 4.0, 0.0), self.options.stiffness)
-        return traced(frame, noise, line, self.options, before)[0]
+        return traced(frame, noise, line, self.options, before, self.clutter)[0]
 
 
 def _turned(line: Array, angle: float) -> Array:

@@ -23,9 +23,12 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial import cKDTree
 
 from vibrissa.io import Frame
-from vibrissa.tracking.trace.curves import find_whiskers
+from vibrissa.tracking.trace.clutter import NEAR, STILL, between_whiskers
+from vibrissa.tracking.trace.curves import Curve, find_curves
 from vibrissa.tracking.trace.follower import (
     ENOUGH,
     FEATURES,
@@ -33,8 +36,9 @@ from vibrissa.tracking.trace.follower import (
     Follower,
     features_of,
 )
-from vibrissa.tracking.trace.ridge import noise_level
-from vibrissa.tracking.trace.trace import STEP, Trace, given, overlap
+from vibrissa.tracking.trace.ridge import noise_level, traced
+from vibrissa.tracking.trace.scene import Scene
+from vibrissa.tracking.trace.trace import STEP, Trace, even, given, overlap
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -68,6 +72,24 @@ _UNLIKE = 3.0
 
 _NEAR = 40.0
 """Distance from a base within which lines begin that are searched without expectations, pixels."""
+
+_MERGED = 0.8
+"""Share of a line that lies on others from which they are not kept apart."""
+
+_TRIED = 4
+"""Number of lines that are measured for each whisker that is missing."""
+
+_ALONG, _DIRECTION = 0.4, 10
+"""Weight of a click's distance along a line, and number of points that give its direction."""
+
+_LIKELY = 100.0
+"""Score of a curve from which it is likely to be a whisker."""
+
+_SAME_CURVE = 0.9
+"""Share of a line along another one from which both are the same curve."""
+
+_FEWEST, _POLYNOMIAL, _AHEAD = 15, 60, 150
+"""Numbers of points: of a whisker's beginning, of what gives its bend, and by which it goes on."""
 
 _LARGEST_TURN = 0.35
 """Largest turn of the row between frames beyond what was expected, rad."""
@@ -186,19 +208,25 @@ def follow_row(
     frame: Frame,
     known: Mapping[int, ArrayLike],
     record: list[Seen] | None = None,
+    scene: Scene | None = None,
 ) -> list[Trace]:
     """Find every whisker in the next frame; no two are the same."""
     noise = noise_level(frame)
     fixed = {k: given(points) for k, points in known.items()}
     free = [k for k in range(len(followers)) if k not in fixed]
-    own = {k: list(followers[k].along_expected(frame, noise)) for k in free}
     before = [follower.last for follower in followers]
-    chosen = _clearly(followers, own, fixed, frame)
+    _part(followers, {k: trace.line for k, trace in fixed.items()}, frame, scene)
+    own = {k: list(followers[k].along_expected(frame, noise)) for k in free}
     pool: list[Trace] = []
-    if chosen is None:
+    if all(line is None for line in before) and free:
+        chosen = clear = _begun(followers, fixed, frame, noise, scene)
+    else:
+        chosen = clear = _clearly(followers, own, fixed, frame)
+    if len(clear) < len(free):
+        own = {k: [clear[k]] if k in clear else traces for k, traces in own.items()}
+        pool = _pool(followers, own, clear, fixed, frame, noise, scene)
+        features = [features_of(frame, trace, followers[0].clutter) for trace in pool]
         apart = _distance_to_next(followers)
-        pool = _pool(followers, own, fixed, frame, noise, apart)
-        features = [features_of(frame, trace) for trace in pool]
         lines = _assigned([followers[k] for k in free], pool, features, apart[free])
         chosen = {k: pool[c] for k, c in zip(free, lines, strict=True) if c >= 0}
     found = []
@@ -210,7 +238,7 @@ def follow_row(
             trace = chosen.get(k)
             found.append(follower.lose() if trace is None else follower.accept(trace))
     _carry(followers, before, found)
-    seen = _seen(frame, pool, found, set(fixed))
+    seen = _seen(frame, pool, found, followers, set(fixed))
     for follower, c in zip(followers, seen.chosen, strict=True):
         if c >= 0:
             follower.remember(seen.features[c])
@@ -219,14 +247,106 @@ def follow_row(
     return found
 
 
-def _seen(frame: Frame, pool: Sequence[Trace], found: Sequence[Trace], fixed: set[int]) -> Seen:
+def _part(
+    followers: Sequence[Follower],
+    lines: Mapping[int, Array],
+    frame: Frame,
+    scene: Scene | None,
+) -> None:
+    """Let nothing be measured where whiskers lie on one another, on known or expected lines."""
+    every = [lines.get(k, follower.expected) for k, follower in enumerate(followers)]
+    still = None if scene is None else scene.still
+    near = NEAR * followers[0].options.scale
+    parted = between_whiskers(every, still, (frame.shape[0], frame.shape[1]), near)
+    for follower, line, clutter in zip(followers, every, parted, strict=True):
+        alone = line is not None and clutter.hides(line).mean() < _MERGED
+        follower.clutter = clutter if alone else clutter._replace(which=clutter.which & STILL)
+
+
+def _begun(
+    followers: Sequence[Follower],
+    fixed: Mapping[int, Trace],
+    frame: Frame,
+    noise: float,
+    scene: Scene | None,
+) -> dict[int, Trace]:
+    """Whiskers in the first frame, each where it was clicked.
+
+    Where whiskers cross, a line may go on as another one. So each is known up to there at first,
+    and followed beyond as it bends until there, with what others hide left out.
+    """
+    options = followers[0].options
+    scene = scene or Scene.of([frame], options.scale)
+    free = [k for k in range(len(followers)) if k not in fixed]
+    clicked = np.array([followers[k].base for k in free])
+    every = [
+        curve
+        for curve in find_curves(frame, scene, options, begins=clicked)
+        if all(overlap(curve.line, other.line) < _SAME for other in fixed.values())
+    ]
+    apart = _distance_to_next(followers)[free]
+    price = np.array(
+        [
+            [_price(click, curve, half) for curve in every]
+            for click, half in zip(clicked, 0.5 * apart, strict=True)
+        ]
+    ).reshape(len(free), len(every))
+    rows, columns = linear_sum_assignment(np.minimum(price, 2.0 * _LOST))
+    guesses = {
+        free[i]: _up_to_a_crossing(every[c].line, [one.line for one in every])
+        for i, c in zip(rows, columns, strict=True)
+        if price[i, c] < 2.0 * _LOST
+    }
+    lines, found = guesses, dict[int, Trace]()
+    given_ = {k: trace.line for k, trace in fixed.items()}
+    for _ in range(_ROUNDS):
+        _part(followers, {**lines, **given_}, frame, scene)
+        found = {
+            k: followers[k].along(frame, noise, guess, "tight") for k, guess in guesses.items()
+        }
+        lines = {k: trace.line for k, trace in found.items()}
+    found = {k: trace for k, trace in found.items() if followers[k].long_enough(trace)}
+    return _without_clashes(found, fixed)
+
+
+def _price(click: Array, curve: Curve, half: float) -> float:
+    """Cost of taking a curve for the whisker that was clicked."""
+    away = _LOST * (_from_click(click, curve.line) / min(_CLICK, half)) ** 2
+    return away + _SHORT / (1.0 + curve.score / _LIKELY)
+
+
+def _up_to_a_crossing(line: Array, every: Sequence[Array]) -> Array:
+    """The beginning of a line, until it meets another one, prolonged as a parabola."""
+    line = even(line)
+    others = [one for one in every if overlap(one, line) < _SAME_CURVE]
+    if others:
+        away, _ = cKDTree(np.concatenate(others)).query(line)
+        met = np.flatnonzero((away < NEAR) & (np.arange(len(line)) >= _FEWEST))
+        line = line[: met[0]] if met.size else line
+    t = np.arange(len(line))[-_POLYNOMIAL:]
+    shape = np.polynomial.polynomial.polyfit(t, line[-len(t) :], 2)
+    ahead = np.arange(len(line), len(line) + _AHEAD)
+    return np.concatenate([line, np.polynomial.polynomial.polyval(ahead, shape).T])
+
+
+def _seen(
+    frame: Frame,
+    pool: Sequence[Trace],
+    found: Sequence[Trace],
+    followers: Sequence[Follower],
+    fixed: set[int],
+) -> Seen:
     """What a frame shows: lines that were considered, and who was found where."""
     lines = [trace for trace in found if len(trace.line)]
     lines += [trace for trace in pool if not any(trace.line is other.line for other in lines)]
     chosen = [
         next((c for c, trace in enumerate(lines) if trace.line is each.line), -1) for each in found
     ]
-    features = [features_of(frame, trace) for trace in lines]
+    whose = {c: followers[k].clutter for k, c in enumerate(chosen)}
+    features = [
+        features_of(frame, trace, whose.get(c, followers[0].clutter))
+        for c, trace in enumerate(lines)
+    ]
     return Seen(lines, features, chosen, fixed, clear=not pool)
 
 
@@ -235,43 +355,61 @@ def _clearly(
     own: Mapping[int, list[Trace]],
     fixed: Mapping[int, Trace],
     frame: Frame,
-) -> dict[int, Trace] | None:
-    """The whiskers' own lines if there is no doubt about any."""
+) -> dict[int, Trace]:
+    """Whiskers about whose own lines there is no doubt."""
     chosen: dict[int, Trace] = {}
     for k, traces in own.items():
         follower, expected = followers[k], followers[k].expected
-        if expected is None or not traces or traces[-1].support < follower.wanted:
-            return None
+        if expected is None or not traces or follower.length_of(traces[-1]) < follower.wanted:
+            continue
         if np.abs(sideways(expected, traces[-1].line)).mean() > 0.5 * follower.reach:
-            return None
-        if follower.appearance.unlikeness(features_of(frame, traces[-1])) > _UNLIKE:
-            return None
+            continue
+        if follower.appearance.unlikeness(features_of(frame, traces[-1], follower.clutter)) > (
+            _UNLIKE
+        ):
+            continue
         chosen[k] = traces[-1]
-    clash = _clashes([trace.line for trace in (*chosen.values(), *fixed.values())])
-    return chosen if clash.sum() == len(clash) else None
+    return _without_clashes(chosen, fixed)
+
+
+def _without_clashes(chosen: Mapping[int, Trace], fixed: Mapping[int, Trace]) -> dict[int, Trace]:
+    """Whiskers whose lines are nobody else's."""
+    every = {**chosen, **fixed}
+    clash = _clashes([trace.line for trace in every.values()])
+    doubtful = {k for k, row in zip(every, clash, strict=True) if row.sum() > 1}
+    return {k: trace for k, trace in chosen.items() if k not in doubtful}
 
 
 def _pool(
     followers: Sequence[Follower],
     own: Mapping[int, list[Trace]],
+    clear: Mapping[int, Trace],
     fixed: Mapping[int, Trace],
     frame: Frame,
     noise: float,
-    apart: Array,
+    scene: Scene | None,
 ) -> list[Trace]:
     """Different lines that may be whiskers, the longest first."""
-    proposed: list[Trace] = []
-    for k, traces in own.items():
-        follower = followers[k]
-        proposed += traces
-        if not any(trace.support >= follower.wanted for trace in traces):
-            proposed += follower.along_turned(frame, noise)
-            if follower.expected is None:
-                proposed += follower.from_base(frame, noise, apart[k])
-    bases = np.array([follower.base for follower in followers])
-    for found in find_whiskers(frame, followers[0].options):
-        if np.linalg.norm(bases - found.trace.line[0], axis=1).min() < _NEAR:
-            proposed.append(found.trace)
+    proposed = [trace for traces in own.values() for trace in traces if len(trace.line)]
+    options = followers[0].options
+    missing = [followers[k] for k in own if k not in clear]
+    taken = [trace.line for trace in (*clear.values(), *fixed.values())]
+    still = None if scene is None else scene.still
+    shape = (frame.shape[0], frame.shape[1])
+    # For a whisker of which nothing is known yet all others are in the way.
+    clutter = between_whiskers([*taken, None], still, shape, NEAR * options.scale)[-1]
+    scene = scene or Scene.of([frame], options.scale)
+    tried: list[Array] = [*taken]
+    begins = np.array([follower.base for follower in followers])
+    for curve in find_curves(frame, scene, options, begins=begins):
+        if len(tried) - len(taken) >= _TRIED * len(missing):
+            break
+        if min(_from_click(follower.base, curve.line) for follower in missing) > _NEAR:
+            continue
+        if any(overlap(curve.line, other) >= _SAME for other in tried):
+            continue
+        tried.append(curve.line)
+        proposed.append(traced(frame, noise, curve.line, options, clutter=clutter)[0])
     kept: list[Trace] = []
     for trace in sorted(proposed, key=lambda t: -t.support):
         if not len(trace.line):
@@ -281,6 +419,18 @@ def _pool(
         if not any(_one(trace, other, 4.0) for other in kept):
             kept.append(trace)
     return kept
+
+
+def _from_click(click: Array, line: Array) -> float:
+    """Distance of a click from the beginning of a line, pixels.
+
+    Along the line's own direction a click may miss by more: the face hides where that begins.
+    """
+    ahead = line[min(_DIRECTION, len(line) - 1)] - line[0]
+    ahead = ahead / max(float(np.hypot(*ahead)), 1e-9)
+    away = line[0] - click
+    along, across = float(away @ ahead), float(away[1] * ahead[0] - away[0] * ahead[1])
+    return float(np.hypot(_ALONG * along, across))
 
 
 def _distance_to_next(followers: Sequence[Follower]) -> Array:
@@ -314,7 +464,13 @@ def _assigned(
     ways = problem.ways(costs.after(*best[1:]), lost, least - best[0] + _DOUBT)
     _, chosen = next(ways)
     others = [way for _, way in ways]
-    return tuple(-1 if any(way[k] != c for way in others) else c for k, c in enumerate(chosen))
+
+    def differs(c: int, d: int) -> bool:
+        return c != d and (min(c, d) < 0 or not _one(pool[c], pool[d]))
+
+    return tuple(
+        -1 if any(differs(c, way[k]) for way in others) else c for k, c in enumerate(chosen)
+    )
 
 
 class _Costs(NamedTuple):
@@ -343,7 +499,7 @@ class _Costs(NamedTuple):
                 if not follower.long_enough(trace):
                     continue
                 if expected is None:
-                    away = float(np.linalg.norm(trace.line[0] - follower.base))
+                    away = _from_click(follower.base, trace.line)
                     far = _LOST * (away / min(_CLICK, half[k])) ** 2
                 elif _aligned(expected, trace.line) > _ALIGNED:
                     offsets[k, c], far = sideways(expected, trace.line), 0.0
@@ -419,6 +575,7 @@ def decided(frames: Sequence[Seen], bases: Array) -> list[list[int]]:
     certain: list[tuple[Seen, Sequence[int]]] = [
         (s, s.chosen) for s in (frames[0], *takewhile(lambda s: s.clear, frames[1:]))
     ]
+    chosen: list[list[int]] = []
     for _ in range(_ROUNDS):
         known = [
             Appearance.of([seen.features[way[k]] for seen, way in certain if way[k] >= 0])
@@ -428,8 +585,10 @@ def decided(frames: Sequence[Seen], bases: Array) -> list[list[int]]:
             _step(seen, problem, known, fixed)
             for seen, problem, fixed in zip(frames, problems, settled, strict=True)
         ]
-        chosen = _cheapest(frames, settled, steps, motions)
+        before, chosen = chosen, _cheapest(frames, settled, steps, motions)
         certain = list(zip(frames, chosen, strict=True))
+        if chosen == before:
+            break
     return chosen
 
 

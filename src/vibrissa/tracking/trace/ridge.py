@@ -23,6 +23,7 @@ from scipy.linalg.lapack import dpbsv
 
 from vibrissa.io import Frame
 from vibrissa.numerics import inlined, kernel
+from vibrissa.tracking.trace.clutter import NOTHING, Clutter, in_the_way
 from vibrissa.tracking.trace.trace import STEP, Trace, TraceOptions, even
 
 Array = NDArray[np.float64]
@@ -170,6 +171,8 @@ def march(
     bridge: float,
     noise: float,
     scale: float,
+    bits: Any,
+    which: int,
     line: Any,
     support: Any,
 ) -> int:
@@ -177,7 +180,8 @@ def march(
 
     Its state is the sideways offset, the direction and the curvature; what it measures is where
     across the line the image is darkest. Where nothing is seen it continues with the curvature it
-    had, and the gate widens with its variance.
+    had, and the gate widens with its variance. Where something else is in the way nothing is
+    measured, nor missed.
     """
     rows, columns = frame.shape
     x, y, angle, bend = start[0], start[1], start[2], 0.0
@@ -187,7 +191,7 @@ def march(
     found = np.empty(2)
     sd = 0.8 * noise
     last, steps = 0, line.shape[0]
-    turned = 0.0
+    turned, missed = 0.0, 0
     for k in range(steps):
         if k > 0:
             h = step
@@ -211,15 +215,21 @@ def march(
         support[k] = 0.0
         if x < 2.0 or y < 2.0 or x > columns - 3.0 or y > rows - 3.0:
             break
+        if in_the_way(bits, which, x, y):
+            continue
         nx, ny = -math.sin(angle), math.cos(angle)
         gate = min(12, math.ceil(3.0 * math.sqrt(p00) / scale + 0.7))
         reach = gate + 5
         sample_across(frame, x, y, nx, ny, reach, scale, profile)
         value, at = darkest_expected(profile, gate, scale, sd, p00)
+        missed += 1
         if value > _CLEARLY_DARK:
             fit(profile, at, ROWS, found)
             if found[0] > 0.0:
                 offset = (at - reach + min(max(found[1], -1.5), 1.5)) * scale
+                if in_the_way(bits, which, x + offset * nx, y + offset * ny):
+                    missed -= 1
+                    continue
                 r = (noise * scale / found[0]) ** 2 * SLOPE_VARIANCE + 0.01 * scale * scale
                 total = p00 + r
                 k0, k1, k2 = p00 / total, p01 / total, p02 / total
@@ -236,8 +246,8 @@ def march(
                 p00 -= k0 * p00
                 line[k, 0], line[k, 1] = x, y
                 support[k] = value
-                last = k + 1
-        if (k - last + 1) * step > bridge:
+                last, missed = k + 1, 0
+        if missed * step > bridge:
             break
     return last
 
@@ -249,12 +259,14 @@ def measure(
     gate: int,
     noise: float,
     scale: float,
+    bits: Any,
+    which: int,
     offset: Any,
     amplitude: Any,
     flank: Any,
     support: Any,
 ) -> None:
-    """Measure a line across a curve near it."""
+    """Measure a line across a curve near it, where nothing else is in the way."""
     n = line.shape[0]
     rows, columns = frame.shape
     reach = gate + 5
@@ -266,6 +278,8 @@ def measure(
         offset[k], amplitude[k], support[k], flank[k] = 0.0, 0.0, 0.0, 0.0
         if x < 1.0 or y < 1.0 or x > columns - 2.0 or y > rows - 2.0:
             continue
+        if in_the_way(bits, which, x, y):
+            continue
         sample_across(frame, x, y, nx, ny, reach, scale, profile)
         best, at = -1e9, reach
         for j in range(5, 2 * gate + 6):
@@ -274,6 +288,9 @@ def measure(
                 best, at = d, j
         fit(profile, at, ROWS, found)
         offset[k] = (at - reach + min(max(found[1], -1.0), 1.0)) * scale
+        if in_the_way(bits, which, x + offset[k] * nx, y + offset[k] * ny):
+            offset[k] = 0.0
+            continue
         amplitude[k] = found[0]
         support[k] = depth(profile, at) / (0.8 * noise)
         flank[k] = (
@@ -282,12 +299,17 @@ def measure(
 
 
 @kernel
-def flanks(frame: Any, line: Any, distance: float, out: Any) -> None:
-    """Grey values at a distance from a curve, to its left (−dy, dx) and to its right."""
+def flanks(frame: Any, line: Any, distance: float, bits: Any, which: int, out: Any) -> None:
+    """Grey values at a distance from a curve, to its left (−dy, dx) and to its right.
+
+    NaN where something else is in the way.
+    """
     for k in range(line.shape[0]):
         nx, ny = normal(line, k)
-        out[k, 0] = sample(frame, line[k, 0] + distance * nx, line[k, 1] + distance * ny)
-        out[k, 1] = sample(frame, line[k, 0] - distance * nx, line[k, 1] - distance * ny)
+        for side in range(2):
+            away = distance * (1 - 2 * side)
+            x, y = line[k, 0] + away * nx, line[k, 1] + away * ny
+            out[k, side] = np.nan if in_the_way(bits, which, x, y) else sample(frame, x, y)
 
 
 _SUPPORTED = 2.5
@@ -345,12 +367,18 @@ class Measured(NamedTuple):
 
 
 def measured(
-    frame: Frame, line: Array, gate: int, noise: float, options: TraceOptions, skipped: int = 0
+    frame: Frame,
+    line: Array,
+    gate: int,
+    noise: float,
+    options: TraceOptions,
+    skipped: int = 0,
+    clutter: Clutter = NOTHING,
 ) -> tuple[Array, Measured]:
     """Measure across a line and smooth it."""
     n = len(line)
     offset, amplitude, flank, support = (np.empty(n) for _ in range(4))
-    measure(frame, line, gate, noise, options.scale, offset, amplitude, flank, support)
+    measure(frame, line, gate, noise, options.scale, *clutter, offset, amplitude, flank, support)
     seen = (support > _SUPPORTED) & (amplitude > 0.0)
     variance = SLOPE_VARIANCE * (noise * options.scale / np.maximum(amplitude, 1e-3)) ** 2
     seen[:skipped] = False
@@ -369,7 +397,8 @@ def measured(
     information = np.convolve(weight, np.ones(min(9, n)), mode="same")
     sigma = 1.0 / np.sqrt(np.maximum(information, 1.0))
     sigma += 0.05 * (0.1 * STEP * _distance_to_seen(seen)) ** 1.5
-    open_ = flank > 0.6 * np.median(flank)
+    shown = ~clutter.hides(line)
+    open_ = shown & (flank > 0.6 * np.median(flank[shown] if shown.any() else flank))
     return better, Measured(amplitude, sigma, seen, open_, noise * float(np.sqrt(excess)))
 
 
@@ -403,25 +432,31 @@ def _third_differences(n: int) -> Array:
 
 
 def traced(
-    frame: Frame, noise: float, line: Array, options: TraceOptions, before: float = OUTSIDE
+    frame: Frame,
+    noise: float,
+    line: Array,
+    options: TraceOptions,
+    before: float = OUTSIDE,
+    clutter: Clutter = NOTHING,
 ) -> tuple[Trace, bool]:
     """Trace a whisker that is about known, and find its ends; whether it begins at the face."""
     line = _lengthened(even(line))
     for gate in (3, 2):
-        line = even(measured(frame, line, gate, noise, options)[0])
+        line = even(measured(frame, line, gate, noise, options, 0, clutter)[0])
         if len(line) < FEWEST:
             # Where nothing is seen, nothing holds the line apart.
             return Trace.lost(), False
-    line, from_face = _with_base(frame, line, before)
+    line, from_face = _with_base(frame, line, before, clutter)
     if before > OUTSIDE and len(line) >= FEWEST:
         # What was only guessed is measured before it counts.
-        line = even(measured(frame, line, 3, noise, options, _FUR if from_face else 0)[0])
+        fur = _FUR if from_face else 0
+        line = even(measured(frame, line, 3, noise, options, fur, clutter)[0])
     if len(line) < FEWEST:
         return Trace.lost(), False
     if not from_face:
         # Without a face it begins as it ends: where the line does.
         line = _lengthened(line[::-1])[::-1]
-    line, along = measured(frame, line, 1, noise, options, _FUR if from_face else 0)
+    line, along = measured(frame, line, 1, noise, options, _FUR if from_face else 0, clutter)
     first = 0 if from_face else len(line) - _tip(along.part(slice(None, None, -1)))
     last = _tip(along)
     if last - first < FEWEST:
@@ -435,10 +470,10 @@ def traced(
     return Trace(line, along.sigma, along.seen, trusted, base_seen, tip_seen), from_face
 
 
-def _with_base(frame: Frame, line: Array, before: float) -> tuple[Array, bool]:
+def _with_base(frame: Frame, line: Array, before: float, clutter: Clutter) -> tuple[Array, bool]:
     """Let a line begin where the whisker leaves the face."""
     longer = even(line, -before)
-    near, far = (_edge(frame, longer[:40], distance) for distance in _FLANKS)
+    near, far = (_edge(frame, longer[:40], distance, clutter) for distance in _FLANKS)
     if near is None:
         return line, False
     at = near
@@ -449,10 +484,14 @@ def _with_base(frame: Frame, line: Array, before: float) -> tuple[Array, bool]:
     return even(longer, max(at, 0.0) * STEP), True
 
 
-def _edge(frame: Frame, line: Array, distance: float) -> float | None:
+def _edge(frame: Frame, line: Array, distance: float, clutter: Clutter) -> float | None:
     """Point number at which both sides of a line come out of the dark, on average."""
-    numbers = []
-    for level in grey_flanks(frame, line, distance).T:
+    numbers, points = [], np.arange(len(line))
+    for level in grey_flanks(frame, line, distance, clutter).T:
+        known = np.isfinite(level)
+        if 2 * known.sum() < len(level):
+            return None
+        level = np.interp(points, points[known], level[known])
         bright, dark = float(np.median(level[len(level) // 2 :])), float(level.min())
         half = 0.5 * (bright + dark)
         last = int(np.flatnonzero(level <= half)[-1])
@@ -462,10 +501,10 @@ def _edge(frame: Frame, line: Array, distance: float) -> float | None:
     return float(np.mean(numbers))
 
 
-def grey_flanks(frame: Frame, line: Array, distance: float) -> Array:
+def grey_flanks(frame: Frame, line: Array, distance: float, clutter: Clutter = NOTHING) -> Array:
     """Grey values (n, 2) at a distance to the left and to the right of a line, pixels."""
     levels = np.empty((len(line), 2))
-    flanks(frame, np.ascontiguousarray(line), distance, levels)
+    flanks(frame, np.ascontiguousarray(line), distance, *clutter, levels)
     return levels
 
 

@@ -52,6 +52,9 @@ _SMALLEST = 40
 _LARGE = 0.02
 """Smallest share of the image that a face covers."""
 
+_BESIDE = 10.0
+"""Distance from a face up to which a point is taken to be on it, pixels."""
+
 _RANGE = (-20.0, 80.0)
 """Differences that count, grey values: what is darker or brighter counts as these."""
 
@@ -70,6 +73,12 @@ class Bodies:
         row, column = at[:, 1].clip(0, rows - 1), at[:, 0].clip(0, columns - 1)
         return np.asarray(self.label[row, column])
 
+    def near(self, points: Array) -> list[int]:
+        """Numbers of the bodies on which points are, or that are next to them."""
+        around = np.stack(np.meshgrid([-_BESIDE, 0.0, _BESIDE], [-_BESIDE, 0.0, _BESIDE]), axis=-1)
+        found = self.at((points[:, None] + around.reshape(-1, 2)).reshape(-1, 2))
+        return sorted({int(body) for body in found if body})
+
 
 @dataclass(frozen=True, eq=False)
 class Scene:
@@ -80,6 +89,7 @@ class Scene:
     background: Image | None
     sample: Image
     thin: int
+    still: NDArray[np.bool_] | None = None
 
     @classmethod
     def of(cls, frames: Sequence[Frame], scale: float = 1.0) -> Scene:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from itertools import islice
+from itertools import chain, islice
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from vibrissa.io import (
 from vibrissa.tracking.trace.curves import find_whiskers
 from vibrissa.tracking.trace.follower import Follower, features_of, start_at
 from vibrissa.tracking.trace.identity import Seen, decided, follow_row
+from vibrissa.tracking.trace.scene import Scene
 from vibrissa.tracking.trace.start import FRAMES, is_bright, negative
 from vibrissa.tracking.trace.trace import Trace, TraceOptions, given, overlap
 
@@ -37,6 +38,9 @@ _BACK = 64
 
 _AGREES = 0.9
 """Share of a line along another one from which both are the same."""
+
+_SCENE = 30
+"""Number of first frames from which light and background are taken."""
 
 _SPAN = 400
 """Number of frames at the beginning of a film from which those for its start are taken."""
@@ -93,9 +97,14 @@ def trace_video(
     recent: deque[Frame] = deque(maxlen=_BACK)
     seen: list[Seen] = []
     starts, bright, shape = np.empty((0, 2)), False, (0, 0)
-    for i, frame in enumerate(frames):
+    scene: Scene | None = None
+    source = iter(frames)
+    first = list(islice(source, _SCENE))
+    for i, frame in enumerate(chain(first, source)):
         if i == 0:
             bright, shape = is_bright(frame, bases, options), frame.shape
+            alike = [negative(f) if bright else f for f in first if f.shape == shape]
+            scene = Scene.of(alike, options.scale)
         if frame.shape != shape:
             raise ValueError(
                 f"frame {i} has {frame.shape[1]} × {frame.shape[0]} pixels and those before it "
@@ -114,7 +123,8 @@ def trace_video(
                 seen.append(_seen_before(frame, [row[i] for row in traces], followers))
             continue
         known = {k: points for (j, k), points in corrections.items() if j == i}
-        for trace, row in zip(follow_all(followers, frame, known, seen), traces, strict=True):
+        found = follow_all(followers, frame, known, seen, scene)
+        for trace, row in zip(found, traces, strict=True):
             row.append(trace)
         for k in range(len(followers)):
             if k in known:
@@ -181,11 +191,15 @@ def _check(corrections: Corrections, count: int) -> None:
 
 
 def follow_all(
-    followers: Sequence[Follower], frame: Frame, known: Mapping[int, ArrayLike], seen: list[Seen]
+    followers: Sequence[Follower],
+    frame: Frame,
+    known: Mapping[int, ArrayLike],
+    seen: list[Seen],
+    scene: Scene | None = None,
 ) -> list[Trace]:
     """Find every whisker in the next frame."""
     if len(followers) > 1:
-        return follow_row(followers, frame, known, seen)
+        return follow_row(followers, frame, known, seen, scene)
     (follower,) = followers
     if not known:
         return [follower.follow(frame)]

@@ -1,0 +1,87 @@
+"""Where a view shows a whisker together with something else, so that it is not measured there.
+
+Next to another whisker, or to an edge or a line that never moves, the image is dark where that is,
+not where the whisker is. Such pixels are marked; a trace is bridged over them, and its uncertainty
+grows with the distance from where it is seen. What marks a pixel is a bit: one for all that stands
+still, and one for each whisker, so that none hides itself.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vibrissa.numerics import inlined, kernel
+
+Array = NDArray[np.float64]
+Bits = NDArray[np.uint32]
+Mask = NDArray[np.bool_]
+
+NEAR = 5.0
+"""Distance up to which another whisker is in the way, pixels, for a whisker of usual width."""
+
+STILL = 1
+"""Bit of what stands still."""
+
+_WHISKERS = 31
+"""Number of bits for whiskers."""
+
+
+class Clutter(NamedTuple):
+    """What is in the way of one whisker: pixels whose bits are among some."""
+
+    bits: Bits
+    which: int
+
+    def hides(self, points: Array) -> Mask:
+        """Whether something is in the way of points (n, 2)."""
+        rows, columns = self.bits.shape
+        column, row = np.rint(points).astype(np.intp).T
+        found = self.bits[row.clip(0, rows - 1), column.clip(0, columns - 1)]
+        return np.asarray((found & np.uint32(self.which)) != 0)
+
+
+NOTHING = Clutter(np.zeros((1, 1), dtype=np.uint32), 0)
+"""Nothing is in the way."""
+
+
+@inlined
+def in_the_way(bits: Any, which: Any, x: float, y: float) -> Any:
+    """Whether something is in the way of a point."""
+    row = min(max(int(y + 0.5), 0), bits.shape[0] - 1)
+    column = min(max(int(x + 0.5), 0), bits.shape[1] - 1)
+    return (bits[row, column] & which) != 0
+
+
+def between_whiskers(
+    lines: Sequence[Array | None], still: Mask | None, shape: tuple[int, int], near: float = NEAR
+) -> list[Clutter]:
+    """What is in the way of each of some whiskers, whose lines (n, 2) are about known, or None."""
+    bits = np.zeros(shape, np.uint32) if still is None else still.astype(np.uint32)
+    for k, line in enumerate(lines):
+        if line is not None and len(line):
+            paint(bits, np.ascontiguousarray(line), near, np.uint32(_own(k)))
+    every = (1 << (_WHISKERS + 1)) - 1
+    return [Clutter(bits, every & ~_own(k)) for k in range(len(lines))]
+
+
+def _own(whisker: int) -> int:
+    return STILL << (1 + whisker % _WHISKERS)
+
+
+@kernel
+def paint(bits: Any, line: Any, near: float, bit: Any) -> None:
+    """Mark what is near a line."""
+    rows, columns = bits.shape
+    for k in range(line.shape[0]):
+        x, y = line[k, 0], line[k, 1]
+        for row in range(max(0, math.ceil(y - near)), min(rows, math.floor(y + near) + 1)):
+            for column in range(
+                max(0, math.ceil(x - near)), min(columns, math.floor(x + near) + 1)
+            ):
+                if (row - y) ** 2 + (column - x) ** 2 <= near * near:
+                    bits[row, column] |= bit

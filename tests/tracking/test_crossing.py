@@ -1,0 +1,51 @@
+"""Whiskers that cross before a furry face: each stays itself, beyond the crossing too."""
+
+import numpy as np
+import pytest
+from rows import RowFilm, scored
+
+from vibrissa.tracking import trace_video
+from vibrissa.tracking.trace.clutter import between_whiskers
+from vibrissa.tracking.trace.ridge import measured, noise_level
+from vibrissa.tracking.trace.trace import TraceOptions
+
+
+@pytest.fixture(scope="module")
+def crossing():
+    """Three whiskers that cross in both views, in the first frame already."""
+    return RowFilm(1, 3, frames=12)
+
+
+@pytest.mark.parametrize("view", [0, 1], ids=["top", "front"])
+@pytest.mark.parametrize("inside", [0.0, 25.0], ids=["at the base", "inside the fur"])
+def test_crossing_whiskers_stay_themselves(crossing, view, inside):
+    truth = crossing.truth[view]
+    ahead = truth[0, :, 2] - truth[0, :, 0]
+    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    traces = trace_video(crossing.images[view], truth[0, :, 0] - inside * ahead)
+    score = scored(traces, truth)
+    assert np.isfinite(score).mean() > 0.6
+    assert (score[np.isfinite(score)] == 1.0).mean() > 0.97
+
+
+def test_nothing_is_measured_where_another_line_is():
+    """A line at 10 pixels from another is measured, where they cross it is bridged."""
+    y, x = np.mgrid[:120, :240].astype(float)
+    slope = np.tan(0.15)
+    other = 60.0 + slope * (x - 120.0)
+    depth = 90.0 * np.exp(-0.5 * ((y - 60.0) / 1.3) ** 2)
+    depth = np.maximum(depth, 110.0 * np.exp(-0.5 * ((y - other) / 1.3) ** 2))
+    frame = (200.0 - depth).astype(np.uint8)
+    column = np.arange(20.0, 220.0, 2.0)
+    lines = [
+        np.stack([column, 60.0 + 0.0 * column], axis=1),
+        np.stack([column, 60.0 + slope * (column - 120.0)], axis=1),
+    ]
+    own, _ = between_whiskers(lines, None, frame.shape)
+    options, noise = TraceOptions(), noise_level(frame)
+    line, along = measured(frame, lines[0], 2, noise, options, 0, own)
+    crossed = np.abs(column - 120.0) * slope < 4.0
+    assert not along.seen[crossed].any()
+    assert along.seen[np.abs(column - 120.0) * slope > 8.0].all()
+    assert along.sigma[crossed].max() > 5.0 * along.sigma[~crossed].min()
+    np.testing.assert_allclose(line[:, 1], 60.0, atol=0.3)

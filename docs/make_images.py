@@ -42,7 +42,7 @@ from vibrissa.simulation import (
 
 WIDTH = 1200
 WIDER = {"title": 1360}
-LEVELS = {"title": 48, "trial": 32, "movie_signals": 64, "movie_contour": 64}
+LEVELS = {"title": 48, "signal_space": 48, "contact_surfaces": 48, "trial": 32, "movie_signals": 64, "movie_contour": 64}
 """Of red, green and blue in figures for which 256 colours are too few."""
 
 CURVATURES = np.arange(8) / 5.0

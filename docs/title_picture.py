@@ -17,6 +17,7 @@ from vibrissa.plots.contact_surfaces import coordinate_bar, levels
 from vibrissa.plots.objects import outline
 from vibrissa.plots.space import (
     bounds,
+    drop_lines,
     name_axes,
     paint,
     painted,
@@ -202,6 +203,7 @@ def solids(figure: Figure, course: Course, samples: xr.Dataset, line: Array, mom
         coordinate_bar(figure, (118.0, 86.5 - 37.5 * i, 1.6, 15.0), name, norm, marks)
         axes.plot(*course_way.T, color=ORANGE, linewidth=0.7, zorder=12)
         axes.scatter(*course_way[moment], s=14.0, color=ORANGE, zorder=14, depthshade=False)
+        drop_lines(axes, limits, course_way[moment])
 
 
 def contour(figure: Figure, trial: xr.DataTree, peg: Peg, fit: CylinderFit, moment: int) -> None:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 import vibrissa as vb
 from vibrissa.cameras import orthogonal_views
 from vibrissa.io import read_video
-from vibrissa.plots.style import MUTED, ORANGE, RED, box_axes, head, looking, new_figure
+from vibrissa.plots.style import MUTED, ORANGE, RED, TRACE, box_axes, head, looking, new_figure
 from vibrissa.quantities import axis_label, to_display
 from vibrissa.scene import Array
 from vibrissa.simulation import facing_peg, film, simulate, sweep_past, with_true_traces
@@ -54,7 +54,7 @@ def sights(figure: Figure, images: list[Array], found: xr.Dataset, row: int) -> 
     wide = TALL * 760 / 620
     for i, (image, trace, there) in enumerate(zip(images, traces, seen, strict=True)):
         axes = picture(figure, (1.0 + i * (wide + 2.0), HEIGHT - TALL - 6.0, wide, TALL), image)
-        axes.plot(*trace[there].T, color=RED, linewidth=0.9)
+        axes.plot(*trace[there].T, **TRACE)
         head(axes, "ab"[i], ("from the top, and the trace", "from the front")[i])
     middle = traces[0][np.flatnonzero(seen[0])[int(0.35 * seen[0].sum())]].round()
     box = (2.0 * (wide + 2.0) + 1.0, HEIGHT - TALL - 6.0, 178.0 - 2.0 * (wide + 2.0) - 2.0, TALL)

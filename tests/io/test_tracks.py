@@ -89,7 +89,7 @@ def test_what_the_file_does_not_say_is_needed_and_what_it_says_stands():
         labelled(deep(), "a.csv", unit="inch")
     with pytest.raises(ValueError, match=r"in m its whiskers reach across [23]\d.*millimetres"):
         labelled(deep(), "a.csv", unit="m")
-    with pytest.raises(ValueError, match="unit is 'mm', but 'm' is given"):
+    with pytest.raises(ValueError, match="the unit 'mm', but 'm' is given"):
         labelled(deep(unit="mm"), "a.csv", unit="m")
     with pytest.raises(ValueError, match="states 500 frames per second, but 1000"):
         labelled(flat(fps=500.0), "a.csv", fps=1000.0)

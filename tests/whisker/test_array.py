@@ -183,7 +183,7 @@ def test_names_in_many_spellings(said, name):
 
 @pytest.mark.parametrize("said", ["", "F1", "C", "2C", "epsilon", "LC2R", "C12", "whisker"])
 def test_what_is_no_name(said):
-    with pytest.raises(ValueError, match="no whisker's name"):
+    with pytest.raises(ValueError, match="not a whisker's name"):
         Identity.of(said)
 
 
@@ -194,7 +194,7 @@ def test_whiskers_are_found_by_any_name():
         _ = ARRAY["gamma"]
     with pytest.raises(KeyError, match="no such whisker"):
         _ = ARRAY["LA6"]
-    with pytest.raises(KeyError, match="no whisker's name"):
+    with pytest.raises(KeyError, match="not a whisker's name"):
         _ = ARRAY["nose"]
 
 

@@ -46,8 +46,11 @@ from vibrissa.scene import (
     values_of,
 )
 
-_COORDINATES = ("r", "theta", "phi")
+COORDINATES = ("r", "theta", "phi")
 _LEVELS = 3
+_PAPER = {"r": (11.0, 15.0, 24.0), "theta": (-25.0, 5.0, 35.0), "phi": (-25.0, 5.0, 35.0)}
+"""Values of the paper's surfaces, mm and degrees."""
+
 _OPEN = (np.pi, 2.5 * np.pi)
 """Bearings drawn where solids and surfaces are cut open: all but a quarter."""
 
@@ -102,13 +105,17 @@ def contact_surfaces(
     with looking():
         height, panels, rails = _sheet(width)
         figure = new_figure(width, height, None)
-        for i, name in enumerate(_COORDINATES):
+        for i, name in enumerate(COORDINATES):
             norm, marks = levels(name, shell)
+            values = to_display(name, values_of(name, shell))
+            if values.min() < min(_PAPER[name]) and max(_PAPER[name]) < values.max():
+                marks = list(_PAPER[name])
             among, into, inside = panels[3 * i : 3 * i + 3]
             axes = _contact_axes(figure, among, contacts)
             surface, hues = _level_sets(whole, name, norm, marks)
             paint(axes, _places(surface), hues)
             axes.plot(*line.T, color="black", linewidth=1.2, zorder=10)
+            _write_values(figure, among.box, name, norm, marks)
             axes = _cylinder(figure, into, signals)
             if name == "r":  # its surfaces lie one within the other
                 surface, hues = _level_sets(opened, name, norm, marks)
@@ -132,6 +139,19 @@ def _level_sets(
     return np.concatenate(surfaces), np.concatenate(hues)
 
 
+def _write_values(
+    figure: Figure, box: Box, name: str, norm: Normalize, marks: Sequence[float]
+) -> None:
+    """Values of the surfaces, in their colours, below the title of their panel."""
+    wide, tall = 25.4 * figure.get_size_inches()
+    unit = quantity(name).display_unit
+    for i, mark in enumerate(marks):
+        text = f"{mark:g}{'' if unit == '°' else ' '}{unit}".replace("-", "−")
+        place = (box[0] + 5.5 + 9.5 * i) / wide, (box[1] + box[3] - 3.6) / tall
+        look: dict[str, Any] = {"fontsize": 6.0, "fontweight": "bold", "va": "top"}
+        figure.text(*place, text, color=sequential()(norm(mark)), **look)
+
+
 def _places(triangles: Array) -> Array:
     return to_display("contact_point", triangles[..., :3])
 
@@ -152,7 +172,7 @@ def levels(name: str, shell: Array) -> tuple[Normalize, list[float]]:
 def _sheet(width: Width) -> tuple[float, list[_Panel], list[Box]]:
     """Height of the figure, panels (contacts, signals, solid of r, of θ, of φ), colour bars."""
     kinds = ("contacts of equal {}", "their signals", "all signals, coloured by {}")
-    titles = [kind.format(f"${quantity(n).symbol}$") for n in _COORDINATES for kind in kinds]
+    titles = [kind.format(f"${quantity(n).symbol}$") for n in COORDINATES for kind in kinds]
     cells = [(row, side) for row in range(3) for side in range(3)]
     if width == "double":
         height, wide, tall = 141.0, 56.0, 46.5
@@ -210,8 +230,7 @@ def coordinate_bar(
         rail.set_xlabel(axis_label(name), fontsize=6.5, labelpad=1.0)
 
 
-COORDINATES = ("r", "theta", "phi")
-
+_SKIN = (0.62, 0.68, 0.75, 1.0)
 _OPACITY = 0.22
 _ROOM = 1.5
 
@@ -221,34 +240,43 @@ def solid_panels(
     samples: xr.Dataset,
     centerline: ArrayLike,
     panels: Sequence[Box],
-    rails: Sequence[Box],
-    way: Array | None = None,
-) -> list[Any]:
-    """Draw the signals of all contacts three times, coloured by r, θ and φ."""
+    measured: Array,
+) -> tuple[list[Any], Array]:
+    """Draw the solid of all signals that is near those measured (n, 3) once a panel; its limits."""
     nodes = sample_contacts(samples, centerline)
     within: list[int] = []
-    if way is not None and np.isfinite(way).all(axis=1).any():
-        gentle = _gentle(nodes, way)
+    if np.isfinite(measured).all(axis=1).any():
+        gentle = _gentle(nodes, measured)
         within = [nodes.shape[-1] + i for i in range(gentle.shape[-1])]
         nodes = np.concatenate([nodes, gentle], axis=-1)
     body = solid_surface(nodes, True, column("deflection"), *within)
     places = signal_rows(body)
     limits = signal_limits(places)
-    found = []
-    for name, panel, rail in zip(COORDINATES, panels, rails, strict=True):
-        norm, marks = levels(name, body)
-        axes = signal_axes(figure, panel, limits)
-        values = to_display(name, values_of(name, body))
-        colours = painted(values, norm, sequential())
-        paint(axes, places, colours, opacity=_OPACITY, flat=0.9)
+    solids = [signal_axes(figure, panel, limits) for panel in panels]
+    for axes in solids:
+        paint(axes, places, _SKIN, opacity=_OPACITY, flat=0.6)
+    return solids, limits
+
+
+def course_scales(
+    figure: Figure, rails: Sequence[Box], coordinates: Array
+) -> list[tuple[Array, Normalize]]:
+    """Values of r, θ and φ (n, 3) in display units, each with its colours, shown on a bar."""
+    scales = []
+    for name, rail, column_of in zip(COORDINATES, rails, coordinates.T, strict=True):
+        values = to_display(name, column_of)
+        norm = Normalize(*robust_limits(values))
+        low, high = float(norm.vmin or 0.0), float(norm.vmax or 1.0)
+        ticks = MaxNLocator(4).tick_values(low, high)
+        marks = [float(t) for t in ticks if low <= t <= high]
         coordinate_bar(figure, rail, name, norm, marks)
-        found.append(axes)
-    return found
+        scales.append((values, norm))
+    return scales
 
 
-def _gentle(nodes: Array, way: Array) -> Array:
-    """How far signals are within what a trial reaches, and half as much again; negative beyond."""
-    force, moment = _ROOM * np.nanmax(np.abs(way[:, :2]), axis=0)
+def _gentle(nodes: Array, measured: Array) -> Array:
+    """How far signals are within 1.5 times those of a trial; negative beyond."""
+    force, moment = _ROOM * np.nanmax(np.abs(measured[:, :2]), axis=0)
     tension = 1.0 - np.abs(values_of("Fx", nodes)) / max(force, 1e-12)
     bending = 1.0 - values_of("MB", nodes) / max(moment, 1e-15)
     return np.stack([tension, bending], axis=-1)

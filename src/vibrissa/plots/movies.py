@@ -16,21 +16,26 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
-from matplotlib.collections import CircleCollection
+from matplotlib.collections import CircleCollection, LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.plots.cameras import Sight, Window, part_of, scale_bar, seen, sight_axes
-from vibrissa.plots.contact_surfaces import solid_panels
+from vibrissa.plots.contact_surfaces import course_scales, solid_panels
 from vibrissa.plots.objects import Body, draw_body, one_scale, room_for
 from vibrissa.plots.overview import Curve, curve_legend, curves_over_time
-from vibrissa.plots.space import bounds, name_axes, signal_places, space_axes
+from vibrissa.plots.space import (
+    bounds,
+    coloured_segments,
+    name_axes,
+    signal_places,
+    space_axes,
+)
 from vibrissa.plots.style import (
-    INK,
     ORANGE,
-    RED,
+    TRACE,
     box_axes,
     looking,
     plain,
@@ -38,7 +43,7 @@ from vibrissa.plots.style import (
     sized_figure,
 )
 from vibrissa.quantities import axis_label, to_display
-from vibrissa.scene import TRIPLET, Array, Course
+from vibrissa.scene import TRIPLET, Array, Course, spherical
 
 Picture = NDArray[np.uint8]
 
@@ -180,7 +185,7 @@ def contour_frames(
 
     Above both views with the traced whisker and the contact point, and contacts about the resting
     whisker; below contacts in the laboratory from above, from the front and from the side, with
-    the objects if these are known. Colours of contacts tell their time.
+    the objects if these are known. The colour of a contact is its time.
 
     Parameters
     ----------
@@ -278,7 +283,7 @@ def _views(
         axes = sight_axes(figure, box, low, high)
         axes.set_title(view.name, loc="right", pad=2.0)
         scale_bar(axes, course, view)
-        line = moving_line(axes, color=RED, linewidth=0.8)
+        line = moving_line(axes, **TRACE)
         dot = moving_line(axes, **_CONTACT)
         panels.append(_Sight(axes, low, high, view.size))
         parts.append(_Part(line, lines, dot, dots))
@@ -307,7 +312,7 @@ def _about_whisker(
         animated=True,
     )
     figure.add_artist(cloud)
-    line = flat_line(axes, color=RED, linewidth=0.8, animated=True)
+    line = flat_line(axes, animated=True, **TRACE)
     dot = flat_line(axes, animated=True, **_CONTACT)
     there = flattened(axes, points)
     return _Part(line, flattened(axes, lines), dot, there), _Cloud(cloud, there)
@@ -348,7 +353,7 @@ def _sides(
             zorder=3,
         )
         axes.add_collection(cloud, autolim=False)
-        moving = moving_line(axes, color=RED, linewidth=0.8)
+        moving = moving_line(axes, **TRACE)
         dot = moving_line(axes, **_CONTACT)
         there = points[:, list(view)]
         yield _Part(moving, line[..., list(view)], dot, there), _Cloud(cloud, there)
@@ -433,19 +438,23 @@ def _signal_frames(
         rails = [(66.5 * i + 59.7, 66.0, 1.6, 24.0) for i in range(3)]
         measured = np.stack([signals[name] for name in TRIPLET], axis=1)
         measured[~course.touching] = np.nan
-        solids = solid_panels(
-            figure, samples, centerline, panels, rails, measured[first : last + 1]
-        )
+        span = slice(first, last + 1)
+        solids, _ = solid_panels(figure, samples, centerline, panels, measured[span])
         places = signal_places(*measured.T)
         ways = [flattened(axes, places) for axes in solids]
-        for axes, way in zip(solids, ways, strict=True):
-            path = flat_line(axes, color=INK, linewidth=0.3, alpha=0.4)
-            path.set_data(*way[first : last + 1].T)
+        points = course.known if course.estimated is None else course.estimated
+        coordinates = np.full(places.shape, np.nan) if points is None else spherical(points)
+        scales = course_scales(figure, rails, coordinates[span])
+        for axes, way, (values, norm) in zip(solids, ways, scales, strict=True):
+            segments, means = coloured_segments(way[span], values)
+            path = LineCollection(list(segments), cmap=sequential(), norm=norm, linewidths=1.0)
+            path.set(array=means, transform=axes.transData, clip_on=False)
+            figure.add_artist(path)
         curves = curves_over_time(figure, _BOXES, course, signals, slice(first, last + 1))
         curve_legend(figure, course, (1.0 - 2.0 / WIDTH, 48.0 / HEIGHT))
         marks = [_mark(curve, time[first]) for curve in curves]
         clock = figure.text(0.5, 0.985, "", ha="center", va="top", fontsize=8.0, animated=True)
-        trails = [flat_line(a, color=ORANGE, linewidth=1.6, animated=True) for a in solids]
+        trails = [flat_line(a, color=ORANGE, linewidth=2.0, animated=True) for a in solids]
         look = {"markeredgecolor": "white", "markeredgewidth": 0.6, "linestyle": "none"}
         dots = [
             flat_line(a, marker="o", markersize=5.5, color=ORANGE, animated=True, **look)

@@ -14,16 +14,17 @@ from matplotlib.patches import Patch
 from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.plots.cameras import Sight, Window, part_of, scale_bar, seen, sight_axes
-from vibrissa.plots.contact_surfaces import COORDINATES, solid_panels
+from vibrissa.plots.contact_surfaces import COORDINATES, course_scales, solid_panels
 from vibrissa.plots.estimates import against
 from vibrissa.plots.signals import intervals
-from vibrissa.plots.space import signal_places
+from vibrissa.plots.space import coloured_segments, drop_lines, signal_places
 from vibrissa.plots.style import (
     BLUE,
+    INK,
     MUTED,
     ORANGE,
-    RED,
     SHADE,
+    TRACE,
     Box,
     Width,
     box_axes,
@@ -31,6 +32,7 @@ from vibrissa.plots.style import (
     new_figure,
     page_width,
     plain,
+    sequential,
     shading,
 )
 from vibrissa.quantities import axis_label, to_display
@@ -137,7 +139,7 @@ def trial_overview(
         for row in shown:
             for axes, _ in curves:
                 axes.axvline(float(course.time[row]), color=ORANGE, linewidth=0.6)
-        _way(figure, sheet, course, samples, centerline)
+        _trajectory(figure, sheet, course, samples, centerline, shown)
         if compared:
             _compared(figure, sheet.against, course)
         _letters(figure, sheet)
@@ -195,7 +197,7 @@ def _images(
             part = Window(low, high, view.size, panel).of(next(stream))
             extent = (low[0], high[0], high[1], low[1])
             axes.imshow(part, cmap="gray", vmin=0, vmax=255, extent=extent, aspect="auto")
-            axes.plot(*lines[row].T, color=RED, linewidth=0.8)
+            axes.plot(*lines[row].T, **TRACE)
             axes.scatter(dots[row, 0], dots[row, 1], 9.0, zorder=5, **_CONTACT)
             when = f"{to_display('time', course.time[row]):.3f} s"
             axes.set_title(f"{view.name}, {when}", loc="right", fontsize=6.5, pad=2.0)
@@ -203,16 +205,37 @@ def _images(
                 scale_bar(axes, course, view)
 
 
-def _way(
-    figure: Figure, sheet: _Sheet, course: Course, samples: xr.Dataset, centerline: ArrayLike
+def _trajectory(
+    figure: Figure,
+    sheet: _Sheet,
+    course: Course,
+    samples: xr.Dataset,
+    centerline: ArrayLike,
+    rows: NDArray[np.intp],
 ) -> None:
-    """Solids, and the trajectory of the trial through them."""
+    """The trial in the space of signals, coloured by r, θ and φ; shown frames with drop lines."""
+    from mpl_toolkits.mplot3d.art3d import Line3DCollection  # type: ignore[import-untyped]
+
     assert course.signals is not None
     measured = np.stack([course.signals[name] for name in TRIPLET], axis=1)
     measured[~course.touching] = np.nan
     trajectory = signal_places(*measured.T)
-    for axes in solid_panels(figure, samples, centerline, sheet.solids, sheet.rails, measured):
-        axes.plot(*trajectory.T, color=ORANGE, linewidth=0.7, zorder=12)
+    solids, limits = solid_panels(figure, samples, centerline, sheet.solids, measured)
+    points = course.known if course.estimated is None else course.estimated
+    for axes in solids:
+        for row in rows[np.isfinite(trajectory[rows]).all(axis=1)]:
+            drop_lines(axes, limits, trajectory[row])
+            axes.scatter(*trajectory[row], s=9.0, color=ORANGE, zorder=13, depthshade=False)
+    if points is None:
+        for axes in solids:
+            axes.plot(*trajectory.T, color=INK, linewidth=0.7, zorder=12)
+        return
+    scales = course_scales(figure, sheet.rails, spherical(points))
+    for axes, (values, norm) in zip(solids, scales, strict=True):
+        segments, means = coloured_segments(trajectory, values)
+        path = Line3DCollection(segments, cmap=sequential(), norm=norm, linewidths=1.2, zorder=12)
+        path.set_array(means)
+        axes.add_collection3d(path, autolim=False)
 
 
 def _compared(figure: Figure, boxes: Sequence[Box], course: Course) -> None:

@@ -3,7 +3,7 @@
 Matplotlib's 3D axes carry no types, hence ``Any``. Surfaces are painted as pixels in a PDF too, so
 that files stay small. The space of (F_x, M_B, M_D) is a cylinder: M_B is the distance from
 the axis, M_D the angle about it, and F_x the height. M_B and F_x are drawn on square-root scales,
-as most contacts are light.
+as most contacts are light, and in parallel projection, so that heights can be read off the axis.
 """
 
 from __future__ import annotations
@@ -36,14 +36,18 @@ def space_axes(
     zoom: float = 1.0,
     frame: bool = True,
     aspect: tuple[float, float, float] | None = None,
+    parallel: bool = False,
 ) -> Any:
-    """Add three-dimensional axes, by default to one scale."""
+    """Add three-dimensional axes, by default to one scale and in perspective."""
     axes: Any = box_axes(figure, box, projection="3d", computed_zorder=False)
     axes.patch.set_visible(False)
     axes.set(xlim=limits[0], ylim=limits[1], zlim=limits[2])
     axes.set_box_aspect(aspect or tuple(np.ptp(limits, axis=1)), zoom=zoom)
     axes.view_init(*view)
-    axes.set_proj_type("persp", focal_length=1.6)
+    if parallel:
+        axes.set_proj_type("ortho")
+    else:
+        axes.set_proj_type("persp", focal_length=1.6)
     if not frame:
         axes.set_axis_off()
         return axes
@@ -117,6 +121,9 @@ _ASPECT = (1.0, 1.0, 0.85)
 _FRONT = 222.0
 """Direction, degrees, in which rings carry their labels: toward the viewer."""
 
+_AXIS = 1.4
+"""Distance of the axis of F_x from the cylinder's axis, over its radius."""
+
 _FLOOR: dict[str, Any] = {"color": "#c8c8c8", "linewidth": 0.4, "zorder": 0}
 
 
@@ -154,7 +161,9 @@ def signal_axes(figure: Figure, panel: Box, limits: Array) -> Any:
     left, bottom, side, _ = square(panel)
     box = left + 3.5, bottom + 0.5, side, side
     zoom = 0.98 if side > 50.0 else 0.86  # lettering does not shrink with the panel
-    axes = space_axes(figure, box, limits, _VIEW, zoom=zoom, frame=False, aspect=_ASPECT)
+    axes = space_axes(
+        figure, box, limits, _VIEW, zoom=zoom, frame=False, aspect=_ASPECT, parallel=True
+    )
     reach, floor = limits[0, 1], limits[2, 0]
     turn = np.linspace(0.0, 2.0 * np.pi, 181)
     rings = _round_squares(0.0, reach)[1:]
@@ -163,7 +172,7 @@ def signal_axes(figure: Figure, panel: Box, limits: Array) -> Any:
         axes.plot(*places, floor, **_FLOOR)
         near = 1.0 if ring < rings[-1] else 1.28
         size, unit = quantity("MB").symbol, quantity("MB").display_unit
-        label = f"{ring:g}" if ring < rings[-1] else f"${size}$ = {ring:g} {unit}"
+        label = f"{ring:g}" if ring < rings[-1] else f"${size}$ = {ring:g} {unit} (√ scale)"
         _write(axes, _FRONT, np.sqrt(ring) * near, floor, label, ha="left", va="top", color=MUTED)
     for angle in (0, 90, 180, -90):
         axes.plot(*np.outer(_toward(angle), [0.0, reach]), floor, **_FLOOR)
@@ -180,7 +189,7 @@ def _height_axis(axes: Any, limits: Array) -> None:
     """The axis of F_x, upright at the left."""
     reach, (floor, top) = limits[0, 1], limits[2]
     left = _VIEW[1] - 90.0
-    place = 1.4 * reach * _toward(left)
+    place = _AXIS * reach * _toward(left)
     axes.plot(*np.repeat(place[:, None], 2, axis=1), [floor, top], color=INK, linewidth=0.5)
     for mark in _round_squares(floor, top):
         height = float(root(mark))
@@ -188,7 +197,25 @@ def _height_axis(axes: Any, limits: Array) -> None:
         axes.plot(*tick, height, color=INK, linewidth=0.5)
         label = f"{mark:g}".replace("-", "−")
         _write(axes, left, 1.49 * reach, height, label, ha="right")
-    _write(axes, left, 1.4 * reach, top + 0.1 * (top - floor), axis_label("Fx"), fontsize=6.0)
+    for up, text in ((0.17, axis_label("Fx")), (0.07, "√ scale")):
+        height = top + up * (top - floor)
+        _write(axes, left, 1.4 * reach, height, text, fontsize=6.0 if up > 0.1 else 5.0)
+
+
+def drop_lines(axes: Any, limits: Array, place: Array) -> None:
+    """Lead from a place in the cylinder to the axis of F_x and to its foot on the floor."""
+    axis = _AXIS * limits[0, 1] * _toward(_VIEW[1] - 90.0)
+    look = {"color": MUTED, "linewidth": 0.5, "linestyle": (0, (2, 2)), "zorder": 11}
+    axes.plot(*np.stack([place, [*axis, place[2]]]).T, **look)
+    axes.plot(*np.stack([place, [*place[:2], limits[2, 0]]]).T, **look)
+
+
+def coloured_segments(places: Array, values: Array) -> tuple[Array, Array]:
+    """Segments (m, 2, k) of a path (n, k), with the mean value of each; gaps are left out."""
+    segments = np.stack([places[:-1], places[1:]], axis=1)
+    means = 0.5 * (values[:-1] + values[1:])
+    kept = np.isfinite(segments).all(axis=(1, 2)) & np.isfinite(means)
+    return segments[kept], means[kept]
 
 
 def _toward(angle: float) -> Array:

@@ -4,10 +4,10 @@ Figures are made for print at the width of one or two columns (85 and 178 mm), w
 to 8 points at that size. Only Matplotlib's object-oriented interface is used: no window opens, no
 global state changes, and a figure is freed with its last name. Colours can be distinguished with
 any colour vision (Okabe & Ito 2008, https://jfly.uni-koeln.de/color/); colormaps are perceptual.
-The cyclic one is a circle in the plane of lightness and of blue against yellow in OKLab
-(B. Ottosson 2020, https://bottosson.github.io/posts/oklab/), the plane that every common kind of
-colour vision sees; green against red is added for those who see it. Equal turns are therefore about
-equal steps in colour, and nothing is so pale that it is lost on white paper.
+The cyclic one is a closed curve in OKLab (B. Ottosson 2020,
+https://bottosson.github.io/posts/oklab/) through blue, magenta, yellow and green, at equal steps of
+colour. Its green is light and its magenta dark, so that opposite directions also differ where green
+and red look alike, and nothing is so pale that it is lost on white paper.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from matplotlib.backend_bases import RendererBase
 from matplotlib.colorbar import Colorbar
 from matplotlib.colors import Colormap, ListedColormap
 from matplotlib.figure import Figure
+from scipy.interpolate import CubicSpline
 
 from vibrissa.io import replacing
 from vibrissa.scene import Array, robust_limits
@@ -45,6 +46,11 @@ ORANGE = "#d55e00"
 GREEN = "#009e73"
 RED = "#e8000b"
 """Text, what is secondary, shaded areas, three colours of lines, and that of a traced whisker."""
+
+TRACE: Mapping[str, Any] = MappingProxyType(
+    {"color": RED, "linewidth": 1.0, "linestyle": (0, (1.0, 3.0)), "dash_capstyle": "round"}
+)
+"""Look of a traced whisker: dots, so that the whisker is seen between them."""
 
 LOOK: Mapping[str, Any] = MappingProxyType(
     {
@@ -268,8 +274,10 @@ def _drawn(figure: Figure, **how: Any) -> bytes:
     return file.getvalue()
 
 
-_LIGHTNESS, _RADIUS, _YELLOW, _RED = 0.62, 0.20, 0.115, 0.06
-"""Centre and radius in lightness, radii in b (yellow) and a (red), within the gamut of sRGB."""
+_QUARTERS = np.array(
+    [[0.47, -0.02, -0.18], [0.44, 0.16, 0.0], [0.80, 0.03, 0.155], [0.78, -0.11, 0.0]]
+)
+"""OKLab of the directions −180° (blue), −90° (magenta), 0° (yellow) and 90° (green)."""
 
 _LMS_FROM_LAB = np.array(
     [
@@ -304,16 +312,15 @@ def cyclic() -> Colormap:
     Colormap
         Colours from the lowest to the highest value.
     """
-    turn = np.linspace(-np.pi, np.pi, 512, endpoint=False)
-    lab = np.stack(
-        [
-            _LIGHTNESS + _RADIUS * np.cos(turn),
-            -_RED * np.cos(turn),
-            _YELLOW * np.sin(turn),
-        ],
-        axis=-1,
-    )
-    return ListedColormap(_srgb(lab), name="vibrissa_cyclic")
+    quarters = np.arange(len(_QUARTERS) + 1)
+    curve = CubicSpline(quarters, np.vstack([_QUARTERS, _QUARTERS[:1]]), bc_type="periodic")
+    fine = np.linspace(0.0, quarters[-1], 2001)
+    steps = np.linalg.norm(np.diff(curve(fine), axis=0), axis=1)
+    along = np.concatenate([[0.0], np.cumsum(steps)])
+    # Equal steps of colour within each quarter, so that the four directions keep their colours.
+    share = np.interp(along, np.interp(quarters, fine, along), quarters)
+    turns = np.linspace(0.0, quarters[-1], 512, endpoint=False)
+    return ListedColormap(_srgb(curve(np.interp(turns, share, fine))), name="vibrissa_cyclic")
 
 
 def sequential() -> Colormap:

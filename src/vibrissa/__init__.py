@@ -51,7 +51,13 @@ if TYPE_CHECKING:
     )
     from vibrissa.display import show
     from vibrissa.identifiability import best_triplet, critical_cones, sensitivity, uniqueness
-    from vibrissa.io import load_array, load_whisker
+    from vibrissa.io import (
+        load_array,
+        load_recording,
+        load_signals,
+        load_tracks,
+        load_whisker,
+    )
     from vibrissa.paper import sensitivity_findings
     from vibrissa.rod import Deflection, PegContact, PointContact, PointForce, deflect
     from vibrissa.signals import base_signals
@@ -86,6 +92,9 @@ __all__ = [
     "identifiability",
     "io",
     "load_array",
+    "load_recording",
+    "load_signals",
+    "load_tracks",
     "load_whisker",
     "numerics",
     "objects",
@@ -131,7 +140,13 @@ _HOMES = {
         "sensitivity",
         "uniqueness",
     ),
-    "io": ("load_array", "load_whisker"),
+    "io": (
+        "load_array",
+        "load_recording",
+        "load_signals",
+        "load_tracks",
+        "load_whisker",
+    ),
     "paper": ("sensitivity_findings",),
     "rod": (
         "Deflection",

@@ -54,6 +54,8 @@ class Quantity:
     description: str
 
 
+# Pairs of one size, written in two ways.
+_SAME = {("pixel", "px"), ("1", "")}
 # What a value in a unit of storage is multiplied with to be in the unit that it is shown in.
 _FACTORS = {
     ("m", "mm"): 1e3,
@@ -70,13 +72,23 @@ _FACTORS = {
 }
 
 
+def _display_factor(unit: str, shown: str) -> float:
+    """What a value is multiplied with to be shown in another unit; ValueError if not known."""
+    # Units of covariances are made of others, whose products are written with a dot.
+    if unit.replace("N m", "N·m").replace("^2", "²") == shown or (unit, shown) in _SAME:
+        return 1.0
+    if (unit, shown) not in _FACTORS:
+        raise ValueError(f"how a value in {unit!r} is shown in {shown!r} is not known")
+    return _FACTORS[unit, shown]
+
+
 def _table() -> dict[str, Quantity]:
     """Read the table next to this module."""
     text = Path(__file__).with_suffix(".csv").read_text(encoding="utf-8")
     rows = csv.DictReader(text.splitlines())
     return {
         row["name"]: Quantity(
-            **row, display_factor=_FACTORS.get((row["unit"], row["display_unit"]), 1.0)
+            **row, display_factor=_display_factor(row["unit"], row["display_unit"])
         )
         for row in rows
     }

@@ -232,6 +232,38 @@ def describe(codes: ArrayLike) -> Counter[str]:
     )
 
 
+def names(codes: ArrayLike) -> NDArray[np.str_]:
+    """Name the statuses of many rows.
+
+    Parameters
+    ----------
+    codes : array_like of int, any shape
+        Numbers of :class:`Status`.
+
+    Returns
+    -------
+    array of str, same shape
+        Name of each status.
+
+    Raises
+    ------
+    ValueError
+        Where a number is not a status.
+
+    Examples
+    --------
+    >>> names([0, 2]).tolist()
+    ['OK', 'NO_CONTACT']
+    """
+    numbers = np.asarray(codes)
+    describe(numbers)
+    longest = max(len(status.name) for status in Status)
+    out = np.empty(numbers.shape, dtype=f"U{longest}")
+    for status in Status:
+        out[numbers == int(status)] = status.name
+    return out
+
+
 def flag_attributes() -> dict[str, NDArray[np.int8] | str]:
     """Describe the numbers of :class:`Status` in a dataset, as the CF conventions ask.
 

@@ -343,10 +343,29 @@ def test_what_is_not_a_store_is_left_alone(study, tmp_path):
     with pytest.raises(ValueError, match="not a store of a sweep"):
         open_sweep(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
-    # As stores were laid out before.
-    (tmp_path / ".study.json").write_text('{"name": "of long ago", "layout": 3}')
+    (tmp_path / ".study.json").write_text('{"name": "of long ago", "layout": 1}')
     with pytest.raises(ValueError, match=r"laid out as by another version.*do the study again"):
         open_sweep(tmp_path)
+
+
+def test_a_store_of_before_is_read_and_not_written_to(study, tmp_path):
+    # Three cells of maps, one of which failed, and three of verdicts, as version 0.1.0 kept them
+    # before one file held all cells of a task (commit 8748dad).
+    data = Path(__file__).parents[1] / "data" / "old_study.zip"
+    shutil.unpack_archive(data, tmp_path / "old")
+    found = open_sweep(tmp_path / "old")
+    assert found["status"].values.tolist() == [[1, 1], [1, 1], [2, 1]]
+    np.testing.assert_allclose(found["map_slip_force"], [1e-4, 2e-4, np.nan], rtol=1e-15)
+    np.testing.assert_allclose(found["map_r_largest"][1], [0.02, 0.04], rtol=1e-15)
+    assert found["uniqueness_verdict"].values[:, 1].tolist() == [
+        "unique",
+        "unique off a surface",
+        "not unique",
+    ]
+    np.testing.assert_allclose(found["taper_ratio"], [5.0, 15.0, 30.0])
+    assert "broken" in failures(tmp_path / "old")["map-2"]
+    with pytest.raises(ValueError, match="sweep show"):
+        run_sweep(study, tmp_path / "old", workers=0)
 
 
 def test_a_result_of_another_shape_is_a_failure_until_it_is_done(

@@ -10,6 +10,7 @@ from vibrissa.objects import Peg
 from vibrissa.recording import Recording
 from vibrissa.simulation import Motion, simulate
 from vibrissa.tracking import HeadPose, TrackOptions, trace_video, track
+from vibrissa.tracking.contact_points import outside_video
 
 FRAMES = 30
 RATE = 1000.0
@@ -167,3 +168,14 @@ def test_a_head_is_found_in_every_frame():
     np.testing.assert_array_equal(HeadPose.of(rows, np.array([1, 4]), RATE).position[:, 0], [1, 4])
     with pytest.raises(ValueError, match="missing for 1 frames of the video, the first"):
         HeadPose.of(rows, np.arange(6), RATE)
+
+
+def test_contact_points_outside_of_the_videos_are_stated():
+    pairs = np.stack([np.arange(10), np.arange(10)], axis=1)
+    table = xr.Dataset(coords={"frame": np.arange(4, 14)})
+    (remark,) = outside_video(table, pairs, 1000.0)
+    assert remark.startswith("4 of the 10 moments")
+    assert "frames 0 to 9" in remark
+    assert outside_video(table.isel(frame=slice(6)), pairs, 1000.0) == []
+    timed = xr.Dataset(coords={"time": np.arange(-2, 8) / 1000.0})
+    assert outside_video(timed, pairs, 1000.0)[0].startswith("2 of the 10")

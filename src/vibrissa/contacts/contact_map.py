@@ -139,8 +139,8 @@ class ContactMap:
         Parameters
         ----------
         signals : Dataset or mapping
-            Measured signals by name, SI units, any shape; for the wrench ``force`` and ``moment``,
-            (..., 3), or the six components.
+            Measured signals by name, SI units, any shape, or ``force`` and ``moment``, (..., 3), as
+            `vibrissa.load_signals` returns them; for the wrench these, or the six components.
         using : str or sequence of str
             Signals to use, three or more of the six; or "wrench": all six components of force and
             moment, with or without friction, as `estimate_from_wrench` does.
@@ -279,15 +279,23 @@ class ContactMap:
 
     def _repr_html_(self) -> str:
         """Show the contact points that the whisker can hold, with the range of each signal."""
-        data = self._samples
-        points = data.contact_point.transpose(..., "space").to_numpy()
-        picture = views(
+        return card("ContactMap", self._rows(), self.plot())
+
+    def plot(self) -> str:
+        """Draw the contact points that the whisker can hold.
+
+        Returns
+        -------
+        str
+            SVG element: the x-y and the x-z plane of the whisker's frame.
+        """
+        points = self._samples.contact_point.transpose(..., "space").to_numpy()
+        return views(
             [
                 Mark(points, CONTACT, dots=True, width=1.5, label="contacts"),
                 Mark(self.whisker.centerline(41), REST, width=2.5, label="at rest"),
             ]
         )
-        return card("ContactMap", self._rows(), picture)
 
     def __str__(self) -> str:
         """Tell the range of each signal as well."""

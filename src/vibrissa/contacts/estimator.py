@@ -68,6 +68,8 @@ if TYPE_CHECKING:
 _UNKNOWNS = 3
 # What is larger is brought to this: no less absurd, in any unit, and its square is still a number.
 _LARGEST = 1e100
+_LARGEST_SCALE, _OFTEN = 100.0, 0.95
+"""Non-dimensional force or moment that one in twenty exceeds only if its unit is another."""
 _STATUSES = {int(status): status for status in Status}
 
 
@@ -217,6 +219,7 @@ def estimate(
     check_signals(values, names)
     d = contact_map.chart.discretization
     flat = values.reshape(-1, len(names)) / signal_scales(names, d.force, d.moment)
+    _check_scale(flat, names)
     if contact_map.determines(names):
         readout = Named(contact_map, names, sensor)
         search = Search(contact_map, readout)
@@ -231,6 +234,17 @@ def estimate(
         known = np.isfinite(flat).all(axis=1)
         status = np.where(known, int(Status.DEGENERATE), int(Status.MISSING))
     return contacts_of(found, status, chi_squared, d, names, values.shape[:-1], dims, coords)
+
+
+def _check_scale(flat: Array, names: tuple[str, ...]) -> None:
+    """Refuse forces and moments far too large to have bent the whisker, as in other units."""
+    for values, name, turned in zip(flat.T, names, circular_among(names), strict=True):
+        size = np.abs(values[np.isfinite(values)])
+        if not turned and size.size and np.quantile(size, _OFTEN) > _LARGEST_SCALE:
+            raise ValueError(
+                f"{name} reaches {np.quantile(size, _OFTEN):.2g} times what is natural to this "
+                "whisker: SI units are needed, N and N·m; are these mN, µN, mN·m or µN·m?"
+            )
 
 
 class Estimator:

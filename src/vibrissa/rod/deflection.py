@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.numerics import Array, IntArray
+from vibrissa.quantities import attributes
 from vibrissa.rod.discretization import STEPS, discretize
 from vibrissa.rod.outward import shapes
 from vibrissa.sketch import (
@@ -23,9 +24,11 @@ from vibrissa.sketch import (
     thinned,
     views,
 )
-from vibrissa.status import Status, counted, describe
+from vibrissa.status import Status, counted, describe, flag_attributes
 
 if TYPE_CHECKING:
+    import xarray as xr
+
     from vibrissa.whisker import Whisker
 
 
@@ -290,6 +293,29 @@ class Deflection:
     steps: int = field(default=STEPS, repr=False)
     # Steps that each row needs, where some need more.
     _needed: IntArray | None = field(default=None, repr=False)
+
+    def to_dataset(self) -> xr.Dataset:
+        """Return the results as a dataset.
+
+        Returns
+        -------
+        Dataset
+            ``force``, ``moment``, ``contact_point``, ``arc_length``, ``residual`` and ``status``;
+            leading dimensions are called ``load``, or ``load_0``, ``load_1``, ... if several.
+        """
+        import xarray as xr
+
+        count = self.status.ndim
+        dims = ("load",) if count == 1 else tuple(f"load_{i}" for i in range(count))
+        data: dict[str, Any] = {
+            name: ((*dims, "space"), getattr(self, name), attributes(name))
+            for name in ("force", "moment", "contact_point")
+        } | {
+            name: (dims, getattr(self, name), attributes(name))
+            for name in ("arc_length", "residual")
+        }
+        data["status"] = (dims, self.status, {**attributes("status"), **flag_attributes()})
+        return xr.Dataset(data, {"space": list("xyz")})
 
     def centerline(self, n: int = 100) -> Array:
         """Return the deflected centrelines.

@@ -74,6 +74,8 @@ def deflect(
     >>> vb.Status(bent.status).name
     'OK'
     """
+    if isinstance(whisker, Load):
+        raise ValueError("the whisker comes first, then its load: deflect(whisker, load)")
     d = discretize(whisker, steps)
     if isinstance(load, PointForce):
         solved, needed = _by_force(whisker, d, load, steps)

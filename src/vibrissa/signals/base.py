@@ -191,8 +191,8 @@ def measured(
     Parameters
     ----------
     signals : Dataset or mapping
-        Signals in SI units, the named ones at least; shapes must broadcast. DataArrays are matched
-        by the names of their dimensions.
+        Signals in SI units, the named ones at least, or ``force`` and ``moment``, from which they
+        follow; shapes must broadcast. DataArrays are matched by the names of their dimensions.
     names : tuple of str
         Names of the signals.
 
@@ -215,6 +215,8 @@ def measured(
             f"signals must be a dataset or mapping with {', '.join(names)}; got {signals!r}"
         )
     missing = [name for name in names if name not in signals]
+    if missing and {"force", "moment"} <= set(map(str, signals)):
+        signals, missing = base_signals(signals["force"], signals["moment"]), []
     if missing:
         raise ValueError(
             f"signals lack {', '.join(missing)}; they have {', '.join(map(str, signals)) or 'none'}"

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from vibrissa.sweeps.store import (
     DAMAGED,
     DESCRIBED,
     DONE,
     FAILED,
+    LAYOUT,
     NOT_ASKED,
+    OLD_LAYOUTS,
     TO_DO,
     Cells,
     described,
@@ -49,9 +52,32 @@ def open_sweep(path: str | PathLike[str]) -> xr.Dataset:
         If it is not a store, or so damaged that it cannot be read.
     """
     path = Path(path)
-    kept = described(path)
-    tasks = list(kept["tasks"])
+    kept = described(path, (LAYOUT, *OLD_LAYOUTS))
     names, groups, _ = (list(words) for words in zip(*kept["whiskers"], strict=True))
+    read = _records if kept["layout"] == LAYOUT else _arrays
+    cells, numbers, found = read(path, kept, names, groups)
+    about = {
+        name: ("whisker", values, {"units": DESCRIBED[name], "long_name": name.replace("_", " ")})
+        for name, values in numbers.items()
+    }
+    out = xr.Dataset(
+        {name: (("whisker", "task"), values) for name, values in cells.items()},
+        {"whisker": names, "group": ("whisker", groups), **about, "task": list(kept["tasks"])},
+        {"study": kept["name"], "origins": kept["origins"]},
+    )
+    for task, data in found.items():
+        data = data.rename({name: f"{task}_{name}" for name in data.data_vars})
+        out = out.merge(data.rename(_differing(out, data, task)), combine_attrs="override")
+    return out
+
+
+_Read = tuple[dict[str, NDArray[Any]], dict[str, NDArray[Any]], dict[str, xr.Dataset]]
+"""Arrays over cells, arrays over whiskers, and the results of each task."""
+
+
+def _records(path: Path, kept: dict[str, Any], names: list[str], groups: list[str]) -> _Read:
+    """Read the records of a store."""
+    tasks = list(kept["tasks"])
     shape = len(names), len(tasks)
     asked = np.array(
         [[t not in kept["groups"] or g in kept["groups"][t] for t in tasks] for g in groups]
@@ -75,20 +101,51 @@ def open_sweep(path: str | PathLike[str]) -> xr.Dataset:
         at = failure["index"], tasks.index(failure["task"])
         if status[at] != DONE:
             status[at], seconds[at], origin[at] = FAILED, failure["seconds"], failure["origin"]
-    about = {
-        name: ("whisker", values, {"units": DESCRIBED[name], "long_name": name.replace("_", " ")})
-        for name, values in numbers.items()
-    }
-    over = ("whisker", "task")
-    out = xr.Dataset(
-        {"status": (over, status), "seconds": (over, seconds), "origin": (over, origin)},
-        {"whisker": names, "group": ("whisker", groups), **about, "task": tasks},
-        {"study": kept["name"], "origins": kept["origins"]},
-    )
-    for task, cells in found.items():
-        data = _results(cells).rename({name: f"{task}_{name}" for name in cells.layout.variables})
-        out = out.merge(data.rename(_differing(out, data, task)), combine_attrs="override")
-    return out
+    told = {"status": status, "seconds": seconds, "origin": origin}
+    return told, numbers, {task: _results(cells) for task, cells in found.items()}
+
+
+def _arrays(path: Path, kept: dict[str, Any], names: list[str], groups: list[str]) -> _Read:
+    """Read a store of before, a Zarr group for each task, without looking for damage in it."""
+    cells, whiskers = (_group(path / name) for name in ("cells", "whiskers"))
+    status = cells["status"].values.astype(np.int8)
+    some = (status == DONE).any(axis=1)
+    numbers = {name: np.where(some, whiskers[name].values, np.nan) for name in DESCRIBED}
+    found = {}
+    for k, task in enumerate(kept["tasks"]):
+        if not (path / task).exists():
+            continue
+        data = _group(path / task)
+        done = status[:, k] == DONE
+        for name, one in data.data_vars.items():
+            nothing = -1 if one.dtype.kind == "i" else np.nan
+            rows = done.reshape(-1, *[1] * (one.ndim - 1))
+            data[name] = (one.dims, *_worded(np.where(rows, one.values, nothing), one.attrs))
+        found[task] = data
+    told = {"status": status} | {name: cells[name].values for name in ("seconds", "origin")}
+    return told, numbers, found
+
+
+def _group(path: Path) -> xr.Dataset:
+    """A group of a store of before, as it is stored."""
+    try:
+        data: xr.Dataset = xr.open_zarr(path, chunks=None, decode_cf=False).load()
+    except Exception as fault:  # of a damaged file, libraries raise whatever they meet
+        raise ValueError(f"{path} is damaged: {' '.join(str(fault).split())[:200]}") from fault
+    for each in data.variables.values():
+        each.attrs.pop("_FillValue", None)
+    return data.drop_attrs(deep=False)
+
+
+def _worded(
+    values: NDArray[Any], attributes: Mapping[Any, Any]
+) -> tuple[NDArray[Any], dict[str, Any]]:
+    """Words in place of flags, and the attributes that remain."""
+    about = {str(key): one for key, one in attributes.items() if not str(key).startswith("flag_")}
+    if meanings := attributes.get("flag_meanings"):
+        words = [word.replace("_", " ") for word in meanings.split()]
+        values = np.array([*words, ""])[values.astype(int)]
+    return values, about
 
 
 def _results(cells: Cells) -> xr.Dataset:
@@ -96,11 +153,7 @@ def _results(cells: Cells) -> xr.Dataset:
     data: dict[str, Any] = {}
     for name, (dims, _, kind, attributes) in cells.layout.variables.items():
         values = cells.column("result", name, fill=-1 if kind == "<i1" else np.nan)
-        about = {key: one for key, one in attributes.items() if not key.startswith("flag_")}
-        if meanings := attributes.get("flag_meanings"):
-            words = [word.replace("_", " ") for word in meanings.split()]
-            values = np.array([*words, ""])[values]
-        data[name] = (("whisker", *dims), values, about)
+        data[name] = (("whisker", *dims), *_worded(values, attributes))
     coords = {name: (name, *one) for name, one in cells.layout.coordinates.items()}
     return xr.Dataset(data, coords)
 
@@ -129,7 +182,10 @@ def failures(path: str | PathLike[str]) -> dict[str, str]:
         of cells that have not been done since.
     """
     path = Path(path)
-    kept = described(path)
+    kept = described(path, (LAYOUT, *OLD_LAYOUTS))
+    if kept["layout"] != LAYOUT:
+        texts = sorted(path.glob(".failures/*.txt"))
+        return {text.stem: text.read_text(encoding="utf-8") for text in texts}
     last = {(one["task"], one["index"]): one["failure"] for one in read_failures(path)}
     done = {task: Cells.read(path, task, len(kept["whiskers"])) for task in kept["tasks"]}
     return {

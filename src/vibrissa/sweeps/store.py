@@ -20,7 +20,7 @@ import json
 import re
 import shutil
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import version
@@ -50,7 +50,10 @@ DESCRIBED = {
 """Numbers that describe every whisker, and their units."""
 
 _STUDY, _LOCK, _FAILURES, RESULTS = ".study.json", ".sweep.lock", "failures.jsonl", "results"
-_LAYOUT = 4
+LAYOUT = 4
+OLD_LAYOUTS = (2, 3)
+"""Layouts that can be read but not written to: a Zarr group for each task."""
+
 _SUM = "checksum"
 _LIBRARIES = ("numpy", "scipy", "numba")
 # Modules that compute a cell; results depend on them and on the packages that they import.
@@ -414,7 +417,7 @@ class Store:
             aside.rename(self.path / RESULTS)
 
 
-def described(path: Path) -> dict[str, Any]:
+def described(path: Path, layouts: Collection[int] = (LAYOUT,)) -> dict[str, Any]:
     """Read what the study of a store is, and by which codes it was done."""
     file = path / _STUDY
     if not file.exists():
@@ -422,12 +425,15 @@ def described(path: Path) -> dict[str, Any]:
     kept: Any = None
     with contextlib.suppress(ValueError):
         kept = json.loads(file.read_bytes())
-    if isinstance(kept, dict) and kept.get("layout") != _LAYOUT:
+    if isinstance(kept, dict) and kept.get("layout") not in layouts:
+        able = "its results can be shown (`vibrissa sweep show`), but it cannot be continued"
         raise ValueError(
-            f"{path} is laid out as by another version of vibrissa: open it with that one (or its "
-            f"tables with xarray.open_zarr, {path}/TASK), or do the study again in another store"
+            f"{path} is laid out as by another version of vibrissa: "
+            f"{able if kept.get('layout') in OLD_LAYOUTS else 'open it with that one'}; "
+            "to do the study again give another store"
         )
-    if not isinstance(kept, dict) or kept.pop(_SUM, None) != _sum(kept):
+    unchecked = isinstance(kept, dict) and kept.get("layout") == min(OLD_LAYOUTS)
+    if not isinstance(kept, dict) or (kept.pop(_SUM, None) != _sum(kept) and not unchecked):
         raise ValueError(
             f"{file} is damaged, which describes what the store holds: put back a copy of it, "
             "or remove it, and the study is begun anew"
@@ -447,7 +453,7 @@ def read_failures(path: Path) -> Iterator[dict[str, Any]]:
 def _described(study: Study) -> dict[str, Any]:
     """What two studies must have in common to share a store."""
     content = {
-        "layout": _LAYOUT,
+        "layout": LAYOUT,
         "name": study.name,
         "seed": study.seed,
         "whiskers": [[one.name, one.group, one.identity] for one in study.specimens],

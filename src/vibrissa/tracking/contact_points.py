@@ -80,6 +80,23 @@ def given_contacts(
     return _compared(points, rod, "table")
 
 
+def outside_video(table: xr.Dataset, pairs: NDArray[np.int64], rate: float) -> list[str]:
+    """State how many moments of a table of contact points no frame of the videos has."""
+    timed = "time" in table.dims
+    known = table["time"].values * rate if timed else table["frame"].values.astype(float)
+    within = _NEAR if timed else 0.0
+    first, last = pairs.min() - within, pairs.max() + within
+    outside = known[(known < first) | (known > last)]
+    if not outside.size:
+        return []
+    where = [f"{x / rate:g} s" if timed else f"frame {x:.0f}" for x in (known.min(), known.max())]
+    return [
+        f"{outside.size} of the {known.size} moments in the table of contact points (from "
+        f"{where[0]} to {where[1]}) are outside of the videos, frames {pairs.min()} to "
+        f"{pairs.max()}, and are left out: check where it counts its frames from."
+    ]
+
+
 def _rows(
     known: NDArray[np.generic], wanted: NDArray[np.generic], within: float
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

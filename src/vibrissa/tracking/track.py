@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from vibrissa.cameras import Camera
 from vibrissa.objects import Surface
 from vibrissa.recording import ONE_VIEW
-from vibrissa.tracking.contact_points import contacts_at, given_contacts
+from vibrissa.tracking.contact_points import contacts_at, given_contacts, outside_video
 from vibrissa.tracking.recording import Tracked, tracked_recording
 from vibrissa.tracking.refine.fit import FitOptions, Fitter, with_length_unsure
 from vibrissa.tracking.refine.rods import rolled
@@ -191,6 +191,8 @@ def track(
                 raise
             reason = " ".join(str(fault).split()) or type(fault).__name__
             remarks.append(f"{name} could not be tracked and is left out: {reason}")
+    if contacts is not None:
+        remarks += outside_video(contacts, pairs, rate)
     if not found:
         raise ValueError(f"no whisker could be tracked: {'; '.join(remarks)}")
     recording = tracked_recording(cameras, found, pairs, rate, moving, objects, options.cutoff)

@@ -1,10 +1,8 @@
 """From the points of other trackers to traces and views, so that they are tracked like videos.
 
-Trackers give a few points along a whisker in one or more views, or points in space. Points of two
-calibrated views are traces already. Where there is one view, the whisker is taken to stay in the
-plane that the view shows: a second camera is added that looks along this plane. Points in space are
-projected into two such cameras. The added cameras see only what is stated about the points, and are
-perpendicular to the usual direction of the whisker, so that no whisker points towards one.
+Trackers give a few points along a whisker in one or more views, or points in space. Points in views
+are traces already; points in space are projected into two orthogonal cameras, perpendicular to the
+usual direction of the whisker, so that no whisker points towards one.
 """
 
 from __future__ import annotations
@@ -38,6 +36,9 @@ _SPACING = 8.0
 _USUAL = 0.5
 """Share of the frames in which a whisker is seen, from which it is worth tracking."""
 
+_SHARE = 1e-3
+"""Usual standard deviation of a point in space, as a share of the whisker's length."""
+
 _WIDE = 1000.0
 """Width of the image of a camera that is added, pixels."""
 
@@ -55,7 +56,7 @@ class TrackerTraces:
     Parameters
     ----------
     cameras : tuple of Camera
-        Cameras of the views, those that are added included.
+        Cameras of the views; of points in space two that show them.
     traces : list of list of list of Trace
         Traces view by view, whisker by whisker, frame by frame, as `track` takes them.
     names : list of str
@@ -121,8 +122,8 @@ def tracker_traces(
     points, known = _identified(tracks, points, notes)
     kept = _wanted(known, points, names, tracks.attrs.get("identity") == "per frame", notes)
     known, points = [known[k] for k in kept], points[:, kept]
-    if views is None or len(views) == 1:
-        points, views, sigma = _with_added(points, views, pixel_size, sigma, notes)
+    if views is None:
+        points, views, sigma = _in_two_views(points, sigma, notes)
     scatter = POINT_SIGMA if sigma is None else sigma
     traces = [
         [[_trace(points[i, k, v], scatter) for i in range(len(points))] for k in range(len(known))]
@@ -282,40 +283,23 @@ def _wanted(
     return [longest]
 
 
-def _with_added(
-    points: Array,
-    views: tuple[Camera, ...] | None,
-    pixel_size: float | None,
-    sigma: float | None,
-    notes: list[str],
-) -> tuple[Array, tuple[Camera, ...], float | None]:
-    """Points in all views where cameras are added: of one view, or of points in space."""
-    if views is None:
-        space, plane = points, None
-    else:
-        if views[0].projection != "orthographic" or pixel_size is None:
-            raise ValueError("one view needs the size of a pixel, not a calibrated camera")
-        (plane,) = views
-        shown = points[:, :, 0] - plane.matrix[:2, 2]
-        flat = np.zeros(shown.shape[:-1])
-        space = np.stack([pixel_size * shown[..., 0], -pixel_size * shown[..., 1], flat], axis=-1)
-        notes.append("there is one view: the whisker is taken to stay in the plane that it shows")
+def _in_two_views(
+    space: Array, sigma: float | None, notes: list[str]
+) -> tuple[Array, tuple[Camera, ...], float]:
+    """Points in space (time, whisker, node, 3) as two cameras show them; sigma in pixels."""
     every = space.reshape(-1, 3)
     every = every[np.isfinite(every).all(axis=1)]
     low, high = every.min(axis=0), every.max(axis=0)
     direction = np.nanmean(space[:, :, -1] - space[:, :, 0], axis=(0, 1))
     if not np.isfinite(direction).all() or not direction.any():
         direction = high - low
-    added = _looking_across(0.5 * (low + high), float(np.linalg.norm(high - low)), direction)
-    if plane is not None:
-        cameras: tuple[Camera, ...] = (plane, added[1])
-    else:
-        cameras = added
-        lengths = np.nansum(np.linalg.norm(np.diff(space, axis=2), axis=-1), axis=-1)
-        sigma = 1e-3 * float(np.median(lengths[lengths > 0.0])) if sigma is None else sigma
-        sigma *= float(added[0].matrix[1, 1])
-        notes.append("points in space are tracked as two orthogonal views would show them")
-    return np.stack([camera.project(space) for camera in cameras], axis=2), cameras, sigma
+    cameras = _looking_across(0.5 * (low + high), float(np.linalg.norm(high - low)), direction)
+    lengths = np.nansum(np.linalg.norm(np.diff(space, axis=2), axis=-1), axis=-1)
+    if sigma is None:
+        sigma = _SHARE * float(np.median(lengths[lengths > 0.0]))
+    notes.append("points in space are tracked as two orthogonal views would show them")
+    points = np.stack([camera.project(space) for camera in cameras], axis=2)
+    return points, cameras, sigma * float(cameras[0].matrix[1, 1])
 
 
 def _looking_across(middle: Array, extent: float, direction: Array) -> tuple[Camera, Camera]:

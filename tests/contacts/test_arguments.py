@@ -1,0 +1,55 @@
+"""What users hand over: datasets of files, other units, swapped arguments."""
+
+import numpy as np
+import pytest
+
+import vibrissa as vb
+
+
+@pytest.fixture(scope="module")
+def bent():
+    points = [[24e-3, 13e-3, 2e-3], [26e-3, 11e-3, 1e-3]]
+    return vb.deflect(vb.samples.gamma(), vb.PointContact(points))
+
+
+@pytest.fixture(scope="module")
+def contact_map(bent):
+    return vb.ContactMap.simulate(bent.whisker, grid=False)
+
+
+def test_a_table_of_signals_is_estimated_as_it_is_loaded(bent, contact_map, tmp_path):
+    path = tmp_path / "signals.csv"
+    rows = np.column_stack([[0.0, 0.001], bent.force, bent.moment])
+    header = "time,Fx,Fy,Fz,Mx,My,Mz"
+    np.savetxt(path, rows, delimiter=",", header=header, comments="", fmt="%.17g")
+    found = contact_map.estimate(vb.load_signals(path))
+    np.testing.assert_allclose(found.candidates.point[:, 0], bent.contact_point, atol=1e-6)
+    assert vb.status.names(found.status).tolist() == ["UNIQUE", "UNIQUE"]
+
+
+def test_signals_in_other_units_get_a_hint(bent, contact_map):
+    signals = vb.base_signals(1e6 * bent.force, 1e6 * bent.moment)
+    with pytest.raises(ValueError, match="are these mN"):
+        contact_map.estimate(signals)
+
+
+def test_swapped_arguments_get_a_hint(bent):
+    with pytest.raises(ValueError, match="whisker comes first"):
+        vb.deflect(bent.load, bent.whisker)
+
+
+def test_results_become_datasets_and_pictures(bent, contact_map):
+    data = bent.to_dataset()
+    assert data["force"].dims == ("load", "space")
+    np.testing.assert_array_equal(data["moment"], bent.moment)
+    assert data["arc_length"].attrs["units"] == "m"
+    assert contact_map.plot().startswith("<svg")
+
+
+def test_statuses_have_names_in_any_shape():
+    assert vb.status.names([[0, 2], [10, 11]]).tolist() == [
+        ["OK", "NO_CONTACT"],
+        ["BEYOND_FOLD", "BEYOND_TIP"],
+    ]
+    with pytest.raises(ValueError, match="not statuses"):
+        vb.status.names([0, 77])

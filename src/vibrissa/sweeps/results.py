@@ -101,8 +101,8 @@ def _records(path: Path, kept: dict[str, Any], names: list[str], groups: list[st
         at = failure["index"], tasks.index(failure["task"])
         if status[at] != DONE:
             status[at], seconds[at], origin[at] = FAILED, failure["seconds"], failure["origin"]
-    told = {"status": status, "seconds": seconds, "origin": origin}
-    return told, numbers, {task: _results(cells) for task, cells in found.items()}
+    over_cells = {"status": status, "seconds": seconds, "origin": origin}
+    return over_cells, numbers, {task: _results(cells) for task, cells in found.items()}
 
 
 def _arrays(path: Path, kept: dict[str, Any], names: list[str], groups: list[str]) -> _Read:
@@ -122,8 +122,8 @@ def _arrays(path: Path, kept: dict[str, Any], names: list[str], groups: list[str
             rows = done.reshape(-1, *[1] * (one.ndim - 1))
             data[name] = (one.dims, *_worded(np.where(rows, one.values, nothing), one.attrs))
         found[task] = data
-    told = {"status": status} | {name: cells[name].values for name in ("seconds", "origin")}
-    return told, numbers, found
+    over_cells = {"status": status} | {name: cells[name].values for name in ("seconds", "origin")}
+    return over_cells, numbers, found
 
 
 def _group(path: Path) -> xr.Dataset:

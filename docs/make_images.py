@@ -42,7 +42,14 @@ from vibrissa.simulation import (
 
 WIDTH = 1200
 WIDER = {"title": 1360}
-LEVELS = {"title": 48, "signal_space": 48, "contact_surfaces": 48, "trial": 32, "movie_signals": 64, "movie_contour": 64}
+LEVELS = {
+    "title": 48,
+    "signal_space": 48,
+    "contact_surfaces": 48,
+    "trial": 32,
+    "movie_signals": 64,
+    "movie_contour": 64,
+}
 """Of red, green and blue in figures for which 256 colours are too few."""
 
 CURVATURES = np.arange(8) / 5.0
@@ -154,10 +161,10 @@ def signal_movie() -> np.ndarray:
 def contour_movie() -> np.ndarray:
     """A frame of the movie of the contour."""
     course = course_of(trial())
-    rows = [0, plots.key_frames(course)[-1] - 4]
+    rows = [0, plots.key_frames(course)[-1] - 4, len(course.time) - 1]
     return list(
         plots.contour_frames(course, line(), filmed(rows), rows, Recording(trial()).objects)
-    )[-1]
+    )[1]
 
 
 def line() -> np.ndarray:

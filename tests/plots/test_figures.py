@@ -165,10 +165,33 @@ def test_files_are_written_the_same_each_time(tmp_path) -> None:
         assert file.read_bytes() == file.with_stem("one").read_bytes()
 
 
-def test_cyclic_colours_close_and_turn_evenly() -> None:
-    colours = cyclic()(np.linspace(0.0, 1.0, 513)[:-1])[:, :3]
-    steps = np.linalg.norm(np.roll(colours, -1, axis=0) - colours, axis=1)
-    assert steps.max() < 4.0 * np.median(steps)
+OKLAB = (
+    # Linear sRGB to cones, and their cube roots to lightness, a and b (B. Ottosson 2020).
+    [
+        [0.4122214708, 0.5363325363, 0.0514459929],
+        [0.2119034982, 0.6806995451, 0.1073969566],
+        [0.0883024619, 0.2817188376, 0.6299787005],
+    ],
+    [
+        [0.2104542553, 0.7936177850, -0.0040720468],
+        [1.9779984951, -2.4285922050, 0.4505937099],
+        [0.0259040371, 0.7827717662, -0.8086757660],
+    ],
+)
+DEUTERANOPE = [[0.29275, 0.70725, 0.0], [0.29275, 0.70725, 0.0], [-0.02234, 0.02234, 1.0]]
+"""Linear sRGB as seen without medium cones (Viénot, Brettel & Mollon 1999)."""
+
+
+def test_cyclic_colours_close_turn_evenly_and_differ_without_medium_cones() -> None:
+    encoded = cyclic()(np.linspace(0.0, 1.0, 513)[:-1])[:, :3]
+    linear = np.where(encoded < 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    first, second = map(np.array, OKLAB)
+    for seen, even, apart in ((np.eye(3), 2.0, 0.25), (DEUTERANOPE, 4.0, 0.12)):
+        rgb = np.clip(linear @ np.transpose(seen), 0.0, 1.0)
+        lab = np.cbrt(rgb @ first.T) @ second.T
+        steps = np.linalg.norm(np.roll(lab, -1, axis=0) - lab, axis=1)
+        assert steps.max() < even * np.median(steps)
+        assert np.linalg.norm(np.roll(lab, 256, axis=0) - lab, axis=1).min() > apart
 
 
 def test_robust_limits_never_collapse() -> None:

@@ -91,7 +91,7 @@ def test_the_whisker_is_red_where_it_is_traced(known):
             assert to_line.min(axis=1).max() < 3.0, "nothing red elsewhere"
             # The contact is drawn over a bit of it.
             hidden = np.linalg.norm(fine - fine[int(400 * 26 / 40)], axis=1) < 10.0
-            assert to_line.min(axis=0)[~hidden].max() < 3.0, "red all along"
+            assert to_line.min(axis=0)[~hidden].max() < 8.0, "red dots all along"
 
 
 def test_contacts_stay_from_frame_to_frame(known):
@@ -105,6 +105,9 @@ def test_contacts_stay_from_frame_to_frame(known):
         ]
         painted = [(np.ptp(p[..., :3].astype(int), axis=-1) > 60).sum() for p in panel]
         assert painted[-1] > painted[4] > painted[0] - 400
+    # The outline of the peg appears with them, wholly in the last frame.
+    peg = [(np.abs(p[..., :3].astype(int) - 140).max(axis=-1) < 25).sum() for p in panel]
+    assert peg[-1] > peg[-2] + 50 > peg[0]
     # In between two frames none is left out.
     (last,) = list(contour_frames(course, line(), [], [11], [known.peg]))
     jump = list(contour_frames(course, line(), [], [0, 11], [known.peg]))[-1]

@@ -61,10 +61,10 @@ def report(
     seed: int | None = None,
     force: bool = False,
 ) -> None:
-    """Write a page that opens offline: what was done, how well, figures, a contour to turn.
+    """Write a page that opens offline: results, errors, figures, and a contour to turn.
 
     It is about the whisker most in contact, unless --which chooses another; the seed is that of the
-    draws behind what is predicted. With SOURCE_DATE_EPOCH set, the same command gives the same
+    predicted errors. With SOURCE_DATE_EPOCH set, the same command gives the same
     page. Example: `vibrissa report trial.nc --video top.mp4 --video front.mp4 -o report.html`
     """
     from vibrissa.io import check_readable, check_writable, load_recording
@@ -100,14 +100,14 @@ def report(
             unused = of_trial.given() | {"--make-movies": make, "--seed": seed}
             refuse(unused, f"{path} is a map")
             content = _of_map(path, uniqueness)
-        content.sections.append(figure_sections(_drawn(content.drawings, tell)))
+        content.sections.extend(figure_sections(_drawn(content.drawings, tell)))
     if make:
         kinds = ("signals", "contour")
         movies += sorted(make_movies(path, target.parent, kinds, of_trial, FrameOptions(), force))
     # The page is the same, whether there was one before or not.
     command = ["vibrissa", *(word for word in sys.argv[1:] if word != "--force")]
     origin = provenance_section(provenance(command, given, (seed or 0) if is_trial else None))
-    about = "From the forces at a whisker's base to what it touched, by vibrissa."
+    about = "From the forces and moments at a whisker's base to the object that it touched."
 
     def page(sections: list[Section]) -> str:
         return document(content.title, about, [*sections, origin], content.script)
@@ -155,8 +155,8 @@ def _of_trial(
         things = trial["objects"].children.values() if "objects" in trial.children else ()
         known = [thing.to_dataset() for thing in things]
         shown = ["Contact points in the laboratory"]
-        shown += ["the object as known"] if things else []
-        shown += ["as fitted"] if "contour" in trial.children else []
+        shown += ["the known object"] if things else []
+        shown += ["the fitted shape"] if "contour" in trial.children else []
         picture = contacts_in_space(course, known, fits_of(trial))
         section, script = space_section(picture, f"{', '.join(shown)}, and the whisker.")
         sections = [*sections, section]
@@ -176,7 +176,7 @@ def _of_map(path: Path, uniqueness: Path | None) -> _Content:
     drawings = dict(map_drawings(contact_map, "double", verdicts, None))
     if _can_draw():
         picture = reachable_space(contact_map.to_dataset(), contact_map.whisker.centerline(NODES))
-        section, script = space_section(picture, "All contacts that the whisker can hold.")
+        section, script = space_section(picture, "All stable contacts of the whisker.")
         sections = [*sections, section]
     return _Content(f"Map of contacts: {path.name}", sections, script, drawings)
 

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.plots.cameras import Sight, Window, part_of, scale_bar, seen, sight_axes
 from vibrissa.plots.contact_surfaces import course_scales, solid_panels
-from vibrissa.plots.objects import Body, draw_body, one_scale, room_for
+from vibrissa.plots.objects import Body, one_scale, outline_segments, room_for
 from vibrissa.plots.overview import Curve, curve_legend, curves_over_time
 from vibrissa.plots.space import (
     bounds,
@@ -34,6 +34,8 @@ from vibrissa.plots.space import (
     space_axes,
 )
 from vibrissa.plots.style import (
+    INK,
+    MUTED,
     ORANGE,
     TRACE,
     box_axes,
@@ -164,6 +166,36 @@ class _Cloud(NamedTuple):
     places: Array
 
 
+_REVEALED = 0.05
+"""Distance from a contact within which an outline appears, as a share of the view's width."""
+
+_OUTLINES: tuple[dict[str, Any], ...] = (
+    {"color": MUTED, "linewidth": 1.6, "zorder": 1.5},
+    {"color": ORANGE, "linewidth": 0.9, "zorder": 2.0},
+)
+"""Looks of the outlines of true objects and of fitted shapes."""
+
+
+class _Outline:
+    """An outline (n, 2, 2) that appears near contacts."""
+
+    def __init__(self, axes: Axes, segments: Array, reach: float, look: dict[str, Any]) -> None:
+        self.lines = LineCollection([], animated=True, **look)
+        axes.add_collection(self.lines, autolim=False)
+        self._segments, self._reach = segments, reach
+        self._shown = np.zeros(len(segments), dtype=bool)
+
+    def reveal(self, contacts: Array | None) -> None:
+        """Show what is near contacts (n, 2); all of it if there are none."""
+        middle = self._segments.mean(axis=1)
+        if contacts is None:
+            self._shown[:] = True
+        elif middle.size:
+            away = np.linalg.norm(middle[:, None] - contacts, axis=-1)
+            self._shown |= away.min(axis=1) < self._reach
+        self.lines.set_segments(list(self._segments[self._shown]))
+
+
 class _Sight(NamedTuple):
     """A panel for what a camera sees, and which part of its images is shown there."""
 
@@ -181,11 +213,12 @@ def contour_frames(
     bodies: Sequence[Body] = (),
     fitted: Sequence[Body] = (),
 ) -> Iterator[Picture]:
-    """Draw the frames of a movie: what cameras see, and contacts as they come.
+    """Draw the frames of a movie: camera views, and a contour that grows contact by contact.
 
     Above both views with the traced whisker and the contact point, and contacts about the resting
-    whisker; below contacts in the laboratory from above, from the front and from the side, with
-    the objects if these are known. The colour of a contact is its time.
+    whisker; below contacts in the laboratory from above, from the front and from the side, in the
+    colour of their time. The outlines of objects and fitted shapes appear where contacts are, and
+    wholly in the last frame.
 
     Parameters
     ----------
@@ -198,8 +231,8 @@ def contour_frames(
     rows : array_like (m,) of int
         Which frames of the trial, rising. Contacts in between are shown too.
     bodies, fitted : sequence of object
-        Objects as they are, filled grey, and as they were fitted to contacts, dashed: with
-        ``signed_distance``, laboratory frame, m.
+        True objects, grey, and shapes fitted to the contacts, orange: with ``signed_distance``,
+        laboratory frame, m.
 
     Returns
     -------
@@ -240,9 +273,11 @@ def _contour_frames(
         part, cloud = _about_whisker(figure, course, places, centerline, slice(first, last + 1))
         parts.append(part)
         clouds.append(cloud)
-        for part, cloud in _sides(figure, course, places, bodies, slice(first, last + 1)):
+        outlines = []
+        for part, cloud, lines_of in _sides(figure, course, places, bodies, slice(first, last + 1)):
             parts.append(part)
             clouds.append(cloud)
+            outlines += [(outline, cloud.places) for outline in lines_of]
         _bar(figure, norm)
         clock = figure.text(0.0125, 0.985, "", va="top", fontsize=8.0, animated=True)
         screen = Screen(figure)
@@ -258,7 +293,14 @@ def _contour_frames(
             for points, there in clouds:
                 points.set_offsets(there[new])
                 points.set_facecolor(colours[new])
-            screen.keep([points for points, _ in clouds])
+            for outline, there in outlines:
+                outline.reveal(there[new])
+        if row == rows[-1]:
+            for outline, _ in outlines:
+                outline.reveal(None)
+        if new.size or row == rows[-1]:
+            grown = [outline.lines for outline, _ in outlines]
+            screen.keep([*grown, *(points for points, _ in clouds)])
         images = [
             (panel.axes, window.of(next(stream)))
             for panel, window, stream in zip(panels, windows, streams, strict=True)
@@ -324,8 +366,8 @@ def _sides(
     places: Array,
     bodies: tuple[Sequence[Body], Sequence[Body]],
     span: slice,
-) -> Iterator[tuple[_Part, _Cloud]]:
-    """Contacts in the laboratory from three sides."""
+) -> Iterator[tuple[_Part, _Cloud, list[_Outline]]]:
+    """Contacts in the laboratory from three sides, with outlines that are still hidden."""
     points = to_display("contact_point", places)
     known = points[span][np.isfinite(points[span]).all(axis=1)]
     limits = room_for(known, [*bodies[0], *bodies[1]])
@@ -342,9 +384,13 @@ def _sides(
         axes = box_axes(figure, box, xlim=both[0], ylim=both[1])
         axes.set(xlabel=axis_label("xyz"[i]), ylabel=axis_label("xyz"[j]))
         axes.set_title(title, loc="left", pad=3.0)
-        for group, look in zip(bodies, ("true", "fitted"), strict=True):
-            for body in group:
-                draw_body(axes, body, view, _window(limits, view, both), look)
+        window = _window(limits, view, both)
+        reach = _REVEALED * float(np.ptp(both[0]))
+        outlines = [
+            _Outline(axes, outline_segments(body, view, window), reach, look)
+            for group, look in zip(bodies, _OUTLINES, strict=True)
+            for body in group
+        ]
         cloud = CircleCollection(
             [_dot_size(len(known))],
             offsets=np.empty((0, 2)),
@@ -356,7 +402,7 @@ def _sides(
         moving = moving_line(axes, **TRACE)
         dot = moving_line(axes, **_CONTACT)
         there = points[:, list(view)]
-        yield _Part(moving, line[..., list(view)], dot, there), _Cloud(cloud, there)
+        yield _Part(moving, line[..., list(view)], dot, there), _Cloud(cloud, there), outlines
 
 
 def _dot_size(count: int) -> float:
@@ -454,7 +500,7 @@ def _signal_frames(
         curve_legend(figure, course, (1.0 - 2.0 / WIDTH, 48.0 / HEIGHT))
         marks = [_mark(curve, time[first]) for curve in curves]
         clock = figure.text(0.5, 0.985, "", ha="center", va="top", fontsize=8.0, animated=True)
-        trails = [flat_line(a, color=ORANGE, linewidth=2.0, animated=True) for a in solids]
+        trails = [flat_line(a, color=INK, linewidth=0.6, animated=True) for a in solids]
         look = {"markeredgecolor": "white", "markeredgewidth": 0.6, "linestyle": "none"}
         dots = [
             flat_line(a, marker="o", markersize=5.5, color=ORANGE, animated=True, **look)

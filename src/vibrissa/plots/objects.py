@@ -28,14 +28,27 @@ class Body(Protocol):
 
 def draw_body(axes: Axes, body: Body, view: tuple[int, int], limits: Array, look: str) -> None:
     """Draw the outline of an object, or rather of what of it lies within limits."""
+    right, up, nearest = _shadow(body, view, limits)
+    if 0.0 < np.mean(nearest < 0.0) < _FULL:
+        _draw_zero(axes, right, up, nearest, look)
+
+
+def outline_segments(body: Body, view: tuple[int, int], limits: Array) -> Array:
+    """Segments (n, 2, 2), mm, of the outline of an object within limits."""
+    from contourpy import contour_generator
+
+    lines: Any = contour_generator(*_shadow(body, view, limits)).lines(0.0)
+    pieces = [np.stack([line[:-1], line[1:]], axis=1) for line in lines]
+    return np.concatenate([np.empty((0, 2, 2)), *pieces])
+
+
+def _shadow(body: Body, view: tuple[int, int], limits: Array) -> tuple[Array, Array, Array]:
+    """Least distance from a body, mm, over a grid of lines of sight, and the grid's axes."""
     i, j = view
     right, up = (np.linspace(limits[n, 0], limits[n, 1], _CELLS) for n in view)
     points: Array = np.zeros((_CELLS, _CELLS, 3))
     points[..., i], points[..., j] = right, up[:, None]
-    nearest = _nearest(body, points, limits, 3 - i - j)
-    if not 0.0 < np.mean(nearest < 0.0) < _FULL:
-        return
-    _draw_zero(axes, right, up, nearest, look)
+    return right, up, _nearest(body, points, limits, 3 - i - j)
 
 
 def _draw_zero(axes: Axes, right: Array, up: Array, distance: Array, look: str) -> None:
@@ -52,7 +65,7 @@ def _draw_zero(axes: Axes, right: Array, up: Array, distance: Array, look: str) 
 def _nearest(body: Body, points: Array, limits: Array, depth: int) -> Array:
     """Least distance from a body along lines of sight through points (m, m, 3), mm.
 
-    Finely only where the outline is near: some bodies take their time to tell distances.
+    Finely only where the outline is near, as distances from some bodies take long to compute.
     """
     from scipy.interpolate import RegularGridInterpolator
 
@@ -140,17 +153,17 @@ _UNKNOWN = 0.05
 
 
 def is_cylinder(body: Body) -> bool:
-    """Tell whether a body is a cylinder."""
+    """Whether a body is a cylinder."""
     return hasattr(body, "axis") and hasattr(body, "radius")
 
 
 def has_band(body: Body) -> bool:
-    """Tell whether a body is drawn with a band."""
+    """Whether a body is drawn with a band."""
     return hasattr(body, "distance_sigma") and not is_cylinder(body)
 
 
 def lies_flat(body: Body, view: tuple[int, int], places: Array) -> bool:
-    """Tell whether one looks straight at a surface, so that a section would lie in it."""
+    """Whether a surface faces the view, so that a section would lie in it."""
     normals = getattr(body, "outward_normals", None)
     if normals is None:
         return False
@@ -227,9 +240,9 @@ class Head(NamedTuple):
 
 
 def head_of(course: Course) -> Head:
-    """Say where the head must be, on the average of a trial.
+    """Mean pose of the head over a trial.
 
-    Where the recording does not tell, the head is level, the whisker points away from it sideways
+    Unless the recording states it, the head is level, the whisker points away from it sideways
     and curves forward, and its base is on the snout.
     """
     base = np.nanmean(course.position, axis=0)

@@ -25,11 +25,16 @@ _POLICY = (
 )
 """What the page may load: only what is in it."""
 
-# Figures are those of the paper, dark on white, and the page is white as they are: on a dark one
-# they would glare.
+# Figures are dark on white; on a dark page each is on a card of its own, slightly dimmed.
 _STYLE = """
-:root { color-scheme: only light; --ink: #1b1b1b; --paper: #ffffff; --soft: #5c5c5c;
+:root { color-scheme: light dark; --ink: #1b1b1b; --paper: #ffffff; --soft: #5c5c5c;
   --line: #d5d0ca; --band: #f6f3ef; --link: #6b3d2e; }
+@media (prefers-color-scheme: dark) {
+  :root { --ink: #e8e4df; --paper: #16181b; --soft: #a9a49d; --line: #3a3d42; --band: #202327;
+    --link: #e0a58f; }
+  figure img, .space { background: #ffffff; border-radius: 6px; padding: 6px;
+    filter: brightness(0.88); }
+}
 body { margin: 0 auto; padding: 1.5rem; max-width: 70rem; color: var(--ink);
   background: var(--paper); font: 16px/1.5 system-ui, sans-serif; }
 a { color: var(--link); }
@@ -38,6 +43,11 @@ h2 { margin: 2.5rem 0 0.6rem; font-size: 1.25rem; border-bottom: 1px solid var(-
 header p, figcaption, .note { color: var(--soft); }
 nav ul { padding: 0; display: flex; flex-wrap: wrap; gap: 0.3rem 1.2rem; list-style: none; }
 .scroll { overflow-x: auto; }
+.tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(12rem, 1fr)); gap: 0.8rem;
+  margin: 1rem 0; padding: 0; list-style: none; }
+.tiles li { background: var(--band); border-radius: 6px; padding: 0.8rem 1rem; }
+.tiles b { display: block; font-size: 1.5rem; font-variant-numeric: tabular-nums; }
+.tiles span { color: var(--soft); font-size: 0.92rem; }
 table { border-collapse: collapse; margin: 0.8rem 0; font-size: 0.92rem; }
 caption { text-align: left; font-weight: 600; padding: 0.2rem 0; white-space: nowrap; }
 th, td { padding: 0.15rem 1.1rem 0.15rem 0.3rem; text-align: left; vertical-align: top; }
@@ -58,6 +68,35 @@ svg { max-width: 100%; height: auto; }
 
 
 _CODE = re.compile(r"`([^`]+)`")
+
+
+_ORDER = (
+    "results",
+    "picture",
+    "map",
+    "verdicts",
+    "space",
+    "contour",
+    "estimates",
+    "signals",
+    "tracking",
+    "tracked",
+    "whiskers",
+    "figures",
+    "movies",
+    "statuses",
+    "recording",
+    "settings",
+    "provenance",
+)
+"""Names of sections as they follow each other: results first, settings and origin last."""
+
+
+class Tile(NamedTuple):
+    """A number that stands out, and its meaning, plain text."""
+
+    number: str
+    meaning: str
 
 
 class Section(NamedTuple):
@@ -122,8 +161,21 @@ def table(
 def paragraph(text: str, kind: str = "") -> str:
     """Write a paragraph."""
     named = f' class="{kind}"' if kind else ""
-    marked_up = _CODE.sub(r"<code>\1</code>", escape(text))
-    return f"<p{named}>{marked_up}</p>"
+    return f"<p{named}>{_marked(text)}</p>"
+
+
+def tiles(numbers: Iterable[Tile]) -> str:
+    """Lay out the main numbers side by side."""
+    items = "".join(
+        f"<li><b>{escape(one.number)}</b><span>{_marked(one.meaning)}</span></li>"
+        for one in numbers
+    )
+    return f'<ul class="tiles">{items}</ul>'
+
+
+def _marked(text: str) -> str:
+    """Plain text as HTML, with `code`."""
+    return _CODE.sub(r"<code>\1</code>", escape(text))
 
 
 def document(title: str, about: str, sections: Sequence[Section], script: str = "") -> str:
@@ -134,7 +186,7 @@ def document(title: str, about: str, sections: Sequence[Section], script: str = 
     title, about : str
         Plain text: its heading, and a line below.
     sections : sequence of Section
-        In their order.
+        Parts of the page, in any order: results come first, settings and origin last.
     script : str
         JavaScript that sections need, once.
 
@@ -143,6 +195,7 @@ def document(title: str, about: str, sections: Sequence[Section], script: str = 
     str
         HTML, the whole file.
     """
+    sections = sorted(sections, key=lambda s: _ORDER.index(s.name) if s.name in _ORDER else 0)
     links = "".join(f'<li><a href="#{escape(s.name)}">{escape(s.title)}</a></li>' for s in sections)
     bodies = "\n".join(
         f'<section id="{escape(s.name)}" aria-labelledby="{escape(s.name)}-title">'
@@ -163,17 +216,17 @@ def document(title: str, about: str, sections: Sequence[Section], script: str = 
 
 CAPTIONS = {
     "trial": "The trial at a glance: what the cameras see where the whisker is bent most, signals "
-    "and contact over time, the way of the signals through the solids of all contacts, and "
-    "estimated against known coordinates.",
+    "and contact over time, the trajectory in the space of signals, and estimated against known "
+    "coordinates.",
     "signals": "All six signals over time.",
     "estimates": "Estimated against known coordinates of the contact in the whisker's frame.",
     "contact_places": "Contacts about the resting whisker and in the laboratory; grey: the object, "
     "where it is known; dashed: what was fitted.",
     "contour": "Contact points in the laboratory from three sides.",
     "whisker": "The resting whisker in its own frame, and how thick it is.",
-    "signal_space": "All contacts that the whisker can hold, coloured by what they feel like.",
-    "contact_surfaces": "Contacts of equal r, θ and φ, and where they lie among all "
-    "contacts in the space of three signals.",
+    "signal_space": "All stable contacts of the whisker, coloured by their signals.",
+    "contact_surfaces": "Contacts of equal r, θ and φ, and their position among all contacts in "
+    "the space of three signals.",
     "sensitivity": "How the contact moves when a signal changes.",
     "solid": "A slice of the solid of all contacts.",
     "critical_cones": "Critical cones by curvature and taper.",
@@ -186,7 +239,7 @@ CAPTIONS = {
 _WITNESS = "witness_"
 
 
-def figure_sections(pictures: Mapping[str, bytes]) -> Section:
+def figure_sections(pictures: Mapping[str, bytes]) -> list[Section]:
     """Embed figures.
 
     Parameters
@@ -196,14 +249,15 @@ def figure_sections(pictures: Mapping[str, bytes]) -> Section:
 
     Returns
     -------
-    Section
-        All of them, with captions.
+    list of Section
+        The contour, or else the first of them, by itself; then all others, with captions.
     """
-    # The most informative figures come first.
     known = [name for name in CAPTIONS if name in pictures]
     order = [*known, *(name for name in pictures if name not in CAPTIONS)]
-    parts = [_figure(name, pictures[name]) for name in order]
-    return Section("figures", "Figures", "\n".join(parts))
+    first = [name for name in ("contour", *order[:1]) if name in pictures][:1]
+    parts = [_figure(name, pictures[name]) for name in order if name not in first]
+    out = [Section("picture", "At a glance", _figure(name, pictures[name])) for name in first]
+    return [*out, Section("figures", "Figures", "\n".join(parts))] if parts else out
 
 
 def _figure(name: str, png: bytes) -> str:

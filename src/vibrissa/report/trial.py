@@ -28,7 +28,7 @@ from vibrissa.evaluation import (
 from vibrissa.pipeline import compare_contacts, distances_by_class
 from vibrissa.quantities import QUANTITIES, quantity
 from vibrissa.recording import Recording
-from vibrissa.report.page import Section, paragraph, shown_value, table
+from vibrissa.report.page import Section, Tile, paragraph, shown_value, table, tiles
 from vibrissa.signals import CIRCULAR, SIGNALS, base_signals, within_turn
 from vibrissa.status import describe
 from vibrissa.whisker import Whisker
@@ -47,6 +47,8 @@ _SPREADS = ("covariance", "contact_covariance", "candidates")
 _SPREAD = ("median", "95 %")
 
 _NOTHING = "None of this whisker's true contacts was detected, so there is nothing to compare."
+
+_SIGNAL_NAMES = {"wrench": "all components of force and moment"}
 
 _SUSPECT = 1.5
 """Misfit above which another shape may fit better."""
@@ -67,8 +69,8 @@ def trial_sections(recording: xr.DataTree, whisker: int = 0, seed: int = 0) -> l
     Returns
     -------
     list of Section
-        The recording; settings; then tracking, signals, estimates and the contour, as far as
-        they are there; statuses.
+        The results in four numbers; the recording; settings; then tracking, signals, estimates and
+        the contour, as far as they are there; statuses.
 
     Raises
     ------
@@ -81,6 +83,7 @@ def trial_sections(recording: xr.DataTree, whisker: int = 0, seed: int = 0) -> l
     if "truth" in recording.children:
         truth, true_whisker = truth_of(recording, whisker)
     parts = [
+        Section("results", "Results", _results(recording, groups, truth, true_whisker, seed)),
         Section("recording", "Recording", show(recording).html + bent._repr_html_()),
         Section("settings", "Settings", _settings(recording)),
     ]
@@ -103,22 +106,82 @@ def _one(recording: xr.DataTree, name: str, whisker: int) -> xr.Dataset | None:
     return None if group is None else group.whisker(whisker).data
 
 
+def _results(
+    recording: xr.DataTree,
+    groups: dict[str, xr.Dataset | None],
+    truth: xr.Dataset | None,
+    whisker: Whisker,
+    seed: int,
+) -> str:
+    """The four numbers of a trial: contacts, their error, the object's size, how well it fits."""
+    estimates = groups["estimates"]
+    if estimates is None:
+        missing = "no contacts yet: `vibrissa estimate` adds them"
+        found = [Tile("–", missing), Tile("–", "error of the contact point")]
+    else:
+        located = np.isfinite(estimates["contact_point"].values).all(axis=-1)
+        detected = estimates["in_contact"].values.astype(bool)
+        number = f"{int((located & detected).sum())} of {int(detected.sum())}"
+        found = [
+            Tile(number, "contacts located of those detected"),
+            _error_tile(estimates, truth, whisker, seed),
+        ]
+    if "contour" not in recording.children:
+        missing = "no contour yet: `vibrissa reconstruct` adds it"
+        return tiles([*found, Tile("–", missing), Tile("–", "misfit of the shape")])
+    fit = shape_from_dataset(recording["contour"].to_dataset())
+    size = Tile(f"{fit.kind}", "shape fitted to the contacts")
+    if "radius" in fit.sigma:
+        width = shown_value("object_radius", 2.0 * float(getattr(fit, "radius")), 3)  # noqa: B009
+        sigma = shown_value("object_radius", 2.0 * fit.sigma["radius"], 2)
+        size = Tile(f"{width} ± {sigma}", f"diameter of the {fit.kind} fitted to the contacts")
+    misfit = Tile(f"{fit.misfit:.2g}", "misfit (χ² per degree of freedom; 1 is expected)")
+    return tiles([*found, size, misfit])
+
+
+def _error_tile(
+    estimates: xr.Dataset, truth: xr.Dataset | None, whisker: Whisker, seed: int
+) -> Tile:
+    """Median error of the contact point: true where the truth is known, else predicted."""
+    known = np.isfinite(estimates["contact_point"].values).any()
+    if truth is not None and known and not _lacking(_FOUND, estimates, truth, _SPREADS):
+        rows, _ = error_rows(contact_errors(estimates, truth, whisker, seed))
+        for row in rows:
+            if row.quantity == "error_distance":
+                error = shown_value(row.quantity, float(row.measured[0]), 2)
+                predicted = shown_value(row.quantity, float(row.predicted[0]), 2)
+                return Tile(error, f"median error of the contact point (predicted: {predicted})")
+    if "contact_covariance" not in estimates or not known:
+        return Tile("–", "error of the contact point: unknown without noise or ground truth")
+    sigma = np.sqrt(np.trace(estimates["contact_covariance"].values, axis1=-2, axis2=-1))
+    error = shown_value("contact_point", float(np.nanmedian(sigma)), 2)
+    return Tile(error, "predicted error of the contact point, median")
+
+
+_LABELS = {
+    "origin": "origin",
+    "source": "source of the signals",
+    "signals": "signals used",
+    "noise": "sensor noise, standard deviation",
+    "felt_above": "contact is detected for",
+    "shape": "fitted shape",
+    "cutoff": "low-pass filter of the pose",
+    "frames_together": "frames with correlated errors",
+    "remarks": "remarks",
+}
+"""Settings that are shown, by the attribute that holds them."""
+
+
 def _settings(recording: xr.DataTree) -> str:
-    """Attributes of the groups, and which stages are missing."""
+    """Settings of the stages, and which stages are missing."""
     rows = [
-        (
-            str(group.path).strip("/") or "recording",
-            str(name).replace("_", " "),
-            _shown_setting(name, value),
-        )
+        (f"{group.path.strip('/') or 'recording'}: {label}", _shown_setting(name, value))
         for group in recording.subtree
         if not group.path.startswith(("/whiskers", "/objects"))
-        for name, value in group.attrs.items()
-        if name != "kind"
+        for name, label in _LABELS.items()
+        if (value := group.attrs.get(name)) is not None
     ]
-    facts = table(
-        [(f"{where}: {name}", value) for where, name, value in rows], caption="Settings by stage"
-    )
+    facts = table(rows, caption="Settings by stage")
     lacking = [
         f"The stage {group} is missing: `vibrissa {verb}` adds it."
         for group, verb in STAGES.items()
@@ -132,7 +195,9 @@ def _settings(recording: xr.DataTree) -> str:
 def _shown_setting(name: object, value: object) -> str:
     """Write an attribute; what is known to be a signal's size in its unit."""
     if name == "felt_above":
-        return f"M_B over {shown_value('MB', float(str(value)))}"
+        return f"bending moments above {shown_value('MB', float(str(value)), 2)}"
+    if name == "signals":
+        return _SIGNAL_NAMES.get(str(value), ", ".join(str(value).split()))
     if name == "noise" and isinstance(value, np.ndarray | list | tuple) and len(value) == 6:
         force, moment = np.split(np.asarray(value, dtype=np.float64), 2)
         sizes = (("force", force), ("moment", moment))
@@ -141,7 +206,7 @@ def _shown_setting(name: object, value: object) -> str:
         return f"{float(str(value)):g} Hz"
     if isinstance(value, np.ndarray | list | tuple):
         return ", ".join(_shown_setting("", each) for each in value)
-    return f"{value:.6g}" if isinstance(value, float | np.floating) else str(value)
+    return f"{value:.3g}" if isinstance(value, float | np.floating) else str(value)
 
 
 def _one_or_all(name: str, sigma: Array) -> str:
@@ -352,8 +417,8 @@ def _contour(recording: xr.DataTree, seed: int) -> str:
             rows.append(
                 (
                     label,
-                    shown_value(meant, float(value), 6),
-                    shown_value(meant, sigma[parameter], 3),
+                    shown_value(meant, float(value), 4),
+                    shown_value(meant, sigma[parameter], 2),
                 )
             )
     text = table(

@@ -4,7 +4,7 @@
 has one of the words in it, by default all, some ten minutes on a free core. Results are kept in the
 folder `output/image_conditions`, case by case: stopped, it continues from there; `--again` repeats
 all.
-`--page` writes the table into `docs/tracking.md`, else it is printed.
+`--page` writes the table into `docs/image-conditions.md`, else it is printed.
 """
 
 import argparse
@@ -108,7 +108,7 @@ def main() -> None:
         rows.append(row(result(case, chosen.again)))
         print(" | ".join(rows[-1]), flush=True)
     if chosen.page:
-        put(ROOT / "docs" / "tracking.md", {"image conditions": table(HEAD, rows)})
+        put(ROOT / "docs" / "image-conditions.md", {"image conditions": table(HEAD, rows)})
 
 
 if __name__ == "__main__":

@@ -18,16 +18,20 @@ _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _TAIL = "<!-- end -->\n"
 
 
-def put(page: Path, blocks: Mapping[str, str]) -> None:
-    """Put texts between their marks; all marks must be there."""
-    text = page.read_text(encoding="utf-8")
+def put(pages: Path | Sequence[Path], blocks: Mapping[str, str]) -> None:
+    """Put texts between their marks; each mark must be once on one of the pages."""
+    files = [pages] if isinstance(pages, Path) else list(pages)
+    texts = [page.read_text(encoding="utf-8") for page in files]
     for name, block in blocks.items():
         head = f"<!-- {name} -->\n"
-        if text.count(head) != 1:
-            raise ValueError(f"{page} has {text.count(head)} marks {head.strip()}; one is needed")
-        before, rest = text.split(head)
-        text = f"{before}{head}\n{block}\n\n{_TAIL}{rest.split(_TAIL, 1)[1]}"
-    page.write_text(text, encoding="utf-8")
+        marked = [i for i, text in enumerate(texts) for _ in range(text.count(head))]
+        if len(marked) != 1:
+            names = ", ".join(map(str, files))
+            raise ValueError(f"{names}: {len(marked)} marks {head.strip()}; one is needed")
+        before, rest = texts[marked[0]].split(head)
+        texts[marked[0]] = f"{before}{head}\n{block}\n\n{_TAIL}{rest.split(_TAIL, 1)[1]}"
+    for page, text in zip(files, texts, strict=True):
+        page.write_text(text, encoding="utf-8")
 
 
 def save(figure: Figure, path: Path) -> None:

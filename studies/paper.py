@@ -237,8 +237,8 @@ def laws(whisker: vb.Whisker, contacts: dict[str, np.ndarray]) -> str:
             "their deflection angle: median, 95 % below",
             f"{among('angle', 0.5):.1f}°, {among('angle', 0.95):.1f}°",
         ],
-        ["|M_D − F_D|, median", f"{weighted_quantile(apart, weight, 0.5):.1f}°"],
-        ["its difference from 90°: 95 % below", f"{far:.1f}°"],
+        ["angle between M_D and F_D, median", f"{weighted_quantile(apart, weight, 0.5):.1f}°"],
+        ["its difference from a right angle: 95 % below", f"{far:.1f}°"],
     ]
     head = ["over the reachable contacts of the paper's grid outside 2°, by volume", "found"]
     return table(head, rows)

@@ -4,7 +4,7 @@
 `--no-video` nothing is filmed. Recordings and results are kept in the folder (`output/validation`
 by default), condition by condition: stopped, it goes on from there. `--again` computes the results
 anew from the recordings; remove the folder to simulate, film and track anew. `--page` writes the
-tables into `docs/validation.md` and the figure next to it, else they are written to the folder.
+tables into the pages `docs/validation*.md`, else they are written to the folder.
 """
 
 import argparse
@@ -92,7 +92,7 @@ def main() -> None:
         print(f"\n{name}\n{make(found)}")
     page = ROOT / "docs" / "validation.md" if chosen.page else None
     if page is not None:
-        write(page, found)
+        write([page, page.with_name("validation-tables.md")], found)
     images = folder if page is None else page.parent / "images"
     save(draw(found), images / "validation.png")
 

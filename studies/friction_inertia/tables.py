@@ -1,6 +1,6 @@
 """The tables of the page, from the results; mm, degrees, per cent."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +22,9 @@ NAMES = {
 CLASSES = (*LABELS, "all")
 
 
-def write(page: Path, results: Results) -> None:
-    """Put the tables between their marks on the page."""
-    put(page, {name: make(results) for name, make in TABLES.items()})
+def write(pages: Sequence[Path], results: Results) -> None:
+    """Put the tables between their marks on the pages."""
+    put(pages, {name: make(results) for name, make in TABLES.items()})
 
 
 def mm(value: float) -> str:

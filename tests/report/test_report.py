@@ -193,10 +193,12 @@ def test_numbers_are_those_of_the_recording(written, folder):
     rows = {row[0]: row for row in tables[f"The fitted {fit.attrs['shape']}"]}
     sigma = np.sqrt(np.diag(fit["parameter_covariance"].values))
     names = list(fit["parameter"].values)
-    assert number(rows["radius"][1]) == pytest.approx(1e3 * float(fit["object_radius"]), rel=1e-5)
+    assert number(rows["radius"][1]) == pytest.approx(
+        1e3 * float(fit["object_radius"]), rel=5e-4
+    )  # four digits
     assert number(rows["radius"][2]) == pytest.approx(1e3 * sigma[names.index("radius")], rel=5e-3)
     x = 1e3 * float(fit["object_position"].sel(space="x"))
-    assert number(rows["origin, x"][1]) == pytest.approx(x, rel=1e-5)
+    assert number(rows["origin, x"][1]) == pytest.approx(x, rel=5e-4)
 
     heading, *rows = tables["Number of frames"]
     for column, name in enumerate(heading[1:], 1):

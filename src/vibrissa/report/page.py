@@ -33,6 +33,7 @@ _STYLE = """
   :root { --ink: #e8e4df; --paper: #16181b; --soft: #a9a49d; --line: #3a3d42; --band: #202327;
     --link: #e0a58f; }
   figure img, .space { background: #ffffff; border-radius: 6px; padding: 6px;
+    box-sizing: border-box;
     filter: brightness(0.88); }
 }
 body { margin: 0 auto; padding: 1.5rem; max-width: 70rem; color: var(--ink);

@@ -134,6 +134,7 @@ def _results(
     if "radius" in fit.sigma:
         width = shown_value("object_radius", 2.0 * float(getattr(fit, "radius")), 3)  # noqa: B009
         sigma = shown_value("object_radius", 2.0 * fit.sigma["radius"], 2)
+        width = width.removesuffix(sigma.rpartition(" ")[2]).strip()
         size = Tile(f"{width} ± {sigma}", f"diameter of the {fit.kind} fitted to the contacts")
     misfit = Tile(f"{fit.misfit:.2g}", "misfit (χ² per degree of freedom; 1 is expected)")
     return tiles([*found, size, misfit])

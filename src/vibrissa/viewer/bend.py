@@ -71,7 +71,28 @@ def axes(whisker: Whisker) -> dict[str, Mark]:
     size = _size(0.14 * whisker.length)
     ends = size * np.eye(3)
     out: dict[str, Mark] = {"axes": Arrows(np.zeros((3, 3)), ends, _AXES, 0.05 * size)}
-    return out | {f"axis {name}": Label(1.12 * ends[i], name) for i, name in enumerate("xyz")}
+    out |= {f"axis {name}": Label(1.12 * ends[i], name) for i, name in enumerate("xyz")}
+    return out | ruler(np.zeros(3), _size(whisker.length))
+
+
+def ruler(start: Array, length: float) -> dict[str, Mark]:
+    """Ticks with values along x from a place (3,), mm, over a length, mm."""
+    step = round_step(length / 4.0)
+    ticks = np.arange(0.0, length + 1e-9, step)
+    at = start + ticks[:, None] * np.array([1.0, 0.0, 0.0])
+    down = np.array([0.0, 0.0, -0.02 * length])
+    pieces = np.concatenate([np.stack([at, at + down], axis=1), [[at[0], at[-1]]]])
+    out: dict[str, Mark] = {"ruler": Line(pieces, REST, 1.5)}
+    for place, tick in zip(at[1:], ticks[1:], strict=True):
+        unit = " mm" if tick == ticks[-1] else ""
+        out[f"tick {tick:g}"] = Label(place + 3.0 * down, f"{tick:g}{unit}")
+    return out
+
+
+def round_step(size: float) -> float:
+    """The largest of 1, 2 and 5 times a power of ten that is at most a size."""
+    power = 10.0 ** np.floor(np.log10(size))
+    return float(max(f for f in (1.0, 2.0, 5.0) if f * power <= size) * power)
 
 
 def arrow(start: Array, end: Array, thickness: float) -> Arrows:

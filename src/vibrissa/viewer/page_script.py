@@ -13,11 +13,71 @@ from typing import Any
 SCRIPT = """
 (() => {
   document.title = "vibrissa";
-  const asked = new URLSearchParams(location.search);
-  if (matchMedia("(prefers-color-scheme: dark)").matches && !asked.has("darkMode")) {
-    asked.set("darkMode", "");
-    history.replaceState(null, "", "?" + asked);
-  }
+  // The page is dark as long as the browser is.
+  const dark = matchMedia("(prefers-color-scheme: dark)");
+  const matched = () => {
+    const asked = new URLSearchParams(location.search);
+    if (dark.matches) asked.set("darkMode", ""); else asked.delete("darkMode");
+    history.replaceState(null, "", "?" + asked + location.hash);
+  };
+  if (dark.matches) matched();
+  dark.addEventListener("change", () => { matched(); location.reload(); });
+
+  // Keys press buttons; a click in a plot over time sets the time.
+  const button = (...texts) => [...document.querySelectorAll("button")].find(
+    (each) => each.offsetParent && texts.includes(each.textContent.trim()));
+  const setTime = (share) => {
+    const label = [...document.querySelectorAll("label")].find(
+      (each) => each.textContent.trim() === "Time (ms)");
+    let box = label;
+    const number = "input[type=text], input:not([type])";
+    while (box && !box.querySelector(number)) box = box.parentElement;
+    const input = box?.querySelector(number);
+    const slider = box?.querySelector("[role=slider]");
+    if (!input || !slider) return;
+    const value = String(Number(slider.getAttribute("aria-valuemax")) * share);
+    Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, "value").set.call(input, value);
+    input.dispatchEvent(new Event("input", { bubbles: true }));
+    input.dispatchEvent(new Event("blur", { bubbles: true }));
+  };
+  const keys = {
+    ",": ["◀ frame"], ".": ["frame ▶"], "n": ["Next contact"], " ": ["Play", "Pause"],
+  };
+  addEventListener("keydown", (event) => {
+    const typing = /^(INPUT|TEXTAREA|BUTTON)$/.test(event.target.tagName);
+    if (typing || event.ctrlKey || event.metaKey || event.altKey || !keys[event.key]) return;
+    const found = button(...keys[event.key]);
+    if (found) { event.preventDefault(); found.click(); }
+  });
+  addEventListener("click", (event) => {
+    const plot = event.target.closest?.("svg[data-seek]");
+    if (!plot) return;
+    const box = plot.getBoundingClientRect(), left = Number(plot.dataset.seek);
+    const share = ((event.clientX - box.left) / box.width - left) / (1 - left);
+    if (share >= 0 && share <= 1) setTime(share);
+  });
+
+  // The address keeps mode and time, so that a link leads back to what is seen.
+  const wanted = new URLSearchParams(location.hash.slice(1));
+  const kept = () => {
+    const mode = [...document.querySelectorAll("button")].map((each) => each.textContent.trim())
+      .find((text) => text.startsWith("● "))?.slice(2);
+    if (!mode) return;
+    const asked = wanted.get("mode");
+    if (asked && asked !== mode) { button(asked)?.click(); return; }
+    wanted.delete("mode");
+    const cursor = document.querySelector("[data-cursor]");
+    if (wanted.has("t") && mode === "Trial") {
+      if (!cursor) return;
+      setTime(Number(wanted.get("t")));
+      wanted.delete("t");
+      return;
+    }
+    const share = mode === "Trial" && cursor ? `&t=${cursor.dataset.cursor}` : "";
+    const state = `#mode=${mode}${share}`;
+    if (location.hash !== state) history.replaceState(null, "", location.search + state);
+  };
+  setInterval(kept, 500);
 
   // Arrow keys that move a slider are not for the view as well.
   addEventListener("DOMContentLoaded", () => document.body.addEventListener("keydown", (event) => {

@@ -119,7 +119,7 @@ _MOST = 700
 
 def chart(time: Array, signals: dict[str, Array], touching: NDArray[np.bool_]) -> str:
     """Draw the six signals over time."""
-    parts = [_shade(time, touching)]
+    parts = [_shade(time, touching, len(ROWS) * ROW)]
     for row, names in enumerate(ROWS):
         parts.append(_row(time, signals, names, row * ROW))
     end = f"{1e3 * (time[-1] - time[0]):.0f} ms"
@@ -143,10 +143,42 @@ def cursor(share: float) -> str:
     return f'<div style="margin-top:{-100.0 * height() / WIDTH:.3f}%">{_svg(line)}</div>'
 
 
-def _svg(body: str) -> str:
+STRIP = 20.0
+"""Height of the timeline, pixels per :data:`WIDTH` of them."""
+
+
+def timeline(time: Array, touching: NDArray[np.bool_], onsets: NDArray[np.int64]) -> str:
+    """Draw contacts, their onsets and the time over a whole trial, in ms."""
+    duration = 1e3 * float(time[-1] - time[0])
+    parts = [_shade(time, touching, 10.0)]
+    parts += [
+        f'<line x1="{x:.1f}" x2="{x:.1f}" y1="0" y2="10" stroke="#d55e00"/>'
+        for x in _x(time, time[onsets])
+    ]
+    for share in np.linspace(0.0, 1.0, 5):
+        x = LEFT + (WIDTH - LEFT) * share
+        anchor = "end" if share == 1.0 else "middle"
+        parts.append(f'<line x1="{x:.1f}" x2="{x:.1f}" y1="10" y2="12" stroke="#888"/>')
+        parts.append(_text(x, STRIP - 1.0, f"{share * duration:.0f}", anchor))
+    parts.append(_text(LEFT - 14.0, STRIP - 1.0, "ms", "end"))
+    return _svg("".join(parts), STRIP)
+
+
+def timeline_cursor(share: float) -> str:
+    """A line at a share of the time, to be laid over the timeline."""
+    x = LEFT + (WIDTH - LEFT) * share
+    line = (
+        f'<line x1="{x:.2f}" x2="{x:.2f}" y1="0" y2="12" stroke="currentColor" stroke-width="1.2"/>'
+    )
+    return f'<div style="margin-top:{-100.0 * STRIP / WIDTH:.3f}%">{_svg(line, STRIP)}</div>'
+
+
+def _svg(body: str, tall: float | None = None) -> str:
+    """A picture over time; the page's script seeks where it is clicked."""
     return (
-        f'<svg viewBox="0 0 {WIDTH:.0f} {height():.0f}" style="display:block;width:100%" '
-        f'font-family="sans-serif" font-size="8.5">{body}</svg>'
+        f'<svg data-seek="{LEFT / WIDTH:.4f}" viewBox="0 0 {WIDTH:.0f} {tall or height():.0f}" '
+        f'style="display:block;width:100%;cursor:pointer" font-family="sans-serif" '
+        f'font-size="8.5">{body}</svg>'
     )
 
 
@@ -158,14 +190,14 @@ def _x(time: Array, at: Array) -> Array:
     return np.asarray(LEFT + (WIDTH - LEFT) * (at - time[0]) / max(time[-1] - time[0], 1e-12))
 
 
-def _shade(time: Array, touching: NDArray[np.bool_]) -> str:
+def _shade(time: Array, touching: NDArray[np.bool_], tall: float) -> str:
     edges = np.flatnonzero(np.diff(np.concatenate([[False], touching, [False]]).astype(int)))
     out = []
     for first, beyond in edges.reshape(-1, 2):
         x, end = _x(time, time[[first, beyond - 1]])
         out.append(
             f'<rect x="{x:.1f}" width="{max(end - x, 0.4):.1f}" y="0" '
-            f'height="{len(ROWS) * ROW:.0f}" fill="#7895b2" fill-opacity="0.17"/>'
+            f'height="{tall:.0f}" fill="#7895b2" fill-opacity="0.3"/>'
         )
     return "".join(out)
 

@@ -34,6 +34,7 @@ class Watched:
     names: tuple[str, ...]
     lines: Array
     contacts: Array
+    covariance: Array | None
     touching: Mask
     forces: Array
     signals: dict[str, Array]
@@ -92,6 +93,7 @@ def watched(recording: xr.DataTree) -> Watched:
         names=tuple(trial.names),
         lines=_lines(trial, whiskers),
         contacts=np.where(touching[..., None], contacts, np.nan),
+        covariance=trial.known("contact_covariance", ("estimates", "")),
         touching=touching,
         forces=forces,
         signals=signals,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +12,13 @@ import viser
 import xarray as xr
 
 from vibrissa.contacts import ContactMap
-from vibrissa.io import netcdf_image, save_centerline, save_recording
+from vibrissa.io import netcdf_image, save_centerline, save_recording, write_movie
 from vibrissa.quantities import attributes
 from vibrissa.rod import Deflection
 from vibrissa.signals import base_signals
 from vibrissa.status import flag_attributes
 from vibrissa.viewer.page import Page
+from vibrissa.viewer.trial import TrialMode
 from vibrissa.whisker import Whisker
 
 NODES = 200
@@ -96,6 +97,30 @@ def _written(name: str, write: Callable[[Path], object]) -> bytes:
 
 
 _TIMEOUT = 20.0
+_FRAMES = 100
+"""Most frames of a movie."""
+
+
+def _render(client: viser.ClientHandle) -> np.ndarray[Any, np.dtype[np.uint8]]:
+    """What a browser shows, without the panels."""
+    camera = client.camera
+    return client.get_render(
+        camera.image_height, camera.image_width, transport_format="png", timeout=_TIMEOUT
+    )
+
+
+def _frames(
+    client: viser.ClientHandle, mode: TrialMode
+) -> Iterator[np.ndarray[Any, np.dtype[np.uint8]]]:
+    """A trial, frame by frame, on white; sizes are even, as encoders need them."""
+    mode.pause()
+    count = min(mode.trial.frames, _FRAMES)
+    for row in np.linspace(0, mode.trial.frames - 1, count).round().astype(int):
+        mode.show(int(row))
+        image = _render(client)
+        share = image[..., 3:] / 255.0
+        paper = np.round(image[..., :3] * share + 255.0 * (1.0 - share)).astype(np.uint8)
+        yield paper[: paper.shape[0] // 2 * 2, : paper.shape[1] // 2 * 2]
 
 
 class SaveControls:
@@ -109,11 +134,13 @@ class SaveControls:
         with self.folder:
             files = gui.add_button_group("Whisker", ("CSV", "NetCDF"))
             picture = gui.add_button_group("Picture", ("PNG",))
+            movie = gui.add_button_group("Movie", ("MP4",), hint="The trial from where one looks")
             data = gui.add_button_group(
                 "Data", ("NetCDF",), hint="The bent whisker, the map or the trial that is seen"
             )
         files.on_click(self._whisker)
         picture.on_click(self._picture)
+        movie.on_click(self._movie)
         data.on_click(lambda event: self._send(event, *self._data()))
 
     def _whisker(self, event: viser.GuiEvent[Any]) -> None:
@@ -139,23 +166,32 @@ class SaveControls:
         client = event.client
         if client is None:
             return
-        camera = client.camera
 
         def drawn() -> bytes:
-            grip = self._page.grip
-            grip.show(None)  # nobody takes hold of a picture
+            self._page.grip.show(None)  # nobody takes hold of a picture
             try:
-                image = client.get_render(
-                    camera.image_height,
-                    camera.image_width,
-                    transport_format="png",
-                    timeout=_TIMEOUT,
-                )
+                return png(on_paper(_render(client)))
             finally:
                 self._page.place_grip()
-            return png(on_paper(image))
 
         self._send(event, "vibrissa.png", drawn)
+
+    def _movie(self, event: viser.GuiEvent[Any]) -> None:
+        """A short movie of the trial, seen as the browser that asks sees it."""
+        client, mode = event.client, self._page.mode
+        if client is None:
+            return
+        if not isinstance(mode, TrialMode):
+            self._page.say("Not saved", "a movie is of a trial: choose the mode Trial", "red")
+            return
+        self._page.say("Movie", f"{_FRAMES} frames are drawn; it takes about a minute")
+
+        def filmed() -> bytes:
+            return _written(
+                "trial.mp4", lambda path: write_movie(path, _frames(client, mode), 25.0)
+            )
+
+        self._send(event, "trial.mp4", filmed)
 
     def _send(self, event: viser.GuiEvent[Any], name: str, made: Callable[[], bytes]) -> None:
         client = event.client

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from functools import partial
 
 import numpy as np
 import viser
@@ -25,10 +26,10 @@ from vibrissa.scene import (
     object_surface,
     sheet,
 )
-from vibrissa.viewer.bend import arrow, whisker_body
+from vibrissa.viewer.bend import arrow, round_step, ruler, whisker_body
 from vibrissa.viewer.colours import CONTACT, FIT, OBJECT
 from vibrissa.viewer.page import Page, asked, put
-from vibrissa.viewer.readout import chart, cursor, table
+from vibrissa.viewer.readout import chart, cursor, table, timeline, timeline_cursor
 from vibrissa.viewer.recorded import View, Watched, picture, views
 from vibrissa.viewer.state import force_scale
 from vibrissa.viewer.threads import Player
@@ -48,22 +49,43 @@ def extent(trial: Watched) -> tuple[Array, float]:
     return _mm(0.5 * (low + high)), float(_mm(np.linalg.norm(high - low)))
 
 
-def moment_drawing(trial: Watched, frame: int, exaggeration: float) -> Drawing:
+LAYERS = ("Whiskers", "Forces", "Contacts", "Uncertainty", "Objects", "Fitted shape", "Scale")
+"""Layers that can be switched."""
+
+_SIGMAS = 2.0
+"""Size of the ellipsoid of a contact, standard deviations."""
+
+_SHARP = 0.3e-3
+"""Standard deviation, m, from which on contacts are paler."""
+
+_PALE = np.array([205.0, 208.0, 212.0])
+
+
+def moment_drawing(
+    trial: Watched, frame: int, exaggeration: float, layers: Collection[str] = LAYERS
+) -> Drawing:
     """Draw whiskers, forces and contacts of one frame."""
     out: dict[str, Mark] = {}
     for i, whisker in enumerate(trial.whiskers):
         line = trial.lines[frame, i]
         if not np.isfinite(line).all():
             continue
-        out[f"whisker {i}"] = whisker_body(whisker, line, exaggeration)
+        if "Whiskers" in layers:
+            out[f"whisker {i}"] = whisker_body(whisker, line, exaggeration)
         at, force = trial.contacts[frame, i], trial.forces[frame, i]
         if not np.isfinite(at).all():
             continue
         radius = float(_mm(0.012 * whisker.length))
         vertices, faces = ellipsoid(_mm(at), radius * np.eye(3))
         out[f"contact {i}"] = Body(vertices, faces, CONTACT)
+        if "Uncertainty" in layers and trial.covariance is not None:
+            covariance = trial.covariance[frame, i]
+            if np.isfinite(covariance).all() and np.sqrt(np.trace(covariance)) < _SHARP * 10.0:
+                variances, axes = np.linalg.eigh(covariance)
+                half = _SIGMAS * np.sqrt(np.maximum(variances, 0.0))
+                out[f"error {i}"] = Body(*ellipsoid(_mm(at), _mm(axes * half)), CONTACT, 0.25)
         size = float(np.linalg.norm(force))
-        if np.isfinite(size) and size > 0.0:
+        if "Forces" in layers and np.isfinite(size) and size > 0.0:
             reach = 0.3 * whisker.length * np.sqrt(size / force_scale(whisker))
             start, thickness = at - reach * force / size, float(_mm(0.006 * whisker.length))
             out[f"force {i}"] = arrow(start, at, thickness)
@@ -71,7 +93,7 @@ def moment_drawing(trial: Watched, frame: int, exaggeration: float) -> Drawing:
 
 
 def touched(trial: Watched, frame: int) -> Drawing:
-    """All contact points up to a frame, each whisker's in its own colour."""
+    """All contact points up to a frame in their whisker's colour, paler where uncertain."""
     points, colours = trial.contacts[: frame + 1], _whisker_colours(trial)
     known = np.isfinite(points).all(axis=-1)
     which = np.nonzero(known)[1]
@@ -80,7 +102,12 @@ def touched(trial: Watched, frame: int) -> Drawing:
     if not chosen.size:
         return {}
     size = float(_mm(0.011 * trial.whiskers[0].length))
-    return {"contacts": Cloud(_mm(chosen[::step]), colours[which[::step]], size)}
+    shown = colours[which[::step]]
+    if trial.covariance is not None:
+        spread = np.trace(trial.covariance[: frame + 1][known][::step], axis1=1, axis2=2)
+        bold = np.nan_to_num(np.clip(_SHARP / np.sqrt(np.maximum(spread, 1e-20)), 0.08, 1.0))
+        shown = np.asarray(bold[:, None] * shown + (1.0 - bold[:, None]) * _PALE, dtype=np.uint8)
+    return {"contacts": Cloud(_mm(chosen[::step]), shown, size)}
 
 
 def _whisker_colours(trial: Watched) -> Bytes:
@@ -88,16 +115,20 @@ def _whisker_colours(trial: Watched) -> Bytes:
     return np.asarray(_COLOURS[count], dtype=np.uint8)
 
 
-def surroundings(trial: Watched, objects: bool = True, fit: bool = True) -> Drawing:
-    """Objects, and the shape fitted to the contacts."""
+def surroundings(trial: Watched, layers: Collection[str] = LAYERS) -> Drawing:
+    """Objects, the shape fitted to the contacts, and a scale."""
     middle, size = extent(trial)
     near = _known(trial)
     centre = np.mean(near, axis=0) if near.size else middle / to_display("length", 1.0)
     out: dict[str, Mark] = {}
-    if objects:
+    if "Scale" in layers:
+        length = 2.0 * round_step(size / 6.0)
+        low = middle - np.array([0.5 * length, 0.45 * size, 0.3 * size])
+        out |= ruler(low, length)
+    if "Objects" in layers:
         for i, thing in enumerate(trial.objects):
             out[f"object {i}"] = object_body(thing, 0.6 * size, _mm(centre))
-    if fit and trial.contour is not None:
+    if "Fitted shape" in layers and trial.contour is not None:
         body = fitted_body(trial.contour, near)
         if body is not None:
             out["fit"] = Body(_mm(body[0]), body[1], FIT, 0.4, "double")
@@ -143,6 +174,7 @@ def _mm(values: object) -> Array:
 _MS = 1e3
 SPEEDS = {"real time": 1.0, "1 : 2": 0.5, "1 : 5": 0.2, "1 : 10": 0.1, "1 : 50": 0.02}
 _USUAL = "1 : 10"
+BACK, AHEAD = "◀ frame", "frame ▶"
 
 
 class TrialMode:
@@ -158,8 +190,8 @@ class TrialMode:
         self._now = float(trial.time[0])
         self._speed = SPEEDS[_USUAL]
         self._whisker = trial.busiest
-        self._still: tuple[bool, bool] | None = None
-        self._objects = self._fit = True
+        self._still: frozenset[str] | None = None
+        self._layers = frozenset(LAYERS)
         self._views = views(trial)
         self._player = Player(self._tick)
         page.closing.append(self._player.close)
@@ -173,15 +205,18 @@ class TrialMode:
         with self._folder:
             self._time = gui.add_slider("Time (ms)", 0.0, max(end, step), step, 0.0)
             self._play = gui.add_button("Play", color="blue")
-            jump = gui.add_button("Next contact", color="blue")
+            jump = gui.add_button("Next contact", color="blue", hint="Key n")
+            step_by = gui.add_button_group("Step", (BACK, AHEAD), hint="Keys , and .")
             speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value=_USUAL)
             if len(trial.names) > 1:
                 which = gui.add_dropdown(
                     "Signals of", trial.names, initial_value=trial.names[self._whisker]
                 )
                 asked(which, self._choose)
-            objects = gui.add_checkbox("Objects", True, visible=bool(trial.objects))
-            fit = gui.add_checkbox("Fitted shape", True, visible=trial.contour is not None)
+            with gui.add_folder("Layers", expand_by_default=False):
+                for layer in LAYERS:
+                    box = gui.add_checkbox(layer, True, visible=self._has(layer))
+                    asked(box, partial(self._see, layer))
             self._words = gui.add_html("")
             self._chart = gui.add_html("")
             self._cursor = gui.add_html("")
@@ -196,14 +231,21 @@ class TrialMode:
             self._window.set_width(330.0)
         asked(self._time, lambda value: self.go(float(trial.time[0]) + value / _MS))
         asked(speed, self.hurry)
-        asked(objects, lambda on: self._see(objects=on))
-        asked(fit, lambda on: self._see(fit=on))
+        step_by.on_click(lambda event: self.step(1 if event.target.value == AHEAD else -1))
+        self._timeline = gui.add_panel(visible=False)
+        with self._timeline.add_tab("Timeline"):
+            gui.add_html(
+                timeline(trial.time, np.asarray(trial.touching.any(axis=1)), trial.onsets())
+            )
+            self._now_line = gui.add_html("")
+        self._timeline.float(x=16.0, y=-16.0, width=520.0, height=96.0)
         self._play.on_click(lambda _: self.toggle())
         jump.on_click(lambda _: self.jump())
 
     def enter(self) -> None:
         """Show controls, and point the camera at the whiskers."""
         self._folder.visible = True
+        self._timeline.visible = True
         if self._window is not None:
             self._window.visible = True
         middle, size = extent(self.trial)
@@ -213,7 +255,7 @@ class TrialMode:
     def leave(self) -> None:
         """Stop, and hide controls and things."""
         self.pause()
-        self._folder.visible = False
+        self._folder.visible = self._timeline.visible = False
         if self._window is not None:
             self._window.visible = False
         self._still = None
@@ -223,11 +265,12 @@ class TrialMode:
     def redraw(self) -> None:
         """Draw the frame of now."""
         trial, stage, frame = self.trial, self._page.stage, self.frame
-        stage.show("moment", moment_drawing(trial, frame, self._page.exaggeration))
-        stage.show("touched", touched(trial, frame))
-        if self._still != (self._objects, self._fit):
-            self._still = (self._objects, self._fit)
-            stage.show("surroundings", surroundings(trial, *self._still))
+        layers = self._layers
+        stage.show("moment", moment_drawing(trial, frame, self._page.exaggeration, layers))
+        stage.show("touched", touched(trial, frame) if "Contacts" in layers else {})
+        if self._still != layers:
+            self._still = layers
+            stage.show("surroundings", surroundings(trial, layers))
         for view, shown in self._pictures:
             image = self._videos[view.number].frame(frame) if self._videos else None
             shown.image = picture(view, trial, frame, image)
@@ -237,7 +280,9 @@ class TrialMode:
         trial, frame = self.trial, self.frame
         passed = float(trial.time[frame] - trial.time[0])
         put(self._time, _MS * passed)
-        self._cursor.content = cursor(passed / max(float(np.ptp(trial.time)), 1e-12))
+        share = passed / max(float(np.ptp(trial.time)), 1e-12)
+        self._cursor.content = cursor(share)
+        self._now_line.content = timeline_cursor(share)
         self._words.content = self._words_of(frame)
 
     def go(self, time: float) -> None:
@@ -274,6 +319,17 @@ class TrialMode:
         """Go to where the next contact begins."""
         self.go(float(self.trial.time[self.trial.next_contact(self.frame)]))
 
+    def show(self, frame: int) -> None:
+        """Show a frame, and wait until it is drawn."""
+        self.go(float(self.trial.time[frame]))
+        self._page.work.wait()
+
+    def step(self, frames: int) -> None:
+        """Go so many frames on, or back."""
+        self.pause()
+        frame = int(np.clip(self.frame + frames, 0, self.trial.frames - 1))
+        self.go(float(self.trial.time[frame]))
+
     def _tick(self, passed: float) -> None:
         time = self._now + self._speed * passed
         if time >= self.trial.time[-1]:
@@ -286,9 +342,17 @@ class TrialMode:
         self._page.work.put("chart", self._draw_chart)
         self._page.work.put("time", self._page.redraw)
 
-    def _see(self, objects: bool | None = None, fit: bool | None = None) -> None:
-        self._objects = self._objects if objects is None else objects
-        self._fit = self._fit if fit is None else fit
+    def _has(self, layer: str) -> bool:
+        """Whether there is anything in a layer."""
+        there = {
+            "Objects": bool(self.trial.objects),
+            "Fitted shape": self.trial.contour is not None,
+            "Uncertainty": self.trial.covariance is not None,
+        }
+        return there.get(layer, True)
+
+    def _see(self, layer: str, shown: bool) -> None:
+        self._layers = self._layers | {layer} if shown else self._layers - {layer}
         self._page.work.put("time", self._page.redraw)
 
     def _draw_chart(self) -> None:

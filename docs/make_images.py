@@ -45,7 +45,6 @@ WIDER = {"title": 1360}
 LEVELS = {
     "title": 48,
     "signal_space": 48,
-    "contact_surfaces": 48,
     "trial": 32,
     "movie_signals": 64,
     "movie_contour": 64,

@@ -419,7 +419,7 @@ def _contour(recording: xr.DataTree, seed: int) -> str:
                 (
                     label,
                     shown_value(meant, float(value), 4),
-                    shown_value(meant, sigma[parameter], 2),
+                    shown_value(meant, sigma[parameter], 3),
                 )
             )
     text = table(

@@ -13,6 +13,9 @@ from typing import Any
 SCRIPT = """
 (() => {
   document.title = "vibrissa";
+  // What a link asks for; viser would take it for a part of the server's address.
+  const wanted = new URLSearchParams(location.hash.slice(1));
+  if (location.hash) history.replaceState(null, "", location.pathname + location.search);
   // The page is dark as long as the browser is.
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const matched = () => {
@@ -53,12 +56,11 @@ SCRIPT = """
     const plot = event.target.closest?.("svg[data-seek]");
     if (!plot) return;
     const box = plot.getBoundingClientRect(), left = Number(plot.dataset.seek);
-    const share = ((event.clientX - box.left) / box.width - left) / (1 - left);
+    const share = ((event.clientX - box.left) / (box.width - 8) - left) / (1 - left);
     if (share >= 0 && share <= 1) setTime(share);
   });
 
   // The address keeps mode and time, so that a link leads back to what is seen.
-  const wanted = new URLSearchParams(location.hash.slice(1));
   const kept = () => {
     const mode = [...document.querySelectorAll("button")].map((each) => each.textContent.trim())
       .find((text) => text.startsWith("● "))?.slice(2);

@@ -143,6 +143,9 @@ def cursor(share: float) -> str:
     return f'<div style="margin-top:{-100.0 * height() / WIDTH:.3f}%">{_svg(line)}</div>'
 
 
+PAD = 8
+"""Empty pixels at the right of a picture over time; the page's script knows them."""
+
 STRIP = 20.0
 """Height of the timeline, pixels per :data:`WIDTH` of them."""
 
@@ -177,7 +180,8 @@ def _svg(body: str, tall: float | None = None) -> str:
     """A picture over time; the page's script seeks where it is clicked."""
     return (
         f'<svg data-seek="{LEFT / WIDTH:.4f}" viewBox="0 0 {WIDTH:.0f} {tall or height():.0f}" '
-        f'style="display:block;width:100%;cursor:pointer" font-family="sans-serif" '
+        f'style="display:block;width:100%;padding-right:{PAD}px;box-sizing:border-box;'
+        f'cursor:pointer" font-family="sans-serif" '
         f'font-size="8.5">{body}</svg>'
     )
 

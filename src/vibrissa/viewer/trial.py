@@ -123,7 +123,7 @@ def surroundings(trial: Watched, layers: Collection[str] = LAYERS) -> Drawing:
     out: dict[str, Mark] = {}
     if "Scale" in layers:
         length = 2.0 * round_step(size / 6.0)
-        low = middle - np.array([0.5 * length, 0.45 * size, 0.3 * size])
+        low = middle - np.array([0.5 * length, 0.2 * size, 0.15 * size])
         out |= ruler(low, length)
     if "Objects" in layers:
         for i, thing in enumerate(trial.objects):

@@ -7,7 +7,7 @@ What measured signals leave open is a curve: one contact for each arc length s, 
 has three components. It is short where four or more signals determine µ_x, and with three it bends
 too much for an ellipsoid. So it is traced along the whisker, finer where contacts are probable. The
 forces at s that noise leaves open have, to first order, a covariance C_f; with all contact points
-as probable beforehand, and ratios as said, the density of s is
+as probable beforehand, and ratios as stated, the density of s is
 
     exp(-χ²/2 - µ_x²/2σ²) |∂(p, µ_x)/∂(s, f)| √det C_f,
 

@@ -11,7 +11,7 @@ from vibrissa.simulation import ImageConditions, Motion, film_frames, simulate, 
 from vibrissa.tracking import Trace, trace_video
 from vibrissa.tracking.trace import ridge
 from vibrissa.tracking.trace.follower import start_at
-from vibrissa.tracking.trace.identity import follow_row
+from vibrissa.tracking.trace.row import follow_row
 
 COUNT = 6
 FRAMES = 50

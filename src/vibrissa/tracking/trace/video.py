@@ -23,7 +23,8 @@ from vibrissa.io import (
 )
 from vibrissa.tracking.trace.curves import find_whiskers
 from vibrissa.tracking.trace.follower import Follower, features_of, start_at
-from vibrissa.tracking.trace.identity import Seen, decided, follow_row
+from vibrissa.tracking.trace.identity import Seen, decided
+from vibrissa.tracking.trace.row import follow_row
 from vibrissa.tracking.trace.scene import Scene
 from vibrissa.tracking.trace.start import FRAMES, is_bright, negative
 from vibrissa.tracking.trace.trace import Trace, TraceOptions, given, overlap

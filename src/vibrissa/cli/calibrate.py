@@ -1,4 +1,4 @@
-"""`vibrissa calibrate`: from images of a checkerboard to calibrated cameras."""
+"""`vibrissa calibrate`: cameras by images of a checkerboard, sensors by touches at known points."""
 
 from __future__ import annotations
 
@@ -20,27 +20,80 @@ _FRAMES = 40
 """Frames that are used of a video, by default."""
 
 
-@with_options("the cameras, TOML of Anipose")
+@with_options("the cameras, TOML of Anipose; or the sensor, NetCDF (.nc)")
 def calibrate(
     images: Annotated[
         list[Path],
         typer.Argument(
-            help="Images of all cameras, named like top_01.png, front_01.png, or a video of each.",
+            help="Images of all cameras, named like top_01.png, front_01.png, or a video of each; "
+            "or the description of touches by a stage, TOML.",
             metavar="IMAGE...",
         ),
     ],
-    pattern: str,
-    square: float,
     target: Path,
+    pattern: str | None = None,
+    square: float | None = None,
     frames: int | None = None,
     force: bool = False,
 ) -> None:
-    """Calibrate cameras by a checkerboard that they see at the same moments (extra cameras).
+    """Calibrate cameras by a checkerboard, or a suspended whisker by touches at known points.
 
-    The board is to be turned and moved between images. The file is for `vibrissa track --cameras`;
-    its laboratory frame is that of the board in the first moment in which all cameras see it.
+    The board is to be seen by all cameras at the same moments (extra cameras), and turned and moved
+    between images. The file is for `vibrissa track --cameras`; its laboratory frame is that of the
+    board in the first moment in which all cameras see it. The description of a stage
+    (vibrissa.sensors.Stage) names tables of touches and of the resting whisker; the calibrated
+    sensor is for `vibrissa estimate --sensor`.
     Example: `vibrissa calibrate --pattern 9x6 --square 5 top_*.png front_*.png -o cameras.toml`
+    Example: `vibrissa calibrate stage.toml -o sensor.nc`
     """
+    if len(images) == 1 and images[0].suffix == ".toml":
+        boards = {"--pattern": pattern, "--square": square, "--frames": frames}
+        refuse(boards, "it is of a checkerboard, and this is the description of a stage")
+        _suspended(images[0], target, force)
+        return
+    if pattern is None or square is None:
+        raise ValueError("--pattern and --square of the checkerboard are needed, as 9x6 and 5")
+    _cameras(images, pattern, square, target, frames, force)
+
+
+def _suspended(description: Path, target: Path, force: bool) -> None:
+    """Calibrate a whisker on a compliant suspension."""
+    from vibrissa.io import NETCDF, check_readable, check_writable
+    from vibrissa.sensors import Stage, calibrate_suspension, save_suspended
+
+    check_writable(target, NETCDF)
+    free([target], force)
+    stage = Stage.load(check_readable(description))
+    points, readings, rest = stage.touches()
+    found = calibrate_suspension(
+        stage.whisker(),
+        points,
+        readings,
+        channels=stage.channels,
+        rest=rest,
+        base_sigma=stage.base_sigma,
+    )
+    save_suspended(target, found, stage)
+    lost = len(points) - int(found.used.sum())
+    say(f"{found.used.sum()} touches" + (f"; {lost} have no equilibrium in the model" * (lost > 0)))
+    spread = found.covariance.diagonal() ** 0.5
+    for name, value, sigma in zip(found.names, found.values, spread, strict=True):
+        open_ = "  (not determined by the touches)" if name in found.undetermined else ""
+        say(f"{name}: {value:.3g} ± {sigma:.2g}{open_}")
+    sensor = found.sensor
+    for k, name in enumerate(sensor.channels):
+        scale = abs(readings[:, k]).max()
+        say(
+            f"{name}: noise {sensor.noise[k]:.3g}, {100 * sensor.noise[k] / scale:.2g} % of the "
+            f"largest reading; the rod leaves {found.residual[k]:.3g}"
+        )
+    say(f"wrote {target}")
+
+
+def _cameras(
+    images: list[Path], pattern: str, square: float, target: Path, frames: int | None, force: bool
+) -> None:
+    """Calibrate cameras."""
     from vibrissa.cameras import calibrate as calibrated
     from vibrissa.cameras import save_cameras
     from vibrissa.io import Kind, check_readable, check_writable, load_series, recognise

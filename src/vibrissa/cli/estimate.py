@@ -143,6 +143,7 @@ def estimate(
         ),
     ],
     how: EstimateOptions,
+    sensor: Path | None = None,
     target: Path | None = None,
     force: bool = False,
 ) -> None:
@@ -153,7 +154,8 @@ def estimate(
     status is not_felt. To a recording they are added as a group `estimates`, in the laboratory too,
     where continuity decides which of several contacts it was; signals are made first where there
     are none (see `vibrissa signals`), and a contour that was made of other contacts is left out. A
-    table goes to a table.
+    table goes to a table. With the --sensor of `vibrissa calibrate` the table is a sweep: positions
+    of the stage, and its channels.
     Example: `vibrissa estimate signals.csv --map map.nc --using Fx,FT,MB,MD -o contacts.csv`
     """
     from vibrissa.io import CSV, NETCDF, check_readable, check_writable
@@ -164,7 +166,11 @@ def estimate(
     target = target or (signals if recorded else Path("contacts.csv"))
     check_writable(target, (*NETCDF, *CSV) if recorded else CSV)
     free_beside(signals, [target], force)
-    if recorded:
+    if sensor is not None:
+        if recorded or how.given:
+            raise ValueError("--sensor is of tables, and has its own whisker, channels and noise")
+        _from_sweep(signals, target, sensor)
+    elif recorded:
         _from_recording(signals, target, how)
     else:
         _from_table(signals, target, how)
@@ -198,6 +204,27 @@ def _from_table(signals: Path, target: Path, how: EstimateOptions) -> None:
     used = WRENCH if how.whole else found.attrs["triplet"]
     remark(how.described(used, how.noise.described(), found.attrs["felt_above"]))
     print_statuses(found["status"].values)
+    print_written(target)
+
+
+def _from_sweep(table: Path, target: Path, path: Path) -> None:
+    """Contacts of a sweep with a suspended whisker, laboratory frame, as a table."""
+    from vibrissa.io import write_table
+    from vibrissa.sensors import follow_sweep, load_suspended
+
+    sensor, stage = load_suspended(path)
+    sweep = stage.sweep(table)
+    found = follow_sweep(sensor, *sweep)
+    sigma = found.covariance.diagonal(axis1=1, axis2=2) ** 0.5
+    header = [a + b for a in ("", "normal_", "sigma_") for b in "xyz"]
+    columns = (found.points, found.normal, sigma)
+    names = ["sample", *header, "arc_length", "in_contact"]
+    rows = [
+        [i, *(v for part in columns for v in part[i].tolist()), float(found.arc_length[i]), int(on)]
+        for i, on in enumerate(found.in_contact)
+    ]
+    write_table(target, names, rows)
+    remark(f"{found.in_contact.sum()} of {len(rows)} samples are in contact; m, laboratory frame")
     print_written(target)
 
 

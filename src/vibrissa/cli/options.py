@@ -77,7 +77,9 @@ OPTIONS = {
         "FILE",
     ),
     "sensor": Option(
-        "Description of the sensor, TOML: the lines then carry its channels, raw.", "FILE"
+        "Description of the sensor, TOML: the lines then carry its channels, raw; or one of a "
+        "suspended whisker by `vibrissa calibrate` (.nc).",
+        "FILE",
     ),
     "uniqueness": Option("Result of `vibrissa uniqueness` for the map, NetCDF (.nc).", "FILE"),
     "cones": Option("Critical cones by curvature and taper, NetCDF (.nc).", "FILE"),

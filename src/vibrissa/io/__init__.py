@@ -47,11 +47,13 @@ from vibrissa.io.table import (
     delimiter_of,
     is_number,
     number,
+    read_numbers,
     read_text,
     signal_column,
     signal_columns,
     table_rows,
     with_point,
+    write_table,
 )
 from vibrissa.io.toml import (
     check_keys,
@@ -144,6 +146,7 @@ __all__ = [
     "quoted",
     "read_calibration",
     "read_dataset",
+    "read_numbers",
     "read_text",
     "read_toml",
     "read_tree",
@@ -174,5 +177,6 @@ __all__ = [
     "write_calibration",
     "write_movie",
     "write_netcdf",
+    "write_table",
     "write_video",
 ]

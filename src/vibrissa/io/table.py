@@ -266,7 +266,20 @@ class Table:
 
 
 def read_numbers(path: str | PathLike[str]) -> tuple[list[str], NDArray[np.float64]]:
-    """Read a table of numbers under one line of names; columns of labels are NaN."""
+    """Read a table of numbers under one line of names.
+
+    Parameters
+    ----------
+    path : str or path
+        File with the table.
+
+    Returns
+    -------
+    names : list of str
+        Names of the columns.
+    values : array (rows, columns)
+        Numbers; columns of labels are NaN.
+    """
     table = Table(path)
     columns = [table.numbers(name, labels=True) for name in table.names]
     return table.names, np.stack(columns, axis=1)
@@ -284,7 +297,17 @@ def table_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 def write_table(
     path: str | PathLike[str], header: Sequence[str], rows: Iterable[Sequence[object]]
 ) -> None:
-    """Write a table as CSV; an existing file is replaced once the new one is complete."""
+    """Write a table as CSV.
+
+    Parameters
+    ----------
+    path : str or path
+        File to write; an existing one is replaced once the new one is complete.
+    header : sequence of str
+        Names of the columns.
+    rows : iterable of sequences
+        Cells of each row.
+    """
     text = table_text(header, rows)
     with replacing(path) as part:
         part.write_bytes(text.encode("utf-8"))

@@ -8,7 +8,12 @@ from vibrissa.sensors.mixing import (
     calibrate_on_contacts,
 )
 from vibrissa.sensors.sensor import COMPONENTS, FORCE_NOISE, GRAVITY, MOMENT_NOISE, Sensor
+from vibrissa.sensors.stage import Stage, StageSweep, StageTouches, load_suspended, save_suspended
 from vibrissa.sensors.stiffness import StiffnessFit, fit_stiffness
+from vibrissa.sensors.suspended import SuspendedWhisker, Touches
+from vibrissa.sensors.suspension import SuspensionCalibration, calibrate_suspension
+from vibrissa.sensors.sweep import SweptContacts, follow_sweep
+from vibrissa.sensors.thin_plate import ThinPlate
 from vibrissa.sensors.weight import WeightCalibration, calibrate_weight, tare
 
 __all__ = [
@@ -20,14 +25,26 @@ __all__ = [
     "MixingCalibration",
     "Sensor",
     "SensorFrame",
+    "Stage",
+    "StageSweep",
+    "StageTouches",
     "StiffnessFit",
+    "SuspendedWhisker",
+    "SuspensionCalibration",
+    "SweptContacts",
+    "ThinPlate",
+    "Touches",
     "WeightCalibration",
     "calibrate_frame",
     "calibrate_mixing",
     "calibrate_on_contacts",
+    "calibrate_suspension",
     "calibrate_weight",
     "fit_stiffness",
+    "follow_sweep",
     "load_sensor",
+    "load_suspended",
     "save_sensor",
+    "save_suspended",
     "tare",
 ]

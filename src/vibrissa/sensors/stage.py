@@ -1,0 +1,407 @@
+"""Tables of a positioning stage: touches at known points, the resting shape, sweeps.
+
+    unit = "mm"                              # of all lengths in the tables and below
+    readings = ["sx", "sy", "sz"]            # columns of the channels
+    position = ["px", "py", "pz"]            # columns of the stage
+
+    [touches]                                # a probe on the stage touches the whisker
+    file = "touches.csv"
+    origin = [64.3, 98.1, 16.1]              # where the stage is when the probe is at the base
+    axes = ["x", "y", "z"]                   # the sensor's along the stage's; or a 3 × 3 matrix
+    farthest = 40                            # contacts farther from the base are not used
+    rest = [0, 0, 0]                         # readings of the free whisker; by default those of
+                                             # rows in which the probe is at the base
+
+    [[shape]]                                # points along the whisker at rest, from base to tip
+    file = "shape_y.csv"
+    columns = {x = "px", y = "py"}           # the sensor's coordinates
+    [[shape]]                                # one that the first lacks is read off another
+    file = "shape_x.csv"
+    columns = {x = "px", z = "pz"}
+    leave_out = [7]                          # rows that are wrong, from 0
+
+    [whisker]                                # only their ratios count but for forces
+    base_radius = 0.1
+    tip_radius = 0.1
+
+    [sweep]                                  # a moving sensor, or the thing that it touches
+    moves = "sensor"
+    origin = [60.4, 86.9, 47.0]
+    axes = ["-x", "-y", "z"]
+
+Files are found next to the description. A calibrated sensor is a NetCDF file that carries it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from vibrissa.io import (
+    check_keys,
+    in_file,
+    is_netcdf,
+    number_array,
+    one_number,
+    parsed_toml,
+    quoted,
+    read_dataset,
+    read_numbers,
+    read_text,
+    subtable,
+    three_numbers,
+    write_netcdf,
+)
+from vibrissa.numerics import Array
+from vibrissa.sensors.frame import SensorFrame
+from vibrissa.sensors.suspended import FEATURES, SuspendedWhisker
+from vibrissa.sensors.suspension import SuspensionCalibration
+from vibrissa.sensors.thin_plate import ThinPlate
+from vibrissa.whisker import Whisker
+
+_UNITS = {"m": 1.0, "mm": 1e-3, "um": 1e-6}
+_TOP = {"unit", "readings", "position", "touches", "shape", "whisker", "sweep"}
+_TOUCHES = {"file", "origin", "axes", "farthest", "base_sigma", "rest"}
+_SHAPE = {"file", "columns", "leave_out"}
+_WHISKER = {"base_radius", "tip_radius", "youngs_modulus", "noise"}
+_SWEEP = {"origin", "axes", "moves"}
+_AT_BASE = 1e-6
+"""Distance from the base, m, up to which a probe touches nothing."""
+
+
+class StageTouches(NamedTuple):
+    """Touches of a table.
+
+    Attributes
+    ----------
+    points : (n, 3) array
+        Contact points, sensor frame, m.
+    readings : (n, k) array
+        Readings of the channels.
+    rest : (k,) array or None
+        Readings of the free whisker: as stated, or the median of those with the probe at the base.
+    """
+
+    points: Array
+    readings: Array
+    rest: Array | None
+
+
+class StageSweep(NamedTuple):
+    """A sweep of a table.
+
+    Attributes
+    ----------
+    readings : (n, k) array
+        Readings of the channels.
+    position : (n, 3) array
+        Positions of the sensor's origin in the frame of what is touched, m.
+    rotation : (3, 3) array
+        Rotation from the sensor's frame to it.
+    """
+
+    readings: Array
+    position: Array
+    rotation: Array
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Description of a stage's tables.
+
+    Parameters
+    ----------
+    text : str
+        Description, TOML.
+    folder : Path
+        Folder of its files.
+
+    Raises
+    ------
+    ValueError
+        If it is not TOML, or has unknown keys or units.
+    """
+
+    text: str
+    folder: Path = Path()
+
+    def __post_init__(self) -> None:
+        """Check the keys."""
+        table = parsed_toml(self.text)
+        check_keys(table, _TOP, "the description of the stage")
+        for name, keys in (("touches", _TOUCHES), ("whisker", _WHISKER), ("sweep", _SWEEP)):
+            check_keys(subtable(table, name), keys, f"[{name}]")
+        shapes = table.get("shape", [])
+        if not isinstance(shapes, list) or not all(isinstance(s, Mapping) for s in shapes):
+            raise ValueError(f"shape is {quoted(shapes)}; write [[shape]] for each of its tables")
+        for shape in shapes:
+            check_keys(shape, _SHAPE, "[[shape]]")
+        if table.get("unit", "mm") not in _UNITS:
+            raise ValueError(f"unit is {quoted(table['unit'])}; known are {', '.join(_UNITS)}")
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> Stage:
+        """Read a description.
+
+        Parameters
+        ----------
+        path : str or path
+            TOML file.
+
+        Returns
+        -------
+        Stage
+            Its description.
+        """
+        with in_file(path):
+            return cls(read_text(path), Path(path).parent)
+
+    @property
+    def _table(self) -> dict[str, Any]:
+        return parsed_toml(self.text)
+
+    @property
+    def _unit(self) -> float:
+        return _UNITS[self._table.get("unit", "mm")]
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of the channels."""
+        return _names(self._table, "readings")
+
+    @property
+    def base_sigma(self) -> float:
+        """Standard deviation of the stated place of the base, m."""
+        return self._unit * one_number(subtable(self._table, "touches"), "base_sigma", 0.15)
+
+    def _columns(self, file: Any, names: tuple[str, ...]) -> Array:
+        """Columns of a file of the description, or of any other."""
+        if isinstance(file, Path):
+            path = file
+        elif isinstance(file, str):
+            path = self.folder / file
+        else:
+            raise ValueError(f"file is {quoted(file)}; the name of a table is needed")
+        known, values = read_numbers(path)
+        missing = [name for name in names if name not in known]
+        if missing:
+            got = ", ".join(name for name in known if name)
+            raise ValueError(f"{path} lacks {', '.join(missing)}; its columns are {got}")
+        return values[:, [known.index(name) for name in names]]
+
+    def touches(self) -> StageTouches:
+        """Touches of the whisker at known points.
+
+        Returns
+        -------
+        StageTouches
+            Points and readings of the contacts, and the readings at rest.
+        """
+        own = subtable(self._table, "touches")
+        position = self._columns(own.get("file"), _names(self._table, "position"))
+        readings = self._columns(own.get("file"), self.channels)
+        axes = _axes(own, "touches")
+        points = self._unit * (position - three_numbers(own, "origin", (0.0, 0.0, 0.0))) @ axes
+        radius = np.linalg.norm(points, axis=1)
+        rest = radius <= _AT_BASE
+        touched = ~rest & (radius <= self._unit * one_number(own, "farthest", np.inf))
+        free = np.median(readings[rest], axis=0) if rest.any() else None
+        if "rest" in own:
+            free = number_array(own["rest"], "rest")
+        return StageTouches(points[touched], readings[touched], free)
+
+    def whisker(self) -> Whisker:
+        """Whisker at rest, in the sensor's frame, its base at the origin.
+
+        Returns
+        -------
+        Whisker
+            Whisker through the points of the shape.
+        """
+        shapes = self._table.get("shape", [])
+        if not shapes:
+            raise ValueError("[[shape]] is missing: points along the whisker at rest are needed")
+        found: dict[str, Array] = {}
+        tables = [self._shape(shape) for shape in shapes]
+        found |= tables[0]
+        for other in tables[1:]:
+            shared = [name for name in other if name in tables[0]]
+            for name in set(other) - set(found):
+                if not shared:
+                    raise ValueError("two tables of the shape have no coordinate in common")
+                found[name] = _read_off(other[shared[0]], other[name], found[shared[0]], shared[0])
+        lacking = [name for name in "xyz" if name not in found]
+        if lacking:
+            raise ValueError(f"the shape lacks {', '.join(lacking)}: name its columns")
+        points = np.stack([found[name] for name in "xyz"], axis=1)
+        apart = np.linalg.norm(np.diff(points, axis=0), axis=1) > _AT_BASE
+        own = subtable(self._table, "whisker")
+        usual = 1e-4 / self._unit
+        noise = self._unit * one_number(own, "noise", 0.0)
+        return Whisker.from_points(
+            points[np.append(True, apart)],
+            noise=noise or None,
+            youngs_modulus=one_number(own, "youngs_modulus", 200e9),
+            any_length=True,
+            base_radius=self._unit * one_number(own, "base_radius", usual),
+            tip_radius=self._unit * one_number(own, "tip_radius", usual),
+        )
+
+    def _shape(self, shape: Mapping[str, Any]) -> dict[str, Array]:
+        """Coordinates of a table of the shape, m, less those of its first point."""
+        columns = shape.get("columns", {"x": "px", "y": "py", "z": "pz"})
+        if not isinstance(columns, Mapping) or not set(columns) <= set("xyz"):
+            raise ValueError(f"columns is {quoted(columns)}; as {{x = 'px', y = 'py'}} is needed")
+        values = self._columns(shape.get("file"), tuple(columns.values()))
+        wrong = number_array(shape.get("leave_out", []), "leave_out").astype(int)
+        values = np.delete(values, wrong, axis=0)
+        return dict(zip(columns, self._unit * (values - values[0]).T, strict=True))
+
+    def sweep(self, path: str | PathLike[str]) -> StageSweep:
+        """Read a sweep.
+
+        Parameters
+        ----------
+        path : str or path
+            Table with the columns of the stage and of the channels.
+
+        Returns
+        -------
+        StageSweep
+            Readings, and the poses of the sensor.
+        """
+        own = subtable(self._table, "sweep")
+        moves = own.get("moves", "sensor")
+        if moves not in ("sensor", "object"):
+            raise ValueError(f"moves is {quoted(moves)}; 'sensor' or 'object' is needed")
+        axes = _axes(own, "sweep")
+        position = self._columns(Path(path), _names(self._table, "position"))
+        position = self._unit * (position - three_numbers(own, "origin", (0.0, 0.0, 0.0)))
+        return StageSweep(
+            self._columns(Path(path), self.channels),
+            position if moves == "sensor" else -position,
+            axes,
+        )
+
+
+def _names(table: Mapping[str, Any], key: str) -> tuple[str, ...]:
+    names = table.get(key)
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise ValueError(f"{key} is {quoted(names)}; the names of columns are needed")
+    if key == "position" and len(names) != 3:
+        raise ValueError(f"position is {quoted(names)}; the columns of x, y and z are needed")
+    return tuple(names)
+
+
+def _axes(table: Mapping[str, Any], where: str) -> Array:
+    """Sensor's axes (columns) along the stage's."""
+    axes = table.get("axes", ["x", "y", "z"])
+    with in_file(f"[{where}]"):
+        return np.asarray(SensorFrame(axes=axes).axes)
+
+
+def _read_off(known: Array, values: Array, wanted: Array, name: str) -> Array:
+    """Values where a shared coordinate is the wanted one."""
+    forward = known if known[-1] >= known[0] else -known
+    order = np.argsort(forward, kind="stable")
+    if np.abs(forward[order] - forward).max() > 0.1 * np.ptp(known):
+        raise ValueError(f"{name} turns back along the shape: nothing can be read off by it")
+    sign = 1.0 if known[-1] >= known[0] else -1.0
+    return np.interp(sign * wanted, forward[order], values[order])
+
+
+def save_suspended(
+    path: str | PathLike[str], calibration: SuspensionCalibration, stage: Stage
+) -> None:
+    """Write a calibrated sensor that `load_suspended` reads.
+
+    Parameters
+    ----------
+    path : str or path
+        NetCDF file; an existing one is replaced.
+    calibration : SuspensionCalibration
+        Calibration.
+    stage : Stage
+        Description of the tables that sweeps come in.
+    """
+    sensor = calibration.sensor
+    channel, unknown = ("channel", list(sensor.channels)), ("unknown", list(calibration.names))
+    data = xr.Dataset(
+        {
+            "rotation_compliance": ((), sensor.rotation_compliance, {"units": "rad N-1 m-1"}),
+            "shift_compliance": ((), sensor.shift_compliance, {"units": "m N-1"}),
+            "pivot": ("space", sensor.pivot, {"units": "m"}),
+            "friction": ((), sensor.friction, {"units": "1"}),
+            "readout": (("channel", "feature"), sensor.readout),
+            "noise": ("channel", sensor.noise),
+            "value": ("unknown", calibration.values),
+            "covariance": (("unknown", "unknown_"), calibration.covariance),
+            "readout_covariance": (
+                ("channel", "feature", "feature_"),
+                calibration.readout_covariance,
+            ),
+            "residual": ("channel", calibration.residual),
+        },
+        {channel[0]: channel[1], unknown[0]: unknown[1], "feature": list(FEATURES)},
+        {"kind": KIND, "stage": stage.text, "undetermined": ", ".join(calibration.undetermined)},
+    )
+    if sensor.residual is not None:
+        data["plate_points"] = (("touch", "space"), sensor.residual.points, {"units": "m"})
+        data["plate_weights"] = (("touch", "channel"), sensor.residual.weights)
+        data["plate_reach"] = ((), sensor.residual.reach, {"units": "m"})
+    parts = {"/": data, "whisker": sensor.whisker.to_dataset()}
+    write_netcdf(path, xr.DataTree.from_dict(parts))
+
+
+KIND = "suspended whisker"
+
+
+def load_suspended(path: str | PathLike[str]) -> tuple[SuspendedWhisker, Stage]:
+    """Read a calibrated sensor, and the description of its stage's tables.
+
+    Parameters
+    ----------
+    path : str or path
+        NetCDF file of `save_suspended`.
+
+    Returns
+    -------
+    sensor : SuspendedWhisker
+        Calibrated sensor.
+    stage : Stage
+        Description of the tables that sweeps come in.
+
+    Raises
+    ------
+    ValueError
+        If it is another file.
+    """
+    data = read_dataset(path) if is_netcdf(path) else xr.Dataset()
+    if data.attrs.get("kind") != KIND:
+        raise ValueError(f"{path} holds no calibrated suspended whisker; `vibrissa calibrate` does")
+    residual = None
+    if "plate_points" in data:
+        residual = ThinPlate(
+            data["plate_points"].values,
+            data["plate_weights"].values,
+            float(data["plate_reach"]),
+            data["noise"].values,
+        )
+    sensor = SuspendedWhisker(
+        Whisker.from_dataset(read_dataset(path, "whisker")),
+        rotation_compliance=float(data["rotation_compliance"]),
+        shift_compliance=float(data["shift_compliance"]),
+        pivot=data["pivot"].values,
+        friction=float(data["friction"]),
+        channels=tuple(str(name) for name in data["channel"].values),
+        readout=data["readout"].values,
+        noise=data["noise"].values,
+        residual=residual,
+    )
+    return sensor, Stage(str(data.attrs["stage"]), Path(path).parent)

@@ -1,0 +1,322 @@
+"""A whisker on a compliant suspension that is read by the motion of its base.
+
+The usual read-out is a magnet over a Hall sensor. The contact's force F and its moment M about a
+pivot turn the base by θ and shift it by u:
+
+    θ = c_r M,    u = c_t F,    p = o + b + u + exp(θ) (D x − b),
+
+with the contact x(ξ), ξ = (s, f_y, f_z), of the rod in the frame of its base section, the base o,
+the pivot o + b and the base's orientation D at rest, in the sensor's frame. Each channel reads
+
+    y = w · φ,    φ = (1, θ, u / L, θ_i θ_j),
+
+for the field of a magnet that turns and moves is linear in neither. The force is normal to the
+whisker, or with friction µ has the component µ |f| along it towards the tip. All of it is explicit
+in ξ: the suspension does not enter the rod, and a compliant base costs no more than a rigid one.
+
+Lengths are in units of L, forces in EI/L² and moments in EI/L inside. Readings determine the
+compliances only relative to the whisker's stiffness; in SI they hold for the modulus it has.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from vibrissa.numerics import AnyArray, Array
+from vibrissa.rod import discretize, solve_forces
+from vibrissa.sensors.thin_plate import ThinPlate
+from vibrissa.status import Status
+
+if TYPE_CHECKING:
+    from vibrissa.whisker import Whisker
+
+FEATURES = (
+    "1",
+    *(f"θ{a}" for a in "xyz"),
+    *(f"u{a}" for a in "xyz"),
+    *(f"θ{a}θ{b}" for i, a in enumerate("xyz") for b in "xyz"[i:]),
+)
+"""What a channel reads a combination of: rotation, rad, and shift over L, of the base."""
+
+_PAIRS = np.triu_indices(3)
+_STEPS, _ROUNDS, _LAST_ROUNDS = 16, 4, 12
+"""Turns of the path from rest to a contact, and Newton steps after each of them and the last."""
+_SOLVED = 1e-8
+"""Miss of the point, over L, up to which a contact is solved."""
+_MOST_ARC, _MOST_FORCE = 0.1, 3.0
+"""Largest Newton steps of s, over L, and of the force, over EI/L²."""
+_LEAST_ARC = 0.01
+_SMALL = 1e-6
+"""Step of differences, and angle squared below which series replace quotients."""
+
+
+class Touches(NamedTuple):
+    """Contacts of a suspended whisker, non-dimensional.
+
+    Attributes
+    ----------
+    points : (n, 3) array
+        Contact points over L, sensor frame.
+    features : (n, 13) array
+        Motion of the base: `FEATURES`.
+    force : (n, 3) array
+        Force on the whisker over EI/L², sensor frame.
+    point_slopes : (n, 3, 3) array
+        Derivatives of the points by ξ = (s, f_y, f_z).
+    feature_slopes : (n, 13, 3) array
+        Derivatives of the features by ξ.
+    """
+
+    points: Array
+    features: Array
+    force: Array
+    point_slopes: Array
+    feature_slopes: Array
+
+
+@dataclass(frozen=True, eq=False)
+class SuspendedWhisker:
+    """A whisker on a compliant suspension, with channels that read the motion of its base.
+
+    Parameters
+    ----------
+    whisker : Whisker
+        Whisker; its pose is that of the base at rest in the sensor's frame.
+    rotation_compliance : float
+        Rotation of the base per moment about the pivot, rad/(N·m).
+    shift_compliance : float
+        Shift of the base per force, m/N.
+    pivot : array_like (3,)
+        Pivot relative to the base, sensor frame, m.
+    friction : float
+        Force along the whisker, towards the tip, over the normal force at contacts.
+    channels : sequence of str
+        Names of the channels.
+    readout : array_like (k, 13), optional
+        Weights of `FEATURES` in each channel, in the channel's unit.
+    noise : array_like (k,)
+        Standard deviation of what the model leaves unexplained of a reading; most of it is the same
+        in neighbouring contacts.
+    residual : ThinPlate, optional
+        Correction of the readings as a function of the contact point, m, sensor frame.
+
+    Raises
+    ------
+    ValueError
+        If compliances are negative, or shapes do not fit.
+    """
+
+    whisker: Whisker
+    rotation_compliance: float
+    shift_compliance: float
+    pivot: Any = (0.0, 0.0, 0.0)
+    friction: float = 0.0
+    channels: tuple[str, ...] = ()
+    readout: Any = field(default_factory=lambda: np.zeros((0, len(FEATURES))))
+    noise: Any = ()
+    residual: ThinPlate | None = None
+
+    def __post_init__(self) -> None:
+        """Check, and make arrays."""
+        k = len(self.channels)
+        for name, shape in (("pivot", (3,)), ("readout", (k, len(FEATURES))), ("noise", (k,))):
+            value = np.asarray(getattr(self, name), dtype=np.float64)
+            if value.shape != shape or not np.isfinite(value).all():
+                raise ValueError(f"{name} has shape {value.shape}; finite {shape} is needed")
+            object.__setattr__(self, name, value)
+        for name in ("rotation_compliance", "shift_compliance"):
+            if not 0.0 <= getattr(self, name) < np.inf:
+                raise ValueError(f"{name} is {getattr(self, name)!r}; it must not be negative")
+
+    @property
+    def length(self) -> float:
+        """Unit of length, m."""
+        return self.whisker.length
+
+    def touches(self, contacts: Array) -> Touches:
+        """Contact points and base motions of known contacts, with derivatives.
+
+        Parameters
+        ----------
+        contacts : (n, 3) array
+            Contacts ξ = (s, f_y, f_z) over L and EI/L².
+
+        Returns
+        -------
+        Touches
+            Their points and features.
+        """
+        d = discretize(self.whisker)
+        value, slope = self._rod(contacts)
+        turn, pivot = self.whisker.pose.rotation, np.asarray(self.pivot) / d.length
+        rotation, shift = self.rotation_compliance * d.moment, self.shift_compliance * d.force
+        force, arm = value[:, :3] @ turn.T, value[:, 3:] @ turn.T - pivot
+        d_force, d_arm = turn @ slope[:, :3], turn @ slope[:, 3:]
+        angle = rotation * np.cross(arm, force)
+        d_angle = rotation * (_cross(arm) @ d_force - _cross(force) @ d_arm)
+        turned, spin = Rotation.from_rotvec(angle).as_matrix(), _right_jacobian(angle) @ d_angle
+        felt = (turned @ force[:, :, None])[:, :, 0]
+        d_felt = turned @ (d_force - _cross(force) @ spin)
+        base = self.whisker.pose.origin / d.length + pivot
+        point = base + shift / d.length * felt + (turned @ arm[:, :, None])[:, :, 0]
+        d_point = shift / d.length * d_felt + turned @ (d_arm - _cross(arm) @ spin)
+        i, j = _PAIRS
+        n = len(contacts)
+        features = (np.ones((n, 1)), angle, shift / d.length * felt, angle[:, i] * angle[:, j])
+        product = d_angle[:, i] * angle[:, j, None] + angle[:, i, None] * d_angle[:, j]
+        slopes = (np.zeros((n, 1, 3)), d_angle, shift / d.length * d_felt, product)
+        return Touches(
+            point, np.concatenate(features, axis=1), felt, d_point, np.concatenate(slopes, axis=1)
+        )
+
+    def _rod(self, contacts: Array) -> tuple[Array, Array]:
+        """Force and point of the rod in its base frame, with derivatives by ξ."""
+        d = discretize(self.whisker)
+        size = np.hypot(contacts[:, 1], contacts[:, 2])
+        along = self.friction * size
+        full = np.concatenate([contacts[:, :1], along[:, None], contacts[:, 1:]], axis=1)
+        value, slope = solve_forces(d, full, tangents=True)
+        if self.friction:
+            ahead, _ = solve_forces(d, full + np.array([0.0, _SMALL, 0.0, 0.0]))
+            unit = self.friction * contacts[:, 1:] / np.maximum(size, 1e-12)[:, None]
+            slope[:, :, 1:] += ((ahead - value) / _SMALL)[:, :, None] * unit[:, None, :]
+        return value, slope
+
+    def solve(self, points: ArrayLike, start: Array | None = None) -> tuple[Array, AnyArray]:
+        """Contacts at known points.
+
+        Parameters
+        ----------
+        points : array_like (n, 3)
+            Contact points, sensor frame, m.
+        start : (n, 3) array, optional
+            Contacts ξ nearby; by default they are followed from rest.
+
+        Returns
+        -------
+        contacts : (n, 3) array
+            Contacts ξ, non-dimensional.
+        statuses : (n,) int array
+            `Status` of each: ``OK``, or ``BEYOND_FOLD`` where there is no equilibrium with this
+            friction.
+        """
+        target = np.asarray(points, dtype=np.float64) / self.length
+        if start is None:
+            contacts, miss = self._from_rest(target)
+        else:
+            contacts, miss = self._newton(target, start, _LAST_ROUNDS)
+            lost = np.flatnonzero(~(miss < _SOLVED))
+            if lost.size:
+                contacts[lost], miss[lost] = self._from_rest(target[lost])
+        statuses = np.where(miss < _SOLVED, int(Status.OK), int(Status.BEYOND_FOLD))
+        return contacts, statuses
+
+    def _from_rest(self, target: Array) -> tuple[Array, Array]:
+        """Follow contacts from the resting whisker by turning their radius vector."""
+        base = self.whisker.pose.origin / self.length
+        s = np.linspace(2.0 * _LEAST_ARC, 1.0, 400)
+        rest = self.whisker.pose.vectors_to_source(self.whisker.position(s * self.length))
+        rest = rest / self.length
+        radius = np.linalg.norm(target - base, axis=1)
+        nearest = np.abs(np.linalg.norm(rest, axis=1) - radius[:, None]).argmin(axis=1)
+        a, b = rest[nearest], target - base
+        axis = np.cross(a, b)
+        size = np.linalg.norm(axis, axis=1)
+        axis *= (np.arctan2(size, np.sum(a * b, axis=1)) / np.maximum(size, 1e-12))[:, None]
+        a *= (radius / np.linalg.norm(a, axis=1))[:, None]
+        contacts = np.stack([s[nearest], 0.0 * radius, 0.0 * radius], axis=1)
+        miss = np.full(len(target), np.inf)
+        for share in np.linspace(0.0, 1.0, _STEPS + 1)[1:]:
+            on_path = base + Rotation.from_rotvec(share * axis).apply(a)
+            rounds = _ROUNDS if share < 1.0 else _LAST_ROUNDS
+            contacts, miss = self._newton(on_path, contacts, rounds)
+        return contacts, miss
+
+    def _newton(self, target: Array, contacts: Array, rounds: int) -> tuple[Array, Array]:
+        """Newton's method for the contacts at points; and by how much they miss them."""
+        contacts = contacts.copy()
+        for last in (*([False] * rounds), True):
+            touch = self.touches(contacts)
+            away = touch.points - target
+            miss = np.abs(away).max(axis=1)
+            if last or (miss < 0.1 * _SOLVED).all():
+                break
+            regular = np.abs(np.linalg.det(touch.point_slopes)) > 1e-14
+            slopes = np.where(regular[:, None, None], touch.point_slopes, np.eye(3))
+            step = np.nan_to_num(np.linalg.solve(slopes, away[:, :, None])[:, :, 0])
+            most = np.maximum(
+                np.abs(step[:, 0]) / _MOST_ARC, np.linalg.norm(step[:, 1:], axis=1) / _MOST_FORCE
+            )
+            contacts -= step / np.maximum(most, 1.0)[:, None]
+            contacts[:, 0] = np.clip(contacts[:, 0], _LEAST_ARC, 1.0)
+        return contacts, miss
+
+    def readings(self, touches: Touches) -> tuple[Array, Array]:
+        """Readings of contacts, and their derivatives by ξ.
+
+        Parameters
+        ----------
+        touches : Touches
+            Contacts.
+
+        Returns
+        -------
+        readings : (n, k) array
+            Readings without noise.
+        slopes : (n, k, 3) array
+            Derivatives by ξ.
+        """
+        weights = np.asarray(self.readout)
+        values, slopes = touches.features @ weights.T, weights @ touches.feature_slopes
+        if self.residual is not None:
+            more, by_point = self.residual(touches.points * self.length)
+            values = values + more
+            slopes = slopes + by_point @ touches.point_slopes * self.length
+        return values, slopes
+
+    def read(self, points: ArrayLike, seed: int | None = None) -> tuple[Array, AnyArray]:
+        """Readings while the whisker is touched at known points.
+
+        Parameters
+        ----------
+        points : array_like (n, 3)
+            Contact points, sensor frame, m.
+        seed : int, optional
+            Seed of the noise; by default there is none.
+
+        Returns
+        -------
+        readings : (n, k) array
+            Readings; NaN where there is no equilibrium.
+        statuses : (n,) int array
+            `Status` of each contact.
+        """
+        contacts, statuses = self.solve(points)
+        values, _ = self.readings(self.touches(contacts))
+        if seed is not None:
+            values = values + np.random.default_rng(seed).normal(size=values.shape) * self.noise
+        return np.where((statuses == int(Status.OK))[:, None], values, np.nan), statuses
+
+
+def _cross(vectors: Array) -> Array:
+    """Matrices (n, 3, 3) of the vector product with vectors (n, 3)."""
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(-1, 3, 3)
+
+
+def _right_jacobian(angle: Array) -> Array:
+    """Right Jacobians (n, 3, 3) of the rotation vectors (n, 3)."""
+    square = np.sum(angle * angle, axis=-1)[:, None, None]
+    small = square < _SMALL
+    x = np.where(small, 1.0, square)
+    size = np.sqrt(x)
+    first = np.where(small, 0.5 - square / 24.0, (1.0 - np.cos(size)) / x)
+    second = np.where(small, 1.0 / 6.0 - square / 120.0, (size - np.sin(size)) / (x * size))
+    matrix = _cross(angle)
+    return np.asarray(np.eye(3) - first * matrix + second * (matrix @ matrix))

@@ -1,0 +1,282 @@
+"""Contacts of a suspended whisker that is swept over things with a known motion.
+
+All samples of a touch are explained at once. Unknown are the contact ξ_k of each sample, and the
+errors b_k of the model, which hardly change from one sample to the next: what a calibration leaves
+unexplained, and the drift of the sensor. The most probable minimise
+
+    Σ |y(ξ_k) + b_k − y_k|² / (ε σ)² + Σ |b_k − a_k b_(k−1)|² / ((1 − a_k²) σ²)
+      + Σ (n · Δp_k)² / q_n² + Σ |Δp_k − n (n · Δp_k)|² / q_t²,
+
+with σ the sensor's noise and Δp the steps of the contact point in the laboratory: a contact slides
+along the surface of what it touches, whose normal n is the direction of the force, so that steps
+along n are as good as zero, and those across it are up to about those of the base. Nothing needs to
+be known of where a touch begins: the steps of all samples show it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.linalg import LinAlgError, solveh_banded
+
+from vibrissa.numerics import AnyArray, Array
+from vibrissa.sensors.suspended import SuspendedWhisker, Touches
+
+WHITE, BIAS = 0.5, 1.0
+"""Standard deviations of what differs from sample to sample, and of what hardly does, over that of
+a calibration's residuals."""
+PERSISTENCE = 0.1
+"""Motion of the base over which the errors change, m."""
+NORMAL, SLIDING = 0.07, 0.7
+"""Steps of contact points along the force and across it, over those of the base."""
+_LEAST_STEP = 1e-6
+_FEWEST = 5
+_STARTS = (0.45, 0.65, 0.85)
+_ROUNDS, _ENOUGH = 40, 1e-4
+_MOST_STEP = 0.1
+_LEAST_ARC = 0.05
+
+
+class SweptContacts(NamedTuple):
+    """Contacts along a sweep.
+
+    Attributes
+    ----------
+    points : (n, 3) array
+        Contact points, laboratory frame, m; NaN where nothing is touched.
+    covariance : (n, 3, 3) array
+        Their covariance, m².
+    normal : (n, 3) array
+        Direction of the force on the whisker, laboratory frame: the surface's normal.
+    arc_length : (n,) array
+        Arc lengths of the contacts, m.
+    in_contact : (n,) bool array
+        Whether the whisker touches.
+    bias : (n, k) array
+        Errors of the model that were found, in the channels' units.
+    """
+
+    points: Array
+    covariance: Array
+    normal: Array
+    arc_length: Array
+    in_contact: AnyArray
+    bias: Array
+
+
+def follow_sweep(
+    sensor: SuspendedWhisker,
+    readings: ArrayLike,
+    position: ArrayLike,
+    rotation: ArrayLike | None = None,
+    *,
+    rest: ArrayLike | None = None,
+    threshold: float = 4.0,
+) -> SweptContacts:
+    """Find the contacts of a sweep, with their onset and loss.
+
+    Parameters
+    ----------
+    sensor : SuspendedWhisker
+        Calibrated sensor.
+    readings : array_like (n, k)
+        Readings of its channels in order of time, at equal or unequal steps.
+    position : array_like (n, 3)
+        Positions of the sensor's origin in the laboratory, m.
+    rotation : array_like (3, 3) or (n, 3, 3), optional
+        Rotation from the sensor's to the laboratory frame; by default they are parallel.
+    rest : array_like (k,), optional
+        Readings of the untouched whisker; by default those of the first sample.
+    threshold : float
+        Change of a reading, over its noise, from which the whisker touches.
+
+    Returns
+    -------
+    SweptContacts
+        Contact points with covariance, and the normal of the surface there.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit.
+    """
+    y, base = np.asarray(readings, dtype=np.float64), np.asarray(position, dtype=np.float64)
+    k = len(sensor.channels)
+    turn = np.eye(3) if rotation is None else np.asarray(rotation, dtype=np.float64)
+    if y.ndim != 2 or y.shape[1] != k or base.shape != (len(y), 3) or turn.shape[-2:] != (3, 3):
+        raise ValueError(
+            f"readings (n, {k}), positions (n, 3) and rotations (3, 3) or (n, 3, 3) are needed; "
+            f"got {y.shape}, {base.shape} and {turn.shape}"
+        )
+    turn = np.broadcast_to(turn, (len(y), 3, 3))
+    change = y - (y[0] if rest is None else np.asarray(rest, dtype=np.float64))
+    touching = (np.abs(change) > threshold * np.asarray(sensor.noise)).any(axis=1)
+    n = len(y)
+    out = SweptContacts(
+        np.full((n, 3), np.nan),
+        np.full((n, 3, 3), np.nan),
+        np.full((n, 3), np.nan),
+        np.full(n, np.nan),
+        np.zeros(n, dtype=bool),
+        np.full((n, k), np.nan),
+    )
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], touching, [False]]).astype(int)))
+    for first, last in edges.reshape(-1, 2):
+        if last - first < _FEWEST:
+            continue
+        rows = slice(first, last)
+        touch = _Touch(sensor, change[rows] + sensor.readout[:, 0], base[rows], turn[rows])
+        for mine, found in zip(out, touch.contacts(), strict=True):
+            mine[rows] = found
+    return out
+
+
+class _State(NamedTuple):
+    """Unknowns of all samples, and what follows from them."""
+
+    contacts: Array
+    bias: Array
+    touches: Touches
+    points: Array
+    misfit: Array
+    slopes: Array
+    metric: Array
+    cost: float
+
+
+class _Touch:
+    """Samples of one touch; lengths are over the whisker's."""
+
+    def __init__(self, sensor: SuspendedWhisker, readings: Array, base: Array, turn: Array) -> None:
+        self.sensor, self.readings, self.turn = sensor, readings, turn
+        self.base = base / sensor.length
+        noise = np.asarray(sensor.noise)
+        self.weight = 1.0 / (WHITE * noise) ** 2
+        moved = np.linalg.norm(np.diff(self.base, axis=0), axis=1) + _LEAST_STEP
+        self.kept = np.exp(-moved * sensor.length / PERSISTENCE)
+        self.first = 1.0 / (BIAS * noise) ** 2
+        self.change = self.first / (1.0 - self.kept**2)[:, None]
+        self.normal, self.sliding = 1.0 / (NORMAL * moved) ** 2, 1.0 / (SLIDING * moved) ** 2
+
+    def state(self, contacts: Array, bias: Array, metric: Array | None = None) -> _State:
+        """Evaluate unknowns; without a metric the one of these contacts' normals."""
+        touches = self.sensor.touches(contacts)
+        points = self.base + (self.turn @ touches.points[:, :, None])[:, :, 0]
+        values, slopes = self.sensor.readings(touches)
+        misfit = values + bias - self.readings
+        used = self.metric(touches) if metric is None else metric
+        step, drift = np.diff(points, axis=0), bias[1:] - self.kept[:, None] * bias[:-1]
+        cost = (misfit**2 * self.weight).sum() + (bias[0] ** 2 * self.first).sum()
+        cost += np.einsum("ki,kij,kj->", step, used, step) + (drift**2 * self.change).sum()
+        return _State(contacts, bias, touches, points, misfit, slopes, used, float(cost))
+
+    def normals(self, touches: Touches) -> Array:
+        """Directions of the forces, laboratory frame."""
+        force = (self.turn @ touches.force[:, :, None])[:, :, 0]
+        return np.asarray(force / np.maximum(np.linalg.norm(force, axis=1), 1e-12)[:, None])
+
+    def metric(self, touches: Touches) -> Array:
+        """Weights of the steps between samples (n - 1, 3, 3)."""
+        n = self.normals(touches)
+        n = n[1:] + n[:-1]
+        n /= np.maximum(np.linalg.norm(n, axis=1), 1e-12)[:, None]
+        along = n[:, :, None] * n[:, None, :]
+        return np.asarray(
+            self.normal[:, None, None] * along + self.sliding[:, None, None] * (np.eye(3) - along)
+        )
+
+    def system(self, at: _State) -> tuple[Array, Array]:
+        """Gradient (n, m) and banded Hessian of half the cost, by contacts and bias."""
+        n, k = at.bias.shape
+        size = 3 + k
+        point = self.turn @ at.touches.point_slopes
+        both = np.concatenate([at.slopes, np.broadcast_to(np.eye(k), (n, k, k))], axis=2)
+        gradient = np.einsum("kai,a,ka->ki", both, self.weight, at.misfit)
+        own = np.einsum("kai,a,kaj->kij", both, self.weight, both)
+        pull = (at.metric @ np.diff(at.points, axis=0)[:, :, None])[:, :, 0]
+        gradient[1:, :3] += np.einsum("kji,kj->ki", point[1:], pull)
+        gradient[:-1, :3] -= np.einsum("kji,kj->ki", point[:-1], pull)
+        after, before = at.metric @ point[1:], at.metric @ point[:-1]
+        own[1:, :3, :3] += np.swapaxes(point[1:], 1, 2) @ after
+        own[:-1, :3, :3] += np.swapaxes(point[:-1], 1, 2) @ before
+        cross = np.zeros((n - 1, size, size))
+        cross[:, :3, :3] = -np.swapaxes(point[1:], 1, 2) @ before
+        drift = (at.bias[1:] - self.kept[:, None] * at.bias[:-1]) * self.change
+        gradient[0, 3:] += at.bias[0] * self.first
+        gradient[1:, 3:] += drift
+        gradient[:-1, 3:] -= self.kept[:, None] * drift
+        i = np.arange(3, size)
+        own[0, i, i] += self.first
+        own[1:, i, i] += self.change
+        own[:-1, i, i] += self.kept[:, None] ** 2 * self.change
+        cross[:, i, i] = -self.kept[:, None] * self.change
+        return gradient, _banded(own, cross)
+
+    def minimise(self, start: float) -> _State:
+        """Least cost from contacts at some arc length."""
+        n, k = self.readings.shape
+        light = np.tile([start, 1e-3, 1e-3], (n, 1))
+        at, damping = self.state(light, np.zeros((n, k))), 1e-2
+        for _ in range(_ROUNDS):
+            gradient, band = self.system(at)
+            while damping < 1e8:
+                damped = band.copy()
+                damped[0] *= 1.0 + damping
+                try:
+                    step = -solveh_banded(damped, gradient.ravel(), lower=True).reshape(n, -1)
+                except LinAlgError:
+                    damping *= 10.0
+                    continue
+                step /= max(np.abs(step[:, 0]).max() / _MOST_STEP, 1.0)
+                contacts = at.contacts + step[:, :3]
+                contacts[:, 0] = np.clip(contacts[:, 0], _LEAST_ARC, 1.0)
+                new = self.state(contacts, at.bias + step[:, 3:], at.metric)
+                if new.cost < at.cost:
+                    break
+                damping *= 10.0
+            else:
+                break
+            gain, damping = at.cost - new.cost, max(0.1 * damping, 1e-9)
+            at = self.state(new.contacts, new.bias)
+            if gain < _ENOUGH * at.cost:
+                break
+        return at
+
+    def contacts(self) -> SweptContacts:
+        """Most probable contacts."""
+        at = min((self.minimise(start) for start in _STARTS), key=lambda one: one.cost)
+        _, band = self.system(at)
+        n, k = at.bias.shape
+        spread = _inverse_blocks(band, 3 + k)[:, :3, :3]
+        point = self.turn @ at.touches.point_slopes * self.sensor.length
+        return SweptContacts(
+            at.points * self.sensor.length,
+            point @ spread @ np.swapaxes(point, 1, 2),
+            self.normals(at.touches),
+            at.contacts[:, 0] * self.sensor.length,
+            np.ones(n, dtype=bool),
+            at.bias,
+        )
+
+
+def _banded(own: Array, cross: Array) -> Array:
+    """Lower band of a block-tridiagonal symmetric matrix."""
+    n, size, _ = own.shape
+    band = np.zeros((2 * size, n * size))
+    for i in range(size):
+        for j in range(size):
+            if j <= i:
+                band[i - j, j::size] = own[:, i, j]
+            band[size + i - j, j : size * (n - 1) : size] = cross[:, i, j]
+    return band
+
+
+def _inverse_blocks(band: Array, size: int) -> Array:
+    """Diagonal blocks of the inverse of a banded matrix."""
+    n = band.shape[1]
+    unit = np.eye(n)
+    inverse = solveh_banded(band, unit, lower=True)
+    index = np.arange(n).reshape(-1, size)
+    return np.asarray(inverse[index[:, :, None], index[:, None, :]])

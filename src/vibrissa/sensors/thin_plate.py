@@ -1,0 +1,101 @@
+"""A Gaussian process with the thin-plate kernel, of readings over contact points.
+
+    k(d) = a² (2 d³ − 3 R d² + R³) / R³ for distances d ≤ R
+
+(Williams & Fitzgibbon, *Gaussian process implicit surfaces*, 2007): it has no length to be fitted
+and does not fall back to its mean between points, as a squared exponential does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.spatial.distance import cdist
+
+from vibrissa.numerics import Array
+
+_RATIOS = np.logspace(-7, 1, 17)
+"""Noise variance over that of the process; the one of largest marginal likelihood is taken."""
+
+
+@dataclass(frozen=True, eq=False)
+class ThinPlate:
+    """Mean of a thin-plate Gaussian process.
+
+    Parameters
+    ----------
+    points : (n, 3) array
+        Points of the data, m.
+    weights : (n, k) array
+        Weights of the kernel at each point for each of k values.
+    reach : float
+        Distance R beyond which points are unrelated, m; none of the data are farther apart.
+    noise : (k,) array
+        Standard deviation of the noise that was found.
+    """
+
+    points: Array
+    weights: Array
+    reach: float
+    noise: Array
+
+    @classmethod
+    def fit(cls, points: Array, values: Array, ratio: float | None = None) -> ThinPlate:
+        """Fit values at points, with the noise of largest marginal likelihood.
+
+        Parameters
+        ----------
+        points : (n, 3) array
+            Points, m.
+        values : (n, k) array
+            Values of zero mean.
+        ratio : float, optional
+            Variance of the noise over that of the process, if it is known.
+
+        Returns
+        -------
+        ThinPlate
+            Process given the values.
+        """
+        reach = 2.0 * float(np.linalg.norm(np.ptp(points, axis=0)))
+        kernel = _kernel(cdist(points, points) / reach)
+        n, k = values.shape
+        weights, noise = np.empty((n, k)), np.empty(k)
+        best = np.full(k, np.inf)
+        for one in _RATIOS if ratio is None else (ratio,):
+            factor = cho_factor(kernel + one * np.eye(n), lower=True)
+            back = cho_solve(factor, values)
+            variance = np.maximum(np.sum(values * back, axis=0) / n, np.finfo(np.float64).tiny)
+            cost = n * np.log(variance) + 2.0 * np.log(np.diag(factor[0])).sum()
+            better = cost < best
+            best[better], weights[:, better] = cost[better], back[:, better]
+            noise[better] = np.sqrt(one * variance[better])
+        return cls(np.array(points), weights, reach, noise)
+
+    def __call__(self, points: Array) -> tuple[Array, Array]:
+        """Mean at points, and its derivatives.
+
+        Parameters
+        ----------
+        points : (n, 3) array
+            Points, m.
+
+        Returns
+        -------
+        values : (n, k) array
+            Mean of the process.
+        slopes : (n, k, 3) array
+            Derivatives by the point, 1/m.
+        """
+        away = points[:, None, :] - self.points
+        x = np.minimum(np.linalg.norm(away, axis=2) / self.reach, 1.0)
+        by_square = 6.0 * (x - 1.0) / self.reach**2  # (dk/dx) / (x R²)
+        slopes = np.einsum("nm,nma,mk->nka", by_square, away, self.weights, optimize=True)
+        return np.asarray(_kernel(x) @ self.weights), slopes
+
+
+def _kernel(x: Array) -> Array:
+    x = np.minimum(x, 1.0)
+    return np.asarray((2.0 * x - 3.0) * x * x + 1.0)

@@ -1,0 +1,301 @@
+"""A whisker on a compliant suspension: model, calibration, sweeps, by contacts of `deflect`."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import vibrissa as vb
+from vibrissa.cli.app import app
+from vibrissa.sensors import (
+    Stage,
+    SuspendedWhisker,
+    ThinPlate,
+    calibrate_suspension,
+    follow_sweep,
+    load_suspended,
+)
+from vibrissa.whisker import Pose
+
+WIRE = vb.Whisker.parabola(
+    50e-3, 4.0, base_radius=1e-4, tip_radius=1e-4, youngs_modulus=200e9, poisson_ratio=0.3
+)
+EI, LENGTH = WIRE.base_bending_stiffness, WIRE.length
+TURN, SHIFT = 0.4 * LENGTH / EI, 3e-3 * LENGTH**3 / EI
+CHANNELS = ("sx", "sy", "sz")
+RNG = np.random.default_rng(0)
+# Counts by rotation (rad), shift over L, and products of rotations: a magnet over a Hall sensor.
+READOUT = np.concatenate(
+    [
+        np.zeros((3, 1)),
+        RNG.normal(scale=4000.0, size=(3, 3)),
+        RNG.normal(scale=9000.0, size=(3, 3)),
+        RNG.normal(scale=3000.0, size=(3, 6)),
+    ],
+    axis=1,
+)
+TRUE = SuspendedWhisker(
+    WIRE, TURN, SHIFT, [0.5e-3, 1e-3, 0.0], 0.0, CHANNELS, READOUT, noise=[5.0, 5.0, 5.0]
+)
+
+
+def points(number, seed=1):
+    """Points that a probe can push the wire to."""
+    rng = np.random.default_rng(seed)
+    rest = WIRE.position(rng.uniform(0.25, 0.8, number) * LENGTH)
+    angle, size = rng.uniform(-np.pi, np.pi, number), rng.uniform(0.02, 0.25, number)
+    aside = np.stack([0 * angle, np.cos(angle), np.sin(angle)], axis=1)
+    return rest + size[:, None] * np.linalg.norm(rest, axis=1)[:, None] * aside
+
+
+def test_rotation_agrees_with_a_whisker_whose_base_is_a_spring():
+    soft = replace(WIRE, base_stiffness=(1.0 / TURN, 1.0 / TURN))
+    at = points(20)
+    bent = vb.deflect(soft, vb.PointContact(at), proximal=0.1)
+    sensor = SuspendedWhisker(WIRE, TURN, 0.0)
+    contacts, status = sensor.solve(at)
+    good = bent.status == vb.Status.OK
+    assert good.sum() >= 15
+    np.testing.assert_array_equal(status[good], int(vb.Status.OK))
+    np.testing.assert_allclose(contacts[good, 0] * LENGTH, bent.arc_length[good], rtol=2e-4)
+    turned = sensor.touches(contacts).features[good, 1:4]
+    np.testing.assert_allclose(turned, TURN * bent.moment[good], atol=2e-4)
+
+
+def test_shift_is_that_of_a_rigid_base_moved_by_the_force():
+    sensor = SuspendedWhisker(WIRE, 0.0, SHIFT)
+    at = points(20)
+    contacts, _ = sensor.solve(at)
+    force = sensor.touches(contacts).force * EI / LENGTH**2
+    bent = vb.deflect(WIRE, vb.PointContact(at - SHIFT * force), proximal=0.1)
+    good = bent.status == vb.Status.OK
+    assert good.sum() >= 15
+    np.testing.assert_allclose(force[good], bent.force[good], atol=1e-5 * np.abs(force).max())
+
+
+def test_a_pivot_off_the_base_is_a_rotation_about_the_base_and_a_shift():
+    about = np.array([0.0, 3e-3, 0.0])
+    sensor = SuspendedWhisker(WIRE, TURN, 0.0, about)
+    touch = sensor.touches(np.array([[0.6, 0.5, 0.3]]))
+    turn = vb.whisker.Pose().rotation + 0.0
+    angle = touch.features[0, 1:4]
+    size = np.linalg.norm(angle)
+    axis = angle / size
+    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    turn = turn + np.sin(size) * cross + (1.0 - np.cos(size)) * cross @ cross
+    plain = SuspendedWhisker(WIRE, 0.0, 0.0).touches(np.array([[0.6, 0.5, 0.3]]))
+    moved = about + turn @ (plain.points[0] * LENGTH - about)
+    np.testing.assert_allclose(touch.points[0] * LENGTH, moved, atol=1e-12)
+    moment = np.cross(plain.points[0] * LENGTH - about, plain.force[0] * EI / LENGTH**2)
+    np.testing.assert_allclose(angle, TURN * moment, rtol=1e-12)
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.2])
+def test_derivatives_are_those_of_differences(friction):
+    sensor = replace(TRUE, friction=friction, residual=plate())
+    at = np.array([[0.4, 0.8, 0.2], [0.7, -0.5, 0.6]])
+    touch, step = sensor.touches(at), 1e-5
+    _, slopes = sensor.readings(touch)
+    for k in range(3):
+        ahead, back = (sensor.touches(at + sign * step * np.eye(3)[k]) for sign in (1, -1))
+        change = (ahead.points - back.points) / (2 * step)
+        np.testing.assert_allclose(change, touch.point_slopes[:, :, k], atol=2e-6)
+        change = (sensor.readings(ahead)[0] - sensor.readings(back)[0]) / (2 * step)
+        np.testing.assert_allclose(change, slopes[:, :, k], rtol=1e-4, atol=1e-2)
+
+
+def plate():
+    at = points(60, seed=5)
+    return ThinPlate.fit(at, 1e3 * np.sin(60.0 * at), ratio=1e-9)
+
+
+def test_a_thin_plate_passes_through_its_data_and_fills_the_gaps():
+    at = points(200, seed=5)
+    values = np.sin(60.0 * at)
+    exact = ThinPlate.fit(at, values, ratio=1e-10)
+    np.testing.assert_allclose(exact(at)[0], values, atol=1e-5)
+    noisy = values + np.random.default_rng(2).normal(scale=0.05, size=values.shape)
+    found = ThinPlate.fit(at, noisy)
+    assert np.all((found.noise > 0.025) & (found.noise < 0.1))
+    between = points(50, seed=6)
+    assert np.sqrt(np.mean((found(between)[0] - np.sin(60.0 * between)) ** 2)) < 0.05
+
+
+def test_two_compliances_are_found_where_the_pivot_is_the_base():
+    plain, at = replace(TRUE, pivot=np.zeros(3)), points(60)
+    found = calibrate_suspension(WIRE, at, plain.read(at, seed=3)[0], free=2)
+    assert found.names == ("log rotation compliance", "log shift compliance")
+    off = np.abs(found.values - np.log([0.4, 3e-3]))
+    sigma = np.sqrt(np.diag(found.covariance))
+    assert np.all(off < 3.0 * sigma), (off, sigma)
+    assert sigma[0] < 0.5
+    assert found.undetermined == ()
+    np.testing.assert_array_less(found.sensor.noise, 10.0)
+
+
+def test_calibration_recovers_compliances_and_predicts_to_the_noise():
+    at = points(90)
+    readings, status = TRUE.read(at, seed=3)
+    assert (status == int(vb.Status.OK)).mean() > 0.8
+    found = calibrate_suspension(WIRE, at, readings, channels=CHANNELS, free=5)
+    truth = np.array([np.log(0.4), np.log(3e-3), 0.01, 0.02, 0.0])
+    off = found.values - truth
+    assert np.all(np.abs(off) < 4.0 * np.sqrt(np.diag(found.covariance)))
+    assert np.all(np.abs(off) < [1.0, 2.5, 0.1, 0.1, 0.1])
+    np.testing.assert_array_less(found.sensor.noise, 12.0)
+    others = points(80, seed=9)
+    expected, good = TRUE.read(others)
+    predicted, _ = found.sensor.read(others)
+    rows = (good == int(vb.Status.OK)) & np.isfinite(predicted).all(axis=1)
+    assert np.sqrt(np.mean((predicted - expected)[rows] ** 2)) < 8.0
+
+
+def test_what_touches_do_not_determine_is_named():
+    straight = np.array(
+        [WIRE.position(0.5 * LENGTH) + np.array([0, 1e-3 * k, 0]) for k in range(1, 31)]
+    )
+    readings, _ = TRUE.read(straight, seed=1)
+    found = calibrate_suspension(WIRE, straight, readings, free=11)
+    assert "base x / L" in found.undetermined
+
+
+def test_too_few_or_idle_touches_are_refused():
+    at = points(30)
+    readings, _ = TRUE.read(at)
+    with pytest.raises(ValueError, match="too few"):
+        calibrate_suspension(WIRE, at[:10], readings[:10])
+    with pytest.raises(ValueError, match="sy"):
+        calibrate_suspension(WIRE, at, readings * [1, 0, 1], channels=CHANNELS)
+    with pytest.raises(ValueError, match=r"\(n, 3\)"):
+        calibrate_suspension(WIRE, at[:, :2], readings)
+
+
+def swept(steps=80):
+    """A wire on a spring, carried past a cylinder; contact points by `deflect`, and positions."""
+    soft = replace(WIRE, base_stiffness=(1.0 / TURN, 1.0 / TURN))
+    radius, axis = 6e-3, np.array([30e-3, 6e-3 + WIRE.position(30e-3)[1], 0.0])
+    base = np.stack(
+        [np.linspace(0, 4e-3, steps), np.linspace(-3e-3, 7e-3, steps), 0 * np.arange(steps)]
+    )
+    base = base.T
+    peg = vb.PegContact(axis - base, [0.0, 0.0, 1.0], radius=radius, side=[0.0, -1.0, 0.0])
+    bent = vb.deflect(soft, peg, proximal=0.2)
+    return base, axis, radius, bent
+
+
+def test_a_sweep_finds_onset_contact_points_and_normals():
+    base, axis, radius, bent = swept()
+    on = bent.status == vb.Status.OK
+    assert 30 < on.sum() < 80
+    sensor = replace(TRUE, shift_compliance=0.0, pivot=np.zeros(3), noise=[10.0, 10.0, 10.0])
+    theta = np.where(on[:, None], TURN * bent.moment, 0.0)
+    i, j = np.triu_indices(3)
+    features = np.concatenate(
+        [np.ones((80, 1)), theta, np.zeros((80, 3)), theta[:, i] * theta[:, j]], axis=1
+    )
+    readings = features @ READOUT.T + np.random.default_rng(0).normal(scale=5.0, size=(80, 3))
+    found = follow_sweep(sensor, readings, base)
+    both = found.in_contact & on
+    assert not (found.in_contact & ~on).any()
+    assert both.sum() >= on.sum() - 8
+    gap = np.linalg.norm((found.points - axis)[both][:, :2], axis=1) - radius
+    sigma = np.sqrt(
+        np.einsum("ki,kij,kj->k", found.normal[both], found.covariance[both], found.normal[both])
+    )
+    assert np.abs(gap).max() < 0.3e-3
+    assert np.median(np.abs(gap)) < 0.1e-3
+    assert np.mean((gap / sigma) ** 2) < 2.0
+    away = found.points[both] - (bent.contact_point[both] + base[both])
+    assert np.median(np.linalg.norm(away, axis=1)) < 1e-3
+    outward = (found.points[both] - axis)[:, :2] / radius
+    assert np.median(np.abs(np.sum(outward * found.normal[both][:, :2], axis=1))) > 0.98
+
+
+STAGE = """
+readings = ["sx", "sy", "sz"]
+position = ["px", "py", "pz"]
+[touches]
+file = "touches.csv"
+origin = [10, 20, 30]
+axes = ["y", "x", "-z"]
+[[shape]]
+file = "top.csv"
+columns = {x = "py", y = "px"}
+[[shape]]
+file = "side.csv"
+columns = {x = "py", z = "pz"}
+[sweep]
+moves = "sensor"
+"""
+
+
+def test_the_command_line_goes_from_tables_to_contacts(tmp_path):
+    at = points(60)
+    readings, status = TRUE.read(at, seed=4)
+    readings, at = readings[status == 0], at[status == 0]
+    # The stage's x is the sensor's y, its z points down.
+    stage = np.array([10.0, 20.0, 30.0]) + 1e3 * at[:, [1, 0, 2]] * [1, 1, -1]
+    rest = np.array([[10.0, 20.0, 30.0, 1.0, 2.0, 3.0]])
+    table = np.concatenate([rest, np.concatenate([stage, readings + np.array([1, 2, 3])], axis=1)])
+    header = "px,py,pz,sx,sy,sz"
+    np.savetxt(tmp_path / "touches.csv", table, delimiter=",", header=header, comments="")
+    line = 1e3 * WIRE.centerline(40)
+    shown = {"top.csv": line[:, [1, 0]], "side.csv": line[:, [0, 2]]}
+    names = {"top.csv": "px,py", "side.csv": "py,pz"}
+    for name, columns in shown.items():
+        np.savetxt(tmp_path / name, columns, delimiter=",", header=names[name], comments="")
+    (tmp_path / "stage.toml").write_text(STAGE)
+    run = CliRunner().invoke
+    done = run(app, ["calibrate", str(tmp_path / "stage.toml"), "-o", str(tmp_path / "s.nc")])
+    assert done.exit_code == 0, done.output
+    sensor, known = load_suspended(tmp_path / "s.nc")
+    assert known.channels == CHANNELS
+    predicted, _ = sensor.read(at)
+    expected, _ = TRUE.read(at)
+    assert np.sqrt(np.nanmean((predicted - expected - [1, 2, 3]) ** 2)) < 60.0
+    base = np.stack([np.linspace(0, 4, 40), np.linspace(-3, 7, 40), np.zeros(40)], axis=1)
+    read = np.tile([1.0, 2.0, 3.0], (40, 1))
+    read[20:] += np.linspace(100.0, 600.0, 20)[:, None]
+    sweep = np.concatenate([base, read], axis=1)
+    np.savetxt(tmp_path / "w.csv", sweep, delimiter=",", header=header, comments="")
+    given = ["estimate", str(tmp_path / "w.csv"), "--sensor", str(tmp_path / "s.nc")]
+    done = run(app, [*given, "-o", str(tmp_path / "c.csv")])
+    assert done.exit_code == 0, done.output
+    contacts = np.genfromtxt(tmp_path / "c.csv", delimiter=",", names=True)
+    assert contacts.size == 40
+    assert not contacts["in_contact"][:19].any()
+    assert np.isfinite(contacts["x"]).sum() == contacts["in_contact"].sum() >= 18
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (("[sweep]", "[swept]"), "swept"),
+        (('moves = "sensor"', 'moves = "table"'), "moves"),
+        (("unit", "unit"), None),
+        (('"px", "py", "pz"', '"px", "py"'), "position"),
+    ],
+)
+def test_a_wrong_description_is_refused(change, named, tmp_path):
+    if named is None:
+        text, named = 'unit = "inch"\n' + STAGE, "inch"
+    else:
+        text = STAGE.replace(*change)
+    np.savetxt(
+        tmp_path / "w.csv", np.zeros((3, 6)), delimiter=",", header="px,py,pz,sx,sy,sz", comments=""
+    )
+    with pytest.raises(ValueError, match=named):
+        Stage(text, tmp_path).sweep(tmp_path / "w.csv")
+
+
+def test_a_pose_moves_the_base_in_the_sensors_frame():
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    moved = replace(
+        TRUE, whisker=replace(WIRE, pose=Pose(turn, [1e-3, 2e-3, 3e-3])), pivot=[-1e-3, 0.5e-3, 0.0]
+    )
+    at = np.array([[0.5, 0.6, -0.2]])
+    plain = TRUE.touches(at)
+    np.testing.assert_allclose(
+        moved.touches(at).points[0] * LENGTH, turn @ plain.points[0] * LENGTH + [1e-3, 2e-3, 3e-3]
+    )

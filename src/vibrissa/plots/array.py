@@ -132,6 +132,10 @@ def array_views(
         return _drawn(scene, width)
 
 
+_SIDEWAYS = 0.5
+"""Cosine between x and the animal's right from which on left and right are written."""
+
+
 def _drawn(scene: _Scene, width: Width) -> Figure:
     limits, page = scene.limits, page_width(width)
     x, y, z = np.ptp(limits, axis=1)
@@ -166,6 +170,12 @@ def _panel(axes: Axes, scene: _Scene, limits: Array, view: tuple[int, int], towa
     for thing in scene.objects:
         _flat(axes, _triangles(thing, limits)[..., view], _THING, "#9aa3ad", 1.0)
     _flat(axes, skull[..., view], _HEAD, _EDGE, 2.0)
+    right = float(scene.head[0][0, 0]) * np.subtract(*axes.get_xlim()[::-1])
+    if view[0] == 0 and abs(scene.head[0][0, 0]) > _SIDEWAYS:
+        sides = ("L", "R") if right > 0.0 else ("R", "L")
+        for x, side in zip((0.03, 0.97), sides, strict=True):
+            words: dict[str, Any] = {"transform": axes.transAxes, "ha": "center", "va": "top"}
+            axes.text(x, 0.97, side, fontsize=8.0, fontweight="bold", color=MUTED, **words)
     if toward != 1:
         near = eyes[eyes[..., toward].mean(axis=1) > skull[..., toward].mean()]
         _flat(axes, near[..., view], INK, INK, 2.2)

@@ -160,18 +160,18 @@ class SuspendedWhisker:
         angle = rotation * np.cross(arm, force)
         d_angle = rotation * (_cross(arm) @ d_force - _cross(force) @ d_arm)
         turned, spin = Rotation.from_rotvec(angle).as_matrix(), _right_jacobian(angle) @ d_angle
-        felt = (turned @ force[:, :, None])[:, :, 0]
+        pull = (turned @ force[:, :, None])[:, :, 0]
         d_felt = turned @ (d_force - _cross(force) @ spin)
         base = self.whisker.pose.origin / d.length + pivot
-        point = base + shift / d.length * felt + (turned @ arm[:, :, None])[:, :, 0]
+        point = base + shift / d.length * pull + (turned @ arm[:, :, None])[:, :, 0]
         d_point = shift / d.length * d_felt + turned @ (d_arm - _cross(arm) @ spin)
         i, j = _PAIRS
         n = len(contacts)
-        features = (np.ones((n, 1)), angle, shift / d.length * felt, angle[:, i] * angle[:, j])
+        features = (np.ones((n, 1)), angle, shift / d.length * pull, angle[:, i] * angle[:, j])
         product = d_angle[:, i] * angle[:, j, None] + angle[:, i, None] * d_angle[:, j]
         slopes = (np.zeros((n, 1, 3)), d_angle, shift / d.length * d_felt, product)
         return Touches(
-            point, np.concatenate(features, axis=1), felt, d_point, np.concatenate(slopes, axis=1)
+            point, np.concatenate(features, axis=1), pull, d_point, np.concatenate(slopes, axis=1)
         )
 
     def _rod(self, contacts: Array) -> tuple[Array, Array]:

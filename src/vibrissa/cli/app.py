@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 from rich.text import Text
 
+from vibrissa.cli.batch import batch
 from vibrissa.cli.calibrate import calibrate
 from vibrissa.cli.correct import correct
 from vibrissa.cli.deflect import deflect
@@ -54,6 +55,7 @@ VERBS: dict[str, Callable[..., None]] = {
     "estimate": estimate,
     "reconstruct": reconstruct,
     "export": export,
+    "batch": batch,
     "figures": figures,
     "movie": movie,
     "report": report,

@@ -99,7 +99,7 @@ def reconstruct(
     with progress_bars() as tell:
         made = []
         try:
-            for name, after in _stages(tree, wanted, source, how, known, tell, str(recording)):
+            for name, after in stages(tree, wanted, source, how, known, tell, str(recording)):
                 made.append(name)
                 tree = after
         except ValueError as fault:
@@ -115,7 +115,7 @@ def reconstruct(
     print_written(points)
 
 
-def _stages(
+def stages(
     tree: xr.DataTree,
     wanted: ShapeOptions,
     source: SourceOptions,

@@ -1,0 +1,154 @@
+"""`vibrissa batch`: all recordings of a folder, to their objects, with one table and one page."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from vibrissa.cli.estimate import EstimateOptions
+from vibrissa.cli.inputs import objects_from, recording_from
+from vibrissa.cli.options import with_options
+from vibrissa.cli.reconstruct import ShapeOptions, stages
+from vibrissa.cli.signals import SourceOptions
+from vibrissa.cli.terminal import Tell, progress_bars, say, shown
+
+if TYPE_CHECKING:
+    from vibrissa.objects import Surface
+    from vibrissa.pipeline import TrialSummary
+
+TABLE, PAGE = "summary.csv", "summary.html"
+"""Files that are written into the folder, replaced by each run."""
+
+_COLUMNS = (
+    *("file", "whiskers", "duration", "frames", "frames_in_contact", "contacts"),
+    *("largest_force", "largest_moment", "estimated", "surface_distance", "fitted", "fault"),
+)
+_HEADING = (
+    *("recording", "whiskers", "duration", "frames", "in contact", "contacts", "largest force"),
+    *("largest moment", "estimated", "distance from the object (median)", "object, or fault"),
+)
+
+
+@with_options()
+def batch(
+    folder: Annotated[
+        Path, typer.Argument(help="Folder of recordings, NetCDF (.nc).", metavar="FOLDER")
+    ],
+    wanted: ShapeOptions,
+    source: SourceOptions,
+    how: EstimateOptions,
+    objects: Path | None = None,
+    force: bool = False,
+) -> None:
+    """Find the object in every recording of a folder, and summarise them in one table and page.
+
+    Each recording is treated as by `vibrissa reconstruct`, and its groups are added to it. Those
+    that have a contour are left as they are unless --force is given, so that a run that was stopped
+    goes on where it was. A recording that cannot be done does not stop the others: the table states
+    the fault, and the next run tries it again. The table is FOLDER/summary.csv, in SI units, the
+    page FOLDER/summary.html.
+    Example: `vibrissa batch trials --shape sphere`
+    """
+    from vibrissa.io import replacing, write_table
+    from vibrissa.report import Section, document, table
+
+    if not folder.is_dir():
+        raise ValueError(f"{folder} is not a folder; one with recordings is needed")
+    paths = [path for path in sorted(folder.glob("*.nc")) if path.stat().st_size]
+    paths = [path for path in paths if _is_recording(path)]
+    if not paths:
+        raise ValueError(f"{folder} holds no recordings; `vibrissa track` and `import` make them")
+    known = None if objects is None else objects_from(objects)
+    rows, lines = [], []
+    with progress_bars() as tell:
+        for number, path in enumerate(paths):
+            tell("recordings", number, len(paths))
+            found, fault = _one(path, wanted, source, how, known, force, tell)
+            rows.append(_cells(path, found, fault))
+            lines.append(_shown(path, found, fault))
+            # What is done is in the table even if the next one is interrupted.
+            write_table(folder / TABLE, _COLUMNS, rows)
+        tell("recordings", len(paths), len(paths))
+    failed = sum(bool(row[-1]) for row in rows)
+    about = f"{len(rows)} recordings, {failed} with a fault"
+    section = Section("recordings", "Recordings", table(lines, _HEADING))
+    with replacing(folder / PAGE) as part:
+        part.write_text(document(folder.resolve().name, about, [section]), encoding="utf-8")
+    for row in rows:
+        say(f"{row[0]}: {row[-1] or row[-2]}")
+    say(about)
+    say(f"wrote {folder / TABLE}\nwrote {folder / PAGE}")
+
+
+def _is_recording(path: Path) -> bool:
+    """Whether a file is a recording, or perhaps one that is damaged."""
+    from vibrissa.io import Kind, recognise
+
+    try:
+        return recognise(path) == Kind.RECORDING
+    except ValueError:
+        return True  # reading it states what is wrong
+
+
+def _one(
+    path: Path,
+    wanted: ShapeOptions,
+    source: SourceOptions,
+    how: EstimateOptions,
+    objects: tuple[Surface, ...] | None,
+    again: bool,
+    tell: Tell,
+) -> tuple[TrialSummary | None, str]:
+    """Bring one recording to its object; its summary, and what was wrong."""
+    from vibrissa.io import save_recording
+    from vibrissa.pipeline import summarise
+    from vibrissa.recording import Recording
+
+    fault, tree, made = "", None, False
+    try:
+        tree = recording_from(path)
+        if again or "contour" not in tree.children:
+            known = Recording(tree).objects if objects is None else objects
+            for stage, after in stages(tree, wanted, source, how, known, tell, str(path)):
+                tree, made = after, True
+                tell(f"{path.name}: {stage}", 1, 1)
+    except (ValueError, OSError) as error:
+        fault = " ".join(str(error).split())
+    if tree is not None and made:
+        save_recording(path, tree)
+    return None if tree is None else summarise(tree), fault
+
+
+def _cells(path: Path, found: TrialSummary | None, fault: str) -> list[object]:
+    """A line of the table."""
+    if found is None:
+        return [path.name, *[""] * (len(_COLUMNS) - 2), fault]
+    names = " ".join(found.whiskers)
+    numbers = (found.duration, found.frames, found.in_contact, found.contacts)
+    sizes = (found.largest_force, found.largest_moment, found.estimated, found.distance)
+    return [path.name, names, *numbers, *sizes, found.fitted, fault]
+
+
+def _shown(path: Path, found: TrialSummary | None, fault: str) -> list[str]:
+    """A line of the page, in the units that are shown."""
+    if found is None:
+        return [path.name, *[""] * (len(_HEADING) - 2), fault]
+
+    def size(name: str, value: float) -> str:
+        return shown(name, value, 3) if math.isfinite(value) else ""
+
+    return [
+        path.name,
+        ", ".join(found.whiskers),
+        f"{found.duration:g} s",
+        *(str(n) if n is not None else "" for n in (found.frames, found.in_contact)),
+        "" if found.contacts is None else str(found.contacts),
+        size("force", found.largest_force),
+        size("moment", found.largest_moment),
+        str(found.estimated),
+        size("surface_distance", found.distance),
+        fault or found.fitted,
+    ]

@@ -1,0 +1,53 @@
+"""A folder of recordings in one command: one fault stops nothing, and done is done."""
+
+import csv
+
+import numpy as np
+from typer.testing import CliRunner
+
+import vibrissa as vb
+from vibrissa.cli.app import app
+from vibrissa.io import load_recording, save_recording
+from vibrissa.objects import Peg
+from vibrissa.simulation import Motion, measure, simulate
+
+
+def run(*words):
+    done = CliRunner().invoke(app, [str(word) for word in words])
+    if done.exception and not isinstance(done.exception, SystemExit):
+        raise done.exception
+    return done.output
+
+
+def trial(path, peg):
+    t = np.arange(40) / 1000.0
+    azimuth = -0.15 + 0.45 * np.sin(np.pi * t / t[-1])
+    motion = Motion(t, azimuth, 0.1 * azimuth, 0.0 * t, np.zeros((40, 3)))
+    whisker = vb.Whisker.parabola(length=15e-3, coefficient=12.0)
+    save_recording(path, measure(simulate(whisker, motion, peg)))
+
+
+def test_a_folder_is_done_once_and_summarised(tmp_path):
+    near = Peg([9e-3, 2.6e-3, 0.0], [0.0, 0.0, 1.0], 0.5e-3)
+    trial(tmp_path / "touch.nc", near)
+    trial(tmp_path / "miss.nc", Peg([90e-3, 2.6e-3, 0.0], [0.0, 0.0, 1.0], 0.5e-3))
+    (tmp_path / "broken.nc").write_bytes((tmp_path / "touch.nc").read_bytes()[:5000])
+    (tmp_path / "notes.txt").write_text("not a recording")
+    text = run("batch", tmp_path, "--axis", "0,0,1")
+    assert "3 recordings, 2 with a fault" in text
+    with (tmp_path / "summary.csv").open() as file:
+        rows = {row["file"]: row for row in csv.DictReader(file)}
+    assert set(rows) == {"broken.nc", "miss.nc", "touch.nc"}
+    assert "broken.nc" in rows["broken.nc"]["fault"]
+    assert rows["miss.nc"]["frames_in_contact"] == "0"
+    assert rows["miss.nc"]["fault"]
+    touch = rows["touch.nc"]
+    assert touch["fault"] == ""
+    assert "cylinder" in touch["fitted"]
+    truth = load_recording(tmp_path / "touch.nc")["truth"]
+    assert int(touch["contacts"]) == 1
+    assert 0 < int(touch["frames_in_contact"]) <= int(truth["in_contact"].sum())
+    assert "touch.nc" in (tmp_path / "summary.html").read_text(encoding="utf-8")
+    before = (tmp_path / "touch.nc").stat().st_mtime_ns
+    run("batch", tmp_path, "--axis", "0,0,1")
+    assert (tmp_path / "touch.nc").stat().st_mtime_ns == before

@@ -59,7 +59,15 @@ if TYPE_CHECKING:
         load_whisker,
     )
     from vibrissa.paper import sensitivity_findings
-    from vibrissa.rod import Deflection, PegContact, PointContact, PointForce, deflect
+    from vibrissa.rod import (
+        Deflection,
+        PegContact,
+        PointContact,
+        PointForce,
+        Resting,
+        deflect,
+        resting,
+    )
     from vibrissa.signals import base_signals
     from vibrissa.status import Status
     from vibrissa.whisker import Whisker, WhiskerArray, whisker_array
@@ -76,6 +84,7 @@ __all__ = [
     "PointContact",
     "PointForce",
     "Prior",
+    "Resting",
     "Status",
     "Whisker",
     "WhiskerArray",
@@ -104,6 +113,7 @@ __all__ = [
     "quantities",
     "recording",
     "report",
+    "resting",
     "rod",
     "samples",
     "scene",
@@ -153,7 +163,9 @@ _HOMES = {
         "PegContact",
         "PointContact",
         "PointForce",
+        "Resting",
         "deflect",
+        "resting",
     ),
     "signals": ("base_signals",),
     "status": ("Status",),

@@ -34,6 +34,25 @@ def test_the_same_shape_in_another_material(tmp_path):
     assert abs(whisker.centerline(20) - usual.centerline(20)).max() < 1e-12
 
 
+def test_density_and_base_go_with_the_map_and_bend_it(tmp_path):
+    path = tmp_path / "rod.nc"
+    rod = ("--length", 250, "--base-radius", 2, "--tip-radius", 0.8, "--modulus", 2.3)
+    held = ("--density", 1240, "--base-stiffness", "5e6,8e6")
+    done = run(*rod, *held, "-o", path)
+    assert done.exit_code == 0, done.exception
+    whisker = vb.ContactMap.load(path).whisker
+    assert whisker.density == 1240.0
+    assert whisker.base_stiffness == pytest.approx((5.0, 8.0))
+    bend = ["deflect", "--whisker", str(path), "--point-force", "150,2e5,30"]
+    heavy = CliRunner().invoke(app, [*bend, "--gravity", "0,0,-9.81"])
+    assert heavy.exit_code == 0, heavy.exception
+    assert heavy.stdout != CliRunner().invoke(app, bend).stdout
+    point = ["deflect", "--point", "25,12,1", "--gravity", "0,0,-9.81"]
+    unknown = CliRunner().invoke(app, point)
+    assert unknown.exit_code != 0
+    assert "density" in str(unknown.exception)
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

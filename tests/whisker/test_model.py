@@ -381,6 +381,20 @@ def test_stored_it_is_the_same(make, stiffness, tmp_path):
     np.testing.assert_array_equal(again.pose.rotation, whisker.pose.rotation)
 
 
+def test_density_gives_the_mass_and_is_stored():
+    rod = Whisker.straight(0.1, base_radius=1e-3, tip_radius=0.5e-3, density=2000.0)
+    frustum = np.pi * 0.1 * (1.0 + 0.5 + 0.25) / 3.0 * 1e-6
+    assert rod.mass == pytest.approx(2000.0 * frustum, rel=1e-12)
+    assert Whisker.from_dataset(rod.to_dataset()).density == 2000.0
+    unknown = samples.gamma()
+    assert np.isnan(unknown.mass)
+    assert Whisker.from_dataset(unknown.to_dataset()).density is None
+    assert rod.trimmed(0.05).density == 2000.0
+    for wrong in (-1.0, 1.2, np.nan):
+        with pytest.raises(ValueError, match="density is"):
+            rod.with_properties(density=wrong)
+
+
 def test_another_dataset_is_refused():
     with pytest.raises(ValueError, match="lacks base_bending_stiffness"):
         Whisker.from_dataset(samples.gamma().to_dataset().drop_vars("base_bending_stiffness"))

@@ -31,11 +31,14 @@ def deflect(
     peg: str | None = None,
     axis: str | None = None,
     push: str | None = None,
+    gravity: str | None = None,
+    density: float | None = None,
     proximal: float | None = None,
 ) -> None:
     """Bend a whisker by a point, a force or a peg, and print force and moment at its base.
 
     All in the whisker's frame. Give one of --point, --point-force, --peg (upright without --axis).
+    With --gravity the whisker sags, and its base reads what a sensor does that was tared at rest.
     Without an answer the status states why, and the exit status is 1.
     Example: `vibrissa deflect --point 25,12,1`
     """
@@ -46,9 +49,12 @@ def deflect(
     if point_force is not None:
         refuse({"--proximal": proximal}, "a --point-force acts where it is stated")
     whisker = own.read()
+    if density is not None:
+        whisker = whisker.with_properties(density=density)
+    pull = None if gravity is None else numbers(gravity, _XYZ, "--gravity")
     say(repr(whisker))
     print_notes(whisker)
-    bent = deflected(whisker, load, proximal=smallest_arc(proximal))
+    bent = deflected(whisker, load, gravity=pull, proximal=smallest_arc(proximal))
     status = Status(int(bent.status))
     # The advice by the name that the option has here.
     option = " The option is --proximal." if status == Status.TOO_PROXIMAL else ""

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vibrissa.cli.inputs import WhiskerOptions, map_of, metres_of, print_notes, smallest_arc
-from vibrissa.cli.options import free, with_options
+from vibrissa.cli.options import free, numbers, with_options
 from vibrissa.cli.terminal import progress_bars, say
 
 if TYPE_CHECKING:
@@ -23,6 +23,8 @@ class MadeOptions(WhiskerOptions):
     tip_radius: float | None = None
     modulus: float | None = None
     poisson: float | None = None
+    density: float | None = None
+    base_stiffness: str | None = None
 
     def __post_init__(self) -> None:
         """Refuse what does not go together."""
@@ -50,6 +52,11 @@ class MadeOptions(WhiskerOptions):
             changes["youngs_modulus"] = 1e9 * self.modulus
         if self.poisson is not None:
             changes["poisson_ratio"] = self.poisson
+        if self.density is not None:
+            changes["density"] = self.density
+        if self.base_stiffness is not None:
+            stiffness = numbers(self.base_stiffness, ("BENDING", "TWIST"), "--base-stiffness")
+            changes["base_stiffness"] = tuple(1e-6 * value for value in stiffness)
         return whisker.with_properties(**changes) if changes else whisker
 
 

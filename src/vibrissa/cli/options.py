@@ -202,6 +202,16 @@ OPTIONS = {
     "tip_radius": Option("Radius at the tip, mm; by default 1/15 of the base's.", "MM", least=0.0),
     "modulus": Option("Young's modulus, GPa.", "GPA", least=0.0),
     "poisson": Option("Poisson's ratio.", "RATIO"),
+    "density": Option("Density of the whisker, kg/m³, for its weight.", "KG/M3"),
+    "gravity": Option(
+        "Gravity in the whisker's frame, minus the acceleration of its base, m/s²; 0,0,-9.81 is a "
+        "level whisker. By default the whisker has no weight.",
+        "X,Y,Z",
+    ),
+    "base_stiffness": Option(
+        "Stiffness of the base in bending and in twist, µN·m/rad; by default it is rigid.",
+        "BENDING,TWIST",
+    ),
     "point": Option("Contact point, mm.", "X,Y,Z"),
     "point_force": Option(
         "Arc length of a force, mm, its size, µN, and its angle from d1 to d2, degrees.",

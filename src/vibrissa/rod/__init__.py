@@ -22,19 +22,17 @@ from vibrissa.rod.chart import (
 )
 from vibrissa.rod.deflection import Deflection, Load, PegContact, PointContact, PointForce
 from vibrissa.rod.discretization import STEPS, Discretization, Rod, discretize
+from vibrissa.rod.gravity import Resting, Weighted, evaluated, resting
+from vibrissa.rod.integration import contact_tangents, evaluate, integrate, solve_forces
 from vibrissa.rod.kernels import (
     BUFFER_SIZE,
     LANES,
     contact_state,
-    contact_tangents,
-    evaluate,
-    integrate,
     lane_tangents,
     lane_value,
     lanes_tangents,
     set_all_lanes,
     set_lane,
-    solve_forces,
 )
 from vibrissa.rod.newton import (
     ROUNDING,
@@ -70,10 +68,12 @@ __all__ = [
     "PointContact",
     "PointForce",
     "PointSolver",
+    "Resting",
     "Rod",
     "SearchTree",
     "StableSet",
     "SurfaceDeflection",
+    "Weighted",
     "along",
     "chart_of",
     "chart_to_contact",
@@ -85,6 +85,7 @@ __all__ = [
     "determinant",
     "discretize",
     "evaluate",
+    "evaluated",
     "fold_force",
     "fold_forces",
     "follow_surfaces",
@@ -95,6 +96,7 @@ __all__ = [
     "newton_group",
     "point_determinant",
     "point_solver",
+    "resting",
     "search_tree",
     "seeds",
     "set_all_lanes",

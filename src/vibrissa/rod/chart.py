@@ -19,17 +19,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
 from vibrissa.numerics import AnyArray, Array, inlined, kernel
-from vibrissa.rod.discretization import STEPS, Discretization, discretize
-from vibrissa.rod.kernels import solve_forces
-
-if TYPE_CHECKING:
-    from vibrissa.whisker import Whisker
+from vibrissa.rod.discretization import STEPS, Bendable, Discretization, discretize
+from vibrissa.rod.integration import solve_forces
 
 #: Contacts nearer the base than this fraction of the length are not considered, unless asked for.
 PROXIMAL = 0.3
@@ -43,6 +40,8 @@ _SCAN = 0.0625
 _GRADING = 0.85
 #: No solution is looked for nearer to the base than this (over L).
 LEAST_ARC = 0.05
+# Rounds in which a chart is curtailed to what can be solved.
+_CURTAILED = 6
 # Directions have no value at zero force; just above it they have their limit.
 _LEAST_LOAD = 0.01
 
@@ -124,7 +123,7 @@ class StableSet:
 
 @lru_cache(maxsize=16)
 def stable_set(
-    whisker: Whisker,
+    whisker: Bendable,
     proximal: float = PROXIMAL,
     cells: tuple[int, int, int] = CELLS,
     steps: int = STEPS,
@@ -133,7 +132,7 @@ def stable_set(
 
     Parameters
     ----------
-    whisker : Whisker
+    whisker : Bendable
         Whisker to be touched.
     proximal : float
         Smallest arc length of a contact, over L.
@@ -164,7 +163,37 @@ def stable_set(
     bearings = np.linspace(0.0, 2.0 * np.pi, cells[1] + 1)
     loads = np.linspace(0.0, 1.0, cells[2] + 1)
     force, folded = _fold_forces(discretization, stations, bearings[:-1])
-    log_fold = _log_fold(eta, bearings, force)
+    for _ in range(_CURTAILED):
+        log_fold = _log_fold(eta, bearings, force)
+        contacts, frames = _nodes_of(log_fold, stations, bearings, loads, stretch)
+        values, tangents = solve_forces(
+            discretization, with_normal_force(contacts.reshape(-1, 3)), tangents=True
+        )
+        lost: AnyArray = np.isnan(tangents.sum(axis=(1, 2))).reshape(contacts.shape[:3])
+        if discretization.rod.weight is None or not lost.any():
+            break
+        # Under its weight a whisker may turn over before it slips off: there the chart ends.
+        held = np.where(lost.any(axis=2), loads[np.maximum(lost.argmax(axis=2) - 1, 1)], 1.0)
+        force *= np.minimum(held[:, :-1], 1.0) ** 2
+    grid = contacts.shape[:3]
+    return StableSet(
+        discretization=discretization,
+        stations=stations,
+        bearings=bearings,
+        loads=loads,
+        fold=Fold(np.array([proximal, grading]), log_fold),
+        contacts=contacts,
+        values=values.reshape(*grid, 6),
+        tangents=tangents.reshape(*grid, 6, 3),
+        frames=frames,
+        folded=np.concatenate([folded, folded[:, :1]], axis=1),
+    )
+
+
+def _nodes_of(
+    log_fold: Array, stations: Array, bearings: Array, loads: Array, stretch: Array
+) -> tuple[Array, Array]:
+    """Contacts at the nodes, and their derivatives by the chart's coordinates."""
     s, psi, rho = np.meshgrid(stations, bearings, np.maximum(loads, _LEAST_LOAD), indexing="ij")
     f, f_eta, f_psi = (a[..., None] for a in _expand(log_fold))
     cos, sin = np.cos(psi), np.sin(psi)
@@ -184,22 +213,7 @@ def stable_set(
         ],
         axis=-2,
     )
-    values, tangents = solve_forces(
-        discretization, with_normal_force(contacts.reshape(-1, 3)), tangents=True
-    )
-    grid = s.shape
-    return StableSet(
-        discretization=discretization,
-        stations=stations,
-        bearings=bearings,
-        loads=loads,
-        fold=Fold(np.array([proximal, grading]), log_fold),
-        contacts=contacts,
-        values=values.reshape(*grid, 6),
-        tangents=tangents.reshape(*grid, 6, 3),
-        frames=frames,
-        folded=np.concatenate([folded, folded[:, :1]], axis=1),
-    )
+    return contacts, frames
 
 
 def with_normal_force(contacts: Array) -> Array:

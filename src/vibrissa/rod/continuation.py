@@ -28,10 +28,10 @@ import numpy as np
 from vibrissa.numerics import Array, IntArray, copy, inlined, kernel, norm3, solve3
 from vibrissa.rod.chart import LEAST_ARC, Fold, fold_force
 from vibrissa.rod.discretization import Rod
+from vibrissa.rod.integration import integrate
 from vibrissa.rod.kernels import (
     BUFFER_SIZE,
     LANES,
-    integrate,
     lane_tangents,
     lane_value,
     set_lane,

@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike
 from vibrissa.numerics import Array, IntArray
 from vibrissa.quantities import attributes
 from vibrissa.rod.discretization import STEPS, discretize
+from vibrissa.rod.gravity import evaluated, resting, trace
+from vibrissa.rod.integration import solve_forces
 from vibrissa.rod.outward import shapes
 from vibrissa.sketch import (
     BENT,
@@ -30,6 +32,11 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from vibrissa.whisker import Whisker
+
+
+def vectors(name: str, value: ArrayLike) -> Array:
+    """Return float64 (..., 3); raise a ValueError that states what is wrong."""
+    return _numbers(name, value, vector=True)
 
 
 def _numbers(name: str, value: ArrayLike, vector: bool) -> Array:
@@ -144,6 +151,22 @@ class PointForce:
         """Leading shape: how many loads."""
         return tuple(np.shape(self.arc_length))
 
+    def rows(self, which: IntArray) -> PointForce:
+        """Pick loads, counted without regard to their shape.
+
+        Parameters
+        ----------
+        which : (n,) int array
+            Their numbers.
+
+        Returns
+        -------
+        PointForce
+            Those loads, of shape (n,).
+        """
+        parts = np.reshape(self.components, (-1, 3))[which]
+        return PointForce(np.reshape(self.arc_length, -1)[which], components=parts)
+
 
 @dataclass(frozen=True, eq=False)
 class PointContact:
@@ -169,6 +192,21 @@ class PointContact:
     def shape(self) -> tuple[int, ...]:
         """Leading shape: how many loads."""
         return tuple(np.shape(self.points)[:-1])
+
+    def rows(self, which: IntArray) -> PointContact:
+        """Pick loads, counted without regard to their shape.
+
+        Parameters
+        ----------
+        which : (n,) int array
+            Their numbers.
+
+        Returns
+        -------
+        PointContact
+            Those loads, of shape (n,).
+        """
+        return PointContact(np.reshape(self.points, (-1, 3))[which])
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,6 +287,25 @@ class PegContact:
         """Leading shape: how many loads."""
         return tuple(np.shape(self.radius))
 
+    def rows(self, which: IntArray) -> PegContact:
+        """Pick loads, counted without regard to their shape.
+
+        Parameters
+        ----------
+        which : (n,) int array
+            Their numbers.
+
+        Returns
+        -------
+        PegContact
+            Those loads, of shape (n,).
+        """
+        if self.start is not None:
+            raise ValueError("pegs that go on from a start have one gravity in common")
+        side = None if self.side is None else np.reshape(self.side, (-1, 3))[which]
+        origin, axis = (np.reshape(a, (-1, 3))[which] for a in (self.origin, self.axis))
+        return PegContact(origin, axis, np.reshape(self.radius, -1)[which], side)
+
 
 Load = PointForce | PointContact | PegContact
 
@@ -266,7 +323,8 @@ class Deflection:
     force : (..., 3) array
         Force of the object on the whisker, N; zero without contact, NaN without an answer.
     moment : (..., 3) array
-        Moment about the base, contact_point × force, N·m.
+        Moment about the base, N·m: contact_point × force, and with gravity what the weight has
+        come to exert in addition since rest, as a sensor reads it that was tared at rest.
     contact_point : (..., 3) array
         Contact point on the centreline, m; NaN without contact or answer.
     arc_length : (...) array
@@ -279,6 +337,8 @@ class Deflection:
         :class:`~vibrissa.Status` of each load.
     steps : int
         Integration steps along the whisker.
+    gravity : (..., 3) array or None
+        Gravity of each load, whisker frame, m/s²; None without weight.
     """
 
     whisker: Whisker
@@ -291,6 +351,7 @@ class Deflection:
     residual: Array
     status: IntArray
     steps: int = field(default=STEPS, repr=False)
+    gravity: Array | None = None
     # Steps that each row needs, where some need more.
     _needed: IntArray | None = field(default=None, repr=False)
 
@@ -344,6 +405,10 @@ class Deflection:
         arc = self.arc_length.reshape(-1)[rows] / d.length
         free = np.flatnonzero(self.status.reshape(-1)[rows] == Status.NO_CONTACT)
         values[free, 3:], arc[free] = 0.0, 0.0
+        if self.gravity is not None:
+            force = np.nan_to_num(self.contact_force.reshape(-1, 3)[rows] / d.force)
+            contacts = np.concatenate([arc[:, None], force], axis=1)
+            return self._weighted_centerlines(rows, contacts, needed, n)
         # All that are free are the same: the first of them stands for the others.
         own = np.delete(np.arange(arc.size), free[1:])
         places = np.empty((arc.size, n, 3))
@@ -352,6 +417,22 @@ class Deflection:
             line = shapes(finer, values[which], arc[which], np.linspace(0.0, 1.0, n))
             places[which] = line * d.length
         places[free[1:]] = places[free[:1]]
+        return places
+
+    def _weighted_centerlines(
+        self, rows: IntArray, contacts: Array, needed: IntArray, n: int
+    ) -> Array:
+        assert self.gravity is not None
+        gravity, places = self.gravity.reshape(-1, 3)[rows], np.full((rows.size, n, 3), np.nan)
+        s = np.linspace(0.0, 1.0, n)
+        for i in np.flatnonzero(np.isfinite(contacts[:, 0])):
+            d = discretize(resting(self.whisker, gravity[i]), int(needed[i]))
+            if d.rod.weight is None:
+                values = solve_forces(d, contacts[i : i + 1])[0]
+                places[i] = shapes(d, values, contacts[i : i + 1, 0], s)[0] * d.length
+                continue
+            lean = evaluated(d, contacts[i : i + 1]).leans[0]
+            places[i] = trace(d, contacts[i], lean, s).places * d.length
         return places
 
     def __repr__(self) -> str:

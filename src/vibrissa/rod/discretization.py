@@ -14,8 +14,8 @@ between 0.2 and 1), follow the intrinsic curvature's total turning, and never st
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from functools import lru_cache, singledispatch
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -39,6 +39,53 @@ _ORDER = 4
 _ROUGH = 1e-4
 
 
+class Bendable(Protocol):
+    """What loads bend: a whisker, by itself or under its weight."""
+
+    def __hash__(self) -> int:
+        """Hash: results are cached."""
+
+    @property
+    def length(self) -> float:
+        """Length, m."""
+
+    @property
+    def base_radius(self) -> float:
+        """Radius at the base, m."""
+
+    @property
+    def tip_radius(self) -> float:
+        """Radius at the tip, m."""
+
+    def radius(self, s: Array) -> Array:
+        """Radii at arc lengths, m."""
+
+    def position(self, s: Array) -> Array:
+        """Points of the resting whisker at increasing arc lengths, m."""
+
+    def frame(self, s: Array) -> Array:
+        """Material frames of the resting whisker there, in columns."""
+
+
+class Weight(NamedTuple):
+    """Weight of a rod, non-dimensional, for the kernels.
+
+    Attributes
+    ----------
+    beyond : (n, 8) array
+        Weight of all that is beyond a place of each step, over EI/L²: polynomials in the fraction
+        of the step, constant term first.
+    toward : (3,) array
+        Unit vector along which weight acts, base frame.
+    at_tip : (3,) array
+        The same in the material frame at the tip of the resting whisker.
+    """
+
+    beyond: Array
+    toward: Array
+    at_tip: Array
+
+
 class Rod(NamedTuple):
     """The rod in n steps from base to tip, non-dimensional, for the kernels.
 
@@ -57,6 +104,8 @@ class Rod(NamedTuple):
     shape : (n, 4, 4) array
         Cubics in the fraction of the step, constant term first: the three intrinsic curvatures
         (times L), and the radius over that of the base.
+    weight : Weight or None
+        Weight; None where the rod has none.
     """
 
     start: Array
@@ -65,6 +114,7 @@ class Rod(NamedTuple):
     twist: Array
     bending: Array
     shape: Array
+    weight: Weight | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,13 +143,13 @@ class Discretization:
 
 
 @lru_cache(maxsize=64)
-def discretize(whisker: Whisker, steps: int = STEPS) -> Discretization:
+def discretize(whisker: Bendable, steps: int = STEPS) -> Discretization:
     """Cut a whisker into steps for the kernels; cached.
 
     Parameters
     ----------
-    whisker : Whisker
-        Whisker to be bent.
+    whisker : Bendable
+        Whisker to be bent, by itself or under its weight.
     steps : int
         Number of integration steps along it, at least; a corkscrew gets more.
 
@@ -108,6 +158,12 @@ def discretize(whisker: Whisker, steps: int = STEPS) -> Discretization:
     Discretization
         Rod and units.
     """
+    return discretized(whisker, steps)
+
+
+@singledispatch
+def discretized(whisker: Any, steps: int) -> Discretization:
+    """Cut what bends into steps; a whisker, or what else is registered."""
     if not 4 <= steps <= MOST_STEPS or int(steps) != steps:
         raise ValueError(f"steps is {steps}; it must be a whole number from 4 to {MOST_STEPS}")
     steps, length = int(steps), whisker.length
@@ -126,12 +182,39 @@ def discretize(whisker: Whisker, steps: int = STEPS) -> Discretization:
         pieces = _JOINT_STEPS * max(1, steps // STEPS)
         rod = _with_joint(rod, pieces, stiffness / length, *whisker.base_stiffness)
     return Discretization(
-        rod=Rod(*(np.ascontiguousarray(a, dtype=np.float64) for a in rod)),
+        rod=Rod._make([*(np.ascontiguousarray(a, dtype=np.float64) for a in rod[:-1]), None]),
         length=length,
         force=stiffness / length**2,
         moment=stiffness / length,
         radius=whisker.base_radius / length,
     )
+
+
+def weight_beyond(rod: Rod, weight: float) -> Array:
+    """Weight of all that is beyond a place, in the polynomials of :class:`Weight`.
+
+    Parameters
+    ----------
+    rod : Rod
+        Rod.
+    weight : float
+        Weight per length at the base, over EI/L³.
+
+    Returns
+    -------
+    (n, 8) array
+        Polynomials in the fraction of each step.
+    """
+    radius = rod.shape[:, 3]
+    integral = np.zeros((len(radius), 8))  # of radius² over the step, from its start
+    for i in range(4):
+        for j in range(4):
+            integral[:, i + j + 1] += radius[:, i] * radius[:, j] / (i + j + 1)
+    integral *= (weight * rod.width * rod.extent)[:, None]
+    whole = integral.sum(axis=1)
+    out = -integral
+    out[:, 0] += whole[::-1].cumsum()[::-1]
+    return out
 
 
 def _nodes(whisker: Whisker, steps: int) -> Array:
@@ -234,4 +317,5 @@ def _with_joint(rod: Rod, n: int, moment_scale: float, bending: float, twist: fl
         bending=np.full(n, moment_scale / bending),
         shape=unit,
     )
-    return Rod(*(np.concatenate(parts) for parts in zip(joint, rod, strict=True)))
+    parts = [np.concatenate(pair) for pair in zip(joint[:-1], rod[:-1], strict=True)]
+    return Rod._make([*parts, None])

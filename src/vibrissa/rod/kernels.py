@@ -32,31 +32,35 @@ without length (``extent`` 0) ahead of the first step.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 
-from vibrissa.numerics import Array, Vector, inlined, kernel, share_out
-from vibrissa.rod.discretization import Discretization, Rod
+from vibrissa.numerics import Array, Vector, inlined, kernel
+from vibrissa.rod.discretization import Rod
 
 #: A step of the rod: cubics of curvature and radius, compliances in twist and bending, extent.
 Cubic: TypeAlias = tuple[float, float, float, float]
 Piece: TypeAlias = tuple[tuple[Cubic, Cubic, Cubic, Cubic], float, float, float]
 Pair: TypeAlias = tuple[Vector, Vector]
+#: Two vectors as one.
+Six: TypeAlias = tuple[float, float, float, float, float, float]
+Step = TypeVar("Step", Vector, Six)
 
 LANES = 4
 STAGE = 14 * LANES  # a stage keeps n, q, u (3 each), the two compliances and δu (3)
 TURN = 6 * LANES  # u in a stage
 _SOFT = 9 * LANES
 _D_TURN = 11 * LANES
-_ARC = 7 * STAGE  # s_c
-_N = _ARC + LANES
-_Q = _N + 3 * LANES
-_TANGENT = _Q + 3 * LANES  # three tangents of (n, q), or vectors that are carried along
-_H = _TANGENT + 18 * LANES  # the step, negative from the contact to the base
-_TIP = _H + LANES  # 1 where the first unknown is f_x instead of s_c
-_MOVING = _TIP + LANES  # the tangent that takes a step
-BUFFER_SIZE = _MOVING + 6 * LANES
+ARC = 7 * STAGE  # s_c
+FORCE = ARC + LANES
+LEVER = FORCE + 3 * LANES
+TANGENT = LEVER + 3 * LANES  # three tangents of (n, q), or vectors that are carried along
+_H = TANGENT + 18 * LANES  # the step, negative from the contact to the base
+TIP = _H + LANES  # 1 where the first unknown is f_x instead of s_c
+_MOVING = TIP + LANES  # the tangent that takes a step
+LEAN = _MOVING + 6 * LANES  # direction of weight at the tip, material frame, where it was last
+BUFFER_SIZE = LEAN + 3 * LANES
 
 
 @inlined
@@ -70,12 +74,22 @@ def cross(a: Vector, b: Vector) -> Vector:
 
 
 @inlined
-def _add(a: Vector, b: Vector) -> Vector:
+def add(a: Vector, b: Vector) -> Vector:
+    """Sum of vectors."""
     return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
 
 
 @inlined
-def _axpy(y: Vector, a: float, x: Vector) -> Vector:
+def _axpy(y: Step, a: float, x: Step) -> Step:
+    if len(y) == 6:  # the compiler keeps the branch that is right
+        return (
+            y[0] + a * x[0],
+            y[1] + a * x[1],
+            y[2] + a * x[2],
+            y[3] + a * x[3],
+            y[4] + a * x[4],
+            y[5] + a * x[5],
+        )
     return (y[0] + a * x[0], y[1] + a * x[1], y[2] + a * x[2])
 
 
@@ -97,43 +111,41 @@ def put(b: Array, row: int, i: int, v: Vector) -> None:
 
 
 @inlined
-def _y2(y: Vector, h: float, k1: Vector) -> Vector:
+def _y2(y: Step, h: float, k1: Step) -> Step:
     return _axpy(y, h / 3.0, k1)
 
 
 @inlined
-def _y3(y: Vector, h: float, k2: Vector) -> Vector:
+def _y3(y: Step, h: float, k2: Step) -> Step:
     return _axpy(y, h * (2.0 / 3.0), k2)
 
 
 @inlined
-def _y4(y: Vector, h: float, k1: Vector, k2: Vector, k3: Vector) -> Vector:
+def _y4(y: Step, h: float, k1: Step, k2: Step, k3: Step) -> Step:
     return _axpy(_axpy(_axpy(y, h / 12.0, k1), h / 3.0, k2), -h / 12.0, k3)
 
 
 @inlined
-def _y5(y: Vector, h: float, k1: Vector, k2: Vector, k3: Vector, k4: Vector) -> Vector:
+def _y5(y: Step, h: float, k1: Step, k2: Step, k3: Step, k4: Step) -> Step:
     y = _axpy(_axpy(y, -h / 16.0, k1), h * (9.0 / 8.0), k2)
     return _axpy(_axpy(y, h * (-3.0 / 16.0), k3), h * (-3.0 / 8.0), k4)
 
 
 @inlined
-def _y6(y: Vector, h: float, k2: Vector, k3: Vector, k4: Vector, k5: Vector) -> Vector:
+def _y6(y: Step, h: float, k2: Step, k3: Step, k4: Step, k5: Step) -> Step:
     y = _axpy(_axpy(y, h * (9.0 / 8.0), k2), h * (-3.0 / 8.0), k3)
     return _axpy(_axpy(y, h * (-3.0 / 4.0), k4), h * 0.5, k5)
 
 
 @inlined
-def _y7(y: Vector, h: float, k1: Vector, k2: Vector, k3: Vector, k4: Vector, k6: Vector) -> Vector:
+def _y7(y: Step, h: float, k1: Step, k2: Step, k3: Step, k4: Step, k6: Step) -> Step:
     y = _axpy(_axpy(y, h * (9.0 / 44.0), k1), h * (-9.0 / 11.0), k2)
     y = _axpy(_axpy(y, h * (63.0 / 44.0), k3), h * (18.0 / 11.0), k4)
     return _axpy(y, h * (-16.0 / 11.0), k6)
 
 
 @inlined
-def _advance(
-    y: Vector, h: float, k1: Vector, k3: Vector, k4: Vector, k5: Vector, k6: Vector, k7: Vector
-) -> Vector:
+def _advance(y: Step, h: float, k1: Step, k3: Step, k4: Step, k5: Step, k6: Step, k7: Step) -> Step:
     y = _axpy(_axpy(y, h * (11.0 / 120.0), k1), h * (27.0 / 40.0), k3)
     y = _axpy(_axpy(y, h * (27.0 / 40.0), k4), h * (-4.0 / 15.0), k5)
     return _axpy(_axpy(y, h * (-4.0 / 15.0), k6), h * (11.0 / 120.0), k7)
@@ -141,8 +153,8 @@ def _advance(
 
 @inlined
 def runge_kutta_step(
-    rates: Callable[..., Pair], data: Any, i: int, h: float, x: Vector, y: Vector
-) -> Pair:
+    rates: Callable[..., tuple[Step, Step]], data: Any, i: int, h: float, x: Step, y: Step
+) -> tuple[Step, Step]:
     """Take a step of length h with two vectors of lane i.
 
     ``rates(data, stage, left, i, x, y)`` gives their slopes in a stage (from 0), of which the
@@ -221,11 +233,11 @@ def _tangent_rates(
     row = stage * STAGE
     n, q, u = get(b, row, i), get(b, row + 3 * LANES, i), get(b, row + TURN, i)
     c0, c1 = b[row + _SOFT + i], b[row + _SOFT + LANES + i]
-    dm = _add(cross(dq, n), cross(q, dn))
+    dm = add(cross(dq, n), cross(q, dn))
     du = (c0 * dm[0], c1 * dm[1], c1 * dm[2])
     if keep:
         put(b, row + _D_TURN, i, du)
-    return _add(cross(dn, u), cross(n, du)), _add(cross(dq, u), cross(q, du))
+    return add(cross(dn, u), cross(n, du)), add(cross(dq, u), cross(q, du))
 
 
 @inlined
@@ -246,7 +258,7 @@ def _d_carried_rates(
     """Slopes of a vector that is fixed in space and of its tangent."""
     b, row = data[0], stage * STAGE
     u, du = get(b, row + TURN, i), get(b, row + _D_TURN, i)
-    return cross(v, u), _add(cross(dv, u), cross(v, du))
+    return cross(v, u), add(cross(dv, u), cross(v, du))
 
 
 @inlined
@@ -255,21 +267,21 @@ def _value_step(rod: Rod, b: Array, k: int, tangents: bool) -> None:
     start, width, piece = rod.start[k], rod.width[k], piece_of(rod, k)
     inverse_width = 1.0 / width
     for i in range(LANES):
-        s = b[_ARC + i]
+        s = b[ARC + i]
         h = min(max(s - start, 0.0), width)
         data = (b, piece, h * inverse_width, tangents)
-        n0, q0 = get(b, _N, i), get(b, _Q, i)
+        n0, q0 = get(b, FORCE, i), get(b, LEVER, i)
         n, q = runge_kutta_step(_value_rates, data, i, -h, n0, q0)
-        put(b, _N, i, n)
-        put(b, _Q, i, q)
+        put(b, FORCE, i, n)
+        put(b, LEVER, i, q)
         if tangents:
             b[_H + i] = -h
             # The lane's contact lies in this step: its s-tangent starts here.
-            if s > start and s <= start + width and b[_TIP + i] == 0.0:
+            if s > start and s <= start + width and b[TIP + i] == 0.0:
                 u = get(b, TURN, i)
                 dq = cross(u, q0)
-                put(b, _TANGENT, i, cross(u, n0))
-                put(b, _TANGENT + 3 * LANES, i, (dq[0] + piece[3], dq[1], dq[2]))
+                put(b, TANGENT, i, cross(u, n0))
+                put(b, TANGENT + 3 * LANES, i, (dq[0] + piece[3], dq[1], dq[2]))
 
 
 @inlined
@@ -311,16 +323,16 @@ def whisker_radius(rod: Rod, s: float) -> tuple[float, float]:
 @inlined
 def set_lane(b: Array, i: int, s: float, fx: float, fy: float, fz: float, tip: bool) -> None:
     """Load lane i with a contact at s and its force; ``tip`` makes f_x the first unknown."""
-    b[_ARC + i] = s
-    put(b, _N, i, (fx, fy, fz))
-    put(b, _Q, i, (0.0, 0.0, 0.0))
-    b[_TIP + i] = 1.0 if tip else 0.0
-    for row in range(_TANGENT, _TANGENT + 18 * LANES, LANES):
+    b[ARC + i] = s
+    put(b, FORCE, i, (fx, fy, fz))
+    put(b, LEVER, i, (0.0, 0.0, 0.0))
+    b[TIP + i] = 1.0 if tip else 0.0
+    for row in range(TANGENT, TANGENT + 18 * LANES, LANES):
         b[row + i] = 0.0
     if tip:
-        b[_TANGENT + i] = 1.0
-    b[_TANGENT + (6 + 1) * LANES + i] = 1.0
-    b[_TANGENT + (12 + 2) * LANES + i] = 1.0
+        b[TANGENT + i] = 1.0
+    b[TANGENT + (6 + 1) * LANES + i] = 1.0
+    b[TANGENT + (12 + 2) * LANES + i] = 1.0
 
 
 @inlined
@@ -329,7 +341,7 @@ def set_all_lanes(b: Array, s: float, fx: float, fy: float, fz: float) -> None:
     for i in range(LANES):
         set_lane(b, i, s, fx, fy, fz, i > 0)
         for row in range(3):
-            b[_TANGENT + row * LANES + i] = 1.0 if i == row + 1 else 0.0
+            b[TANGENT + row * LANES + i] = 1.0 if i == row + 1 else 0.0
 
 
 @inlined
@@ -337,14 +349,14 @@ def lanes_tangents(b: Array, tangents: Array) -> None:
     """Copy ∂(F, p)/∂(s, f_x, f_y, f_z) of the one contact in all lanes into ``tangents`` (6, 4)."""
     for row in range(6):
         for i in range(LANES):
-            tangents[row, i] = b[_TANGENT + row * LANES + i]
+            tangents[row, i] = b[TANGENT + row * LANES + i]
 
 
 @inlined
 def lane_value(b: Array, i: int, value: Array) -> None:
     """Copy (F, p) of lane i into ``value`` (6,)."""
     for j in range(6):
-        value[j] = b[_N + j * LANES + i]
+        value[j] = b[FORCE + j * LANES + i]
 
 
 @inlined
@@ -352,74 +364,41 @@ def lane_tangents(b: Array, i: int, tangents: Array) -> None:
     """Copy ∂(F, p)/∂ξ of lane i into ``tangents`` (6, 3)."""
     for j in range(3):
         for row in range(6):
-            tangents[row, j] = b[_TANGENT + (6 * j + row) * LANES + i]
+            tangents[row, j] = b[TANGENT + (6 * j + row) * LANES + i]
 
 
-@kernel
-def integrate(rod: Rod, b: Array, tangents: int) -> None:
-    """Integrate every lane from its contact to the base, with its first so many tangents."""
+@inlined
+def integrate_weightless(rod: Rod, b: Array, tangents: int) -> None:
+    """Integrate every lane from its contact to the base; see :func:`vibrissa.rod.integrate`."""
     start = rod.start
-    farthest = b[_ARC]
+    farthest = b[ARC]
     for i in range(1, LANES):
-        farthest = max(farthest, b[_ARC + i])
+        farthest = max(farthest, b[ARC + i])
     for k in range(start.shape[0] - 1, -1, -1):
         if start[k] < farthest:
             if tangents > 0:
                 _value_step(rod, b, k, True)
                 for j in range(tangents):
-                    _tangent_step(b, _TANGENT + 6 * LANES * j, False)
+                    _tangent_step(b, TANGENT + 6 * LANES * j, False)
             else:
                 _value_step(rod, b, k, False)
 
 
 @kernel
-def evaluate(
-    rod: Rod, contacts: Array, values: Array, tangents: Array, first: int, last: int
-) -> None:
-    """Base force and contact point of many contacts."""
-    b, four = np.zeros(BUFFER_SIZE), np.empty((6, 4))
-    wanted = tangents.shape[0] > 0
-    if wanted and last == first + 1:  # a contact by itself: its tangents side by side
-        c = contacts[first]
-        set_all_lanes(b, c[0], c[1], c[2], c[3])
-        integrate(rod, b, 1)
-        lane_value(b, 0, values[first])
-        lanes_tangents(b, four)
-        for a in range(6):
-            t = tangents[first, a]
-            t[0], t[1], t[2] = four[a, 0], four[a, 2], four[a, 3]
-        return
-    for row in range(first, last, LANES):
-        for i in range(LANES):
-            j = min(row + i, last - 1)
-            set_lane(b, i, contacts[j, 0], contacts[j, 1], contacts[j, 2], contacts[j, 3], False)
-        integrate(rod, b, 3 if wanted else 0)
-        for i in range(min(LANES, last - row)):
-            lane_value(b, i, values[row + i])
-            if wanted:
-                lane_tangents(b, i, tangents[row + i])
-
-
-@kernel
-def _carry_tangents(rod: Rod, contacts: Array, tangents: Array, first: int, last: int) -> None:
+def carry_tangents(rod: Rod, contacts: Array, tangents: Array, first: int, last: int) -> None:
+    """Unit tangents of the deflected whisker at many contacts."""
     b = np.zeros(BUFFER_SIZE)
     for row in range(first, last, LANES):
         for i in range(LANES):
             j = min(row + i, last - 1)
             set_lane(b, i, contacts[j, 0], contacts[j, 1], contacts[j, 2], contacts[j, 3], True)
-            put(b, _TANGENT, i, (1.0, 0.0, 0.0))
+            put(b, TANGENT, i, (1.0, 0.0, 0.0))
         for k in range(rod.start.shape[0] - 1, -1, -1):
             _value_step(rod, b, k, True)
-            _carry_step(b, _TANGENT)
+            _carry_step(b, TANGENT)
         for i in range(min(LANES, last - row)):
             for j in range(3):
-                tangents[row + i, j] = b[_TANGENT + j * LANES + i]
-
-
-@kernel
-def relative_radius(rod: Rod, s: float) -> tuple[float, float]:
-    """Radius of the whisker relative to that of the base at s, and its derivative."""
-    return whisker_radius(rod, s)
+                tangents[row + i, j] = b[TANGENT + j * LANES + i]
 
 
 @kernel
@@ -431,7 +410,7 @@ def contact_state(rod: Rod, contact: Array, state: Array) -> None:
     b = np.zeros(BUFFER_SIZE)
     s = contact[0]
     set_all_lanes(b, s, contact[1], contact[2], contact[3])
-    carried = _TANGENT + 6 * LANES  # t and δt take the place of the tangents that are not used
+    carried = TANGENT + 6 * LANES  # t and δt take the place of the tangents that are not used
     for i in range(LANES):
         put(b, carried, i, (1.0, 0.0, 0.0))
         put(b, carried + 3 * LANES, i, (0.0, 0.0, 0.0))
@@ -444,72 +423,18 @@ def contact_state(rod: Rod, contact: Array, state: Array) -> None:
             b[carried + 4 * LANES] = b[TURN + 2 * LANES]
             b[carried + 5 * LANES] = -b[TURN + LANES]
             at_contact = False
-        _tangent_step(b, _TANGENT, True)
+        _tangent_step(b, TANGENT, True)
         for i in range(LANES):
             t, dt = get(b, carried, i), get(b, carried + 3 * LANES, i)
             t, dt = runge_kutta_step(_d_carried_rates, (b,), i, b[_H + i], t, dt)
             put(b, carried, i, t)
             put(b, carried + 3 * LANES, i, dt)
     for a in range(6):
-        state[a, 0] = b[_N + a * LANES]
+        state[a, 0] = b[FORCE + a * LANES]
     for a in range(3):
         state[6 + a, 0] = b[carried + a * LANES]
     for i in range(LANES):
         for a in range(6):
-            state[a, 1 + i] = b[_TANGENT + a * LANES + i]
+            state[a, 1 + i] = b[TANGENT + a * LANES + i]
         for a in range(3):
             state[6 + a, 1 + i] = b[carried + (3 + a) * LANES + i]
-
-
-def solve_forces(
-    discretization: Discretization, contacts: Array, tangents: bool = False
-) -> tuple[Array, Array]:
-    """Base force and contact point of contacts whose force is known, non-dimensional.
-
-    Parameters
-    ----------
-    discretization : Discretization
-        Rod.
-    contacts : (n, 4) array
-        Arc length and force in the material frame there, (s, f_x, f_y, f_z).
-    tangents : bool
-        Whether derivatives are wanted.
-
-    Returns
-    -------
-    values : (n, 6) array
-        Base force and contact point (F, p).
-    tangents : (n, 6, 3) array
-        Derivatives by ξ = (s, f_y, f_z); no rows unless wanted.
-    """
-    contacts = np.ascontiguousarray(contacts, dtype=np.float64)
-    n = contacts.shape[0]
-    values = np.empty((n, 6))
-    derivatives = np.empty((n if tangents else 0, 6, 3))
-    rod = discretization.rod
-    share_out(n, lambda first, last: evaluate(rod, contacts, values, derivatives, first, last))
-    return values, derivatives
-
-
-def contact_tangents(discretization: Discretization, contacts: Array) -> Array:
-    """Unit tangents of the deflected whisker at its contacts.
-
-    Parameters
-    ----------
-    discretization : Discretization
-        Rod.
-    contacts : (n, 4) array
-        Arc length and force in the material frame there, (s, f_x, f_y, f_z).
-
-    Returns
-    -------
-    (n, 3) array
-        Tangents in the whisker frame.
-    """
-    contacts = np.ascontiguousarray(contacts, dtype=np.float64)
-    tangents = np.empty((len(contacts), 3))
-    rod = discretization.rod
-    share_out(
-        len(contacts), lambda first, last: _carry_tangents(rod, contacts, tangents, first, last)
-    )
-    return tangents

@@ -24,9 +24,9 @@ import numpy as np
 from vibrissa.numerics import AnyArray, Array, copy, inlined, solve3
 from vibrissa.rod.chart import LEAST_ARC, Fold, chart_to_contact, fold_force
 from vibrissa.rod.discretization import Rod
+from vibrissa.rod.integration import integrate
 from vibrissa.rod.kernels import (
     LANES,
-    integrate,
     lane_tangents,
     lane_value,
     lanes_tangents,

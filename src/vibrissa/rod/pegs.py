@@ -10,18 +10,16 @@ place. A peg met from an earlier deflection moves straight from its place then t
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.rod.chart import LEAST_ARC, stable_set
 from vibrissa.rod.continuation import LEAST_FORCE, SIDE, TIP
+from vibrissa.rod.discretization import Bendable
 from vibrissa.rod.points import Solutions, follow_all
 from vibrissa.status import Status
-
-if TYPE_CHECKING:
-    from vibrissa.whisker import Whisker
 
 _SAMPLES = 513
 # The first touch, as deep as the least force needs.
@@ -59,7 +57,7 @@ class Rest(NamedTuple):
 
     @classmethod
     @lru_cache(maxsize=16)
-    def of(cls, whisker: Whisker) -> Rest:
+    def of(cls, whisker: Bendable) -> Rest:
         """Sample a whisker; cached."""
         s = np.linspace(0.0, 1.0, _SAMPLES)
         arc_length = np.minimum(s * whisker.length, whisker.length)
@@ -96,7 +94,7 @@ def nearest_side(rest: Rest, pegs: Pegs, outward: bool) -> Array:
 
 
 def solve_from_rest(
-    whisker: Whisker, pegs: Pegs, side: Array, proximal: float, steps: int
+    whisker: Bendable, pegs: Pegs, side: Array, proximal: float, steps: int
 ) -> Solutions:
     """Solve pegs met from rest."""
     parts = [Solutions.empty(0)]
@@ -108,7 +106,7 @@ def solve_from_rest(
 
 
 def _solve_from_rest(
-    whisker: Whisker, rest: Rest, pegs: Pegs, side: Array, proximal: float, steps: int
+    whisker: Bendable, rest: Rest, pegs: Pegs, side: Array, proximal: float, steps: int
 ) -> Solutions:
     out = Solutions.empty(len(side))
     there = np.isfinite(pegs.parameters()).all(axis=1) & np.isfinite(side).all(axis=1)
@@ -135,7 +133,7 @@ def _solve_from_rest(
 
 
 def _from_near_tip(
-    whisker: Whisker,
+    whisker: Bendable,
     rest: Rest,
     pegs: Pegs,
     push: Array,
@@ -166,7 +164,7 @@ def _from_near_tip(
 
 
 def solve_from_contact(
-    whisker: Whisker,
+    whisker: Bendable,
     before: Pegs,
     contacts: Array,
     tip: AnyArray,
@@ -190,7 +188,7 @@ def solve_from_contact(
 
 
 def _follow(
-    whisker: Whisker,
+    whisker: Bendable,
     begins: Array,
     ends: Array,
     kinds: IntArray,

@@ -11,7 +11,7 @@ reached is the answer.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -30,15 +30,13 @@ from vibrissa.rod.chart import (
     with_normal_force,
 )
 from vibrissa.rod.continuation import POINT, follow
-from vibrissa.rod.discretization import Rod
-from vibrissa.rod.kernels import BUFFER_SIZE, LANES, solve_forces
+from vibrissa.rod.discretization import Bendable, Rod
+from vibrissa.rod.integration import solve_forces
+from vibrissa.rod.kernels import BUFFER_SIZE, LANES
 from vibrissa.rod.newton import ABOVE_FOLD, TOLERANCE, newton_group, stable, start_from
 from vibrissa.rod.search import MOST_SEEDS, seeds
 from vibrissa.rod.tree import SearchTree, search_tree
 from vibrissa.status import Status
-
-if TYPE_CHECKING:
-    from vibrissa.whisker import Whisker
 
 # A point without a seed is unreachable, and the nearest face of the chart shows why. This near to
 # a face (over L) it is approached from inside instead, in case the interpolant misjudges; and this
@@ -461,12 +459,12 @@ def follow_all(
 
 
 @lru_cache(maxsize=16)
-def point_solver(whisker: Whisker, proximal: float, steps: int) -> PointSolver:
+def point_solver(whisker: Bendable, proximal: float, steps: int) -> PointSolver:
     """Return the point solver of a whisker, made on first use.
 
     Parameters
     ----------
-    whisker : Whisker
+    whisker : Bendable
         Whisker to be bent.
     proximal : float
         Smallest arc length of a contact, over L.

@@ -13,12 +13,14 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.rod.chart import PROXIMAL
-from vibrissa.rod.deflection import Deflection, Load, PegContact, PointContact, PointForce
-from vibrissa.rod.discretization import MOST_STEPS, STEPS, Discretization, discretize
-from vibrissa.rod.kernels import solve_forces
+from vibrissa.rod.deflection import Deflection, Load, PegContact, PointForce, vectors
+from vibrissa.rod.discretization import MOST_STEPS, STEPS, Bendable, Discretization, discretize
+from vibrissa.rod.gravity import Resting, moved_moments, resting
+from vibrissa.rod.integration import solve_forces
 from vibrissa.rod.pegs import Pegs, Rest, nearest_side, solve_from_contact, solve_from_rest
 from vibrissa.rod.points import Solutions, point_solver
 from vibrissa.status import Status
@@ -36,7 +38,12 @@ _SETTLED = 1e-4
 
 
 def deflect(
-    whisker: Whisker, load: Load, *, proximal: float = PROXIMAL, steps: int = STEPS
+    whisker: Whisker,
+    load: Load,
+    *,
+    gravity: ArrayLike | None = None,
+    proximal: float = PROXIMAL,
+    steps: int = STEPS,
 ) -> Deflection:
     """Bend a whisker quasi-statically.
 
@@ -46,6 +53,10 @@ def deflect(
         Whisker to be bent.
     load : PointForce, PointContact or PegContact
         Load that bends it; arrays of any leading shape.
+    gravity : (..., 3) array_like, optional
+        Gravitational acceleration minus that of the base, whisker frame, m/s²: one for all loads,
+        or one each. The whisker then sags at rest, and is bent from there; it needs a density. By
+        default it has no weight.
     proximal : float
         Smallest arc length of a contact, over L; nearer ones get a status instead of an answer (not
         for a ``PointForce``).
@@ -76,26 +87,61 @@ def deflect(
     """
     if isinstance(whisker, Load):
         raise ValueError("the whisker comes first, then its load: deflect(whisker, load)")
-    d = discretize(whisker, steps)
-    if isinstance(load, PointForce):
-        solved, needed = _by_force(whisker, d, load, steps)
-        return replace(dimensional(whisker, load, d, solved, steps), _needed=needed)
-    if isinstance(load, PointContact):
-        solver = point_solver(whisker, proximal, steps)
-        with np.errstate(over="ignore"):
-            points = np.asarray(load.points).reshape(-1, 3) / d.length
-        solved = solver.solve(points)
-    elif isinstance(load, PegContact):
-        solved = _by_peg(whisker, d, load, proximal, steps)
-    else:
+    if not isinstance(load, Load):
         raise ValueError(
             f"a load is a PointForce, a PointContact or a PegContact; got {type(load).__name__}"
         )
-    return dimensional(whisker, load, d, solved, steps)
+    if gravity is None:
+        solved, needed = _solve(whisker, load, proximal, steps)
+        return replace(dimensional(whisker, load, solved, steps), _needed=needed)
+    directions = _gravities(gravity, load)
+    kinds, kind = np.unique(directions, axis=0, return_inverse=True)
+    solved = Solutions.empty(len(directions))
+    needed = np.full(len(directions), steps)
+    moments = np.zeros((len(directions), 3))
+    for k, one in enumerate(kinds):
+        if np.isnan(one).any():
+            continue
+        rows = np.flatnonzero(kind.reshape(-1) == k)
+        part = load if len(kinds) == 1 else load.rows(rows)
+        bent = resting(whisker, one)
+        found, finer = _solve(bent, part, proximal, steps)
+        solved.put(rows, found)
+        if finer is not None:
+            needed[rows] = finer
+        moments[rows] = moved_moments(discretize(bent, steps), found.contacts)
+    out = dimensional(whisker, load, solved, steps, moments)
+    kept = directions.reshape(*load.shape, 3)
+    return replace(out, gravity=kept, _needed=needed)
+
+
+def _gravities(gravity: ArrayLike, load: Load) -> Array:
+    """Gravity of each load, (n, 3)."""
+    values = vectors("gravity", gravity)
+    try:
+        return np.broadcast_to(values, (*load.shape, 3)).reshape(-1, 3)
+    except ValueError as error:
+        raise ValueError(
+            f"gravity of shape {values.shape} does not broadcast to the loads' {(*load.shape, 3)}"
+        ) from error
+
+
+def _solve(
+    bent: Bendable, load: Load, proximal: float, steps: int
+) -> tuple[Solutions, IntArray | None]:
+    """Solve loads; return, of known forces, how many steps each needs."""
+    d = discretize(bent, steps)
+    if isinstance(load, PointForce):
+        return _by_force(bent, d, load, steps)
+    if isinstance(load, PegContact):
+        return _by_peg(bent, d, load, proximal, steps), None
+    with np.errstate(over="ignore"):
+        points = np.asarray(load.points).reshape(-1, 3) / d.length
+    return point_solver(bent, proximal, steps).solve(points), None
 
 
 def _by_force(
-    whisker: Whisker, d: Discretization, load: PointForce, steps: int
+    whisker: Bendable, d: Discretization, load: PointForce, steps: int
 ) -> tuple[Solutions, IntArray]:
     s = np.asarray(load.arc_length).reshape(-1) / d.length
     with np.errstate(over="ignore"):
@@ -116,7 +162,7 @@ def _by_force(
 
 
 def _solve_known_forces(
-    whisker: Whisker, contacts: Array, steps: int
+    whisker: Bendable, contacts: Array, steps: int
 ) -> tuple[Array, IntArray, AnyArray]:
     """Base force and contact point of known forces of any size, non-dimensional."""
     values = solve_forces(discretize(whisker, steps), contacts)[0]
@@ -152,7 +198,7 @@ def _pegs(load: PegContact, length: float) -> Pegs:
 
 
 def _by_peg(
-    whisker: Whisker, d: Discretization, load: PegContact, proximal: float, steps: int
+    whisker: Bendable, d: Discretization, load: PegContact, proximal: float, steps: int
 ) -> Solutions:
     pegs = _pegs(load, d.length)
     start = load.start
@@ -162,7 +208,7 @@ def _by_peg(
         else:
             side = nearest_side(Rest.of(whisker), pegs, outward=bool((pegs.radius >= 0.0).any()))
         return solve_from_rest(whisker, pegs, side, proximal, steps)
-    if start.whisker is not whisker:
+    if start.whisker is not (whisker.whisker if isinstance(whisker, Resting) else whisker):
         raise ValueError("start is a deflection of another whisker")
     shape = load.shape
     contacts = np.concatenate(
@@ -198,13 +244,13 @@ def _by_peg(
 
 
 def dimensional(
-    whisker: Whisker, load: Load, d: Discretization, solved: Solutions, steps: int
+    whisker: Whisker, load: Load, solved: Solutions, steps: int, moments: Array | float = 0.0
 ) -> Deflection:
-    """Give solved rows their units and the shape of their load."""
-    shape = load.shape
+    """Give solved rows their units and the shape of their load; ``moments`` add to p × F."""
+    shape, d = load.shape, discretize(whisker, steps)
     force = solved.values[:, :3] * d.force
     point = solved.values[:, 3:] * d.length
-    moment = np.cross(point, force)
+    moment = np.cross(point, force) + moments * d.moment
     moment[solved.statuses == Status.NO_CONTACT] = 0.0
     return Deflection(
         whisker=whisker,

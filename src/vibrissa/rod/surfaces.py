@@ -168,7 +168,7 @@ def follow_surfaces(
             progress(i + 1, n)
     d = follower.discretization
     load = PointForce(solved.contacts[:, 0] * d.length, components=solved.contacts[:, 1:] * d.force)
-    bent = dimensional(whisker, load, d, solved, steps)
+    bent = dimensional(whisker, load, solved, steps)
     return SurfaceDeflection(bent, out.surface, out.normal, out.surface_point, out.sliding)
 
 

@@ -34,7 +34,8 @@ from vibrissa.numerics import Array, inlined, kernel, solve
 from vibrissa.objects import Placement, Surface
 from vibrissa.rod.chart import LEAST_ARC
 from vibrissa.rod.discretization import Discretization
-from vibrissa.rod.kernels import contact_state, relative_radius
+from vibrissa.rod.integration import relative_radius
+from vibrissa.rod.kernels import contact_state
 
 EITHER, STICKING, SLIDING = 0, 1, 2
 # Numbers that an integration gives: (F, p, t).
@@ -79,6 +80,15 @@ def _give(n: Array, state: Array) -> float:
     return float(np.sqrt(give))
 
 
+@inlined
+def _polar(v: Array) -> tuple[float, float, float]:
+    """Length and direction of a vector (2,); no direction where it vanishes."""
+    size = np.hypot(v[0], v[1])
+    if size > 0.0:
+        return float(size), float(v[0] / size), float(v[1] / size)
+    return 0.0, 0.0, 0.0
+
+
 @kernel
 def _surface_equations(
     contact: Array,
@@ -112,13 +122,9 @@ def _surface_equations(
             push[r] += e[r, i] * (state[i, 0] - pressing * lean[i])
             way[r] += e[r, i] * (state[3 + i, 0] - earlier[i] - away * mean)
         wanted[r] = push[r] - way[r] / give
-    strength = np.hypot(wanted[0], wanted[1])
+    strength, toward0, toward1 = _polar(wanted)
     beyond = bool(strength >= limit)
     sliding = beyond if mode == EITHER else mode == SLIDING
-    if strength > 0.0:
-        toward0, toward1 = wanted[0] / strength, wanted[1] / strength
-    else:
-        toward0, toward1 = 0.0, 0.0
 
     step[0] = -(geometry[0] - whisker_radius + softness * pressing)
     step[1] = -((contact[0] - 1.0) if tip else along)

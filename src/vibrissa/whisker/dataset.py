@@ -38,6 +38,8 @@ def whisker_dataset(whisker: Any) -> xr.Dataset:
         "centerline": (("node", "space"), whisker.position(s)),
         "radius": (("node",), whisker.radius(s)),
     }
+    if whisker.density is not None:
+        known["density"] = ((), whisker.density)
     variables = {
         name: xr.Variable(dims, np.asarray(values), attributes(name))
         for name, (dims, values) in known.items()
@@ -145,6 +147,7 @@ def whisker_fields(dataset: xr.Dataset) -> dict[str, Any]:
         ),
         "youngs_modulus": float(value["youngs_modulus"]),
         "poisson_ratio": float(value["poisson_ratio"]),
+        "density": float(dataset["density"]) if "density" in dataset else None,
         "base_stiffness": None if np.isinf(stiffness).all() else stiffness,
         "pose": Pose(value["pose_rotation"], value["pose_origin"]),
         "breaks": tuple(float(s) for s in value["breaks"]),

@@ -85,6 +85,8 @@ class Whisker:
         E, Pa.
     poisson_ratio : float
         ν, in (−1, 0.5].
+    density : float, optional
+        Density of the material, kg/m³, for its weight; None where it is not known.
     base_stiffness : tuple of float, optional
         Rotational stiffness of the base (bending, twist), N·m/rad; None is a rigid clamp.
     pose : Pose
@@ -125,6 +127,7 @@ class Whisker:
     section_radius: Profile
     youngs_modulus: float = YOUNGS_MODULUS
     poisson_ratio: float = POISSON_RATIO
+    density: float | None = None
     base_stiffness: tuple[float, float] | None = None
     pose: Pose = field(default_factory=Pose)
     breaks: tuple[float, ...] = ()
@@ -134,7 +137,9 @@ class Whisker:
     def __post_init__(self) -> None:
         """Check every field and bring the numbers into plain Python types."""
         faults = length_faults(self.length, any_length=True)
-        faults += material_faults(self.youngs_modulus, self.poisson_ratio, self.base_stiffness)
+        faults += material_faults(
+            self.youngs_modulus, self.poisson_ratio, self.base_stiffness, self.density
+        )
         faults += _break_faults(self.breaks, self.length)
         for what, profile, shape in (
             ("intrinsic_curvature", self.intrinsic_curvature, (3,)),
@@ -149,6 +154,8 @@ class Whisker:
         stiffness = self.base_stiffness
         if stiffness is not None:
             object.__setattr__(self, "base_stiffness", tuple(float(value) for value in stiffness))
+        if self.density is not None:
+            object.__setattr__(self, "density", float(self.density))
         for what in ("length", "youngs_modulus", "poisson_ratio"):
             object.__setattr__(self, what, float(getattr(self, what)))
         object.__setattr__(self, "breaks", tuple(sorted(float(s) for s in self.breaks)))
@@ -315,6 +322,16 @@ class Whisker:
     def base_bending_stiffness(self) -> float:
         """E π r⁴ / 4 at the base, N·m²."""
         return self.youngs_modulus * np.pi * self.base_radius**4 / 4.0
+
+    @property
+    def mass(self) -> float:
+        """Mass, kg; NaN where the density is not known."""
+        knots = np.unique(np.clip(self.section_radius.knots, 0.0, self.length))
+        middle, half = 0.5 * (knots[1:] + knots[:-1]), 0.5 * np.diff(knots)
+        at, weight = np.polynomial.legendre.leggauss(8)
+        area = np.pi * self.radius(middle[:, None] + half[:, None] * at) ** 2
+        density = np.nan if self.density is None else self.density
+        return float(density * (half * (area @ weight)).sum())
 
     @property
     def assumed(self) -> tuple[str, ...]:
@@ -586,7 +603,8 @@ class Whisker:
 
     def _repr_html_(self) -> str:
         """Show its shape, with size and material."""
-        names = ("length", "base_radius", "tip_radius", "youngs_modulus", "poisson_ratio")
+        names = ["length", "base_radius", "tip_radius", "youngs_modulus", "poisson_ratio"]
+        names += [] if self.density is None else ["density"]
         rows = [(quantity(name).long_name, shown(name, getattr(self, name))) for name in names]
         rows += [("note", note) for note in self.notes]
         picture = views([Mark(self.centerline(81), BENT, width=2.0)])

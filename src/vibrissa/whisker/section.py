@@ -34,6 +34,8 @@ POISSON_RATIO = 0.38
 
 # From a soft gel to diamond, Pa; what lies outside is in another unit.
 _SOFTEST, _HARDEST = 1e3, 1e13
+# From a foam to osmium, kg/m³.
+_LIGHTEST, _HEAVIEST = 10.0, 23000.0
 SHORTEST, LONGEST = 0.5e-3, 0.5
 """Lengths, m, between which the unit is not doubted."""
 
@@ -66,6 +68,7 @@ class Holding(TypedDict, total=False):
 
     youngs_modulus: float
     poisson_ratio: float
+    density: float | None
     base_stiffness: tuple[float, float] | None
     name: str
 
@@ -102,6 +105,7 @@ def settled(length: float, properties: Properties) -> tuple[Profile, Holding, tu
         holding.get("youngs_modulus", YOUNGS_MODULUS),
         holding.get("poisson_ratio", POISSON_RATIO),
         holding.get("base_stiffness"),
+        holding.get("density"),
     )
     try:
         section = radius_profile(length, **stated)
@@ -196,7 +200,10 @@ def radius_notes(length: float, section: Profile, stated: Section) -> tuple[str,
 
 
 def material_faults(
-    youngs_modulus: float, poisson_ratio: float, base_stiffness: tuple[float, float] | None
+    youngs_modulus: float,
+    poisson_ratio: float,
+    base_stiffness: tuple[float, float] | None,
+    density: float | None,
 ) -> list[str]:
     """Say what is wrong with a material and its holding; empty if nothing is."""
     faults = []
@@ -206,6 +213,13 @@ def material_faults(
         faults.append(
             f"youngs_modulus is {youngs_modulus:.4g} Pa, and from a gel to diamond it is between "
             f"{_SOFTEST:.0e} and {_HARDEST:.0e}: is it in Pa? 1 GPa is 1e9"
+        )
+    if density is not None and not (np.isfinite(density) and density > 0.0):
+        faults.append(f"density is {density!r} kg/m³; it must be positive, or None if not known")
+    elif density is not None and not _LIGHTEST <= density <= _HEAVIEST:
+        faults.append(
+            f"density is {density:.4g} kg/m³, and of a foam to osmium it is between "
+            f"{_LIGHTEST:g} and {_HEAVIEST:g}: is it in kg/m³? 1 g/cm³ is 1000"
         )
     if not -1.0 < poisson_ratio <= 0.5:
         faults.append(f"poisson_ratio is {poisson_ratio!r}; it must lie in (-1, 0.5]")

@@ -1,0 +1,128 @@
+"""Base force and contact point of contacts: the rod equations integrated, with weight or without.
+
+Kernels call :func:`integrate` for the contacts in a buffer (:mod:`vibrissa.rod.kernels`). A rod
+that has a weight is integrated as :mod:`vibrissa.rod.weight` says, by a kernel of its own that is
+compiled where it is needed, so that a rod without one loses nothing by it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vibrissa.numerics import Array, inlined, kernel, share_out
+from vibrissa.rod.discretization import Discretization, Rod, Weight
+from vibrissa.rod.kernels import (
+    BUFFER_SIZE,
+    LANES,
+    carry_tangents,
+    integrate_weightless,
+    lane_tangents,
+    lane_value,
+    lanes_tangents,
+    set_all_lanes,
+    set_lane,
+    whisker_radius,
+)
+from vibrissa.rod.weight import integrate_weighted
+
+
+@inlined
+def _integrate(rod: Rod, b: Array, tangents: int, weight: Weight | None) -> None:
+    if weight is None:  # decided by the compiler
+        integrate_weightless(rod, b, tangents)
+    else:
+        integrate_weighted(rod, weight, b, tangents)
+
+
+@kernel
+def integrate(rod: Rod, b: Array, tangents: int) -> None:
+    """Integrate every lane from its contact to the base, with its first so many tangents."""
+    _integrate(rod, b, tangents, rod.weight)
+
+
+@kernel
+def evaluate(
+    rod: Rod, contacts: Array, values: Array, tangents: Array, first: int, last: int
+) -> None:
+    """Base force and contact point of many contacts."""
+    b, four = np.zeros(BUFFER_SIZE), np.empty((6, 4))
+    wanted = tangents.shape[0] > 0
+    if wanted and last == first + 1:  # a contact by itself: its tangents side by side
+        c = contacts[first]
+        set_all_lanes(b, c[0], c[1], c[2], c[3])
+        integrate(rod, b, 1)
+        lane_value(b, 0, values[first])
+        lanes_tangents(b, four)
+        for a in range(6):
+            t = tangents[first, a]
+            t[0], t[1], t[2] = four[a, 0], four[a, 2], four[a, 3]
+        return
+    for row in range(first, last, LANES):
+        for i in range(LANES):
+            j = min(row + i, last - 1)
+            set_lane(b, i, contacts[j, 0], contacts[j, 1], contacts[j, 2], contacts[j, 3], False)
+        integrate(rod, b, 3 if wanted else 0)
+        for i in range(min(LANES, last - row)):
+            lane_value(b, i, values[row + i])
+            if wanted:
+                lane_tangents(b, i, tangents[row + i])
+
+
+@kernel
+def relative_radius(rod: Rod, s: float) -> tuple[float, float]:
+    """Radius of the whisker relative to that of the base at s, and its derivative."""
+    return whisker_radius(rod, s)
+
+
+def solve_forces(
+    discretization: Discretization, contacts: Array, tangents: bool = False
+) -> tuple[Array, Array]:
+    """Base force and contact point of contacts whose force is known, non-dimensional.
+
+    Parameters
+    ----------
+    discretization : Discretization
+        Rod.
+    contacts : (n, 4) array
+        Arc length and force in the material frame there, (s, f_x, f_y, f_z).
+    tangents : bool
+        Whether derivatives are wanted.
+
+    Returns
+    -------
+    values : (n, 6) array
+        Base force and contact point (F, p).
+    tangents : (n, 6, 3) array
+        Derivatives by ξ = (s, f_y, f_z); no rows unless wanted.
+    """
+    contacts = np.ascontiguousarray(contacts, dtype=np.float64)
+    n = contacts.shape[0]
+    values = np.empty((n, 6))
+    derivatives = np.empty((n if tangents else 0, 6, 3))
+    rod = discretization.rod
+    share_out(n, lambda first, last: evaluate(rod, contacts, values, derivatives, first, last))
+    return values, derivatives
+
+
+def contact_tangents(discretization: Discretization, contacts: Array) -> Array:
+    """Unit tangents of the deflected whisker at its contacts.
+
+    Parameters
+    ----------
+    discretization : Discretization
+        Rod.
+    contacts : (n, 4) array
+        Arc length and force in the material frame there, (s, f_x, f_y, f_z).
+
+    Returns
+    -------
+    (n, 3) array
+        Tangents in the whisker frame.
+    """
+    contacts = np.ascontiguousarray(contacts, dtype=np.float64)
+    tangents = np.empty((len(contacts), 3))
+    rod = discretization.rod
+    share_out(
+        len(contacts), lambda first, last: carry_tangents(rod, contacts, tangents, first, last)
+    )
+    return tangents

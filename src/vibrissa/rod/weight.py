@@ -1,0 +1,553 @@
+"""The rod equations with weight, integrated from the tip to the base, four contacts at a time.
+
+Weight acts along a unit vector that is fixed in the base frame, ĝ; let g = Rᵀĝ be the same in the
+material frame, and W(s) the weight of all that is beyond s, a known number. The whisker carries the
+force n = φ + W g, with φ that of the contact, and the moment m = q × φ + μ, with μ the moment that
+the weight beyond s exerts about r(s)::
+
+    φ' = φ × u,   q' = q × u - e₁,   g' = g × u,   μ' = μ × u + W g × e₁,
+    u = u₀(s) + c(s) ∘ (q × φ + μ)
+
+Beyond the contact φ and q are zero, but weight bends the whisker there too. At the tip μ = 0, and
+the direction g(L) is unknown: two numbers, to be chosen such that g(0) = ĝ. At the base φ = F,
+q = p, and the base carries the force F + W(0) ĝ and the moment p × F + μ.
+
+The two unknowns are removed by Newton's method with the derivatives by them, δ₁ and δ₂, integrated
+alongside: with a = -[δ₁ δ₂]⁺ (g(0) - ĝ) the base values are y + a₁ δ₁ y + a₂ δ₂ y, and derivatives
+by any other unknown of the contact get the same correction. So (F, p) are again smooth functions of
+(s_c, f) alone, and what solves a rod without weight solves one with it. A lane starts where it
+ended last: along a path, or in the rounds of another Newton's method, that is next to the solution.
+A base that accelerates by a₀ is one with gravity g - a₀.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vibrissa.numerics import Array, Vector, inlined, kernel
+from vibrissa.rod.discretization import Rod, Weight
+from vibrissa.rod.kernels import (
+    ARC,
+    BUFFER_SIZE,
+    FORCE,
+    LANES,
+    LEAN,
+    TANGENT,
+    TIP,
+    Pair,
+    Piece,
+    Six,
+    add,
+    cross,
+    get,
+    piece_of,
+    put,
+    runge_kutta_step,
+    section,
+    set_all_lanes,
+    turning,
+)
+
+# A stage keeps φ, q, g, μ, u (3 each), two compliances, W.
+_STAGE = 18 * LANES
+_TURN, _SOFT, _WEIGHT = 12 * LANES, 15 * LANES, 17 * LANES
+_SIX = 6 * LANES
+_STATE = 7 * _STAGE  # φ, q, g, μ
+# Derivatives of the state by the two unknowns at the tip, and up to three more.
+_SLOPES = _STATE + 2 * _SIX
+_MOVING = _SLOPES + 10 * _SIX  # the derivative that takes a step
+_H = _MOVING + 2 * _SIX
+#: Numbers that a buffer for :func:`solve_lanes` holds.
+WEIGHT_BUFFER = _H + LANES
+#: Numbers of a solved state: (F, p), ĝ and μ at the base.
+STATES = 12
+
+# Rounds of Newton's method for the direction at the tip.
+_ROUNDS = 8
+# Where they do not converge the force grows from rest to its size in so many steps.
+_SHARES = 8
+# The error of g(0) that one correction to first order may take away: it leaves its square.
+_SMALL, _NEAR = 1e-6, 1e-3
+
+Load = tuple[float, float, float, float, float, float, float, float]
+
+
+@inlined
+def _load_of(weight: Weight, k: int) -> Load:
+    w = weight.beyond
+    return (w[k, 0], w[k, 1], w[k, 2], w[k, 3], w[k, 4], w[k, 5], w[k, 6], w[k, 7])
+
+
+@inlined
+def _beyond(w: Load, t: float) -> float:
+    """Weight of what is beyond the fraction t of a step."""
+    high = w[4] + t * (w[5] + t * (w[6] + t * w[7]))
+    return w[0] + t * (w[1] + t * (w[2] + t * (w[3] + t * high)))
+
+
+@inlined
+def _first(x: Six) -> Vector:
+    return (x[0], x[1], x[2])
+
+
+@inlined
+def _second(x: Six) -> Vector:
+    return (x[3], x[4], x[5])
+
+
+@inlined
+def _both(a: Vector, b: Vector) -> Six:
+    return (a[0], a[1], a[2], b[0], b[1], b[2])
+
+
+@inlined
+def _get_six(b: Array, row: int, i: int) -> Six:
+    return _both(get(b, row, i), get(b, row + 3 * LANES, i))
+
+
+@inlined
+def _put_six(b: Array, row: int, i: int, x: Six) -> None:
+    put(b, row, i, _first(x))
+    put(b, row + 3 * LANES, i, _second(x))
+
+
+@inlined
+def _keep(b: Array, row: int, i: int, u: Vector, c: Vector, w: float) -> None:
+    put(b, row + _TURN, i, u)
+    b[row + _SOFT + i] = c[0]
+    b[row + _SOFT + LANES + i] = c[1]
+    b[row + _WEIGHT + i] = w
+
+
+@inlined
+def _free_rates(
+    data: tuple[Array, Piece, Load, float, float],
+    stage: int,
+    left: float,
+    i: int,
+    g: Vector,
+    m: Vector,
+) -> Pair:
+    """Slopes of (g, μ) beyond the contact."""
+    b, piece, load, low, span = data
+    t = low + span * left
+    u0, c = section(piece, t)
+    u = turning(u0, c, m)
+    w = piece[3] * _beyond(load, t)
+    row = stage * _STAGE
+    put(b, row + _SIX, i, g)
+    put(b, row + _SIX + 3 * LANES, i, m)
+    _keep(b, row, i, u, c, w)
+    return cross(g, u), add(cross(m, u), (0.0, w * g[2], -w * g[1]))
+
+
+@inlined
+def _free_slope_rates(
+    data: tuple[Array], stage: int, left: float, i: int, dg: Vector, dm: Vector
+) -> Pair:
+    """Slopes of a derivative of (g, μ) beyond the contact."""
+    b, row = data[0], stage * _STAGE
+    g, m = get(b, row + _SIX, i), get(b, row + _SIX + 3 * LANES, i)
+    u, w = get(b, row + _TURN, i), b[row + _WEIGHT + i]
+    c0, c1 = b[row + _SOFT + i], b[row + _SOFT + LANES + i]
+    du = (c0 * dm[0], c1 * dm[1], c1 * dm[2])
+    moment = add(add(cross(dm, u), cross(m, du)), (0.0, w * dg[2], -w * dg[1]))
+    return add(cross(dg, u), cross(g, du)), moment
+
+
+@inlined
+def _held_rates(
+    data: tuple[Array, Piece, Load, float, float],
+    stage: int,
+    left: float,
+    i: int,
+    x: Six,
+    y: Six,
+) -> tuple[Six, Six]:
+    """Slopes of (φ, q) and (g, μ) between contact and base."""
+    b, piece, load, low, span = data
+    t = low + span * left
+    f, q, g, m = _first(x), _second(x), _first(y), _second(y)
+    u0, c = section(piece, t)
+    u = turning(u0, c, add(cross(q, f), m))
+    w = piece[3] * _beyond(load, t)
+    row = stage * _STAGE
+    _put_six(b, row, i, x)
+    _put_six(b, row + _SIX, i, y)
+    _keep(b, row, i, u, c, w)
+    lever = add(cross(q, u), (-piece[3], 0.0, 0.0))
+    moment = add(cross(m, u), (0.0, w * g[2], -w * g[1]))
+    return _both(cross(f, u), lever), _both(cross(g, u), moment)
+
+
+@inlined
+def _held_slope_rates(
+    data: tuple[Array], stage: int, left: float, i: int, dx: Six, dy: Six
+) -> tuple[Six, Six]:
+    """Slopes of a derivative of (φ, q) and (g, μ) between contact and base."""
+    b, row = data[0], stage * _STAGE
+    x, y = _get_six(b, row, i), _get_six(b, row + _SIX, i)
+    f, q, g, m = _first(x), _second(x), _first(y), _second(y)
+    df, dq, dg, dm = _first(dx), _second(dx), _first(dy), _second(dy)
+    u, w = get(b, row + _TURN, i), b[row + _WEIGHT + i]
+    c0, c1 = b[row + _SOFT + i], b[row + _SOFT + LANES + i]
+    more = add(add(cross(dq, f), cross(q, df)), dm)
+    du = (c0 * more[0], c1 * more[1], c1 * more[2])
+    moment = add(add(cross(dm, u), cross(m, du)), (0.0, w * dg[2], -w * dg[1]))
+    return (
+        _both(add(cross(df, u), cross(f, du)), add(cross(dq, u), cross(q, du))),
+        _both(add(cross(dg, u), cross(g, du)), moment),
+    )
+
+
+@inlined
+def _free_step(rod: Rod, weight: Weight, b: Array, h: Array, k: int) -> None:
+    """Step k beyond the contacts, with the derivatives by the unknowns at the tip."""
+    start, width, piece, load = rod.start[k], rod.width[k], piece_of(rod, k), _load_of(weight, k)
+    for i in range(LANES):
+        low = min(max(b[ARC + i] - start, 0.0), width)
+        step = width - low
+        data = (h, piece, load, low / width, step / width)
+        y = _get_six(h, _STATE + _SIX, i)
+        g, m = runge_kutta_step(_free_rates, data, i, -step, _first(y), _second(y))
+        _put_six(h, _STATE + _SIX, i, _both(g, m))
+        h[_H + i] = -step
+    for j in range(2):
+        row = _SLOPES + (2 * j + 1) * _SIX
+        for i in range(_SIX):
+            h[_MOVING + i] = h[row + i]
+        for i in range(LANES):
+            y = _get_six(h, _MOVING, i)
+            g, m = runge_kutta_step(_free_slope_rates, (h,), i, h[_H + i], _first(y), _second(y))
+            _put_six(h, _MOVING, i, _both(g, m))
+        for i in range(_SIX):
+            h[row + i] = h[_MOVING + i]
+
+
+@inlined
+def _held_step(rod: Rod, weight: Weight, b: Array, h: Array, k: int, slopes: int) -> None:
+    """Step k between contacts and base, with the first so many derivatives."""
+    start, width, piece, load = rod.start[k], rod.width[k], piece_of(rod, k), _load_of(weight, k)
+    for i in range(LANES):
+        s = b[ARC + i]
+        step = min(max(s - start, 0.0), width)
+        data = (h, piece, load, 0.0, step / width)
+        x0, y0 = _get_six(h, _STATE, i), _get_six(h, _STATE + _SIX, i)
+        x, y = runge_kutta_step(_held_rates, data, i, -step, x0, y0)
+        _put_six(h, _STATE, i, x)
+        _put_six(h, _STATE + _SIX, i, y)
+        h[_H + i] = -step
+        # The lane's contact is in this step: its derivative by s starts here.
+        if slopes > 2 and s > start and s <= start + width and b[TIP + i] == 0.0:
+            u = get(h, _TURN, i)
+            turned = cross(u, _first(x0))
+            put(h, _SLOPES + 4 * _SIX, i, turned)
+            put(h, _SLOPES + 4 * _SIX + 3 * LANES, i, (piece[3], 0.0, 0.0))
+    for j in range(slopes):
+        row = _SLOPES + 2 * j * _SIX
+        for i in range(2 * _SIX):
+            h[_MOVING + i] = h[row + i]
+        for i in range(LANES):
+            x, y = _get_six(h, _MOVING, i), _get_six(h, _MOVING + _SIX, i)
+            x, y = runge_kutta_step(_held_slope_rates, (h,), i, h[_H + i], x, y)
+            _put_six(h, _MOVING, i, x)
+            _put_six(h, _MOVING + _SIX, i, y)
+        for i in range(2 * _SIX):
+            h[row + i] = h[_MOVING + i]
+
+
+@inlined
+def normal_plane(n: Vector) -> Pair:
+    """Two unit vectors such that they and the unit vector n are right-handed: e₁ × e₂ = n."""
+    x, y, z = n
+    if abs(x) <= abs(y) and abs(x) <= abs(z):
+        size = 1.0 / np.sqrt(y * y + z * z)
+        first = (0.0, z * size, -y * size)
+    elif abs(y) <= abs(z):
+        size = 1.0 / np.sqrt(x * x + z * z)
+        first = (-z * size, 0.0, x * size)
+    else:
+        size = 1.0 / np.sqrt(x * x + y * y)
+        first = (y * size, -x * size, 0.0)
+    return first, cross(n, first)
+
+
+@inlined
+def _start(weight: Weight, b: Array, h: Array, more: int, share: float) -> None:
+    """Load all lanes from the buffer of contacts, at the tip, with a share of their force."""
+    for i in range(_STATE, _MOVING):
+        h[i] = 0.0
+    for i in range(LANES):
+        g = get(b, LEAN, i)
+        if not abs(g[0] * g[0] + g[1] * g[1] + g[2] * g[2] - 1.0) < 1e-9:
+            g = (weight.at_tip[0], weight.at_tip[1], weight.at_tip[2])
+            put(b, LEAN, i, g)
+        f = get(b, FORCE, i)
+        put(h, _STATE, i, (share * f[0], share * f[1], share * f[2]))
+        put(h, _STATE + _SIX, i, g)
+        first, second = normal_plane(g)
+        put(h, _SLOPES + _SIX, i, first)
+        put(h, _SLOPES + 3 * _SIX, i, second)
+        for j in range(more):
+            x = _get_six(b, TANGENT + j * _SIX, i)
+            _put_six(h, _SLOPES + (4 + 2 * j) * _SIX, i, x)
+
+
+@inlined
+def _shares(h: Array, i: int, v: Vector) -> tuple[float, float]:
+    """Shares of the two derivatives of g(0) that come nearest to v."""
+    first, second = get(h, _SLOPES + _SIX, i), get(h, _SLOPES + 3 * _SIX, i)
+    aa = ab = bb = av = bv = 0.0
+    for j in range(3):
+        aa += first[j] * first[j]
+        ab += first[j] * second[j]
+        bb += second[j] * second[j]
+        av += first[j] * v[j]
+        bv += second[j] * v[j]
+    det = aa * bb - ab * ab
+    return (bb * av - ab * bv) / det, (aa * bv - ab * av) / det
+
+
+@inlined
+def _correct(h: Array, row: int, i: int, a: float, c: float) -> None:
+    """Subtract shares of the two derivatives from the 12 numbers of a lane at ``row``."""
+    for j in range(0, 2 * _SIX, LANES):
+        h[row + j + i] -= a * h[_SLOPES + j + i] + c * h[_SLOPES + 2 * _SIX + j + i]
+
+
+@inlined
+def _improve(weight: Weight, b: Array, h: Array) -> float:
+    """Correct all lanes' directions at the tip; return the largest error at the base."""
+    worst = 0.0
+    for i in range(LANES):
+        base = get(h, _STATE + _SIX, i)
+        toward = weight.toward
+        off = (base[0] - toward[0], base[1] - toward[1], base[2] - toward[2])
+        error = np.sqrt(off[0] * off[0] + off[1] * off[1] + off[2] * off[2])
+        worst = max(worst, error) if error < np.inf else worst
+        # What turns g(0) into ĝ turns g(L) as well: exactly so, were the shape to stay.
+        along = base[0] * toward[0] + base[1] * toward[1] + base[2] * toward[2]
+        across = (
+            toward[0] - along * base[0],
+            toward[1] - along * base[1],
+            toward[2] - along * base[2],
+        )
+        a, c = _shares(h, i, across)
+        g = get(b, LEAN, i)
+        first, second = normal_plane(g)
+        g = (
+            along * g[0] + a * first[0] + c * second[0],
+            along * g[1] + a * first[1] + c * second[1],
+            along * g[2] + a * first[2] + c * second[2],
+        )
+        size = 1.0 / np.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
+        put(b, LEAN, i, (g[0] * size, g[1] * size, g[2] * size))
+    return float(worst)
+
+
+@kernel
+def _pass(rod: Rod, weight: Weight, b: Array, h: Array, more: int, share: float) -> None:
+    """Integrate all lanes from the tip to the base, from the directions there that they have."""
+    _start(weight, b, h, more, share)
+    nearest = farthest = b[ARC]
+    for i in range(1, LANES):
+        nearest, farthest = min(nearest, b[ARC + i]), max(farthest, b[ARC + i])
+    for k in range(rod.start.shape[0] - 1, -1, -1):
+        if nearest < rod.start[k] + rod.width[k]:
+            _free_step(rod, weight, b, h, k)
+        if rod.start[k] < farthest:
+            _held_step(rod, weight, b, h, k, 2 + more)
+
+
+@kernel
+def _settle(rod: Rod, weight: Weight, b: Array, h: Array, share: float, enough: float) -> float:
+    """Newton's method for all lanes' directions at the tip; return the largest error."""
+    error = np.inf
+    for _ in range(_ROUNDS):
+        _pass(rod, weight, b, h, 0, share)
+        error = _improve(weight, b, h)
+        if error < enough:
+            break
+    return float(error)
+
+
+@kernel
+def solve_lanes(rod: Rod, weight: Weight, b: Array, h: Array, more: int) -> bool:
+    """Solve the contacts in the buffer ``b``, with their first so many derivatives.
+
+    ``h``, of ``WEIGHT_BUFFER`` numbers, has the base values and derivatives afterwards.
+    """
+    enough = _SMALL if more == 0 else _NEAR
+    error = _settle(rod, weight, b, h, 1.0, enough)
+    if not error < enough:  # from rest, step by step
+        for i in range(LANES):
+            put(b, LEAN, i, (0.0, 0.0, 0.0))
+        for n in range(1, _SHARES + 1):
+            error = _settle(rod, weight, b, h, n / _SHARES, enough)
+    if more > 0:
+        for _ in range(3):
+            _pass(rod, weight, b, h, more, 1.0)
+            error = _improve(weight, b, h)
+            if error < _SMALL:
+                break
+    for i in range(LANES):
+        base, toward = get(h, _STATE + _SIX, i), weight.toward
+        off = (base[0] - toward[0], base[1] - toward[1], base[2] - toward[2])
+        a, c = _shares(h, i, off)
+        lost = not abs(off[0]) + abs(off[1]) + abs(off[2]) < 4.0 * _SMALL
+        if lost:
+            put(b, LEAN, i, (0.0, 0.0, 0.0))
+        _correct(h, _STATE, i, np.nan if lost else a, c)
+        for j in range(more):
+            row = _SLOPES + (4 + 2 * j) * _SIX
+            a, c = _shares(h, i, get(h, row + _SIX, i))
+            _correct(h, row, i, np.nan if lost else a, c)
+    return error < _SMALL
+
+
+@inlined
+def integrate_weighted(rod: Rod, weight: Weight, b: Array, tangents: int) -> None:
+    """Integrate every lane of a rod with weight; see :func:`vibrissa.rod.integrate`."""
+    h = np.empty(WEIGHT_BUFFER)
+    solve_lanes(rod, weight, b, h, tangents)
+    for i in range(_SIX):
+        b[FORCE + i] = h[_STATE + i]
+    for j in range(tangents):
+        for i in range(_SIX):
+            b[TANGENT + j * _SIX + i] = h[_SLOPES + (4 + 2 * j) * _SIX + i]
+
+
+@inlined
+def _stability(weight: Weight, h: Array) -> float:
+    """Determinant of g(0) by g(L): positive until the whisker bends over under its weight."""
+    turned = cross(get(h, _SLOPES + _SIX, 0), get(h, _SLOPES + 3 * _SIX, 0))
+    toward = weight.toward
+    return float(toward[0] * turned[0] + toward[1] * turned[1] + toward[2] * turned[2])
+
+
+@kernel
+def evaluate_weighted(
+    rod: Rod,
+    weight: Weight,
+    contacts: Array,
+    leans: Array,
+    states: Array,
+    tangents: Array,
+    directions: Array,
+    first: int,
+    last: int,
+) -> None:
+    """Base values (F, p, ĝ, μ) of contacts (s, f), stability (13 in all), and all derivatives.
+
+    ``leans`` (n, 3) has the directions of weight at the tip: where to start, NaN for the resting
+    one, and what was found. ``tangents`` (n, 12, 4) are by (s, f_x, f_y, f_z), ``directions``
+    (n, 12, 3) by the direction of weight ĝ; where they have no rows they are not computed.
+    """
+    b, h = np.zeros(BUFFER_SIZE), np.empty(WEIGHT_BUFFER)
+    wanted = tangents.shape[0] > 0
+    for row in range(first, last):
+        c = contacts[row]
+        set_all_lanes(b, c[0], c[1], c[2], c[3])
+        for i in range(LANES):
+            put(b, LEAN, i, (leans[row, 0], leans[row, 1], leans[row, 2]))
+        solve_lanes(rod, weight, b, h, 1 if wanted else 0)
+        for a in range(STATES):
+            states[row, a] = h[_STATE + a * LANES]
+        states[row, STATES] = _stability(weight, h)
+        for a in range(3):
+            leans[row, a] = b[LEAN + a * LANES]
+        if not wanted:
+            continue
+        for a in range(STATES):
+            for i in range(LANES):
+                tangents[row, a, i] = h[_SLOPES + 4 * _SIX + a * LANES + i]
+        for axis in range(3):
+            one, two = _shares(
+                h,
+                0,
+                (
+                    1.0 if axis == 0 else 0.0,
+                    1.0 if axis == 1 else 0.0,
+                    1.0 if axis == 2 else 0.0,
+                ),
+            )
+            for a in range(STATES):
+                at = _SLOPES + a * LANES
+                directions[row, a, axis] = one * h[at] + two * h[at + 2 * _SIX]
+
+
+@inlined
+def _carried_rates(
+    data: tuple[Array, float], stage: int, left: float, i: int, v: Vector, w: Vector
+) -> Pair:
+    """Slopes of a vector that is fixed in space, and of one to the tip (with the extent)."""
+    h, extent = data
+    u = get(h, stage * _STAGE + _TURN, i)
+    return cross(v, u), add(cross(w, u), (-extent, 0.0, 0.0))
+
+
+@inlined
+def _record(axes: Array, ends: Array, moments: Array, m: int, x: Six, y: Six, mu: Vector) -> None:
+    for a in range(3):
+        axes[m, 0, a], axes[m, 1, a] = x[a], x[3 + a]
+        axes[m, 2, a], ends[m, a] = y[a], y[3 + a]
+        moments[m, a] = mu[a]
+
+
+@kernel
+def trace_weighted(
+    rod: Rod,
+    weight: Weight,
+    contact: Array,
+    lean: Array,
+    s: Array,
+    axes: Array,
+    ends: Array,
+    moments: Array,
+) -> None:
+    """Follow one solved whisker from the tip to the base.
+
+    At increasing arc lengths s (m,), and last at the base: three axes that are fixed in space
+    ``axes`` (m + 1, 3, 3), row by row, the vector to the tip ``ends`` (m + 1, 3) and the moment μ,
+    as the material frame there sees them.
+    """
+    h = np.zeros(WEIGHT_BUFFER)
+    x = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    y = (lean[0], lean[1], lean[2], 0.0, 0.0, 0.0)
+    v, w = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+    wanted, held = s.shape[0] - 1, False
+    for k in range(rod.start.shape[0] - 1, -1, -1):
+        start, width, extent = rod.start[k], rod.width[k], rod.extent[k]
+        piece, load, here = piece_of(rod, k), _load_of(weight, k), rod.start[k] + rod.width[k]
+        while True:
+            if not held and contact[0] >= here - 1e-15:
+                x, held = (contact[1], contact[2], contact[3], 0.0, 0.0, 0.0), True
+            while wanted >= 0 and s[wanted] >= here - 1e-12 and extent > 0.0:
+                _record(axes, ends, moments, wanted, v, w, _second(y))
+                wanted -= 1
+            if here <= start + 1e-15:
+                break
+            to = start
+            if wanted >= 0 and extent > 0.0:
+                to = max(to, s[wanted])
+            if not held:
+                to = max(to, contact[0])
+            data = (h, piece, load, (to - start) / width, (here - to) / width)
+            if held:
+                x, y = runge_kutta_step(_held_rates, data, 0, to - here, x, y)
+            else:
+                g, m = runge_kutta_step(_free_rates, data, 0, to - here, _first(y), _second(y))
+                y = _both(g, m)
+            carried = (h, 0.0)
+            one, two = runge_kutta_step(
+                _carried_rates, carried, 0, to - here, _first(v), _second(v)
+            )
+            three, end = runge_kutta_step(
+                _carried_rates, (h, extent), 0, to - here, _first(w), _second(w)
+            )
+            v, w = _both(one, two), _both(three, end)
+            here = to
+    while wanted >= 0:
+        _record(axes, ends, moments, wanted, v, w, _second(y))
+        wanted -= 1
+    _record(axes, ends, moments, s.shape[0], v, w, _second(y))

@@ -247,6 +247,12 @@ OPTIONS = {
     "pixel_size": Option(
         "Size of a pixel of the views in space, mm, without --cameras; 0.058 by default.", "MM"
     ),
+    "distance": Option(
+        "Approximate distance of the cameras' lenses from the whisker, m, without --cameras, or "
+        "inf for telecentric ones; by default they are far, but it is not known how far. What the "
+        "views show of the free whisker corrects it.",
+        "M",
+    ),
     "views": Option(
         "Parts of the images of one video that show the views, as where a mirror is in the image: "
         "COLUMN,ROW,WIDTH,HEIGHT of each, one after the other; :mirrored after it exchanges left "

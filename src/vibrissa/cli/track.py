@@ -35,6 +35,9 @@ _POOR = 2.0
 _VIEW = re.compile(r"\d+,\d+,\d+,\d+(:[a-z]+)*")
 """Part of the images of a video."""
 
+_NEAREST, _FARTHEST = 0.03, 30.0
+"""Smallest and largest distance of a lens, m."""
+
 _RATE, _CUTOFF = 1000.0, 85.0
 
 
@@ -43,6 +46,7 @@ class FilmOptions:
     """How the videos were filmed."""
 
     pixel_size: float | None = None
+    distance: float | None = None
     rate: float | None = None
     cameras: Path | None = None
     views: list[str] | None = None
@@ -55,7 +59,14 @@ class FilmOptions:
         if not 0.0 < self.frames_per_second < math.inf:
             raise ValueError(f"--rate is {self.rate:g}; frames per second, more than 0, are needed")
         if self.cameras is not None:
-            refuse({"--pixel-size": self.pixel_size}, "the --cameras determine it")
+            given = {"--pixel-size": self.pixel_size, "--distance": self.distance}
+            refuse(given, "the --cameras determine it")
+        far = self.distance is None or math.isinf(self.distance)
+        if self.distance is not None and not (far or _NEAREST <= self.distance <= _FARTHEST):
+            raise ValueError(
+                f"--distance is {self.distance:g} m; {_NEAREST:g} to {_FARTHEST:g} m are allowed, "
+                "or inf for telecentric lenses"
+            )
 
     @property
     def frames_per_second(self) -> float:
@@ -233,6 +244,8 @@ def track(
         cutoff=low_pass or None,
         offset=None if filmed.offset == "auto" else int(filmed.offset),
         properties=properties,
+        rough=filmed.cameras is None and filmed.distance != math.inf,
+        distance=filmed.distance,
         whisker=None if own.whisker is None else own.read().with_properties(**properties),
     )
     bases, fixed = traced.bases(views), known.corrected(len(views))

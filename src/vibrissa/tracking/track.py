@@ -21,11 +21,12 @@ from vibrissa.objects import Surface
 from vibrissa.recording import ONE_VIEW
 from vibrissa.tracking.contact_points import contacts_at, given_contacts, outside_video
 from vibrissa.tracking.recording import Tracked, tracked_recording
-from vibrissa.tracking.refine.fit import FitOptions, Fitter, with_length_unsure
+from vibrissa.tracking.refine.fit import FitOptions, Fitter, RodFit, with_length_unsure
 from vibrissa.tracking.refine.rods import rolled
 from vibrissa.tracking.refine.trace_series import TraceSeries
 from vibrissa.tracking.space.curve import merge
 from vibrissa.tracking.space.frame_pairs import better_offset, paired_frames
+from vibrissa.tracking.space.optics import Optics, rough_optics, stated_lenses
 from vibrissa.tracking.space.pose import CUTOFF, BasePose, HeadPose, base_pose
 from vibrissa.tracking.space.rest_shape import (
     Length,
@@ -67,6 +68,9 @@ _NEAR, _FAR = 2.0, 10.0
 _STRANGE, _OFTEN = 2.0, 0.05
 """Misfit that is not usual, and the share of the frames with it that is worth a remark."""
 
+_MOST = 0.7
+"""Share of the uncertainty of contact points that comes from the cameras and is worth a remark."""
+
 _SHARE = 0.03
 """Distance between bases that are not the same, as a share of the whisker's length."""
 
@@ -91,6 +95,11 @@ class TrackOptions:
     whisker : Whisker, optional
         Whisker at rest, where it is known: its base is where it leaves the face. By default it is
         taken from the frames that are free of contact.
+    rough : bool
+        Whether the cameras, orthographic ones, are not calibrated: what the views show of a free
+        whisker then corrects them, where they cannot explain it.
+    distance : float, optional
+        Approximate distance of rough cameras from what they see, m; by default they are far away.
     """
 
     cutoff: float | None = CUTOFF
@@ -99,6 +108,8 @@ class TrackOptions:
     fit: FitOptions = field(default_factory=FitOptions)
     properties: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
     whisker: Whisker | None = None
+    rough: bool = False
+    distance: float | None = None
 
 
 def track(
@@ -167,8 +178,12 @@ def track(
     pairs = paired_frames(cameras, timed, options.offset)
     if head is not None and len(cameras) == 1:
         raise ValueError("the head moves in space, which one view does not show: leave it out")
+    optics: Optics | None = None
+    doubts: list[str] = []
+    if options.rough and len(cameras) > 1:
+        optics, cameras, doubts = _corrected(cameras, timed, pairs, options.distance)
     moving = None if head is None else HeadPose.of(head, pairs[:, 0], rate)
-    found, remarks = [], _remarks_on_time(cameras, timed, options.offset)
+    found, remarks = [], doubts + _remarks_on_time(cameras, timed, options.offset)
     if len(cameras) == 1:
         remarks.append(ONE_VIEW)
     count = counts.pop()
@@ -182,6 +197,9 @@ def track(
                 one = replace(one, contacts=other)
             elif objects:
                 one = replace(one, contacts=contacts_at(objects, one.curves, one.touching, one.fit))
+            if optics is not None:
+                one = replace(one, fit=_with_optics_unsure(one.fit, optics))
+                remarks += _remarks_on_optics(one, optics, name)
             found.append(one)
             remarks += remarks_on(cameras, one.traces, one.length, one.fit.misfit, name)
             if len(cameras) == 1:
@@ -199,6 +217,59 @@ def track(
     if remarks:
         recording.attrs["remarks"] = "\n".join(remarks)
     return recording
+
+
+def _corrected(
+    cameras: Sequence[Camera],
+    traces: Sequence[Sequence[Trace]],
+    pairs: NDArray[np.int64],
+    distance: float | None,
+) -> tuple[Optics | None, Sequence[Camera], list[str]]:
+    """What a free whisker shows of the cameras, those to use, and what there is to say of them."""
+    rows = [[view[i] for i in pairs[:, v]] for v, view in enumerate(traces)]
+    optics = rough_optics(cameras, rows, distance)
+    stated = "orthographic cameras" if distance is None else f"lenses at {distance:g} m"
+    if optics is None:
+        doubt = f"too few frames show a free whisker to check that {stated} explain the views."
+        return None, stated_lenses(cameras, distance), [doubt]
+    if not optics.needed:
+        optics = optics.as_stated()
+        return optics, optics.cameras, []
+    return (
+        optics,
+        optics.cameras,
+        [
+            f"cameras: {stated}, as they are stated, leave {optics.before:.2f} pixels of what the "
+            f"views show of the free whisker unexplained, these leave {optics.after:.2f} and are "
+            f"used: {optics}. Calibrated cameras (vibrissa calibrate, --cameras) are better."
+        ],
+    )
+
+
+def _with_optics_unsure(fit: RodFit, optics: Optics) -> RodFit:
+    """Add to the covariances of points what is not known of the cameras."""
+    contact, base = (optics.displacements(points) for points in (fit.contact_point, fit.position))
+    pose = fit.pose_covariance.copy()
+    pose[:, :3, :3] += np.einsum("vti,vtj->tij", base, base)
+    return replace(
+        fit,
+        contact_covariance=fit.contact_covariance + np.einsum("vti,vtj->tij", contact, contact),
+        pose_covariance=pose,
+    )
+
+
+def _remarks_on_optics(one: Tracked, optics: Optics, name: str) -> list[str]:
+    """How much what is not known of the cameras moves contact points, where that is most of it."""
+    moved = np.linalg.norm(optics.displacements(one.fit.contact_point), axis=(0, 2))
+    spread = np.sqrt(np.trace(one.fit.contact_covariance, axis1=1, axis2=2))
+    if not np.isfinite(moved).any() or np.nanmedian(moved / spread) < _MOST:
+        return []
+    return [
+        f"{name}: the cameras are not calibrated, by which contact points are uncertain by "
+        f"{1e6 * np.nanmedian(moved):.0f} µm (median; in the covariances, but an object fitted to "
+        "them errs as a whole). State the distance of the lenses (--distance, in m; inf for "
+        "telecentric ones), or calibrate them (vibrissa calibrate, --cameras)."
+    ]
 
 
 def _best_seen(traces: Sequence[Sequence[Sequence[Trace]]]) -> list[Sequence[Trace]]:

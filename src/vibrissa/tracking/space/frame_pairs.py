@@ -32,6 +32,9 @@ _WORST = 6.0
 _CLEARLY = 20.0
 """Cost by which another shift must fit better than the given one."""
 
+_LEFT = 0.3
+"""Share of the cost of the given shift that one which explains the misfit leaves at most."""
+
 _KNOWN = 10
 """Number of frames that must show an end of the whisker."""
 
@@ -88,7 +91,7 @@ def better_offset(
 
     An error of the calibration is common to all shifts, and does not count.
     """
-    cost = np.zeros((len(a), len(_SHIFTS)))
+    cost, blank = np.zeros((2, len(a), len(_SHIFTS)))
     for end in (0, -1):
         rows, other = (_shown(row, end) for row in (a, b))
         if min(len(rows), len(other)) < _KNOWN or abs(offset) > _LARGEST:
@@ -101,11 +104,16 @@ def better_offset(
         if np.isfinite(given).sum() < _KNOWN:
             continue
         away = passing - np.nanmedian(given)
-        cost += np.where(np.isfinite(away), np.minimum(away**2, _WORST), 0.5 * _WORST)
-    path = _cheapest(cost)
+        blank += np.where(np.isfinite(away), 0.0, 0.5 * _WORST)
+        cost += np.where(np.isfinite(away), np.minimum(away**2, _WORST), 0.0)
+    path = _cheapest(cost + blank)
     switched = np.concatenate([[True], np.diff(path) != 0])
     changed = _SWITCH * int(switched[1:].sum()) + _CLEARLY
-    if cost[np.arange(len(a)), path].sum() + changed >= cost[:, offset + _LARGEST].sum():
+    row, column = np.arange(len(a)), offset + _LARGEST
+    both = (blank[row, path] == 0.0) & (blank[:, column] == 0.0)
+    left, given = cost[row, path][both].sum(), cost[both, column].sum()
+    # Of other optics some offset always explains a little; of a true one hardly anything is left.
+    if left + changed >= given or left > _LEFT * given:
         return np.empty(0, dtype=np.int64)
     return np.asarray(_SHIFTS[path[switched]])
 

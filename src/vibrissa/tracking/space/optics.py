@@ -1,0 +1,453 @@
+"""Lenses of cameras that are known only roughly, from what two views disagree about.
+
+A free whisker is a rigid body. Its shape S, its pose in every frame and the optics q are chosen
+together such that its images are on the traces of all views, by least squares,
+
+    | across the trace: trace − π_q(R_t S + p_t) |² / σ²  +  | (q − q₀) / s |²,
+
+where q holds, of each view, how strong its perspective is (the inverse of its distance, 0 for an
+orthographic one) and, of each but the first, how it is turned, how its scale differs and how far it
+is shifted along its columns. Poses are eliminated frame by frame (Schur), so that what is solved
+has the size of shape and optics together. What the whisker's motion does not show stays as it was
+stated, with the uncertainty s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from vibrissa.cameras import Camera, triangulate
+from vibrissa.tracking.refine.trace_series import TraceSeries
+from vibrissa.tracking.space.curve import merge
+from vibrissa.tracking.space.rest_shape import RestShape, aligned_lengths, motions, rest_shape
+from vibrissa.tracking.trace.trace import Trace, arc_lengths, interpolated
+
+Array = NDArray[np.float64]
+
+_STRENGTH = 2.0
+"""Standard deviation of the inverse of a distance that is not stated, 1/m: lenses at 0.5 m."""
+
+_DISTANCE = 0.1
+"""Standard deviation of a stated distance, as a share of it."""
+
+_WEAKEST, _STRONGEST = 0.02, 20.0
+"""Inverse of the largest and of the smallest distance that are considered, 1/m."""
+
+_TURN, _SCALE, _SHIFT = np.radians(3.0), 0.03, 10.0
+"""Standard deviations of a turn of a view, rad, of its scale, and of its shift, pixels."""
+
+_NODES, _LENGTH = 33, 0.9
+"""Number of points of the shape, and the share of the usual length that they cover."""
+
+_FRAMES, _FEWEST = 60, 8
+"""Largest and smallest number of free frames that are used."""
+
+_SAMPLE = 150
+"""Largest number of frames from which the free ones are selected."""
+
+_ALIKE = 0.04
+"""Deviation from the rest shape up to which a frame may be free, as a share of the whisker's
+length: wrong optics make free frames differ too, and what is bent is left out later."""
+
+_VISIBLE, _BETTER, _CERTAIN = 0.05, 0.6, 3.0
+"""Misfit of stated cameras that is visible, pixels; share of it that others must leave at most; and
+standard deviations by which these must differ from the stated ones."""
+
+_ROUNDS, _DAMPING = 12, 1e-3
+"""Number of Gauss–Newton steps, and Levenberg's damping."""
+
+_LOOSE, _SLIDING = 0.02, 0.05
+"""Standard deviations of third differences of the shape, and of motions of its points along it, as
+a share of their spacing."""
+
+_STEP = 1e-3
+"""Step of differences by the optics, in their standard deviations."""
+
+_UNIT = 0.5
+"""Standard deviation to which traces are set, pixels: as their errors are common to many points and
+frames, it is far above that of one point."""
+
+_SELECTIONS = 3
+"""Number of rounds in which frames that are bent are left out."""
+
+_ODD = 3.0
+"""Misfit of frames that are left out, in units of the usual one: they are bent."""
+
+_FAR = 6.0
+"""Misses from which `TraceSeries.equations` weighs down, standard deviations."""
+
+
+@dataclass(frozen=True, eq=False)
+class Optics:
+    """What the motion of a free whisker shows about the cameras.
+
+    Parameters
+    ----------
+    cameras : tuple of Camera
+        Cameras that explain the views.
+    orthographic : tuple of Camera
+        Cameras as they were stated, without perspective.
+    values, sigma : array (n,)
+        Inverse distance of each view, 1/m, and then of each view but the first its turn about the
+        camera's axes, rad, its relative scale and its shift, pixels; their standard deviations.
+    stated : array (n,)
+        The same numbers of the cameras as they were stated.
+    before, after : float
+        Root mean square distance of the rigid whisker from the traces with the stated cameras and
+        with these, pixels.
+    """
+
+    cameras: tuple[Camera, ...]
+    orthographic: tuple[Camera, ...]
+    values: Array
+    sigma: Array
+    stated: Array
+    before: float
+    after: float
+
+    @property
+    def needed(self) -> bool:
+        """Whether the stated cameras cannot explain what these explain."""
+        apart = np.abs(self.values - self.stated) / self.sigma
+        explains = self.after < _BETTER * self.before
+        return bool(self.before > _VISIBLE and explains and apart.max() > _CERTAIN)
+
+    def as_stated(self) -> Optics:
+        """The stated cameras, with the uncertainty that was found."""
+        return replace(
+            self,
+            values=self.stated,
+            cameras=with_optics(self.orthographic, self.stated),
+        )
+
+    def displacements(self, points: Array) -> Array:
+        """Shifts of points (view, ..., 3) if a view's lens were one standard deviation nearer."""
+        shifts = []
+        for view in range(len(self.cameras)):
+            values = self.values.copy()
+            values[view] = max(values[view], 0.0) + self.sigma[view]
+            nearer = with_optics(self.orthographic, values)
+            seen = np.stack([camera.project(points) for camera in nearer])
+            shifts.append(triangulate(self.cameras, seen)[0] - points)
+        return np.stack(shifts)
+
+    def __str__(self) -> str:
+        """Distances, turns, scales and shifts with their standard deviations."""
+        count = len(self.cameras)
+        parts = []
+        for camera, strength, error in zip(self.cameras, self.values, self.sigma, strict=False):
+            least = 1.0 / max(strength + 2.0 * error, 1e-9)
+            if strength > 2.0 * error:
+                parts.append(f"{camera.name} at {1.0 / strength:.2f} m (at least {least:.2f})")
+            else:
+                parts.append(f"{camera.name} farther than {least:.2f} m")
+        rest = zip(
+            *(np.reshape(a[count:], (-1, 5)) for a in (self.values, self.sigma)), strict=True
+        )
+        for camera, (value, error) in zip(self.cameras[1:], rest, strict=True):
+            turn, about = np.degrees((np.linalg.norm(value[:3]), error[:3].max()))
+            parts.append(
+                f"{camera.name} turned by {turn:.1f} ± {about:.1f}°, scaled by "
+                f"{100.0 * value[3]:+.1f} ± {100.0 * error[3]:.1f} % and shifted by "
+                f"{value[4]:+.1f} ± {error[4]:.1f} pixels"
+            )
+        return ", ".join(parts)
+
+
+def rough_optics(
+    cameras: Sequence[Camera], traces: Sequence[Sequence[Trace]], distance: float | None = None
+) -> Optics | None:
+    """Find the optics of cameras that are known only roughly from a trial's traces.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        Orthographic cameras, as they are stated.
+    traces : sequence of sequence of Trace
+        Traces of one whisker, view by view, of frames that belong together.
+    distance : float, optional
+        Approximate distance of the lenses from what they see, m.
+
+    Returns
+    -------
+    Optics or None
+        What was found; None if too few frames show a free whisker.
+    """
+    count = len(traces[0])
+    rows = np.linspace(0, count - 1, min(_SAMPLE, count)).astype(int)
+    some = [[view[i] for i in rows] for view in traces]
+    stated = stated_lenses(cameras, distance)
+    curves = np.array([merge(stated, views).points for views in zip(*some, strict=True)])
+    try:
+        shape = rest_shape(curves)
+    except ValueError:
+        return None
+    return estimated_optics(cameras, TraceSeries.of(some), curves, shape, distance)
+
+
+def stated_lenses(cameras: Sequence[Camera], distance: float | None) -> tuple[Camera, ...]:
+    """Give orthographic cameras lenses at a distance from the origin; None: none."""
+    strength = 0.0 if distance is None else 1.0 / distance
+    return tuple(lens(camera, strength, np.zeros(3), 0.0, 0.0) for camera in cameras)
+
+
+def lens(camera: Camera, strength: float, turn: Array, scale: float, shift: float) -> Camera:
+    """Give an orthographic view a lens at 1/strength from the origin; turn, scale, shift it."""
+    focal = camera.matrix.copy()
+    focal[:2, :2] *= 1.0 + scale
+    focal[0, 2] += shift
+    rotation = Rotation.from_rotvec(turn).as_matrix() @ camera.rotation
+    if strength <= 0.0:
+        return replace(camera, matrix=focal, rotation=rotation)
+    focal[:2, :2] /= strength
+    return replace(
+        camera,
+        matrix=focal,
+        rotation=rotation,
+        translation=camera.translation + np.array([0.0, 0.0, 1.0 / strength]),
+        projection="perspective",
+    )
+
+
+def with_optics(cameras: Sequence[Camera], values: Array) -> tuple[Camera, ...]:
+    """Give orthographic cameras the optics of `Optics.values`."""
+    count = len(cameras)
+    rest = np.concatenate([np.zeros(5), values[count:]]).reshape(count, 5)
+    return tuple(
+        lens(camera, min(float(strength), _STRONGEST), one[:3], one[3], one[4])
+        for camera, strength, one in zip(cameras, values[:count], rest, strict=True)
+    )
+
+
+def estimated_optics(
+    cameras: Sequence[Camera],
+    traces: TraceSeries,
+    curves: Array,
+    shape: RestShape,
+    distance: float | None = None,
+) -> Optics | None:
+    """Find the optics that explain a free whisker in all views.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        Orthographic cameras, as they are stated.
+    traces : TraceSeries
+        Traces of one whisker.
+    curves : array (time, node, 3)
+        The whisker in space as the stated cameras show it, m.
+    shape : RestShape
+        Its rest shape, with the frames that are free of contact.
+    distance : float, optional
+        Approximate distance of the lenses from what they see, m.
+
+    Returns
+    -------
+    Optics or None
+        What was found; None if too few frames are free.
+    """
+    alike = np.nan_to_num(shape.deviation, nan=np.inf) < _ALIKE * shape.length
+    rows = np.flatnonzero((shape.free | alike) & np.isfinite(curves).all(axis=(1, 2)))
+    if len(rows) < _FEWEST:
+        return None
+    rows = rows[np.linspace(0, len(rows) - 1, min(_FRAMES, len(rows))).astype(int)]
+    problem = _Problem.of(cameras, traces.rows(rows), curves[rows], distance)
+    fitted = problem.solved()
+    for _ in range(_SELECTIONS):
+        each = fitted.misses()
+        fine = each < _ODD * float(np.median(each))
+        if _FEWEST <= fine.sum() < len(fine):
+            problem, fitted = problem.rows(fine), fitted.rows(fine).solved()
+    before = problem.solved(optics=False)
+    hessian = fitted.normal()[0]
+    inverse = np.linalg.inv(hessian)[-len(fitted.q) :, -len(fitted.q) :]
+    size = fitted.prior[1]
+    sigma = np.sqrt(np.diag(inverse)) * size
+    return Optics(
+        fitted.cameras_at(fitted.q),
+        fitted.stated,
+        fitted.prior[0] + fitted.q * size,
+        sigma,
+        fitted.prior[0],
+        *(float(np.sqrt(np.mean(one.misses() ** 2))) for one in (before, fitted)),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """A rigid shape, its poses and the optics, in units of their standard deviations."""
+
+    stated: tuple[Camera, ...]
+    traces: TraceSeries
+    points: Array
+    rotation: Array
+    position: Array
+    q: Array
+    prior: tuple[Array, Array]
+
+    @classmethod
+    def of(
+        cls,
+        cameras: Sequence[Camera],
+        traces: TraceSeries,
+        curves: Array,
+        distance: float | None,
+    ) -> _Problem:
+        _, shapes = aligned_lengths(curves)
+        known = np.isfinite(shapes[:, :, 0]).sum(axis=1)
+        first = int(np.argmax(known))
+        line = shapes[first, : known[first]]
+        s = arc_lengths(line)
+        points = interpolated(np.linspace(0.0, _LENGTH * s[-1], _NODES), s, line)
+        back = [motions(line[None, :n], part[:n]) for n, part in zip(known, shapes, strict=True)]
+        more = len(cameras) - 1
+        strength = 0.0 if distance is None else 1.0 / distance
+        spread = _STRENGTH if distance is None else _DISTANCE * strength
+        start = np.concatenate([np.full(len(cameras), strength), np.zeros(5 * more)])
+        size = [spread] * len(cameras) + [_TURN, _TURN, _TURN, _SCALE, _SHIFT] * more
+        even = replace(traces, sigma=np.where(np.isfinite(traces.sigma), _UNIT, np.nan))
+        return cls(
+            tuple(cameras),
+            even,
+            points,
+            np.concatenate([b[0] for b in back]),
+            np.concatenate([b[1] for b in back]),
+            np.where(np.arange(len(start)) < len(cameras), _WEAKEST / np.array(size), 0.0)
+            * (distance is None),
+            (start, np.array(size)),
+        )
+
+    def inside(self, q: Array) -> Array:
+        """The optics, none of them beyond infinitely far."""
+        count = len(self.stated)
+        least = (_WEAKEST - self.prior[0][:count]) / self.prior[1][:count]
+        return np.concatenate([np.maximum(q[:count], least), q[count:]])
+
+    def rows(self, used: NDArray[np.bool_]) -> _Problem:
+        """Some of the frames."""
+        return replace(
+            self,
+            traces=self.traces.rows(np.flatnonzero(used)),
+            rotation=self.rotation[used],
+            position=self.position[used],
+        )
+
+    def cameras_at(self, q: Array) -> tuple[Camera, ...]:
+        """Cameras with the optics q."""
+        return with_optics(self.stated, self.prior[0] + q * self.prior[1])
+
+    def placed(self) -> Array:
+        """Points (time, node, 3) in the laboratory."""
+        turned = np.einsum("tij,nj->tni", self.rotation, self.points)
+        return np.asarray(turned + self.position[:, None])
+
+    def misses(self) -> Array:
+        """Root mean square distance of each frame's traces, pixels."""
+        placed, total, count = self.placed(), 0.0, 0.0
+        for view, camera in enumerate(self.cameras_at(self.q)):
+            pixels, slopes = camera.project_with_slopes(placed)
+            miss = np.abs(self.traces.equations(view, pixels, slopes)[1][:, :-2])
+            whole = np.where(miss > _FAR, miss**2 / _FAR, miss)
+            total, count = total + (whole**2).sum(1), count + (miss > 0.0).sum(1)
+        return np.asarray(_UNIT * np.sqrt(total / np.maximum(count, 1.0)))
+
+    def normal(self) -> tuple[Array, Array, Array, Array, Array, float]:
+        """Normal equations of shape and optics without the poses, and what gives the poses."""
+        t, n, k = len(self.position), len(self.points), len(self.q)
+        placed = self.placed()
+        turned = placed - self.position[:, None]
+        x, y, z = np.moveaxis(turned, -1, 0)
+        o = np.zeros_like(x)
+        cross = np.stack([o, z, -y, -z, o, x, y, -x, o], -1).reshape(t, n, 3, 3)
+        own = np.broadcast_to(self.rotation[:, None], (t, n, 3, 3))
+        moved = np.concatenate([np.broadcast_to(np.eye(3), (t, n, 3, 3)), cross, own], axis=-1)
+        inner, mixed = np.zeros((t, 6, 6)), np.zeros((t, 6, 3 * n + k))
+        common, right = np.zeros((3 * n + k,) * 2), np.zeros(3 * n + k)
+        pull, cost = np.zeros((t, 6)), 0.0
+        steps = _STEP * np.eye(k)
+        ahead = [self.cameras_at(self.q + step) for step in steps]
+        back = [self.cameras_at(self.q - step) for step in steps]
+        where = np.concatenate([np.arange(n), [0, n - 1]])
+        for view, camera in enumerate(self.cameras_at(self.q)):
+            pixels, by_point = camera.project_with_slopes(placed)
+            by_optics = np.stack(
+                [
+                    (a[view].project(placed) - b[view].project(placed)) / (2.0 * _STEP)
+                    for a, b in zip(ahead, back, strict=True)
+                ],
+                axis=-1,
+            )
+            slopes = np.concatenate([by_point @ moved, by_optics], axis=-1)
+            rows, misses = self.traces.equations(view, pixels, slopes)
+            pose, shape, optics = rows[..., :6], rows[..., 6:9], rows[..., 9:]
+            design = np.zeros((t, n + 2, 3 * n + k))
+            for axis in range(3):
+                design[:, np.arange(n + 2), 3 * where + axis] = shape[..., axis]
+            design[..., 3 * n :] = optics
+            # The tip of the traces is not that of the part of the shape that is compared.
+            design[:, -1], pose[:, -1], misses[:, -1] = 0.0, 0.0, 0.0
+            inner += np.einsum("tni,tnj->tij", pose, pose)
+            mixed += np.einsum("tni,tnj->tij", pose, design)
+            common += np.einsum("tni,tnj->ij", design, design)
+            pull += np.einsum("tni,tn->ti", pose, misses)
+            right += np.einsum("tni,tn->i", design, misses)
+            cost += float((misses**2).sum())
+        cost += self._priors(common, right)
+        inner += 1e-9 * np.trace(inner, axis1=1, axis2=2)[:, None, None] * np.eye(6)
+        solved = np.linalg.solve(inner, np.concatenate([mixed, pull[..., None]], axis=-1))
+        reduced = common - np.einsum("tij,tik->jk", mixed, solved[..., :-1])
+        reduced += 1e-9 * np.diag(np.diag(common))
+        right = right - np.einsum("tij,ti->j", mixed, solved[..., -1])
+        return reduced, right, solved, inner, mixed, cost
+
+    def _priors(self, common: Array, right: Array) -> float:
+        """Add what keeps the shape smooth, its points in place and the optics near the stated."""
+        n, k = len(self.points), len(self.q)
+        spacing = float(np.linalg.norm(self.points[1] - self.points[0]))
+        third = np.diff(np.eye(n), n=3, axis=0) / (_LOOSE * spacing)
+        stiff = np.kron(third.T @ third, np.eye(3))
+        common[: 3 * n, : 3 * n] += stiff
+        right[: 3 * n] -= stiff @ self.points.reshape(-1)
+        along = np.gradient(self.points, axis=0)
+        along /= np.linalg.norm(along, axis=1, keepdims=True) * _SLIDING * spacing
+        for i, row in enumerate(along):
+            common[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += np.outer(row, row)
+        common[-k:, -k:] += np.eye(k)
+        right[-k:] -= self.q
+        return float(self.q @ self.q + ((third @ self.points) ** 2).sum())
+
+    def solved(self, optics: bool = True) -> _Problem:
+        """Gauss–Newton with Levenberg's damping."""
+        best, damping = self, _DAMPING
+        reduced, right, solved, _, _, cost = best.normal()
+        n, k = len(self.points), len(self.q)
+        for _ in range(_ROUNDS):
+            system = reduced + damping * np.diag(np.diag(reduced))
+            if not optics:
+                system[-k:, :-k] = system[:-k, -k:] = 0.0
+                system[-k:, -k:] = np.eye(k)
+                right = np.concatenate([right[:-k], np.zeros(k)])
+            step = np.linalg.solve(system, right)
+            poses = solved[..., -1] - solved[..., :-1] @ step
+            trial = replace(
+                best,
+                points=best.points + step[: 3 * n].reshape(n, 3),
+                rotation=Rotation.from_rotvec(poses[:, 3:]).as_matrix() @ best.rotation,
+                position=best.position + poses[:, :3],
+                q=best.inside(best.q + step[-k:]) if optics else best.q,
+            )
+            tried = trial.normal()
+            if tried[-1] < cost:
+                small = cost - tried[-1] < 1e-4 * cost
+                best, (reduced, right, solved, _, _, cost) = trial, tried
+                damping = max(damping / 5.0, 1e-7)
+                if small:
+                    break
+            else:
+                damping *= 10.0
+        return best

@@ -1,0 +1,104 @@
+"""Cameras that are known only roughly: what a free whisker shows of them, from exact traces."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from vibrissa.cameras import orthogonal_views, triangulate
+from vibrissa.tracking import Trace
+from vibrissa.tracking.space.frame_pairs import better_offset
+from vibrissa.tracking.space.optics import rough_optics, stated_lenses
+
+PIXEL = 150e-6
+STATED = orthogonal_views(PIXEL, (400, 400))
+TOP = [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]
+FRONT = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]]
+"""Directions right, down and forward of the views; the front one is mirrored."""
+
+
+def pinhole(points, axes, distance):
+    """Pixels by the equations of a lens, which share nothing with the cameras under test."""
+    right, down, ahead = np.moveaxis(points @ np.array(axes).T, -1, 0)
+    scale = distance / (distance + ahead) / PIXEL
+    return 199.5 + np.stack([right * scale, down * scale], axis=-1)
+
+
+def sweep(count=30):
+    """A rigid whisker of 36 mm that turns through 70° and up and down through 60°."""
+    x = np.linspace(0.0, 34e-3, 101)
+    line = np.column_stack([x, 8.0 * x**2, 0.0 * x])
+    u = np.linspace(0.0, 1.0, count)
+    turns = np.column_stack([0.6 * np.sin(7.0 * u), 0.5 * np.sin(5.0 * u), 0.4 * np.cos(4.0 * u)])
+    base = np.column_stack([-14.0 + u, 2.0 + np.sin(6.0 * u), u**2]) * 1e-3
+    turned = Rotation.from_euler("zyx", turns).as_matrix() @ line.T
+    return np.swapaxes(turned, 1, 2) + base[:, None]
+
+
+def traces(lines, axes, distance):
+    sigma, seen = np.full(lines.shape[1], 0.02), np.ones(lines.shape[1], dtype=bool)
+    views = [pinhole(lines, axis, distance) for axis in axes]
+    return [[Trace(line, sigma, seen, 1.0) for line in view] for view in views]
+
+
+def turned(axes, angle):
+    """A view that is turned about its own direction to the right."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[1.0, 0.0, 0.0], [0.0, c, s], [0.0, -s, c]]) @ np.array(axes)
+
+
+@pytest.fixture(scope="module")
+def lenses():
+    """A lens at 0.3 m in each view, the second turned by 4° from where it is stated."""
+    lines = sweep()
+    views = traces(lines, [TOP, turned(FRONT, np.radians(4.0))], 0.3)
+    return lines, views, rough_optics(STATED, views)
+
+
+def test_lenses_that_orthographic_cameras_cannot_explain_are_found(lenses):
+    lines, views, found = lenses
+    assert found.needed
+    assert found.before > 3.0 * found.after
+    assert (np.abs(found.values[:2] - 1.0 / 0.3) < 3.0 * found.sigma[:2] + 0.1).all()
+    pixels = np.stack([[trace.line for trace in view] for view in views])
+    errors = [
+        np.linalg.norm(triangulate(cameras, pixels)[0] - lines, axis=-1).max()
+        for cameras in (STATED, found.cameras)
+    ]
+    assert errors[0] > 2e-3
+    assert errors[1] < 0.3 * errors[0]
+    assert "turned by" in str(found)
+
+
+def test_a_stated_distance_is_used():
+    lines = sweep()
+    views = traces(lines, [TOP, FRONT], 0.4)
+    found = rough_optics(STATED, views, 0.4)
+    np.testing.assert_allclose(1.0 / found.values[:2], 0.4, rtol=0.02)
+    exact = stated_lenses(STATED, 0.4)
+    for view, axes in zip(exact, (TOP, FRONT), strict=True):
+        np.testing.assert_allclose(view.project(lines), pinhole(lines, axes, 0.4), atol=1e-8)
+
+
+def test_orthographic_views_are_explained_by_what_was_stated():
+    found = rough_optics(STATED, traces(sweep(), [TOP, FRONT], 1e6))
+    assert not found.needed
+    assert found.before < 0.05
+
+
+def test_what_is_not_known_of_lenses_moves_points_away_from_the_middle():
+    lines = sweep()
+    # A whisker that hardly moves does not show how far the lenses are.
+    still = np.repeat(lines[:1], 20, axis=0) + 1e-5 * np.arange(20)[:, None, None]
+    found = rough_optics(STATED, traces(still, [TOP, FRONT], 1e6)).as_stated()
+    points = np.array([[0.0, 0.0, 0.0], [10e-3, 0.0, 8e-3]])
+    moved = found.displacements(points)
+    np.testing.assert_allclose(moved[:, 0], 0.0, atol=1e-9)
+    # A lens above at 1/s instead of infinity shows (10, 0, 8) mm larger by 8 mm · s.
+    assert moved[0, 1, 0] == pytest.approx(0.5 * 10e-3 * 8e-3 * found.sigma[0], rel=0.1)
+
+
+def test_no_offset_is_noted_where_none_explains_the_misfit():
+    """Lenses and angles that were not stated make lines of sight pass each other."""
+    lines = sweep(100)
+    wrong = traces(lines, [TOP, turned(FRONT, np.radians(10.0))], 0.3)
+    assert not better_offset(*STATED, *wrong, 0).size

@@ -16,7 +16,7 @@ from vibrissa.cameras import orthogonal_views
 from vibrissa.objects import Peg
 from vibrissa.simulation import Motion, simulate
 from vibrissa.tracking import TrackOptions, trace_video, track
-from vibrissa.tracking.space.optics import stated_lenses
+from vibrissa.tracking.refine.optics import stated_lenses
 
 PIXEL, SIZE, DISTANCE, RATE = 150e-6, 360, 0.6, 500.0
 HELD = 7.815

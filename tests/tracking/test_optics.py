@@ -6,8 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from vibrissa.cameras import orthogonal_views, triangulate
 from vibrissa.tracking import Trace
+from vibrissa.tracking.refine.optics import rough_optics, stated_lenses
 from vibrissa.tracking.space.frame_pairs import better_offset
-from vibrissa.tracking.space.optics import rough_optics, stated_lenses
 
 PIXEL = 150e-6
 STATED = orthogonal_views(PIXEL, (400, 400))

@@ -67,6 +67,19 @@ def test_followed_from_there_no_frame_is_lost():
             assert np.median(away.min(axis=1)) < 1.5
 
 
+@pytest.mark.parametrize("inside", [12.0, 28.0])
+def test_a_click_inside_the_fur_is_for_the_whisker_that_leaves_it(films, inside):
+    film = films(200)
+    for view, frames in enumerate(film.frames):
+        true = film.curves[view][0]
+        ahead = true[20] - true[0]
+        click = true[0] - inside * ahead / np.linalg.norm(ahead)
+        (row,) = trace_video(frames[:1], [click])
+        away = np.linalg.norm(row[0].line[:, None] - true[None], axis=2)
+        assert np.median(away.min(axis=1)) < 1.5
+        assert row[0].support > 0.7 * np.linalg.norm(np.diff(true, axis=0), axis=1).sum()
+
+
 def test_films_without_a_whisker_are_in_doubt(films):
     film = films(205, whisker=False)
     start = find_start(film.cameras, film.frames)

@@ -77,9 +77,9 @@ _SAME_CURVE = 0.9
 _FEWEST, _POLYNOMIAL, _AHEAD = 15, 60, 150
 """Numbers of points: of a whisker's beginning, of what gives its bend, and by which it goes on."""
 
-_KINKED, _SMOOTH = 0.6, 4
-"""Distance of a whisker from a smooth curve from which it has a kink, pixels, and the degree of
-that curve's polynomials."""
+_KINKED, _SMOOTH, _STRAIGHTER = 0.25, 4, 0.7
+"""Distance of a whisker from a smooth curve from which it may have a kink, pixels, the degree of
+that curve's polynomials, and the share of a kink that may be left."""
 
 _LARGEST_TURN = 0.35
 """Largest turn of the row between frames beyond what was expected, rad."""
@@ -236,7 +236,7 @@ def _straightened(
     return {
         k: [trace]
         for k, trace in found.items()
-        if followers[k].long_enough(trace) and _kink(trace) < kinks[k]
+        if followers[k].long_enough(trace) and _kink(trace) < _STRAIGHTER * kinks[k]
     }
 
 

@@ -203,6 +203,10 @@ def follow_all(
         return follow_row(followers, frame, known, seen, scene)
     (follower,) = followers
     if not known:
+        if follower.last is None:
+            (trace,) = follow_row(followers, frame, known, scene=scene)
+            if len(trace.line):
+                return [trace]
         return [follower.follow(frame)]
     trace = given(known[0])
     follower.restart(trace)

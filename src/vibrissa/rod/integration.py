@@ -1,8 +1,8 @@
 """Base force and contact point of contacts: the rod equations integrated, with weight or without.
 
 Kernels call :func:`integrate` for the contacts in a buffer (:mod:`vibrissa.rod.kernels`). A rod
-that has a weight is integrated as :mod:`vibrissa.rod.weight` describes, by a kernel of its own that is
-compiled where it is needed, so that a rod without one loses nothing by it.
+that has a weight is integrated as :mod:`vibrissa.rod.weight` describes, by a kernel of its own that
+is compiled where it is needed, so that a rod without one loses nothing by it.
 """
 
 from __future__ import annotations

@@ -174,7 +174,7 @@ def test_a_report_of_the_trial_has_the_same_errors(from_video, folder):
             whisker.centerline(9), Recording(from_video.simulated).whisker().centerline(9)
         )
         scores = tracking_scores(recording.to_dataset().isel(whisker=0), truth)
-        for field in ("trace", "centerline", "base", "contact", "told"):
+        for field in ("trace", "centerline", "base", "contact", "classified"):
             np.testing.assert_array_equal(
                 getattr(scores, field), getattr(from_video.tracking, field)
             )

@@ -30,8 +30,10 @@ def commands():
 
 
 def test_the_verbs():
-    listed = "demo deflect map uniqueness sensitivity simulate track calibrate correct signals"
-    listed += " estimate reconstruct figures movie report view stream sweep info"
+    listed = "demo deflect map uniqueness sensitivity simulate track import calibrate correct"
+    listed += (
+        " signals estimate reconstruct export batch figures movie report view stream sweep info"
+    )
     assert list(VERBS) == listed.split()
 
 

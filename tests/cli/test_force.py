@@ -33,6 +33,8 @@ VERBS = {
     "simulate": (("-o", "out.nc"), "out.nc"),
     "simulate ": (("-o", "none.nc", "--film", "."), "top.mkv"),
     "track": (("top.mkv", "front.mkv", "-o", "out.nc"), "out.nc"),
+    "import": (("tracks.csv", "-o", "out.nc"), "out.nc"),
+    "export": (("in.nc",), "in.csv"),
     "calibrate": (("--pattern", "9x6", "--square", "5", "a.png", "-o", "c.toml"), "c.toml"),
     "signals": (("in.nc", "-o", "out.nc"), "out.nc"),
     "signals ": (("in.nc", "-o", "out.csv"), "out.csv"),
@@ -70,13 +72,13 @@ def test_what_is_there_stays(folder, monkeypatch, verb):
 
 
 def test_every_verb_that_writes_is_asked(folder):
-    """The demo and a study go on with what they made; `stream` and `correct` add to it."""
+    """The demo, a study and a batch go on with what they made; `stream` and `correct` add to it."""
     with_force = [
         command.name
         for command in app.registered_commands
         if "force" in command.callback.__annotations__
     ]
-    assert {verb.strip() for verb in VERBS} == set(with_force) - {"sweep", "stream"}
+    assert {verb.strip() for verb in VERBS} == set(with_force) - {"sweep", "stream", "batch"}
 
 
 def test_force_replaces(folder, tmp_path):

@@ -28,9 +28,17 @@ def test_a_table_of_signals_is_estimated_as_it_is_loaded(bent, contact_map, tmp_
 
 
 def test_signals_in_other_units_get_a_hint(bent, contact_map):
-    signals = vb.base_signals(1e6 * bent.force, 1e6 * bent.moment)
+    force, moment = (np.tile(1e6 * part, (10, 1)) for part in (bent.force, bent.moment))
+    signals = vb.base_signals(force, moment)
     with pytest.raises(ValueError, match="are these mN"):
         contact_map.estimate(signals)
+
+
+def test_a_few_odd_samples_stop_no_table(bent, contact_map):
+    force, moment = (np.tile(part, (15, 1)) for part in (bent.force, bent.moment))
+    force[3], moment[4] = 1e6 * force[3], 1e6 * moment[4]
+    found = contact_map.estimate(vb.base_signals(force, moment))
+    assert (found.status == vb.Status.UNIQUE).sum() == 28
 
 
 def test_swapped_arguments_get_a_hint(bent):

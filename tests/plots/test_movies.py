@@ -212,7 +212,7 @@ def test_videos_are_shown(known, trial, tmp_path):
         videos += ["--video", tmp_path / f"{view.name}.mkv"]
         write_video(videos[-1], repeat_frames(grey, 12))
     target = tmp_path / "a.mp4"
-    done = run(trial, "-o", target, "--kind", "contour", "--from", 0.002, "--to", 0.004, *videos)
+    done = run(trial, "-o", target, "--kind", "contour", "--from", 0.002, "--until", 0.004, *videos)
     assert done.exit_code == 0, done.output
     frames = list(video_frames(target, [0, 1, 2]))
     for box, grey in zip(_SIGHT_BOXES, (60, 180), strict=True):

@@ -254,7 +254,8 @@ def test_a_sender_of_json_may_begin_anew_as_well(gamma_map, wrench):
 
 
 @pytest.mark.parametrize(
-    ("factor", "suspicion"), [(1000.0, "larger than any"), (1e-3, "far from zero"), (1.0, "")]
+    ("factor", "suspicion"),
+    [(1000.0, "larger than any"), (1e-3, "far enough from zero"), (1.0, "")],
 )
 def test_wrong_units_are_suspected(gamma_map, wrench, factor, suspicion):
     running = ContactStream(estimator(gamma_map, "Fx FT MB MD", felt_above=5.0))

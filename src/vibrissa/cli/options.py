@@ -116,7 +116,7 @@ OPTIONS = {
         "that the movie lasts up to 45 s."
     ),
     "start": Option("Time of the first frame, s.", "S", names="--from"),
-    "stop": Option("Time of the last frame, s.", "S", names="--to"),
+    "stop": Option("Time of the last frame, s.", "S", names="--until"),
     "kind": Option("What the movies show."),
     "colour": Option("Colour of a trial's contacts in both frames: time by default."),
     "make": Option("Make the movies of the trial first, next to the page.", names="--make-movies"),

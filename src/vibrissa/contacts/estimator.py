@@ -69,6 +69,8 @@ _UNKNOWNS = 3
 # What is larger is brought to this: no less absurd, in any unit, and its square is still a number.
 _LARGEST = 1e100
 _LARGEST_SCALE, _OFTEN = 100.0, 0.95
+# A few odd numbers have a status each; so many, nearly all of them, are a table in other units.
+_TABLE = 20
 """Non-dimensional force or moment that one in twenty exceeds only if its unit is another."""
 _STATUSES = {int(status): status for status in Status}
 
@@ -240,9 +242,12 @@ def _check_scale(flat: Array, names: tuple[str, ...]) -> None:
     """Refuse forces and moments far too large to have bent the whisker, as in other units."""
     for values, name, turned in zip(flat.T, names, circular_among(names), strict=True):
         size = np.abs(values[np.isfinite(values)])
-        if not turned and size.size and np.quantile(size, _OFTEN) > _LARGEST_SCALE:
+        if turned or size.size < _TABLE:
+            continue
+        reached = np.quantile(size, _OFTEN, method="lower")
+        if reached > _LARGEST_SCALE:
             raise ValueError(
-                f"{name} reaches {np.quantile(size, _OFTEN):.2g} times what is natural to this "
+                f"{name} reaches {reached:.2g} times what is natural to this "
                 "whisker: SI units are needed, N and N·m; are these mN, µN, mN·m or µN·m?"
             )
 

@@ -32,7 +32,7 @@ _WORST = 6.0
 _CLEARLY = 20.0
 """Cost by which another shift must fit better than the given one."""
 
-_LEFT = 0.3
+_LEFT = 0.65
 """Share of the cost of the given shift that one which explains the misfit leaves at most."""
 
 _KNOWN = 10
@@ -112,7 +112,7 @@ def better_offset(
     row, column = np.arange(len(a)), offset + _LARGEST
     both = (blank[row, path] == 0.0) & (blank[:, column] == 0.0)
     left, given = cost[row, path][both].sum(), cost[both, column].sum()
-    # Of other optics some offset always explains a little; of a true one hardly anything is left.
+    # Of other optics some offset always explains a little; of a true one noise alone is left.
     if left + changed >= given or left > _LEFT * given:
         return np.empty(0, dtype=np.int64)
     return np.asarray(_SHIFTS[path[switched]])

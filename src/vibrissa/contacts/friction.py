@@ -11,8 +11,8 @@ as probable beforehand, and ratios as stated, the density of s is
 
     exp(-χ²/2 - µ_x²/2σ²) |∂(p, µ_x)/∂(s, f)| √det C_f,
 
-and that of the contact point a mixture along the curve. Its second moment about the most probable
-of its contacts, widened for tails as in :mod:`~vibrissa.contacts.posterior`, is the covariance.
+and that of the contact point a mixture along the curve. Its second moment about the contact nearest
+to its mean, widened for tails as in :mod:`~vibrissa.contacts.posterior`, is the covariance.
 Where the density has several peaks with valleys between, these are several candidates.
 """
 

@@ -3,8 +3,7 @@ import enum
 import numba
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from vibrissa.status import Status, describe, flag_attributes, is_ok
 

@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 import vibrissa as vb
 from vibrissa.rod import contact_tangents, discretize, fold_forces, solve_forces, stable_set

@@ -94,8 +94,7 @@ def _cameras(
     images: list[Path], pattern: str, square: float, target: Path, frames: int | None, force: bool
 ) -> None:
     """Calibrate cameras."""
-    from vibrissa.cameras import calibrate as calibrated
-    from vibrissa.cameras import save_cameras
+    from vibrissa.cameras import calibrate as calibrated, save_cameras
     from vibrissa.io import Kind, check_readable, check_writable, load_series, recognise
 
     corners = _corners(pattern)

@@ -57,8 +57,7 @@ def import_tracks(
     from vibrissa.cameras import load_cameras
     from vibrissa.io import NETCDF, check_writable, load_recording, save_recording
     from vibrissa.recording import Recording
-    from vibrissa.tracking import CUTOFF, TrackOptions, tracker_traces
-    from vibrissa.tracking import track as tracked
+    from vibrissa.tracking import CUTOFF, TrackOptions, track as tracked, tracker_traces
 
     check_writable(target, NETCDF)
     free([target], force)

@@ -34,8 +34,7 @@ def sensitivity(
     within 2° of rest are left out of the tables, not of the file.
     Example: `vibrissa sensitivity map.nc --using Fx,MB,MD -o sensitivity.nc`
     """
-    from vibrissa.identifiability import best_triplet
-    from vibrissa.identifiability import sensitivity as derivatives
+    from vibrissa.identifiability import best_triplet, sensitivity as derivatives
     from vibrissa.io import NETCDF, check_writable
     from vibrissa.numerics import contact_weights
     from vibrissa.paper import sensitivity_findings

@@ -64,8 +64,7 @@ def simulate(
     --friction 0.3 -o trial.nc`; `vibrissa simulate --array average --object sphere -o face.nc`
     """
     from vibrissa.io import NETCDF, check_writable, in_file, read_text, save_recording
-    from vibrissa.simulation import EXAMPLE, measure, read_script
-    from vibrissa.simulation import simulate as simulated
+    from vibrissa.simulation import EXAMPLE, measure, read_script, simulate as simulated
     from vibrissa.whisker import Whisker
 
     if example:

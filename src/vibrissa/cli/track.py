@@ -271,8 +271,7 @@ def _track(
 ) -> None:
     """Track one trial and report what was found."""
     from vibrissa.io import save_recording
-    from vibrissa.tracking import partial_traces, trace_file
-    from vibrissa.tracking import track as tracked
+    from vibrissa.tracking import partial_traces, trace_file, track as tracked
 
     if bases[0] is None:
         bases, options = _found(videos, picture, cameras, options, how.offset or 0)

@@ -39,8 +39,12 @@ def uniqueness(
 
     Example: `vibrissa uniqueness map.nc -o uniqueness.nc`
     """
-    from vibrissa.identifiability import ENDINGS, save_uniqueness, verdict_table
-    from vibrissa.identifiability import uniqueness as judge
+    from vibrissa.identifiability import (
+        ENDINGS,
+        save_uniqueness,
+        uniqueness as judge,
+        verdict_table,
+    )
     from vibrissa.io import check_writable
     from vibrissa.paper import with_network_errors
 

@@ -14,8 +14,13 @@ import numpy as np
 from vibrissa.contacts.noise import SensorNoise, common_covariance, scaled_errors, trusted
 from vibrissa.numerics import Array
 from vibrissa.rod import Discretization
-from vibrissa.signals import CIRCULAR as CIRCULAR_SIGNALS
-from vibrissa.signals import SIGNALS, signal_scales, signals_of, wrench_derivatives
+from vibrissa.signals import (
+    CIRCULAR as CIRCULAR_SIGNALS,
+    SIGNALS,
+    signal_scales,
+    signals_of,
+    wrench_derivatives,
+)
 
 #: What can be fitted to: the signals, and the components that they are made of.
 CHANNELS = (*SIGNALS, "Fy", "Fz", "My", "Mz")

@@ -13,8 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.channels import CHANNELS, channels_of
-from vibrissa.contacts.channels import CIRCULAR as CIRCULAR_CHANNELS
+from vibrissa.contacts.channels import CHANNELS, CIRCULAR as CIRCULAR_CHANNELS, channels_of
 from vibrissa.contacts.contacts import MOST_CANDIDATES
 from vibrissa.numerics import Array, IntArray, copy, inlined, kernel, share_out, wrapped
 from vibrissa.rod import (

@@ -3,13 +3,13 @@
 from vibrissa.contour.comparison import axis_offset, compare_with, distances_by
 from vibrissa.contour.drawing import Ellipsoids, ellipsoids, surface_grid
 from vibrissa.contour.fit import fit_shape
-from vibrissa.contour.fitted_shape import FittedShape, evidence_of
+from vibrissa.contour.fitted_shape import FittedShape, evidence_of as evidence_of
 from vibrissa.contour.free_fit import fit_free
 from vibrissa.contour.free_surface import FreeFit, shape_from_dataset
 from vibrissa.contour.laboratory import (
     continuing_candidates,
-    covariance_to_laboratory,
-    to_laboratory,
+    covariance_to_laboratory as covariance_to_laboratory,
+    to_laboratory as to_laboratory,
 )
 from vibrissa.contour.simple_shapes import CylinderFit, PlaneFit, SphereFit
 
@@ -23,13 +23,10 @@ __all__ = [
     "axis_offset",
     "compare_with",
     "continuing_candidates",
-    "covariance_to_laboratory",
     "distances_by",
     "ellipsoids",
-    "evidence_of",
     "fit_free",
     "fit_shape",
     "shape_from_dataset",
     "surface_grid",
-    "to_laboratory",
 ]

@@ -275,19 +275,6 @@ def excess_of(chi_squared: Array, equations: int) -> float:
 
 
 def evidence_of(chi_squared: Array, unknowns: int) -> float:
-    """Bayesian information criterion of a shape, which few outliers change little.
-
-    Parameters
-    ----------
-    chi_squared : array (n,)
-        Squared misfits of the contacts, in standard deviations.
-    unknowns : int
-        Number of the shape's free parameters.
-
-    Returns
-    -------
-    float
-        Criterion; differences of more than ten are strong evidence for the shape with the smaller.
-    """
+    """Bayesian information criterion of a shape, which few outliers change little."""
     cost = 8.0 * (np.sqrt(1.0 + 0.25 * chi_squared) - 1.0)
     return float(cost.sum() + unknowns * np.log(max(chi_squared.size, 1)))

@@ -9,47 +9,14 @@ Array = NDArray[np.float64]
 
 
 def to_laboratory(points: ArrayLike, base_rotation: ArrayLike, base_position: ArrayLike) -> Array:
-    """Transform points from the whisker's to the laboratory frame.
-
-    Parameters
-    ----------
-    points : array_like (..., 3)
-        Points in the whisker's frame, m; NaN stays NaN.
-    base_rotation : array_like (..., 3, 3)
-        Rotation from the whisker's to the laboratory frame; broadcasts with the points.
-    base_position : array_like (..., 3)
-        The whisker's base in the laboratory frame, m.
-
-    Returns
-    -------
-    array (..., 3)
-        Points in the laboratory frame, m.
-
-    Examples
-    --------
-    >>> to_laboratory([1.0, 0.0, 0.0], np.eye(3), [0.0, 2.0, 0.0])
-    array([1., 2., 0.])
-    """
+    """Transform points from the whisker's to the laboratory frame."""
     p = np.asarray(points, dtype=np.float64)
     turned = np.einsum("...ij,...j->...i", np.asarray(base_rotation, dtype=np.float64), p)
     return np.asarray(turned + np.asarray(base_position, dtype=np.float64))
 
 
 def covariance_to_laboratory(covariance: ArrayLike, base_rotation: ArrayLike) -> Array:
-    """Transform covariances of points from the whisker's to the laboratory frame.
-
-    Parameters
-    ----------
-    covariance : array_like (..., 3, 3)
-        Covariances in the whisker's frame, m².
-    base_rotation : array_like (..., 3, 3)
-        Rotation from the whisker's to the laboratory frame; broadcasts with the covariances.
-
-    Returns
-    -------
-    array (..., 3, 3)
-        Covariances in the laboratory frame, m².
-    """
+    """Transform covariances of points from the whisker's to the laboratory frame."""
     rotation = np.asarray(base_rotation, dtype=np.float64)
     turned = rotation @ np.asarray(covariance, dtype=np.float64) @ np.swapaxes(rotation, -1, -2)
     return np.asarray(turned, dtype=np.float64)

@@ -1,41 +1,33 @@
 """Scores against the truth: one for each stage, used by the demo, reports and studies alike."""
 
 from vibrissa.evaluation.contacts import (
-    ANGLES,
-    REPLICATES,
-    ErrorRow,
+    ANGLES as ANGLES,
+    REPLICATES as REPLICATES,
+    ErrorRow as ErrorRow,
     Scores,
-    angle_label,
+    angle_label as angle_label,
     contact_errors,
     deflection_angle,
-    error_rows,
+    error_rows as error_rows,
     score,
 )
 from vibrissa.evaluation.stages import (
-    SignalRow,
+    SignalRow as SignalRow,
     TrackingScores,
     signal_errors,
     spread,
     tracking_scores,
 )
-from vibrissa.evaluation.truth import caution, truth_of, with_truth
+from vibrissa.evaluation.truth import caution as caution, truth_of, with_truth as with_truth
 
 __all__ = [
-    "ANGLES",
-    "REPLICATES",
-    "ErrorRow",
     "Scores",
-    "SignalRow",
     "TrackingScores",
-    "angle_label",
-    "caution",
     "contact_errors",
     "deflection_angle",
-    "error_rows",
     "score",
     "signal_errors",
     "spread",
     "tracking_scores",
     "truth_of",
-    "with_truth",
 ]

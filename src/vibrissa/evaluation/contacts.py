@@ -222,20 +222,7 @@ def score(contacts: xr.Dataset, truth: xr.Dataset, errors: xr.Dataset, fit: Cyli
 
 
 def error_rows(errors: xr.Dataset) -> tuple[tuple[ErrorRow, ...], tuple[ErrorRow, ...]]:
-    """Summarise errors of contacts.
-
-    Parameters
-    ----------
-    errors : xarray.Dataset
-        Dataset of `contact_errors`.
-
-    Returns
-    -------
-    of_all : tuple of ErrorRow
-        Errors of r, θ, φ and in space, all contacts that have an estimate.
-    by_angle : tuple of ErrorRow
-        Errors in space, for each class of deflection angle with contacts.
-    """
+    """Summarise errors of contacts."""
     known = np.isfinite(errors["error_distance"].values)
     angle = np.degrees(errors["deflection_angle"].values)
     by_angle = []
@@ -247,18 +234,7 @@ def error_rows(errors: xr.Dataset) -> tuple[tuple[ErrorRow, ...], tuple[ErrorRow
 
 
 def angle_label(low: float, high: float) -> str:
-    """Name a class of deflection angle.
-
-    Parameters
-    ----------
-    low, high : float
-        Bounds of the class, degrees.
-
-    Returns
-    -------
-    str
-        Label such as ``2–5°``.
-    """
+    """Name a class of deflection angle."""
     return f"{low:g}–{high:g}°" if high < ANGLES[-1] else f"over {low:g}°"
 
 

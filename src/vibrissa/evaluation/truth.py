@@ -16,21 +16,7 @@ _CIRCULAR = (
 
 
 def with_truth(tracked: xr.DataTree, simulated: xr.DataTree) -> xr.DataTree:
-    """Tracked recording with the truth of its simulated trial.
-
-    Parameters
-    ----------
-    tracked : xarray.DataTree
-        Tracked recording.
-    simulated : xarray.DataTree
-        Same trial in the same frames, as it was simulated.
-
-    Returns
-    -------
-    xarray.DataTree
-        Tracked recording with the objects and the group ``truth``, which has the base's true pose
-        and the true whiskers.
-    """
+    """Tracked recording with the truth of its simulated trial."""
     groups = {group.path: group.to_dataset(inherit=False) for group in tracked.subtree}
     for group in simulated.subtree:
         if group.path.startswith(("/truth", "/objects")):
@@ -72,16 +58,5 @@ def truth_of(recording: xr.DataTree, whisker: int = 0) -> tuple[xr.Dataset, Whis
 
 
 def caution(source: object) -> str | None:
-    """What errors of contacts do not test, by the source of their signals.
-
-    Parameters
-    ----------
-    source : object
-        Attribute ``source`` of the group ``signals``.
-
-    Returns
-    -------
-    str or None
-        A sentence where the model itself computed the signals, from what was tracked.
-    """
+    """What errors of contacts do not test, by the source of their signals."""
     return _CIRCULAR if source in ("contact point", "rod") else None

@@ -113,18 +113,7 @@ _NUMBERS = {
 
 
 def read_calibration(path: str | PathLike[str]) -> list[dict[str, Any]]:
-    """Read the calibration of each camera.
-
-    Parameters
-    ----------
-    path : str or path
-        TOML file as Anipose writes it.
-
-    Returns
-    -------
-    list of dict
-        Tables of the cameras, with ``name`` and numbers of the shapes that they need.
-    """
+    """Read the calibration of each camera."""
     path = Path(path)
     cameras = []
     for name, table in read_toml(path).items():
@@ -161,15 +150,7 @@ def _checked(table: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def write_calibration(path: str | PathLike[str], cameras: Sequence[Mapping[str, Any]]) -> None:
-    """Write a calibration that `read_calibration` reads.
-
-    Parameters
-    ----------
-    path : str or path
-        TOML file to write; an existing file is replaced.
-    cameras : sequence of mapping
-        Tables of the cameras, with values by key.
-    """
+    """Write a calibration that `read_calibration` reads."""
     lines = []
     for i, camera in enumerate(cameras):
         lines.append(f"[cam_{i}]")

@@ -110,20 +110,7 @@ def save_contour(path: str | PathLike[str], contour: xr.Dataset) -> None:
 
 
 def holds_contour(path: str | PathLike[str], contour: xr.Dataset) -> bool:
-    """Tell whether a file is just what `save_contour` writes of contour points.
-
-    Parameters
-    ----------
-    path : str or path
-        Existing file.
-    contour : xarray.Dataset
-        Contour points as for `save_contour`.
-
-    Returns
-    -------
-    bool
-        True where the file's bytes are the same.
-    """
+    """Tell whether a file is just what `save_contour` writes of contour points."""
     return Path(path).read_bytes() == _contour_text(contour).encode("utf-8")
 
 

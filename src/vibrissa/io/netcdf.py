@@ -40,22 +40,7 @@ _HEAP = b"GCOL\1\0\0\0"
 
 @contextmanager
 def opened(path: str | PathLike[str], what: str, *, soft_links: bool = True) -> Iterator[h5py.File]:
-    """Open a file in HDF5 for reading, once it has been found harmless.
-
-    Parameters
-    ----------
-    path : str or path
-        File to open.
-    what : str
-        Name of what it should hold, for messages.
-    soft_links : bool
-        Whether links within the file are allowed.
-
-    Yields
-    ------
-    h5py.File
-        Open file.
-    """
+    """Open a file in HDF5 for reading, once it has been found harmless."""
     path = check_readable(path)
     with naming(path, what):
         _check_heaps(path)
@@ -66,20 +51,7 @@ def opened(path: str | PathLike[str], what: str, *, soft_links: bool = True) -> 
 
 @contextmanager
 def naming(path: Path, what: str) -> Iterator[None]:
-    """Turn whatever is raised while a file is read into one error that names it.
-
-    Parameters
-    ----------
-    path : Path
-        File that is read.
-    what : str
-        Name of what it should hold, for messages.
-
-    Yields
-    ------
-    None
-        The context in which it is read.
-    """
+    """Turn whatever is raised while a file is read into one error that names it."""
     try:
         yield
     except (OSError, RuntimeError) as error:
@@ -187,18 +159,7 @@ COMPRESSED: Mapping[str, Any] = {"zlib": True, "complevel": 1, "shuffle": True}
 
 
 def is_netcdf(path: str | PathLike[str]) -> bool:
-    """Tell whether a file is to be read as NetCDF-4.
-
-    Parameters
-    ----------
-    path : str or path
-        The file; it need not exist.
-
-    Returns
-    -------
-    bool
-        Whether it begins as HDF5, of which NetCDF-4 is a kind, or is named like one.
-    """
+    """Tell whether a file is to be read as NetCDF-4."""
     path = Path(path)
     if path.suffix.lower() in NETCDF:
         return True
@@ -209,25 +170,7 @@ def is_netcdf(path: str | PathLike[str]) -> bool:
 
 
 def kind_of(path: str | PathLike[str]) -> str:
-    """Read the kind of content that a NetCDF-4 file states.
-
-    Parameters
-    ----------
-    path : str or path
-        The file.
-
-    Returns
-    -------
-    str
-        Its attribute ``kind``, such as ``vibrissa recording``; empty if it has none.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is a folder, empty, cut off, or no NetCDF-4 file.
-    """
+    """Read the kind of content that a NetCDF-4 file states."""
     try:
         with opened(path, "NetCDF-4") as file:
             kind = file.attrs.get("kind", "")
@@ -240,22 +183,7 @@ def kind_of(path: str | PathLike[str]) -> str:
 def read_dataset(
     path: str | PathLike[str], group: str | None = None, names: Sequence[str] | None = None
 ) -> xr.Dataset:
-    """Read the dataset of one group.
-
-    Parameters
-    ----------
-    path : str or path
-        NetCDF-4 file.
-    group : str, optional
-        Path of the group; by default the top.
-    names : sequence of str, optional
-        Names of the variables to read, as far as they are there; by default all.
-
-    Returns
-    -------
-    xarray.Dataset
-        Dataset in memory, without the encoding of the file.
-    """
+    """Read the dataset of one group."""
     with (
         opened(path, "NetCDF-4", soft_links=False),
         xr.open_dataset(path, engine="h5netcdf", group=group) as data,
@@ -266,18 +194,7 @@ def read_dataset(
 
 
 def read_tree(path: str | PathLike[str]) -> xr.DataTree:
-    """Read the datasets of all groups; see `read_dataset`.
-
-    Parameters
-    ----------
-    path : str or path
-        NetCDF-4 file.
-
-    Returns
-    -------
-    xarray.DataTree
-        Tree in memory, without the encoding of the file.
-    """
+    """Read the datasets of all groups; see `read_dataset`."""
     with (
         opened(path, "NetCDF-4", soft_links=False),
         xr.open_datatree(path, engine="h5netcdf") as tree,
@@ -291,17 +208,7 @@ def write_netcdf(
     data: xr.Dataset | xr.DataTree,
     encoding: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> None:
-    """Write a dataset, or a tree with a group for each dataset.
-
-    Parameters
-    ----------
-    path : str or path
-        File to write; an existing file is replaced once the new one is complete.
-    data : xarray.Dataset or xarray.DataTree
-        Content of the file.
-    encoding : mapping, optional
-        Encoding of variables, such as `COMPRESSED`, by group and name.
-    """
+    """Write a dataset, or a tree with a group for each dataset."""
     with replacing(path) as part:
         part.write_bytes(netcdf_image(data, encoding))
 
@@ -309,20 +216,7 @@ def write_netcdf(
 def netcdf_image(
     data: xr.Dataset | xr.DataTree, encoding: Mapping[str, Mapping[str, Any]] | None = None
 ) -> memoryview:
-    """Give the bytes of the file that `write_netcdf` writes.
-
-    Parameters
-    ----------
-    data : xarray.Dataset or xarray.DataTree
-        Content of the file.
-    encoding : mapping, optional
-        Encoding of variables by group and name.
-
-    Returns
-    -------
-    memoryview
-        Bytes of the file.
-    """
+    """Give the bytes of the file that `write_netcdf` writes."""
     import h5netcdf
     from xarray.backends import H5NetCDFStore
 

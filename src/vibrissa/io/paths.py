@@ -39,33 +39,14 @@ _VIDEO_PART = re.compile(r"^(?P<file>.+)#(?P<part>\d+,\d+,\d+,\d+(?::[a-z]+)*)$"
 
 
 def without_part(path: str | PathLike[str]) -> tuple[Path, str]:
-    """Separate the file of a video from the part of its images that is meant.
-
-    Parameters
-    ----------
-    path : str or path
-        File, or file and part as in ``film.mp4#512,0,512,512:mirrored``.
-
-    Returns
-    -------
-    file : Path
-        The file alone.
-    part : str
-        The part; empty for whole images.
-    """
+    """Separate the file of a video from the part of its images that is meant."""
     path = Path(path)
     match = _VIDEO_PART.match(str(path))
     return (path, "") if match is None or path.exists() else (Path(match["file"]), match["part"])
 
 
 def refuse_whisk(path: str | PathLike[str]) -> None:
-    """Raise where a file is whisk's and something else is needed.
-
-    Parameters
-    ----------
-    path : str or path
-        File, which need not exist.
-    """
+    """Raise where a file is whisk's and something else is needed."""
     path = Path(path)
     if not path.is_file():
         return
@@ -80,25 +61,7 @@ def refuse_whisk(path: str | PathLike[str]) -> None:
 
 
 def check_readable(path: str | PathLike[str]) -> Path:
-    """Make sure that there is a file with something in it.
-
-    Parameters
-    ----------
-    path : str or path
-        To be read.
-
-    Returns
-    -------
-    Path
-        The same.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is a folder or empty.
-    """
+    """Make sure that there is a file with something in it."""
     file, _ = without_part(path)
     if not file.exists():
         raise FileNotFoundError(f"there is no file {file}")
@@ -110,29 +73,7 @@ def check_readable(path: str | PathLike[str]) -> Path:
 
 
 def check_writable(path: str | PathLike[str], endings: Sequence[str] = ()) -> Path:
-    """Make sure that a file can be written, or replaced, here.
-
-    Parameters
-    ----------
-    path : str or path
-        To be written.
-    endings : sequence of str
-        That it may have, such as `NETCDF`; none: any.
-
-    Returns
-    -------
-    Path
-        The same.
-
-    Raises
-    ------
-    FileNotFoundError
-        If its folder does not exist.
-    PermissionError
-        If the folder cannot be written to.
-    ValueError
-        If it is a folder, or has another ending.
-    """
+    """Make sure that a file can be written, or replaced, here."""
     path = Path(path)
     if path.is_dir():
         raise ValueError(f"{path} is a folder; the name of a file is needed")
@@ -145,25 +86,7 @@ def check_writable(path: str | PathLike[str], endings: Sequence[str] = ()) -> Pa
 
 
 def check_folder(path: str | PathLike[str]) -> Path:
-    """Make sure that a folder for results is there or can be made.
-
-    Parameters
-    ----------
-    path : str or path
-        Of the folder.
-
-    Returns
-    -------
-    Path
-        The same.
-
-    Raises
-    ------
-    PermissionError
-        If it, or the folder to make it in, cannot be written to.
-    ValueError
-        If a file stands there, or among the folders above.
-    """
+    """Make sure that a folder for results is there or can be made."""
     path = Path(path)
     above = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
     if not above.is_dir():
@@ -186,18 +109,7 @@ _PART = re.compile(rf"\..+{re.escape(_MARK)}[a-z0-9_]{{8}}(\.[^.]*)?")
 
 @contextmanager
 def replacing(path: str | PathLike[str]) -> Iterator[Path]:
-    """Give a place to write to, and put what was written in place of the file at the end.
-
-    Parameters
-    ----------
-    path : str or path
-        File to write; what is there stays as it is if writing fails.
-
-    Yields
-    ------
-    Path
-        Temporary file in the same folder, with the same ending.
-    """
+    """Give a place to write to, and put what was written in place of the file at the end."""
     path = check_writable(path)
     _remove_left(path.parent)
     with _failing(path):

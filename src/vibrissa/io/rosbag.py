@@ -43,18 +43,7 @@ _KEPT_EVERY = 0.5
 
 
 def is_bag(path: str | PathLike[str]) -> bool:
-    """Tell whether a path looks like a bag.
-
-    Parameters
-    ----------
-    path : str or path
-        File or folder, which need not exist.
-
-    Returns
-    -------
-    bool
-        True for a folder with metadata and for a file with a bag's ending.
-    """
+    """Tell whether a path looks like a bag."""
     path = Path(path)
     return (path / "metadata.yaml").is_file() or (path.is_file() and path.suffix in _SUFFIXES)
 
@@ -79,20 +68,7 @@ class BagMessage(NamedTuple):
 
 
 def bag_wrenches(path: str | PathLike[str], topic: str | None = None) -> Iterator[BagMessage]:
-    """Read wrenches from a bag, in the order of recording.
-
-    Parameters
-    ----------
-    path : str or path
-        Bag of ROS 1 or 2.
-    topic : str, optional
-        Name of the topic; not needed where only one has wrenches.
-
-    Returns
-    -------
-    iterator of BagMessage
-        Messages with (Fx, Fy, Fz, Mx, My, Mz), N and N·m.
-    """
+    """Read wrenches from a bag, in the order of recording."""
 
     def values(message: Any) -> list[float]:
         f, t = message.wrench.force, message.wrench.torque
@@ -102,20 +78,7 @@ def bag_wrenches(path: str | PathLike[str], topic: str | None = None) -> Iterato
 
 
 def bag_poses(path: str | PathLike[str], topic: str | None = None) -> Iterator[BagMessage]:
-    """Read poses from a bag, in the order of recording.
-
-    Parameters
-    ----------
-    path : str or path
-        Bag of ROS 1 or 2.
-    topic : str, optional
-        Name of the topic; not needed where only one has poses.
-
-    Returns
-    -------
-    iterator of BagMessage
-        Messages with position, m, and quaternion (x, y, z, qw, qx, qy, qz).
-    """
+    """Read poses from a bag, in the order of recording."""
 
     def values(message: Any) -> list[float]:
         if hasattr(message, "pose"):
@@ -304,23 +267,7 @@ class ContactBag:
         frame: str | None = None,
         recorded: int | None = None,
     ) -> None:
-        """Write one sample.
-
-        Parameters
-        ----------
-        stamp : int
-            Time of the measurement, ns.
-        point : array (3,) or None
-            Contact point, m; None where there is none.
-        candidates : array (n, 3)
-            Points of all candidates, m.
-        values : array (n,)
-            Probabilities of the candidates.
-        frame : str, optional
-            Name of the frame of the points, if it is another.
-        recorded : int, optional
-            Time of the recording, ns; by default that of the measurement.
-        """
+        """Write one sample."""
         if self._fault is not None:
             raise self._fault
         types = self._types.types

@@ -86,20 +86,7 @@ def _notes(time: Array) -> list[str]:
 
 
 def check_scale(wrench: xr.Dataset, whisker: Whisker) -> None:
-    """Refuse forces and moments that are far too large to have bent this whisker.
-
-    Parameters
-    ----------
-    wrench : xarray.Dataset
-        Variables ``force``, N, and ``moment``, N·m.
-    whisker : Whisker
-        Whisker at whose base they were measured.
-
-    Raises
-    ------
-    ValueError
-        If they are in other units, or of another whisker.
-    """
+    """Refuse forces and moments that are far too large to have bent this whisker."""
     stiffness = whisker.base_bending_stiffness
     scales = {"force": stiffness / whisker.length**2, "moment": stiffness / whisker.length}
     faults = []

@@ -35,18 +35,7 @@ _SPREADSHEET = re.compile(rb"[\t\n\r\x20-\x7e\xa0-\xff]*")
 
 
 def read_text(path: str | PathLike[str]) -> str:
-    """Read a text file.
-
-    Parameters
-    ----------
-    path : str or path
-        File in UTF-8, UTF-16, or the encoding of Western spreadsheets.
-
-    Returns
-    -------
-    str
-        Text of the file.
-    """
+    """Read a text file."""
     path = check_readable(path)
     refuse_whisk(path)
     content = path.read_bytes()
@@ -66,18 +55,7 @@ def read_text(path: str | PathLike[str]) -> str:
 
 
 def table_rows(text: str) -> Iterator[tuple[int, list[str]]]:
-    """Take a table apart.
-
-    Parameters
-    ----------
-    text : str
-        Lines of a table; those that are empty or begin with # are left out.
-
-    Yields
-    ------
-    tuple of int and list of str
-        Number of the line, from 1, and its cells.
-    """
+    """Take a table apart."""
     lines = [
         (number, line)
         for number, line in enumerate(text.splitlines(), start=1)
@@ -97,71 +75,25 @@ def table_rows(text: str) -> Iterator[tuple[int, list[str]]]:
 
 
 def delimiter_of(header: str) -> str:
-    """Tell what separates the cells of a table.
-
-    Parameters
-    ----------
-    header : str
-        First line of the table.
-
-    Returns
-    -------
-    str
-        Comma, semicolon, tab or blank.
-    """
+    """Tell what separates the cells of a table."""
     most = max(",;\t", key=header.count)
     return most if header.count(most) or len(header.split()) < 2 else " "
 
 
 def cells_of(line: str, delimiter: str) -> list[str]:
-    """Take a line of a table apart.
-
-    Parameters
-    ----------
-    line : str
-        Line of the table.
-    delimiter : str
-        Delimiter as `delimiter_of` returns it.
-
-    Returns
-    -------
-    list of str
-        Cells without the blanks around them.
-    """
+    """Take a line of a table apart."""
     if delimiter == " ":
         return line.split()
     return [cell.strip() for cell in next(csv.reader([line.rstrip("\r\n")], delimiter=delimiter))]
 
 
 def with_point(cell: str) -> str:
-    """Write a number that has a decimal comma with a point; leave other text alone.
-
-    Parameters
-    ----------
-    cell : str
-        Cell of a table.
-
-    Returns
-    -------
-    str
-        Cell with a decimal point.
-    """
+    """Write a number that has a decimal comma with a point; leave other text alone."""
     return cell.replace(",", ".") if _COMMA.fullmatch(cell) else cell
 
 
 def is_number(cell: str) -> bool:
-    """Tell whether a cell is a number.
-
-    Parameters
-    ----------
-    cell : str
-        Cell of a table.
-
-    Returns
-    -------
-    bool
-        True for a number and for a missing one.
-    """
+    """Tell whether a cell is a number."""
     try:
         number(cell)
     except ValueError:
@@ -170,18 +102,7 @@ def is_number(cell: str) -> bool:
 
 
 def number(cell: str) -> float:
-    """Read a cell.
-
-    Parameters
-    ----------
-    cell : str
-        Cell of a table.
-
-    Returns
-    -------
-    float
-        Number; NaN for a cell that is empty or marks a missing number.
-    """
+    """Read a cell."""
     return float("nan") if cell.lower() in _MISSING else float(cell)
 
 
@@ -266,20 +187,7 @@ class Table:
 
 
 def read_numbers(path: str | PathLike[str]) -> tuple[list[str], NDArray[np.float64]]:
-    """Read a table of numbers under one line of names.
-
-    Parameters
-    ----------
-    path : str or path
-        File with the table.
-
-    Returns
-    -------
-    names : list of str
-        Names of the columns.
-    values : array (rows, columns)
-        Numbers; columns of labels are NaN.
-    """
+    """Read a table of numbers under one line of names."""
     table = Table(path)
     columns = [table.numbers(name, labels=True) for name in table.names]
     return table.names, np.stack(columns, axis=1)
@@ -297,17 +205,7 @@ def table_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 def write_table(
     path: str | PathLike[str], header: Sequence[str], rows: Iterable[Sequence[object]]
 ) -> None:
-    """Write a table as CSV.
-
-    Parameters
-    ----------
-    path : str or path
-        File to write; an existing one is replaced once the new one is complete.
-    header : sequence of str
-        Names of the columns.
-    rows : iterable of sequences
-        Cells of each row.
-    """
+    """Write a table as CSV."""
     text = table_text(header, rows)
     with replacing(path) as part:
         part.write_bytes(text.encode("utf-8"))
@@ -346,19 +244,7 @@ _BETWEEN = re.compile(r"[\s·⋅×*.^_-]")
 
 
 def signal_column(header: str) -> tuple[str, float | None]:
-    """Tell which signal a column holds, and in which unit.
-
-    Parameters
-    ----------
-    header : str
-        Name of the column, with or without a unit.
-
-    Returns
-    -------
-    tuple of str and float
-        Name of the signal, empty for other columns, and SI units per unit of the column; None where
-        the unit is not known.
-    """
+    """Tell which signal a column holds, and in which unit."""
     text = header.strip()
     if match := _COMPONENT.fullmatch(text):
         name = ("F" if match[1][0] in "Ff" else "M") + match[2].lower()
@@ -388,21 +274,7 @@ def units_of(kind: str) -> str:
 def signal_columns(
     header: Sequence[str], names: Sequence[str]
 ) -> tuple[dict[str, tuple[int, float]], dict[str, list[str]]]:
-    """Find signals among columns.
-
-    Parameters
-    ----------
-    header : sequence of str
-        Names of the columns.
-    names : sequence of str
-        Names of the signals to find.
-
-    Returns
-    -------
-    tuple of dict
-        By signal its column and SI units per unit; and by signal the columns in a unit that is not
-        known.
-    """
+    """Find signals among columns."""
     known = [signal_column(cell) for cell in header]
     found: dict[str, tuple[int, float]] = {}
     strange: dict[str, list[str]] = {}

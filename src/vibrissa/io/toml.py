@@ -20,18 +20,7 @@ _THREE_NUMBERS = "three numbers are needed"
 
 
 def read_toml(path: str | PathLike[str]) -> dict[str, Any]:
-    """Read a TOML file.
-
-    Parameters
-    ----------
-    path : str or path
-        File in UTF-8.
-
-    Returns
-    -------
-    dict
-        Values by key.
-    """
+    """Read a TOML file."""
     path = check_readable(path)
     try:
         text = path.read_bytes().decode("utf-8-sig")
@@ -43,18 +32,7 @@ def read_toml(path: str | PathLike[str]) -> dict[str, Any]:
 
 
 def parsed_toml(text: str) -> dict[str, Any]:
-    """Read TOML.
-
-    Parameters
-    ----------
-    text : str
-        Text of a TOML file.
-
-    Returns
-    -------
-    dict
-        Values by key.
-    """
+    """Read TOML."""
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -67,18 +45,7 @@ def parsed_toml(text: str) -> dict[str, Any]:
 
 @contextmanager
 def in_file(path: object) -> Iterator[None]:
-    """Name the file in what is raised because of its content.
-
-    Parameters
-    ----------
-    path : object
-        File, or the part of it that is read.
-
-    Yields
-    ------
-    None
-        The context in which it is read.
-    """
+    """Name the file in what is raised because of its content."""
     try:
         yield
     except ValueError as error:
@@ -90,22 +57,7 @@ def in_file(path: object) -> Iterator[None]:
 def number_array(
     value: Any, name: str, needed: str = "numbers, or lists of as many each, are needed"
 ) -> NDArray[np.float64]:
-    """Read a number, or lists of them, from a value of TOML.
-
-    Parameters
-    ----------
-    value : object
-        Value as TOML has it.
-    name : str
-        Name of the value, for messages.
-    needed : str
-        Sentence on what is needed, for messages.
-
-    Returns
-    -------
-    array
-        Numbers in as many dimensions as the lists have.
-    """
+    """Read a number, or lists of them, from a value of TOML."""
     try:
         if _numeric(value):
             return np.array(value, dtype=np.float64)
@@ -115,17 +67,7 @@ def number_array(
 
 
 def check_keys(table: Mapping[str, Any], allowed: set[str], where: str) -> None:
-    """Raise a ValueError if a table has an unknown key.
-
-    Parameters
-    ----------
-    table : mapping
-        Table of TOML.
-    allowed : set of str
-        Keys that are allowed.
-    where : str
-        Name of the table, for the message.
-    """
+    """Raise a ValueError if a table has an unknown key."""
     unknown = sorted(set(table) - allowed)
     if unknown:
         raise ValueError(
@@ -134,20 +76,7 @@ def check_keys(table: Mapping[str, Any], allowed: set[str], where: str) -> None:
 
 
 def subtable(table: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-    """Table [name] of a table; empty by default.
-
-    Parameters
-    ----------
-    table : mapping
-        Table of TOML.
-    name : str
-        Key of the table in it.
-
-    Returns
-    -------
-    mapping
-        Table of that name.
-    """
+    """Table [name] of a table; empty by default."""
     value = table.get(name, {})
     if not isinstance(value, Mapping):
         raise ValueError(f"{name} is {quoted(value)}; it is written as a table, [{name}]")
@@ -155,22 +84,7 @@ def subtable(table: Mapping[str, Any], name: str) -> Mapping[str, Any]:
 
 
 def one_number(table: Mapping[str, Any], name: str, default: float) -> float:
-    """Number of a table, finite if it is there.
-
-    Parameters
-    ----------
-    table : mapping
-        Table of TOML.
-    name : str
-        Key of the number.
-    default : float
-        Number where there is none.
-
-    Returns
-    -------
-    float
-        Number of that name.
-    """
+    """Number of a table, finite if it is there."""
     value = table.get(name, default)
     array = number_array(value, name, "a number is needed")
     if array.ndim or (name in table and not np.isfinite(array)):
@@ -179,22 +93,7 @@ def one_number(table: Mapping[str, Any], name: str, default: float) -> float:
 
 
 def three_numbers(table: Mapping[str, Any], name: str, default: Any = None) -> NDArray[np.float64]:
-    """Three numbers of a table.
-
-    Parameters
-    ----------
-    table : mapping
-        Table of TOML.
-    name : str
-        Key of the numbers.
-    default : object, optional
-        Numbers where there are none.
-
-    Returns
-    -------
-    array (3,)
-        Numbers of that name.
-    """
+    """Three numbers of a table."""
     value = table.get(name, default)
     array = number_array(list(value) if isinstance(value, tuple) else value, name, _THREE_NUMBERS)
     if array.shape != (3,) or not np.isfinite(array).all():
@@ -203,18 +102,7 @@ def three_numbers(table: Mapping[str, Any], name: str, default: Any = None) -> N
 
 
 def quoted(value: object) -> str:
-    """Quote the beginning of a value.
-
-    Parameters
-    ----------
-    value : object
-        Value of any type.
-
-    Returns
-    -------
-    str
-        Text of at most some sixty characters.
-    """
+    """Quote the beginning of a value."""
     try:
         text = repr(value)
     except ValueError:  # a whole number of more digits than Python writes

@@ -28,17 +28,7 @@ Row = tuple[Array, Array, NDArray[np.bool_], float, bool, bool]
 
 
 def save_traces(path: str | PathLike[str], key: str, traces: Sequence[Sequence[Row]]) -> None:
-    """Write traces.
-
-    Parameters
-    ----------
-    path : str or path
-        Where; an existing file is replaced once the new one is complete.
-    key : str
-        Of what they are.
-    traces : sequence of sequence of tuple
-        Whisker by whisker, frame by frame: line, sigma, seen, confidence, base and tip seen.
-    """
+    """Write traces."""
     rows = [row for whisker in traces for row in whisker]
     columns = [np.concatenate([row[k] for row in rows]) if rows else np.empty(0) for k in range(3)]
     with replacing(path) as part, part.open("wb") as file:
@@ -56,20 +46,7 @@ def save_traces(path: str | PathLike[str], key: str, traces: Sequence[Sequence[R
 
 
 def load_traces(path: str | PathLike[str], key: str) -> list[list[Row]] | None:
-    """Read traces.
-
-    Parameters
-    ----------
-    path : str or path
-        Of `save_traces`.
-    key : str
-        Of what they must be.
-
-    Returns
-    -------
-    list of list of tuple, or None
-        As they were; None if there is no such file, or it is of something else, or damaged.
-    """
+    """Read traces."""
     if not Path(path).is_file():
         return None
     try:

@@ -109,22 +109,7 @@ class RawTracks:
 
 
 def labelled(raw: RawTracks, path: str | PathLike[str], **labels: Unpack[Labels]) -> xr.Dataset:
-    """Check tracks, bring them to SI units and name everything.
-
-    Parameters
-    ----------
-    raw : RawTracks
-        Tracks as a reader found them.
-    path : str or path
-        File they were read from.
-    **labels
-        What the file may not say; see `Labels`.
-
-    Returns
-    -------
-    xarray.Dataset
-        Tracks; see the module.
-    """
+    """Check tracks, bring them to SI units and name everything."""
     path = Path(path)
     _check_size(raw, path)
     data: dict[str, xr.Variable] = {}

@@ -156,27 +156,7 @@ def read_video(path: str | PathLike[str]) -> Iterator[Frame]:
 
 
 def video_frames(path: str | PathLike[str], numbers: Iterable[int]) -> Iterator[Frame]:
-    """Read some frames of a video, and decode no more than need be.
-
-    Parameters
-    ----------
-    path : str or path
-        Of the video.
-    numbers : iterable of int
-        Of the frames, counted from 0, never falling; one may come several times.
-
-    Yields
-    ------
-    array (height, width)
-        Grey values, one array for each number.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If numbers fall or are negative, the video has fewer frames, or it is none or damaged.
-    """
+    """Read some frames of a video, and decode no more than need be."""
     wanted = [int(number) for number in numbers]
     if any(b < a for a, b in pairwise([0, *wanted])):
         raise ValueError("numbers of frames must not be negative and must not fall")
@@ -276,18 +256,7 @@ class Footage:
         self._last: Frame | None = None
 
     def frame(self, number: int) -> Frame:
-        """Give one frame.
-
-        Parameters
-        ----------
-        number : int
-            Number of the frame, from 0.
-
-        Returns
-        -------
-        array (height, width)
-            Grey values.
-        """
+        """Give one frame."""
         import av
 
         if number < 0:
@@ -387,20 +356,7 @@ _NUMBERED = re.compile(r"^(.*?)[ _.-]*(\d+)$")
 
 
 def load_series(paths: Sequence[str | PathLike[str]], most: int = 40) -> dict[str, list[Frame]]:
-    """Read images of several cameras.
-
-    Parameters
-    ----------
-    paths : sequence of str or path
-        Images (PNG, JPEG, TIFF, …), or videos.
-    most : int
-        Frames that are taken of a video, evenly spread.
-
-    Returns
-    -------
-    dict
-        By name of the camera its grey images, moment by moment.
-    """
+    """Read images of several cameras."""
     files = [Path(path) for path in paths]
     videos = [recognise(path) == Kind.VIDEO for path in files]
     if all(videos):

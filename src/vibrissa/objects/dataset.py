@@ -49,18 +49,7 @@ _DIMS: dict[str, tuple[str, ...]] = {
 
 
 def objects_datasets(objects: Sequence[Surface]) -> dict[str, xr.Dataset]:
-    """Write objects as datasets.
-
-    Parameters
-    ----------
-    objects : sequence of Surface
-        Pegs, spheres, planes, boxes and meshes.
-
-    Returns
-    -------
-    dict of str to xarray.Dataset
-        Dataset of each object by its number.
-    """
+    """Write objects as datasets."""
     return {str(i): _dataset(thing) for i, thing in enumerate(objects)}
 
 
@@ -79,23 +68,7 @@ def _dataset(thing: Surface) -> xr.Dataset:
 
 
 def object_from_dataset(dataset: xr.Dataset) -> Surface:
-    """Restore an object from its dataset.
-
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        Dataset of `objects_datasets`.
-
-    Returns
-    -------
-    Peg, Sphere, Plane, Box or Mesh
-        Object as it was.
-
-    Raises
-    ------
-    ValueError
-        If its kind is unknown, or something is missing.
-    """
+    """Restore an object from its dataset."""
     kind = dataset.attrs.get("kind")
     if kind not in _FIELDS:
         raise ValueError(f"the object is of kind {kind!r}; it must be one of {', '.join(_FIELDS)}")

@@ -74,37 +74,13 @@ class Placement(NamedTuple):
     position: Array
 
     def outside(self, points: Array) -> Array:
-        """Points in the surfaces' frame.
-
-        Parameters
-        ----------
-        points : array (..., 3)
-            Points in the whisker's frame, m.
-
-        Returns
-        -------
-        array (..., 3)
-            Points in the surfaces' frame, m.
-        """
+        """Points in the surfaces' frame."""
         moved: Array = points @ self.rotation.T + self.position
         return moved
 
 
 def between(before: Placement, now: Placement, share: float) -> Placement:
-    """Placement between two others, turned steadily about one axis and moved straight.
-
-    Parameters
-    ----------
-    before, now : Placement
-        Placements at the shares 0 and 1.
-    share : float
-        Share of the movement.
-
-    Returns
-    -------
-    Placement
-        Placement in between.
-    """
+    """Placement between two others, turned steadily about one axis and moved straight."""
     turn = before.rotation.T @ now.rotation
     axis = 0.5 * np.array(
         [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]

@@ -6,9 +6,9 @@ from vibrissa.paper.findings import sensitivity_findings
 from vibrissa.paper.lookup import LookupTable
 from vibrissa.paper.natural_neighbour import NaturalNeighbour
 from vibrissa.paper.network import (
-    DrawnContacts,
+    DrawnContacts as DrawnContacts,
     NetworkSolver,
-    draw_contacts,
+    draw_contacts as draw_contacts,
     train_network,
     with_network_errors,
 )
@@ -16,12 +16,10 @@ from vibrissa.paper.slices import error_solid, interpolation_errors, signal_slic
 
 __all__ = [
     "METHODS",
-    "DrawnContacts",
     "LookupTable",
     "NaturalNeighbour",
     "NetworkSolver",
     "central_differences",
-    "draw_contacts",
     "error_solid",
     "estimate",
     "interpolation_errors",

@@ -66,24 +66,7 @@ class DrawnContacts:
 def draw_contacts(
     contact_map: ContactMap, number: int, seed: int, *, near_rest: bool = False
 ) -> DrawnContacts:
-    """Draw stable contacts, uniform in arc length, bearing and share of the force at slip-off.
-
-    Parameters
-    ----------
-    contact_map : ContactMap
-        Map of the whisker's contacts.
-    number : int
-        Number of contacts.
-    seed : int
-        Seed of the draw.
-    near_rest : bool
-        Whether contacts within 2° of rest are drawn too.
-
-    Returns
-    -------
-    DrawnContacts
-        The contacts.
-    """
+    """Draw stable contacts, uniform in arc length, bearing and share of the force at slip-off."""
     rng, kept, missing = np.random.default_rng(seed), [], number
     d, fold = contact_map.chart.discretization, contact_map.chart.fold
     while missing > 0:

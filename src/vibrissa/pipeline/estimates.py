@@ -212,29 +212,7 @@ def in_laboratory(
     pose_covariance: ArrayLike | None = None,
     pose_wrench_covariance: ArrayLike | None = None,
 ) -> xr.Dataset:
-    """Contacts in the laboratory, chosen among candidates by continuity there.
-
-    Parameters
-    ----------
-    contacts : xarray.Dataset
-        Dataset of `locate`.
-    base_rotation : array_like (n, 3, 3)
-        Rotation from the whisker's to the laboratory frame, frame by frame.
-    base_position : array_like (n, 3)
-        Position of the base in the laboratory, m.
-    pose_covariance : array_like (n, 6, 6), optional
-        Covariance of that position, m, and of a small turn about the laboratory's axes, rad; exact
-        by default.
-    pose_wrench_covariance : array_like (n, 6, 6), optional
-        Covariance of position and turn with (F, M); none by default, as for a sensor.
-
-    Returns
-    -------
-    xarray.Dataset
-        Contacts with ``contact_point``, ``contact_covariance`` and ``contact_normal`` with
-        ``normal_covariance`` and ``point_normal_covariance``, laboratory frame; all of the
-        chosen candidate.
-    """
+    """Contacts in the laboratory, chosen among candidates by continuity there."""
     rotation, position = np.asarray(base_rotation), np.asarray(base_position)
     points = contacts["candidate_points"].values
     lab = to_laboratory(points, rotation[:, None], position[:, None])
@@ -313,18 +291,7 @@ def _chosen(candidates: xr.DataArray, chosen: NDArray[np.int64]) -> xr.DataArray
 
 
 def contact_columns(contacts: xr.Dataset) -> xr.Dataset:
-    """Columns of a table of contacts, whisker's frame.
-
-    Parameters
-    ----------
-    contacts : xarray.Dataset
-        Dataset of `locate` or `in_laboratory`.
-
-    Returns
-    -------
-    xarray.Dataset
-        Dataset of dimension time: x, y, z, r, theta, phi, sigma_x, sigma_y, sigma_z and status.
-    """
+    """Columns of a table of contacts, whisker's frame."""
     point = contacts["contact_point_whisker"].values
     variance = np.einsum("tii->ti", contacts["covariance"].values)
     values = np.concatenate([point, spherical(point), np.sqrt(variance)], axis=1)

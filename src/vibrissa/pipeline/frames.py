@@ -42,18 +42,7 @@ ESTIMATED = (
 
 
 def check_recording(recording: xr.DataTree) -> None:
-    """Make sure that a recording has frames and whiskers, and variables with their dimensions.
-
-    Parameters
-    ----------
-    recording : xarray.DataTree
-        Recording to be checked.
-
-    Raises
-    ------
-    ValueError
-        If something is missing or has other dimensions.
-    """
+    """Make sure that a recording has frames and whiskers, and variables with their dimensions."""
     root = recording.to_dataset(inherit=False)
     missing = [name for name in ("time", "whisker") if name not in root.dims]
     if missing:
@@ -155,20 +144,7 @@ def cross_matrices(vectors: Array) -> Array:
 
 
 def whisker_radii(estimates: xr.Dataset, whiskers: Sequence[Whisker]) -> Array:
-    """Radii of whiskers at their contacts.
-
-    Parameters
-    ----------
-    estimates : xarray.Dataset
-        Dataset with ``arc_length``, dimensions time, whisker.
-    whiskers : sequence of Whisker
-        Whiskers along the dimension ``whisker``.
-
-    Returns
-    -------
-    array (time, whisker)
-        Radii, m; NaN where the arc length is.
-    """
+    """Radii of whiskers at their contacts."""
     arc_length = Group(estimates)["arc_length"]
     radius = np.full(arc_length.shape, np.nan)
     for k, whisker in enumerate(whiskers):

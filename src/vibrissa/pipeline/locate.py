@@ -83,18 +83,7 @@ class _Candidates(NamedTuple):
 
 
 def component_noise(force_noise: float, moment_noise: float) -> Array:
-    """Covariance of a sensor whose components have independent noise.
-
-    Parameters
-    ----------
-    force_noise, moment_noise : float
-        Standard deviation of a component of force, N, and of moment, N·m.
-
-    Returns
-    -------
-    array (6, 6)
-        Covariance of (F, M), SI units.
-    """
+    """Covariance of a sensor whose components have independent noise."""
     return np.diag(np.repeat([force_noise**2, moment_noise**2], 3))
 
 

@@ -239,28 +239,7 @@ def fit_contacts(
 
 
 def contour_points(recording: xr.DataTree, whiskers: Sequence[Whisker] | None = None) -> xr.Dataset:
-    """Contacts of all whiskers as points of a contour, laboratory frame.
-
-    Parameters
-    ----------
-    recording : xarray.DataTree
-        Recording with a group ``estimates``, and ``contour`` if an object was fitted.
-    whiskers : sequence of Whisker, optional
-        Whiskers; by default those of the recording.
-
-    Returns
-    -------
-    xarray.Dataset
-        Dataset of dimension contact, by time: ``time``, ``whisker``, the contact point ``x``,
-        ``y``, ``z`` with ``sigma_x``, …, ``normal_x``, …, the point ``surface_x``, … of the
-        object's surface, one whisker radius away, and where an object was fitted
-        ``surface_distance`` and ``inlier``; the columns of `vibrissa.io.save_contour`.
-
-    Raises
-    ------
-    ValueError
-        If there are no estimates.
-    """
+    """Contacts of all whiskers as points of a contour, laboratory frame."""
     estimates = estimates_in(recording)
     known = Recording(recording).whiskers if whiskers is None else whiskers
     point = _rows(estimates["contact_point"])

@@ -123,21 +123,6 @@ def default_source(recording: xr.DataTree) -> Source:
     The rod of a tracked recording is never the default. It fits the images with a little
     friction, which hardly moves the contact point but is a large share of the axial force, so that
     its wrench is to be used whole, not by signals that presume no friction.
-
-    Parameters
-    ----------
-    recording : xarray.DataTree
-        Recording, tracked, simulated or measured.
-
-    Returns
-    -------
-    str
-        First of these sources that it has.
-
-    Raises
-    ------
-    ValueError
-        If it has neither.
     """
     root = recording.to_dataset()
     measured = {"force", "moment"} <= set(root.data_vars) or "reading" in root
@@ -252,18 +237,7 @@ def _labelled(
 
 
 def sensor_noise(signals: xr.Dataset) -> Array | None:
-    """Noise that is stated with signals.
-
-    Parameters
-    ----------
-    signals : xarray.Dataset
-        Dataset of `signals_of`, of one whisker or more.
-
-    Returns
-    -------
-    array (6, 6), (time, 6, 6), (time, whisker, 6, 6) or None
-        Covariance of (F, M), SI units; None where it is not known.
-    """
+    """Noise that is stated with signals."""
     if "wrench_covariance" in signals:
         return Group(signals)["wrench_covariance"]
     if "noise" in signals.attrs:

@@ -56,27 +56,7 @@ def due_stages(recording: xr.DataTree, last: str, asked: Collection[str] = ()) -
 
 
 def with_group(recording: xr.DataTree, name: str, dataset: xr.Dataset) -> xr.DataTree:
-    """Add the group of a stage to a recording.
-
-    Parameters
-    ----------
-    recording : xarray.DataTree
-        Recording, tracked, simulated or measured.
-    name : {"signals", "estimates", "contour"}
-        Name of the group.
-    dataset : xarray.Dataset
-        Group with as many frames and whiskers as the recording.
-
-    Returns
-    -------
-    xarray.DataTree
-        New recording; an existing group is replaced, and those of later stages are left out.
-
-    Raises
-    ------
-    ValueError
-        If the name is none of these, or frames or whiskers differ.
-    """
+    """Add the group of a stage to a recording."""
     if name not in STAGES:
         raise ValueError(f"the group is called {name!r}; one of {', '.join(STAGES)} is needed")
     check_recording(recording)

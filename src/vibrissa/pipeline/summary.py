@@ -63,18 +63,7 @@ class TrialSummary:
 
 
 def summarise(recording: xr.DataTree) -> TrialSummary:
-    """Summarise a recording.
-
-    Parameters
-    ----------
-    recording : xarray.DataTree
-        Recording; variables along the frames that it lacks are left out of the summary.
-
-    Returns
-    -------
-    TrialSummary
-        What it holds.
-    """
+    """Summarise a recording."""
     record = Recording(recording)
     time = record.root.data["time"].values
     step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0

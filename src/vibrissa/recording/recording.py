@@ -312,28 +312,7 @@ def recording_tree(
     objects: Sequence[Surface] | None = None,
     cameras: Sequence[Camera] = (),
 ) -> xr.DataTree:
-    """Put a recording together.
-
-    Parameters
-    ----------
-    root : xarray.Dataset
-        Variables at the top, as `recorded` labels them, with their coordinates.
-    whiskers : sequence of Whisker
-        One for each along the dimension ``whisker``.
-    origin : str
-        Sentence that states where the recording comes from.
-    groups : mapping of str to xarray.Dataset, optional
-        Further groups by name.
-    objects : sequence of Surface, optional
-        Objects in the laboratory; by default it is not known which there are.
-    cameras : sequence of Camera
-        Cameras, one for each view.
-
-    Returns
-    -------
-    xarray.DataTree
-        Recording.
-    """
+    """Put a recording together."""
     tree = {"/": root.assign_attrs(kind=RECORDING_KIND, origin=origin)}
     tree |= {f"/{name}": data for name, data in (groups or {}).items()}
     if cameras:

@@ -141,25 +141,7 @@ _NUMBERS = "fiub"
 
 
 def recorded(name: str, values: ArrayLike) -> xr.Variable:
-    """Label one variable of a recording.
-
-    Parameters
-    ----------
-    name : str
-        Name of a declared variable.
-    values : array_like
-        Values in the declared order, of all whiskers or, with one dimension less, of one whisker.
-
-    Returns
-    -------
-    xarray.Variable
-        Variable with its dimensions, unit, long name and frame.
-
-    Raises
-    ------
-    ValueError
-        If nothing of that name is declared, or the values have another number of dimensions.
-    """
+    """Label one variable of a recording."""
     about = _declared(name)
     array = np.asarray(values)
     if "whisker" in about.dims and array.ndim == len(about.dims) - 1:
@@ -180,20 +162,7 @@ def recorded(name: str, values: ArrayLike) -> xr.Variable:
 
 
 def coordinates(time: ArrayLike, names: Sequence[str]) -> dict[Hashable, Any]:
-    """List the coordinates of a recording.
-
-    Parameters
-    ----------
-    time : array_like (n,)
-        Times of the frames, s.
-    names : sequence of str
-        Names of the whiskers.
-
-    Returns
-    -------
-    dict
-        Coordinates by name.
-    """
+    """List the coordinates of a recording."""
     return {
         "time": xr.Variable("time", np.asarray(time), attributes("time")),
         "whisker": list(names),
@@ -203,18 +172,7 @@ def coordinates(time: ArrayLike, names: Sequence[str]) -> dict[Hashable, Any]:
 
 
 def faults_in(data: xr.Dataset) -> list[str]:
-    """List what is wrong with the variables of a recording or of one of its groups.
-
-    Parameters
-    ----------
-    data : xarray.Dataset
-        Group of a recording, with all whiskers and frames.
-
-    Returns
-    -------
-    list of str
-        One sentence for each faulty variable.
-    """
+    """List what is wrong with the variables of a recording or of one of its groups."""
     faults = (_fault(name, data[name].variable, frozenset()) for name in VARIABLES if name in data)
     return [fault for fault in faults if fault]
 

@@ -4,33 +4,32 @@ Sections are made by pure functions of datasets; figures are drawn elsewhere and
 loads nothing: pictures, movies and scripts are in the file, and its security policy forbids more.
 """
 
-from vibrissa.report.contact_map import chart_sections
-from vibrissa.report.page import Section, document, figure_sections, movies_section, table
-from vibrissa.report.provenance import Provenance, provenance, provenance_section
-from vibrissa.report.space import (
-    NO_SPACE,
-    can_draw,
-    contacts_in_space,
-    reachable_space,
-    space_section,
+from vibrissa.report.contact_map import chart_sections as chart_sections
+from vibrissa.report.page import (
+    Section as Section,
+    document,
+    figure_sections as figure_sections,
+    movies_section as movies_section,
+    table as table,
 )
-from vibrissa.report.trial import contacts_by_whisker, trial_sections
+from vibrissa.report.provenance import (
+    Provenance as Provenance,
+    provenance as provenance,
+    provenance_section as provenance_section,
+)
+from vibrissa.report.space import (
+    NO_SPACE as NO_SPACE,
+    can_draw as can_draw,
+    contacts_in_space as contacts_in_space,
+    reachable_space,
+    space_section as space_section,
+)
+from vibrissa.report.trial import (
+    contacts_by_whisker as contacts_by_whisker,
+    trial_sections as trial_sections,
+)
 
 __all__ = [
-    "NO_SPACE",
-    "Provenance",
-    "Section",
-    "can_draw",
-    "chart_sections",
-    "contacts_by_whisker",
-    "contacts_in_space",
     "document",
-    "figure_sections",
-    "movies_section",
-    "provenance",
-    "provenance_section",
     "reachable_space",
-    "space_section",
-    "table",
-    "trial_sections",
 ]

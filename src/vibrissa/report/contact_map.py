@@ -14,20 +14,7 @@ from vibrissa.status import describe
 
 
 def chart_sections(contact_map: ContactMap, verdicts: xr.Dataset | None = None) -> list[Section]:
-    """Describe a contact map, and which signals locate its contacts.
-
-    Parameters
-    ----------
-    contact_map : ContactMap
-        The map.
-    verdicts : Dataset, optional
-        Of :func:`vibrissa.uniqueness` for it.
-
-    Returns
-    -------
-    list of Section
-        The map; verdicts, or how to have them.
-    """
+    """Describe a contact map, and which signals locate its contacts."""
     about = Section("map", "The map", contact_map._repr_html_() + _ranges(contact_map.to_dataset()))
     if verdicts is None:
         advice = paragraph(

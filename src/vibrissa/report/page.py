@@ -124,22 +124,7 @@ def table(
     caption: str = "",
     note: str = "",
 ) -> str:
-    """Lay out a table; the first column names the rows, and under a heading others are numbers.
-
-    Parameters
-    ----------
-    rows : iterable of sequence of str
-        Plain text.
-    heading : sequence of str
-        Of the columns; none: names and what belongs to them.
-    caption, note : str
-        Plain text above and below.
-
-    Returns
-    -------
-    str
-        HTML.
-    """
+    """Lay out a table; the first column names the rows, and under a heading others are numbers."""
     kind = ' class="number"' if heading else ""
     parts = [f'<div class="scroll"><table class="{"data" if heading else "facts"}">']
     if caption:
@@ -241,18 +226,7 @@ _WITNESS = "witness_"
 
 
 def figure_sections(pictures: Mapping[str, bytes]) -> list[Section]:
-    """Embed figures.
-
-    Parameters
-    ----------
-    pictures : mapping of str to bytes
-        PNG by name of the figure.
-
-    Returns
-    -------
-    list of Section
-        The contour, or else the first of them, by itself; then all others, with captions.
-    """
+    """Embed figures."""
     known = [name for name in CAPTIONS if name in pictures]
     order = [*known, *(name for name in pictures if name not in CAPTIONS)]
     first = [name for name in ("contour", *order[:1]) if name in pictures][:1]
@@ -275,22 +249,7 @@ def _figure(name: str, png: bytes) -> str:
 
 
 def movies_section(movies: Sequence[Path], folder: Path, room: int) -> Section:
-    """Embed movies as far as there is room, and link the others.
-
-    Parameters
-    ----------
-    movies : sequence of Path
-        MP4.
-    folder : Path
-        Of the page, from which links lead.
-    room : int
-        How many characters they may take.
-
-    Returns
-    -------
-    Section
-        With a player for each that is embedded.
-    """
+    """Embed movies as far as there is room, and link the others."""
     parts = []
     for path in movies:
         name = escape(path.name)

@@ -50,27 +50,6 @@ def provenance(command: Sequence[str], inputs: Sequence[Path], seed: int | None)
 
     The date is that of the environment variable ``SOURCE_DATE_EPOCH``, seconds since 1970 in UTC,
     if it is set; then the same command gives the same page.
-
-    Parameters
-    ----------
-    command : sequence of str
-        Program and arguments.
-    inputs : sequence of Path
-        Files that are read.
-    seed : int or None
-        Of the draws; None where there are none.
-
-    Returns
-    -------
-    Provenance
-        All of it.
-
-    Raises
-    ------
-    OSError
-        If a file cannot be read.
-    ValueError
-        If ``SOURCE_DATE_EPOCH`` is not a whole number.
     """
     files = tuple((str(path), path.stat().st_size, sha256(path)) for path in inputs)
     return Provenance(shlex.join(command), files, tuple(_versions()), seed, _date())
@@ -111,18 +90,7 @@ def _date() -> datetime:
 
 
 def provenance_section(known: Provenance) -> Section:
-    """Show where a page comes from.
-
-    Parameters
-    ----------
-    known : Provenance
-        All of it.
-
-    Returns
-    -------
-    Section
-        The last of a page.
-    """
+    """Show where a page comes from."""
     rows = [
         ("command", known.command),
         ("made", known.date.strftime("%Y-%m-%d %H:%M:%S UTC")),

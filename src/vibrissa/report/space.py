@@ -32,40 +32,14 @@ _CAMERA = {"eye": {"x": 1.65, "y": -1.8, "z": 1.05}, "center": {"x": 0.0, "y": 0
 
 
 def can_draw() -> bool:
-    """Check whether the drawing library is installed.
-
-    Returns
-    -------
-    bool
-        Whether there can be a picture in 3D.
-    """
+    """Check whether the drawing library is installed."""
     return find_spec("plotly") is not None
 
 
 def contacts_in_space(
     course: Course, objects: Sequence[xr.Dataset] = (), fits: Sequence[FittedShape] = ()
 ) -> Any:
-    """Draw contact points in the laboratory with the object, as it is known and as it was fitted.
-
-    Parameters
-    ----------
-    course : Course
-        Of a trial, with places.
-    objects : sequence of Dataset
-        The groups of a recording's ``objects``.
-    fits : sequence of FittedShape
-        In the laboratory.
-
-    Returns
-    -------
-    plotly.graph_objects.Figure
-        Axes in mm.
-
-    Raises
-    ------
-    ValueError
-        If there are no contact points.
-    """
+    """Draw contact points in the laboratory with the object, as known and as fitted."""
     import plotly.graph_objects as go
 
     places = course.places
@@ -130,22 +104,7 @@ def reachable_space(samples: xr.Dataset, centerline: Array, colour: str = "MB") 
 
 
 def space_section(figure: Any, about: str) -> tuple[Section, str]:
-    """Put a picture into the page.
-
-    Parameters
-    ----------
-    figure : plotly.graph_objects.Figure
-        The picture.
-    about : str
-        What it shows, plain text.
-
-    Returns
-    -------
-    section : Section
-        With the picture.
-    script : str
-        The library that draws it, for `vibrissa.report.document`.
-    """
+    """Put a picture into the page."""
     from plotly.offline import get_plotlyjs
 
     drawn = figure.to_html(

@@ -55,28 +55,7 @@ _SUSPECT = 1.5
 
 
 def trial_sections(recording: xr.DataTree, whisker: int = 0, seed: int = 0) -> list[Section]:
-    """Sections that describe a recording, its stages and their errors.
-
-    Parameters
-    ----------
-    recording : DataTree
-        A trial.
-    whisker : int
-        Which one, from 0.
-    seed : int
-        Of the draws of what covariances predict.
-
-    Returns
-    -------
-    list of Section
-        The results in four numbers; the recording; settings; then tracking, signals, estimates and
-        the contour, as far as they are there; statuses.
-
-    Raises
-    ------
-    ValueError
-        If there is no such whisker.
-    """
+    """Sections that describe a recording, its stages and their errors."""
     bent = Recording(recording).whisker(whisker)
     groups = {name: _one(recording, name, whisker) for name in ("", "signals", "estimates")}
     truth, true_whisker = None, bent
@@ -529,18 +508,7 @@ def whiskers_table(recording: xr.DataTree, chosen: int) -> str:
 
 
 def contacts_by_whisker(recording: xr.DataTree) -> NDArray[np.int64]:
-    """Count frames in contact, from the first of estimates, signals, tracking and truth.
-
-    Parameters
-    ----------
-    recording : DataTree
-        A trial.
-
-    Returns
-    -------
-    array (whiskers,) of int
-        Number of frames; zero where no group states contact.
-    """
+    """Count frames in contact, from the first of estimates, signals, tracking and truth."""
     trial = Recording(recording)
     for group in map(trial.find, ("estimates", "signals", "", "truth")):
         if group is not None and "in_contact" in group:

@@ -1,20 +1,15 @@
 """Studies of many whiskers: plain data in, one labelled store out, on one machine or many."""
 
-from vibrissa.sweeps.results import failures, open_sweep, sweep_summary
-from vibrissa.sweeps.run import Outcome, run_sweep
-from vibrissa.sweeps.store import Busy, Store
-from vibrissa.sweeps.study import EXAMPLE, Cell, Study, read_study
+from vibrissa.sweeps.results import failures, open_sweep, sweep_summary as sweep_summary
+from vibrissa.sweeps.run import Outcome as Outcome, run_sweep
+from vibrissa.sweeps.store import Busy as Busy, Store
+from vibrissa.sweeps.study import EXAMPLE as EXAMPLE, Cell as Cell, Study, read_study
 
 __all__ = [
-    "EXAMPLE",
-    "Busy",
-    "Cell",
-    "Outcome",
     "Store",
     "Study",
     "failures",
     "open_sweep",
     "read_study",
     "run_sweep",
-    "sweep_summary",
 ]

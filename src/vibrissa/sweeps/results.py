@@ -196,20 +196,7 @@ def failures(path: str | PathLike[str]) -> dict[str, str]:
 
 
 def sweep_summary(found: xr.Dataset) -> str:
-    """Summarise how far a study is, and what it found.
-
-    Parameters
-    ----------
-    found : Dataset
-        Results of `open_sweep`.
-
-    Returns
-    -------
-    str
-        Lines of text: which versions computed; by task, how many cells are done; by group of
-        whiskers and triplet, for how many it is unique, with the median and the largest critical
-        cone; and the medians of errors.
-    """
+    """Summarise how far a study is, and what it found."""
     return "\n".join(_lines(found))
 
 

@@ -5,29 +5,33 @@ from vibrissa.whisker.array import WhiskerArray
 from vibrissa.whisker.average import whisker_array
 from vibrissa.whisker.identity import Identity
 from vibrissa.whisker.model import Whisker
-from vibrissa.whisker.morphology import published_note, published_radii
-from vibrissa.whisker.pose import ORTHOGONALITY, Pose, angles_of, base_rotation, mirrored
-from vibrissa.whisker.profile import Profile, constant
-from vibrissa.whisker.rest import parabola_curvature
-from vibrissa.whisker.section import TAPER, Properties, length_faults
+from vibrissa.whisker.morphology import (
+    published_note as published_note,
+    published_radii as published_radii,
+)
+from vibrissa.whisker.pose import (
+    ORTHOGONALITY as ORTHOGONALITY,
+    Pose,
+    angles_of as angles_of,
+    base_rotation,
+    mirrored,
+)
+from vibrissa.whisker.profile import Profile, constant as constant
+from vibrissa.whisker.rest import parabola_curvature as parabola_curvature
+from vibrissa.whisker.section import (
+    TAPER as TAPER,
+    Properties as Properties,
+    length_faults as length_faults,
+)
 
 __all__ = [
-    "ORTHOGONALITY",
-    "TAPER",
     "Identity",
     "Pose",
     "Profile",
-    "Properties",
     "Whisker",
     "WhiskerArray",
-    "angles_of",
     "base_rotation",
-    "constant",
-    "length_faults",
     "mirrored",
     "morphology",
-    "parabola_curvature",
-    "published_note",
-    "published_radii",
     "whisker_array",
 ]

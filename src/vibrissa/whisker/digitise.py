@@ -48,8 +48,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import BSpline, make_interp_spline
 from scipy.linalg import eigh, qr, solve_triangular, svd
-from scipy.stats import chi2
-from scipy.stats import f as fisher
+from scipy.stats import chi2, f as fisher
 
 from vibrissa.whisker.pose import Pose, least_turn
 from vibrissa.whisker.profile import Profile, approximate, constant

@@ -187,25 +187,10 @@ _ALIKE = 5e-3
 
 
 def published_radii(name: str, length: float) -> tuple[float, float]:
-    """Radii of a rat's whisker by row, column and length (Belli et al. 2017).
+    """Base and tip radius, m, of a rat's whisker by its name and length, m (Belli et al. 2017).
 
-    Parameters
-    ----------
-    name : str
-        Which whisker, such as ``C2`` or ``left gamma``; `ANY` takes the mean of those that were
-        measured, weighted by how near their published lengths (Towal et al. 2011) are.
-    length : float
-        Arc length, m.
-
-    Returns
-    -------
-    base_radius, tip_radius : float
-        m.
-
-    Raises
-    ------
-    ValueError
-        If the name is not a whisker's.
+    For `ANY` the mean of those that were measured, weighted by how near their published lengths
+    (Towal et al. 2011) are.
     """
     if name != ANY:
         identity = Identity.of(name)
@@ -224,17 +209,7 @@ def published_radii(name: str, length: float) -> tuple[float, float]:
 
 
 def published_note(name: str) -> str:
-    """Say where such radii come from.
-
-    Parameters
-    ----------
-    name : str
-        As for `published_radii`.
-
-    Returns
-    -------
-    str
-    """
+    """State where such radii come from."""
     if name == ANY:
         which = "its length, of a rat's whisker of unknown row and column"
     else:

@@ -210,18 +210,7 @@ def base_rotation(azimuth: ArrayLike, elevation: ArrayLike, roll: ArrayLike) -> 
 
 
 def angles_of(rotation: Array) -> Array:
-    """Say the emergence angles of orientations of the base.
-
-    Parameters
-    ----------
-    rotation : array (..., 3, 3)
-        From the whisker's frame to that of the angles.
-
-    Returns
-    -------
-    array (..., 3)
-        Azimuth, elevation and roll, rad: the inverse of `base_rotation`.
-    """
+    """Azimuth, elevation and roll (..., 3), rad: the inverse of `base_rotation`."""
     azimuth = np.arctan2(rotation[..., 1, 0], rotation[..., 0, 0])
     elevation = np.arcsin(np.clip(rotation[..., 2, 0], -1.0, 1.0))
     level = base_rotation(azimuth, elevation, 0.0 * azimuth)

@@ -170,20 +170,7 @@ class Profile:
 
 
 def constant(value: ArrayLike, length: float) -> Profile:
-    """Make a profile that has one value from the base to the tip.
-
-    Parameters
-    ----------
-    value : array_like (...)
-        Value of the profile, in its unit.
-    length : float
-        Arc length from base to tip, m.
-
-    Returns
-    -------
-    Profile
-        One interval, from 0 to `length`.
-    """
+    """Make a profile that has one value from the base to the tip."""
     array = np.asarray(value, dtype=np.float64)
     return Profile(np.array([0.0, length]), array[np.newaxis, np.newaxis])
 

@@ -157,20 +157,7 @@ def proximal_roll(points: Array, weights: Array) -> float:
 
 
 def parabola_curvature(length: float, coefficient: float) -> Profile:
-    """Intrinsic curvature of y = A x², bending toward +y.
-
-    Parameters
-    ----------
-    length : float
-        Arc length, m.
-    coefficient : float
-        A, 1/m, not negative.
-
-    Returns
-    -------
-    Profile
-        Values (3,): (0, 0, κ), 1/m.
-    """
+    """Intrinsic curvature of y = A x², bending toward +y."""
     if coefficient == 0.0:
         return constant(np.zeros(3), length)
 

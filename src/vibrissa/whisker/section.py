@@ -234,19 +234,7 @@ def material_faults(
 
 
 def length_faults(length: float, any_length: bool | None = False) -> list[str]:
-    """Say what is wrong with a length; empty if nothing is.
-
-    Parameters
-    ----------
-    length : float
-        Arc length, m.
-    any_length : bool, optional
-        Whether a length that no animal's whisker has is meant.
-
-    Returns
-    -------
-    list of str
-    """
+    """Say what is wrong with a length; empty if nothing is."""
     if not (np.isfinite(length) and length > 0.0):
         return [f"length is {length!r} m; it must be positive"]
     if any_length or SHORTEST <= length <= LONGEST:

@@ -25,7 +25,7 @@ from typing import TypeAlias
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from vibrissa.numerics import Array
 from vibrissa.quantities import attributes
@@ -41,7 +41,7 @@ _SINGULAR = 1e-10
 # A measurement is explained if a perfect model would fit worse in one of a thousand.
 _RARE = 1e-3
 #: Contacts whose χ² differ by less are indistinguishable (the odds are below 200 to 1).
-INDISTINCT = float(chi2.isf(_RARE, 1))
+INDISTINCT = float(chdtri(1, _RARE))
 #: Standard deviation of each signal, or covariance (6, 6) of (F, M), SI units.
 Noise: TypeAlias = Mapping[str, float] | ArrayLike
 
@@ -367,4 +367,4 @@ def rank(covariance: Array) -> int:
 @cache
 def explained(degrees: int) -> float:
     """Largest χ² of a measurement that counts as explained, for so many degrees of freedom."""
-    return float(chi2.isf(_RARE, max(degrees, 1)))
+    return float(chdtri(max(degrees, 1), _RARE))

@@ -35,7 +35,7 @@ from typing import Any, Literal, overload
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import OptimizeResult, least_squares
-from scipy.stats import chi2
+from scipy.special import chdtrc, chdtri
 
 from vibrissa.contour.fitted_shape import excess_of
 from vibrissa.contour.simple_shapes import (
@@ -51,7 +51,7 @@ from vibrissa.contour.touches import FLOOR, Array, Checked, Touches, checked, wh
 _SOFT = 2.0
 """Residual, in standard deviations, from which points count less."""
 
-_OUTLIER = float(chi2.sf(16.0, 1))
+_OUTLIER = float(chdtrc(1, 16.0))
 """Chance of missing by as much as counts as an outlier: that of four standard deviations."""
 
 _WIDE = 0.5
@@ -246,7 +246,7 @@ def _fitted(starts: Sequence[_Posed], given: Checked) -> SimpleShape:
         given,
         covariance=covariance * scale[:, None] * scale,
         residuals=residuals,
-        inliers=np.asarray(chi_squared < chi2.isf(_OUTLIER, equations)),
+        inliers=np.asarray(chi_squared < chdtri(equations, _OUTLIER)),
         chi_squared=chi_squared,
         equations=0 if given.touches.covariance is None else equations,
     )

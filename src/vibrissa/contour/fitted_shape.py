@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Protocol, Self
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from vibrissa.contour.touches import Array, Mask
 from vibrissa.quantities import QUANTITIES, attributes
@@ -271,7 +271,7 @@ def excess_of(chi_squared: Array, equations: int) -> float:
     known = chi_squared[np.isfinite(chi_squared)]
     if not known.size or equations < 1:
         return float("nan")
-    return float(np.median(known) / chi2.median(equations))
+    return float(np.median(known) / chdtri(equations, 0.5))
 
 
 def evidence_of(chi_squared: Array, unknowns: int) -> float:

@@ -48,7 +48,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import BSpline, make_interp_spline
 from scipy.linalg import eigh, qr, solve_triangular, svd
-from scipy.stats import chi2, f as fisher
+from scipy.special import chdtri, fdtrc
 
 from vibrissa.whisker.pose import Pose, least_turn
 from vibrissa.whisker.profile import Profile, approximate, constant
@@ -217,7 +217,7 @@ class _Line:
         """Whether the points are no farther from the line than noise puts them."""
         n = len(points)
         if noise is not None:
-            limit = chi2.ppf(1.0 - SIGNIFICANCE, components * (n - 2))
+            limit = chdtri(components * (n - 2), SIGNIFICANCE)
             return bool(self.rss <= noise**2 * limit)
         rss = float(np.sum(fit.residuals**2)) * unit**2
         left, spent = components * (n - fit.freedom), components * (fit.freedom - 2.0)
@@ -225,7 +225,7 @@ class _Line:
         if left <= 0.0 or rss <= 0.0 or self.noise(components) > STRAIGHT * self.extent:
             return False
         ratio = (self.rss - rss) / spent / (rss / left)
-        return bool(fisher.sf(ratio, spent, left) > SIGNIFICANCE)
+        return bool(fdtrc(spent, left, ratio) > SIGNIFICANCE)
 
     def noise(self, components: int) -> float:
         """Standard deviation per coordinate of points about the line, m."""

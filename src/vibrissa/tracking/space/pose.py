@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
-from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation, Slerp
 
 from vibrissa.tracking.space.rest_shape import RestShape, aligned_lengths, motions
@@ -72,6 +71,8 @@ def low_pass(values: ArrayLike, rate: float, cutoff: float | None = CUTOFF) -> A
         )
     flat = array.reshape(len(array), -1)
     known = np.isfinite(flat)
+    from scipy.signal import butter, sosfiltfilt  # loads slowly
+
     sections = butter(_ORDER, cutoff, fs=rate, output="sos")
     pad = min(len(flat) - 1, round(3.0 * rate / cutoff))
     frames = np.arange(len(flat))

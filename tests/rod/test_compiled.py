@@ -103,6 +103,17 @@ def square(tmp_path):
     return call, folder
 
 
+def test_kernels_are_known_by_what_their_files_contain(square, tmp_path):
+    """A file that was copied or checked out anew has another time, and the same kernels."""
+    call, _ = square
+    script = tmp_path / "script.py"
+    assert [call().stdout, call().stdout] == ["0\n", "2\n"]
+    os.utime(script, (1e9, 1e9))
+    assert call().stdout == "2\n"
+    script.write_text(SQUARE.replace("return x * x", "return x**2"))
+    assert call().stdout == "0\n"
+
+
 def test_a_damaged_cache_counts_as_none(square):
     call, folder = square
     assert call().stdout == "0\n"

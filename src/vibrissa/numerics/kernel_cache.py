@@ -2,7 +2,8 @@
 
 Numba knows a cached kernel by its own file alone, and would go on using it after a function that it
 inlines from another file has changed; here all files with kernels of its own package, and of
-``numerics``, ``rod`` and ``signals``, whose helpers others use, are part of the key.
+``numerics``, ``rod`` and ``signals``, whose helpers others use, are part of the key. By their
+content: the time at which a file was written, by which numba knows it, says nothing of a copy.
 
 A result must not hang on the cache. A file in it that is not as it was written, whatever cut it or
 changed it, counts as none: each has its SHA-256 in front, for machine code that is not whole would
@@ -48,11 +49,10 @@ class _CheckedFiles(IndexDataCacheFile):
         try:
             with open(self._index_path, "rb") as file:
                 version = pickle.load(file)
-                stamp, overloads = _whole(file.read())
+                _, overloads = _whole(file.read())
         except Exception:  # of what is damaged, pickle raises whatever it stumbles over
             return {}
-        fresh = version == self._version and stamp == self._source_stamp
-        return overloads if fresh else {}
+        return overloads if version == self._version else {}
 
     def _load_data(self, name: str) -> Any:
         return _whole(Path(self._data_path(name)).read_bytes())  # type: ignore[no-untyped-call]

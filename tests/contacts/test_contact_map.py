@@ -7,6 +7,8 @@ import xarray as xr
 
 import vibrissa as vb
 from vibrissa.contacts import spherical, within_paper_bounds
+from vibrissa.rod import CELLS, MOST_CELLS, cells_around, contacts_at, solve_forces
+from vibrissa.signals import SIGNALS, signals_of
 
 
 def test_samples_are_equilibria_of_their_contact_points(gamma_map):
@@ -109,3 +111,24 @@ def test_the_papers_grid(tmp_path):
     np.testing.assert_allclose(bent.moment, grid.moment[i, j, k], rtol=1e-9)
     contact_map.save(tmp_path / "map.nc")
     xr.testing.assert_identical(vb.ContactMap.load(tmp_path / "map.nc").grid, grid)
+
+
+def test_cells_about_measurements_hold_the_contacts_that_noise_has_moved(gamma_map, rng):
+    """Cells listed for signals that are wrong by less than the slack hold the true contact."""
+    chart, triplet, number = gamma_map.chart, ("Fx", "MB", "MD"), 300
+    charted = rng.uniform([0.02, -np.pi, 0.2], [0.98, np.pi, 0.98], (number, 3))
+    contacts = contacts_at(chart.fold, charted)
+    values, _ = solve_forces(chart.discretization, np.insert(contacts, 1, 0.0, axis=1))
+    force, moment = values[:, :3], np.cross(values[:, 3:], values[:, :3])
+    exact = signals_of(force, moment)[:, [SIGNALS.index(name) for name in triplet]]
+    slack = 0.02 * np.abs(exact)
+    wrong = exact + rng.uniform(-1.0, 1.0, exact.shape) * slack
+    cell = np.array([1.0, 2.0 * np.pi, 1.0]) / CELLS
+    spots, away = np.empty((MOST_CELLS, 3)), np.empty(MOST_CELLS)
+    for aim, reach, true in zip(wrong, slack, charted, strict=True):
+        n = cells_around(gamma_map.tree(triplet), aim, reach, spots, away)
+        assert n < MOST_CELLS
+        apart = spots[:n] - true
+        apart[:, 1] = (apart[:, 1] + np.pi) % (2.0 * np.pi) - np.pi
+        assert (np.abs(apart) <= cell + 1e-9).all(axis=1).any()
+        assert (away[:n] <= 1.0).all()

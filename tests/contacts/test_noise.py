@@ -7,6 +7,7 @@ from scipy.stats import chi2
 import vibrissa as vb
 from vibrissa.contacts.posterior import ranked
 from vibrissa.identifiability.regions import sample
+from vibrissa.rod import fold_forces, solve_forces
 from vibrissa.signals import SIGNALS
 
 SIGMA = np.repeat([1e-6, 2e-8], 3)
@@ -187,3 +188,24 @@ def test_ranks_are_probabilities(rng):
         np.testing.assert_allclose(probability[row, :n], expected / expected.sum(), rtol=1e-12)
         assert (np.diff(probability[row, :n]) <= 0.0).all()
         assert np.isnan(probability[row, n:]).all()
+
+
+def test_contacts_where_signals_fold_are_counted(gamma_map):
+    """(FT, Mx, MB) folds near bearings of ±1.6 rad: noise moves what such contacts signal off it.
+
+    Another contact, a quarter of the length away, explains the signals exactly. It is not the only
+    one that is probable.
+    """
+    rng = np.random.default_rng(0)
+    d, number = gamma_map.chart.discretization, 60
+    s, psi = rng.uniform(0.38, 0.46, number), rng.choice([-1.6, 1.6], number)
+    fold = fold_forces(gamma_map.chart.fold, np.column_stack([s, np.cos(psi), np.sin(psi)]))
+    force = rng.uniform(0.1, 0.3, number) * fold
+    contacts = np.column_stack([s, 0.0 * s, force * np.cos(psi), force * np.sin(psi)])
+    values, _ = solve_forces(d, contacts)
+    force, point = values[:, :3] * d.force, values[:, 3:] * d.length
+    noisy = noisy_wrenches(force, np.cross(point, force), rng)
+    found = gamma_map.estimate(vb.base_signals(*noisy), "FT Mx MB", np.diag(SIGMA**2))
+    away = np.linalg.norm(found.point - point, axis=1)
+    assert (found.status == vb.Status.AMBIGUOUS).mean() > 0.9
+    assert (found.covariance_valid & (away > 0.1 * d.length)).mean() < 0.05

@@ -4,7 +4,7 @@ from vibrissa.contacts.channels import WRENCH, Channels, channel_derivatives, ch
 from vibrissa.contacts.chosen_contacts import At, ChosenContacts, chosen_contacts, large_deflection
 from vibrissa.contacts.contact_map import ContactMap, Domain, Progress, within_paper_bounds
 from vibrissa.contacts.contacts import Candidates, Contact, Contacts, contacts_of, spherical
-from vibrissa.contacts.estimator import Estimator, signals_at_nodes
+from vibrissa.contacts.estimator import Estimator
 from vibrissa.contacts.filter import ContactFilter, Followed
 from vibrissa.contacts.friction import ratio_derivatives
 from vibrissa.contacts.inversion import invert, seeding_triplet
@@ -25,6 +25,7 @@ from vibrissa.contacts.noise import (
 )
 from vibrissa.contacts.prior import Prior
 from vibrissa.contacts.readout import check_signals
+from vibrissa.contacts.search import signals_at_nodes
 from vibrissa.contacts.wrench import estimate_from_wrench
 
 __all__ = [

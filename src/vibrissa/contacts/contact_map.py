@@ -20,12 +20,12 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from vibrissa.contacts.contacts import Contacts, spherical
-from vibrissa.contacts.estimator import estimate
 from vibrissa.contacts.friction import estimate_with_friction
 from vibrissa.contacts.inversion import triplet_tree
 from vibrissa.contacts.jacobian import determining
 from vibrissa.contacts.noise import common_errors
 from vibrissa.contacts.prior import Prior
+from vibrissa.contacts.search import estimate
 from vibrissa.contacts.wrench import estimate_components
 from vibrissa.io import COMPRESSED, kind_of, naming, read_tree, write_netcdf
 from vibrissa.numerics import AnyArray, Array

@@ -25,11 +25,11 @@ import xarray as xr
 
 from vibrissa.contacts.channels import Channels, channel_derivatives
 from vibrissa.contacts.contacts import MOST_CANDIDATES, Candidates, Contacts, contacts_of
-from vibrissa.contacts.estimator import estimate
 from vibrissa.contacts.least_squares import Fits, fit
 from vibrissa.contacts.noise import Noise, SensorNoise, explained, sensor_noise, whitening
 from vibrissa.contacts.posterior import CERTAIN, NORMAL_KURTOSIS, ranked
 from vibrissa.contacts.prior import Prior, possible_candidates
+from vibrissa.contacts.search import estimate
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.signals import measured, selection, signal_scales
 from vibrissa.status import Status

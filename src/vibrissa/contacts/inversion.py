@@ -33,7 +33,16 @@ from vibrissa.rod import (
     stable,
     start_from,
 )
-from vibrissa.signals import CIRCULAR, SIGNALS, signal_derivatives, signal_equations, signals_of
+from vibrissa.signals import (
+    CIRCULAR,
+    FD,
+    MD,
+    MX,
+    SIGNALS,
+    signal_derivatives,
+    signal_equations,
+    signals_of,
+)
 
 #: Parts of the chart in each of which the nearest node is a start.
 PARTS = 16
@@ -187,10 +196,10 @@ def _match(
         residual[k] -= target[k]
         w = which[k]
         scale = 1.0
-        if w == 2 or w == 5:
+        if w in (FD, MD):
             residual[k] = wrapped(residual[k])
         else:
-            scale = 1.0 / (force if w < 2 else moment)
+            scale = 1.0 / (force if w < MX else moment)
         total += (scale * residual[k]) ** 2
     return float(np.sqrt(total))
 

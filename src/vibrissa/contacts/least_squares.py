@@ -32,6 +32,7 @@ from vibrissa.numerics import (
     AnyArray,
     Array,
     IntArray,
+    cholesky,
     copy,
     inlined,
     kernel,
@@ -56,7 +57,7 @@ from vibrissa.rod import (
     set_lane,
     stable,
 )
-from vibrissa.signals import signal_equations
+from vibrissa.signals import FD, MD, signal_equations
 
 # Some valleys of χ² are narrow and bent: most fits take 5 rounds, but a few a hundred. What is not
 # at rest after so many goes on only if it may still count.
@@ -73,6 +74,8 @@ _MOST_DAMPING = 1e8
 _ROUNDS_WITHIN = 40
 # A step that promises less of χ² (as a share of it, and by itself) is not taken.
 _IDLE_WITHIN, _LITTLE = 1e-7, 1e-10
+# Nor is one that promises less of what χ² is above what counts.
+_SLOW = 0.05
 # The longest steps of s, ψ and λ.
 _LONGEST_WITHIN = (0.1, 0.5, 0.25)
 # The chart knows the fold to a part in a million: as near to it contacts are still stable.
@@ -110,7 +113,7 @@ def channel_equations(
             jacobian[k, 0], jacobian[k, 1] = 0.0, 1.0 / normal
             jacobian[k, 2], jacobian[k, 3] = -x[1] * x[2] / normal**3, -x[1] * x[3] / normal**3
         residual[k] -= targets[k]
-        if codes[k] == 2 or codes[k] == 5:
+        if codes[k] in (FD, MD):
             residual[k] = wrapped(residual[k])
 
 
@@ -149,17 +152,8 @@ def _damped_step(
         for i in range(k):
             total -= j[i, p] * r[i]
         step[p] = 0.0 if fixed[p] > 0.0 else total
-    for p in range(4):
-        for q in range(p + 1):
-            total = a[p, q]
-            for i in range(q):
-                total -= a[p, i] * a[q, i]
-            if p > q:
-                a[p, q] = total / a[q, q]
-            elif total > 1e-14 * a[p, p]:
-                a[p, p] = np.sqrt(total)
-            else:
-                return False
+    if not cholesky(a, a):
+        return False
     for p in range(4):
         for i in range(p):
             step[p] -= a[p, i] * step[i]
@@ -225,6 +219,38 @@ def _finish(
     return float(total)
 
 
+@inlined
+def lane_contact(b: Array, lane: int, friction: bool, value: Array, t: Array, third: Array) -> None:
+    """Copy (F, p) and ∂(F, p)/∂x (6, 4) of a contact; with friction of its two lanes."""
+    lane_value(b, lane, value)
+    lane_tangents(b, lane, third)
+    for a in range(6):
+        t[a, 0], t[a, 1], t[a, 2], t[a, 3] = third[a, 0], 0.0, third[a, 1], third[a, 2]
+    if friction:
+        lane_tangents(b, lane + 1, third)
+        for a in range(6):
+            t[a, 1] = third[a, 0]
+
+
+@inlined
+def _integrate_active(rod: Rod, b: Array, to: Array, n: int, lanes: int, active: AnyArray) -> int:
+    """Integrate n contacts, ``lanes`` lanes each; how many are active, -1 if one by itself."""
+    number, only = 0, 0
+    for i in range(n):
+        if active[i]:
+            number, only = number + 1, i
+    if number == 0:
+        return 0
+    if number == 1:  # its tangents side by side
+        set_all_lanes(b, to[only, 0], to[only, 1], to[only, 2], to[only, 3])
+    else:
+        for i in range(LANES):
+            c = to[min(i // lanes, n - 1)]
+            set_lane(b, i, c[0], c[1], c[2], c[3], i % lanes == 1)
+    integrate(rod, b, 1 if number == 1 else 3)
+    return -1 if number == 1 else number
+
+
 @kernel
 def fit_rows(
     rod: Rod,
@@ -233,73 +259,48 @@ def fit_rows(
     codes: IntArray,
     targets: Array,
     weights: Array,
-    contacts: Array,
-    values: Array,
-    tangents: Array,
-    misfits: Array,
-    converged: AnyArray,
+    fits: Fits,
     first: int,
     last: int,
 ) -> None:
     """Fit contacts for some rows, four side by side (two with friction)."""
-    b = np.zeros(BUFFER_SIZE)
-    k = codes.shape[0]
+    contacts, values, tangents, misfits, converged = fits
+    b, k = np.zeros(BUFFER_SIZE), codes.shape[0]
     value, t, third = np.empty(6), np.zeros((6, 4)), np.empty((6, 3))
     residual, jacobian = np.empty(k), np.empty((k, 4))
     trial_r, trial_j = np.empty(k), np.empty((k, 4))
     r, j = np.empty((LANES, k)), np.empty((LANES, k, 4))
-    x, to, work = np.empty((LANES, 4)), np.empty((LANES, 4)), np.empty((7, 4))
-    damping = np.empty(LANES)
-    active = np.zeros(LANES, np.bool_)
+    to, work = np.empty((LANES, 4)), np.empty((7, 4))
+    damping, active = np.empty(LANES), np.zeros(LANES, np.bool_)
     # With friction a contact takes two lanes: their tangents differ in the first unknown.
     lanes = 2 if free else 1
-    together = LANES // lanes
-    for row in range(first, last, together):
-        n = min(together, last - row)
+    for row in range(first, last, LANES // lanes):
+        n = min(LANES // lanes, last - row)
         for i in range(n):
             copy(contacts[row + i], to[i])
             damping[i], active[i] = 0.0, True
             misfits[row + i], converged[row + i] = np.inf, False
         for _ in range(_ROUNDS):
-            number, only = 0, 0
-            for i in range(n):
-                if active[i]:
-                    number, only = number + 1, i
+            number = _integrate_active(rod, b, to, n, lanes, active)
             if number == 0:
                 break
-            alone = number == 1  # its tangents side by side
-            if alone:
-                set_all_lanes(b, to[only, 0], to[only, 1], to[only, 2], to[only, 3])
-            else:
-                for i in range(LANES):
-                    c = to[min(i // lanes, n - 1)]
-                    set_lane(b, i, c[0], c[1], c[2], c[3], i % lanes == 1)
-            integrate(rod, b, 1 if alone else 3)
             for i in range(n):
                 if not active[i]:
                     continue
-                lane_value(b, lanes * i, value)
-                if alone:
-                    lanes_tangents(b, t)
-                else:
-                    lane_tangents(b, lanes * i, third)
-                    for a in range(6):
-                        t[a, 0], t[a, 2], t[a, 3] = third[a, 0], third[a, 1], third[a, 2]
-                    if free:
-                        lane_tangents(b, lanes * i + 1, third)
-                        for a in range(6):
-                            t[a, 1] = third[a, 0]
-                if not free:
-                    for a in range(6):
-                        t[a, 1] = 0.0
                 at = row + i
+                if number < 0:
+                    lane_value(b, 0, value)
+                    lanes_tangents(b, t)
+                    for a in range(0 if free else 6):
+                        t[a, 1] = 0.0
+                else:
+                    lane_contact(b, lanes * i, free, value, t, third)
                 channel_equations(to[i], value, t, codes, targets[at], residual, jacobian)
                 misfit = whiten(weights[at], residual, jacobian, k, trial_r, trial_j)
                 if misfit < misfits[at]:
                     damping[i] = 0.0 if damping[i] < 1e-5 else 0.1 * damping[i]
                     misfits[at] = misfit
                     copy(to[i], contacts[at])
-                    copy(to[i], x[i])
                     copy(value, values[at])
                     for a in range(6):
                         copy(t[a], tangents[at, a])
@@ -311,10 +312,10 @@ def fit_rows(
                     continue
                 else:
                     damping[i] = max(10.0 * damping[i], 1e-2)
-                size = _next(x[i], r[i], j[i], k, damping[i], least, free, work)
+                size = _next(contacts[at], r[i], j[i], k, damping[i], least, free, work)
                 while size < 0.0 and damping[i] <= _MOST_DAMPING:
                     damping[i] = max(10.0 * damping[i], 1e-8)
-                    size = _next(x[i], r[i], j[i], k, damping[i], least, free, work)
+                    size = _next(contacts[at], r[i], j[i], k, damping[i], least, free, work)
                 active[i] = size >= 0.0
                 if size > (_LAST if damping[i] == 0.0 else _SMALL):
                     copy(work[6], to[i])
@@ -410,7 +411,7 @@ def _once(
     share_out(
         n,
         lambda first, last: fit_rows(
-            rod, friction, least, codes, targets, weights, *out, first, last
+            rod, friction, least, codes, targets, weights, out, first, last
         ),
     )
     return out
@@ -497,8 +498,9 @@ def fit_within(
     x: Array,
     value: Array,
     tangents: Array,
+    worth: float,
 ) -> float:
-    """Find the contact of least χ² in Ω, downhill from another."""
+    """Find the contact of least χ² in Ω, downhill from another; given up if above ``worth``."""
     b, k = np.zeros(BUFFER_SIZE), codes.shape[0]
     z, to, step = np.empty(3), np.empty(3), np.zeros(3)
     at, frame, work = np.empty(4), np.empty((4, 3)), np.empty((5, 3))
@@ -539,6 +541,8 @@ def fit_within(
             damping = max(10.0 * damping, 1e-8)
             gain = _next_within(r, j, k, proximal, z, damping, work, step)
         if gain <= _IDLE_WITHIN * best + _LITTLE or damping > _MOST_DAMPING:
+            break
+        if gain < _SLOW * (best - worth):
             break
         shorten = 1.0
         for p in range(3):

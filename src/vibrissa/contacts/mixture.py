@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.least_squares import channel_equations, fit_rows
+from vibrissa.contacts.least_squares import Fits, channel_equations, fit_rows
 from vibrissa.contacts.weighing import Weighing, gradients, weigh, wrong_by
 from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel
 from vibrissa.rod import Fold, Rod, point_determinant, stable
@@ -296,7 +296,7 @@ def _fits(
     """Move x to where χ² of measurement and prediction is least; fill the rest."""
     k = how.codes.shape[0]
     targets, weights = np.empty((rows, k + 3)), np.zeros((rows, k + 3, k + 3))
-    rest, own = np.zeros(rows, np.bool_), np.empty((k, k))
+    fits, own = Fits(x, v, t, chi, np.zeros(rows, np.bool_)), np.empty((k, k))
     codes = np.empty(k + 3, np.int64)
     codes[:k] = how.codes
     for a in range(3):
@@ -309,14 +309,12 @@ def _fits(
             if not weigh(how, v[row], measured, own):
                 own[:] = 0.0
             weights[row, :k, :k] = own
-        fit_rows(rod, False, proximal, codes, targets, weights, x, v, t, chi, rest, 0, rows)
+        fit_rows(rod, False, proximal, codes, targets, weights, fits, 0, rows)
         for row in range(rows):
             for _ in range(_TIMES):
-                if rest[row] or not chi[row] < np.inf:
+                if fits.converged[row] or not chi[row] < np.inf:
                     break
-                fit_rows(
-                    rod, False, proximal, codes, targets, weights, x, v, t, chi, rest, row, row + 1
-                )
+                fit_rows(rod, False, proximal, codes, targets, weights, fits, row, row + 1)
 
 
 @inlined

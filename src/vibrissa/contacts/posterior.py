@@ -26,16 +26,14 @@ import numpy as np
 from scipy.special import ndtri
 
 from vibrissa.contacts.channels import FITTED
-from vibrissa.contacts.least_squares import channel_equations, whiten
-from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel, share_out
+from vibrissa.contacts.least_squares import channel_equations, lane_contact, whiten
+from vibrissa.numerics import AnyArray, Array, IntArray, cholesky, copy, inlined, kernel, share_out
 from vibrissa.rod import (
     BUFFER_SIZE,
     LANES,
     Discretization,
     Rod,
     integrate,
-    lane_tangents,
-    lane_value,
     set_lane,
 )
 
@@ -203,19 +201,6 @@ def _load(
 
 
 @inlined
-def _unload(b: Array, lane: int, friction: bool, value: Array, t: Array, third: Array) -> None:
-    """Copy (F, p) and ∂(F, p)/∂x (6, 4) of a displaced contact."""
-    lane_value(b, lane, value)
-    lane_tangents(b, lane, third)
-    for a in range(6):
-        t[a, 0], t[a, 1], t[a, 2], t[a, 3] = third[a, 0], 0.0, third[a, 1], third[a, 2]
-    if friction:
-        lane_tangents(b, lane + 1, third)
-        for a in range(6):
-            t[a, 1] = third[a, 0]
-
-
-@inlined
 def _by_axes(derivatives: Array, axes: Array, row: int, n: int, i: int) -> float:
     """One derivative along axis i."""
     total = 0.0
@@ -261,7 +246,7 @@ def _second_order(
         integrate(rod, b, 3)
         for i in range(first, min(first + LANES // lanes, n)):
             lane = lanes * (i - first)
-            _unload(b, lane, friction, value, t, third)
+            lane_contact(b, lane, friction, value, t, third)
             channel_equations(moved[lane], value, t, codes, target, residual, jacobian)
             whiten(weights, residual, jacobian, k, r, there)
             _outputs(moved[lane], t, friction, slopes_there)
@@ -296,7 +281,7 @@ def _even(model: Model, n: int) -> float:
             v[a, c] = 0.0
             for i in range(n):
                 v[a, c] += by_y[a, i] * by_y[c, i]
-    if not cholesky3(v, root):
+    if not cholesky(v, root):
         return np.inf
     largest = 0.0
     for i in range(n):
@@ -312,23 +297,6 @@ def _even(model: Model, n: int) -> float:
                 total += back[a] ** 2
             largest = max(largest, total)
     return math.sqrt(largest)
-
-
-@inlined
-def cholesky3(v: Array, root: Array) -> bool:
-    """Fill the lower root (3, 3) of a covariance; False where it is singular."""
-    for a in range(3):
-        for c in range(a + 1):
-            total = v[a, c]
-            for i in range(c):
-                total -= root[a, i] * root[c, i]
-            if a > c:
-                root[a, c] = total / root[c, c]
-            elif total > 1e-14 * v[a, a]:
-                root[a, a] = math.sqrt(total)
-            else:
-                return False
-    return True
 
 
 @inlined
@@ -412,7 +380,7 @@ def second_moment(
             covariance[a, c] = 0.0
             for k in range(points.shape[0]):
                 covariance[a, c] += density[k] / total * points[k, a] * points[k, c]
-    if not cholesky3(covariance, root):
+    if not cholesky(covariance, root):
         return np.inf
     fourth = 0.0
     for k in range(points.shape[0]):

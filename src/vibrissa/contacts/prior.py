@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vibrissa.contacts.candidates import chi_squared_of
 from vibrissa.contacts.contacts import Candidates, spherical
 from vibrissa.contacts.posterior import CERTAIN
+from vibrissa.contacts.ranking import chi_squared_of
 from vibrissa.contacts.readout import Mixed, Named
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.rod import Discretization, contact_tangents, discretize

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vibrissa.numerics import Array, IntArray, copy, inlined, kernel
+from vibrissa.signals import FT, FX, FY, FZ, MB, MX, MY, MZ
 
 # Of a channel's variance, what others do not explain; below this the covariance is singular.
 _SINGULAR = 1e-10
@@ -37,17 +38,17 @@ def gradients(codes: IntArray, force: Array, moment: Array, out: Array) -> None:
         for a in range(6):
             out[k, a] = 0.0
         w = codes[k]
-        if w == 0 or w == 3:
+        if w in (FX, MX):
             out[k, w] = 1.0
-        elif w == 6 or w == 7:
-            out[k, w - 5] = 1.0
-        elif w == 8 or w == 9:
-            out[k, w - 4] = 1.0
+        elif w in (FY, FZ):
+            out[k, 1 + w - FY] = 1.0
+        elif w in (MY, MZ):
+            out[k, 4 + w - MY] = 1.0
         else:
-            first = 0 if w < 3 else 3
-            y, z = (force[1], force[2]) if w < 3 else (moment[1], moment[2])
+            first = 0 if w < MX else 3
+            y, z = (force[1], force[2]) if w < MX else (moment[1], moment[2])
             size = np.sqrt(y * y + z * z)
-            if w == 1 or w == 4:
+            if w in (FT, MB):
                 out[k, first + 1], out[k, first + 2] = y / size, z / size
             else:
                 out[k, first + 1], out[k, first + 2] = -z / size**2, y / size**2
@@ -95,14 +96,14 @@ def channel_covariance(how: Weighing, value: Array, measured: Array, sigma: Arra
         return
     for i in range(k):
         w = codes[i]
-        if w == 6 or w == 8:  # a size is followed by its direction
+        if w in (FY, MY):  # a size is followed by its direction
             size, cos, sin = measured[i], np.cos(measured[i + 1]), np.sin(measured[i + 1])
             along, across = deviations[i] ** 2, (size * deviations[i + 1]) ** 2
             sigma[i, i] += cos * cos * along + sin * sin * across
             sigma[i + 1, i + 1] += sin * sin * along + cos * cos * across
             sigma[i, i + 1] += cos * sin * (along - across)
             sigma[i + 1, i] += cos * sin * (along - across)
-        elif w != 7 and w != 9:
+        elif w not in (FZ, MZ):
             sigma[i, i] += deviations[i] ** 2
 
 

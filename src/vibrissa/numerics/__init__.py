@@ -12,8 +12,8 @@ from vibrissa.numerics.arrays import AnyArray, Array, IntArray, Vector
 from vibrissa.numerics.threads import share_out, threads
 
 if TYPE_CHECKING:
-    from vibrissa.numerics.algebra import norm3, solve, solve3, wrapped
-    from vibrissa.numerics.compiled import copy, inlined, kernel
+    from vibrissa.numerics.algebra import cholesky, norm3, solve, solve3, wrapped
+    from vibrissa.numerics.compiled import copy, inlined, kernel, specialised
     from vibrissa.numerics.quantiles import contact_weights, weighted_quantile
 
 __all__ = [
@@ -21,6 +21,7 @@ __all__ = [
     "Array",
     "IntArray",
     "Vector",
+    "cholesky",
     "contact_weights",
     "copy",
     "inlined",
@@ -29,14 +30,15 @@ __all__ = [
     "share_out",
     "solve",
     "solve3",
+    "specialised",
     "threads",
     "weighted_quantile",
     "wrapped",
 ]
 
 _HOMES = {
-    "algebra": ("norm3", "solve", "solve3", "wrapped"),
-    "compiled": ("copy", "inlined", "kernel"),
+    "algebra": ("cholesky", "norm3", "solve", "solve3", "wrapped"),
+    "compiled": ("copy", "inlined", "kernel", "specialised"),
     "quantiles": ("contact_weights", "weighted_quantile"),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}

@@ -7,6 +7,9 @@ import numpy as np
 from vibrissa.numerics.arrays import Array
 from vibrissa.numerics.compiled import inlined
 
+# Of a variance, what other coordinates do not explain; below this a covariance is singular.
+_SINGULAR = 1e-14
+
 
 @inlined
 def wrapped(angle: float) -> float:
@@ -74,3 +77,20 @@ def solve(a: Array, x: Array) -> float:
             x[c] -= a[c, k] * x[k]
         x[c] /= a[c, c]
     return det
+
+
+@inlined
+def cholesky(v: Array, root: Array) -> bool:
+    """Fill the lower root of a covariance, which may be v itself; False where it is singular."""
+    for a in range(v.shape[0]):
+        for c in range(a + 1):
+            total = v[a, c]
+            for i in range(c):
+                total -= root[a, i] * root[c, i]
+            if a > c:
+                root[a, c] = total / root[c, c]
+            elif total > _SINGULAR * v[a, a]:
+                root[a, a] = np.sqrt(total)
+            else:
+                return False
+    return True

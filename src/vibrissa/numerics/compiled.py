@@ -10,6 +10,7 @@ from contextlib import suppress
 from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
+from numba import types
 from numba.core.registry import CPUDispatcher
 
 from vibrissa.numerics.kernel_cache import PackageCache
@@ -27,6 +28,15 @@ _OPTIONS: dict[str, Any] = {
 }
 
 
+class _Kernel(CPUDispatcher):
+    """What is compiled once for all constants that other kernels call it with."""
+
+    def get_call_template(self, args: Any, kws: Any) -> Any:
+        """Forget which constants the arguments are."""
+        args = tuple(types.unliteral(a) for a in args)
+        return super().get_call_template(args, kws)
+
+
 class _Inlined(CPUDispatcher):
     """What only kernels can call: wrappers for Python would be a third of all compiling."""
 
@@ -36,6 +46,24 @@ class _Inlined(CPUDispatcher):
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function that Python calls; cached on disk, releases the GIL.
+
+    Parameters
+    ----------
+    function : callable
+        Function in Numba's subset of Python.
+
+    Returns
+    -------
+    callable
+        Compiled function.
+    """
+    compiled: Any = specialised(function)
+    compiled.__class__ = _Kernel
+    return cast("Callable[P, R]", compiled)
+
+
+def specialised(function: Callable[P, R]) -> Callable[P, R]:
+    """Compile a kernel anew for each constant that others call it with, so that it is faster.
 
     Parameters
     ----------

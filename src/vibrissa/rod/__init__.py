@@ -44,7 +44,7 @@ from vibrissa.rod.newton import (
 )
 from vibrissa.rod.outward import contact_forces, shapes, vanishing_moments
 from vibrissa.rod.points import PointSolver, point_solver
-from vibrissa.rod.search import MOST_SEEDS, seeds
+from vibrissa.rod.search import MOST_CELLS, MOST_SEEDS, cells_around, seeds
 from vibrissa.rod.statics import deflect
 from vibrissa.rod.surfaces import SurfaceDeflection, follow_surfaces
 from vibrissa.rod.tree import PlaneVector, SearchTree, search_tree
@@ -54,6 +54,7 @@ __all__ = [
     "CELLS",
     "LANES",
     "LEAST_ARC",
+    "MOST_CELLS",
     "MOST_SEEDS",
     "PROXIMAL",
     "ROUNDING",
@@ -75,6 +76,7 @@ __all__ = [
     "SurfaceDeflection",
     "Weighted",
     "along",
+    "cells_around",
     "chart_of",
     "chart_to_contact",
     "contact_forces",

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibrissa.numerics import Array, inlined, kernel, share_out
+from vibrissa.numerics import Array, inlined, kernel, share_out, specialised
 from vibrissa.rod.discretization import Discretization, Rod, Weight
 from vibrissa.rod.kernels import (
     BUFFER_SIZE,
@@ -34,7 +34,7 @@ def _integrate(rod: Rod, b: Array, tangents: int, weight: Weight | None) -> None
         integrate_weighted(rod, weight, b, tangents)
 
 
-@kernel
+@specialised
 def integrate(rod: Rod, b: Array, tangents: int) -> None:
     """Integrate every lane from its contact to the base, with its first so many tangents."""
     _integrate(rod, b, tangents, rod.weight)

@@ -20,6 +20,8 @@ from vibrissa.rod.tree import EVEN, FOLDED, SearchTree
 
 #: At most so many contacts are found for one target.
 MOST_SEEDS = 32
+#: At most so many cells are listed about one target.
+MOST_CELLS = 128
 # A solution may lie this far outside a cell (in cell widths) and still be its own: neighbours
 # overlap.
 _OVERLAP = 0.05
@@ -513,4 +515,63 @@ def seeds(tree: SearchTree, target: Array, found: Array, inverses: Array, qualit
                         quality,
                         count,
                     )
+    return count
+
+
+@inlined
+def _near_cell(tree: SearchTree, cell: int, target: Array, slack: Array, x: Array) -> float:
+    """How far outside a cell what is within ``slack`` of the target must lie, -1 if it cannot.
+
+    It is relative to the slack; where in the cell comes nearest is left in x.
+    """
+    frame, most = tree.frame[cell], 0.0
+    for a in range(3):
+        y, off = 0.0, 1e-300
+        for q in range(3):
+            y += frame[a, q] * _less(tree, q, target[q], frame[3, q])
+            off += abs(frame[a, q]) * slack[q]
+        away = max(frame[4, a] - y, y - frame[5, a], 0.0) / off
+        if away > 1.0:
+            return -1.0
+        most, x[a] = max(most, away), min(max(y, 0.0), 1.0)
+    return most
+
+
+@kernel
+def cells_around(tree: SearchTree, target: Array, slack: Array, spots: Array, away: Array) -> int:
+    """Fill where in cells that may hold values within ``slack`` of a target's these are nearest.
+
+    ``spots`` (n, 3) are chart coordinates, ``away`` (n,) how far they miss, relative to the slack.
+    Return how many cells there are, at most n.
+    """
+    grid, offsets, boxes, place = tree.grid, tree.offsets, tree.boxes, tree.place
+    levels, count, top = offsets.shape[0] - 1, 0, 1
+    stack, x = np.empty((_STACK, 2), np.int64), np.empty(3)
+    stack[0, 0], stack[0, 1] = 0, 0
+    while top > 0:
+        top -= 1
+        level, node = stack[top, 0], stack[top, 1]
+        box = boxes[offsets[level] + node]
+        for c in range(8):
+            inside = box[3, c] >= 0.0
+            for q in range(3):
+                apart = abs(_less(tree, q, target[q], box[q, c]))
+                inside = inside and apart <= box[3 + q, c] + slack[q]
+            if not inside:
+                continue
+            child = 8 * node + c
+            if level < levels - 1:
+                if top < _STACK:
+                    stack[top, 0], stack[top, 1] = level + 1, child
+                    top += 1
+                continue
+            miss, x[:] = 0.0, 0.5
+            if tree.polar[child] < 0:
+                miss = _near_cell(tree, child, target, slack, x)
+            if miss < 0.0 or count == spots.shape[0]:
+                continue
+            for a in range(3):
+                spots[count, a] = grid[0, a] + grid[1, a] * (place[child, a] + x[a])
+            away[count] = miss
+            count += 1
     return count

@@ -27,7 +27,9 @@ Coordinates: TypeAlias = dict[Hashable, xr.Variable]
 
 #: The signals in their canonical order.
 SIGNALS = ("Fx", "FT", "FD", "Mx", "MB", "MD")
-#: Which of them are angles.
+#: Numbers of the signals, and of the components of force and moment, as channels of kernels.
+FX, FT, FD, MX, MB, MD, FY, FZ, MY, MZ = range(10)
+#: Which of the signals are angles.
 CIRCULAR = (False, False, True, False, False, True)
 
 
@@ -304,17 +306,17 @@ def signal_scales(names: tuple[str, ...], force: float, moment: float) -> Array:
 @inlined
 def _linear_channel(w: int, s: float, force: Vector, moment: Vector, point: Vector) -> float:
     """A channel that is linear in s, F, M and p, or its derivative from theirs."""
-    if w == 0:
+    if w == FX:
         return force[0]
-    if w == 3:
+    if w == MX:
         return moment[0]
-    if w == 6:
+    if w == FY:
         return force[1]
-    if w == 7:
+    if w == FZ:
         return force[2]
-    if w == 8:
+    if w == MY:
         return moment[1]
-    if w == 9:
+    if w == MZ:
         return moment[2]
     if w == 10:
         return s
@@ -343,13 +345,13 @@ def signal_equations(
     ft, mb = np.sqrt(fy * fy + fz * fz), np.sqrt(my * my + mz * mz)
     for k in range(which.shape[0]):
         w = which[k]
-        if w == 1:
+        if w == FT:
             signal[k] = ft
-        elif w == 2:
+        elif w == FD:
             signal[k] = np.arctan2(fz, fy)
-        elif w == 4:
+        elif w == MB:
             signal[k] = mb
-        elif w == 5:
+        elif w == MD:
             signal[k] = np.arctan2(mz, my)
         else:
             signal[k] = _linear_channel(w, s, (fx, fy, fz), (mx, my, mz), (px, py, pz))
@@ -364,13 +366,13 @@ def signal_equations(
         ds = 1.0 if c == 0 else 0.0
         for k in range(which.shape[0]):
             w = which[k]
-            if w == 1:
+            if w == FT:
                 d = (fy * dfy + fz * dfz) / ft
-            elif w == 2:
+            elif w == FD:
                 d = (fy * dfz - fz * dfy) / (ft * ft)
-            elif w == 4:
+            elif w == MB:
                 d = (my * dmy + mz * dmz) / mb
-            elif w == 5:
+            elif w == MD:
                 d = (my * dmz - mz * dmy) / (mb * mb)
             else:
                 d_force, d_point = (dfx, dfy, dfz), (dpx, dpy, dpz)

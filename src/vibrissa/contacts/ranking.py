@@ -1,0 +1,534 @@
+"""Candidates under noise: hidden ones are added, all are judged and ranked; compiled.
+
+A contact near which T(Ω) ends or folds may be the true one although noise has carried the signals
+out of its reach, and another, far away, explains them exactly. So the cells of the chart that may
+hold signals within two standard deviations of the measured ones are listed, and from each that is
+not near a known contact χ² is minimised within Ω. Then all candidates are judged
+(:mod:`~vibrissa.contacts.posterior`); where the second order does not describe one of them, they
+are compared by their likelihoods alone, and the nodes of the chart show what else is probable.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from vibrissa.contacts.candidates import (
+    SAME,
+    UNEXPLAINED,
+    Problem,
+    Searched,
+    explain_rows,
+    finite,
+    solve_rows,
+)
+from vibrissa.contacts.contacts import MOST_CANDIDATES, Candidates
+from vibrissa.contacts.inversion import PARTS, nearest_of
+from vibrissa.contacts.least_squares import channel_equations, fit_within, whiten
+from vibrissa.contacts.noise import INDISTINCT
+from vibrissa.contacts.posterior import CERTAIN, NORMAL_KURTOSIS, judge, rank, second_moment
+from vibrissa.contacts.weighing import Weighing, channel_covariance, weigh_any
+from vibrissa.numerics import AnyArray, Array, IntArray, cholesky, copy, inlined, kernel, wrapped
+from vibrissa.rod import (
+    LEAST_ARC,
+    MOST_CELLS,
+    along,
+    cells_around,
+    chart_to_contact,
+    evaluate,
+    fold_force,
+)
+from vibrissa.signals import FY, MY
+from vibrissa.status import Status
+
+_UNIQUE, _AMBIGUOUS = int(Status.UNIQUE), int(Status.AMBIGUOUS)
+# How far apart signals are that the tree is asked for as well, in standard deviations; and where
+# nothing that is known explains the measurement.
+_APART, _FAR_APART = 2.0, 4.0
+# The most that this can be; more than half a turn.
+_WIDEST = 1e3
+# Contacts nearer than this (of the chart's size, about a cell) lead to the same one.
+_NEAR = 0.06
+# At most so many starts for one measurement, and so many in a row that lead to nothing new.
+_MOST_STARTS, _MOST_WASTED = 6, 3
+# So many of the chart's nodes must count for their moments to replace those about one contact.
+_MANY = 30.0
+# Squared Mahalanobis distance of three standard deviations of a point in space (99.73 %).
+_OUTSIDE_REGION = 14.16
+# Logarithm of the volume of a normal distribution of three coordinates, over its peak.
+_LOG_NORMAL = 1.5 * math.log(2.0 * math.pi)
+_MOST_LOG = 700.0
+# Nodes whose χ², or the logarithm of whose density, is so much worse than the best do not count.
+_NEGLIGIBLE = 50.0
+
+
+@kernel
+def chi_squared_of(how: Weighing, x: Array, value: Array, target: Array, measured: Array) -> float:
+    """χ² of a contact; NaN where it cannot be weighed."""
+    k = how.codes.shape[0]
+    weights, residual, jacobian = np.empty((k, k)), np.empty(k), np.empty((k, 4))
+    if not weigh_any(how, value, measured, weights):
+        return np.nan
+    channel_equations(x, value, np.zeros((6, 4)), how.codes, target, residual, jacobian)
+    return whiten(weights, residual, jacobian, k, np.empty(k), np.empty((k, 4)))
+
+
+@inlined
+def _deviations(of: Searched, how: Weighing, value: Array, measured: Array, out: Array) -> None:
+    """Standard deviations of the three quantities that the tree is asked for, near (F, p)."""
+    k = how.codes.shape[0]
+    if how.own[0, 0] > 0.0:  # a mix of components, white
+        for q in range(3):
+            out[q] = 1.0
+        return
+    sigma = np.empty((k, k))
+    channel_covariance(how, value, measured, sigma)
+    for q in range(3):
+        i = of.where[q]
+        code = how.codes[i]
+        out[q] = sigma[i, i]
+        if code >= FY:  # components instead of a size (first) and its direction
+            first = i if code in (FY, MY) else i - 1
+            angle = measured[first + 1]
+            along_y, along_z = math.cos(angle), math.sin(angle)
+            if i > first:
+                size = max(measured[first], 1e-300)
+                along_y, along_z = -along_z / size, along_y / size
+            out[q] = (
+                along_y * along_y * sigma[first, first]
+                + 2.0 * along_y * along_z * sigma[first, first + 1]
+                + along_z * along_z * sigma[first + 1, first + 1]
+            )
+        out[q] = math.sqrt(out[q])
+
+
+@inlined
+def _chart_of(of: Searched, x: Array, out: Array) -> None:
+    """Chart coordinates (η, ψ, ρ) of a contact x (4,)."""
+    out[1] = math.atan2(x[3], x[2])
+    out[0] = along(of.fold.bounds, x[0])
+    out[2] = math.sqrt(math.hypot(x[2], x[3]) / fold_force(of.fold, x[0], out[1]))
+
+
+@inlined
+def _close(a: Array, b: Array) -> bool:
+    """Whether two positions in the chart are so near that the same contact is found from them."""
+    turn = abs(wrapped(a[1] - b[1])) / (2.0 * math.pi)
+    turn *= min(a[2], b[2])  # near rest bearings are all one
+    return bool(max(abs(a[0] - b[0]), turn, abs(a[2] - b[2])) <= _NEAR)
+
+
+@kernel
+def _starts(
+    of: Searched,
+    apart: float,
+    sigma: Array,
+    measured: Array,
+    known: Array,
+    number: int,
+    starts: Array,
+) -> int:
+    """Fill positions in the chart to start from that are not known yet; how many."""
+    target, slack = np.empty(3), np.empty(3)
+    spots, away, count = np.empty((MOST_CELLS, 3)), np.empty(MOST_CELLS), 0
+    for q in range(3):
+        target[q], slack[q] = measured[of.where[q]], min(apart * sigma[q], _WIDEST)
+    n = cells_around(of.tree, target, slack, spots, away)
+    for i in range(n):
+        for c in range(number):
+            if _close(known[c], spots[i]):
+                away[i] = np.inf
+    while count < starts.shape[0]:
+        best = 0
+        for i in range(n):
+            if away[i] < away[best]:
+                best = i
+        if n == 0 or away[best] == np.inf:
+            break
+        copy(spots[best], starts[count])
+        for i in range(n):
+            if _close(starts[count], spots[i]):
+                away[i] = np.inf
+        count += 1
+    return count
+
+
+@inlined
+def _same(a: Array, b: Array) -> bool:
+    """Whether two contacts x (4,) are one."""
+    apart = math.hypot(a[2] - b[2], a[3] - b[3])
+    return bool(abs(a[0] - b[0]) < SAME and apart < 10.0 * SAME * math.hypot(a[2], a[3]))
+
+
+@kernel
+def _try(
+    of: Searched,
+    how: Weighing,
+    passes: int,
+    worth: float,
+    target: Array,
+    measured: Array,
+    start: Array,
+    number: int,
+    x: Array,
+    values: Array,
+    misfits: Array,
+) -> int:
+    """Fit from a contact; add the result if it is new, and χ² at most ``worth``; how many then."""
+    k = how.codes.shape[0]
+    weights, value, tangents = np.empty((k, k)), np.empty((1, 6)), np.zeros((6, 4))
+    if number == MOST_CANDIDATES:
+        return number
+    at, misfit, known = start.copy(), np.inf, False
+    evaluate(of.rod, at.reshape(1, 4), value, np.empty((0, 6, 3)), 0, 1)
+    for _ in range(passes):
+        if not weigh_any(how, value[0], measured, weights):
+            return number
+        most = worth if number > 0 and misfits[0] <= worth else np.inf
+        misfit = fit_within(
+            of.rod, of.fold, of.proximal, how.codes, target, weights, at, value[0], tangents, most
+        )
+        for c in range(number):
+            known = known or _same(at, x[c])
+        if known:
+            break
+    if not misfit <= worth:  # but if nothing explains the measurement, the nearest is kept
+        if number == 0 or (misfits[0] > worth and misfit < misfits[0]):
+            copy(at, x[0])
+            copy(value[0], values[0])
+            misfits[0] = misfit
+            return max(number, 1)
+        return number
+    for c in range(number):
+        if _same(at, x[c]):
+            if not misfits[c] <= worth:
+                copy(at, x[c])
+                copy(value[0], values[c])
+                misfits[c] = misfit
+            return number
+    copy(at, x[number])
+    copy(value[0], values[number])
+    misfits[number] = misfit
+    return number + 1
+
+
+@kernel
+def complete(
+    of: Searched,
+    how: Weighing,
+    passes: int,
+    limit: float,
+    target: Array,
+    measured: Array,
+    number: int,
+    x: Array,
+    values: Array,
+    misfits: Array,
+) -> int:
+    """Add contacts of Ω that noise has hidden."""
+    sigma, starts = np.empty(3), np.empty((_MOST_STARTS, 3))
+    known, start, nodes = np.empty((MOST_CANDIDATES, 3)), np.zeros(4), np.full((1, PARTS), -1)
+    least = np.inf
+    for c in range(number):
+        _chart_of(of, x[c], known[c])
+        if misfits[c] < least:
+            least = misfits[c]
+    lost = not least <= limit
+    if lost:
+        nearest_of(of.seen, of.turns, of.part, of.kinds, how.mixing, target, nodes)
+        node = 0
+        while node < PARTS - 1 and nodes[0, node] < 0:
+            node += 1
+        _deviations(of, how, of.values[max(nodes[0, node], 0)], measured, sigma)
+    else:
+        _deviations(of, how, values[0], measured, sigma)
+    worth = limit if lost else min(limit, least + INDISTINCT)
+    apart = _FAR_APART if lost else _APART
+    xi = np.empty(3)
+    wasted = 0
+    for i in range(_starts(of, apart, sigma, measured, known, number, starts)):
+        chart_to_contact(of.fold, starts[i], xi)
+        start[0], start[2], start[3] = xi[0], xi[1], xi[2]
+        before = number
+        number = _try(of, how, passes, worth, target, measured, start, number, x, values, misfits)
+        if number > before:
+            wasted = 0
+        elif number > 0 and misfits[0] <= worth:
+            wasted += 1
+        if wasted == _MOST_WASTED:
+            break
+    for c in range(number):
+        lost = lost and not misfits[c] <= limit
+    for i in range(PARTS if lost else 0):
+        if nodes[0, i] >= 0:
+            contact = of.contacts[nodes[0, i]]
+            start[0], start[2], start[3] = contact[0], contact[1], contact[2]
+            number = _try(
+                of, how, passes, worth, target, measured, start, number, x, values, misfits
+            )
+    return _kept(limit, number, x, values, misfits)
+
+
+@inlined
+def _kept(limit: float, number: int, x: Array, values: Array, misfits: Array) -> int:
+    """Keep candidates that explain a measurement, or the nearest one; how many."""
+    best = 0
+    for c in range(number):
+        if misfits[c] < misfits[best]:
+            best = c
+    if number == 0 or not misfits[best] <= limit:
+        if number > 0:
+            copy(x[best], x[0])
+            copy(values[best], values[0])
+            misfits[0] = misfits[best]
+        return min(number, 1)
+    most, kept = min(limit, misfits[best] + INDISTINCT), 0
+    for c in range(number):
+        if misfits[c] <= most:
+            copy(x[c], x[kept])
+            copy(values[c], values[kept])
+            misfits[kept] = misfits[c]
+            kept += 1
+    return kept
+
+
+@inlined
+def _misfits_at_nodes(of: Searched, how: Weighing, weights: Array, target: Array) -> Array:
+    """χ² at the chart's nodes."""
+    q, nodes = of.seen.shape
+    away, r, misfits = np.empty((q, nodes)), np.empty(nodes), np.zeros(nodes)
+    white = how.own[0, 0] > 0.0
+    for i in range(q):
+        seen, turn, aim, mine = of.seen[i], of.turns[i], target[i], away[i]
+        for node in range(nodes):
+            apart = seen[node] - aim
+            mine[node] = apart - np.rint(apart * turn) * 2.0 * np.pi
+    for i in range(q):
+        r[:] = 0.0
+        for c in range(q):
+            w, mine = weights[i, c], away[c]
+            if white:
+                w = 1.0 if i == c else 0.0
+            if w != 0.0:
+                for node in range(nodes):
+                    r[node] += w * mine[node]
+        for node in range(nodes):
+            misfits[node] += r[node] * r[node]
+    return misfits
+
+
+@kernel
+def _over_the_map(
+    of: Searched,
+    how: Weighing,
+    weights: Array,
+    target: Array,
+    point: Array,
+    chi: float,
+    log_mass: float,
+    covariance: Array,
+) -> float:
+    """Share of the probability that the chart's nodes leave to other regions than a candidate's.
+
+    Where noise leaves more open than the second order about one contact can describe, so that many
+    nodes count, the covariance is replaced by the second moment of the posterior over them. The
+    share outside three standard deviations is that of contact points or of the chart, whichever is
+    larger: contact points of little volume, as near slip-off, are not left out.
+    """
+    misfits = _misfits_at_nodes(of, how, weights, target)
+    nodes, kept = misfits.shape[0], 0
+    largest = -np.inf
+    for node in range(nodes):
+        largest = max(largest, of.log_volume[node] - 0.5 * misfits[node])
+    points, density, likelihood = np.empty((nodes, 3)), np.empty(nodes), np.empty(nodes)
+    total, squares = 0.0, 0.0
+    for node in range(nodes):
+        log = of.log_volume[node] - 0.5 * misfits[node]
+        if log < largest - _NEGLIGIBLE and misfits[node] > chi + _NEGLIGIBLE:
+            continue
+        density[kept] = math.exp(log - largest)
+        likelihood[kept] = math.exp(-0.5 * max(misfits[node] - chi, 0.0))
+        total += density[kept]
+        squares += density[kept] * density[kept]
+        for a in range(3):
+            points[kept, a] = of.values[node, 3 + a] - point[a]
+        kept += 1
+    if total * total > _MANY * squares:
+        second_moment(points[:kept], density[:kept], total, NORMAL_KURTOSIS, covariance)
+    root, back = np.zeros((3, 3)), np.empty(3)
+    if not cholesky(covariance, root):
+        return 0.0
+    mass, mass_out, like, like_out = 0.0, 0.0, 0.0, 0.0
+    for node in range(kept):
+        far = 0.0
+        for a in range(3):
+            back[a] = points[node, a]
+            for c in range(a):
+                back[a] -= root[a, c] * back[c]
+            back[a] /= root[a, a]
+            far += back[a] * back[a]
+        if far > _OUTSIDE_REGION:
+            mass_out += density[node]
+            like_out += likelihood[node]
+        else:
+            mass += density[node]
+            like += likelihood[node]
+    # The nodes may be too far apart to see all of the candidate itself.
+    mass = max(mass, math.exp(min(log_mass - largest, _MOST_LOG)))
+    like = max(like, 1.0)
+    return max(mass_out / (mass + mass_out), like_out / (like + like_out))
+
+
+# Working memory of `settle`: aims, weights, tangents (n, 6, 4) and (n, 6, 3), covariances, log
+# weights (as they count, and with volumes), probabilities, whether covariances are valid, order,
+# and copies of x, (F, p) and χ².
+Room = tuple[
+    Array, Array, Array, Array, Array, Array, Array, AnyArray, IntArray, Array, Array, Array
+]
+
+
+@inlined
+def _judging(most: int, k: int) -> Room:
+    """Make the working memory of `settle`."""
+    return (
+        np.empty((most, k)),
+        np.zeros((most, k, k)),
+        np.zeros((most, 6, 4)),
+        np.empty((most, 6, 3)),
+        np.empty((most, 3, 3)),
+        np.empty((2, most)),
+        np.empty((1, most)),
+        np.zeros(most, np.bool_),
+        np.zeros((1, most), np.int64),
+        np.empty((most, 4)),
+        np.empty((most, 6)),
+        np.empty(most),
+    )
+
+
+@kernel
+def settle(
+    of: Searched,
+    how: Weighing,
+    problem: Problem,
+    target: Array,
+    measured: Array,
+    row: int,
+    out: Candidates,
+    room: Room,
+) -> None:
+    """Complete the candidates of a noisy measurement and rank them by probability."""
+    aims, weights, tangents, third, spread, weight, chance, fine, order, x0, values0, chi0 = room
+    x, values, chi = out.x[row], out.values[row], out.chi_squared[row]
+    for c in range(out.number[row]):
+        chi[c] = chi_squared_of(how, x[c], values[c], target, measured)
+    n = complete(
+        of, how, problem.passes, problem.limit, target, measured, out.number[row], x, values, chi
+    )
+    out.number[row] = n
+    if n == 0:
+        return
+    evaluate(of.rod, x, values0, third, 0, n)
+    for c in range(n):
+        copy(target, aims[c])
+        if not weigh_any(how, values[c], measured, weights[c]):
+            weights[c, 0, 0] = np.nan
+        for a in range(6):
+            t = third[c, a]
+            tangents[c, a, 0], tangents[c, a, 2], tangents[c, a, 3] = t[0], t[1], t[2]
+    judge(
+        of.rod,
+        False,
+        LEAST_ARC,
+        of.proximal,
+        how.codes,
+        aims,
+        weights,
+        x,
+        values,
+        tangents,
+        spread,
+        weight[0],
+        fine,
+        0,
+        n,
+    )
+    sound = True
+    for c in range(n):
+        sound = sound and fine[c]
+        weight[1, c] = weight[0, c]
+    for c in range(n):  # volumes that mean little, as at folds of the signals, are left out
+        if not sound and chi[c] < np.inf:
+            weight[0, c] = -0.5 * chi[c]
+    rank(weight, out.number[row : row + 1], chance, order)
+    for c in range(n):
+        copy(x[c], x0[c])
+        copy(values[c], values0[c])
+        chi0[c] = chi[c]
+    for c in range(x.shape[0]):
+        out.probability[row, c] = chance[0, c]
+        if c >= n:
+            chi[c], x[c], values[c] = np.nan, np.nan, np.nan
+            continue
+        old = order[0, c]
+        copy(x0[old], x[c])
+        copy(values0[old], values[c])
+        chi[c], out.valid[row, c] = chi0[old], fine[old]
+        for a in range(3):
+            copy(spread[old, a], out.covariances[row, c, a])
+    if out.probability[row, 0] > CERTAIN and not out.valid[row, 0]:
+        seen, best = measured if how.own[0, 0] > 0.0 else target, order[0, 0]
+        log_mass = weight[1, best] + _LOG_NORMAL
+        outside = _over_the_map(
+            of, how, weights[best], seen, values[0, 3:], chi[0], log_mass, out.covariances[row, 0]
+        )
+        out.probability[row, 0] *= 1.0 - outside
+
+
+@kernel
+def settle_rows(
+    of: Searched,
+    how: Weighing,
+    problem: Problem,
+    targets: Array,
+    measured: Array,
+    out: Candidates,
+    status: IntArray,
+    first: int,
+    last: int,
+) -> None:
+    """Complete the candidates of noisy measurements, judge and rank them."""
+    room = _judging(MOST_CANDIDATES, targets.shape[1])
+    for row in range(first, last):
+        if not finite(targets[row]):
+            continue
+        settle(of, how, problem, targets[row], measured[row], row, out, room)
+        status[row] = UNEXPLAINED
+        if out.number[row] > 0 and out.chi_squared[row, 0] <= problem.limit:
+            status[row] = _UNIQUE if out.probability[row, 0] > CERTAIN else _AMBIGUOUS
+
+
+def estimate_rows(
+    of: Searched,
+    how: Weighing,
+    problem: Problem,
+    targets: Array,
+    measured: Array,
+    out: Candidates,
+    status: IntArray,
+    first: int,
+    last: int,
+) -> None:
+    """Find, complete, judge and rank the candidates of measurements; NaN rows are left alone.
+
+    Each stage is compiled by itself, so that whoever needs one does not wait for the others.
+    """
+    if problem.exact:
+        solve_rows(of, targets, measured, out, status, first, last)
+    else:
+        explain_rows(of, how, problem, targets, measured, out, status, False, first, last)
+    if problem.noisy:
+        settle_rows(of, how, problem, targets, measured, out, status, first, last)
+        if not problem.exact and (status[first:last] == UNEXPLAINED).any():
+            explain_rows(of, how, problem, targets, measured, out, status, True, first, last)

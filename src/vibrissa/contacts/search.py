@@ -1,0 +1,243 @@
+"""Measured signals in, contacts out: all that explain them, each with its covariance.
+
+Three signals T have as many unknowns ξ: every contact with T(ξ) = T is a candidate. More signals
+are explained by weighted least squares, χ² = |T(ξ) - T|² in standard deviations. With noise three
+are treated so too: contacts on the boundary of T(Ω) explain what noise has carried out of it. For
+noise of covariance Σ the covariance is ∂p/∂ξ (JᵀΣ⁻¹J)⁻¹ ∂p/∂ξᵀ with J = ∂T/∂ξ to first order, see
+:mod:`~vibrissa.contacts.posterior`. For a covariance of force and moment, Σ is carried over to the
+signals by their derivatives. Fewer than three signals leave a curve or a surface of contacts, see
+:mod:`~vibrissa.contacts.ambiguity`.
+
+Many measurements at once and one at a time go through the same compiled rows
+(:mod:`~vibrissa.contacts.candidates`). Each is searched for in the whole map, so that no candidate
+is lost by looking only near the last one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike
+from scipy.spatial import cKDTree
+
+from vibrissa.contacts.candidates import UNEXPLAINED, Problem
+from vibrissa.contacts.contacts import Candidates, Contacts, contacts_of
+from vibrissa.contacts.inversion import polish
+from vibrissa.contacts.noise import explained, sensor_noise
+from vibrissa.contacts.prior import Prior, among_allowed
+from vibrissa.contacts.ranking import estimate_rows
+from vibrissa.contacts.readout import (
+    Bounds,
+    Measurement,
+    Mixed,
+    Named,
+    check_signals,
+    independent,
+)
+from vibrissa.numerics import AnyArray, Array, IntArray, share_out
+from vibrissa.rod import TOLERANCE
+from vibrissa.signals import (
+    SIGNALS,
+    circular_among,
+    measured,
+    selection,
+    signal_scales,
+    signals_of,
+    within_turn,
+)
+from vibrissa.status import Status
+
+if TYPE_CHECKING:
+    from vibrissa.contacts.charted_whisker import ChartedWhisker
+
+#: Signals that determine a contact.
+UNKNOWNS = 3
+#: What is larger is brought to this: no less absurd, in any unit, and its square is still a number.
+LARGEST = 1e100
+# Non-dimensional force or moment that one in twenty exceeds only if its unit is another.
+_LARGEST_SCALE, _OFTEN = 100.0, 0.95
+# A few odd numbers have a status each; so many, nearly all of them, are a table in other units.
+_TABLE = 20
+#: Statuses by their number.
+STATUSES = {int(status): status for status in Status}
+
+
+class Search:
+    """Finds the contacts that explain measurements of three or more signals."""
+
+    def __init__(self, contact_map: ChartedWhisker, readout: Named | Mixed) -> None:
+        self.contact_map, self.readout = contact_map, readout
+        exact = isinstance(readout, Named) and len(readout.names) == UNKNOWNS
+        limit = explained(independent(contact_map, readout) - UNKNOWNS)
+        self._problem = Problem(exact, readout.noisy, readout.passes, limit)
+
+    def batch(self, values: Array, targets: Array) -> tuple[Candidates, IntArray, Array]:
+        """Candidates of measurements (n, k), with statuses and χ² of the first (n,)."""
+        readout = self.readout
+        assert isinstance(readout, Named)
+        known = np.isfinite(values).all(axis=1)
+        status = np.where(known, int(Status.UNIQUE), int(Status.MISSING))
+        nothing = known & readout.bounds.nothing(values)
+        beyond = known & readout.bounds.exceeded(values)
+        status[beyond], status[nothing] = self._beyond, self._nothing
+        aims = np.where((status == Status.UNIQUE)[:, None], targets, np.nan)
+        return self._rows(np.ascontiguousarray(values), aims, status)
+
+    def one(self, measurement: Measurement) -> tuple[Candidates, Status, float]:
+        """Candidates of one measurement, with its status and χ² of the first."""
+        readout = self.readout
+        values, targets = measurement.measured[None], measurement.target[None]
+        status = np.array([int(Status.UNIQUE)])
+        if readout.nothing(measurement):
+            status[0], targets = self._nothing, np.full(targets.shape, np.nan)
+        elif readout.beyond(measurement):
+            status[0], targets = self._beyond, np.full(targets.shape, np.nan)
+        found, status, chi_squared = self._rows(values, targets, status)
+        return found, STATUSES[int(status[0])], float(chi_squared[0])
+
+    @property
+    def _nothing(self) -> int:
+        return UNEXPLAINED if self._problem.exact else int(Status.DEGENERATE)
+
+    @property
+    def _beyond(self) -> int:
+        return UNEXPLAINED if self._problem.exact else int(Status.OUTSIDE_MAP)
+
+    def _rows(
+        self, values: Array, targets: Array, status: IntArray
+    ) -> tuple[Candidates, IntArray, Array]:
+        readout, out = self.readout, Candidates.room(len(values))
+        share_out(
+            len(values),
+            lambda first, last: estimate_rows(
+                readout.searched,
+                readout.how,
+                self._problem,
+                targets,
+                values,
+                out,
+                status,
+                first,
+                last,
+            ),
+        )
+        chi_squared = out.chi_squared[:, 0].copy()
+        rows = np.flatnonzero(status == UNEXPLAINED)
+        if rows.size:
+            assert isinstance(readout, Named)
+            status[rows], away = why_none(self.contact_map, readout.names, values[rows])
+            none = out.number[rows] == 0
+            chi_squared[rows[none]] = away[none]
+        return out, status, chi_squared
+
+
+def why_none(
+    contact_map: ChartedWhisker, names: tuple[str, ...], targets: Array
+) -> tuple[IntArray, Array]:
+    """Why three signals have no contact, and how far the nearest are that have one."""
+    chart, turned = contact_map.chart, circular_among(names)
+    known, size, tree, bounds = signals_at_nodes(contact_map, names)
+    _, nearest = tree.query(_on_circle(targets, turned, size))
+    away = within_turn(known[nearest] - targets, turned)
+    span = np.where(turned, 2.0 * np.pi, size)
+    misfit = np.abs(away / span).max(axis=1)
+    # Perhaps a contact nearer to the base than the map goes explains them.
+    start = chart.contacts.reshape(-1, 3)[nearest]
+    xi, _, residual, sign = polish(chart, names, targets, start)
+    nearer = (residual <= TOLERANCE) & (sign > 0.0) & (xi[:, 0] < chart.proximal)
+    nearer |= bounds.exceeded(targets)
+    status = np.where(nearer, int(Status.OUTSIDE_MAP), int(Status.NOT_FRICTIONLESS))
+    status[bounds.nothing(targets)] = int(Status.DEGENERATE)
+    return status, misfit
+
+
+@lru_cache(maxsize=16)
+def signals_at_nodes(
+    contact_map: ChartedWhisker, names: tuple[str, ...]
+) -> tuple[Array, Array, cKDTree, Bounds]:
+    """Return the signals at the nodes of the chart, and what searches among them need.
+
+    Parameters
+    ----------
+    contact_map : ContactMap
+        Map of the whisker's contacts.
+    names : tuple of str
+        Names of the signals.
+
+    Returns
+    -------
+    signals : array (n, k)
+        Signals at the nodes, non-dimensional.
+    ranges : array (k,)
+        Range of each over the map.
+    tree : cKDTree
+        The signals over their ranges.
+    bounds : Bounds
+        Bounds of force and moment over the map.
+    """
+    values = contact_map.chart.values.reshape(-1, 6)
+    which = [SIGNALS.index(name) for name in names]
+    known = signals_of(values[:, :3], np.cross(values[:, 3:], values[:, :3]))[:, which]
+    turned = circular_among(names)
+    size = np.where(turned, 1.0, np.ptp(known, axis=0))
+    tree = cKDTree(_on_circle(known, turned, size))
+    return known, size, tree, Bounds.of(contact_map, names)
+
+
+def _on_circle(values: Array, turned: AnyArray, size: Array) -> Array:
+    """Signals as points of a space where distance means difference: angles on the unit circle."""
+    parts = []
+    for k, turns in enumerate(turned.tolist()):
+        v = values[:, k]
+        parts += [np.cos(v), np.sin(v)] if turns else [np.clip(v / size[k], -LARGEST, LARGEST)]
+    return np.stack(parts, axis=1)
+
+
+def estimate(
+    contact_map: ChartedWhisker,
+    signals: xr.Dataset | Mapping[str, ArrayLike],
+    using: str | Sequence[str],
+    noise: Mapping[str, float] | ArrayLike | None,
+    errors: Array,
+    prior: Prior | None,
+) -> Contacts:
+    """Find all frictionless contacts of a whisker that explain measured signals."""
+    names = selection(using)
+    sensor = sensor_noise(noise, names, errors)
+    values, dims, coords = measured(signals, names)
+    check_signals(values, names)
+    d = contact_map.chart.discretization
+    flat = values.reshape(-1, len(names)) / signal_scales(names, d.force, d.moment)
+    _check_scale(flat, names)
+    if contact_map.determines(names):
+        readout = Named(contact_map, names, sensor)
+        search = Search(contact_map, readout)
+        targets = readout.channels.targets(flat)
+        found, status, chi_squared = search.batch(flat, targets)
+        if prior is not None:
+            found, status, chi_squared = among_allowed(
+                prior, contact_map, readout, (flat, targets), found, status, chi_squared
+            )
+    else:
+        found, chi_squared = Candidates.room(len(flat), 1), np.full(len(flat), np.nan)
+        known = np.isfinite(flat).all(axis=1)
+        status = np.where(known, int(Status.DEGENERATE), int(Status.MISSING))
+    return contacts_of(found, status, chi_squared, d, names, values.shape[:-1], dims, coords)
+
+
+def _check_scale(flat: Array, names: tuple[str, ...]) -> None:
+    """Refuse forces and moments far too large to have bent the whisker, as in other units."""
+    for values, name, turned in zip(flat.T, names, circular_among(names), strict=True):
+        size = np.abs(values[np.isfinite(values)])
+        if turned or size.size < _TABLE:
+            continue
+        reached = np.quantile(size, _OFTEN, method="lower")
+        if reached > _LARGEST_SCALE:
+            raise ValueError(
+                f"{name} reaches {reached:.2g} times what is natural to this "
+                "whisker: SI units are needed, N and N·m; are these mN, µN, mN·m or µN·m?"
+            )

@@ -125,8 +125,9 @@ def test_cells_about_measurements_hold_the_contacts_that_noise_has_moved(gamma_m
     wrong = exact + rng.uniform(-1.0, 1.0, exact.shape) * slack
     cell = np.array([1.0, 2.0 * np.pi, 1.0]) / CELLS
     spots, away = np.empty((MOST_CELLS, 3)), np.empty(MOST_CELLS)
+    cells = np.empty(MOST_CELLS, np.int64)
     for aim, reach, true in zip(wrong, slack, charted, strict=True):
-        n = cells_around(gamma_map.tree(triplet), aim, reach, spots, away)
+        n = cells_around(gamma_map.tree(triplet), aim, reach, cells, spots, away)
         assert n < MOST_CELLS
         apart = spots[:n] - true
         apart[:, 1] = (apart[:, 1] + np.pi) % (2.0 * np.pi) - np.pi

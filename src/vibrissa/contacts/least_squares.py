@@ -71,11 +71,14 @@ _SMALL = 1e-9
 _IDLE = 1e-8
 _LONGEST = 0.1
 _MOST_DAMPING = 1e8
-_ROUNDS_WITHIN = 40
+_ROUNDS_WITHIN = 100
 # A step that promises less of χ² (as a share of it, and by itself) is not taken.
 _IDLE_WITHIN, _LITTLE = 1e-7, 1e-10
 # Nor is one that promises less of what χ² is above what counts.
 _SLOW = 0.05
+# Where a fit within Ω ends χ² must be level in each unknown by itself: what that could still gain
+# is at most the square of this.
+_LEVEL = 0.03
 # The longest steps of s, ψ and λ.
 _LONGEST_WITHIN = (0.1, 0.5, 0.25)
 # The chart knows the fold to a part in a million: as near to it contacts are still stable.
@@ -487,6 +490,22 @@ def _next_within(
     return gain
 
 
+@inlined
+def _level(r: Array, j: Array, k: int, proximal: float, z: Array) -> bool:
+    """Whether χ² falls nowhere but out of the box."""
+    for p in range(3):
+        slope, size = 0.0, 0.0
+        for i in range(k):
+            slope += j[i, p] * r[i]
+            size += j[i, p] * j[i, p]
+        outward = (p == 0 and z[0] >= 1.0) or (p == 2 and z[2] >= _MOST_LOAD)
+        if (outward and slope < 0.0) or (p == 0 and z[0] <= proximal and slope > 0.0):
+            continue
+        if slope * slope > _LEVEL * _LEVEL * size:
+            return False
+    return True
+
+
 @kernel
 def fit_within(
     rod: Rod,
@@ -499,8 +518,11 @@ def fit_within(
     value: Array,
     tangents: Array,
     worth: float,
-) -> float:
-    """Find the contact of least χ² in Ω, downhill from another; given up if above ``worth``."""
+) -> tuple[float, bool]:
+    """Find the contact of least χ² in Ω, downhill from another; given up if above ``worth``.
+
+    Return χ², and whether it is a least one.
+    """
     b, k = np.zeros(BUFFER_SIZE), codes.shape[0]
     z, to, step = np.empty(3), np.empty(3), np.zeros(3)
     at, frame, work = np.empty(4), np.empty((4, 3)), np.empty((5, 3))
@@ -533,7 +555,7 @@ def fit_within(
                     for a in range(4):
                         j[i, p] += trial_j[i, a] * frame[a, p]
         elif best == np.inf:
-            return best
+            return best, False
         else:
             damping = max(10.0 * damping, 1e-2)
         gain = _next_within(r, j, k, proximal, z, damping, work, step)
@@ -541,7 +563,7 @@ def fit_within(
             damping = max(10.0 * damping, 1e-8)
             gain = _next_within(r, j, k, proximal, z, damping, work, step)
         if gain <= _IDLE_WITHIN * best + _LITTLE or damping > _MOST_DAMPING:
-            break
+            return best, _level(r, j, k, proximal, z)
         if gain < _SLOW * (best - worth):
             break
         shorten = 1.0
@@ -549,7 +571,7 @@ def fit_within(
             shorten = min(shorten, _LONGEST_WITHIN[p] / max(abs(step[p]), 1e-300))
         for p in range(3):
             to[p] = z[p] + shorten * step[p]
-    return best
+    return best, False
 
 
 def unknowns_covariance(

@@ -2,10 +2,12 @@
 
 A contact near which T(Ω) ends or folds may be the true one although noise has carried the signals
 out of its reach, and another, far away, explains them exactly. So the cells of the chart that may
-hold signals within two standard deviations of the measured ones are listed, and from each that is
-not near a known contact χ² is minimised within Ω. Then all candidates are judged
+hold signals within two standard deviations of the measured ones are listed. They form basins,
+separated by cells that come less near; in each that holds no known contact χ² is minimised within
+Ω. Where that leads to no least χ², as in long flat valleys, there is no candidate, but what else is
+probable is asked of the chart's nodes. All candidates are judged
 (:mod:`~vibrissa.contacts.posterior`); where the second order does not describe one of them, they
-are compared by their likelihoods alone, and the nodes of the chart show what else is probable.
+are compared by their likelihoods alone, and the nodes are asked too.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ from vibrissa.contacts.least_squares import channel_equations, fit_within, white
 from vibrissa.contacts.noise import INDISTINCT
 from vibrissa.contacts.posterior import CERTAIN, NORMAL_KURTOSIS, judge, rank, second_moment
 from vibrissa.contacts.weighing import Weighing, channel_covariance, weigh_any
-from vibrissa.numerics import AnyArray, Array, IntArray, cholesky, copy, inlined, kernel, wrapped
+from vibrissa.numerics import AnyArray, Array, IntArray, cholesky, copy, inlined, kernel
 from vibrissa.rod import (
     LEAST_ARC,
     MOST_CELLS,
@@ -48,10 +50,10 @@ _UNIQUE, _AMBIGUOUS = int(Status.UNIQUE), int(Status.AMBIGUOUS)
 _APART, _FAR_APART = 2.0, 4.0
 # The most that this can be; more than half a turn.
 _WIDEST = 1e3
-# Contacts nearer than this (of the chart's size, about a cell) lead to the same one.
-_NEAR = 0.06
-# At most so many starts for one measurement, and so many in a row that lead to nothing new.
-_MOST_STARTS, _MOST_WASTED = 6, 3
+# Between two basins cells must miss the measurement by so much more, relative to the slack.
+_SILL = 0.5
+# At most so many starts for one measurement.
+_MOST_STARTS = 6
 # So many of the chart's nodes must count for their moments to replace those about one contact.
 _MANY = 30.0
 # Squared Mahalanobis distance of three standard deviations of a point in space (99.73 %).
@@ -112,11 +114,72 @@ def _chart_of(of: Searched, x: Array, out: Array) -> None:
 
 
 @inlined
-def _close(a: Array, b: Array) -> bool:
-    """Whether two positions in the chart are so near that the same contact is found from them."""
-    turn = abs(wrapped(a[1] - b[1])) / (2.0 * math.pi)
-    turn *= min(a[2], b[2])  # near rest bearings are all one
-    return bool(max(abs(a[0] - b[0]), turn, abs(a[2] - b[2])) <= _NEAR)
+def _adjacent(of: Searched, a: int, b: int) -> bool:
+    """Whether two cells of the chart touch; near rest bearings are all one."""
+    one, other = of.tree.place[a], of.tree.place[b]
+    around = round(2.0 * math.pi / of.tree.grid[1, 1])
+    turn = abs(one[1] - other[1])
+    beside = min(turn, around - turn) <= 1 or one[2] + other[2] == 0
+    return bool(beside and abs(one[0] - other[0]) <= 1 and abs(one[2] - other[2]) <= 1)
+
+
+@inlined
+def _holds(of: Searched, cell: int, position: Array) -> bool:
+    """Whether a position in the chart is in a cell or next to it."""
+    place, grid, apart = of.tree.place[cell], of.tree.grid, np.empty(3)
+    for a in range(3):
+        apart[a] = abs((position[a] - grid[0, a]) / grid[1, a] - place[a] - 0.5)
+    apart[1] = min(apart[1], 2.0 * math.pi / grid[1, 1] - apart[1])
+    return bool(max(apart[0], apart[2]) <= 1.5 and (apart[1] <= 1.5 or place[2] == 0))
+
+
+@inlined
+def _root(parent: IntArray, i: int) -> int:
+    """Which basin a cell belongs to."""
+    while parent[i] != i:
+        i = parent[i]
+    return i
+
+
+@kernel
+def _basins(
+    of: Searched,
+    cells: IntArray,
+    away: Array,
+    n: int,
+    known: Array,
+    number: int,
+    order: IntArray,
+    parent: IntArray,
+) -> None:
+    """Fill the order of cells by how far they miss, and the basin (its best cell) of each.
+
+    Cells that touch are of one basin unless they are separated by a sill. That of the known
+    contacts has the number n.
+    """
+    low = np.empty(n + 1)
+    parent[n], low[n] = n, 0.0
+    for i in range(n):
+        place = i
+        while place > 0 and away[order[place - 1]] > away[i]:
+            order[place] = order[place - 1]
+            place -= 1
+        order[place] = i
+    for nth in range(n):
+        i = order[nth]
+        parent[i], low[i] = i, away[i]
+        for c in range(number):
+            if _holds(of, cells[i], known[c]):
+                parent[i] = n
+        for before in range(nth):
+            j = order[before]
+            mine, theirs = _root(parent, i), _root(parent, j)
+            if mine == theirs or not _adjacent(of, cells[i], cells[j]):
+                continue
+            if low[mine] < low[theirs] or mine == n:
+                mine, theirs = theirs, mine
+            if away[i] - low[mine] <= _SILL:
+                parent[mine] = theirs
 
 
 @kernel
@@ -128,30 +191,29 @@ def _starts(
     known: Array,
     number: int,
     starts: Array,
-) -> int:
-    """Fill positions in the chart to start from that are not known yet; how many."""
-    target, slack = np.empty(3), np.empty(3)
-    spots, away, count = np.empty((MOST_CELLS, 3)), np.empty(MOST_CELLS), 0
+) -> tuple[int, bool]:
+    """Fill positions in the chart to start from, one for each basin without known contacts.
+
+    Return how many there are, and whether there are more.
+    """
+    target, slack, count = np.empty(3), np.empty(3), 0
+    cells, order = np.empty(MOST_CELLS, np.int64), np.empty(MOST_CELLS, np.int64)
+    spots, away = np.empty((MOST_CELLS, 3)), np.empty(MOST_CELLS)
+    parent = np.empty(MOST_CELLS + 1, np.int64)
     for q in range(3):
         target[q], slack[q] = measured[of.where[q]], min(apart * sigma[q], _WIDEST)
-    n = cells_around(of.tree, target, slack, spots, away)
-    for i in range(n):
-        for c in range(number):
-            if _close(known[c], spots[i]):
-                away[i] = np.inf
-    while count < starts.shape[0]:
-        best = 0
-        for i in range(n):
-            if away[i] < away[best]:
-                best = i
-        if n == 0 or away[best] == np.inf:
-            break
-        copy(spots[best], starts[count])
-        for i in range(n):
-            if _close(starts[count], spots[i]):
-                away[i] = np.inf
-        count += 1
-    return count
+    n = cells_around(of.tree, target, slack, cells, spots, away)
+    if n == MOST_CELLS and number > 0:  # noise leaves so much open that candidates mean little
+        return 0, True
+    _basins(of, cells, away, n, known, number, order, parent)
+    for nth in range(n):
+        i = order[nth]
+        if parent[i] == i:
+            if count == starts.shape[0]:
+                return count, True
+            copy(spots[i], starts[count])
+            count += 1
+    return count, False
 
 
 @inlined
@@ -174,43 +236,40 @@ def _try(
     x: Array,
     values: Array,
     misfits: Array,
-) -> int:
-    """Fit from a contact; add the result if it is new, and χ² at most ``worth``; how many then."""
+) -> tuple[int, bool]:
+    """Fit from a contact; add the result if it is a new least χ², at most ``worth``.
+
+    Return how many there are then, and whether the fit ended elsewhere although χ² is so small.
+    """
     k = how.codes.shape[0]
     weights, value, tangents = np.empty((k, k)), np.empty((1, 6)), np.zeros((6, 4))
     if number == MOST_CANDIDATES:
-        return number
-    at, misfit, known = start.copy(), np.inf, False
+        return number, True
+    at, misfit, known, least = start.copy(), np.inf, False, False
     evaluate(of.rod, at.reshape(1, 4), value, np.empty((0, 6, 3)), 0, 1)
     for _ in range(passes):
         if not weigh_any(how, value[0], measured, weights):
-            return number
+            return number, False
         most = worth if number > 0 and misfits[0] <= worth else np.inf
-        misfit = fit_within(
+        misfit, least = fit_within(
             of.rod, of.fold, of.proximal, how.codes, target, weights, at, value[0], tangents, most
         )
         for c in range(number):
             known = known or _same(at, x[c])
         if known:
             break
-    if not misfit <= worth:  # but if nothing explains the measurement, the nearest is kept
-        if number == 0 or (misfits[0] > worth and misfit < misfits[0]):
-            copy(at, x[0])
-            copy(value[0], values[0])
-            misfits[0] = misfit
-            return max(number, 1)
-        return number
-    for c in range(number):
-        if _same(at, x[c]):
-            if not misfits[c] <= worth:
-                copy(at, x[c])
-                copy(value[0], values[c])
-                misfits[c] = misfit
-            return number
+    lost = number == 0 or not misfits[0] <= worth
+    if lost and (number == 0 or misfit < misfits[0]):  # the nearest so far, whatever it is
+        copy(at, x[0])
+        copy(value[0], values[0])
+        misfits[0] = misfit
+        return max(number, 1), misfit <= worth and not least
+    if known or not (least and misfit <= worth):
+        return number, not known and misfit <= worth
     copy(at, x[number])
     copy(value[0], values[number])
     misfits[number] = misfit
-    return number + 1
+    return number + 1, False
 
 
 @kernel
@@ -225,8 +284,11 @@ def complete(
     x: Array,
     values: Array,
     misfits: Array,
-) -> int:
-    """Add contacts of Ω that noise has hidden."""
+) -> tuple[int, bool]:
+    """Add contacts of Ω that noise has hidden.
+
+    Return how many there are then, and whether others may be probable that are not among them.
+    """
     sigma, starts = np.empty(3), np.empty((_MOST_STARTS, 3))
     known, start, nodes = np.empty((MOST_CANDIDATES, 3)), np.zeros(4), np.full((1, PARTS), -1)
     least = np.inf
@@ -246,28 +308,25 @@ def complete(
     worth = limit if lost else min(limit, least + INDISTINCT)
     apart = _FAR_APART if lost else _APART
     xi = np.empty(3)
-    wasted = 0
-    for i in range(_starts(of, apart, sigma, measured, known, number, starts)):
+    n, others = _starts(of, apart, sigma, measured, known, number, starts)
+    for i in range(n):
         chart_to_contact(of.fold, starts[i], xi)
         start[0], start[2], start[3] = xi[0], xi[1], xi[2]
-        before = number
-        number = _try(of, how, passes, worth, target, measured, start, number, x, values, misfits)
-        if number > before:
-            wasted = 0
-        elif number > 0 and misfits[0] <= worth:
-            wasted += 1
-        if wasted == _MOST_WASTED:
-            break
+        number, other = _try(
+            of, how, passes, worth, target, measured, start, number, x, values, misfits
+        )
+        others = others or other
     for c in range(number):
         lost = lost and not misfits[c] <= limit
     for i in range(PARTS if lost else 0):
         if nodes[0, i] >= 0:
             contact = of.contacts[nodes[0, i]]
             start[0], start[2], start[3] = contact[0], contact[1], contact[2]
-            number = _try(
+            number, other = _try(
                 of, how, passes, worth, target, measured, start, number, x, values, misfits
             )
-    return _kept(limit, number, x, values, misfits)
+            others = others or other
+    return _kept(limit, number, x, values, misfits), others
 
 
 @inlined
@@ -423,7 +482,7 @@ def settle(
     x, values, chi = out.x[row], out.values[row], out.chi_squared[row]
     for c in range(out.number[row]):
         chi[c] = chi_squared_of(how, x[c], values[c], target, measured)
-    n = complete(
+    n, others = complete(
         of, how, problem.passes, problem.limit, target, measured, out.number[row], x, values, chi
     )
     out.number[row] = n
@@ -477,7 +536,7 @@ def settle(
         chi[c], out.valid[row, c] = chi0[old], fine[old]
         for a in range(3):
             copy(spread[old, a], out.covariances[row, c, a])
-    if out.probability[row, 0] > CERTAIN and not out.valid[row, 0]:
+    if out.probability[row, 0] > CERTAIN and (others or not out.valid[row, 0]):
         seen, best = measured if how.own[0, 0] > 0.0 else target, order[0, 0]
         log_mass = weight[1, best] + _LOG_NORMAL
         outside = _over_the_map(

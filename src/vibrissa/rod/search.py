@@ -538,11 +538,13 @@ def _near_cell(tree: SearchTree, cell: int, target: Array, slack: Array, x: Arra
 
 
 @kernel
-def cells_around(tree: SearchTree, target: Array, slack: Array, spots: Array, away: Array) -> int:
-    """Fill where in cells that may hold values within ``slack`` of a target's these are nearest.
+def cells_around(
+    tree: SearchTree, target: Array, slack: Array, cells: IntArray, spots: Array, away: Array
+) -> int:
+    """List ``cells`` (n,) that may hold values within ``slack`` of a target's.
 
-    ``spots`` (n, 3) are chart coordinates, ``away`` (n,) how far they miss, relative to the slack.
-    Return how many cells there are, at most n.
+    ``spots`` (n, 3) are chart coordinates where in a cell these are nearest, ``away`` (n,) is how
+    far they miss, relative to the slack. Return how many cells there are, at most n.
     """
     grid, offsets, boxes, place = tree.grid, tree.offsets, tree.boxes, tree.place
     levels, count, top = offsets.shape[0] - 1, 0, 1
@@ -572,6 +574,6 @@ def cells_around(tree: SearchTree, target: Array, slack: Array, spots: Array, aw
                 continue
             for a in range(3):
                 spots[count, a] = grid[0, a] + grid[1, a] * (place[child, a] + x[a])
-            away[count] = miss
+            cells[count], away[count] = child, miss
             count += 1
     return count

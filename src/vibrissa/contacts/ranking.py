@@ -119,8 +119,8 @@ def _adjacent(of: Searched, a: int, b: int) -> bool:
     one, other = of.tree.place[a], of.tree.place[b]
     around = round(2.0 * math.pi / of.tree.grid[1, 1])
     turn = abs(one[1] - other[1])
-    beside = min(turn, around - turn) <= 1 or one[2] + other[2] == 0
-    return bool(beside and abs(one[0] - other[0]) <= 1 and abs(one[2] - other[2]) <= 1)
+    near = min(turn, around - turn) <= 1 or one[2] + other[2] == 0
+    return bool(near and abs(one[0] - other[0]) <= 1 and abs(one[2] - other[2]) <= 1)
 
 
 @inlined

@@ -303,7 +303,9 @@ def test_the_rest_shape_ignores_how_it_is_held():
     curves = []
     for i in range(30):
         bent = rest + np.outer(s**2, [0.0, 3.0 if i % 3 == 0 else 0.0, 0.0])
-        turn = Rotation.random(rng=generator).as_matrix()
+        # As wide as whiskers are moved: by azimuth, elevation and roll.
+        angles = generator.uniform(-1.0, 1.0, 3) * [80.0, 40.0, 50.0]
+        turn = Rotation.from_euler("ZYX", angles, degrees=True).as_matrix()
         noise = generator.normal(0.0, 1e-6, rest.shape)
         curves.append(bent @ turn.T + generator.normal(size=3) + noise)
     shape = rest_shape(np.array(curves))
@@ -311,6 +313,24 @@ def test_the_rest_shape_ignores_how_it_is_held():
     whisker = whisker_at_rest(shape)
     expected = 2.0 * 8.0 / (1.0 + (2.0 * 8.0 * 10e-3) ** 2) ** 1.5
     assert whisker.curvature(10e-3)[2] == pytest.approx(expected, rel=0.05)
+
+
+def test_a_whisker_pressed_to_its_mirror_image_is_not_at_rest():
+    """It slows down against an object in most frames, bent the other way as much as it curves."""
+    from scipy.spatial.transform import Rotation
+
+    azimuth = 0.8 * np.sin(np.linspace(0.0, np.pi, 90))
+    s = np.linspace(0.0, 20e-3, 101)
+    straightened = np.maximum(azimuth - 0.4, 0.0) / 0.4
+    coefficient = 8.0 * (1.0 - 2.0 * straightened)
+    curves = np.zeros((90, 101, 3))
+    curves[..., 0], curves[..., 1] = s, coefficient[:, None] * s**2
+    turn = Rotation.from_euler("z", azimuth[:, None]).as_matrix()
+    noise = np.random.default_rng(0).normal(0.0, 1e-5, curves.shape)
+    shape = rest_shape(np.einsum("tij,tnj->tni", turn, curves) + noise)
+    assert (straightened > 0).mean() > 0.6
+    clear = (straightened == 0) | (straightened > 0.2)
+    np.testing.assert_array_equal(shape.free[clear], straightened[clear] == 0)
 
 
 def test_the_rest_shape_of_a_whisker_whose_tip_is_mostly_hidden():

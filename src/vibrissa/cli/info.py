@@ -132,7 +132,9 @@ def _recording(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
         yield from listed
     else:
         yield from (line for line in listed if line[0] == "note")
-    follows = "report" if not missing else "reconstruct"
+    # What was estimated does not make an object.
+    stuck = "estimates" in found.stages and not found.estimated
+    follows = "report" if stuck or not missing else "reconstruct"
     yield "next", f"vibrissa {follows} {path}{'' if whole else ' (groups and variables: --all)'}"
 
 

@@ -270,7 +270,9 @@ class _Measured(NamedTuple):
             touching = Group(wrench)["in_contact"]
             rows &= touching
             free |= known & ~touching
-        above = float(np.median(least[rows])) if rows.any() else float(np.nanmax(least, initial=0))
+        # Where no contact is detected, of the frames in which one could have been.
+        possible = rows if rows.any() else known & ~free
+        above = float(np.median(least[possible])) if possible.any() else 0.0
         typical, steady = None, bool((covariance == covariance[:1]).all())
         if noise is not None:
             typical = covariance[0] if steady else _typical(covariance[rows])

@@ -36,6 +36,7 @@ from vibrissa.pipeline.frames import EACH, estimates_in, whisker_radii
 from vibrissa.quantities import attributes
 from vibrissa.recording import Group, Recording
 from vibrissa.signals import nearest_on_rest
+from vibrissa.status import describe
 from vibrissa.whisker import Whisker
 
 Array = NDArray[np.float64]
@@ -232,9 +233,11 @@ def fit_contacts(
             return fit_free(points, **known)
         return fit_shape(shape, points, axis=axis, **known)
     except ValueError as fault:
-        found = int(np.isfinite(points).all(axis=1).sum())
+        found = np.isfinite(points).all(axis=1)
+        reasons = describe(estimates["status"].values.reshape(-1)[~found]).most_common(2)
+        others = "".join(f"; {count} frames: {why.rstrip('.')}" for why, count in reasons)
         raise ValueError(
-            f"{fault} (contacts were estimated in {found} of {len(points)} frames)"
+            f"{fault} (contacts were estimated in {found.sum()} of {len(points)} frames{others})"
         ) from None
 
 

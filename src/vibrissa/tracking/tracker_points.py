@@ -24,6 +24,9 @@ Array = NDArray[np.float64]
 POINT_SIGMA = 0.5
 """Usual standard deviation of a tracked point across the whisker, pixels."""
 
+_SHOWN = 12
+"""Number of whiskers that are listed."""
+
 _FEWEST = 3
 """Smallest number of points that make a trace."""
 
@@ -278,7 +281,8 @@ def _wanted(
     longest = int(often[np.argmax(length[often])])
     notes.append(
         f"{often.size} whiskers are seen in half of the frames; the longest, {names[longest]}, is "
-        "taken: name others"
+        f"taken: name others ({', '.join(names[k] for k in often[:_SHOWN])}"
+        f"{', …' if often.size > _SHOWN else ''})"
     )
     return [longest]
 

@@ -3,6 +3,9 @@
 Whatever bends the whisker changes its shape; how it is held only moves it. Frames whose shapes are
 the same but for a rigid motion are therefore taken for frames without contact, if there are enough
 of them: the largest such group. Their median, each moved to where it fits best, is the rest shape.
+A whisker pressed against an object may keep its shape too, but only while its base hardly moves, so
+that frames count by how fast it moves; and bent to the mirror image of its rest shape, it is the
+same only when rolled over, which no animal does.
 
 A whisker tapers to its tip, so that its length determines how thick it is everywhere, and so how it
 bends where. If its tip is too faint to be seen, or not in the image, then of all lengths that are
@@ -50,6 +53,12 @@ _ENDS = 3
 _SMOOTH = 4.0
 """Factor of the noise of a shape: errors of neighbouring points are correlated, so that they seem
 smoother than they are right."""
+
+_OVER = np.deg2rad(120.0)
+"""Roll about the whisker's chord from which a rigid motion is not one that an animal makes."""
+
+_BASE = 6
+"""Number of parts of a shape of which the first shows the direction of its base."""
 
 _ROUNDS = 4
 """Number of rounds in which the free frames are selected."""
@@ -126,8 +135,7 @@ def rest_shape(curves: Array, least: float = 0.1, tips: Mask | None = None) -> R
     _, shapes, known, compared = _compared(curves[seen])
     whole = _whole(known, compared)
     part = shapes[whole, :compared]
-    chords = np.linalg.norm(part[:, ::4, None, :] - part[:, None, ::4, :], axis=-1)
-    best, near = _largest_group(chords.reshape(len(part), -1), least)
+    best, near = _largest_group(part, least)
     group = np.flatnonzero(seen)[whole][near]
     length, ends = _length(curves[group], None if tips is None else tips[group])
     # The same once more, at arc lengths that divide this length evenly.
@@ -213,7 +221,7 @@ def known_rest(curves: Array, whisker: Whisker, least: float = 0.1) -> RestShape
     for row, shape, count in zip(np.flatnonzero(seen), shapes, known, strict=True):
         n = min(int(count), len(points), compared)
         if n >= _LEAST * compared:
-            out[row] = _deviations(shape[None, :n], points[:n])[0]
+            out[row] = _deviations(shape[None, :n], points[:n], rolled=True)[0]
     lowest = np.sort(out[np.isfinite(out)])
     noise = float(np.median(lowest[: max(_FEWEST, round(least * len(lowest)))]))
     free = np.zeros(len(curves), dtype=bool)
@@ -223,9 +231,29 @@ def known_rest(curves: Array, whisker: Whisker, least: float = 0.1) -> RestShape
     return RestShape(points, free, out, noise)
 
 
-def _deviations(shapes: Array, target: Array) -> Array:
-    square = ((_onto(shapes, target) - target) ** 2).sum(axis=2)
+def _deviations(shapes: Array, target: Array, rolled: bool = False) -> Array:
+    """Root mean square distances from a target on which shapes are put, rolled over or not."""
+    rotation, _ = motions(shapes, target)
+    chord = shapes[:, -1] - shapes[:, 0]
+    swing = _swings(chord, target[-1] - target[0])
+    # About the chord of the target, onto which both rotations bring that of the shape.
+    twist = np.trace(rotation @ np.swapaxes(swing, 1, 2), axis1=1, axis2=2)
+    over = (twist < 1.0 + 2.0 * np.cos(_OVER)) & (not rolled)
+    rotation[over] = swing[over]
+    shift = target.mean(axis=0) - np.einsum("tij,tj->ti", rotation, shapes.mean(axis=1))
+    square = ((_moved(shapes, rotation, shift) - target) ** 2).sum(axis=2)
     return np.asarray(np.sqrt(square.mean(axis=1)))
+
+
+def _swings(directions: Array, goal: Array) -> Array:
+    """Smallest rotations (n, 3, 3) that bring directions (n, 3) onto a goal (3,)."""
+    a = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    b = goal / np.linalg.norm(goal)
+    outer = b[:, None] * a[:, None, :]
+    across = outer - np.swapaxes(outer, 1, 2)
+    # A whisker never points the opposite way; there the rotation would be undefined.
+    nearness = np.maximum(1.0 + a @ b, 1e-6)[:, None, None]
+    return np.asarray(np.eye(3) + across + across @ across / nearness)
 
 
 def whisker_at_rest(shape: RestShape, name: str = "tracked", **properties: float) -> Whisker:
@@ -263,15 +291,38 @@ def aligned_lengths(curves: Array, spacing: float | None = None) -> tuple[float,
     return spacing, np.stack([interpolated(s, at, curve, np.nan) for at, curve in pairs])
 
 
-def _largest_group(signatures: Array, least: float) -> tuple[int, Mask]:
+def _largest_group(shapes: Array, least: float) -> tuple[int, Mask]:
     """Frame that has the nearest neighbours, and which frames are near it."""
+    points = shapes[:, ::4]
+    chords = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1)
+    signatures = chords.reshape(len(shapes), -1)
     square = (signatures**2).sum(axis=1)
     away = square[:, None] + square[None] - 2.0 * signatures @ signatures.T
+    # Distances do not distinguish mirror images: opposite bends are as far apart as they are deep.
+    chord = shapes[:, -1] - shapes[:, 0]
+    bends = (shapes - shapes[:, :1]).mean(axis=1) - 0.5 * chord
+    bends = np.einsum("tij,tj->ti", _swings(chord, chord.mean(axis=0)), bends)
+    depth = np.linalg.norm(bends, axis=1)
+    over = bends @ bends.T < np.cos(_OVER) * depth[:, None] * depth
+    away += over * chords[0].size * (2.0 * np.minimum(depth[:, None], depth)) ** 2
     distance = np.sqrt(np.maximum(away, 0.0))
-    rank = max(2, round(least * len(signatures)))
-    radius = np.sort(distance, axis=1)[:, min(rank, len(signatures) - 1)]
+    pace = _pace(shapes)
+    order = np.argsort(distance, axis=1)
+    rank = np.argmax(np.cumsum(pace[order], axis=1) >= least * pace.sum(), axis=1)
+    nearest = np.take_along_axis(distance, order, axis=1)
+    last = np.clip(rank, 2, len(shapes) - 1)
+    radius = np.take_along_axis(nearest, last[:, None], axis=1)[:, 0]
     best = int(np.argmin(radius))
     return best, distance[best] <= max(2.0 * float(radius[best]), 1e-12)
+
+
+def _pace(shapes: Array) -> Array:
+    """How fast the direction of the base turns in each frame, at most as 1, the usual pace."""
+    ahead = shapes[:, shapes.shape[1] // _BASE] - shapes[:, 0]
+    ahead = ahead / np.linalg.norm(ahead, axis=1, keepdims=True)
+    pace = np.linalg.norm(np.gradient(ahead, axis=0), axis=1)
+    usual = float(np.median(pace))
+    return np.minimum(pace / usual, 1.0) if usual else np.ones(len(pace))
 
 
 def motions(shapes: Array, target: Array) -> tuple[Array, Array]:

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
         report,
         rod,
         samples,
+        scene,
         sensors,
         signals,
         simulation,

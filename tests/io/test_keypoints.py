@@ -13,13 +13,7 @@ import pandas as pd
 import pytest
 import xarray as xr
 
-from vibrissa.io import (
-    load_anipose,
-    load_deeplabcut,
-    load_movement,
-    load_sleap,
-    load_tracks,
-)
+from vibrissa.io import Kind, load_tracks
 
 PARTS = ("base", "low", "high", "tip")
 
@@ -79,7 +73,7 @@ def test_points_that_deeplabcut_triangulated(tmp_path, rng):
     table.to_csv(path)
     with pytest.raises(ValueError, match="unit of its points"):
         load_tracks(path)
-    line = load_deeplabcut(path, unit="um")["centerline"]
+    line = load_tracks(path, unit="um")["centerline"]
     np.testing.assert_allclose(line, points * 1e-6)
 
 
@@ -124,7 +118,7 @@ def test_bad_deeplabcut(tmp_path, rng):
     ):
         path.write_text(spoilt)
         with pytest.raises(ValueError, match=message) as caught:
-            load_deeplabcut(path)
+            load_tracks(path, Kind.DEEPLABCUT)
         assert "video.csv" in str(caught.value)
 
 
@@ -213,10 +207,10 @@ def test_anipose(tmp_path, rng):
         load_tracks(path, unit="m")
     table.drop(columns="tip_z", errors="ignore").drop(columns="low_z").to_csv(path, index=False)
     with pytest.raises(ValueError, match="lacks low_z"):
-        load_anipose(path, unit="mm")
+        load_tracks(path, Kind.ANIPOSE, unit="mm")
     path.write_text(path.read_text()[:-30])
     with pytest.raises(ValueError, match="cells; the file may be cut short"):
-        load_anipose(path, unit="mm")
+        load_tracks(path, Kind.ANIPOSE, unit="mm")
 
 
 def poses(rng, plural, flat=True):
@@ -260,10 +254,10 @@ def test_movement(tmp_path, rng, plural):
     )
     poses(rng, plural).assign_attrs(space_unit="mm").to_netcdf(path, engine="h5netcdf")
     with pytest.raises(ValueError, match="pixels are needed"):
-        load_movement(path)
+        load_tracks(path, Kind.MOVEMENT)
     poses(rng, plural).drop_vars("position").to_netcdf(path, engine="h5netcdf")
     with pytest.raises(ValueError, match="not a poses dataset"):
-        load_movement(path)
+        load_tracks(path, Kind.MOVEMENT)
 
 
 def sleap_analysis(path, points, sure, dims=None):
@@ -295,11 +289,11 @@ def test_sleap_analysis(tmp_path, rng, dims):
     with pytest.raises(
         ValueError, match=r"a.analysis.h5 cannot be read as an analysis file of SLEAP.*cut off"
     ):
-        load_sleap(path)
+        load_tracks(path, Kind.SLEAP_ANALYSIS)
     with h5py.File(path, "w") as file:
         file["tracks"] = points
     with pytest.raises(ValueError, match="lacks tracks or node_names"):
-        load_sleap(path)
+        load_tracks(path, Kind.SLEAP_ANALYSIS)
 
 
 @pytest.mark.parametrize("tracked", [True, False])
@@ -339,4 +333,4 @@ def test_sleap_labels(tmp_path, rng, tracked):
     path = tmp_path / "cut.slp"
     path.write_bytes(content[: len(content) // 2])
     with pytest.raises(ValueError, match=r"cut.slp"):
-        load_sleap(path)
+        load_tracks(path, Kind.SLEAP_LABELS)

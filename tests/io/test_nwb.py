@@ -9,11 +9,11 @@ import xarray as xr
 from scipy.spatial.transform import Rotation
 
 from vibrissa.io import (
+    Kind,
     RawTracks,
     Session,
     join_views,
     labelled,
-    load_nwb,
     load_nwb_series,
     load_tracks,
     recognise,
@@ -112,7 +112,7 @@ def test_a_trial_that_nobody_traced_comes_back_with_its_poses(tmp_path, recordin
     np.testing.assert_allclose(found["time"], root["time"], atol=1e-12)
     assert list(found["whisker"].values) == ["C1", "C2"]
     with pytest.raises(ValueError, match="read by load_nwb_series"):
-        load_nwb(path)
+        load_tracks(path)
     nwbinspector = pytest.importorskip("nwbinspector")
     bad = ("ERROR", "PYNWB_VALIDATION", "CRITICAL")
     messages = nwbinspector.inspect_nwbfile(nwbfile_path=str(path))
@@ -171,7 +171,7 @@ def test_tracks_without_cameras_and_uneven_times(tmp_path, recording):
     data = recording.to_dataset()[["trace", "trace_confidence"]]
     data = data.rename(trace_confidence="confidence").isel(time=[0, 1, 3, 4, 9, 10, 11])
     save_nwb(path, data, SESSION)
-    tracks = load_nwb(path).sel(view=list(VIEWS))
+    tracks = load_tracks(path).sel(view=list(VIEWS))
     np.testing.assert_allclose(tracks["trace"], data["trace"])
     np.testing.assert_allclose(tracks["time"], data["time"])
     np.testing.assert_allclose(tracks["confidence"], data["confidence"])
@@ -238,7 +238,7 @@ def foreign(path, devices, whiskers=("A",), timestamps=None, unit="pixels"):
 def test_poses_of_others(tmp_path):
     path = tmp_path / "other.nwb"
     points = foreign(path, ())
-    tracks = load_nwb(path, view="top")
+    tracks = load_tracks(path, view="top")
     assert list(tracks["whisker"].values) == ["A"]
     assert list(tracks["node"].values) == ["tip", "base"]
     np.testing.assert_allclose(tracks["trace"][:, 0, 0], 2.0 * points[:, ::-1])
@@ -246,24 +246,24 @@ def test_poses_of_others(tmp_path):
     np.testing.assert_allclose(tracks["confidence"], 0.5)
 
     points = foreign(path, ("left", "right"), ("poses_left", "poses_right"))
-    tracks = load_nwb(path)
+    tracks = load_tracks(path)
     assert list(tracks["view"].values) == ["left", "right"]
     assert list(tracks["whisker"].values) == ["whisker"]
     np.testing.assert_allclose(tracks["trace"][:, 0, 1], 2.0 * (points[:, ::-1] + 100))
 
     foreign(path, ("left", "left"), ("A", "B"))
-    assert load_nwb(path)["trace"].shape == (6, 2, 1, 2, 2)
+    assert load_tracks(path)["trace"].shape == (6, 2, 1, 2, 2)
     front = tmp_path / "front.nwb"
     foreign(front, ("left", "left"), ("A", "B"))
-    both = join_views(load_nwb(path, view="top"), load_nwb(front, view="front"))
+    both = join_views(load_tracks(path, view="top"), load_tracks(front, view="front"))
     assert both.sizes["view"] == 2
 
     foreign(path, (), ("A", "B"), timestamps=np.arange(6) * 0.1)
     with pytest.raises(ValueError, match=r"other.nwb has poses at different times"):
-        load_nwb(path)
+        load_tracks(path)
     foreign(path, (), unit="furlongs")
     with pytest.raises(ValueError, match="positions in furlongs"):
-        load_nwb(path)
+        load_tracks(path)
 
 
 def test_bad_files(tmp_path, recording):
@@ -280,7 +280,7 @@ def test_bad_files(tmp_path, recording):
     with h5py.File(path, "w") as file:
         file["a"] = 1
     with pytest.raises(ValueError, match="not an NWB file"):
-        load_nwb(path)
+        load_tracks(path, Kind.NWB)
 
 
 def without(*names):

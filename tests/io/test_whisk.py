@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vibrissa.io import join_views, load_measurements, load_tracks, load_whiskers
+from vibrissa.io import Kind, join_views, load_tracks, load_whiskers
 
 REAL = Path(__file__).parents[3] / "shared" / "formats" / "test.measurements"
 
@@ -121,23 +121,26 @@ def test_files_that_do_not_belong_together(tmp_path):
 
 def test_whole_or_refused(tmp_path):
     """A file cut at any place is an error that names it."""
-    for make, load in ((whiskers_file, load_whiskers), (measurements_file, load_measurements)):
+    for make, kind in (
+        (whiskers_file, Kind.WHISKERS),
+        (measurements_file, Kind.MEASUREMENTS),
+    ):
         path = make(tmp_path / "whole")
         content = path.read_bytes()
         cut = tmp_path / "cut"
         for end in [*range(1, 60), *range(60, len(content), 97), len(content) - 1]:
             cut.write_bytes(content[:end])
             with pytest.raises(ValueError, match="cut"):
-                load(cut)
+                load_tracks(cut, kind)
         cut.write_bytes(content + b"\0")
         with pytest.raises(ValueError, match="cut"):
-            load(cut)
+            load_tracks(cut, kind)
         cut.write_bytes(b"")
         with pytest.raises(ValueError, match="is empty"):
-            load(cut)
+            load_tracks(cut, kind)
         cut.write_bytes(b"something else, long enough to be one")
         with pytest.raises(ValueError, match="is no"):
-            load(cut)
+            load_tracks(cut, kind)
     with pytest.raises(ValueError, match="nodes is 1"):
         load_whiskers(whiskers_file(tmp_path / "whole"), nodes=1)
     nothing = whiskers_file(tmp_path / "nothing", {})

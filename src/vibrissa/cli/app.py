@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 from rich.text import Text
 
+import vibrissa as vb
 from vibrissa.cli.batch import batch
 from vibrissa.cli.calibrate import calibrate
 from vibrissa.cli.correct import correct
@@ -79,9 +80,7 @@ for _name, _verb in VERBS.items():
 
 def _version(asked: bool) -> None:
     if asked:
-        from vibrissa._version import __version__
-
-        output.print(f"vibrissa {__version__}", highlight=False)
+        output.print(f"vibrissa {vb.__version__}", highlight=False)
         raise typer.Exit
 
 

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+import vibrissa as vb
 from vibrissa.cli.estimate import EstimateOptions
 from vibrissa.cli.inputs import objects_from, recording_from
 from vibrissa.cli.options import with_options
 from vibrissa.cli.reconstruct import ShapeOptions, stages
 from vibrissa.cli.signals import SourceOptions
 from vibrissa.cli.terminal import Tell, progress_bars, say, shown
-
-if TYPE_CHECKING:
-    from vibrissa.objects import Surface
-    from vibrissa.pipeline import TrialSummary
 
 TABLE, PAGE = "summary.csv", "summary.html"
 """Files that are written into the folder, replaced by each run."""
@@ -52,9 +49,6 @@ def batch(
     page FOLDER/summary.html.
     Example: `vibrissa batch trials --shape sphere`
     """
-    from vibrissa.io import replacing, write_table
-    from vibrissa.report import Section, document, table
-
     if not folder.is_dir():
         raise ValueError(f"{folder} is not a folder; one with recordings is needed")
     paths = [path for path in sorted(folder.glob("*.nc")) if path.stat().st_size]
@@ -70,13 +64,15 @@ def batch(
             rows.append(_cells(path, found, fault))
             lines.append(_shown(path, found, fault))
             # What is done is in the table even if the next one is interrupted.
-            write_table(folder / TABLE, _COLUMNS, rows)
+            vb.io.write_table(folder / TABLE, _COLUMNS, rows)
         tell("recordings", len(paths), len(paths))
     failed = sum(bool(row[-1]) for row in rows)
     about = f"{len(rows)} recordings, {failed} with a fault"
-    section = Section("recordings", "Recordings", table(lines, _HEADING))
-    with replacing(folder / PAGE) as part:
-        part.write_text(document(folder.resolve().name, about, [section]), encoding="utf-8")
+    section = vb.report.Section("recordings", "Recordings", vb.report.table(lines, _HEADING))
+    with vb.io.replacing(folder / PAGE) as part:
+        part.write_text(
+            vb.report.document(folder.resolve().name, about, [section]), encoding="utf-8"
+        )
     for row in rows:
         say(f"{row[0]}: {row[-1] or row[-2]}")
     say(about)
@@ -85,10 +81,8 @@ def batch(
 
 def _is_recording(path: Path) -> bool:
     """Whether a file is a recording, or perhaps one that is damaged."""
-    from vibrissa.io import Kind, recognise
-
     try:
-        return recognise(path) == Kind.RECORDING
+        return vb.io.recognise(path) == vb.io.Kind.RECORDING
     except ValueError:
         return True  # reading it states what is wrong
 
@@ -98,31 +92,27 @@ def _one(
     wanted: ShapeOptions,
     source: SourceOptions,
     how: EstimateOptions,
-    objects: tuple[Surface, ...] | None,
+    objects: tuple[vb.objects.Surface, ...] | None,
     again: bool,
     tell: Tell,
-) -> tuple[TrialSummary | None, str]:
+) -> tuple[vb.pipeline.TrialSummary | None, str]:
     """Bring one recording to its object; its summary, and what was wrong."""
-    from vibrissa.io import save_recording
-    from vibrissa.pipeline import summarise
-    from vibrissa.recording import Recording
-
     fault, tree, made = "", None, False
     try:
         tree = recording_from(path)
         if again or "contour" not in tree.children:
-            known = Recording(tree).objects if objects is None else objects
+            known = vb.recording.Recording(tree).objects if objects is None else objects
             for stage, after in stages(tree, wanted, source, how, known, tell, str(path)):
                 tree, made = after, True
                 tell(f"{path.name}: {stage}", 1, 1)
     except (ValueError, OSError) as error:
         fault = " ".join(str(error).split())
     if tree is not None and made:
-        save_recording(path, tree)
-    return None if tree is None else summarise(tree), fault
+        vb.io.save_recording(path, tree)
+    return None if tree is None else vb.pipeline.summarise(tree), fault
 
 
-def _cells(path: Path, found: TrialSummary | None, fault: str) -> list[object]:
+def _cells(path: Path, found: vb.pipeline.TrialSummary | None, fault: str) -> list[object]:
     """A line of the table."""
     if found is None:
         return [path.name, *[""] * (len(_COLUMNS) - 2), fault]
@@ -132,7 +122,7 @@ def _cells(path: Path, found: TrialSummary | None, fault: str) -> list[object]:
     return [path.name, names, *numbers, *sizes, found.fitted, fault]
 
 
-def _shown(path: Path, found: TrialSummary | None, fault: str) -> list[str]:
+def _shown(path: Path, found: vb.pipeline.TrialSummary | None, fault: str) -> list[str]:
     """A line of the page, in the units that are shown."""
     if found is None:
         return [path.name, *[""] * (len(_HEADING) - 2), fault]

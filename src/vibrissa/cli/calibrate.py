@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from vibrissa.cli.options import free, refuse, with_options
+import vibrissa as vb
+from vibrissa.cli.options import check_new, refuse, with_options
 from vibrissa.cli.terminal import say
 
 _POOR = 1.0
@@ -58,14 +59,10 @@ def calibrate(
 
 def _suspended(description: Path, target: Path, force: bool) -> None:
     """Calibrate a whisker on a compliant suspension."""
-    from vibrissa.io import NETCDF, check_readable, check_writable
-    from vibrissa.sensors import Stage, calibrate_suspension, save_suspended
-
-    check_writable(target, NETCDF)
-    free([target], force)
-    stage = Stage.load(check_readable(description))
+    check_new(target, vb.io.NETCDF, force)
+    stage = vb.sensors.Stage.load(vb.io.check_readable(description))
     points, readings, rest = stage.touches()
-    found = calibrate_suspension(
+    found = vb.sensors.calibrate_suspension(
         stage.whisker(),
         points,
         readings,
@@ -73,7 +70,7 @@ def _suspended(description: Path, target: Path, force: bool) -> None:
         rest=rest,
         base_sigma=stage.base_sigma,
     )
-    save_suspended(target, found, stage)
+    vb.sensors.save_suspended(target, found, stage)
     lost = len(points) - int(found.used.sum())
     say(f"{found.used.sum()} touches" + (f"; {lost} have no equilibrium in the model" * (lost > 0)))
     spread = found.covariance.diagonal() ** 0.5
@@ -94,20 +91,20 @@ def _cameras(
     images: list[Path], pattern: str, square: float, target: Path, frames: int | None, force: bool
 ) -> None:
     """Calibrate cameras."""
-    from vibrissa.cameras import calibrate as calibrated, save_cameras
-    from vibrissa.io import Kind, check_readable, check_writable, load_series, recognise
-
     corners = _corners(pattern)
     if not _SMALLEST < square < _LARGEST:
         raise ValueError(f"--square is {square:g}; the side of a square in mm is needed, as 5")
     if frames is not None and frames < 2:
         raise ValueError(f"--frames is {frames}; a few dozen are needed")
-    check_writable(target, (".toml",))
-    free([target], force)
-    if not any(recognise(check_readable(image)) == Kind.VIDEO for image in images):
+    check_new(target, (".toml",), force)
+    if not any(
+        vb.io.recognise(vb.io.check_readable(image)) == vb.io.Kind.VIDEO for image in images
+    ):
         refuse({"--frames": frames}, "it is of videos, and these are images")
-    cameras, error = calibrated(load_series(images, frames or _FRAMES), corners, 1e-3 * square)
-    save_cameras(target, cameras)
+    cameras, error = vb.cameras.calibrate(
+        vb.io.load_series(images, frames or _FRAMES), corners, 1e-3 * square
+    )
+    vb.cameras.save_cameras(target, cameras)
     for camera in cameras:
         say(
             f"{camera.name}: {camera.size[0]} × {camera.size[1]} pixels, focal length "

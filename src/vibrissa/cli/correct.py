@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+import vibrissa as vb
 from vibrissa.cli.options import with_options
 from vibrissa.cli.terminal import say
 
@@ -30,35 +31,24 @@ def correct(
     Click points from base to tip; arrows go to other frames, s saves, q saves and closes; all keys
     are shown in the window. Example: `vibrissa correct top.mp4 -o corrections.csv --trace trial.nc`
     """
-    from vibrissa.io import (
-        FrameReader,
-        check_writable,
-        load_corrections,
-        save_corrections,
-        video_info,
-    )
-    from vibrissa.plots import correct as corrected
-
     if view < 0:
         raise ValueError(f"--view is {view}; views are counted from 0")
-    check_writable(target, (".csv",))
-    all_ = load_corrections(target) if target.exists() else {}
+    vb.io.check_writable(target, (".csv",))
+    all_ = vb.io.load_corrections(target) if target.exists() else {}
     traces = {} if trace is None else _traces(trace, view)
 
     def save(found: dict[tuple[int, int], NDArray[np.float64]]) -> None:
-        save_corrections(target, {**all_, view: found})
+        vb.io.save_corrections(target, {**all_, view: found})
 
-    count = video_info(video).frames or _ENDLESS
-    found = corrected(FrameReader(video), count, all_.get(view), traces, save)
+    count = vb.io.video_info(video).frames or _ENDLESS
+    found = vb.plots.correct(vb.io.FrameReader(video), count, all_.get(view), traces, save)
     say(f"{len(found)} corrected traces of view {view}")
     say(f"use them: vibrissa track … --corrections {target}")
 
 
 def _traces(path: Path, view: int) -> dict[tuple[int, int], Any]:
     """Traces of a recording, by frame of the video and whisker."""
-    from vibrissa.io import load_recording
-
-    data = load_recording(path).to_dataset()
+    data = vb.load_recording(path).to_dataset()
     if "trace" not in data:
         raise ValueError(f"{path} is a recording without traces")
     if view >= data.sizes["view"]:

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import typer
 
+import vibrissa as vb
 from vibrissa.cli.inputs import WhiskerOptions, print_notes, smallest_arc
 from vibrissa.cli.options import numbers, refuse, with_options
 from vibrissa.cli.tables import print_table
 from vibrissa.cli.terminal import fixed, remark, say
-
-if TYPE_CHECKING:
-    from vibrissa.rod import Deflection, Load
-    from vibrissa.whisker import Whisker
 
 _MM = 1e-3
 _MICRO = 1e-6
@@ -42,9 +38,6 @@ def deflect(
     Without an answer the status states why, and the exit status is 1.
     Example: `vibrissa deflect --point 25,12,1`
     """
-    from vibrissa.rod import deflect as deflected
-    from vibrissa.status import Status
-
     load = _load(point, point_force, peg, axis, push)
     if point_force is not None:
         refuse({"--proximal": proximal}, "a --point-force acts where it is stated")
@@ -54,10 +47,10 @@ def deflect(
     pull = None if gravity is None else numbers(gravity, _XYZ, "--gravity")
     say(repr(whisker))
     print_notes(whisker)
-    bent = deflected(whisker, load, gravity=pull, proximal=smallest_arc(proximal))
-    status = Status(int(bent.status))
+    bent = vb.deflect(whisker, load, gravity=pull, proximal=smallest_arc(proximal))
+    status = vb.Status(int(bent.status))
     # The advice by the name that the option has here.
-    option = " The option is --proximal." if status == Status.TOO_PROXIMAL else ""
+    option = " The option is --proximal." if status == vb.Status.TOO_PROXIMAL else ""
     say(f"{status}{option}")
     _doubt_the_unit(load, whisker)
     if not (status.ok and math.isfinite(bent.arc_length)):
@@ -65,16 +58,14 @@ def deflect(
     _print(bent)
 
 
-def _doubt_the_unit(load: Load, whisker: Whisker) -> None:
+def _doubt_the_unit(load: vb.rod.Load, whisker: vb.Whisker) -> None:
     """Ask whether metres were meant where a position would then be on the whisker."""
     import numpy as np
 
-    from vibrissa.rod import PointContact, PointForce
-
-    if isinstance(load, PointForce):
+    if isinstance(load, vb.PointForce):
         away = float(load.arc_length)
     else:
-        position = load.points if isinstance(load, PointContact) else load.origin
+        position = load.points if isinstance(load, vb.PointContact) else load.origin
         away = float(np.linalg.norm(position))
     if 0.0 < away < _NEXT_TO_BASE * whisker.length:
         remark(
@@ -86,10 +77,8 @@ def _doubt_the_unit(load: Load, whisker: Whisker) -> None:
 
 def _load(
     point: str | None, force: str | None, peg: str | None, axis: str | None, push: str | None
-) -> Load:
+) -> vb.rod.Load:
     """Make the one load that was asked for."""
-    from vibrissa.rod import PegContact, PointContact, PointForce
-
     kinds = {"--point": point, "--point-force": force, "--peg": peg}
     given = [name for name, value in kinds.items() if value]
     if len(given) != 1:
@@ -98,36 +87,32 @@ def _load(
     if peg is None:
         refuse({"--axis": axis, "--push": push}, "they are of a --peg")
     if point is not None:
-        return PointContact([x * _MM for x in numbers(point, _XYZ, "--point")])
+        return vb.PointContact([x * _MM for x in numbers(point, _XYZ, "--point")])
     if force is not None:
         s, size, angle = numbers(force, ("S", "F", "ANGLE"), "--point-force")
-        return PointForce(s * _MM, size * _MICRO, math.radians(angle))
+        return vb.PointForce(s * _MM, size * _MICRO, math.radians(angle))
     *origin, diameter = numbers(peg or "", (*_XYZ, "D"), "--peg")
     direction = numbers(axis or "0,0,1", _XYZ, "--axis")
     side = None if push is None else numbers(push, _XYZ, "--push")
-    return PegContact([x * _MM for x in origin], direction, 0.5 * diameter * _MM, side=side)
+    return vb.PegContact([x * _MM for x in origin], direction, 0.5 * diameter * _MM, side=side)
 
 
-def _print(bent: Deflection) -> None:
-    from vibrissa.contacts import spherical
-    from vibrissa.quantities import quantity
-    from vibrissa.signals import SIGNALS, base_signals
-
-    signals = base_signals(bent.force, bent.moment)
+def _print(bent: vb.Deflection) -> None:
+    signals = vb.base_signals(bent.force, bent.moment)
     point, components = bent.contact_point, ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
     groups = {
         "contact": [
             *zip("xyz", point, strict=True),
-            *zip(("r", "theta", "phi"), spherical(point), strict=True),
+            *zip(("r", "theta", "phi"), vb.contacts.spherical(point), strict=True),
             ("arc_length", bent.arc_length),
         ],
-        "signal": [(name, signals[name]) for name in SIGNALS],
+        "signal": [(name, signals[name]) for name in vb.signals.SIGNALS],
         "wrench": list(zip(components, (*bent.force, *bent.moment), strict=True)),
     }
     rows: list[tuple[str, ...] | None] = []
     for kind, values in groups.items():
         rows += [
-            (kind, name, quantity(name).long_name, fixed(name, float(value)))
+            (kind, name, vb.quantities.quantity(name).long_name, fixed(name, float(value)))
             for name, value in values
         ]
         rows.append(None)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import vibrissa as vb
 from vibrissa.cli.drawings import NODES, TrialOptions, trial_drawings
 from vibrissa.cli.figures import saved
 from vibrissa.cli.inputs import WhiskerOptions, print_notes
@@ -15,8 +16,6 @@ from vibrissa.cli.terminal import Tell, progress_bars, say, shown
 
 if TYPE_CHECKING:
     from vibrissa.demo import DemoResult, Located
-    from vibrissa.evaluation import ErrorRow, TrackingScores
-
 _SENSED = "measured by a sensor"
 _SEEN = "the paper's method"
 
@@ -40,11 +39,10 @@ def demo(
     Example: `vibrissa demo --output try --seed 1`
     """
     from vibrissa.demo import DURATION, FULL_DURATION, run_demo
-    from vibrissa.io import check_folder
 
     if duration is not None and full is not None:
         raise ValueError("give either --duration or one of --full and --quick")
-    check_folder(target)
+    vb.io.check_folder(target)
     whisker = own.read()
     say(repr(whisker))
     print_notes(whisker)
@@ -69,7 +67,6 @@ def demo(
 
 def _pictures(result: DemoResult, folder: Path, tell: Tell) -> list[Path]:
     """The figures of the trial, and signals over the space of all contacts."""
-    from vibrissa import plots
     from vibrissa.demo import video_files
 
     videos = None if result.tracking is None else video_files(folder)
@@ -77,13 +74,11 @@ def _pictures(result: DemoResult, folder: Path, tell: Tell) -> list[Path]:
     drawings = trial_drawings(folder / "trial.nc", "double", given, tell)
     contact_map = result.contact_map
     line = contact_map.whisker.centerline(NODES)
-    drawings["signal_space"] = lambda: plots.signal_clouds(contact_map.to_dataset(), line)
+    drawings["signal_space"] = lambda: vb.plots.signal_clouds(contact_map.to_dataset(), line)
     return saved(drawings, folder, ("png",), tell)
 
 
 def _report(result: DemoResult, noise: bool) -> None:
-    from vibrissa.evaluation import caution
-
     sensed, seen = result.sensed, result.seen
     scores = sensed.scores
     none, one, several = scores.candidates
@@ -107,12 +102,12 @@ def _report(result: DemoResult, noise: bool) -> None:
     if seen is not None:
         title = f"The same by {_SEEN}*, signals and map being of one model"
         _print_errors(title, "angle", seen.scores.by_angle, False, _label)
-        say(f"* {caution(seen.contacts.attrs['source'])}")
+        say(f"* {vb.evaluation.caution(seen.contacts.attrs['source'])}")
         say()
     _print_peg(result)
 
 
-def _print_tracking(scores: TrackingScores) -> None:
+def _print_tracking(scores: vb.evaluation.TrackingScores) -> None:
     views, lengths = ("top", "front"), ("centreline in space", "base", "contact point")
     rows = [
         (f"trace, {name}", *(f"{value:.3f} px" for value in pixels))
@@ -146,20 +141,20 @@ def _print_signals(sensed: Located, seen: Located) -> None:
     print_table(columns, rows, "Signals, median error by deflection angle")
 
 
-def _coordinate(row: ErrorRow) -> str:
+def _coordinate(row: vb.evaluation.ErrorRow) -> str:
     return {"error_r": "r", "error_theta": "θ", "error_phi": "φ"}.get(row.quantity, "3D")
 
 
-def _label(row: ErrorRow) -> str:
+def _label(row: vb.evaluation.ErrorRow) -> str:
     return row.label
 
 
 def _print_errors(
     title: str,
     first: str,
-    rows: Sequence[ErrorRow],
+    rows: Sequence[vb.evaluation.ErrorRow],
     noise: bool,
-    label: Callable[[ErrorRow], str],
+    label: Callable[[vb.evaluation.ErrorRow], str],
 ) -> None:
     """Errors as measured and, with noise, as predicted."""
     cells: list[Row] = []

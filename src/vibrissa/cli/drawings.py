@@ -11,19 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+import vibrissa as vb
 from vibrissa.cli.inputs import map_from, map_of
 from vibrissa.cli.terminal import Tell, say
 
 if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import NDArray
-
-    from vibrissa.cameras import Camera
-    from vibrissa.contacts import ContactMap
-    from vibrissa.contour import FittedShape
-    from vibrissa.plots import Sight
-    from vibrissa.scene import Course
-    from vibrissa.whisker import Whisker
 
 Draw = Callable[[], Any]
 """Draws a figure when it is called."""
@@ -58,11 +52,9 @@ class TrialOptions:
         """Number of the whisker, the first by default."""
         return self.which or 0
 
-    def contact_map(self, trial: xr.DataTree, tell: Tell) -> ContactMap:
+    def contact_map(self, trial: xr.DataTree, tell: Tell) -> vb.ContactMap:
         """Read the map of a trial's whisker, or simulate it."""
-        from vibrissa.recording import Recording
-
-        own = Recording(trial).whisker(self.whisker)
+        own = vb.recording.Recording(trial).whisker(self.whisker)
         if self.map is None:
             return map_of(own, tell)
         found = map_from(self.map)
@@ -78,12 +70,9 @@ class TrialOptions:
 
 
 def sights_of(
-    trial: xr.DataTree, course: Course, videos: Sequence[Path], rows: NDArray[np.intp]
-) -> list[Sight]:
+    trial: xr.DataTree, course: vb.scene.Course, videos: Sequence[Path], rows: NDArray[np.intp]
+) -> list[vb.plots.Sight]:
     """Return what the cameras of a trial see in some frames; without videos it is drawn."""
-    from vibrissa.io import video_frames
-    from vibrissa.plots import Sight
-
     cameras = _cameras(trial)
     if videos and len(videos) != len(cameras):
         raise ValueError(
@@ -97,27 +86,22 @@ def sights_of(
             frames = rows if course.frames is None else course.frames[rows, number]
             listed = [int(frame) for frame in frames]
             _check_video(videos[number], camera, listed)
-            images = video_frames(videos[number], listed)
-        sights.append(Sight(camera, images))
+            images = vb.io.video_frames(videos[number], listed)
+        sights.append(vb.plots.Sight(camera, images))
     return sights
 
 
-def _cameras(trial: xr.DataTree) -> tuple[Camera, ...]:
+def _cameras(trial: xr.DataTree) -> tuple[vb.cameras.Camera, ...]:
     """Cameras of a recording; for a simulated trial without, two that look at it."""
-    from vibrissa.recording import Recording
-    from vibrissa.simulation import views_of
-
     if "cameras" in trial.children:
-        return Recording(trial).cameras
+        return vb.recording.Recording(trial).cameras
     if "truth" in trial.children and "centerline" in trial["truth"]:
-        return views_of(trial)
+        return vb.simulation.views_of(trial)
     return ()
 
 
-def _check_video(video: Path, camera: Camera, frames: Sequence[int]) -> None:
-    from vibrissa.io import video_info
-
-    info = video_info(video)
+def _check_video(video: Path, camera: vb.cameras.Camera, frames: Sequence[int]) -> None:
+    info = vb.io.video_info(video)
     if (info.width, info.height) != tuple(camera.size):
         raise ValueError(
             f"{video} has {info.width} × {info.height} pixels, the camera {camera.name!r} has "
@@ -127,23 +111,20 @@ def _check_video(video: Path, camera: Camera, frames: Sequence[int]) -> None:
         raise ValueError(f"{video} has {info.frames} frames; frame {max(frames)} is needed")
 
 
-def _backdrop(trial: xr.DataTree, camera: Camera, course: Course) -> Any:
+def _backdrop(trial: xr.DataTree, camera: vb.cameras.Camera, course: vb.scene.Course) -> Any:
     """Objects as a camera sees them, on even light."""
-    from vibrissa.recording import Recording
-    from vibrissa.simulation import silhouette
-
     middle = np.nanmean(course.position, axis=0)
-    covered = silhouette(camera, list(Recording(trial).objects), middle, 0.7)
+    covered = vb.simulation.silhouette(
+        camera, list(vb.recording.Recording(trial).objects), middle, 0.7
+    )
     return np.asarray(_LIGHT * (1.0 - covered) + _DARK * covered, dtype=np.uint8)
 
 
-def fits_of(trial: xr.DataTree) -> list[FittedShape]:
+def fits_of(trial: xr.DataTree) -> list[vb.contour.FittedShape]:
     """List the shapes that were fitted to the contacts of a trial."""
-    from vibrissa.contour import shape_from_dataset
-
     if "contour" not in trial.children:
         return []
-    return [shape_from_dataset(trial["contour"].to_dataset())]
+    return [vb.contour.shape_from_dataset(trial["contour"].to_dataset())]
 
 
 # Figures ------------------------------------------------------------------------------------------
@@ -151,70 +132,60 @@ def fits_of(trial: xr.DataTree) -> list[FittedShape]:
 
 def array_drawings(path: Path, width: Any) -> dict[str, Draw]:
     """Return the figure of an array of whiskers, or of a trial with one; none of other files."""
-    from vibrissa import plots
-    from vibrissa.io import Kind, load_array, load_recording, recognise
-
-    kind = None if path.is_dir() else recognise(path)
-    if kind in (None, Kind.ARRAY, Kind.ARRAY_TABLE):
-        face = load_array(path).to_tree()
-        return {"array": lambda: plots.array_views(face, width=width)}
-    if kind != Kind.RECORDING:
+    kind = None if path.is_dir() else vb.io.recognise(path)
+    if kind in (None, vb.io.Kind.ARRAY, vb.io.Kind.ARRAY_TABLE):
+        face = vb.load_array(path).to_tree()
+        return {"array": lambda: vb.plots.array_views(face, width=width)}
+    if kind != vb.io.Kind.RECORDING:
         return {}
-    trial = load_recording(path)
+    trial = vb.load_recording(path)
     groups = {name: group for name in _CONTACTS if (group := trial.get(name)) is not None}
     groups["/"] = trial
     contacts = [name for name, group in groups.items() if "contact_point" in group.data_vars]
     lines = any("centerline" in group.data_vars for group in groups.values())
     if trial.sizes.get("whisker", 0) < 2 or not contacts or not lines:
         return {}
-    return {"array": lambda: plots.array_views(trial, contacts=contacts[0], width=width)}
+    return {"array": lambda: vb.plots.array_views(trial, contacts=contacts[0], width=width)}
 
 
 def map_drawings(
-    contact_map: ContactMap, width: Any, verdicts: xr.Dataset | None, cones: xr.Dataset | None
+    contact_map: vb.ContactMap, width: Any, verdicts: xr.Dataset | None, cones: xr.Dataset | None
 ) -> Iterator[tuple[str, Draw]]:
     """Yield the figures of a map."""
-    from vibrissa import plots
-    from vibrissa.identifiability import sensitivity, witness_pairs
-    from vibrissa.paper import error_solid, signal_slice
-    from vibrissa.plots import HIGHLIGHTED
-
     whisker, samples = contact_map.whisker, contact_map.to_dataset()
     line = whisker.centerline(NODES)
     gridded = contact_map.grid is not None
 
     def solid() -> Any:
         """The slice at M_D = −π/2, and all contacts with the errors of a look-up in the grid."""
-        errors = error_solid(contact_map) if gridded else None
-        return plots.solid_slices(signal_slice(contact_map), errors, width=width)
+        errors = vb.paper.error_solid(contact_map) if gridded else None
+        return vb.plots.solid_slices(vb.paper.signal_slice(contact_map), errors, width=width)
 
     def panels() -> Any:
         """Derivatives at the paper's contacts, which fill the panels best, or at the map's."""
-        found = sensitivity(contact_map, at="grid" if gridded else None)
-        return plots.sensitivity_panels(found, width=width)
+        found = vb.sensitivity(contact_map, at="grid" if gridded else None)
+        return vb.plots.sensitivity_panels(found, width=width)
 
     yield "whisker", _whisker_drawing(whisker, width)
-    yield "signal_space", lambda: plots.signal_clouds(samples, line, width=width)
-    yield "contact_surfaces", lambda: plots.contact_surfaces(samples, line, width=width)
+    yield "signal_space", lambda: vb.plots.signal_clouds(samples, line, width=width)
+    yield "contact_surfaces", lambda: vb.plots.contact_surfaces(samples, line, width=width)
     yield "sensitivity", panels
     yield "solid", solid
     if cones is not None:
-        yield "critical_cones", lambda: plots.critical_cones(cones, width=width)
+        yield "critical_cones", lambda: vb.plots.critical_cones(cones, width=width)
     if verdicts is None:
         return
-    yield "verdicts", lambda: plots.verdict_table(verdicts, width=width)
+    yield "verdicts", lambda: vb.plots.verdict_table(verdicts, width=width)
     if "ambiguous_share" in verdicts:
-        yield "resolution", lambda: plots.resolution(verdicts, width=width)
-    triplets = (*HIGHLIGHTED, str(verdicts.attrs.get("chosen_triplet", "")))
-    for name, pair in witness_pairs(whisker, verdicts, triplets):
-        drawn = partial(plots.witness_pair, pair, width=width)
+        yield "resolution", lambda: vb.plots.resolution(verdicts, width=width)
+    triplets = (*vb.plots.HIGHLIGHTED, str(verdicts.attrs.get("chosen_triplet", "")))
+    for name, pair in vb.identifiability.witness_pairs(whisker, verdicts, triplets):
+        drawn = partial(vb.plots.witness_pair, pair, width=width)
         yield f"witness_{name.replace(' ', '_')}", drawn
 
 
-def _whisker_drawing(whisker: Whisker, width: Any) -> Draw:
-    from vibrissa import plots
-
-    return lambda: plots.whisker_views(
+def _whisker_drawing(whisker: vb.Whisker, width: Any) -> Draw:
+    return lambda: vb.plots.whisker_views(
         whisker.centerline(NODES),
         whisker.radius(np.linspace(0.0, whisker.length, NODES)),
         name=whisker.name,
@@ -227,15 +198,11 @@ def trial_drawings(
     path: Path, width: Any, given: TrialOptions, tell: Tell, colour: str = "time"
 ) -> dict[str, Draw]:
     """Return the figures of a trial; what it lacks is printed, with the verb that makes it."""
-    from vibrissa.io import load_recording
-    from vibrissa.recording import Recording
-    from vibrissa.scene import course_of
-
-    trial = load_recording(path)
-    course = course_of(trial, given.whisker)
+    trial = vb.load_recording(path)
+    course = vb.scene.course_of(trial, given.whisker)
     for reason in _lacking(course, trial, path):
         say(f"{path} has {reason}")
-    whisker = Recording(trial).whisker(given.whisker)
+    whisker = vb.recording.Recording(trial).whisker(given.whisker)
     drawings = {"whisker": _whisker_drawing(whisker, width)}
     drawings |= _contact_drawings(trial, course, whisker, width, colour)
     if course.signals is not None:
@@ -243,7 +210,7 @@ def trial_drawings(
     return drawings
 
 
-def _lacking(course: Course, trial: xr.DataTree, path: Path) -> Iterator[str]:
+def _lacking(course: vb.scene.Course, trial: xr.DataTree, path: Path) -> Iterator[str]:
     if course.signals is None:
         yield f"no signals: `vibrissa signals {path}` makes them"
     if course.estimated is None and "estimates" in trial.children:
@@ -255,35 +222,28 @@ def _lacking(course: Course, trial: xr.DataTree, path: Path) -> Iterator[str]:
 
 
 def _contact_drawings(
-    trial: xr.DataTree, course: Course, whisker: Whisker, width: Any, colour: str
+    trial: xr.DataTree, course: vb.scene.Course, whisker: vb.Whisker, width: Any, colour: str
 ) -> dict[str, Draw]:
     """Figures of contact points."""
-    from vibrissa import plots
-    from vibrissa.contacts import spherical
-    from vibrissa.contour import CylinderFit
-    from vibrissa.objects import Peg
-    from vibrissa.recording import Recording
-    from vibrissa.scene import deflection_angles
-
     by: Any = "time" if colour == "time" else "deflection_angle"
     line = whisker.centerline(NODES)
-    angles = deflection_angles(course, line)
-    bodies, fits = list(Recording(trial).objects), fits_of(trial)
+    angles = vb.scene.deflection_angles(course, line)
+    bodies, fits = list(vb.recording.Recording(trial).objects), fits_of(trial)
     points, known, estimated = course.places, course.known, course.estimated
     drawings: dict[str, Draw] = {}
     if points is not None:
-        peg = next((body for body in bodies if isinstance(body, Peg)), None)
-        fit = next((shape for shape in fits if isinstance(shape, CylinderFit)), None)
-        drawings["contact_places"] = lambda: plots.contact_places(
+        peg = next((body for body in bodies if isinstance(body, vb.objects.Peg)), None)
+        fit = next((shape for shape in fits if isinstance(shape, vb.contour.CylinderFit)), None)
+        drawings["contact_places"] = lambda: vb.plots.contact_places(
             course, line, bodies, fits, colour=by, width=width
         )
-        drawings["contour"] = lambda: plots.contour_views(
+        drawings["contour"] = lambda: vb.plots.contour_views(
             points, peg, fit, colour=angles, width=width
         )
     if known is not None and estimated is not None:
-        drawings["estimates"] = lambda: plots.estimated_against_true(
-            spherical(known),
-            spherical(estimated),
+        drawings["estimates"] = lambda: vb.plots.estimated_against_true(
+            vb.contacts.spherical(known),
+            vb.contacts.spherical(estimated),
             time=course.time,
             colour=angles,
             known_as=course.known_as,
@@ -293,23 +253,21 @@ def _contact_drawings(
 
 def _signal_drawings(
     trial: xr.DataTree,
-    course: Course,
-    whisker: Whisker,
+    course: vb.scene.Course,
+    whisker: vb.Whisker,
     width: Any,
     given: TrialOptions,
     tell: Tell,
 ) -> dict[str, Draw]:
     """Figures of signals."""
-    from vibrissa import plots
-
     samples = given.contact_map(trial, tell).to_dataset()
-    rows = plots.key_frames(course)
+    rows = vb.plots.key_frames(course)
     if width == "single":
         rows = rows[-1:]
     sights = sights_of(trial, course, given.videos or (), rows)
     line = whisker.centerline(NODES)
     signals = trial["signals"].to_dataset()
     return {
-        "trial": lambda: plots.trial_overview(course, samples, line, sights, rows, width=width),
-        "signals": lambda: plots.signals_over_time(signals, whisker=given.whisker, width=width),
+        "trial": lambda: vb.plots.trial_overview(course, samples, line, sights, rows, width=width),
+        "signals": lambda: vb.plots.signals_over_time(signals, whisker=given.whisker, width=width),
     }

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+import vibrissa as vb
 from vibrissa.cli.inputs import (
     RECORDING,
     AssumptionOptions,
@@ -32,8 +33,6 @@ from vibrissa.cli.terminal import Tell, progress_bars, remark, shown
 if TYPE_CHECKING:
     import xarray as xr
 
-    from vibrissa.whisker import Whisker
-
 WRENCH = "wrench"
 
 
@@ -52,9 +51,7 @@ class EstimateOptions:
 
     def __post_init__(self) -> None:
         """Refuse what does not go together."""
-        from vibrissa.pipeline import TRIPLET
-
-        names = self.names or TRIPLET
+        names = self.names or vb.pipeline.TRIPLET
         if self.whole and self.method != "exact":
             raise ValueError(f"--using wrench has no --method {self.method}")
         if self.method != "exact" and len(names) != 3:
@@ -82,9 +79,7 @@ class EstimateOptions:
     @property
     def names(self) -> tuple[str, ...] | None:
         """Signals that are stated, but the wrench."""
-        from vibrissa.signals import selection
-
-        return None if self.using is None or self.whole else selection(self.using)
+        return None if self.using is None or self.whole else vb.signals.selection(self.using)
 
     @property
     def grid(self) -> bool:
@@ -158,13 +153,11 @@ def estimate(
     of the stage, and its channels.
     Example: `vibrissa estimate signals.csv --map map.nc --using Fx,FT,MB,MD -o contacts.csv`
     """
-    from vibrissa.io import CSV, NETCDF, check_readable, check_writable
-
     if how.noise.covariance is not None:
         how.noise.matrix()
-    recorded = kind_in(check_readable(signals)) == RECORDING
+    recorded = kind_in(vb.io.check_readable(signals)) == RECORDING
     target = target or (signals if recorded else Path("contacts.csv"))
-    check_writable(target, (*NETCDF, *CSV) if recorded else CSV)
+    vb.io.check_writable(target, (*vb.io.NETCDF, *vb.io.CSV) if recorded else vb.io.CSV)
     free_beside(signals, [target], force)
     if sensor is not None:
         if recorded or how.given:
@@ -178,9 +171,6 @@ def estimate(
 
 def _from_table(signals: Path, target: Path, how: EstimateOptions) -> None:
     """Contacts in the whisker's frame, as a table."""
-    from vibrissa.io import save_contacts
-    from vibrissa.pipeline import TRIPLET, contact_columns, locate, locate_from_wrench
-
     noise = how.noise.matrix()
     wrench = wrench_from(signals)
     for note in wrench.attrs.get("notes", ()):
@@ -196,11 +186,13 @@ def _from_table(signals: Path, target: Path, how: EstimateOptions) -> None:
         tell("contact points", 0, 1)
         if how.whole:
             errors, prior = how.assumed.errors, how.assumed.prior
-            found = locate_from_wrench(known, wrench, noise, errors, prior)
+            found = vb.pipeline.locate_from_wrench(known, wrench, noise, errors, prior)
         else:
-            found = locate(maps[0], wrench, how.names or TRIPLET, noise=noise, **how.keywords())
+            found = vb.pipeline.locate(
+                maps[0], wrench, how.names or vb.pipeline.TRIPLET, noise=noise, **how.keywords()
+            )
         tell("contact points", 1, 1)
-    save_contacts(target, contact_columns(found))
+    vb.io.save_contacts(target, vb.pipeline.contact_columns(found))
     used = WRENCH if how.whole else found.attrs["triplet"]
     remark(how.described(used, how.noise.described(), found.attrs["felt_above"]))
     print_statuses(found["status"].values)
@@ -209,12 +201,9 @@ def _from_table(signals: Path, target: Path, how: EstimateOptions) -> None:
 
 def _from_sweep(table: Path, target: Path, path: Path) -> None:
     """Contacts of a sweep with a suspended whisker, laboratory frame, as a table."""
-    from vibrissa.io import write_table
-    from vibrissa.sensors import follow_sweep, load_suspended
-
-    sensor, stage = load_suspended(path)
+    sensor, stage = vb.sensors.load_suspended(path)
     sweep = stage.sweep(table)
-    found = follow_sweep(sensor, *sweep)
+    found = vb.sensors.follow_sweep(sensor, *sweep)
     sigma = found.covariance.diagonal(axis1=1, axis2=2) ** 0.5
     header = [a + b for a in ("", "normal_", "sigma_") for b in "xyz"]
     columns = (found.points, found.normal, sigma)
@@ -223,31 +212,30 @@ def _from_sweep(table: Path, target: Path, path: Path) -> None:
         [i, *(v for part in columns for v in part[i].tolist()), float(found.arc_length[i]), int(on)]
         for i, on in enumerate(found.in_contact)
     ]
-    write_table(target, names, rows)
+    vb.io.write_table(target, names, rows)
     remark(f"{found.in_contact.sum()} of {len(rows)} samples are in contact; m, laboratory frame")
     print_written(target)
 
 
 def _from_recording(signals: Path, target: Path, how: EstimateOptions) -> None:
     """Contacts added to a recording, or as a table."""
-    from vibrissa.io import CSV, save_contacts, save_recording
-    from vibrissa.pipeline import contact_columns, due_stages, with_signals
-
     tree = recording_from(signals)
-    table = target.suffix.lower() in CSV
+    table = target.suffix.lower() in vb.io.CSV
     if table:
         check_one_whisker(tree, signals)
     with progress_bars() as tell:
-        if "signals" in due_stages(tree, "estimates"):
-            tree = with_signals(tree, **SourceOptions().as_keywords(tree, how.known, how.proximal))
+        if "signals" in vb.pipeline.due_stages(tree, "estimates"):
+            tree = vb.pipeline.with_signals(
+                tree, **SourceOptions().as_keywords(tree, how.known, how.proximal)
+            )
         done, used = estimated(tree, how, tell, str(signals))
     remark(f"{described(done)}; {used}")
     found = done["estimates"].to_dataset()
     print_statuses(found["status"].values)
     if table:
-        save_contacts(target, contact_columns(found.isel(whisker=0)))
+        vb.io.save_contacts(target, vb.pipeline.contact_columns(found.isel(whisker=0)))
     else:
-        save_recording(target, done)
+        vb.io.save_recording(target, done)
     print_written(target, signals, "estimates")
 
 
@@ -255,12 +243,10 @@ def estimated(
     tree: xr.DataTree, how: EstimateOptions, tell: Tell, name: str
 ) -> tuple[xr.DataTree, str]:
     """Add contacts to a recording that has signals, and describe how they were found."""
-    from vibrissa.pipeline import sensor_noise, with_estimates
-
     signals = tree["signals"].to_dataset()
     source = signals.attrs.get("source")
     # A sensor that does not state its noise is a usual one.
-    noisy = how.noise.given or (source == "sensor" and sensor_noise(signals) is None)
+    noisy = how.noise.given or (source == "sensor" and vb.pipeline.sensor_noise(signals) is None)
     maps = maps_from(how.map, tree.sizes["whisker"], how.grid) if how.map else []
     whiskers = [one.whisker for one in maps] if maps else how.own.in_recording(tree)
     print_notes(*whiskers)
@@ -272,7 +258,7 @@ def estimated(
         one = f"no map given; simulating that of {whiskers[0]!r}"
         several = "no maps given; simulating those of the whiskers that have a contact"
         remark(one if len(whiskers) == 1 else several)
-    done = with_estimates(
+    done = vb.pipeline.with_estimates(
         tree,
         WRENCH if whole else how.names,
         noise=how.noise.matrix() if noisy else None,
@@ -286,10 +272,8 @@ def estimated(
     return done, how.described(str(about["signals"]), noise, float(about["felt_above"]))
 
 
-def _check_scale(path: Path | str, wrench: xr.Dataset, whisker: Whisker) -> None:
-    from vibrissa.io import check_scale
-
+def _check_scale(path: Path | str, wrench: xr.Dataset, whisker: vb.Whisker) -> None:
     try:
-        check_scale(wrench, whisker)
+        vb.io.check_scale(wrench, whisker)
     except ValueError as fault:
         raise ValueError(f"{path}: {fault}") from None

@@ -6,8 +6,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
 
+import vibrissa as vb
 from vibrissa.cli.inputs import recording_from
-from vibrissa.cli.options import RecordingArgument, free, refuse, with_options
+from vibrissa.cli.options import RecordingArgument, check_new, refuse, with_options
 from vibrissa.cli.terminal import remark, say
 
 
@@ -28,28 +29,24 @@ def export(
     first where there are none, by `vibrissa signals`. NWB holds the tracked whisker too.
     Example: `vibrissa export trial.nc --to nwb --session-start 2026-03-01T14:30+01:00`
     """
-    from vibrissa.io import Session, check_writable, save_nwb, save_predictors
-    from vibrissa.pipeline import predictors, with_signals
-
     ending = f".{to}"
     target = recording.with_suffix(ending) if target is None else target
-    check_writable(target, (ending,))
-    free([target], force)
+    check_new(target, (ending,), force)
     if to != "nwb":
         about = {"--session-start": session_start, "--subject": subject, "--species": species}
         refuse(about, "only NWB states it")
     tree = recording_from(recording)
     if "signals" not in tree.children:
         remark("the recording has no signals yet: they are made as `vibrissa signals` makes them")
-        tree = with_signals(tree)
-    table = predictors(tree)
+        tree = vb.pipeline.with_signals(tree)
+    table = vb.pipeline.predictors(tree)
     if to == "nwb":
         animal = {"subject_id": subject, "species": species}
         stated = {name: value for name, value in animal.items() if value is not None}
-        session = Session(_start(session_start, recording), subject=stated)
-        save_nwb(target, tree, session, predictors=table)
+        session = vb.io.Session(_start(session_start, recording), subject=stated)
+        vb.io.save_nwb(target, tree, session, predictors=table)
     else:
-        save_predictors(target, table)
+        vb.io.save_predictors(target, table)
     touching = int(table["in_contact"].sum()) if "in_contact" in table else 0
     say(
         f"{table.sizes['time']} frames of {table.sizes['whisker']} whiskers, {touching} in "

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+import vibrissa as vb
 from vibrissa.cli.drawings import Draw, TrialOptions, array_drawings, map_drawings, trial_drawings
 from vibrissa.cli.inputs import map_from
 from vibrissa.cli.options import Format, free, refuse, with_options
@@ -44,15 +45,13 @@ def figures(
     face, the whiskers, and what they touch.
     Example: `vibrissa figures map.nc -o figures --width single`
     """
-    from vibrissa.io import Kind, check_folder, recognise
-
     endings = tuple(dict.fromkeys(map(str, format_ or ("png", "pdf"))))
-    check_folder(target)
+    vb.io.check_folder(target)
     verdicts = None if uniqueness is None else dataset_with(uniqueness, "verdict")
     sweep = None if cones is None else dataset_with(cones, "critical_cone")
     with progress_bars() as tell:
         drawings = array_drawings(path, width)
-        if not path.is_dir() and recognise(path) == Kind.RECORDING:
+        if not path.is_dir() and vb.io.recognise(path) == vb.io.Kind.RECORDING:
             refuse({"--uniqueness": uniqueness, "--cones": cones}, f"{path} is a recording")
             drawings |= trial_drawings(path, width, of_trial, tell, colour or "time")
         else:
@@ -70,24 +69,20 @@ def saved(
     drawings: dict[str, Draw], folder: Path, endings: Sequence[str], tell: Tell
 ) -> list[Path]:
     """Draw figures into a folder."""
-    from vibrissa.plots import save
-
     files: list[Path] = []
     for i, (name, draw) in enumerate(drawings.items()):
         tell("figures", i, len(drawings))
-        files += save(draw(), folder / name, endings)
+        files += vb.plots.save(draw(), folder / name, endings)
     tell("figures", len(drawings), len(drawings))
     return files
 
 
 def dataset_with(path: Path, needed: str) -> xr.Dataset:
     """Read a dataset that holds a variable."""
-    from vibrissa.io import CSV, kind_of, read_dataset
-
-    if path.suffix.lower() in CSV:
+    if path.suffix.lower() in vb.io.CSV:
         raise ValueError(f"{path} is a table; the same saved as NetCDF (-o FILE.nc) is needed")
-    kind = kind_of(path)
-    data = read_dataset(path)
+    kind = vb.io.kind_of(path)
+    data = vb.io.read_dataset(path)
     if needed not in data:
         raise ValueError(
             f"{path} holds {kind or 'data of another kind'}, and no variable {needed!r}"

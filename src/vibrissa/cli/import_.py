@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import typer
 
-from vibrissa.cli.inputs import WhiskerOptions, metres_of, objects_from
-from vibrissa.cli.options import free, with_options
+import vibrissa as vb
+from vibrissa.cli.inputs import WhiskerOptions, cameras_from, metres_of, objects_from
+from vibrissa.cli.options import check_new, with_options
 from vibrissa.cli.terminal import progress_bars, remark
 from vibrissa.cli.track import print_tracked
 
@@ -17,8 +18,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     import xarray as xr
-
-    from vibrissa.cameras import Camera
 
 _VIEWS = ("top", "front")
 """Names of views that neither files nor cameras name."""
@@ -54,21 +53,10 @@ def import_tracks(
     as `vibrissa track` fits it to videos; `vibrissa reconstruct` goes on from there.
     Example: `vibrissa import topDLC.csv frontDLC.csv --pixel-size 0.058 --rate 1000 -o trial.nc`
     """
-    from vibrissa.cameras import load_cameras
-    from vibrissa.io import NETCDF, check_writable, load_recording, save_recording
-    from vibrissa.recording import Recording
-    from vibrissa.tracking import CUTOFF, TrackOptions, track as tracked, tracker_traces
-
-    check_writable(target, NETCDF)
-    free([target], force)
-    views = None
-    if cameras is not None:
-        is_recording = cameras.suffix.lower() in NETCDF
-        views = (
-            Recording(load_recording(cameras)).cameras if is_recording else load_cameras(cameras)
-        )
+    check_new(target, vb.io.NETCDF, force)
+    views = None if cameras is None else cameras_from(cameras)
     found = _tracks(tracks, rate, unit, views)
-    traces = tracker_traces(
+    traces = vb.tracking.tracker_traces(
         found,
         views,
         pixel_size=None if pixel_size is None else 1e-3 * pixel_size,
@@ -80,14 +68,14 @@ def import_tracks(
     properties: dict[str, Any] = {}
     if base_radius is not None:
         properties["base_radius"] = metres_of(base_radius, "--base-radius")
-    how = TrackOptions(
-        cutoff=CUTOFF if cutoff is None else cutoff or None,
+    how = vb.tracking.TrackOptions(
+        cutoff=vb.tracking.CUTOFF if cutoff is None else cutoff or None,
         properties=properties,
         whisker=None if own.whisker is None else own.read().with_properties(**properties),
     )
     known: dict[str, Any] = {} if objects is None else {"objects": objects_from(objects)}
     with progress_bars() as tell:
-        result = tracked(
+        result = vb.tracking.track(
             traces.cameras,
             traces.traces,
             1.0 / float(np.median(np.diff(found["time"].values))),
@@ -99,7 +87,7 @@ def import_tracks(
     result.attrs["origin"] = (
         f"tracked by {found.attrs['source_software']} in {found.attrs['source']}"
     )
-    save_recording(target, result)
+    vb.io.save_recording(target, result)
     print_tracked(result, target)
 
 
@@ -116,17 +104,15 @@ def _tracks(
     paths: Sequence[Path],
     rate: float | None,
     unit: str | None,
-    cameras: Sequence[Camera] | None,
+    cameras: Sequence[vb.cameras.Camera] | None,
 ) -> xr.Dataset:
     """Read the tracks of all views, with every frame from the first to the last."""
-    from vibrissa.io import Kind, join_views, load_tracks, recognise
-
     given: dict[str, Any] = {"fps": rate, "unit": unit}
     labels: Any = {name: value for name, value in given.items() if value is not None}
     parts = []
     for path in paths:
-        own = recognise(path) in (Kind.TRACKS, Kind.RECORDING)
-        parts.append(load_tracks(path, **({} if own else labels)))
+        own = vb.io.recognise(path) in (vb.io.Kind.TRACKS, vb.io.Kind.RECORDING)
+        parts.append(vb.load_tracks(path, **({} if own else labels)))
     if len(paths) > 1:
         named = [camera.name for camera in cameras] if cameras else list(_VIEWS)
         if len(paths) > len(named):
@@ -138,7 +124,7 @@ def _tracks(
         together = [
             part.assign_coords(view=[name]) for part, name in zip(parts, named, strict=False)
         ]
-        found = join_views(*together)
+        found = vb.io.join_views(*together)
         found.attrs |= {k: parts[0].attrs[k] for k in ("source_software",)}
     else:
         found = parts[0]

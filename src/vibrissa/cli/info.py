@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
+import vibrissa as vb
 from vibrissa.cli.options import with_options
 from vibrissa.cli.tables import print_properties
 from vibrissa.cli.terminal import shown
@@ -19,9 +20,6 @@ if TYPE_CHECKING:
 
     import xarray as xr
     from xarray import Dataset
-
-    from vibrissa.io import RawTracks
-    from vibrissa.pipeline import TrialSummary
 
 _SHOWN = 12
 _TABLES = """\
@@ -57,47 +55,45 @@ def _installation() -> Iterator[tuple[str, str]]:
     from importlib.metadata import version
 
     import vibrissa
-    from vibrissa.numerics import threads
-    from vibrissa.rod import evaluate
 
     yield "vibrissa", f"{vibrissa.__version__}, {Path(vibrissa.__file__).parent}"
     yield "python", f"{platform.python_version()}, {platform.system()} {platform.machine()}"
     for name in _PACKAGES:
         yield name, version(name)
-    yield "threads", f"{threads()} (VIBRISSA_THREADS sets another number)"
-    folder = getattr(getattr(evaluate, "_cache", None), "cache_path", None)
+    yield "threads", f"{vb.numerics.threads()} (VIBRISSA_THREADS sets another number)"
+    folder = getattr(getattr(vb.rod.evaluate, "_cache", None), "cache_path", None)
     yield "kernels", f"cached in {folder}" if folder else "compiled anew in every run"
 
 
 def _file(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
-    from vibrissa.io import READERS, Kind, check_readable, recognise
-
     if path.is_dir():
         yield from _array(path, "folder of centrelines")
         return
-    check_readable(path)
-    kind = recognise(path)
-    if kind == Kind.RECORDING:
+    vb.io.check_readable(path)
+    kind = vb.io.recognise(path)
+    if kind == vb.io.Kind.RECORDING:
         yield from _recording(path, whole)
         return
     yield "file", f"{path}, {path.stat().st_size / 1e6:.3g} MB"
     if _is_sensor(path):
         yield from _sensor(path)
         return
-    if kind in (Kind.ARRAY, Kind.ARRAY_TABLE):
+    if kind in (vb.io.Kind.ARRAY, vb.io.Kind.ARRAY_TABLE):
         yield from _array(path, kind)
-    elif kind == Kind.NETCDF:
+    elif kind == vb.io.Kind.NETCDF:
         yield from _groups(path)
-    elif kind in (Kind.TRACKS, *READERS):
+    elif kind in (vb.io.Kind.TRACKS, *vb.io.READERS):
         yield from _tracks(path, kind)
-    elif kind == Kind.VIDEO:
+    elif kind == vb.io.Kind.VIDEO:
         yield from _video(path)
-    elif kind == Kind.CALIBRATION:
+    elif kind == vb.io.Kind.CALIBRATION:
         yield from _calibration(path)
     elif path.suffix == ".toml":
         yield from _settings(path)
-    elif kind == Kind.UNKNOWN and not _is_text(path):
-        known = "; ".join([*READERS, Kind.TRACKS, Kind.RECORDING, "tables as text"])
+    elif kind == vb.io.Kind.UNKNOWN and not _is_text(path):
+        known = "; ".join(
+            [*vb.io.READERS, vb.io.Kind.TRACKS, vb.io.Kind.RECORDING, "tables as text"]
+        )
         raise ValueError(f"{path} is of no kind that is known. Known are: {known}")
     else:
         yield from _table(path)
@@ -105,9 +101,7 @@ def _file(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
 
 def _recording(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
     """What a recording is and holds in five lines, what is assumed, and what comes next."""
-    from vibrissa.pipeline import STAGES, summarise
-
-    found = summarise(_summarised(path))
+    found = vb.pipeline.summarise(_summarised(path))
     one = len(found.whiskers) == 1
     names = ", ".join(found.whiskers[:_SHOWN]) + (", …" if len(found.whiskers) > _SHOWN else "")
     yield (
@@ -118,7 +112,7 @@ def _recording(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
     rate = f" at {found.frames / found.duration:g} a second" if found.duration else ""
     yield "duration", f"{found.duration:g} s, {found.frames} frames{rate}"
     yield "contacts", _contacts(found)
-    missing = [stage for stage in STAGES if stage not in found.stages]
+    missing = [stage for stage in vb.pipeline.STAGES if stage not in found.stages]
     lacking = ", ".join(missing)
     there = ", ".join(found.stages) or "none"
     yield "stages", f"{there}{f' (missing: {lacking})' if missing else ''}"
@@ -138,7 +132,7 @@ def _recording(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
     yield "next", f"vibrissa {follows} {path}{'' if whole else ' (groups and variables: --all)'}"
 
 
-def _contacts(found: TrialSummary) -> str:
+def _contacts(found: vb.pipeline.TrialSummary) -> str:
     """Contacts and their forces, and how many contact points were estimated."""
     if found.contacts is None:
         return "not known"
@@ -153,49 +147,41 @@ def _summarised(path: Path) -> xr.DataTree:
     """What a summary needs of a recording; a long one takes a while to read whole."""
     import xarray as xr
 
-    from vibrissa.io import opened, read_dataset
-
-    with opened(path, "a recording") as file:
+    with vb.io.opened(path, "a recording") as file:
         groups = [name for name in ("truth", "signals", "estimates", "contour") if name in file]
         objects = [f"objects/{name}" for name in file["objects"]] if "objects" in file else []
     needed = ["in_contact", "force", "moment"]
-    parts = {"/": read_dataset(path, None, needed)}
+    parts = {"/": vb.io.read_dataset(path, None, needed)}
     for group in (*groups, *objects):
         along = needed if group in ("truth", "signals", "estimates") else None
-        parts[f"/{group}"] = read_dataset(path, group, along)
+        parts[f"/{group}"] = vb.io.read_dataset(path, group, along)
     return xr.DataTree.from_dict(parts)
 
 
 def _settings(path: Path) -> Iterator[tuple[str, str]]:
     """What other settings are for; they are checked by the verb that takes them."""
-    from vibrissa.io import read_toml
-
-    settings = read_toml(path)
+    settings = vb.io.read_toml(path)
     study = {"whiskers", "tasks"} & set(settings)
     yield "kind", "a study, for vibrissa sweep" if study else "settings, as of vibrissa simulate"
     yield "states", ", ".join(settings) or "nothing"
 
 
 def _is_sensor(path: Path) -> bool:
-    from vibrissa.io import read_toml
-
     if path.suffix != ".toml":
         return False
-    settings = read_toml(path)
+    settings = vb.io.read_toml(path)
     return "noise" in settings and not isinstance(settings["noise"], dict)
 
 
 def _sensor(path: Path) -> Iterator[tuple[str, str]]:
     """A sensor, a line for each channel."""
-    from vibrissa.sensors import COMPONENTS, load_sensor
-
-    sensor = load_sensor(path)
+    sensor = vb.sensors.load_sensor(path)
     yield "kind", "sensor"
     numbers = zip(
         sensor.channels, sensor.mixing, sensor.noise, sensor.bias, sensor.largest, strict=True
     )
     for name, mixing, noise, bias, largest in numbers:
-        parts = [f"{a:g} {c}" for a, c in zip(mixing, COMPONENTS, strict=True) if a]
+        parts = [f"{a:g} {c}" for a, c in zip(mixing, vb.sensors.COMPONENTS, strict=True) if a]
         ends = f", saturates at ±{largest:g}" if np.isfinite(largest) else ""
         yield name, f"{' + '.join(parts)} + {bias:.4g}, noise {noise:.3g}{ends}"
     x, y, z = 1e3 * sensor.frame.position
@@ -218,9 +204,7 @@ def _sensor(path: Path) -> Iterator[tuple[str, str]]:
 
 def _array(path: Path, kind: str) -> Iterator[tuple[str, str]]:
     """The whiskers of an array, a line each."""
-    from vibrissa.io import load_array
-
-    array = load_array(path)
+    array = vb.load_array(path)
     yield "kind", kind
     sides = [array.identity(name).side for name in array]
     yield "whiskers", f"{len(array)}: {sides.count('left')} left, {sides.count('right')} right"
@@ -230,9 +214,7 @@ def _array(path: Path, kind: str) -> Iterator[tuple[str, str]]:
 
 
 def _video(path: Path) -> Iterator[tuple[str, str]]:
-    from vibrissa.io import video_info
-
-    found = video_info(path)
+    found = vb.io.video_info(path)
     yield "kind", f"video, {found.codec}"
     yield "size", f"{found.width} × {found.height} pixels"
     yield "frames", f"{found.frames or 'number not stated'}, shown at {found.rate:g} a second"
@@ -240,18 +222,14 @@ def _video(path: Path) -> Iterator[tuple[str, str]]:
 
 
 def _calibration(path: Path) -> Iterator[tuple[str, str]]:
-    from vibrissa.cameras import load_cameras
-
     yield "kind", "calibration of cameras"
-    for camera in load_cameras(path):
+    for camera in vb.cameras.load_cameras(path):
         yield camera.name, f"{camera.size[0]} × {camera.size[1]} pixels, {camera.projection}"
 
 
 def _is_text(path: Path) -> bool:
-    from vibrissa.io import read_text
-
     try:
-        read_text(path)
+        vb.io.read_text(path)
     except ValueError:
         return False
     return True
@@ -259,14 +237,12 @@ def _is_text(path: Path) -> bool:
 
 def _tracks(path: Path, kind: str) -> Iterator[tuple[str, str]]:
     """Sizes, times and how much is missing of tracks; also where their unit is not stated."""
-    from vibrissa.io import READERS, Kind, load_tracks
-
     yield "kind", kind
     note = ""
-    if kind == Kind.TRACKS:
-        tracks = load_tracks(path)
+    if kind == vb.io.Kind.TRACKS:
+        tracks = vb.load_tracks(path)
     else:
-        raw = READERS[Kind(kind)](path)
+        raw = vb.io.READERS[vb.io.Kind(kind)](path)
         tracks, note = _without_unit(raw, path)
     for name in ("source_software", "scorer", "identity", "direction", "variable"):
         if tracks.attrs.get(name):
@@ -306,14 +282,12 @@ def _import(path: Path, tracks: Dataset, *, stated: bool) -> str:
     return f"{' '.join(words)} -o trial.nc{hint}"
 
 
-def _without_unit(raw: RawTracks, path: Path) -> tuple[Dataset, str]:
+def _without_unit(raw: vb.io.RawTracks, path: Path) -> tuple[Dataset, str]:
     """Label tracks even if the unit of their points is not stated, with a note on it."""
-    from vibrissa.io import labelled
-
     if raw.space is None or raw.unit:
-        return labelled(raw, path), ""
+        return vb.io.labelled(raw, path), ""
     # The smallest unit passes for any: no number is shown.
-    return labelled(raw, path, unit="um"), "unit not stated: give it when reading"
+    return vb.io.labelled(raw, path, unit="um"), "unit not stated: give it when reading"
 
 
 def _listed(tracks: Dataset, dim: str) -> str:
@@ -328,10 +302,8 @@ def _groups(path: Path) -> Iterator[tuple[str, str]]:
     """Kind, groups and variables of a NetCDF file; of its values only names are read."""
     import h5netcdf
 
-    from vibrissa.io import kind_of, opened
-
-    yield "kind", kind_of(path) or "unknown"
-    with opened(path, "NetCDF-4", soft_links=False), h5netcdf.File(path, "r") as file:
+    yield "kind", vb.io.kind_of(path) or "unknown"
+    with vb.io.opened(path, "NetCDF-4", soft_links=False), h5netcdf.File(path, "r") as file:
         names = [_text(one) for one in file.variables["whisker"][...]] if _many(file) else []
         for name, group in _within(file, "/"):
             if not (names and f"{name}/".startswith("/whiskers/")):
@@ -401,9 +373,7 @@ def _compared(path: Path) -> Iterator[tuple[str, str]]:
     """How contact points that do not come from the rod compare with those that do."""
     import xarray as xr
 
-    from vibrissa.io import opened, read_dataset
-
-    with opened(path, "a recording") as file:
+    with vb.io.opened(path, "a recording") as file:
         if "measured/contact_difference" not in file:
             return
     # A long recording takes a while to read whole.
@@ -411,7 +381,7 @@ def _compared(path: Path) -> Iterator[tuple[str, str]]:
         None: ["arc_length"],
         "measured": ["contact_difference", "contact_point", "arc_length"],
     }
-    parts = {f"/{group or ''}": read_dataset(path, group, of) for group, of in names.items()}
+    parts = {f"/{group or ''}": vb.io.read_dataset(path, group, of) for group, of in names.items()}
     recording = xr.DataTree.from_dict(parts)
     for k, name in enumerate(recording.coords["whisker"].values):
         for sentence in compared_contacts(recording, k):
@@ -420,27 +390,16 @@ def _compared(path: Path) -> Iterator[tuple[str, str]]:
 
 def _table(path: Path) -> Iterator[tuple[str, str]]:
     """What a CSV file is."""
-    from vibrissa.io import (
-        Kind,
-        load_contact_points,
-        load_contacts,
-        load_corrections,
-        load_head,
-        load_signals,
-        load_whisker,
-        recognise,
-    )
-
     # A centreline comes last: other tables have columns x, y and z too.
-    readers: tuple[tuple[str, Kind | None, Callable[[Path], Any]], ...] = (
-        ("contacts", Kind.CONTACTS, load_contacts),
-        ("signals", Kind.SIGNALS, load_signals),
-        ("the head's pose", Kind.HEAD, load_head),
-        ("contact points", None, load_contact_points),
-        ("corrections", Kind.CORRECTIONS, load_corrections),
-        ("whisker", Kind.CENTERLINE, partial(load_whisker, any_length=True)),
+    readers: tuple[tuple[str, vb.io.Kind | None, Callable[[Path], Any]], ...] = (
+        ("contacts", vb.io.Kind.CONTACTS, vb.io.load_contacts),
+        ("signals", vb.io.Kind.SIGNALS, vb.load_signals),
+        ("the head's pose", vb.io.Kind.HEAD, vb.io.load_head),
+        ("contact points", None, vb.io.load_contact_points),
+        ("corrections", vb.io.Kind.CORRECTIONS, vb.io.load_corrections),
+        ("whisker", vb.io.Kind.CENTERLINE, partial(vb.load_whisker, any_length=True)),
     )
-    looks = recognise(path)
+    looks = vb.io.recognise(path)
     for kind, known, reader in readers:
         try:
             data = reader(path)
@@ -457,24 +416,21 @@ def _table(path: Path) -> Iterator[tuple[str, str]]:
 
 def _header(path: Path) -> str:
     """What a table begins with."""
-    from vibrissa.io import read_text, table_rows
-
-    cells = next(table_rows(read_text(path)), (0, []))[1]
+    cells = next(vb.io.table_rows(vb.io.read_text(path)), (0, []))[1]
     shown = ", ".join(cells[:_SHOWN]) + (", …" if len(cells) > _SHOWN else "")
     return f"its first line is {shown}" if cells else "it has no lines"
 
 
 def _rows(kind: str, data: Any) -> Iterator[tuple[str, str]]:
     """What a table holds."""
-    from vibrissa.status import describe
-    from vibrissa.whisker import length_faults
-
     if kind == "whisker":
         yield "whisker", repr(data)
         base, tip = (data.pose.to_source(data.position(s)) * 1e3 for s in (0.0, data.length))
         for name, (x, y, z) in (("base", base), ("tip", tip)):
             yield name, f"at ({x:.2f}, {y:.2f}, {z:.2f}) mm in the file"
-        yield from (("note", note) for note in (*data.notes, *length_faults(data.length)))
+        yield from (
+            ("note", note) for note in (*data.notes, *vb.whisker.length_faults(data.length))
+        )
     elif kind == "corrections":
         for view, each in data.items():
             yield f"view {view}", f"{len(each)} corrected traces"
@@ -488,5 +444,5 @@ def _rows(kind: str, data: Any) -> Iterator[tuple[str, str]]:
         yield "rows", f"{time.size}, {span}"
         yield from (("note", note) for note in data.attrs.get("notes", ()))
         if kind == "contacts":
-            for sentence, count in describe(data["status"].values).most_common():
+            for sentence, count in vb.status.describe(data["status"].values).most_common():
                 yield str(count), sentence

@@ -8,16 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import vibrissa as vb
 from vibrissa.cli.options import free, refuse
 from vibrissa.cli.terminal import Tell, remark, say
 
 if TYPE_CHECKING:
     import xarray as xr
-
-    from vibrissa.contacts import ContactMap, Prior
-    from vibrissa.numerics import Array
-    from vibrissa.objects import Surface
-    from vibrissa.whisker import Whisker
 
 RECORDING, MAP = "vibrissa recording", "vibrissa contact map"
 """Kinds of NetCDF files."""
@@ -46,32 +42,27 @@ class WhiskerOptions:
         if (self.rat is not None or self.any_length) and not given:
             raise ValueError("--rat and --any-length are about a --whisker, and none is given")
 
-    def read(self, path: Path | None = None) -> Whisker:
+    def read(self, path: Path | None = None) -> vb.Whisker:
         """Read the whisker, or that of another file; by default it is the γ whisker."""
-        from vibrissa import samples
-        from vibrissa.io import is_netcdf, load_whisker
-
         path = self.whisker if path is None else path
         if path is None:
-            return samples.gamma()
+            return vb.samples.gamma()
         if not path.exists():
             raise FileNotFoundError(f"there is no file {path}")
-        if not is_netcdf(path):
-            return load_whisker(path, rat=self.rat, any_length=self.any_length)
+        if not vb.io.is_netcdf(path):
+            return vb.load_whisker(path, rat=self.rat, any_length=self.any_length)
         whisker = _whisker_in(path)
         return whisker if self.rat is None else whisker.with_properties(rat=self.rat)
 
-    def in_recording(self, recording: xr.DataTree) -> list[Whisker]:
+    def in_recording(self, recording: xr.DataTree) -> list[vb.Whisker]:
         """Find the whisker of each that a recording has signals of."""
-        from vibrissa.recording import Recording
-
         count = recording.sizes["whisker"]
         if self.whisker is not None:
             if count > 1:
                 raise ValueError(f"--whisker is one whisker; the recording has {count}")
             return [self.read()]
         try:
-            return Recording(recording).whiskers
+            return vb.recording.Recording(recording).whiskers
         except ValueError as fault:
             raise ValueError(f"{fault}; give its centreline with --whisker") from None
 
@@ -106,25 +97,20 @@ class NoiseOptions:
 
     def _usual(self) -> tuple[float, float]:
         """Noise of force and moment, µN and µN·m; what is not stated is that of a usual sensor."""
-        from vibrissa.sensors import FORCE_NOISE, MOMENT_NOISE
-
         return (
-            FORCE_NOISE * 1e6 if self.force_noise is None else self.force_noise,
-            MOMENT_NOISE * 1e6 if self.moment_noise is None else self.moment_noise,
+            vb.sensors.FORCE_NOISE * 1e6 if self.force_noise is None else self.force_noise,
+            vb.sensors.MOMENT_NOISE * 1e6 if self.moment_noise is None else self.moment_noise,
         )
 
-    def matrix(self) -> Array:
+    def matrix(self) -> vb.numerics.Array:
         """Covariance of force and moment, (6, 6), SI units."""
         import numpy as np
 
-        from vibrissa.io import read_text, table_rows
-        from vibrissa.pipeline import component_noise
-
         if self.covariance is None:
             force, moment = self._usual()
-            return component_noise(force * 1e-6, moment * 1e-6)
+            return vb.pipeline.component_noise(force * 1e-6, moment * 1e-6)
         try:
-            rows = table_rows(read_text(self.covariance))
+            rows = vb.io.table_rows(vb.io.read_text(self.covariance))
             covariance = np.array([[float(cell) for cell in cells] for _, cells in rows])
         except ValueError as fault:
             raise ValueError(f"{self.covariance} is not a covariance: {fault}") from None
@@ -158,12 +144,10 @@ class AssumptionOptions:
         return {name: 0.01 * getattr(self, name) for name in names if getattr(self, name) > 0.0}
 
     @property
-    def prior(self) -> Prior | None:
+    def prior(self) -> vb.Prior | None:
         """The contacts that are possible; None: all."""
         if self.region is None and self.least_force is None and self.greatest_force is None:
             return None
-        from vibrissa.contacts import Prior
-
         least = 0.0 if self.least_force is None else 1e-6 * self.least_force
         greatest = math.inf if self.greatest_force is None else 1e-6 * self.greatest_force
         if not least < greatest:
@@ -172,7 +156,7 @@ class AssumptionOptions:
                 f"{1e6 * greatest:g} µN"
             )
         region = self.region or "all"
-        return Prior(_limits(region) if "=" in region else region, least, greatest)
+        return vb.Prior(_limits(region) if "=" in region else region, least, greatest)
 
     def described(self) -> str:
         """State all of it, to be put at the end of a sentence; empty where there is nothing."""
@@ -221,12 +205,10 @@ def metres_of(radius: float, option: str) -> float:
 
 def smallest_arc(proximal: float | None) -> float:
     """Return the smallest arc length of a contact, share of the whisker's length."""
-    from vibrissa.rod import PROXIMAL
-
-    return PROXIMAL if proximal is None else proximal
+    return vb.rod.PROXIMAL if proximal is None else proximal
 
 
-def print_notes(*whiskers: Whisker) -> None:
+def print_notes(*whiskers: vb.Whisker) -> None:
     """Print what is assumed about whiskers, and all else that their user should know."""
     for note in dict.fromkeys(note for whisker in whiskers for note in whisker.notes):
         remark(f"note: {note}")
@@ -234,21 +216,16 @@ def print_notes(*whiskers: Whisker) -> None:
 
 def kind_in(path: Path) -> str:
     """Return the kind of a NetCDF file; empty for other files."""
-    from vibrissa.io import is_netcdf, kind_of
-
     if not path.is_file() or path.stat().st_size == 0:
         return ""
-    return (kind_of(path) or "") if is_netcdf(path) else ""
+    return (vb.io.kind_of(path) or "") if vb.io.is_netcdf(path) else ""
 
 
-def _whisker_in(path: Path) -> Whisker:
+def _whisker_in(path: Path) -> vb.Whisker:
     """Read the whisker of a recording or a map."""
-    from vibrissa.io import kind_of, load_recording
-    from vibrissa.recording import Recording
-
-    kind = kind_of(path)
+    kind = vb.io.kind_of(path)
     if kind == RECORDING:
-        return Recording(load_recording(path)).whisker()
+        return vb.recording.Recording(vb.load_recording(path)).whisker()
     if kind == MAP:
         return map_from(path).whisker
     raise ValueError(f"{path} holds {kind or 'data of another kind'}, and no whisker")
@@ -256,10 +233,8 @@ def _whisker_in(path: Path) -> Whisker:
 
 def refuse_tracks(path: Path) -> None:
     """Raise, with the verb that takes it, if a file holds the tracks of another program."""
-    from vibrissa.io import READERS, Kind, recognise
-
-    kind = recognise(path)
-    if kind in (Kind.TRACKS, *READERS):
+    kind = vb.io.recognise(path)
+    if kind in (vb.io.Kind.TRACKS, *vb.io.READERS):
         raise ValueError(
             f"{path} holds tracks ({kind}): make a recording of it by `vibrissa import {path} "
             "-o trial.nc` first"
@@ -268,32 +243,25 @@ def refuse_tracks(path: Path) -> None:
 
 def recording_from(path: Path) -> xr.DataTree:
     """Read a recording."""
-    from vibrissa.io import load_recording
-    from vibrissa.pipeline import check_recording
-
     refuse_tracks(path)
-    recording = load_recording(path)
+    recording = vb.load_recording(path)
     try:
-        check_recording(recording)
+        vb.pipeline.check_recording(recording)
     except ValueError as fault:
         raise ValueError(f"{path}: {fault}") from None
     return recording
 
 
-def map_from(path: Path) -> ContactMap:
+def map_from(path: Path) -> vb.ContactMap:
     """Read a map."""
-    from vibrissa.contacts import ContactMap
-
-    return ContactMap.load(path)
+    return vb.ContactMap.load(path)
 
 
-def map_of(whisker: Whisker, tell: Tell, *, grid: bool = False, **how: Any) -> ContactMap:
+def map_of(whisker: vb.Whisker, tell: Tell, *, grid: bool = False, **how: Any) -> vb.ContactMap:
     """Simulate the map of a whisker."""
-    from vibrissa.contacts import ContactMap
-
     stage = "map of all contacts"
     tell(stage, 0, 1)
-    made = ContactMap.simulate(
+    made = vb.ContactMap.simulate(
         whisker, grid=grid, progress=lambda done, total: tell(stage, done, total), **how
     )
     tell(stage, 1, 1)
@@ -302,13 +270,11 @@ def map_of(whisker: Whisker, tell: Tell, *, grid: bool = False, **how: Any) -> C
 
 def wrench_from(path: Path) -> xr.Dataset:
     """Read force and moment over time from a table of signals or a recording."""
-    from vibrissa.io import load_recording, load_signals
-
     if not path.exists():
         raise FileNotFoundError(f"there is no file {path}")
     if kind_in(path) != RECORDING:
-        return load_signals(path)
-    recording = load_recording(path)
+        return vb.load_signals(path)
+    recording = vb.load_recording(path)
     if not {"force", "moment"} <= set(recording.data_vars):
         raise ValueError(f"{path} is a recording without force and moment")
     wrench = recording.to_dataset()[["force", "moment"]]
@@ -317,16 +283,19 @@ def wrench_from(path: Path) -> xr.Dataset:
     return wrench.isel(whisker=0)
 
 
-def objects_from(path: Path) -> tuple[Surface, ...]:
-    """Read known objects from a recording, or from TOML with ``[[object]]``."""
-    from vibrissa.io import NETCDF, in_file, load_recording, read_text
-    from vibrissa.recording import Recording
-    from vibrissa.simulation import read_objects
+def cameras_from(path: Path) -> tuple[vb.cameras.Camera, ...]:
+    """Read calibrated cameras from a recording, or from TOML of Anipose."""
+    if path.suffix.lower() in vb.io.NETCDF:
+        return vb.recording.Recording(vb.load_recording(path)).cameras
+    return vb.cameras.load_cameras(path)
 
-    if path.suffix.lower() not in NETCDF:
-        with in_file(path):
-            return tuple(read_objects(read_text(path), path.parent))
-    objects = Recording(load_recording(path)).objects
+
+def objects_from(path: Path) -> tuple[vb.objects.Surface, ...]:
+    """Read known objects from a recording, or from TOML with ``[[object]]``."""
+    if path.suffix.lower() not in vb.io.NETCDF:
+        with vb.io.in_file(path):
+            return tuple(vb.simulation.read_objects(vb.io.read_text(path), path.parent))
+    objects = vb.recording.Recording(vb.load_recording(path)).objects
     if not objects:
         raise ValueError(f"{path} is a recording without objects")
     return objects
@@ -334,9 +303,7 @@ def objects_from(path: Path) -> tuple[Surface, ...]:
 
 def print_statuses(codes: object, each: str = "") -> None:
     """Print how many frames have which status."""
-    from vibrissa.status import describe
-
-    for sentence, count in describe(codes).most_common():  # type: ignore[arg-type]
+    for sentence, count in vb.status.describe(codes).most_common():  # type: ignore[arg-type]
         say(f"{count:6d} {each} {sentence}")
 
 
@@ -365,7 +332,7 @@ def check_one_whisker(recording: xr.DataTree, path: Path) -> None:
         )
 
 
-def maps_from(paths: Sequence[Path], count: int, grid: bool = False) -> list[ContactMap]:
+def maps_from(paths: Sequence[Path], count: int, grid: bool = False) -> list[vb.ContactMap]:
     """Read the map of each whisker."""
     if len(paths) != count:
         raise ValueError(f"there are {len(paths)} --map for {count} whiskers; each needs one")

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import vibrissa as vb
 from vibrissa.cli.inputs import WhiskerOptions, map_of, metres_of, print_notes, smallest_arc
-from vibrissa.cli.options import free, numbers, with_options
+from vibrissa.cli.options import check_new, numbers, with_options
 from vibrissa.cli.terminal import progress_bars, say
-
-if TYPE_CHECKING:
-    from vibrissa.whisker import Whisker
 
 
 @dataclass(frozen=True)
@@ -32,14 +30,14 @@ class MadeOptions(WhiskerOptions):
         if self.length is not None and self.whisker is not None:
             raise ValueError("give either --whisker or the --length of a straight one")
 
-    def read(self, path: Path | None = None) -> Whisker:
+    def read(self, path: Path | None = None) -> vb.Whisker:
         """Read or make the whisker, of the thickness and material that are stated."""
-        from vibrissa.whisker import TAPER, Whisker
-
         if self.length is None:
             whisker = super().read(path)
         else:
-            whisker = Whisker.straight(1e-3 * self.length, rat=self.rat, any_length=self.any_length)
+            whisker = vb.Whisker.straight(
+                1e-3 * self.length, rat=self.rat, any_length=self.any_length
+            )
         changes: dict[str, Any] = {}
         if self.base_radius is not None or self.tip_radius is not None:
             base, tip = whisker.base_radius, None
@@ -47,7 +45,10 @@ class MadeOptions(WhiskerOptions):
                 base = metres_of(self.base_radius, "--base-radius")
             if self.tip_radius is not None:
                 tip = metres_of(self.tip_radius, "--tip-radius")
-            changes |= {"base_radius": base, "tip_radius": base / TAPER if tip is None else tip}
+            changes |= {
+                "base_radius": base,
+                "tip_radius": base / vb.whisker.TAPER if tip is None else tip,
+            }
         if self.modulus is not None:
             changes["youngs_modulus"] = 1e9 * self.modulus
         if self.poisson is not None:
@@ -74,10 +75,7 @@ def simulate_map(
     Example: `vibrissa map --whisker C1.csv -o map.nc`; steel wire:
     `vibrissa map --length 300 --base-radius 0.5 --tip-radius 0.25 --modulus 200 --poisson 0.29`
     """
-    from vibrissa.io import NETCDF, check_writable
-
-    check_writable(target, NETCDF)
-    free([target], force)
+    check_new(target, vb.io.NETCDF, force)
     whisker = own.read()
     print_notes(whisker)
     with progress_bars() as tell:

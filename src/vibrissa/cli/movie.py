@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import typer
 
+import vibrissa as vb
 from vibrissa.cli.drawings import NODES, TrialOptions, fits_of, sights_of
 from vibrissa.cli.options import RecordingArgument, free, refuse, with_options
 from vibrissa.cli.terminal import Tell, progress_bars, say, stoppable
@@ -17,8 +18,6 @@ from vibrissa.cli.terminal import Tell, progress_bars, say, stoppable
 if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import NDArray
-
-    from vibrissa.scene import Course
 
 _KINDS = ("signals", "contour")
 _LASTS = 45.0
@@ -83,13 +82,10 @@ def make_movies(
     force: bool,
 ) -> list[Path]:
     """Make the movies that a trial allows."""
-    from vibrissa.io import load_recording
-    from vibrissa.scene import course_of
-
     files = _files(target, path, kinds)
     free(files.values(), force)
-    trial = load_recording(path)
-    course = course_of(trial, of_trial.whisker)
+    trial = vb.load_recording(path)
+    course = vb.scene.course_of(trial, of_trial.whisker)
     rows = frames.rows(course.time)
     possible = _possible(kinds, course, rows, path)
     with progress_bars() as tell, stoppable() as stopped:
@@ -104,19 +100,17 @@ def make_movies(
 
 def _files(target: Path, trial: Path, kinds: Sequence[str]) -> dict[str, Path]:
     """Where each movie goes."""
-    from vibrissa.io import check_folder, check_writable
-
     if target.suffix.lower() == ".mp4":
         if len(kinds) > 1:
             raise ValueError(f"--output is the file {target}; for one file choose one --kind")
-        check_writable(target)
+        vb.io.check_writable(target)
         return {kinds[0]: target}
-    check_folder(target)
+    vb.io.check_folder(target)
     return {name: target / f"{trial.stem}-{name}.mp4" for name in kinds}
 
 
 def _possible(
-    kinds: Sequence[str], course: Course, rows: NDArray[np.intp], path: Path
+    kinds: Sequence[str], course: vb.scene.Course, rows: NDArray[np.intp], path: Path
 ) -> list[str]:
     """Kinds for which the trial has what is needed; prints what is lacking for others."""
     lacking = {}
@@ -138,33 +132,28 @@ def _possible(
 
 def _signal_frames(
     trial: xr.DataTree,
-    course: Course,
+    course: vb.scene.Course,
     rows: NDArray[np.intp],
     of_trial: TrialOptions,
     tell: Tell,
 ) -> Iterator[Any]:
-    from vibrissa.plots import signal_frames
-
     contact_map = of_trial.contact_map(trial, tell)
-    return signal_frames(
+    return vb.plots.signal_frames(
         course, contact_map.to_dataset(), contact_map.whisker.centerline(NODES), rows
     )
 
 
 def _contour_frames(
     trial: xr.DataTree,
-    course: Course,
+    course: vb.scene.Course,
     rows: NDArray[np.intp],
     of_trial: TrialOptions,
     tell: Tell,
 ) -> Iterator[Any]:
-    from vibrissa.plots import contour_frames
-    from vibrissa.recording import Recording
-
-    rest = Recording(trial).whisker(of_trial.whisker).centerline(NODES)
+    rest = vb.recording.Recording(trial).whisker(of_trial.whisker).centerline(NODES)
     sights = sights_of(trial, course, of_trial.videos or (), rows)
-    bodies = list(Recording(trial).objects)
-    return contour_frames(course, rest, sights, rows, bodies, fits_of(trial))
+    bodies = list(vb.recording.Recording(trial).objects)
+    return vb.plots.contour_frames(course, rest, sights, rows, bodies, fits_of(trial))
 
 
 _FRAMES = {"signals": _signal_frames, "contour": _contour_frames}
@@ -179,8 +168,6 @@ def _write(
     stopped: Callable[[], bool],
 ) -> None:
     """Write a movie; if it is stopped, what was done stays next to it."""
-    from vibrissa.io import write_movie
-
     name, total = about
     stage = f"movie of {'the contour' if name == 'contour' else name}"
 
@@ -193,7 +180,7 @@ def _write(
                 return
 
     part = path.with_name(f"{path.stem}-part.mp4")
-    count = write_movie(part, counted(), fps)
+    count = vb.io.write_movie(part, counted(), fps)
     if count < total:
         say(f"stopped after {count} of {total} frames: {part} holds these")
         return

@@ -18,6 +18,8 @@ from typing import Annotated, Any, Literal, NamedTuple, TypeVar, cast, get_origi
 
 import typer
 
+import vibrissa as vb
+
 _NAMED = 3
 """How many files are named in one message."""
 
@@ -460,6 +462,12 @@ def free(files: Iterable[Path], force: bool) -> None:
             f"{', '.join(there[:_NAMED])}{more} {are} there already: write elsewhere with "
             "--output, or replace with --force"
         )
+
+
+def check_new(path: Path, endings: Sequence[str], force: bool) -> None:
+    """Raise if a file cannot be written, or is there and not to be replaced."""
+    vb.io.check_writable(path, endings)
+    free([path], force)
 
 
 def refuse(options: Mapping[str, object], reason: str) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+import vibrissa as vb
 from vibrissa.cli.estimate import EstimateOptions, estimated
 from vibrissa.cli.inputs import (
     RECORDING,
@@ -29,10 +30,6 @@ from vibrissa.cli.terminal import Tell, fixed, progress_bars, remark, say
 
 if TYPE_CHECKING:
     import xarray as xr
-
-    from vibrissa.contour import FittedShape
-    from vibrissa.objects import Surface
-    from vibrissa.whisker import Whisker
 
 _SUSPECT = 1.5
 """χ² per degree of freedom from which it is asked whether another shape fits better."""
@@ -83,19 +80,15 @@ def reconstruct(
     The contacts are compared with --objects, by default those of the recording.
     Example: `vibrissa reconstruct trial.nc --shape cylinder`
     """
-    from vibrissa.io import CSV, NETCDF, check_writable, save_contour, save_recording
-    from vibrissa.pipeline import contour_points
-    from vibrissa.recording import Recording
-
     refuse_tracks(recording)
     target = target or recording
     points = target.with_name(f"{target.stem}_contour.csv") if csv is None else csv
-    check_writable(target, NETCDF)
-    check_writable(points, CSV)
+    vb.io.check_writable(target, vb.io.NETCDF)
+    vb.io.check_writable(points, vb.io.CSV)
     own = not force and _of_contour(points, recording, how.own)
     free_beside(recording, [target] if own else [target, points], force)
     tree = recording_from(recording)
-    known = Recording(tree).objects if objects is None else objects_from(objects)
+    known = vb.recording.Recording(tree).objects if objects is None else objects_from(objects)
     with progress_bars() as tell:
         made = []
         try:
@@ -105,12 +98,12 @@ def reconstruct(
         except ValueError as fault:
             if not made:
                 raise
-            save_recording(target, tree)
+            vb.io.save_recording(target, tree)
             raise ValueError(f"{fault}; {' and '.join(made)} are in {target}") from None
     whiskers = how.known.in_recording(tree)
     _report(tree, known, whiskers, wanted)
-    save_recording(target, tree)
-    save_contour(points, contour_points(tree, whiskers))
+    vb.io.save_recording(target, tree)
+    vb.io.save_contour(points, vb.pipeline.contour_points(tree, whiskers))
     print_written(target, recording, "contour")
     print_written(points)
 
@@ -120,21 +113,21 @@ def stages(
     wanted: ShapeOptions,
     source: SourceOptions,
     how: EstimateOptions,
-    known: tuple[Surface, ...],
+    known: tuple[vb.objects.Surface, ...],
     tell: Tell,
     name: str,
 ) -> Iterator[tuple[str, xr.DataTree]]:
     """The recording after each stage that is due."""
-    from vibrissa.pipeline import due_stages, with_contour, with_signals
-
     made = tree["signals"].attrs if "signals" in tree.children else None
     if made and how.own.whisker is not None and not source.given:
         source = _as_made(made)  # by another whisker
     asked = {"signals": source.given, "estimates": how.given}
-    due = due_stages(tree, "contour", [stage for stage, again in asked.items() if again])
+    due = vb.pipeline.due_stages(
+        tree, "contour", [stage for stage, again in asked.items() if again]
+    )
     if "signals" in due:
         tell("signals", 0, 1)
-        tree = with_signals(tree, **source.as_keywords(tree, how.known, how.proximal))
+        tree = vb.pipeline.with_signals(tree, **source.as_keywords(tree, how.known, how.proximal))
         tell("signals", 1, 1)
         yield "signals", tree
     remark(described(tree))
@@ -146,7 +139,9 @@ def stages(
     whiskers = how.known.in_recording(tree)
     yield (
         "contour",
-        with_contour(tree, wanted.shape, whiskers=whiskers, objects=known, **wanted.keywords()),
+        vb.pipeline.with_contour(
+            tree, wanted.shape, whiskers=whiskers, objects=known, **wanted.keywords()
+        ),
     )
     tell(wanted.shape, 1, 1)
 
@@ -160,16 +155,13 @@ def _as_made(about: Any) -> SourceOptions:
 
 def _of_contour(points: Path, recording: Path, own: WhiskerOptions) -> bool:
     """Whether a table holds what the recording does: replaced with it, nothing else is lost."""
-    from vibrissa.io import holds_contour
-    from vibrissa.pipeline import contour_points
-
     if not points.is_file() or kind_in(recording) != RECORDING:
         return False
     tree = recording_from(recording)
     if not {"estimates", "contour"} <= set(tree.children):
         return False
     try:
-        return holds_contour(points, contour_points(tree, own.in_recording(tree)))
+        return vb.io.holds_contour(points, vb.pipeline.contour_points(tree, own.in_recording(tree)))
     except ValueError:
         return False
 
@@ -178,42 +170,40 @@ def _of_contour(points: Path, recording: Path, own: WhiskerOptions) -> bool:
 
 
 def _report(
-    tree: xr.DataTree, known: tuple[Surface, ...], whiskers: list[Whisker], wanted: ShapeOptions
+    tree: xr.DataTree,
+    known: tuple[vb.objects.Surface, ...],
+    whiskers: list[vb.Whisker],
+    wanted: ShapeOptions,
 ) -> None:
     """What became of the frames, the object, and how far contacts are from one that is known."""
-    from vibrissa.contour import shape_from_dataset
-    from vibrissa.evaluation import caution
-    from vibrissa.pipeline import compare_contacts, compare_shapes, distances_by_class
-    from vibrissa.recording import Recording
-
     contour, estimates = (tree[name].to_dataset() for name in ("contour", "estimates"))
-    shapes, fit = None, shape_from_dataset(contour)
+    shapes, fit = None, vb.contour.shape_from_dataset(contour)
     if wanted.shape != "free" and fit.misfit > _SUSPECT:
-        shapes = compare_shapes(estimates, whiskers, **wanted.keywords())
+        shapes = vb.pipeline.compare_shapes(estimates, whiskers, **wanted.keywords())
     print_statuses(estimates["status"].values)
     _print_object(fit, contour, known)
     for line in (_agreement(fit, contour), *_judgement(fit, shapes)):
         say(line)
     if known:
-        compared = compare_contacts(tree, known, whiskers)
-        _print_distances(distances_by_class(compared)["deflection_angle"])
-    if Recording(tree).planar:
+        compared = vb.pipeline.compare_contacts(tree, known, whiskers)
+        _print_distances(vb.pipeline.distances_by_class(compared)["deflection_angle"])
+    if vb.recording.Recording(tree).planar:
         say(
             "One view shows the section of the object in its plane: a cylinder is taken to be "
             "along the line of sight; how it is tilted, and what is in front or behind, is not "
             "measured."
         )
-    if warning := caution(contour.attrs.get("source")):
+    if warning := vb.evaluation.caution(contour.attrs.get("source")):
         say(warning)
 
 
-def _print_object(fit: FittedShape, contour: xr.Dataset, known: tuple[Surface, ...]) -> None:
+def _print_object(
+    fit: vb.contour.FittedShape, contour: xr.Dataset, known: tuple[vb.objects.Surface, ...]
+) -> None:
     """The fitted object with its uncertainty, and how far it is from the known one."""
-    from vibrissa.contour import FreeFit
-
     true = _matching(contour, known)
     title = f"The {fit.kind}"
-    if isinstance(fit, FreeFit):
+    if isinstance(fit, vb.contour.FreeFit):
         deviation = fixed("surface_distance", fit.amplitude, 0)
         title = f"A surface within about {deviation} of this {fit.base.kind}"
         fit = fit.base
@@ -231,7 +221,7 @@ def _print_object(fit: FittedShape, contour: xr.Dataset, known: tuple[Surface, .
     print_table(["", "fitted", "sigma", *(("known", "error") if true else ())], rows, title)
 
 
-def _parameters(fit: FittedShape) -> list[tuple[str, Any, Any]]:
+def _parameters(fit: vb.contour.FittedShape) -> list[tuple[str, Any, Any]]:
     """Name, value and standard deviation of each parameter; diameters instead of radii."""
     rows = []
     for name in fit.fields:
@@ -244,7 +234,7 @@ def _parameters(fit: FittedShape) -> list[tuple[str, Any, Any]]:
     return rows
 
 
-def _matching(contour: xr.Dataset, known: tuple[Surface, ...]) -> dict[str, list[str]]:
+def _matching(contour: xr.Dataset, known: tuple[vb.objects.Surface, ...]) -> dict[str, list[str]]:
     """Known value and error of each row, where a known object is of the fitted kind."""
     offset = next((n for n in ("axis_offset", "center_offset") if n in contour), None)
     if offset is None:
@@ -263,7 +253,7 @@ def _matching(contour: xr.Dataset, known: tuple[Surface, ...]) -> dict[str, list
     return rows
 
 
-def _agreement(fit: FittedShape, contour: xr.Dataset) -> str:
+def _agreement(fit: vb.contour.FittedShape, contour: xr.Dataset) -> str:
     """How well contacts agree with the fitted object."""
     found, used = int(np.isfinite(fit.residuals).sum()), int(fit.used.sum())
     inside = int((fit.used & fit.inliers).sum())
@@ -279,11 +269,9 @@ def _agreement(fit: FittedShape, contour: xr.Dataset) -> str:
     return text
 
 
-def _judgement(fit: FittedShape, shapes: xr.Dataset | None) -> Iterator[str]:
+def _judgement(fit: vb.contour.FittedShape, shapes: xr.Dataset | None) -> Iterator[str]:
     """Whether the contacts are of another shape."""
-    from vibrissa.pipeline import AGREES, STRONG
-
-    if fit.misfit > AGREES:
+    if fit.misfit > vb.pipeline.AGREES:
         yield (
             f"The contacts do not fit a {fit.kind}{_by(fit.misfit)}: the object has another "
             "shape (--shape), or there is more than the noise, such as friction; sigma is as much "
@@ -291,13 +279,13 @@ def _judgement(fit: FittedShape, shapes: xr.Dataset | None) -> Iterator[str]:
         )
     if shapes is None or fit.kind not in shapes["shape"].values:
         return
-    if not shapes["evidence"].sel(shape=fit.kind).item() > STRONG:
+    if not shapes["evidence"].sel(shape=fit.kind).item() > vb.pipeline.STRONG:
         return
     best = shapes.isel(shape=int(np.nanargmin(shapes["evidence"].values)))
     kind, misfit = str(best["shape"].item()), float(best["misfit"])
-    if misfit < AGREES:
+    if misfit < vb.pipeline.AGREES:
         yield f"A {kind} fits them better{_by(misfit)}: --shape {kind}"
-    elif fit.misfit > AGREES:
+    elif fit.misfit > vb.pipeline.AGREES:
         yield f"No simple shape fits them, a {kind} best{_by(misfit)}: --shape free"
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import numpy as np
 import typer
 
+import vibrissa as vb
 from vibrissa.cli.drawings import (
     NODES,
     Draw,
@@ -23,13 +24,11 @@ from vibrissa.cli.drawings import (
 from vibrissa.cli.figures import dataset_with
 from vibrissa.cli.inputs import MAP, RECORDING, kind_in, map_from
 from vibrissa.cli.movie import FrameOptions, make_movies
-from vibrissa.cli.options import free, refuse, with_options
+from vibrissa.cli.options import check_new, refuse, with_options
 from vibrissa.cli.terminal import Tell, progress_bars, say
 
 if TYPE_CHECKING:
     from xarray import DataTree
-
-    from vibrissa.report import Section
 
 _LARGEST = 15_000_000
 """Bytes of a page at most, as far as movies decide about it."""
@@ -42,7 +41,7 @@ class _Content(NamedTuple):
     """Title, sections, script and figures of a page."""
 
     title: str
-    sections: list[Section]
+    sections: list[vb.report.Section]
     script: str
     drawings: Mapping[str, Draw]
 
@@ -67,23 +66,12 @@ def report(
     predicted errors. With SOURCE_DATE_EPOCH set, the same command gives the same
     page. Example: `vibrissa report trial.nc --video top.mp4 --video front.mp4 -o report.html`
     """
-    from vibrissa.io import check_readable, check_writable, load_recording
-    from vibrissa.report import (
-        contacts_by_whisker,
-        document,
-        figure_sections,
-        movies_section,
-        provenance,
-        provenance_section,
-    )
-
-    check_writable(target, (".html", ".htm"))
-    free([target], force)
+    check_new(target, (".html", ".htm"), force)
     movies = list(movie or [])
     files = [file for file in (path, uniqueness, of_trial.map) if file]
     given = [*files, *(of_trial.videos or []), *movies]
     for file in given:
-        check_readable(file)
+        vb.io.check_readable(file)
     for file in movies:
         if file.suffix.lower() != ".mp4":
             raise ValueError(f"--movie is {file}; a movie that ends in .mp4 is needed")
@@ -91,45 +79,43 @@ def report(
     with progress_bars() as tell:
         if is_trial:
             refuse({"--uniqueness": uniqueness}, f"{path} is a recording")
-            trial = load_recording(path)
+            trial = vb.load_recording(path)
             if of_trial.which is None:
-                most = int(np.argmax(contacts_by_whisker(trial)))
+                most = int(np.argmax(vb.report.contacts_by_whisker(trial)))
                 of_trial = replace(of_trial, which=most)
             content = _of_trial(path, trial, of_trial, seed or 0, tell)
         else:
             unused = of_trial.given() | {"--make-movies": make, "--seed": seed}
             refuse(unused, f"{path} is a map")
             content = _of_map(path, uniqueness)
-        content.sections.extend(figure_sections(_drawn(content.drawings, tell)))
+        content.sections.extend(vb.report.figure_sections(_drawn(content.drawings, tell)))
     if make:
         kinds = ("signals", "contour")
         movies += sorted(make_movies(path, target.parent, kinds, of_trial, FrameOptions(), force))
     # The page is the same, whether there was one before or not.
     command = ["vibrissa", *(word for word in sys.argv[1:] if word != "--force")]
-    origin = provenance_section(provenance(command, given, (seed or 0) if is_trial else None))
+    origin = vb.report.provenance_section(
+        vb.report.provenance(command, given, (seed or 0) if is_trial else None)
+    )
     about = "From the forces and moments at a whisker's base to the object that it touched."
 
-    def page(sections: list[Section]) -> str:
-        return document(content.title, about, [*sections, origin], content.script)
+    def page(sections: list[vb.report.Section]) -> str:
+        return vb.report.document(content.title, about, [*sections, origin], content.script)
 
     if movies:
         room = _LARGEST - len(page(content.sections).encode("utf-8")) - _TAGS
-        content.sections.append(movies_section(movies, target.parent, room))
+        content.sections.append(vb.report.movies_section(movies, target.parent, room))
     _write(target, page(content.sections))
 
 
 def _write(target: Path, page: str) -> None:
-    from vibrissa.io import replacing
-
-    with replacing(target) as part:
+    with vb.io.replacing(target) as part:
         part.write_text(page, encoding="utf-8")
     say(f"wrote {target}, {target.stat().st_size / 1e6:.1f} MB")
 
 
 def _is_trial(path: Path) -> bool:
-    from vibrissa.io import refuse_whisk
-
-    refuse_whisk(path)
+    vb.io.refuse_whisk(path)
     kind = kind_in(path)
     if kind not in (RECORDING, MAP):
         raise ValueError(
@@ -143,12 +129,8 @@ def _of_trial(
     path: Path, trial: DataTree, of_trial: TrialOptions, seed: int, tell: Tell
 ) -> _Content:
     """The page of a trial."""
-    from vibrissa.recording import Recording
-    from vibrissa.report import contacts_in_space, space_section, trial_sections
-    from vibrissa.scene import course_of
-
-    course = course_of(trial, of_trial.whisker)
-    sections, script = trial_sections(trial, of_trial.whisker, seed), ""
+    course = vb.scene.course_of(trial, of_trial.whisker)
+    sections, script = vb.report.trial_sections(trial, of_trial.whisker, seed), ""
     drawings = array_drawings(path, "double")
     drawings |= trial_drawings(path, "double", of_trial, tell)
     if course.places is not None and np.isfinite(course.places).any() and _can_draw():
@@ -157,45 +139,41 @@ def _of_trial(
         shown = ["Contact points in the laboratory"]
         shown += ["the known object"] if things else []
         shown += ["the fitted shape"] if "contour" in trial.children else []
-        picture = contacts_in_space(course, known, fits_of(trial))
-        section, script = space_section(picture, f"{', '.join(shown)}, and the whisker.")
+        picture = vb.report.contacts_in_space(course, known, fits_of(trial))
+        section, script = vb.report.space_section(picture, f"{', '.join(shown)}, and the whisker.")
         sections = [*sections, section]
     title = f"Trial: {path.name}"
     if trial.sizes["whisker"] > 1:
-        title += f", whisker {Recording(trial).whisker(of_trial.whisker).name}"
+        title += f", whisker {vb.recording.Recording(trial).whisker(of_trial.whisker).name}"
     return _Content(title, sections, script, drawings)
 
 
 def _of_map(path: Path, uniqueness: Path | None) -> _Content:
     """The page of a map."""
-    from vibrissa.report import chart_sections, reachable_space, space_section
-
     contact_map = map_from(path)
     verdicts = None if uniqueness is None else dataset_with(uniqueness, "verdict")
-    sections, script = chart_sections(contact_map, verdicts), ""
+    sections, script = vb.report.chart_sections(contact_map, verdicts), ""
     drawings = dict(map_drawings(contact_map, "double", verdicts, None))
     if _can_draw():
-        picture = reachable_space(contact_map.to_dataset(), contact_map.whisker.centerline(NODES))
-        section, script = space_section(picture, "All stable contacts of the whisker.")
+        picture = vb.report.reachable_space(
+            contact_map.to_dataset(), contact_map.whisker.centerline(NODES)
+        )
+        section, script = vb.report.space_section(picture, "All stable contacts of the whisker.")
         sections = [*sections, section]
     return _Content(f"Map of contacts: {path.name}", sections, script, drawings)
 
 
 def _can_draw() -> bool:
     """Whether there can be a picture in 3D; prints so if not."""
-    from vibrissa.report import NO_SPACE, can_draw
-
-    if not can_draw():
-        say(NO_SPACE)
-    return can_draw()
+    if not vb.report.can_draw():
+        say(vb.report.NO_SPACE)
+    return vb.report.can_draw()
 
 
 def _drawn(drawings: Mapping[str, Draw], tell: Tell) -> dict[str, bytes]:
-    from vibrissa.plots import png
-
     pictures = {}
     for i, (name, draw) in enumerate(drawings.items()):
         tell("figures", i, len(drawings))
-        pictures[name] = png(draw())
+        pictures[name] = vb.plots.png(draw())
     tell("figures", len(drawings), len(drawings))
     return pictures

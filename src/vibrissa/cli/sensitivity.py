@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+import vibrissa as vb
 from vibrissa.cli.inputs import RECORDING, NoiseOptions, kind_in, map_from, wrench_from
-from vibrissa.cli.options import MapArgument, free, with_options
+from vibrissa.cli.options import MapArgument, check_new, with_options
 from vibrissa.cli.tables import Row, print_table
 from vibrissa.cli.terminal import progress_bars, say, shown
 
@@ -34,30 +35,23 @@ def sensitivity(
     within 2° of rest are left out of the tables, not of the file.
     Example: `vibrissa sensitivity map.nc --using Fx,MB,MD -o sensitivity.nc`
     """
-    from vibrissa.identifiability import best_triplet, sensitivity as derivatives
-    from vibrissa.io import NETCDF, check_writable
-    from vibrissa.numerics import contact_weights
-    from vibrissa.paper import sensitivity_findings
-    from vibrissa.signals import selection
-
     if target is not None:
-        check_writable(target, NETCDF)
-        free([target], force)
-    names = selection([name.strip() for name in using.split(",")], exactly=3)
+        check_new(target, vb.io.NETCDF, force)
+    names = vb.signals.selection([name.strip() for name in using.split(",")], exactly=3)
     contact_map = map_from(path)
     covariance = noise.matrix()
     moment_noise = float(np.sqrt(0.5 * (covariance[4, 4] + covariance[5, 5])))
     at = None if trial is None else _contacts_of(trial, moment_noise)
     with progress_bars() as tell:
         tell("derivatives", 0, 2)
-        found = derivatives(contact_map, names, at, noise=covariance)
+        found = vb.sensitivity(contact_map, names, at, noise=covariance)
         tell("derivatives", 1, 2)
-        rivals = best_triplet(contact_map, covariance, at)
+        rivals = vb.best_triplet(contact_map, covariance, at)
         tell("derivatives", 2, 2)
-    if not contact_weights(found).any():
+    if not vb.numerics.contact_weights(found).any():
         raise ValueError(f"{trial or path} holds no contact farther than 2° from rest")
     say(repr(contact_map.whisker))
-    _print_derivatives(sensitivity_findings(found))
+    _print_derivatives(vb.sensitivity_findings(found))
     _print_rivals(rivals, names, noise.described())
     if target is not None:
         _save(target, found)
@@ -69,29 +63,26 @@ def _contacts_of(path: Path, moment_noise: float) -> Dataset:
 
     As for estimates, there is a contact where M_B exceeds five standard deviations of its noise.
     """
-    from vibrissa.io import load_recording
-    from vibrissa.pipeline import DETECTED
-    from vibrissa.signals import base_signals
-
     if kind_in(path) == RECORDING:
-        recording = load_recording(path).to_dataset(inherit=False)
+        recording = vb.load_recording(path).to_dataset(inherit=False)
         if "contact_point_whisker" in recording:
             return recording
     wrench = wrench_from(path)
-    touching = base_signals(wrench["force"], wrench["moment"])["MB"] > DETECTED * moment_noise
+    touching = (
+        vb.base_signals(wrench["force"], wrench["moment"])["MB"]
+        > vb.pipeline.DETECTED * moment_noise
+    )
     return wrench[["force", "moment"]].where(touching)
 
 
 def _print_derivatives(findings: Dataset) -> None:
     """Median sizes, where they are large, and what differs between the sides."""
-    from vibrissa.quantities import quantity
-
     by = [str(n) for n in findings["sorted_by"].values]
     rows: list[list[str] | None] = []
     for signal in map(str, findings["signal"].values):
-        below = quantity(signal)
+        below = vb.quantities.quantity(signal)
         for coordinate in ("r", "theta", "phi"):
-            above = quantity(coordinate)
+            above = vb.quantities.quantity(coordinate)
             entry = findings.sel(coordinate=coordinate, signal=signal)
             factor = above.display_factor / below.display_factor
             unit = below.display_unit
@@ -155,8 +146,6 @@ def _error(value: float) -> str:
 
 
 def _save(path: Path, found: Dataset) -> None:
-    from vibrissa.io import COMPRESSED, write_netcdf
-
     floats = [str(name) for name, v in found.data_vars.items() if v.dtype.kind == "f"]
     about = found.assign_attrs(kind="vibrissa sensitivity")
-    write_netcdf(path, about, {"/": dict.fromkeys(floats, COMPRESSED)})
+    vb.io.write_netcdf(path, about, {"/": dict.fromkeys(floats, vb.io.COMPRESSED)})

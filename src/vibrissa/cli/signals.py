@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+import vibrissa as vb
 from vibrissa.cli.inputs import (
     WhiskerOptions,
     check_one_whisker,
@@ -42,16 +43,17 @@ class SourceOptions:
         self, recording: xr.DataTree, own: WhiskerOptions, proximal: float | None = None
     ) -> dict[str, Any]:
         """Turn options into those of `signals_of`."""
-        from vibrissa.pipeline import default_source
-        from vibrissa.tracking import CUTOFF
-
-        source = default_source(recording) if self.source is None else self.source.replace("-", " ")
+        source = (
+            vb.pipeline.default_source(recording)
+            if self.source is None
+            else self.source.replace("-", " ")
+        )
         if source != "contact point":
             refuse({"--cutoff": self.cutoff}, f"signals of the {source} have a pose of their own")
             return {"source": source, "whiskers": None}
         return {
             "source": source,
-            "cutoff": CUTOFF if self.cutoff is None else self.cutoff or None,
+            "cutoff": vb.tracking.CUTOFF if self.cutoff is None else self.cutoff or None,
             "whiskers": own.in_recording(recording),
             "proximal": smallest_arc(proximal),
         }
@@ -74,15 +76,12 @@ def signals(
     They are added to the recording as a group `signals`; what it already holds stays, but estimates
     and a contour that were made of other signals are left out. Example: `vibrissa signals trial.nc`
     """
-    from vibrissa.io import CSV, NETCDF, check_writable, save_recording, save_signals
-    from vibrissa.pipeline import with_signals
-
     refuse_tracks(recording)
     target = target or recording
-    check_writable(target, (*NETCDF, *CSV))
+    vb.io.check_writable(target, (*vb.io.NETCDF, *vb.io.CSV))
     free_beside(recording, [target], force)
     tree = recording_from(recording)
-    table = target.suffix.lower() in CSV
+    table = target.suffix.lower() in vb.io.CSV
     if table:
         check_one_whisker(tree, recording)
     with progress_bars() as tell:
@@ -91,7 +90,7 @@ def signals(
         if keywords["whiskers"] is None:
             unused = {"--whisker": own.whisker, "--proximal": proximal}
             refuse(unused, f"signals of the {keywords['source']} need none")
-        done = with_signals(tree, **keywords)
+        done = vb.pipeline.with_signals(tree, **keywords)
         tell("signals", 1, 1)
     print_notes(*(keywords["whiskers"] or ()))
     remark(described(done))
@@ -99,17 +98,19 @@ def signals(
     print_statuses(found["status"].values)
     _print_largest(found)
     if table:
-        save_signals(target, found.isel(whisker=0)[["force", "moment"]])
+        vb.io.save_signals(target, found.isel(whisker=0)[["force", "moment"]])
     else:
-        save_recording(target, done)
+        vb.io.save_recording(target, done)
     print_written(target, recording, "signals")
 
 
 def described(tree: xr.DataTree) -> str:
     """State what the signals of a recording come from."""
-    from vibrissa.recording import Recording
-
-    flat = "; one view: depth, Fz, Mx and My are taken for 0" if Recording(tree).planar else ""
+    flat = (
+        "; one view: depth, Fz, Mx and My are taken for 0"
+        if vb.recording.Recording(tree).planar
+        else ""
+    )
     return f"{_origin(tree)}{flat}"
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import typer
 
+import vibrissa as vb
 from vibrissa.cli.inputs import WhiskerOptions, print_notes, print_statuses
 from vibrissa.cli.options import free, with_options
 from vibrissa.cli.terminal import output, progress_bars, say, shown
@@ -63,22 +64,20 @@ def simulate(
     0.5 s). Options count more than the file. Example: `vibrissa simulate --duration 0.5
     --friction 0.3 -o trial.nc`; `vibrissa simulate --array average --object sphere -o face.nc`
     """
-    from vibrissa.io import NETCDF, check_writable, in_file, read_text, save_recording
-    from vibrissa.simulation import EXAMPLE, measure, read_script, simulate as simulated
-    from vibrissa.whisker import Whisker
-
     if example:
-        output.out(EXAMPLE, highlight=False, end="")
+        output.out(vb.simulation.EXAMPLE, highlight=False, end="")
         return
-    check_writable(target, NETCDF)
+    vb.io.check_writable(target, vb.io.NETCDF)
     free([target, *(() if film is None else _films(film))], force)
     with progress_bars() as tell:
         tell("how far to whisk", 0, 1)
-        text, folder = ("", Path()) if script is None else (read_text(script), script.parent)
-        with nullcontext() if script is None else in_file(script):
-            plan = read_script(text, folder, own.read, whisker=own.whisker, **wanted.changes())
+        text, folder = ("", Path()) if script is None else (vb.io.read_text(script), script.parent)
+        with nullcontext() if script is None else vb.io.in_file(script):
+            plan = vb.simulation.read_script(
+                text, folder, own.read, whisker=own.whisker, **wanted.changes()
+            )
         tell("how far to whisk", 1, 1)
-        trial = simulated(
+        trial = vb.simulation.simulate(
             plan.whisker,
             plan.motion,
             plan.objects,
@@ -86,10 +85,10 @@ def simulate(
             dynamics=plan.dynamics,
             progress=lambda done, total: tell("whisking trial", done, total),
         )
-        trial = measure(trial, seed=plan.seed, sensor=plan.sensor)
-        save_recording(target, trial)
+        trial = vb.simulation.measure(trial, seed=plan.seed, sensor=plan.sensor)
+        vb.io.save_recording(target, trial)
     say(repr(plan.whisker))
-    if isinstance(plan.whisker, Whisker):
+    if isinstance(plan.whisker, vb.Whisker):
         print_notes(plan.whisker)
     for solid in plan.objects:
         say(repr(solid))
@@ -129,20 +128,17 @@ def _films(folder: Path) -> list[Path]:
 
 def _film(trial: xr.DataTree, path: Path, folder: Path, seed: int) -> None:
     """Film the trial, and add cameras and true traces to the recording."""
-    from vibrissa.io import save_recording
-    from vibrissa.simulation import film, views_of
-
     folder.mkdir(parents=True, exist_ok=True)
-    cameras = views_of(trial)
+    cameras = vb.simulation.views_of(trial)
     files = dict(zip([camera.name for camera in cameras], _films(folder), strict=True))
     with progress_bars() as tell:
-        filmed = film(
+        filmed = vb.simulation.film(
             trial,
             files,
             cameras,
             seed=seed,
             progress=lambda done, total: tell("filming", done, total),
         )
-        save_recording(path, filmed)
+        vb.io.save_recording(path, filmed)
     for file in files.values():
         say(f"wrote {file}")

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+import vibrissa as vb
 from vibrissa.cli.inputs import (
     AssumptionOptions,
     NoiseOptions,
@@ -28,10 +29,6 @@ from vibrissa.cli.terminal import Ended, ending_in_order, remark
 
 if TYPE_CHECKING:
     import socket
-
-    from vibrissa.contacts import ContactMap, Estimator
-    from vibrissa.sensors import Sensor
-    from vibrissa.streaming import ContactRecorder, ContactStream, NewestLines, Poses
 
 _SOON = 500
 """Samples after which advice is given; it is given again at the end."""
@@ -63,12 +60,10 @@ class LineOptions:
 
     def __post_init__(self) -> None:
         """Refuse what does not go together."""
-        from vibrissa.io import refuse_whisk
-
         if self.source is not None and self.udp is not None:
             raise ValueError("give either a source or --udp")
         if self.source is not None:
-            refuse_whisk(self.source)
+            vb.io.refuse_whisk(self.source)
         if not self.bag:
             topics = {"--topic": self.topic, "--pose-topic": self.pose_topic}
             refuse(topics, "it is of a ROS bag, and the source is not one")
@@ -82,31 +77,26 @@ class LineOptions:
     @property
     def bag(self) -> bool:
         """Whether the source is a ROS bag."""
-        from vibrissa.io import is_bag
-
-        return self.source is not None and is_bag(self.source)
+        return self.source is not None and vb.io.is_bag(self.source)
 
     def lines(self, heard: socket.socket | None) -> Iterator[str]:
         """Return lines as they come."""
-        from vibrissa.io import check_readable
-        from vibrissa.streaming import bag_lines, bounded_lines, file_lines, udp_lines
-
         if heard is not None:
-            return udp_lines(heard)
+            return vb.streaming.udp_lines(heard)
         if self.source is None or str(self.source) == "-":
             refuse({"--reconnect": self.reconnect}, "standard input does not open again")
             if isinstance(sys.stdin, TextIOWrapper):  # noise on a serial line must not end a stream
                 sys.stdin.reconfigure(errors="replace")
-            return bounded_lines(sys.stdin)
+            return vb.streaming.bounded_lines(sys.stdin)
         if self.bag:
-            return bag_lines(self.source, self.topic, self.pose_topic)
+            return vb.streaming.bag_lines(self.source, self.topic, self.pose_topic)
         if self.source.is_dir() or not self.source.exists():
-            check_readable(self.source)
+            vb.io.check_readable(self.source)
         if self.reconnect and self.source.is_file():
             raise ValueError(
                 f"{self.source} is a file, which ends; --reconnect is for pipes and devices"
             )
-        return file_lines(self.source, self.reconnect, remark)
+        return vb.streaming.file_lines(self.source, self.reconnect, remark)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,34 +129,28 @@ class MeasurementOptions:
         errors.pop("--stiffness-sigma", None)
         refuse(errors, "the --sensor's file states gain_error and mixing_error")
 
-    def contact_map(self) -> ContactMap:
+    def contact_map(self) -> vb.ContactMap:
         """Read or simulate the map."""
-        from vibrissa.contacts import ContactMap
-
         if self.map is not None:
             return map_from(self.map)
         whisker = self.own.read()
         print_notes(whisker)
         remark(f"no map given; simulating that of {whisker!r}")
-        return ContactMap.simulate(whisker, grid=False, proximal=smallest_arc(self.proximal))
+        return vb.ContactMap.simulate(whisker, grid=False, proximal=smallest_arc(self.proximal))
 
-    def described(self) -> Sensor | None:
+    def described(self) -> vb.sensors.Sensor | None:
         """Read the sensor."""
-        from vibrissa.sensors import load_sensor
+        return None if self.sensor is None else vb.sensors.load_sensor(self.sensor)
 
-        return None if self.sensor is None else load_sensor(self.sensor)
-
-    def estimator(self, sensor: Sensor | None) -> Estimator:
+    def estimator(self, sensor: vb.sensors.Sensor | None) -> vb.Estimator:
         """Return what estimates contacts from measurements."""
-        from vibrissa.contacts import Estimator
-
         contact_map, prior, errors = self.contact_map(), self.assumed.prior, self.assumed.errors
         if sensor is not None:
             stiffness = errors.get("stiffness_sigma", 0.0)
             if self.tare:
                 sensor = sensor.with_new_offset(self.tare)
-            return Estimator.of_sensor(contact_map, sensor, stiffness, self.threshold, prior)
-        return Estimator(
+            return vb.Estimator.of_sensor(contact_map, sensor, stiffness, self.threshold, prior)
+        return vb.Estimator(
             contact_map,
             self.using or "Fx,MB,MD",
             self.noise.matrix(),
@@ -189,31 +173,33 @@ class FollowOptions:
         if not self.filter:
             refuse({"--speed": self.speed}, "it is of the filter: add --filter")
 
-    def poses(self) -> Poses:
+    def poses(self) -> vb.streaming.Poses:
         """Return the poses of what the whisker is mounted on."""
-        from vibrissa.streaming import Poses, rotation_of
-
         if self.mount is None:
-            return Poses()
+            return vb.streaming.Poses()
         values = numbers(self.mount, _MOUNT, "--mount")
-        return Poses(rotation_of(values[3:]), [1e-3 * x for x in values[:3]])
+        return vb.streaming.Poses(
+            vb.streaming.rotation_of(values[3:]), [1e-3 * x for x in values[:3]]
+        )
 
     def running(
-        self, estimator: Estimator, sensor: Sensor | None, poses: Poses, bag: bool, tare: int
-    ) -> ContactStream:
+        self,
+        estimator: vb.Estimator,
+        sensor: vb.sensors.Sensor | None,
+        poses: vb.streaming.Poses,
+        bag: bool,
+        tare: int,
+    ) -> vb.streaming.ContactStream:
         """Return what turns lines into contacts."""
-        from vibrissa.contacts import ContactFilter
-        from vibrissa.streaming import COMPONENTS, ContactStream
-
         speed = None if self.speed is None else 1e-3 * self.speed
-        filtered = ContactFilter(estimator, speed=speed) if self.filter else None
+        filtered = vb.ContactFilter(estimator, speed=speed) if self.filter else None
         names = None if sensor is None else tuple(sensor.channels)
-        if bag and names is not None and not set(names) <= set(COMPONENTS):
+        if bag and names is not None and not set(names) <= set(vb.streaming.COMPONENTS):
             raise ValueError(
-                f"a bag of wrenches carries {', '.join(COMPONENTS)}; the sensor has "
+                f"a bag of wrenches carries {', '.join(vb.streaming.COMPONENTS)}; the sensor has "
                 f"{', '.join(names)}"
             )
-        return ContactStream(estimator, names, filtered, poses, tare)
+        return vb.streaming.ContactStream(estimator, names, filtered, poses, tare)
 
 
 @with_options()
@@ -232,15 +218,12 @@ def stream(
     Ctrl-C or any signal.
     Example: `vibrissa stream --udp 127.0.0.1:5005 --map wire.nc --sensor sensor.toml`
     """
-    from vibrissa.io import ContactBag
-    from vibrissa.streaming import ContactRecorder
-
     sensor, poses = measured.described(), follow.poses()
     with ending_in_order(), ExitStack() as opened:
         writer = None
         if bag is not None:
             frame = "laboratory" if follow.filter else "whisker"
-            writer = opened.enter_context(ContactBag(bag, frame=frame))
+            writer = opened.enter_context(vb.io.ContactBag(bag, frame=frame))
         heard = None if source.udp is None else _socket(source.udp, opened)
         lines: Iterable[str] = source.lines(heard)
         estimator = measured.estimator(sensor)
@@ -253,7 +236,7 @@ def stream(
                 lines = losses.newest(running)
         recorder = None
         if writer is not None:
-            recorder = ContactRecorder(writer, running, sensor, follow.filter, remark)
+            recorder = vb.streaming.ContactRecorder(writer, running, sensor, follow.filter, remark)
         try:
             _write(running, islice(lines, source.count), recorder, losses)
         except Ended as signalled:  # the usual end
@@ -264,25 +247,21 @@ def stream(
         raise typer.Exit(1)
 
 
-def _report(running: ContactStream, lost: str, follow: bool) -> None:
+def _report(running: vb.streaming.ContactStream, lost: str, follow: bool) -> None:
     if follow and not running.poses.number:
         remark("no pose came: the base was taken to stand still")
     remark(f"{running.samples} samples, {running.faults} lines that could not be read{lost}")
     _advise(running)
 
 
-def _advise(running: ContactStream) -> None:
-    from vibrissa.streaming import advice
-
-    for sentence in advice(running):
+def _advise(running: vb.streaming.ContactStream) -> None:
+    for sentence in vb.streaming.advice(running):
         remark(sentence)
 
 
 def _socket(udp: str, opened: ExitStack) -> socket.socket:
     """Listen before the map is made, so that nothing is lost."""
-    from vibrissa.streaming import udp_address, udp_socket
-
-    heard = opened.enter_context(udp_socket(*udp_address(udp)))
+    heard = opened.enter_context(vb.streaming.udp_socket(*vb.streaming.udp_address(udp)))
     host, port = heard.getsockname()[:2]
     remark(f"listening at {host}:{port}")
     return heard
@@ -293,14 +272,12 @@ class _Losses:
 
     def __init__(self, heard: socket.socket) -> None:
         self._heard = heard
-        self._lines: NewestLines | None = None
+        self._lines: vb.streaming.NewestLines | None = None
         self._before, self._next = (0, 0), 0.0
 
-    def newest(self, running: ContactStream) -> NewestLines:
+    def newest(self, running: vb.streaming.ContactStream) -> vb.streaming.NewestLines:
         """Lines of which only the newest are passed on."""
-        from vibrissa.streaming import NewestLines
-
-        self._lines = NewestLines(self._heard, running.lines.kind)
+        self._lines = vb.streaming.NewestLines(self._heard, running.lines.kind)
         return self._lines
 
     def report(self) -> None:
@@ -319,26 +296,22 @@ class _Losses:
         return text + (f", {lost} datagrams lost because too many waited" if lost else "")
 
     def _counts(self) -> tuple[int, int]:
-        from vibrissa.streaming import udp_lost
-
-        return 0 if self._lines is None else self._lines.dropped, udp_lost(self._heard)
+        return 0 if self._lines is None else self._lines.dropped, vb.streaming.udp_lost(self._heard)
 
 
 def _write(
-    running: ContactStream,
+    running: vb.streaming.ContactStream,
     lines: Iterator[str],
-    recorder: ContactRecorder | None,
+    recorder: vb.streaming.ContactRecorder | None,
     losses: _Losses | None,
 ) -> None:
     """Print records as they come, each at once; stop quietly when nobody reads any more."""
-    from vibrissa.streaming import as_json
-
     try:
         for record in running.records(lines):
             # First, so that all that was answered is in the bag, wherever a signal comes.
             if recorder is not None:
                 recorder.put(record)
-            sys.stdout.write(as_json(record) + "\n")
+            sys.stdout.write(vb.streaming.as_json(record) + "\n")
             sys.stdout.flush()
             if losses is not None:
                 losses.report()

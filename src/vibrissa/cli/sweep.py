@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
+import vibrissa as vb
 from vibrissa.cli.options import free, refuse, with_options
 from vibrissa.cli.terminal import output, progress_bars, remark, say
-
-if TYPE_CHECKING:
-    from vibrissa.sweeps import Study
 
 _SHOW = "show"
 _LISTED = 3
@@ -49,10 +47,8 @@ def sweep(
         raise ModuleNotFoundError(
             "studies are kept with zarr: pip install 'vibrissa[sweeps]'"
         ) from missing
-    from vibrissa.sweeps import EXAMPLE
-
     if example:
-        output.out(EXAMPLE, highlight=False, end="")
+        output.out(vb.sweeps.EXAMPLE, highlight=False, end="")
     elif study is None:
         raise ValueError("a study is needed; `vibrissa sweep --example` prints one")
     elif study == _SHOW:
@@ -76,23 +72,18 @@ def sweep(
         _run(plan, target, workers=workers, **how)
 
 
-def _plan(path: Path) -> Study:
-    from vibrissa.io import check_readable, read_text
-    from vibrissa.sweeps import read_study
-
-    text = read_text(check_readable(path))
+def _plan(path: Path) -> vb.sweeps.Study:
+    text = vb.io.read_text(vb.io.check_readable(path))
     try:
-        return read_study(text, path.parent)
+        return vb.sweeps.read_study(text, path.parent)
     except ValueError as fault:
         raise ValueError(f"{path}: {fault}") from None
 
 
-def _run(plan: Study, path: Path, **how: Any) -> None:
-    from vibrissa.sweeps import failures, open_sweep, run_sweep, sweep_summary
-
+def _run(plan: vb.sweeps.Study, path: Path, **how: Any) -> None:
     try:
         with progress_bars() as tell:
-            outcome = run_sweep(
+            outcome = vb.sweeps.run_sweep(
                 plan, path, **how, progress=lambda done, total: tell("cells", done, total)
             )
     except KeyboardInterrupt:
@@ -113,12 +104,12 @@ def _run(plan: Study, path: Path, **how: Any) -> None:
     for line in outcome.faults:
         remark(line)
     say(text)
-    say(sweep_summary(open_sweep(path)))
-    _print_failures(failures(path))
+    say(vb.sweeps.sweep_summary(vb.sweeps.open_sweep(path)))
+    _print_failures(vb.sweeps.failures(path))
     say(f"results are in {path}")
 
 
-def _cost(plan: Study, workers: int) -> None:
+def _cost(plan: vb.sweeps.Study, workers: int) -> None:
     say(
         f"{plan.size} cells: {len(plan.specimens)} whiskers, "
         f"{', '.join(f'{task} of {plan.count(task)}' for task in plan.tasks)}\n"
@@ -131,17 +122,14 @@ def _cost(plan: Study, workers: int) -> None:
 def _show(store: Path | None, folder: Path, force: bool) -> None:
     if store is None:
         raise ValueError("state what to show: vibrissa sweep show STORE")
-    from vibrissa import plots
-    from vibrissa.sweeps import failures, open_sweep, sweep_summary
-
-    found = open_sweep(store).load()
-    say(sweep_summary(found))
-    _print_failures(failures(store))
+    found = vb.sweeps.open_sweep(store).load()
+    say(vb.sweeps.sweep_summary(found))
+    _print_failures(vb.sweeps.failures(store))
     folder.mkdir(parents=True, exist_ok=True)
-    names = {task: folder / f"{store.resolve().stem}-{task}" for task in plots.drawable(found)}
+    names = {task: folder / f"{store.resolve().stem}-{task}" for task in vb.plots.drawable(found)}
     free([name.with_name(f"{name.name}.png") for name in names.values()], force)
     for task, name in names.items():
-        for file in plots.save(plots.sweep_overview(found, task=task), name, ("png",)):
+        for file in vb.plots.save(vb.plots.sweep_overview(found, task=task), name, ("png",)):
             say(f"wrote {file}")
 
 

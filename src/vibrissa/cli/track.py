@@ -13,15 +13,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from vibrissa.cli.inputs import WhiskerOptions, metres_of, objects_from, print_notes, refuse_tracks
+import vibrissa as vb
+from vibrissa.cli.inputs import (
+    WhiskerOptions,
+    cameras_from,
+    metres_of,
+    objects_from,
+    print_notes,
+    refuse_tracks,
+)
 from vibrissa.cli.options import free, numbers, refuse, with_options
 from vibrissa.cli.terminal import progress_bars, say, shown
 
 if TYPE_CHECKING:
     import xarray as xr
-
-    from vibrissa.cameras import Camera
-    from vibrissa.tracking import Start, TraceOptions, TrackOptions
 
 _WIDEST = 1.0
 """Largest width of views of a whisker, m."""
@@ -87,26 +92,23 @@ class FilmOptions:
                 )
         return [Path(f"{v}#{part}") for v in videos for part in parts] if parts else videos
 
-    def seen_by(self, videos: Sequence[Path]) -> tuple[Camera, ...]:
+    def seen_by(self, videos: Sequence[Path]) -> tuple[vb.cameras.Camera, ...]:
         """Return the cameras of the views: those that are calibrated, or orthogonal ones."""
-        from vibrissa.cameras import PIXEL_SIZE, orthogonal_views
-        from vibrissa.io import video_info
-
         if self.cameras is not None:
             return _calibrated(self.cameras, videos)
         if len(videos) % 2 and len(videos) > 1:
             raise ValueError(f"{len(videos)} videos: give one or two a trial, or their --cameras")
-        sizes = [(info.width, info.height) for info in map(video_info, videos)]
+        sizes = [(info.width, info.height) for info in map(vb.io.video_info, videos)]
         if len(set(sizes)) > 1:
             raise ValueError(f"the videos differ in size, {sorted(set(sizes))}: give --cameras")
-        pixel_size = PIXEL_SIZE if self.pixel_size is None else 1e-3 * self.pixel_size
+        pixel_size = vb.cameras.PIXEL_SIZE if self.pixel_size is None else 1e-3 * self.pixel_size
         wide = pixel_size * sizes[0][0]
         if not 0.0 < wide <= _WIDEST:
             raise ValueError(
                 f"--pixel-size is {1e3 * pixel_size:g} mm, by which the views are {wide:g} m wide; "
                 "it is in mm, such as 0.058"
             )
-        return orthogonal_views(pixel_size, sizes[0])[: len(videos)]
+        return vb.cameras.orthogonal_views(pixel_size, sizes[0])[: len(videos)]
 
 
 @dataclass(frozen=True)
@@ -124,14 +126,12 @@ class TraceStatements:
             if not 0.0 < pixels < math.inf:
                 raise ValueError(f"--{name} is {pixels:g}; pixels, more than 0, are needed")
 
-    def trace_options(self) -> TraceOptions:
+    def trace_options(self) -> vb.tracking.TraceOptions:
         """Return the options of traces."""
-        from vibrissa.tracking import TraceOptions
-
         scale = max(self.base_width / _FINEST, 1.0)
-        return TraceOptions(scale=scale, jump=self.jump, bright=self.bright)
+        return vb.tracking.TraceOptions(scale=scale, jump=self.jump, bright=self.bright)
 
-    def bases(self, cameras: Sequence[Camera]) -> list[list[list[float]] | None]:
+    def bases(self, cameras: Sequence[vb.cameras.Camera]) -> list[list[list[float]] | None]:
         """Return the bases in each view; None: to be found."""
         views = len(cameras)
         if not self.base:
@@ -167,9 +167,7 @@ class KnownOptions:
 
     def corrected(self, views: int) -> Any:
         """Read corrected traces, by view."""
-        from vibrissa.io import load_corrections
-
-        fixed = {} if self.corrections is None else load_corrections(self.corrections)
+        fixed = {} if self.corrections is None else vb.io.load_corrections(self.corrections)
         if unknown := sorted(view for view in fixed if view >= views):
             raise ValueError(
                 f"{self.corrections} corrects view {unknown[0]}; views are counted from 0"
@@ -178,15 +176,13 @@ class KnownOptions:
 
     def read(self, video: Path, rate: float) -> dict[str, Any]:
         """Read the head, the contact points and the objects, by the names that `track` has."""
-        from vibrissa.io import load_contact_points
-
         if self.contact is not None and self.objects is not None:
             raise ValueError("--contact and --objects both state where the contact is; give one")
         known: dict[str, Any] = {}
         if self.head is not None:
             known["head"] = _head(self.head, video, rate)
         if self.contact is not None:
-            known["contacts"] = load_contact_points(self.contact)
+            known["contacts"] = vb.io.load_contact_points(self.contact)
         if self.objects is not None:
             known["objects"] = objects_from(self.objects)
         return known
@@ -222,8 +218,6 @@ def track(
     continues when it is called again.
     Example: `vibrissa track top.mp4 front.mp4 --pixel-size 0.058 --rate 1000 -o trial.nc`
     """
-    from vibrissa.tracking import TrackOptions
-
     videos = filmed.split(videos)
     for video in videos:
         refuse_tracks(video)
@@ -240,7 +234,7 @@ def track(
     properties: dict[str, Any] = {}
     if base_radius is not None:
         properties["base_radius"] = metres_of(base_radius, "--base-radius")
-    how = TrackOptions(
+    how = vb.tracking.TrackOptions(
         cutoff=low_pass or None,
         offset=None if filmed.offset == "auto" else int(filmed.offset),
         properties=properties,
@@ -261,24 +255,21 @@ def _track(
     videos: Sequence[Path],
     recording: Path,
     picture: Path,
-    cameras: tuple[Camera, ...],
+    cameras: tuple[vb.cameras.Camera, ...],
     rate: float,
     bases: Sequence[Any],
     corrections: Any,
-    options: TraceOptions,
-    how: TrackOptions,
+    options: vb.tracking.TraceOptions,
+    how: vb.tracking.TrackOptions,
     known: Mapping[str, Any],
 ) -> None:
     """Track one trial and report what was found."""
-    from vibrissa.io import save_recording
-    from vibrissa.tracking import partial_traces, trace_file, track as tracked
-
     if bases[0] is None:
         bases, options = _found(videos, picture, cameras, options, how.offset or 0)
-    kept = [partial_traces(recording, view) for view in range(len(videos))]
+    kept = [vb.tracking.partial_traces(recording, view) for view in range(len(videos))]
     with progress_bars() as tell:
         traces = [
-            trace_file(
+            vb.tracking.trace_file(
                 path,
                 kept[view],
                 bases[view],
@@ -288,9 +279,9 @@ def _track(
             )
             for view, path in enumerate(videos)
         ]
-        result = tracked(cameras, traces, rate, how, progress=tell, **known)
+        result = vb.tracking.track(cameras, traces, rate, how, progress=tell, **known)
     _compare_lengths(videos, traces, result.sizes["time"])
-    save_recording(recording, result)
+    vb.io.save_recording(recording, result)
     for file in kept:
         file.unlink(missing_ok=True)
     print_tracked(result, recording)
@@ -299,21 +290,18 @@ def _track(
 def _found(
     videos: Sequence[Path],
     picture: Path,
-    cameras: tuple[Camera, ...],
-    options: TraceOptions,
+    cameras: tuple[vb.cameras.Camera, ...],
+    options: vb.tracking.TraceOptions,
     offset: int,
-) -> tuple[list[Any], TraceOptions]:
+) -> tuple[list[Any], vb.tracking.TraceOptions]:
     """Find the whisker, and show what is taken for it before any time is spent on it."""
-    from vibrissa.plots import save, start_views
-    from vibrissa.tracking import find_start, start_frames
-
-    numbers, frames = start_frames(videos, offset)
-    start = find_start(cameras, frames, options)
+    numbers, frames = vb.tracking.start_frames(videos, offset)
+    start = vb.tracking.find_start(cameras, frames, options)
     names = [camera.name for camera in cameras]
     images = [view[start.frame] for view in frames]
     remarks = [f"frame {numbers[start.frame]} of {videos[0].name}: {why}" for why in start.doubts]
-    figure = start_views(images, start.lines, names, start.confidence, remarks)
-    save(figure, picture.with_suffix(""), ("png",))
+    figure = vb.plots.start_views(images, start.lines, names, start.confidence, remarks)
+    vb.plots.save(figure, picture.with_suffix(""), ("png",))
     if start.bases is None:
         raise ValueError(
             f"where the whisker begins was not found: {start.doubts[0]}. See {picture}, and state "
@@ -324,20 +312,13 @@ def _found(
     return [[base.tolist()] for base in start.bases], replace(options, bright=start.bright)
 
 
-def _calibrated(path: Path, videos: Sequence[Path]) -> tuple[Camera, ...]:
+def _calibrated(path: Path, videos: Sequence[Path]) -> tuple[vb.cameras.Camera, ...]:
     """Cameras of a file, each for videos of its size."""
-    from vibrissa.cameras import load_cameras
-    from vibrissa.io import NETCDF, load_recording, video_info
-    from vibrissa.recording import Recording
-
-    if path.suffix.lower() in NETCDF:
-        cameras = Recording(load_recording(path)).cameras
-    else:
-        cameras = load_cameras(path)
+    cameras = cameras_from(path)
     if len(videos) % len(cameras):
         raise ValueError(f"{path} holds {len(cameras)} cameras; there are {len(videos)} videos")
     for i, video in enumerate(videos):
-        camera, info = cameras[i % len(cameras)], video_info(video)
+        camera, info = cameras[i % len(cameras)], vb.io.video_info(video)
         if (info.width, info.height) != tuple(camera.size):
             raise ValueError(
                 f"{video} is {info.width} × {info.height} pixels; {path} calibrates camera "
@@ -351,8 +332,6 @@ def _trials(
     videos: Sequence[Path], count: int, recording: Path, alone: Mapping[str, Path | None]
 ) -> dict[Path, Sequence[Path]]:
     """Videos of each trial, by the recording that they give."""
-    from vibrissa.io import NETCDF, check_writable
-
     trials = [videos[i : i + count] for i in range(0, len(videos), count)]
     files = [recording]
     if len(trials) > 1:
@@ -366,7 +345,7 @@ def _trials(
         if len(set(files)) < len(files):
             raise ValueError("two trials would have one file: their first videos share a name")
     for file, trial in zip(files, trials, strict=True):
-        check_writable(file, NETCDF)
+        vb.io.check_writable(file, vb.io.NETCDF)
         # One video cannot show a whisker from two sides.
         if len({path.resolve() for path in trial}) < len(trial):
             names = ", ".join(map(str, trial))
@@ -376,17 +355,14 @@ def _trials(
 
 def _head(path: Path, video: Path, rate: float) -> xr.Dataset:
     """The head's pose; whether it is known in all frames is found out before the work."""
-    from vibrissa.io import NETCDF, load_head, load_recording, video_info
-    from vibrissa.tracking import HeadPose
-
-    if path.suffix.lower() in NETCDF:
-        head = load_recording(path).to_dataset()
+    if path.suffix.lower() in vb.io.NETCDF:
+        head = vb.load_recording(path).to_dataset()
         if "head_rotation" not in head:
             raise ValueError(f"{path} is a recording without the pose of a head")
     else:
-        head = load_head(path)
-    if frames := video_info(video).frames:
-        HeadPose.of(head, np.arange(frames), rate)
+        head = vb.io.load_head(path)
+    if frames := vb.io.video_info(video).frames:
+        vb.tracking.HeadPose.of(head, np.arange(frames), rate)
     return head
 
 
@@ -404,7 +380,7 @@ def _compare_lengths(videos: Sequence[Path], traces: Sequence[Sequence[Any]], us
         )
 
 
-def _report_start(start: Start, names: Sequence[str], picture: Path) -> None:
+def _report_start(start: vb.tracking.Start, names: Sequence[str], picture: Path) -> None:
     """Report what is taken for the whisker."""
     bases = start.bases or []
     points = " and ".join(
@@ -423,14 +399,13 @@ def _report_start(start: Start, names: Sequence[str], picture: Path) -> None:
 
 def print_tracked(result: xr.DataTree, path: Path) -> None:
     """Report what was tracked of each whisker."""
-    from vibrissa.recording import Recording
-
     data = result.to_dataset()
     for k, name in enumerate(data["whisker"].values):
         one = data.isel(whisker=k)
         misfit = float(one["trace_misfit"].median())
+        length = vb.recording.Recording(result).whisker(k).length
         say(
-            f"{name}: {shown('length', Recording(result).whisker(k).length)} long, in contact in "
+            f"{name}: {shown('length', length)} long, in contact in "
             f"{int(np.nansum(one['in_contact'].values))} of {one.sizes['time']} frames, lost in "
             f"{int((one['confidence'] == 0.0).sum())}, misfit of the traces {misfit:.2f} of their "
             "standard deviation"
@@ -442,7 +417,7 @@ def print_tracked(result: xr.DataTree, path: Path) -> None:
             )
         for line in compared_contacts(result, k):
             say(f"  {line}")
-    print_notes(*(Recording(result).whisker(k) for k in range(data.sizes["whisker"])))
+    print_notes(*(vb.recording.Recording(result).whisker(k) for k in range(data.sizes["whisker"])))
     for line in result.attrs.get("remarks", "").splitlines():
         say(f"note: {line}")
     say(f"wrote {path}")

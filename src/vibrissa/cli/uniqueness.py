@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+import vibrissa as vb
 from vibrissa.cli.inputs import map_from
-from vibrissa.cli.options import MapArgument, Region, free, with_options
+from vibrissa.cli.options import MapArgument, Region, check_new, with_options
 from vibrissa.cli.terminal import output, progress_bars, say, shown
 
 if TYPE_CHECKING:
@@ -39,22 +40,12 @@ def uniqueness(
 
     Example: `vibrissa uniqueness map.nc -o uniqueness.nc`
     """
-    from vibrissa.identifiability import (
-        ENDINGS,
-        save_uniqueness,
-        uniqueness as judge,
-        verdict_table,
-    )
-    from vibrissa.io import check_writable
-    from vibrissa.paper import with_network_errors
-
     if target is not None:
-        check_writable(target, ENDINGS)
-        free([target], force)
+        check_new(target, vb.identifiability.ENDINGS, force)
     contact_map = map_from(path)
     with progress_bars() as tell:
         tell("verdicts", 0, 1)
-        found = judge(
+        found = vb.uniqueness(
             contact_map,
             using or "all",
             [str(one) for one in region] if region else "all",
@@ -66,14 +57,16 @@ def uniqueness(
             progress=lambda done, total: tell("verdicts", done, total),
         )
         if network:
-            found = with_network_errors(
+            found = vb.paper.with_network_errors(
                 contact_map, found, progress=lambda done, total: tell("networks", done, total)
             )
     say(f"{contact_map.whisker!r}\n")
-    output.print(verdict_table(found), highlight=False, soft_wrap=True, markup=False)
+    output.print(
+        vb.identifiability.verdict_table(found), highlight=False, soft_wrap=True, markup=False
+    )
     _print_witness(found)
     if target is not None:
-        save_uniqueness(found, target)
+        vb.identifiability.save_uniqueness(found, target)
         say(f"wrote {target}")
 
 

@@ -7,15 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+import vibrissa as vb
 from vibrissa.cli.inputs import MAP, RECORDING, WhiskerOptions, kind_in, map_from, print_notes
 from vibrissa.cli.options import with_options
 from vibrissa.cli.terminal import say
 
 if TYPE_CHECKING:
     import xarray as xr
-
-    from vibrissa.contacts import ContactMap
-    from vibrissa.whisker import Whisker
 
 
 @with_options()
@@ -40,22 +38,19 @@ def view(
     Serves a page on this machine until Ctrl-C. Example: `vibrissa view trial.nc --video top.mp4
     --video front.mp4`
     """
-    from vibrissa.io import load_recording
-    from vibrissa.viewer import view as serve
-
     kind = "" if path is None else kind_in(path)
-    viewed: Whisker | ContactMap | xr.DataTree
+    viewed: vb.Whisker | vb.ContactMap | xr.DataTree
     if path is not None and kind in (MAP, RECORDING):
         if rat is not None or any_length:
             raise ValueError(
                 f"--rat and --any-length are about a whisker, and {path} is not its file"
             )
-        viewed = map_from(path) if kind == MAP else load_recording(path)
+        viewed = map_from(path) if kind == MAP else vb.load_recording(path)
     else:
         viewed = WhiskerOptions(path, rat, any_length).read()
         print_notes(viewed)
     try:
-        with serve(viewed, videos=videos or (), host=host, port=port) as viewer:
+        with vb.viewer.view(viewed, videos=videos or (), host=host, port=port) as viewer:
             say(f"{viewer.url}   Ctrl-C ends it")
             if browser:
                 import webbrowser

@@ -6,7 +6,6 @@ Nothing in a file is run or unpickled, and no file leads to another.
 """
 
 from vibrissa.io.anipose import (
-    load_anipose,
     read_calibration as read_calibration,
     write_calibration as write_calibration,
 )
@@ -18,10 +17,8 @@ from vibrissa.io.contacts_table import (
     save_contacts,
     save_contour,
 )
-from vibrissa.io.deeplabcut import load_deeplabcut
 from vibrissa.io.kinds import READERS as READERS, Kind, load_tracks, recognise
 from vibrissa.io.matlab import load_matlab
-from vibrissa.io.movement import load_movement
 from vibrissa.io.movie import write_movie, write_video
 from vibrissa.io.netcdf import (
     COMPRESSED as COMPRESSED,
@@ -34,7 +31,7 @@ from vibrissa.io.netcdf import (
     read_tree as read_tree,
     write_netcdf as write_netcdf,
 )
-from vibrissa.io.nwb import load_nwb, load_nwb_series
+from vibrissa.io.nwb import load_nwb_series
 from vibrissa.io.nwb_writing import Session, save_nwb
 from vibrissa.io.paths import (
     CSV as CSV,
@@ -56,7 +53,6 @@ from vibrissa.io.rosbag import (
     is_bag as is_bag,
 )
 from vibrissa.io.signals_table import check_scale as check_scale, load_signals, save_signals
-from vibrissa.io.sleap import load_sleap
 from vibrissa.io.table import (
     cells_of as cells_of,
     delimiter_of as delimiter_of,
@@ -88,7 +84,7 @@ from vibrissa.io.traces import (
     save_traces as save_traces,
 )
 from vibrissa.io.tracks import RawTracks as RawTracks, join_views, labelled as labelled
-from vibrissa.io.tracks_file import load_tracks_table, save_tracks
+from vibrissa.io.tracks_file import save_tracks
 from vibrissa.io.video import (
     Footage as Footage,
     Frame as Frame,
@@ -100,31 +96,24 @@ from vibrissa.io.video import (
     video_info,
 )
 from vibrissa.io.video_tables import load_contact_points, load_head
-from vibrissa.io.whisk import load_measurements, load_whiskers
+from vibrissa.io.whisk import load_whiskers
 
 __all__ = [
     "Kind",
     "Session",
     "VideoInfo",
     "join_views",
-    "load_anipose",
     "load_array",
     "load_centerline",
     "load_contact_points",
     "load_contacts",
     "load_corrections",
-    "load_deeplabcut",
     "load_head",
     "load_matlab",
-    "load_measurements",
-    "load_movement",
-    "load_nwb",
     "load_nwb_series",
     "load_recording",
     "load_signals",
-    "load_sleap",
     "load_tracks",
-    "load_tracks_table",
     "load_whisker",
     "load_whiskers",
     "read_video",

@@ -23,7 +23,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -32,32 +32,13 @@ from numpy.typing import NDArray
 from vibrissa.io.paths import replacing
 from vibrissa.io.table import read_numbers
 from vibrissa.io.toml import in_file, number_array, quoted, read_toml
-from vibrissa.io.tracks import SPACE, Labels, RawTracks, labelled
+from vibrissa.io.tracks import SPACE, RawTracks
 
 Array = NDArray[np.float64]
 
 
-def load_anipose(path: str | PathLike[str], **labels: Unpack[Labels]) -> xr.Dataset:
-    """Read points in space that Anipose triangulated.
-
-    Parameters
-    ----------
-    path : str or path
-        CSV of its folder ``pose-3d``.
-    **labels
-        fps, unit (needed), reference_frame; see `Labels`.
-
-    Returns
-    -------
-    xarray.Dataset
-        Tracks of one whisker with a ``centerline``; with ``reprojection_error``, pixels, and
-        ``cameras``, how many saw each point.
-    """
-    return labelled(read_anipose(path), path, **labels)
-
-
 def read_anipose(path: str | PathLike[str]) -> RawTracks:
-    """Read a table of Anipose as raw tracks; see `load_anipose`."""
+    """Read a table of Anipose as raw tracks; ``cameras`` is how many saw each point."""
     path = Path(path)
     names, values = read_numbers(path)
     parts = [name.removesuffix("_ncams") for name in names if name.endswith("_ncams")]

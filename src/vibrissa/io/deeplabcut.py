@@ -19,17 +19,16 @@ import re
 from collections.abc import Iterator
 from os import PathLike
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any
 
 import h5py
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa.io.netcdf import is_netcdf, opened
 from vibrissa.io.paths import check_readable
 from vibrissa.io.table import read_text, table_rows
-from vibrissa.io.tracks import Labels, RawTracks, labelled
+from vibrissa.io.tracks import RawTracks
 
 Array = NDArray[np.float64]
 Names = list[tuple[str, ...]]
@@ -39,26 +38,8 @@ _NEEDED = "Columns headed by scorer, bodyparts (after individuals, if any) and c
 _LIGHTNING = re.compile("heatmap|regression|lightning|ensemble|eks", re.IGNORECASE)
 
 
-def load_deeplabcut(path: str | PathLike[str], **labels: Unpack[Labels]) -> xr.Dataset:
-    """Read what DeepLabCut or LightningPose found, or what was labelled for it.
-
-    Parameters
-    ----------
-    path : str or path
-        CSV or HDF5.
-    **labels
-        fps, view; unit and reference_frame where the points are in space; see `Labels`.
-
-    Returns
-    -------
-    xarray.Dataset
-        Tracks.
-    """
-    return labelled(read_deeplabcut(path), path, **labels)
-
-
 def read_deeplabcut(path: str | PathLike[str]) -> RawTracks:
-    """Read a table of DeepLabCut or LightningPose as raw tracks; see `load_deeplabcut`."""
+    """Read a table of DeepLabCut or LightningPose as raw tracks."""
     path = check_readable(path)
     names, values, index = _hdf5(path) if is_netcdf(path) else _csv(path)
     if len(set(names)) != len(names):

@@ -172,17 +172,21 @@ READERS: Mapping[Kind, Callable[[Path], RawTracks]] = MappingProxyType(
 """What reads the files of other programs, by their kind."""
 
 
-def load_tracks(path: str | PathLike[str], **labels: Unpack[Labels]) -> xr.Dataset:
+def load_tracks(
+    path: str | PathLike[str], kind: Kind | None = None, **labels: Unpack[Labels]
+) -> xr.Dataset:
     """Read tracks, whatever program made them.
 
     Known are files of whisk, DeepLabCut, LightningPose, SLEAP, Anipose, movement, NWB (ndx-pose)
-    and MATLAB, tables of points, and our own tracks and recordings. Readers of one format, such
-    as `load_whiskers` or `load_matlab`, may have more to choose.
+    and MATLAB, tables of points, and our own tracks and recordings. `load_whiskers` and
+    `load_matlab` have more to choose.
 
     Parameters
     ----------
     path : str or path
-        The file; its kind follows from its content.
+        The file.
+    kind : Kind, optional
+        Kind of the file; by default it follows from its content.
     **labels
         What the file may not say: fps (frames per second), view (name of the camera), and for
         points in space unit ("m", "cm", "mm" or "um") and reference_frame; see `Labels`.
@@ -195,7 +199,7 @@ def load_tracks(path: str | PathLike[str], **labels: Unpack[Labels]) -> xr.Datas
         Missing is NaN. Attributes say the source.
     """
     path = Path(path)
-    kind = recognise(path)
+    kind = recognise(path) if kind is None else kind
     if kind in (Kind.TRACKS, Kind.RECORDING):
         if labels:
             raise ValueError(f"{path} is a {kind}, which states {', '.join(labels)} itself")

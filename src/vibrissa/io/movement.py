@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from os import PathLike
 from pathlib import Path
-from typing import Unpack
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa.io.netcdf import naming, read_dataset
-from vibrissa.io.tracks import Labels, RawTracks, labelled
+from vibrissa.io.tracks import RawTracks
 
 Array = NDArray[np.float64]
 Frames = NDArray[np.int64]
@@ -25,26 +24,8 @@ _DIMS = ("time", "individual", "keypoint", "space")
 _PIXELS = ("", "px", "pixel", "pixels")
 
 
-def load_movement(path: str | PathLike[str], **labels: Unpack[Labels]) -> xr.Dataset:
-    """Read a poses dataset of movement.
-
-    Parameters
-    ----------
-    path : str or path
-        NetCDF.
-    **labels
-        fps, view; unit and reference_frame where the points are in space; see `Labels`.
-
-    Returns
-    -------
-    xarray.Dataset
-        Tracks.
-    """
-    return labelled(read_movement(path), path, **labels)
-
-
 def read_movement(path: str | PathLike[str]) -> RawTracks:
-    """Read a poses dataset as raw tracks; see `load_movement`."""
+    """Read a poses dataset as raw tracks."""
     path = Path(path)
     with naming(path, "a poses dataset of movement"):
         return _raw(path, read_dataset(path))

@@ -18,7 +18,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any
 
 import h5py
 import numpy as np
@@ -26,7 +26,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa.io.netcdf import opened
-from vibrissa.io.tracks import Labels, RawTracks, labelled
+from vibrissa.io.tracks import RawTracks
 from vibrissa.quantities import attributes
 
 Array = NDArray[np.float64]
@@ -52,26 +52,8 @@ class _Series:
     frame: str
 
 
-def load_nwb(path: str | PathLike[str], **labels: Unpack[Labels]) -> xr.Dataset:
-    """Read the poses of an NWB file.
-
-    Parameters
-    ----------
-    path : str or path
-        The ``.nwb`` file.
-    **labels
-        view, unit, reference_frame, where the file does not say them; see `Labels`.
-
-    Returns
-    -------
-    xarray.Dataset
-        Tracks: ``trace`` for what is in pixels, ``centerline`` for what is in space.
-    """
-    return labelled(read_nwb(path), path, **labels)
-
-
 def read_nwb(path: str | PathLike[str]) -> RawTracks:
-    """Read an NWB file as raw tracks; see `load_nwb`."""
+    """Read an NWB file as raw tracks."""
     path = Path(path)
     with opened(path, "an NWB file with poses") as file:
         if "nwb_version" not in file.attrs:

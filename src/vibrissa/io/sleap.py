@@ -10,44 +10,22 @@ from __future__ import annotations
 import json
 from os import PathLike
 from pathlib import Path
-from typing import Unpack
 
 import h5py
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa.io.netcdf import opened
 from vibrissa.io.paths import check_readable
-from vibrissa.io.tracks import Labels, RawTracks, labelled
+from vibrissa.io.tracks import RawTracks
 
 Array = NDArray[np.float64]
 
 _OWN = {"tracks": ("track", "xy", "node", "frame"), "point_scores": ("track", "node", "frame")}
 
 
-def load_sleap(path: str | PathLike[str], **labels: Unpack[Labels]) -> xr.Dataset:
-    """Read what SLEAP found.
-
-    Parameters
-    ----------
-    path : str or path
-        Analysis file (``.h5``), or labels (``.slp``), for which sleap-io is needed.
-    **labels
-        fps, view; see `Labels`.
-
-    Returns
-    -------
-    xarray.Dataset
-        Tracks.
-    """
-    path = check_readable(path)
-    raw = read_sleap_labels(path) if path.suffix.lower() == ".slp" else read_sleap_analysis(path)
-    return labelled(raw, path, **labels)
-
-
 def read_sleap_analysis(path: str | PathLike[str]) -> RawTracks:
-    """Read an analysis file as raw tracks; see `load_sleap`."""
+    """Read an analysis file (``.h5``) as raw tracks."""
     path = Path(path)
     with opened(path, "an analysis file of SLEAP") as file:
         if "tracks" not in file or "node_names" not in file:
@@ -78,7 +56,7 @@ def read_sleap_analysis(path: str | PathLike[str]) -> RawTracks:
 
 
 def read_sleap_labels(path: str | PathLike[str]) -> RawTracks:
-    """Read labels as raw tracks; see `load_sleap`."""
+    """Read labels as raw tracks."""
     path = check_readable(path)
     try:
         import sleap_io

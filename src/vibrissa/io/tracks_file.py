@@ -13,7 +13,7 @@ import itertools
 from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from vibrissa.io.netcdf import COMPRESSED, kind_of, read_dataset, write_netcdf
 from vibrissa.io.paths import CSV, NETCDF, check_writable, replacing
 from vibrissa.io.table import Table, table_text
-from vibrissa.io.tracks import KIND, UNITS, Labels, RawTracks, labelled
+from vibrissa.io.tracks import KIND, UNITS, RawTracks
 
 Array = NDArray[np.float64]
 
@@ -76,26 +76,8 @@ def load_own_tracks(path: str | PathLike[str]) -> xr.Dataset:
     return tracks
 
 
-def load_tracks_table(path: str | PathLike[str], **labels: Unpack[Labels]) -> xr.Dataset:
-    """Read a table of points.
-
-    Parameters
-    ----------
-    path : str or path
-        CSV, as the module describes.
-    **labels
-        fps, view, reference_frame; see `Labels`.
-
-    Returns
-    -------
-    xarray.Dataset
-        Tracks.
-    """
-    return labelled(read_tracks_table(path), path, **labels)
-
-
 def read_tracks_table(path: str | PathLike[str]) -> RawTracks:
-    """Read a table of points as raw tracks; see `load_tracks_table`."""
+    """Read a table of points as raw tracks."""
     path = Path(path)
     table = Table(path)
     table.names = [name.lower() for name in table.names]

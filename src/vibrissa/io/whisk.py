@@ -112,28 +112,12 @@ def read_whiskers(
     )
 
 
-def load_measurements(path: str | PathLike[str], **labels: Unpack[Labels]) -> xr.Dataset:
-    """Read a measurements file.
-
-    Parameters
-    ----------
-    path : str or path
-        The ``.measurements`` file.
-    **labels
-        fps and view; see `Labels`.
-
-    Returns
-    -------
-    xarray.Dataset
-        Tracks whose ``trace`` has the two nodes ``follicle`` and ``tip``; and each trace's
-        ``trace_length``, ``angle``, ``trace_curvature`` (1/pixel), ``score`` and ``segment`` (its
-        id in the whiskers file, −1 where there is none).
-    """
-    return labelled(read_measurements(path), path, **labels)
-
-
 def read_measurements(path: str | PathLike[str]) -> RawTracks:
-    """Read a measurements file as raw tracks; see `load_measurements`."""
+    """Read a measurements file as raw tracks.
+
+    Its ``trace`` has the nodes ``follicle`` and ``tip``; ``segment`` is the id of a trace in the
+    whiskers file, −1 where there is none.
+    """
     path = check_readable(path)
     rows = _rows(path)
     identity, kind = _identity(rows)

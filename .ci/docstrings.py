@@ -93,18 +93,22 @@ def field_names(cls: type) -> set[str]:
     return set(getattr(cls, "_fields", ()))
 
 
+def described(doc: Mapping[str, list[Parameter]]) -> set[str]:
+    """Names under Parameters and Attributes."""
+    rows = [*doc["Parameters"], *doc["Attributes"]]
+    return {name.strip() for row in rows for name in row.name.split(",")}
+
+
 def field_faults(cls: type, doc: Mapping[str, list[Parameter]]) -> Iterator[tuple[str, str]]:
-    """Fields of a class that it does not describe, and parameters that are no fields.
+    """Fields that neither a class nor its bases describe, and parameters that are not fields.
 
     Other Parameters are left out: they are those that its constructors share.
     """
     fields = field_names(cls)
-    parameters, attributes = (
-        {name.strip() for row in doc[section] for name in row.name.split(",")}
-        for section in ("Parameters", "Attributes")
-    )
-    if fields - parameters - attributes:
-        yield "PR01", f"Fields {sorted(fields - parameters - attributes)} not documented"
+    bases = [get_doc_object(base) for base in cls.__mro__[1:] if field_names(base)]
+    if missing := fields - described(doc).union(*map(described, bases)):
+        yield "PR01", f"Fields {sorted(missing)} not documented"
+    parameters = {name.strip() for row in doc["Parameters"] for name in row.name.split(",")}
     if parameters - fields:
         yield "PR02", f"Unknown parameters {sorted(parameters - fields)}"
 

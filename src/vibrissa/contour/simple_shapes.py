@@ -392,16 +392,6 @@ class CylinderFit(Cylinder):
         Radius of the surface, m.
     covariance : array (7, 7)
         Covariance of (origin, axis, radius), m and 1; of rank 5, or 3 where the axis was given.
-    residuals : array (n,)
-        Distances of the whisker's surface from the cylinder's, m, positive outside; NaN for
-        points that were missing.
-    inliers : array (n,) of bool
-        Points that were used and whose misfit is at most that of four standard deviations in one
-        dimension.
-    chi_squared : array (n,)
-        Squared misfits of the points used, in standard deviations.
-    equations : int
-        Number of equations of each point; 0 if its noise is not known.
     """
 
 
@@ -417,16 +407,6 @@ class SphereFit(Sphere):
         Radius of the surface, m.
     covariance : array (4, 4)
         Covariance of (origin, radius), m².
-    residuals : array (n,)
-        Distances of the whisker's surface from the sphere's, m, positive outside; NaN for
-        points that were missing.
-    inliers : array (n,) of bool
-        Points that were used and whose misfit is at most that of four standard deviations in one
-        dimension.
-    chi_squared : array (n,)
-        Squared misfits of the points used, in standard deviations.
-    equations : int
-        Number of equations of each point; 0 if its noise is not known.
     """
 
 
@@ -442,16 +422,6 @@ class PlaneFit(Plane):
         Outward unit vector, toward the whisker.
     covariance : array (6, 6)
         Covariance of (origin, normal), m and 1; of rank 3.
-    residuals : array (n,)
-        Distances of the whisker's surface from the plane, m, positive outside; NaN for points
-        that were missing.
-    inliers : array (n,) of bool
-        Points that were used and whose misfit is at most that of four standard deviations in one
-        dimension.
-    chi_squared : array (n,)
-        Squared misfits of the points used, in standard deviations.
-    equations : int
-        Number of equations of each point; 0 if its noise is not known.
     """
 
 

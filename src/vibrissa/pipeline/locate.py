@@ -23,7 +23,7 @@ c being the signals that the contact is found from, and K the inverse of âˆ‚c/âˆ
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import xarray as xr
@@ -33,6 +33,7 @@ from vibrissa.contacts import (
     WRENCH,
     Channels,
     ContactMap,
+    Contacts,
     Prior,
     SensorNoise,
     channel_derivatives,
@@ -81,6 +82,13 @@ class _Candidates(NamedTuple):
     number: NDArray[np.int64]
     status: NDArray[np.int64]
 
+    @classmethod
+    def of(cls, found: Contacts) -> Self:
+        """Candidates of estimates."""
+        one = found.candidates
+        arrays = (one.point, one.arc_length, one.force, one.contact_force)
+        return cls(*arrays, found.n_candidates, found.status)
+
 
 def component_noise(force_noise: float, moment_noise: float) -> Array:
     """Covariance of a sensor whose components have independent noise."""
@@ -112,16 +120,14 @@ def locate(
     noise : array_like (6, 6) or (time, 6, 6), optional
         Covariance of (F, M), SI units, of all frames or of each; see `component_noise`. Without it
         there are no covariances, and every frame in which M_B is not zero has a contact.
-    method : {"exact", "lookup", "lookup-linear", "network"}
-        Exact, or one of the paper's methods, as of :func:`vibrissa.paper.estimate`.
+    method : str
+        Method, as for `estimates_of`.
     errors : mapping of str to float, optional
-        ``stiffness_sigma``, ``gain_sigma`` and ``mixing_sigma``, as of ``ContactMap.estimate``:
-        the same errors in all frames. They need noise.
+        Standard deviations of common errors, as for `estimates_of`.
     prior : Prior, optional
-        Which contacts are possible; others are left out of the candidates.
+        Contacts that are possible, as for `estimates_of`.
     friction : float
-        Standard deviation of the ratio of the force along the whisker to that across it, as of
-        ``ContactMap.estimate``; only with the exact method.
+        Ratio of forces, as for `estimates_of`; only with the exact method.
 
     Returns
     -------
@@ -151,17 +157,8 @@ def locate(
         from vibrissa.paper import estimate  # it loads what only comparisons need
 
         found = estimate(contact_map, signals, names, method=method, prior=prior)
-    every = found.candidates
-    candidates = _Candidates(
-        every.point,
-        every.arc_length,
-        every.force,
-        every.contact_force,
-        found.n_candidates,
-        found.status,
-    )
-    stated = every.covariance if method == "exact" else None
-    return _located(contact_map.whisker, names, measured, candidates, stated, friction)
+    stated = found.candidates.covariance if method == "exact" else None
+    return _located(contact_map.whisker, names, measured, _Candidates.of(found), stated, friction)
 
 
 def without_contact(
@@ -216,16 +213,8 @@ def locate_from_wrench(
         prior=prior,
         **(errors or {}),
     )
-    every = found.candidates
-    candidates = _Candidates(
-        every.point,
-        every.arc_length,
-        every.force,
-        every.contact_force,
-        found.n_candidates,
-        found.status,
-    )
-    return _located(whisker, WRENCH, measured, candidates, every.covariance)
+    stated = found.candidates.covariance
+    return _located(whisker, WRENCH, measured, _Candidates.of(found), stated)
 
 
 class _Measured(NamedTuple):

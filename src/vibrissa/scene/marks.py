@@ -147,17 +147,6 @@ Drawing = Mapping[str, Mark]
 
 
 def pieces(points: Array) -> Array:
-    """Cut a line into straight pieces.
-
-    Parameters
-    ----------
-    points : array (n, 3)
-        Points along the line.
-
-    Returns
-    -------
-    array (m, 2, 3)
-        Ends of the pieces; those with a NaN are left out.
-    """
+    """Cut a line into straight pieces."""
     parts = np.stack([points[:-1], points[1:]], axis=1)
     return np.asarray(parts[np.isfinite(parts).all(axis=(1, 2))])

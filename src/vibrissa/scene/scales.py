@@ -9,22 +9,7 @@ from vibrissa.scene.marks import Array
 
 
 def robust_limits(values: ArrayLike, share: float = 0.98, symmetric: bool = False) -> Array:
-    """Give limits between which most of the finite values are.
-
-    Parameters
-    ----------
-    values : array_like
-        Any values; those that are not finite are ignored.
-    share : float
-        Share of the values within the limits.
-    symmetric : bool
-        Whether the limits are equally far from zero.
-
-    Returns
-    -------
-    array (2,)
-        Lower and upper limit, never equal.
-    """
+    """Give limits between which most of the finite values are."""
     finite = np.asarray(values, dtype=np.float64)
     finite = finite[np.isfinite(finite)]
     if finite.size == 0:
@@ -40,34 +25,12 @@ def robust_limits(values: ArrayLike, share: float = 0.98, symmetric: bool = Fals
 
 
 def root(values: ArrayLike) -> Array:
-    """Take square roots of sizes and keep signs, for scales on which small values are seen.
-
-    Parameters
-    ----------
-    values : array_like
-        Any values.
-
-    Returns
-    -------
-    array
-        Roots with the values' signs.
-    """
+    """Take square roots of sizes and keep signs, for scales on which small values are seen."""
     x = np.asarray(values, dtype=np.float64)
     return np.asarray(np.sign(x) * np.sqrt(np.abs(x)))
 
 
 def squared(values: ArrayLike) -> Array:
-    """Take squares and keep signs: the inverse of `root`.
-
-    Parameters
-    ----------
-    values : array_like
-        Any values.
-
-    Returns
-    -------
-    array
-        Squares with the values' signs.
-    """
+    """Take squares and keep signs: the inverse of `root`."""
     x = np.asarray(values, dtype=np.float64)
     return np.asarray(np.sign(x) * np.square(x))

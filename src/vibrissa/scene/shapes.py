@@ -45,18 +45,7 @@ _EYE, _AROUND = 1.5, 40
 
 
 def across(direction: Array) -> tuple[Array, Array]:
-    """Give two unit vectors that make a right-handed frame with a direction.
-
-    Parameters
-    ----------
-    direction : array (3,)
-        Any vector but zero.
-
-    Returns
-    -------
-    first, second : array (3,)
-        Unit vectors across the direction and each other.
-    """
+    """Give two unit vectors that make a right-handed frame with a direction."""
     along = direction / np.linalg.norm(direction)
     helper = np.eye(3)[np.argmin(np.abs(along))]
     first = np.cross(along, helper)
@@ -76,20 +65,7 @@ def _faces(rows: int, columns: int, closed: bool = False) -> Ints:
 
 
 def sheet(grid: Array) -> tuple[Array, Ints]:
-    """Make a surface of the points of a grid.
-
-    Parameters
-    ----------
-    grid : array (m, n, 3)
-        Points, row by row.
-
-    Returns
-    -------
-    vertices : array (m n, 3)
-        The points.
-    faces : array (k, 3) of int
-        Triangles; their front is where columns follow rows counter-clockwise.
-    """
+    """Make a surface of the points of a grid."""
     return grid.reshape(-1, 3), _faces(*grid.shape[:2])
 
 
@@ -98,22 +74,6 @@ def tube(line: Array, radius: Array, sides: int = _SIDES) -> tuple[Array, Ints]:
 
     Its sections do not twist: the normal of each is that of the one before, made perpendicular to
     the tangent.
-
-    Parameters
-    ----------
-    line : array (n, 3)
-        Points along the middle.
-    radius : array (n,)
-        Radius at each.
-    sides : int
-        Corners of a section.
-
-    Returns
-    -------
-    vertices : array (m, 3)
-        Corners.
-    faces : array (k, 3) of int
-        Triangles, seen from outside.
     """
     tangents = np.gradient(line, axis=0)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
@@ -153,49 +113,13 @@ def _tube_faces(count: int, sides: int) -> Ints:
 def cylinder(
     origin: Array, axis: Array, radius: float, length: float, sides: int = 32
 ) -> tuple[Array, Ints]:
-    """Make a closed cylinder.
-
-    Parameters
-    ----------
-    origin : array (3,)
-        Middle of its axis.
-    axis : array (3,)
-        Direction of its axis, of any size.
-    radius, length : float
-        Radius and length.
-    sides : int
-        Corners of a section.
-
-    Returns
-    -------
-    vertices : array (n, 3)
-        Corners.
-    faces : array (m, 3) of int
-        Triangles, seen from outside.
-    """
+    """Make a closed cylinder."""
     along = 0.5 * length * axis / np.linalg.norm(axis)
     return tube(np.stack([origin - along, origin + along]), np.full(2, radius), sides)
 
 
 def ellipsoid(centre: Array, axes: Array, around: int = 24) -> tuple[Array, Ints]:
-    """Make an ellipsoid.
-
-    Parameters
-    ----------
-    centre : array (3,)
-        Its middle.
-    axes : array (3, 3)
-        Semi-axes, as columns.
-    around : int
-        Points of its equator.
-
-    Returns
-    -------
-    vertices : array (n, 3)
-        Corners.
-    faces : array (m, 3) of int
-        Triangles, seen from outside.
-    """
+    """Make an ellipsoid."""
     latitude = np.linspace(-np.pi / 2, np.pi / 2, around // 2 + 1)
     longitude = np.linspace(0.0, 2.0 * np.pi, around, endpoint=False)
     lat, lon = np.meshgrid(latitude, longitude, indexing="ij")
@@ -207,48 +131,14 @@ def ellipsoid(centre: Array, axes: Array, around: int = 24) -> tuple[Array, Ints
 def error_ellipsoid(
     centre: Array, covariance: Array, sigmas: float, most: float = np.inf
 ) -> tuple[Array, Ints]:
-    """Make the ellipsoid of an uncertain position.
-
-    Parameters
-    ----------
-    centre : array (3,)
-        The position.
-    covariance : array (3, 3)
-        Its covariance.
-    sigmas : float
-        Length of the semi-axes in standard deviations.
-    most : float
-        Length to which semi-axes are cut.
-
-    Returns
-    -------
-    vertices : array (n, 3)
-        Corners.
-    faces : array (m, 3) of int
-        Triangles, seen from outside.
-    """
+    """Make the ellipsoid of an uncertain position."""
     values, directions = np.linalg.eigh(covariance)
     sizes = np.minimum(sigmas * np.sqrt(np.clip(values, 0.0, None)), most)
     return ellipsoid(centre, directions * sizes)
 
 
 def head_surfaces(rotation: Array, position: Array) -> tuple[Array, Array]:
-    """Sketch a rat's head.
-
-    Parameters
-    ----------
-    rotation : array (3, 3)
-        Rotation from the head's frame (right, forward, up) to the laboratory's.
-    position : array (3,)
-        Tip of the snout, laboratory frame, m.
-
-    Returns
-    -------
-    skin : array (n, 3, 3)
-        Triangles, mm.
-    eyes : array (m, 3, 3)
-        Triangles of the right eye, then as many of the left, mm.
-    """
+    """Sketch a rat's head."""
     from scipy.interpolate import PchipInterpolator
 
     turn = np.linspace(0.0, 2.0 * np.pi, _AROUND)
@@ -265,27 +155,7 @@ def head_surfaces(rotation: Array, position: Array) -> tuple[Array, Array]:
 
 
 def object_surface(thing: xr.Dataset, limits: Array) -> tuple[Array, Ints]:
-    """Make the surface of an object of a recording.
-
-    Parameters
-    ----------
-    thing : Dataset
-        One of a recording's group ``objects``: its attribute ``kind`` is its shape.
-    limits : array (3, 2)
-        Limits of the view, mm, outside which an object without end is cut off.
-
-    Returns
-    -------
-    vertices : array (n, 3)
-        Corners, mm.
-    faces : array (m, 3) of int
-        Triangles.
-
-    Raises
-    ------
-    ValueError
-        If it is of an unknown kind.
-    """
+    """Make the surface of an object of a recording."""
     kind = str(thing.attrs.get("kind"))
     if kind not in _KINDS:
         raise ValueError(f"an object is of kind {kind!r}; one of {', '.join(_KINDS)} is known")
@@ -293,18 +163,7 @@ def object_surface(thing: xr.Dataset, limits: Array) -> tuple[Array, Ints]:
 
 
 def is_bounded(thing: xr.Dataset) -> bool:
-    """Check whether an object of a recording ends on all sides.
-
-    Parameters
-    ----------
-    thing : Dataset
-        One of a recording's group ``objects``.
-
-    Returns
-    -------
-    bool
-        Whether a view can hold all of it.
-    """
+    """Check whether an object of a recording ends on all sides."""
     return thing.attrs.get("kind") in ("sphere", "box", "mesh")
 
 

@@ -35,37 +35,12 @@ _SHAPE = (36, 72, 24)
 
 
 def column(name: str) -> int:
-    """Give the column of a quantity.
-
-    Parameters
-    ----------
-    name : str
-        Quantity, one of ``x``, ``y``, ``z``, ``r``, ``theta``, ``phi``, ``Fx``, ``Mx``,
-        ``arc_length`` and ``deflection``.
-
-    Returns
-    -------
-    int
-        Column of rows of `sample_contacts`.
-    """
+    """Give the column of a quantity."""
     return _COLUMN[name]
 
 
 def values_of(name: str, rows: Array) -> Array:
-    """Take a signal, a coordinate or another column out of rows.
-
-    Parameters
-    ----------
-    name : str
-        Any of the six signals, or a quantity that has a `column`.
-    rows : array (..., columns)
-        Rows of `sample_contacts`, or of what is cut out of them.
-
-    Returns
-    -------
-    array (...)
-        Values, SI units.
-    """
+    """Take a signal, a coordinate or another column out of rows."""
     if name in _COLUMN:
         return np.asarray(rows[..., _COLUMN[name]])
     kind = name[0]
@@ -80,29 +55,7 @@ def sample_contacts(
     bearings: tuple[float, float] | None = None,
     shape: tuple[int, int, int] | None = None,
 ) -> Array:
-    """Sample the contacts of a map as finely as a picture needs.
-
-    Parameters
-    ----------
-    samples : Dataset
-        ``ContactMap.to_dataset()``: all of the reachable space.
-    centerline : array_like (k, 3)
-        Resting whisker from base to tip, whisker frame, m.
-    bearings : tuple of float, optional
-        First and last bearing of the force that are kept, rad; by default all.
-    shape : tuple of int, optional
-        Cells along arc length, around by bearing over a full turn, and along load.
-
-    Returns
-    -------
-    array (stations, bearings, loads, columns)
-        Rows at the nodes, SI units, read with `values_of`.
-
-    Raises
-    ------
-    ValueError
-        If the dataset lacks variables, dimensions or values.
-    """
+    """Sample the contacts of a map as finely as a picture needs."""
     names = ("contact_point", "arc_length", *SIGNALS)
     missing = [name for name in names if name not in samples]
     if missing:
@@ -199,22 +152,7 @@ def _triangulated(face: Array) -> Array:
 
 
 def level_surface(nodes: Array, column: int, value: float) -> Array:
-    """Find the surface on which a column has a given value.
-
-    Parameters
-    ----------
-    nodes : array (stations, bearings, loads, columns)
-        Nodes of `sample_contacts`.
-    column : int
-        Column.
-    value : float
-        Value in that column.
-
-    Returns
-    -------
-    array (n, 3, columns)
-        Triangles whose corners are rows, by marching tetrahedra.
-    """
+    """Find the surface on which a column has a given value."""
     rows = nodes.reshape(-1, nodes.shape[-1])
     height = rows[:, column] - value
     corners = _tetrahedra(nodes.shape[:3])
@@ -264,20 +202,7 @@ def _crossing(rows: Array, height: Array, i: int, j: int) -> Array:
 
 
 def clip(triangles: Array, column: int) -> Array:
-    """Cut triangles off where a column is negative.
-
-    Parameters
-    ----------
-    triangles : array (n, 3, columns)
-        Triangles whose corners are rows.
-    column : int
-        Column.
-
-    Returns
-    -------
-    array (m, 3, columns)
-        Triangles that remain.
-    """
+    """Cut triangles off where a column is negative."""
     height = triangles[..., column]
     inside: Mask = height > 0.0
     count = inside.sum(axis=1)
@@ -298,22 +223,7 @@ def clip(triangles: Array, column: int) -> Array:
 
 
 def subdivide(triangles: Array, chosen: Mask, times: int = 3) -> Array:
-    """Halve the edges of some triangles, so that they can be coloured finely.
-
-    Parameters
-    ----------
-    triangles : array (n, 3, columns)
-        Triangles whose corners are rows.
-    chosen : array (n,) of bool
-        Triangles that are halved.
-    times : int
-        Number of halvings.
-
-    Returns
-    -------
-    array (m, 3, columns)
-        Other triangles first.
-    """
+    """Halve the edges of some triangles, so that they can be coloured finely."""
     pieces = triangles[chosen]
     for _ in range(times):
         middles = 0.5 * (pieces + np.roll(pieces, -1, axis=1))
@@ -325,22 +235,7 @@ def subdivide(triangles: Array, chosen: Mask, times: int = 3) -> Array:
 
 
 def solid_surface(nodes: Array, closed: bool, *columns: int) -> Array:
-    """Find the surface around the contacts where some columns are positive.
-
-    Parameters
-    ----------
-    nodes : array (stations, bearings, loads, columns)
-        Nodes of `sample_contacts`.
-    closed : bool
-        Whether bearings make a full turn, so that there are no sides.
-    *columns : int
-        Columns that are positive inside.
-
-    Returns
-    -------
-    array (n, 3, columns)
-        Triangles whose corners are rows.
-    """
+    """Find the surface around the contacts where some columns are positive."""
     around = []
     for cut in (None, *columns):
         part = skin(nodes, closed) if cut is None else level_surface(nodes, cut, 0.0)

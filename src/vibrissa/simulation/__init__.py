@@ -20,15 +20,18 @@ from vibrissa.simulation.motion import (
     whisking,
 )
 from vibrissa.simulation.plan import facing_peg, sweep_past, within_reach
-from vibrissa.simulation.script import EXAMPLE, Script, read_objects, read_script
+from vibrissa.simulation.script import (
+    EXAMPLE as EXAMPLE,
+    Script as Script,
+    read_objects as read_objects,
+    read_script as read_script,
+)
 from vibrissa.simulation.simulate import simulate
 
 __all__ = [
-    "EXAMPLE",
     "Dynamics",
     "ImageConditions",
     "Motion",
-    "Script",
     "array_whisking",
     "facing_peg",
     "film",
@@ -36,8 +39,6 @@ __all__ = [
     "head_path",
     "measure",
     "protracted",
-    "read_objects",
-    "read_script",
     "resonances",
     "shared_whisking",
     "silhouette",

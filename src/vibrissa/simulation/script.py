@@ -165,24 +165,7 @@ class Script:
 def read_script(
     text: str, folder: Path, read_whisker: Callable[[Path | None], Whisker], **changes: Any
 ) -> Script:
-    """Trial from its text.
-
-    Parameters
-    ----------
-    text : str
-        Trial in TOML.
-    folder : Path
-        Folder that its files are relative to.
-    read_whisker : callable
-        Function from the path of a whisker's file, or None, to the whisker.
-    **changes
-        Values that replace those of the text.
-
-    Returns
-    -------
-    Script
-        Whiskers, objects, motion and sensor.
-    """
+    """Trial from its text."""
     table = parsed_toml(text)
     given = {name: value for name, value in changes.items() if value is not None}
     table |= {k: given[k] for k in ("duration", "rate", "friction", "seed") if k in given}
@@ -272,20 +255,7 @@ def _objects(
 
 
 def read_objects(text: str, folder: Path) -> tuple[Surface, ...]:
-    """Objects of a trial, and nothing else of it.
-
-    Parameters
-    ----------
-    text : str
-        Trial in TOML.
-    folder : Path
-        Folder that its files are relative to.
-
-    Returns
-    -------
-    tuple of Surface
-        Objects in the laboratory.
-    """
+    """Objects of a trial, and nothing else of it."""
     things = parsed_toml(text).get("object", [])
     if not isinstance(things, list) or not things:
         raise ValueError("there is no object; one is written as [[object]], in double brackets")

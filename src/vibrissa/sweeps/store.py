@@ -321,14 +321,7 @@ class Store:
         return origins.index(mine)
 
     def statuses(self) -> NDArray[np.int8]:
-        """Read what is there.
-
-        Returns
-        -------
-        array (whisker, task) of int8
-            0 where nothing is, 1 where a cell is done, 2 where it failed, 3 where what is there is
-            not what was written.
-        """
+        """Read what is there."""
         columns = {name: k for k, name in enumerate(self.study.tasks)}
         count = len(self.study.specimens)
         asked = np.zeros((count, len(columns)), dtype="S16")
@@ -346,27 +339,7 @@ class Store:
         return out
 
     def write(self, cell: Cell, answer: Mapping[str, Any]) -> bool:
-        """Keep the outcome of a cell.
-
-        Parameters
-        ----------
-        cell : Cell
-            The cell.
-        answer : mapping
-            Its outcome, of `vibrissa.sweeps.study.answer`.
-
-        Returns
-        -------
-        bool
-            Whether it is done; false if it failed, also where its result cannot be kept together
-            with those of other whiskers.
-
-        Raises
-        ------
-        OSError
-            If it cannot be written; it is then as if it had not been done, and what was written
-            before is whole.
-        """
+        """Keep the outcome of a cell."""
         failure = answer.get("failure") or self._kept(cell, answer)
         if failure:
             line = {
@@ -402,13 +375,7 @@ class Store:
         return ""
 
     def publish(self, results: xr.Dataset) -> None:
-        """Write all results as Zarr.
-
-        Parameters
-        ----------
-        results : Dataset
-            Results of `open_sweep`.
-        """
+        """Write all results as Zarr."""
         aside = self.path / f".new-{RESULTS}"
         with _naming(aside):
             shutil.rmtree(aside, ignore_errors=True)

@@ -103,7 +103,7 @@ def test_a_scheduler_that_is_killed_ends_the_run_and_the_next_goes_on(
     address, head = scheduler
     with monkeypatch.context() as patch:
         patch.setenv("ORIGIN", "newer")
-        patch.setattr("vibrissa.sweeps.executors.origin", partial(os.getenv, "ORIGIN", "older"))
+        patch.setattr("vibrissa.sweeps.run.origin", partial(os.getenv, "ORIGIN", "older"))
         with pytest.raises(ValueError, match="has older; newer is needed"):
             run_sweep(study, tmp_path / "other", scheduler=address)
 
@@ -125,6 +125,6 @@ def test_a_scheduler_that_is_killed_ends_the_run_and_the_next_goes_on(
 
 
 def test_no_scheduler_is_told(study, tmp_path, monkeypatch):
-    monkeypatch.setattr("vibrissa.sweeps.executors._PATIENCE", 0.2)
+    monkeypatch.setattr("vibrissa.sweeps.run._PATIENCE", 0.2)
     with pytest.raises(ValueError, match=r"no Dask scheduler at tcp://127\.0\.0\.1:9"):
         run_sweep(study, tmp_path / "s", scheduler="tcp://127.0.0.1:9")

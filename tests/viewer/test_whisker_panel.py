@@ -14,7 +14,7 @@ pytest.importorskip("viser", reason="viser is not installed", exc_type=ImportErr
 )
 def test_sliders_hold_the_whisker_as_it_is(base, tip, modulus):
     from vibrissa.viewer import view
-    from vibrissa.viewer.whisker import WhiskerControls
+    from vibrissa.viewer.bend import WhiskerControls
 
     whisker = vb.Whisker.straight(0.3, base_radius=base, tip_radius=tip, youngs_modulus=modulus)
     with view(whisker) as viewer:

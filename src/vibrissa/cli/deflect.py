@@ -9,8 +9,7 @@ import typer
 import vibrissa as vb
 from vibrissa.cli.inputs import WhiskerOptions, print_notes, smallest_arc
 from vibrissa.cli.options import numbers, refuse, with_options
-from vibrissa.cli.tables import print_table
-from vibrissa.cli.terminal import fixed, remark, say
+from vibrissa.cli.terminal import fixed, print_table, remark, say
 
 _MM = 1e-3
 _MICRO = 1e-6

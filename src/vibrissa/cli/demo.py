@@ -11,8 +11,7 @@ from vibrissa.cli.drawings import NODES, TrialOptions, trial_drawings
 from vibrissa.cli.figures import saved
 from vibrissa.cli.inputs import WhiskerOptions, print_notes
 from vibrissa.cli.options import with_options
-from vibrissa.cli.tables import Row, print_table
-from vibrissa.cli.terminal import Tell, progress_bars, say, shown
+from vibrissa.cli.terminal import Row, Tell, print_table, progress_bars, say, shown
 
 if TYPE_CHECKING:
     from vibrissa.demo import DemoResult, Located

@@ -11,8 +11,7 @@ import typer
 
 import vibrissa as vb
 from vibrissa.cli.options import with_options
-from vibrissa.cli.tables import print_properties
-from vibrissa.cli.terminal import shown
+from vibrissa.cli.terminal import print_properties, shown
 from vibrissa.cli.track import compared_contacts
 
 if TYPE_CHECKING:

@@ -25,8 +25,7 @@ from vibrissa.cli.inputs import (
 )
 from vibrissa.cli.options import RecordingArgument, numbers, with_options
 from vibrissa.cli.signals import SourceOptions, described
-from vibrissa.cli.tables import print_table
-from vibrissa.cli.terminal import Tell, fixed, progress_bars, remark, say
+from vibrissa.cli.terminal import Tell, fixed, print_table, progress_bars, remark, say
 
 if TYPE_CHECKING:
     import xarray as xr

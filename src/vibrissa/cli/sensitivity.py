@@ -10,8 +10,7 @@ import numpy as np
 import vibrissa as vb
 from vibrissa.cli.inputs import RECORDING, NoiseOptions, kind_in, map_from, wrench_from
 from vibrissa.cli.options import MapArgument, check_new, with_options
-from vibrissa.cli.tables import Row, print_table
-from vibrissa.cli.terminal import progress_bars, say, shown
+from vibrissa.cli.terminal import Row, print_table, progress_bars, say, shown
 
 if TYPE_CHECKING:
     from xarray import Dataset

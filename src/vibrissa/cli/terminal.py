@@ -1,15 +1,16 @@
-"""Consoles, progress bars and signals; numbers in display units."""
+"""Consoles, tables, progress bars and signals; numbers in display units."""
 
 from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
+from rich.text import Text
 
 from vibrissa.quantities import quantity
 
@@ -128,3 +129,51 @@ def fixed(name: str, value: float, decimals: int = 4) -> str:
 def _with_unit(number: str, name: str) -> str:
     unit = quantity(name).display_unit
     return f"{number}{'' if unit in ('', '°') else ' '}{unit}"
+
+
+Row = Sequence[str | Text]
+"""The cells of a row."""
+
+
+def print_table(
+    columns: Sequence[str],
+    rows: Iterable[Row | None],
+    title: str | None = None,
+    caption: str | None = None,
+    *,
+    left: Sequence[int] = (0,),
+) -> None:
+    """Print rows of cells; ``None`` is a line between two sections.
+
+    The columns numbered in ``left`` are text, the others numbers, which are aligned at the right.
+    Without names of columns there is no head.
+    """
+    from rich.table import Table
+
+    table = Table(
+        title=title,
+        caption=caption,
+        title_justify="left",
+        caption_justify="left",
+        show_header=any(columns),
+    )
+    for number, name in enumerate(columns):
+        table.add_column(name, justify="left" if number in left else "right")
+    for row in rows:
+        if row is None:
+            table.add_section()
+        else:
+            table.add_row(*row)
+    output.print(table)
+
+
+def print_properties(rows: Iterable[tuple[str, str]]) -> None:
+    """Print names and values, without lines between them."""
+    from rich.table import Table
+
+    table = Table(show_header=False, box=None)
+    table.add_column()
+    table.add_column(overflow="fold")
+    for name, value in rows:
+        table.add_row(Text(name, style="bold"), value)
+    output.print(table, highlight=False)

@@ -112,15 +112,10 @@ class FreeFit(FittedShape):
         Length over which the deviation changes, m.
     covariance : array (k, k)
         Covariance of the base's parameters.
-    residuals : array (n,)
-        Distances of the whisker's surface from the fitted one, m, positive outside; NaN for
-        points that were missing.
     inliers : array (n,) of bool
         Points within four standard deviations.
     chi_squared : array (n,)
         Squared distances of the points used, over their variance and that of the surface.
-    equations : int
-        Number of equations of each point, 1; 0 if the points' noise is not known.
     """
 
     base: SimpleShape

@@ -14,11 +14,13 @@ from vibrissa.evaluation.contacts import (
 from vibrissa.evaluation.stages import (
     SignalRow as SignalRow,
     TrackingScores,
+    caution as caution,
     signal_errors,
     spread,
     tracking_scores,
+    truth_of,
+    with_truth as with_truth,
 )
-from vibrissa.evaluation.truth import caution as caution, truth_of, with_truth as with_truth
 
 __all__ = [
     "Scores",

@@ -42,18 +42,7 @@ def save_predictors(path: str | PathLike[str], table: xr.Dataset) -> None:
 
 
 def meaning(variable: xr.DataArray) -> str:
-    """Long name and description of a variable, in a line.
-
-    Parameters
-    ----------
-    variable : xarray.DataArray
-        Variable of a table of predictors.
-
-    Returns
-    -------
-    str
-        Text without a line break.
-    """
+    """Long name and description of a variable, in a line."""
     return f"{variable.attrs['long_name']}. {variable.attrs.get('description', '')}".strip()
 
 

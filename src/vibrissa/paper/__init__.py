@@ -1,8 +1,6 @@
 """The methods of Huet, Emnett & Hartmann (2022), for comparison."""
 
 from vibrissa.paper.approximation import METHODS, estimate
-from vibrissa.paper.differences import central_differences
-from vibrissa.paper.findings import sensitivity_findings
 from vibrissa.paper.lookup import LookupTable
 from vibrissa.paper.natural_neighbour import NaturalNeighbour
 from vibrissa.paper.network import (
@@ -12,6 +10,7 @@ from vibrissa.paper.network import (
     train_network,
     with_network_errors,
 )
+from vibrissa.paper.sensitivity import central_differences, sensitivity_findings
 from vibrissa.paper.slices import error_solid, interpolation_errors, signal_slice
 
 __all__ = [

@@ -40,13 +40,14 @@ from vibrissa.pipeline.signals import (
 )
 from vibrissa.pipeline.stages import (
     STAGES as STAGES,
+    TrialSummary as TrialSummary,
     due_stages,
+    summarise as summarise,
     with_contour,
     with_estimates,
     with_group as with_group,
     with_signals,
 )
-from vibrissa.pipeline.summary import TrialSummary as TrialSummary, summarise as summarise
 
 __all__ = [
     "compare_contacts",

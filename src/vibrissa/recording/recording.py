@@ -169,24 +169,12 @@ class Recording:
 
     @property
     def root(self) -> Group:
-        """What is known at the top of the recording.
-
-        Returns
-        -------
-        Group
-            Variables of the recording itself.
-        """
+        """Variables of the recording itself."""
         return self[""]
 
     @property
     def names(self) -> list[str]:
-        """Names of the whiskers.
-
-        Returns
-        -------
-        list of str
-            One for each along the dimension ``whisker``.
-        """
+        """Names of the whiskers, along the dimension ``whisker``."""
         return [str(name) for name in np.atleast_1d(self.root.data["whisker"].values)]
 
     def known(self, name: str, groups: Sequence[str]) -> NDArray[Any] | None:
@@ -238,53 +226,24 @@ class Recording:
 
     @property
     def whiskers(self) -> list[Whisker]:
-        """Make all whiskers of the recording again.
-
-        Returns
-        -------
-        list of Whisker
-            One for each along the dimension ``whisker``.
-        """
+        """Whiskers of the recording, made again."""
         return [self.whisker(k) for k in range(self.tree.sizes["whisker"])]
 
     @property
     def cameras(self) -> tuple[Camera, ...]:
-        """Make the cameras of a filmed or tracked recording again.
-
-        Returns
-        -------
-        tuple of Camera
-            One for each view.
-
-        Raises
-        ------
-        ValueError
-            If it has none.
-        """
+        """Cameras of a filmed or tracked recording, made again; ValueError if it has none."""
         if "cameras" not in self:
             raise ValueError("the recording has no cameras")
         return cameras_from_dataset(self["cameras"].data)
 
     @property
     def planar(self) -> bool:
-        """Whether one camera alone has seen the trial, so that it is known in a plane only.
-
-        Returns
-        -------
-        bool
-            True if there is one camera.
-        """
+        """Whether one camera alone has seen the trial, so that it is known in a plane only."""
         return "cameras" in self and self["cameras"].data.sizes.get("view") == 1
 
     @property
     def objects(self) -> tuple[Surface, ...]:
-        """Make the objects of the recording again.
-
-        Returns
-        -------
-        tuple of Surface
-            Objects in the laboratory frame; empty if the recording has none.
-        """
+        """Objects of the recording, made again, in the laboratory frame; there may be none."""
         objects = self.tree.children.get("objects")
         if objects is None:
             return ()
@@ -293,13 +252,7 @@ class Recording:
 
     @property
     def pegs(self) -> tuple[Peg, ...]:
-        """Make the pegs of the recording again.
-
-        Returns
-        -------
-        tuple of Peg
-            Pegs in the laboratory frame; empty if the recording has none.
-        """
+        """Pegs of the recording, made again, in the laboratory frame; there may be none."""
         return tuple(thing for thing in self.objects if isinstance(thing, Peg))
 
 

@@ -178,25 +178,7 @@ def faults_in(data: xr.Dataset) -> list[str]:
 
 
 def ordered(name: str, variable: xr.Variable) -> NDArray[Any]:
-    """Give the values of a variable in the declared order and type.
-
-    Parameters
-    ----------
-    name : str
-        Name of a declared variable.
-    variable : xarray.Variable
-        Variable of a recording, or of one of its whiskers, frames or views.
-
-    Returns
-    -------
-    array
-        Values; where truth values are declared a missing one is False.
-
-    Raises
-    ------
-    ValueError
-        If it has other dimensions, sizes, or holds no numbers.
-    """
+    """Give the values of a variable in the declared order and type; a missing truth is False."""
     fault = _fault(name, variable, _SELECTED)
     if fault:
         raise ValueError(fault)

@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike
 
 from vibrissa.contacts import ContactMap
 from vibrissa.io import Footage
-from vibrissa.viewer.bend import BendMode
+from vibrissa.viewer.bend import BendMode, WhiskerControls
 from vibrissa.viewer.locate import LocateMode, coloured, located, usual_sensor
 from vibrissa.viewer.map import MapMode
 from vibrissa.viewer.page import Mode, Page
@@ -38,7 +38,6 @@ from vibrissa.viewer.stage import lit
 from vibrissa.viewer.state import loaded, moved, with_radius
 from vibrissa.viewer.threads import CompileNotice, Rehearsal
 from vibrissa.viewer.trial import TrialMode
-from vibrissa.viewer.whisker import WhiskerControls
 from vibrissa.whisker import Whisker
 
 HOST = "127.0.0.1"

@@ -1,8 +1,7 @@
 """What bends: shape, section, material and frame of a whisker, and the array on the face."""
 
 from vibrissa.whisker import morphology
-from vibrissa.whisker.array import WhiskerArray
-from vibrissa.whisker.average import whisker_array
+from vibrissa.whisker.array import WhiskerArray, whisker_array
 from vibrissa.whisker.identity import Identity
 from vibrissa.whisker.model import Whisker
 from vibrissa.whisker.morphology import (

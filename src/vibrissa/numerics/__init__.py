@@ -13,7 +13,14 @@ from vibrissa.numerics.threads import share_out, threads
 
 if TYPE_CHECKING:
     from vibrissa.numerics.algebra import cholesky, norm3, solve, solve3, wrapped
-    from vibrissa.numerics.compiled import copy, inlined, kernel, specialised
+    from vibrissa.numerics.compiled import (
+        copy,
+        inlined,
+        inlined_rigorous,
+        kernel,
+        rigorous,
+        specialised,
+    )
     from vibrissa.numerics.quantiles import contact_weights, weighted_quantile
 
 __all__ = [
@@ -25,8 +32,10 @@ __all__ = [
     "contact_weights",
     "copy",
     "inlined",
+    "inlined_rigorous",
     "kernel",
     "norm3",
+    "rigorous",
     "share_out",
     "solve",
     "solve3",
@@ -38,7 +47,7 @@ __all__ = [
 
 _HOMES = {
     "algebra": ("cholesky", "norm3", "solve", "solve3", "wrapped"),
-    "compiled": ("copy", "inlined", "kernel", "specialised"),
+    "compiled": ("copy", "inlined", "inlined_rigorous", "kernel", "rigorous", "specialised"),
     "quantiles": ("contact_weights", "weighted_quantile"),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}

@@ -20,12 +20,12 @@ R = TypeVar("R")
 
 # Reassociation stays off: results must not depend on how the compiler orders a sum.
 _FASTMATH = {"contract", "nsz", "arcp"}
-_OPTIONS: dict[str, Any] = {
+_STRICT: dict[str, Any] = {
     "error_model": "numpy",
-    "fastmath": _FASTMATH,
     "nogil": True,
     "no_cfunc_wrapper": True,  # nobody calls a kernel from C
 }
+_OPTIONS = _STRICT | {"fastmath": _FASTMATH}
 
 
 class _Kernel(CPUDispatcher):
@@ -97,6 +97,43 @@ def inlined(function: Callable[P, R]) -> Callable[P, R]:
     compiled: Any = numba.njit(**_OPTIONS | {"forceinline": True, "no_cpython_wrapper": True})(
         function
     )
+    compiled.__class__ = _Inlined
+    return cast("Callable[P, R]", compiled)
+
+
+def rigorous(function: Callable[P, R]) -> Callable[P, R]:
+    """Compile a function whose rounding is that of IEEE 754, operation by operation.
+
+    Parameters
+    ----------
+    function : callable
+        Function in Numba's subset of Python.
+
+    Returns
+    -------
+    callable
+        Compiled function.
+    """
+    compiled = numba.njit(**_STRICT)(function)
+    with suppress(RuntimeError):
+        compiled._cache = PackageCache(function)
+    return cast("Callable[P, R]", compiled)
+
+
+def inlined_rigorous(function: Callable[P, R]) -> Callable[P, R]:
+    """Compile a small function into its callers as :func:`rigorous` ones are compiled.
+
+    Parameters
+    ----------
+    function : callable
+        Function in Numba's subset of Python.
+
+    Returns
+    -------
+    callable
+        Function that only kernels can call.
+    """
+    compiled: Any = numba.njit(**_STRICT | {"no_cpython_wrapper": True})(function)
     compiled.__class__ = _Inlined
     return cast("Callable[P, R]", compiled)
 

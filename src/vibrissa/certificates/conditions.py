@@ -1,0 +1,337 @@
+"""The sign conditions over one box of contacts.
+
+Boxes are in (s, ℓ) for a straight whisker, with F = f² = ℓ f_max(s)², and in (s, φ, ℓ) for any,
+with f = f_min(s) + (f_max(s, φ) - f_min(s)) ℓ. With q = 1/s - α and polynomials P_i(s)
+
+    f_min = q² P₀,    f_max = q² (P₁ + P₂ cos φ + P₃ sin φ + P₄ cos² φ).
+
+On each box the sign of every condition is to be that which the proof needs: they are written so
+that all are to be positive. What is computed from the unknowns, and from the states at the base,
+is a table of products like the rod's equations.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from vibrissa.certificates.equations import (
+    ALGEBRAIC,
+    Equations,
+    ExactRod,
+    Program,
+    planar_equations,
+    spatial_equations,
+)
+from vibrissa.certificates.flow import enclose
+from vibrissa.certificates.forms import (
+    ROUNDING,
+    TINY,
+    UP,
+    add_product,
+    clear,
+    close,
+    copy_row,
+    reciprocal,
+)
+from vibrissa.numerics import Array, IntArray, inlined_rigorous, rigorous
+
+#: Conditions of a straight whisker: μ > 0; ∂ ln M/∂s < 0; ∂(M, R)/∂(s, f) < 0; ∂R/∂f > 0.
+PLANAR = ("moment", "moment along s", "determinant", "ratio along the load")
+#: Beyond the fold: x_s(η + 2Fη_F) - 2F x_F η_s < 0, the determinant of the contact point in its
+#: plane; η > 0, which makes it that in space.
+PLANAR_FOLD = ("determinant of the point", "deflection")
+#: Conditions of any whisker: f_ℓ > 0; ∂g₁/∂s < 0; ∂(g₁, g₂)/∂(s, φ) < 0; the sign of the
+#: determinant; ∂g₂/∂φ > 0; the sign of ∂(g₂, g₃)/∂(φ, ℓ). The last two are needed on the faces.
+SPATIAL = ("load", "moment along s", "moments", "determinant", "direction", "direction and force")
+#: Beyond the fold: det ∂p/∂(s, f_y, f_z) < 0.
+SPATIAL_FOLD = ("determinant of the point",)
+# Coefficients of each polynomial P.
+DEGREES = 6
+_GIVEN = ("one", "s", "level", "cos", "sin", "inverse", "alpha")
+_POLYNOMIALS = 5
+
+
+class Conditions(NamedTuple):
+    """What is computed on a box, as tables for the kernel.
+
+    Attributes
+    ----------
+    equations : Program
+        Equations of the rod.
+    table : Program
+        Sums of products, before and after the rod's equations are solved.
+    middle : int
+        First variable of the table that is computed after them.
+    start : (states,) array
+        Variables that are the states at the contact; -1 for zero.
+    load : int
+        Variable that is the load of the equations; -1 if they have none.
+    base : int
+        Variable that is the first state at the base.
+    conditions : (c,) array
+        Variables that are to be positive.
+    unknowns : int
+        Number of unknowns.
+    """
+
+    equations: Program
+    table: Program
+    middle: int
+    start: IntArray
+    load: int
+    base: int
+    conditions: IntArray
+    unknowns: int
+
+
+def _polynomial(out: Equations, i: int) -> None:
+    """P_i(s), its derivative, and q² times it with its derivative: names p, dp, b, db."""
+    out.add(ALGEBRAIC, f"p{i}_{DEGREES - 1}", f"a{i}_{DEGREES - 1}")
+    for k in range(DEGREES - 2, -1, -1):
+        out.add(ALGEBRAIC, f"p{i}_{k}", f"p{i}_{k + 1} s", f"a{i}_{k}")
+        before = [f"d{i}_{k + 1} s"] if k < DEGREES - 2 else []
+        out.add(ALGEBRAIC, f"d{i}_{k}", *before, f"p{i}_{k + 1}")
+    out.add(ALGEBRAIC, f"b{i}", f"q2 p{i}_0")
+    out.add(ALGEBRAIC, f"db{i}", f"q2 d{i}_0", *2 * [f"-qi2 p{i}_0"])
+
+
+def _bounds(polynomials: tuple[int, ...]) -> Equations:
+    """Start of a table: the unknowns, and bounds on the force."""
+    out = Equations()
+    out.given(*_GIVEN, *(f"a{i}_{k}" for i in range(_POLYNOMIALS) for k in range(DEGREES)))
+    out.add(ALGEBRAIC, "i2", "inverse inverse")
+    out.add(ALGEBRAIC, "q", "inverse", "-alpha")
+    out.add(ALGEBRAIC, "q2", "q q")
+    out.add(ALGEBRAIC, "qi2", "q i2")  # q' = -1/s²
+    for i in polynomials:
+        _polynomial(out, i)
+    return out
+
+
+def _assembled(
+    out: Equations,
+    equations: Program,
+    middle: int,
+    start: dict[int, str],
+    base: str,
+    conditions: tuple[str, ...],
+    unknowns: int,
+) -> Conditions:
+    at = out.names.index
+    first = np.full(equations.groups.size, -1)
+    for i, name in start.items():
+        first[i] = at(name)
+    load = at("F") if unknowns == 2 else -1
+    rows = np.array([at(name) for name in conditions])
+    return Conditions(equations, out.program(), middle, first, load, at(base), rows, unknowns)
+
+
+def planar_conditions(fold: bool = False) -> Conditions:
+    """Conditions `PLANAR` of a straight whisker, or `PLANAR_FOLD`."""
+    out = _bounds((1,))
+    out.add(ALGEBRAIC, "limit", "b1 b1")
+    out.add(ALGEBRAIC, "F", "limit level")
+    middle = len(out.names)
+    states = ("r", "n", "m", "x", "e") if fold else ("r", "n", "m")
+    out.given(*(f"{state}{by}" for by in ("", "s", "F") for state in states))
+    out.add(ALGEBRAIC, "FmF", "F mF")
+    out.add(ALGEBRAIC, "Fms", "F ms")
+    out.add(ALGEBRAIC, "along", "m", *2 * ["FmF"])
+    out.add(ALGEBRAIC, "ratio", "rF m", *2 * ["-r mF"])
+    out.add(ALGEBRAIC, "steady", "rs m", *2 * ["-r ms"])
+    out.add(ALGEBRAIC, "fall", "-b1 ms", "-db1 along")
+    out.add(ALGEBRAIC, "det", "along steady", *2 * ["-Fms ratio"])
+    wanted: tuple[str, ...] = ("m", "fall", "det", "ratio")
+    if fold:
+        out.add(ALGEBRAIC, "FeF", "F eF")
+        out.add(ALGEBRAIC, "FxF", "F xF")
+        out.add(ALGEBRAIC, "rise", "e", *2 * ["FeF"])
+        out.add(ALGEBRAIC, "beyond", "-xs rise", *2 * ["FxF es"])
+        wanted = ("beyond", "e")
+    return _assembled(out, planar_equations(fold), middle, {1: "one"}, "r", wanted, 2)
+
+
+def spatial_conditions(sign: float, fold: bool = False) -> Conditions:
+    """Conditions `SPATIAL` of any whisker, or `SPATIAL_FOLD`.
+
+    ``sign`` is that of det ∂(M_y, M_z, F_x)/∂(s, f_y, f_z).
+    """
+    out = _bounds(tuple(range(_POLYNOMIALS)))
+    out.add(ALGEBRAIC, "cos2", "cos cos")
+    out.add(ALGEBRAIC, "cossin", "cos sin")
+    for d in ("", "d"):
+        out.add(ALGEBRAIC, f"{d}most", f"{d}b1", f"{d}b2 cos", f"{d}b3 sin", f"{d}b4 cos2")
+        out.add(ALGEBRAIC, f"{d}extent", f"{d}most", f"-{d}b0")
+        out.add(ALGEBRAIC, f"{d}f", f"{d}b0", f"{d}extent level")
+    out.add(ALGEBRAIC, "swing", "-b2 sin", "b3 cos", *2 * ["-b4 cossin"])
+    out.add(ALGEBRAIC, "fphi", "swing level")
+    out.add(ALGEBRAIC, "fy", "f cos")
+    out.add(ALGEBRAIC, "fz", "f sin")
+    middle = len(out.names)
+    states: tuple[str, ...] = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
+    if fold:
+        states += ("px", "py", "pz")
+    out.given(*(f"{state}{by}" for by in ("", "_s", "_y", "_z") for state in states))
+    # Derivatives along the force (r) and across it (a), then by s, φ and ℓ.
+    for name in ("My", "Mz", "Fx"):
+        out.add(ALGEBRAIC, f"{name}r", f"cos {name}_y", f"sin {name}_z")
+        out.add(ALGEBRAIC, f"{name}a", f"cos {name}_z", f"-sin {name}_y")
+        out.add(ALGEBRAIC, f"{name}s", f"{name}_s", f"df {name}r")
+        out.add(ALGEBRAIC, f"{name}p", f"fphi {name}r", f"f {name}a")
+        out.add(ALGEBRAIC, f"{name}l", f"extent {name}r")
+    out.add(ALGEBRAIC, "fall", "-My Mys", "-Mz Mzs")
+    out.add(ALGEBRAIC, "moments", "-Mys Mzp", "Mzs Myp")
+    mark, other = ("", "-") if sign > 0.0 else ("-", "")
+    for i, (a, b) in enumerate((("My", "Mz"), ("Mz", "Fx"), ("Fx", "My"))):
+        out.add(ALGEBRAIC, f"minor{i}", f"{a}_y {b}_z", f"-{b}_y {a}_z")
+    out.add(ALGEBRAIC, "det", *(f"{mark}{n}_s minor{i}" for i, n in enumerate(("Fx", "My", "Mz"))))
+    # ω = M_y dM_z - M_z dM_y, δ = M_y dM_y + M_z dM_z, ζ = M_B² dF_x - F_x δ, by φ and by ℓ.
+    out.add(ALGEBRAIC, "square", "My My", "Mz Mz")
+    for by in ("p", "l"):
+        out.add(ALGEBRAIC, f"turn{by}", f"My Mz{by}", f"-Mz My{by}")
+        out.add(ALGEBRAIC, f"grow{by}", f"My My{by}", f"Mz Mz{by}")
+        out.add(ALGEBRAIC, f"zeta{by}", f"square Fx{by}", f"-Fx grow{by}")
+    out.add(ALGEBRAIC, "both", f"{mark}turnp zetal", f"{other}turnl zetap")
+    wanted: tuple[str, ...] = ("extent", "fall", "moments", "det", "turnp", "both")
+    if fold:
+        for i, (a, b) in enumerate((("py", "pz"), ("pz", "px"), ("px", "py"))):
+            out.add(ALGEBRAIC, f"area{i}", f"{a}_y {b}_z", f"-{b}_y {a}_z")
+        out.add(ALGEBRAIC, "beyond", *(f"-{n}_s area{i}" for i, n in enumerate(states[6:])))
+        wanted = ("beyond",)
+    n = len(states)
+    start = {1: "fy", 2: "fz", 2 * n + 1: "one", 3 * n + 2: "one"}
+    return _assembled(out, spatial_equations(fold), middle, start, "Fx", wanted, 3)
+
+
+@inlined_rigorous
+def compute(table: Program, z: Array, first: int, end: int) -> None:
+    """Sums of products, row by row."""
+    for v in range(first, end):
+        if table.kind[v] == 1:
+            clear(z, v)
+            for o in range(table.first[v], table.first[v + 1]):
+                add_product(table.sign[o], z, table.left[o], z, table.right[o], z, v)
+            close(z, v, 1.0)
+
+
+@inlined_rigorous
+def set_number(value: float, spread: float, symbol: int, z: Array, k: int) -> None:
+    """The number, or unknown, within a spread of a value."""
+    clear(z, k)
+    z[k, 0] = value
+    z[k, symbol] = spread
+    close(z, k, 1.0)
+
+
+@inlined_rigorous
+def set_angle(middle: float, half: float, symbol: int, z: Array, cos: int, sin: int) -> None:
+    """Cosine and sine of an angle within ±3.2, by their series."""
+    even, odd, term = 0.0, 0.0, 1.0
+    for k in range(40):
+        sign = 1.0 if k % 4 < 2 else -1.0
+        if k % 2:
+            odd += sign * term
+        else:
+            even += sign * term
+        term *= middle / (k + 1)
+    # Beyond the tangent at most half²/2; the series is good to 80 u cosh 3.2 < 1.2e-13.
+    bend = 0.5 * half * half * UP + 1.2e-13
+    set_number(even, -odd * half, symbol, z, cos)
+    set_number(odd, even * half, symbol, z, sin)
+    for row in (cos, sin):
+        z[row, z.shape[1] - 2] += bend
+        close(z, row, 1.0)
+
+
+@rigorous
+def conditions_on(
+    conditions: Conditions,
+    rod: ExactRod,
+    bound: Array,
+    boxes: Array,
+    order: int,
+    tolerance: float,
+    found: Array,
+    widths: Array,
+    first: int,
+    end: int,
+) -> None:
+    """Enclose the conditions over boxes.
+
+    Parameters
+    ----------
+    conditions : Conditions
+        What is computed.
+    rod : ExactRod
+        Whisker.
+    bound : (31,) array
+        The taper α, and the coefficients of P₀ … P₄.
+    boxes : (n, unknowns, 2) array
+        Bounds of the unknowns.
+    order : int
+        Order of the Taylor polynomials.
+    tolerance : float
+        Share of the states to which the last Taylor coefficient falls in a step.
+    found : (n, c, unknowns + 2) array
+        Conditions, each a centre, the share of each unknown, and the remainder with all else; NaN
+        where the states could not be enclosed.
+    widths : (n, unknowns) array
+        Relative widths of the states by unknown.
+    first, end : int
+        Rows to do.
+    """
+    groups, states = conditions.equations.groups.shape
+    unknowns = conditions.unknowns
+    n = unknowns + 2 * states
+    last = n + 2
+    table = conditions.table
+    z = np.zeros((table.kind.size, last + 1))
+    state, arc, load = np.zeros((groups * states, last + 1)), z[1:2].copy(), z[1:2].copy()
+    set_number(1.0, 0.0, 1, z, 0)
+    for k in range(bound.size):
+        set_number(bound[k], 0.0, 1, z, 6 + k)
+    for box in range(first, end):
+        found[box] = np.nan
+        widths[box] = 1.0
+        for a in range(unknowns):
+            low, high = boxes[box, a, 0], boxes[box, a, 1]
+            middle = 0.5 * (low + high)
+            half = 0.5 * (high - low) * UP + 4e-16 * (abs(low) + abs(high))
+            if a == 1 and unknowns == 3:
+                set_angle(middle, half, 2, z, 3, 4)
+            else:
+                set_number(middle, half, a + 1, z, 1 if a == 0 else 2)
+        if not reciprocal(z, 1, z, 5):
+            continue
+        compute(table, z, 0, conditions.middle)
+        copy_row(z, 1, arc, 0)
+        if conditions.load >= 0:
+            copy_row(z, conditions.load, load, 0)
+        for i in range(groups * states):
+            clear(state, i)
+            if conditions.start[i] >= 0:
+                copy_row(z, conditions.start[i], state, i)
+        if enclose(conditions.equations, rod, arc, load, state, unknowns, order, tolerance) != 0:
+            continue
+        for i in range(groups * states):
+            if i >= states:  # remainders of different derivatives only share their symbols' names
+                for a in range(1 + unknowns + states, n + 1):
+                    state[i, n + 1] += abs(state[i, a])
+                    state[i, a] = 0.0
+                close(state, i, 1.0)
+            copy_row(state, i, z, conditions.base + i)
+        compute(table, z, conditions.middle, table.kind.size)
+        for c in range(conditions.conditions.size):
+            row = conditions.conditions[c]
+            rest = z[row, n + 1] + ROUNDING * z[row, last]
+            for a in range(1 + unknowns, n + 1):
+                rest += abs(z[row, a])
+            found[box, c, 0], found[box, c, unknowns + 1] = z[row, 0], rest * UP
+            for a in range(unknowns):
+                found[box, c, a + 1] = abs(z[row, a + 1])
+        for a in range(unknowns):
+            widths[box, a] = TINY
+            for i in range(groups * states):
+                widths[box, a] += abs(state[i, a + 1]) / (state[i, last] + TINY)

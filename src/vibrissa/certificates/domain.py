@@ -1,0 +1,128 @@
+"""The domain of a certificate: bounds on the force that enclose the stable contacts outside a cone.
+
+With q = 1/s - α, α = 1 - r_tip/r_base, the bounds are (:mod:`vibrissa.certificates.conditions`)
+
+    f_min = q² P₀(s),    f_max = q² (P₁(s) + P₂(s) cos φ + P₃(s) sin φ + P₄(s) cos² φ),
+
+polynomials fitted to the fold forces, a little above all of them, and to the forces that deflect
+the contact by the cone's angle, a little below. Any polynomials make a valid domain; whether it
+holds all stable contacts is a condition of its own.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from vibrissa.certificates.conditions import DEGREES
+from vibrissa.numerics import Array
+from vibrissa.rod import (
+    fold_forces,
+    solve_forces,
+    with_normal_force,
+)
+from vibrissa.signals import cone_angle
+
+if TYPE_CHECKING:
+    from vibrissa.contacts import ContactMap
+
+# The fold is exceeded, and the cone undercut, by at least these shares.
+_BEYOND, _INSIDE = 2.5e-2, 1e-2
+_STATIONS, _BEARINGS = 40, 24
+
+
+class Bounds(NamedTuple):
+    """Bounds on the force, non-dimensional.
+
+    Attributes
+    ----------
+    alpha : float
+        Taper of the bounds.
+    factors : (5, k) array
+        Coefficients of P₀ … P₄.
+    """
+
+    alpha: float
+    factors: Array
+
+    def packed(self) -> Array:
+        """All numbers as the kernel takes them."""
+        return np.concatenate([[self.alpha], self.factors.ravel()])
+
+    def force(self, s: Array, phi: Array, level: Array) -> tuple[Array, Array, Array, Array]:
+        """Force f at (s, φ, ℓ) with its derivatives by s, φ and ℓ."""
+        q = 1.0 / s - self.alpha
+        powers = s[..., None] ** np.arange(DEGREES)
+        p = powers @ self.factors.T
+        dp = (powers[..., :-1] * np.arange(1, DEGREES)) @ self.factors[:, 1:].T
+        b = q[..., None] ** 2 * p
+        db = q[..., None] ** 2 * dp - 2.0 * (q / s**2)[..., None] * p
+        cos, sin = np.cos(phi), np.sin(phi)
+        turn = np.stack([np.ones_like(cos), cos, sin, cos**2], axis=-1)
+        swing = np.stack([np.zeros_like(cos), -sin, cos, -2.0 * cos * sin], axis=-1)
+        most, dmost = ((x[..., 1:] * turn).sum(axis=-1) for x in (b, db))
+        extent, dextent = most - b[..., 0], dmost - db[..., 0]
+        return (
+            b[..., 0] + extent * level,
+            db[..., 0] + dextent * level,
+            (b[..., 1:] * swing).sum(axis=-1) * level,
+            extent,
+        )
+
+
+def bounds_of(contact_map: ContactMap, cone: float) -> Bounds:
+    """Fit the bounds to a whisker.
+
+    Parameters
+    ----------
+    contact_map : ContactMap
+        Map of the whisker.
+    cone : float
+        Half angle about the resting whisker within which contacts are left out, rad.
+
+    Returns
+    -------
+    Bounds
+        Bounds on the force.
+    """
+    whisker, chart = contact_map.whisker, contact_map.chart
+    alpha = 1.0 - whisker.tip_radius / whisker.base_radius
+    x = 0.5 - 0.5 * np.cos(np.pi * np.arange(_STATIONS) / (_STATIONS - 1))
+    stations = chart.proximal + (1.0 - chart.proximal) * x
+    bearings = 2.0 * np.pi * np.arange(_BEARINGS) / _BEARINGS
+    s, phi = (a.ravel() for a in np.meshgrid(stations, bearings, indexing="ij"))
+    q = 1.0 / s - alpha
+    unit = np.stack([s, np.cos(phi), np.sin(phi)], axis=1)
+    fold = fold_forces(chart.fold, unit)
+    powers = s[:, None] ** np.arange(DEGREES)
+    turn = np.stack([np.ones_like(phi), np.cos(phi), np.sin(phi), np.cos(phi) ** 2], axis=1)
+    if whisker.is_straight:
+        turn[:, 1:] = 0.0
+    basis = (turn[:, :, None] * powers[:, None, :]).reshape(len(s), -1)
+    target = fold / q**2
+    # Relative misfits count.
+    fitted = np.linalg.lstsq(basis / target[:, None], np.ones(len(s)), rcond=1e-9)[0]
+    lift = (1.0 + _BEYOND) * (target / (basis @ fitted)).max()
+    factors = np.zeros((5, DEGREES))
+    factors[1:] = lift * fitted.reshape(4, DEGREES)
+    if cone > 0.0:
+        least = _cone_force(contact_map, s, phi, fold, cone).reshape(_STATIONS, -1).min(axis=1)
+        target = least / (1.0 / stations - alpha) ** 2
+        basis = stations[:, None] ** np.arange(DEGREES)
+        fitted = np.linalg.lstsq(basis / target[:, None], np.ones(_STATIONS), rcond=None)[0]
+        factors[0] = (1.0 - _INSIDE) * (target / (basis @ fitted)).min() * fitted
+    return Bounds(alpha, factors)
+
+
+def _cone_force(contact_map: ContactMap, s: Array, phi: Array, fold: Array, cone: float) -> Array:
+    """Forces that deflect the contact to a cone angle."""
+    d = contact_map.chart.discretization
+    low, high = np.zeros_like(fold), fold.copy()
+    for _ in range(40):
+        force = 0.5 * (low + high)
+        xi = np.stack([s, force * np.cos(phi), force * np.sin(phi)], axis=1)
+        values, _ = solve_forces(d, with_normal_force(xi))
+        inside = cone_angle(contact_map.whisker, values[:, 3:] * d.length) < cone
+        low, high = np.where(inside, force, low), np.where(inside, high, force)
+    return low

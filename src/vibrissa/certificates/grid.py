@@ -1,0 +1,176 @@
+"""The sign conditions in plain floats on a grid: whether a certificate can exist.
+
+A certificate needs every sign on a whole domain. Where a sign is wrong at one contact it cannot
+exist; where all are right on a grid it probably does. The determinant alone decides near rest, so
+that the largest cone angle of a contact at which it has the wrong sign is where certificates, and
+the upper bounds of critical cones, must end.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from vibrissa.certificates.conditions import PLANAR, SPATIAL
+from vibrissa.certificates.domain import Bounds, bounds_of
+from vibrissa.numerics import AnyArray, Array
+from vibrissa.rod import fold_forces, solve_forces, with_normal_force
+from vibrissa.signals import cone_angle
+
+if TYPE_CHECKING:
+    from vibrissa.contacts import ContactMap
+
+_STATIONS, _BEARINGS, _LEVELS = 15, 24, 11
+# Cone about rest within which a straight whisker's grid does not look.
+_REST = 1e-3
+# Halvings that find where the determinant changes its sign, and where rays begin.
+_HALVINGS = 30
+_LEAST_LOAD = 1e-3
+
+
+class Outlook(NamedTuple):
+    """What a grid shows of a certificate.
+
+    Attributes
+    ----------
+    failing : dict of float
+        Share of the grid on which each condition fails.
+    possible : bool
+        Whether none fails outside the cone.
+    determinant_cone : float
+        Smallest cone about rest outside which the determinant keeps its sign on the grid, rad.
+    """
+
+    failing: dict[str, float]
+    possible: bool
+    determinant_cone: float
+
+
+def outlook(contact_map: ContactMap, cone: float) -> Outlook:
+    """Look for wrong signs on a grid.
+
+    Parameters
+    ----------
+    contact_map : ContactMap
+        Map of the whisker.
+    cone : float
+        Half angle about the resting whisker within which contacts are left out, rad.
+
+    Returns
+    -------
+    Outlook
+        Whether a certificate can exist, and outside which cone.
+    """
+    straight = bool(contact_map.whisker.is_straight)
+    near = contact_map.chart.proximal
+    s = np.linspace(near, 1.0, _STATIONS)
+    phi = np.array([0.0]) if straight else 2.0 * np.pi * np.arange(_BEARINGS) / _BEARINGS
+    level = np.linspace(0.0, 1.0, _LEVELS)
+    bounds = bounds_of(contact_map, _REST if straight else cone)
+    grid = np.meshgrid(s, phi, level, indexing="ij")
+    names, signs = (PLANAR if straight else SPATIAL), _conditions(contact_map, bounds, *grid)
+    edge = (grid[0] == near) | (grid[0] == 1.0)
+    wanted = np.stack([edge | (name not in _ON_FACES) for name in names])
+    failing = {
+        name: float((~(sign > 0.0) & on).sum() / on.sum())
+        for name, sign, on in zip(names, signs, wanted, strict=True)
+    }
+    angle = _determinant_cone(contact_map, s, phi)
+    return Outlook(failing, not any(failing.values()), angle)
+
+
+_ON_FACES = ("ratio along the load", "direction", "direction and force")
+
+
+def _derivatives(contact_map: ContactMap, xi: Array) -> tuple[Array, Array, Array]:
+    """(F_x, M_y, M_z) at contacts ξ (n, 3), with derivatives (n, 3, 3), and points (n, 3)."""
+    values, tangents = solve_forces(
+        contact_map.chart.discretization, with_normal_force(xi), tangents=True
+    )
+    force, point = values[:, None, :3], values[:, None, 3:]
+    by_xi = tangents.transpose(0, 2, 1)
+    moment = np.cross(point, force)[:, 0]
+    turned = np.cross(by_xi[..., 3:], force) + np.cross(point, by_xi[..., :3])
+    value = np.stack([values[:, 0], moment[:, 1], moment[:, 2]], axis=1)
+    slope = np.stack([by_xi[..., 0], turned[..., 1], turned[..., 2]], axis=1)
+    return value, slope, values[:, 3:]
+
+
+def _conditions(
+    contact_map: ContactMap, bounds: Bounds, s: Array, phi: Array, level: Array
+) -> Array:
+    """Conditions, to be positive, over a grid: (c, ...)."""
+    f, f_s, f_phi, f_l = bounds.force(s, phi, level)
+    cos, sin = np.cos(phi), np.sin(phi)
+    xi = np.stack([s, f * cos, f * sin], axis=-1).reshape(-1, 3)
+    value, slope, _ = _derivatives(contact_map, xi)
+    x, y, z = (value[:, i].reshape(s.shape) for i in range(3))
+    raw = slope.reshape(*s.shape, 3, 3)
+    along = raw[..., 1] * cos[..., None] + raw[..., 2] * sin[..., None]
+    across = raw[..., 2] * cos[..., None] - raw[..., 1] * sin[..., None]
+    by_s = raw[..., 0] + f_s[..., None] * along
+    by_phi = f_phi[..., None] * along + f[..., None] * across
+    by_l = f_l[..., None] * along
+    if contact_map.whisker.is_straight:
+        moment = np.hypot(y, z)
+        grown = raw[..., 2, :] * np.sign(z)[..., None]  # all in one plane: M = |M_z|
+        det = grown[..., 0] * raw[..., 0, 1] - grown[..., 1] * raw[..., 0, 0]
+        fall = grown[..., 0] + f_s * grown[..., 1]
+        ratio = -raw[..., 0, 1] * moment + 2.0 * x * grown[..., 1]
+        return np.stack([moment, -fall, det, ratio])
+    square = y**2 + z**2
+    sign = _majority(np.linalg.det(raw))
+    turn_phi, turn_l = (y * d[..., 2] - z * d[..., 1] for d in (by_phi, by_l))
+    zeta_phi, zeta_l = (
+        square * d[..., 0] - x * (y * d[..., 1] + z * d[..., 2]) for d in (by_phi, by_l)
+    )
+    return np.stack(
+        [
+            f_l,
+            -(y * by_s[..., 1] + z * by_s[..., 2]),
+            by_s[..., 2] * by_phi[..., 1] - by_s[..., 1] * by_phi[..., 2],
+            sign * np.linalg.det(raw),
+            turn_phi,
+            sign * (turn_phi * zeta_l - turn_l * zeta_phi),
+        ]
+    )
+
+
+def _majority(x: AnyArray) -> float:
+    return 1.0 if (x > 0.0).mean() > 0.5 else -1.0
+
+
+def _determinant_cone(contact_map: ContactMap, s: Array, phi: Array) -> float:
+    """Largest cone angle at which the determinant has the rarer sign, along rays from rest."""
+    if contact_map.whisker.is_straight:
+        return 0.0
+    d = contact_map.chart.discretization
+    stations, bearings = (a.ravel() for a in np.meshgrid(s, phi, indexing="ij"))
+    unit = np.stack([stations, np.cos(bearings), np.sin(bearings)], axis=1)
+    fold = fold_forces(contact_map.chart.fold, unit)
+
+    def determinant(force: Array) -> tuple[Array, Array]:
+        xi = unit * np.stack([np.ones_like(force), force, force], axis=1)
+        _, slope, point = _derivatives(contact_map, xi)
+        return np.linalg.det(slope), point
+
+    shares = np.linspace(1.0, _LEAST_LOAD, 41) ** 2
+    signs = np.stack([np.sign(determinant(share * fold)[0]) for share in shares])
+    common = _majority(signs)
+    wrong = signs != common
+    if not wrong.any():
+        return 0.0
+    first = np.argmax(wrong, axis=0)
+    rays = np.flatnonzero(wrong.any(axis=0))
+    low, high = shares[first[rays]], shares[np.maximum(first[rays] - 1, 0)]
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        force = np.zeros_like(fold)
+        force[rays] = middle * fold[rays]
+        bad = np.sign(determinant(force)[0][rays]) != common
+        low, high = np.where(bad, middle, low), np.where(bad, high, middle)
+    force = np.zeros_like(fold)
+    force[rays] = high * fold[rays]
+    point = determinant(force)[1][rays]
+    return float(cone_angle(contact_map.whisker, point * d.length).max())

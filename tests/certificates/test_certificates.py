@@ -2,12 +2,17 @@
 
 from fractions import Fraction
 
+import numba
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import linprog
 
 import vibrissa as vb
-from vibrissa.certificates import certify, outlook
-from vibrissa.certificates.equations import enclosed
+from vibrissa.certificates import certify, load_certificate, outlook
+from vibrissa.certificates.certificate import _TOLERANCES, prepared
+from vibrissa.certificates.equations import enclosed, spatial_equations
+from vibrissa.certificates.flow import absorb
 from vibrissa.certificates.search import covers
 
 
@@ -26,17 +31,193 @@ def curved():
 
 @pytest.fixture(scope="module")
 def theorem(tmp_path_factory):
+    """Certificate of a straight whisker: stopped at once, read again, continued."""
     path = tmp_path_factory.mktemp("certificates") / "straight.nc"
-    return path, certify(straight(15.0), path=path)
+    contact_map = straight(15.0)
+    stopped = certify(contact_map, path=path, seconds=0.0)
+    return path, stopped, certify(contact_map, path=path)
 
 
 def test_a_straight_tapered_whisker_is_located_by_fx_mb_md(theorem):
-    _, found = theorem
+    _, stopped, found = theorem
+    assert not stopped.proved
+    assert "not finished" in stopped.summary()
     assert found.proved
-    assert not found.refuted
+    assert "unique (proved)" in found.summary()
     assert found.share == 1.0
     assert set(found.parts) == {"interior", "proximal", "distal", "fold"}
-    assert all(covers(part.certified) for part in found.parts.values())
+
+
+def test_a_cylinder_is_not_proved():
+    # F_x = -M_B²/2EI for a cylinder: the determinant is zero everywhere.
+    found = certify(straight(1.0), seconds=5.0)
+    assert not found.proved
+    assert "determinant" in found.refuted
+    assert sum(part.evaluated for part in found.parts.values()) == 0
+
+
+def test_a_curved_whisker_with_wrong_signs_is_refuted_at_once():
+    found = certify(charted(vb.Whisker.parabola(40e-3, 0.82 / 40e-3)), np.deg2rad(1.0))
+    assert not found.proved
+    assert "is certainly wrong" in found.refuted
+
+
+def test_a_certificate_with_a_hole_or_a_wrong_whisker_is_noticed(theorem):
+    path, _, found = theorem
+    again = load_certificate(path)
+    assert again.identity == found.identity
+    assert again.proved
+    interior = again.parts["interior"]
+    interior.certified = np.delete(interior.certified, 77, axis=0)
+    assert not again.proved
+    data = found.to_dataset()
+    data["factors"] = data["factors"] * 1.1
+    with pytest.raises(ValueError, match="not those"):
+        type(found).from_dataset(data)
+    with pytest.raises(ValueError, match="another whisker"):
+        certify(straight(8.0), path=path)
+
+
+def test_boxes_cover_or_leave_a_hole():
+    rng = np.random.default_rng(0)
+    boxes = [np.zeros((3, 2), dtype=np.int64)]
+    for _ in range(60):
+        box = boxes.pop(rng.integers(len(boxes)))
+        axis = rng.integers(3)
+        for half in (0, 1):
+            child = box.copy()
+            child[axis] = child[axis, 0] + 1, 2 * child[axis, 1] + half
+            boxes.append(child)
+    everything = np.stack(boxes)
+    assert covers(everything)
+    assert covers(np.concatenate([everything, everything[:1]]))
+    assert not any(covers(np.delete(everything, i, axis=0)) for i in range(len(boxes)))
+
+
+def signals(whisker, s, force):
+    """(M_y, M_z, F_x) by the rod's equations in SciPy's hands, contact to base."""
+    length, radius = whisker.length, whisker.base_radius
+    poisson = whisker.poisson_ratio
+
+    def rate(t, state):
+        at = (s - t) * length
+        n, q = state[:3], state[3:]
+        compliance = (float(whisker.section_radius(at)) / radius) ** -4
+        stretch = compliance * np.array([1.0 + poisson, 1.0, 1.0])
+        u = whisker.intrinsic_curvature(at) * length + stretch * np.cross(q, n)
+        return np.concatenate([-np.cross(n, u), -np.cross(q, u) + [1.0, 0.0, 0.0]])
+
+    start = np.concatenate([[0.0], force, np.zeros(3)])
+    end = solve_ivp(rate, (0.0, s), start, "DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+    moment = np.cross(end[3:], end[:3])
+    return np.array([moment[1], moment[2], end[0]])
+
+
+def located(certificate, whisker, at):
+    """(ln M_B, M_D, F_x/M_B), M_B, f and ∂f/∂ℓ at (s, φ, ℓ)."""
+    s, phi, level = at
+    f, _, _, f_level = (one[0] for one in certificate.bounds.force(*np.array([at]).T))
+    if certificate.straight:
+        f = np.sqrt(level) * certificate.bounds.force(*np.array([[s, 0.0, 1.0]]).T)[0][0]
+    y, z, x = signals(whisker, s, f * np.array([np.cos(phi), np.sin(phi)]))
+    moment = np.hypot(y, z)
+    return np.array([np.log(moment), np.arctan2(z, y), x / moment]), moment, f, f_level
+
+
+def conditions(certificate, whisker, at):
+    """The conditions by their definition, with differences of fourth order."""
+    value, moment, f, f_level = located(certificate, whisker, at)
+    slope = np.zeros((3, 3))
+    for i in range(3):
+        step = 2e-3 * np.eye(3)[i] * [1.0, 1.0, 0.3]
+        near = np.stack([located(certificate, whisker, at + k * step)[0] for k in (-2, -1, 1, 2)])
+        near[:, 1] -= 2.0 * np.pi * np.round((near[:, 1] - value[1]) / (2.0 * np.pi))
+        slope[:, i] = [1 / 12, -2 / 3, 2 / 3, -1 / 12] @ near / step[i]
+    if certificate.straight:
+        # F = f² = ℓ b², R = -F_x/M², μ = M/f: by s at fixed f, and by f.
+        b, b_s = (one[0] for one in certificate.bounds.force(*np.array([[at[0], 0, 1.0]]).T)[:2])
+        ratio = -value[2] / moment
+        by_level = f / (2.0 * at[2])
+        log_f = slope[0, 2] / by_level
+        log_s = slope[0, 0] - log_f * f * b_s / b
+        ratio_f = (-slope[2, 2] / moment - ratio * slope[0, 2]) / by_level
+        ratio_s = -slope[2, 0] / moment - ratio * slope[0, 0] - ratio_f * f * b_s / b
+        mu = moment / f
+        det = moment * (log_s * ratio_f - log_f * ratio_s)
+        return np.array([b, mu, -b * mu * slope[0, 0], -(mu**3) * det, mu**3 * ratio_f / (2 * f)])
+    minor = np.linalg.det(slope[:2, :2])
+    raw = -(moment**3) / (f * f_level) * np.linalg.det(slope)
+    both = moment**5 * np.linalg.det(slope[1:, 1:])
+    least = f - f_level * at[2]
+    sign = certificate.sign
+    return np.array(
+        [
+            least,
+            f_level,
+            -(moment**2) * slope[0, 0],
+            -(moment**2) * minor,
+            sign * raw,
+            moment**2 * slope[1, 1],
+            sign * both,
+        ]
+    )
+
+
+@pytest.mark.parametrize("kind", ["straight", "curved"])
+def test_enclosures_over_boxes_never_miss_a_point(curved, kind, monkeypatch):
+    contact_map = curved if kind == "curved" else straight(15.0)
+    certificate, rng = prepared(contact_map), np.random.default_rng(3)
+    keep = [0, 1, 2] if kind == "curved" else [0, 2]
+    count = 7 if kind == "curved" else 5
+    for half, tolerance in ((0.0, 1e-11), (2e-4, 1e-5), (2e-3, 1e-5)):
+        monkeypatch.setitem(_TOLERANCES, "interior", tolerance)
+        near = rng.random((2, 3)) * [0.6, 2.8, 0.8] + [0.35, 0.1, 0.1]
+        near[0, 0] = 0.37  # where forces are large
+        ends = np.stack([near - half, near + half], axis=-1)[:, keep]
+        found, _ = certificate.evaluate("interior", ends, list(range(count)))
+        for box, enclosure in zip(near, found, strict=True):
+            centre, reach = enclosure[:, 0], enclosure[:, 1:].sum(axis=1)
+            at = box + half * (2.0 * rng.random(3) - 1.0)
+            true = conditions(certificate, contact_map.whisker, at)
+            size = np.abs(centre) + 1e-3
+            assert (np.abs(true - centre) <= reach + 2e-8 * size).all()
+            assert (reach <= (300.0 * half + 100.0 * tolerance + 1e-7) * (size + 1.0)).all()
+
+
+def test_a_box_across_an_end_of_polynomials_is_not_enclosed(curved):
+    # Contacts on both sides have different equations.
+    certificate = prepared(curved)
+    box = np.array([[[0.499, 0.501], [1.0, 1.0], [0.5, 0.5]]])
+    assert np.isnan(certificate.evaluate("interior", box, [0])[0]).all()
+    assert 0.5 in certificate.stations
+
+
+@numba.njit
+def absorbed(program, state, unknowns):
+    absorb(program, state, unknowns)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_what_symbols_carry_still_holds_all_states_together(seed):
+    # Values x = Aε + r and derivatives y = Bε + Cδ + r: every pair has new symbols and remainders.
+    rng, n, unknowns = np.random.default_rng(seed), 3, 1
+    program = spatial_equations(False)._replace(groups=np.zeros((2, n), dtype=np.int64))
+    state = np.zeros((2 * n, unknowns + 2 * n + 3))
+    state[:, 2 : 2 + n] = rng.standard_normal((2 * n, n)) * 10.0 ** rng.integers(-2, 1)
+    state[n:, 2 + n : 2 + 2 * n] = rng.standard_normal((n, n))
+    state[:, -2] = rng.random(2 * n) * 10.0 ** rng.integers(-3, 1)
+    state[:, -1] = np.abs(state[:, :-1]).sum(axis=1)
+    old = state.copy()
+    absorbed(program, state, unknowns)
+    columns = slice(1 + unknowns, 1 + unknowns + 2 * n)
+    for _ in range(8):
+        symbols = rng.choice([-1.0, 1.0], 2 * n)
+        point = old[:, columns] @ symbols + old[:, -2] * rng.choice([-1.0, 1.0], 2 * n)
+        rest = np.diag(state[:, -2])
+        new = linprog(
+            np.zeros(4 * n), A_eq=np.hstack([state[:, columns], rest]), b_eq=point, bounds=(-1, 1)
+        )
+        assert new.success
 
 
 def test_a_grid_shows_whether_a_certificate_can_exist(curved):
@@ -54,3 +235,9 @@ def test_rational_numbers_are_enclosed():
     centre, radius = enclosed(Fraction(14, 15))
     assert abs(Fraction(14, 15) - Fraction(centre)) <= Fraction(radius)
     assert radius < 1e-15
+
+
+def test_a_compliant_base_is_refused():
+    whisker = vb.Whisker.straight(40e-3, base_stiffness=(1e-4, 1e-4))
+    with pytest.raises(ValueError, match="rigid base"):
+        certify(charted(whisker))

@@ -5,7 +5,12 @@ faces; each is a *part* with a cover of its own:
 
 - ``interior``: the whole domain;
 - ``proximal``, ``distal``: the faces at the smallest and the largest arc length of a contact;
-- ``fold``: the face of the largest force, beyond the fold, so that the domain holds Ω.
+- ``fold``: the face of the largest force, beyond the fold, so that the domain holds Ω;
+- ``rest``: contacts with less force than the domain's, which are within the cone.
+
+A straight whisker has no cone, and no part ``rest``. For any other the lemma also needs that M_D
+turns once where the direction of the force does; that is shown on one circle, and holds on all as
+M_B is not zero.
 """
 
 from __future__ import annotations
@@ -22,14 +27,17 @@ import numpy as np
 import xarray as xr
 
 from vibrissa.certificates.conditions import (
+    PLANAR,
+    SPATIAL,
     Conditions,
     conditions_on,
     planar_conditions,
     spatial_conditions,
+    spatial_point_conditions,
 )
-from vibrissa.certificates.domain import Bounds, bounds_of
+from vibrissa.certificates.domain import Bounds, bounds_of, is_planar
 from vibrissa.certificates.equations import ExactRod, exact_rod
-from vibrissa.certificates.search import Cover, cover, volume
+from vibrissa.certificates.search import bounds, cover, covers, volume
 from vibrissa.io import read_dataset, write_netcdf
 from vibrissa.numerics import Array, IntArray, share_out
 from vibrissa.signals import CONE
@@ -42,10 +50,16 @@ TRIPLET = "Fx MB MD"
 KIND = "vibrissa certificate"
 _ORDER = 8
 # Share of the states to which the last Taylor coefficient falls in a step, by part.
-_TOLERANCES = {"interior": 1e-5, "proximal": 1e-6, "distal": 1e-6, "fold": 1e-6}
+_TOLERANCES = {"interior": 1e-5, "proximal": 1e-6, "distal": 1e-6, "fold": 1e-6, "rest": 1e-5}
 # Conditions by part: of the straight whisker, and of any.
-_WANTED = {"interior": ((0, 1, 2), (0, 1, 2, 3)), "proximal": ((3,), (0, 4, 5))}
-_WANTED |= {"distal": _WANTED["proximal"], "fold": ((0, 1), (0,))}
+_PLANAR = {"interior": [0, 1, 2, 3], "proximal": [0, 4], "distal": [0, 4], "fold": [0, 1]}
+_SPATIAL = {"interior": [0, 1, 2, 3, 4], "proximal": [0, 1, 5, 6], "distal": [0, 1, 5, 6]}
+_SPATIAL |= {"fold": [0], "rest": [0]}
+# M_y and M_z among the conditions, and the parts of the circle on which they are followed.
+_MOMENT = [7, 8]
+_ARCS = 48
+# Contacts along each unknown at which signs are looked at first.
+_PROBES = 5
 # Boxes that are evaluated between two looks at the clock.
 _AT_A_TIME = 2048
 # How often a certificate that is being made is written, s.
@@ -78,6 +92,11 @@ class Part:
         """Share of the part's volume that is certified."""
         return float(1.0 - volume(self.undecided).sum())
 
+    @property
+    def complete(self) -> bool:
+        """Whether nothing is undecided, and the certified boxes leave no hole."""
+        return not len(self.undecided) and covers(self.certified)
+
 
 @dataclass
 class Certificate:
@@ -89,6 +108,8 @@ class Certificate:
         Whisker as polynomials with exact coefficients.
     bounds : Bounds
         Bounds on the force.
+    stations : (2^k + 1,) array
+        Arc lengths between which boxes are halved.
     straight : bool
         Whether the whisker is straight, so that contacts in one plane stand for all.
     sign : float
@@ -99,6 +120,8 @@ class Certificate:
         Boxes by part.
     whisker : str
         Description of the whisker.
+    turns : bool
+        Whether M_D certainly turns once where the direction of the force does.
     refuted : str
         Where a condition certainly fails; empty if nowhere.
     seconds : float
@@ -107,24 +130,26 @@ class Certificate:
 
     rod: ExactRod
     bounds: Bounds
+    stations: Array
     straight: bool
     sign: float
     cone: float
     parts: dict[str, Part]
     whisker: str = ""
+    turns: bool = False
     refuted: str = ""
     seconds: float = 0.0
-    _tables: dict[bool, Conditions] = field(default_factory=dict, repr=False, compare=False)
+    _tables: dict[str, Conditions] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def proved(self) -> bool:
-        """Whether the theorem follows: all signs are certain everywhere.
+        """Whether the theorem follows: all signs are certain everywhere."""
+        turns = self.straight or self.turns
+        return turns and not self.refuted and all(p.complete for p in self.parts.values())
 
-        Never of a curved whisker: that M_D turns once, and that what is left out is within the
-        cone, is not shown yet.
-        """
-        decided = all(not len(part.undecided) for part in self.parts.values())
-        return self.straight and decided and not self.refuted
+    @property
+    def _which(self) -> dict[str, list[int]]:
+        return _PLANAR if self.straight else _SPATIAL
 
     @property
     def share(self) -> float:
@@ -135,7 +160,8 @@ class Certificate:
     def identity(self) -> str:
         """Hash of the whisker and the domain."""
         digest = hashlib.sha256()
-        for array in (*self.rod, self.bounds.packed(), self.parts["interior"].domain):
+        domain = self.parts["interior"].domain
+        for array in (*self.rod, self.bounds.packed(), self.stations, domain):
             digest.update(np.ascontiguousarray(array, dtype=np.float64).tobytes())
         return digest.hexdigest()[:16]
 
@@ -149,14 +175,14 @@ class Certificate:
         """
         left = np.rad2deg(self.cone)
         where = f" outside the cone of {left:.3g}°" if self.cone > 0.0 else ""
-        number = sum(len(part.certified) for part in self.parts.values())
         if self.proved:
+            number = sum(len(part.certified) for part in self.parts.values())
             return (
                 f"Certificate: (Fx, MB, MD) is unique (proved){where}, by {number} boxes found in "
                 f"{self.seconds:.0f} s."
             )
         if self.refuted:
-            return f"No certificate{where}: a sign is wrong, {self.refuted}."
+            return f"No certificate{where}: {self.refuted}."
         shares = ", ".join(f"{n} {100.0 * p.share:.3f} %" for n, p in self.parts.items())
         return f"Certificate{where} not finished: certain by now {shares}; run again to continue."
 
@@ -179,8 +205,8 @@ class Certificate:
         same = all(np.array_equal(a, b) for a, b in zip(self.rod, rod, strict=True))
         return same and bool(self.parts["interior"].domain[0, 0] <= contact_map.chart.proximal)
 
-    def evaluate(self, name: str, boxes: Array) -> tuple[Array, Array]:
-        """Enclose the conditions of a part.
+    def evaluate(self, name: str, boxes: Array, which: list[int]) -> tuple[Array, Array]:
+        """Enclose conditions of a part.
 
         Parameters
         ----------
@@ -188,6 +214,8 @@ class Certificate:
             Name of the part.
         boxes : (n, unknowns, 2) array
             Bounds of the unknowns.
+        which : list of int
+            Conditions that are returned.
 
         Returns
         -------
@@ -196,24 +224,48 @@ class Certificate:
         widths : (n, unknowns) array
             Relative widths by unknown.
         """
-        fold = name == "fold"
-        if fold not in self._tables:
-            tables = (
-                planar_conditions(fold) if self.straight else spatial_conditions(self.sign, fold)
-            )
-            self._tables[fold] = tables
-        tables = self._tables[fold]
+        kind = name if name in ("fold", "rest") else ""
+        if kind not in self._tables:
+            if self.straight:
+                self._tables[kind] = planar_conditions(fold=bool(kind))
+            elif kind:
+                self._tables[kind] = spatial_point_conditions(rest=kind == "rest")
+            else:
+                self._tables[kind] = spatial_conditions(self.sign)
+        tables = self._tables[kind]
         unknowns = tables.unknowns
         found = np.empty((len(boxes), len(tables.conditions), unknowns + 2))
         widths = np.empty((len(boxes), unknowns))
         bound, tolerance = self.bounds.packed(), _TOLERANCES[name]
+        boxes = np.ascontiguousarray(boxes)
         share_out(
             len(boxes),
             lambda first, end: conditions_on(
                 tables, self.rod, bound, boxes, _ORDER, tolerance, found, widths, first, end
             ),
         )
-        return found[:, _WANTED[name][0 if self.straight else 1]], widths
+        return found[:, which], widths
+
+    def probe(self) -> None:
+        """Look for signs that are not certain at single contacts, so that boxes cannot help."""
+        names = PLANAR if self.straight else SPATIAL
+        for part in ("interior", "proximal", "distal"):
+            which = self._which[part]
+            low, high = self.parts[part].domain.T
+            share = np.meshgrid(*[np.linspace(0.02, 1.0, _PROBES)] * len(low), indexing="ij")
+            at = low + (high - low) * np.stack([one.ravel() for one in share], axis=1)
+            found, _ = self.evaluate(part, np.stack([at, at], axis=-1), which)
+            centre, reach = found[..., 0], found[..., 1:].sum(axis=-1)
+            doubt = np.argwhere(~(centre > reach))
+            if doubt.size:
+                wrong = np.argwhere(centre < -reach)
+                row, column = (wrong if wrong.size else doubt)[0]
+                where = ", ".join(f"{x:.4g}" for x in at[row])
+                what = "is certainly wrong" if wrong.size else "cannot be distinguished from zero"
+                unknowns = "(s, ℓ)" if self.straight else "(s, φ, ℓ)"
+                sign = f"the sign of the {names[which[column]]} {what}"
+                self.refuted = f"{sign} at {unknowns} = ({where})"
+                return
 
     def pursue(self, name: str, most: int) -> None:
         """Decide more boxes of a part.
@@ -225,15 +277,35 @@ class Certificate:
         most : int
             Number of boxes that are evaluated, about.
         """
-        part = self.parts[name]
-        found: Cover = cover(
-            lambda boxes: self.evaluate(name, boxes), part.domain, part.undecided, most
-        )
+        part, which = self.parts[name], self._which[name]
+
+        def where(boxes: IntArray) -> Array:
+            return bounds(boxes, part.domain, self.stations)
+
+        found = cover(lambda boxes: self.evaluate(name, where(boxes), which), part.undecided, most)
         part.certified = np.concatenate([part.certified, found.certified])
         part.undecided = found.undecided
         part.evaluated += found.evaluated
-        if found.refuted.size:
-            self.refuted = f"{name}: in {found.refuted.tolist()}"
+        if len(found.refuted):
+            box = where(found.refuted)[0].tolist()
+            self.refuted = f"a sign is certainly wrong in the part {name}, box {box}"
+
+    def _turned(self) -> bool:
+        """Whether M_D certainly turns once with the direction, on the circle s = 1, ℓ = 1/2."""
+        low, high = self.parts["interior"].domain[1]
+        ends = np.linspace(low, high, _ARCS + 1)
+        boxes = np.tile([[1.0, 1.0], [0.0, 0.0], [0.5, 0.5]], (_ARCS, 1, 1))
+        boxes[:, 1] = np.stack([ends[:-1], ends[1:]], axis=1)
+        found = self.evaluate("distal", boxes, _MOMENT)[0]
+        centre, reach = found[..., 0], found[..., 1:].sum(axis=-1)
+        # Each arc's moments are within 45° of their centre, so that neighbouring centres turn
+        # by less than 90°; a half circle by π, as the ends are mirror images of themselves.
+        near = 2.01 * (reach**2).sum(axis=1) < (centre**2).sum(axis=1)
+        angle = np.arctan2(centre[:, 1], centre[:, 0])
+        if low < 0.0:
+            angle = np.append(angle, angle[:1])
+        turn = float(np.unwrap(angle)[-1] - angle[0])
+        return bool(near.all()) and abs(turn - (2.0 * np.pi if low < 0.0 else np.pi)) < 1.5
 
     def to_dataset(self) -> xr.Dataset:
         """Write it as a dataset.
@@ -245,6 +317,7 @@ class Certificate:
         """
         data = {f"rod_{n}": (_dims(n, a), a) for n, a in self.rod._asdict().items()}
         data["factors"] = (("polynomial", "power"), self.bounds.factors)
+        data["stations"] = (("station",), self.stations)
         for name, part in self.parts.items():
             data[f"{name}_domain"] = (("unknown", "end"), part.domain)
             for kind in ("certified", "undecided"):
@@ -263,9 +336,11 @@ class Certificate:
             "sign": self.sign,
             "cone": self.cone,
             "alpha": self.bounds.alpha,
+            "room": self.bounds.room,
+            "turns": int(self.turns),
             "order": _ORDER,
             "seconds": self.seconds,
-            "evaluated": [self.parts[name].evaluated for name in _WANTED],
+            "evaluated": [part.evaluated for part in self.parts.values()],
         }
         return out
 
@@ -300,18 +375,23 @@ class Certificate:
                 data[f"{name}_undecided"].values.astype(np.int64),
                 int(number),
             )
-            for name, number in zip(_WANTED, evaluated, strict=True)
+            for name, number in zip(
+                _PLANAR if data.attrs["straight"] else _SPATIAL, evaluated, strict=True
+            )
         }
+        attrs = data.attrs
         out = cls(
             ExactRod(*(data[f"rod_{name}"].values for name in ExactRod._fields)),
-            Bounds(float(data.attrs["alpha"]), data["factors"].values),
-            bool(data.attrs["straight"]),
-            float(data.attrs["sign"]),
-            float(data.attrs["cone"]),
+            Bounds(float(attrs["alpha"]), data["factors"].values, float(attrs["room"])),
+            data["stations"].values,
+            bool(attrs["straight"]),
+            float(attrs["sign"]),
+            float(attrs["cone"]),
             parts,
-            str(data.attrs["whisker"]),
-            str(data.attrs["refuted"]),
-            float(data.attrs["seconds"]),
+            str(attrs["whisker"]),
+            bool(attrs["turns"]),
+            str(attrs["refuted"]),
+            float(attrs["seconds"]),
         )
         if out.identity != data.attrs["identity"]:
             raise ValueError("the certificate's numbers are not those that it was written with")
@@ -368,27 +448,46 @@ def prepared(contact_map: ContactMap, cone: float = CONE) -> Certificate:
     straight = bool(whisker.is_straight)
     if straight:
         cone = 0.0
-    bounds = bounds_of(contact_map, cone)
+    elif not cone > 0.0:
+        raise ValueError("a curved whisker's certificate needs a cone about rest; got 0")
+    rod = exact_rod(whisker)
+    force = bounds_of(contact_map, cone)
     near = contact_map.chart.proximal
-    planar = not np.any(whisker.intrinsic_curvature.coefficients[..., :2])
+    stations = _stations(rod, near)
     turn = float(np.nextafter(np.pi, 4.0))
-    angles = [] if straight else [[0.0 if planar else -turn, turn]]
-    start = np.zeros((1, 2 if straight else 3, 2), dtype=np.int64)
-    parts = {
-        name: Part(np.array([reach, *angles, load]), start[:0], start)
-        for name, reach, load in (
-            ("interior", [near, 1.0], [0.0, 1.0]),
-            ("proximal", [near, near], [0.0, 1.0]),
-            ("distal", [1.0, 1.0], [0.0, 1.0]),
-            ("fold", [near, 1.0], [1.0, 1.0]),
-        )
+    angles = [] if straight else [[0.0 if is_planar(whisker) else -turn, turn]]
+    unknowns = 2 if straight else 3
+    whole = np.zeros((len(stations) - 1, unknowns, 2), dtype=np.int64)
+    whole[:, 0, 0] = np.log2(len(whole)).astype(int)
+    whole[:, 0, 1] = np.arange(len(whole))
+    ends: dict[str, tuple[list[float], list[float]]] = {
+        "interior": ([near, 1.0], [0.0, 1.0]),
+        "proximal": ([near, near], [0.0, 1.0]),
+        "distal": ([1.0, 1.0], [0.0, 1.0]),
+        "fold": ([near, 1.0], [1.0, 1.0]),
+        "rest": ([near, 1.0], [0.0, 1.0]),
     }
-    out = Certificate(exact_rod(whisker), bounds, straight, 1.0, cone, parts, f"{whisker!r}")
+    parts = {}
+    for name in _PLANAR if straight else _SPATIAL:
+        reach, load = ends[name]
+        start = whole if reach[0] < reach[1] else 0 * whole[:1]
+        parts[name] = Part(np.array([reach, *angles, load]), start[:0], start)
+    out = Certificate(rod, force, stations, straight, 1.0, cone, parts, f"{whisker!r}")
     if not straight:  # the sign at one contact, which the cover then shows everywhere
         middle = np.array([[[0.65, 0.65], [1.0, 1.0], [0.5, 0.5]]])
-        out.sign = float(np.sign(out.evaluate("interior", middle)[0][0, 3, 0]))
+        out.sign = float(np.sign(out.evaluate("interior", middle, [4])[0][0, 0, 0]))
         out._tables.clear()
+        out.turns = out._turned()
     return out
+
+
+def _stations(rod: ExactRod, near: float) -> Array:
+    """Arc lengths of contacts at which pieces of the rod end, 2^k + 1 in all, with others."""
+    stations = [near, *rod.edges[rod.edges > near].tolist()]
+    while (len(stations) - 1) & (len(stations) - 2):
+        widest = int(np.argmax(np.diff(stations))) + 1
+        stations.insert(widest, 0.5 * (stations[widest - 1] + stations[widest]))
+    return np.array(stations)
 
 
 def certify(
@@ -432,21 +531,21 @@ def certify(
         if before.identity != out.identity:
             raise ValueError(f"{path} is a certificate of another whisker or domain")
         out = before
+    if not sum(part.evaluated for part in out.parts.values()):
+        out.probe()
     began, saved = time.monotonic(), time.monotonic()
     spent = out.seconds
-    for name in _WANTED:
-        part = out.parts[name]
-        while len(part.undecided) and not out.refuted:
+    for name, part in out.parts.items():
+        while len(part.undecided) and not out.refuted and time.monotonic() - began <= seconds:
             out.pursue(name, _AT_A_TIME)
             now = time.monotonic()
             out.seconds = spent + now - began
             if progress is not None:
-                progress(int(1000.0 * sum(p.share for p in out.parts.values())), 4000)
+                total = sum(p.share for p in out.parts.values())
+                progress(int(1000.0 * total), 1000 * len(out.parts))
             if path is not None and now - saved > _SAVED_EVERY:
                 out.save(path)
                 saved = now
-            if now - began > seconds:
-                break
     if path is not None:
         out.save(path)
     return out

@@ -1,7 +1,8 @@
 """The sign conditions over one box of contacts.
 
 Boxes are in (s, ℓ) for a straight whisker, with F = f² = ℓ f_max(s)², and in (s, φ, ℓ) for any,
-with f = f_min(s) + (f_max(s, φ) - f_min(s)) ℓ. With q = 1/s - α and polynomials P_i(s)
+with f = f_min(s) + (f_max(s, φ) - f_min(s)) ℓ; of contacts near rest with f = f_min(s) ℓ. With
+q = 1/s - α and polynomials P_i(s)
 
     f_min = q² P₀,    f_max = q² (P₁ + P₂ cos φ + P₃ sin φ + P₄ cos² φ).
 
@@ -37,16 +38,27 @@ from vibrissa.certificates.forms import (
 )
 from vibrissa.numerics import Array, IntArray, inlined_rigorous, rigorous
 
-#: Conditions of a straight whisker: μ > 0; ∂ ln M/∂s < 0; ∂(M, R)/∂(s, f) < 0; ∂R/∂f > 0.
-PLANAR = ("moment", "moment along s", "determinant", "ratio along the load")
+#: Conditions of a straight whisker: f_max > 0; μ > 0; ∂ ln M/∂s < 0; ∂(M, R)/∂(s, f) < 0;
+#: ∂R/∂f > 0, which is needed on the faces only.
+PLANAR = ("load", "moment", "moment along s", "determinant", "ratio along the load")
 #: Beyond the fold: x_s(η + 2Fη_F) - 2F x_F η_s < 0, the determinant of the contact point in its
 #: plane; η > 0, which makes it that in space.
 PLANAR_FOLD = ("determinant of the point", "deflection")
-#: Conditions of any whisker: f_ℓ > 0; ∂g₁/∂s < 0; ∂(g₁, g₂)/∂(s, φ) < 0; the sign of the
-#: determinant; ∂g₂/∂φ > 0; the sign of ∂(g₂, g₃)/∂(φ, ℓ). The last two are needed on the faces.
-SPATIAL = ("load", "moment along s", "moments", "determinant", "direction", "direction and force")
+#: Conditions of any whisker: f_min > 0; f_ℓ > 0; ∂g₁/∂s < 0; ∂(g₁, g₂)/∂(s, φ) < 0; the sign of
+#: the determinant; ∂g₂/∂φ > 0; the sign of ∂(g₂, g₃)/∂(φ, ℓ). The last two are needed on the faces.
+SPATIAL = (
+    "least load",
+    "load",
+    "moment along s",
+    "moments",
+    "determinant",
+    "direction",
+    "direction and force",
+)
 #: Beyond the fold: det ∂p/∂(s, f_y, f_z) < 0.
 SPATIAL_FOLD = ("determinant of the point",)
+#: Near rest: f_min |∂p/∂f| < ``room`` · s, so that contacts with less force are within the cone.
+SPATIAL_REST = ("deflection",)
 # Coefficients of each polynomial P.
 DEGREES = 6
 _GIVEN = ("one", "s", "level", "cos", "sin", "inverse", "alpha")
@@ -100,7 +112,8 @@ def _polynomial(out: Equations, i: int) -> None:
 def _bounds(polynomials: tuple[int, ...]) -> Equations:
     """Start of a table: the unknowns, and bounds on the force."""
     out = Equations()
-    out.given(*_GIVEN, *(f"a{i}_{k}" for i in range(_POLYNOMIALS) for k in range(DEGREES)))
+    factors = (f"a{i}_{k}" for i in range(_POLYNOMIALS) for k in range(DEGREES))
+    out.given(*_GIVEN, *factors, "room")
     out.add(ALGEBRAIC, "i2", "inverse inverse")
     out.add(ALGEBRAIC, "q", "inverse", "-alpha")
     out.add(ALGEBRAIC, "q2", "q q")
@@ -143,7 +156,7 @@ def planar_conditions(fold: bool = False) -> Conditions:
     out.add(ALGEBRAIC, "steady", "rs m", *2 * ["-r ms"])
     out.add(ALGEBRAIC, "fall", "-b1 ms", "-db1 along")
     out.add(ALGEBRAIC, "det", "along steady", *2 * ["-Fms ratio"])
-    wanted: tuple[str, ...] = ("m", "fall", "det", "ratio")
+    wanted: tuple[str, ...] = ("b1", "m", "fall", "det", "ratio")
     if fold:
         out.add(ALGEBRAIC, "FeF", "F eF")
         out.add(ALGEBRAIC, "FxF", "F xF")
@@ -153,26 +166,33 @@ def planar_conditions(fold: bool = False) -> Conditions:
     return _assembled(out, planar_equations(fold), middle, {1: "one"}, "r", wanted, 2)
 
 
-def spatial_conditions(sign: float, fold: bool = False) -> Conditions:
-    """Conditions `SPATIAL` of any whisker, or `SPATIAL_FOLD`.
+def _spatial_load(rest: bool) -> Equations:
+    """Start of a table in space: the force with its derivatives by s, φ and ℓ."""
+    out = _bounds((0,) if rest else tuple(range(_POLYNOMIALS)))
+    if rest:
+        out.add(ALGEBRAIC, "f", "b0 level")
+    else:
+        out.add(ALGEBRAIC, "cos2", "cos cos")
+        out.add(ALGEBRAIC, "cossin", "cos sin")
+        for d in ("", "d"):
+            out.add(ALGEBRAIC, f"{d}most", f"{d}b1", f"{d}b2 cos", f"{d}b3 sin", f"{d}b4 cos2")
+            out.add(ALGEBRAIC, f"{d}extent", f"{d}most", f"-{d}b0")
+            out.add(ALGEBRAIC, f"{d}f", f"{d}b0", f"{d}extent level")
+        out.add(ALGEBRAIC, "swing", "-b2 sin", "b3 cos", *2 * ["-b4 cossin"])
+        out.add(ALGEBRAIC, "fphi", "swing level")
+    out.add(ALGEBRAIC, "fy", "f cos")
+    out.add(ALGEBRAIC, "fz", "f sin")
+    return out
+
+
+def spatial_conditions(sign: float) -> Conditions:
+    """Conditions `SPATIAL` of any whisker, and then M_y and M_z.
 
     ``sign`` is that of det ∂(M_y, M_z, F_x)/∂(s, f_y, f_z).
     """
-    out = _bounds(tuple(range(_POLYNOMIALS)))
-    out.add(ALGEBRAIC, "cos2", "cos cos")
-    out.add(ALGEBRAIC, "cossin", "cos sin")
-    for d in ("", "d"):
-        out.add(ALGEBRAIC, f"{d}most", f"{d}b1", f"{d}b2 cos", f"{d}b3 sin", f"{d}b4 cos2")
-        out.add(ALGEBRAIC, f"{d}extent", f"{d}most", f"-{d}b0")
-        out.add(ALGEBRAIC, f"{d}f", f"{d}b0", f"{d}extent level")
-    out.add(ALGEBRAIC, "swing", "-b2 sin", "b3 cos", *2 * ["-b4 cossin"])
-    out.add(ALGEBRAIC, "fphi", "swing level")
-    out.add(ALGEBRAIC, "fy", "f cos")
-    out.add(ALGEBRAIC, "fz", "f sin")
+    out = _spatial_load(rest=False)
     middle = len(out.names)
-    states: tuple[str, ...] = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
-    if fold:
-        states += ("px", "py", "pz")
+    states = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
     out.given(*(f"{state}{by}" for by in ("", "_s", "_y", "_z") for state in states))
     # Derivatives along the force (r) and across it (a), then by s, φ and ℓ.
     for name in ("My", "Mz", "Fx"):
@@ -194,15 +214,31 @@ def spatial_conditions(sign: float, fold: bool = False) -> Conditions:
         out.add(ALGEBRAIC, f"grow{by}", f"My My{by}", f"Mz Mz{by}")
         out.add(ALGEBRAIC, f"zeta{by}", f"square Fx{by}", f"-Fx grow{by}")
     out.add(ALGEBRAIC, "both", f"{mark}turnp zetal", f"{other}turnl zetap")
-    wanted: tuple[str, ...] = ("extent", "fall", "moments", "det", "turnp", "both")
-    if fold:
+    wanted = ("b0", "extent", "fall", "moments", "det", "turnp", "both", "My", "Mz")
+    start = {1: "fy", 2: "fz", 13: "one", 20: "one"}
+    return _assembled(out, spatial_equations(False), middle, start, "Fx", wanted, 3)
+
+
+def spatial_point_conditions(rest: bool) -> Conditions:
+    """Conditions `SPATIAL_REST` of contacts near rest, or `SPATIAL_FOLD`."""
+    out = _spatial_load(rest)
+    middle = len(out.names)
+    states = ("Fx", "Fy", "Fz", "Mx", "My", "Mz", "px", "py", "pz")
+    out.given(*(f"{state}{by}" for by in ("", "_s", "_y", "_z") for state in states))
+    if rest:
+        for x in "xyz":
+            out.add(ALGEBRAIC, f"along{x}", f"cos p{x}_y", f"sin p{x}_z")
+            out.add(ALGEBRAIC, f"moved{x}", f"b0 along{x}")
+        out.add(ALGEBRAIC, "allowed", "room s")
+        wanted = "inside"
+        out.add(ALGEBRAIC, wanted, "allowed allowed", *(f"-moved{x} moved{x}" for x in "xyz"))
+    else:
         for i, (a, b) in enumerate((("py", "pz"), ("pz", "px"), ("px", "py"))):
             out.add(ALGEBRAIC, f"area{i}", f"{a}_y {b}_z", f"-{b}_y {a}_z")
-        out.add(ALGEBRAIC, "beyond", *(f"-{n}_s area{i}" for i, n in enumerate(states[6:])))
-        wanted = ("beyond",)
-    n = len(states)
-    start = {1: "fy", 2: "fz", 2 * n + 1: "one", 3 * n + 2: "one"}
-    return _assembled(out, spatial_equations(fold), middle, start, "Fx", wanted, 3)
+        wanted = "beyond"
+        out.add(ALGEBRAIC, wanted, *(f"-{n}_s area{i}" for i, n in enumerate(("px", "py", "pz"))))
+    start = {1: "fy", 2: "fz", 19: "one", 29: "one"}
+    return _assembled(out, spatial_equations(True), middle, start, "Fx", (wanted,), 3)
 
 
 @inlined_rigorous
@@ -266,8 +302,8 @@ def conditions_on(
         What is computed.
     rod : ExactRod
         Whisker.
-    bound : (31,) array
-        The taper α, and the coefficients of P₀ … P₄.
+    bound : (32,) array
+        The taper α, the coefficients of P₀ … P₄, and ``room``.
     boxes : (n, unknowns, 2) array
         Bounds of the unknowns.
     order : int

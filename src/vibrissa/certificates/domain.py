@@ -6,7 +6,17 @@ With q = 1/s - α, α = 1 - r_tip/r_base, the bounds are (:mod:`vibrissa.certifi
 
 polynomials fitted to the fold forces, a little above all of them, and to the forces that deflect
 the contact by the cone's angle, a little below. Any polynomials make a valid domain; whether it
-holds all stable contacts is a condition of its own.
+holds all stable contacts outside the cone is a condition of its own.
+
+A contact p at s is within the cone of half angle c if f_min |∂p/∂f| ≤ `room` · s on the way from
+rest, r₀(s), for then |p - r₀(s)| ≤ room · s, room = √k sin c: with the nearest point r₀(s') of the
+whisker at rest, e = s - s' > 0 and its largest curvature κ ≤ π/L,
+
+    |p - r₀(s)|² ≥ |p - r₀(s')|² + e² k,    k = 1 - κD - κ²(πD)²/12,    D = L sin c ≥ |p - r₀(s')|,
+
+as p - r₀(s') is across the whisker, the chord from s' to s is at least that of a circle (Schur)
+and leaves the tangent by κe²/2 at most, and e ≤ πD. The largest |p - r₀(s')|/s' that this leaves
+is tan c.
 """
 
 from __future__ import annotations
@@ -16,16 +26,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from vibrissa.certificates.conditions import DEGREES
+from vibrissa.certificates.equations import ExactRod, exact_rod
 from vibrissa.numerics import Array
-from vibrissa.rod import (
-    fold_forces,
-    solve_forces,
-    with_normal_force,
-)
-from vibrissa.signals import cone_angle
+from vibrissa.rod import fold_forces, solve_forces, with_normal_force
 
 if TYPE_CHECKING:
     from vibrissa.contacts import ContactMap
+    from vibrissa.whisker import Whisker
 
 # The fold is exceeded, and the cone undercut, by at least these shares.
 _BEYOND, _INSIDE = 2.5e-2, 1e-2
@@ -41,14 +48,17 @@ class Bounds(NamedTuple):
         Taper of the bounds.
     factors : (5, k) array
         Coefficients of P₀ … P₄.
+    room : float
+        Share of the arc length by which contacts within the cone may be deflected.
     """
 
     alpha: float
     factors: Array
+    room: float
 
     def packed(self) -> Array:
         """All numbers as the kernel takes them."""
-        return np.concatenate([[self.alpha], self.factors.ravel()])
+        return np.concatenate([[self.alpha], self.factors.ravel(), [self.room]])
 
     def force(self, s: Array, phi: Array, level: Array) -> tuple[Array, Array, Array, Array]:
         """Force f at (s, φ, ℓ) with its derivatives by s, φ and ℓ."""
@@ -69,6 +79,19 @@ class Bounds(NamedTuple):
             (b[..., 1:] * swing).sum(axis=-1) * level,
             extent,
         )
+
+
+def room_within(rod: ExactRod, cone: float, proximal: float) -> float:
+    """Share of the arc length by which a contact may be deflected so that it is in the cone."""
+    largest = np.abs(rod.coefficients[:, 1:3]).sum(axis=(2, 3)) * (1.0 + 1e-12)
+    kappa, sine = float(np.hypot(*largest.T).max()), float(np.sin(cone))
+    if kappa > 3.1 or np.pi * sine > proximal:
+        raise ValueError(
+            f"certificates are for curvatures below 3.1/L and cones below {proximal:g}/π rad; this "
+            f"whisker's curvature is up to {kappa:.3g}/L, and the cone {cone:.3g} rad"
+        )
+    k = 1.0 - kappa * sine - (kappa * np.pi * sine) ** 2 / 12.0
+    return float(np.sqrt(k) * sine * (1.0 - 1e-12))
 
 
 def bounds_of(contact_map: ContactMap, cone: float) -> Bounds:
@@ -99,6 +122,8 @@ def bounds_of(contact_map: ContactMap, cone: float) -> Bounds:
     turn = np.stack([np.ones_like(phi), np.cos(phi), np.sin(phi), np.cos(phi) ** 2], axis=1)
     if whisker.is_straight:
         turn[:, 1:] = 0.0
+    if is_planar(whisker):
+        turn[:, 2] = 0.0
     basis = (turn[:, :, None] * powers[:, None, :]).reshape(len(s), -1)
     target = fold / q**2
     # Relative misfits count.
@@ -106,23 +131,37 @@ def bounds_of(contact_map: ContactMap, cone: float) -> Bounds:
     lift = (1.0 + _BEYOND) * (target / (basis @ fitted)).max()
     factors = np.zeros((5, DEGREES))
     factors[1:] = lift * fitted.reshape(4, DEGREES)
+    room = 0.0
     if cone > 0.0:
-        least = _cone_force(contact_map, s, phi, fold, cone).reshape(_STATIONS, -1).min(axis=1)
+        room = room_within(exact_rod(whisker), cone, chart.proximal)
+        least = _least_force(contact_map, s, phi, fold, room).reshape(_STATIONS, -1).min(axis=1)
         target = least / (1.0 / stations - alpha) ** 2
         basis = stations[:, None] ** np.arange(DEGREES)
         fitted = np.linalg.lstsq(basis / target[:, None], np.ones(_STATIONS), rcond=None)[0]
         factors[0] = (1.0 - _INSIDE) * (target / (basis @ fitted)).min() * fitted
-    return Bounds(alpha, factors)
+    return Bounds(alpha, factors, room)
 
 
-def _cone_force(contact_map: ContactMap, s: Array, phi: Array, fold: Array, cone: float) -> Array:
-    """Forces that deflect the contact to a cone angle."""
-    d = contact_map.chart.discretization
-    low, high = np.zeros_like(fold), fold.copy()
-    for _ in range(40):
-        force = 0.5 * (low + high)
+def is_planar(whisker: Whisker) -> bool:
+    """Whether a whisker is exactly in the plane z = 0, and so its own mirror image."""
+    return not np.any(whisker.intrinsic_curvature.coefficients[..., :2])
+
+
+def _least_force(contact_map: ContactMap, s: Array, phi: Array, fold: Array, room: float) -> Array:
+    """Forces f at which f |∂p/∂f| is a share of the arc length, on the way from rest."""
+
+    def compliance(force: Array) -> Array:
         xi = np.stack([s, force * np.cos(phi), force * np.sin(phi)], axis=1)
-        values, _ = solve_forces(d, with_normal_force(xi))
-        inside = cone_angle(contact_map.whisker, values[:, 3:] * d.length) < cone
+        _, tangents = solve_forces(
+            contact_map.chart.discretization, with_normal_force(xi), tangents=True
+        )
+        along = np.cos(phi)[:, None] * tangents[..., 1] + np.sin(phi)[:, None] * tangents[..., 2]
+        return np.asarray(np.linalg.norm(along[:, 3:], axis=1))
+
+    low, high = np.zeros_like(fold), fold.copy()
+    resting = compliance(1e-6 * fold)
+    for _ in range(30):
+        force = 0.5 * (low + high)
+        inside = force * np.maximum(resting, compliance(force)) < room * s
         low, high = np.where(inside, force, low), np.where(inside, high, force)
     return low

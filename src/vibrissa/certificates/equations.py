@@ -70,8 +70,8 @@ class ExactRod(NamedTuple):
 
     Attributes
     ----------
-    edges : (n + 1, 2) array
-        Ends of the pieces, over L.
+    edges : (n + 1,) array
+        Ends of the pieces, over L: exact numbers, the stored ones rounded to double precision.
     local : (n, 4, 2, 2) array
         Slope and offset that turn arc length into the polynomials' own variable.
     coefficients : (n, 4, d, 2) array
@@ -221,7 +221,7 @@ def tapered_rod(ratio: Fraction) -> ExactRod:
     coefficients[0, 3] = [enclosed(one, _SLACK) for one in b]
     local = np.zeros((1, _POLYNOMIALS, 2, 2))
     local[:, :, 0, 0] = 1.0
-    return ExactRod(np.array([[0.0, 0.0], [1.0, 0.0]]), local, coefficients, np.array([1.0, 0.0]))
+    return ExactRod(np.array([0.0, 1.0]), local, coefficients, np.array([1.0, 0.0]))
 
 
 def exact_rod(whisker: Whisker) -> ExactRod:
@@ -268,7 +268,7 @@ def exact_rod(whisker: Whisker) -> ExactRod:
             slack = _SLACK * max(map(abs, row))
             coefficients[p, i, : len(row)] = [enclosed(a, slack if a else Fraction(0)) for a in row]
     return ExactRod(
-        np.array([enclosed(one / length) for one in knots]),
+        np.array([float(one / length) for one in knots]),
         local,
         coefficients,
         np.array(enclosed(1 + Fraction(whisker.poisson_ratio))),

@@ -41,6 +41,8 @@ _MOST_TRIALS = 12
 _PIVOT = 1e-7
 # A step ends at the end of a piece if that is nearer than this share of the way.
 _NEAR_EDGE = 0.05
+# Boxes end at the edges of pieces; only outward rounding may exceed these.
+_ROUNDED = 1e-13
 
 
 @inlined_rigorous
@@ -158,11 +160,15 @@ def invert(a: Array, inverse: Array) -> bool:
 
 
 @inlined_rigorous
-def stretched(a: Array, r: Array, basis: Array, inverse: Array, out: Array, left: Array) -> float:
+def stretched(
+    a: Array, r: Array, basis: Array, inverse: Array, out: Array, left: Array, change: Array
+) -> float:
     """Parallelepiped along a basis that contains a ε + r η but for what is left; its size.
 
     a ε + r η = basis (inverse (a ε + r η)) + (1 - basis inverse) (a ε + r η), whatever the
-    matrix ``inverse`` is; the second term, and what rounding loses, goes into ``left``.
+    matrix ``inverse`` is; the second term, and what rounding loses, goes into ``left``. The new
+    symbols ε' are inverse (a ε + r η) over their bounds, which are the first row of ``change``;
+    its second row bounds how much the old ε differ from these bounds times ε'.
     """
     n = r.shape[0]
     wide = np.empty(n)
@@ -172,15 +178,18 @@ def stretched(a: Array, r: Array, basis: Array, inverse: Array, out: Array, left
             wide[i] += abs(a[i, j])
         left[i] = 0.0
     for j in range(n):
-        stretch = TINY
+        fresh = TINY
         for k in range(n):
-            stretch += abs(inverse[j, k]) * (r[k] + ROUNDING * wide[k])
+            fresh += abs(inverse[j, k]) * (r[k] + ROUNDING * wide[k])
+        stretch, differs = fresh, fresh
         for column in range(n):
             value = 0.0
             for k in range(n):
                 value += inverse[j, k] * a[k, column]
             stretch += abs(value)
+            differs += abs(value - 1.0) if column == j else abs(value)
         stretch *= UP
+        change[0, j], change[1, j] = stretch, differs * UP
         for i in range(n):
             out[i, j] = basis[i, j] * stretch
             left[i] += ROUNDING * abs(out[i, j]) + TINY
@@ -201,25 +210,37 @@ def stretched(a: Array, r: Array, basis: Array, inverse: Array, out: Array, left
 
 @inlined_rigorous
 def absorb(program: Program, state: Array, unknowns: int) -> None:
-    """Take the remainders of all states into the symbols that carry them."""
+    """Take the remainders of all states into the symbols that carry them.
+
+    The derivatives depend on the symbols of the values too, which get a new meaning: these
+    coefficients are turned into the new symbols, and where that cannot be done into remainders.
+    """
     groups, n = program.groups.shape
     last = state.shape[1] - 1
     a, r = np.empty((n, n)), np.empty(n)
     along, axes, inverse = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
     left, left_axes, unit = np.empty(n), np.empty(n), np.eye(n)
+    change, unused = np.empty((2, n)), np.empty((2, n))
     for group in range(groups):
         at = 1 + unknowns + (n if group else 0)
         for i in range(n):
             r[i] = state[group * n + i, last - 1]
             for j in range(n):
                 a[i, j] = state[group * n + i, at + j]
-        size = stretched(a, r, unit, unit, axes, left_axes)
-        better = invert(a, inverse) and stretched(a, r, a, inverse, along, left) < size
+        size = stretched(a, r, unit, unit, axes, left_axes, unused)
+        better = invert(a, inverse) and stretched(a, r, a, inverse, along, left, change) < size
         for i in range(n):
             for j in range(n):
                 state[group * n + i, at + j] = along[i, j] if better else axes[i, j]
             state[group * n + i, last - 1] = left[i] if better else left_axes[i]
             close(state, group * n + i, 1.0)
+        if group == 0:
+            for row in range(n, groups * n):
+                for j in range(n):
+                    old = state[row, at + j]
+                    state[row, at + j] = old * change[0, j] if better else 0.0
+                    lost = change[1, j] + ROUNDING * change[0, j] if better else 1.0
+                    state[row, last - 1] += abs(old) * lost
 
 
 @inlined_rigorous
@@ -357,8 +378,12 @@ def enclose(
         g = 8
         copy_row(load, 0, x, 7 * rows)
     piece = rod.edges.shape[0] - 2
-    while piece > 0 and rod.edges[piece, 0] >= s[0, 0]:
+    while piece > 0 and rod.edges[piece] >= s[0, 0]:
         piece -= 1
+    spread = (s[0, last] - abs(s[0, 0])) * UP
+    beyond = max(rod.edges[piece] - s[0, 0], s[0, 0] - rod.edges[piece + 1]) + spread
+    if beyond > _ROUNDED:  # contacts on both sides of an edge have different equations
+        return NO_ENCLOSURE
     for steps in range(_MOST_STEPS):
         set_known(rod, piece, s, x, rows, order, work)
         if not reciprocal(x, 3 * rows, x, g * rows):
@@ -374,15 +399,13 @@ def enclose(
         recursion(program, x, rows, order - 1)
         wide = 1.5 * (s[0, last] - abs(s[0, 0]))
         node = s[0, 0] - max(step_length(program, x, rows, order, tolerance), wide)
-        edge, blur = rod.edges[piece, 0], rod.edges[piece, 1]
+        edge = rod.edges[piece]
         done = node < edge + _NEAR_EDGE * (s[0, 0] - edge)
         if done:
             node = edge
-        else:
-            blur = 0.0
         copy_row(s, 0, h, 0)
         h[0, 0] = s[0, 0] - node
-        h[0, n + 1] += blur + ROUNDING
+        h[0, n + 1] += ROUNDING
         close(h, 0, 1.0)
         longest = h[0, last]
         if not remainder(program, rod, piece, s, longest, x, y, order, coarse):
@@ -403,7 +426,7 @@ def enclose(
         if n > unknowns:
             absorb(program, state, unknowns)
         clear(s, 0)
-        s[0, 0], s[0, n + 1] = node, blur
+        s[0, 0] = node
         close(s, 0, 1.0)
         if done:
             if piece == 0:

@@ -118,7 +118,7 @@ def _conditions(
         det = grown[..., 0] * raw[..., 0, 1] - grown[..., 1] * raw[..., 0, 0]
         fall = grown[..., 0] + f_s * grown[..., 1]
         ratio = -raw[..., 0, 1] * moment + 2.0 * x * grown[..., 1]
-        return np.stack([moment, -fall, det, ratio])
+        return np.stack([f_l, moment, -fall, det, ratio])
     square = y**2 + z**2
     sign = _majority(np.linalg.det(raw))
     turn_phi, turn_l = (y * d[..., 2] - z * d[..., 1] for d in (by_phi, by_l))
@@ -127,6 +127,7 @@ def _conditions(
     )
     return np.stack(
         [
+            np.broadcast_to(bounds.force(s, phi, 0.0 * level)[0], f.shape),
             f_l,
             -(y * by_s[..., 1] + z * by_s[..., 2]),
             by_s[..., 2] * by_phi[..., 1] - by_s[..., 1] * by_phi[..., 2],

@@ -17,7 +17,7 @@ _BATCH = 2048
 _MOST_HALVINGS = 3
 _DEEPEST = 40
 
-Evaluate = Callable[[Array], tuple[Array, Array]]
+Evaluate = Callable[[IntArray], tuple[Array, Array]]
 
 
 class Cover(NamedTuple):
@@ -29,49 +29,50 @@ class Cover(NamedTuple):
         Levels and indices of the boxes on which all signs are certain, and of the others.
     evaluated : int
         Number of boxes that were evaluated.
-    refuted : array
-        Bounds (unknowns, 2) of a box at whose centre a sign is certainly wrong; empty if none.
+    refuted : (m, unknowns, 2) array
+        Box at whose centre a sign is certainly wrong, if any.
     """
 
     certified: IntArray
     undecided: IntArray
     evaluated: int
-    refuted: Array
+    refuted: IntArray
 
 
-def bounds(boxes: IntArray, domain: Array) -> Array:
-    """Bounds (n, unknowns, 2) of boxes in a domain (unknowns, 2)."""
+def bounds(boxes: IntArray, domain: Array, stations: Array) -> Array:
+    """Bounds (n, unknowns, 2) of boxes in a domain (unknowns, 2).
+
+    The first unknown is linear between stations, of which there are 2^k + 1, at equal shares: so
+    boxes can end where the whisker's polynomials do.
+    """
     part = 2.0 ** (-boxes[..., 0].astype(np.float64))
-    extent = domain[:, 1] - domain[:, 0]
-    low = domain[:, 0] + extent * (boxes[..., 1] * part)
-    high = domain[:, 0] + extent * ((boxes[..., 1] + 1) * part)
-    high = np.where((boxes[..., 1] + 1) * part == 1.0, domain[:, 1], high)
-    return np.stack([low, high], axis=-1)
+    share = np.stack([boxes[..., 1] * part, (boxes[..., 1] + 1) * part], axis=-1)
+    out = domain[:, :1] + (domain[:, 1:] - domain[:, :1]) * share
+    out = np.where(share == 1.0, domain[:, 1:], out)
+    if domain[0, 0] < domain[0, 1]:
+        cell, inside = np.divmod(share[:, 0] * (len(stations) - 1), 1.0)
+        low = cell.astype(np.int64)
+        high = np.minimum(low + 1, len(stations) - 1)
+        out[:, 0] = stations[low] + (stations[high] - stations[low]) * inside
+    return np.asarray(out)
 
 
 def volume(boxes: IntArray) -> Array:
-    """Share of the domain that each box takes."""
+    """Share of the unit cube that each box takes."""
     return np.asarray(2.0 ** (-boxes[..., 0].sum(axis=-1).astype(np.float64)))
 
 
-def cover(
-    evaluate: Evaluate,
-    domain: Array,
-    start: IntArray | None = None,
-    most: int = 10**6,
-) -> Cover:
+def cover(evaluate: Evaluate, start: IntArray, most: int = 10**6) -> Cover:
     """Halve boxes until all conditions are certainly positive on each.
 
     Parameters
     ----------
     evaluate : callable
-        Function of bounds (n, unknowns, 2) that returns conditions (n, c, unknowns + 2), each a
+        Function of boxes (n, unknowns, 2) that returns conditions (n, c, unknowns + 2), each a
         centre, the share of each unknown in its range and the remainder, and the relative widths
         (n, unknowns) of what they are computed from.
-    domain : (unknowns, 2) array
-        Bounds of the unknowns.
-    start : (n, unknowns, 2) array, optional
-        Boxes to begin with; by default the whole domain.
+    start : (n, unknowns, 2) array
+        Boxes to begin with.
     most : int
         Largest number of boxes that are evaluated.
 
@@ -80,28 +81,23 @@ def cover(
     Cover
         Boxes, certified or not.
     """
-    unknowns = len(domain)
-    left = np.zeros((1, unknowns, 2), dtype=np.int64) if start is None else start
-    done: list[IntArray] = []
+    left, none = start, start[:0]
+    done: list[IntArray] = [none]
     evaluated = 0
     while len(left) and evaluated < most:
         batch, left = left[-_BATCH:], left[:-_BATCH]
-        found, widths = evaluate(bounds(batch, domain))
+        found, widths = evaluate(batch)
         evaluated += len(batch)
         centre, shares, rest = found[..., 0], found[..., 1:-1], found[..., -1]
         certain = (centre > (shares.sum(axis=-1) + rest) * (1.0 + 1e-12)).all(axis=-1)
-        wrong = (centre < -rest).any(axis=-1)
-        if wrong.any():
-            bad = bounds(batch, domain)[np.flatnonzero(wrong)[0]]
-            return Cover(_joined(done, unknowns), np.concatenate([left, batch]), evaluated, bad)
+        wrong = np.flatnonzero((centre < -rest).any(axis=-1))
+        if wrong.size:
+            bad = batch[wrong[:1]]
+            return Cover(np.concatenate(done), np.concatenate([left, batch]), evaluated, bad)
         done.append(batch[certain])
         open_ = ~certain
         left = np.concatenate([left, _halved(batch[open_], found[open_], widths[open_])])
-    return Cover(_joined(done, unknowns), left, evaluated, np.zeros((0, unknowns, 2)))
-
-
-def _joined(parts: list[IntArray], unknowns: int) -> IntArray:
-    return np.concatenate([np.zeros((0, unknowns, 2), dtype=np.int64), *parts])
+    return Cover(np.concatenate(done), left, evaluated, none)
 
 
 def _halvings(found: Array, widths: Array) -> IntArray:
@@ -152,22 +148,32 @@ def _halved(boxes: IntArray, found: Array, widths: Array) -> IntArray:
 
 def covers(boxes: IntArray) -> bool:
     """Whether boxes, rows of (level, index) by unknown, fill the unit cube: by halving it."""
-    unknowns = boxes.shape[1]
-    cells = [(np.zeros(unknowns, int), np.zeros(unknowns, int), np.arange(len(boxes)))]
-    while cells:
-        level, index, rows = cells.pop()
-        if not len(rows):
+    number, unknowns = boxes.shape[:2]
+    level, index = np.zeros((2, 1, unknowns), dtype=np.int64)
+    rows, cell = np.arange(number), np.zeros(number, dtype=np.int64)
+    while len(level):
+        finer = boxes[rows, :, 0] > level[cell]
+        filled = np.zeros(len(level), dtype=bool)
+        filled[cell[~finer.any(axis=1)]] = True
+        kept = ~filled[cell]
+        rows, finer, cell = rows[kept], finer[kept], cell[kept]
+        split = np.flatnonzero(~filled)
+        if len(np.unique(cell)) < len(split):
             return False
-        finer = boxes[rows, :, 0] > level
-        if (~finer.any(axis=1)).any():
-            continue
-        axis = int(np.argmax(finer.sum(axis=0)))
+        renumbered = np.cumsum(~filled) - 1
+        cell, level, index = renumbered[cell], level[split], index[split]
+        wanted = np.stack([np.bincount(cell, one, len(split)) for one in finer.T], axis=1)
+        axis = wanted.argmax(axis=1)
+        at = np.arange(len(split)), axis
+        level[at] += 1
+        index[at] *= 2
+        own = boxes[rows, axis[cell]]
+        shift = own[:, 0] - level[at][cell]
+        parts = []
         for half in (0, 1):
-            lower, at = level.copy(), index.copy()
-            lower[axis] += 1
-            at[axis] = 2 * at[axis] + half
-            own = boxes[rows, axis]
-            shift = own[:, 0] - lower[axis]
-            inside = np.where(shift >= 0, own[:, 1] >> np.maximum(shift, 0) == at[axis], True)
-            cells.append((lower, at, rows[inside]))
+            inside = (shift < 0) | (own[:, 1] >> np.maximum(shift, 0) == index[at][cell] + half)
+            parts.append((rows[inside], 2 * cell[inside] + half))
+        rows, cell = (np.concatenate(one) for one in zip(*parts, strict=True))
+        level, index = level.repeat(2, axis=0), index.repeat(2, axis=0)
+        index[np.arange(1, len(index), 2), axis] += 1
     return True

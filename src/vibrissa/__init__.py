@@ -15,6 +15,7 @@ from vibrissa._version import __version__
 if TYPE_CHECKING:
     from vibrissa import (
         cameras,
+        certificates,
         contacts,
         contour,
         evaluation,
@@ -93,6 +94,7 @@ __all__ = [
     "base_signals",
     "best_triplet",
     "cameras",
+    "certificates",
     "contacts",
     "contour",
     "critical_cones",

@@ -63,6 +63,34 @@ def test_views_together_say_where_the_whisker_begins(filmed):
     assert find_bases(filmed.cameras, [frames[0], np.roll(frames[1], 40, axis=1)]) is None
 
 
+def past_a_peg(away, grey, seed):
+    """A straight line before the edge of a peg with a dark stripe, so far from it, and its row."""
+    x, y = np.arange(240.0), np.arange(140.0)[:, None]
+    line = 70.0 - away
+    whisker = 0.4 * np.exp(-0.5 * ((y - line) / 1.1) ** 2) * (x >= 20.0)
+    inward = 22.0 - np.hypot(x - 150.0, y - 92.0)
+    peg = 1.0 / (1.0 + np.exp(np.clip(-3.0 * inward, -40.0, 40.0)))
+    body = grey * (1.0 - 0.8 * np.exp(-0.5 * ((inward - 4.0) / 1.2) ** 2))
+    picture = (190.0 * (1.0 - peg) + body * peg) * (1.0 - whisker)
+    picture += np.random.default_rng(seed).normal(0.0, 2.0, picture.shape)
+    return np.clip(picture, 0, 255).astype(np.uint8), line
+
+
+@pytest.mark.parametrize(("grey", "at"), [(25.0, 1.0), (130.0, -1.5)], ids=["dark", "shiny"])
+def test_the_edge_of_what_never_moves_draws_no_trace_aside(grey, at):
+    away = [*np.linspace(16.0, at, 15), *[at] * 15, *np.linspace(at, 16.0, 10)]
+    frames, lines = zip(*(past_a_peg(a, grey, i) for i, a in enumerate(away)), strict=True)
+    (row,) = trace_video(list(frames), [(20.0, lines[0])], TraceOptions(shortest=60.0))
+    for trace, line in zip(row, lines, strict=True):
+        beside = np.abs(trace.line[:, 0] - 150.0) < 20.0
+        assert beside.sum() > 15
+        assert np.abs(trace.line[beside, 1] - line).max() < 0.4
+    # Where whisker and edge coincide the trace is less certain than elsewhere.
+    sigma = row[20].sigma
+    near, far = (np.abs(row[20].line[:, 0] - at) < 10.0 for at in (150.0, 70.0))
+    assert sigma[near].max() > 1.5 * sigma[far].max()
+
+
 def test_frames_of_another_size_are_refused():
     with pytest.raises(ValueError, match="frame 1 has 100 × 120 pixels"):
         trace_video([image(30, 170), image(30, 170)[:, :100]], [(30.0, 53.0)])

@@ -24,10 +24,10 @@ Mask = NDArray[np.bool_]
 NEAR = 5.0
 """Distance up to which another whisker is in the way, pixels, for a whisker of usual width."""
 
-STILL = 1
-"""Bit of what stands still."""
+STILL, EDGE = np.uint32(1), np.uint32(2)
+"""Bits of still things that hide whiskers, and of those before or next to which they show."""
 
-_WHISKERS = 31
+_WHISKERS = 30
 """Number of bits for whiskers."""
 
 
@@ -39,10 +39,22 @@ class Clutter(NamedTuple):
 
     def hides(self, points: Array) -> Mask:
         """Whether something is in the way of points (n, 2)."""
+        return self._at(points, self.which)
+
+    def disturbs(self, points: Array) -> Mask:
+        """Whether something that never moves is behind points (n, 2) or next to them."""
+        return self._at(points, int(EDGE))
+
+    def _at(self, points: Array, which: int) -> Mask:
         rows, columns = self.bits.shape
         column, row = np.rint(points).astype(np.intp).T
         found = self.bits[row.clip(0, rows - 1), column.clip(0, columns - 1)]
-        return np.asarray((found & np.uint32(self.which)) != 0)
+        return np.asarray((found & np.uint32(which)) != 0)
+
+    @property
+    def still_only(self) -> Clutter:
+        """What stands still, without other whiskers."""
+        return self._replace(which=int(STILL))
 
 
 NOTHING = Clutter(np.zeros((1, 1), dtype=np.uint32), 0)
@@ -58,19 +70,19 @@ def in_the_way(bits: Any, which: Any, x: float, y: float) -> Any:
 
 
 def between_whiskers(
-    lines: Sequence[Array | None], still: Mask | None, shape: tuple[int, int], near: float = NEAR
+    lines: Sequence[Array | None], still: Bits | None, shape: tuple[int, int], near: float = NEAR
 ) -> list[Clutter]:
     """What is in the way of each of some whiskers, whose lines (n, 2) are about known, or None."""
-    bits = np.zeros(shape, np.uint32) if still is None else still.astype(np.uint32)
+    bits = np.zeros(shape, np.uint32) if still is None else still.copy()
     for k, line in enumerate(lines):
         if line is not None and len(line):
             paint(bits, np.ascontiguousarray(line), near, np.uint32(_own(k)))
-    every = (1 << (_WHISKERS + 1)) - 1
+    every = (1 << 32) - 1 - int(EDGE)
     return [Clutter(bits, every & ~_own(k)) for k in range(len(lines))]
 
 
 def _own(whisker: int) -> int:
-    return STILL << (1 + whisker % _WHISKERS)
+    return 1 << (2 + whisker % _WHISKERS)
 
 
 @kernel

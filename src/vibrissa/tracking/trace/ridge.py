@@ -324,6 +324,9 @@ OUTSIDE = 12.0
 FEWEST = 12
 """Number of points of the shortest line that is considered."""
 
+_DISTURBED = 0.15
+"""Standard deviation next to an edge that never moves, common to neighbouring points, pixels."""
+
 _FUR = 3
 """Number of points next to the face that are not measured: fur is dark too."""
 
@@ -397,6 +400,7 @@ def measured(
     information = np.convolve(weight, np.ones(min(9, n)), mode="same")
     sigma = 1.0 / np.sqrt(np.maximum(information, 1.0))
     sigma += 0.05 * (0.1 * STEP * _distance_to_seen(seen)) ** 1.5
+    sigma = np.hypot(sigma, np.where(clutter.disturbs(line), _DISTURBED, 0.0))
     shown = ~clutter.hides(line)
     open_ = shown & (flank > 0.6 * np.median(flank[shown] if shown.any() else flank))
     return better, Measured(amplitude, sigma, seen, open_, noise * float(np.sqrt(excess)))

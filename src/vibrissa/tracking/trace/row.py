@@ -19,7 +19,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
 from vibrissa.io import Frame
-from vibrissa.tracking.trace.clutter import NEAR, STILL, between_whiskers
+from vibrissa.tracking.trace.clutter import NEAR, between_whiskers
 from vibrissa.tracking.trace.curves import Curve, find_curves
 from vibrissa.tracking.trace.follower import Follower, features_of
 from vibrissa.tracking.trace.identity import (
@@ -145,12 +145,12 @@ def _part(
 ) -> None:
     """Let nothing be measured where whiskers lie on one another, on known or expected lines."""
     every = [lines.get(k, follower.expected) for k, follower in enumerate(followers)]
-    still = None if scene is None else scene.still
+    still = None if scene is None else scene.bits
     near = NEAR * followers[0].options.scale
     parted = between_whiskers(every, still, (frame.shape[0], frame.shape[1]), near)
     for follower, line, clutter in zip(followers, every, parted, strict=True):
         alone = line is not None and clutter.hides(line).mean() < _MERGED
-        follower.clutter = clutter if alone else clutter._replace(which=clutter.which & STILL)
+        follower.clutter = clutter if alone else clutter.still_only
 
 
 def _begun(
@@ -341,7 +341,7 @@ def _pool(
     options = followers[0].options
     missing = [followers[k] for k in own if k not in clear]
     taken = [trace.line for trace in (*clear.values(), *fixed.values())]
-    still = None if scene is None else scene.still
+    still = None if scene is None else scene.bits
     shape = (frame.shape[0], frame.shape[1])
     # For a whisker of which nothing is known yet all others are in the way.
     clutter = between_whiskers([*taken, None], still, shape, NEAR * options.scale)[-1]

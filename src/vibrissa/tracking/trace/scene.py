@@ -9,7 +9,7 @@ difference from it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from vibrissa.io import Frame
 from vibrissa.numerics import kernel
+from vibrissa.tracking.trace.clutter import EDGE, STILL, Bits
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -55,6 +56,28 @@ _LARGE = 0.02
 _BESIDE = 10.0
 """Distance from a face up to which a point is taken to be on it, pixels."""
 
+_LINE = 0.06
+"""Share of the light by which a thin line that never moves is darker."""
+
+_MANY = 15
+"""Number of frames from which it is clear what never moves."""
+
+_LONG, _THICK = 60, 5
+"""Extent of the smallest still line and half the width of the thinnest still body, pixels."""
+
+_BLUR, _AROUND = 3, 12.0
+"""How far an edge is blurred, and the smoothing of the light around still things, pixels."""
+
+_ENOUGH = 0.02
+"""Share of open ground around a pixel from which its light is known."""
+
+_OPAQUE, _SEEN = 0.5, 1
+"""Share of the light below which nothing is seen before a still thing, and how far from there a
+whisker's middle must be, pixels."""
+
+_AT_BASE = 25.0
+"""Distance from a base within which a still thing is taken to be the face, pixels."""
+
 _RANGE = (-20.0, 80.0)
 """Differences that count, grey values: what is darker or brighter counts as these."""
 
@@ -89,7 +112,9 @@ class Scene:
     background: Image | None
     sample: Image
     thin: int
-    still: NDArray[np.bool_] | None = None
+    ground: Image
+    count: int
+    still: Still | None = None
 
     @classmethod
     def of(cls, frames: Sequence[Frame], scale: float = 1.0) -> Scene:
@@ -106,7 +131,9 @@ class Scene:
             background -= np.median(background[::_SPARSE, ::_SPARSE] - usual)
         still = _closed(_halved(frames[0] if background is None else background), thin + 2)
         light = _doubled(_smoothed(still, _SOFT), frames[0].shape)
-        return cls(light, _level(still), background, np.asarray(usual, dtype=np.float32), thin)
+        ground, share = _ground(still)
+        usual = np.asarray(usual, dtype=np.float32)
+        return cls(light, share * ground, background, usual, thin, ground, len(frames))
 
     def gain(self, frame: Frame) -> float:
         """Brightness of a frame relative to the scene."""
@@ -132,6 +159,52 @@ class Scene:
         darker(frame, self.light, self.gain(frame), *_RANGE, out)
         return out
 
+    @property
+    def bits(self) -> Bits | None:
+        """Bits of `Clutter` of what never moves; None if it is not known."""
+        return None if self.still is None else self.still.bits
+
+    def without_still(self, frame: Frame) -> Frame:
+        """Give a frame without what never moves, where that is known."""
+        return frame if self.still is None else self.still.removed(frame, self.gain(frame))
+
+    def with_still(self, bases: Array) -> Scene:
+        """Find what never moves, if it is known, but for what whiskers begin at (n, 2)."""
+        from scipy.ndimage import (
+            binary_dilation,
+            binary_erosion,
+            find_objects,
+            gaussian_filter,
+            label,
+        )
+
+        if self.background is None or self.count < _MANY:
+            return self
+        shown = np.maximum(self.background, 1.0)
+        ground = _doubled(self.ground, shown.shape)
+        stands = np.abs(shown / ground - 1.0) > 1.0 - _LIT
+        stands = binary_dilation(stands | (self.light / shown - 1.0 > _LINE), iterations=_BLUR)
+        known = np.where(stands, 0.0, 1.0).astype(np.float32)
+        weight, light = (gaussian_filter(one, _AROUND) for one in (known, known * shown))
+        open_ = np.where(weight > _ENOUGH, light / np.maximum(weight, 1e-6), ground)
+        parts, _ = label(stands)
+        # The face moves, with whatever hangs on it.
+        row, column = (np.arange(n) for n in stands.shape)
+        for x, y in bases:
+            near = np.hypot.outer(row - y, column - x) < _AT_BASE
+            stands &= ~np.isin(parts, np.unique(parts[near & stands]))
+        # Where whiskers cross or turn it is always dark too, though not over a long way.
+        thick = binary_erosion(stands, iterations=_BLUR + _THICK)
+        boxes = enumerate(find_objects(parts), 1)
+        long = [k for k, box in boxes if max(side.stop - side.start for side in box) >= _LONG]
+        stands &= np.isin(parts, long) | np.isin(parts, np.unique(parts[thick]))
+        at = np.flatnonzero(stands)
+        factor = (open_ / shown).ravel()[at]
+        dark = stands & (shown < _OPAQUE * open_)
+        bits = STILL * binary_dilation(dark, iterations=_SEEN).astype(np.uint32)
+        bits |= EDGE * stands.astype(np.uint32)
+        return replace(self, still=Still(at, factor, open_.ravel()[at], bits))
+
     def moved(self, frame: Frame, points: Array, gain: float) -> float:
         """Share of dark points of a frame, of known brightness, that are usually not dark."""
         if self.background is None:
@@ -140,6 +213,31 @@ class Scene:
         grey = frame[row, column].astype(np.float64)
         whole = gain * self.light[row, column] - grey
         return float((gain * self.background[row, column] - grey > 0.5 * whole).mean())
+
+
+@dataclass(frozen=True, eq=False)
+class Still:
+    """What never moves: pixels, and by how much they are darker than open ground would be.
+
+    Divided by that, an image shows a whisker before bright or grey things, or next to an edge, as
+    it would before open ground. Where little light is left nothing can be seen.
+    """
+
+    at: NDArray[np.intp]
+    factor: Array
+    open: Array
+    bits: Bits
+
+    def removed(self, frame: Frame, gain: float) -> Frame:
+        """Give a frame, of known brightness, without it."""
+        if not self.at.size:
+            return frame
+        out = frame.copy()
+        flat, most = out.reshape(-1), np.iinfo(frame.dtype).max
+        opaque = self.factor > 1.0 / _OPAQUE
+        grey = np.where(opaque, gain * self.open, self.factor * flat[self.at])
+        flat[self.at] = np.minimum(grey + 0.5, most).astype(frame.dtype)
+        return out
 
 
 def _gain(sparse: Any, usual: Any) -> float:
@@ -175,8 +273,8 @@ def _smoothed(image: Image, sigma: float) -> Image:
     return np.asarray(gaussian_filter(image, sigma, truncate=3.0, mode="nearest"))
 
 
-def _level(still: Image) -> Image:
-    """Grey values below which there is a body: a share of the light, which may fall unevenly."""
+def _ground(still: Image) -> tuple[Image, np.float32]:
+    """Light on open ground, which may fall unevenly, and the share of it below which bodies are."""
     part = still[::4, ::4].astype(np.float64)
     rows, columns = (np.linspace(-1.0, 1.0, n) for n in still.shape)
 
@@ -199,7 +297,7 @@ def _level(still: Image) -> Image:
         )[0]
     whole = terms(*np.meshgrid(rows, columns, indexing="ij"))
     share = _threshold(np.exp(value - design @ coefficients))
-    return np.asarray(share * np.exp(whole @ coefficients), dtype=np.float32)
+    return np.asarray(np.exp(whole @ coefficients), dtype=np.float32), np.float32(share)
 
 
 def _threshold(share: Array) -> float:

@@ -21,6 +21,7 @@ from vibrissa.io import (
     video_info,
     without_part,
 )
+from vibrissa.tracking.trace.clutter import between_whiskers
 from vibrissa.tracking.trace.curves import find_whiskers
 from vibrissa.tracking.trace.follower import Follower, features_of, start_at
 from vibrissa.tracking.trace.identity import Seen, decided
@@ -41,7 +42,7 @@ _AGREES = 0.9
 """Share of a line along another one from which both are the same."""
 
 _SCENE = 30
-"""Number of first frames from which light and background are taken."""
+"""Number of frames from which light and background are taken."""
 
 _SPAN = 400
 """Number of frames at the beginning of a film from which those for its start are taken."""
@@ -55,6 +56,7 @@ def trace_video(
     corrections: Corrections | None = None,
     begun: Sequence[Sequence[Trace]] = (),
     kept: list[list[Trace]] | None = None,
+    sample: Sequence[Frame] | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> list[list[Trace]]:
     """Trace whiskers from frame to frame.
@@ -76,6 +78,9 @@ def trace_video(
         Traces of the first frames, made before: taken as they are.
     kept : list, optional
         List that is filled with the result while it is made, for the case of an interruption.
+    sample : sequence of array (height, width), optional
+        Frames spread over the film, which show what never moves; by default some of ``frames`` if
+        they are a sequence, else the first 30.
     progress : callable, optional
         Function that is called after every frame with the number of frames done.
 
@@ -92,32 +97,35 @@ def trace_video(
     """
     options = options or TraceOptions()
     corrections = corrections or {}
-    followers: list[Follower] = []
     traces: list[list[Trace]] = [] if kept is None else kept
     done = len(begun[0]) if begun else 0
     recent: deque[Frame] = deque(maxlen=_BACK)
     seen: list[Seen] = []
-    starts, bright, shape = np.empty((0, 2)), False, (0, 0)
-    scene: Scene | None = None
     source = iter(frames)
     first = list(islice(source, _SCENE))
+    if not first:
+        return traces
+    if sample is None:
+        sample = frames[:: max(1, len(frames) // _SCENE)] if isinstance(frames, Sequence) else first
+    bright, shape = is_bright(first[0], bases, options), first[0].shape
+    start = negative(first[0]) if bright else first[0]
+    followers = _begun(start, bases, begun if done else (), options)
+    begins = [follower.base for follower in followers] if bases is None else bases
+    starts = np.array(begins, dtype=np.float64)
+    alike = [negative(f) if bright else f for f in sample if f.shape == shape]
+    scene = Scene.of(alike, options.scale).with_still(starts)
+    (still,) = between_whiskers([None], scene.bits, start.shape)
+    for follower in followers:
+        follower.clutter = still.still_only
+    traces[:] = [list(row) for row in begun] or [[] for _ in followers]
+    _check(corrections, len(followers))
     for i, frame in enumerate(chain(first, source)):
-        if i == 0:
-            bright, shape = is_bright(frame, bases, options), frame.shape
-            alike = [negative(f) if bright else f for f in first if f.shape == shape]
-            scene = Scene.of(alike, options.scale)
         if frame.shape != shape:
             raise ValueError(
                 f"frame {i} has {frame.shape[1]} × {frame.shape[0]} pixels and those before it "
                 f"{shape[1]} × {shape[0]}: a video is needed whose frames are of one size"
             )
-        frame = negative(frame) if bright else frame
-        if i == 0:
-            followers = _begun(frame, bases, begun if done else (), options)
-            begins = [follower.base for follower in followers] if bases is None else bases
-            starts = np.array(begins, dtype=np.float64)
-            traces[:] = [list(row) for row in begun] or [[] for _ in followers]
-            _check(corrections, len(followers))
+        frame = scene.without_still(negative(frame) if bright else frame)
         if i < done:
             recent.append(frame)
             if len(followers) > 1:
@@ -129,7 +137,7 @@ def trace_video(
             row.append(trace)
         for k in range(len(followers)):
             if k in known:
-                _backward(traces[k], recent, k, corrections, options, seen)
+                _backward(traces[k], recent, followers[k], k, corrections, seen)
         recent.append(frame)
         if progress is not None:
             progress(i + 1)
@@ -216,13 +224,13 @@ def follow_all(
 def _backward(
     row: list[Trace],
     recent: Sequence[Frame],
+    ahead: Follower,
     whisker: int,
     corrections: Corrections,
-    options: TraceOptions,
     seen: Sequence[Seen],
 ) -> None:
     """Trace back from a corrected frame, the last of the row, until nothing changes."""
-    follower = Follower(row[-1].line[0], options)
+    follower = Follower(row[-1].line[0], ahead.options, clutter=ahead.clutter.still_only)
     follower.restart(row[-1])
     for back, frame in enumerate(reversed(recent)):
         i = len(row) - 2 - back
@@ -351,6 +359,7 @@ def trace_file(
             corrections=corrections,
             begun=begun,
             kept=kept,
+            sample=start_frames([video])[1][0],
             progress=report,
         )
     finally:

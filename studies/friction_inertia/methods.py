@@ -13,7 +13,6 @@ from vibrissa.contour import axis_offset, fit_shape
 from vibrissa.evaluation import REPLICATES
 from vibrissa.pipeline import (
     SOLVED_TO,
-    component_noise,
     fit_contacts,
     in_laboratory,
     locate,
@@ -21,7 +20,7 @@ from vibrissa.pipeline import (
     whisker_radii,
 )
 from vibrissa.recording import Recording
-from vibrissa.sensors import FORCE_NOISE, MOMENT_NOISE
+from vibrissa.sensors import FORCE_NOISE, MOMENT_NOISE, component_noise
 from vibrissa.signals import SIGNALS, nearest_on_rest
 from vibrissa.whisker import Whisker
 

@@ -13,7 +13,6 @@ from vibrissa.pipeline import (
     STRONG,
     compare_contacts,
     compare_shapes,
-    component_noise,
     distances_by_class,
     estimates_of,
     fit_contacts,
@@ -30,6 +29,7 @@ from vibrissa.pipeline import (
 from vibrissa.pipeline.locate import without_contact
 from vibrissa.pipeline.reconstruct import frames_together
 from vibrissa.recording import Recording
+from vibrissa.sensors import component_noise
 from vibrissa.simulation import facing_peg, measure, simulate, sweep_past
 from vibrissa.status import Status
 

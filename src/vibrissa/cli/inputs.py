@@ -108,7 +108,7 @@ class NoiseOptions:
 
         if self.covariance is None:
             force, moment = self._usual()
-            return vb.pipeline.component_noise(force * 1e-6, moment * 1e-6)
+            return vb.sensors.component_noise(force * 1e-6, moment * 1e-6)
         try:
             rows = vb.io.table_rows(vb.io.read_text(self.covariance))
             covariance = np.array([[float(cell) for cell in cells] for _, cells in rows])

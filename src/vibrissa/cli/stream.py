@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 import time
-from collections.abc import Iterable, Iterator
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from io import TextIOWrapper
 from itertools import islice
@@ -219,7 +220,7 @@ def stream(
     Example: `vibrissa stream --udp 127.0.0.1:5005 --map wire.nc --sensor sensor.toml`
     """
     sensor, poses = measured.described(), follow.poses()
-    with ending_in_order(), ExitStack() as opened:
+    with ending_in_order(), _without_long_collections() as settled, ExitStack() as opened:
         writer = None
         if bag is not None:
             frame = "laboratory" if follow.filter else "whisker"
@@ -229,6 +230,7 @@ def stream(
         estimator = measured.estimator(sensor)
         running = follow.running(estimator, sensor, poses, source.bag, measured.tare or 0)
         running.warm_up()
+        settled()
         losses = None if heard is None else _Losses(heard)
         if losses is not None:
             remark("ready")
@@ -245,6 +247,25 @@ def stream(
     _report(running, lost, follow.filter)
     if recorder is not None and recorder.broken:
         raise typer.Exit(1)
+
+
+@contextmanager
+def _without_long_collections() -> Iterator[Callable[[], None]]:
+    """Collect no garbage until all is loaded, and what is there then never.
+
+    To look through all objects of the libraries takes longer than a sample may wait.
+    """
+
+    def settled() -> None:
+        gc.freeze()
+        gc.enable()
+
+    gc.disable()
+    try:
+        yield settled
+    finally:
+        gc.enable()
+        gc.unfreeze()
 
 
 def _report(running: vb.streaming.ContactStream, lost: str, follow: bool) -> None:

@@ -13,7 +13,6 @@ from vibrissa.pipeline.frames import (
 from vibrissa.pipeline.locate import (
     DETECTED as DETECTED,
     TRIPLET as TRIPLET,
-    component_noise as component_noise,
     locate,
     locate_from_wrench,
 )

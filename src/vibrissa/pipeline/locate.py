@@ -47,6 +47,7 @@ from vibrissa.contacts import (
 from vibrissa.quantities import attributes
 from vibrissa.recording import Group
 from vibrissa.rod import Discretization, contact_tangents, discretize, solve_forces
+from vibrissa.sensors import component_noise
 from vibrissa.signals import base_signals, selection, signals_of
 from vibrissa.status import Status, flag_attributes
 from vibrissa.whisker import Whisker
@@ -88,11 +89,6 @@ class _Candidates(NamedTuple):
         one = found.candidates
         arrays = (one.point, one.arc_length, one.force, one.contact_force)
         return cls(*arrays, found.n_candidates, found.status)
-
-
-def component_noise(force_noise: float, moment_noise: float) -> Array:
-    """Covariance of a sensor whose components have independent noise."""
-    return np.diag(np.repeat([force_noise**2, moment_noise**2], 3))
 
 
 def locate(

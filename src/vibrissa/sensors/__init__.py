@@ -7,7 +7,14 @@ from vibrissa.sensors.mixing import (
     calibrate_mixing,
     calibrate_on_contacts,
 )
-from vibrissa.sensors.sensor import COMPONENTS, FORCE_NOISE, GRAVITY, MOMENT_NOISE, Sensor
+from vibrissa.sensors.sensor import (
+    COMPONENTS,
+    FORCE_NOISE,
+    GRAVITY,
+    MOMENT_NOISE,
+    Sensor,
+    component_noise,
+)
 from vibrissa.sensors.stage import Stage, StageSweep, StageTouches, load_suspended, save_suspended
 from vibrissa.sensors.stiffness import StiffnessFit, fit_stiffness
 from vibrissa.sensors.suspended import SuspendedWhisker, Touches
@@ -40,6 +47,7 @@ __all__ = [
     "calibrate_on_contacts",
     "calibrate_suspension",
     "calibrate_weight",
+    "component_noise",
     "fit_stiffness",
     "follow_sweep",
     "load_sensor",

@@ -401,6 +401,11 @@ class Sensor:
         return np.asarray(np.clip(reading, -self.largest, self.largest))
 
 
+def component_noise(force_noise: float, moment_noise: float) -> Array:
+    """Covariance of a sensor whose components have independent noise."""
+    return np.diag(np.repeat([force_noise**2, moment_noise**2], 3))
+
+
 def _checked_mixing(names: tuple[str, ...], mixing: Any, faults: list[str]) -> Array:
     """Mixing (k, 6) of channels; what is wrong is added to the faults."""
     array = np.array(1.0 if mixing is None else mixing, dtype=np.float64)

@@ -74,6 +74,7 @@ class ContactStream:
         if tare and estimator.sensor is None:
             raise ValueError("the offset is that of a sensor's channels, and there is no sensor")
         by_name = estimator.announced
+        self._announced = by_name
         self.lines = Lines(names, raw=True) if names else Lines(by_name, _components(by_name))
         self.samples, self.faults = 0, 0
         self._estimator, self._follow = estimator, follow
@@ -128,22 +129,23 @@ class ContactStream:
         (self._follow or self._estimator).reset()
 
     def warm_up(self) -> None:
-        """Locate a contact of the whisker once, so that no sample waits for code to be compiled."""
+        """Locate what samples may be of once each, so that none waits for code to be loaded.
+
+        These are a contact, a lighter one, a free whisker and a wrench that no contact has.
+        """
         whisker, sensor = self._estimator.contact_map.whisker, self._estimator.sensor
         size = 0.5 * whisker.base_bending_stiffness / whisker.length**2
         bent = deflect(whisker, PointForce(0.7 * whisker.length, size, 0.5))
-        turn = np.eye(3)
-        if sensor is None:
-            names = self._estimator.announced
-            signals = signals_of(bent.force, bent.moment)
-            values = signals[[SIGNALS.index(name) for name in names]]
-        else:
-            wrench = np.concatenate([bent.force, bent.moment])
-            values = sensor.read([0.0], wrench[None], rotation=turn[None])[0]
-        self._estimator(values, turn)
-        if self._follow is not None:
-            for time in (0.0, 1e-3):
-                self._follow(time, values, turn)
+        contact, turn = np.concatenate([bent.force, bent.moment]), np.eye(3)
+        for k, share in enumerate((1.0, 0.9, 0.0, -1.0)):
+            wrench = share * contact
+            if sensor is None:
+                values = signals_of(wrench[:3], wrench[3:])[self._which]
+            else:
+                values = sensor.read([0.0], wrench[None], rotation=turn[None])[0]
+            self._estimator(values, turn)
+            if self._follow is not None:
+                self._follow(1e-3 * k, values, turn)
         (self._follow or self._estimator).reset()
 
     def record(self, sample: Sample) -> dict[str, Any]:
@@ -183,7 +185,7 @@ class ContactStream:
         if len(self._free) < self._tare:
             return known | {"status": self._tared(sample.values, rotation)}
         values = sample.values - self._offset
-        if self._which and sample.names != self._estimator.announced:
+        if self._which and sample.names != self._announced:
             wrench = np.zeros(6)
             wrench[[COMPONENTS.index(name) for name in sample.names]] = values
             values = signals_of(wrench[:3], wrench[3:])[self._which]
@@ -271,7 +273,10 @@ def as_json(record: dict[str, Any]) -> str:
     str
         The line.
     """
-    return json.dumps(_finite(record), ensure_ascii=False)
+    try:
+        return json.dumps(record, ensure_ascii=False, allow_nan=False)
+    except ValueError:
+        return json.dumps(_finite(record), ensure_ascii=False)
 
 
 def _place(point: Array) -> dict[str, float]:

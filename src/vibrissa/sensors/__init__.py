@@ -13,7 +13,7 @@ from vibrissa.sensors.sensor import (
     GRAVITY,
     MOMENT_NOISE,
     Sensor,
-    component_noise,
+    component_noise as component_noise,
 )
 from vibrissa.sensors.stage import Stage, StageSweep, StageTouches, load_suspended, save_suspended
 from vibrissa.sensors.stiffness import StiffnessFit, fit_stiffness
@@ -47,7 +47,6 @@ __all__ = [
     "calibrate_on_contacts",
     "calibrate_suspension",
     "calibrate_weight",
-    "component_noise",
     "fit_stiffness",
     "follow_sweep",
     "load_sensor",

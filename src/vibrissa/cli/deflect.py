@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 import typer
 
@@ -29,6 +30,7 @@ def deflect(
     gravity: str | None = None,
     density: float | None = None,
     proximal: float | None = None,
+    device: Literal["cpu", "cuda"] = "cpu",
 ) -> None:
     """Bend a whisker by a point, a force or a peg, and print force and moment at its base.
 
@@ -46,7 +48,7 @@ def deflect(
     pull = None if gravity is None else numbers(gravity, _XYZ, "--gravity")
     say(repr(whisker))
     print_notes(whisker)
-    bent = vb.deflect(whisker, load, gravity=pull, proximal=smallest_arc(proximal))
+    bent = vb.deflect(whisker, load, gravity=pull, proximal=smallest_arc(proximal), device=device)
     status = vb.Status(int(bent.status))
     # The advice by the name that the option has here.
     option = " The option is --proximal." if status == vb.Status.TOO_PROXIMAL else ""

@@ -147,6 +147,10 @@ OPTIONS = {
         "0.3 by default.",
         "SHARE",
     ),
+    "device": Option(
+        "Where it is computed: cpu, or cuda, an NVIDIA GPU (extra `gpu`), for a --point or a "
+        "--point-force."
+    ),
     "force_noise": Option(
         "Standard deviation of a force component, µN; by default as recorded, or 1.",
         "µN",

@@ -21,13 +21,16 @@ if TYPE_CHECKING:
         rigorous,
         specialised,
     )
+    from vibrissa.numerics.device import Translation, check_device
     from vibrissa.numerics.quantiles import contact_weights, weighted_quantile
 
 __all__ = [
     "AnyArray",
     "Array",
     "IntArray",
+    "Translation",
     "Vector",
+    "check_device",
     "cholesky",
     "contact_weights",
     "copy",
@@ -48,6 +51,7 @@ __all__ = [
 _HOMES = {
     "algebra": ("cholesky", "norm3", "solve", "solve3", "wrapped"),
     "compiled": ("copy", "inlined", "inlined_rigorous", "kernel", "rigorous", "specialised"),
+    "device": ("Translation", "check_device"),
     "quantiles": ("contact_weights", "weighted_quantile"),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}

@@ -23,6 +23,7 @@ from vibrissa.rod.kernels import (
     set_lane,
     whisker_radius,
 )
+from vibrissa.rod.rows import share_rows
 from vibrissa.rod.weight import integrate_weighted
 
 
@@ -47,7 +48,7 @@ def evaluate(
     """Base force and contact point of many contacts."""
     b, four = np.zeros(BUFFER_SIZE), np.empty((6, 4))
     wanted = tangents.shape[0] > 0
-    if wanted and last == first + 1:  # a contact by itself: its tangents side by side
+    if LANES > 1 and wanted and last == first + 1:  # a contact by itself: its tangents side by side
         c = contacts[first]
         set_all_lanes(b, c[0], c[1], c[2], c[3])
         integrate(rod, b, 1)
@@ -75,7 +76,7 @@ def relative_radius(rod: Rod, s: float) -> tuple[float, float]:
 
 
 def solve_forces(
-    discretization: Discretization, contacts: Array, tangents: bool = False
+    discretization: Discretization, contacts: Array, tangents: bool = False, device: str = "cpu"
 ) -> tuple[Array, Array]:
     """Base force and contact point of contacts whose force is known, non-dimensional.
 
@@ -87,6 +88,8 @@ def solve_forces(
         Arc length and force in the material frame there, (s, f_x, f_y, f_z).
     tangents : bool
         Whether derivatives are wanted.
+    device : str
+        Device that computes, "cpu" or "cuda".
 
     Returns
     -------
@@ -99,8 +102,7 @@ def solve_forces(
     n = contacts.shape[0]
     values = np.empty((n, 6))
     derivatives = np.empty((n if tangents else 0, 6, 3))
-    rod = discretization.rod
-    share_out(n, lambda first, last: evaluate(rod, contacts, values, derivatives, first, last))
+    share_rows(evaluate, (discretization.rod,), (contacts,), (values, derivatives), device)
     return values, derivatives
 
 

@@ -121,7 +121,7 @@ def _integrate_rows(
         if active[i]:
             wanted = wanted or stale[i]
             number, only = number + 1, i
-    alone = wanted and number == 1  # its tangents side by side
+    alone = LANES > 1 and wanted and number == 1  # its tangents side by side
     if alone:
         set_all_lanes(b, xi[only, 0], 0.0, xi[only, 1], xi[only, 2])
     else:

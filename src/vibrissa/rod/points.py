@@ -34,6 +34,7 @@ from vibrissa.rod.discretization import Bendable, Rod
 from vibrissa.rod.integration import solve_forces
 from vibrissa.rod.kernels import BUFFER_SIZE, LANES
 from vibrissa.rod.newton import ABOVE_FOLD, TOLERANCE, newton_group, stable, start_from
+from vibrissa.rod.rows import share_rows
 from vibrissa.rod.search import MOST_SEEDS, seeds
 from vibrissa.rod.tree import SearchTree, search_tree
 from vibrissa.status import Status
@@ -305,13 +306,15 @@ class PointSolver:
             [np.full(len(p), int(r)) for p, r in zip(places, reasons, strict=True)]
         )
 
-    def solve(self, points: Array) -> Solutions:
+    def solve(self, points: Array, device: str = "cpu") -> Solutions:
         """Find the contact of least force that holds the whisker at each point.
 
         Parameters
         ----------
         points : (n, 3) array
             Contact points over L, whisker frame; NaN means missing.
+        device : str
+            Device that solves them, "cpu" or "cuda"; the few in doubt are left to the CPU.
 
         Returns
         -------
@@ -326,24 +329,8 @@ class PointSolver:
         xi, found = np.empty((there.size, 3)), np.empty((there.size, 6))
         residuals, solved = np.empty(there.size), np.zeros(there.size, np.int64)
         chart = self.chart
-        rod, fold = chart.discretization.rod, chart.fold
-        share_out(
-            there.size,
-            lambda first, last: _solve_points(
-                rod,
-                fold,
-                self._tree,
-                self._resting,
-                chart.proximal,
-                wanted,
-                xi,
-                found,
-                residuals,
-                solved,
-                first,
-                last,
-            ),
-        )
+        tables = chart.discretization.rod, chart.fold, self._tree, self._resting, chart.proximal
+        share_rows(_solve_points, tables, (wanted,), (xi, found, residuals, solved), device)
         good = solved > 0
         rows = there[good]
         contacts[rows, 0], contacts[rows, 1], contacts[rows, 2:] = xi[good, 0], 0.0, xi[good, 1:]

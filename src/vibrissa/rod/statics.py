@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.numerics import AnyArray, Array, IntArray
+from vibrissa.numerics import AnyArray, Array, IntArray, check_device
 from vibrissa.rod.chart import PROXIMAL
 from vibrissa.rod.deflection import Deflection, Load, PegContact, PointForce, vectors
 from vibrissa.rod.discretization import MOST_STEPS, STEPS, Bendable, Discretization, discretize
@@ -44,6 +44,7 @@ def deflect(
     gravity: ArrayLike | None = None,
     proximal: float = PROXIMAL,
     steps: int = STEPS,
+    device: str = "cpu",
 ) -> Deflection:
     """Bend a whisker quasi-statically.
 
@@ -65,6 +66,9 @@ def deflect(
         turns by less than about 65°, and to 1e-4 up to slip-off; the error falls with the sixth
         power. A ``PointForce`` that bends the whisker further gets as many more as it needs for
         1e-4.
+    device : str
+        Device that solves: "cpu", on all cores, or "cuda", an NVIDIA GPU (extra ``gpu``), for a
+        ``PointForce`` or a ``PointContact`` without gravity. The answers are the same to 1e-9.
 
     Returns
     -------
@@ -75,7 +79,10 @@ def deflect(
     Raises
     ------
     ValueError
-        If the load does not fit (see the loads), not if it has no equilibrium.
+        If the load does not fit (see the loads), not if it has no equilibrium; if the device
+        does not solve it.
+    ImportError, RuntimeError
+        If the device is a GPU, and the extra or the GPU is missing.
 
     Examples
     --------
@@ -91,8 +98,14 @@ def deflect(
         raise ValueError(
             f"a load is a PointForce, a PointContact or a PegContact; got {type(load).__name__}"
         )
+    check_device(device)
+    if device != "cpu" and (isinstance(load, PegContact) or gravity is not None):
+        got = type(load).__name__ + (" with gravity" if gravity is not None else "")
+        raise ValueError(
+            f"device {device!r} solves a PointForce or a PointContact without gravity; got a {got}"
+        )
     if gravity is None:
-        solved, needed = _solve(whisker, load, proximal, steps)
+        solved, needed = _solve(whisker, load, proximal, steps, device)
         return replace(dimensional(whisker, load, solved, steps), _needed=needed)
     directions = _gravities(gravity, load)
     kinds, kind = np.unique(directions, axis=0, return_inverse=True)
@@ -105,7 +118,7 @@ def deflect(
         rows = np.flatnonzero(kind.reshape(-1) == k)
         part = load if len(kinds) == 1 else load.rows(rows)
         bent = resting(whisker, one)
-        found, finer = _solve(bent, part, proximal, steps)
+        found, finer = _solve(bent, part, proximal, steps, device)
         solved.put(rows, found)
         if finer is not None:
             needed[rows] = finer
@@ -127,21 +140,21 @@ def _gravities(gravity: ArrayLike, load: Load) -> Array:
 
 
 def _solve(
-    bent: Bendable, load: Load, proximal: float, steps: int
+    bent: Bendable, load: Load, proximal: float, steps: int, device: str
 ) -> tuple[Solutions, IntArray | None]:
     """Solve loads; return, of known forces, how many steps each needs."""
     d = discretize(bent, steps)
     if isinstance(load, PointForce):
-        return _by_force(bent, d, load, steps)
+        return _by_force(bent, d, load, steps, device)
     if isinstance(load, PegContact):
         return _by_peg(bent, d, load, proximal, steps), None
     with np.errstate(over="ignore"):
         points = np.asarray(load.points).reshape(-1, 3) / d.length
-    return point_solver(bent, proximal, steps).solve(points), None
+    return point_solver(bent, proximal, steps).solve(points, device), None
 
 
 def _by_force(
-    whisker: Bendable, d: Discretization, load: PointForce, steps: int
+    whisker: Bendable, d: Discretization, load: PointForce, steps: int, device: str
 ) -> tuple[Solutions, IntArray]:
     s = np.asarray(load.arc_length).reshape(-1) / d.length
     with np.errstate(over="ignore"):
@@ -154,7 +167,9 @@ def _by_force(
     rows = np.flatnonzero(statuses == Status.OK)
     values = np.full((s.size, 6), np.nan)
     needed = np.full(s.size, steps)
-    values[rows], needed[rows], settled = _solve_known_forces(whisker, contacts[rows], steps)
+    values[rows], needed[rows], settled = _solve_known_forces(
+        whisker, contacts[rows], steps, device
+    )
     statuses[rows[~settled]] = Status.TOO_STRONG
     lost = statuses != Status.OK
     contacts[lost], values[lost], needed[lost] = np.nan, np.nan, steps
@@ -162,10 +177,10 @@ def _by_force(
 
 
 def _solve_known_forces(
-    whisker: Bendable, contacts: Array, steps: int
+    whisker: Bendable, contacts: Array, steps: int, device: str
 ) -> tuple[Array, IntArray, AnyArray]:
     """Base force and contact point of known forces of any size, non-dimensional."""
-    values = solve_forces(discretize(whisker, steps), contacts)[0]
+    values = solve_forces(discretize(whisker, steps), contacts, device=device)[0]
     needed = np.full(len(contacts), steps)
     with np.errstate(over="ignore", invalid="ignore"):
         size = np.linalg.norm(contacts[:, 1:], axis=1)
@@ -174,7 +189,7 @@ def _solve_known_forces(
         rows = np.flatnonzero(~kept)
         while rows.size and 2 * steps <= MOST_STEPS:
             steps *= 2
-            finer = solve_forces(discretize(whisker, steps), contacts[rows])[0]
+            finer = solve_forces(discretize(whisker, steps), contacts[rows], device=device)[0]
             settled = (np.abs(finer - values[rows]) <= _SETTLED * scale[rows]).all(axis=1)
             # Halving changes nothing while the whole contact is within the first step.
             error = np.abs(np.linalg.norm(finer[:, :3], axis=1) - size[rows])

@@ -1,0 +1,224 @@
+"""Row kernels on a GPU: the functions that the CPU runs, compiled once more for a row a thread.
+
+A row kernel ``kernel(*tables, *inputs, *outputs, first, last)`` works on the rows from ``first`` to
+``last``. On the GPU each thread takes one row. It and all that it calls are compiled from the same
+source, with as little changed as a thread needs: arrays made inside are its own, and names may have
+substitutes. A GPU needs no lanes, as its threads are the lanes.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+from collections import namedtuple
+from collections.abc import Callable, Mapping
+from functools import cache
+from importlib.util import find_spec
+from types import FunctionType
+from typing import Any
+
+import numpy as np
+
+from vibrissa.numerics.arrays import AnyArray
+
+# Rows on the GPU at a time, so that its memory does not limit a call.
+_ROWS = 1 << 20
+_THREADS = 128
+_ARRAYS = ("empty", "zeros", "ones")
+# Functions of NumPy that Numba does not compile for a GPU.
+_ROUNDING = ("exp", "floor", "rint", "sqrt")
+
+
+def check_device(device: str) -> None:
+    """Raise unless kernels can run on a device.
+
+    Parameters
+    ----------
+    device : str
+        Name of the device, "cpu" or "cuda".
+
+    Raises
+    ------
+    ValueError
+        If the name is another.
+    ImportError
+        If the extra ``gpu`` is not installed.
+    RuntimeError
+        If there is no GPU.
+    """
+    if device not in ("cpu", "cuda"):
+        raise ValueError(f"device is {device!r}; it must be 'cpu' or 'cuda'")
+    if device == "cpu":
+        return
+    from numba import cuda
+
+    if not _simulated() and find_spec("numba_cuda") is None:
+        raise ImportError("a GPU needs numba-cuda: pip install 'vibrissa[gpu]'")
+    if not cuda.is_available():
+        raise RuntimeError("no NVIDIA GPU with a driver was found; use device 'cpu'")
+
+
+def _simulated() -> bool:
+    from numba.core import config
+
+    return bool(config.ENABLE_CUDASIM)  # type: ignore[attr-defined]
+
+
+class Translation:
+    """Compiler of row kernels for the GPU.
+
+    Parameters
+    ----------
+    substitutes : mapping of str
+        Values for global names of the kernels and of what they call: other functions of the CPU, or
+        numbers.
+    """
+
+    def __init__(self, substitutes: Mapping[str, Any]) -> None:
+        self._substitutes = dict(substitutes)
+        self._compiled: dict[Any, Any] = {}
+        self._launchers: dict[Any, Any] = {}
+
+    def run(
+        self,
+        kernel: Callable[..., Any],
+        tables: tuple[Any, ...],
+        inputs: tuple[AnyArray, ...],
+        outputs: tuple[AnyArray, ...],
+    ) -> None:
+        """Run a row kernel over all rows.
+
+        Parameters
+        ----------
+        kernel : callable
+            Row kernel of the CPU.
+        tables : tuple
+            Arrays, numbers and named tuples of them that all rows share.
+        inputs, outputs : tuple of (n, ...) array
+            What each row has and what it fills; an array without rows is passed on as it is.
+        """
+        from numba import cuda
+
+        if kernel not in self._launchers:
+            scope = _own_functions() | {"_gpu_kernel": self._translated(kernel)}
+            self._launchers[kernel] = cuda.jit(FunctionType(_launch.__code__, scope, "launch"))
+        launch, shared = self._launchers[kernel], _on_gpu(tables)
+        for first in range(0, len(inputs[0]), _ROWS):
+            part = slice(first, min(first + _ROWS, len(inputs[0])))
+            count = part.stop - first
+            rows = tuple(cuda.to_device(np.ascontiguousarray(a[part])) for a in inputs + outputs)
+            self.launch(launch[-(-count // _THREADS), _THREADS], count, shared, rows)
+            for target, row in zip(outputs, rows[len(inputs) :], strict=True):
+                if target.size:
+                    row.copy_to_host(target[part])
+
+    @staticmethod
+    def launch(configured: Any, *args: Any) -> None:
+        """Launch a compiled kernel; benchmarks measure the GPU here.
+
+        Parameters
+        ----------
+        configured : callable
+            Compiled kernel with its blocks and threads.
+        *args : Any
+            Its arguments, on the GPU.
+        """
+        configured(*args)
+
+    def _translated(self, function: Any) -> Any:
+        """Compile a function of the CPU for the GPU, with what it calls."""
+        if function not in self._compiled:
+            from numba import cuda
+
+            self._compiled[function] = cuda.jit(device=True)(self._source(function.py_func))
+        return self._compiled[function]
+
+    def _source(self, function: Any) -> FunctionType:
+        """The function as the GPU can compile it."""
+        scope = dict(function.__globals__) | _own_functions()
+        scope |= {name: self._substitutes[name] for name in self._substitutes if name in scope}
+        tree = ast.parse(inspect.getsource(function))
+        definition = tree.body[0]
+        assert isinstance(definition, ast.FunctionDef)
+        definition.decorator_list, definition.returns = [], None
+        for argument in definition.args.args:
+            argument.annotation = None
+        tree = ast.fix_missing_locations(_Local(scope).visit(tree))
+        ast.increment_lineno(tree, function.__code__.co_firstlineno - 1)
+        code = compile(tree, function.__code__.co_filename, "exec").co_consts[0]
+        for name in code.co_names:
+            if hasattr(scope.get(name), "py_func") and name not in _own_functions():
+                scope[name] = self._translated(scope[name])
+        return FunctionType(code, scope, function.__name__, function.__defaults__)
+
+
+class _Local(ast.NodeTransformer):
+    """Makes arrays local to a thread, and names what takes the place of NumPy's functions."""
+
+    def __init__(self, scope: Mapping[str, Any]) -> None:
+        self._scope = dict(scope)
+
+    def visit_Call(self, node: ast.Call) -> ast.AST:
+        self.generic_visit(node)
+        module, _, name = ast.unparse(node.func).partition(".")
+        if module != "np" or (f"_gpu_{name}" not in self._scope and name not in _ARRAYS):
+            return node
+        text = f"_gpu_{name}({', '.join(ast.unparse(a) for a in node.args)})"
+        if name in _ARRAYS:
+            shape = eval(ast.unparse(node.args[0]), self._scope)  # of constants alone
+            kind = ast.unparse(node.args[1]) if len(node.args) > 1 else "np.float64"
+            text = f"_gpu_cuda.local.array({shape!r}, _gpu_types.{kind[3:]})"
+            if name != "empty":
+                text = f"_gpu_fill({text}, {int(name == 'ones')})"
+        return ast.copy_location(ast.parse(text, mode="eval").body, node)
+
+
+def _fill(array: Any, value: Any) -> Any:
+    for i in range(array.shape[0]):
+        array[i] = value
+    return array
+
+
+def _sign(x: float) -> float:
+    return 1.0 if x > 0.0 else (-1.0 if x < 0.0 else x)
+
+
+@cache
+def _own_functions() -> dict[str, Any]:
+    """What translated functions call by names of our own."""
+    from numba import cuda, types
+
+    library: Any = np
+    if not _simulated():
+        from numba.cuda import libdevice as library
+    own = {f"_gpu_{name}": getattr(library, name) for name in _ROUNDING}
+    own |= {"_gpu_fill": cuda.jit(device=True)(_fill), "_gpu_sign": cuda.jit(device=True)(_sign)}
+    return own | {"_gpu_cuda": cuda, "_gpu_types": types}
+
+
+# Names in the scope in which each launch is compiled.
+_gpu_cuda: Any
+_gpu_kernel: Any
+
+
+def _launch(count: Any, tables: Any, rows: Any) -> None:
+    row = _gpu_cuda.grid(1)  # noqa: F821
+    if row < count:
+        _gpu_kernel(*(tables + rows + (row, row + 1)))  # noqa: F821
+
+
+@cache
+def _without_gaps(kind: str, names: tuple[str, ...]) -> Any:
+    return namedtuple(kind, names)
+
+
+def _on_gpu(value: Any) -> Any:
+    """Copy arrays to the GPU, also those in named tuples; fields that are None are left out."""
+    if isinstance(value, np.ndarray):
+        from numba import cuda
+
+        return cuda.to_device(np.ascontiguousarray(value))
+    if hasattr(value, "_fields"):
+        parts = {name: _on_gpu(part) for name, part in value._asdict().items() if part is not None}
+        return _without_gaps(type(value).__name__, tuple(parts))(**parts)
+    return tuple(_on_gpu(part) for part in value) if isinstance(value, tuple) else value

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 import vibrissa as vb
 from vibrissa.cli import movie as movie_module
 from vibrissa.cli.app import app, main
-from vibrissa.cli.drawings import sights_of
+from vibrissa.cli.figures import sights_of
 from vibrissa.cli.movie import FrameOptions
 from vibrissa.io import save_recording, video_frames, video_info, write_movie, write_video
 from vibrissa.plots import Sight, contour_frames, signal_frames

@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import vibrissa as vb
-from vibrissa.cli.drawings import NODES, TrialOptions, trial_drawings
-from vibrissa.cli.figures import saved
+from vibrissa.cli.figures import NODES, TrialOptions, saved, trial_drawings
 from vibrissa.cli.inputs import WhiskerOptions, print_notes
 from vibrissa.cli.options import with_options
 from vibrissa.cli.terminal import Row, Tell, print_table, progress_bars, say, shown

@@ -1,21 +1,278 @@
-"""`vibrissa figures`: everything that can be drawn from a map, or from a trial."""
+"""`vibrissa figures`: what figures, movies and reports draw of a map, a trial or an array."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import repeat
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import numpy as np
 import typer
 
 import vibrissa as vb
-from vibrissa.cli.drawings import Draw, TrialOptions, array_drawings, map_drawings, trial_drawings
-from vibrissa.cli.inputs import map_from
+from vibrissa.cli.inputs import map_from, map_of
 from vibrissa.cli.options import Format, free, refuse, with_options
 from vibrissa.cli.terminal import Tell, progress_bars, say
 
 if TYPE_CHECKING:
     import xarray as xr
+    from numpy.typing import NDArray
+
+Draw = Callable[[], Any]
+"""Draws a figure when it is called."""
+
+NODES = 101
+"""Points of a whisker that is drawn."""
+
+_LIGHT, _DARK = 235.0, 70.0
+"""Grey values of the background and of objects, where there is no video."""
+
+_VIEWS = 2
+"""Largest number of views that are drawn."""
+
+_CONTACTS = ("estimates", "truth")
+"""Groups of a recording whose contact points an array's figure shows, the first there is."""
+
+
+@dataclass(frozen=True)
+class TrialOptions:
+    """What a picture of a trial is drawn with, and of which whisker."""
+
+    videos: list[Path] | None = None
+    map: Path | None = None
+    which: int | None = None
+
+    def given(self) -> dict[str, object]:
+        """Return the options by their names."""
+        return {"--video": self.videos, "--map": self.map, "--which": self.which}
+
+    @property
+    def whisker(self) -> int:
+        """Number of the whisker, the first by default."""
+        return self.which or 0
+
+    def contact_map(self, trial: xr.DataTree, tell: Tell) -> vb.ContactMap:
+        """Read the map of a trial's whisker, or simulate it."""
+        own = vb.recording.Recording(trial).whisker(self.whisker)
+        if self.map is None:
+            return map_of(own, tell)
+        found = map_from(self.map)
+        if not np.isclose(found.whisker.length, own.length, rtol=1e-6):
+            raise ValueError(
+                f"{self.map} is the map of a whisker of {1e3 * found.whisker.length:.3f} mm, that "
+                f"of the trial has {1e3 * own.length:.3f} mm: leave --map out to have its own"
+            )
+        return found
+
+
+# Views of a trial ---------------------------------------------------------------------------------
+
+
+def sights_of(
+    trial: xr.DataTree, course: vb.scene.Course, videos: Sequence[Path], rows: NDArray[np.intp]
+) -> list[vb.plots.Sight]:
+    """Return what the cameras of a trial see in some frames; without videos it is drawn."""
+    cameras = _cameras(trial)
+    if videos and len(videos) != len(cameras):
+        raise ValueError(
+            f"the trial has {len(cameras)} cameras; there are {len(videos)} videos: give one "
+            "--video for each"
+        )
+    sights = []
+    for number, camera in enumerate(cameras[:_VIEWS]):
+        images: Iterable[Any] = repeat(_backdrop(trial, camera, course)) if not videos else ()
+        if videos:
+            frames = rows if course.frames is None else course.frames[rows, number]
+            listed = [int(frame) for frame in frames]
+            _check_video(videos[number], camera, listed)
+            images = vb.io.video_frames(videos[number], listed)
+        sights.append(vb.plots.Sight(camera, images))
+    return sights
+
+
+def _cameras(trial: xr.DataTree) -> tuple[vb.cameras.Camera, ...]:
+    """Cameras of a recording; for a simulated trial without, two that look at it."""
+    if "cameras" in trial.children:
+        return vb.recording.Recording(trial).cameras
+    if "truth" in trial.children and "centerline" in trial["truth"]:
+        return vb.simulation.views_of(trial)
+    return ()
+
+
+def _check_video(video: Path, camera: vb.cameras.Camera, frames: Sequence[int]) -> None:
+    info = vb.io.video_info(video)
+    if (info.width, info.height) != tuple(camera.size):
+        raise ValueError(
+            f"{video} has {info.width} × {info.height} pixels, the camera {camera.name!r} has "
+            f"{camera.size[0]} × {camera.size[1]}: is it the video of another view?"
+        )
+    if 0 < info.frames <= max(frames):
+        raise ValueError(f"{video} has {info.frames} frames; frame {max(frames)} is needed")
+
+
+def _backdrop(trial: xr.DataTree, camera: vb.cameras.Camera, course: vb.scene.Course) -> Any:
+    """Objects as a camera sees them, on even light."""
+    middle = np.nanmean(course.position, axis=0)
+    covered = vb.simulation.silhouette(
+        camera, list(vb.recording.Recording(trial).objects), middle, 0.7
+    )
+    return np.asarray(_LIGHT * (1.0 - covered) + _DARK * covered, dtype=np.uint8)
+
+
+def fits_of(trial: xr.DataTree) -> list[vb.contour.FittedShape]:
+    """List the shapes that were fitted to the contacts of a trial."""
+    if "contour" not in trial.children:
+        return []
+    return [vb.contour.shape_from_dataset(trial["contour"].to_dataset())]
+
+
+# Figures ------------------------------------------------------------------------------------------
+
+
+def array_drawings(path: Path, width: Any) -> dict[str, Draw]:
+    """Return the figure of an array of whiskers, or of a trial with one; none of other files."""
+    kind = None if path.is_dir() else vb.io.recognise(path)
+    if kind in (None, vb.io.Kind.ARRAY, vb.io.Kind.ARRAY_TABLE):
+        face = vb.load_array(path).to_tree()
+        return {"array": lambda: vb.plots.array_views(face, width=width)}
+    if kind != vb.io.Kind.RECORDING:
+        return {}
+    trial = vb.load_recording(path)
+    groups = {name: group for name in _CONTACTS if (group := trial.get(name)) is not None}
+    groups["/"] = trial
+    contacts = [name for name, group in groups.items() if "contact_point" in group.data_vars]
+    lines = any("centerline" in group.data_vars for group in groups.values())
+    if trial.sizes.get("whisker", 0) < 2 or not contacts or not lines:
+        return {}
+    return {"array": lambda: vb.plots.array_views(trial, contacts=contacts[0], width=width)}
+
+
+def map_drawings(
+    contact_map: vb.ContactMap, width: Any, verdicts: xr.Dataset | None, cones: xr.Dataset | None
+) -> Iterator[tuple[str, Draw]]:
+    """Yield the figures of a map."""
+    whisker, samples = contact_map.whisker, contact_map.to_dataset()
+    line = whisker.centerline(NODES)
+    gridded = contact_map.grid is not None
+
+    def solid() -> Any:
+        """The slice at M_D = −π/2, and all contacts with the errors of a look-up in the grid."""
+        errors = vb.paper.error_solid(contact_map) if gridded else None
+        return vb.plots.solid_slices(vb.paper.signal_slice(contact_map), errors, width=width)
+
+    def panels() -> Any:
+        """Derivatives at the paper's contacts, which fill the panels best, or at the map's."""
+        found = vb.sensitivity(contact_map, at="grid" if gridded else None)
+        return vb.plots.sensitivity_panels(found, width=width)
+
+    yield "whisker", _whisker_drawing(whisker, width)
+    yield "signal_space", lambda: vb.plots.signal_clouds(samples, line, width=width)
+    yield "contact_surfaces", lambda: vb.plots.contact_surfaces(samples, line, width=width)
+    yield "sensitivity", panels
+    yield "solid", solid
+    if cones is not None:
+        yield "critical_cones", lambda: vb.plots.critical_cones(cones, width=width)
+    if verdicts is None:
+        return
+    yield "verdicts", lambda: vb.plots.verdict_table(verdicts, width=width)
+    if "ambiguous_share" in verdicts:
+        yield "resolution", lambda: vb.plots.resolution(verdicts, width=width)
+    triplets = (*vb.plots.HIGHLIGHTED, str(verdicts.attrs.get("chosen_triplet", "")))
+    for name, pair in vb.identifiability.witness_pairs(whisker, verdicts, triplets):
+        drawn = partial(vb.plots.witness_pair, pair, width=width)
+        yield f"witness_{name.replace(' ', '_')}", drawn
+
+
+def _whisker_drawing(whisker: vb.Whisker, width: Any) -> Draw:
+    return lambda: vb.plots.whisker_views(
+        whisker.centerline(NODES),
+        whisker.radius(np.linspace(0.0, whisker.length, NODES)),
+        name=whisker.name,
+        assumed=whisker.assumed,
+        width=width,
+    )
+
+
+def trial_drawings(
+    path: Path, width: Any, given: TrialOptions, tell: Tell, colour: str = "time"
+) -> dict[str, Draw]:
+    """Return the figures of a trial; what it lacks is printed, with the verb that makes it."""
+    trial = vb.load_recording(path)
+    course = vb.scene.course_of(trial, given.whisker)
+    for reason in _lacking(course, trial, path):
+        say(f"{path} has {reason}")
+    whisker = vb.recording.Recording(trial).whisker(given.whisker)
+    drawings = {"whisker": _whisker_drawing(whisker, width)}
+    drawings |= _contact_drawings(trial, course, whisker, width, colour)
+    if course.signals is not None:
+        drawings |= _signal_drawings(trial, course, whisker, width, given, tell)
+    return drawings
+
+
+def _lacking(course: vb.scene.Course, trial: xr.DataTree, path: Path) -> Iterator[str]:
+    if course.signals is None:
+        yield f"no signals: `vibrissa signals {path}` makes them"
+    if course.estimated is None and "estimates" in trial.children:
+        yield "no estimated contacts of this whisker"
+    elif course.estimated is None:
+        yield f"no estimated contacts: `vibrissa estimate {path}` makes them"
+    if course.places is None:
+        yield f"no contact points: `vibrissa reconstruct {path}` makes them"
+
+
+def _contact_drawings(
+    trial: xr.DataTree, course: vb.scene.Course, whisker: vb.Whisker, width: Any, colour: str
+) -> dict[str, Draw]:
+    """Figures of contact points."""
+    by: Any = "time" if colour == "time" else "deflection_angle"
+    line = whisker.centerline(NODES)
+    angles = vb.scene.deflection_angles(course, line)
+    bodies, fits = list(vb.recording.Recording(trial).objects), fits_of(trial)
+    points, known, estimated = course.places, course.known, course.estimated
+    drawings: dict[str, Draw] = {}
+    if points is not None:
+        peg = next((body for body in bodies if isinstance(body, vb.objects.Peg)), None)
+        fit = next((shape for shape in fits if isinstance(shape, vb.contour.CylinderFit)), None)
+        drawings["contact_places"] = lambda: vb.plots.contact_places(
+            course, line, bodies, fits, colour=by, width=width
+        )
+        drawings["contour"] = lambda: vb.plots.contour_views(
+            points, peg, fit, colour=angles, width=width
+        )
+    if known is not None and estimated is not None:
+        drawings["estimates"] = lambda: vb.plots.estimated_against_true(
+            vb.contacts.spherical(known),
+            vb.contacts.spherical(estimated),
+            time=course.time,
+            colour=angles,
+            known_as=course.known_as,
+        )
+    return drawings
+
+
+def _signal_drawings(
+    trial: xr.DataTree,
+    course: vb.scene.Course,
+    whisker: vb.Whisker,
+    width: Any,
+    given: TrialOptions,
+    tell: Tell,
+) -> dict[str, Draw]:
+    """Figures of signals."""
+    samples = given.contact_map(trial, tell).to_dataset()
+    rows = vb.plots.key_frames(course)
+    if width == "single":
+        rows = rows[-1:]
+    sights = sights_of(trial, course, given.videos or (), rows)
+    line = whisker.centerline(NODES)
+    signals = trial["signals"].to_dataset()
+    return {
+        "trial": lambda: vb.plots.trial_overview(course, samples, line, sights, rows, width=width),
+        "signals": lambda: vb.plots.signals_over_time(signals, whisker=given.whisker, width=width),
+    }
 
 
 @with_options("figures, in a folder")

@@ -11,7 +11,7 @@ import numpy as np
 import typer
 
 import vibrissa as vb
-from vibrissa.cli.drawings import NODES, TrialOptions, fits_of, sights_of
+from vibrissa.cli.figures import NODES, TrialOptions, fits_of, sights_of
 from vibrissa.cli.options import RecordingArgument, free, refuse, with_options
 from vibrissa.cli.terminal import Tell, progress_bars, say, stoppable
 

@@ -12,16 +12,16 @@ import numpy as np
 import typer
 
 import vibrissa as vb
-from vibrissa.cli.drawings import (
+from vibrissa.cli.figures import (
     NODES,
     Draw,
     TrialOptions,
     array_drawings,
+    dataset_with,
     fits_of,
     map_drawings,
     trial_drawings,
 )
-from vibrissa.cli.figures import dataset_with
 from vibrissa.cli.inputs import MAP, RECORDING, kind_in, map_from
 from vibrissa.cli.movie import FrameOptions, make_movies
 from vibrissa.cli.options import check_new, refuse, with_options

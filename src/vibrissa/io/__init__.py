@@ -11,12 +11,6 @@ from vibrissa.io.anipose import (
 )
 from vibrissa.io.array import load_array, save_array
 from vibrissa.io.centerline import load_centerline, load_whisker, save_centerline
-from vibrissa.io.contacts_table import (
-    holds_contour as holds_contour,
-    load_contacts,
-    save_contacts,
-    save_contour,
-)
 from vibrissa.io.kinds import READERS as READERS, Kind, load_tracks, recognise
 from vibrissa.io.matlab import load_matlab
 from vibrissa.io.movie import write_movie, write_video
@@ -43,8 +37,14 @@ from vibrissa.io.paths import (
     replacing as replacing,
     without_part as without_part,
 )
-from vibrissa.io.predictor_table import save_predictors
 from vibrissa.io.recording import RECORDING_KIND as RECORDING_KIND, load_recording, save_recording
+from vibrissa.io.result_tables import (
+    holds_contour as holds_contour,
+    load_contacts,
+    save_contacts,
+    save_contour,
+    save_predictors,
+)
 from vibrissa.io.rosbag import (
     BagMessage as BagMessage,
     ContactBag as ContactBag,
@@ -77,14 +77,12 @@ from vibrissa.io.toml import (
     subtable as subtable,
     three_numbers as three_numbers,
 )
-from vibrissa.io.traces import (
-    load_corrections,
-    load_traces as load_traces,
-    save_corrections,
-    save_traces as save_traces,
-)
 from vibrissa.io.tracks import RawTracks as RawTracks, join_views, labelled as labelled
-from vibrissa.io.tracks_file import save_tracks
+from vibrissa.io.tracks_file import (
+    load_traces as load_traces,
+    save_traces as save_traces,
+    save_tracks,
+)
 from vibrissa.io.video import (
     Footage as Footage,
     Frame as Frame,
@@ -95,7 +93,12 @@ from vibrissa.io.video import (
     video_frames as video_frames,
     video_info,
 )
-from vibrissa.io.video_tables import load_contact_points, load_head
+from vibrissa.io.video_tables import (
+    load_contact_points,
+    load_corrections,
+    load_head,
+    save_corrections,
+)
 from vibrissa.io.whisk import load_whiskers
 
 __all__ = [

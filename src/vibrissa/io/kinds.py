@@ -25,10 +25,9 @@ from vibrissa.io.nwb import read_nwb
 from vibrissa.io.paths import check_readable, without_part
 from vibrissa.io.sleap import read_sleap_analysis, read_sleap_labels
 from vibrissa.io.table import read_text, signal_column, table_rows
-from vibrissa.io.traces import CORRECTION_COLUMNS
 from vibrissa.io.tracks import Labels, RawTracks, labelled
 from vibrissa.io.tracks_file import load_own_tracks, read_tracks_table
-from vibrissa.io.video_tables import ANGLES, MATRIX, QUATERNION
+from vibrissa.io.video_tables import ANGLES, CORRECTION_COLUMNS, MATRIX, QUATERNION
 from vibrissa.io.whisk import MEASUREMENTS, WHISKERS, read_measurements, read_whiskers
 
 

@@ -21,19 +21,24 @@ head's to the laboratory frame, in one of three ways:
 
 ``frame`` counts the frames of the first video from 0, ``time`` is seconds since its first frame.
 Other columns are left alone.
+
+Corrected traces, points that a person has confirmed, as CSV ``view,frame,whisker,x,y``: the points
+of a whisker in one frame of one view (a number from 0), from base to tip, column and row in pixels,
+a line each.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from vibrissa.io.table import read_numbers
+from vibrissa.io.table import Table, read_numbers, write_table
 from vibrissa.quantities import attributes
 
 Array = NDArray[np.float64]
@@ -240,3 +245,74 @@ def _refuse(path: Path, wrong: NDArray[np.bool_], what: str, value: Array) -> No
     rows = np.flatnonzero(wrong)
     if rows.size:
         raise ValueError(f"{path}: {what}: {value[rows[0]]:.4g} in row {few(rows + 1)}")
+
+
+CORRECTION_COLUMNS = ("view", "frame", "whisker", "x", "y")
+
+
+def load_corrections(path: str | PathLike[str]) -> dict[int, dict[tuple[int, int], Array]]:
+    """Read corrected traces.
+
+    Parameters
+    ----------
+    path : str or path
+        CSV file.
+
+    Returns
+    -------
+    dict
+        By view: by frame and whisker the points (n, 2) from base to tip, column and row.
+    """
+    table = Table(path, CORRECTION_COLUMNS)
+    values = np.stack([table.numbers(name) for name in CORRECTION_COLUMNS], axis=1)
+    numbers = values[:, :3]
+    wrong = ~np.isfinite(values).all(axis=1) | (numbers < 0.0).any(axis=1)
+    table.refuse(wrong | (numbers != np.round(numbers)).any(axis=1), "no point of a trace")
+    points: dict[int, dict[tuple[int, int], list[Array]]] = {}
+    for (view, frame, whisker), place in zip(
+        numbers.astype(int).tolist(), values[:, 3:], strict=True
+    ):
+        points.setdefault(view, {}).setdefault((frame, whisker), []).append(place)
+    short = [(v, *key) for v, each in points.items() for key, p in each.items() if len(p) < 2]
+    if short:
+        view, frame, whisker = short[0]
+        raise ValueError(
+            f"{path}: whisker {whisker} in frame {frame} of view {view} has one point; from base "
+            "to tip at least two are needed"
+        )
+    return {view: {key: np.array(p) for key, p in each.items()} for view, each in points.items()}
+
+
+def save_corrections(
+    path: str | PathLike[str], corrections: Mapping[int, Mapping[tuple[int, int], ArrayLike]]
+) -> None:
+    """Write corrected traces so that `load_corrections` reads them.
+
+    Parameters
+    ----------
+    path : str or path
+        CSV file; an existing one is replaced once the new one is complete.
+    corrections : mapping
+        By view: by frame and whisker the points (n, 2) from base to tip, column and row.
+
+    Raises
+    ------
+    ValueError
+        If a trace has less than two points, or one that is not finite.
+    """
+    rows: list[list[float]] = []
+    for view, each in sorted(corrections.items()):
+        for (frame, whisker), points in sorted(each.items()):
+            array = np.asarray(points, dtype=np.float64)
+            if array.ndim != 2 or array.shape[1:] != (2,) or len(array) < 2:
+                raise ValueError(
+                    f"whisker {whisker} in frame {frame} of view {view}: points of shape "
+                    f"{array.shape}; (n, 2), n ≥ 2, is needed"
+                )
+            if not np.isfinite(array).all():
+                raise ValueError(
+                    f"whisker {whisker} in frame {frame} of view {view} has points that are not "
+                    "finite"
+                )
+            rows += [[view, frame, whisker, *place] for place in array.tolist()]
+    write_table(path, CORRECTION_COLUMNS, rows)

@@ -6,16 +6,14 @@ loads nothing: pictures, movies and scripts are in the file, and its security po
 
 from vibrissa.report.contact_map import chart_sections as chart_sections
 from vibrissa.report.page import (
+    Provenance as Provenance,
     Section as Section,
     document,
     figure_sections as figure_sections,
     movies_section as movies_section,
-    table as table,
-)
-from vibrissa.report.provenance import (
-    Provenance as Provenance,
     provenance as provenance,
     provenance_section as provenance_section,
+    table as table,
 )
 from vibrissa.report.space import (
     NO_SPACE as NO_SPACE,

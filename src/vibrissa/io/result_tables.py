@@ -1,13 +1,18 @@
-"""Contact points over time as CSV: ``time, x, y, z, r, theta, phi, sigma_x, …, status``.
+"""Contact points, contour points and predictors over time, as tables.
 
-In SI units and the whisker's frame; the status is written by its name, and missing is ``nan``.
+Contact points as CSV: ``time, x, y, z, r, theta, phi, sigma_x, …, status``. In SI units and the
+whisker's frame; the status is written by its name, and missing is ``nan``.
 
-Contour points as CSV: ``time, whisker, x, y, z, sigma_x, …``, a line for each contact.
+Contour points as CSV: ``time, whisker, x, y, z, sigma_x, …``, a line for each contact. In SI units
+and the laboratory frame: the contact point on the whisker's centreline with its standard
+deviations, the surface's outward normal there, the point of the surface, one whisker radius away,
+and, where an object was fitted, how far the surface of the whisker is from it and whether the
+contact is not an outlier.
 
-In SI units and the laboratory frame: the contact point on the whisker's centreline with its
-standard deviations, the surface's outward normal there, the point of the surface, one whisker
-radius away, and, where an object was fitted, how far the surface of the whisker is from it and
-whether the contact is not an outlier.
+Predictors of a trial as CSV, first a line ``# name [unit]: meaning`` for each column, then the
+header and a line for each frame and whisker; or for MATLAB, a matrix (frames, whiskers) for each
+column, ``time``, ``whisker``, the names of the ``predictors`` of models of spikes, and ``units``
+and ``descriptions`` by column.
 """
 
 from __future__ import annotations
@@ -18,7 +23,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from vibrissa.io.paths import replacing
+from vibrissa.io.paths import CSV, check_writable, replacing
 from vibrissa.io.table import Table, table_text, write_table
 from vibrissa.quantities import attributes
 from vibrissa.status import Status, flag_attributes
@@ -128,3 +133,68 @@ def _contour_text(contour: xr.Dataset) -> str:
     ]
     plain = [(one.astype(int) if one.dtype == bool else one).tolist() for one in columns]
     return table_text(CONTOUR, zip(*plain, strict=True))
+
+
+def save_predictors(path: str | PathLike[str], table: xr.Dataset) -> None:
+    """Write a table of predictors.
+
+    Parameters
+    ----------
+    path : str or path
+        File to write, ``.csv`` or ``.mat``; an existing file is replaced.
+    table : xarray.Dataset
+        Variables over (time, whisker), as `vibrissa.pipeline.predictors` returns them.
+
+    Raises
+    ------
+    ValueError
+        If the path has another ending.
+    """
+    path = check_writable(path, (*CSV, ".mat"))
+    columns = {str(name): one.transpose("time", "whisker") for name, one in table.items()}
+    with replacing(path) as part:
+        if path.suffix.lower() == ".mat":
+            _write_matlab(part, table, columns)
+        else:
+            part.write_text(_text(table, columns), encoding="utf-8")
+
+
+def meaning(variable: xr.DataArray) -> str:
+    """Long name and description of a variable, in a line."""
+    return f"{variable.attrs['long_name']}. {variable.attrs.get('description', '')}".strip()
+
+
+def _text(table: xr.Dataset, columns: dict[str, xr.DataArray]) -> str:
+    about = [f"# predictors of models of spikes: {table.attrs['predictors']}"]
+    about += [f"# {name} [{one.attrs['units']}]: {meaning(one)}" for name, one in columns.items()]
+    time, whiskers = table["time"].values.tolist(), table["whisker"].values.tolist()
+    values = [_plain(name, one.values) for name, one in columns.items()]
+    rows = (
+        [moment, whisker, *(column[i][k] for column in values)]
+        for i, moment in enumerate(time)
+        for k, whisker in enumerate(whiskers)
+    )
+    return "\n".join(about) + "\n" + table_text(("time", "whisker", *columns), rows)
+
+
+def _plain(name: str, values: np.ndarray) -> list[list[object]]:
+    """Numbers as they are written: flags as 0 and 1, statuses by name."""
+    if name == "status":
+        return [[Status(int(code)).name.lower() for code in row] for row in values]
+    found: list[list[object]] = (values.astype(int) if values.dtype == bool else values).tolist()
+    return found
+
+
+def _write_matlab(path: PathLike[str], table: xr.Dataset, columns: dict[str, xr.DataArray]) -> None:
+    from scipy.io import savemat
+
+    content = {
+        "time": table["time"].values[:, None],
+        "whisker": np.array(table["whisker"].values.tolist(), dtype=object),
+        "predictors": np.array(table.attrs["predictors"].split(), dtype=object),
+        "units": {name: one.attrs["units"] for name, one in columns.items()},
+        "descriptions": {name: meaning(one) for name, one in columns.items()},
+        "statuses": {status.name.lower(): int(status) for status in Status},
+        **{name: one.values for name, one in columns.items()},
+    }
+    savemat(path, content, appendmat=False, long_field_names=True, oned_as="column")

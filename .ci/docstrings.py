@@ -2,7 +2,7 @@
 
 Public is a name without a leading underscore in a module without one, and the methods and
 properties of such a class. What a package exports by name in its ``__init__``, and what a module
-directly under ``vibrissa`` defines, is its face and describes every parameter and what it
+that ``vibrissa`` itself exports defines, is its face and describes every parameter and what it
 returns. Elsewhere a summary will do. The objects
 themselves are looked at rather than their source, so that the parameters of a dataclass and of a
 named tuple are its fields, which it may describe under Attributes too. An enumeration has no
@@ -68,7 +68,7 @@ def exported() -> Iterator[object]:
         module = importlib.import_module(name)
         if hasattr(module, "__path__"):
             yield from (getattr(module, key) for key in getattr(module, "__all__", ()))
-        elif name.count(".") == 1:
+        elif name.removeprefix("vibrissa.") in vibrissa.__all__:
             own = (v for v in vars(module).values() if getattr(v, "__module__", None) == name)
             yield from own
 

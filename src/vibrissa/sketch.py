@@ -63,19 +63,7 @@ class Mark:
 
 
 def views(marks: Sequence[Mark]) -> str:
-    """Draw marks in the x–y and in the x–z plane, at one scale.
-
-    Parameters
-    ----------
-    marks : sequence of Mark
-        From back to front.
-
-    Returns
-    -------
-    str
-        An SVG element, and a legend below if marks have labels; empty if nothing is known of any
-        place.
-    """
+    """Draw marks, from back to front, in the x–y and the x–z plane; empty if no place is known."""
     every = np.concatenate([np.asarray(mark.places, dtype=float).reshape(-1, 3) for mark in marks])
     every = every[np.isfinite(every).all(axis=1)]
     if not len(every):
@@ -134,20 +122,7 @@ def _drawn(mark: Mark, pixels: Array) -> str:
 
 
 def thinned(values: NDArray[_Kind], most: int) -> NDArray[_Kind]:
-    """Take at most so many rows, evenly among all of them.
-
-    Parameters
-    ----------
-    values : array (n, ...)
-        The rows.
-    most : int
-        How many at most.
-
-    Returns
-    -------
-    array
-        The rows taken, first and last among them.
-    """
+    """Take at most so many rows, evenly among all of them, first and last included."""
     if len(values) <= most:
         return values
     rows: NDArray[_Kind] = values[np.linspace(0, len(values) - 1, most).astype(int)]
@@ -176,40 +151,12 @@ def _text(x: float, y: float, text: str) -> str:
 
 
 def card(title: str, rows: Sequence[tuple[str, str]], picture: str = "") -> str:
-    """Lay out a title, a picture and a table of names and values.
-
-    Parameters
-    ----------
-    title : str
-        Plain text.
-    rows : sequence of (str, str)
-        Names and values with their units, plain text.
-    picture : str
-        SVG.
-
-    Returns
-    -------
-    str
-        HTML.
-    """
+    """Lay out a title, a picture and a table of names and values."""
     return f"<div><strong>{escape(title)}</strong><br>{picture}{table(rows)}</div>"
 
 
 def lines(title: str, rows: Sequence[tuple[str, str]]) -> str:
-    """Lay out a title and a table of names and values for a terminal of 80 columns.
-
-    Parameters
-    ----------
-    title : str
-        The first line.
-    rows : sequence of (str, str)
-        Names and values with their units.
-
-    Returns
-    -------
-    str
-        A line each, and more where a value is long.
-    """
+    """Lay out a title and a table of names and values for a terminal of 80 columns."""
     width = max(len(name) for name, _ in rows) + 4
     filled = [
         textwrap.fill(f"  {name:{width - 4}}  {value}", 80, subsequent_indent=" " * width)
@@ -219,20 +166,7 @@ def lines(title: str, rows: Sequence[tuple[str, str]]) -> str:
 
 
 def table(rows: Sequence[Sequence[str]], heading: Sequence[str] = ()) -> str:
-    """Lay out a table.
-
-    Parameters
-    ----------
-    rows : sequence of sequence of str
-        Plain text.
-    heading : sequence of str
-        Of the columns; none by default.
-
-    Returns
-    -------
-    str
-        HTML.
-    """
+    """Lay out a table."""
     head = "".join(f'<th style="{_CELL}">{escape(cell)}</th>' for cell in heading)
     body = "".join(
         "<tr>"
@@ -248,21 +182,7 @@ def table(rows: Sequence[Sequence[str]], heading: Sequence[str] = ()) -> str:
 
 
 def shown(name: str, values: ArrayLike) -> str:
-    """Write a quantity: the one value, or the median and the range of several.
-
-    Parameters
-    ----------
-    name : str
-        A name of `vibrissa.quantities.QUANTITIES`.
-    values : array_like
-        SI units; NaN is left out.
-
-    Returns
-    -------
-    str
-        In the display unit, such as ``12.3 mm`` or ``12.3 mm (4.5 to 20.1)``; a dash if nothing is
-        known.
-    """
+    """Write a quantity: the one value, or the median and the range of several."""
     known = np.asarray(values, dtype=np.float64).reshape(-1)
     known = known[np.isfinite(known)]
     if not known.size:
@@ -277,18 +197,7 @@ def shown(name: str, values: ArrayLike) -> str:
 
 
 def symbol(name: str) -> str:
-    """Write the symbol of a quantity without mathtext.
-
-    Parameters
-    ----------
-    name : str
-        A name of `vibrissa.quantities.QUANTITIES`.
-
-    Returns
-    -------
-    str
-        Such as ``F_x``.
-    """
+    """Write the symbol of a quantity without mathtext."""
     plain = quantity(name).symbol.replace("\\mathrm", "")
     for command, letter in (("\\theta", "θ"), ("\\phi", "φ"), ("\\varphi", "φ")):
         plain = plain.replace(command, letter)

@@ -9,13 +9,12 @@ from vibrissa.simulation.film import (
     views_of,
     with_true_traces,
 )
-from vibrissa.simulation.measurement import measure
 from vibrissa.simulation.motion import (
     Motion,
     array_whisking,
     head_path,
-    protracted,
-    shared_whisking,
+    protracted as protracted,
+    shared_whisking as shared_whisking,
     tabulated,
     whisking,
 )
@@ -26,7 +25,7 @@ from vibrissa.simulation.script import (
     read_objects as read_objects,
     read_script as read_script,
 )
-from vibrissa.simulation.simulate import simulate
+from vibrissa.simulation.simulate import measure, simulate
 
 __all__ = [
     "Dynamics",
@@ -38,9 +37,7 @@ __all__ = [
     "film_frames",
     "head_path",
     "measure",
-    "protracted",
     "resonances",
-    "shared_whisking",
     "silhouette",
     "simulate",
     "sweep_past",

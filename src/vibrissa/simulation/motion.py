@@ -322,7 +322,7 @@ def array_whisking(
     head_position : array_like (n, 3) or (3,), optional
         Position of the snout in the laboratory, m; by default its origin.
     **motion
-        Other parameters of `shared_whisking`: frequency, amplitude, set point, …
+        Other parameters of `whisking`, except ``row`` and the ratios, which are those of each row.
 
     Returns
     -------
@@ -354,34 +354,9 @@ def shared_whisking(
     position_drift: float = 0.0,
     **motion: Any,
 ) -> Motion:
-    """Whisking about rest, as all whiskers of an array share it.
+    """Whisking about rest, as all whiskers of an array share it; the azimuth is from rest.
 
-    Parameters
-    ----------
-    duration : float
-        Duration of the trial, s.
-    rate : float
-        Frame rate, Hz.
-    frequency : float
-        Frequency of whisking, Hz.
-    amplitude : float
-        Half of the sweep, rad; 0 holds the whiskers still, except for drifts.
-    set_point : float
-        Angle from the pose of rest forward to the middle of the sweep, rad.
-    position_drift : float
-        Largest drift of the bases on the face, m.
-    **motion
-        Other parameters of `whisking`, except ``row`` and the ratios, which are those of each row.
-
-    Returns
-    -------
-    Motion
-        Motion whose azimuth is the protraction from rest; for `protracted`.
-
-    Raises
-    ------
-    ValueError
-        As `whisking` does.
+    An amplitude of 0 holds the whiskers still, except for drifts.
     """
     return whisking(
         duration,
@@ -404,28 +379,9 @@ def protracted(
 ) -> dict[str, Motion]:
     """Motions of all whiskers by one protraction, each from its own pose of rest.
 
-    Parameters
-    ----------
-    array : WhiskerArray
-        Whiskers of the face.
-    motion : Motion
-        Motion whose azimuth is the angle by which whiskers are protracted from rest, to which each
-        row's elevation and roll are added; its own elevation, roll and displacement (of the right
-        side, mirrored on the left one) are added to these.
-    head_rotation : array_like (n, 3, 3) or (3, 3), optional
-        Rotation from the head's to the laboratory frame; by default they are the same.
-    head_position : array_like (n, 3) or (3,), optional
-        Position of the snout in the laboratory, m; by default its origin.
-
-    Returns
-    -------
-    dict of str to Motion
-        Motions by the whiskers' names.
-
-    Raises
-    ------
-    ValueError
-        As `Motion.on_head` does.
+    The azimuth of ``motion`` is the angle by which whiskers are protracted from rest, to which each
+    row's elevation and roll are added; its own elevation, roll and displacement (of the right side,
+    mirrored on the left one) are added to these.
     """
     turn = np.eye(3) if head_rotation is None else head_rotation
     shift = np.zeros(3) if head_position is None else head_position

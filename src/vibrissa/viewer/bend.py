@@ -54,7 +54,7 @@ def whisker_body(
 ) -> Body:
     """A whisker along a centreline (n, 3), m, so many times as thick as it is."""
     radius = whisker.radius(np.linspace(0.0, whisker.length, len(line)))
-    vertices, faces = tube(_mm(line), exaggeration * _mm(radius))
+    vertices, faces = tube(mm(line), exaggeration * mm(radius))
     return Body(vertices, faces, colour, opacity)
 
 
@@ -63,7 +63,7 @@ def follicle(whisker: Whisker, exaggeration: float) -> Body:
     radius = 1.9 * exaggeration * whisker.base_radius
     depth = 0.06 * whisker.length
     middle = np.array([-0.5 * depth, 0.0, 0.0])
-    vertices, faces = cylinder(_mm(middle), np.array([1.0, 0.0, 0.0]), _size(radius), _size(depth))
+    vertices, faces = cylinder(mm(middle), np.array([1.0, 0.0, 0.0]), _size(radius), _size(depth))
     return Body(vertices, faces, (196, 152, 132))
 
 
@@ -98,7 +98,7 @@ def round_step(size: float) -> float:
 
 def arrow(start: Array, end: Array, thickness: float) -> Arrows:
     """The arrow of a force between two places (3,), m; so many mm thick."""
-    return Arrows(_mm(start)[None], _mm(end)[None], np.array([FORCE], dtype=np.uint8), thickness)
+    return Arrows(mm(start)[None], mm(end)[None], np.array([FORCE], dtype=np.uint8), thickness)
 
 
 def force_arrow(whisker: Whisker, force: Array, at: Array) -> dict[str, Mark]:
@@ -111,7 +111,7 @@ def force_arrow(whisker: Whisker, force: Array, at: Array) -> dict[str, Mark]:
     thickness = _size(0.006 * whisker.length)
     return {
         "force": arrow(start, at, thickness),
-        "force size": Label(_mm(start), number("force", size, 3)),
+        "force size": Label(mm(start), number("force", size, 3)),
     }
 
 
@@ -129,7 +129,7 @@ def bend_drawing(bend: Bend, exaggeration: float) -> Drawing:
     if bend.kind == "peg":
         out["peg"] = _peg(bend)
     elif ok:
-        x, y, z = _mm(held.contact_point).tolist()
+        x, y, z = mm(held.contact_point).tolist()
         out["contact"] = replace(_ball(whisker, exaggeration), position=(x, y, z))
     return out
 
@@ -148,7 +148,7 @@ def _peg(bend: Bend) -> Body:
     """The peg; a line is drawn a little thick, so that it is seen."""
     length = bend.whisker.length
     radius = max(bend.radius, 0.004 * length)
-    vertices, faces = cylinder(_mm(bend.origin), bend.axis, _size(radius), _size(0.8 * length))
+    vertices, faces = cylinder(mm(bend.origin), bend.axis, _size(radius), _size(0.8 * length))
     return Body(vertices, faces, OBJECT, 0.8)
 
 
@@ -166,13 +166,14 @@ def _missed(bend: Bend) -> dict[str, Mark]:
     last = np.asarray(bend.held.contact_point)
     out: dict[str, Mark] = {}
     if np.isfinite(last).all() and bend.kind == "point":
-        out["missed"] = Line(_mm(np.stack([last, bend.point])[None]), GHOST)
+        out["missed"] = Line(mm(np.stack([last, bend.point])[None]), GHOST)
     words = bend.status.explanation.split(":")[0].rstrip(".")
     lift = np.array([0.0, 0.0, 0.05 * bend.whisker.length])
-    return {**out, "reason": Label(_mm(bend.target + lift), words)}
+    return {**out, "reason": Label(mm(bend.target + lift), words)}
 
 
-def _mm(values: object) -> Array:
+def mm(values: object) -> Array:
+    """Lengths in mm."""
     return to_display("length", np.asarray(values, dtype=np.float64))
 
 

@@ -24,7 +24,7 @@ from vibrissa.scene import (
 )
 from vibrissa.signals import SIGNALS, TRIPLETS, base_signals
 from vibrissa.status import Status
-from vibrissa.viewer.bend import NODES, bend_drawing, whisker_body
+from vibrissa.viewer.bend import NODES, bend_drawing, mm, whisker_body
 from vibrissa.viewer.colours import FIT, GHOST, Legend, counted, shaded
 from vibrissa.viewer.page import Page, asked
 from vibrissa.viewer.readout import note, number, sentence, table
@@ -151,14 +151,14 @@ def locate_drawing(whisker: Whisker, found: Located, exaggeration: float) -> Dra
         if i in others:
             out[f"ghost {i}"] = whisker_body(whisker, found.lines[i], exaggeration, GHOST, 0.55)
             radius = float(to_display("length", 0.008 * whisker.length))
-            ball = ellipsoid(_mm(point), radius * np.eye(3))
+            ball = ellipsoid(mm(point), radius * np.eye(3))
             out[f"ball {i}"] = Body(*ball, GHOST)
             apart = number("separation", float(found.distances[i]), 3)
-            out[f"apart {i}"] = Label(_mm(point), f"same signals, {apart} away")
+            out[f"apart {i}"] = Label(mm(point), f"same signals, {apart} away")
         if np.isfinite(covariances[i]).all():
             most = MOST * whisker.length
             vertices, faces = error_ellipsoid(point, covariances[i], SIGMAS, most)
-            out[f"error {i}"] = Body(_mm(vertices), faces, FIT, 0.45)
+            out[f"error {i}"] = Body(mm(vertices), faces, FIT, 0.45)
     return out
 
 
@@ -184,10 +184,6 @@ def of_located(whisker: Whisker, found: Located | None, status: Status) -> str:
     rest = {name: value for name, value in signals.items() if name not in names}
     parts.append(table(rest, "Not used"))
     return "".join(parts)
-
-
-def _mm(values: Array) -> Array:
-    return to_display("length", values)
 
 
 _UN = quantity("force").display_factor

@@ -26,7 +26,7 @@ from vibrissa.scene import (
     object_surface,
     sheet,
 )
-from vibrissa.viewer.bend import arrow, round_step, ruler, whisker_body
+from vibrissa.viewer.bend import arrow, mm, round_step, ruler, whisker_body
 from vibrissa.viewer.colours import CONTACT, FIT, OBJECT
 from vibrissa.viewer.page import Page, asked, put
 from vibrissa.viewer.readout import chart, cursor, table, timeline, timeline_cursor
@@ -46,7 +46,7 @@ def extent(trial: Watched) -> tuple[Array, float]:
     """Middle, mm, and size, mm, of where whiskers go."""
     points = trial.lines.reshape(-1, 3)
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
-    return _mm(0.5 * (low + high)), float(_mm(np.linalg.norm(high - low)))
+    return mm(0.5 * (low + high)), float(mm(np.linalg.norm(high - low)))
 
 
 LAYERS = ("Whiskers", "Forces", "Contacts", "Uncertainty", "Objects", "Fitted shape", "Scale")
@@ -75,19 +75,19 @@ def moment_drawing(
         at, force = trial.contacts[frame, i], trial.forces[frame, i]
         if not np.isfinite(at).all():
             continue
-        radius = float(_mm(0.012 * whisker.length))
-        vertices, faces = ellipsoid(_mm(at), radius * np.eye(3))
+        radius = float(mm(0.012 * whisker.length))
+        vertices, faces = ellipsoid(mm(at), radius * np.eye(3))
         out[f"contact {i}"] = Body(vertices, faces, CONTACT)
         if "Uncertainty" in layers and trial.covariance is not None:
             covariance = trial.covariance[frame, i]
             if np.isfinite(covariance).all() and np.sqrt(np.trace(covariance)) < _SHARP * 10.0:
                 variances, axes = np.linalg.eigh(covariance)
                 half = _SIGMAS * np.sqrt(np.maximum(variances, 0.0))
-                out[f"error {i}"] = Body(*ellipsoid(_mm(at), _mm(axes * half)), CONTACT, 0.25)
+                out[f"error {i}"] = Body(*ellipsoid(mm(at), mm(axes * half)), CONTACT, 0.25)
         size = float(np.linalg.norm(force))
         if "Forces" in layers and np.isfinite(size) and size > 0.0:
             reach = 0.3 * whisker.length * np.sqrt(size / force_scale(whisker))
-            start, thickness = at - reach * force / size, float(_mm(0.006 * whisker.length))
+            start, thickness = at - reach * force / size, float(mm(0.006 * whisker.length))
             out[f"force {i}"] = arrow(start, at, thickness)
     return out
 
@@ -101,13 +101,13 @@ def touched(trial: Watched, frame: int) -> Drawing:
     step = max(1, int(np.ceil(trial.touching.sum() / POINTS)))
     if not chosen.size:
         return {}
-    size = float(_mm(0.011 * trial.whiskers[0].length))
+    size = float(mm(0.011 * trial.whiskers[0].length))
     shown = colours[which[::step]]
     if trial.covariance is not None:
         spread = np.trace(trial.covariance[: frame + 1][known][::step], axis1=1, axis2=2)
         bold = np.nan_to_num(np.clip(_SHARP / np.sqrt(np.maximum(spread, 1e-20)), 0.08, 1.0))
         shown = np.asarray(bold[:, None] * shown + (1.0 - bold[:, None]) * _PALE, dtype=np.uint8)
-    return {"contacts": Cloud(_mm(chosen[::step]), shown, size)}
+    return {"contacts": Cloud(mm(chosen[::step]), shown, size)}
 
 
 def _whisker_colours(trial: Watched) -> Bytes:
@@ -127,11 +127,11 @@ def surroundings(trial: Watched, layers: Collection[str] = LAYERS) -> Drawing:
         out |= ruler(low, length)
     if "Objects" in layers:
         for i, thing in enumerate(trial.objects):
-            out[f"object {i}"] = object_body(thing, 0.6 * size, _mm(centre))
+            out[f"object {i}"] = object_body(thing, 0.6 * size, mm(centre))
     if "Fitted shape" in layers and trial.contour is not None:
         body = fitted_body(trial.contour, near)
         if body is not None:
-            out["fit"] = Body(_mm(body[0]), body[1], FIT, 0.4, "double")
+            out["fit"] = Body(mm(body[0]), body[1], FIT, 0.4, "double")
     return out
 
 
@@ -165,10 +165,6 @@ def fitted_body(contour: xr.Dataset, near: Array) -> tuple[Array, Ints] | None:
         return cylinder(middle, shape.axis, shape.radius, length)
     grid = surface_grid(shape, near)["surface_grid_point"].to_numpy()
     return sheet(grid)
-
-
-def _mm(values: object) -> Array:
-    return to_display("length", np.asarray(values, dtype=np.float64))
 
 
 _MS = 1e3

@@ -15,7 +15,7 @@ from vibrissa.whisker.pose import (
     base_rotation,
     mirrored,
 )
-from vibrissa.whisker.profile import Profile, constant as constant
+from vibrissa.whisker.profile import Profile as Profile, constant as constant
 from vibrissa.whisker.rest import parabola_curvature as parabola_curvature
 from vibrissa.whisker.section import (
     TAPER as TAPER,
@@ -26,7 +26,6 @@ from vibrissa.whisker.section import (
 __all__ = [
     "Identity",
     "Pose",
-    "Profile",
     "Whisker",
     "WhiskerArray",
     "base_rotation",

@@ -104,13 +104,7 @@ class Profile:
         return value + 0.0 * tau
 
     def breaks(self) -> Array:
-        """Find the knots at which the function jumps or has a kink.
-
-        Returns
-        -------
-        array (n,)
-            Arc lengths, m, rising; neither start nor end is among them.
-        """
+        """Find the knots at which the function jumps or has a kink."""
         power = np.arange(len(self.coefficients)).reshape(-1, *(1,) * (1 + len(self.shape)))
         half = (np.diff(self.knots) / 2.0).reshape(-1, *(1,) * len(self.shape))
         signed = self.coefficients * (-1.0) ** power
@@ -124,48 +118,16 @@ class Profile:
         return found
 
     def trimmed(self, length: float) -> "Profile":
-        """Drop the intervals that begin at or beyond a length.
-
-        Parameters
-        ----------
-        length : float
-            Arc length that must stay, m.
-
-        Returns
-        -------
-        Profile
-        """
+        """Drop the intervals that begin at or beyond a length."""
         count = int(np.searchsorted(self.knots[:-1], length, side="left"))
         return Profile(self.knots[: count + 1], self.coefficients[:, :count], self.error)
 
     def scaled(self, length_factor: float, value_factor: float) -> "Profile":
-        """Stretch arc length and multiply values.
-
-        Parameters
-        ----------
-        length_factor : float
-            Factor on arc length.
-        value_factor : float
-            Factor on values.
-
-        Returns
-        -------
-        Profile
-        """
+        """Stretch arc length and multiply values."""
         return Profile(self.knots * length_factor, self.coefficients * value_factor, self.error)
 
     def transformed(self, matrix: Array) -> "Profile":
-        """Multiply every value by a matrix.
-
-        Parameters
-        ----------
-        matrix : array (3, 3)
-            Multiplies values (3,) from the left.
-
-        Returns
-        -------
-        Profile
-        """
+        """Multiply every value by a matrix."""
         return Profile(self.knots, self.coefficients @ matrix.T, self.error)
 
 

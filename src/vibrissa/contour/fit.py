@@ -158,12 +158,12 @@ def fit_shape(
     given = checked(
         kind,
         points,
-        covariance,
-        whisker_radius,
-        normals,
-        normal_covariance,
-        point_normal_covariance,
         least=count + 1,
+        covariance=covariance,
+        whisker_radius=whisker_radius,
+        normals=normals,
+        normal_covariance=normal_covariance,
+        point_normal_covariance=point_normal_covariance,
     )
     starts = declared.starts(given, outside if axis is None else axis)
     return _fitted([_Posed.at(shape, toward, count) for shape, toward in starts], given)

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -35,7 +35,7 @@ from vibrissa.contour.fit import TO_SIGMA, fit_shape
 from vibrissa.contour.fitted_shape import excess_of
 from vibrissa.contour.free_surface import FreeFit, Support, merged
 from vibrissa.contour.simple_shapes import SHAPES, SimpleShape, frame_across
-from vibrissa.contour.touches import FLOOR, Array, Mask, checked
+from vibrissa.contour.touches import FLOOR, Array, ContactArrays, Mask, checked
 
 _BETTER = {"plane": 1.0, "sphere": 0.9, "cylinder": 0.5}
 """Largest deviations from a base, as a share of those from simpler ones, for it to be chosen.
@@ -89,14 +89,7 @@ _TINY = 1e-12
 
 
 def fit_free(
-    points: ArrayLike,
-    covariance: ArrayLike | None = None,
-    whisker_radius: ArrayLike | None = None,
-    normals: ArrayLike | None = None,
-    normal_covariance: ArrayLike | None = None,
-    point_normal_covariance: ArrayLike | None = None,
-    base: str | None = None,
-    most: int = 600,
+    points: ArrayLike, base: str | None = None, most: int = 600, **contacts: Unpack[ContactArrays]
 ) -> FreeFit:
     """Fit a smooth surface of any shape to contact points on parts of it.
 
@@ -104,24 +97,15 @@ def fit_free(
     ----------
     points : array_like (n, 3)
         Contact points on the whisker's centreline, m, in any one frame; rows with NaN are left out.
-    covariance : array_like (n, 3, 3), optional
-        Covariance of each point, m². Without it all points count the same, and their scatter gives
-        the noise.
-    whisker_radius : array_like (n,) or float, optional
-        Radius of the whisker at each contact, m; 0 by default.
-    normals : array_like (n, 3), optional
-        Outward normals of the surface at the contacts, such as the directions of the contact
-        forces; of any length but zero.
-    normal_covariance : array_like (n, 3, 3), optional
-        Covariance of each unit normal.
-    point_normal_covariance : array_like (n, 3, 3), optional
-        Covariance of each point (rows) with its unit normal (columns), m; none by default.
     base : {"plane", "sphere", "cylinder"}, optional
         Simple shape that the surface deviates from; by default the simplest from which less simple
         ones are not much nearer to the points.
     most : int
         Number of positions that the points are merged to at most; the time grows with the third
         power.
+    **contacts
+        covariance, whisker_radius, normals, normal_covariance and point_normal_covariance, as for
+        `fit_shape`.
 
     Returns
     -------
@@ -138,25 +122,11 @@ def fit_free(
         raise ValueError(f"base is {base!r}; it must be one of {', '.join(SHAPES)}")
     if most < 6:
         raise ValueError(f"most is {most}; at least 6 positions are needed")
-    given = checked(
-        "surface",
-        points,
-        covariance,
-        whisker_radius,
-        normals,
-        normal_covariance,
-        point_normal_covariance,
-        least=6,
-    )
+    given = checked("surface", points, least=6, **contacts)
     # Rows that are not usable for the base are not usable for what deviates from it.
     rows = np.flatnonzero(given.usable)
-    known = {
-        "covariance": covariance,
-        "normals": normals,
-        "normal_covariance": normal_covariance,
-        "point_normal_covariance": point_normal_covariance,
-    }
-    picked = {n: np.asarray(v, dtype=np.float64)[rows] for n, v in known.items() if v is not None}
+    known = {name: v for name, v in contacts.items() if name != "whisker_radius" and v is not None}
+    picked = {name: np.asarray(v, dtype=np.float64)[rows] for name, v in known.items()}
     p = np.asarray(points, dtype=np.float64)[rows]
     radius = given.touches.whisker_radius * given.extent
     shape = _base(p, radius, picked, (base,) if base else tuple(SHAPES))
@@ -164,10 +134,8 @@ def fit_free(
     normal = shape.outward_normals(p) if touches.normal is None else touches.normal
     spread = np.zeros((len(p), 3, 3)) if touches.covariance is None else touches.covariance
     unit = np.repeat([given.extent, 1.0], 3)[: spread.shape[1]]
-    contacts = _Contacts(
-        p - radius[:, None] * normal, touches.normal, spread * unit[:, None] * unit
-    )
-    fit, squares, sharp = _with_deviation(shape, contacts, given.extent, most)
+    touched = _Contacts(p - radius[:, None] * normal, touches.normal, spread * unit[:, None] * unit)
+    fit, squares, sharp = _with_deviation(shape, touched, given.extent, most)
     residuals, chi_squared = np.full((2, given.usable.size), np.nan)
     residuals[rows] = fit.signed_distance(p) - radius
     chi_squared[rows] = np.where(sharp, squares, np.nan)

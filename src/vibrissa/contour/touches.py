@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -63,32 +63,35 @@ class Checked:
     extent: float
 
 
+class ContactArrays(TypedDict, total=False):
+    """What may be known of contacts in addition to their points; see `fit_shape`."""
+
+    covariance: ArrayLike | None
+    whisker_radius: ArrayLike | None
+    normals: ArrayLike | None
+    normal_covariance: ArrayLike | None
+    point_normal_covariance: ArrayLike | None
+
+
 def checked(
-    what: str,
-    points: ArrayLike,
-    covariance: ArrayLike | None = None,
-    whisker_radius: ArrayLike | None = None,
-    normals: ArrayLike | None = None,
-    normal_covariance: ArrayLike | None = None,
-    point_normal_covariance: ArrayLike | None = None,
-    *,
-    least: int,
+    what: str, points: ArrayLike, *, least: int, **contacts: Unpack[ContactArrays]
 ) -> Checked:
     """Check contacts and bring them into units of their extent."""
+    if unknown := sorted(contacts.keys() - ContactArrays.__annotations__.keys()):
+        known = ", ".join(ContactArrays.__annotations__)
+        raise TypeError(f"of contacts {', '.join(unknown)} is given; {known} can be")
     n = _number(what, points)
-    given: dict[str, tuple[ArrayLike | None, list[tuple[int, ...]]]] = {
-        "points": (points, [(n, 3)]),
-        "whisker_radius": (0.0 if whisker_radius is None else whisker_radius, [(n,), ()]),
-        "covariance": (covariance, [(n, 3, 3)]),
-        "normals": (normals, [(n, 3)]),
-        "normal_covariance": (normal_covariance, [(n, 3, 3)]),
-        "point_normal_covariance": (point_normal_covariance, [(n, 3, 3)]),
+    given: dict[str, Any] = {"points": points, "whisker_radius": 0.0}
+    given |= {name: values for name, values in contacts.items() if values is not None}
+    allowed: dict[str, list[tuple[int, ...]]] = {
+        "points": [(n, 3)],
+        "normals": [(n, 3)],
+        "whisker_radius": [(n,), ()],
     }
     arrays, faults = {}, []
-    for name, (values, shapes) in given.items():
-        if values is None:
-            continue
+    for name, values in given.items():
         arrays[name] = np.asarray(values, dtype=np.float64)
+        shapes = allowed.get(name, [(n, 3, 3)])
         if arrays[name].shape not in shapes:
             wanted = " or ".join(map(str, shapes))
             faults.append(f"{name} has shape {arrays[name].shape}; {wanted} is needed")

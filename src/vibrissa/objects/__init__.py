@@ -1,11 +1,14 @@
 """What a whisker touches: solids with their signed distance, gradient and curvature."""
 
-from vibrissa.objects.dataset import (
+from vibrissa.objects.mesh import Mesh
+from vibrissa.objects.solids import (
+    Box,
+    Peg,
+    Plane,
+    Sphere,
     object_from_dataset as object_from_dataset,
     objects_datasets as objects_datasets,
 )
-from vibrissa.objects.mesh import Mesh
-from vibrissa.objects.solids import Box, Peg, Plane, Sphere
 from vibrissa.objects.surface import Placement as Placement, Surface, between as between
 
 __all__ = [

@@ -26,8 +26,10 @@ from vibrissa.scene.marks import (
     Painted as Painted,
     Side as Side,
     pieces as pieces,
+    robust_limits as robust_limits,
+    root as root,
+    squared as squared,
 )
-from vibrissa.scene.scales import robust_limits as robust_limits, root as root, squared as squared
 from vibrissa.scene.shapes import (
     across as across,
     cylinder as cylinder,

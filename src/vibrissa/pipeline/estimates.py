@@ -128,11 +128,10 @@ def estimates_of(
     names = TRIPLET if whole else selection(signals)
     count = data.sizes["whisker"]
     report = progress or _silent
-    if whiskers is None:
-        if contact_maps is not None:
-            whiskers = [one.whisker for one in contact_maps]
-        else:
-            whiskers = Recording(recording).whiskers
+    how: Any = {"method": method, "errors": errors, "prior": prior, "friction": friction}
+    if whiskers is None and contact_maps is not None:
+        whiskers = [one.whisker for one in contact_maps]
+    whiskers = Recording(recording).whiskers if whiskers is None else whiskers
     for things in (whiskers, contact_maps):
         if things is not None and len(things) != count:
             raise ValueError(f"there are signals of {count} whiskers; {len(things)} are given")
@@ -146,10 +145,11 @@ def estimates_of(
         wrench = one[["force", "moment"]]
         if data.attrs.get("source") != "sensor":
             wrench = wrench.assign(in_contact=one["in_contact"])
-        found = None if whole else without_contact(whisker, wrench, names, noise=sigma)
         if whole:
             found = locate_from_wrench(whisker, wrench, sigma, errors, prior)
-        elif found is None:
+        elif (none := without_contact(whisker, wrench, names, noise=sigma)) is not None:
+            found = none
+        else:
             if contact_maps is not None:
                 contact_map = contact_maps[k]
             else:
@@ -157,16 +157,7 @@ def estimates_of(
                 grid = method.startswith("lookup")
                 contact_map = ContactMap.simulate(whisker, grid=grid, proximal=proximal)
                 report("map of all contacts", k + 1, count)
-            found = locate(
-                contact_map,
-                wrench,
-                names,
-                noise=sigma,
-                method=method,
-                errors=errors,
-                prior=prior,
-                friction=friction,
-            )
+            found = locate(contact_map, wrench, names, noise=sigma, **how)
         parts.append(_one_whisker(one, found, other_noise=noise is not None))
         report("contact points", k + 1, count)
     out = xr.concat(parts, "whisker").transpose("time", "whisker", ...)

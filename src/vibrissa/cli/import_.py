@@ -9,7 +9,7 @@ import numpy as np
 import typer
 
 import vibrissa as vb
-from vibrissa.cli.inputs import WhiskerOptions, cameras_from, metres_of, objects_from
+from vibrissa.cli.inputs import WhiskerOptions, cameras_from, objects_from
 from vibrissa.cli.options import check_new, with_options
 from vibrissa.cli.terminal import progress_bars, remark
 from vibrissa.cli.track import print_tracked
@@ -65,13 +65,9 @@ def import_tracks(
     )
     for note in traces.notes:
         remark(f"note: {note}")
-    properties: dict[str, Any] = {}
-    if base_radius is not None:
-        properties["base_radius"] = metres_of(base_radius, "--base-radius")
     how = vb.tracking.TrackOptions(
         cutoff=vb.tracking.CUTOFF if cutoff is None else cutoff or None,
-        properties=properties,
-        whisker=None if own.whisker is None else own.read().with_properties(**properties),
+        **own.tracked(base_radius),
     )
     known: dict[str, Any] = {} if objects is None else {"objects": objects_from(objects)}
     with progress_bars() as tell:

@@ -54,6 +54,14 @@ class WhiskerOptions:
         whisker = _whisker_in(path)
         return whisker if self.rat is None else whisker.with_properties(rat=self.rat)
 
+    def tracked(self, base_radius: float | None) -> dict[str, Any]:
+        """Options of tracking: the whisker, if it is given, with a radius that is stated."""
+        properties: dict[str, Any] = {}
+        if base_radius is not None:
+            properties["base_radius"] = metres_of(base_radius, "--base-radius")
+        whisker = None if self.whisker is None else self.read().with_properties(**properties)
+        return {"properties": properties, "whisker": whisker}
+
     def in_recording(self, recording: xr.DataTree) -> list[vb.Whisker]:
         """Find the whisker of each that a recording has signals of."""
         count = recording.sizes["whisker"]

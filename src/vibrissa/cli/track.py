@@ -17,7 +17,6 @@ import vibrissa as vb
 from vibrissa.cli.inputs import (
     WhiskerOptions,
     cameras_from,
-    metres_of,
     objects_from,
     print_notes,
     refuse_tracks,
@@ -231,16 +230,12 @@ def track(
             f"--cutoff is {low_pass:g} Hz; it must be below half of {rate:g} frames/s, or 0 for "
             "none"
         )
-    properties: dict[str, Any] = {}
-    if base_radius is not None:
-        properties["base_radius"] = metres_of(base_radius, "--base-radius")
     how = vb.tracking.TrackOptions(
         cutoff=low_pass or None,
         offset=None if filmed.offset == "auto" else int(filmed.offset),
-        properties=properties,
         rough=filmed.cameras is None and filmed.distance != math.inf,
         distance=filmed.distance,
-        whisker=None if own.whisker is None else own.read().with_properties(**properties),
+        **own.tracked(base_radius),
     )
     bases, fixed = traced.bases(views), known.corrected(len(views))
     reference = known.read(videos[0], rate)

@@ -178,10 +178,10 @@ _NEARLY = 1e-3
 def whiskers_from_table(path: Path) -> list[Whisker]:
     """Read a table of whiskers."""
     columns = _Columns(path)
-    place = np.stack([columns.numbers(axis, UNITS) for axis in "xyz"], axis=-1)
-    length = columns.numbers("length", UNITS)
-    coefficient = columns.numbers("coefficient", _CURVATURES)
-    radii = {name: columns.numbers(name, UNITS) for name in _RADII if columns.has(name, UNITS)}
+    place = np.stack([columns.values(axis, UNITS) for axis in "xyz"], axis=-1)
+    length = columns.values("length", UNITS)
+    coefficient = columns.values("coefficient", _CURVATURES)
+    radii = {name: columns.values(name, UNITS) for name in _RADII if columns.has(name, UNITS)}
     rotation = _rotations(columns)
     columns.tell()
     whiskers = []
@@ -218,37 +218,30 @@ def _whisker(
     return replace(whisker, pose=Pose(pose.rotation @ whisker.pose.rotation, pose.origin))
 
 
-class _Columns:
+class _Columns(Table):
     """Numbers of a table by name, in SI units, and what is wrong with it."""
 
     def __init__(self, path: Path) -> None:
+        super().__init__(path)
         self.faults: list[str] = []
-        self._table = Table(path)
-        self.lines = self._table.lines
-        self._names = [name.lower() for name in self._table.names]
-        if "name" not in self._names:
-            raise ValueError(
-                f"{path} has the columns {', '.join(self._table.names)}; {_NEEDED} are needed"
-            )
+        stated = ", ".join(self.names)
+        self.names = [name.lower() for name in self.names]
+        if "name" not in self.names:
+            raise ValueError(f"{path} has the columns {stated}; {_NEEDED} are needed")
 
     def tell(self) -> None:
         """Raise a ValueError with all faults, if there are any."""
         if self.faults:
-            raise ValueError(f"{self._table.path}: {few_faults(self.faults)}")
-
-    def text(self, name: str) -> list[str]:
-        """Cells as they are."""
-        at = self._names.index(name)
-        return [cells[at] for cells in self._table.rows]
+            raise ValueError(f"{self.path}: {few_faults(self.faults)}")
 
     def has(self, name: str, units: Mapping[str, float]) -> bool:
         """Whether there is such a quantity, in any of the units."""
-        return any(name + suffix in self._names for suffix in units)
+        return any(name + suffix in self.names for suffix in units)
 
-    def numbers(self, name: str, units: Mapping[str, float]) -> Array:
+    def values(self, name: str, units: Mapping[str, float]) -> Array:
         """Values of a quantity; NaN, and a fault, where there is none."""
         values = np.full(len(self.lines), np.nan)
-        suffix = next((suffix for suffix in units if name + suffix in self._names), None)
+        suffix = next((suffix for suffix in units if name + suffix in self.names), None)
         if suffix is None:
             allowed = " or ".join(name + suffix for suffix in units if suffix) or name
             self.faults.append(f"there is no column {allowed}")
@@ -264,8 +257,8 @@ class _Columns:
 def _rotations(columns: _Columns) -> Array:
     """Rotations (n, 3, 3), from angles or from matrices."""
     if not columns.has("r11", _PLAIN):
-        return base_rotation(*(columns.numbers(name, _TURNS) for name in _ANGLES))
-    entries = np.stack([columns.numbers(name, _PLAIN) for name in _ROTATION], axis=-1)
+        return base_rotation(*(columns.values(name, _TURNS) for name in _ANGLES))
+    entries = np.stack([columns.values(name, _PLAIN) for name in _ROTATION], axis=-1)
     if columns.faults:
         return entries
     matrix = entries.reshape(-1, 3, 3)

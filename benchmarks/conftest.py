@@ -1,27 +1,36 @@
-"""What each benchmark reports: microseconds for one of what it computes, beside a reference.
+"""What each benchmark reports: the time of one of what it computes, beside two references.
 
 The table at the end comes from the best of several rounds, so that what else runs on the machine
-counts least. Ratios compare CPU times of the same run, core for core, which other work hardly
-changes; by the clock several cores are faster.
+counts least. Times are CPU times, core for core, which other work hardly changes; next to each a
+matrix product (dgemm) is timed, since clocks of shared machines swing by two, and the flops that it
+does in the same time are compared with ``stored.json`` (``--store`` renews it). Nothing fails for
+being slow.
 """
 
 from __future__ import annotations
 
+import json
+import platform
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
+import numba
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
+from threadpoolctl import threadpool_limits
 
 import vibrissa as vb
 from vibrissa import samples
 from vibrissa.numerics import threads
 from vibrissa.rod import discretize, fold_forces, solve_forces, stable_set
 
-_ROWS: list[tuple[str, float, float, float, str]] = []
+STORED = Path(__file__).parent / "stored.json"
+_ROWS: list[dict[str, Any]] = []
 
 
 @pytest.fixture(scope="session")
@@ -116,13 +125,41 @@ def scipy_solve(whisker):
         if np.linalg.norm(solve(rtol) - exact) <= error:
             break
     seconds = best(lambda: solve(rtol))
-    _ROWS.append((f"SciPy, one solve to the same {error:.0e}", seconds, seconds, 1.0, ""))
+    row = dict.fromkeys(("dgemm_flops", "share_of_dgemm"), None)
+    row |= {"what": f"SciPy, one solve to the same {error:.0e}", "aim": ""}
+    row |= {"seconds_each": seconds, "cpu_seconds_each": seconds, "times_the_reference": 1.0}
+    _ROWS.append(row)
     return seconds
+
+
+def dgemm() -> float:
+    """Rate of a matrix product on one core, flop/s: what this machine does at its best, now."""
+    a = np.random.default_rng(1).normal(size=(512, 512))
+    with threadpool_limits(1, user_api="blas"):
+        return 2.0 * 512**3 / best(lambda: a @ a, rounds=10)
+
+
+@pytest.fixture(scope="session")
+def flops_of(whisker, contacts):
+    """Floating-point operations that a contact needs on average: its steps, to its own place.
+
+    A step has four cubics and a compliance at five fractions of it (four of 30 operations, and 5
+    where it ends), curvature and slopes at seven stages (34 each), and 24 sums of six numbers with
+    20 coefficients. A tangent has slopes at seven stages (66 each) and the same sums.
+    """
+    steps = np.searchsorted(discretize(whisker).rod.start, contacts.rows[:, 0]).mean()
+    sums = 24 * 6 * 2
+
+    def count(tangents: int = 0) -> float:
+        step = 4 * 30 + 5 + 7 * 34 + sums + 20 + tangents * (7 * 66 + sums)
+        return float(steps * step)
+
+    return count
 
 
 @pytest.fixture
 def report(benchmark):
-    """Measure, and put a line into the table: what, how many at once, reference, target."""
+    """Measure, and put a line into the table; beside it a matrix product."""
 
     def measure(
         what: str,
@@ -131,8 +168,9 @@ def report(benchmark):
         reference: float | None = None,
         target: str = "",
         rounds: int = 20,
+        flops: float | None = None,
     ) -> object:
-        spent = []
+        spent, rate = [], dgemm()
 
         def counted() -> object:
             begun = time.process_time()
@@ -141,31 +179,84 @@ def report(benchmark):
             return answer
 
         answer = benchmark.pedantic(counted, rounds=rounds, iterations=1, warmup_rounds=1)
+        rate = max(rate, dgemm())
         seconds, cpu = benchmark.stats.stats.min / each, min(spent[1:]) / each
-        if cpu < 0.1 * seconds:  # another process did the work
-            cpu = np.nan
-        ratio = np.nan if reference is None else reference / cpu
-        benchmark.extra_info.update(
-            what=what,
-            aim=target,
-            seconds_each=seconds,
-            cpu_seconds_each=None if np.isnan(cpu) else cpu,
-            times_the_reference=None if reference is None else ratio,
-        )
-        _ROWS.append((what, seconds, cpu, ratio, target))
+        measured = cpu >= 0.1 * seconds  # else another process did the work
+        row = {
+            "what": what,
+            "aim": target,
+            "seconds_each": seconds,
+            "cpu_seconds_each": cpu if measured else None,
+            "times_the_reference": reference / cpu if measured and reference else None,
+            "dgemm_flops": rate * cpu if measured else None,
+            "share_of_dgemm": flops / (rate * cpu) if flops else None,
+        }
+        benchmark.extra_info.update(row)
+        _ROWS.append(row)
         return answer
 
     return measure
 
 
-def pytest_terminal_summary(terminalreporter):
+def pytest_addoption(parser):
+    parser.addoption("--store", action="store_true", help="keep the result to compare with")
+
+
+def pytest_terminal_summary(terminalreporter, config):
     if not _ROWS:
         return
+    stored = json.loads(STORED.read_text()) if STORED.exists() else {"machine": "", "rows": {}}
+    write = terminalreporter.write_line
     terminalreporter.section(f"best of the rounds, {threads()} threads")
-    head = f"{'what':44} {'by the clock':>12} {'CPU':>10} {'SciPy / ours':>13}  target"
-    terminalreporter.write_line(head)
-    for what, *seconds, ratio, target in _ROWS:
-        clock, cpu = (f"{s * 1e6:.2f} µs" if s < 0.01 else f"{s:.3f} s" for s in seconds)
-        compared = "" if np.isnan(ratio) else f"{ratio:,.0f}"
-        line = f"{what:44} {clock:>12} {cpu:>10} {compared:>13}  {target}"
-        terminalreporter.write_line(line)
+    write(f"{machine()}; dgemm {dgemm() / 1e9:.0f} GFlop/s a core")
+    write("flop: what dgemm does in the same CPU time; compared with the stored result in those")
+    write(
+        f"{'what':48} {'clock':>9} {'CPU':>9} {'flop':>8} {'of dgemm':>9} {'SciPy':>7} "
+        f"{'stored':>7}  aim"
+    )
+    for row in _ROWS:
+        clock, cpu = (_seconds(row[name]) for name in ("seconds_each", "cpu_seconds_each"))
+        flops, share, ratio = (
+            row[name] for name in ("dgemm_flops", "share_of_dgemm", "times_the_reference")
+        )
+        before = stored["rows"].get(row["what"])
+        cells = (
+            f"{flops:.2g}" if flops else "",
+            f"{share:.0%}" if share else "",
+            f"× {ratio:,.0f}" if ratio else "",
+            f"× {flops / before:.2f}" if flops and before else "",
+        )
+        write(
+            "{:48} {:>9} {:>9} {:>8} {:>9} {:>7} {:>7}  {}".format(
+                row["what"], clock, cpu, *cells, row["aim"]
+            )
+        )
+    if stored["rows"]:
+        write(f"stored: {stored['machine']}")
+    if config.getoption("--store"):
+        rows = stored["rows"] | {
+            row["what"]: float(f"{row['dgemm_flops']:.3g}") for row in _ROWS if row["dgemm_flops"]
+        }
+        STORED.write_text(
+            json.dumps({"machine": machine(), "rows": rows}, indent=1, ensure_ascii=False) + "\n"
+        )
+
+
+def _seconds(value: float | None) -> str:
+    if value is None:
+        return ""
+    for unit, size in (("s", 1.0), ("ms", 1e-3)):
+        if value >= 0.1 * size:
+            return f"{value / size:.2f} {unit}"
+    return f"{value * 1e6:.2f} µs"
+
+
+def machine() -> str:
+    """Processor, cores and versions."""
+    model, info = platform.machine(), Path("/proc/cpuinfo")
+    if info.exists():
+        names = [line for line in info.read_text().splitlines() if line.startswith("model name")]
+        model = names[0].split(":", 1)[1].strip() if names else model
+    return (
+        f"{model}, {threads()} cores, Python {platform.python_version()}, Numba {numba.__version__}"
+    )

@@ -18,7 +18,7 @@ def contacts_map(whisker):
 
 
 @pytest.fixture(scope="module")
-def felt(whisker, contacts):
+def measured(whisker, contacts):
     """Contact points and the signals they give."""
     d = discretize(whisker)
     values, _ = solve_forces(d, contacts.rows)
@@ -26,8 +26,9 @@ def felt(whisker, contacts):
     return point, vb.base_signals(force, np.cross(point, force))
 
 
-def test_batch_of_estimates(contacts_map, felt, scipy_solve, report):
-    point, signals = felt
+@pytest.mark.quick
+def test_batch_of_estimates(contacts_map, measured, scipy_solve, report):
+    point, signals = measured
     chart = contacts_map.chart
     tree = contacts_map.tree(TRIPLET)
     scale = np.array([chart.discretization.force, chart.discretization.moment, 1.0])
@@ -37,8 +38,8 @@ def test_batch_of_estimates(contacts_map, felt, scipy_solve, report):
         lambda: invert(chart, tree, TRIPLET, targets),
         len(targets),
         scipy_solve,
-        "3.3 µs",
-        rounds=20,
+        "2 µs",
+        rounds=8,
     )
     away = np.linalg.norm(
         found.values[..., 3:] * chart.discretization.length - point[:, None], axis=-1
@@ -50,8 +51,8 @@ def test_batch_of_estimates(contacts_map, felt, scipy_solve, report):
     assert hit.mean() > 0.999
 
 
-def test_batch_of_labelled_estimates(contacts_map, felt, scipy_solve, report):
-    _, signals = felt
+def test_batch_of_labelled_estimates(contacts_map, measured, scipy_solve, report):
+    _, signals = measured
     found = report(
         "the same as a dataset, with covariances",
         lambda: contacts_map.estimate(signals, TRIPLET, NOISE),
@@ -62,8 +63,8 @@ def test_batch_of_labelled_estimates(contacts_map, felt, scipy_solve, report):
     assert np.isfinite(found.covariance[found.n_candidates > 0]).all()
 
 
-def test_batch_of_six_signals(contacts_map, felt, scipy_solve, report):
-    point, signals = felt
+def test_batch_of_six_signals(contacts_map, measured, scipy_solve, report):
+    point, signals = measured
     some = signals.isel(sample=slice(10_000))
     found = report(
         "six signals by least squares, with covariances",
@@ -76,8 +77,8 @@ def test_batch_of_six_signals(contacts_map, felt, scipy_solve, report):
     assert (away < 1e-9).mean() > 0.99
 
 
-def test_batch_of_wrenches(whisker, felt, contacts_map, scipy_solve, report):
-    point, signals = felt
+def test_batch_of_wrenches(whisker, measured, contacts_map, scipy_solve, report):
+    point, signals = measured
     bent = contacts_map.estimate(signals.isel(sample=slice(10_000)), SIGNALS)
     found = report(
         "force and moment → contact and friction",
@@ -109,8 +110,9 @@ def test_one_measurement_of_six_signals_at_a_time(contacts_map, scipy_solve, rep
     assert all(np.isfinite(one.point).all() for one in found)
 
 
-def test_one_estimate_at_a_time(contacts_map, felt, scipy_solve, report):
-    _, signals = felt
+@pytest.mark.quick
+def test_one_estimate_at_a_time(contacts_map, measured, scipy_solve, report):
+    _, signals = measured
     rows = np.stack([signals[name].to_numpy() for name in TRIPLET], axis=-1)[:500]
     locate = vb.Estimator(contacts_map, TRIPLET)
     found = report(
@@ -118,7 +120,7 @@ def test_one_estimate_at_a_time(contacts_map, felt, scipy_solve, report):
         lambda: [locate(row) for row in rows],
         len(rows),
         scipy_solve,
-        "100 µs",
+        "25 µs",
         rounds=10,
     )
     assert all(np.isfinite(one.point).all() for one in found)

@@ -4,37 +4,43 @@ import subprocess
 import sys
 
 import numpy as np
+import pytest
 
 import vibrissa as vb
 from vibrissa.rod import discretize, point_solver, solve_forces
 
 
-def test_force_to_signals(whisker, contacts, scipy_solve, report):
+@pytest.mark.quick
+def test_force_to_signals(whisker, contacts, flops_of, scipy_solve, report):
     d = discretize(whisker)
     values, _ = report(
         "force → base force and contact point",
         lambda: solve_forces(d, contacts.rows),
         len(contacts.rows),
         scipy_solve,
-        "0.5 µs",
-        rounds=100,
+        "0.3 µs, 50 %",
+        rounds=30,
+        flops=flops_of(),
     )
     assert np.isfinite(values).all()
 
 
-def test_force_to_signals_with_jacobian(whisker, contacts, scipy_solve, report):
+@pytest.mark.quick
+def test_force_to_signals_with_jacobian(whisker, contacts, flops_of, scipy_solve, report):
     d = discretize(whisker)
     _, tangents = report(
         "the same with the exact Jacobian",
         lambda: solve_forces(d, contacts.rows, tangents=True),
         len(contacts.rows),
         scipy_solve,
-        "2 µs",
-        rounds=50,
+        "1 µs, 40 %",
+        rounds=12,
+        flops=flops_of(tangents=3),
     )
     assert np.isfinite(tangents).all()
 
 
+@pytest.mark.quick
 def test_points_to_contacts(whisker, contacts, scipy_solve, report):
     load = vb.PointContact(contacts.points)
     bent = report(
@@ -42,8 +48,8 @@ def test_points_to_contacts(whisker, contacts, scipy_solve, report):
         lambda: vb.deflect(whisker, load),
         len(contacts.rows),
         scipy_solve,
-        "5 µs",
-        rounds=20,
+        "2 µs",
+        rounds=8,
     )
     assert (bent.status == vb.Status.OK).all()
     assert (np.abs(bent.arc_length / whisker.length - contacts.rows[:, 0]) < 1e-6).all()
@@ -60,13 +66,14 @@ def test_the_paper_s_grid(whisker, report):
     bent = report(
         "the paper's grid, 237,765 points",
         lambda: vb.deflect(whisker, load),
-        target="2 s",
-        rounds=5,
+        target="0.5 s",
+        rounds=3,
     )
     assert bent.status.size == 237_765
     assert not np.isin(bent.status, (vb.Status.NOT_CONVERGED, vb.Status.MISSING)).any()
 
 
+@pytest.mark.quick
 def test_one_point(whisker, contacts, scipy_solve, report):
     """One contact at a time, as in a control loop."""
     load = vb.PointContact(contacts.points[0])
@@ -105,11 +112,12 @@ def test_tables(report):
     assert report("tables for a new whisker", prepare, rounds=5) is not None
 
 
+@pytest.mark.quick
 def test_import(report):
     def load():
         subprocess.run([sys.executable, "-c", "import vibrissa"], check=True)
 
-    report("python -c 'import vibrissa'", load, target="0.5 s")
+    report("python -c 'import vibrissa'", load, target="0.1 s", rounds=5)
     assert load() is None
 
 

@@ -72,9 +72,13 @@ def speeds(found: list[dict[str, Any]], module: str) -> str:
         info = one["extra_info"]
         ratio, cpu = info["times_the_reference"], info["cpu_seconds_each"]
         times = "" if ratio is None else few(ratio)
+        share = info["share_of_dgemm"]
+        part = "" if share is None else f"{100 * share:.0f} %"
         spent = "" if cpu is None else duration(cpu)
-        rows.append([info["what"], times, spent, duration(info["seconds_each"]), info["aim"]])
-    head = ["what", "times as fast as SciPy", "CPU each", "by the clock each", "aim, by the clock"]
+        clock = duration(info["seconds_each"])
+        rows.append([info["what"], times, spent, part, clock, info["aim"]])
+    head = ["what", "times as fast as SciPy", "CPU each", "flop rate over dgemm's"]
+    head += ["by the clock each", "aim, by the clock"]
     return table(head, rows)
 
 

@@ -5,14 +5,14 @@
     python benchmarks/peers.py [--elements 10 20]
 
 A straight rod (40 mm, 0.4 mm in radius at the base, ratio 15) is bent by a force at 0.6 of its
-length until the tangent there has turned by about 50°. Beyond the force nothing is loaded, so that
+length until the tangent there has turned by about 65°. Beyond the force nothing is loaded, so that
 all three solve the rod up to it. vibrissa has the force in the bent frame and integrates once, or
 has the point and searches; SciPy's ``solve_bvp`` and PyElastica have the force in space.
 PyElastica, which is dynamic, is damped until the loaded point moves by less than 1e-6 of the length
 in a period of its slowest vibration. Errors are distances of the loaded point over the length, from
 vibrissa with eight times the steps, which ``solve_bvp`` at 1e-10 confirms; PyElastica's rod also
-stretches and shears, which alone is some 1e-4. Times are CPU times of one core, after a first call that
-compiles. Without PyElastica its rows are left out.
+stretches and shears, which alone is some 1e-4. Times are CPU times of one core, after a first call
+that compiles. Without PyElastica its rows are left out.
 """
 
 from __future__ import annotations

@@ -45,6 +45,7 @@ WIDER = {"title": 1360}
 LEVELS = {
     "title": 48,
     "signal_space": 48,
+    "solid": 32,
     "trial": 32,
     "movie_signals": 64,
     "movie_contour": 64,

@@ -126,16 +126,19 @@ for i in (0, 20, 60, len(time) - 1):
     )
 
 # %% What the two signals leave, and how the motion of the base narrows it down
-figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.2), layout="constrained")
-rest_line = wire.centerline(60) * 1e3
-left.plot(rest_line[:, 0], rest_line[:, 1], color="0.6", label="wire at rest")
-order = np.argsort(one.candidates.arc_length)
-left.plot(*(one.candidates.point[order, :2] * 1e3).T, "o-", ms=3, label="give the same two moments")
-left.plot(*(point[:2] * 1e3), "k*", ms=10, label="true contact")
-left.set(xlabel="x (mm)", ylabel="y (mm)", title="one sample")
-left.legend(frameon=False)
-right.semilogy(time, error * 1e3, label="error")
-right.semilogy(time, sigma * 1e3, label="predicted")
-right.set(xlabel="time (s)", ylabel="contact point (mm)", title="with the motion of the base")
-right.legend(frameon=False)
+with plots.looking():
+    figure, (left, right) = plt.subplots(1, 2, figsize=(7.0, 2.6), layout="constrained")
+    rest_line = wire.centerline(60) * 1e3
+    left.plot(rest_line[:, 0], rest_line[:, 1], color="0.6", linewidth=2.0, label="wire at rest")
+    order = np.argsort(one.candidates.arc_length)
+    candidates = one.candidates.point[order, :2] * 1e3
+    left.plot(*candidates.T, "o-", color="#0072b2", ms=3, label="contacts with these two moments")
+    left.plot(*(point[:2] * 1e3), "*", color="#d55e00", ms=9, label="true contact")
+    left.set(xlabel="x (mm)", ylabel="y (mm)", title="One sample leaves a curve of contacts")
+    left.legend()
+    right.semilogy(time, error * 1e3, color="#0072b2", label="error")
+    right.semilogy(time, sigma * 1e3, "--", color="#d55e00", label="predicted error")
+    right.set(xlabel="time (s)", ylabel="error of the contact point (mm)")
+    right.set_title("The motion of the base narrows it down")
+    right.legend()
 plots.save(figure, folder / "robot_whisker", ["png"])

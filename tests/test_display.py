@@ -1,6 +1,8 @@
 """What results look like in a notebook and in a terminal."""
 
 import re
+import sys
+import types
 import xml.etree.ElementTree as ET
 
 import numpy as np
@@ -151,3 +153,68 @@ def test_what_is_printed_fits_a_terminal_and_tells_numbers(bent):
     assert shown("force", [1e-4, 1.0000000001e-4]) == "100 µN"
     # A wire's forces are not told in a million micronewtons.
     assert shown("force", [2.0, 4.0]) == "3000 mN (2000 to 4000)"
+
+
+def curves_in(figure, label):
+    """Lines (n, 3) of one name, m."""
+    lines = [one for one in figure.data if one.name == label]
+    return [1e-3 * np.column_stack([one.x, one.y, one.z]) for one in lines]
+
+
+def test_results_in_space(bent):
+    pytest.importorskip("plotly")
+    figure = vb.in_space(bent)
+    (rest,) = curves_in(figure, "at rest")
+    np.testing.assert_allclose(rest, WHISKER.centerline(101), atol=1e-9)
+    np.testing.assert_allclose(curves_in(figure, "bent"), bent.centerline(101), atol=1e-9)
+    (dots,) = (one for one in figure.data if one.name == "contacts")
+    np.testing.assert_allclose(dots.z, 1e3 * bent.contact_point[:, 2], atol=1e-9)
+    assert len(curves_in(vb.in_space(WHISKER), "at rest")) == 1
+    with pytest.raises(ValueError, match="got float"):
+        vb.in_space(1.0)
+
+
+def test_a_recording_in_space():
+    pytest.importorskip("plotly")
+    peg = facing_peg(WHISKER)
+    trial = simulate(WHISKER, sweep_past(WHISKER, peg, 0.1, seed=1), peg)
+    figure = vb.in_space(trial)
+    (dots,) = (one for one in figure.data if one.name == "true contacts")
+    points = trial["truth"]["contact_point"].values[:, 0]
+    points = points[np.isfinite(points).all(axis=1)]
+    assert len(points) > 10
+    np.testing.assert_allclose(np.column_stack([dots.x, dots.y, dots.z]), 1e3 * points, atol=1e-9)
+    assert "peg, known" in [one.name for one in figure.data]
+
+
+class Kernel:
+    """A notebook's kernel, which keeps what was displayed."""
+
+    kernel = True
+
+    def __init__(self):
+        self.shown = []
+
+    def update(self, html):
+        self.shown.append(html)
+
+
+def test_progress_in_a_notebook_and_in_a_terminal(monkeypatch, capsys):
+    kernel = Kernel()
+    display = types.ModuleType("IPython.display")
+    display.HTML, display.display = str, lambda html, display_id: kernel
+    notebook = types.ModuleType("IPython")
+    notebook.get_ipython = lambda: kernel
+    with vb.progress() as bar:
+        bar("<signals>", 1, 4)
+        bar(3, 4)
+    assert "<signals>" in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, "IPython", notebook)
+    monkeypatch.setitem(sys.modules, "IPython.display", display)
+    with vb.progress() as bar:
+        bar("<signals>", 1, 4)
+        bar(3, 4)
+    first, second = kernel.shown[-1].split("<br>")
+    assert 'value="1" max="4"' in first
+    assert "&lt;signals&gt; 1/4" in first
+    assert second.endswith("done 3/4")

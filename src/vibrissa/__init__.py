@@ -61,6 +61,7 @@ if TYPE_CHECKING:
         load_whisker,
     )
     from vibrissa.paper import sensitivity_findings
+    from vibrissa.report import in_space
     from vibrissa.rod import (
         Deflection,
         PegContact,
@@ -71,6 +72,7 @@ if TYPE_CHECKING:
         resting,
     )
     from vibrissa.signals import base_signals
+    from vibrissa.sketch import progress
     from vibrissa.status import Status
     from vibrissa.whisker import Whisker, WhiskerArray, whisker_array
 
@@ -102,6 +104,7 @@ __all__ = [
     "estimate_from_wrench",
     "evaluation",
     "identifiability",
+    "in_space",
     "io",
     "load_array",
     "load_recording",
@@ -113,6 +116,7 @@ __all__ = [
     "paper",
     "pipeline",
     "plots",
+    "progress",
     "quantities",
     "recording",
     "report",
@@ -170,7 +174,9 @@ _HOMES = {
         "deflect",
         "resting",
     ),
+    "report": ("in_space",),
     "signals": ("base_signals",),
+    "sketch": ("progress",),
     "status": ("Status",),
     "whisker": ("Whisker", "WhiskerArray", "whisker_array"),
 }

@@ -1,4 +1,4 @@
-"""How results show themselves in a notebook: a small picture and a table with units.
+"""How results show themselves in a notebook: a small picture, a table with units, progress bars.
 
 The picture is a few lines of SVG, so that showing a value never loads a plotting library: the
 whisker's x–y and x–z planes at one scale, with a bar of round length. Figures are in
@@ -7,16 +7,22 @@ whisker's x–y and x–z planes at one scale, with a bar of round length. Figur
 
 from __future__ import annotations
 
+import importlib
+import sys
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from html import escape
-from typing import TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.quantities import quantity, shown_unit
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 Array = NDArray[np.float64]
 _Kind = TypeVar("_Kind", bound=np.generic)
@@ -202,3 +208,65 @@ def symbol(name: str) -> str:
     for command, letter in (("\\theta", "θ"), ("\\phi", "φ"), ("\\varphi", "φ")):
         plain = plain.replace(command, letter)
     return plain.replace("{", "").replace("}", "")
+
+
+@contextmanager
+def progress(console: Console | None = None) -> Iterator[Callable[..., None]]:
+    """Show a bar for each stage of a computation, in a notebook or a terminal.
+
+    Parameters
+    ----------
+    console : rich.console.Console, optional
+        Terminal to write to; by default the notebook, where there is one, or standard error.
+
+    Yields
+    ------
+    callable
+        Function to be passed as ``progress=``; it is called as ``(done, total)`` or as ``(stage,
+        done, total)``.
+    """
+    stages: dict[str, Any] = {}
+
+    if console is None and _in_notebook():
+        notebook: Any = importlib.import_module("IPython.display")
+        handle = notebook.display(notebook.HTML(""), display_id=True)
+
+        def show(stage: str, done: int, total: int) -> None:
+            stages[stage] = (
+                f'<progress value="{done}" max="{total}"></progress> {escape(stage)} {done}/{total}'
+            )
+            handle.update(notebook.HTML("<br>".join(stages.values())))
+
+        yield lambda *report: show(*_report(*report))
+        return
+
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = (
+        SpinnerColumn(finished_text="[green]✓"),
+        TextColumn("{task.description}", markup=False),
+        BarColumn(bar_width=30),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=console or Console(stderr=True)) as bars:
+
+        def tell(*report: Any) -> None:
+            stage, done, total = _report(*report)
+            if stage not in stages:
+                stages[stage] = bars.add_task(stage, total=total)
+            bars.update(stages[stage], completed=done, total=total)
+
+        yield tell
+
+
+def _report(*report: Any) -> tuple[str, int, int]:
+    """Stage, which not all computations name, and how much of how much is done."""
+    *stage, done, total = report
+    return (stage[0] if stage else "done"), done, total
+
+
+def _in_notebook() -> bool:
+    """Whether code runs in a notebook's kernel."""
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    return shell is not None and hasattr(shell, "kernel")

@@ -20,6 +20,17 @@ SYMBOLS = {
     SIX: "six signals",
     WRENCH: "force and moment",
 }
+TRIALS = {
+    "friction-0": ("#b8a9d9", "-"),
+    "friction-01": ("#9677c2", "-"),
+    "friction-03": ("#6f42a6", "-"),
+    "friction-05": ("#3b1070", "-"),
+    "dynamic": (INK, "--"),
+    "fast": (INK, "--"),
+}
+"""Colours and lines of trials, none of them that of a method: the darker the more friction, broken
+where the whisker moves fast."""
+
 SHOWN = ("friction-0", "friction-03", "dynamic")
 RUBBED = LABELS[-1]
 
@@ -82,13 +93,10 @@ def by_friction(axes: Axes, results: Mapping[str, Any]) -> None:
 
 
 def flags(axes: Axes, results: Mapping[str, Any], labels: Mapping[str, str]) -> None:
-    shades = dict(zip(labels, (BLUE, "#56b4e9", ORANGE, INK, GREEN), strict=False))
-    for name, colour in shades.items():
+    for name in [name for name in TRIALS if name in labels]:
         classes = results[name]["true"][SIX]["classes"]
         values = [100 * classes[label]["flagged"] for label in LABELS]
-        axes.plot(
-            range(len(LABELS)), values, "o-", color=colour, label=labels[name], markersize=2.5
-        )
+        trial_line(axes, name, values, labels[name])
     axes.set_ylim(-3, 145)  # room for the legend
     axes.set_yticks(range(0, 101, 20))
     axes.set_ylabel("share of contacts (%)")
@@ -96,20 +104,24 @@ def flags(axes: Axes, results: Mapping[str, Any], labels: Mapping[str, str]) -> 
     by_class(axes)
 
 
+def trial_line(axes: Axes, name: str, values: Any, label: str) -> None:
+    colour, style = TRIALS[name]
+    axes.plot(range(len(values)), values, f"o{style}", color=colour, label=label, markersize=2.5)
+
+
 def cutoffs(axes: Axes, results: Mapping[str, Any]) -> None:
     """What the pose alone adds, and what the paper's method makes of the contact."""
-    shown = (("friction-0", BLUE), ("friction-03", GREEN), ("fast", ORANGE))
     labels = {
         "friction-0": "5 whisks a second",
         "friction-03": "friction 0.3",
         "fast": "10 a second",
     }
-    for name, colour in shown:
+    for name, label in labels.items():
         rows = results.get(name, {}).get("cutoffs")
         if not rows:
             continue
         values = np.array([row["moved"][0] for row in rows.values()]) * 1e6
-        axes.plot(range(len(rows)), values, "o-", color=colour, label=labels[name], markersize=2.5)
+        trial_line(axes, name, values, label)
         axes.set_xticks(range(len(rows)), list(rows))
     axes.set_xlabel("cut-off (Hz)")
     axes.set_ylabel("contact moved by the pose (µm)")

@@ -48,8 +48,9 @@ def export(
     else:
         vb.io.save_predictors(target, table)
     touching = int(table["in_contact"].sum()) if "in_contact" in table else 0
+    count = table.sizes["whisker"]
     say(
-        f"{table.sizes['time']} frames of {table.sizes['whisker']} whiskers, {touching} in "
+        f"{table.sizes['time']} frames of {count} whisker{'s' * (count > 1)}, {touching} in "
         f"contact; {len(table)} columns, {len(table.attrs['predictors'].split())} of them "
         "predictors of models of spikes"
     )

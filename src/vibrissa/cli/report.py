@@ -18,7 +18,6 @@ from vibrissa.cli.figures import (
     TrialOptions,
     array_drawings,
     dataset_with,
-    fits_of,
     map_drawings,
     trial_drawings,
 )
@@ -134,12 +133,10 @@ def _of_trial(
     drawings = array_drawings(path, "double")
     drawings |= trial_drawings(path, "double", of_trial, tell)
     if course.places is not None and np.isfinite(course.places).any() and _can_draw():
-        things = trial["objects"].children.values() if "objects" in trial.children else ()
-        known = [thing.to_dataset() for thing in things]
         shown = ["Contact points in the laboratory"]
-        shown += ["the known object"] if things else []
+        shown += ["the known object"] if "objects" in trial.children else []
         shown += ["the fitted shape"] if "contour" in trial.children else []
-        picture = vb.report.contacts_in_space(course, known, fits_of(trial))
+        picture = vb.report.trial_in_space(trial, course)
         section, script = vb.report.space_section(picture, f"{', '.join(shown)}, and the whisker.")
         sections = [*sections, section]
     title = f"Trial: {path.name}"

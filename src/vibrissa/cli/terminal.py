@@ -5,14 +5,14 @@ from __future__ import annotations
 import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
 from rich.text import Text
 
 from vibrissa.quantities import quantity
+from vibrissa.sketch import progress
 
 output = Console(markup=False, emoji=False)
 """Where results go, as they are: names of files and whiskers may have brackets."""
@@ -34,24 +34,9 @@ def remark(line: str) -> None:
     errors.print(line, highlight=False, soft_wrap=True)
 
 
-@contextmanager
-def progress_bars() -> Iterator[Tell]:
+def progress_bars() -> AbstractContextManager[Tell]:
     """Show a bar for each stage that is reported."""
-    columns = (
-        SpinnerColumn(finished_text="[green]✓"),
-        TextColumn("{task.description}", markup=False),
-        BarColumn(bar_width=30),
-        TimeElapsedColumn(),
-    )
-    with Progress(*columns, console=errors) as bars:
-        tasks: dict[str, TaskID] = {}
-
-        def tell(stage: str, done: int, total: int) -> None:
-            if stage not in tasks:
-                tasks[stage] = bars.add_task(stage, total=total)
-            bars.update(tasks[stage], completed=done, total=total)
-
-        yield tell
+    return progress(errors)
 
 
 @contextmanager

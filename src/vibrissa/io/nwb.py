@@ -62,7 +62,7 @@ def read_nwb(path: str | PathLike[str]) -> RawTracks:
     if not space and not image:
         raise ValueError(
             f"{path} has no poses: no PoseEstimation holds any series of points; "
-            "what whiskers feel and how they are held is read by load_nwb_series"
+            "forces and poses of the base are read by load_nwb_series"
         )
     every = [*space.values(), *image.values()]
     time = every[0].time

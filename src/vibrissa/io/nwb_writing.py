@@ -170,7 +170,9 @@ def _fill(
 ) -> None:
     from ndx_pose import Skeletons
 
-    behavior = file.create_processing_module("behavior", "Whiskers, what they feel, and contacts")
+    behavior = file.create_processing_module(
+        "behavior", "Whiskers, forces at their bases, and contacts"
+    )
     clock = _clock(data["time"].values)
     poses = {"trace", "centerline"} & set(data.data_vars)
     skeletons = Skeletons(skeletons=[])

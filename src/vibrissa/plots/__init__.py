@@ -14,7 +14,7 @@ from vibrissa.plots.sensitivity import sensitivity_panels
 from vibrissa.plots.signal_space import signal_clouds
 from vibrissa.plots.signals import signals_over_time
 from vibrissa.plots.slices import solid_slices
-from vibrissa.plots.style import cyclic, diverging, png, save, sequential
+from vibrissa.plots.style import cyclic, diverging, looking, png, save, sequential
 from vibrissa.plots.sweep import drawable, sweep_overview
 from vibrissa.plots.verdicts import HIGHLIGHTED, critical_cones, resolution, verdict_table
 from vibrissa.plots.whisker import whisker_views
@@ -36,6 +36,7 @@ __all__ = [
     "drawable",
     "estimated_against_true",
     "key_frames",
+    "looking",
     "png",
     "resolution",
     "save",

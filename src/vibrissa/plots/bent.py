@@ -217,7 +217,7 @@ _TABLE = 70.0
 
 
 def witness_pair(witness: xr.Dataset, *, width: Width = "double") -> Figure:
-    """Draw two bent whiskers that feel the same by three signals, and list all six.
+    """Draw two bent whiskers with three equal signals, and list all six.
 
     Parameters
     ----------

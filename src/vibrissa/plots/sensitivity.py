@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb
+from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
@@ -27,14 +28,15 @@ from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.scene import Array, Mask, robust_limits
 
 COORDINATES = ("r", "theta", "phi")
-BINS = 50
+BINS = 25
 SHARE = 0.99
 _PAPER = ("MD", "MB", "Fx")
 _DIRECTIONS = ("FD", "MD")
-_FAINTEST = 0.15
-"""Opacity of a bin that holds next to nothing."""
+_SHARES = (0.1, 0.25, 0.5, 0.75, 0.9)
+_MEDIAN = 2
+_BANDS = ((0, 4), (1, 3))
+"""Quantiles that are drawn, which of them is the median, and which bound the two bands."""
 
-_CURVE_BINS = 20
 _HEIGHTS = {"single": 104.0, "double": 125.0}
 _SKEWED = 30.0
 """Signals that reach so many times their lowest tenth get an axis that is wider near zero."""
@@ -64,10 +66,10 @@ def sensitivity_panels(data: xr.Dataset, *, width: Width = "double") -> Figure:
     """Draw the derivatives of r, θ and φ with respect to three signals, over these signals.
 
     Nine panels: a row for each coordinate, a column for each signal, in each the derivative over
-    the signal in 50 × 50 bins, the more opaque the more contacts (by the volume that they stand
-    for, if the dataset has it). Axes hold the central 99 % of the values; contacts within 2° of
-    rest are left out. A bin's colour distinguishes concave forward from backward, mixed where both
-    occur; lines are their medians. Signals that pile up near zero have an axis that is wider there.
+    the signal, of concave forward and concave backward contacts (by the volume that they stand for,
+    if the dataset has it): the median in 25 bins, and bands that hold half and four fifths of the
+    contacts. Axes hold the central 99 % of the signals; contacts within 2° of rest are left out.
+    Signals that pile up near zero have an axis that is wider there.
 
     Parameters
     ----------
@@ -104,9 +106,16 @@ def sensitivity_panels(data: xr.Dataset, *, width: Width = "double") -> Figure:
                     axes.set_xlabel(axis_label(name))
         labels = (("concave forward", BLUE), ("concave backward", ORANGE))
         figure.legend(
-            handles=[Patch(color=colour, label=words) for words, colour in labels],
+            handles=[
+                *(
+                    Line2D([], [], color=_darker(c), label=f"{words}, median")
+                    for words, c in labels
+                ),
+                Patch(color=MUTED, alpha=0.6, linewidth=0.0, label="50 % of contacts"),
+                Patch(color=MUTED, alpha=0.25, linewidth=0.0, label="80 %"),
+            ],
             loc="outside upper center",
-            ncols=2,
+            ncols=4 if width == "double" else 2,
             borderpad=0.0,
         )
         return figure
@@ -150,20 +159,19 @@ def _panel(axes: Axes, contacts: _Contacts, coordinate: str, name: str, *, small
     weight, backward = contacts.weight[kept], contacts.backward[kept]
     direction = name in _DIRECTIONS
     limits = np.array([-180.0, 180.0]) if direction else _limits(x, weight)
-    heights = _limits(y, weight)
     bend = _bend(x, weight, direction)
-    columns, rows = _edges(limits, BINS, bend), _edges(heights, BINS, None)
-    counts = [
-        np.histogram2d(x[side], y[side], (columns, rows), weights=weight[side])[0].T
-        for side in (~backward, backward)
-    ]
     axes.axhline(0.0, color=MUTED, linewidth=0.5, zorder=0)
-    axes.pcolormesh(columns, rows, _blend(*counts), rasterized=True, linewidth=0.0)
-    edges = _edges(limits, _CURVE_BINS, bend)
+    edges = _edges(limits, BINS, bend)
+    bands = []
     for side, colour in ((~backward, BLUE), (backward, ORANGE)):
-        middle, curve = _medians(x[side], y[side], weight[side], edges)
-        axes.plot(middle, curve, color="white", linewidth=1.8)
-        axes.plot(middle, curve, color=_darker(colour), linewidth=0.9)
+        middle, curves = _spread(x[side], y[side], weight[side], edges)
+        bands.append(curves)
+        for (low, high), opacity in zip(_BANDS, (0.15, 0.3), strict=True):
+            axes.fill_between(
+                middle, curves[low], curves[high], color=colour, alpha=opacity, linewidth=0.0
+            )
+        axes.plot(middle, curves[_MEDIAN], color=_darker(colour), linewidth=1.0)
+    heights = robust_limits(np.concatenate(bands, axis=1), 1.0)
     scale_near_zero(axes, "x", limits, bend)
     axes.set_ylim(*heights)
     _ticks(axes, direction, bend, small)
@@ -199,34 +207,22 @@ def _edges(limits: Array, bins: int, bend: float | None) -> Array:
     return edges if bend is None else np.asarray(bend * np.sinh(edges))
 
 
-def _blend(forward: Array, backward: Array) -> Array:
-    """Colours (n, m, 4) of bins: hue by the side, opacity by how much is in them."""
-    total = forward + backward
-    share = np.divide(backward, total, out=np.zeros_like(total), where=total > 0.0)[..., None]
-    out = np.zeros((*total.shape, 4))
-    out[..., :3] = (1.0 - share) * to_rgb(BLUE) + share * to_rgb(ORANGE)
-    # The square root shows the thin bins too.
-    strength = np.sqrt(total / max(float(np.quantile(total[total > 0.0], 0.98)), 1e-300))
-    out[..., 3] = np.where(total > 0.0, _FAINTEST + (1.0 - _FAINTEST) * np.minimum(strength, 1), 0)
-    return out
+def _darker(colour: str) -> str:
+    red, green, blue = 0.6 * np.array(to_rgb(colour)) + 0.4 * np.array(to_rgb(INK))
+    return to_hex((red, green, blue))
 
 
-def _darker(colour: str) -> Array:
-    return np.asarray(0.6 * np.array(to_rgb(colour)) + 0.4 * np.array(to_rgb(INK)))
-
-
-def _medians(x: Array, y: Array, weight: Array, edges: Array) -> tuple[Array, Array]:
-    """Middles of bins of x and weighted medians of y in them; NaN in bins with few."""
-    middle, curve = np.full((2, edges.size - 1), np.nan)
+def _spread(x: Array, y: Array, weight: Array, edges: Array) -> tuple[Array, Array]:
+    """Middles of bins of x and weighted quantiles of y in them; NaN in bins with few."""
+    middle = np.full(edges.size - 1, np.nan)
+    curves = np.full((len(_SHARES), edges.size - 1), np.nan)
     place = np.digitize(x, edges) - 1
     for k in range(edges.size - 1):
         rows = np.flatnonzero(place == k)
         if weight[rows].sum() > _LEAST * weight.sum():
-            order = rows[np.argsort(y[rows])]
-            total = np.cumsum(weight[order])
             middle[k] = np.median(x[rows])
-            curve[k] = y[order[np.searchsorted(total, 0.5 * total[-1])]]
-    return middle, curve
+            curves[:, k] = _quantiles(y[rows], weight[rows], list(_SHARES))
+    return middle, curves
 
 
 def _ticks(axes: Axes, direction: bool, bend: float | None, small: bool) -> None:

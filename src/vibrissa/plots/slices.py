@@ -161,14 +161,27 @@ def _lines(axes: Axes, x: Array, y: Array, values: Array, name: str) -> None:
     look: dict[str, Any] = {"cmap": diverging() if signed else sequential(), "norm": norm}
     mesh = axes.pcolormesh(x, y, values, rasterized=True, **look)
     if error:
-        rail = axes.inset_axes((0.52, 0.93, 0.46, 0.035))
-        bar = axes.figure.colorbar(mesh, cax=rail, orientation="horizontal", extend="both")
-        _error_bar(bar)
-        bar.ax.tick_params(labelsize=5.0)
+        _error_bar(_rail(axes, mesh))
         return
-    steps = MaxNLocator(8).tick_values(low, high)
-    lines = axes.contour(x, y, values, steps, colors=INK, linewidths=0.5, linestyles="solid")
-    axes.clabel(lines, fontsize=5.0, inline_spacing=1.0, fmt=lambda v: f"{v:g}".replace("-", "−"))
+    steps = MaxNLocator(5).tick_values(low, high)
+    steps = steps[(steps >= low) & (steps <= high)]
+    axes.contour(x, y, values, steps, colors=INK, linewidths=0.5, linestyles="solid")
+    bar = _rail(axes, mesh)
+    bar.set_ticks(steps, labels=[f"{step:g}".replace("-", "−") for step in steps])
+    # The lines in the panel are at the ticks.
+    bar.ax.vlines(
+        steps, 0.0, 1.0, colors=INK, linewidths=0.5, transform=bar.ax.get_xaxis_transform()
+    )
+
+
+def _rail(axes: Axes, mesh: Any) -> Colorbar:
+    """A colour bar in the upper right corner of a panel, which the solid leaves empty."""
+    rail = axes.inset_axes((0.5, 0.93, 0.46, 0.035))
+    bar: Colorbar = axes.figure.colorbar(mesh, cax=rail, orientation="horizontal", extend="both")
+    plain(bar)
+    bar.ax.tick_params(labelsize=5.0, length=2.0, pad=1.5)
+    bar.minorticks_off()
+    return bar
 
 
 def _decades(values: Array) -> tuple[float, float]:
@@ -226,7 +239,8 @@ def _solid(figure: Figure | SubFigure, solid: xr.Dataset, plane: xr.Dataset) -> 
     _error_bar(bar)
     bar.ax.set_xlabel(axis_label("error_distance"))
     figure.text(0.02, 0.97, "a", fontsize=8.0, fontweight="bold", va="top")
-    figure.text(0.07, 0.97, "all contacts", fontsize=7.0, va="top")
+    title = "error of the look-up table in all contacts, cut at the slice"
+    figure.text(0.07, 0.97, title, fontsize=7.0, va="top")
 
 
 def _error_bar(bar: Colorbar) -> None:
@@ -241,7 +255,7 @@ def _error_bar(bar: Colorbar) -> None:
 def _frame(axes: Any, names: tuple[str, str, str]) -> None:
     axes.patch.set_visible(False)
     axes.view_init(16.0, -25.0)
-    axes.set_box_aspect((1.0, 1.0, 1.0), zoom=1.0)
+    axes.set_box_aspect((1.0, 1.0, 1.0), zoom=1.1)
     for name, letter, pad in zip(names, "xyz", (-8.0, -8.0, -5.0), strict=True):
         axis = getattr(axes, f"{letter}axis")
         axis.set_pane_color((1.0, 1.0, 1.0, 0.0))

@@ -114,7 +114,13 @@ class _StyledFigure(Figure):
 
 
 def looking() -> AbstractContextManager[None]:
-    """Put :data:`LOOK` into force as long as a ``with`` block lasts."""
+    """Apply the look of these figures to Matplotlib as long as a ``with`` block lasts.
+
+    Returns
+    -------
+    context manager
+        Sizes of type, fonts and lines in force within the block.
+    """
     settings: Any = dict(LOOK)
     return mpl.rc_context(settings)
 

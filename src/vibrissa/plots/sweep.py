@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
@@ -12,10 +14,8 @@ from numpy.typing import NDArray
 
 from vibrissa.plots.style import (
     BLUE,
-    GREEN,
     INK,
     MUTED,
-    ORANGE,
     SHADE,
     Width,
     head,
@@ -28,12 +28,16 @@ from vibrissa.plots.verdicts import VERDICTS, triplet_label
 from vibrissa.scene import Array, root, squared
 
 _MARKS = dict(zip(VERDICTS, ("o", "D", "X"), strict=True))
-_INKS = dict(zip(VERDICTS, (BLUE, GREEN, ORANGE), strict=True))
+_KEY: Any = {"facecolors": "white", "edgecolors": INK, "linewidths": 0.6}
+"""Look of marks in the legend: their shape is the verdict, their colour the critical cone."""
+
 _MOST = 3
 """Triplets that get panels of their own; more share one."""
 
 _CONES = (0.0, 1.0, 2.0, 5.0, 10.0, 20.0, 40.0, 90.0)
 """Classes of critical cones, degrees."""
+
+_NORM = BoundaryNorm(_CONES, 256)
 
 _TURNS = (0, 20, 50, 90, 180, 360)
 _ERRORS = (1e-4, 1e3)
@@ -123,7 +127,7 @@ def _verdicts(found: xr.Dataset, verdict: xr.DataArray, degrees: Array, width: W
         for i in range(count):
             _spread(axes, degrees[:, i], verdict.values[:, i], np.full(len(degrees), i))
         _cone_axis(axes)
-        _key(figure)
+        _key(figure, verdict.values)
         return figure
     groups = found["group"].values.astype(str)
     rows = list(dict.fromkeys(groups))
@@ -131,29 +135,29 @@ def _verdicts(found: xr.Dataset, verdict: xr.DataArray, degrees: Array, width: W
     figure = new_figure(width, tall if width == "double" else 1.7 * tall, "constrained")
     shape = (count, 2) if width == "double" else (2 * count, 1)
     panels = figure.subplots(*shape, squeeze=False).ravel()
-    norm, colours = BoundaryNorm(_CONES, 256), sequential().reversed()
     for i, name in enumerate(names):
         left, right = panels[2 * i], panels[2 * i + 1]
         words = verdict.values[:, i]
-        _chart(left, found, words, degrees[:, i], norm)
-        head(left, "ace"[i], triplet_label(name))
+        _chart(left, found, words, degrees[:, i])
+        head(left, "ace"[i], f"{triplet_label(name)}, by taper and curvature")
         _lines(right, rows)
         at = np.array([rows.index(group) for group in groups], dtype=int)
         _spread(right, degrees[:, i], words, at)
         _cone_axis(right)
         head(right, "bdf"[i], "by group of whiskers")
     bar = figure.colorbar(
-        ScalarMappable(norm, colours), ax=list(panels[::2]), aspect=30, spacing="uniform"
+        ScalarMappable(_NORM, sequential().reversed()),
+        ax=list(panels[::2]),
+        aspect=30,
+        spacing="uniform",
     )
     plain(bar)
     bar.set_label("critical cone (°)")
-    _key(figure)
+    _key(figure, verdict.values)
     return figure
 
 
-def _chart(
-    axes: Axes, found: xr.Dataset, words: NDArray[np.str_], degrees: Array, norm: BoundaryNorm
-) -> None:
+def _chart(axes: Axes, found: xr.Dataset, words: NDArray[np.str_], degrees: Array) -> None:
     """Every whisker by taper and turn; the widest cones below, so that none hides another."""
     x, y = found["taper_ratio"].values, np.degrees(found["turn"].values)
     size = 10.0 + 26.0 * np.clip(degrees / _CONES[-1], 0.0, 1.0) ** 0.5
@@ -164,7 +168,7 @@ def _chart(
                 y[k],
                 c=degrees[k : k + 1],
                 s=size[k],
-                norm=norm,
+                norm=_NORM,
                 cmap=sequential().reversed(),
                 marker=_MARKS[str(words[k])],
                 edgecolors=INK,
@@ -201,10 +205,12 @@ def _spread(axes: Axes, x: Array, words: NDArray[np.str_], line: NDArray[np.int_
             x[here],
             (line + 0.13 * (place - 2.0))[here],
             marker=mark,
-            s=11,
-            color=_INKS[word],
-            alpha=0.75,
-            linewidths=0.0,
+            s=13,
+            c=x[here],
+            norm=_NORM,
+            cmap=sequential().reversed(),
+            edgecolors=INK,
+            linewidths=0.3,
         )
 
 
@@ -216,10 +222,11 @@ def _cone_axis(axes: Axes) -> None:
     axes.set_xlabel("critical cone (°; shaded: the paper's 2°)")
 
 
-def _key(figure: Figure) -> None:
+def _key(figure: Figure, words: NDArray[np.str_]) -> None:
     marks = [
-        figure.axes[0].scatter([], [], marker=mark, color=_INKS[word], s=14, label=word)
+        figure.axes[0].scatter([], [], marker=mark, s=14, label=word, **_KEY)
         for word, mark in _MARKS.items()
+        if word in words
     ]
     figure.legend(handles=marks, loc="outside lower center", ncols=3, frameon=False)
 

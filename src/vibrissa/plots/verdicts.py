@@ -53,10 +53,10 @@ def verdict_table(verdicts: xr.Dataset, *, width: Width = "double") -> Figure:
 
     A full disc stands for unique, a half one for unique off a surface, an open ring for not unique.
     The triplet chosen is printed in blue, with a mark. At double width, what is not unique is given
-    with the largest distance of two contacts that feel the same, and two more columns follow: the
-    critical cone, outside which no two contacts feel the same, and the share of contacts that
-    another one resembles within 1e-3 of the signals' ranges, both of all contacts and only if
-    the region "all" was judged.
+    with the largest distance of two contacts with the same signals, and two more columns follow:
+    the critical cone, outside which no two contacts have the same signals, and the share of
+    contacts that another one resembles within 1e-3 of the signals' ranges, both of all contacts and
+    only if the region "all" was judged.
 
     Parameters
     ----------
@@ -174,7 +174,7 @@ def _symbol(axes: Axes, x: float, y: float, kind: str) -> None:
 
 
 def _separation(verdict: xr.Dataset, region: int) -> str:
-    """Largest distance of two contacts that feel the same, mm."""
+    """Largest distance of two contacts with the same signals, mm."""
     if "witness_separation" not in verdict:
         return ""
     apart = to_display("contact_point", verdict["witness_separation"].isel(region=region).values)
@@ -208,7 +208,7 @@ def _key(axes: Axes, height: float, width: Width) -> None:
         axes.text(x + 2.2, y, kind, fontsize=6.0, va="center")
         x += room
     if width == "double":
-        text = "numbers: largest distance (mm) of two contacts that feel the same"
+        text = "numbers: largest distance (mm) of two contacts with the same signals"
         axes.text(x, y, text, fontsize=6.0, va="center")
 
 
@@ -320,9 +320,9 @@ def critical_cones(cones: xr.Dataset, *, width: Width = "double") -> Figure:
     ----------
     cones : Dataset
         ``critical_cone`` over (triplet, taper_ratio, curvature), rad: the smallest cone about the
-        resting whisker outside which no two contacts feel the same, zero where there are none at
-        all, NaN where it was not computed. ``taper_ratio`` is the radius at the base over that at
-        the tip, ``curvature`` the coefficient of y = A x² times the length, A·L.
+        resting whisker outside which no two contacts have the same signals, zero where there are
+        none at all, NaN where it was not computed. ``taper_ratio`` is the radius at the base over
+        that at the tip, ``curvature`` the coefficient of y = A x² times the length, A·L.
     width : {"single", "double"}
         Columns of the page.
 

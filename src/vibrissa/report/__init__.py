@@ -18,9 +18,10 @@ from vibrissa.report.page import (
 from vibrissa.report.space import (
     NO_SPACE as NO_SPACE,
     can_draw as can_draw,
-    contacts_in_space as contacts_in_space,
+    in_space,
     reachable_space,
     space_section as space_section,
+    trial_in_space as trial_in_space,
 )
 from vibrissa.report.trial import (
     contacts_by_whisker as contacts_by_whisker,
@@ -29,5 +30,6 @@ from vibrissa.report.trial import (
 
 __all__ = [
     "document",
+    "in_space",
     "reachable_space",
 ]

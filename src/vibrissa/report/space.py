@@ -1,4 +1,4 @@
-"""The contour, or all contacts of a map, as a picture in 3D that can be turned.
+"""Whiskers, contacts and objects as a picture in 3D that can be turned.
 
 Numbers are in mm, in the laboratory frame for a trial and in the whisker's for a map. The drawing
 library is an extra: it is loaded here only, and its script goes into the page once.
@@ -14,14 +14,20 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from vibrissa.contour import FittedShape, surface_grid
+from vibrissa.contacts import ContactMap
+from vibrissa.contour import FittedShape, shape_from_dataset, surface_grid
 from vibrissa.quantities import quantity, shown_unit
 from vibrissa.report.page import Section, paragraph
-from vibrissa.scene import Array, Course, Ints, object_surface
+from vibrissa.rod import Deflection
+from vibrissa.scene import Array, Course, Ints, course_of, object_surface
 from vibrissa.sketch import BENT, REST, thinned
+from vibrissa.whisker import Whisker
 
 NO_SPACE = "The 3D picture needs Plotly: `pip install 'vibrissa[report]'`."
 """Message shown where the drawing library is not installed."""
+
+_NODES = 101
+"""Number of points of a whisker."""
 
 _MOST_POINTS = 4000
 _SHAPES = 7
@@ -36,8 +42,69 @@ def can_draw() -> bool:
     return find_spec("plotly") is not None
 
 
-def contacts_in_space(
-    course: Course, objects: Sequence[xr.Dataset] = (), fits: Sequence[FittedShape] = ()
+def in_space(result: Any) -> Any:
+    """Draw a result as a picture in 3D that can be turned, such as in a notebook.
+
+    Parameters
+    ----------
+    result : Whisker, Deflection, ContactMap or DataTree
+        Whisker at rest; whisker bent by loads, of which some are drawn, with all contacts; all
+        contacts that a whisker can hold, coloured by the bending moment; or a recording, whose
+        first whisker is drawn with its contact points and the objects, known and fitted.
+
+    Returns
+    -------
+    plotly.graph_objects.Figure
+        Picture, which a notebook shows by itself; axes in mm.
+
+    Raises
+    ------
+    ModuleNotFoundError
+        If Plotly is not installed.
+    ValueError
+        If it is none of these, or there are no contacts to be drawn.
+    """
+    if not can_draw():
+        raise ModuleNotFoundError(NO_SPACE)
+    if isinstance(result, xr.DataTree):
+        return trial_in_space(result, course_of(result))
+    if isinstance(result, ContactMap):
+        return reachable_space(result.to_dataset(), result.whisker.centerline(_NODES))
+    if isinstance(result, Deflection):
+        return _bent_in_space(result)
+    if isinstance(result, Whisker):
+        line = result.centerline(_NODES)
+        return _framed(_whiskers(line[None], "at rest"), "whisker")
+    raise ValueError(
+        f"got {type(result).__name__}; a whisker, a deflection, a map of contacts or a recording "
+        "is needed"
+    )
+
+
+def _bent_in_space(bent: Deflection) -> Any:
+    """Draw bent whiskers, the resting one and the contact points."""
+    rest = bent.whisker.centerline(_NODES)
+    lines = bent.centerline(_NODES).reshape(-1, _NODES, 3)
+    drawn = [*_whiskers(rest[None], "at rest", REST), *_whiskers(lines, "bent", BENT)]
+    force = np.linalg.norm(bent.force, axis=-1).reshape(-1)
+    known = np.isfinite(bent.contact_point).all(axis=-1).reshape(-1) & (force > 0.0)
+    if known.any():
+        points = 1e3 * bent.contact_point.reshape(-1, 3)[known]
+        drawn.append(_points(points, "force", force[known], "contacts"))
+    return _framed(drawn, "whisker")
+
+
+def trial_in_space(trial: xr.DataTree, course: Course) -> Any:
+    """Draw contact points of a recording with its objects, known and fitted."""
+    things = trial["objects"].children.values() if "objects" in trial.children else ()
+    fits = []
+    if "contour" in trial.children:
+        fits.append(shape_from_dataset(trial["contour"].to_dataset()))
+    return _contacts_in_space(course, [thing.to_dataset() for thing in things], fits)
+
+
+def _contacts_in_space(
+    course: Course, objects: Sequence[xr.Dataset], fits: Sequence[FittedShape]
 ) -> Any:
     """Draw contact points in the laboratory with the object, as known and as fitted."""
     import plotly.graph_objects as go
@@ -71,7 +138,7 @@ def contacts_in_space(
         )
     if course.centerline is not None:
         drawn += _whiskers(course.centerline[known])
-    return _framed(drawn, points, "laboratory")
+    return _framed(drawn, "laboratory")
 
 
 def reachable_space(samples: xr.Dataset, centerline: Array, colour: str = "MB") -> Any:
@@ -98,9 +165,7 @@ def reachable_space(samples: xr.Dataset, centerline: Array, colour: str = "MB") 
     # Any even choice will do, but not one that follows the grid.
     both = thinned(np.random.default_rng(0).permutation(both), _MOST_POINTS)
     drawn = [_points(both[:, :3], colour, both[:, 3], "contacts")]
-    return _framed(
-        [*drawn, *_whiskers(centerline[None], "resting whisker")], both[:, :3], "whisker"
-    )
+    return _framed([*drawn, *_whiskers(centerline[None], "resting whisker")], "whisker")
 
 
 def space_section(figure: Any, about: str) -> tuple[Section, str]:
@@ -145,7 +210,7 @@ def _triangles(vertices: Array, faces: Ints, label: str) -> Any:
     )
 
 
-def _whiskers(lines: Array, label: str = "whisker") -> list[Any]:
+def _whiskers(lines: Array, label: str = "whisker", colour: str = "#a0522d") -> list[Any]:
     """Some of the whiskers (n, k, 3), m."""
     import plotly.graph_objects as go
 
@@ -153,7 +218,7 @@ def _whiskers(lines: Array, label: str = "whisker") -> list[Any]:
     drawn = []
     for count, line in enumerate(some):
         x, y, z = 1e3 * line.T
-        look = {"color": "#a0522d", "width": 3}
+        look = {"color": colour, "width": 3}
         drawn.append(
             go.Scatter3d(
                 x=x,
@@ -177,7 +242,7 @@ def _limits(points: Array) -> Array:
     return np.stack([low - room, high + room], axis=1)
 
 
-def _framed(drawn: list[Any], points: Array, frame: str) -> Any:
+def _framed(drawn: list[Any], frame: str) -> Any:
     """Put things into axes of one scale."""
     import plotly.graph_objects as go
 

@@ -105,7 +105,7 @@ def located(chart: Chart, bend: Bend, sensor: Sensor) -> Located | None:
 
 
 def coloured(chart: Chart, what: str, sensor: Sensor) -> tuple[Bytes, Legend]:
-    """Colours (n, 3) of the cloud: how many contacts feel the same there, or how far apart."""
+    """Colours (n, 3) of the cloud: number of contacts with the same signals, or their distance."""
     if what in SIGNALS:
         return shaded(what, chart.signals[what])
     if what == "sensitivity":

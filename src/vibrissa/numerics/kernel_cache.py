@@ -3,7 +3,7 @@
 Numba knows a cached kernel by its own file alone, and would go on using it after a function that it
 inlines from another file has changed; here all files with kernels of its own package, and of
 ``numerics``, ``rod`` and ``signals``, whose helpers others use, are part of the key. By their
-content: the time at which a file was written, by which numba knows it, says nothing of a copy.
+content: the time at which a file was written, by which numba knows it, does not identify a copy.
 
 A result must not hang on the cache. A file in it that is not as it was written, whatever cut it or
 changed it, counts as none: each has its SHA-256 in front, for machine code that is not whole would

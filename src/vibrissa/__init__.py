@@ -48,6 +48,7 @@ if TYPE_CHECKING:
         ContactMap,
         Contacts,
         Estimator,
+        Gravity,
         Prior,
         estimate_from_wrench,
     )
@@ -84,6 +85,7 @@ __all__ = [
     "Contacts",
     "Deflection",
     "Estimator",
+    "Gravity",
     "PegContact",
     "PointContact",
     "PointForce",
@@ -147,6 +149,7 @@ _HOMES = {
         "ContactMap",
         "Contacts",
         "Estimator",
+        "Gravity",
         "Prior",
         "estimate_from_wrench",
     ),

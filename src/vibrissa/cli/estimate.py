@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -26,7 +27,7 @@ from vibrissa.cli.inputs import (
     smallest_arc,
     wrench_from,
 )
-from vibrissa.cli.options import Method, refuse, with_options
+from vibrissa.cli.options import Method, numbers, refuse, with_options
 from vibrissa.cli.signals import SourceOptions, described
 from vibrissa.cli.terminal import Tell, progress_bars, remark, shown
 
@@ -34,6 +35,54 @@ if TYPE_CHECKING:
     import xarray as xr
 
 WRENCH = "wrench"
+_XYZ = ("X", "Y", "Z")
+
+
+@dataclass(frozen=True)
+class GravityOptions:
+    """Gravity that a whisker bends under, and how well it is known."""
+
+    gravity: str | None = None
+    tare_gravity: str | None = None
+    gravity_sigma: float | None = None
+    density: float | None = None
+    density_sigma: float | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse statements about no weight."""
+        if self.gravity is None:
+            about = {
+                "--tare-gravity": self.tare_gravity,
+                "--gravity-sigma": self.gravity_sigma,
+                "--density": self.density,
+                "--density-sigma": self.density_sigma,
+            }
+            refuse(about, "without --gravity the whisker has no weight")
+
+    @property
+    def known(self) -> vb.Gravity | None:
+        """Gravity; None: the whisker has no weight."""
+        if self.gravity is None:
+            return None
+        x, y, z = numbers(self.gravity, _XYZ, "--gravity")
+        tare = None
+        if self.tare_gravity is not None:
+            tare_x, tare_y, tare_z = numbers(self.tare_gravity, _XYZ, "--tare-gravity")
+            tare = (tare_x, tare_y, tare_z)
+        return vb.Gravity(
+            (x, y, z),
+            tare,
+            math.radians(self.gravity_sigma or 0.0),
+            0.01 * (self.density_sigma or 0.0),
+        )
+
+    def of(self, whisker: vb.Whisker) -> vb.Whisker:
+        """The whisker with the density that is stated."""
+        return whisker if self.density is None else whisker.with_properties(density=self.density)
+
+    def described(self) -> str:
+        """State the gravity, to be put at the end of a sentence; empty where there is none."""
+        return "" if self.gravity is None else f"; bent by gravity of {self.gravity} m/s²"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,6 +187,7 @@ def estimate(
         ),
     ],
     how: EstimateOptions,
+    weight: GravityOptions,
     sensor: Path | None = None,
     target: Path | None = None,
     force: bool = False,
@@ -150,7 +200,7 @@ def estimate(
     where continuity decides which of several contacts it was; signals are made first where there
     are none (see `vibrissa signals`), and a contour that was made of other contacts is left out. A
     table goes to a table. With the --sensor of `vibrissa calibrate` the table is a sweep: positions
-    of the stage, and its channels.
+    of the stage, and its channels. With --gravity a whisker of known density sags.
     Example: `vibrissa estimate signals.csv --map map.nc --using Fx,FT,MB,MD -o contacts.csv`
     """
     if how.noise.covariance is not None:
@@ -160,23 +210,29 @@ def estimate(
     vb.io.check_writable(target, (*vb.io.NETCDF, *vb.io.CSV) if recorded else vb.io.CSV)
     free_beside(signals, [target], force)
     if sensor is not None:
-        if recorded or how.given:
+        if recorded or how.given or weight.gravity is not None:
             raise ValueError("--sensor is of tables, and has its own whisker, channels and noise")
         _from_sweep(signals, target, sensor)
     elif recorded:
+        refuse({"--gravity": weight.gravity}, "it is of tables, with one direction")
         _from_recording(signals, target, how)
     else:
-        _from_table(signals, target, how)
+        _from_table(signals, target, how, weight)
 
 
-def _from_table(signals: Path, target: Path, how: EstimateOptions) -> None:
+def _from_table(signals: Path, target: Path, how: EstimateOptions, weight: GravityOptions) -> None:
     """Contacts in the whisker's frame, as a table."""
+    if how.method != "exact":
+        refuse({"--gravity": weight.gravity}, f"--method {how.method} has no weight")
+    if how.map:
+        refuse({"--density": weight.density}, "a map states that of its whisker")
     noise = how.noise.matrix()
     wrench = wrench_from(signals)
     for note in wrench.attrs.get("notes", ()):
         remark(f"{signals}: {note}")
     maps = maps_from(how.map, 1, how.grid) if how.map else []
-    known = maps[0].whisker if maps else how.own.read()
+    known = maps[0].whisker if maps else weight.of(how.own.read())
+    gravity = weight.known
     print_notes(known)
     _check_scale(signals, wrench, known)
     with progress_bars() as tell:
@@ -186,15 +242,17 @@ def _from_table(signals: Path, target: Path, how: EstimateOptions) -> None:
         tell("contact points", 0, 1)
         if how.whole:
             errors, prior = how.assumed.errors, how.assumed.prior
-            found = vb.pipeline.locate_from_wrench(known, wrench, noise, errors, prior)
+            found = vb.pipeline.locate_from_wrench(known, wrench, noise, errors, prior, gravity)
         else:
+            names, others = how.names or vb.pipeline.TRIPLET, how.keywords()
             found = vb.pipeline.locate(
-                maps[0], wrench, how.names or vb.pipeline.TRIPLET, noise=noise, **how.keywords()
+                maps[0], wrench, names, noise=noise, gravity=gravity, **others
             )
         tell("contact points", 1, 1)
     vb.io.save_contacts(target, vb.pipeline.contact_columns(found))
     used = WRENCH if how.whole else found.attrs["triplet"]
-    remark(how.described(used, how.noise.described(), found.attrs["felt_above"]))
+    about = how.noise.described() + weight.described()
+    remark(how.described(used, about, found.attrs["felt_above"]))
     print_statuses(found["status"].values)
     print_written(target)
 

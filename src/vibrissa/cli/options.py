@@ -214,6 +214,15 @@ OPTIONS = {
         "level whisker. By default the whisker has no weight.",
         "X,Y,Z",
     ),
+    "tare_gravity": Option(
+        "Gravity, likewise, when the sensor was tared with the whisker at rest; by default as it "
+        "is now. 0,0,0: the sensor reads the weight.",
+        "X,Y,Z",
+    ),
+    "gravity_sigma": Option(
+        "Standard deviation of gravity's direction about each axis, degrees.", "DEG", least=0.0
+    ),
+    "density_sigma": Option("Standard deviation of the whisker's density, %.", "%", least=0.0),
     "base_stiffness": Option(
         "Stiffness of the base in bending and in twist, µN·m/rad; by default it is rigid.",
         "BENDING,TWIST",

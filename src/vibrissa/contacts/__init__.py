@@ -26,6 +26,7 @@ from vibrissa.contacts.noise import (
 from vibrissa.contacts.prior import Prior
 from vibrissa.contacts.readout import check_signals
 from vibrissa.contacts.search import signals_at_nodes
+from vibrissa.contacts.weight import Gravity, estimate_with_weight
 from vibrissa.contacts.wrench import estimate_from_wrench
 
 __all__ = [
@@ -42,6 +43,7 @@ __all__ = [
     "Domain",
     "Estimator",
     "Followed",
+    "Gravity",
     "Noise",
     "Prior",
     "Progress",
@@ -57,6 +59,7 @@ __all__ = [
     "deficient",
     "ellipsoids",
     "estimate_from_wrench",
+    "estimate_with_weight",
     "invert",
     "large_deflection",
     "ratio_derivatives",

@@ -79,7 +79,11 @@ class Channels:
         list of int
             Place of each size.
         """
-        return [i for i, name in enumerate(self.names) if name in ("Fy", "My")]
+        return [
+            i
+            for i, name in enumerate(self.names)
+            if name in ("Fy", "My") and name != self.signals[i]
+        ]
 
     def targets(self, measured: Array) -> Array:
         """Turn measured signals into channels.

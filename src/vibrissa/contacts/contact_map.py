@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -26,6 +26,7 @@ from vibrissa.contacts.jacobian import determining
 from vibrissa.contacts.noise import common_errors
 from vibrissa.contacts.prior import Prior
 from vibrissa.contacts.search import estimate
+from vibrissa.contacts.weight import Gravity, estimate_with_weight
 from vibrissa.contacts.wrench import estimate_components
 from vibrissa.io import COMPRESSED, kind_of, naming, read_tree, write_netcdf
 from vibrissa.numerics import AnyArray, Array
@@ -41,6 +42,7 @@ from vibrissa.rod import (
     contact_tangents,
     deflect,
     discretize,
+    resting,
     stable_set,
     with_normal_force,
 )
@@ -133,6 +135,7 @@ class ContactMap:
         mixing_sigma: float | ArrayLike = 0.0,
         prior: Prior | None = None,
         friction: float = 0.0,
+        gravity: Gravity | ArrayLike | None = None,
     ) -> Contacts:
         """Find the contacts that explain measured signals.
 
@@ -165,6 +168,11 @@ class ContactMap:
             default, for contacts without friction. It needs noise. With F_T among four or more
             signals, µ_x is found with the contact; with three the covariance contains what it
             leaves open. The wrench needs none.
+        gravity : Gravity or (3,) array_like, optional
+            Gravity minus the acceleration of the base, whisker frame, m/s², for a whisker of known
+            density that bends under its weight, by a sensor that was tared at rest; or, with the
+            tare and what is uncertain, a `Gravity`. Contacts are proposed by a second map, of the
+            sagged whisker, made on first use.
 
         Returns
         -------
@@ -172,6 +180,22 @@ class ContactMap:
             One contact for each measurement, with all candidates.
         """
         errors = common_errors(stiffness_sigma, gain_sigma, mixing_sigma)
+        weight = Gravity.of(gravity)
+        if weight is not None:
+            if friction != 0.0:
+                raise ValueError("friction is not combined with gravity; use the wrench with it")
+            sagged = None if using == "wrench" else _sagged(self, weight.acceleration)
+            return estimate_with_weight(
+                self.whisker,
+                sagged,
+                signals,
+                using,
+                noise,
+                errors,
+                prior,
+                weight,
+                stiffness_sigma,
+            )
         if using == "wrench":
             return estimate_components(self.whisker, signals, noise, errors, prior)
         if friction != 0.0:
@@ -312,6 +336,20 @@ class ContactMap:
             rows.append(("paper's grid", f"{reached} of {self.grid.status.size} points reached"))
         rows.append(("signals", "median (least to largest)"))
         return rows + [(symbol(name), shown(name, data[name])) for name in (*SIGNALS, "r")]
+
+
+@lru_cache(maxsize=8)
+def _sagged(contact_map: ContactMap, gravity: tuple[float, float, float]) -> ContactMap:
+    """Map of a whisker without weight that has the shape of this one under its weight."""
+    chart = contact_map.chart
+    along, around, loads = (n - 1 for n in chart.values.shape[:3])
+    return ContactMap.simulate(
+        resting(contact_map.whisker, gravity).shape(),
+        proximal=chart.proximal,
+        cells=(along, around, loads),
+        steps=contact_map.steps,
+        grid=False,
+    )
 
 
 def within_paper_bounds(whisker: Whisker, points: Array) -> AnyArray:

@@ -243,7 +243,7 @@ def _solve(
         near = np.concatenate([row[near], more])
     else:
         near = row[near]
-    doubt = found.misfits + (_friction_angle(found.contacts) / _LIKELY) ** 2
+    doubt = found.misfits + (friction_angle(found.contacts) / _LIKELY) ** 2
     kept = chosen(len(wrenches), near, found, doubt, limit, _MOST)
     row, place = np.nonzero(np.arange(kept.contacts.shape[1]) < kept.number[:, None])
     final = _fit(fine, wrenches, weights, row, kept.contacts[row, place], limit)
@@ -288,7 +288,7 @@ def _promising(
     return np.asarray(misfit <= _FAR * (1.0 + best[row]))
 
 
-def _friction_angle(contacts: Array) -> Array:
+def friction_angle(contacts: Array) -> Array:
     """Angle of forces (..., 1:4) from the plane normal to the whisker, rad."""
     return np.arctan2(contacts[..., 1], np.hypot(contacts[..., 2], contacts[..., 3]))
 
@@ -328,7 +328,7 @@ def _judged(
     spread = unknowns_covariance(WRENCH, values, tangents, weights[row], friction=True)
     size = np.einsum("nai,nij,naj->n", tangents[:, 3:], spread, tangents[:, 3:])
     weight, far = np.full((n, most), -np.inf), np.full((n, most), np.nan)
-    weight[row, place] = judgement.weight - 0.5 * (_friction_angle(x) / _LIKELY) ** 2
+    weight[row, place] = judgement.weight - 0.5 * (friction_angle(x) / _LIKELY) ** 2
     far[row, place] = size
     found.covariances[row, place], found.valid[row, place] = judgement.covariances, judgement.valid
     found.angle_sigma[row, place] = _angle_deviation(x, spread)

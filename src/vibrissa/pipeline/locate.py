@@ -34,6 +34,7 @@ from vibrissa.contacts import (
     Channels,
     ContactMap,
     Contacts,
+    Gravity,
     Prior,
     SensorNoise,
     channel_derivatives,
@@ -41,12 +42,13 @@ from vibrissa.contacts import (
     common_covariance,
     common_errors,
     estimate_from_wrench,
+    estimate_with_weight,
     ratio_derivatives,
     whitening,
 )
 from vibrissa.quantities import attributes
 from vibrissa.recording import Group
-from vibrissa.rod import Discretization, contact_tangents, discretize, solve_forces
+from vibrissa.rod import Discretization, contact_tangents, discretize, resting, solve_forces
 from vibrissa.sensors import component_noise
 from vibrissa.signals import base_signals, selection, signals_of
 from vibrissa.status import Status, flag_attributes
@@ -101,6 +103,7 @@ def locate(
     errors: Mapping[str, Any] | None = None,
     prior: Prior | None = None,
     friction: float = 0.0,
+    gravity: Gravity | None = None,
 ) -> xr.Dataset:
     """Estimate the contact point in every frame with a contact.
 
@@ -124,6 +127,9 @@ def locate(
         Contacts that are possible, as for `estimates_of`.
     friction : float
         Ratio of forces, as for `estimates_of`; only with the exact method.
+    gravity : Gravity, optional
+        Gravity that the whisker bends under, as of ``ContactMap.estimate``; only with the exact
+        method. Derivatives are then those of a whisker without weight that has the resting shape.
 
     Returns
     -------
@@ -147,14 +153,26 @@ def locate(
     signals = base_signals(measured.force[measured.rows], measured.moment[measured.rows])
     if method == "exact":
         found = contact_map.estimate(
-            signals, names, measured.typical, prior=prior, friction=friction, **(errors or {})
+            signals,
+            names,
+            measured.typical,
+            prior=prior,
+            friction=friction,
+            gravity=gravity,
+            **(errors or {}),
         )
     else:
         from vibrissa.paper import estimate  # it loads what only comparisons need
 
         found = estimate(contact_map, signals, names, method=method, prior=prior)
     stated = found.candidates.covariance if method == "exact" else None
-    return _located(contact_map.whisker, names, measured, _Candidates.of(found), stated, friction)
+    whisker = _at_rest(contact_map.whisker, gravity)
+    return _located(whisker, names, measured, _Candidates.of(found), stated, friction)
+
+
+def _at_rest(whisker: Whisker, gravity: Gravity | None) -> Whisker:
+    """Whisker without weight that has the resting shape."""
+    return whisker if gravity is None else resting(whisker, gravity.acceleration).shape()
 
 
 def without_contact(
@@ -179,6 +197,7 @@ def locate_from_wrench(
     noise: ArrayLike | None,
     errors: Mapping[str, Any] | None = None,
     prior: Prior | None = None,
+    gravity: Gravity | None = None,
 ) -> xr.Dataset:
     """Locate contacts from all six components, with friction or without.
 
@@ -194,6 +213,8 @@ def locate_from_wrench(
         Standard deviations of common errors, as for `locate`.
     prior : Prior, optional
         Contacts that are possible, as for `locate`.
+    gravity : Gravity, optional
+        Gravity that the whisker bends under, as for `locate`.
 
     Returns
     -------
@@ -201,16 +222,25 @@ def locate_from_wrench(
         Contacts as of `locate`, with ``friction_angle``.
     """
     measured = _Measured.of(wrench, noise, errors)
-    found = estimate_from_wrench(
-        whisker,
-        measured.force[measured.rows],
-        measured.moment[measured.rows],
-        noise=measured.typical,
-        prior=prior,
-        **(errors or {}),
-    )
+    force, moment = measured.force[measured.rows], measured.moment[measured.rows]
+    if gravity is None:
+        found = estimate_from_wrench(
+            whisker, force, moment, noise=measured.typical, prior=prior, **(errors or {})
+        )
+    else:
+        found = estimate_with_weight(
+            whisker,
+            None,
+            {"force": force, "moment": moment},
+            "wrench",
+            measured.typical,
+            measured.errors,
+            prior,
+            gravity,
+            (errors or {}).get("stiffness_sigma", 0.0),
+        )
     stated = found.candidates.covariance
-    return _located(whisker, WRENCH, measured, _Candidates.of(found), stated)
+    return _located(_at_rest(whisker, gravity), WRENCH, measured, _Candidates.of(found), stated)
 
 
 class _Measured(NamedTuple):

@@ -290,7 +290,7 @@ def signal_scales(names: tuple[str, ...], force: float, moment: float) -> Array:
     Parameters
     ----------
     names : tuple of str
-        Names of the signals.
+        Names of signals, or of components of force and moment.
     force, moment : float
         Unit of force, N, and of moment, N·m.
 
@@ -299,7 +299,8 @@ def signal_scales(names: tuple[str, ...], force: float, moment: float) -> Array:
     (k,) array
         Unit of each signal; 1 for directions.
     """
-    scales = {"Fx": force, "FT": force, "Mx": moment, "MB": moment}
+    scales = dict.fromkeys(("Fx", "Fy", "Fz", "FT"), force)
+    scales |= dict.fromkeys(("Mx", "My", "Mz", "MB"), moment)
     return np.array([scales.get(name, 1.0) for name in names])
 
 

@@ -3,16 +3,20 @@
 A contact near which T(Ω) ends or folds may be the true one although noise has carried the signals
 out of its reach, and another, far away, explains them exactly. So the cells of the chart that may
 hold signals within two standard deviations of the measured ones are listed. They form basins,
-separated by cells that come less near; in each that holds no known contact χ² is minimised within
-Ω. Where that leads to no least χ², as in long flat valleys, there is no candidate, but what else is
-probable is asked of the chart's nodes. All candidates are judged
-(:mod:`~vibrissa.contacts.posterior`); where the second order does not describe one of them, they
-are compared by their likelihoods alone, and the nodes are asked too.
+separated by cells that come less near; in each that known contacts do not explain by their slopes
+χ² is minimised within Ω. Where that leads to no least χ², as in long flat valleys, there is no
+candidate, but the chart's nodes show what else is probable.
+
+All candidates are judged (:mod:`~vibrissa.contacts.posterior`). The volumes of contact points that
+they stand for nearly vanish near slip-off, where a whisker may yet be: probabilities are the mean
+of those by volumes and of those by likelihoods alone. Where the second order does not describe one
+of the candidates, likelihoods count alone, and the nodes are asked too.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -52,6 +56,9 @@ _APART, _FAR_APART = 2.0, 4.0
 _WIDEST = 1e3
 # Between two basins cells must miss the measurement by so much more, relative to the slack.
 _SILL = 0.5
+# What a known contact explains by its slopes: χ² of three quantities, each up to the slack away,
+# and as much again for what cells are wrong by.
+_LINEAR = 25.0
 # At most so many starts for one measurement.
 _MOST_STARTS = 6
 # So many of the chart's nodes must count for their moments to replace those about one contact.
@@ -63,6 +70,8 @@ _LOG_NORMAL = 1.5 * math.log(2.0 * math.pi)
 _MOST_LOG = 700.0
 # Nodes whose χ², or the logarithm of whose density, is so much worse than the best do not count.
 _NEGLIGIBLE = 50.0
+# Nodes that are computed together stay in the nearest memory.
+_BLOCK = 512
 
 
 @kernel
@@ -143,22 +152,12 @@ def _root(parent: IntArray, i: int) -> int:
 
 @kernel
 def _basins(
-    of: Searched,
-    cells: IntArray,
-    away: Array,
-    n: int,
-    known: Array,
-    number: int,
-    order: IntArray,
-    parent: IntArray,
+    of: Searched, cells: IntArray, away: Array, n: int, order: IntArray, parent: IntArray
 ) -> None:
     """Fill the order of cells by how far they miss, and the basin (its best cell) of each.
 
-    Cells that touch are of one basin unless they are separated by a sill. That of the known
-    contacts has the number n.
+    Cells that touch are of one basin unless they are separated by a sill.
     """
-    low = np.empty(n + 1)
-    parent[n], low[n] = n, 0.0
     for i in range(n):
         place = i
         while place > 0 and away[order[place - 1]] > away[i]:
@@ -167,19 +166,28 @@ def _basins(
         order[place] = i
     for nth in range(n):
         i = order[nth]
-        parent[i], low[i] = i, away[i]
-        for c in range(number):
-            if _holds(of, cells[i], known[c]):
-                parent[i] = n
+        parent[i] = i
         for before in range(nth):
             j = order[before]
             mine, theirs = _root(parent, i), _root(parent, j)
             if mine == theirs or not _adjacent(of, cells[i], cells[j]):
                 continue
-            if low[mine] < low[theirs] or mine == n:
+            if away[mine] < away[theirs]:
                 mine, theirs = theirs, mine
-            if away[i] - low[mine] <= _SILL:
+            if away[i] - away[mine] <= _SILL:
                 parent[mine] = theirs
+
+
+@inlined
+def _by_slopes(x: Array, r: Array, j: Array, xi: Array) -> float:
+    """χ² at a contact ξ by the slopes of a known one; it bends little in s and s f."""
+    total, ds = 0.0, xi[0] - x[0]
+    dy = (xi[0] * (xi[1] - x[2])) / x[0]
+    dz = (xi[0] * (xi[2] - x[3])) / x[0]
+    for a in range(r.shape[0]):
+        away = r[a] + j[a, 0] * ds + j[a, 2] * dy + j[a, 3] * dz
+        total += away * away
+    return total
 
 
 @kernel
@@ -188,30 +196,46 @@ def _starts(
     apart: float,
     sigma: Array,
     measured: Array,
-    known: Array,
+    x: Array,
+    residuals: Array,
+    jacobians: Array,
     number: int,
     starts: Array,
 ) -> tuple[int, bool]:
-    """Fill positions in the chart to start from, one for each basin without known contacts.
+    """Fill contacts to start from, one for each basin that known contacts x do not explain.
 
     Return how many there are, and whether there are more.
     """
-    target, slack, count = np.empty(3), np.empty(3), 0
+    target, slack, known = np.empty(3), np.empty(3), np.empty((MOST_CANDIDATES, 3))
     cells, order = np.empty(MOST_CELLS, np.int64), np.empty(MOST_CELLS, np.int64)
     spots, away = np.empty((MOST_CELLS, 3)), np.empty(MOST_CELLS)
-    parent = np.empty(MOST_CELLS + 1, np.int64)
+    parent, kept, count = np.empty(MOST_CELLS, np.int64), 0, 0
     for q in range(3):
         target[q], slack[q] = measured[of.where[q]], min(apart * sigma[q], _WIDEST)
     n = cells_around(of.tree, target, slack, cells, spots, away)
     if n == MOST_CELLS and number > 0:  # noise leaves so much open that candidates mean little
         return 0, True
-    _basins(of, cells, away, n, known, number, order, parent)
-    for nth in range(n):
+    for c in range(number):
+        _chart_of(of, x[c], known[c])
+    for i in range(n):
+        xi, new = starts[0, 1:], True
+        chart_to_contact(of.fold, spots[i], xi)
+        for c in range(number):
+            new = new and not _holds(of, cells[i], known[c])
+            new = new and not _by_slopes(x[c], residuals[c], jacobians[c], xi) < _LINEAR
+        if new:
+            cells[kept], away[kept] = cells[i], away[i]
+            copy(spots[i], spots[kept])
+            kept += 1
+    _basins(of, cells, away, kept, order, parent)
+    for nth in range(kept):
         i = order[nth]
         if parent[i] == i:
             if count == starts.shape[0]:
                 return count, True
-            copy(spots[i], starts[count])
+            start = starts[count]
+            chart_to_contact(of.fold, spots[i], start[1:])
+            start[0], start[1] = start[1], 0.0
             count += 1
     return count, False
 
@@ -284,18 +308,17 @@ def complete(
     x: Array,
     values: Array,
     misfits: Array,
+    residuals: Array,
+    jacobians: Array,
 ) -> tuple[int, bool]:
-    """Add contacts of Ω that noise has hidden.
+    """Add contacts of Ω that noise has hidden, given residuals and slopes of those that are known.
 
     Return how many there are then, and whether others may be probable that are not among them.
     """
-    sigma, starts = np.empty(3), np.empty((_MOST_STARTS, 3))
-    known, start, nodes = np.empty((MOST_CANDIDATES, 3)), np.zeros(4), np.full((1, PARTS), -1)
-    least = np.inf
+    sigma, starts = np.empty(3), np.empty((_MOST_STARTS, 4))
+    start, nodes, least = np.zeros(4), np.full((1, PARTS), -1), np.inf
     for c in range(number):
-        _chart_of(of, x[c], known[c])
-        if misfits[c] < least:
-            least = misfits[c]
+        least = min(least, misfits[c])
     lost = not least <= limit
     if lost:
         nearest_of(of.seen, of.turns, of.part, of.kinds, how.mixing, target, nodes)
@@ -307,13 +330,12 @@ def complete(
         _deviations(of, how, values[0], measured, sigma)
     worth = limit if lost else min(limit, least + INDISTINCT)
     apart = _FAR_APART if lost else _APART
-    xi = np.empty(3)
-    n, others = _starts(of, apart, sigma, measured, known, number, starts)
+    n, others = _starts(
+        of, apart, sigma, measured, x, residuals, jacobians, 0 if lost else number, starts
+    )
     for i in range(n):
-        chart_to_contact(of.fold, starts[i], xi)
-        start[0], start[2], start[3] = xi[0], xi[1], xi[2]
         number, other = _try(
-            of, how, passes, worth, target, measured, start, number, x, values, misfits
+            of, how, passes, worth, target, measured, starts[i], number, x, values, misfits
         )
         others = others or other
     for c in range(number):
@@ -356,24 +378,26 @@ def _kept(limit: float, number: int, x: Array, values: Array, misfits: Array) ->
 def _misfits_at_nodes(of: Searched, how: Weighing, weights: Array, target: Array) -> Array:
     """χ² at the chart's nodes."""
     q, nodes = of.seen.shape
-    away, r, misfits = np.empty((q, nodes)), np.empty(nodes), np.zeros(nodes)
+    away, r, misfits = np.empty((q, _BLOCK)), np.empty(_BLOCK), np.zeros(nodes)
     white = how.own[0, 0] > 0.0
-    for i in range(q):
-        seen, turn, aim, mine = of.seen[i], of.turns[i], target[i], away[i]
-        for node in range(nodes):
-            apart = seen[node] - aim
-            mine[node] = apart - np.rint(apart * turn) * 2.0 * np.pi
-    for i in range(q):
-        r[:] = 0.0
-        for c in range(q):
-            w, mine = weights[i, c], away[c]
-            if white:
-                w = 1.0 if i == c else 0.0
-            if w != 0.0:
-                for node in range(nodes):
-                    r[node] += w * mine[node]
-        for node in range(nodes):
-            misfits[node] += r[node] * r[node]
+    for first in range(0, nodes, _BLOCK):
+        number = min(_BLOCK, nodes - first)
+        for i in range(q):
+            seen, turn, aim, mine = of.seen[i], of.turns[i], target[i], away[i]
+            for n in range(number):
+                mine[n] = seen[first + n] - aim
+            for n in range(number if turn > 0.0 else 0):
+                mine[n] -= np.rint(mine[n] * turn) * 2.0 * np.pi
+        for i in range(q):
+            r[:] = 0.0
+            for c in range(q):
+                w, mine = weights[i, c], away[c]
+                if white:
+                    w = 1.0 if i == c else 0.0
+                for n in range(number if w != 0.0 else 0):
+                    r[n] += w * mine[n]
+            for n in range(number):
+                misfits[first + n] += r[n] * r[n]
     return misfits
 
 
@@ -439,22 +463,40 @@ def _over_the_map(
     return max(mass_out / (mass + mass_out), like_out / (like + like_out))
 
 
-# Working memory of `settle`: aims, weights, tangents (n, 6, 4) and (n, 6, 3), covariances, log
-# weights (as they count, and with volumes), probabilities, whether covariances are valid, order,
-# and copies of x, (F, p) and χ².
-Room = tuple[
-    Array, Array, Array, Array, Array, Array, Array, AnyArray, IntArray, Array, Array, Array
-]
+class _Room(NamedTuple):
+    """Working memory of `settle`, by candidate.
+
+    Targets, weights, ∂(F, p)/∂x (n, 6, 4) and ∂(F, p)/∂ξ (n, 6, 3), residuals and slopes in
+    standard deviations; covariances, log weights (as they count, and with volumes), probabilities,
+    whether covariances are valid, order; and copies of x, (F, p) and χ².
+    """
+
+    aims: Array
+    weights: Array
+    tangents: Array
+    third: Array
+    residuals: Array
+    jacobians: Array
+    spread: Array
+    weight: Array
+    chance: Array
+    fine: AnyArray
+    order: IntArray
+    x: Array
+    values: Array
+    misfits: Array
 
 
 @inlined
-def _judging(most: int, k: int) -> Room:
+def _judging(most: int, k: int) -> _Room:
     """Make the working memory of `settle`."""
-    return (
+    return _Room(
         np.empty((most, k)),
         np.zeros((most, k, k)),
         np.zeros((most, 6, 4)),
         np.empty((most, 6, 3)),
+        np.empty((most, k)),
+        np.empty((most, k, 4)),
         np.empty((most, 3, 3)),
         np.empty((2, most)),
         np.empty((1, most)),
@@ -467,6 +509,54 @@ def _judging(most: int, k: int) -> Room:
 
 
 @kernel
+def _weighed(
+    of: Searched,
+    how: Weighing,
+    target: Array,
+    measured: Array,
+    x: Array,
+    values: Array,
+    n: int,
+    room: _Room,
+) -> None:
+    """Fill the first half of the working memory, and χ², of n candidates."""
+    k = how.codes.shape[0]
+    residual, jacobian = np.empty(k), np.empty((k, 4))
+    evaluate(of.rod, x, room.values, room.third, 0, n)
+    for c in range(n):
+        copy(target, room.aims[c])
+        if not weigh_any(how, values[c], measured, room.weights[c]):
+            room.weights[c, 0, 0] = np.nan
+        for a in range(6):
+            t, by_x = room.third[c, a], room.tangents[c, a]
+            by_x[0], by_x[2], by_x[3] = t[0], t[1], t[2]
+        channel_equations(x[c], values[c], room.tangents[c], how.codes, target, residual, jacobian)
+        room.misfits[c] = whiten(
+            room.weights[c], residual, jacobian, k, room.residuals[c], room.jacobians[c]
+        )
+
+
+@inlined
+def _both_priors(weight: Array, chi: Array, n: int, sound: bool) -> None:
+    """Fill the log weights that count from those with volumes, and χ²."""
+    by_volume, by_fit, volumes, fits = -np.inf, -np.inf, 0.0, 0.0
+    for c in range(n):
+        by_volume = max(by_volume, weight[1, c])
+        if chi[c] < np.inf:
+            by_fit = max(by_fit, -0.5 * chi[c])
+    for c in range(n):
+        volumes += math.exp(weight[1, c] - by_volume)
+        if chi[c] < np.inf:
+            fits += math.exp(-0.5 * chi[c] - by_fit)
+    for c in range(n):
+        if by_fit > -np.inf:
+            share = math.exp(-0.5 * chi[c] - by_fit) / fits if chi[c] < np.inf else 0.0
+            if sound and by_volume > -np.inf:
+                share += math.exp(weight[1, c] - by_volume) / volumes
+            weight[0, c] = math.log(share)
+
+
+@kernel
 def settle(
     of: Searched,
     how: Weighing,
@@ -475,40 +565,52 @@ def settle(
     measured: Array,
     row: int,
     out: Candidates,
-    room: Room,
+    room: _Room,
 ) -> None:
     """Complete the candidates of a noisy measurement and rank them by probability."""
-    aims, weights, tangents, third, spread, weight, chance, fine, order, x0, values0, chi0 = room
+    weight, chance, fine, order = room.weight, room.chance, room.fine, room.order
     x, values, chi = out.x[row], out.values[row], out.chi_squared[row]
-    for c in range(out.number[row]):
-        chi[c] = chi_squared_of(how, x[c], values[c], target, measured)
+    number = out.number[row]
+    if number > 0:
+        _weighed(of, how, target, measured, x, values, number, room)
+    for c in range(number):
+        chi[c] = room.misfits[c]
+        copy(x[c], room.x[c])
     n, others = complete(
-        of, how, problem.passes, problem.limit, target, measured, out.number[row], x, values, chi
+        of,
+        how,
+        problem.passes,
+        problem.limit,
+        target,
+        measured,
+        number,
+        x,
+        values,
+        chi,
+        room.residuals,
+        room.jacobians,
     )
     out.number[row] = n
     if n == 0:
         return
-    evaluate(of.rod, x, values0, third, 0, n)
+    changed = n > number
     for c in range(n):
-        copy(target, aims[c])
-        if not weigh_any(how, values[c], measured, weights[c]):
-            weights[c, 0, 0] = np.nan
-        for a in range(6):
-            t = third[c, a]
-            tangents[c, a, 0], tangents[c, a, 2], tangents[c, a, 3] = t[0], t[1], t[2]
+        changed = changed or x[c, 0] != room.x[c, 0] or x[c, 2] != room.x[c, 2]
+    if changed:
+        _weighed(of, how, target, measured, x, values, n, room)
     judge(
         of.rod,
         False,
         LEAST_ARC,
         of.proximal,
         how.codes,
-        aims,
-        weights,
+        room.aims,
+        room.weights,
         x,
         values,
-        tangents,
-        spread,
-        weight[0],
+        room.tangents,
+        room.spread,
+        weight[1],
         fine,
         0,
         n,
@@ -516,31 +618,36 @@ def settle(
     sound = True
     for c in range(n):
         sound = sound and fine[c]
-        weight[1, c] = weight[0, c]
-    for c in range(n):  # volumes that mean little, as at folds of the signals, are left out
-        if not sound and chi[c] < np.inf:
-            weight[0, c] = -0.5 * chi[c]
+        weight[0, c] = weight[1, c]
+    _both_priors(weight, chi, n, sound)
     rank(weight, out.number[row : row + 1], chance, order)
     for c in range(n):
-        copy(x[c], x0[c])
-        copy(values[c], values0[c])
-        chi0[c] = chi[c]
+        copy(x[c], room.x[c])
+        copy(values[c], room.values[c])
+        room.misfits[c] = chi[c]
     for c in range(x.shape[0]):
         out.probability[row, c] = chance[0, c]
         if c >= n:
             chi[c], x[c], values[c] = np.nan, np.nan, np.nan
             continue
         old = order[0, c]
-        copy(x0[old], x[c])
-        copy(values0[old], values[c])
-        chi[c], out.valid[row, c] = chi0[old], fine[old]
+        copy(room.x[old], x[c])
+        copy(room.values[old], values[c])
+        chi[c], out.valid[row, c] = room.misfits[old], fine[old]
         for a in range(3):
-            copy(spread[old, a], out.covariances[row, c, a])
+            copy(room.spread[old, a], out.covariances[row, c, a])
     if out.probability[row, 0] > CERTAIN and (others or not out.valid[row, 0]):
         seen, best = measured if how.own[0, 0] > 0.0 else target, order[0, 0]
         log_mass = weight[1, best] + _LOG_NORMAL
         outside = _over_the_map(
-            of, how, weights[best], seen, values[0, 3:], chi[0], log_mass, out.covariances[row, 0]
+            of,
+            how,
+            room.weights[best],
+            seen,
+            values[0, 3:],
+            chi[0],
+            log_mass,
+            out.covariances[row, 0],
         )
         out.probability[row, 0] *= 1.0 - outside
 

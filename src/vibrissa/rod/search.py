@@ -21,7 +21,7 @@ from vibrissa.rod.tree import EVEN, FOLDED, SearchTree
 #: At most so many contacts are found for one target.
 MOST_SEEDS = 32
 #: At most so many cells are listed about one target.
-MOST_CELLS = 128
+MOST_CELLS = 64
 # A solution may lie this far outside a cell (in cell widths) and still be its own: neighbours
 # overlap.
 _OVERLAP = 0.05
@@ -403,15 +403,17 @@ def _keep(
 
 
 @inlined
-def _boxes_around(turns: Array, box: Array, target: Array, inside: AnyArray) -> None:
-    """Which of eight sibling boxes contain the target."""
+def _boxes_around(turns: Array, box: Array, target: Array, slack: Array, inside: AnyArray) -> None:
+    """Which of eight sibling boxes contain what is within ``slack`` of the target."""
     t0, t1, t2 = target[0], target[1], target[2]
+    s0, s1, s2 = slack[0], slack[1], slack[2]
     for c in range(8):
         d0, d1, d2 = t0 - box[0, c], t1 - box[1, c], t2 - box[2, c]
         d0 -= 2.0 * np.pi * np.rint(d0 * turns[0])
         d1 -= 2.0 * np.pi * np.rint(d1 * turns[1])
         d2 -= 2.0 * np.pi * np.rint(d2 * turns[2])
-        inside[c] = (abs(d0) <= box[3, c]) & (abs(d1) <= box[4, c]) & (abs(d2) <= box[5, c])
+        near = (abs(d0) <= box[3, c] + s0) & (abs(d1) <= box[4, c] + s1)
+        inside[c] = near & (abs(d2) <= box[5, c] + s2)
 
 
 @inlined
@@ -458,7 +460,7 @@ def seeds(tree: SearchTree, target: Array, found: Array, inverses: Array, qualit
     grid, offsets, boxes, place = tree.grid, tree.offsets, tree.boxes, tree.place
     levels = offsets.shape[0] - 1
     stack = np.empty((_STACK, 2), np.int64)
-    inside = np.empty(8, np.bool_)
+    inside, slack = np.empty(8, np.bool_), np.zeros(3)
     work, relative, x = np.empty((6, 3)), np.empty(3), np.empty(3)
     b = np.zeros(_BUFFER)
     nearest, sides, half = np.empty(3), np.empty((3, 3)), np.empty(3)
@@ -469,7 +471,7 @@ def seeds(tree: SearchTree, target: Array, found: Array, inverses: Array, qualit
         top -= 1
         level, node = stack[top, 0], stack[top, 1]
         box = boxes[offsets[level] + node]
-        _boxes_around(tree.turns, box, target, inside)
+        _boxes_around(tree.turns, box, target, slack, inside)
         for c in range(8):
             if not inside[c]:
                 continue
@@ -548,18 +550,15 @@ def cells_around(
     """
     grid, offsets, boxes, place = tree.grid, tree.offsets, tree.boxes, tree.place
     levels, count, top = offsets.shape[0] - 1, 0, 1
-    stack, x = np.empty((_STACK, 2), np.int64), np.empty(3)
+    stack, x, inside = np.empty((_STACK, 2), np.int64), np.empty(3), np.empty(8, np.bool_)
     stack[0, 0], stack[0, 1] = 0, 0
     while top > 0:
         top -= 1
         level, node = stack[top, 0], stack[top, 1]
         box = boxes[offsets[level] + node]
+        _boxes_around(tree.turns, box, target, slack, inside)
         for c in range(8):
-            inside = box[3, c] >= 0.0
-            for q in range(3):
-                apart = abs(_less(tree, q, target[q], box[q, c]))
-                inside = inside and apart <= box[3 + q, c] + slack[q]
-            if not inside:
+            if not (inside[c] and box[3, c] >= 0.0):
                 continue
             child = 8 * node + c
             if level < levels - 1:
@@ -570,10 +569,12 @@ def cells_around(
             miss, x[:] = 0.0, 0.5
             if tree.polar[child] < 0:
                 miss = _near_cell(tree, child, target, slack, x)
-            if miss < 0.0 or count == spots.shape[0]:
+            if miss < 0.0:
                 continue
             for a in range(3):
                 spots[count, a] = grid[0, a] + grid[1, a] * (place[child, a] + x[a])
             cells[count], away[count] = child, miss
             count += 1
+            if count == spots.shape[0]:
+                return count
     return count

@@ -213,8 +213,6 @@ def _starts(
     for q in range(3):
         target[q], slack[q] = measured[of.where[q]], min(apart * sigma[q], _WIDEST)
     n = cells_around(of.tree, target, slack, cells, spots, away)
-    if n == MOST_CELLS and number > 0:  # noise leaves so much open that candidates mean little
-        return 0, True
     for c in range(number):
         _chart_of(of, x[c], known[c])
     for i in range(n):
@@ -237,7 +235,7 @@ def _starts(
             chart_to_contact(of.fold, spots[i], start[1:])
             start[0], start[1] = start[1], 0.0
             count += 1
-    return count, False
+    return count, n == MOST_CELLS
 
 
 @inlined

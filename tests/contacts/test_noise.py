@@ -190,22 +190,47 @@ def test_ranks_are_probabilities(rng):
         assert np.isnan(probability[row, n:]).all()
 
 
+def located(gamma_map, triplet, rng, s, psi, load):
+    """Contacts under some share of the fold's force, with noise: what is found, and its error."""
+    d = gamma_map.chart.discretization
+    fold = fold_forces(gamma_map.chart.fold, np.column_stack([s, np.cos(psi), np.sin(psi)]))
+    force = load * fold
+    contacts = np.column_stack([s, 0.0 * s, force * np.cos(psi), force * np.sin(psi)])
+    values, _ = solve_forces(d, contacts)
+    force, point = values[:, :3] * d.force, values[:, 3:] * d.length
+    noisy = noisy_wrenches(force, np.cross(point, force), rng)
+    found = gamma_map.estimate(vb.base_signals(*noisy), triplet, np.diag(SIGMA**2))
+    return found, np.linalg.norm(found.point - point, axis=1) / d.length
+
+
 def test_contacts_where_signals_fold_are_counted(gamma_map):
     """(FT, Mx, MB) folds near bearings of ±1.6 rad: noise moves what such contacts signal off it.
 
     Another contact, a quarter of the length away, explains the signals exactly. It is not the only
     one that is probable.
     """
-    rng = np.random.default_rng(0)
-    d, number = gamma_map.chart.discretization, 60
+    rng, number = np.random.default_rng(0), 60
     s, psi = rng.uniform(0.38, 0.46, number), rng.choice([-1.6, 1.6], number)
-    fold = fold_forces(gamma_map.chart.fold, np.column_stack([s, np.cos(psi), np.sin(psi)]))
-    force = rng.uniform(0.1, 0.3, number) * fold
-    contacts = np.column_stack([s, 0.0 * s, force * np.cos(psi), force * np.sin(psi)])
-    values, _ = solve_forces(d, contacts)
-    force, point = values[:, :3] * d.force, values[:, 3:] * d.length
-    noisy = noisy_wrenches(force, np.cross(point, force), rng)
-    found = gamma_map.estimate(vb.base_signals(*noisy), "FT Mx MB", np.diag(SIGMA**2))
-    away = np.linalg.norm(found.point - point, axis=1)
+    load = rng.uniform(0.1, 0.3, number)
+    found, away = located(gamma_map, "FT Mx MB", rng, s, psi, load)
     assert (found.status == vb.Status.AMBIGUOUS).mean() > 0.9
-    assert (found.covariance_valid & (away > 0.1 * d.length)).mean() < 0.05
+    assert (found.covariance_valid & (away > 0.1)).mean() < 0.05
+
+
+def test_contacts_near_slip_off_are_counted(gamma_map):
+    """They fill little space, but of two contacts that explain signals either may be the true."""
+    rng, number = np.random.default_rng(1), 60
+    s, psi = rng.uniform(0.35, 0.6, number), rng.uniform(-np.pi, np.pi, number)
+    load = rng.uniform(0.97, 0.995, number)
+    found, away = located(gamma_map, "Fx FT FD", rng, s, psi, load)
+    wrong = away > 0.1
+    assert wrong.mean() > 0.1
+    assert (found.status[wrong] == vb.Status.AMBIGUOUS).mean() > 0.9
+
+
+def test_a_light_contact_is_one_candidate(gamma_map):
+    """What noise leaves open is a long valley, not several contacts in it."""
+    rng, number = np.random.default_rng(2), 60
+    s, psi = rng.uniform(0.6, 0.9, number), rng.uniform(-np.pi, np.pi, number)
+    found, _ = located(gamma_map, "Fx MB MD", rng, s, psi, rng.uniform(0.01, 0.05, number))
+    assert (found.n_candidates == 1).mean() > 0.95

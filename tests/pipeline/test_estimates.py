@@ -28,7 +28,7 @@ from vibrissa.pipeline import (
 )
 from vibrissa.pipeline.locate import without_contact
 from vibrissa.pipeline.reconstruct import frames_together
-from vibrissa.recording import Recording
+from vibrissa.recording import Recording, recorded
 from vibrissa.sensors import component_noise
 from vibrissa.simulation import facing_peg, measure, simulate, sweep_past
 from vibrissa.status import Status
@@ -356,6 +356,19 @@ def test_without_noise_there_is_no_covariance_but_a_fit(trial):
     assert Recording(done).whisker().length == pytest.approx(40e-3)
     contour = reconstruct(done)
     assert float(contour["object_radius"]) > 0
+
+
+def test_an_error_that_all_contacts_share_is_in_the_covariance_of_the_object(trial):
+    done = with_estimates(trial)
+    shift = np.array([20e-6, -10e-6, 5e-6])
+    shared = np.broadcast_to(shift, (trial.sizes["time"], 1, 1, 3))
+    known = done.copy()
+    known.dataset = done.to_dataset().assign(contact_shared=recorded("contact_shared", shared))
+    more, less = (reconstruct(one)["parameter_covariance"].values for one in (known, done))
+    # Contacts that are all shifted shift the object with them, and change nothing else of it.
+    expected = np.zeros((7, 7))
+    expected[:3, :3] = np.outer(shift, shift)
+    np.testing.assert_allclose(more - less, expected, atol=1e-12)
 
 
 def test_contacts_are_as_far_from_the_known_object_as_predicted(trial):

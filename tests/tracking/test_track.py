@@ -157,6 +157,21 @@ def test_the_covariance_of_the_contact_is_of_the_size_of_its_errors(filmed, foun
     assert 0.1 < np.median(squares) < 30.0
 
 
+def test_an_error_that_all_frames_share_is_in_the_covariances(filmed, traces, found, both):
+    """Traces of one view, all shifted by a twentieth of a pixel, as light from the side does."""
+    across = np.array([0.0, 0.05])
+    front = [[one._replace(line=one.line + across) for one in row] for row in traces[1]]
+    shifted = track(filmed.cameras, [traces[0], front], 1000.0).to_dataset().isel(whisker=0)
+    moved = (shifted["contact_point"].values - found["contact_point"].values)[both]
+    assert np.median(np.linalg.norm(moved, axis=1)) > 2e-6
+    spread, shared = (found[f"contact_{n}"].values[both] for n in ("covariance", "shared"))
+    together = np.einsum("tki,tkj->tij", shared, shared)
+    assert (np.linalg.eigvalsh(spread - together) > -1e-14).all()
+    held = np.einsum("ti,tij,tj->t", moved, np.linalg.inv(spread), moved)
+    alone = np.einsum("ti,tij,tj->t", moved, np.linalg.inv(spread - together), moved)
+    assert np.percentile(held, 95.0) < 7.8 < np.median(alone)
+
+
 def test_the_paper_s_way_is_beside_it(filmed, recording):
     measured = recording["measured"].to_dataset().isel(whisker=0)
     truth = filmed.recording.to_dataset().isel(whisker=0)

@@ -10,7 +10,7 @@ correlated from frame to frame count as fewer.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any, Literal, get_args
 
@@ -92,7 +92,8 @@ def reconstruct(
         freedom: much more than 1 means that the object has another shape.
         `vibrissa.contour.shape_from_dataset` restores the shape. The covariance is larger by the
         misfit, and counts contacts of consecutive frames whose errors are correlated as one; the
-        attribute ``frames_together`` is their number. With known objects also
+        attribute ``frames_together`` is their number. Of simple shapes it includes the errors that
+        all contacts of a tracked recording share (its ``contact_shared``). With known objects also
         ``object_distance`` of each contact from the one that is nearest to them (attribute
         ``object``, its number), and for a cylinder compared with a peg ``axis_offset``,
         ``axis_tilt`` and ``diameter_error``, for spheres ``center_offset`` and ``diameter_error``.
@@ -110,6 +111,10 @@ def reconstruct(
     fit = fit_contacts(estimates, whiskers, shape, axis=axis, lean=lean)
     together = frames_together(scores_of(fit, estimates))
     fit = _widened(fit, together)
+    if not isinstance(fit, FreeFit):
+        moved = _moved_together(recording, estimates)
+        others = [fit_contacts(one, whiskers, shape, axis=axis, lean=lean) for one in moved]
+        fit = _with_shared_errors(fit, others)
     each = {n: estimates[n].variable for n in EACH if n in estimates.coords}
     out = fit.to_dataset(EACH, tuple(estimates.sizes[n] for n in EACH), each)
     out.attrs |= {"reference_frame": "laboratory", "frames_together": together}
@@ -137,6 +142,30 @@ def _widened(fit: FittedShape, together: float) -> FittedShape:
     support = fit.support._replace(variance=together * fit.support.variance)
     base = replace(fit.base, covariance=covariance)
     return replace(fit, base=base, support=support, covariance=covariance)
+
+
+def _moved_together(recording: xr.DataTree, estimates: xr.Dataset) -> Iterator[xr.Dataset]:
+    """Estimates shifted by each error that all contacts of a tracked recording share."""
+    shared = recording.to_dataset().get("contact_shared")
+    if shared is None:
+        return
+    for _, shift in shared.transpose("error", "time", "whisker", "space").groupby("error"):
+        shift = shift.squeeze("error").reindex(time=estimates["time"])
+        # A contact that was not tracked does not show by how much it is shifted.
+        yield estimates.assign(contact_point=estimates["contact_point"] + shift.fillna(0.0))
+
+
+def _with_shared_errors(fit: FittedShape, others: Sequence[FittedShape]) -> FittedShape:
+    """Same fit, less certain by what errors that all contacts share, one a fit, change of it."""
+
+    def numbers(one: FittedShape) -> Array:
+        return np.concatenate([np.ravel(getattr(one, name)) for name in one.fields])
+
+    covariance = fit.covariance.copy()
+    for other in others:
+        apart = numbers(other) - numbers(fit)
+        covariance += np.outer(apart, apart)
+    return replace(fit, covariance=covariance)
 
 
 def frames_together(scores: ArrayLike) -> float:

@@ -96,6 +96,7 @@ VARIABLES: Mapping[str, RecordedVariable] = MappingProxyType(
         "contact_point": RecordedVariable(_VECTOR, ("", "truth", "measured", "estimates"), _LAB),
         "contact_point_whisker": RecordedVariable(_VECTOR, ("", "truth", "estimates"), _WHISKER),
         "contact_covariance": RecordedVariable(_SQUARE, ("", "estimates"), _LAB),
+        "contact_shared": RecordedVariable((*_EACH, "error", "space"), _TOP, _LAB),
         "covariance": RecordedVariable(_SQUARE, _ESTIMATES, _WHISKER),
         "contact_normal": RecordedVariable(_VECTOR, _ESTIMATES, _LAB),
         "normal_covariance": RecordedVariable(_SQUARE, _ESTIMATES, _LAB),

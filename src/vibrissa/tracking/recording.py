@@ -24,6 +24,10 @@ from vibrissa.whisker import Whisker, angles_of
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+_ERRORS = 8
+"""Number of independent errors of contact points that are kept, the largest: the rest is less than
+the tolerance of the contour."""
+
 
 @dataclass(frozen=True, eq=False)
 class Tracked:
@@ -133,6 +137,7 @@ def _variables(one: Tracked) -> xr.Dataset:
         "confidence": np.where(fitted, traces.confidence.min(axis=1), 0.0),
         "status": status,
         "contact_covariance": fit.contact_covariance,
+        "contact_shared": _few(fit.contact_shared),
         "wrench_covariance": fit.wrench_covariance,
         "pose_covariance": fit.pose_covariance,
         "pose_wrench_covariance": fit.pose_wrench_covariance,
@@ -143,6 +148,19 @@ def _variables(one: Tracked) -> xr.Dataset:
         "trace_confidence": traces.confidence,
     }
     return xr.Dataset(_labelled(values))
+
+
+def _few(shared: Array) -> Array:
+    """Shifts (time, error, 3) by as many errors that have the same covariance but for little."""
+    known = np.isfinite(shared).all(axis=(1, 2))
+    out = np.full((len(shared), _ERRORS, 3), np.nan)
+    if known.any():
+        every = np.concatenate(list(shared[known]), axis=1)
+        _, size, ways = np.linalg.svd(every, full_matrices=False)
+        most = (size[:, None] * ways)[:_ERRORS]
+        out[known] = 0.0
+        out[known, : len(most)] = np.stack(np.split(most, known.sum(), axis=1))
+    return out
 
 
 def _measured(one: Tracked) -> xr.Dataset:

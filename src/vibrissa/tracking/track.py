@@ -254,6 +254,7 @@ def _with_optics_unsure(fit: RodFit, optics: Optics) -> RodFit:
     return replace(
         fit,
         contact_covariance=fit.contact_covariance + np.einsum("vti,vtj->tij", contact, contact),
+        contact_shared=np.concatenate([fit.contact_shared, np.moveaxis(contact, 0, 1)], axis=1),
         pose_covariance=pose,
     )
 

@@ -56,6 +56,14 @@ _REST = np.array([0.5, 0.0, 0.0, 0.0])
 _RUBBING = 1e-4
 """Standard deviation of the force along the whisker if there is none across, in units of EI/L²."""
 
+_COMMON, _WAVES = 0.05, 4
+"""Standard deviation of errors that a view's traces share in all frames, pixels, if residuals show
+no larger ones, and number of their waves along the whisker."""
+
+_AT_BASE, _ENDS = (0.5, 0.03), 2.0
+"""The same at the base, which fur hides, and over what share of the length; and of ends along the
+whisker, in units of their standard deviation in one frame."""
+
 _WILD = 1e6
 """Slopes of points of a rod, in units of L, from which it is not in balance."""
 
@@ -112,6 +120,9 @@ class RodFit:
         Contact point in the whisker's and in the laboratory frame, m.
     contact_covariance : array (time, 3, 3)
         Covariance of the contact point in the laboratory, m².
+    contact_shared : array (time, error, 3)
+        Shifts of the contact point by errors that all frames share, m: each by one standard
+        deviation of one error, which is independent of the others. They are part of the covariance.
     force, moment : array (time, 3)
         Force and moment at the base, whisker's frame, N and N·m; 0 without contact.
     wrench_covariance : array (time, 6, 6)
@@ -132,6 +143,7 @@ class RodFit:
     contact_point_whisker: Array
     contact_point: Array
     contact_covariance: Array
+    contact_shared: Array
     force: Array
     moment: Array
     wrench_covariance: Array
@@ -256,6 +268,9 @@ class _Linear(NamedTuple):
     wild: Mask
     data: Array
     misses: list[Array]
+    ends: list[Array]
+    designs: list[Array]
+    weights: list[Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -319,10 +334,10 @@ class Problem:
         gradient = np.zeros((len(points), UNKNOWNS))
         total, count = np.zeros(len(points)), np.zeros(len(points))
         weight = np.ones(len(points)) if self.variance is None else 1.0 / self.variance
-        along = []
+        along, ends, designs, weights = [], [], [], []
         for view, camera in enumerate(self.cameras):
             pixels, by_point = camera.project_with_slopes(points)
-            rows, misses = self.traces.equations(view, pixels, by_point * self.d.length)
+            rows, misses, sharp = self.traces.equations(view, pixels, by_point * self.d.length)
             design = np.einsum("tni,tnij->tnj", rows, with_ends)
             hessian += np.einsum("tni,tnj->tij", design, design)
             gradient += np.einsum("tni,tn->ti", design, misses)
@@ -330,12 +345,15 @@ class Problem:
             count += (misses != 0.0).sum(axis=1)
             # The last two are errors of the ends along the trace.
             along.append(np.where(wild[:, None], 0.0, misses[:, :-2]))
+            ends.append(misses[:, -2:])
+            designs.append(design * weight[:, None, None])
+            weights.append(sharp)
         misfit = np.sqrt(total / np.maximum(count, 1.0))
         total[wild] = np.inf
         data = hessian * weight[:, None, None]
         smoother = Smoother(data, gradient * weight[:, None])
         cost = float((weight * total).sum()) + self._priors(smoother, state)
-        return _Linear(smoother, cost, misfit, wild, data, along)
+        return _Linear(smoother, cost, misfit, wild, data, along, ends, designs, weights)
 
     def _priors(self, smoother: Smoother, state: State) -> float:
         o = self.options
@@ -384,9 +402,38 @@ def _turning(rotation: Array) -> Array:
     return np.asarray(Rotation.from_matrix(step).as_rotvec())
 
 
+def _shared(fit: _Linear) -> Array:
+    """Changes (error, time, unknown) by errors of traces that all frames share, one sigma each.
+
+    Light from the side, a halo of compression or fur over the base shift a trace in the same way in
+    many frames, so that neither many points nor many frames make it smaller: waves along the
+    whisker, and shifts of its ends along it. What of them the fit does not follow stays in the mean
+    of the residuals over time.
+    """
+    pulls = []
+    for misses, ends, design, weight in zip(
+        fit.misses, fit.ends, fit.designs, fit.weights, strict=True
+    ):
+        shown = weight[:, :-2] > 0.0
+        left = np.where(shown, misses / np.where(shown, weight[:, :-2], 1.0), 0.0)
+        left = left.sum(axis=0) / np.maximum(shown.sum(axis=0), 1)
+        sigma = np.hypot(_COMMON, np.sqrt(np.mean(left**2)))
+        s = np.linspace(0.0, 1.0, design.shape[1] - 2)
+        waves = [sigma / (1.0 + k) * np.cos(k * np.pi * s) for k in range(_WAVES)]
+        waves.append(_AT_BASE[0] * np.exp(-s / _AT_BASE[1]))
+        across = design[:, :-2] * weight[:, :-2, None]
+        pulls += [np.einsum("tni,n->ti", across, wave) for wave in waves]
+        for end in (0, 1):
+            counts = weight[:, end - 2] > 0.0
+            miss = float(ends[counts, end].mean()) if counts.any() else 0.0
+            pulls.append(design[:, end - 2] * np.hypot(_ENDS, miss))
+    return fit.smoother.responses(np.array(pulls))
+
+
 def _answer(d: Discretization, state: State, fit: _Linear, touching: Mask, nodes: int) -> RodFit:
     """Results in SI units, relative to the head."""
-    covariance, misfit = fit.smoother.covariances(), fit.misfit
+    shared, misfit = _shared(fit), fit.misfit
+    covariance = fit.smoother.covariances() + np.einsum("kti,ktj->tij", shared, shared)
     values, _ = solve_forces(d, state.contact)
     slope = tangents(d, state.contact)
     force, point = values[:, :3], values[:, 3:]
@@ -404,6 +451,7 @@ def _answer(d: Discretization, state: State, fit: _Linear, touching: Mask, nodes
     line = np.einsum("tij,tnj->tni", state.rotation, line) + state.position[:, None]
     none = np.where(touching, 1.0, np.nan)
     spread = slopes @ covariance @ np.swapaxes(slopes, 1, 2)
+    moved = np.einsum("tij,ktj->tki", slopes, shared)
     wrench_spread = by_contact @ inside @ np.swapaxes(by_contact, 1, 2)
     return RodFit(
         rotation=state.rotation,
@@ -412,6 +460,7 @@ def _answer(d: Discretization, state: State, fit: _Linear, touching: Mask, nodes
         contact_point_whisker=point * d.length * none[:, None],
         contact_point=(turned + state.position) * d.length * none[:, None],
         contact_covariance=spread * (d.length**2 * none[:, None, None]),
+        contact_shared=moved * (d.length * none[:, None, None]),
         force=wrench[:, :3] * touching[:, None],
         moment=wrench[:, 3:] * touching[:, None],
         wrench_covariance=wrench_spread * touching[:, None, None],
@@ -433,6 +482,7 @@ def _in_laboratory(found: RodFit, head: HeadPose) -> RodFit:
         position=head.put_in(found.position),
         contact_point=head.put_in(found.contact_point),
         contact_covariance=turn @ found.contact_covariance @ np.swapaxes(turn, 1, 2),
+        contact_shared=found.contact_shared @ np.swapaxes(turn, 1, 2),
         pose_covariance=both @ found.pose_covariance @ np.swapaxes(both, 1, 2),
         pose_wrench_covariance=both @ found.pose_wrench_covariance,
         centerline=head.put_in(found.centerline),
@@ -463,6 +513,7 @@ def with_length_unsure(found: RodFit, other: RodFit, share: float) -> RodFit:
     return replace(
         found,
         contact_covariance=found.contact_covariance + point[:, :, None] * point[:, None],
+        contact_shared=np.concatenate([found.contact_shared, point[:, None]], axis=1),
         pose_covariance=found.pose_covariance + pose[:, :, None] * pose[:, None],
         wrench_covariance=found.wrench_covariance + wrench[:, :, None] * wrench[:, None],
         pose_wrench_covariance=found.pose_wrench_covariance + pose[:, :, None] * wrench[:, None],

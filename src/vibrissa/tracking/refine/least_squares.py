@@ -73,6 +73,10 @@ class Smoother:
 
     def solved(self, damping: float = 0.0) -> Array:
         """Solve for the step (time, unknown)."""
+        return np.asarray(self.responses(self.gradient[None], damping)[0])
+
+    def responses(self, pulls: Array, damping: float = 0.0) -> Array:
+        """Solve for the steps (pull, time, unknown) to which pulls on the unknowns lead."""
         count, n, _ = self.diagonal.shape
         band = np.zeros((3 * n, count * n))
         rows, columns = np.indices((n, n))
@@ -85,8 +89,8 @@ class Smoother:
             if i + 2 < count:
                 band[2 * n + rows - columns, start + columns] = self.second[i].T
         band[0] += damping * band[0] + _REGULAR * band[0].max()
-        step = solveh_banded(band, self.gradient.reshape(-1), lower=True)
-        return np.asarray(step).reshape(count, n)
+        step = solveh_banded(band, pulls.reshape(len(pulls), -1).T, lower=True)
+        return np.asarray(step.T).reshape(len(pulls), count, n)
 
     def covariances(self) -> Array:
         """Blocks (time, unknown, unknown) on the diagonal of the inverse."""

@@ -383,7 +383,7 @@ class _Problem:
                 axis=-1,
             )
             slopes = np.concatenate([by_point @ moved, by_optics], axis=-1)
-            rows, misses = self.traces.equations(view, pixels, slopes)
+            rows, misses, _ = self.traces.equations(view, pixels, slopes)
             pose, shape, optics = rows[..., :6], rows[..., 6:9], rows[..., 9:]
             design = np.zeros((t, n + 2, 3 * n + k))
             for axis in range(3):

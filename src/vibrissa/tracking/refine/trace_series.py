@@ -98,7 +98,7 @@ class TraceSeries:
         """
         return TraceSeries(*(getattr(self, name)[frames] for name in vars(self)))
 
-    def equations(self, view: int, pixels: Array, slopes: Array) -> tuple[Array, Array]:
+    def equations(self, view: int, pixels: Array, slopes: Array) -> tuple[Array, Array, Array]:
         """Distances of points from the traces of a view, and their derivatives.
 
         Parameters
@@ -116,6 +116,8 @@ class TraceSeries:
             Gradient of each equation by its point, the last two those of base and tip.
         misses : array (time, n + 2)
             Distances in standard deviations; 0 where the trace shows nothing.
+        weights : array (time, n + 2)
+            Inverse standard deviations, 1/pixel; 0 where the trace shows nothing.
         """
         line, sigma = self.line[:, view], self.sigma[:, view]
         tangent = np.gradient(line, axis=1)
@@ -146,7 +148,7 @@ class TraceSeries:
         weight = weight / np.sqrt(np.maximum(scaled / _FAR, 1.0))
         rows = np.einsum("tni,tnij->tnj", across, slopes) * weight[..., None]
         misses = miss * weight
-        ends, gaps = [], []
+        ends, gaps, shown = [], [], []
         for end in (0, -1):
             gap = ((line[:, end] - pixels[:, end]) * tangent[:, end]).sum(axis=1)
             counts = np.isfinite(gap) & (self.ends[:, view, end] > 0.5)
@@ -154,6 +156,8 @@ class TraceSeries:
             pull = np.einsum("ti,tij->tj", tangent[:, end], slopes[:, end]) / _END
             ends.append(np.where(counts[:, None], pull, 0.0))
             gaps.append(np.where(counts, gap / _END, 0.0))
+            shown.append(np.where(counts, 1.0 / _END, 0.0))
         rows = np.concatenate([rows, np.stack(ends, axis=1)], axis=1)
         misses = np.concatenate([misses, np.stack(gaps, axis=1)], axis=1)
-        return np.nan_to_num(rows), np.nan_to_num(misses)
+        weight = np.concatenate([weight, np.stack(shown, axis=1)], axis=1)
+        return np.nan_to_num(rows), np.nan_to_num(misses), np.nan_to_num(weight)

@@ -69,14 +69,14 @@ def spread(values) -> str:
 def main(folder: Path, number: int, draws: int) -> None:
     """Print a line for each kind of error."""
     stage = Stage((HERE / "robot_whisker.toml").read_text(), folder)
-    points, readings, rest = stage.touches()
+    points, readings, rest, drift = stage.touches()
     whisker, mesh = stage.whisker(), cone(folder)
     rod, plate, swept = [], [], {name: [] for name in REPORTED}
     for draw in range(FIRST_DRAW, FIRST_DRAW + draws):
         chosen = np.random.default_rng(draw).permutation(len(points))
         train, test = chosen[:number], chosen[number:][:300]
         found = calibrate_suspension(
-            whisker, points[train], readings[train], channels=stage.channels, rest=rest
+            whisker, points[train], readings[train], channels=stage.channels, rest=rest, drift=drift
         )
         predicted, _ = found.sensor.read(points[test])
         rod.append(np.sqrt(np.nanmean((predicted - readings[test]) ** 2)))

@@ -22,7 +22,17 @@ from vibrissa.cli.app import app
 from vibrissa.contacts import ContactFilter, Estimator
 from vibrissa.io import bag_wrenches
 from vibrissa.sensors import Sensor, SensorFrame, save_sensor
-from vibrissa.streaming import ContactStream, Lines, NewestLines, Poses, advice, file_lines
+from vibrissa.streaming import (
+    Answers,
+    ContactStream,
+    ContactStreams,
+    LineKind,
+    Lines,
+    NewestLines,
+    Poses,
+    advice,
+    file_lines,
+)
 from vibrissa.streaming.contacts import COMPONENTS, as_json
 from vibrissa.streaming.lines import POSITION, QUATERNION
 from vibrissa.streaming.sources import udp_lost, udp_socket
@@ -645,7 +655,7 @@ def test_a_bag_is_whole_however_the_stream_ends(map_file, wrench, tmp_path, name
     ]
     assert len(messages["/contact_candidates"]) == 7
     metadata = json.loads((tmp_path / "out" / "metadata.yaml").read_text())  # JSON is YAML
-    assert metadata["rosbag2_bagfile_information"]["message_count"] == 14
+    assert metadata["rosbag2_bagfile_information"]["message_count"] == 28
 
 
 def test_a_bag_that_was_killed_while_it_was_written_is_finished_by_the_reader(wrench, tmp_path):
@@ -676,7 +686,7 @@ def test_a_bag_that_cannot_be_written_is_said_and_the_stream_goes_on(
 
     lines = list(csv_lines(wrench))
     (tmp_path / "lines.csv").write_text("\n".join(lines))
-    monkeypatch.setattr("vibrissa.io.rosbag.ContactBag.write", lambda *_: full(None))
+    monkeypatch.setattr("vibrissa.io.rosbag.ContactBag.write", lambda *_, **__: full(None))
     done = stream(tmp_path / "lines.csv", "--map", map_file, "--bag-out", tmp_path / "out")
     assert done.exit_code == 1
     assert len(done.stdout.splitlines()) == len(wrench)
@@ -701,21 +711,15 @@ def test_bags_that_hold_something_else(wrench, tmp_path):
     assert stamps == [7_000_000_000, 7_001_000_000, 7_002_000_000]
 
 
-def test_a_bag_goes_in_and_a_bag_comes_out(map_file, bent, wrench, tmp_path):
+@pytest.mark.parametrize("name", ["out", "out.mcap"])
+def test_a_bag_goes_in_and_a_bag_comes_out(name, map_file, bent, wrench, tmp_path):
     pytest.importorskip("rosbags")
-    from rosbags.highlevel import AnyReader
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS2_HUMBLE)
     write_wrenches(tmp_path / "in", {"/wrench": wrench})
-    output = stream(tmp_path / "in", "--map", map_file, "--bag-out", tmp_path / "out").stdout
+    out = tmp_path / name
+    output = stream(tmp_path / "in", "--map", map_file, "--bag-out", out).stdout
     records = [json.loads(line) for line in output.splitlines()]
     assert [record["time"] for record in records] == pytest.approx(7.0 + 1e-3 * np.arange(12))
-    with AnyReader([tmp_path / "out"], default_typestore=store) as reader:
-        found = {c.topic: [] for c in reader.connections}
-        for connection, stamp, raw in reader.messages():
-            message = reader.deserialize(raw, connection.msgtype)
-            found[connection.topic].append((stamp, message))
+    found = bag_messages(out)
     points = [(m.point.x, m.point.y, m.point.z) for _, m in found["/contact_point"]]
     np.testing.assert_allclose(points, bent.contact_point, atol=1e-8)
     stamp, first = found["/contact_point"][3]
@@ -723,10 +727,112 @@ def test_a_bag_goes_in_and_a_bag_comes_out(map_file, bent, wrench, tmp_path):
     assert (first.header.stamp.sec, first.header.stamp.nanosec) == (7, 3_000_000)
     assert first.header.frame_id == "sensor"
     for record, (_, cloud) in zip(records, found["/contact_candidates"], strict=True):
-        table = np.frombuffer(cloud.data.tobytes(), "<f8").reshape(cloud.width, 4)
-        np.testing.assert_array_equal(table[:, :3], record["candidates"])
+        table = np.frombuffer(cloud.data.tobytes(), "<f4").reshape(cloud.width, 4)
+        np.testing.assert_allclose(table[:, :3], record["candidates"], rtol=1e-6)
         assert [field.name for field in cloud.fields] == ["x", "y", "z", "probability"]
-        assert cloud.row_step == cloud.data.size == 32 * cloud.width
+        assert cloud.row_step == cloud.data.size == 16 * cloud.width
+    for k, (record, (_, pose)) in enumerate(zip(records, found["/contact_pose"], strict=True)):
+        place, spread = pose.pose.pose.position, pose.pose.covariance.reshape(6, 6)
+        np.testing.assert_allclose([place.x, place.y, place.z], bent.contact_point[k], atol=1e-8)
+        sigma = [record[f"sigma_{axis}"] for axis in "xyz"]
+        np.testing.assert_allclose(np.sqrt(np.diag(spread)[:3]), sigma, rtol=1e-12)
+    for k, (_, message) in enumerate(found["/contact_force"]):
+        pull = message.wrench.force
+        np.testing.assert_allclose([pull.x, pull.y, pull.z], bent.force[k], rtol=1e-6)
+
+
+def test_onset_loss_and_slip_are_events(gamma_map, wrench):
+    """A free whisker, a contact that slides, jumps by 8 mm, and is lost; sample by sample."""
+    load = vb.PointForce(np.array([32e-3, 31.9e-3, 31.8e-3, 24e-3, 23.9e-3]), 5e-5, 0.5)
+    bent = vb.deflect(gamma_map.whisker, load)
+    rows = np.concatenate([bent.force, bent.moment], axis=1)
+    rows = np.concatenate([np.zeros((2, 6)), rows, np.zeros((2, 6))])
+    running = ContactStream(estimator(gamma_map, felt_above=5.0))
+    lines = [
+        json.dumps({"time": 0.01 * i} | dict(zip(COMPONENTS, row, strict=True)))
+        for i, row in enumerate(rows.tolist())
+    ]
+    events = {r["time"]: r["event"] for r in running.records(lines) if "event" in r}
+    assert events == {0.02: "onset", 0.05: "slip", 0.07: "loss"}
+    assert running.events == {"onset": 1, "slip": 1, "loss": 1}
+    steady = ContactStream(estimator(gamma_map, felt_above=5.0), slip_speed=10.0)
+    assert "slip" not in {r.get("event") for r in steady.records(lines)}
+    with pytest.raises(ValueError, match="speed of a slip"):
+        ContactStream(estimator(gamma_map), slip_speed=0.0)
+
+
+@pytest.mark.parametrize("kind", ["csv", "json", "apart"])
+def test_several_whiskers_in_one_stream(gamma_map, bent, wrench, kind):
+    both = ContactStreams([ContactStream(estimator(gamma_map), whisker=w) for w in ("a", "b")])
+    pairs = list(zip(wrench[:3].tolist(), wrench[3:6].tolist(), strict=True))
+    named = [[f"{w}.{n}" for n in COMPONENTS] for w in "ab"]
+    if kind == "csv":
+        lines = [",".join(["time", *named[0], *named[1]])]
+        lines += [",".join(map(repr, [0.1 * i, *a, *b])) for i, (a, b) in enumerate(pairs)]
+    else:
+        rows = [
+            [dict(zip(n, v, strict=True)) for n, v in zip(named, p, strict=True)] for p in pairs
+        ]
+        rows = [[a | b] if kind == "json" else [a, b] for a, b in rows]
+        lines = [json.dumps({"time": 0.1 * i} | one) for i, row in enumerate(rows) for one in row]
+    records = list(both.records(lines))
+    assert [record["whisker"] for record in records] == 3 * ["a", "b"]
+    for k, record in enumerate(records):
+        point = bent.contact_point[k // 2 + 3 * (k % 2)]
+        np.testing.assert_allclose([record[n] for n in "xyz"], point, atol=1e-8)
+    assert both.samples == 6
+    (fault,) = both.records(["{broken"])
+    assert "not JSON" in fault["error"]
+    assert both.kind(lines[-1]) == LineKind.SAMPLE
+    with pytest.raises(ValueError, match="different names"):
+        ContactStreams(2 * [ContactStream(estimator(gamma_map))])
+
+
+def test_two_whiskers_from_the_command_line(map_file, bent, wrench, tmp_path):
+    pytest.importorskip("rosbags")
+    rows = [
+        {
+            f"{w}.{n}": v
+            for w, row in zip(("left", "right"), pair, strict=True)
+            for n, v in zip(COMPONENTS, row, strict=True)
+        }
+        for pair in zip(wrench[:2].tolist(), wrench[2:4].tolist(), strict=True)
+    ]
+    path = tmp_path / "lines.jsonl"
+    path.write_text("\n".join(json.dumps({"time": 0.1 * i} | row) for i, row in enumerate(rows)))
+    maps = ["--map", f"left={map_file}", "--map", f"right={map_file}"]
+    done = stream(path, *maps, "--bag-out", tmp_path / "out")
+    records = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [record["whisker"] for record in records] == 2 * ["left", "right"]
+    assert "right: 2 samples" in done.stderr
+    (_, first), _ = bag_messages(tmp_path / "out")["/right/contact_point"]
+    np.testing.assert_allclose([first.point.x, first.point.y], bent.contact_point[2, :2], atol=1e-8)
+    with pytest.raises(ValueError, match="each has a name"):
+        stream(path, "--map", map_file, "--map", map_file)
+    with pytest.raises(ValueError, match="--sensor is of other"):
+        stream(path, *maps, "--sensor", "other=sensor.toml")
+
+
+def test_answers_go_to_another_program(map_file, wrench, tmp_path):
+    path = tmp_path / "lines.csv"
+    path.write_text("\n".join(csv_lines(wrench[:3])))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as heard:
+        heard.bind(("127.0.0.1", 0))
+        heard.settimeout(10.0)
+        port = heard.getsockname()[1]
+        printed = stream(path, "--map", map_file, "--send", f"udp://127.0.0.1:{port}").stdout
+        assert "".join(heard.recv(65535).decode() for _ in range(3)) == printed
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        assert stream(path, "--map", map_file, "--send", address).stdout == printed
+        accepted, _ = server.accept()
+        with accepted, accepted.makefile() as lines:
+            assert lines.read() == printed
+    with pytest.raises(ValueError, match="answers cannot go to tcp"):
+        Answers(address)
+    for wrong in ("127.0.0.1:5", "http://127.0.0.1:5", "tcp://here"):
+        with pytest.raises(ValueError, match="HOST:PORT"):
+            Answers(wrong)
 
 
 def test_a_bag_may_hold_the_pose_of_what_carries_the_base(map_file, wrench, tmp_path):

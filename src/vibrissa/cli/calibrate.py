@@ -61,7 +61,7 @@ def _suspended(description: Path, target: Path, force: bool) -> None:
     """Calibrate a whisker on a compliant suspension."""
     check_new(target, vb.io.NETCDF, force)
     stage = vb.sensors.Stage.load(vb.io.check_readable(description))
-    points, readings, rest = stage.touches()
+    points, readings, rest, drift = stage.touches()
     found = vb.sensors.calibrate_suspension(
         stage.whisker(),
         points,
@@ -69,6 +69,7 @@ def _suspended(description: Path, target: Path, force: bool) -> None:
         channels=stage.channels,
         rest=rest,
         base_sigma=stage.base_sigma,
+        drift=drift,
     )
     vb.sensors.save_suspended(target, found, stage)
     lost = len(points) - int(found.used.sum())
@@ -82,7 +83,7 @@ def _suspended(description: Path, target: Path, force: bool) -> None:
         scale = abs(readings[:, k]).max()
         say(
             f"{name}: noise {sensor.noise[k]:.3g}, {100 * sensor.noise[k] / scale:.2g} % of the "
-            f"largest reading; the rod leaves {found.residual[k]:.3g}"
+            f"largest reading; the rod leaves {found.residual[k]:.3g}; drift {sensor.drift[k]:.3g}"
         )
     say(f"wrote {target}")
 

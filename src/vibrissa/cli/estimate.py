@@ -84,6 +84,11 @@ class GravityOptions:
         """State the gravity, to be put at the end of a sentence; empty where there is none."""
         return "" if self.gravity is None else f"; bent by gravity of {self.gravity} m/s²"
 
+_SHOWN = 5
+"""Faults of a table that are reported."""
+
+_NUMBERS = ("time", "x", "y", "z", "r", "theta", "phi", "sigma_x", "sigma_y", "sigma_z")
+
 
 @dataclass(frozen=True, kw_only=True)
 class EstimateOptions:
@@ -182,7 +187,8 @@ def estimate(
     signals: Annotated[
         Path,
         typer.Argument(
-            help="A recording, .nc; or a table with time, Fx, Fy, Fz, Mx, My, Mz in SI units.",
+            help="A recording, .nc; or a table with time, and Fx, Fy, Fz, Mx, My, Mz, the signals "
+            "that are used, or the channels of the --sensor.",
             metavar="SIGNALS",
         ),
     ],
@@ -199,8 +205,9 @@ def estimate(
     status is not_felt. To a recording they are added as a group `estimates`, in the laboratory too,
     where continuity decides which of several contacts it was; signals are made first where there
     are none (see `vibrissa signals`), and a contour that was made of other contacts is left out. A
-    table goes to a table. With the --sensor of `vibrissa calibrate` the table is a sweep: positions
-    of the stage, and its channels. With --gravity a whisker of known density sags.
+    table goes to a table. With a --sensor (.toml) its columns are the sensor's channels, and poses
+    of the base, as lines of `vibrissa stream` are; with that of `vibrissa calibrate` (.nc) it is a
+    sweep: positions of the stage, and the channels. With --gravity a whisker of known density sags.
     Example: `vibrissa estimate signals.csv --map map.nc --using Fx,FT,MB,MD -o contacts.csv`
     """
     if how.noise.covariance is not None:
@@ -209,15 +216,83 @@ def estimate(
     target = target or (signals if recorded else Path("contacts.csv"))
     vb.io.check_writable(target, (*vb.io.NETCDF, *vb.io.CSV) if recorded else vb.io.CSV)
     free_beside(signals, [target], force)
-    if sensor is not None:
+    if sensor is not None and not vb.io.is_netcdf(sensor):
+        stated = (recorded, how.using, weight.gravity, how.noise.given, how.method != "exact", how.friction_sigma)
+        if any(map(bool, stated)):
+            raise ValueError(f"{sensor} is for tables, and has its own channels and noise")
+        _from_lines(signals, target, how, vb.sensors.load_sensor(sensor))
+    elif sensor is not None:
         if recorded or how.given or weight.gravity is not None:
             raise ValueError("--sensor is of tables, and has its own whisker, channels and noise")
         _from_sweep(signals, target, sensor)
     elif recorded:
         refuse({"--gravity": weight.gravity}, "it is of tables, with one direction")
         _from_recording(signals, target, how)
+    elif weight.gravity is None and _named_signals(signals, how):
+        _from_lines(signals, target, how, None)
     else:
         _from_table(signals, target, how, weight)
+
+
+def _named_signals(table: Path, how: EstimateOptions) -> bool:
+    """Whether a table has the signals that are used, and not what they are computed from."""
+    if how.whole or how.method != "exact" or how.friction_sigma:
+        return False
+    names = how.names or vb.pipeline.TRIPLET
+    first = next((line for line in vb.io.read_text(table).splitlines() if line.strip()), "")
+    try:
+        vb.streaming.Lines(vb.streaming.COMPONENTS)(first)
+    except ValueError:
+        try:
+            return vb.streaming.Lines(names)(first) is None and bool(first)
+        except ValueError:
+            return False
+    return False
+
+
+def _from_lines(
+    signals: Path, target: Path, how: EstimateOptions, sensor: vb.sensors.Sensor | None
+) -> None:
+    """Contacts of a table whose lines are those of a stream."""
+    import numpy as np
+    import xarray as xr
+
+    prior, errors = how.assumed.prior, dict(how.assumed.errors)
+    with progress_bars() as tell:
+        if how.map:
+            contact_map = maps_from(how.map, 1, False)[0]
+        else:
+            known = how.own.read()
+            remark(f"no map given; simulating that of {known!r}")
+            contact_map = map_of(known, tell, grid=False, proximal=smallest_arc(how.proximal))
+        if sensor is None:
+            names, used = None, how.names or vb.pipeline.TRIPLET
+            noise = how.noise.matrix()
+            estimator = vb.Estimator(
+                contact_map, used, noise, felt_above=vb.pipeline.DETECTED, prior=prior, **errors
+            )
+        else:
+            names = used = tuple(sensor.channels)
+            stiffness = errors.pop("stiffness_sigma", 0.0)
+            if errors:
+                raise ValueError("the --sensor's file states gain_error and mixing_error")
+            estimator = vb.Estimator.of_sensor(
+                contact_map, sensor, stiffness, vb.pipeline.DETECTED, prior
+            )
+        running = vb.streaming.ContactStream(estimator, names)
+        records = list(running.records(vb.io.read_text(signals).splitlines()))
+    faults = [f"line {one['line']}: {one['error']}" for one in records if "error" in one]
+    if faults or not records:
+        raise ValueError(f"{signals}: {'; '.join(faults[:_SHOWN]) or 'there are no samples'}")
+    columns = {name: [one.get(name, float("nan")) for one in records] for name in _NUMBERS}
+    statuses = [int(vb.Status[one["status"].upper()]) for one in records]
+    found = xr.Dataset({name: ("time", values) for name, values in columns.items()})
+    vb.io.save_contacts(target, found.assign(status=("time", statuses)))
+    for sentence in vb.streaming.advice(running):
+        remark(sentence)
+    remark(f"signals ({', '.join(used)}){how.assumed.described()}")
+    print_statuses(np.array(statuses))
+    print_written(target)
 
 
 def _from_table(signals: Path, target: Path, how: EstimateOptions, weight: GravityOptions) -> None:

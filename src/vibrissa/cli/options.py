@@ -52,7 +52,7 @@ OPTIONS = {
     "any_length": Option("A whisker shorter than 0.5 mm or longer than 0.5 m is meant."),
     "map": Option(
         "Map of the whisker; by default it is simulated. Of several whiskers: one for each, in "
-        "their order.",
+        "their order, in `stream` as NAME=FILE.",
         "FILE",
     ),
     "videos": Option(
@@ -98,7 +98,15 @@ OPTIONS = {
         "Table of the contour points; by default NAME_contour.csv next to the result.", "FILE"
     ),
     "film": Option("Folder for videos of the two views.", "DIR"),
-    "bag": Option("New ROS 2 bag for PointStamped and PointCloud2.", "FOLDER", names="--bag-out"),
+    "bag": Option(
+        "New ROS 2 bag for contact points with covariance, forces and candidates: a folder, or a "
+        "file that ends in .mcap.",
+        "FOLDER",
+        names="--bag-out",
+    ),
+    "answers": Option(
+        "Send each answer there too: udp://HOST:PORT or tcp://HOST:PORT.", "ADDRESS", names="--send"
+    ),
     "grid": Option("Whether the paper's 237,765 points are solved too."),
     "to": Option("Format of the table: text, Neurodata Without Borders, or MATLAB."),
     "session_start": Option(
@@ -334,6 +342,11 @@ OPTIONS = {
     "speed": Option(
         "Speed of contacts in the laboratory, for the filter, mm/s; by default a quarter of "
         "the whisker's length a second.",
+        "MM/S",
+    ),
+    "slip_speed": Option(
+        "Speed of contacts in the laboratory from which they slip, mm/s; by default two lengths of "
+        "the whisker a second.",
         "MM/S",
     ),
     "mount": Option(

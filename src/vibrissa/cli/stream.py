@@ -104,10 +104,10 @@ class LineOptions:
 class MeasurementOptions:
     """The whisker and what is measured at its base."""
 
-    map: Path | None = None
+    map: list[str] | None = None
     proximal: float | None = None
     own: WhiskerOptions
-    sensor: Path | None = None
+    sensor: list[str] | None = None
     using: str | None = None
     noise: NoiseOptions
     assumed: AssumptionOptions
@@ -116,11 +116,16 @@ class MeasurementOptions:
 
     def __post_init__(self) -> None:
         """Refuse what does not go together."""
-        if self.map is not None:
+        if self.map:
             if self.own.whisker is not None:
                 raise ValueError("give either --map or --whisker: a map already has its whisker")
             refuse({"--proximal": self.proximal}, "it is of a map that is simulated")
-        if self.sensor is None:
+        sensors = _named(self.sensor, "--sensor")
+        if set(sensors) - {"", *self.whiskers}:
+            raise ValueError(
+                f"--sensor is of {', '.join(sensors)}; --map of {', '.join(self.whiskers) or 'one'}"
+            )
+        if not sensors:
             reason = "the offset is that of a sensor's channels: give the --sensor"
             refuse({"--tare": self.tare}, reason)
             return
@@ -130,22 +135,29 @@ class MeasurementOptions:
         errors.pop("--stiffness-sigma", None)
         refuse(errors, "the --sensor's file states gain_error and mixing_error")
 
-    def contact_map(self) -> vb.ContactMap:
-        """Read or simulate the map."""
-        if self.map is not None:
-            return map_from(self.map)
+    @property
+    def whiskers(self) -> tuple[str, ...]:
+        """Names of the whiskers, by their maps; one without a name where there is one only."""
+        return tuple(_named(self.map, "--map")) or ("",)
+
+    def contact_map(self, name: str) -> vb.ContactMap:
+        """Read or simulate the map of a whisker."""
+        if self.map:
+            return map_from(Path(_named(self.map, "--map")[name]))
         whisker = self.own.read()
         print_notes(whisker)
         remark(f"no map given; simulating that of {whisker!r}")
         return vb.ContactMap.simulate(whisker, grid=False, proximal=smallest_arc(self.proximal))
 
-    def described(self) -> vb.sensors.Sensor | None:
-        """Read the sensor."""
-        return None if self.sensor is None else vb.sensors.load_sensor(self.sensor)
+    def described(self, name: str) -> vb.sensors.Sensor | None:
+        """Read the sensor of a whisker: its own, or that of all."""
+        sensors = _named(self.sensor, "--sensor")
+        path = sensors.get(name, sensors.get(""))
+        return None if path is None else vb.sensors.load_sensor(path)
 
-    def estimator(self, sensor: vb.sensors.Sensor | None) -> vb.Estimator:
-        """Return what estimates contacts from measurements."""
-        contact_map, prior, errors = self.contact_map(), self.assumed.prior, self.assumed.errors
+    def estimator(self, name: str, sensor: vb.sensors.Sensor | None) -> vb.Estimator:
+        """Return what estimates contacts of a whisker from measurements."""
+        contact_map, prior, errors = self.contact_map(name), self.assumed.prior, self.assumed.errors
         if sensor is not None:
             stiffness = errors.get("stiffness_sigma", 0.0)
             if self.tare:
@@ -167,18 +179,21 @@ class FollowOptions:
 
     filter: bool = False
     speed: float | None = None
-    mount: str | None = None
+    slip_speed: float | None = None
+    mount: list[str] | None = None
 
     def __post_init__(self) -> None:
         """Refuse what does not go together."""
         if not self.filter:
             refuse({"--speed": self.speed}, "it is of the filter: add --filter")
 
-    def poses(self) -> vb.streaming.Poses:
-        """Return the poses of what the whisker is mounted on."""
-        if self.mount is None:
+    def poses(self, name: str) -> vb.streaming.Poses:
+        """Return the poses of what a whisker is mounted on."""
+        mounts = _named(self.mount, "--mount")
+        mount = mounts.get(name, mounts.get(""))
+        if mount is None:
             return vb.streaming.Poses()
-        values = numbers(self.mount, _MOUNT, "--mount")
+        values = numbers(mount, _MOUNT, "--mount")
         return vb.streaming.Poses(
             vb.streaming.rotation_of(values[3:]), [1e-3 * x for x in values[:3]]
         )
@@ -187,7 +202,7 @@ class FollowOptions:
         self,
         estimator: vb.Estimator,
         sensor: vb.sensors.Sensor | None,
-        poses: vb.streaming.Poses,
+        whisker: str,
         bag: bool,
         tare: int,
     ) -> vb.streaming.ContactStream:
@@ -200,7 +215,23 @@ class FollowOptions:
                 f"a bag of wrenches carries {', '.join(vb.streaming.COMPONENTS)}; the sensor has "
                 f"{', '.join(names)}"
             )
-        return vb.streaming.ContactStream(estimator, names, filtered, poses, tare)
+        slip = None if self.slip_speed is None else 1e-3 * self.slip_speed
+        poses = self.poses(whisker)
+        return vb.streaming.ContactStream(
+            estimator, names, filtered, poses, tare, whisker=whisker, slip_speed=slip
+        )
+
+
+def _named(given: list[str] | None, option: str) -> dict[str, str]:
+    """Values of an option by the names of whiskers: NAME=VALUE, or one value without a name."""
+    pairs = [one.rpartition("=") if "=" in one else ("", "", one) for one in given or ()]
+    names = [name for name, _, _ in pairs]
+    if len(set(names)) < len(names) or ("" in names and len(names) > 1):
+        raise ValueError(
+            f"{option} is given {len(names)} times; of several whiskers each has a name, as "
+            f"{option} left=VALUE {option} right=VALUE"
+        )
+    return {name: value for name, _, value in pairs}
 
 
 @with_options()
@@ -209,26 +240,37 @@ def stream(
     measured: MeasurementOptions,
     follow: FollowOptions,
     bag: Path | None = None,
+    answers: str | None = None,
 ) -> None:
     """Find contacts while signals come in, one line of JSON each.
 
     Lines are CSV with a header, or JSON objects, in SI units, with the signals that are used or
     Fx, Fy, Fz, Mx, My, Mz; a column time is passed on. A line that cannot be read gives a line with
     its number and the error; after a header that cannot be used, rows wait for another one. Points
-    are in the whisker's frame, m; with --filter also in the laboratory's (lab_x, ...). Stop with
-    Ctrl-C or any signal.
+    are in the whisker's frame, m; with --filter also in the laboratory's (lab_x, ...). Onset, loss
+    and slip of a contact are in the field event. Of several whiskers, --map left=left.nc --map
+    right=right.nc, lines carry left.Fx, right.Fx and so on. Stop with Ctrl-C or any signal.
     Example: `vibrissa stream --udp 127.0.0.1:5005 --map wire.nc --sensor sensor.toml`
     """
-    sensor, poses = measured.described(), follow.poses()
+    sensors = {name: measured.described(name) for name in measured.whiskers}
     with ending_in_order(), _without_long_collections() as settled, ExitStack() as opened:
         writer = None
         if bag is not None:
             frame = "laboratory" if follow.filter else "whisker"
-            writer = opened.enter_context(vb.io.ContactBag(bag, frame=frame))
+            writer = opened.enter_context(
+                vb.io.ContactBag(bag, frame=frame, whiskers=measured.whiskers)
+            )
+        sent = None if answers is None else opened.enter_context(vb.streaming.Answers(answers))
         heard = None if source.udp is None else _socket(source.udp, opened)
         lines: Iterable[str] = source.lines(heard)
-        estimator = measured.estimator(sensor)
-        running = follow.running(estimator, sensor, poses, source.bag, measured.tare or 0)
+        running = vb.streaming.ContactStreams(
+            [
+                follow.running(
+                    measured.estimator(name, sensor), sensor, name, source.bag, measured.tare or 0
+                )
+                for name, sensor in sensors.items()
+            ]
+        )
         running.warm_up()
         settled()
         losses = None if heard is None else _Losses(heard)
@@ -238,13 +280,18 @@ def stream(
                 lines = losses.newest(running)
         recorder = None
         if writer is not None:
-            recorder = vb.streaming.ContactRecorder(writer, running, sensor, follow.filter, remark)
+            same = all(
+                one is None or (one.frame.to_base() == vb.sensors.SensorFrame().to_base()).all()
+                for one in sensors.values()
+            )
+            recorder = vb.streaming.ContactRecorder(writer, running, same, follow.filter, remark)
         try:
-            _write(running, islice(lines, source.count), recorder, losses)
+            _write(running, islice(lines, source.count), recorder, losses, sent)
         except Ended as signalled:  # the usual end
             remark(f"stopped: {signalled}")
         lost = "" if losses is None else losses.described()
-    _report(running, lost, follow.filter)
+    for one in running.streams:
+        _report(one, lost, follow.filter)
     if recorder is not None and recorder.broken:
         raise typer.Exit(1)
 
@@ -271,13 +318,16 @@ def _without_long_collections() -> Iterator[Callable[[], None]]:
 def _report(running: vb.streaming.ContactStream, lost: str, follow: bool) -> None:
     if follow and not running.poses.number:
         remark("no pose came: the base was taken to stand still")
-    remark(f"{running.samples} samples, {running.faults} lines that could not be read{lost}")
+    whose = f"{running.whisker}: " if running.whisker else ""
+    remark(f"{whose}{running.samples} samples, {running.faults} lines that could not be read{lost}")
+    if running.events:
+        remark(whose + ", ".join(f"{name}: {n}" for name, n in running.events.items()))
     _advise(running)
 
 
 def _advise(running: vb.streaming.ContactStream) -> None:
     for sentence in vb.streaming.advice(running):
-        remark(sentence)
+        remark(f"{running.whisker}: {sentence}" if running.whisker else sentence)
 
 
 def _socket(udp: str, opened: ExitStack) -> socket.socket:
@@ -296,9 +346,9 @@ class _Losses:
         self._lines: vb.streaming.NewestLines | None = None
         self._before, self._next = (0, 0), 0.0
 
-    def newest(self, running: vb.streaming.ContactStream) -> vb.streaming.NewestLines:
+    def newest(self, running: vb.streaming.ContactStreams) -> vb.streaming.NewestLines:
         """Lines of which only the newest are passed on."""
-        self._lines = vb.streaming.NewestLines(self._heard, running.lines.kind)
+        self._lines = vb.streaming.NewestLines(self._heard, running.kind)
         return self._lines
 
     def report(self) -> None:
@@ -321,10 +371,11 @@ class _Losses:
 
 
 def _write(
-    running: vb.streaming.ContactStream,
+    running: vb.streaming.ContactStreams,
     lines: Iterator[str],
     recorder: vb.streaming.ContactRecorder | None,
     losses: _Losses | None,
+    sent: vb.streaming.Answers | None,
 ) -> None:
     """Print records as they come, each at once; stop quietly when nobody reads any more."""
     try:
@@ -332,12 +383,20 @@ def _write(
             # First, so that all that was answered is in the bag, wherever a signal comes.
             if recorder is not None:
                 recorder.put(record)
-            sys.stdout.write(vb.streaming.as_json(record) + "\n")
+            answer = vb.streaming.as_json(record)
+            sys.stdout.write(answer + "\n")
             sys.stdout.flush()
+            if sent is not None:
+                try:
+                    sent.send(answer)
+                except OSError as fault:
+                    remark(f"answers are no longer sent: {fault}")
+                    sent = None
             if losses is not None:
                 losses.report()
             if running.samples == _SOON:
-                _advise(running)
+                for one in running.streams:
+                    _advise(one)
     except BrokenPipeError:
         # What is flushed at the end must not fail again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

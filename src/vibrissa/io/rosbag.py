@@ -1,8 +1,9 @@
 """ROS 2 bags: wrenches in, contact points out (extra ``ros``: rosbags, which needs no ROS).
 
 `geometry_msgs/WrenchStamped` is read, and `PoseStamped` or `TransformStamped` for the pose of the
-base, from ROS 1 bags as well; `geometry_msgs/PointStamped` is written for contact points, and
-`sensor_msgs/PointCloud2` for all candidates of a sample. Time stamps are whole nanoseconds
+base, from ROS 1 bags as well. Written are, of each sample, `geometry_msgs/PointStamped` and
+`PoseWithCovarianceStamped` for the contact point, `WrenchStamped` for the force at it, and
+`sensor_msgs/PointCloud2` for all candidates. Time stamps are whole nanoseconds
 throughout: seconds since 1970 as a 64-bit float are rounded to a quarter of a microsecond.
 
 The writer of rosbags leaves a bag that can be read only when it is closed. A stream may be stopped
@@ -13,14 +14,16 @@ by anything, so a bag is written here as the format prescribes (SQLite, schema 4
 from __future__ import annotations
 
 import json
+import shutil
 import sqlite3
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,9 +35,20 @@ _POINT = "geometry_msgs/msg/PointStamped"
 _CLOUD = "sensor_msgs/msg/PointCloud2"
 _POSE = "geometry_msgs/msg/PoseStamped"
 _TRANSFORM = "geometry_msgs/msg/TransformStamped"
-_SUFFIXES = {".bag", ".db3", ".mcap"}
-# Of sensor_msgs/PointField: 64-bit floats.
-_FLOAT64 = 8
+_UNCERTAIN = "geometry_msgs/msg/PoseWithCovarianceStamped"
+_MCAP = ".mcap"
+_SUFFIXES = {".bag", ".db3", _MCAP}
+# Topics of the contact point, its covariance, the force, and all candidates.
+_TOPICS = {
+    _POINT: "/contact_point",
+    _UNCERTAIN: "/contact_pose",
+    _WRENCH: "/contact_force",
+    _CLOUD: "/contact_candidates",
+}
+# Of sensor_msgs/PointField: 32-bit floats.
+_FLOAT32 = 7
+# Variance of an angle of which nothing is known.
+_ANY_ANGLE = np.pi**2 / 3.0
 _SECOND = 1_000_000_000
 # Seconds of a ROS time stamp are 32-bit numbers.
 _LARGEST_SECOND = 2**31 - 1
@@ -184,40 +198,45 @@ CREATE TABLE messages(
 CREATE INDEX timestamp_idx ON messages (timestamp ASC);
 INSERT INTO schema(schema_version, ros_distro) VALUES (4, 'rosbags');
 """
-_METADATA_VERSION = 9
+_METADATA_VERSION: Final = 9
 
 
 class ContactBag:
-    """Writes contact points and clouds of candidates into a ROS 2 bag; a context manager.
+    """Writes contacts of one or several whiskers into a ROS 2 bag; a context manager.
 
-    The bag is whole every half second, however the process ends; a power cut may spoil it.
+    A folder is whole every half second, however the process ends; a power cut may spoil it. An
+    MCAP file is written next to it and takes its name once it is complete.
 
     Parameters
     ----------
     path : str or path
-        Folder to write, which must not exist.
+        Folder to write, or file that ends in ``.mcap``; it must not exist.
     frame : str
         Name of the frame of the points.
-    point_topic, cloud_topic : str
-        Names of the topics of the contact point and of all candidates.
+    whiskers : sequence of str
+        Names of the whiskers; with names topics begin with them: ``/left/contact_point``.
     """
 
     def __init__(
         self,
         path: str | PathLike[str],
         frame: str = "whisker",
-        point_topic: str = "/contact_point",
-        cloud_topic: str = "/contact_candidates",
+        whiskers: Sequence[str] = ("",),
     ) -> None:
         self._types = _library().types
         self._path = Path(path)
         if self._path.exists():
-            raise FileExistsError(f"{path} exists; a bag is written to a new folder")
+            raise FileExistsError(f"{path} exists; a bag is written to a new folder or file")
         if not self._path.parent.is_dir():
             raise FileNotFoundError(f"there is no folder {self._path.parent}")
         self.frame = frame
-        self._topics = {_POINT: point_topic, _CLOUD: cloud_topic}
-        self._numbers = {kind: k for k, kind in enumerate(self._topics, start=1)}
+        self._topics = {
+            (name, kind): f"/{name}{topic}" if name else topic
+            for name in whiskers
+            for kind, topic in _TOPICS.items()
+        }
+        self._numbers = {key: k for k, key in enumerate(self._topics, start=1)}
+        self._mcap: Any = None
         self._counts = dict.fromkeys(self._numbers.values(), 0)
         self._begin, self._end, self._counted = 2**63 - 1, 0, 0
         self._lock, self._closed = threading.Lock(), threading.Event()
@@ -225,6 +244,15 @@ class ContactBag:
 
     def __enter__(self) -> ContactBag:
         """Open the bag."""
+        if self._path.suffix == _MCAP:
+            self._part = self._path.with_name(f"{self._path.stem}.part")
+            self._mcap = _library().mcap(self._part)
+            self._mcap.open()
+            self._connections = [
+                self._mcap.add_connection(topic, kind, typestore=self._types)
+                for (_, kind), topic in self._topics.items()
+            ]
+            return self
         self._path.mkdir()
         file = self._path / f"{self._path.name}.db3"
         self._database = sqlite3.connect(file, check_same_thread=False)
@@ -233,13 +261,16 @@ class ContactBag:
         self._database.executescript(
             f"PRAGMA synchronous = OFF; PRAGMA cache_spill = OFF; {_SCHEMA}"
         )
-        for kind, number in self._numbers.items():
+        for (name, kind), number in self._numbers.items():
             definition, _ = self._types.generate_msgdef(kind, ros_version=2)
             digest = self._types.hash_rihs01(kind)
-            topic = number, self._topics[kind], kind, "cdr", "[]", digest
+            topic = number, self._topics[name, kind], kind, "cdr", "[]", digest
             self._database.execute("INSERT INTO topics VALUES (?, ?, ?, ?, ?, ?)", topic)
-            row = number, kind, "ros2msg", definition, digest
-            self._database.execute("INSERT INTO message_definitions VALUES (?, ?, ?, ?, ?)", row)
+            if number <= len(_TOPICS):
+                row = number, kind, "ros2msg", definition, digest
+                self._database.execute(
+                    "INSERT INTO message_definitions VALUES (?, ?, ?, ?, ?)", row
+                )
         self._keep()
         self._keeper = threading.Thread(target=self._keep_on, daemon=True)
         self._keeper.start()
@@ -252,6 +283,12 @@ class ContactBag:
         trace: TracebackType | None,
     ) -> None:
         """Close it."""
+        if self._mcap is not None:
+            self._mcap.close()
+            (written,) = self._part.glob(f"*{_MCAP}")
+            written.replace(self._path)
+            shutil.rmtree(self._part)
+            return
         self._closed.set()
         self._keeper.join()
         with closing(self._database):
@@ -266,8 +303,12 @@ class ContactBag:
         values: Array,
         frame: str | None = None,
         recorded: int | None = None,
+        *,
+        covariance: Array | None = None,
+        force: Array | None = None,
+        whisker: str = "",
     ) -> None:
-        """Write one sample."""
+        """Write one sample of a whisker; covariance (3, 3) of the point, force (3,) at it."""
         if self._fault is not None:
             raise self._fault
         types = self._types.types
@@ -283,21 +324,45 @@ class ContactBag:
         if point is not None:
             place = types["geometry_msgs/msg/Point"](*(float(x) for x in point))
             messages = {_POINT: types[_POINT](header=header, point=place), **messages}
+            if covariance is not None:
+                messages[_UNCERTAIN] = self._uncertain(header, place, covariance)
+        if force is not None:
+            vector = types["geometry_msgs/msg/Vector3"]
+            pair = vector(*(float(x) for x in force)), vector(0.0, 0.0, 0.0)
+            wrench = types["geometry_msgs/msg/Wrench"](*pair)
+            messages[_WRENCH] = types[_WRENCH](header=header, wrench=wrench)
         rows = [
-            (self._numbers[kind], at, bytes(self._types.serialize_cdr(message, kind)))
+            (self._numbers[whisker, kind], at, bytes(self._types.serialize_cdr(message, kind)))
             for kind, message in messages.items()
         ]
+        if self._mcap is not None:
+            with _kept(self._path):
+                for number, when, data in rows:
+                    self._mcap.write(self._connections[number - 1], when, data)
+            return
         with self._lock, _kept(self._path):
             self._database.executemany(
                 "INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)", rows
             )
 
+    def _uncertain(self, header: Any, place: Any, covariance: Array) -> Any:
+        """Pose of a contact point, with an orientation of which nothing is known."""
+        types = self._types.types
+        whole = _ANY_ANGLE * np.eye(6)
+        whole[:3, :3] = covariance
+        level = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+        pose = types["geometry_msgs/msg/Pose"](place, level)
+        return types[_UNCERTAIN](
+            header=header,
+            pose=types["geometry_msgs/msg/PoseWithCovariance"](pose, whole.ravel()),
+        )
+
     def _cloud(self, header: Any, candidates: Array, values: Array) -> Any:
         types = self._types.types
-        table = np.column_stack([candidates, values]).astype("<f8")
+        table = np.column_stack([candidates, values]).astype("<f4")
         names = ("x", "y", "z", "probability")
         fields = [
-            types["sensor_msgs/msg/PointField"](name, 8 * i, _FLOAT64, 1)
+            types["sensor_msgs/msg/PointField"](name, 4 * i, _FLOAT32, 1)
             for i, name in enumerate(names)
         ]
         return types[_CLOUD](
@@ -306,8 +371,8 @@ class ContactBag:
             width=len(table),
             fields=fields,
             is_bigendian=False,
-            point_step=32,
-            row_step=32 * len(table),
+            point_step=16,
+            row_step=16 * len(table),
             data=np.frombuffer(table.tobytes(), dtype=np.uint8),
             is_dense=True,
         )
@@ -356,7 +421,7 @@ class ContactBag:
         topics = [
             {
                 "topic_metadata": {
-                    "name": self._topics[kind],
+                    "name": self._topics[name, kind],
                     "type": kind,
                     "serialization_format": "cdr",
                     "offered_qos_profiles": [],
@@ -364,7 +429,7 @@ class ContactBag:
                 },
                 "message_count": self._counts[number],
             }
-            for kind, number in self._numbers.items()
+            for (name, kind), number in self._numbers.items()
         ]
         return {
             "version": _METADATA_VERSION,
@@ -394,10 +459,12 @@ class _Rosbags:
 
     def __init__(self) -> None:
         from rosbags.highlevel import AnyReader
+        from rosbags.rosbag2 import StoragePlugin, Writer
         from rosbags.typesys import Stores, get_typestore
 
         self.reader = AnyReader
         self.types: Any = get_typestore(Stores.ROS2_HUMBLE)
+        self.mcap = partial(Writer, version=_METADATA_VERSION, storage_plugin=StoragePlugin.MCAP)
 
 
 def _library() -> _Rosbags:

@@ -11,6 +11,8 @@
     farthest = 40                            # contacts farther from the base are not used
     rest = [0, 0, 0]                         # readings of the free whisker; by default those of
                                              # rows in which the probe is at the base
+    drift = [15, 40, 40]                     # change from one recording to the next; by default
+                                             # that of those rows from the stated rest
 
     [[shape]]                                # points along the whisker at rest, from base to tip
     file = "shape_y.csv"
@@ -67,7 +69,7 @@ from vibrissa.whisker import Whisker
 
 _UNITS = {"m": 1.0, "mm": 1e-3, "um": 1e-6}
 _TOP = {"unit", "readings", "position", "touches", "shape", "whisker", "sweep"}
-_TOUCHES = {"file", "origin", "axes", "farthest", "base_sigma", "rest"}
+_TOUCHES = {"file", "origin", "axes", "farthest", "base_sigma", "rest", "drift"}
 _SHAPE = {"file", "columns", "leave_out"}
 _WHISKER = {"base_radius", "tip_radius", "youngs_modulus", "noise"}
 _SWEEP = {"origin", "axes", "moves"}
@@ -86,11 +88,15 @@ class StageTouches(NamedTuple):
         Readings of the channels.
     rest : (k,) array or None
         Readings of the free whisker: as stated, or the median of those with the probe at the base.
+    drift : (k,) array
+        Standard deviation of what readings change by from one recording to the next: as stated, or
+        the change of those with the probe at the base from the stated rest; else zero.
     """
 
     points: Array
     readings: Array
     rest: Array | None
+    drift: Array
 
 
 class StageSweep(NamedTuple):
@@ -201,7 +207,7 @@ class Stage:
         Returns
         -------
         StageTouches
-            Points and readings of the contacts, and the readings at rest.
+            Points and readings of the contacts, the readings at rest, and their drift.
         """
         own = subtable(self._table, "touches")
         position = self._columns(own.get("file"), _names(self._table, "position"))
@@ -212,9 +218,15 @@ class Stage:
         rest = radius <= _AT_BASE
         touched = ~rest & (radius <= self._unit * one_number(own, "farthest", np.inf))
         free = np.median(readings[rest], axis=0) if rest.any() else None
+        drift = np.zeros(len(self.channels))
         if "rest" in own:
-            free = number_array(own["rest"], "rest")
-        return StageTouches(points[touched], readings[touched], free)
+            stated = number_array(own["rest"], "rest")
+            if free is not None and stated.shape == free.shape:
+                drift = np.abs(free - stated)
+            free = stated
+        if "drift" in own:
+            drift = number_array(own["drift"], "drift")
+        return StageTouches(points[touched], readings[touched], free, drift)
 
     def whisker(self) -> Whisker:
         """Whisker at rest, in the sensor's frame, its base at the origin.
@@ -340,6 +352,7 @@ def save_suspended(
             "friction": ((), sensor.friction, {"units": "1"}),
             "readout": (("channel", "feature"), sensor.readout),
             "noise": ("channel", sensor.noise),
+            "drift": ("channel", sensor.drift),
             "value": ("unknown", calibration.values),
             "covariance": (("unknown", "unknown_"), calibration.covariance),
             "readout_covariance": (
@@ -403,5 +416,6 @@ def load_suspended(path: str | PathLike[str]) -> tuple[SuspendedWhisker, Stage]:
         readout=data["readout"].values,
         noise=data["noise"].values,
         residual=residual,
+        drift=data["drift"].values if "drift" in data else 0.0,
     )
     return sensor, Stage(str(data.attrs["stage"]), Path(path).parent)

@@ -104,6 +104,8 @@ class SuspendedWhisker:
         in neighbouring contacts.
     residual : ThinPlate, optional
         Correction of the readings as a function of the contact point, m, sensor frame.
+    drift : float or array_like (k,)
+        Standard deviation of what readings change by from one recording to the next.
 
     Raises
     ------
@@ -120,11 +122,15 @@ class SuspendedWhisker:
     readout: Any = field(default_factory=lambda: np.zeros((0, len(FEATURES))))
     noise: Any = ()
     residual: ThinPlate | None = None
+    drift: Any = 0.0
 
     def __post_init__(self) -> None:
         """Check, and make arrays."""
         k = len(self.channels)
-        for name, shape in (("pivot", (3,)), ("readout", (k, len(FEATURES))), ("noise", (k,))):
+        if np.ndim(self.drift) == 0:
+            object.__setattr__(self, "drift", np.full(k, self.drift))
+        shapes = {"pivot": (3,), "readout": (k, len(FEATURES)), "noise": (k,), "drift": (k,)}
+        for name, shape in shapes.items():
             value = np.asarray(getattr(self, name), dtype=np.float64)
             if value.shape != shape or not np.isfinite(value).all():
                 raise ValueError(f"{name} has shape {value.shape}; finite {shape} is needed")
@@ -137,6 +143,11 @@ class SuspendedWhisker:
     def length(self) -> float:
         """Unit of length, m."""
         return self.whisker.length
+
+    @property
+    def uncertainty(self) -> Array:
+        """Standard deviation (k,) of readings in another recording than the calibration's."""
+        return np.asarray(np.hypot(self.noise, self.drift), dtype=np.float64)
 
     def touches(self, contacts: Array) -> Touches:
         """Contact points and base motions of known contacts, with derivatives.

@@ -113,6 +113,7 @@ def calibrate_suspension(
     channels: tuple[str, ...] | None = None,
     rest: ArrayLike | None = None,
     base_sigma: float = 0.15e-3,
+    drift: ArrayLike = 0.0,
     free: int | None = None,
 ) -> SuspensionCalibration:
     """Calibrate a whisker on a compliant suspension by touches at known points.
@@ -131,6 +132,8 @@ def calibrate_suspension(
         Readings of the untouched whisker; by default they are zero.
     base_sigma : float
         Standard deviation of the stated place of the base, m.
+    drift : array_like (k,)
+        Standard deviation of what readings change by from one recording to the next.
     free : int, optional
         Number of mechanical unknowns that are free, 2 to 19; by default the two compliances up to
         40 touches, with pivot and pose of the base 11 up to 100, and all above.
@@ -166,7 +169,8 @@ def calibrate_suspension(
     if not 2 <= number <= len(unknowns):
         raise ValueError(f"free is {free}; 2 to {len(unknowns)} mechanical unknowns can be free")
     problem = _Problem(whisker, p[known], y[known] - zero, unknowns[:number])
-    return problem.solved(names, zero, np.asarray(known))
+    found = problem.solved(names, zero, np.asarray(known))
+    return replace(found, sensor=replace(found.sensor, drift=drift))
 
 
 class _State(NamedTuple):

@@ -7,10 +7,10 @@ unexplained, and the drift of the sensor. The most probable minimise
     Σ |y(ξ_k) + b_k − y_k|² / (ε σ)² + Σ |b_k − a_k b_(k−1)|² / ((1 − a_k²) σ²)
       + Σ (n · Δp_k)² / q_n² + Σ |Δp_k − n (n · Δp_k)|² / q_t²,
 
-with σ the sensor's noise and Δp the steps of the contact point in the laboratory: a contact slides
-along the surface of what it touches, whose normal n is the direction of the force, so that steps
-along n are as good as zero, and those across it are up to about those of the base. Nothing needs to
-be known of where a touch begins: the steps of all samples show it.
+with σ the sensor's noise and drift and Δp the steps of the contact point in the laboratory: a
+contact slides along the surface of what it touches, whose normal n is the direction of the force,
+so that steps along n are as good as zero, and those across it are up to about those of the base.
+Nothing needs to be known of where a touch begins: the steps of all samples show it.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def follow_sweep(
     rest : array_like (k,), optional
         Readings of the untouched whisker; by default those of the first sample.
     threshold : float
-        Change of a reading, over its noise, from which the whisker touches.
+        Change of a reading, over its noise and drift, from which the whisker touches.
 
     Returns
     -------
@@ -112,7 +112,7 @@ def follow_sweep(
         )
     turn = np.broadcast_to(turn, (len(y), 3, 3))
     change = y - (y[0] if rest is None else np.asarray(rest, dtype=np.float64))
-    touching = (np.abs(change) > threshold * np.asarray(sensor.noise)).any(axis=1)
+    touching = (np.abs(change) > threshold * sensor.uncertainty).any(axis=1)
     n = len(y)
     out = SweptContacts(
         np.full((n, 3), np.nan),
@@ -152,7 +152,7 @@ class _Touch:
     def __init__(self, sensor: SuspendedWhisker, readings: Array, base: Array, turn: Array) -> None:
         self.sensor, self.readings, self.turn = sensor, readings, turn
         self.base = base / sensor.length
-        noise = np.asarray(sensor.noise)
+        noise = sensor.uncertainty
         self.weight = 1.0 / (WHITE * noise) ** 2
         moved = np.linalg.norm(np.diff(self.base, axis=0), axis=1) + _LEAST_STEP
         self.kept = np.exp(-moved * sensor.length / PERSISTENCE)

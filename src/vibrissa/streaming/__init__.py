@@ -2,10 +2,11 @@
 
 from vibrissa.streaming.advice import advice
 from vibrissa.streaming.bag import ContactRecorder, bag_lines
-from vibrissa.streaming.contacts import COMPONENTS, ContactStream, as_json
+from vibrissa.streaming.contacts import COMPONENTS, ContactStream, ContactStreams, as_json
 from vibrissa.streaming.lines import LineKind, Lines, Sample, rotation_of
 from vibrissa.streaming.poses import Pose, Poses
 from vibrissa.streaming.sources import (
+    Answers,
     NewestLines,
     bounded_lines,
     file_lines,
@@ -17,8 +18,10 @@ from vibrissa.streaming.sources import (
 
 __all__ = [
     "COMPONENTS",
+    "Answers",
     "ContactRecorder",
     "ContactStream",
+    "ContactStreams",
     "LineKind",
     "Lines",
     "NewestLines",

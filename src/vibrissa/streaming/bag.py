@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from vibrissa.io import BagMessage, ContactBag, bag_poses, bag_wrenches
-from vibrissa.sensors import Sensor
-from vibrissa.streaming.contacts import COMPONENTS, ContactStream
+from vibrissa.streaming.contacts import COMPONENTS, ContactStreams
 from vibrissa.streaming.lines import FRAME, POSITION, QUATERNION, RECORDED, STAMP
 
 
@@ -54,10 +53,11 @@ class ContactRecorder:
     ----------
     bag : ContactBag
         Open bag.
-    running : ContactStream
-        Stream whose records are written.
-    sensor : Sensor or None
-        Sensor at the base, which defines the frame of the points.
+    running : ContactStreams
+        Streams whose records are written.
+    same : bool
+        Whether points are in the frame of the measurements: that of a sensor unless it is mounted
+        otherwise than along the whisker.
     follow : bool
         Whether contacts are followed in the laboratory.
     remark : callable
@@ -67,14 +67,14 @@ class ContactRecorder:
     def __init__(
         self,
         bag: ContactBag,
-        running: ContactStream,
-        sensor: Sensor | None,
+        running: ContactStreams,
+        same: bool,
         follow: bool,
         remark: Callable[[str], None],
     ) -> None:
-        self._bag, self._running, self._follow, self._remark = bag, running, follow, remark
-        # Points are in the whisker's frame, which is the sensor's unless that is mounted otherwise.
-        self._same = sensor is None or np.array_equal(sensor.frame.to_base(), np.eye(6))
+        self._bag, self._follow, self._remark = bag, follow, remark
+        self._poses = {one.whisker: one for one in running.streams}
+        self._same = same
         self.broken = False
 
     def put(self, record: dict[str, Any]) -> None:
@@ -96,7 +96,17 @@ class ContactRecorder:
             stamp = round(record["time"] * 1e9)
         frame, recorded = self._frame(record), record.get(RECORDED)
         try:
-            self._bag.write(stamp, point, points, np.array(likely), frame, recorded)
+            self._bag.write(
+                stamp,
+                point,
+                points,
+                np.array(likely),
+                frame,
+                recorded,
+                covariance=record.get("lab_covariance" if self._follow else "covariance"),
+                force=record.get("force"),
+                whisker=record.get("whisker", ""),
+            )
         except ValueError as fault:
             self._remark(f"not in the bag: {fault}")
         except OSError as fault:
@@ -105,6 +115,7 @@ class ContactRecorder:
 
     def _frame(self, record: dict[str, Any]) -> str | None:
         """Name of the frame that points are in, where the input states it."""
-        if self._follow and self._running.poses.number:
-            return self._running.laboratory or None
+        running = self._poses[record.get("whisker", "")]
+        if self._follow and running.poses.number:
+            return running.laboratory or None
         return record.get(FRAME) if self._same else None

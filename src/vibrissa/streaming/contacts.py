@@ -6,7 +6,7 @@ import json
 import math
 import time as clock
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from vibrissa.contacts import Contact, ContactFilter, Estimator, Followed, spherical
 from vibrissa.rod import PointForce, deflect
 from vibrissa.signals import SIGNALS, signals_of
-from vibrissa.streaming.lines import FRAME, Lines, Sample
+from vibrissa.streaming.lines import FRAME, LineKind, Lines, Sample
 from vibrissa.streaming.poses import Poses
 
 Array = NDArray[np.float64]
@@ -24,6 +24,13 @@ Array = NDArray[np.float64]
 _ANEW = 1.0
 # Samples farther apart than this seem to have times in a smaller unit, s.
 _SLOW = 100.0
+# A contact point slips if its step is larger than all but one in a thousand of noise (χ², three
+# degrees of freedom), in samples that are not farther apart than this, s.
+_BEYOND_NOISE, _NEXT = 16.27, 0.5
+# Lengths of the whisker that a contact point moves in a second from which it slips, by default.
+_SLIPPING = 2.0
+# Statuses that show neither that something is touched nor that nothing is.
+_SILENT = ("missing", "tare", "degenerate")
 # Longest message about a line that cannot be read; it may quote the line.
 _MESSAGE = 400
 
@@ -50,13 +57,19 @@ class ContactStream:
     tare : int
         Number of complete samples at the beginning, of a free whisker, that give the offset of the
         sensor anew. It needs an estimator of a sensor.
+    whisker : str
+        Name of the whisker, where lines carry the signals of several: its own are called
+        ``name.Fx`` and so on, and lines without any are left to the others.
+    slip_speed : float, optional
+        Speed of a contact point in the laboratory from which it slips, m/s; by default two lengths
+        of the whisker a second.
 
     Attributes
     ----------
     samples, faults : int
         Numbers of samples so far, and of lines that could not be read.
-    statuses : Counter
-        Numbers of samples by status.
+    statuses, events : Counter
+        Numbers of samples by status, and by event.
     poses : Poses
         Poses of the base.
     laboratory : str
@@ -70,17 +83,27 @@ class ContactStream:
         follow: ContactFilter | None = None,
         poses: Poses | None = None,
         tare: int = 0,
+        whisker: str = "",
+        slip_speed: float | None = None,
     ) -> None:
         if tare and estimator.sensor is None:
             raise ValueError("the offset is that of a sensor's channels, and there is no sensor")
         by_name = estimator.announced
         self._announced = by_name
-        self.lines = Lines(names, raw=True) if names else Lines(by_name, _components(by_name))
+        choices = (names,) if names else (by_name, _components(by_name))
+        self.lines = Lines(*choices, raw=bool(names), whisker=whisker)
+        self.whisker = whisker
+        if slip_speed is None:
+            slip_speed = _SLIPPING * estimator.contact_map.whisker.length
+        if not slip_speed > 0.0:
+            raise ValueError(f"the speed of a slip is positive, m/s; got {slip_speed!r}")
+        self._events = _Events(slip_speed)
         self.samples, self.faults = 0, 0
         self._estimator, self._follow = estimator, follow
         self._which = [SIGNALS.index(name) for name in by_name] if names is None else []
         self._begun, self._time = clock.monotonic(), -math.inf
         self.statuses: Counter[str] = Counter()
+        self.events: Counter[str] = Counter()
         self._headers = 0
         self.poses = poses or Poses()
         self.laboratory = ""
@@ -101,7 +124,9 @@ class ContactStream:
         ------
         dict
             Record for JSON: ``time``, ``status`` and the contact, with the line's ``stamp_ns``,
-            ``recorded_ns`` and ``frame_id`` as they are; or ``line`` and ``error``.
+            ``recorded_ns`` and ``frame_id`` as they are; ``whisker``, if it has a name, and
+            ``event`` (``onset``, ``loss`` or ``slip``) of a sample with one; or ``line`` and
+            ``error``.
         """
         for line in lines:
             try:
@@ -121,10 +146,13 @@ class ContactStream:
                 continue
             self.samples += 1
             self.statuses[record["status"]] += 1
+            if "event" in record:
+                self.events[record["event"]] += 1
             yield record
 
     def _forget(self) -> None:
         self._time = -math.inf
+        self._events.forget()
         self.poses.forget()
         (self._follow or self._estimator).reset()
 
@@ -182,6 +210,8 @@ class ContactStream:
                 "base_qy and base_qz in the line, or a pose before it"
             )
         known = {"time": time, **sample.passed}
+        if self.whisker:
+            known["whisker"] = self.whisker
         if len(self._free) < self._tare:
             return known | {"status": self._tared(sample.values, rotation)}
         values = sample.values - self._offset
@@ -189,9 +219,19 @@ class ContactStream:
             wrench = np.zeros(6)
             wrench[[COMPONENTS.index(name) for name in sample.names]] = values
             values = signals_of(wrench[:3], wrench[3:])[self._which]
+        place: Array | None
         if self._follow is None:
-            return known | located_record(self._estimator(values, rotation))
-        return known | followed_record(self._follow(time, values, rotation, position), rotation)
+            found = self._estimator(values, rotation)
+            known |= located_record(found)
+            turn = np.eye(3) if rotation is None else rotation
+            origin = np.zeros(3) if position is None else position
+            place, spread = turn @ found.point + origin, turn @ found.covariance @ turn.T
+        else:
+            followed = self._follow(time, values, rotation, position)
+            known |= followed_record(followed, rotation)
+            place, spread = followed.point, followed.covariance
+        event = self._events(time, known["status"], place, spread)
+        return known if event is None else known | {"event": event}
 
     def _put(self, sample: Sample) -> None:
         """Remember a pose that came alone."""
@@ -221,6 +261,92 @@ class ContactStream:
         return "tare"
 
 
+class _Events:
+    """Onset, loss and slip of a contact, sample by sample."""
+
+    def __init__(self, slip_speed: float) -> None:
+        self._slip_speed = slip_speed
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew, with a free whisker."""
+        self._touching = False
+        self._last: tuple[float, Array, Array] | None = None
+
+    def __call__(self, time: float, status: str, point: Array, covariance: Array) -> str | None:
+        """Take a sample: what happened with it, if anything."""
+        if status in _SILENT:
+            return None
+        before, self._touching = self._touching, status != "not_felt"
+        last, self._last = self._last, None
+        if status == "unique" and np.isfinite(point).all():
+            self._last = time, point, covariance
+        if before != self._touching:
+            return "onset" if self._touching else "loss"
+        return "slip" if self._slips(last) else None
+
+    def _slips(self, last: tuple[float, Array, Array] | None) -> bool:
+        """Whether the point moved faster than anything slides, and farther than noise moves it."""
+        if last is None or self._last is None:
+            return False
+        step, moved = self._last[0] - last[0], self._last[1] - last[1]
+        if not 0.0 < step < _NEXT or np.linalg.norm(moved) < self._slip_speed * step:
+            return False
+        spread = self._last[2] + last[2]
+        if not np.isfinite(spread).all():  # noise is not known
+            return True
+        return bool(moved @ np.linalg.pinv(spread, hermitian=True) @ moved > _BEYOND_NOISE)
+
+
+class ContactStreams:
+    """Several whiskers whose signals come in the same lines, each with its own stream.
+
+    Parameters
+    ----------
+    streams : sequence of ContactStream
+        Stream of each whisker, with its name.
+    """
+
+    def __init__(self, streams: Sequence[ContactStream]) -> None:
+        names = [one.whisker for one in streams]
+        if len(set(names)) < len(names) or (len(names) > 1 and "" in names) or not names:
+            raise ValueError(f"whiskers need different names; got {names}")
+        self.streams = tuple(streams)
+
+    def records(self, lines: Iterable[str]) -> Iterator[dict[str, Any]]:
+        """Turn lines into records, one for each whisker that a line has signals of.
+
+        Parameters
+        ----------
+        lines : iterable of str
+            Lines as they come.
+
+        Yields
+        ------
+        dict
+            Record as of `ContactStream.records`; one error for a line that no whisker can read.
+        """
+        for line in lines:
+            found = [record for one in self.streams for record in one.records((line,))]
+            good = [record for record in found if "error" not in record]
+            yield from good or found[:1]
+
+    @property
+    def samples(self) -> int:
+        """Number of samples of all whiskers so far."""
+        return sum(one.samples for one in self.streams)
+
+    def warm_up(self) -> None:
+        """Locate samples of every kind once; see `ContactStream.warm_up`."""
+        for one in self.streams:
+            one.warm_up()
+
+    def kind(self, line: str) -> LineKind:
+        """Tell what a line is to any of the whiskers; see `Lines.kind`."""
+        kinds = [one.lines.kind(line) for one in self.streams]
+        return next((kind for kind in (LineKind.SAMPLE, LineKind.POSE) if kind in kinds), kinds[0])
+
+
 def _components(signals: tuple[str, ...]) -> tuple[str, ...]:
     """Components of force and moment that signals are computed from."""
     of = {"Fx": "Fx", "FT": "Fy Fz", "FD": "Fy Fz", "Mx": "Mx", "MB": "My Mz", "MD": "My Mz"}
@@ -237,6 +363,7 @@ def located_record(found: Contact) -> dict[str, Any]:
     record["arc_length"] = found.arc_length
     record["force"] = found.force.tolist()
     record |= _sigma(found.covariance)
+    record["covariance"] = found.covariance.tolist()
     record["chi_squared"] = found.chi_squared
     record["continuing"] = found.continuing
     record["candidates"] = found.candidates.point.tolist()
@@ -252,6 +379,7 @@ def followed_record(known: Followed, rotation: Array | None = None) -> dict[str,
     record |= dict(zip(("lab_x", "lab_y", "lab_z"), known.point.tolist(), strict=True))
     turn = np.eye(3) if rotation is None else rotation
     record |= _sigma(turn.T @ known.covariance @ turn)
+    record["lab_covariance"] = known.covariance.tolist()
     record |= {f"lab_{name}": value for name, value in _sigma(known.covariance).items()}
     record["velocity"] = known.velocity.tolist()
     record["probability"] = known.probability

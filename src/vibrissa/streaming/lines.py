@@ -115,6 +115,9 @@ class Lines:
         The values wanted, or several choices of them: the first that a line has counts.
     raw : bool
         Whether they are a sensor's channels, which are called as they are and have no units.
+    whisker : str
+        Name of the whisker, where lines carry the signals of several: its own values are called
+        ``name.value``, and lines that have only others' are passed over.
 
     Attributes
     ----------
@@ -124,8 +127,9 @@ class Lines:
         Headers so far that were taken: another one comes from a sender that has begun anew.
     """
 
-    def __init__(self, *names: tuple[str, ...], raw: bool = False) -> None:
+    def __init__(self, *names: tuple[str, ...], raw: bool = False, whisker: str = "") -> None:
         self.names, self.raw = names, raw
+        self._prefix = f"{whisker}." if whisker else ""
         self.number, self.headers = 0, 0
         self._header: list[str] | None = None
         self._delimiter = ","
@@ -141,7 +145,18 @@ class Lines:
         if not text or text.startswith("#"):
             return None
         known = self._object(text) if text.startswith("{") else self._row(text)
-        return None if known is None else self._sample(known)
+        if known is None or (self._prefix and self._of_others(known)):
+            return None
+        return self._sample(known)
+
+    def _of_others(self, known: Mapping[str, object]) -> bool:
+        """Whether a line has named values, and none that this whisker shares or owns."""
+        wanted = {*POSITION, *QUATERNION, *(name for names in self.names for name in names)}
+        return any("." in name for name in known) and not wanted & set(known)
+
+    def _own(self, name: str) -> str:
+        """Name of a value without the whisker's."""
+        return name.removeprefix(self._prefix) if self._prefix else name
 
     def kind(self, line: str) -> LineKind:
         """Tell what a line is without taking it apart.
@@ -159,7 +174,7 @@ class Lines:
         text = line.lstrip()
         if not text.startswith("{"):
             return LineKind.SAMPLE if text[:1] in _DIGITS else LineKind.OTHER
-        if any(f'"{name}"' in text for names in self.names for name in names):
+        if any(f'"{self._prefix}{name}"' in text for names in self.names for name in names):
             return LineKind.SAMPLE
         return LineKind.POSE if f'"{QUATERNION[0]}"' in text else LineKind.OTHER
 
@@ -177,7 +192,7 @@ class Lines:
             known = json.loads(text)
         except (json.JSONDecodeError, RecursionError) as error:
             raise ValueError(f"not JSON: {error}") from None
-        return {str(name): value for name, value in known.items()}
+        return {self._own(str(name)): value for name, value in known.items()}
 
     def _row(self, text: str) -> dict[str, object] | None:
         try:
@@ -238,7 +253,7 @@ class Lines:
 
     def _named(self, cells: list[str]) -> tuple[list[str], dict[str, float]]:
         """Names of columns as they are used here, and what makes their numbers SI."""
-        names = list(cells)
+        names = cells = [self._own(cell) for cell in cells]
         if self.raw:
             return names, {}
         found, _ = signal_columns(cells, _SIGNALS)

@@ -1,4 +1,4 @@
-"""Where lines come from: a file, pipe or serial device, or UDP datagrams.
+"""Where lines come from: a file, pipe or serial device, or UDP datagrams; and where answers go.
 
 A pipe holds its sender up until what it sent is read. Datagrams wait instead, and where more come
 than can be answered, answers fall behind by as many as the system keeps, and what comes then is
@@ -13,6 +13,7 @@ import struct
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import TextIO
 
@@ -191,6 +192,66 @@ def udp_lost(opened: socket.socket) -> int:
     except OSError:
         return 0
     return int(struct.unpack_from("=I", counters, 4 * _LOST)[0])
+
+
+class Answers:
+    """Answers as messages to another program: a UDP datagram each, or lines of a TCP connection.
+
+    Parameters
+    ----------
+    text : str
+        ``udp://HOST:PORT`` or ``tcp://HOST:PORT``.
+
+    Raises
+    ------
+    ValueError
+        If this is not such an address, or nobody accepts the connection.
+    """
+
+    def __init__(self, text: str) -> None:
+        scheme, mark, rest = text.partition("://")
+        if not mark or scheme not in ("udp", "tcp"):
+            raise ValueError(f"answers go to udp://HOST:PORT or tcp://HOST:PORT; got {text!r}")
+        host, port = udp_address(rest)
+        kind = socket.SOCK_DGRAM if scheme == "udp" else socket.SOCK_STREAM
+        self._datagrams = scheme == "udp"
+        try:
+            family, *_, address = socket.getaddrinfo(host, port, type=kind)[0]
+            self._socket = socket.socket(family, kind)
+            if not self._datagrams:
+                # A small line waits for nothing.
+                self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._socket.connect(address)
+        except OSError as error:
+            raise ValueError(f"answers cannot go to {text}: {error}") from error
+
+    def send(self, line: str) -> None:
+        """Send one answer.
+
+        Parameters
+        ----------
+        line : str
+            Line of JSON.
+
+        Raises
+        ------
+        OSError
+            If a TCP connection is closed; that nobody listens to datagrams is no fault.
+        """
+        data = (line + "\n").encode()
+        if not self._datagrams:
+            self._socket.sendall(data)
+            return
+        with suppress(ConnectionRefusedError):
+            self._socket.send(data)
+
+    def __enter__(self) -> Answers:
+        """Nothing more is to be opened."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close it."""
+        self._socket.close()
 
 
 class NewestLines:

@@ -418,6 +418,49 @@ def test_a_saturated_reading_tells_nothing(tmp_path):
         Sensor(largest=0.0)
 
 
+def test_a_makers_matrix_may_be_given_either_way_round(tmp_path, rng):
+    """Volts per N and N·m of a sensor of 2 cm: its readings per N·m are the larger ones."""
+    mixing = rng.normal(size=(6, 6)) * np.repeat([0.02, 1.0], 3)
+    path = tmp_path / "sensor.toml"
+
+    def described(**matrices):
+        names = ", ".join(f'"ch{i}"' for i in range(6))
+        lines = [f"{name} = {matrix.tolist()}" for name, matrix in matrices.items()]
+        path.write_text("\n".join([f"channels = [{names}]", "noise = 1e-3", *lines]))
+        return load_sensor(path)
+
+    back = np.linalg.inv(mixing)
+    np.testing.assert_allclose(described(mixing=mixing).mixing, mixing)
+    np.testing.assert_allclose(described(calibration=back).mixing, mixing, rtol=1e-9)
+    with pytest.raises(ValueError, match="name it calibration"):
+        described(mixing=back)
+    with pytest.raises(ValueError, match="name it mixing"):
+        described(calibration=mixing)
+    with pytest.raises(ValueError, match="one of them"):
+        described(calibration=back, mixing=mixing)
+    with pytest.raises(ValueError, match="no inverse"):
+        described(calibration=np.diag([1.0, 1, 1, 1e-2, 1e-2, 0]))
+    with pytest.raises(ValueError, match="six lines"):
+        described(calibration=back[:3])
+
+
+def test_a_mixing_keeps_saturation_and_resolution(rng):
+    """Saturated rows would tilt the mix, and rounding is not counted as noise twice."""
+    true = Sensor(("a",), [[0, 0, 0, 0, 1.0, 0]], noise=1e-3, resolution=0.02, largest=[1.0])
+    wrenches = np.zeros((400, 6))
+    wrenches[:, 4] = rng.uniform(-1.5, 1.5, 400)
+    readings = true.read(np.arange(400.0), wrenches, seed=3)
+    found = calibrate_mixing(
+        readings, wrenches, components=("My",), resolution=0.02, largest=1.0
+    ).sensor
+    assert found.mixing[0, 4] == pytest.approx(1.0, abs=5e-3)
+    assert found.resolution[0] == 0.02
+    assert found.largest[0] == 1.0
+    assert found.noise[0] < 3e-3
+    plain = calibrate_mixing(readings, wrenches, components=("My",)).sensor
+    assert plain.mixing[0, 4] < 0.95
+
+
 def test_components_in_other_units_need_one_number(rng):
     wrench = rng.normal(size=(3, 6))
     sensor = Sensor(mixing=1e3, noise=1e-9)  # mN and mN·m

@@ -184,17 +184,23 @@ def swept(steps=80):
     return base, axis, radius, bent
 
 
-def test_a_sweep_finds_onset_contact_points_and_normals():
-    base, axis, radius, bent = swept()
-    on = bent.status == vb.Status.OK
-    assert 30 < on.sum() < 80
+def read_by_spring(bent):
+    """Sensor and readings of a wire on a spring, with noise of 5 counts."""
     sensor = replace(TRUE, shift_compliance=0.0, pivot=np.zeros(3), noise=[10.0, 10.0, 10.0])
+    on = bent.status == vb.Status.OK
     theta = np.where(on[:, None], TURN * bent.moment, 0.0)
     i, j = np.triu_indices(3)
     features = np.concatenate(
         [np.ones((80, 1)), theta, np.zeros((80, 3)), theta[:, i] * theta[:, j]], axis=1
     )
-    readings = features @ READOUT.T + np.random.default_rng(0).normal(scale=5.0, size=(80, 3))
+    noise = np.random.default_rng(0).normal(scale=5.0, size=(80, 3))
+    return sensor, features @ READOUT.T + noise, on
+
+
+def test_a_sweep_finds_onset_contact_points_and_normals():
+    base, axis, radius, bent = swept()
+    sensor, readings, on = read_by_spring(bent)
+    assert 30 < on.sum() < 80
     found = follow_sweep(sensor, readings, base)
     both = found.in_contact & on
     assert not (found.in_contact & ~on).any()
@@ -210,6 +216,33 @@ def test_a_sweep_finds_onset_contact_points_and_normals():
     assert np.median(np.linalg.norm(away, axis=1)) < 1e-3
     outward = (found.points[both] - axis)[:, :2] / radius
     assert np.median(np.abs(np.sum(outward * found.normal[both][:, :2], axis=1))) > 0.98
+
+
+def test_drift_between_recordings_is_in_the_covariance():
+    """Readings that are 60 counts off: where that is stated, errors are as predicted."""
+    base, _, _, bent = swept()
+    sensor, readings, on = read_by_spring(bent)
+    readings = readings + 60.0 * on[:, None] * np.array([1.0, -1.0, 1.0])
+
+    def squared_over_predicted(sensor):
+        found = follow_sweep(sensor, readings, base)
+        both = found.in_contact & on
+        away = (found.points - bent.contact_point - base)[both][:, :2]
+        spread = found.covariance[both][:, :2, :2]
+        return np.mean(np.einsum("ki,kij,kj->k", away, np.linalg.inv(spread), away)) / 2.0
+
+    assert squared_over_predicted(sensor) > 3.0
+    assert squared_over_predicted(replace(sensor, drift=60.0)) < 1.5
+    with pytest.raises(ValueError, match="drift"):
+        replace(sensor, drift=[1.0, 2.0])
+
+
+def test_with_many_touches_a_process_takes_what_the_rod_leaves():
+    at = points(110)
+    found = calibrate_suspension(WIRE, at, TRUE.read(at, seed=3)[0], drift=[1.0, 2.0, 3.0])
+    assert len(found.names) == 5
+    assert found.sensor.residual is not None
+    np.testing.assert_array_equal(found.sensor.drift, [1.0, 2.0, 3.0])
 
 
 STAGE = """
@@ -287,6 +320,20 @@ def test_a_wrong_description_is_refused(change, named, tmp_path):
     )
     with pytest.raises(ValueError, match=named):
         Stage(text, tmp_path).sweep(tmp_path / "w.csv")
+
+
+@pytest.mark.parametrize(
+    ("stated", "drift"),
+    [("", [0, 0, 0]), ("rest = [0, 0, 4]", [1, 2, 1]), ("drift = [4, 5, 6]", [4, 5, 6])],
+)
+def test_drift_is_stated_or_seen_at_the_base(stated, drift, tmp_path):
+    """Rows with the probe at the base read what the free wire reads in this recording."""
+    rows = [[10, 20, 30, 1, 2, 3], [10, 20, 30, 1, 2, 3], [12, 21, 30, 9, 9, 9]]
+    header = "px,py,pz,sx,sy,sz"
+    np.savetxt(tmp_path / "touches.csv", rows, delimiter=",", header=header, comments="")
+    touches = Stage(STAGE.replace("[[shape]]", f"{stated}\n[[shape]]", 1), tmp_path).touches()
+    np.testing.assert_array_equal(touches.drift, drift)
+    assert len(touches.points) == 1
 
 
 def test_a_pose_moves_the_base_in_the_sensors_frame():

@@ -813,6 +813,34 @@ def test_two_whiskers_from_the_command_line(map_file, bent, wrench, tmp_path):
         stream(path, *maps, "--sensor", "other=sensor.toml")
 
 
+@pytest.mark.parametrize("kind", ["sensor", "signals"])
+def test_estimate_takes_the_lines_of_a_stream(kind, gamma_map, map_file, bent, wrench, tmp_path):
+    """Channels of a sensor, or signals by name: one row a sample, as `stream` answers."""
+    sensor = Sensor(("a", "b", "c"), np.eye(6)[[0, 4, 5]] * 1e6, noise=[1.0, 0.02, 0.02])
+    save_sensor(tmp_path / "sensor.toml", sensor)
+    known = vb.base_signals(bent.force, bent.moment)
+    names = {"sensor": "abc", "signals": ("MB", "Fx", "MD")}[kind]
+    rows = wrench[:, [0, 4, 5]] * 1e6
+    options = ["--sensor", tmp_path / "sensor.toml", "--stiffness-sigma", 1.0]
+    if kind == "signals":
+        rows = np.stack([known[name] for name in names], axis=-1)
+        options = ["--using", "Fx,MB,MD"]
+    table = tmp_path / "lines.csv"
+    lines = [",".join(["time", *names])]
+    lines += [",".join(map(repr, [0.1 * i, *row])) for i, row in enumerate(rows.tolist())]
+    table.write_text("\n".join(lines))
+    words = ["estimate", table, "--map", map_file, *options, "-o", tmp_path / "contacts.csv"]
+    done = CliRunner().invoke(app, list(map(str, words)))
+    assert done.exit_code == 0, done.output
+    found = np.genfromtxt(
+        tmp_path / "contacts.csv", delimiter=",", names=True, dtype=None, encoding="utf-8"
+    )
+    points = np.stack([found[name] for name in "xyz"], axis=1)
+    np.testing.assert_allclose(points, bent.contact_point, atol=1e-7)
+    assert (found["sigma_x"] > 0.0).all()
+    assert set(found["status"]) <= {"unique", "ambiguous"}
+
+
 def test_answers_go_to_another_program(map_file, wrench, tmp_path):
     path = tmp_path / "lines.csv"
     path.write_text("\n".join(csv_lines(wrench[:3])))

@@ -17,6 +17,11 @@
     mass = 0.002                       # kg
     moment = [0, 0, 0]                 # kg·m
 
+A maker's matrix may be given the other way round, from the channels to Fx, Fy, Fz, Mx, My, Mz, as
+``calibration`` (6 lines, a number a channel) instead of ``mixing``. A matrix that seems to be under
+the wrong name is refused: of a sensor that is small compared with a metre, readings per N·m are
+larger than those per N.
+
 Everything but channels and noise may be left out. Channels that are components in other units
 need one number only: ``mixing = 1e3`` for mN and mN·m (= N·mm). Noise, bias and the largest reading
 are in the channels' units.
@@ -45,9 +50,11 @@ from vibrissa.sensors.sensor import Sensor
 
 _NUMBERS = ("noise", "bias", "drift", "resolution", "largest", "gain_error")
 _OTHERS = ("relative_noise", "mixing_error", "mixing_covariance")
-_TOP = {"channels", "mixing", *_NUMBERS, *_OTHERS, "frame", "weight"}
+_TOP = {"channels", "mixing", "calibration", *_NUMBERS, *_OTHERS, "frame", "weight"}
 _FRAME = {"axes", "position", "reaction"}
 _WEIGHT = {"mass", "moment"}
+_APART, _ALIKE = 3.0, 2.0
+"""Ratios of readings per N·m and per N from which they differ, and up to which they are alike."""
 
 
 def load_sensor(path: str | PathLike[str]) -> Sensor:
@@ -93,6 +100,15 @@ def _described(table: dict[str, Any]) -> Sensor:
     for name in ("mixing", *_NUMBERS, *_OTHERS):
         if name in table:
             values[name] = number_array(table[name], name)
+    if "calibration" in table:
+        if "mixing" in table:
+            raise ValueError("calibration is another form of mixing: one of them is needed")
+        values["mixing"] = _inverted(number_array(table["calibration"], "calibration"))
+    elif _has_halves(values.get("mixing")) and _apart(values["mixing"].T):
+        raise ValueError(
+            "mixing seems to lead from the channels to forces and moments, as its lines of moments "
+            "are the small ones; if so, name it calibration"
+        )
     if "relative_noise" in table:
         values["relative_noise"] = one_number(table, "relative_noise", 0.0)
     reaction = frame.get("reaction", False)
@@ -114,6 +130,37 @@ def _described(table: dict[str, Any]) -> Sensor:
             "number for all; which contacts are detected and with what uncertainty depends on it"
         )
     return sensor
+
+
+def _inverted(calibration: Any) -> Any:
+    """Mixing (k, 6) of a matrix (6, k) from channels to forces and moments."""
+    if calibration.ndim != 2 or len(calibration) != 6 or calibration.shape[1] < 6:
+        raise ValueError(
+            f"calibration has shape {calibration.shape}; six lines are needed, of Fx, Fy, Fz, Mx, "
+            "My, Mz, with a number for each of six or more channels"
+        )
+    if np.linalg.matrix_rank(calibration) < 6:
+        raise ValueError("calibration has no inverse: its six lines are not independent")
+    if calibration.shape == (6, 6) and _apart(calibration):
+        raise ValueError(
+            "calibration seems to lead from forces and moments to the channels, as its columns of "
+            "moments are the large ones; if so, name it mixing"
+        )
+    return np.linalg.pinv(calibration)
+
+
+def _has_halves(matrix: Any) -> bool:
+    """Whether a matrix is (6, 6), and none of the halves of its lines and columns is zero."""
+    if np.shape(matrix) != (6, 6):
+        return False
+    return all(half.any() for m in (matrix, matrix.T) for half in (m[:3], m[3:]))
+
+
+def _apart(matrix: Any) -> bool:
+    """Whether columns (6, 6) of forces and moments differ in size as of wrenches, and lines not."""
+    lines, columns = (np.linalg.norm(m[3:]) / np.linalg.norm(m[:3]) for m in (matrix, matrix.T))
+    differ = max(columns, 1.0 / columns) > _APART
+    return bool(differ and max(lines, 1.0 / lines) < _ALIKE)
 
 
 def _axes(value: Any) -> Any:

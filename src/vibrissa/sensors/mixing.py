@@ -62,6 +62,8 @@ def calibrate_mixing(
     *,
     channels: Sequence[str] | None = None,
     components: Sequence[str] = COMPONENTS,
+    resolution: ArrayLike = 0.0,
+    largest: ArrayLike = np.inf,
 ) -> MixingCalibration:
     """Find linear mix, offset and noise of a sensor from known wrenches.
 
@@ -77,6 +79,9 @@ def calibrate_mixing(
     components : sequence of str
         Components that a channel may read; the others' mixing is zero. Wrenches of a frictionless
         whisker are a small part of all: most have nearly no Mx.
+    resolution, largest : array_like (k,)
+        Step of the readings and size of the largest, as of `Sensor`, which keeps them. Rows with a
+        saturated reading are left out, and the noise does not include rounding.
 
     Returns
     -------
@@ -100,11 +105,11 @@ def calibrate_mixing(
     if len(names) != y.shape[1]:
         raise ValueError(f"{y.shape[1]} channels have {len(names)} names: {', '.join(names)}")
     which = [COMPONENTS.index(name) for name in components]
-    known = np.isfinite(y).all(axis=1) & np.isfinite(w).all(axis=1)
+    known = (np.isfinite(y) & (np.abs(y) < largest)).all(axis=1) & np.isfinite(w).all(axis=1)
     if not known.any():
         raise ValueError(
-            f"none of {len(y)} rows has both a reading and a load without NaN; at least "
-            f"{len(which) + 2} are needed"
+            f"none of {len(y)} rows has both a reading and a load without NaN or saturation; at "
+            f"least {len(which) + 2} are needed"
         )
     design = np.column_stack([_loaded(w[known])[:, which], np.ones(known.sum())])
     fit = solve(design, y[known], (*components, "the offset"), _ADVICE)
@@ -123,8 +128,10 @@ def calibrate_mixing(
     sensor = Sensor(
         names,
         mixing,
-        np.sqrt(variance),
+        np.sqrt(np.maximum(variance - np.asarray(resolution) ** 2 / 12.0, 0.0)),
         fit.unknowns[-1],
+        resolution=resolution,
+        largest=largest,
         frame=SensorFrame(),
         mixing_covariance=whole,
     )
@@ -161,6 +168,8 @@ def calibrate_on_contacts(
     *,
     channels: Sequence[str] | None = None,
     components: Sequence[str] = COMPONENTS,
+    resolution: ArrayLike = 0.0,
+    largest: ArrayLike = np.inf,
 ) -> MixingCalibration:
     """Find linear mix, offset and noise of a sensor from contacts at known points.
 
@@ -180,6 +189,8 @@ def calibrate_on_contacts(
         Names of the k channels.
     components : sequence of str
         Components that a channel may read.
+    resolution, largest : array_like (k,)
+        Step of the readings and size of the largest, as of `calibrate_mixing`.
 
     Returns
     -------
@@ -196,4 +207,6 @@ def calibrate_on_contacts(
         wrenches_of_contacts(whisker, points),
         channels=channels,
         components=components,
+        resolution=resolution,
+        largest=largest,
     )

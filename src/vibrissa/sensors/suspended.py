@@ -127,8 +127,8 @@ class SuspendedWhisker:
     def __post_init__(self) -> None:
         """Check, and make arrays."""
         k = len(self.channels)
-        if np.ndim(self.drift) == 0:
-            object.__setattr__(self, "drift", np.full(k, self.drift))
+        if np.size(self.drift) < 2:
+            object.__setattr__(self, "drift", np.full(k, np.sum(self.drift)))
         shapes = {"pivot": (3,), "readout": (k, len(FEATURES)), "noise": (k,), "drift": (k,)}
         for name, shape in shapes.items():
             value = np.asarray(getattr(self, name), dtype=np.float64)

@@ -1,11 +1,11 @@
 """Calibration of a suspended whisker from touches at known points.
 
-Unknown are the two compliances, and with more touches, each with its prior, the pivot, the place
-and direction of the base, the rest curvature, the taper and the friction. The read-out is linear
-in its weights, which are solved for within the fit (variable projection), so that it is a problem
-of 2 to 19 unknowns. The prior of the weights is a normal distribution, of a size that makes the
-readings most probable. What remains is given to a thin-plate Gaussian process where there are
-touches enough.
+Unknown are the two compliances, and with more touches, each with its prior, the pivot, and the
+place and direction of the base; on request the rest curvature, the taper and the friction. The
+read-out is linear in its weights, which are solved for within the fit (variable projection), so
+that it is a problem of 2 to 19 unknowns. The prior of the weights is a normal distribution, of a
+size that makes the readings most probable. What remains is given to a thin-plate Gaussian process
+where there are touches enough.
 """
 
 from __future__ import annotations
@@ -27,12 +27,16 @@ from vibrissa.status import Status
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
 
-FEWEST, SOME, MANY, PLENTY = 20, 40, 100, 300
-"""Touches that are needed, above which pivot and pose are free, above which all mechanical unknowns
-are, and from which on a Gaussian process is added."""
+FEWEST, SOME, PLENTY = 20, 40, 100
+"""Touches that are needed, above which pivot and pose are free, and from which on there is a
+Gaussian process."""
 
-POSED = 11
-"""Mechanical unknowns up to the pose of the base."""
+PIVOTED, POSED = 5, 11
+"""Mechanical unknowns up to the pivot, and up to the pose of the base.
+
+A Gaussian process explains what pose, curvature, taper and friction would. Where many touches
+determine these too, they take values that no wire has, and mislead outside the touches.
+"""
 
 _RATIOS = np.logspace(-6, 1, 15)
 """Variances of the noise over those of the (scaled) weights that are tried."""
@@ -136,7 +140,8 @@ def calibrate_suspension(
         Standard deviation of what readings change by from one recording to the next.
     free : int, optional
         Number of mechanical unknowns that are free, 2 to 19; by default the two compliances up to
-        40 touches, with pivot and pose of the base 11 up to 100, and all above.
+        40 touches, with pivot and pose of the base 11 below 100, and with the pivot 5 from there
+        on, where a Gaussian process explains what is left.
 
     Returns
     -------
@@ -165,7 +170,7 @@ def calibrate_suspension(
         raise ValueError(f"{', '.join(idle)} read the same at all touches")
     unknowns = _unknowns(whisker.length, base_sigma)
     enough = int(known.sum())
-    number = free or (2 if enough <= SOME else POSED if enough <= MANY else len(unknowns))
+    number = free or (2 if enough <= SOME else POSED if enough < PLENTY else PIVOTED)
     if not 2 <= number <= len(unknowns):
         raise ValueError(f"free is {free}; 2 to {len(unknowns)} mechanical unknowns can be free")
     problem = _Problem(whisker, p[known], y[known] - zero, unknowns[:number])

@@ -342,7 +342,18 @@ class ContactStreams:
             one.warm_up()
 
     def kind(self, line: str) -> LineKind:
-        """Tell what a line is to any of the whiskers; see `Lines.kind`."""
+        """Tell what a line is to any of the whiskers; see `Lines.kind`.
+
+        Parameters
+        ----------
+        line : str
+            Line with or without its end.
+
+        Returns
+        -------
+        LineKind
+            Sample, if any of the whiskers has one in it.
+        """
         kinds = [one.lines.kind(line) for one in self.streams]
         return next((kind for kind in (LineKind.SAMPLE, LineKind.POSE) if kind in kinds), kinds[0])
 

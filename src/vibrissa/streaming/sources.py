@@ -221,7 +221,11 @@ class Answers:
             if not self._datagrams:
                 # A small line waits for nothing.
                 self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._socket.connect(address)
+            try:
+                self._socket.connect(address)
+            except OSError:
+                self._socket.close()
+                raise
         except OSError as error:
             raise ValueError(f"answers cannot go to {text}: {error}") from error
 
@@ -236,7 +240,7 @@ class Answers:
         Raises
         ------
         OSError
-            If a TCP connection is closed; that nobody listens to datagrams is no fault.
+            If a TCP connection is closed; datagrams that nobody receives are lost without one.
         """
         data = (line + "\n").encode()
         if not self._datagrams:

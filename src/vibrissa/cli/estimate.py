@@ -84,6 +84,7 @@ class GravityOptions:
         """State the gravity, to be put at the end of a sentence; empty where there is none."""
         return "" if self.gravity is None else f"; bent by gravity of {self.gravity} m/s²"
 
+
 _SHOWN = 5
 """Faults of a table that are reported."""
 
@@ -217,7 +218,14 @@ def estimate(
     vb.io.check_writable(target, (*vb.io.NETCDF, *vb.io.CSV) if recorded else vb.io.CSV)
     free_beside(signals, [target], force)
     if sensor is not None and not vb.io.is_netcdf(sensor):
-        stated = (recorded, how.using, weight.gravity, how.noise.given, how.method != "exact", how.friction_sigma)
+        stated = (
+            recorded,
+            how.using,
+            weight.gravity,
+            how.noise.given,
+            how.method != "exact",
+            how.friction_sigma,
+        )
         if any(map(bool, stated)):
             raise ValueError(f"{sensor} is for tables, and has its own channels and noise")
         _from_lines(signals, target, how, vb.sensors.load_sensor(sensor))

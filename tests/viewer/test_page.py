@@ -185,3 +185,38 @@ def test_a_trial_plays(browser, recording):
         person.wait_until(lambda: person.text("MB") == number("MB", float(moment[trial.frame])))
         assert person.faults == []
         person.page.close()
+
+
+def test_keys_clicks_and_links_lead_through_a_trial(browser, recording):
+    from vibrissa.recording import Recording
+    from vibrissa.viewer import view
+
+    with view(Recording(recording).whisker(), recording=recording) as viewer:
+        person = Looking(browser, viewer)
+        trial = viewer.page.modes["Trial"]
+        last = len(trial.trial.time) - 1
+        person.wait_for("button", "frame ▶")
+        first = trial.frame
+        person.page.keyboard.press(".")
+        person.wait_until(lambda: trial.frame == first + 1)
+        person.page.keyboard.press(",")
+        person.wait_until(lambda: trial.frame == first)
+        person.page.keyboard.press("n")
+        person.wait_until(lambda: trial.frame == trial.trial.next_contact(first))
+        plot = person.page.locator("svg[data-seek]").first
+        box, left = plot.bounding_box(), float(plot.get_attribute("data-seek"))
+        middle = (left + 0.5 * (1.0 - left)) * (box["width"] - 8)
+        plot.click(position={"x": middle, "y": 0.5 * box["height"]})
+        person.wait_until(lambda: abs(trial.frame - 0.5 * last) < 0.05 * last)
+        there = trial.frame
+        person.page.wait_for_function("/t=0[.][45]/.test(location.hash)")
+        link = person.page.evaluate("location.href")
+        assert "mode=Trial" in link
+        person.page.close()
+        trial.show(0)
+        person.wait_until(lambda: trial.frame == 0)
+        second = browser.new_page(viewport=SIZE)
+        second.goto(link)
+        person.wait_until(lambda: abs(trial.frame - there) <= 1)
+        second.close()
+        assert person.faults == []

@@ -213,13 +213,12 @@ def test_keys_clicks_and_links_lead_through_a_trial(browser, recording):
         plot = next(one for one in plots if one.evaluate(on_top))
         box, left = plot.bounding_box(), float(plot.get_attribute("data-seek"))
         middle = (left + 0.5 * (1.0 - left)) * (box["width"] - 8)
-        plot.click(position={"x": middle, "y": 0.5 * box["height"]})
+        person.page.mouse.click(box["x"] + middle, box["y"] + 0.5 * box["height"])
         person.wait_until(lambda: abs(trial.frame - 0.5 * last) < 0.05 * last)
         there = trial.frame
         person.page.wait_for_function("/t=0[.][45]/.test(location.hash)")
         link = person.page.evaluate("location.href")
         assert "mode=Trial" in link
-        person.page.close()
         trial.show(0)
         person.wait_until(lambda: trial.frame == 0)
         second = browser.new_page(viewport=SIZE)
@@ -227,3 +226,4 @@ def test_keys_clicks_and_links_lead_through_a_trial(browser, recording):
         person.wait_until(lambda: abs(trial.frame - there) <= 1)
         second.close()
         assert person.faults == []
+        person.page.close()

@@ -1,0 +1,202 @@
+"""Tracking of films by another renderer: traces, contact, wrench, base and the peg, against truth.
+
+``python studies/tracking.py [SEED ...] [--page]`` films whisks past a peg through lenses at 0.6 m,
+100 µm a pixel, under five kinds of image conditions, and tracks them with the base clicked where it
+truly is; whether that would have been found without a click is judged apart. Then rows of whiskers
+that cross. By default seeds 21 and 22, on which no number was set; some minutes on a free core.
+``--page`` writes the tables into `docs/tracking.md`, else they are printed.
+"""
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from pages import few, put, table
+from pinhole_film import Look, film, views
+from rough_cameras import whisk
+from scipy.interpolate import CubicSpline
+from scipy.spatial import cKDTree
+from scipy.stats import chi2
+
+from vibrissa.cameras import orthogonal_views
+from vibrissa.contour import shape_from_dataset
+from vibrissa.pipeline.stages import with_contour
+from vibrissa.tracking import TrackOptions, find_start, trace_video, track
+from vibrissa.tracking.refine.optics import stated_lenses
+
+ROOT = Path(__file__).parents[1]
+
+PIXEL, SIZE, DISTANCE, RATE, FRAMES = 100e-6, 400, 0.6, 500.0, 60
+KINDS = {
+    "dull peg, no fur": Look(),
+    "shiny peg, fur": Look(shine=110.0, fur=60),
+    "light from the side": Look(side=60.0, shine=90.0, fur=60),
+    "JPEG of quality 35": Look(quality=35, shine=110.0, fur=60),
+    "defocus, noise of 4": Look(blur=1.6, noise=4.0, fur=40),
+}
+HEAD = (
+    "film",
+    "lost, wrong",
+    "wrong near contact, %",
+    "contact right, %",
+    "contact, µm (95 %)",
+    "held: contact",
+    "wrench",
+    "base",
+    "radius of the peg, µm",
+    "axis, µm",
+    "start, px (confidence)",
+    "ms",
+)
+ROWS = ((21, 3), (15, 4))
+ROW_HEAD = ("film", "whiskers", "view", "images", "right, %", "lost, %", "swapped, %", "ms")
+NEAR = 3e-3
+"""Distance from a contact within which a trace is near it, m."""
+
+
+def traces_against(found, lenses, truth, touching):
+    """Numbers of images lost and wrong, and the share of contact images wrong near the contact."""
+    lost, wrong, near = 0, 0, []
+    share = np.linspace(0.0, 1.0, truth["centerline"].shape[1])
+    for rows, lens in zip(found, lenses, strict=True):
+        for i, trace in enumerate(rows[0]):
+            if not len(trace.line):
+                lost += 1
+                continue
+            dense = CubicSpline(share, truth["centerline"][i])(np.linspace(0.0, 1.0, 1500))
+            away, nearest = cKDTree(lens(dense)).query(trace.line)
+            wrong += bool(np.median(away) > 1.0)
+            apart = np.linalg.norm(dense[nearest] - truth["contact_point"][i], axis=1)
+            if touching[i] and (apart < NEAR).any():
+                near.append(bool((away[apart < NEAR] > 1.0).any()))
+    return lost, wrong, float(np.mean(near))
+
+
+def held(error, covariance):
+    """Share of errors (n, k) that 95 % regions hold."""
+    known = np.isfinite(error).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
+    error, covariance = error[known], covariance[known]
+    square = np.einsum("ti,ti->t", error, np.linalg.solve(covariance, error[..., None])[..., 0])
+    return float((square < chi2.ppf(0.95, error.shape[1])).mean())
+
+
+def wrench_held(data, truth, turned, rows):
+    """Share of components of force and moment that 95 % intervals hold, laboratory axes."""
+    turn = data["base_rotation"].values[:, 0]
+    spread = data["wrench_covariance"].values[:, 0]
+    inside = []
+    for k, name in enumerate(("force", "moment")):
+        own = np.einsum("tij,tj->ti", turn, data[name].values[:, 0])
+        true = np.einsum("tij,tj->ti", turned, truth[name])
+        block = spread[:, 3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
+        sigma = np.sqrt(np.einsum("tij,tjk,tik->ti", turn, block, turn))
+        inside.append((np.abs(own - true) < 1.96 * sigma)[rows])
+    return float(np.mean(inside))
+
+
+def peg_errors(recording, peg):
+    """Errors of the fitted radius and axis, with their standard deviations, µm."""
+    fit = shape_from_dataset(with_contour(recording)["contour"].to_dataset())
+    at = peg.origin + ((fit.origin - peg.origin) @ peg.axis) * peg.axis - fit.origin
+    at -= (at @ fit.axis) * fit.axis
+    across = np.eye(3) - np.outer(fit.axis, fit.axis)
+    spread = np.sqrt(np.trace(across @ fit.covariance[:3, :3] @ across))
+    numbers = (fit.radius - peg.radius, fit.sigma["radius"], np.linalg.norm(at), spread)
+    error, sigma, offset, about = (f"{1e6 * x:.0f}".replace("-", "−") for x in numbers)
+    return f"{error} ± {sigma}", f"{offset} ± {about}"
+
+
+def start_of(cameras, frames, truth):
+    """Distance of the base that is found without a click, in the worse view, and confidence."""
+    some = np.linspace(0, FRAMES - 1, 30).astype(int)
+    start = find_start(cameras, [[view[i] for i in some] for view in frames])
+    if start.bases is None:
+        return "refused"
+    # The base is that of the first of these frames that shows it: any of them will do.
+    bases = zip(start.bases, truth, strict=True)
+    away = max(float(np.linalg.norm(line - base, axis=1).min()) for base, line in bases)
+    return f"{away:.1f} ({start.confidence:.2f})"
+
+
+def one_film(name, look, seed):
+    """One row of the table."""
+    trial, peg = whisk(seed, FRAMES)
+    lenses = views(DISTANCE, pixel=PIXEL, size=SIZE)
+    frames = film(trial, lenses, (peg.origin, peg.axis, peg.radius), look, seed=seed)
+    cameras = stated_lenses(orthogonal_views(PIXEL, (SIZE, SIZE)), DISTANCE)
+    truth = {n: v.values[:, 0] for n, v in trial["truth"].to_dataset().data_vars.items()}
+    base = trial["base_position"].values[:, 0]
+    begun = time.process_time()
+    traces = [trace_video(v, [lens(base[0])]) for v, lens in zip(frames, lenses, strict=True)]
+    spent = 1e3 * (time.process_time() - begun) / (2 * FRAMES)
+    touching = truth["in_contact"] > 0
+    lost, wrong, near = traces_against(traces, lenses, truth, touching)
+    recording = track(cameras, traces, RATE, TrackOptions())
+    data = recording.to_dataset()
+    told = data["in_contact"].values[:, 0] > 0
+    both = touching & told
+    away = (data["contact_point"].values[:, 0] - truth["contact_point"])[both]
+    half, most = 1e6 * np.percentile(np.linalg.norm(away, axis=1), [50, 95])
+    shares = (
+        held(away, data["contact_covariance"].values[both, 0]),
+        wrench_held(data, truth, trial["base_rotation"].values[:, 0], both),
+        held(
+            data["base_position"].values[:, 0] - base, data["pose_covariance"].values[:, 0, :3, :3]
+        ),
+    )
+    return [
+        f"{name}, {seed}",
+        f"{lost}, {wrong} of {2 * FRAMES}",
+        f"{100 * near:.0f}",
+        f"{100 * float((told == touching).mean()):.1f}",
+        f"{half:.0f} ({most:.0f})",
+        *(f"{100 * share:.0f} %" for share in shares),
+        *peg_errors(recording, peg),
+        start_of(cameras, frames, [lens(base) for lens in lenses]),
+        few(spent),
+    ]
+
+
+def row_films():
+    """Rows of the table of several whiskers, one for each film and view."""
+    sys.path.insert(0, str(ROOT / "tests" / "tracking"))
+    from rows import RowFilm, scored
+
+    for seed, count in ROWS:
+        several = RowFilm(seed, count, frames=30)
+        for view, camera in enumerate(several.cameras):
+            begun = time.process_time()
+            traces = trace_video(several.images[view], several.truth[view][0, :, 0])
+            spent = 1e3 * (time.process_time() - begun) / several.frames
+            score = scored(traces, several.truth[view])
+            clear = score[np.isfinite(score)]
+            shares = (f"{100.0 * float(np.mean(clear == kind)):.1f}" for kind in (1, 0, -1))
+            yield [str(seed), str(count), camera.name, str(len(clear)), *shares, f"{spent:.0f}"]
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("seeds", nargs="*", type=int, default=[21, 22], metavar="SEED")
+    parser.add_argument("--page", action="store_true", help="write the tables into the page")
+    chosen = parser.parse_args()
+    single = []
+    for seed in chosen.seeds:
+        for name, look in KINDS.items():
+            try:
+                single.append(one_film(name, look, seed))
+            except ValueError as fault:
+                single.append([f"{name}, {seed}", *["–"] * (len(HEAD) - 2), f"refused: {fault}"])
+            print(" | ".join(single[-1]), flush=True)
+    several = []
+    for line in row_films():
+        several.append(line)
+        print(" | ".join(line), flush=True)
+    if chosen.page:
+        blocks = {"films": table(HEAD, single), "rows": table(ROW_HEAD, several, 3)}
+        put(ROOT / "docs" / "tracking.md", blocks)
+
+
+if __name__ == "__main__":
+    main()

@@ -135,8 +135,8 @@ def one_film(name, look, seed):
     lost, wrong, near = traces_against(traces, lenses, truth, touching)
     recording = track(cameras, traces, RATE, TrackOptions())
     data = recording.to_dataset()
-    told = data["in_contact"].values[:, 0] > 0
-    both = touching & told
+    stated = data["in_contact"].values[:, 0] > 0
+    both = touching & stated
     away = (data["contact_point"].values[:, 0] - truth["contact_point"])[both]
     half, most = 1e6 * np.percentile(np.linalg.norm(away, axis=1), [50, 95])
     shares = (
@@ -150,7 +150,7 @@ def one_film(name, look, seed):
         f"{name}, {seed}",
         f"{lost}, {wrong} of {2 * FRAMES}",
         f"{100 * near:.0f}",
-        f"{100 * float((told == touching).mean()):.1f}",
+        f"{100 * float((stated == touching).mean()):.1f}",
         f"{half:.0f} ({most:.0f})",
         *(f"{100 * share:.0f} %" for share in shares),
         *peg_errors(recording, peg),

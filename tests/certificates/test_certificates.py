@@ -7,13 +7,17 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import linprog
+from typer.testing import CliRunner
 
 import vibrissa as vb
-from vibrissa.certificates import certify, load_certificate, outlook
+from vibrissa.certificates import certify, check_certificate, load_certificate, outlook
 from vibrissa.certificates.certificate import _TOLERANCES, prepared
 from vibrissa.certificates.equations import enclosed, spatial_equations
 from vibrissa.certificates.flow import absorb
 from vibrissa.certificates.search import covers
+from vibrissa.cli.app import app
+from vibrissa.identifiability import verdict_table
+from vibrissa.io import write_netcdf
 
 
 def charted(whisker):
@@ -76,6 +80,52 @@ def test_a_certificate_with_a_hole_or_a_wrong_whisker_is_noticed(theorem):
         type(found).from_dataset(data)
     with pytest.raises(ValueError, match="another whisker"):
         certify(straight(8.0), path=path)
+
+
+def test_an_independent_check_confirms_boxes_and_no_others(theorem, tmp_path):
+    path, _, found = theorem
+    checked = check_certificate(path, 3)
+    assert checked.covers
+    assert checked.confirmed == checked.boxes == 11
+    # One box, of which nothing is certain, in the place of many.
+    data = found.to_dataset()
+    first = data["interior_certified"].isel(interior_certified_box=slice(1))
+    data = data.drop_vars("interior_certified").assign(interior_certified=0 * first)
+    write_netcdf(tmp_path / "forged.nc", data)
+    forged = check_certificate(tmp_path / "forged.nc", 1, parts=("interior",))
+    assert forged.covers
+    assert forged.confirmed == 0
+    data["interior_domain"][0, 0] = 0.5
+    write_netcdf(tmp_path / "forged.nc", data)
+    assert not check_certificate(tmp_path / "forged.nc", 1, parts=("distal",)).covers
+
+
+def test_verdicts_name_their_evidence(theorem):
+    _, _, certificate = theorem
+    contact_map = straight(15.0)
+    asked = {"regions": ["all"], "samples": 64, "resolution": False}
+    triplets = ["Fx MB MD", "Mx MB MD"]
+    found = vb.uniqueness(contact_map, triplets, certificate=certificate, **asked)
+    assert found.evidence.values[:, 0].tolist() == ["proved", "witness"]
+    assert found.attrs["certificate_possible"]
+    assert "unique (proved)" in verdict_table(found)
+    without = vb.uniqueness(contact_map, triplets[:1], **asked)
+    assert without.evidence.values[0, 0] == "no counterexample found"
+    with pytest.raises(ValueError, match="another whisker"):
+        vb.uniqueness(straight(8.0), triplets, certificate=certificate, **asked)
+
+
+def test_a_certificate_is_made_and_shown_by_commands(theorem, tmp_path):
+    path, _, _ = theorem
+    straight(15.0).save(tmp_path / "map.nc")
+    command = ["uniqueness", str(tmp_path / "map.nc"), "--using", "Fx,MB,MD", "--region", "all"]
+    command += ["--samples", "64", "--no-resolution", "--certify", str(path)]
+    result = CliRunner().invoke(app, command)
+    assert result.exit_code == 0, result.output
+    assert "Certificate: (Fx, MB, MD) is unique (proved)" in result.output
+    shown = CliRunner().invoke(app, ["info", str(path)])
+    assert "unique (proved)" in " ".join(shown.output.split())
+    assert "0 undecided" in shown.output
 
 
 def test_boxes_cover_or_leave_a_hole():

@@ -1,13 +1,17 @@
 """Proofs that base signals locate a contact: validated mechanics and certificates."""
 
-from vibrissa.certificates.certificate import TRIPLET, Certificate, certify, load_certificate
+from vibrissa.certificates.certificate import KIND, TRIPLET, Certificate, certify, load_certificate
+from vibrissa.certificates.checker import Checked, check_certificate
 from vibrissa.certificates.grid import Outlook, outlook
 
 __all__ = [
+    "KIND",
     "TRIPLET",
     "Certificate",
+    "Checked",
     "Outlook",
     "certify",
+    "check_certificate",
     "load_certificate",
     "outlook",
 ]

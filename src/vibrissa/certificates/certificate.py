@@ -35,7 +35,7 @@ from vibrissa.certificates.conditions import (
     spatial_conditions,
     spatial_point_conditions,
 )
-from vibrissa.certificates.domain import Bounds, bounds_of, is_planar
+from vibrissa.certificates.domain import Bounds, bounds_of, is_planar, room_within
 from vibrissa.certificates.equations import ExactRod, exact_rod
 from vibrissa.certificates.search import bounds, cover, covers, volume
 from vibrissa.io import read_dataset, write_netcdf
@@ -451,8 +451,9 @@ def prepared(contact_map: ContactMap, cone: float = CONE) -> Certificate:
     elif not cone > 0.0:
         raise ValueError("a curved whisker's certificate needs a cone about rest; got 0")
     rod = exact_rod(whisker)
-    force = bounds_of(contact_map, cone)
     near = contact_map.chart.proximal
+    room = 0.0 if straight else room_within(rod, cone, near)
+    force = bounds_of(contact_map, room)
     stations = _stations(rod, near)
     turn = float(np.nextafter(np.pi, 4.0))
     angles = [] if straight else [[0.0 if is_planar(whisker) else -turn, turn]]
@@ -533,19 +534,21 @@ def certify(
         out = before
     if not sum(part.evaluated for part in out.parts.values()):
         out.probe()
-    began, saved = time.monotonic(), time.monotonic()
+    began = saved = time.monotonic()
     spent = out.seconds
-    for name, part in out.parts.items():
-        while len(part.undecided) and not out.refuted and time.monotonic() - began <= seconds:
-            out.pursue(name, _AT_A_TIME)
-            now = time.monotonic()
-            out.seconds = spent + now - began
-            if progress is not None:
-                total = sum(p.share for p in out.parts.values())
-                progress(int(1000.0 * total), 1000 * len(out.parts))
-            if path is not None and now - saved > _SAVED_EVERY:
-                out.save(path)
-                saved = now
-    if path is not None:
-        out.save(path)
+    try:
+        for name, part in out.parts.items():
+            while len(part.undecided) and not out.refuted and time.monotonic() - began <= seconds:
+                out.pursue(name, _AT_A_TIME)
+                now = time.monotonic()
+                out.seconds = spent + now - began
+                if progress is not None:
+                    total = sum(p.share for p in out.parts.values())
+                    progress(int(1000.0 * total), 1000 * len(out.parts))
+                if path is not None and now - saved > _SAVED_EVERY:
+                    out.save(path)
+                    saved = now
+    finally:  # also where it is interrupted
+        if path is not None:
+            out.save(path)
     return out

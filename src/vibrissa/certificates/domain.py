@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from vibrissa.certificates.conditions import DEGREES
-from vibrissa.certificates.equations import ExactRod, exact_rod
+from vibrissa.certificates.equations import ExactRod
 from vibrissa.numerics import Array
 from vibrissa.rod import fold_forces, solve_forces, with_normal_force
 
@@ -94,15 +94,15 @@ def room_within(rod: ExactRod, cone: float, proximal: float) -> float:
     return float(np.sqrt(k) * sine * (1.0 - 1e-12))
 
 
-def bounds_of(contact_map: ContactMap, cone: float) -> Bounds:
+def bounds_of(contact_map: ContactMap, room: float) -> Bounds:
     """Fit the bounds to a whisker.
 
     Parameters
     ----------
     contact_map : ContactMap
         Map of the whisker.
-    cone : float
-        Half angle about the resting whisker within which contacts are left out, rad.
+    room : float
+        Share of the arc length by which the contacts that are left out may be deflected.
 
     Returns
     -------
@@ -131,9 +131,7 @@ def bounds_of(contact_map: ContactMap, cone: float) -> Bounds:
     lift = (1.0 + _BEYOND) * (target / (basis @ fitted)).max()
     factors = np.zeros((5, DEGREES))
     factors[1:] = lift * fitted.reshape(4, DEGREES)
-    room = 0.0
-    if cone > 0.0:
-        room = room_within(exact_rod(whisker), cone, chart.proximal)
+    if room > 0.0:
         least = _least_force(contact_map, s, phi, fold, room).reshape(_STATIONS, -1).min(axis=1)
         target = least / (1.0 / stations - alpha) ** 2
         basis = stations[:, None] ** np.arange(DEGREES)

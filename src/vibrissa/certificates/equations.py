@@ -214,16 +214,6 @@ def enclosed(value: Fraction, slack: Fraction = Fraction(0)) -> tuple[float, flo
     return centre, float(np.nextafter(radius, np.inf)) if radius else 0.0
 
 
-def tapered_rod(ratio: Fraction) -> ExactRod:
-    """Straight rod whose radius falls linearly to a share 1/ratio of that at the base."""
-    b = [Fraction(1), 1 / Fraction(ratio) - 1]
-    coefficients = np.zeros((1, _POLYNOMIALS, 2, 2))
-    coefficients[0, 3] = [enclosed(one, _SLACK) for one in b]
-    local = np.zeros((1, _POLYNOMIALS, 2, 2))
-    local[:, :, 0, 0] = 1.0
-    return ExactRod(np.array([0.0, 1.0]), local, coefficients, np.array([1.0, 0.0]))
-
-
 def exact_rod(whisker: Whisker) -> ExactRod:
     """Polynomials of a whisker, as they are stored, in units of its length and base radius.
 

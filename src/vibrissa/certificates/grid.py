@@ -67,7 +67,7 @@ def outlook(contact_map: ContactMap, cone: float) -> Outlook:
     s = np.linspace(near, 1.0, _STATIONS)
     phi = np.array([0.0]) if straight else 2.0 * np.pi * np.arange(_BEARINGS) / _BEARINGS
     level = np.linspace(0.0, 1.0, _LEVELS)
-    bounds = bounds_of(contact_map, _REST if straight else cone)
+    bounds = bounds_of(contact_map, float(np.sin(_REST if straight else cone)))
     grid = np.meshgrid(s, phi, level, indexing="ij")
     names, signs = (PLANAR if straight else SPATIAL), _conditions(contact_map, bounds, *grid)
     edge = (grid[0] == near) | (grid[0] == 1.0)

@@ -43,7 +43,8 @@ def info(
     """List versions and settings of this installation, or what a file holds.
 
     Of a recording that is what it is, its duration, contacts, stages and object; groups and
-    variables follow with --all. The last line is the command that goes on from the file.
+    variables follow with --all, which also checks boxes of a certificate. The last line is the
+    command that goes on from the file.
     Example: `vibrissa info trial.nc`
     """
     print_properties(_installation() if path is None else _file(path, all_))
@@ -80,7 +81,7 @@ def _file(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
     if kind in (vb.io.Kind.ARRAY, vb.io.Kind.ARRAY_TABLE):
         yield from _array(path, kind)
     elif kind == vb.io.Kind.NETCDF:
-        yield from _groups(path)
+        yield from _groups(path, whole)
     elif kind in (vb.io.Kind.TRACKS, *vb.io.READERS):
         yield from _tracks(path, kind)
     elif kind == vb.io.Kind.VIDEO:
@@ -297,11 +298,15 @@ def _listed(tracks: Dataset, dim: str) -> str:
     return f"{count}: {', '.join(names)}{', …' if count > 8 else ''}"
 
 
-def _groups(path: Path) -> Iterator[tuple[str, str]]:
+def _groups(path: Path, whole: bool = False) -> Iterator[tuple[str, str]]:
     """Kind, groups and variables of a NetCDF file; of its values only names are read."""
     import h5netcdf
 
-    yield "kind", vb.io.kind_of(path) or "unknown"
+    kind = vb.io.kind_of(path)
+    yield "kind", kind or "unknown"
+    if kind == vb.certificates.KIND:
+        yield from _certificate(path, whole)
+        return
     with vb.io.opened(path, "NetCDF-4", soft_links=False), h5netcdf.File(path, "r") as file:
         names = [_text(one) for one in file.variables["whisker"][...]] if _many(file) else []
         for name, group in _within(file, "/"):
@@ -312,6 +317,23 @@ def _groups(path: Path) -> Iterator[tuple[str, str]]:
             yield from _notes(file.groups["whiskers"])
         for line in _text(file.attrs.get("remarks", "")).splitlines():
             yield "note", line
+
+
+def _certificate(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
+    """What a certificate proves, and by how many boxes."""
+    found = vb.certificates.load_certificate(path)
+    yield "whisker", found.whisker
+    yield "states", found.summary()
+    for name, part in found.parts.items():
+        yield name, f"{len(part.certified)} boxes certain, {len(part.undecided)} undecided"
+    yield "identity", found.identity
+    if whole and found.straight:
+        checked = vb.certificates.check_certificate(path)
+        yield (
+            "checked",
+            f"the boxes {'fill' if checked.covers else 'do not fill'} the domain; an independent "
+            f"check confirms {checked.confirmed} of {checked.boxes} random ones",
+        )
 
 
 def _many(file: Any) -> bool:

@@ -317,6 +317,11 @@ OPTIONS = {
     "samples": Option("Number of contacts that are tried.", least=16),
     "resolution": Option("Whether to find how finely signals must be measured."),
     "network": Option("Also train a network for each triplet, as the paper did; slow."),
+    "certify": Option(
+        "Also prove that (Fx, MB, MD) is unique: the certificate that is made here, .nc; one of "
+        "this whisker that is there already is continued."
+    ),
+    "minutes": Option("Longest time that a certificate may take, minutes.", least=0.0),
     # Streams
     "udp": Option("Receive lines as UDP datagrams here instead.", "HOST:PORT"),
     "every": Option(

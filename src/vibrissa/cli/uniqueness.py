@@ -33,6 +33,8 @@ def uniqueness(
     samples: int = 4096,
     resolution: bool = True,
     network: bool = False,
+    certify: Path | None = None,
+    minutes: float = 30.0,
     target: Path | None = None,
     force: bool = False,
 ) -> None:
@@ -42,8 +44,19 @@ def uniqueness(
     """
     if target is not None:
         check_new(target, vb.identifiability.ENDINGS, force)
+    if certify is not None:
+        vb.io.check_writable(certify, (".nc",))
     contact_map = map_from(path)
     with progress_bars() as tell:
+        certificate = None
+        if certify is not None:
+            certificate = vb.certificates.certify(
+                contact_map,
+                float(np.deg2rad(cone)),
+                path=certify,
+                seconds=60.0 * minutes,
+                progress=lambda done, total: tell("certificate", done, total),
+            )
         tell("verdicts", 0, 1)
         found = vb.uniqueness(
             contact_map,
@@ -54,6 +67,7 @@ def uniqueness(
             min_separation=min_separation,
             samples=samples,
             resolution=resolution,
+            certificate=certificate,
             progress=lambda done, total: tell("verdicts", done, total),
         )
         if network:
@@ -64,6 +78,8 @@ def uniqueness(
     output.print(
         vb.identifiability.verdict_table(found), highlight=False, soft_wrap=True, markup=False
     )
+    if certificate is not None:
+        say(f"\n{certificate.summary()}\nwrote {certify}")
     _print_witness(found)
     if target is not None:
         vb.identifiability.save_uniqueness(found, target)

@@ -20,6 +20,7 @@ from vibrissa.identifiability.regions import ContactSet, Samples, contact_set, s
 from vibrissa.identifiability.twins import (
     Pairs,
     better_twins,
+    climbed,
     confirmed,
     joined,
     signal_columns,
@@ -221,6 +222,7 @@ def answer(question: Question, names: tuple[str, ...], resolution: bool) -> Answ
         "minority_share_one_side": local.one_sided,
         "fold_angle": local.angle,
         "twin_share": _weighted(question, twin[:, tried], tried),
+        "twin_distance": _distances(question, own, verdict),
     }
     if resolution:
         shares, elevation = _shares(question, hit, probed, verdict)
@@ -253,7 +255,10 @@ def _searched(
         )
         if not regions:
             break
-    return pool
+    summits = climbed(
+        question.contact_map, names, pool, question.regions, question.separation, question.domain
+    )
+    return joined([pool, summits])
 
 
 def _judge(
@@ -353,6 +358,17 @@ def _twinned(question: Question, pairs: Pairs) -> AnyArray:
     out = np.zeros((len(question.regions), len(question.samples.chart)), dtype=bool)
     for i, region in enumerate(question.regions):
         out[i, pairs.sample[pairs.members(region) & (pairs.angle > question.cone)]] = True
+    return out
+
+
+def _distances(question: Question, pairs: Pairs, verdict: list[str]) -> Array:
+    """Median distance of twins outside the cone, region by region, m; NaN where there are none."""
+    length = question.contact_map.chart.discretization.length
+    out = np.full(len(question.regions), np.nan)
+    for i, region in enumerate(question.regions):
+        there = pairs.members(region) & (pairs.angle > question.cone)
+        if verdict[i] == NOT_UNIQUE and there.any():
+            out[i] = length * np.median(pairs.apart[there])
     return out
 
 

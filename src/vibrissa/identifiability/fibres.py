@@ -20,9 +20,10 @@ from vibrissa.identifiability.twins import (
     corrected,
     equations,
     signal_columns,
+    stable,
     units,
 )
-from vibrissa.numerics import AnyArray, Array
+from vibrissa.numerics import Array
 from vibrissa.rod import discretize, solve_forces, with_normal_force
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ def fibres(
             direction = _along(slope * unit[running, None, :], direction, sense)
             xi = xi + _STRIDE * direction * unit[running]
             xi, values, misfit = corrected(d, names, xi, targets[running], unit[running])
-            stays = (misfit <= AGREEMENT) & _stable(contact_map, xi)
+            stays = (misfit <= AGREEMENT) & stable(contact_map, xi)
             xi, running, direction = xi[stays], running[stays], direction[stays]
             if not running.size:
                 break
@@ -79,9 +80,3 @@ def _along(slope: Array, before: Array, sense: float) -> Array:
     fresh = np.isnan(before).any(axis=1)
     turned[fresh] = sense * rows[fresh, 2]
     return np.asarray(turned / np.linalg.norm(turned, axis=1, keepdims=True))
-
-
-def _stable(contact_map: ContactMap, xi: Array) -> AnyArray:
-    force = np.hypot(xi[:, 1], xi[:, 2])
-    inside = (xi[:, 0] >= contact_map.chart.proximal) & (xi[:, 0] <= 1.0)
-    return np.asarray(inside & (force > 0.0) & (force < units(contact_map, xi)[:, 1]))

@@ -101,25 +101,57 @@ def verdict_rows(verdicts: xr.Dataset) -> tuple[list[list[str]], list[str]]:
         Sentences needed to read them.
     """
     regions = [str(r) for r in verdicts.region.to_numpy()]
-    rows = [["triplet", *regions, "in short"]]
+    rows = [["triplet", *regions, "in short", "twins"]]
     for triplet in verdicts.triplet.to_numpy():
         row = [str(triplet)]
         for region in regions:
             cell = verdicts.sel(triplet=triplet, region=region)
             word = str(cell.verdict.item())
             mark = _MARKS.get(word, word)
-            row.append(
-                f"{np.rad2deg(float(cell.critical_cone)):.1f}°" if word == NOT_UNIQUE else mark
-            )
-        rows.append([*row, str(verdicts.notation.sel(triplet=triplet).item())])
+            proved = "evidence" in cell and str(cell.evidence.item()) == "proved"
+            angle = f"≥{np.rad2deg(float(cell.critical_cone)):.1f}°"
+            row.append(angle if word == NOT_UNIQUE else mark + " (proved)" * proved)
+        rows.append(
+            [*row, str(verdicts.notation.sel(triplet=triplet).item()), _twins(verdicts, triplet)]
+        )
     chosen, region = verdicts.attrs["chosen_triplet"], verdicts.attrs["chosen_region"]
     use = f"({chosen.replace(' ', ', ')}), unique in: {region}" if chosen else "none is unique"
     cone = np.rad2deg(verdicts.attrs["cone"])
     return rows, [
-        f"An angle: not unique; twins exist that far from rest. *: off {_surface(verdicts)}.",
+        f"≥ an angle: not unique (witness), twins exist that far from rest, maybe farther. "
+        f"Unique: no counterexample found, unless proved. *: off {_surface(verdicts)}.",
+        f"Twins: share of the contacts of {regions[0]} that have one, and their median distance.",
         f"Contacts within {cone:.3g}° of rest left out; domain: {verdicts.attrs['domain']}; "
         f"contacts nearer than {1e3 * verdicts.attrs['min_separation']:.3g} mm count as one.",
         f"The triplet to use: {use}.",
+        *_certificate_note(verdicts),
+    ]
+
+
+def _twins(verdicts: xr.Dataset, triplet: str) -> str:
+    """Share of contacts that have a twin, in the first region, with the distance of twins."""
+    cell = verdicts.sel(triplet=triplet).isel(region=0)
+    if str(cell.verdict.item()) != NOT_UNIQUE or "twin_distance" not in cell:
+        return "–"
+    share, distance = float(cell.twin_share), float(cell.twin_distance)
+    if not share > 0.0:
+        return "rare pairs"
+    apart = f", {1e3 * distance:.2g} mm" if np.isfinite(distance) else ""
+    return f"{100.0 * share:.2g} %{apart}"
+
+
+def _certificate_note(verdicts: xr.Dataset) -> list[str]:
+    """What a grid shows of a proof."""
+    if "determinant_cone" not in verdicts.attrs:
+        return []
+    angle = np.rad2deg(verdicts.attrs["determinant_cone"])
+    where = f" outside {angle:.2f}°" if angle > 0.0 else ""
+    if verdicts.attrs["certificate_possible"]:
+        return [f"(Fx, MB, MD): on a grid all signs that a proof needs hold{where}."]
+    if angle > np.rad2deg(verdicts.attrs["cone"]):
+        return [f"(Fx, MB, MD): a proof can exist outside {angle:.2f}° at best."]
+    return [
+        "(Fx, MB, MD): signs that a proof needs are wrong on a grid; there is none of this kind."
     ]
 
 

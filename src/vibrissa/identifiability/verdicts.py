@@ -17,10 +17,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from vibrissa.certificates import TRIPLET, Certificate, outlook
 from vibrissa.contacts import Domain, Progress
 from vibrissa.identifiability.evidence import (
+    EMPTY,
+    NOT_UNIQUE,
     OFF_SURFACE,
     TOLERANCES,
+    UNIQUE,
     WITNESSES,
     Answer,
     Question,
@@ -32,14 +36,16 @@ from vibrissa.identifiability.twins import (
     FINER,
     Pairs,
     corrected,
+    equations,
     found_again,
     signal_columns,
+    sizes,
     units,
 )
-from vibrissa.numerics import Array
+from vibrissa.numerics import AnyArray, Array
 from vibrissa.quantities import attributes
-from vibrissa.rod import discretize
-from vibrissa.signals import CONE, REGIONS, SIGNALS, TRIPLETS, selection, signal_scales
+from vibrissa.rod import Discretization, discretize, solve_forces, with_normal_force
+from vibrissa.signals import CONE, REGIONS, SIGNALS, TRIPLETS, selection, signal_scales, signals_of
 
 if TYPE_CHECKING:
     from vibrissa.contacts import ContactMap
@@ -57,7 +63,7 @@ def _about(unit: str, long_name: str) -> dict[str, str]:
 # Variables over (triplet, region) and further dimensions, with their attributes.
 _VARIABLES: dict[str, tuple[tuple[str, ...], dict[str, str]]] = {
     "verdict": ((), {"long_name": "whether the triplet locates the contact"}),
-    "critical_cone": ((), _about("rad", "smallest cone without witnesses outside it")),
+    "critical_cone": ((), _about("rad", "largest cone that a witness found is outside of")),
     "minority_share": ((), _about("1", "share in which det ∂T/∂p has the rarer sign")),
     "minority_share_one_side": (
         (),
@@ -68,6 +74,7 @@ _VARIABLES: dict[str, tuple[tuple[str, ...], dict[str, str]]] = {
         _about("rad", "cone angles between which contacts have the rarer sign"),
     ),
     "twin_share": ((), _about("1", "share that has an exact twin")),
+    "twin_distance": ((), _about("m", "distance of exact twins, the median")),
     "ambiguous_share": (
         ("signal_tolerance",),
         _about("1", "share with another contact within the tolerance of the signals' ranges"),
@@ -90,7 +97,10 @@ _WITNESS_VARIABLES: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {
         _about("N, N m or rad", "signals of both, in the order of the triplet's name"),
     ),
     "separation": ((), _about("m", "distance of the contact points")),
-    "difference": ((), _about("1", "largest difference of a signal, over |F|, |M| or in rad")),
+    "difference": (
+        (),
+        _about("1", "largest difference of a signal on a finer rod, over |F|, |M| or in rad"),
+    ),
     "shift": ((), _about("m", f"move of the second contact at {FINER} times the steps")),
 }
 _SIZES = {"pair": 2, "component": 2, "space": 3, "signal": 3}
@@ -107,6 +117,7 @@ def uniqueness(
     samples: int = SAMPLES,
     resolution: bool = True,
     seed: int = 0,
+    certificate: Certificate | None = None,
     progress: Progress | None = None,
 ) -> xr.Dataset:
     """Decide which triplets of signals locate the contact uniquely, by region, with evidence.
@@ -133,29 +144,37 @@ def uniqueness(
         Whether the shares of contacts that are ambiguous within tolerances are computed too.
     seed : int
         Seed of the samples and of the search.
+    certificate : Certificate, optional
+        Proof for this whisker, of `vibrissa.certificates.certify`, that makes "unique" proved
+        where it applies.
     progress : callable, optional
         Function called as ``progress(done, total)`` after each triplet.
 
     Returns
     -------
     Dataset
-        Over ``triplet`` and ``region``: ``verdict``; ``critical_cone`` (rad): the smallest cone
-        without witnesses outside; ``minority_share``: share of the region's volume in which
-        det ∂T/∂p has the rarer sign, and ``minority_share_one_side`` with the two sides of the
-        whisker's plane separated (where T collapses on the plane, the sign may change there
-        without a fold); ``fold_angle`` (rad): least and largest cone angle of contacts with the
-        rarer sign on their side; ``twin_share``: share that has an exact twin;
-        ``ambiguous_share``: share that has another contact farther than ``min_separation`` within
+        Over ``triplet`` and ``region``: ``verdict``; ``evidence``: "proved" by the certificate,
+        "no counterexample found" or "witness"; ``critical_cone`` (rad): the cone angle of the
+        witness farthest from rest, a lower bound of the critical cone; ``minority_share``: share of
+        the region's volume in which det ∂T/∂p has the rarer sign, and ``minority_share_one_side``
+        with the two sides of the whisker's plane separated (where T collapses on the plane, the
+        sign may change there without a fold); ``fold_angle`` (rad): least and largest cone angle
+        of contacts with the rarer sign on their side; ``twin_share``: share that has an exact
+        twin, and ``twin_distance``, the median distance of these (m); ``ambiguous_share``: share
+        that has another contact farther than ``min_separation`` within
         a ``signal_tolerance``, a share of each signal's range; ``surface`` and ``surface_angle``
         (rad, for "unique off a surface"): off which surface, and the largest elevation from it of
         a contact that is ambiguous within the tolerance; ``witness_…``: the pairs of contacts
         farthest apart, with both contacts' arc length, force and point, the three signals, their
-        relative difference (in :func:`vibrissa.deflect` with ``witness_steps``, the default but
-        where signals depend on each other only as finely as the rod is integrated), the
+        relative difference when the pair is integrated more finely (the signals agree to 1e-10 in
+        :func:`vibrissa.deflect` with ``witness_steps``, with which the rod has converged), the
         separation, and by how much the second contact moves when the pair is found again with
         four times the steps. ``region_share``: the regions' share of the
         contacts' space; ``notation``: the verdicts of a triplet in short. Attributes name the
-        chosen triplet, the domain, the cone and the separation.
+        chosen triplet, the domain, the cone and the separation, and what a grid shows of a
+        certificate for (F_x, M_B, M_D): whether one can exist outside the cone
+        (``certificate_possible``), and outside which cone the determinant keeps its sign
+        (``determinant_cone``, rad).
 
     Raises
     ------
@@ -188,7 +207,7 @@ def uniqueness(
         answers.append(answer(question, triplet, resolution))
         if progress is not None:
             progress(number + 1, len(names))
-    return _labelled(question, names, answers)
+    return _labelled(question, names, answers, certificate)
 
 
 def _listed(triplets: str | Sequence[str | tuple[str, ...]]) -> tuple[tuple[str, ...], ...]:
@@ -215,6 +234,7 @@ def _labelled(
     question: Question,
     names: tuple[tuple[str, ...], ...],
     answers: list[Answer],
+    certificate: Certificate | None,
 ) -> xr.Dataset:
     """All verdicts and evidence as one dataset."""
     data: dict[str, Any] = {
@@ -226,6 +246,11 @@ def _labelled(
         for name, (dims, about) in _VARIABLES.items()
         if name in answers[0].variables
     }
+    data["evidence"] = (
+        ("triplet", "region"),
+        _evidence(question, names, data["verdict"][1], certificate),
+        {"long_name": "evidence for the verdict"},
+    )
     surfaces = np.where(data["verdict"][1] == OFF_SURFACE, _surface(question), "")
     data["surface"] = (
         ("triplet", "region"),
@@ -257,6 +282,10 @@ def _labelled(
             for region, share in zip(question.regions, question.volumes(), strict=True)
         ),
     }
+    if TRIPLET in out.triplet.values and whisker.base_stiffness is None:
+        seen = outlook(question.contact_map, question.cone)
+        out.attrs["certificate_possible"] = int(seen.possible)
+        out.attrs["determinant_cone"] = seen.determinant_cone
     out["region_share"] = (
         "region",
         question.volumes(),
@@ -269,6 +298,35 @@ def _labelled(
     )
     out.attrs["chosen_triplet"], out.attrs["chosen_region"] = choice(out)
     return out
+
+
+def _evidence(
+    question: Question,
+    names: tuple[tuple[str, ...], ...],
+    verdict: AnyArray,
+    certificate: Certificate | None,
+) -> AnyArray:
+    """Evidence of each verdict, (triplets, regions).
+
+    A certificate is for all stable contacts outside a cone, and so for every region and domain.
+    """
+    words = {NOT_UNIQUE: "witness", EMPTY: ""}
+    out = np.vectorize(lambda word: words.get(str(word), "no counterexample found"))(verdict)
+    if certificate is None:
+        return np.asarray(out)
+    if not certificate.is_of(question.contact_map):
+        raise ValueError("the certificate is of another whisker or for other arc lengths")
+    if certificate.proved and certificate.cone <= question.cone:
+        rows = np.array([" ".join(triplet) == TRIPLET for triplet in names])
+        out[rows[:, None] & (verdict == UNIQUE)] = "proved"
+    return np.asarray(out)
+
+
+def _solved(d: Discretization, triplet: tuple[str, ...], xi: Array) -> tuple[Array, Array]:
+    """Triplet and contact point of contacts."""
+    values, _ = solve_forces(d, with_normal_force(xi))
+    force, point = values[:, :3], values[:, 3:]
+    return signals_of(force, np.cross(point, force))[:, signal_columns(triplet)], point
 
 
 def _surface(question: Question) -> str:
@@ -299,7 +357,7 @@ def _witnesses(
     }
     data["witness_steps"] = (
         ("triplet", "region"),
-        np.array([found.steps for found in answers]),
+        FINER * np.array([found.steps for found in answers]),
         _about("1", "integration steps with which the witnesses agree"),
     )
     return xr.Dataset(data)
@@ -308,20 +366,22 @@ def _witnesses(
 def _witness(
     question: Question, triplet: tuple[str, ...], pairs: Pairs, steps: int
 ) -> dict[str, Array]:
-    """Variables of the witnesses of one triplet and region."""
+    """Variables of the witnesses of one triplet and region, on a rod that has converged."""
     contact_map = question.contact_map
-    d = discretize(contact_map.whisker, steps)
-    target = pairs.first.signals[:, signal_columns(triplet)]
-    unit = units(contact_map, pairs.second.xi)
-    second, values, difference = corrected(d, triplet, pairs.second.xi, target, unit)
-    both = np.stack([pairs.first.xi, second], axis=1)
-    point = d.length * np.stack([pairs.first.values[:, 3:], values[:, 3:]], axis=1)
-    _, moved = found_again(contact_map, triplet, pairs.first.xi, second, steps)
+    d, finest = (discretize(contact_map.whisker, n * FINER * steps) for n in (1, 2))
+    first, unit = pairs.first.xi, units(contact_map, pairs.second.xi)
+    signals, point = _solved(d, triplet, first)
+    second, values, _ = corrected(d, triplet, pairs.second.xi, signals, unit)
+    both = np.stack([first, second], axis=1)
+    point = d.length * np.stack([point, values[:, 3:]], axis=1)
+    _, moved = found_again(contact_map, triplet, first, pairs.second.xi, steps)
+    away, _, values = equations(finest, triplet, second, _solved(finest, triplet, first)[0])
+    difference = np.abs(away / sizes(values, triplet)).max(axis=1)
     return {
         "arc_length": both[..., 0] * d.length,
         "contact_force": both[..., 1:] * d.force,
         "point": point,
-        "signals": target * signal_scales(triplet, d.force, d.moment),
+        "signals": signals * signal_scales(triplet, d.force, d.moment),
         "separation": np.linalg.norm(point[:, 0] - point[:, 1], axis=1),
         "difference": difference,
         "shift": d.length * moved,

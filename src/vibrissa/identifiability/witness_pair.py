@@ -65,7 +65,9 @@ def _bent(whisker: Whisker, witness: xr.Dataset) -> xr.Dataset:
     """The two whiskers of one witness."""
     force = witness["witness_contact_force"].transpose("pair", "component").values
     components = np.column_stack([np.zeros(2), force])
-    bent = deflect(whisker, PointForce(witness["witness_arc_length"].values, components=components))
+    load = PointForce(witness["witness_arc_length"].values, components=components)
+    known = "witness_steps" in witness
+    bent = deflect(whisker, load, **{"steps": int(witness["witness_steps"])} if known else {})
     signals = base_signals(bent.force, bent.moment)
     triplet = str(witness["triplet"].item())
     if "witness_signals" in witness:

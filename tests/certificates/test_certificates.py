@@ -10,7 +10,7 @@ from scipy.optimize import linprog
 from typer.testing import CliRunner
 
 import vibrissa as vb
-from vibrissa.certificates import certify, check_certificate, load_certificate, outlook
+from vibrissa.certificates import certify, check_certificate, checker, load_certificate, outlook
 from vibrissa.certificates.certificate import _TOLERANCES, prepared
 from vibrissa.certificates.equations import enclosed, spatial_equations
 from vibrissa.certificates.flow import absorb
@@ -82,19 +82,18 @@ def test_a_certificate_with_a_hole_or_a_wrong_whisker_is_noticed(theorem):
         certify(straight(8.0), path=path)
 
 
-def test_an_independent_check_confirms_boxes_and_no_others(theorem, tmp_path):
+def test_an_independent_check_confirms_boxes_and_no_others(theorem, tmp_path, monkeypatch):
     path, _, found = theorem
-    checked = check_certificate(path, 3)
+    checked = check_certificate(path, 1)
     assert checked.covers
-    assert checked.confirmed == checked.boxes == 11
-    # One box, of which nothing is certain, in the place of many.
+    assert checked.confirmed == checked.boxes == 4
+    # Half the force: that face is not beyond the fold.
+    monkeypatch.setattr(checker, "_ROUNDS", 2)
     data = found.to_dataset()
-    first = data["interior_certified"].isel(interior_certified_box=slice(1))
-    data = data.drop_vars("interior_certified").assign(interior_certified=0 * first)
+    data["factors"] = 0.5 * data["factors"]
     write_netcdf(tmp_path / "forged.nc", data)
-    forged = check_certificate(tmp_path / "forged.nc", 1, parts=("interior",))
-    assert forged.covers
-    assert forged.confirmed == 0
+    forged = check_certificate(tmp_path / "forged.nc", 1, parts=("fold",))
+    assert (forged.boxes, forged.confirmed) == (1, 0)
     data["interior_domain"][0, 0] = 0.5
     write_netcdf(tmp_path / "forged.nc", data)
     assert not check_certificate(tmp_path / "forged.nc", 1, parts=("distal",)).covers

@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from vibrissa.rod import Deflection, PointForce, deflect
+from vibrissa.rod import STEPS, Deflection, PointForce, deflect
 from vibrissa.signals import base_signals
 from vibrissa.whisker import Whisker
 
@@ -66,8 +66,7 @@ def _bent(whisker: Whisker, witness: xr.Dataset) -> xr.Dataset:
     force = witness["witness_contact_force"].transpose("pair", "component").values
     components = np.column_stack([np.zeros(2), force])
     load = PointForce(witness["witness_arc_length"].values, components=components)
-    known = "witness_steps" in witness
-    bent = deflect(whisker, load, **{"steps": int(witness["witness_steps"])} if known else {})
+    bent = deflect(whisker, load, steps=int(witness.get("witness_steps", STEPS)))
     signals = base_signals(bent.force, bent.moment)
     triplet = str(witness["triplet"].item())
     if "witness_signals" in witness:

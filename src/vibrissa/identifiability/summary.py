@@ -137,7 +137,7 @@ def _twins(verdicts: xr.Dataset, triplet: str) -> str:
     if not share > 0.0:
         return "rare pairs"
     apart = f", {1e3 * distance:.2g} mm" if np.isfinite(distance) else ""
-    return f"{100.0 * share:.2g} %{apart}"
+    return f"{100.0 * share:.3g} %{apart}"
 
 
 def _certificate_note(verdicts: xr.Dataset) -> list[str]:

@@ -26,11 +26,13 @@ from vibrissa.simulation.script import (
     read_script as read_script,
 )
 from vibrissa.simulation.simulate import measure, simulate
+from vibrissa.simulation.vibration import Vibration
 
 __all__ = [
     "Dynamics",
     "ImageConditions",
     "Motion",
+    "Vibration",
     "array_whisking",
     "facing_peg",
     "film",

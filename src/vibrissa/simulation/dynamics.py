@@ -245,6 +245,19 @@ class Moment:
 
 def frequencies(chain: Chain, count: int) -> Array:
     """Lowest frequencies of a chain at rest, held at its base: (count,), Hz."""
+    # The stiffness is regular, the mass need not be: twist of a straight whisker has none.
+    n = chain.stiffness.size
+    slow = eigh(
+        at_rest(chain).matrix,
+        np.diag(chain.stiffness.ravel()),
+        eigvals_only=True,
+        subset_by_index=[n - count, n - 1],
+    )
+    return np.asarray(1.0 / np.sqrt(slow[::-1]) / (2.0 * np.pi))
+
+
+def at_rest(chain: Chain) -> State:
+    """State of a chain at rest, with its mass matrix."""
     state = State(chain)
     state.move(chain.rest, np.eye(3), np.zeros(3))
     inertia(
@@ -257,15 +270,7 @@ def frequencies(chain: Chain, count: int) -> Array:
         state.residual,
         state.matrix,
     )
-    # The stiffness is regular, the mass need not be: twist of a straight whisker has none.
-    n = chain.stiffness.size
-    slow = eigh(
-        state.matrix,
-        np.diag(chain.stiffness.ravel()),
-        eigvals_only=True,
-        subset_by_index=[n - count, n - 1],
-    )
-    return np.asarray(1.0 / np.sqrt(slow[::-1]) / (2.0 * np.pi))
+    return state
 
 
 class State:

@@ -383,7 +383,7 @@ def test_a_map_with_verdicts(map_page, folder):
         assert row[-1] == str(cell.notation.item())
         if str(cell.verdict.sel(region="all").item()) == "not unique":
             cone = np.rad2deg(float(cell.critical_cone.sel(region="all")))
-            assert row[1] == f"{cone:.1f}°"
+            assert row[1] == f"≥{cone:.1f}°"
     for row in page.tables["Farthest pairs of contacts with the same signals"][1:]:
         apart = float(verdicts["witness_separation"].sel(triplet=row[0]).max())
         assert number(row[2]) == pytest.approx(1e3 * apart, abs=1e-3)

@@ -377,10 +377,10 @@ def test_a_map_with_verdicts(map_page, folder):
     page = Page(map_page[0].read_text(encoding="utf-8"))
     nothing_is_loaded(page)
     heading, *rows = page.tables["Verdicts by region"]
-    assert heading == ["triplet", "all", "ELD", "in short"]
+    assert heading == ["triplet", "all", "ELD", "in short", "twins"]
     for row in rows:
         cell = verdicts.sel(triplet=row[0])
-        assert row[-1] == str(cell.notation.item())
+        assert row[-2] == str(cell.notation.item())
         if str(cell.verdict.sel(region="all").item()) == "not unique":
             cone = np.rad2deg(float(cell.critical_cone.sel(region="all")))
             assert row[1] == f"≥{cone:.1f}°"

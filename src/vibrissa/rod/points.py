@@ -336,7 +336,8 @@ class PointSolver:
         contacts[rows, 0], contacts[rows, 1], contacts[rows, 2:] = xi[good, 0], 0.0, xi[good, 1:]
         values[rows], misfits[rows], statuses[rows] = found[good], residuals[good], int(Status.OK)
         open_rows = np.flatnonzero((solved < 0) | (solved == 2))
-        self._from_starts(wanted[open_rows], there[open_rows], out)
+        if open_rows.size:
+            self._from_starts(wanted[open_rows], there[open_rows], out)
         lost = np.flatnonzero(np.isin(statuses[there], (Status.MISSING, Status.NOT_CONVERGED)))
         self._approach(wanted[lost], solved[lost] < 0, there[lost], out)
         return out

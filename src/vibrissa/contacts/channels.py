@@ -169,20 +169,7 @@ def channels_of(values: Array) -> Array:
 
 
 def channel_gradients(values: Array, names: tuple[str, ...]) -> Array:
-    """Derivatives of channels with respect to (F, M).
-
-    Parameters
-    ----------
-    values : (..., 6) array
-        Base force and contact point, non-dimensional.
-    names : tuple of str
-        Channels.
-
-    Returns
-    -------
-    (..., k, 6) array
-        Derivatives.
-    """
+    """Derivatives of channels with respect to (F, M)."""
     force = values[..., :3]
     by_wrench = np.zeros((*values.shape[:-1], len(CHANNELS), 6))
     by_wrench[..., : len(SIGNALS), :] = wrench_derivatives(force, np.cross(values[..., 3:], force))
@@ -192,22 +179,7 @@ def channel_gradients(values: Array, names: tuple[str, ...]) -> Array:
 
 
 def channel_derivatives(values: Array, tangents: Array, names: tuple[str, ...]) -> Array:
-    """Derivatives of channels with respect to unknowns of the contact.
-
-    Parameters
-    ----------
-    values : (..., 6) array
-        Base force and contact point, non-dimensional.
-    tangents : (..., 6, p) array
-        Derivatives of those with respect to the unknowns.
-    names : tuple of str
-        Channels.
-
-    Returns
-    -------
-    (..., k, p) array
-        Derivatives.
-    """
+    """Derivatives of channels with respect to unknowns of the contact."""
     force, point = values[..., :3], values[..., 3:]
     d_force, d_point = tangents[..., :3, :], tangents[..., 3:, :]
     d_moment = np.cross(d_point, force[..., None], axis=-2) + np.cross(

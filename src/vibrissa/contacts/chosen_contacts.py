@@ -67,28 +67,7 @@ class ChosenContacts:
 def chosen_contacts(
     contact_map: ContactMap, at: At = None, triplet: tuple[str, ...] = ("Fx", "MB", "MD")
 ) -> ChosenContacts:
-    """Find the contacts that are asked about.
-
-    Parameters
-    ----------
-    contact_map : ContactMap
-        Map of the whisker's contacts.
-    at : optional
-        Contact points (..., 3), m; signals by name; a recording or dataset with either; "grid" for
-        the paper's grid; by default the nodes of the map.
-    triplet : tuple of str
-        Signals to locate contacts from, where ``at`` has signals.
-
-    Returns
-    -------
-    ChosenContacts
-        The contacts, non-dimensional.
-
-    Raises
-    ------
-    ValueError
-        If ``at`` is none of these, or the map has no grid.
-    """
+    """Find the contacts that are asked about."""
     if at is None:
         return _nodes(contact_map)
     if isinstance(at, str):
@@ -239,20 +218,7 @@ def _solved(
 
 
 def large_deflection(contact_map: ContactMap, chosen: ChosenContacts) -> AnyArray:
-    """Whether the deflected whisker points back at each contact; False where there is none.
-
-    Parameters
-    ----------
-    contact_map : ContactMap
-        Map of the whisker's contacts.
-    chosen : ChosenContacts
-        Contacts.
-
-    Returns
-    -------
-    (n,) bool array
-        True for those.
-    """
+    """Whether the deflected whisker points back at each contact; False where there is none."""
     contacts = with_normal_force(chosen.contacts)
     tangents = contact_tangents(contact_map.chart.discretization, contacts)
     return np.asarray(tangents[:, 0] < 0.0)

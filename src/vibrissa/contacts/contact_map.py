@@ -353,20 +353,7 @@ def _sagged(contact_map: ContactMap, gravity: tuple[float, float, float]) -> Con
 
 
 def within_paper_bounds(whisker: Whisker, points: Array) -> AnyArray:
-    """Whether contact points are within the bounds of the paper's grid.
-
-    Parameters
-    ----------
-    whisker : Whisker
-        Whisker that is touched.
-    points : (..., 3) array
-        Contact points, whisker frame, m.
-
-    Returns
-    -------
-    (...) bool array
-        True for those.
-    """
+    """Whether contact points are within the bounds of the paper's grid."""
     r, theta, phi = np.moveaxis(spherical(points), -1, 0)
     inside = (r >= 0.3 * whisker.length) & (r <= whisker.length)
     inside &= np.abs(theta) <= GRID_AZIMUTHS[-1]

@@ -73,20 +73,7 @@ class Candidates(NamedTuple):
 
     @classmethod
     def room(cls, n: int, most: int = MOST_CANDIDATES) -> Candidates:
-        """Make room for candidates of n measurements.
-
-        Parameters
-        ----------
-        n : int
-            Number of measurements.
-        most : int
-            Number of candidates of each, at most.
-
-        Returns
-        -------
-        Candidates
-            None yet: number zero, NaN elsewhere.
-        """
+        """Make room for candidates of n measurements."""
         rows = n * most
         flat = np.full(22 * rows, np.nan)  # of one piece: single estimates take microseconds
         return cls(
@@ -101,18 +88,7 @@ class Candidates(NamedTuple):
         )
 
     def allowed_first(self, allowed: AnyArray) -> Candidates:
-        """Leave out candidates that are not allowed; the others keep their order.
-
-        Parameters
-        ----------
-        allowed : array (n, k)
-            Whether each candidate is allowed.
-
-        Returns
-        -------
-        Candidates
-            Those that are.
-        """
+        """Leave out candidates that are not allowed; the others keep their order."""
         order = np.argsort(~allowed, axis=1, kind="stable")
         gone = np.arange(allowed.shape[1]) >= allowed.sum(axis=1)[:, None]
         parts = []
@@ -124,20 +100,7 @@ class Candidates(NamedTuple):
         return Candidates(allowed.sum(axis=1), *parts)
 
     def spread_out(self, rows: IntArray, n: int) -> Candidates:
-        """Place the candidates of some measurements among those of n.
-
-        Parameters
-        ----------
-        rows : array (m,)
-            Numbers of the measurements.
-        n : int
-            Number of all measurements.
-
-        Returns
-        -------
-        Candidates
-            Those of all; the others have none.
-        """
+        """Place the candidates of some measurements among those of n."""
         out = Candidates.room(n, self.x.shape[1])
         for mine, theirs in zip(out, self, strict=True):
             mine[rows] = theirs
@@ -354,32 +317,7 @@ def contacts_of(
     dims: tuple[str, ...],
     coords: Coordinates,
 ) -> Contacts:
-    """Give candidates of flat measurements their units and the shape of the measurements.
-
-    Parameters
-    ----------
-    found : Candidates
-        Candidates, non-dimensional; the first of each measurement is its answer.
-    status : array (n,)
-        Status of each measurement.
-    chi_squared : array (n,)
-        χ² of each measurement.
-    discretization : Discretization
-        Rod that holds the units of length and force.
-    using : tuple of str
-        Names of the signals.
-    shape : tuple of int
-        Shape of the measurements.
-    dims : tuple of str
-        Dimensions of the measurements.
-    coords : mapping
-        Coordinates of the measurements.
-
-    Returns
-    -------
-    Contacts
-        The contacts, SI units.
-    """
+    """Give candidates of flat measurements their units and the shape of the measurements."""
     d, most = discretization, max(1, int(found.number.max(initial=0)))
 
     def whole(values: AnyArray) -> AnyArray:

@@ -209,18 +209,7 @@ def _ratio(x: Array) -> Array:
 
 
 def ratio_derivatives(x: Array) -> Array:
-    """Differentiate the ratio of the force along the whisker to that across it.
-
-    Parameters
-    ----------
-    x : (n, 4) array
-        Contacts (s, f_x, f_y, f_z), non-dimensional.
-
-    Returns
-    -------
-    (n, 4) array
-        Derivatives by these.
-    """
+    """Differentiate the ratio of the force along the whisker to that across it."""
     normal = np.hypot(x[:, 2], x[:, 3])
     by = -x[:, 1:2] * x[:, 2:] / normal[:, None] ** 3
     return np.column_stack([np.zeros(len(x)), 1.0 / normal, by])

@@ -95,24 +95,7 @@ def _plane(chart: StableSet, triplet: tuple[str, ...]) -> PlaneVector | None:
 def invert(
     chart: StableSet, tree: SearchTree, triplet: tuple[str, ...], targets: Array
 ) -> Solutions:
-    """Find all stable contacts for each measured triplet.
-
-    Parameters
-    ----------
-    chart : StableSet
-        Stable contacts of the whisker.
-    tree : SearchTree
-        Search tree of the triplet, from `ContactMap.tree`.
-    triplet : tuple of str
-        Names of the three signals, in canonical order.
-    targets : array (n, 3)
-        Measured signals, non-dimensional.
-
-    Returns
-    -------
-    Solutions
-        Number (n,), contacts (n, k, 4) and values (n, k, 6) of the solutions, non-dimensional.
-    """
+    """Find all stable contacts for each measured triplet."""
     if len(targets) > _MANY:
         order = _by_neighbourhood(targets)
         found = _inverted(chart, tree, triplet, targets[order])
@@ -327,18 +310,6 @@ def seeding_triplet(chart: StableSet, names: tuple[str, ...]) -> tuple[str, ...]
 
     They are judged by the median volume of the error ellipsoid, with the same relative error of
     forces and moments.
-
-    Parameters
-    ----------
-    chart : StableSet
-        Stable contacts of the whisker.
-    names : tuple of str
-        Names of the measured signals, three or more.
-
-    Returns
-    -------
-    tuple of str
-        Names of three of them.
     """
     values = chart.values[::2, ::4, 1::2].reshape(-1, 6)
     tangents = chart.tangents[::2, ::4, 1::2].reshape(-1, 6, 3)

@@ -50,24 +50,7 @@ _TRIED = 256
 def contact_signal_derivatives(
     discretization: Discretization, values: Array, tangents: Array, names: tuple[str, ...]
 ) -> Array:
-    """Derivatives of the contact point with respect to three signals.
-
-    Parameters
-    ----------
-    discretization : Discretization
-        Rod, with its units.
-    values : (n, 6) array
-        Base force and contact point, non-dimensional.
-    tangents : (n, 6, 3) array
-        Derivatives of those with respect to (s, f_y, f_z).
-    names : tuple of str
-        Three signals.
-
-    Returns
-    -------
-    (n, 3, 3) array
-        Derivatives ∂p/∂T, SI units; NaN where they are singular.
-    """
+    """Derivatives of the contact point with respect to three signals."""
     d = discretization
     which = [SIGNALS.index(name) for name in names]
     with np.errstate(all="ignore"):
@@ -99,18 +82,7 @@ def _row_sizes(values: Array, tangents: Array) -> Array:
 
 
 def spherical_derivatives(points: Array) -> Array:
-    """Derivatives ∂(r, θ, φ)/∂(x, y, z) of points; NaN on the z axis.
-
-    Parameters
-    ----------
-    points : (..., 3) array
-        Points, m.
-
-    Returns
-    -------
-    (..., 3, 3) array
-        Derivatives, 1 and rad/m.
-    """
+    """Derivatives ∂(r, θ, φ)/∂(x, y, z) of points; NaN on the z axis."""
     x, y, z = np.moveaxis(points, -1, 0)
     across = np.hypot(x, y)
     r = np.hypot(across, z)
@@ -139,24 +111,7 @@ def determining(contact_map: ChartedWhisker, names: tuple[str, ...]) -> bool:
 def deficient(
     contact_map: ChartedWhisker, names: tuple[str, ...], xi: Array, span: Array
 ) -> int | None:
-    """Steps along the whisker with which signals have lost a dimension at contacts; None if not.
-
-    Parameters
-    ----------
-    contact_map : ContactMap
-        Map of the whisker's contacts; more integration steps are tried where rounding hides a loss.
-    names : tuple of str
-        Signals, three or more.
-    xi : (n, 3) array
-        Contacts (s, f_y, f_z), non-dimensional.
-    span : (k,) array
-        Range of each signal, which derivatives are compared with; a turn for directions.
-
-    Returns
-    -------
-    int or None
-        Number of steps, or None where the signals keep three dimensions.
-    """
+    """Steps along the whisker with which signals have lost a dimension at contacts; None if not."""
     # A signal without a range is zero everywhere, but for rounding.
     weight = np.where(span > RANK, 1.0 / np.maximum(span, RANK), 0.0)
     strength = fold_forces(contact_map.chart.fold, xi)

@@ -163,27 +163,7 @@ def common_errors(
     gain_sigma: float | ArrayLike = 0.0,
     mixing_sigma: float | ArrayLike = 0.0,
 ) -> Array:
-    """Errors that all measurements of force and moment share.
-
-    Parameters
-    ----------
-    stiffness_sigma : float
-        Relative standard deviation of the whisker's bending stiffness.
-    gain_sigma : float or (6,) array_like
-        Relative standard deviation of the sensor's gains, of all components or each.
-    mixing_sigma : float or (6, 6) array_like
-        Standard deviations of the cross-talk between components.
-
-    Returns
-    -------
-    (n, 6, 7) array
-        Matrices E; a measured wrench has the error Σ ε E (F, M, 1) with ε of standard deviation 1.
-
-    Raises
-    ------
-    ValueError
-        If a standard deviation is negative or has another shape.
-    """
+    """Errors that all measurements of force and moment share."""
     for name, sigma, shape in (("gain", gain_sigma, (6,)), ("mixing", mixing_sigma, (6, 6))):
         given = np.asarray(sigma, dtype=np.float64)
         if given.shape not in ((), shape) or not (np.isfinite(given) & (given >= 0.0)).all():
@@ -218,22 +198,7 @@ def common_channels(errors: Array, gradients: Array, wrenches: Array) -> Array:
 
 
 def common_covariance(errors: Array, gradients: Array, wrenches: Array) -> Array:
-    """Covariance that shared errors add to channels.
-
-    Parameters
-    ----------
-    errors : (n, 6, 7) array
-        Errors, as of `common_errors`.
-    gradients : (..., k, 6) array
-        Derivatives of the channels with respect to (F, M).
-    wrenches : (m, 6) array
-        Measured (F, M).
-
-    Returns
-    -------
-    (m, k, k) array
-        Covariances.
-    """
+    """Covariance that shared errors add to channels."""
     changed = common_channels(errors, gradients, wrenches)
     return np.asarray(changed @ np.swapaxes(changed, -1, -2))
 
@@ -302,18 +267,7 @@ def ellipsoids(covariance: Array, dims: tuple[str, ...], shape: tuple[int, ...])
 
 
 def rms_error(covariance: Array) -> Array:
-    """Root mean square distance that covariances predict.
-
-    Parameters
-    ----------
-    covariance : (..., 3, 3) array
-        Covariances of contact points, m².
-
-    Returns
-    -------
-    (...) array
-        Distances, m.
-    """
+    """Root mean square distance that covariances predict."""
     return np.asarray(np.sqrt(np.trace(covariance, axis1=-2, axis2=-1)))
 
 
@@ -327,18 +281,7 @@ def trusted(wrenches: Array) -> Array:
 
 
 def whitening(covariance: Array) -> Array:
-    """Weights W with WᵀW = Σ⁻¹, see the module; zero where Σ is not finite.
-
-    Parameters
-    ----------
-    covariance : (..., k, k) array
-        Covariances Σ.
-
-    Returns
-    -------
-    (..., k, k) array
-        Weights.
-    """
+    """Weights W with WᵀW = Σ⁻¹, see the module; zero where Σ is not finite."""
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)
     noisy = variance > 0.0
     size = np.sqrt(np.where(noisy, variance, 1.0))

@@ -67,20 +67,7 @@ class Bounds(NamedTuple):
 
 
 def check_signals(values: Array, names: tuple[str, ...]) -> None:
-    """Refuse signals that no sensor in SI units can have measured.
-
-    Parameters
-    ----------
-    values : (..., k) array
-        Measured signals, SI units.
-    names : tuple of str
-        Names of the signals.
-
-    Raises
-    ------
-    ValueError
-        If a size is negative, or an angle is above 2π.
-    """
+    """Refuse signals that no sensor in SI units can have measured."""
     for k, name in enumerate(names):
         if name in ("FT", "MB") and (values[..., k] < 0.0).any():
             raise ValueError(

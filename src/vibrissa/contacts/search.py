@@ -159,26 +159,7 @@ def why_none(
 def signals_at_nodes(
     contact_map: ChartedWhisker, names: tuple[str, ...]
 ) -> tuple[Array, Array, cKDTree, Bounds]:
-    """Return the signals at the nodes of the chart, and what searches among them need.
-
-    Parameters
-    ----------
-    contact_map : ContactMap
-        Map of the whisker's contacts.
-    names : tuple of str
-        Names of the signals.
-
-    Returns
-    -------
-    signals : array (n, k)
-        Signals at the nodes, non-dimensional.
-    ranges : array (k,)
-        Range of each over the map.
-    tree : cKDTree
-        The signals over their ranges.
-    bounds : Bounds
-        Bounds of force and moment over the map.
-    """
+    """Return the signals at the nodes of the chart, and what searches among them need."""
     values = contact_map.chart.values.reshape(-1, 6)
     which = [SIGNALS.index(name) for name in names]
     known = signals_of(values[:, :3], np.cross(values[:, 3:], values[:, :3]))[:, which]

@@ -366,40 +366,7 @@ def estimate_with_weight(
     gravity: Gravity,
     stiffness_sigma: float,
 ) -> Contacts:
-    """Find contacts of a whisker under its weight, as `ContactMap.estimate` does.
-
-    Parameters
-    ----------
-    whisker : Whisker
-        Whisker of known density, without its weight.
-    sagged : ContactMap or None
-        Map of a whisker without weight that has the shape of the resting one; not needed for the
-        wrench.
-    signals : Dataset or mapping
-        Measured signals by name, SI units.
-    using : str or sequence of str
-        Signals to use, or "wrench".
-    noise : mapping or (6, 6) array_like or None
-        Standard deviation of each signal, or covariance of (F, M), SI units.
-    errors : (n, 6, 7) array
-        Errors that all measurements share, as of `common_errors`.
-    prior : Prior or None
-        Possible contacts.
-    gravity : Gravity
-        Gravity, tare, and how well direction and density are known.
-    stiffness_sigma : float
-        Relative standard deviation of the bending stiffness, which weight is compared with.
-
-    Returns
-    -------
-    Contacts
-        One contact for each measurement; ``force`` and ``moment`` are those of the contact alone.
-
-    Raises
-    ------
-    ValueError
-        If signals, noise, gravity or density do not fit.
-    """
+    """Find contacts of a whisker under its weight, as `ContactMap.estimate` does."""
     names = WRENCH if using == "wrench" else selection(using)
     sensor = sensor_noise(noise, names, errors)
     if sensor is None and (gravity.direction_sigma or gravity.density_sigma):

@@ -5,7 +5,7 @@ from vibrissa.identifiability.sensitivity import best_triplet, sensitivity
 from vibrissa.identifiability.summary import (
     ENDINGS,
     save_uniqueness,
-    verdict_rows,
+    verdict_rows as verdict_rows,
     verdict_table,
 )
 from vibrissa.identifiability.verdicts import uniqueness
@@ -18,7 +18,6 @@ __all__ = [
     "save_uniqueness",
     "sensitivity",
     "uniqueness",
-    "verdict_rows",
     "verdict_table",
     "witness_pairs",
 ]

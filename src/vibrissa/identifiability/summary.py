@@ -86,20 +86,7 @@ def verdict_table(verdicts: xr.Dataset) -> str:
 
 
 def verdict_rows(verdicts: xr.Dataset) -> tuple[list[list[str]], list[str]]:
-    """Arrange verdicts as the cells of a table.
-
-    Parameters
-    ----------
-    verdicts : Dataset
-        Verdicts of :func:`vibrissa.uniqueness`.
-
-    Returns
-    -------
-    rows : list of list of str
-        Cells, row by row, the header first.
-    notes : list of str
-        Sentences needed to read them.
-    """
+    """Arrange verdicts as the cells of a table."""
     regions = [str(r) for r in verdicts.region.to_numpy()]
     rows = [["triplet", *regions, "in short", "twins"]]
     for triplet in verdicts.triplet.to_numpy():

@@ -1,4 +1,4 @@
-"""Support for compiled kernels: array types, compilation, threads, small linear systems.
+"""Support for compiled kernels: array types, compilation, threads as threads, small linear systems.
 
 What needs Numba or xarray is imported when it is first used, so that array types cost nothing.
 """
@@ -9,43 +9,36 @@ import importlib
 from typing import TYPE_CHECKING
 
 from vibrissa.numerics.arrays import AnyArray, Array, IntArray, Vector
-from vibrissa.numerics.threads import share_out, threads
+from vibrissa.numerics.threads import share_out as share_out, threads as threads
 
 if TYPE_CHECKING:
-    from vibrissa.numerics.algebra import cholesky, norm3, solve, solve3, wrapped
+    from vibrissa.numerics.algebra import (
+        cholesky,
+        norm3 as norm3,
+        solve,
+        solve3 as solve3,
+        wrapped as wrapped,
+    )
     from vibrissa.numerics.compiled import (
         copy,
-        inlined,
-        inlined_rigorous,
-        kernel,
-        rigorous,
-        specialised,
+        inlined as inlined,
+        inlined_rigorous as inlined_rigorous,
+        kernel as kernel,
+        rigorous as rigorous,
+        specialised as specialised,
     )
-    from vibrissa.numerics.device import Translation, check_device
-    from vibrissa.numerics.quantiles import contact_weights, weighted_quantile
+    from vibrissa.numerics.device import Translation as Translation, check_device as check_device
+    from vibrissa.numerics.quantiles import contact_weights as contact_weights, weighted_quantile
 
 __all__ = [
     "AnyArray",
     "Array",
     "IntArray",
-    "Translation",
     "Vector",
-    "check_device",
     "cholesky",
-    "contact_weights",
     "copy",
-    "inlined",
-    "inlined_rigorous",
-    "kernel",
-    "norm3",
-    "rigorous",
-    "share_out",
     "solve",
-    "solve3",
-    "specialised",
-    "threads",
     "weighted_quantile",
-    "wrapped",
 ]
 
 _HOMES = {

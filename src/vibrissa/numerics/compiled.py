@@ -45,36 +45,14 @@ class _Inlined(CPUDispatcher):
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a function that Python calls; cached on disk, releases the GIL.
-
-    Parameters
-    ----------
-    function : callable
-        Function in Numba's subset of Python.
-
-    Returns
-    -------
-    callable
-        Compiled function.
-    """
+    """Compile a function that Python calls; cached on disk, releases the GIL."""
     compiled: Any = specialised(function)
     compiled.__class__ = _Kernel
     return cast("Callable[P, R]", compiled)
 
 
 def specialised(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a kernel anew for each constant that others call it with, so that it is faster.
-
-    Parameters
-    ----------
-    function : callable
-        Function in Numba's subset of Python.
-
-    Returns
-    -------
-    callable
-        Compiled function.
-    """
+    """Compile a kernel anew for each constant that others call it with, so that it is faster."""
     compiled = numba.njit(**_OPTIONS)(function)
     with suppress(RuntimeError):  # numba finds no folder that it may write to
         compiled._cache = PackageCache(function)
@@ -82,18 +60,7 @@ def specialised(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def inlined(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a small function into its callers, so that their lane loops still vectorise.
-
-    Parameters
-    ----------
-    function : callable
-        Function in Numba's subset of Python.
-
-    Returns
-    -------
-    callable
-        Function that only kernels can call.
-    """
+    """Compile a small function into its callers, so that their lane loops still vectorise."""
     compiled: Any = numba.njit(**_OPTIONS | {"forceinline": True, "no_cpython_wrapper": True})(
         function
     )
@@ -102,18 +69,7 @@ def inlined(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def rigorous(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a function whose rounding is that of IEEE 754, operation by operation.
-
-    Parameters
-    ----------
-    function : callable
-        Function in Numba's subset of Python.
-
-    Returns
-    -------
-    callable
-        Compiled function.
-    """
+    """Compile a function whose rounding is that of IEEE 754, operation by operation."""
     compiled = numba.njit(**_STRICT)(function)
     with suppress(RuntimeError):
         compiled._cache = PackageCache(function)
@@ -121,18 +77,7 @@ def rigorous(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def inlined_rigorous(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a small function into its callers as :func:`rigorous` ones are compiled.
-
-    Parameters
-    ----------
-    function : callable
-        Function in Numba's subset of Python.
-
-    Returns
-    -------
-    callable
-        Function that only kernels can call.
-    """
+    """Compile a small function into its callers as :func:`rigorous` ones are compiled."""
     compiled: Any = numba.njit(**_STRICT | {"no_cpython_wrapper": True})(function)
     compiled.__class__ = _Inlined
     return cast("Callable[P, R]", compiled)

@@ -30,22 +30,7 @@ _ROUNDING = ("exp", "floor", "rint", "sqrt")
 
 
 def check_device(device: str) -> None:
-    """Raise unless kernels can run on a device.
-
-    Parameters
-    ----------
-    device : str
-        Name of the device, "cpu" or "cuda".
-
-    Raises
-    ------
-    ValueError
-        If the name is another.
-    ImportError
-        If the extra ``gpu`` is not installed.
-    RuntimeError
-        If there is no GPU.
-    """
+    """Raise unless kernels can run on a device."""
     if device not in ("cpu", "cuda"):
         raise ValueError(f"device is {device!r}; it must be 'cpu' or 'cuda'")
     if device == "cpu":
@@ -86,17 +71,7 @@ class Translation:
         inputs: tuple[AnyArray, ...],
         outputs: tuple[AnyArray, ...],
     ) -> None:
-        """Run a row kernel over all rows.
-
-        Parameters
-        ----------
-        kernel : callable
-            Row kernel of the CPU.
-        tables : tuple
-            Arrays, numbers and named tuples of them that all rows share.
-        inputs, outputs : tuple of (n, ...) array
-            What each row has and what it fills; an array without rows is passed on as it is.
-        """
+        """Run a row kernel over all rows."""
         from numba import cuda
 
         if kernel not in self._launchers:
@@ -114,15 +89,7 @@ class Translation:
 
     @staticmethod
     def launch(configured: Any, *args: Any) -> None:
-        """Launch a compiled kernel; benchmarks measure the GPU here.
-
-        Parameters
-        ----------
-        configured : callable
-            Compiled kernel with its blocks and threads.
-        *args : Any
-            Its arguments, on the GPU.
-        """
+        """Launch a compiled kernel; benchmarks measure the GPU here."""
         configured(*args)
 
     def _translated(self, function: Any) -> Any:

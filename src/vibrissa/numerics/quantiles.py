@@ -9,21 +9,7 @@ from vibrissa.numerics.arrays import AnyArray, Array
 
 
 def contact_weights(data: xr.Dataset, region: xr.DataArray | None = None) -> Array:
-    """Volumes that contacts of a region stand for, as one row.
-
-    Parameters
-    ----------
-    data : Dataset
-        Contacts with ``status``, ``r`` and ``small_deflection``, and ``volume`` where they are
-        nodes of unequal cells.
-    region : DataArray, optional
-        Truth value of each contact's membership; without it the small deflections are left out.
-
-    Returns
-    -------
-    (n,) array
-        Weights, 0 outside the region and where there is no contact.
-    """
+    """Volumes that contacts of a region stand for, as one row."""
     kept = ~data["small_deflection"] if region is None else region.broadcast_like(data["status"])
     kept = kept.transpose(*data["status"].dims).astype(bool) & np.isfinite(data["r"])
     size = data["volume"] if "volume" in data else xr.ones_like(data["r"])

@@ -21,13 +21,7 @@ def _pool(process: int) -> ThreadPoolExecutor:
 
 
 def threads() -> int:
-    """Return the number of cores that this process may use; ``VIBRISSA_THREADS`` overrides it.
-
-    Returns
-    -------
-    int
-        Number of threads, at least 1.
-    """
+    """Return the number of cores that this process may use; ``VIBRISSA_THREADS`` overrides it."""
     wanted = os.environ.get("VIBRISSA_THREADS")
     if wanted is not None:
         return max(1, int(wanted))
@@ -35,15 +29,7 @@ def threads() -> int:
 
 
 def share_out(rows: int, work: Callable[[int, int], object]) -> None:
-    """Call ``work(first, last)`` for pieces that cover all rows, on all cores.
-
-    Parameters
-    ----------
-    rows : int
-        Number of rows.
-    work : callable
-        Function of the first row and the row after the last; releases the GIL.
-    """
+    """Call ``work(first, last)`` for pieces that cover all rows, on all cores."""
     if rows <= _SERIAL or threads() == 1:
         if rows:
             work(0, rows)

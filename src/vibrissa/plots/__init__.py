@@ -2,20 +2,27 @@
 
 from vibrissa.plots.array import array_views
 from vibrissa.plots.bent import bent_views, witness_pair
-from vibrissa.plots.cameras import Sight, start_views
+from vibrissa.plots.cameras import Sight, start_views as start_views
 from vibrissa.plots.contact_surfaces import contact_surfaces
 from vibrissa.plots.contacts import contact_places
 from vibrissa.plots.contour import contour_views, distances_by_class
-from vibrissa.plots.correction import correct
+from vibrissa.plots.correction import correct as correct
 from vibrissa.plots.estimates import estimated_against_true
 from vibrissa.plots.movies import contour_frames, signal_frames
 from vibrissa.plots.overview import key_frames, trial_overview
 from vibrissa.plots.sensitivity import sensitivity_panels
 from vibrissa.plots.signal_space import signal_clouds
-from vibrissa.plots.signals import signals_over_time
+from vibrissa.plots.signals import signals_over_time as signals_over_time
 from vibrissa.plots.slices import solid_slices
-from vibrissa.plots.style import cyclic, diverging, looking, png, save, sequential
-from vibrissa.plots.sweep import drawable, sweep_overview
+from vibrissa.plots.style import (
+    cyclic as cyclic,
+    diverging as diverging,
+    looking,
+    png,
+    save,
+    sequential,
+)
+from vibrissa.plots.sweep import drawable as drawable, sweep_overview as sweep_overview
 from vibrissa.plots.verdicts import HIGHLIGHTED, critical_cones, resolution, verdict_table
 from vibrissa.plots.whisker import whisker_views
 
@@ -28,12 +35,8 @@ __all__ = [
     "contact_surfaces",
     "contour_frames",
     "contour_views",
-    "correct",
     "critical_cones",
-    "cyclic",
     "distances_by_class",
-    "diverging",
-    "drawable",
     "estimated_against_true",
     "key_frames",
     "looking",
@@ -44,10 +47,7 @@ __all__ = [
     "sequential",
     "signal_clouds",
     "signal_frames",
-    "signals_over_time",
     "solid_slices",
-    "start_views",
-    "sweep_overview",
     "trial_overview",
     "verdict_table",
     "whisker_views",

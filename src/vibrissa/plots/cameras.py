@@ -167,27 +167,7 @@ def start_views(
     confidence: float,
     remarks: Sequence[str] = (),
 ) -> Figure:
-    """Draw the line that is taken for the whisker into an image of each view.
-
-    Parameters
-    ----------
-    images : sequence of array (height, width)
-        8 bit grey images, one for each view, of the same moment.
-    lines : sequence of array_like (n, 2)
-        Column and row from base to tip in each view; empty where nothing was found.
-    names : sequence of str
-        Names of the views.
-    confidence : float
-        Confidence in the line, 0 to 1.
-    remarks : sequence of str
-        Sentences that are written below the images, such as what there is to doubt.
-
-    Returns
-    -------
-    Figure
-        One panel for each view, in pixels of the image; the line is green if nothing is in doubt,
-        else orange, and its base is circled.
-    """
+    """Draw the line that is taken for the whisker into an image of each view."""
     wide = (page_width("double") - _GAP * (len(images) - 1)) / len(images)
     heights = [wide * image.shape[0] / image.shape[1] for image in images]
     below = _LINE * len(remarks) + _GAP

@@ -241,31 +241,7 @@ def correct(
     traces: Mapping[Key, ArrayLike] | None = None,
     save: Save | None = None,
 ) -> dict[Key, Array]:
-    """Open a window to correct traces in, and wait until it is closed.
-
-    Parameters
-    ----------
-    frames : sequence of array (height, width)
-        Frames by number, 8 bit grey, such as a list or `vibrissa.io.FrameReader`.
-    count : int
-        Number of frames.
-    corrections : mapping of (int, int) to array_like (n, 2), optional
-        Corrected points by frame and whisker, columns and rows from base to tip, pixels.
-    traces : mapping of (int, int) to array_like (n, 2), optional
-        Traces by frame and whisker, which are shown for comparison.
-    save : callable, optional
-        Function that is called with all corrections whenever they are to be saved.
-
-    Returns
-    -------
-    dict of (int, int) to array (n, 2)
-        All corrections with at least two points, by frame and whisker.
-
-    Raises
-    ------
-    ValueError
-        If there is no screen for a window, or there are no frames.
-    """
+    """Open a window to correct traces in, and wait until it is closed."""
     import matplotlib as mpl
     import matplotlib.pyplot as plt
 

@@ -27,31 +27,7 @@ def signals_over_time(
     whisker: int = 0,
     width: Width = "double",
 ) -> Figure:
-    """Draw the six signals over time, forces on the left and moments on the right.
-
-    Parameters
-    ----------
-    signals : Dataset
-        ``time`` (s) and any of Fx, FT, FD, Mx, MB, MD, SI units, over ``time`` or over ``time`` and
-        ``whisker``. Where ``in_contact`` is known, contact is shaded, and directions are drawn in
-        contact only, since they mean nothing without a force. NaN leaves a gap.
-    truth : Dataset, optional
-        The same at the same times, as it truly is: drawn over it in black.
-    whisker : int
-        Which, where there are several.
-    width : {"single", "double"}
-        Columns of the page.
-
-    Returns
-    -------
-    Figure
-        Six axes that share their time axis, in s and display units; or the sentence "no signals".
-
-    Raises
-    ------
-    ValueError
-        If the dataset has none of the signals; the message states how to make them.
-    """
+    """Draw the six signals over time, forces on the left and moments on the right."""
     names = [name for column in _COLUMNS for name in column]
     if "time" not in signals.coords or not any(name in signals for name in names):
         raise ValueError(

@@ -311,13 +311,7 @@ def _srgb(lab: Array) -> Array:
 
 
 def cyclic() -> Colormap:
-    """Make a colormap for directions over one turn, from −π to π.
-
-    Returns
-    -------
-    Colormap
-        Colours from the lowest to the highest value.
-    """
+    """Make a colormap for directions over one turn, from −π to π."""
     quarters = np.arange(len(_QUARTERS) + 1)
     curve = CubicSpline(quarters, np.vstack([_QUARTERS, _QUARTERS[:1]]), bc_type="periodic")
     fine = np.linspace(0.0, quarters[-1], 2001)
@@ -343,13 +337,7 @@ def sequential() -> Colormap:
 
 
 def diverging() -> Colormap:
-    """Make a colormap for what has a sign.
-
-    Returns
-    -------
-    Colormap
-        Colours from the lowest to the highest value.
-    """
+    """Make a colormap for what has a sign."""
     return mpl.colormaps["coolwarm"]
 
 

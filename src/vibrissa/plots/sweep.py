@@ -57,28 +57,6 @@ def sweep_overview(
     cones by group of whiskers; of more than three triplets the critical cones only, a line for
     each triplet. Of errors: a line for each set of signals or friction coefficient. The shape of a
     mark is the verdict.
-
-    Parameters
-    ----------
-    found : Dataset
-        As of ``vibrissa.sweeps.open_sweep``: over ``whisker``, with the names of tasks in ``task``,
-        ``group``, ``taper_ratio`` and ``turn`` (what the tangent turns by from base to tip, rad),
-        and either ``TASK_verdict`` and ``TASK_critical_cone`` (rad) over triplet and region, of
-        which the first is drawn, or ``TASK_median_error`` (m) over one more dimension.
-    task : str, optional
-        Name of the task; by default the first that can be drawn.
-    width : {"single", "double"}
-        Columns of the page.
-
-    Returns
-    -------
-    Figure
-        As described.
-
-    Raises
-    ------
-    ValueError
-        If there are neither verdicts nor errors.
     """
     known = drawable(found)
     if not known or (task is not None and task not in known):
@@ -98,18 +76,7 @@ def sweep_overview(
 
 
 def drawable(found: xr.Dataset) -> list[str]:
-    """Say what of a study can be drawn.
-
-    Parameters
-    ----------
-    found : Dataset
-        As of ``vibrissa.sweeps.open_sweep``.
-
-    Returns
-    -------
-    list of str
-        Names of tasks with verdicts or with errors.
-    """
+    """Say what of a study can be drawn."""
     return [
         task
         for task in map(str, found["task"].values)

@@ -8,46 +8,53 @@ from vibrissa.rod.chart import (
     CELLS,
     LEAST_ARC,
     PROXIMAL,
-    Fold,
-    StableSet,
+    Fold as Fold,
+    StableSet as StableSet,
     along,
-    chart_of,
-    chart_to_contact,
+    chart_of as chart_of,
+    chart_to_contact as chart_to_contact,
     contacts_at,
-    determinant,
+    determinant as determinant,
     fold_force,
     fold_forces,
     stable_set,
-    with_normal_force,
+    with_normal_force as with_normal_force,
 )
 from vibrissa.rod.deflection import Deflection, Load, PegContact, PointContact, PointForce
-from vibrissa.rod.discretization import STEPS, Discretization, Rod, discretize
-from vibrissa.rod.gravity import Resting, Weighted, evaluated, resting
+from vibrissa.rod.discretization import STEPS, Discretization, Rod as Rod, discretize
+from vibrissa.rod.gravity import Resting, Weighted, evaluated as evaluated, resting
 from vibrissa.rod.integration import contact_tangents, evaluate, integrate, solve_forces
 from vibrissa.rod.kernels import (
     BUFFER_SIZE,
     LANES,
-    contact_state,
-    lane_tangents,
-    lane_value,
-    lanes_tangents,
-    set_all_lanes,
-    set_lane,
+    contact_state as contact_state,
+    lane_tangents as lane_tangents,
+    lane_value as lane_value,
+    lanes_tangents as lanes_tangents,
+    set_all_lanes as set_all_lanes,
+    set_lane as set_lane,
 )
 from vibrissa.rod.newton import (
     ROUNDING,
     TOLERANCE,
     newton_group,
-    point_determinant,
+    point_determinant as point_determinant,
     stable,
-    start_from,
+    start_from as start_from,
 )
-from vibrissa.rod.outward import contact_forces, shapes, vanishing_moments
-from vibrissa.rod.points import PointSolver, point_solver
-from vibrissa.rod.search import MOST_CELLS, MOST_SEEDS, cells_around, seeds
+from vibrissa.rod.outward import (
+    contact_forces as contact_forces,
+    shapes as shapes,
+    vanishing_moments as vanishing_moments,
+)
+from vibrissa.rod.points import PointSolver as PointSolver, point_solver as point_solver
+from vibrissa.rod.search import MOST_CELLS, MOST_SEEDS, cells_around as cells_around, seeds
 from vibrissa.rod.statics import deflect
-from vibrissa.rod.surfaces import SurfaceDeflection, follow_surfaces
-from vibrissa.rod.tree import PlaneVector, SearchTree, search_tree
+from vibrissa.rod.surfaces import (
+    SurfaceDeflection as SurfaceDeflection,
+    follow_surfaces as follow_surfaces,
+)
+from vibrissa.rod.tree import PlaneVector as PlaneVector, SearchTree as SearchTree, search_tree
 
 __all__ = [
     "BUFFER_SIZE",
@@ -62,52 +69,26 @@ __all__ = [
     "TOLERANCE",
     "Deflection",
     "Discretization",
-    "Fold",
     "Load",
     "PegContact",
-    "PlaneVector",
     "PointContact",
     "PointForce",
-    "PointSolver",
     "Resting",
-    "Rod",
-    "SearchTree",
-    "StableSet",
-    "SurfaceDeflection",
     "Weighted",
     "along",
-    "cells_around",
-    "chart_of",
-    "chart_to_contact",
-    "contact_forces",
-    "contact_state",
     "contact_tangents",
     "contacts_at",
     "deflect",
-    "determinant",
     "discretize",
     "evaluate",
-    "evaluated",
     "fold_force",
     "fold_forces",
-    "follow_surfaces",
     "integrate",
-    "lane_tangents",
-    "lane_value",
-    "lanes_tangents",
     "newton_group",
-    "point_determinant",
-    "point_solver",
     "resting",
     "search_tree",
     "seeds",
-    "set_all_lanes",
-    "set_lane",
-    "shapes",
     "solve_forces",
     "stable",
     "stable_set",
-    "start_from",
-    "vanishing_moments",
-    "with_normal_force",
 ]

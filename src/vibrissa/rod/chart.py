@@ -106,18 +106,7 @@ class StableSet:
         return float(self.stations[0])
 
     def charted(self, derivatives: Array) -> Array:
-        """Turn derivatives by ξ at the nodes into ones by (η, ψ, ρ).
-
-        Parameters
-        ----------
-        derivatives : (..., n, 3) array
-            Derivatives by ξ at all nodes.
-
-        Returns
-        -------
-        (..., n, 3) array
-            Derivatives by the chart's coordinates.
-        """
+        """Turn derivatives by ξ at the nodes into ones by (η, ψ, ρ)."""
         return np.asarray(np.einsum("...ij,...jk->...ik", derivatives, self.frames))
 
 
@@ -217,34 +206,12 @@ def _nodes_of(
 
 
 def with_normal_force(contacts: Array) -> Array:
-    """ξ = (s, f_y, f_z) as (s, 0, f_y, f_z): a frictionless force is normal to the whisker.
-
-    Parameters
-    ----------
-    contacts : (..., 3) array
-        Contacts ξ.
-
-    Returns
-    -------
-    (..., 4) array
-        Arc length and force.
-    """
+    """ξ = (s, f_y, f_z) as (s, 0, f_y, f_z): a frictionless force is normal to the whisker."""
     return np.insert(contacts, 1, 0.0, axis=-1)
 
 
 def determinant(tangents: Array) -> Array:
-    """Det ∂p/∂ξ: positive at rest, zero at the fold.
-
-    Parameters
-    ----------
-    tangents : (..., 6, 3) array
-        Derivatives of (F, p) by ξ.
-
-    Returns
-    -------
-    (...) array
-        Determinants, non-dimensional.
-    """
+    """Det ∂p/∂ξ: positive at rest, zero at the fold."""
     a, b, c = (tangents[..., 3:, j] for j in range(3))
     return np.asarray(np.einsum("...i,...i->...", a, np.cross(b, c)))
 
@@ -396,20 +363,7 @@ def _contacts_at(fold: Fold, chart: Array, contacts: Array) -> None:
 
 
 def chart_of(fold: Fold, contacts: Array) -> Array:
-    """Turn contacts into chart coordinates.
-
-    Parameters
-    ----------
-    fold : Fold
-        Fold force over the chart.
-    contacts : (n, 3) array
-        Contacts ξ.
-
-    Returns
-    -------
-    (n, 3) array
-        Coordinates (η, ψ, ρ).
-    """
+    """Turn contacts into chart coordinates."""
     chart = np.empty((len(contacts), 3))
     _chart_of(fold, np.ascontiguousarray(contacts), chart)
     return chart

@@ -331,24 +331,7 @@ def _stands(d: Discretization, solved: Weighted) -> bool:
 def evaluated(
     d: Discretization, contacts: Array, leans: Array | None = None, tangents: bool = False
 ) -> Weighted:
-    """Solve contacts of a rod with weight, (s, f) being known.
-
-    Parameters
-    ----------
-    d : Discretization
-        Rod with weight.
-    contacts : (n, 4) array
-        Arc length and force in the material frame there, (s, f_x, f_y, f_z).
-    leans : (n, 3) array, optional
-        Directions of weight at the tip to begin with; by default those of the resting whisker.
-    tangents : bool
-        Whether derivatives are wanted.
-
-    Returns
-    -------
-    Weighted
-        Base values and derivatives; NaN where there is no solution.
-    """
+    """Solve contacts of a rod with weight, (s, f) being known."""
     rod, n = d.rod, len(contacts)
     weight = rod.weight
     assert weight is not None

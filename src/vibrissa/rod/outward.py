@@ -246,24 +246,7 @@ def _vanishing_moments(
 
 
 def shapes(discretization: Discretization, values: Array, arc: Array, s: Array) -> Array:
-    """Centrelines of deflected whiskers, non-dimensional.
-
-    Parameters
-    ----------
-    discretization : Discretization
-        Rod.
-    values : (n, 6) array
-        Base force and contact point (F, p) of each whisker.
-    arc : (n,) array
-        Arc length of each contact, over L.
-    s : (m,) array
-        Arc lengths of the wanted points, over L, increasing.
-
-    Returns
-    -------
-    (n, m, 3) array
-        Points over L, whisker frame; NaN where a row has no values.
-    """
+    """Centrelines of deflected whiskers, non-dimensional."""
     places = np.full((len(values), s.size, 3), np.nan)
     rows = np.flatnonzero(np.isfinite(values).all(axis=1) & np.isfinite(arc))
     kept, where = np.ascontiguousarray(values[rows]), np.ascontiguousarray(arc[rows])
@@ -275,22 +258,7 @@ def shapes(discretization: Discretization, values: Array, arc: Array, s: Array) 
 
 
 def contact_forces(discretization: Discretization, values: Array, arc: Array) -> Array:
-    """Forces in the material frame at contacts whose base force and contact point are known.
-
-    Parameters
-    ----------
-    discretization : Discretization
-        Rod.
-    values : (n, 6) array
-        Base force and contact point (F, p), non-dimensional.
-    arc : (n,) array
-        Arc length of each contact, over L.
-
-    Returns
-    -------
-    (n, 3) array
-        Forces (f_x, f_y, f_z), non-dimensional; NaN where a row has no values.
-    """
+    """Forces in the material frame at contacts whose base force and contact point are known."""
     forces = np.full((len(values), 3), np.nan)
     rows = np.flatnonzero(np.isfinite(values).all(axis=1) & np.isfinite(arc))
     at_contact = np.empty((rows.size, 3))
@@ -302,24 +270,7 @@ def contact_forces(discretization: Discretization, values: Array, arc: Array) ->
 def vanishing_moments(
     discretization: Discretization, wrenches: Array, least: float
 ) -> tuple[IntArray, Array]:
-    """Find where the moment in the whisker comes nearest to zero, for known base wrenches.
-
-    Parameters
-    ----------
-    discretization : Discretization
-        Rod.
-    wrenches : (n, 6) array
-        Base force and moment, non-dimensional.
-    least : float
-        Smallest arc length of a contact, over L.
-
-    Returns
-    -------
-    count : (n,) int array
-        Number of contacts found.
-    contacts : (n, MOST_PLACES, 4) array
-        Arc length and force in the material frame of each; NaN beyond the count.
-    """
+    """Find where the moment in the whisker comes nearest to zero, for known base wrenches."""
     count = np.zeros(len(wrenches), np.int64)
     contacts = np.full((len(wrenches), MOST_PLACES, 4), np.nan)
     rod, wrenches = discretization.rod, np.ascontiguousarray(wrenches)

@@ -307,20 +307,7 @@ class PointSolver:
         )
 
     def solve(self, points: Array, device: str = "cpu") -> Solutions:
-        """Find the contact of least force that holds the whisker at each point.
-
-        Parameters
-        ----------
-        points : (n, 3) array
-            Contact points over L, whisker frame; NaN means missing.
-        device : str
-            Device that solves them, "cpu" or "cuda"; the few in doubt are left to the CPU.
-
-        Returns
-        -------
-        Solutions
-            Contacts, base force and contact point, residual and status of each point.
-        """
+        """Find the contact of least force that holds the whisker at each point."""
         n = len(points)
         out = Solutions.empty(n)
         contacts, values, misfits, statuses = out
@@ -448,20 +435,5 @@ def follow_all(
 
 @lru_cache(maxsize=16)
 def point_solver(whisker: Bendable, proximal: float, steps: int) -> PointSolver:
-    """Return the point solver of a whisker, made on first use.
-
-    Parameters
-    ----------
-    whisker : Bendable
-        Whisker to be bent.
-    proximal : float
-        Smallest arc length of a contact, over L.
-    steps : int
-        Number of integration steps along the whisker.
-
-    Returns
-    -------
-    PointSolver
-        Solver of contact points.
-    """
+    """Return the point solver of a whisker, made on first use."""
     return PointSolver(stable_set(whisker, proximal=proximal, steps=steps))

@@ -106,37 +106,7 @@ def follow_surfaces(
     steps: int = STEPS,
     progress: Progress | None = None,
 ) -> SurfaceDeflection:
-    """Carry a whisker past surfaces, quasi-statically.
-
-    Parameters
-    ----------
-    whisker : Whisker
-        Whisker that is carried.
-    surfaces : sequence of Surface
-        Surfaces in the laboratory frame.
-    rotations : (n, 3, 3) array
-        Rotations from the whisker frame to the laboratory frame.
-    positions : (n, 3) array
-        Base positions in the laboratory frame, m.
-    friction : float
-        Coulomb's coefficient of friction.
-    proximal : float
-        Smallest arc length of a contact, over L; nearer ones get a status.
-    steps : int
-        Number of integration steps along the whisker.
-    progress : callable, optional
-        Function of the placements done and of all, called after each.
-
-    Returns
-    -------
-    SurfaceDeflection
-        Deflection and contact at each placement.
-
-    Raises
-    ------
-    ValueError
-        If ``friction`` is negative or not finite.
-    """
+    """Carry a whisker past surfaces, quasi-statically."""
     if not (np.isfinite(friction) and friction >= 0.0):
         raise ValueError(f"friction is {friction!r}; a coefficient from 0 on is needed")
     follower = _Follower(whisker, surfaces, friction, steps)

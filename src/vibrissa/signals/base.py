@@ -66,28 +66,7 @@ def base_signals(force: ArrayLike | xr.DataArray, moment: ArrayLike | xr.DataArr
 def labelled_wrench(
     force: ArrayLike | xr.DataArray, moment: ArrayLike | xr.DataArray
 ) -> tuple[Array, Array, tuple[str, ...], Coordinates]:
-    """Force and moment as arrays of one shape, and what their leading dimensions are called.
-
-    Parameters
-    ----------
-    force, moment : array_like or DataArray
-        Vectors of shape (..., 3). Two DataArrays are matched by the names of their dimensions and
-        must agree in their coordinates; other arrays are matched by position.
-
-    Returns
-    -------
-    force, moment : (..., 3) arrays
-        Components in the units given.
-    dims : tuple of str
-        Names of the leading dimensions.
-    coords : dict
-        Coordinates along them.
-
-    Raises
-    ------
-    ValueError
-        If the last dimension is not of size 3, or shapes or coordinates differ.
-    """
+    """Force and moment as arrays of one shape, and what their leading dimensions are called."""
     vectors = [_by_space(force), _by_space(moment)]
     labels = [a for a in vectors if isinstance(a, xr.DataArray)]
     if len(labels) == 2:
@@ -161,18 +140,7 @@ def signals_of(force: Array, moment: Array) -> Array:
 
 
 def wrench_derivatives(force: Array, moment: Array) -> Array:
-    """Derivatives of the six signals by force and moment.
-
-    Parameters
-    ----------
-    force, moment : (..., 3) array
-        Base force and moment in the whisker frame, any unit.
-
-    Returns
-    -------
-    (..., 6, 6) array
-        Derivatives by (F, M); not finite where a direction has no meaning.
-    """
+    """Derivatives of the six signals by force and moment."""
     out = np.zeros((*force.shape[:-1], 6, 6))
     for first, vector in ((0, force), (3, moment)):
         y, z = vector[..., 1], vector[..., 2]
@@ -251,54 +219,17 @@ def _number(value: ArrayLike, names: tuple[str, ...], given: list[ArrayLike]) ->
 
 
 def circular_among(names: tuple[str, ...]) -> AnyArray:
-    """Mark the signals that are directions.
-
-    Parameters
-    ----------
-    names : tuple of str
-        Names of the signals.
-
-    Returns
-    -------
-    (n,) bool array
-        True for directions.
-    """
+    """Mark the signals that are directions."""
     return np.array([CIRCULAR[SIGNALS.index(name)] for name in names])
 
 
 def within_turn(signals: Array, circular: ArrayLike) -> Array:
-    """Bring directions, or differences of directions, into (−π, π].
-
-    Parameters
-    ----------
-    signals : (..., n) array
-        Signals or differences; directions in rad.
-    circular : (n,) bool array_like
-        True for the directions.
-
-    Returns
-    -------
-    (..., n) array
-        Signals with directions within a turn, the others as they are.
-    """
+    """Bring directions, or differences of directions, into (−π, π]."""
     return np.where(circular, np.pi - (np.pi - signals) % (2.0 * np.pi), signals)
 
 
 def signal_scales(names: tuple[str, ...], force: float, moment: float) -> Array:
-    """Units of signals.
-
-    Parameters
-    ----------
-    names : tuple of str
-        Names of signals, or of components of force and moment.
-    force, moment : float
-        Unit of force, N, and of moment, N·m.
-
-    Returns
-    -------
-    (k,) array
-        Unit of each signal; 1 for directions.
-    """
+    """Units of signals."""
     scales = dict.fromkeys(("Fx", "Fy", "Fz", "FT"), force)
     scales |= dict.fromkeys(("Mx", "My", "Mz", "MB"), moment)
     return np.array([scales.get(name, 1.0) for name in names])
@@ -382,20 +313,7 @@ def signal_equations(
 
 
 def signal_derivatives(values: Array, tangents: Array) -> Array:
-    """Derivatives of the six signals by the contact.
-
-    Parameters
-    ----------
-    values : (..., 6) array
-        Base force and contact point (F, p).
-    tangents : (..., 6, k) array
-        Their derivatives by k unknowns.
-
-    Returns
-    -------
-    (..., 6, k) array
-        Derivatives of the signals by the unknowns; not finite where a direction has no meaning.
-    """
+    """Derivatives of the six signals by the contact."""
     force, point = values[..., :3], values[..., 3:]
     d_force, d_point = tangents[..., :3, :], tangents[..., 3:, :]
     d_moment = np.cross(d_point, force[..., None], axis=-2) + np.cross(

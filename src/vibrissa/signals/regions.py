@@ -89,22 +89,7 @@ def nearest_on_rest(whisker: Whisker, points: Array) -> tuple[Array, Array]:
 
 
 def in_region(region: str, backward: AnyArray, large: AnyArray) -> AnyArray:
-    """Whether contacts belong to a region.
-
-    Parameters
-    ----------
-    region : str
-        Name among :data:`REGIONS`.
-    backward : (...) bool array
-        Whether they are concave backward; see :func:`concave_backward`.
-    large : (...) bool array
-        Whether their deflection is large.
-
-    Returns
-    -------
-    (...) bool array
-        True for those in the region.
-    """
+    """Whether contacts belong to a region."""
     if region not in REGIONS:
         raise ValueError(f"a region is one of {', '.join(REGIONS)}; got {region!r}")
     inside = np.ones(np.shape(backward), dtype=bool)
@@ -118,21 +103,7 @@ def in_region(region: str, backward: AnyArray, large: AnyArray) -> AnyArray:
 
 
 def cone_angle(whisker: Whisker, points: Array) -> Array:
-    """Half angle of the cone about the resting whisker on which contact points lie.
-
-    Parameters
-    ----------
-    whisker : Whisker
-        Whisker at rest.
-    points : (..., 3) array
-        Contact points in the whisker frame, m.
-
-    Returns
-    -------
-    (...) array
-        The angle whose tangent is the distance from the resting whisker over the arc length of the
-        nearest place on it, rad; NaN for NaN.
-    """
+    """Half angle of the cone about the resting whisker on which contact points lie."""
     return np.asarray(np.arctan2(*nearest_on_rest(whisker, points)))
 
 
@@ -157,20 +128,7 @@ def within_cone(whisker: Whisker, points: Array, angle: float = CONE) -> AnyArra
 
 
 def concave_backward(whisker: Whisker, points: Array) -> AnyArray:
-    """Whether contacts have moved toward +y of the resting whisker at the same r: CB, not CF.
-
-    Parameters
-    ----------
-    whisker : Whisker
-        Whisker at rest; of a straight one the sign of y itself decides.
-    points : (..., 3) array
-        Contact points in the whisker frame, m.
-
-    Returns
-    -------
-    (...) bool array
-        True for CB, False for CF (and for NaN).
-    """
+    """Whether contacts have moved toward +y of the resting whisker at the same r: CB, not CF."""
     points = np.asarray(points, dtype=np.float64)
     y = points[..., 1]
     if whisker.is_straight:

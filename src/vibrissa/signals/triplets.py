@@ -14,27 +14,7 @@ TRIPLETS = tuple(combinations(SIGNALS, 3))
 def selection(
     signals: str | Sequence[str], least: int = 3, exactly: int | None = None
 ) -> tuple[str, ...]:
-    """Read a choice of signals.
-
-    Parameters
-    ----------
-    signals : str or sequence of str
-        Names, or one text with names between commas or blanks: ``"Fx MB MD"``.
-    least : int
-        Number of signals that are needed.
-    exactly : int, optional
-        Number of signals that is demanded.
-
-    Returns
-    -------
-    tuple of str
-        Names in canonical order.
-
-    Raises
-    ------
-    ValueError
-        If a name is unknown or given twice, or if there are too few or too many.
-    """
+    """Read a choice of signals."""
     names = signals.replace(",", " ").split() if isinstance(signals, str) else list(signals)
     unknown = [name for name in names if name not in SIGNALS]
     enough = len(names) >= least if exactly is None else len(names) == exactly

@@ -1,11 +1,11 @@
 """Simulated trials with known truth: motion, dynamics, films, sensor readings."""
 
-from vibrissa.simulation.dynamics import Dynamics, resonances
+from vibrissa.simulation.dynamics import Dynamics, resonances as resonances
 from vibrissa.simulation.film import (
     ImageConditions,
     film,
     film_frames,
-    silhouette,
+    silhouette as silhouette,
     views_of,
     with_true_traces,
 )
@@ -39,8 +39,6 @@ __all__ = [
     "film_frames",
     "head_path",
     "measure",
-    "resonances",
-    "silhouette",
     "simulate",
     "sweep_past",
     "tabulated",

@@ -488,24 +488,7 @@ def hidden(points: Array, camera: Camera, objects: Sequence[Surface]) -> Array:
 
 
 def silhouette(camera: Camera, objects: Sequence[Surface], center: Array, soft: float) -> Array:
-    """Share of each pixel that objects cover.
-
-    Parameters
-    ----------
-    camera : Camera
-        Camera that sees them.
-    objects : sequence of Surface
-        Objects in the laboratory.
-    center : array (3,)
-        Middle of the scene, m.
-    soft : float
-        Standard deviation of the outline's blur, pixels.
-
-    Returns
-    -------
-    array (height, width)
-        Shares from 0 to 1.
-    """
+    """Share of each pixel that objects cover."""
     from scipy.special import ndtr
 
     width, height = camera.size

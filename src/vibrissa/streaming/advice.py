@@ -12,18 +12,7 @@ _NEARLY_ALL = 0.9
 
 
 def advice(stream: ContactStream) -> list[str]:
-    """Suspect what users get wrong most often.
-
-    Parameters
-    ----------
-    stream : ContactStream
-        Stream, after some samples.
-
-    Returns
-    -------
-    list of str
-        Sentences; none where nothing is suspected.
-    """
+    """Suspect what users get wrong most often."""
     counts, total = stream.statuses, stream.samples
     measured = total - counts["missing"] - counts["tare"]
     touching = measured - counts["not_felt"]

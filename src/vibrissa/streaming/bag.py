@@ -16,22 +16,7 @@ from vibrissa.streaming.lines import FRAME, POSITION, QUATERNION, RECORDED, STAM
 
 
 def bag_lines(source: Path, topic: str | None, pose_topic: str | None) -> Iterator[str]:
-    """Read lines from a bag, poses and wrenches in the order of their times.
-
-    Parameters
-    ----------
-    source : Path
-        The bag.
-    topic : str, optional
-        Topic of the wrenches; the only one by default.
-    pose_topic : str, optional
-        Topic of the poses; none are read by default.
-
-    Yields
-    ------
-    str
-        One line a message, as a stream would have received it.
-    """
+    """Read lines from a bag, poses and wrenches in the order of their times."""
 
     def named(messages: Iterator[BagMessage], names: tuple[str, ...]) -> Iterator[dict[str, Any]]:
         for stamp, recorded, frame, values in messages:
@@ -78,13 +63,7 @@ class ContactRecorder:
         self.broken = False
 
     def put(self, record: dict[str, Any]) -> None:
-        """Write the record of a sample; those of faults are left out.
-
-        Parameters
-        ----------
-        record : dict
-            Record of the stream.
-        """
+        """Write the record of a sample; those of faults are left out."""
         if self.broken or "error" in record:
             return
         points = np.reshape(record.get("hypotheses", record.get("candidates", [])), (-1, 3))

@@ -400,18 +400,7 @@ def followed_record(known: Followed, rotation: Array | None = None) -> dict[str,
 
 
 def as_json(record: dict[str, Any]) -> str:
-    """Write a record as one line of JSON; numbers that are not finite become null.
-
-    Parameters
-    ----------
-    record : dict
-        A record of `ContactStream`.
-
-    Returns
-    -------
-    str
-        The line.
-    """
+    """Write a record as one line of JSON; numbers that are not finite become null."""
     try:
         return json.dumps(record, ensure_ascii=False, allow_nan=False)
     except ValueError:

@@ -159,18 +159,7 @@ class Lines:
         return name.removeprefix(self._prefix) if self._prefix else name
 
     def kind(self, line: str) -> LineKind:
-        """Tell what a line is without taking it apart.
-
-        Parameters
-        ----------
-        line : str
-            With or without its end.
-
-        Returns
-        -------
-        LineKind
-            A sample, if there is nothing else in it that later lines rely on.
-        """
+        """Tell what a line is without taking it apart."""
         text = line.lstrip()
         if not text.startswith("{"):
             return LineKind.SAMPLE if text[:1] in _DIGITS else LineKind.OTHER
@@ -325,18 +314,7 @@ def _number(name: str, value: object) -> float:
 
 
 def rotation_of(quaternion: Sequence[float]) -> Array:
-    """Return the rotation matrix of a quaternion.
-
-    Parameters
-    ----------
-    quaternion : sequence of float
-        Components (w, x, y, z) of a unit quaternion.
-
-    Returns
-    -------
-    array (3, 3)
-        The matrix; NaN where a component is not finite.
-    """
+    """Return the rotation matrix of a quaternion."""
     q = np.array(quaternion)
     size = math.hypot(*quaternion)
     if not math.isfinite(size):

@@ -36,31 +36,7 @@ _BACK = 0.2
 def file_lines(
     path: Path, reconnect: bool = False, report: Callable[[str], None] | None = None
 ) -> Iterator[str]:
-    """Read lines as they come, from a file, named pipe or device, until it ends.
-
-    Parameters
-    ----------
-    path : Path
-        File, named pipe or device. A serial device is read as it is set up (``stty``); bytes that
-        are not UTF-8 are replaced.
-    reconnect : bool
-        Whether a named pipe or device that closes is waited for and opened anew, without end. A
-        line that it was in the middle of is left out.
-    report : callable, optional
-        Function called with a sentence when it closes and when it is open again.
-
-    Yields
-    ------
-    str
-        A line; of one that is too long, the beginning.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If a file is to be opened anew that is neither a pipe nor a device.
-    """
+    """Read lines as they come, from a file, named pipe or device, until it ends."""
     if not path.exists():
         raise FileNotFoundError(f"there is no file {path}")
     if not reconnect:
@@ -90,18 +66,7 @@ def file_lines(
 
 
 def bounded_lines(file: TextIO) -> Iterator[str]:
-    """Read lines as they come; of longer ones only the first part is kept.
-
-    Parameters
-    ----------
-    file : text file
-        Open file.
-
-    Yields
-    ------
-    str
-        The lines.
-    """
+    """Read lines as they come; of longer ones only the first part is kept."""
     while line := file.readline(LONGEST + 1):
         yield line
         while len(line) > LONGEST and not line.endswith("\n"):
@@ -109,20 +74,7 @@ def bounded_lines(file: TextIO) -> Iterator[str]:
 
 
 def udp_address(text: str) -> tuple[str, int]:
-    """Read an address written as ``HOST:PORT``.
-
-    Parameters
-    ----------
-    text : str
-        The address, such as ``127.0.0.1:5005``.
-
-    Returns
-    -------
-    host : str
-        Name or number of the host; empty for all.
-    port : int
-        Number of the port.
-    """
+    """Read an address written as ``HOST:PORT``."""
     host, colon, port = text.rpartition(":")
     if not colon or not port.isdigit() or int(port) > 65535:
         raise ValueError(f"an address is HOST:PORT, such as 127.0.0.1:5005; got {text!r}")
@@ -130,20 +82,7 @@ def udp_address(text: str) -> tuple[str, int]:
 
 
 def udp_socket(host: str, port: int) -> socket.socket:
-    """Open the socket that `udp_lines` reads.
-
-    Parameters
-    ----------
-    host : str
-        Name or number of the interface; empty for all.
-    port : int
-        Number of the port.
-
-    Returns
-    -------
-    socket
-        The bound socket.
-    """
+    """Open the socket that `udp_lines` reads."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     opened = socket.socket(family, socket.SOCK_DGRAM)
     opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _WAITING)  # or what the system allows
@@ -156,35 +95,13 @@ def udp_socket(host: str, port: int) -> socket.socket:
 
 
 def udp_lines(opened: socket.socket) -> Iterator[str]:
-    """Receive lines without end; a datagram holds one or several whole ones.
-
-    Parameters
-    ----------
-    opened : socket
-        Socket of `udp_socket`.
-
-    Yields
-    ------
-    str
-        A line.
-    """
+    """Receive lines without end; a datagram holds one or several whole ones."""
     while True:
         yield from _text(opened.recv(_LARGEST))
 
 
 def udp_lost(opened: socket.socket) -> int:
-    """Count the datagrams that the system discarded because too many were waiting.
-
-    Parameters
-    ----------
-    opened : socket
-        Socket of `udp_socket`.
-
-    Returns
-    -------
-    int
-        Their number since the socket was opened; 0 where the system does not report it.
-    """
+    """Count the datagrams that the system discarded because too many were waiting."""
     if sys.platform != "linux":
         return 0
     try:
@@ -230,18 +147,7 @@ class Answers:
             raise ValueError(f"answers cannot go to {text}: {error}") from error
 
     def send(self, line: str) -> None:
-        """Send one answer.
-
-        Parameters
-        ----------
-        line : str
-            Line of JSON.
-
-        Raises
-        ------
-        OSError
-            If a TCP connection is closed; datagrams that nobody receives are lost without one.
-        """
+        """Send one answer."""
         data = (line + "\n").encode()
         if not self._datagrams:
             self._socket.sendall(data)

@@ -82,35 +82,7 @@ def tracker_traces(
     names: Sequence[str] | None = None,
     sigma: float | None = None,
 ) -> TrackerTraces:
-    """Make traces of the points of other trackers.
-
-    Parameters
-    ----------
-    tracks : xarray.Dataset
-        Tracks, as `vibrissa.io.load_tracks` and `vibrissa.io.join_views` return them; nodes run
-        from the base to the tip.
-    cameras : sequence of Camera, optional
-        Calibrated cameras of the views, in their order. Without them one view shows a plane, and
-        two are orthogonal, from the top and from the front.
-    pixel_size : float, optional
-        Size of a pixel in the scene, m, where there are no calibrated cameras.
-    names : sequence of str, optional
-        Names of the whiskers that are wanted; by default those seen in half of the frames, or where
-        the tracker did not identify whiskers over time the longest.
-    sigma : float, optional
-        Standard deviation of a point across the whisker, pixels, or for points in space m; by
-        default half a pixel, or a thousandth of the whisker's length.
-
-    Returns
-    -------
-    TrackerTraces
-        Cameras, traces, names, and what is assumed.
-
-    Raises
-    ------
-    ValueError
-        If there are no points, a view has no camera, or no whisker is seen often enough.
-    """
+    """Make traces of the points of other trackers."""
     notes: list[str] = []
     tracks = _arcs(tracks, notes)
     if "centerline" in tracks:

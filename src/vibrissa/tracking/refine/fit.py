@@ -165,37 +165,7 @@ def fit_rod(
     nodes: int = 65,
     head: HeadPose | None = None,
 ) -> RodFit:
-    """Fit the rod to the traces of a whole trial.
-
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        Cameras of the views.
-    traces : TraceSeries
-        Traces of one whisker, all frames and views.
-    whisker : Whisker
-        Whisker at rest.
-    pose : BasePose
-        Approximate pose of its base, relative to the head.
-    touching : array (time,)
-        Whether the whisker is in contact in each frame.
-    curves : array (time, node, 3)
-        Approximate points of the whisker, relative to the head, m, from which the fit starts.
-    rate : float
-        Frames per second.
-    options : FitOptions, optional
-        Smoothness over time.
-    nodes : int
-        Number of points of the fitted centrelines.
-    head : HeadPose, optional
-        Pose of the head in these frames, relative to which the base moves smoothly; by default it
-        does not move, and its frame is that of the laboratory.
-
-    Returns
-    -------
-    RodFit
-        Pose, contact and wrench; NaN in frames that show nothing.
-    """
+    """Fit the rod to the traces of a whole trial."""
     options, head = options or FitOptions(), head or HeadPose.still(len(curves))
     return Fitter(cameras, traces, touching, curves, rate, options, head).fit(whisker, pose, nodes)
 

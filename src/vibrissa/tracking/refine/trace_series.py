@@ -52,18 +52,7 @@ class TraceSeries:
 
     @classmethod
     def of(cls, traces: Sequence[Sequence[Trace]]) -> TraceSeries:
-        """Resample traces.
-
-        Parameters
-        ----------
-        traces : sequence of sequence of Trace
-            Traces of the whisker, view by view, frame by frame.
-
-        Returns
-        -------
-        TraceSeries
-            Traces as arrays.
-        """
+        """Resample traces."""
         shape = (len(traces[0]), len(traces), NODES)
         line, sigma, seen = np.full((*shape, 2), np.nan), np.full(shape, np.nan), np.zeros(shape)
         confidence, ends = np.zeros(shape[:2]), np.zeros((*shape[:2], 2))
@@ -84,41 +73,11 @@ class TraceSeries:
         return cls(line, sigma, seen, confidence, ends)
 
     def rows(self, frames: NDArray[np.intp]) -> TraceSeries:
-        """Select frames.
-
-        Parameters
-        ----------
-        frames : array (n,)
-            Indices of the frames.
-
-        Returns
-        -------
-        TraceSeries
-            Traces in those frames.
-        """
+        """Select frames."""
         return TraceSeries(*(getattr(self, name)[frames] for name in vars(self)))
 
     def equations(self, view: int, pixels: Array, slopes: Array) -> tuple[Array, Array, Array]:
-        """Distances of points from the traces of a view, and their derivatives.
-
-        Parameters
-        ----------
-        view : int
-            Number of the view.
-        pixels : array (time, n, 2)
-            Column and row at which the points of a curve from base to tip are seen.
-        slopes : array (time, n, 2, 3)
-            Derivatives of these by the points, pixels per m.
-
-        Returns
-        -------
-        rows : array (time, n + 2, 3)
-            Gradient of each equation by its point, the last two those of base and tip.
-        misses : array (time, n + 2)
-            Distances in standard deviations; 0 where the trace shows nothing.
-        weights : array (time, n + 2)
-            Inverse standard deviations, 1/pixel; 0 where the trace shows nothing.
-        """
+        """Distances of points from the traces of a view, and their derivatives."""
         line, sigma = self.line[:, view], self.sigma[:, view]
         tangent = np.gradient(line, axis=1)
         tangent /= np.linalg.norm(tangent, axis=2, keepdims=True)

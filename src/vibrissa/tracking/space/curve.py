@@ -82,13 +82,7 @@ class SpaceCurve(NamedTuple):
 
     @classmethod
     def none(cls) -> SpaceCurve:
-        """Make one of a frame without a whisker.
-
-        Returns
-        -------
-        SpaceCurve
-            Curve of NaN.
-        """
+        """Make one of a frame without a whisker."""
         return cls(np.full((NODES, 3), np.nan), np.full((NODES, 3, 3), np.nan), np.nan)
 
     @property

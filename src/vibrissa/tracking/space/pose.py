@@ -39,29 +39,7 @@ _WHOLE = 0.85
 
 
 def low_pass(values: ArrayLike, rate: float, cutoff: float | None = CUTOFF) -> Array:
-    """Filter a signal forward and backward, so that nothing is shifted in time.
-
-    Parameters
-    ----------
-    values : array_like (time, ...)
-        Signal; NaN where it is missing.
-    rate : float
-        Frames per second.
-    cutoff : float, optional
-        Frequency at which half of the power of a wave is left by each of both passes, Hz; None
-        filters nothing.
-
-    Returns
-    -------
-    array (time, ...)
-        Filtered signal, missing where it was missing. Gaps are bridged by straight lines for the
-        filter only.
-
-    Raises
-    ------
-    ValueError
-        If the cut-off is not below half the rate.
-    """
+    """Filter a signal forward and backward, so that nothing is shifted in time."""
     array = np.array(values, dtype=np.float64)
     if cutoff is None:
         return array
@@ -102,45 +80,12 @@ class HeadPose:
 
     @classmethod
     def still(cls, count: int) -> HeadPose:
-        """Make a head whose frame is that of the laboratory.
-
-        Parameters
-        ----------
-        count : int
-            Number of frames.
-
-        Returns
-        -------
-        HeadPose
-            Poses without rotation and shift.
-        """
+        """Make a head whose frame is that of the laboratory."""
         return cls(np.zeros((count, 3)), np.broadcast_to(np.eye(3), (count, 3, 3)))
 
     @classmethod
     def of(cls, table: xr.Dataset, frames: NDArray[np.int64], rate: float) -> HeadPose:
-        """Find the head's pose in some frames.
-
-        Parameters
-        ----------
-        table : xarray.Dataset
-            ``head_position`` and ``head_rotation`` over time or frame, as `vibrissa.io.load_head`
-            gives them, or those of a recording.
-        frames : array (n,)
-            Numbers of frames of the first video.
-        rate : float
-            Frames per second.
-
-        Returns
-        -------
-        HeadPose
-            Poses frame by frame; between rows of a table over time the head moves straight and
-            turns steadily.
-
-        Raises
-        ------
-        ValueError
-            If the table does not cover all frames.
-        """
+        """Find the head's pose in some frames."""
         place = np.asarray(table["head_position"].values, dtype=np.float64)
         turn = np.asarray(table["head_rotation"].values, dtype=np.float64)
         if "frame" in table["head_position"].dims:
@@ -166,49 +111,16 @@ class HeadPose:
         return cls(interpolated(at, known, place), turned)
 
     def rows(self, frames: NDArray[np.intp]) -> HeadPose:
-        """Select frames.
-
-        Parameters
-        ----------
-        frames : array (n,)
-            Indices of the frames.
-
-        Returns
-        -------
-        HeadPose
-            Poses in those frames.
-        """
+        """Select frames."""
         return HeadPose(self.position[frames], self.rotation[frames])
 
     def seen_from(self, points: Array) -> Array:
-        """Transform points from the laboratory's frame to the head's.
-
-        Parameters
-        ----------
-        points : array (time, ..., 3)
-            Points in the laboratory's frame, m.
-
-        Returns
-        -------
-        array (time, ..., 3)
-            Points in the head's frame, m.
-        """
+        """Transform points from the laboratory's frame to the head's."""
         away = points - self.position.reshape(-1, *[1] * (points.ndim - 2), 3)
         return np.asarray(np.einsum("tji,t...j->t...i", self.rotation, away))
 
     def put_in(self, points: Array) -> Array:
-        """Transform points from the head's frame to the laboratory's.
-
-        Parameters
-        ----------
-        points : array (time, ..., 3)
-            Points in the head's frame, m.
-
-        Returns
-        -------
-        array (time, ..., 3)
-            Points in the laboratory's frame, m.
-        """
+        """Transform points from the head's frame to the laboratory's."""
         turned = np.einsum("tij,t...j->t...i", self.rotation, points)
         return np.asarray(turned + self.position.reshape(-1, *[1] * (points.ndim - 2), 3))
 
@@ -236,20 +148,7 @@ class BasePose:
         return base_rotation(self.azimuth, self.elevation, self.roll)
 
     def filtered(self, rate: float, cutoff: float | None = CUTOFF) -> BasePose:
-        """Filter everything over time.
-
-        Parameters
-        ----------
-        rate : float
-            Frames per second.
-        cutoff : float, optional
-            Cut-off frequency, Hz; None filters nothing.
-
-        Returns
-        -------
-        BasePose
-            Pose without what is faster.
-        """
+        """Filter everything over time."""
         angles = np.stack([self.azimuth, self.elevation, self.roll], axis=1)
         known = np.isfinite(angles).all(axis=1)
         angles[known] = np.unwrap(angles[known], axis=0)

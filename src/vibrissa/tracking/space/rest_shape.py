@@ -257,22 +257,7 @@ def _swings(directions: Array, goal: Array) -> Array:
 
 
 def whisker_at_rest(shape: RestShape, name: str = "tracked", **properties: float) -> Whisker:
-    """Make a whisker of the rest shape.
-
-    Parameters
-    ----------
-    shape : RestShape
-        Rest shape of the tracked frames.
-    name : str
-        Name of the whisker.
-    **properties
-        Radius and material; see `vibrissa.Whisker`.
-
-    Returns
-    -------
-    Whisker
-        Whisker whose pose leads to the frame of the shape's points.
-    """
+    """Make a whisker of the rest shape."""
     noise = _SMOOTH * shape.noise
     return Whisker.from_points(shape.points, noise=noise, name=name, **properties)  # type: ignore[arg-type]
 

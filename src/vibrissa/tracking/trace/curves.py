@@ -500,20 +500,7 @@ class Found(NamedTuple):
 
 
 def find_whiskers(frame: Frame, options: TraceOptions | None = None) -> list[Found]:
-    """Find all whiskers of a frame.
-
-    Parameters
-    ----------
-    frame : array (height, width)
-        Grey values.
-    options : TraceOptions, optional
-        Settings of tracing; what is shorter than ``shortest`` is not a whisker.
-
-    Returns
-    -------
-    list of Found
-        Different whiskers, the likeliest first; those that begin at something dark before others.
-    """
+    """Find all whiskers of a frame."""
     options = options or TraceOptions()
     noise = noise_level(frame)
     found: list[Found] = []

@@ -130,22 +130,7 @@ def negative(frame: Frame) -> Frame:
 def is_bright(
     frame: Frame, bases: Sequence[ArrayLike] | None = None, options: TraceOptions | None = None
 ) -> bool:
-    """Decide whether whiskers are bright on a dark background.
-
-    Parameters
-    ----------
-    frame : array (height, width)
-        Grey values.
-    bases : sequence of array_like (2,), optional
-        Columns and rows where whiskers begin.
-    options : TraceOptions, optional
-        Settings of tracing; ``bright``, unless None, is the answer.
-
-    Returns
-    -------
-    bool
-        Whether clearly more is seen of bright whiskers than of dark ones.
-    """
+    """Decide whether whiskers are bright on a dark background."""
     options = options or TraceOptions()
     if options.bright is not None:
         return options.bright
@@ -168,22 +153,7 @@ def _seen(frame: Frame, bases: Sequence[ArrayLike] | None, options: TraceOptions
 def find_bases(
     cameras: Sequence[Camera], frames: Sequence[Frame], options: TraceOptions | None = None
 ) -> list[Array] | None:
-    """Find where the whisker begins that all views show.
-
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        The views.
-    frames : sequence of array (height, width)
-        Frame of each view, of the same moment. Several moments show more: see `find_start`.
-    options : TraceOptions, optional
-        Settings of tracing.
-
-    Returns
-    -------
-    list of array (2,), or None
-        Column and row of its base in each view; None if no line is the same in all.
-    """
+    """Find where the whisker begins that all views show."""
     return find_start(cameras, [[frame] for frame in frames], options).bases
 
 

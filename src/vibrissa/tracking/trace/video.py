@@ -247,20 +247,7 @@ def _backward(
 
 
 def partial_traces(recording: str | PathLike[str], view: int) -> Path:
-    """Give the file that keeps the traces of a view until their recording is written.
-
-    Parameters
-    ----------
-    recording : str or path
-        File of the recording.
-    view : int
-        Number of the view.
-
-    Returns
-    -------
-    Path
-        Hidden file next to the recording.
-    """
+    """Give the file that keeps the traces of a view until their recording is written."""
     recording = Path(recording)
     return recording.with_name(f".{recording.name}.view{view}.npz")
 

@@ -13,7 +13,7 @@ from vibrissa.demo import run_demo
 from vibrissa.evaluation import caution, tracking_scores, truth_of
 from vibrissa.evaluation.stages import from_curves, refined
 from vibrissa.io import load_contacts, load_recording
-from vibrissa.pipeline import fit_contacts
+from vibrissa.pipeline import fit_contacts, reconstruct
 from vibrissa.recording import Recording
 from vibrissa.report import trial_sections
 from vibrissa.report.page import shown_value
@@ -75,7 +75,17 @@ def test_what_the_peg_is_known_to_counts_frames_that_err_together(from_video):
         alone = fit_contacts(
             one.recording["estimates"].to_dataset(), [from_video.contact_map.whisker]
         )
-        np.testing.assert_allclose(one.fit.covariance, together * alone.covariance, rtol=1e-9)
+        expected = together * alone.covariance
+        # What all frames of the film share comes on top.
+        without = one.recording.copy()
+        without.dataset = one.recording.to_dataset().drop_vars("contact_shared")
+        plain = reconstruct(without)["parameter_covariance"].values
+        np.testing.assert_allclose(plain, expected, rtol=1e-9)
+        sigma = np.sqrt(np.diag(expected))
+        more = (one.fit.covariance - expected) / np.outer(sigma, sigma)
+        shared = np.linalg.eigvalsh(more)
+        assert shared.min() > -1e-9 * shared.max()
+        assert shared.max() > 0.01
 
 
 def test_without_noise_contacts_are_exact():

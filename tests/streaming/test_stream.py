@@ -449,13 +449,16 @@ def test_over_udp_stale_samples_are_dropped_and_counted(map_file, wrench):
     with run("--udp", "127.0.0.1:0", "--map", map_file) as process:
         port = int(process.stderr.readline().rsplit(":", 1)[1])
         assert process.stderr.readline() == "ready\n"
+        samples = [f"{i},{lines[1].split(',', 1)[1]}" for i in range(count)]
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
-            for line in (lines[0], *(f"{i},{lines[1].split(',', 1)[1]}" for i in range(count))):
-                out.sendto(line.encode(), ("127.0.0.1", port))
-        while True:
-            record = json.loads(process.stdout.readline())
-            if record["time"] == count - 1:
-                break
+            for burst in ([lines[0], *samples[: count // 2]], samples[count // 2 :]):
+                for line in burst:
+                    out.sendto(line.encode(), ("127.0.0.1", port))
+                while json.loads(process.stdout.readline())["time"] != float(
+                    burst[-1].split(",")[0]
+                ):
+                    pass
+                time.sleep(1.1)  # losses are reported once a second
         process.send_signal(signal.SIGTERM)
         rest, said = process.communicate(timeout=60)
     assert rest == ""

@@ -323,7 +323,7 @@ class Certificate:
             for kind in ("certified", "undecided"):
                 boxes = getattr(part, kind).astype(np.int32)
                 data[f"{name}_{kind}"] = ((f"{name}_{kind}_box", "unknown", "level_index"), boxes)
-        out = xr.Dataset(data)
+        out = xr.Dataset(data).copy(deep=True)  # nobody changes what is proved
         out.attrs = {
             "kind": KIND,
             "triplet": TRIPLET,

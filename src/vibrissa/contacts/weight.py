@@ -69,8 +69,8 @@ _NEAR = 0.01
 # Turn of gravity (rad) and relative change of density for derivatives.
 _NUDGE = 1e-4
 # The second order is taken from this far along each axis, in standard deviations; the covariance is
-# relied on where the contact point moves there by less than as many in addition.
-_REACH, _BENT = 2.0, 2.0
+# relied on where the contact point moves there by less than one in addition.
+_REACH, _BENT = 2.0, 1.0
 _MOST = 8
 # Friction angles scatter by so much: of contacts that explain a wrench equally well, those that
 # need less friction come first.

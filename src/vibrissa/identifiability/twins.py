@@ -192,7 +192,7 @@ def climbed(
     Pairs of twins form a three-dimensional set, charted by the first contact. From each pair a
     step in a random direction is tried, of several lengths; the best twin that is still a witness
     is kept, steps grow with success and shrink without. Where the climb ends depends on where it
-    begins, and not on the random directions, to the digits that are printed.
+    begins: what it gives is a lower bound.
     """
     far = pairs.apart >= separation
     starts = [_apart_in_chart(pairs.rows(pairs.members(r) & far)) for r in regions]

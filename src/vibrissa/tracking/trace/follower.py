@@ -30,11 +30,12 @@ from vibrissa.tracking.trace.ridge import (
     grey_flanks,
     march,
     measure,
+    middle,
     noise_level,
     smooth,
     traced,
 )
-from vibrissa.tracking.trace.trace import STEP, Trace, TraceOptions
+from vibrissa.tracking.trace.trace import STEP, Trace, TraceOptions, overlap
 
 Array = NDArray[np.float64]
 
@@ -79,6 +80,12 @@ _SEARCHED = 5
 
 _WANTED, _LEAST = 0.85, 0.4
 """Share of the usual length with which a whisker is found without doubt, and at least."""
+
+_BETTER = 1.1
+"""Factor by which a line that is found without expectations must be longer."""
+
+_REPEATED = 0.5
+"""Distance of two marches that go the same way, pixels, at most."""
 
 _CLICK = 20.0
 """Standard deviation of a click from the base of its whisker, pixels."""
@@ -133,9 +140,9 @@ def features_of(frame: Frame, trace: Trace, clutter: Clutter = NOTHING) -> Array
     n = len(trace.line)
     if n < 2 or not trace.seen.any():
         return features
-    offset, amplitude, flank, support = (np.empty(n) for _ in range(4))
+    points, amplitude, flank, support = np.empty((n, 2)), np.empty(n), np.empty(n), np.empty(n)
     line = np.ascontiguousarray(trace.line)
-    measure(frame, line, 1, 1.0, 1.0, *NOTHING, offset, amplitude, flank, support)
+    measure(frame, line, 1, 1.0, 1.0, *NOTHING, points, amplitude, flank, support)
     contrast = amplitude / np.maximum(flank, 1.0)
     hidden = clutter.hides(line) & ~trace.seen
     features[0] = np.log(trace.support + STEP * float(hidden.sum()))
@@ -181,13 +188,15 @@ class Follower:
             if self.length_of(trace) > self.length_of(best):
                 best = trace
         # A whisker may be seen shorter because it turns toward the camera, frame after frame.
-        steady = self.length_of(best) >= _WANTED * float(np.median(self._supports[-3:] or [np.inf]))
+        length, recent = self.length_of(best), self._supports[-3:]
+        steady = bool(recent) and length >= _WANTED * middle(np.array(recent))
         self._unsearched += 1
-        if self.length_of(best) < self.wanted and not (steady and self._unsearched < _SEARCHED):
+        if length < self.wanted and not (steady and self._unsearched < _SEARCHED):
             self._unsearched = 0
-            cold = max(self.from_base(frame, noise), key=self._worth, default=Trace.lost())
             # What is as good without expectations as with them is no better.
-            if cold.support > 1.1 * self.length_of(best):
+            least = _BETTER * length
+            cold = max(self.from_base(frame, noise, least), key=self._worth, default=Trace.lost())
+            if cold.support > least:
                 best = cold
         return self.accept(best) if self._belongs(best) else self.lose()
 
@@ -199,7 +208,7 @@ class Follower:
     @property
     def usual(self) -> float:
         """Length that is usually seen, pixels; 0 before anything was."""
-        return float(np.median(self._supports)) if self._supports else 0.0
+        return middle(np.array(self._supports)) if self._supports else 0.0
 
     @property
     def wanted(self) -> float:
@@ -285,14 +294,26 @@ class Follower:
         guesses = [(self.last, "tight"), (self.last, "loose")]
         if moving is not None:
             guesses = [(moving, "tight"), (moving, "loose"), *guesses]
+        tried: list[tuple[Array, Trace]] = []
         for guess in guesses:
-            trace = self.along(frame, noise, *guess)
+            march = self._expected_march(frame, noise, *guess)
+            # Marches that go the same way are traced once.
+            trace = next((one for line, one in tried if _repeats(march[0], line)), None)
+            if trace is None:
+                trace = self._finished(frame, noise, *march)
+                tried.append((march[0], trace))
             yield trace
             if self.length_of(trace) >= self.wanted:
                 return
 
-    def along(self, frame: Frame, noise: float, guess: Array, manner: str = "loose") -> Trace:
+    def along(self, frame: Frame, noise: float, guess: Array, manner: str) -> Trace:
         """Trace along an expected curve."""
+        return self._finished(frame, noise, *self._expected_march(frame, noise, guess, manner))
+
+    def _expected_march(
+        self, frame: Frame, noise: float, guess: Array, manner: str
+    ) -> tuple[Array, Array]:
+        """Line and support of a march along an expected curve."""
         tangent = np.arctan2(*np.diff(guess, axis=0).T[::-1])
         bend = np.diff(np.unwrap(tangent)) / STEP
         wide = min(9, len(bend) | 1)
@@ -302,10 +323,10 @@ class Follower:
         bend = np.concatenate([bend, np.full(extra, bend[-20:].mean())])
         chord = guess[min(6, len(guess) - 1)] - guess[0]
         start = np.array([*guess[0], np.arctan2(chord[1], chord[0]) - 3.0 * STEP * bend[:6].mean()])
-        return self._finished(frame, noise, *self._march(frame, noise, start, bend, manner))
+        return self._march(frame, noise, start, bend, manner)
 
-    def from_base(self, frame: Frame, noise: float) -> list[Trace]:
-        """Trace in all directions from the base.
+    def from_base(self, frame: Frame, noise: float, least: float = 0.0) -> list[Trace]:
+        """Trace in all directions from the base, but for what is shorter than a length, pixels.
 
         Traces are different ones, on bright ground: what is seen on the face is fur.
         """
@@ -322,7 +343,9 @@ class Follower:
         for line, support in tries:
             if len(found) == _COLD:
                 break
-            if len(line) < FEWEST or any(_alike(line, other) for other in kept):
+            if len(line) < FEWEST or STEP * float((support > 0.0).sum()) + _AROUND < least:
+                continue
+            if any(_alike(line, other) for other in kept):
                 continue
             kept.append(line)
             trace = self._finished(frame, noise, line, support, _AROUND)
@@ -378,6 +401,12 @@ def _turned(line: Array, angle: float) -> Array:
     """Turn a line about its first point, from the columns toward the rows."""
     c, s = np.cos(angle), np.sin(angle)
     return np.asarray(line[0] + (line - line[0]) @ np.array([[c, s], [-s, c]]))
+
+
+def _repeats(line: Array, other: Array) -> bool:
+    """Whether a march goes nowhere but where another one went, and as far."""
+    far = abs(len(line) - len(other)) > 1
+    return not far and len(line) > 1 and overlap(line, other, _REPEATED) == 1.0
 
 
 def _alike(line: Array, other: Array) -> bool:

@@ -160,6 +160,17 @@ def darkest_expected(profile: Any, gate: int, scale: float, sd: float, variance:
     return value, at
 
 
+@inlined
+def carried(
+    p00: float, p01: float, p02: float, p11: float, p12: float, p22: float, h: float
+) -> Any:
+    """F P Fᵀ, without its last element, for F = [[1, h, h²/2], [0, 1, h], [0, 0, 1]]."""
+    a01 = p01 + h * p11 + 0.5 * h * h * p12
+    a02 = p02 + h * p12 + 0.5 * h * h * p22
+    p00 = p00 + h * p01 + 0.5 * h * h * p02 + h * a01 + 0.5 * h * h * a02
+    return p00, a01 + h * a02, a02, p11 + 2.0 * h * p12 + h * h * p22, p12 + h * p22
+
+
 @kernel
 def march(
     frame: Any,
@@ -202,14 +213,7 @@ def march(
             turned += kappa * h
             if abs(turned) > TURNING:
                 break
-            # P ← F P Fᵀ + Q with F = [[1, h, h²/2], [0, 1, h], [0, 0, 1]]
-            a01 = p01 + h * p11 + 0.5 * h * h * p12
-            a02 = p02 + h * p12 + 0.5 * h * h * p22
-            p00 = p00 + h * p01 + 0.5 * h * h * p02 + h * a01 + 0.5 * h * h * a02
-            p01 = a01 + h * a02
-            p02 = a02
-            p11 = p11 + 2.0 * h * p12 + h * h * p22
-            p12 = p12 + h * p22
+            p00, p01, p02, p11, p12 = carried(p00, p01, p02, p11, p12, p22, h)
             p22 += drift * drift * h
         line[k, 0], line[k, 1] = x, y
         support[k] = 0.0
@@ -261,7 +265,7 @@ def measure(
     scale: float,
     bits: Any,
     which: int,
-    offset: Any,
+    points: Any,
     amplitude: Any,
     flank: Any,
     support: Any,
@@ -275,7 +279,8 @@ def measure(
     for k in range(n):
         nx, ny = normal(line, k)
         x, y = line[k, 0], line[k, 1]
-        offset[k], amplitude[k], support[k], flank[k] = 0.0, 0.0, 0.0, 0.0
+        points[k, 0], points[k, 1] = x, y
+        amplitude[k], support[k], flank[k] = 0.0, 0.0, 0.0
         if x < 1.0 or y < 1.0 or x > columns - 2.0 or y > rows - 2.0:
             continue
         if in_the_way(bits, which, x, y):
@@ -287,10 +292,10 @@ def measure(
             if d > best:
                 best, at = d, j
         fit(profile, at, ROWS, found)
-        offset[k] = (at - reach + min(max(found[1], -1.0), 1.0)) * scale
-        if in_the_way(bits, which, x + offset[k] * nx, y + offset[k] * ny):
-            offset[k] = 0.0
+        offset = (at - reach + min(max(found[1], -1.0), 1.0)) * scale
+        if in_the_way(bits, which, x + offset * nx, y + offset * ny):
             continue
+        points[k, 0], points[k, 1] = x + offset * nx, y + offset * ny
         amplitude[k] = found[0]
         support[k] = depth(profile, at) / (0.8 * noise)
         flank[k] = (
@@ -330,8 +335,9 @@ _DISTURBED = 0.15
 _FUR = 3
 """Number of points next to the face that are not measured: fur is dark too."""
 
-_BEYOND = 12
-"""Number of points beyond the last supported one in which the tip is searched."""
+_BENDING, _BEYOND = 30, 12
+"""Numbers of the last points of a line, which give its bend, and of those beyond the last supported
+one in which the tip is searched."""
 
 _BORDER = 8.0
 """Distance from the image's border within which a line may end because the image does, pixels."""
@@ -369,6 +375,44 @@ class Measured(NamedTuple):
         )
 
 
+class _Fitted(NamedTuple):
+    """A smooth line through what was measured across another one, and how well it is known."""
+
+    line: Array
+    amplitude: Array
+    flank: Array
+    seen: Mask
+    weight: Array
+    excess: float
+
+
+def _fitted(
+    frame: Frame,
+    line: Array,
+    gate: int,
+    noise: float,
+    options: TraceOptions,
+    clutter: Clutter,
+    skipped: int = 0,
+) -> _Fitted:
+    """Measure across a line and smooth it."""
+    n, line = len(line), np.ascontiguousarray(line)
+    points, amplitude, flank, support = np.empty((n, 2)), np.empty(n), np.empty(n), np.empty(n)
+    measure(frame, line, gate, noise, options.scale, *clutter, points, amplitude, flank, support)
+    seen = (support > _SUPPORTED) & (amplitude > 0.0)
+    seen[:skipped] = False
+    variance = SLOPE_VARIANCE * (noise * options.scale / np.maximum(amplitude, 1e-3)) ** 2
+    weight = seen / (variance + 0.03**2)
+    better = smooth(points, weight, options.stiffness)
+    # What is far from its neighbours counts less, the second time.
+    miss = ((points - better) ** 2).sum(axis=1) * weight
+    # Compression removes noise where nothing is, and adds it where something is.
+    excess = max(1.0, middle(miss[seen]) / _MEDIAN) if seen.any() else 1.0
+    weight *= 9.0 / np.maximum(miss / excess, 9.0) / excess
+    better = smooth(points, weight, options.stiffness)
+    return _Fitted(better, amplitude, flank, seen, weight, excess)
+
+
 def measured(
     frame: Frame,
     line: Array,
@@ -378,32 +422,24 @@ def measured(
     skipped: int = 0,
     clutter: Clutter = NOTHING,
 ) -> tuple[Array, Measured]:
-    """Measure across a line and smooth it."""
-    n = len(line)
-    offset, amplitude, flank, support = (np.empty(n) for _ in range(4))
-    measure(frame, line, gate, noise, options.scale, *clutter, offset, amplitude, flank, support)
-    seen = (support > _SUPPORTED) & (amplitude > 0.0)
-    variance = SLOPE_VARIANCE * (noise * options.scale / np.maximum(amplitude, 1e-3)) ** 2
-    seen[:skipped] = False
-    weight = np.where(seen, 1.0 / (variance + 0.03**2), 0.0)
-    tangent = np.gradient(line, axis=0)
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-    points = line + offset[:, None] * np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
-    better = smooth(points, weight, options.stiffness)
-    # What is far from its neighbours counts less, the second time.
-    miss = ((points - better) ** 2).sum(axis=1) * weight
-    # Compression removes noise where nothing is, and adds it where something is.
-    excess = max(1.0, float(np.median(miss[seen])) / _MEDIAN) if seen.any() else 1.0
-    weight, miss = weight / excess, miss / excess
-    weight = np.where(miss > 9.0, weight * 9.0 / np.maximum(miss, 9.0), weight)
-    better = smooth(points, weight, options.stiffness)
-    information = np.convolve(weight, np.ones(min(9, n)), mode="same")
+    """Measure across a line, smooth it, and state how well each of its points is known."""
+    fit = _fitted(frame, line, gate, noise, options, clutter, skipped)
+    information = np.convolve(fit.weight, np.ones(min(9, len(line))), mode="same")
     sigma = 1.0 / np.sqrt(np.maximum(information, 1.0))
-    sigma += 0.05 * (0.1 * STEP * _distance_to_seen(seen)) ** 1.5
+    sigma += 0.05 * (0.1 * STEP * _distance_to_seen(fit.seen)) ** 1.5
     sigma = np.hypot(sigma, np.where(clutter.disturbs(line), _DISTURBED, 0.0))
     shown = ~clutter.hides(line)
-    open_ = shown & (flank > 0.6 * np.median(flank[shown] if shown.any() else flank))
-    return better, Measured(amplitude, sigma, seen, open_, noise * float(np.sqrt(excess)))
+    open_ = shown & (fit.flank > 0.6 * middle(fit.flank[shown] if shown.any() else fit.flank))
+    noise *= float(np.sqrt(fit.excess))
+    return fit.line, Measured(fit.amplitude, sigma, fit.seen, open_, noise)
+
+
+def middle(values: Array) -> float:
+    """Median of some numbers, without the checks that take longer than it."""
+    half = len(values) // 2
+    before = max(half - 1, 0)
+    part = np.partition(values, (before, half))
+    return float(part[half] if len(values) % 2 else 0.5 * (part[before] + part[half]))
 
 
 def _distance_to_seen(seen: Mask) -> Array:
@@ -444,9 +480,9 @@ def traced(
     clutter: Clutter = NOTHING,
 ) -> tuple[Trace, bool]:
     """Trace a whisker that is about known, and find its ends; whether it begins at the face."""
-    line = _lengthened(even(line))
+    line = prolonged(even(line), _BENDING, _BEYOND)
     for gate in (3, 2):
-        line = even(measured(frame, line, gate, noise, options, 0, clutter)[0])
+        line = even(_fitted(frame, line, gate, noise, options, clutter).line)
         if len(line) < FEWEST:
             # Where nothing is seen, nothing holds the line apart.
             return Trace.lost(), False
@@ -454,12 +490,12 @@ def traced(
     if before > OUTSIDE and len(line) >= FEWEST:
         # What was only guessed is measured before it counts.
         fur = _FUR if from_face else 0
-        line = even(measured(frame, line, 3, noise, options, fur, clutter)[0])
+        line = even(_fitted(frame, line, 3, noise, options, clutter, fur).line)
     if len(line) < FEWEST:
         return Trace.lost(), False
     if not from_face:
         # Without a face it begins as it ends: where the line does.
-        line = _lengthened(line[::-1])[::-1]
+        line = prolonged(line[::-1], _BENDING, _BEYOND)[::-1]
     line, along = measured(frame, line, 1, noise, options, _FUR if from_face else 0, clutter)
     first = 0 if from_face else len(line) - _tip(along.part(slice(None, None, -1)))
     last = _tip(along)
@@ -496,7 +532,7 @@ def _edge(frame: Frame, line: Array, distance: float, clutter: Clutter) -> float
         if 2 * known.sum() < len(level):
             return None
         level = np.interp(points, points[known], level[known])
-        bright, dark = float(np.median(level[len(level) // 2 :])), float(level.min())
+        bright, dark = middle(level[len(level) // 2 :]), float(level.min())
         half = 0.5 * (bright + dark)
         last = int(np.flatnonzero(level <= half)[-1])
         if dark > 0.6 * bright or last + 1 >= len(level):
@@ -546,10 +582,15 @@ def _inside(frame: Frame, point: Array) -> bool:
     return bool((point > _BORDER).all() and (point < far).all())
 
 
-def _lengthened(line: Array) -> Array:
-    """Prolong a line beyond its tip, as a parabola, so that the tip can be seen to end."""
-    t = np.arange(min(len(line), 30))
-    ahead = len(t) + np.arange(_BEYOND)
-    shape = np.polynomial.polynomial.polyfit(t, line[-len(t) :], 2)
-    more = np.polynomial.polynomial.polyval(ahead, shape).T
-    return np.concatenate([line, more])
+def prolonged(line: Array, used: int, ahead: int) -> Array:
+    """Prolong a line by a number of points, as a parabola through the last ones."""
+    n = min(used, len(line))
+    return np.concatenate([line, _onward(n, ahead) @ line[-n:]])
+
+
+@cache
+def _onward(used: int, ahead: int) -> Array:
+    """Matrix (ahead, used) that carries a parabola through some points on to the next ones."""
+    t = np.arange(used + ahead) / max(used - 1, 1) - 0.5
+    powers = np.vander(t, 3)
+    return np.asarray(powers[used:] @ np.linalg.pinv(powers[:used]))

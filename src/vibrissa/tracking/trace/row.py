@@ -34,7 +34,7 @@ from vibrissa.tracking.trace.identity import (
     same_whisker,
     sideways,
 )
-from vibrissa.tracking.trace.ridge import noise_level, traced
+from vibrissa.tracking.trace.ridge import noise_level, prolonged, traced
 from vibrissa.tracking.trace.scene import Scene
 from vibrissa.tracking.trace.trace import STEP, Trace, even, given, overlap
 
@@ -227,7 +227,7 @@ def _straightened(
         met = np.flatnonzero(followers[k].clutter.hides(line))
         met = met[met >= _FEWEST]
         if met.size and (kink := _kink(traces[-1])) > _KINKED:
-            kinks[k], guesses[k] = kink, _prolonged(line[: met[0]])
+            kinks[k], guesses[k] = kink, prolonged(line[: met[0]], _POLYNOMIAL, _AHEAD)
     if not guesses:
         return {}
     known = {k: traces[-1].line for k, traces in own.items() if traces and k not in guesses}
@@ -265,15 +265,7 @@ def _up_to_a_crossing(line: Array, every: Sequence[Array]) -> Array:
         away, _ = cKDTree(np.concatenate(others)).query(line)
         met = np.flatnonzero((away < NEAR) & (np.arange(len(line)) >= _FEWEST))
         line = line[: met[0]] if met.size else line
-    return _prolonged(line)
-
-
-def _prolonged(line: Array) -> Array:
-    """Prolong a line as a parabola."""
-    t = np.arange(len(line))[-_POLYNOMIAL:]
-    shape = np.polynomial.polynomial.polyfit(t, line[-len(t) :], 2)
-    ahead = np.arange(len(line), len(line) + _AHEAD)
-    return np.concatenate([line, np.polynomial.polynomial.polyval(ahead, shape).T])
+    return prolonged(line, _POLYNOMIAL, _AHEAD)
 
 
 def _seen(

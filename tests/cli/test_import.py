@@ -3,8 +3,10 @@
 import csv
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
+import xarray as xr
 from typer.testing import CliRunner
 
 import vibrissa as vb
@@ -18,7 +20,7 @@ from vibrissa.tracking import tracker_traces
 
 NODES = 9
 CAMERAS = orthogonal_views(size=(400, 400), center=(5e-3, 0.0, 0.0))
-PEG = Peg([9e-3, 2.6e-3, 0.0], [0.0, 0.0, 1.0], 0.5e-3)
+PEG = Peg([9e-3, 5.1e-3, 0.0], [0.0, 0.0, 1.0], 3e-3)
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +50,53 @@ def deeplabcut(path, pixels):
     return path
 
 
+def tables(folder, views):
+    """A table of DeepLabCut for each view."""
+    return [deeplabcut(folder / f"{name}.csv", pixels) for name, pixels in views.items()]
+
+
+def labels(folder, views):
+    """One file of labels of SLEAP for both videos, the front first, by sleap-io itself."""
+    sio = pytest.importorskip("sleap_io")
+    skeleton = sio.Skeleton([sio.Node(f"w{i}") for i in range(NODES)])
+    track, frames = sio.Track("w"), []
+    videos = {name: sio.Video(f"{name}.mp4", open_backend=False) for name in reversed(views)}
+    for name, video in videos.items():
+        for i, points in enumerate(views[name]):
+            scores = np.full(NODES, 0.9)
+            instance = sio.PredictedInstance.from_numpy(
+                points, skeleton=skeleton, point_scores=scores, score=0.9, track=track
+            )
+            frames.append(sio.LabeledFrame(video, i, [instance]))
+    path = folder / "labels.slp"
+    sio.Labels(frames, list(videos.values()), [skeleton], [track]).save(path, embed=False)
+    return [path]
+
+
+def analysis(folder, views):
+    """An analysis file of SLEAP for each view, in SLEAP's own layout."""
+    for name, pixels in views.items():
+        with h5py.File(folder / f"{name}.h5", "w") as file:
+            file["tracks"] = pixels.transpose(2, 1, 0)[None]
+            file["point_scores"] = np.full((1, NODES, len(pixels)), 0.9)
+            file["node_names"] = np.array([f"w{i}" for i in range(NODES)], dtype="S")
+            file["track_names"] = np.array(["w"], dtype="S")
+    return [folder / f"{name}.h5" for name in views]
+
+
+def movement(folder, views):
+    """One dataset of movement with both views, the front first."""
+    points = np.stack([views[name].transpose(0, 2, 1) for name in reversed(views)])
+    poses = xr.Dataset(
+        {"position": (("view", "time", "space", "keypoint", "individual"), points[..., None])},
+        {"view": list(reversed(views)), "time": np.arange(points.shape[1]) / 1000.0},
+        {"fps": 1000.0, "time_unit": "seconds", "source_software": "LightningPose"},
+    )
+    names = {"space": ["x", "y"], "keypoint": [f"w{i}" for i in range(NODES)], "individual": ["w"]}
+    poses.assign_coords(names).to_netcdf(folder / "poses.nc", engine="h5netcdf")
+    return [folder / "poses.nc"]
+
+
 def run(*words):
     done = CliRunner().invoke(app, [str(word) for word in words])
     if done.exception and not isinstance(done.exception, SystemExit):
@@ -66,22 +115,37 @@ def errors(path, truth):
     return np.linalg.norm(away[both, 0], axis=-1)
 
 
-def test_two_views_to_the_contour(trial, tmp_path):
+@pytest.mark.parametrize("write", [tables, labels, analysis, movement])
+def test_two_views_to_a_recording(trial, tmp_path, write):
     truth, line = trial
     save_cameras(tmp_path / "cameras.toml", CAMERAS)
-    files = [
-        deeplabcut(tmp_path / f"{camera.name}.csv", camera.project(line[:, 0]))
-        for camera in CAMERAS
-    ]
-    assert "vibrissa import" in run("info", files[0])
-    with pytest.raises(ValueError, match="vibrissa import"):
-        run("reconstruct", files[0])
-    with pytest.raises(ValueError, match="--rate"):
-        run("import", *files, "--cameras", tmp_path / "cameras.toml", "-o", tmp_path / "t.nc")
+    files = write(tmp_path, {camera.name: camera.project(line[:, 0]) for camera in CAMERAS})
+    # What info names is typed, with what only the user knows in place of the capitals.
+    _, _, command = run("info", files[0]).partition("vibrissa import")
+    typed = command.partition(" -o trial.nc")[0].replace("FRAMES_A_SECOND", "1000")
+    typed = typed.replace("[FILE of the other view]", str(files[-1])).replace(
+        "--pixel-size MM (or --cameras CAMERAS.toml)", f"--cameras {tmp_path / 'cameras.toml'}"
+    )
     out = tmp_path / "t.nc"
-    run("import", *files, "--cameras", tmp_path / "cameras.toml", "--rate", 1000, "-o", out)
+    run("import", files[0], *typed.split()[1:], "-o", out)
     assert np.median(errors(out, truth)) < 1.5e-4
     assert "vibrissa reconstruct" in run("info", out)
+
+
+@pytest.mark.parametrize(("write", "program"), [(labels, "SLEAP"), (movement, "movement")])
+def test_two_views_to_the_contour(trial, tmp_path, write, program):
+    line = trial[1]
+    save_cameras(tmp_path / "cameras.toml", CAMERAS)
+    noise = np.random.default_rng(1).normal(0.0, 0.1, (2, *line[:, 0, :, :2].shape))
+    seen = [camera.project(line[:, 0]) for camera in CAMERAS] + noise
+    names = [camera.name for camera in CAMERAS]
+    files = write(tmp_path, dict(zip(names, seen, strict=True)))
+    with pytest.raises(ValueError, match="vibrissa import"):
+        run("reconstruct", files[0])
+    with pytest.raises(ValueError, match="--cameras or --pixel-size"):
+        run("import", *files, "--rate", 1000, "-o", tmp_path / "t.nc")
+    out = tmp_path / "t.nc"
+    run("import", *files, "--cameras", tmp_path / "cameras.toml", "--rate", 1000, "-o", out)
     run("reconstruct", out, "--axis", "0,0,1")
     fitted = load_recording(out)["contour"]
     # The short arc that was touched leaves the radius open; the object's side is determined.
@@ -93,7 +157,7 @@ def test_two_views_to_the_contour(trial, tmp_path):
     assert np.median(np.abs(from_axis - PEG.radius)) < 1.5e-4
     text = run("info", out)
     assert "signals, estimates, contour" in text
-    assert "tracked by DeepLabCut" in text
+    assert f"tracked by {program}" in text
     assert "pose_covariance" not in text
     assert "pose_covariance" in run("info", out, "--all")
 
@@ -114,6 +178,17 @@ def test_points_in_space_and_one_view_of_a_plane(trial, tmp_path):
     assert both.sum() > 10
     arcs = found["arc_length"][both, 0] - truth["arc_length"][both, 0]
     assert np.median(np.abs(arcs)) < 3e-4
+
+
+def test_the_frame_rate_is_asked_for_and_views_are_matched_by_name(trial, tmp_path):
+    files = tables(tmp_path, {"top": trial[1][:, 0, :, :2], "front": trial[1][:, 0, :, 1:]})
+    with pytest.raises(ValueError, match="--rate"):
+        run("import", *files, "--pixel-size", 0.05, "-o", tmp_path / "t.nc")
+    image = np.random.default_rng(5).uniform(0.0, 300.0, (4, 1, 2, 5, 2))
+    for views, order in ((("front", "top"), [1, 0]), (("left", "right"), [0, 1])):
+        raw = RawTracks("test", ["w"], image=image, views=views, fps=500.0)
+        found = tracker_traces(labelled(raw, "a"), CAMERAS)
+        assert [camera.name for camera in found.cameras] == [CAMERAS[i].name for i in order]
 
 
 def test_ends_and_curvature_make_an_arc():

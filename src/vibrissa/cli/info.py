@@ -129,7 +129,7 @@ def _recording(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
     # What was estimated does not make an object.
     stuck = "estimates" in found.stages and not found.estimated
     follows = "report" if stuck or not missing else "reconstruct"
-    yield "next", f"vibrissa {follows} {path}{'' if whole else ' (groups and variables: --all)'}"
+    yield "next", f"vibrissa {follows} {path}{'' if whole else '  # groups and variables: --all'}"
 
 
 def _contacts(found: vb.pipeline.TrialSummary) -> str:
@@ -249,7 +249,9 @@ def _tracks(path: Path, kind: str) -> Iterator[tuple[str, str]]:
             yield name.replace("_", " "), str(tracks.attrs[name])
     time = tracks["time"]
     unit = time.attrs.get("units", "")
-    yield "frames", f"{time.size}, from {float(time.min()):g} to {float(time.max()):g} {unit}"
+    first, last = float(time.min()), float(time.max())
+    span = f"from {first:g} to {last:g} s" if unit == "s" else f"numbered {first:g} to {last:g}"
+    yield "frames", f"{time.size}, {span}"
     for dim in ("whisker", "view", "node"):
         if dim in tracks.sizes:
             yield f"{dim}s", _listed(tracks, dim)
@@ -268,15 +270,16 @@ def _tracks(path: Path, kind: str) -> Iterator[tuple[str, str]]:
 def _import(path: Path, tracks: Dataset, *, stated: bool) -> str:
     """The command that makes a recording of tracks."""
     words = ["vibrissa import", str(path)]
+    hint = ""
     if "centerline" in tracks:
         words += [] if stated else ["--unit mm"]
-        hint = ""
-    elif tracks.sizes["view"] > 1:
+    elif tracks.sizes["view"] > 2:
         words += ["--cameras CAMERAS.toml"]
-        hint = ""
     else:
-        words += ["[FILE of the other view]", "--pixel-size MM (or --cameras CAMERAS.toml)"]
-        hint = "; of one view alone the whisker is taken to stay in its plane"
+        if tracks.sizes["view"] == 1:
+            words += ["[FILE of the other view]"]
+            hint = "  # of one view alone the whisker is taken to stay in its plane"
+        words += ["--pixel-size MM (or --cameras CAMERAS.toml)"]
     if tracks["time"].attrs.get("units") != "s":
         words += ["--rate FRAMES_A_SECOND"]
     return f"{' '.join(words)} -o trial.nc{hint}"

@@ -153,12 +153,19 @@ def print_table(
 
 
 def print_properties(rows: Iterable[tuple[str, str]]) -> None:
-    """Print names and values, without lines between them."""
+    """Print names and values, without lines between them; ``next`` is a command to be copied."""
     from rich.table import Table
 
     table = Table(show_header=False, box=None)
     table.add_column()
     table.add_column(overflow="fold")
+    commands = []
     for name, value in rows:
-        table.add_row(Text(name, style="bold"), value)
+        if name == "next":
+            commands.append(value)
+        else:
+            table.add_row(Text(name, style="bold"), Text(value))
     output.print(table, highlight=False)
+    for command in commands:
+        # On one line, whatever the width of the terminal.
+        output.print(Text.assemble((" next: ", "bold"), command), soft_wrap=True)

@@ -1,7 +1,8 @@
 """Datasets of *movement* (NetCDF): ``position`` and ``confidence`` of keypoints.
 
 Up to its version 0.16 the dimensions are called individuals and keypoints, since 0.17 individual
-and keypoint. Positions in a plane are pixels unless the attribute ``space_unit`` states another.
+and keypoint. Datasets of several cameras have a dimension ``view``. Positions in a plane are pixels
+unless the attribute ``space_unit`` states another.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ Array = NDArray[np.float64]
 Frames = NDArray[np.int64]
 
 _NAMES = {"individuals": "individual", "keypoints": "keypoint"}
-_DIMS = ("time", "individual", "keypoint", "space")
+_DIMS = ("time", "individual", "view", "keypoint", "space")
 _PIXELS = ("", "px", "pixel", "pixels")
 
 
@@ -39,8 +40,11 @@ def _raw(path: Path, poses: xr.Dataset) -> RawTracks:
             f"{path} is not a poses dataset of movement: it has {got}, and position along time, "
             "space, keypoint(s) and individual(s) is needed"
         )
+    views = [str(name) for name in poses["view"].values] if "view" in poses.dims else []
     if "individual" not in poses.dims:
         poses = poses.expand_dims(individual=["whisker"])
+    if not views:
+        poses = poses.expand_dims("view")
     points = poses["position"].transpose(*_DIMS).values.astype(np.float64)
     sure = None
     if "confidence" in poses:
@@ -50,14 +54,17 @@ def _raw(path: Path, poses: xr.Dataset) -> RawTracks:
     fps, time, frames = _clock(poses)
     if flat and unit not in _PIXELS:
         raise ValueError(f"{path} has positions in a plane in {unit}; pixels are needed")
+    if not flat and points.shape[2] > 1:
+        raise ValueError(f"{path} has points in space for {points.shape[2]} views; one is needed")
     return RawTracks(
         software=f"movement ({poses.attrs.get('source_software', 'unknown')})",
         whiskers=[str(name) for name in poses["individual"].values],
-        image=points[:, :, None] if flat else None,
-        image_confidence=sure[:, :, None] if flat and sure is not None else None,
-        space=None if flat else points,
-        space_confidence=None if flat else sure,
+        image=points if flat else None,
+        image_confidence=sure if flat else None,
+        space=None if flat else points[:, :, 0],
+        space_confidence=None if flat or sure is None else sure[:, :, 0],
         nodes=[str(name) for name in poses["keypoint"].values],
+        views=views,
         unit="" if unit in _PIXELS else unit,
         fps=fps,
         time=time,

@@ -2,7 +2,8 @@
 
 An analysis file holds dense arrays of tracks, nodes and scores. Their dimensions are named in an
 attribute where sleap-io wrote them, and are (track, xy, node, frame) in SLEAP's own. Labels are
-lists of instances in frames; sleap-io knows their many versions.
+lists of instances in frames, of one video or of several, which become views; sleap-io reads their
+many versions.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import json
 from os import PathLike
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
@@ -18,6 +20,9 @@ from numpy.typing import NDArray
 from vibrissa.io.netcdf import opened
 from vibrissa.io.paths import check_readable
 from vibrissa.io.tracks import RawTracks
+
+if TYPE_CHECKING:
+    import sleap_io
 
 Array = NDArray[np.float64]
 
@@ -70,25 +75,41 @@ def read_sleap_labels(path: str | PathLike[str]) -> RawTracks:
             raise ValueError(f"{path} holds no labels of SLEAP: it lacks frames or instances")
     try:
         labels = sleap_io.load_slp(path, open_videos=False)
-        if len(labels.videos) != 1:
-            raise ValueError(f"it has labels of {len(labels.videos)} videos, not of one")
-        found = labels.numpy(untracked=not labels.tracks, return_confidence=True)
-        labelled_frames = [frame.frame_idx for frame in labels.labeled_frames]
+        parts = [_of_video(labels, video) for video in labels.videos]
     except Exception as error:  # What sleap-io raises for a damaged file is not documented.
         raise ValueError(f"{path} cannot be read as labels of SLEAP ({error})") from error
-    # Versions of sleap-io begin at frame 0, or at the first that has a label.
-    first, last = min(labelled_frames, default=0), max(labelled_frames, default=0)
-    start = first if len(found) == last - first + 1 else 0
-    nodes = list(labels.skeletons[0].node_names)
-    names = [track.name for track in labels.tracks] or _numbered(found.shape[1])
+    if not any(len(values) for _, values in parts):
+        raise ValueError(f"{path} holds no labelled frame")
+    start = min(first for first, values in parts if len(values))
+    end = max(first + len(values) for first, values in parts)
+    tracks, nodes = (max(values.shape[axis] for _, values in parts) for axis in (1, 2))
+    found = np.full((end - start, tracks, len(parts), nodes, 3), np.nan)
+    for view, (first, values) in enumerate(parts):
+        rows = slice(first - start, first - start + len(values))
+        found[rows, : values.shape[1], view] = values
+    stems = [Path(str(video.filename)).stem for video in labels.videos]
+    if len(set(stems)) < len(stems):
+        stems = [f"view {i + 1}" for i in range(len(stems))]
     return RawTracks(
         software="SLEAP",
-        whiskers=names,
-        image=found[:, :, None, :, :2].astype(np.float64),
-        image_confidence=_confidence(found[:, :, None, :, 2].astype(np.float64)),
-        nodes=nodes,
-        frames=np.arange(len(found)) + start,
+        whiskers=[track.name for track in labels.tracks] or _numbered(tracks),
+        image=found[..., :2],
+        image_confidence=_confidence(found[..., 2]),
+        nodes=list(labels.skeletons[0].node_names),
+        views=stems if len(stems) > 1 else (),
+        frames=np.arange(start, end),
     )
+
+
+def _of_video(labels: sleap_io.Labels, video: sleap_io.Video) -> tuple[int, Array]:
+    """First frame of a video's labels, and these (frame, track, node, column, row and score)."""
+    numbers = [frame.frame_idx for frame in labels.labeled_frames if frame.video == video]
+    if not numbers:
+        return 0, np.full((0, 1, 1, 3), np.nan)
+    found = labels.numpy(video=video, untracked=not labels.tracks, return_confidence=True)
+    # Versions of sleap-io begin at frame 0, or at the first that has a label.
+    first = min(numbers) if len(found) == max(numbers) - min(numbers) + 1 else 0
+    return first, found.astype(np.float64)
 
 
 def _ordered(array: h5py.Dataset, wanted: tuple[str, ...]) -> Array:

@@ -153,16 +153,21 @@ def _views(
     """Cameras of the views; without calibration one or two orthogonal ones."""
     count = points.shape[2]
     if cameras is not None:
+        shown = [str(name) for name in tracks["view"].values]
         if len(cameras) != count:
             raise ValueError(
-                f"there are {len(cameras)} cameras for {count} views: "
-                f"{', '.join(map(str, tracks['view'].values))}"
+                f"there are {len(cameras)} cameras for {count} views: {', '.join(shown)}"
             )
-        return tuple(cameras)
+        named = {camera.name: camera for camera in cameras}
+        # Files name their views in any order; names that fit no camera are in that of the cameras.
+        return tuple(named[name] for name in shown) if set(named) == set(shown) else tuple(cameras)
     if count > 2:
         raise ValueError(f"{count} views need calibrated cameras")
     if pixel_size is None:
-        raise ValueError("points in images need calibrated cameras, or the size of a pixel")
+        raise ValueError(
+            "points in images need calibrated cameras, or the size of a pixel: --cameras or "
+            "--pixel-size (command line), cameras or pixel_size (Python)"
+        )
     size = np.ceil(np.nanmax(points, axis=(0, 1, 2, 3)) + 1.0).astype(int)
     return orthogonal_views(pixel_size, (int(size[0]), int(size[1])))[:count]
 

@@ -51,6 +51,7 @@ if TYPE_CHECKING:
         Gravity,
         Prior,
         estimate_from_wrench,
+        second_contact,
     )
     from vibrissa.display import show
     from vibrissa.identifiability import best_triplet, critical_cones, sensitivity, uniqueness
@@ -126,6 +127,7 @@ __all__ = [
     "rod",
     "samples",
     "scene",
+    "second_contact",
     "sensitivity",
     "sensitivity_findings",
     "sensors",
@@ -152,6 +154,7 @@ _HOMES = {
         "Gravity",
         "Prior",
         "estimate_from_wrench",
+        "second_contact",
     ),
     "display": ("show",),
     "identifiability": (

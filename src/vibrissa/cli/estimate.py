@@ -100,6 +100,7 @@ class EstimateOptions:
     method: Method = "exact"
     proximal: float | None = None
     friction_sigma: float = 0.0
+    second_contacts: float = 0.0
     noise: NoiseOptions
     assumed: AssumptionOptions
     own: WhiskerOptions
@@ -149,6 +150,7 @@ class EstimateOptions:
             self.method != "exact",
             self.proximal is not None,
             self.friction_sigma,
+            self.second_contacts,
             self.assumed.described(),
         )
         return any(bool(one) for one in (*stated, *other))
@@ -166,6 +168,7 @@ class EstimateOptions:
             "errors": self.assumed.errors,
             "prior": self.assumed.prior,
             "friction": self.friction_sigma,
+            "second_contacts": 0.01 * self.second_contacts,
         }
 
     def described(self, names: str, noise: str, least: float) -> str:
@@ -174,6 +177,8 @@ class EstimateOptions:
         used = f"signals ({', '.join(names.split())}){by}"
         if self.friction_sigma:
             used += f", with friction along the whisker of {self.friction_sigma:g} (one sigma)"
+        if self.second_contacts:
+            noise += f"; second contacts at {self.second_contacts:g} % false alarms"
         return (
             f"{'force and moment whole' if names == WRENCH else used}{self.assumed.described()}; "
             f"{noise}; contacts are measured where M_B exceeds {shown('MB', least)}"
@@ -225,6 +230,7 @@ def estimate(
             how.noise.given,
             how.method != "exact",
             how.friction_sigma,
+            how.second_contacts,
         )
         if any(map(bool, stated)):
             raise ValueError(f"{sensor} is for tables, and has its own channels and noise")
@@ -244,7 +250,7 @@ def estimate(
 
 def _named_signals(table: Path, how: EstimateOptions) -> bool:
     """Whether a table has the signals that are used, and not what they are computed from."""
-    if how.whole or how.method != "exact" or how.friction_sigma:
+    if how.whole or how.method != "exact" or how.friction_sigma or how.second_contacts:
         return False
     names = how.names or vb.pipeline.TRIPLET
     first = next((line for line in vb.io.read_text(table).splitlines() if line.strip()), "")
@@ -324,8 +330,9 @@ def _from_table(signals: Path, target: Path, how: EstimateOptions, weight: Gravi
             maps = [map_of(known, tell, grid=how.grid, proximal=smallest_arc(how.proximal))]
         tell("contact points", 0, 1)
         if how.whole:
-            errors, prior = how.assumed.errors, how.assumed.prior
-            found = vb.pipeline.locate_from_wrench(known, wrench, noise, errors, prior, gravity)
+            others = how.keywords()
+            others = {n: others[n] for n in ("errors", "prior", "second_contacts")}
+            found = vb.pipeline.locate_from_wrench(known, wrench, noise, gravity=gravity, **others)
         else:
             names, others = how.names or vb.pipeline.TRIPLET, how.keywords()
             found = vb.pipeline.locate(

@@ -183,6 +183,12 @@ OPTIONS = {
         "0.3 where coefficients of friction are up to 0.5; 0, the default: no friction.",
         least=0.0,
     ),
+    "second_contacts": Option(
+        "Rate of false alarms, %, such as 1, at which frames are marked not_one_contact because "
+        "force and moment whole show a second contact; 0, the default: no test.",
+        "%",
+        least=0.0,
+    ),
     "gain_sigma": Option(
         "Standard deviation of the gain of each component of force and moment, %; likewise.",
         "%",

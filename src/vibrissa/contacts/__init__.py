@@ -47,6 +47,7 @@ from vibrissa.contacts.noise import (
 from vibrissa.contacts.prior import Prior
 from vibrissa.contacts.readout import check_signals as check_signals
 from vibrissa.contacts.search import signals_at_nodes as signals_at_nodes
+from vibrissa.contacts.two_contacts import bent_by_forces as bent_by_forces, second_contact
 from vibrissa.contacts.weight import Gravity, estimate_with_weight as estimate_with_weight
 from vibrissa.contacts.wrench import estimate_from_wrench
 
@@ -68,5 +69,6 @@ __all__ = [
     "SensorNoise",
     "ellipsoids",
     "estimate_from_wrench",
+    "second_contact",
     "spherical",
 ]

@@ -31,6 +31,9 @@ from vibrissa.status import Status, flag_attributes
 NUMBERS = ("time", "x", "y", "z", "r", "theta", "phi", "sigma_x", "sigma_y", "sigma_z")
 """Names of the columns with numbers, in their order; the last column is the status."""
 
+_OPTIONAL = ("one_contact",)
+"""Columns before the status that are written where there is something to write."""
+
 
 def save_contacts(path: str | PathLike[str], contacts: xr.Dataset) -> None:
     """Write contact points, every number in full.
@@ -55,12 +58,13 @@ def save_contacts(path: str | PathLike[str], contacts: xr.Dataset) -> None:
     faults = [n for n in (*NUMBERS, "status") if n in contacts and contacts[n].dims != ("time",)]
     if faults:
         raise ValueError(f"{', '.join(faults)} must have the one dim time")
+    columns = (*NUMBERS, *(name for name in _OPTIONAL if name in contacts))
     table = np.column_stack(
-        [contacts[name].values if name in contacts else np.full(n, np.nan) for name in NUMBERS]
+        [contacts[name].values if name in contacts else np.full(n, np.nan) for name in columns]
     )
     names = [Status(int(code)).name.lower() for code in contacts["status"].values]
     rows = ([*row, name] for row, name in zip(table.tolist(), names, strict=True))
-    write_table(path, (*NUMBERS, "status"), rows)
+    write_table(path, (*columns, "status"), rows)
 
 
 def load_contacts(path: str | PathLike[str]) -> xr.Dataset:
@@ -76,10 +80,11 @@ def load_contacts(path: str | PathLike[str]) -> xr.Dataset:
     xarray.Dataset
         Dim time; a variable for each column, ``status`` as its number.
     """
-    table = Table(path, (*NUMBERS, "status"))
+    numbers = (*NUMBERS, *(name for name in _OPTIONAL if name in Table(path).names))
+    table = Table(path, (*numbers, "status"))
     codes = [Status.__members__.get(name.upper()) for name in table.text("status")]
     table.refuse(np.array([code is None for code in codes], dtype=bool), "no contact")
-    columns = {name: xr.Variable("time", table.numbers(name), attributes(name)) for name in NUMBERS}
+    columns = {name: xr.Variable("time", table.numbers(name), attributes(name)) for name in numbers}
     about = {**attributes("status"), **flag_attributes()}
     columns["status"] = xr.Variable("time", np.array(codes, dtype=np.int8), about)
     return xr.Dataset({k: v for k, v in columns.items() if k != "time"}, {"time": columns["time"]})

@@ -46,6 +46,7 @@ _KEPT = (
     "arc_length",
     "force",
     "friction_angle",
+    "one_contact",
     "candidates",
     "in_contact",
     "status",
@@ -63,6 +64,7 @@ def estimates_of(
     errors: Mapping[str, Any] | None = None,
     prior: Prior | None = None,
     friction: float = 0.0,
+    second_contacts: float = 0.0,
     proximal: float = PROXIMAL,
     progress: Progress | None = None,
 ) -> xr.Dataset:
@@ -92,6 +94,11 @@ def estimates_of(
     friction : float
         Standard deviation of the ratio of the force along the whisker to that across it, as of
         ``ContactMap.estimate``; 0, the default, for contacts without friction.
+    second_contacts : float
+        Rate of false alarms at which frames are detected that more than one contact explains, by
+        force and moment whole (`second_contact`), such as 0.01; they get the status
+        ``NOT_ONE_CONTACT``. 0, the default: no test. With the wrench ratios of friction are taken
+        to be 0.3 (one sigma), otherwise as by ``friction``.
     proximal : float
         Smallest arc length of a contact of maps that are simulated, share of the length.
     progress : callable, optional
@@ -128,7 +135,7 @@ def estimates_of(
     names = TRIPLET if whole else selection(signals)
     count = data.sizes["whisker"]
     report = progress or _silent
-    how: Any = {"method": method, "errors": errors, "prior": prior, "friction": friction}
+    how: Any = {"errors": errors, "prior": prior, "second_contacts": second_contacts}
     if whiskers is None and contact_maps is not None:
         whiskers = [one.whisker for one in contact_maps]
     whiskers = Recording(recording).whiskers if whiskers is None else whiskers
@@ -146,7 +153,7 @@ def estimates_of(
         if data.attrs.get("source") != "sensor":
             wrench = wrench.assign(in_contact=one["in_contact"])
         if whole:
-            found = locate_from_wrench(whisker, wrench, sigma, errors, prior)
+            found = locate_from_wrench(whisker, wrench, sigma, **how)
         elif (none := without_contact(whisker, wrench, names, noise=sigma)) is not None:
             found = none
         else:
@@ -157,7 +164,9 @@ def estimates_of(
                 grid = method.startswith("lookup")
                 contact_map = ContactMap.simulate(whisker, grid=grid, proximal=proximal)
                 report("map of all contacts", k + 1, count)
-            found = locate(contact_map, wrench, names, noise=sigma, **how)
+            found = locate(
+                contact_map, wrench, names, noise=sigma, method=method, friction=friction, **how
+            )
         parts.append(_one_whisker(one, found, other_noise=noise is not None))
         report("contact points", k + 1, count)
     out = xr.concat(parts, "whisker").transpose("time", "whisker", ...)
@@ -289,4 +298,5 @@ def contact_columns(contacts: xr.Dataset) -> xr.Dataset:
     names = ("x", "y", "z", "r", "theta", "phi", "sigma_x", "sigma_y", "sigma_z")
     columns = {name: ("time", values[:, i], attributes(name)) for i, name in enumerate(names)}
     table = xr.Dataset(columns, {"time": contacts["time"]}, contacts.attrs)
-    return table.assign(status=contacts["status"])
+    kept = ("one_contact", "status")
+    return table.assign({name: contacts[name] for name in kept if name in contacts})

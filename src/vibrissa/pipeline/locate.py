@@ -44,6 +44,7 @@ from vibrissa.contacts import (
     estimate_from_wrench,
     estimate_with_weight,
     ratio_derivatives,
+    second_contact,
     whitening,
 )
 from vibrissa.quantities import attributes
@@ -61,6 +62,9 @@ TRIPLET = ("Fx", "MB", "MD")
 
 DETECTED = 5.0
 """Bending moment from which a contact is detected, in standard deviations of its noise."""
+
+_FRICTION = 0.3
+"""Ratio of forces along and across the whisker, one sigma, where second contacts are looked for."""
 
 _WHISKER = {"reference_frame": "whisker"}
 
@@ -104,6 +108,7 @@ def locate(
     prior: Prior | None = None,
     friction: float = 0.0,
     gravity: Gravity | None = None,
+    second_contacts: float = 0.0,
 ) -> xr.Dataset:
     """Estimate the contact point in every frame with a contact.
 
@@ -130,6 +135,9 @@ def locate(
     gravity : Gravity, optional
         Gravity that the whisker bends under, as of ``ContactMap.estimate``; only with the exact
         method. Derivatives are then those of a whisker without weight that has the resting shape.
+    second_contacts : float
+        Rate of false alarms at which frames of more than one contact are detected, as for
+        `estimates_of`.
 
     Returns
     -------
@@ -167,7 +175,8 @@ def locate(
         found = estimate(contact_map, signals, names, method=method, prior=prior)
     stated = found.candidates.covariance if method == "exact" else None
     whisker = _at_rest(contact_map.whisker, gravity)
-    return _located(whisker, names, measured, _Candidates.of(found), stated, friction)
+    out = _located(whisker, names, measured, _Candidates.of(found), stated, friction)
+    return _alone(out, whisker, measured, errors, friction, second_contacts)
 
 
 def _at_rest(whisker: Whisker, gravity: Gravity | None) -> Whisker:
@@ -198,6 +207,7 @@ def locate_from_wrench(
     errors: Mapping[str, Any] | None = None,
     prior: Prior | None = None,
     gravity: Gravity | None = None,
+    second_contacts: float = 0.0,
 ) -> xr.Dataset:
     """Locate contacts from all six components, with friction or without.
 
@@ -215,6 +225,8 @@ def locate_from_wrench(
         Contacts that are possible, as for `locate`.
     gravity : Gravity, optional
         Gravity that the whisker bends under, as for `locate`.
+    second_contacts : float
+        Rate of false alarms, as for `locate`.
 
     Returns
     -------
@@ -240,7 +252,43 @@ def locate_from_wrench(
             (errors or {}).get("stiffness_sigma", 0.0),
         )
     stated = found.candidates.covariance
-    return _located(_at_rest(whisker, gravity), WRENCH, measured, _Candidates.of(found), stated)
+    rest = _at_rest(whisker, gravity)
+    out = _located(rest, WRENCH, measured, _Candidates.of(found), stated)
+    return _alone(out, rest, measured, errors, _FRICTION, second_contacts)
+
+
+def _alone(
+    found: xr.Dataset,
+    whisker: Whisker,
+    measured: _Measured,
+    errors: Mapping[str, Any] | None,
+    friction: float,
+    rate: float,
+) -> xr.Dataset:
+    """Mark the frames that one contact does not explain, at this rate of false alarms."""
+    if not rate > 0.0:
+        return found
+    if measured.typical is None:
+        raise ValueError("second contacts are detected by what exceeds the noise: give the noise")
+    rows = measured.rows
+    force, moment = measured.force[rows], measured.moment[rows]
+    test = second_contact(
+        whisker,
+        force,
+        moment,
+        noise=measured.typical,
+        friction=friction,
+        false_alarms=rate,
+        **(errors or {}),
+    )
+    status = found["status"].values.copy()
+    status[np.flatnonzero(rows)[test["second_contact"].values]] = int(Status.NOT_ONE_CONTACT)
+    alone = _everywhere(rows, test["one_contact"].values)
+    data = {
+        "one_contact": ("time", alone, attributes("one_contact")),
+        "status": found["status"].copy(data=status),
+    }
+    return found.assign(data)
 
 
 class _Measured(NamedTuple):

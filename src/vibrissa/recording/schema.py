@@ -111,6 +111,7 @@ VARIABLES: Mapping[str, RecordedVariable] = MappingProxyType(
         "overlap": RecordedVariable(_EACH, _TRUTH),
         "second_contact": RecordedVariable(_EACH, _TRUTH, kind="bool"),
         "friction_angle": RecordedVariable(_EACH, _ESTIMATES),
+        "one_contact": RecordedVariable(_EACH, _ESTIMATES),
         "candidates": RecordedVariable(_EACH, _ESTIMATES, kind="int"),
         "in_contact": RecordedVariable(_EACH, _ANYWHERE, kind="bool"),
         "confidence": RecordedVariable(_EACH, ("", "truth")),

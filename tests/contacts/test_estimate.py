@@ -231,3 +231,20 @@ def test_one_at_a_time_is_the_same(gamma_map, rng):
     assert locate([np.nan, 1e-5, 1e-7]).status == vb.Status.MISSING
     with pytest.raises(ValueError, match="3 signals"):
         locate([1.0, 2.0])
+
+
+def test_rows_of_a_long_batch_are_those_of_a_short_one(gamma_map, rng):
+    point, force, _ = random_contacts(gamma_map, 300, rng)
+    signals = vb.base_signals(force, np.cross(point, force))[list(CANONICAL)]
+    short = gamma_map.estimate(signals, using=CANONICAL)
+    rows = np.arange(70_000) % 300  # more than are worked on at once, with a remainder
+    long = gamma_map.estimate(signals.isel(sample=rows), using=CANONICAL)
+    np.testing.assert_array_equal(long.status, short.status[rows])
+    np.testing.assert_array_equal(long.n_candidates, short.n_candidates[rows])
+    close = (
+        1e-9 * gamma_map.whisker.length
+    )  # contacts are solved side by side with their neighbours
+    np.testing.assert_allclose(
+        long.candidates.point, short.candidates.point[rows], rtol=0, atol=close
+    )
+    np.testing.assert_allclose(long.force, short.force[rows], rtol=1e-6)

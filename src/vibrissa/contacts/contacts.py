@@ -99,6 +99,28 @@ class Candidates(NamedTuple):
             parts.append(part)
         return Candidates(allowed.sum(axis=1), *parts)
 
+    def trimmed(self) -> Candidates:
+        """Copy as many candidates as any measurement has."""
+        most = max(1, int(self.number.max(initial=0)))
+        return Candidates(self.number, *(values[:, :most].copy() for values in self[1:]))
+
+    @classmethod
+    def joined(cls, parts: list[Candidates]) -> Candidates:
+        """Join candidates of measurements that follow one another; the list is emptied."""
+        count, most = sum(len(one.number) for one in parts), max(one.x.shape[1] for one in parts)
+        number = np.empty(count, np.int64)
+        fields = [np.empty((count, most, *v.shape[2:]), v.dtype) for v in parts[0][1:]]
+        start = count
+        while parts:  # the memory of a part is free again before more is written
+            part = parts.pop()
+            start, end = start - len(part.number), start
+            number[start:end] = part.number
+            for whole, values in zip(fields, part[1:], strict=True):
+                own = values.shape[1]
+                whole[start:end, :own] = values
+                whole[start:end, own:] = False if values.dtype == np.bool_ else np.nan
+        return cls(number, *fields)
+
     def spread_out(self, rows: IntArray, n: int) -> Candidates:
         """Place the candidates of some measurements among those of n."""
         out = Candidates.room(n, self.x.shape[1])
@@ -317,23 +339,28 @@ def contacts_of(
     dims: tuple[str, ...],
     coords: Coordinates,
 ) -> Contacts:
-    """Give candidates of flat measurements their units and the shape of the measurements."""
+    """Give candidates of flat measurements their units, in place, and the measurements' shape."""
     d, most = discretization, max(1, int(found.number.max(initial=0)))
+    found.values[..., :3] *= d.force
+    found.values[..., 3:] *= d.length
+    found.covariances[...] *= d.length**2
+    found.x[..., 0] *= d.length
+    found.x[..., 1:] *= d.force
 
     def whole(values: AnyArray) -> AnyArray:
         return values.reshape((*shape, *values.shape[1:]))
 
     there = np.arange(most) < found.number[:, None]
     every = Contacts(
-        point=whole(found.values[:, :most, 3:] * d.length),
-        covariance=whole(found.covariances[:, :most] * d.length**2),
+        point=whole(found.values[:, :most, 3:]),
+        covariance=whole(found.covariances[:, :most]),
         covariance_valid=whole(found.valid[:, :most] & there),
         chi_squared=whole(found.chi_squared[:, :most]),
         probability=whole(found.probability[:, :most]),
         status=whole(np.where(there, status[:, None], int(Status.MISSING))),
-        arc_length=whole(found.x[:, :most, 0] * d.length),
-        force=whole(found.values[:, :most, :3] * d.force),
-        contact_force=whole(found.x[:, :most, 1:] * d.force),
+        arc_length=whole(found.x[:, :most, 0]),
+        force=whole(found.values[:, :most, :3]),
+        contact_force=whole(found.x[:, :most, 1:]),
         friction_angle_sigma=whole(found.angle_sigma[:, :most]),
         n_candidates=whole(there.astype(np.int64)),
         using=using,

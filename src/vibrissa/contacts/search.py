@@ -62,6 +62,8 @@ LARGEST = 1e100
 _LARGEST_SCALE, _OFTEN = 100.0, 0.95
 # A few odd numbers have a status each; so many, nearly all of them, are a table in other units.
 _TABLE = 20
+# Measurements for which there is room for the most candidates at a time; few have more than one.
+_AT_ONCE = 1 << 16
 #: Statuses by their number.
 STATUSES = {int(status): status for status in Status}
 
@@ -85,7 +87,17 @@ class Search:
         beyond = known & readout.bounds.exceeded(values)
         status[beyond], status[nothing] = self._beyond, self._nothing
         aims = np.where((status == Status.UNIQUE)[:, None], targets, np.nan)
-        return self._rows(np.ascontiguousarray(values), aims, status)
+        values = np.ascontiguousarray(values)
+        if len(values) <= _AT_ONCE:
+            return self._rows(values, aims, status)
+        parts, chi_squared = [], np.empty(len(values))
+        for start in range(0, len(values), _AT_ONCE):
+            rows = slice(start, start + _AT_ONCE)
+            found, status[rows], chi_squared[rows] = self._rows(
+                values[rows], aims[rows], status[rows]
+            )
+            parts.append(found.trimmed())
+        return Candidates.joined(parts), status, chi_squared
 
     def one(self, measurement: Measurement) -> tuple[Candidates, Status, float]:
         """Candidates of one measurement, with its status and χ² of the first."""

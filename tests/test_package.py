@@ -77,6 +77,27 @@ def test_import_loads_nothing_heavy():
     assert loaded.strip() == "[]"
 
 
+def test_finding_a_contact_loads_neither_xarray_nor_splines(tmp_path):
+    """They take longer than all else that a stream needs before its first answer."""
+    code = (
+        "import sys, vibrissa as vb\n"
+        "whisker = vb.Whisker.parabola(length=40e-3, coefficient=10.0)\n"
+        f"known = vb.ContactMap.simulate(whisker, grid=False).save({str(tmp_path / 'a.nc')!r})\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+    code = (
+        "import sys, vibrissa as vb, vibrissa.streaming\n"
+        f"locate = vb.Estimator(vb.ContactMap.load({str(tmp_path / 'a.nc')!r}))\n"
+        "found = locate([-1e-5, 1e-6, 0.5])\n"
+        "slow = {'xarray', 'pandas', 'dask', 'scipy.interpolate', 'scipy.optimize'}\n"
+        "print(sorted(slow & set(sys.modules)))"
+    )
+    loaded = subprocess.run(
+        [sys.executable, "-c", code], check=True, capture_output=True, text=True
+    ).stdout
+    assert loaded.strip() == "[]"
+
+
 def test_children_can_be_interrupted_where_the_tests_cannot(request):
     """As where a shell starts the tests in its background."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)

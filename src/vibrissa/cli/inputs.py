@@ -260,9 +260,9 @@ def recording_from(path: Path) -> xr.DataTree:
     return recording
 
 
-def map_from(path: Path) -> vb.ContactMap:
+def map_from(path: Path, grid: bool = True) -> vb.ContactMap:
     """Read a map."""
-    return vb.ContactMap.load(path)
+    return vb.ContactMap.load(path, grid)
 
 
 def map_of(whisker: vb.Whisker, tell: Tell, *, grid: bool = False, **how: Any) -> vb.ContactMap:

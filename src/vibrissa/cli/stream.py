@@ -143,7 +143,7 @@ class MeasurementOptions:
     def contact_map(self, name: str) -> vb.ContactMap:
         """Read or simulate the map of a whisker."""
         if self.map:
-            return map_from(Path(_named(self.map, "--map")[name]))
+            return map_from(Path(_named(self.map, "--map")[name]), grid=False)
         whisker = self.own.read()
         print_notes(whisker)
         remark(f"no map given; simulating that of {whisker!r}")

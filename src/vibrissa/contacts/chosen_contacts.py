@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
-import xarray as xr
 from numpy.typing import ArrayLike
 
+from vibrissa.deferred import xr
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.rod import (
     PointContact,

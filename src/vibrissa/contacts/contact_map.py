@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import xarray as xr
 from numpy.typing import ArrayLike
 
 from vibrissa.contacts.contacts import Contacts, spherical
@@ -28,13 +27,15 @@ from vibrissa.contacts.prior import Prior
 from vibrissa.contacts.search import estimate
 from vibrissa.contacts.weight import Gravity, estimate_with_weight
 from vibrissa.contacts.wrench import estimate_components
-from vibrissa.io import COMPRESSED, kind_of, naming, read_tree, write_netcdf
+from vibrissa.deferred import xr
+from vibrissa.io import COMPRESSED, naming, read_dataset, read_groups, write_netcdf
 from vibrissa.numerics import AnyArray, Array
 from vibrissa.quantities import attributes
 from vibrissa.rod import (
     CELLS,
     PROXIMAL,
     STEPS,
+    Discretization,
     Fold,
     PointContact,
     SearchTree,
@@ -280,20 +281,22 @@ class ContactMap:
         _save(self, Path(path))
 
     @classmethod
-    def load(cls, path: str | Path) -> ContactMap:
+    def load(cls, path: str | Path, grid: bool = True) -> ContactMap:
         """Read a map written by :meth:`save`.
 
         Parameters
         ----------
         path : str or Path
             The file.
+        grid : bool
+            Whether the paper's grid is read, if there is one; estimates do without.
 
         Returns
         -------
         ContactMap
             The same map.
         """
-        return _load(Path(path))
+        return _load(Path(path), grid)
 
     def __repr__(self) -> str:
         """Say whose map it is and what it holds."""
@@ -499,38 +502,31 @@ def _save(contact_map: ContactMap, path: Path) -> None:
     write_netcdf(path, tree, {"/grid": dict.fromkeys(grid, COMPRESSED)})
 
 
-def _load(path: Path) -> ContactMap:
+def _load(path: Path, grid: bool) -> ContactMap:
     """Read a map; raise a ValueError if the file is not one."""
-    kind = kind_of(path)
+    groups = read_groups(path, ("/", "whisker", "chart", "grid"), {"grid"})
+    kind = groups["/"].attrs.get("kind", "")
     if kind != _KIND:
         raise ValueError(f"{path} holds {kind or 'data of another kind'}, not a contact map")
-    tree = read_tree(path)
-    missing = [name for name in ("whisker", "chart") if name not in tree.children]
+    missing = [name for name in ("whisker", "chart") if name not in groups]
     if missing:
         raise ValueError(f"{path} lacks the group {' and '.join(missing)} of a contact map")
+    solved = read_dataset(path, "grid") if grid and "grid" in groups else None
     with naming(path, "a contact map"):
-        return _from_tree(tree)
+        whisker = Whisker.from_dataset(groups["whisker"])
+        steps = int(groups["/"].attrs["steps"])
+        chart = _chart(groups["chart"].variables, discretize(whisker, steps))
+        if solved is not None:  # files keep a coordinate of the root only there
+            solved = solved.assign_coords(space=["x", "y", "z"])
+    return ContactMap(whisker, chart, steps, solved)
 
 
-def _from_tree(tree: xr.DataTree) -> ContactMap:
-    whisker = Whisker.from_dataset(tree["whisker"].to_dataset())
-    steps = int(tree.attrs["steps"])
-    raw = {str(name): np.asarray(v) for name, v in tree["chart"].to_dataset().variables.items()}
-    chart = StableSet(
-        discretization=discretize(whisker, steps),
-        stations=raw["stations"],
-        bearings=raw["bearings"],
-        loads=raw["loads"],
+def _chart(raw: Mapping[str, AnyArray], discretization: Discretization) -> StableSet:
+    """Contacts of a file."""
+    names = ("stations", "bearings", "loads", "contacts", "values", "tangents", "frames")
+    return StableSet(
+        discretization=discretization,
         fold=Fold(raw["bounds"], np.ascontiguousarray(raw["fold"])),
-        contacts=raw["contacts"],
-        values=raw["values"],
-        tangents=raw["tangents"],
-        frames=raw["frames"],
         folded=raw["folded"].astype(bool),
+        **{name: raw[name] for name in names},
     )
-    grid = None
-    if "grid" in tree.children:
-        # Files keep a coordinate of the root only there.
-        grid = tree.children["grid"].to_dataset(inherit=False)
-        grid = grid.assign_coords(space=["x", "y", "z"])
-    return ContactMap(whisker, chart, steps, grid)

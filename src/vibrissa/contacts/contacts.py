@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
-import xarray as xr
 
+from vibrissa.deferred import xr
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.quantities import attributes
 from vibrissa.rod import Discretization

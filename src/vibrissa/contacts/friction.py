@@ -21,7 +21,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import xarray as xr
 
 from vibrissa.contacts.channels import Channels, channel_derivatives
 from vibrissa.contacts.contacts import MOST_CANDIDATES, Candidates, Contacts, contacts_of
@@ -30,6 +29,7 @@ from vibrissa.contacts.noise import Noise, SensorNoise, explained, sensor_noise,
 from vibrissa.contacts.posterior import CERTAIN, NORMAL_KURTOSIS, ranked
 from vibrissa.contacts.prior import Prior, possible_candidates
 from vibrissa.contacts.search import estimate
+from vibrissa.deferred import xr
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.signals import measured, selection, signal_scales
 from vibrissa.status import Status

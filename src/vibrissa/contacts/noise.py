@@ -23,10 +23,10 @@ from functools import cache
 from typing import TypeAlias
 
 import numpy as np
-import xarray as xr
 from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
+from vibrissa.deferred import xr
 from vibrissa.numerics import Array
 from vibrissa.quantities import attributes
 from vibrissa.sensors import Sensor

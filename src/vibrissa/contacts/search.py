@@ -20,7 +20,6 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-import xarray as xr
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
@@ -38,6 +37,7 @@ from vibrissa.contacts.readout import (
     check_signals,
     independent,
 )
+from vibrissa.deferred import xr
 from vibrissa.numerics import AnyArray, Array, IntArray, share_out
 from vibrissa.rod import TOLERANCE
 from vibrissa.signals import (

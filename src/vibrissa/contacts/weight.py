@@ -26,7 +26,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-import xarray as xr
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
@@ -40,6 +39,7 @@ from vibrissa.contacts.prior import Prior, possible_candidates
 from vibrissa.contacts.readout import check_signals
 from vibrissa.contacts.search import estimate
 from vibrissa.contacts.wrench import chosen, estimate_components, friction_angle
+from vibrissa.deferred import xr
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.rod import Discretization, discretize, evaluated, resting
 from vibrissa.signals import (

@@ -18,7 +18,6 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import xarray as xr
 from numpy.typing import ArrayLike
 
 from vibrissa.contacts.channels import WRENCH
@@ -38,6 +37,7 @@ from vibrissa.contacts.noise import (
 )
 from vibrissa.contacts.posterior import CERTAIN, judged, ranked
 from vibrissa.contacts.prior import Prior, possible_candidates
+from vibrissa.deferred import xr
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.rod import Discretization, discretize, solve_forces, vanishing_moments
 from vibrissa.signals import Coordinates, labelled_wrench, measured

@@ -5,6 +5,8 @@ names the file and what is wrong with it, where it is of another kind, empty, cu
 Nothing in a file is run or unpickled, and no file leads to another.
 """
 
+from __future__ import annotations
+
 from vibrissa.io.anipose import (
     read_calibration as read_calibration,
     write_calibration as write_calibration,
@@ -22,6 +24,7 @@ from vibrissa.io.netcdf import (
     netcdf_image as netcdf_image,
     opened as opened,
     read_dataset as read_dataset,
+    read_groups as read_groups,
     read_tree as read_tree,
     write_netcdf as write_netcdf,
 )

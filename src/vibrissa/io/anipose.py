@@ -26,9 +26,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
+from vibrissa.deferred import xr
 from vibrissa.io.paths import replacing
 from vibrissa.io.table import read_numbers
 from vibrissa.io.toml import in_file, number_array, quoted, read_toml

@@ -14,8 +14,8 @@ from types import MappingProxyType
 from typing import Unpack
 
 import h5py
-import xarray as xr
 
+from vibrissa.deferred import xr
 from vibrissa.io.anipose import read_anipose
 from vibrissa.io.deeplabcut import pandas_tables, read_deeplabcut
 from vibrissa.io.matlab import read_matlab

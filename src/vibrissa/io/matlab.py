@@ -30,9 +30,9 @@ from typing import Any, Unpack
 
 import h5py
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
+from vibrissa.deferred import xr
 from vibrissa.io.netcdf import opened
 from vibrissa.io.paths import check_readable
 from vibrissa.io.tracks import Labels, RawTracks, labelled

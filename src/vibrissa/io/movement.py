@@ -11,9 +11,9 @@ from os import PathLike
 from pathlib import Path
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
+from vibrissa.deferred import xr
 from vibrissa.io.netcdf import naming, read_dataset
 from vibrissa.io.tracks import RawTracks
 

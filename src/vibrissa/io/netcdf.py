@@ -17,18 +17,19 @@ from __future__ import annotations
 import io
 import math
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from mmap import ACCESS_READ, mmap
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
-import xarray as xr
 from h5py import h5d, h5o, h5t
 
+from vibrissa.deferred import xr
 from vibrissa.io.paths import NETCDF, check_readable, refuse_whisk, replacing
+from vibrissa.numerics import AnyArray
 
 # Deflate, the densest of the filters that are read, makes at most 1032 bytes of one.
 _DENSEST = 1100
@@ -191,6 +192,35 @@ def read_dataset(
         wanted = data if names is None else data[[name for name in names if name in data]]
         # How this file was encoded is nothing to the next one, and may be damaged.
         return wanted.load().drop_encoding()
+
+
+class Group(NamedTuple):
+    """Numbers and attributes of a group, as they are in a file."""
+
+    variables: dict[str, AnyArray]
+    attrs: dict[str, Any]
+
+
+def read_groups(
+    path: str | PathLike[str], names: Sequence[str], empty: Collection[str] = ()
+) -> dict[str, Group]:
+    """Read groups, those that are ``empty`` without variables, without xarray, for the time."""
+    with opened(path, "NetCDF-4", soft_links=False) as file:
+        return {name: _group(file[name], name not in empty) for name in names if name in file}
+
+
+def _group(group: h5py.Group, full: bool) -> Group:
+    known = dict(group.items()) if full else {}
+    data = {name: item for name, item in known.items() if isinstance(item, h5py.Dataset)}
+    numbers = {name: item[()] for name, item in data.items() if item.dtype.kind in "fiu"}
+    return Group(numbers, {name: _plain(value) for name, value in group.attrs.items()})
+
+
+def _plain(value: Any) -> Any:
+    """Turn an attribute into text or, if it is an array of one, a number."""
+    if isinstance(value, bytes):
+        return value.decode("utf-8", "replace")
+    return value.item() if getattr(value, "size", 0) == 1 else value
 
 
 def read_tree(path: str | PathLike[str]) -> xr.DataTree:

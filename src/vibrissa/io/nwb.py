@@ -22,9 +22,9 @@ from typing import Any
 
 import h5py
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
+from vibrissa.deferred import xr
 from vibrissa.io.netcdf import opened
 from vibrissa.io.tracks import RawTracks
 from vibrissa.quantities import attributes

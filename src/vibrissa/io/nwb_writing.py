@@ -24,9 +24,9 @@ from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
+from vibrissa.deferred import xr
 from vibrissa.io.paths import NWB, check_writable, replacing
 
 if TYPE_CHECKING:

@@ -26,8 +26,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
 
+from vibrissa.deferred import xr
 from vibrissa.io.netcdf import COMPRESSED, kind_of, naming, read_tree, write_netcdf
 
 RECORDING_KIND = "vibrissa recording"

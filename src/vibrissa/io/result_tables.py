@@ -21,8 +21,8 @@ from os import PathLike
 from pathlib import Path
 
 import numpy as np
-import xarray as xr
 
+from vibrissa.deferred import xr
 from vibrissa.io.paths import CSV, check_writable, replacing
 from vibrissa.io.table import Table, table_text, write_table
 from vibrissa.quantities import attributes

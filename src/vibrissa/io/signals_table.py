@@ -14,9 +14,9 @@ from os import PathLike
 from pathlib import Path
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
+from vibrissa.deferred import xr
 from vibrissa.io.netcdf import is_netcdf, naming, read_dataset
 from vibrissa.io.table import (
     is_number,

@@ -22,9 +22,9 @@ from pathlib import Path
 from typing import Any, TypedDict, Unpack
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
+from vibrissa.deferred import xr
 from vibrissa.quantities import attributes
 
 Array = NDArray[np.float64]

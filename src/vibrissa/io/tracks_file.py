@@ -21,9 +21,9 @@ from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
+from vibrissa.deferred import xr
 from vibrissa.io.netcdf import COMPRESSED, kind_of, read_dataset, write_netcdf
 from vibrissa.io.paths import CSV, NETCDF, check_writable, replacing
 from vibrissa.io.table import Table, table_text

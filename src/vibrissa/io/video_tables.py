@@ -34,10 +34,10 @@ from os import PathLike
 from pathlib import Path
 
 import numpy as np
-import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from vibrissa.deferred import xr
 from vibrissa.io.table import Table, read_numbers, write_table
 from vibrissa.quantities import attributes
 

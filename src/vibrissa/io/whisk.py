@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import Any, Unpack
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
+from vibrissa.deferred import xr
 from vibrissa.io.paths import check_readable
 from vibrissa.io.tracks import Labels, RawTracks, labelled
 

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
+from vibrissa.deferred import ndimage
 from vibrissa.objects.surface import Surface
 
 Array = NDArray[np.float64]

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
+from vibrissa.deferred import xr
 from vibrissa.objects.mesh import Mesh
 from vibrissa.objects.surface import Surface
 from vibrissa.quantities import attributes

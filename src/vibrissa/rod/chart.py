@@ -22,8 +22,8 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
+from vibrissa.deferred import interpolate
 from vibrissa.numerics import AnyArray, Array, inlined, kernel
 from vibrissa.rod.discretization import STEPS, Bendable, Discretization, discretize
 from vibrissa.rod.integration import solve_forces
@@ -272,10 +272,10 @@ def _fold_forces(
 def _log_fold(eta: Array, bearings: Array, force: Array) -> Array:
     """Ln f* with its derivatives (value, s, ψ, sψ) at the nodes, from splines periodic in ψ."""
     values = np.log(np.concatenate([force, force[:, :1]], axis=1))
-    around = CubicSpline(bearings, values, axis=1, bc_type="periodic")
+    around = interpolate.CubicSpline(bearings, values, axis=1, bc_type="periodic")
     in_psi = around(bearings, 1)
-    in_s = CubicSpline(eta, values, axis=0)(eta, 1)
-    in_both = CubicSpline(eta, in_psi, axis=0)(eta, 1)
+    in_s = interpolate.CubicSpline(eta, values, axis=0)(eta, 1)
+    in_both = interpolate.CubicSpline(eta, in_psi, axis=0)(eta, 1)
     return np.ascontiguousarray(np.stack([values, in_s, in_psi, in_both], axis=-1))
 
 

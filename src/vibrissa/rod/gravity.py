@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicSpline
 
+from vibrissa.deferred import interpolate
 from vibrissa.numerics import Array, share_out
 from vibrissa.rod.discretization import (
     STEPS,
@@ -205,7 +205,7 @@ class Resting:
         moments = self._traced(s).moments * d.moment
         ratio = np.array([1.0 + whisker.poisson_ratio, 1.0, 1.0])
         # At a jump of the radius the moment is smooth, the curvature is not.
-        smooth = CubicSpline(s, moments)
+        smooth = interpolate.CubicSpline(s, moments)
 
         def curvature(at: ArrayLike) -> Array:
             arc = np.asarray(at, dtype=np.float64)

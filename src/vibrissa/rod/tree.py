@@ -209,9 +209,12 @@ class _Cells(NamedTuple):
         for axis in range(3):
             sign = np.array([1.0, -1.0]).reshape([2 if a == axis else 1 for a in range(3)])
             inward[..., axis] = self.slope[..., axis] * sign[..., None] / 3.0
-        subsets = (np.arange(8)[:, None] >> np.arange(3)) & 1
-        moved = self.corner[..., None, :] + np.einsum("...qa,na->...nq", inward, subsets)
-        return np.asarray(moved.reshape(len(moved), 64, moved.shape[-1]) + self.base[:, None])
+        moved = np.empty((*self.corner.shape[:4], 8, self.corner.shape[-1]))
+        moved[..., 0, :] = self.corner
+        for axis, first in enumerate((1, 2, 4)):  # with it, each subset of the axes before
+            after = moved[..., first : 2 * first, :]
+            np.add(moved[..., :first, :], inward[..., None, :, axis], out=after)
+        return moved.reshape(len(moved), 64, moved.shape[-1]) + self.base[:, None]
 
     def slopes(self) -> Array:
         """Mean slopes between corners: (cells, q, 3)."""
@@ -335,7 +338,7 @@ def _aligned(cells: _Cells, points: Array) -> Array:
     usable = flatness > _FLAT
     inverse = np.zeros_like(linear)
     inverse[usable] = np.linalg.inv(linear[usable])
-    y = np.einsum("cij,cnj->cni", inverse, points - cells.base[:, None])
+    y = (points - cells.base[:, None]) @ inverse.transpose(0, 2, 1)
     low, high = y.min(axis=1), y.max(axis=1)
     grow = _MARGIN * (high - low) + 1e-9
     return np.ascontiguousarray(

@@ -21,9 +21,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from vibrissa.deferred import optimize
 from vibrissa.sensors.least_squares import solve, warn_of_misfit
 
 Array = NDArray[np.float64]
@@ -238,7 +238,7 @@ def calibrate_frame(
 
     # The lever arm's scale, so that both kinds of unknowns count alike.
     scale = max(float(np.linalg.norm(position)), moment_noise / force_noise)
-    fit = least_squares(
+    fit = optimize.least_squares(
         residuals,
         np.concatenate([np.zeros(3), position]),
         x_scale=[1.0] * 3 + [scale] * 3,

@@ -43,8 +43,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import xarray as xr
 
+from vibrissa.deferred import xr
 from vibrissa.io import (
     check_keys,
     in_file,

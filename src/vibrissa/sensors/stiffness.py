@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import least_squares
 
+from vibrissa.deferred import optimize
 from vibrissa.sensors.least_squares import warn_of_misfit, warn_of_surprise
 from vibrissa.sensors.mixing import wrenches_of_contacts
 from vibrissa.sensors.sensor import Sensor
@@ -212,7 +212,7 @@ def _fitted(
     def residuals(unknowns: Array) -> Array:
         return np.asarray((np.exp(unknowns[0]) * modelled(np.exp(unknowns[1])) - scaled).ravel())
 
-    found = least_squares(
+    found = optimize.least_squares(
         residuals,
         [np.log(factor), np.log(ratio)],
         bounds=([-np.inf, np.log(_SLIM)], [np.inf, np.log(_WIDE)]),

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
+from vibrissa.deferred import interpolate
 from vibrissa.numerics import AnyArray, Array
 from vibrissa.rod import discretize
 from vibrissa.sensors.suspended import SuspendedWhisker, Touches
@@ -386,7 +386,7 @@ def _reshaped(whisker: Whisker, first: Array, second: Array, taper: float) -> Wh
     return replace(
         type(whisker).from_curvature(
             length,
-            CubicSpline(s, curvature),
+            interpolate.CubicSpline(s, curvature),
             radius=whisker.radius(s) * (1.0 - taper * s / length),
             youngs_modulus=whisker.youngs_modulus,
             poisson_ratio=whisker.poisson_ratio,

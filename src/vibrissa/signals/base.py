@@ -16,14 +16,14 @@ from collections.abc import Hashable, Mapping
 from typing import TypeAlias
 
 import numpy as np
-import xarray as xr
 from numpy.typing import ArrayLike
 
+from vibrissa.deferred import xr
 from vibrissa.numerics import AnyArray, Array, IntArray, Vector, inlined
 from vibrissa.quantities import attributes
 
 # Of a DataArray, by name.
-Coordinates: TypeAlias = dict[Hashable, xr.Variable]
+Coordinates: TypeAlias = "dict[Hashable, xr.Variable]"
 
 #: The signals in their canonical order.
 SIGNALS = ("Fx", "FT", "FD", "Mx", "MB", "MD")

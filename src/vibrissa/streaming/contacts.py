@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.contacts import Contact, ContactFilter, Estimator, Followed, spherical
+from vibrissa.contacts import Contact, ContactFilter, Estimator, Followed
 from vibrissa.rod import PointForce, deflect
 from vibrissa.signals import SIGNALS, signals_of
 from vibrissa.streaming.lines import FRAME, LineKind, Lines, Sample
@@ -27,6 +27,8 @@ _SLOW = 100.0
 # A contact point slips if its step is larger than all but one in a thousand of noise (χ², three
 # degrees of freedom), in samples that are not farther apart than this, s.
 _BEYOND_NOISE, _NEXT = 16.27, 0.5
+# Share of the largest variance below which there is none.
+_NO_VARIANCE = 1e-15
 # Lengths of the whisker that a contact point moves in a second from which it slips, by default.
 _SLIPPING = 2.0
 # Statuses that show neither that something is touched nor that nothing is.
@@ -223,9 +225,11 @@ class ContactStream:
         if self._follow is None:
             found = self._estimator(values, rotation)
             known |= located_record(found)
-            turn = np.eye(3) if rotation is None else rotation
-            origin = np.zeros(3) if position is None else position
-            place, spread = turn @ found.point + origin, turn @ found.covariance @ turn.T
+            place, spread = found.point, found.covariance
+            if rotation is not None:
+                place, spread = rotation @ place, rotation @ spread @ rotation.T
+            if position is not None:
+                place = place + position
         else:
             followed = self._follow(time, values, rotation, position)
             known |= followed_record(followed, rotation)
@@ -290,12 +294,14 @@ class _Events:
         if last is None or self._last is None:
             return False
         step, moved = self._last[0] - last[0], self._last[1] - last[1]
-        if not 0.0 < step < _NEXT or np.linalg.norm(moved) < self._slip_speed * step:
+        if not 0.0 < step < _NEXT or math.hypot(*moved.tolist()) < self._slip_speed * step:
             return False
         spread = self._last[2] + last[2]
         if not np.isfinite(spread).all():  # noise is not known
             return True
-        return bool(moved @ np.linalg.pinv(spread, hermitian=True) @ moved > _BEYOND_NOISE)
+        variance, axes = np.linalg.eigh(spread)
+        known = variance > _NO_VARIANCE * variance[-1]
+        return bool(((moved @ axes)[known] ** 2 / variance[known]).sum() > _BEYOND_NOISE)
 
 
 class ContactStreams:
@@ -402,18 +408,22 @@ def followed_record(known: Followed, rotation: Array | None = None) -> dict[str,
 def as_json(record: dict[str, Any]) -> str:
     """Write a record as one line of JSON; numbers that are not finite become null."""
     try:
-        return json.dumps(record, ensure_ascii=False, allow_nan=False)
+        return _ENCODER.encode(record)
     except ValueError:
-        return json.dumps(_finite(record), ensure_ascii=False)
+        return _ENCODER.encode(_finite(record))
+
+
+_ENCODER = json.JSONEncoder(ensure_ascii=False, allow_nan=False)
 
 
 def _place(point: Array) -> dict[str, float]:
-    values = np.concatenate([point, spherical(point)]).tolist()
-    return dict(zip(("x", "y", "z", "r", "theta", "phi"), values, strict=True))
+    x, y, z = point.tolist()  # a single point: NumPy would take ten times as long
+    r = math.hypot(x, y, z)
+    return {"x": x, "y": y, "z": z, "r": r, "theta": math.atan2(y, x), "phi": math.asin(z / r)}
 
 
 def _sigma(covariance: Array) -> dict[str, float]:
-    sigma = np.sqrt(np.diag(covariance)).tolist()
+    sigma = np.sqrt(covariance.diagonal()).tolist()
     return dict(zip(("sigma_x", "sigma_y", "sigma_z"), sigma, strict=True))
 
 

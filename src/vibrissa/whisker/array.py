@@ -12,9 +12,9 @@ from dataclasses import replace
 from typing import Any, Literal, Unpack
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
+from vibrissa.deferred import xr
 from vibrissa.quantities import attributes
 from vibrissa.sketch import BENT, Mark, card, shown, views
 from vibrissa.whisker import morphology

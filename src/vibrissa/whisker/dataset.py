@@ -6,12 +6,15 @@ equally spaced points come along for whoever reads the file with other tools; a 
 of them is not there, or they are those of another whisker, was changed by somebody and is refused.
 """
 
+from __future__ import annotations
+
 import json
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, Protocol
 
 import numpy as np
-import xarray as xr
 
+from vibrissa.deferred import xr
 from vibrissa.quantities import attributes
 from vibrissa.whisker.pose import Pose
 from vibrissa.whisker.profile import Profile
@@ -96,11 +99,23 @@ def _profile_rows(name: str, profile: Profile, units: str, long_name: str) -> li
     ]
 
 
-def check_drawn(dataset: xr.Dataset, whisker: Any) -> None:
+class Stored(Protocol):
+    """What a file holds of a whisker: a dataset, or plain arrays."""
+
+    @property
+    def variables(self) -> Mapping[Any, Any]:
+        """Arrays by name."""
+
+    @property
+    def attrs(self) -> Mapping[Any, Any]:
+        """Attributes by name."""
+
+
+def check_drawn(dataset: Stored, whisker: Any) -> None:
     """Raise if a file draws another whisker than its polynomials make."""
     if dataset.variables.keys().isdisjoint(_DRAWN):
         return
-    s, line, radius = (np.asarray(dataset[name].values, dtype=np.float64) for name in _DRAWN)
+    s, line, radius = (np.asarray(dataset.variables[name], dtype=np.float64) for name in _DRAWN)
     if s.ndim == 1 and line.shape == (*s.shape, 3) and radius.shape == s.shape:
         inside = (s >= 0.0).all() and (s <= whisker.length * (1.0 + _SAME)).all()
         s = np.minimum(s, whisker.length)
@@ -122,7 +137,7 @@ _SAME = 1e-6
 """Tolerance, as a share of the largest value, between drawn and stated values of a file."""
 
 
-def whisker_fields(dataset: xr.Dataset) -> dict[str, Any]:
+def whisker_fields(dataset: Stored) -> dict[str, Any]:
     """Read the fields of a `Whisker` from a dataset that `whisker_dataset` wrote."""
     needed = {"length", "youngs_modulus", "poisson_ratio", "breaks"}
     needed |= {"base_bending_stiffness", "base_twist_stiffness"}
@@ -133,7 +148,7 @@ def whisker_fields(dataset: xr.Dataset) -> dict[str, Any]:
     missing = sorted(needed - set(dataset.variables))
     if missing:
         raise ValueError(f"this is not a dataset of a whisker: it lacks {', '.join(missing)}")
-    value = {name: np.asarray(dataset[name].values, dtype=np.float64) for name in needed}
+    value = {name: np.asarray(dataset.variables[name], dtype=np.float64) for name in needed}
     stiffness = float(value["base_bending_stiffness"]), float(value["base_twist_stiffness"])
     return {
         "length": float(value["length"]),
@@ -147,7 +162,9 @@ def whisker_fields(dataset: xr.Dataset) -> dict[str, Any]:
         ),
         "youngs_modulus": float(value["youngs_modulus"]),
         "poisson_ratio": float(value["poisson_ratio"]),
-        "density": float(dataset["density"]) if "density" in dataset else None,
+        "density": (
+            float(dataset.variables["density"]) if "density" in dataset.variables else None
+        ),
         "base_stiffness": None if np.isinf(stiffness).all() else stiffness,
         "pose": Pose(value["pose_rotation"], value["pose_origin"]),
         "breaks": tuple(float(s) for s in value["breaks"]),

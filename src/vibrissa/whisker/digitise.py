@@ -46,10 +46,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import BSpline, make_interp_spline
 from scipy.linalg import eigh, qr, solve_triangular, svd
 from scipy.special import chdtri, fdtrc
 
+from vibrissa.deferred import interpolate
 from vibrissa.whisker.pose import Pose, least_turn
 from vibrissa.whisker.profile import Profile, approximate, constant
 from vibrissa.whisker.rest import Path
@@ -114,7 +114,7 @@ def digitize(
     if len(fit.residuals) and line.explains(array, fit, components, unit, noise):
         sigma = line.noise(components) if noise is None else noise
         return line.digitized(sigma, any_length)
-    curve = BSpline(fit.curve.t, fit.curve.c * unit + middle, 5)
+    curve = interpolate.BSpline(fit.curve.t, fit.curve.c * unit + middle, 5)
     digitized = _measured(curve, float(parameters[0]), float(parameters[-1]), sigma)
     _require_length(digitized.length, any_length)
     return digitized
@@ -283,7 +283,7 @@ def _unit_interval(t: Array) -> Array:
     return unit
 
 
-def _require_curve(curve: BSpline, found: float, stated: float | None) -> None:
+def _require_curve(curve: interpolate.BSpline, found: float, stated: float | None) -> None:
     """Refuse points that are far from any smooth curve, or joined by a curve that wanders."""
     if found > SCATTER and (stated is None or found > 2.0 * stated):
         raise ValueError(
@@ -316,7 +316,7 @@ def _require_length(length: float, any_length: bool) -> None:
         raise ValueError("no whisker in these points: " + "; ".join(faults))
 
 
-def _measured(curve: BSpline, start: float, end: float, noise: float) -> Digitized:
+def _measured(curve: interpolate.BSpline, start: float, end: float, noise: float) -> Digitized:
     """Measure length, base frame and curvature of a fitted curve."""
     if end <= start:
         raise ValueError(
@@ -368,7 +368,7 @@ class ArcLength:
     """Arc length of a spline curve between two parameters."""
 
     def __init__(
-        self, curve: BSpline, start: float | None = None, end: float | None = None
+        self, curve: interpolate.BSpline, start: float | None = None, end: float | None = None
     ) -> None:
         knots = np.unique(curve.t)
         start = float(knots[0]) if start is None else start
@@ -407,7 +407,9 @@ class ArcLength:
         return np.asarray(t)
 
 
-def nearest_parameters(curve: BSpline, points: Array, guesses: Array, window: float) -> Array:
+def nearest_parameters(
+    curve: interpolate.BSpline, points: Array, guesses: Array, window: float
+) -> Array:
     """Find the nearest points on a curve, each within a window of parameters."""
     grid = np.linspace(-0.02, 1.02, 521)
     apart = np.sum((points[:, np.newaxis] - np.asarray(curve(grid))) ** 2, axis=-1)
@@ -436,19 +438,19 @@ LEVELS = 90
 """Values of λ that are compared."""
 
 
-def natural_spline(t: Array, values: Array) -> BSpline:
+def natural_spline(t: Array, values: Array) -> interpolate.BSpline:
     """Interpolate with a quintic spline that has no third and fourth derivative at the ends."""
     zero = np.zeros(values.shape[1:])
     # The stubs know conditions by name only.
     ends: Any = ([(3, zero), (4, zero)], [(3, zero), (4, zero)])
-    return make_interp_spline(t, values, k=5, bc_type=ends)
+    return interpolate.make_interp_spline(t, values, k=5, bc_type=ends)
 
 
 @dataclass(frozen=True, eq=False)
 class Smoothed:
     """A smoothing spline and what is known about it."""
 
-    curve: BSpline
+    curve: interpolate.BSpline
     residuals: Array
     freedom: float
 
@@ -496,12 +498,14 @@ def smooth(t: Array, points: Array, noise: float | None, components: int) -> Smo
         level = float(levels[(rss + 2.0 * COST * noise**2 * components * freedom).argmin()])
     weights, residuals, hat = fit(level)
     return Smoothed(
-        BSpline(cardinal.t, cardinal.c @ (modes @ weights), 5), residuals, float(hat.sum())
+        interpolate.BSpline(cardinal.t, cardinal.c @ (modes @ weights), 5),
+        residuals,
+        float(hat.sum()),
     )
 
 
 @cache
-def _cardinal() -> tuple[BSpline, Array]:
+def _cardinal() -> tuple[interpolate.BSpline, Array]:
     """Give N and the triangle D with DᵀD = ∫ N‴ N‴ᵀ dt, on equally spaced sites."""
     sites = np.linspace(0.0, 1.0, SITES)
     cardinal = natural_spline(sites, np.eye(SITES))

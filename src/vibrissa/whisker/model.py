@@ -10,18 +10,20 @@ The whisker frame has its origin at the base and x along the base tangent; the p
 whisker lies as close as possible to the x–y plane and bends toward +y.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Unpack
 
 import numpy as np
-import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
+from vibrissa.deferred import xr
 from vibrissa.quantities import quantity
 from vibrissa.sketch import BENT, Mark, card, shown, views
-from vibrissa.whisker.dataset import check_drawn, whisker_dataset, whisker_fields
+from vibrissa.whisker.dataset import Stored, check_drawn, whisker_dataset, whisker_fields
 from vibrissa.whisker.digitise import digitize
 from vibrissa.whisker.pose import Pose, least_turn, roll
 from vibrissa.whisker.profile import (
@@ -171,7 +173,7 @@ class Whisker:
         noise: float | None = None,
         base: str | ArrayLike | None = None,
         **properties: Unpack[Properties],
-    ) -> "Whisker":
+    ) -> Whisker:
         """Make a whisker from a digitised centreline.
 
         Parameters
@@ -211,7 +213,7 @@ class Whisker:
     @classmethod
     def parabola(
         cls, length: float, coefficient: float, **properties: Unpack[Properties]
-    ) -> "Whisker":
+    ) -> Whisker:
         """Make a planar whisker on the parabola y = A x².
 
         Parameters
@@ -239,7 +241,7 @@ class Whisker:
         return _assembled(length, curvature, pose, properties)
 
     @classmethod
-    def straight(cls, length: float, **properties: Unpack[Properties]) -> "Whisker":
+    def straight(cls, length: float, **properties: Unpack[Properties]) -> Whisker:
         """Make a straight whisker.
 
         Parameters
@@ -265,7 +267,7 @@ class Whisker:
         length: float,
         curvature: Callable[..., object],
         **properties: Unpack[Properties],
-    ) -> "Whisker":
+    ) -> Whisker:
         """Make a whisker from its intrinsic curvature.
 
         Parameters
@@ -449,7 +451,7 @@ class Whisker:
 
     # The same whisker, changed.
 
-    def aligned(self) -> "Whisker":
+    def aligned(self) -> Whisker:
         """Roll the frame so that the proximal 70 % lies in the x–y plane and bends toward +y.
 
         Returns
@@ -472,7 +474,7 @@ class Whisker:
             notes=notes,
         )
 
-    def with_properties(self, **properties: Unpack[Properties]) -> "Whisker":
+    def with_properties(self, **properties: Unpack[Properties]) -> Whisker:
         """Give the same shape another radius, material, holding or name.
 
         Parameters
@@ -498,7 +500,7 @@ class Whisker:
             whisker = replace(whisker, section_radius=section, breaks=breaks, notes=notes)
         return replace(whisker, notes=kept_notes(whisker.notes, holding), **holding)
 
-    def trimmed(self, length: float) -> "Whisker":
+    def trimmed(self, length: float) -> Whisker:
         """Cut the tip off; shape and radius of what stays do not change.
 
         Parameters
@@ -524,7 +526,7 @@ class Whisker:
             breaks=tuple(s for s in self.breaks if s < length),
         )
 
-    def scaled(self, length_factor: float = 1.0, radius_factor: float = 1.0) -> "Whisker":
+    def scaled(self, length_factor: float = 1.0, radius_factor: float = 1.0) -> Whisker:
         """Stretch the whole shape, the radius, or both.
 
         Parameters
@@ -565,13 +567,13 @@ class Whisker:
         return whisker_dataset(self)
 
     @classmethod
-    def from_dataset(cls, dataset: xr.Dataset) -> "Whisker":
+    def from_dataset(cls, dataset: Stored) -> Whisker:
         """Make a whisker again from its dataset.
 
         Parameters
         ----------
         dataset : xarray.Dataset
-            What `to_dataset` wrote.
+            Dataset of `to_dataset`, or anything with its ``variables`` and ``attrs``.
 
         Returns
         -------

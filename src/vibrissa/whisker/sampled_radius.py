@@ -17,12 +17,14 @@ noise comes from the smallest quarter of the differences, so that a staircase of
 does not pass for noise; a smooth profile with noise has neither jumps nor kinks.
 """
 
+from __future__ import annotations
+
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import PchipInterpolator
 
+from vibrissa.deferred import interpolate
 from vibrissa.whisker.profile import Profile, approximate
 
 Array = NDArray[np.float64]
@@ -54,7 +56,7 @@ def sampled_radius(length: float, s: Array, r: Array) -> Profile:
     ends = _pieces(s, r, jumps(s, r))
     if len(ends) - 1 > MOST:
         ends = _pieces(s, r, _stated(s, r), kinked=False)
-    parts = [PchipInterpolator(x, y) for x, y in ends]
+    parts = [interpolate.PchipInterpolator(x, y) for x, y in ends]
     edges = np.array([x[0] for x, _ in ends[1:]])
 
     def radius(x: Array) -> Array:

@@ -23,7 +23,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import xarray as xr
 from numpy.typing import ArrayLike
 from scipy.special import chdtrc, chdtri
 
@@ -38,6 +37,7 @@ from vibrissa.contacts.noise import (
     whitening,
 )
 from vibrissa.contacts.wrench import PROXIMAL, estimate_components
+from vibrissa.deferred import xr
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.quantities import attributes
 from vibrissa.rod import Discretization, discretize

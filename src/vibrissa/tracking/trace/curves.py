@@ -68,22 +68,29 @@ class Segment(NamedTuple):
         return Segment(self.points[::-1], self.strength[::-1])
 
 
-def segments(
-    difference: Image, bodies: Bodies, scale: float = 1.0, inside: bool = False
-) -> list[Segment]:
-    """Find the lines of a difference image."""
+def smoothed(
+    difference: Image, bodies: Bodies, scale: float = 1.0
+) -> tuple[Image, NDArray[np.float64]]:
+    """Smooth a difference image; strength per second derivative on open ground and on bodies."""
     sigma = SIGMA * scale
     reach = math.ceil(3.0 * sigma)
     taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
     smooth = np.empty_like(difference)
     blur(difference, (taps / taps.sum()).astype(np.float32), np.empty_like(difference), smooth)
     factors = np.zeros(2)
-    for kind in range(1 + inside):
+    for kind in range(2):
         values = np.empty(difference.size // 16 + 1)
         count = roughness(smooth, bodies.label, bool(kind), values)
         if count:
             noise = max(1.4826 * float(np.median(values[:count])) * sigma**2, _QUIET)
             factors[kind] = sigma**2 / noise
+    return smooth, factors
+
+
+def segments(difference: Image, bodies: Bodies, scale: float = 1.0) -> list[Segment]:
+    """Find the lines of a difference image, but on bodies."""
+    smooth, factors = smoothed(difference, bodies, scale)
+    factors[1] = 0.0
     points, index = np.empty((_MOST, 4)), np.full(difference.shape, -1, dtype=np.int32)
     count = ridge_points(smooth, bodies.label, factors, _LEAST, points, index)
     order = np.argsort(-points[:count, 3])
@@ -325,13 +332,12 @@ def find_curves(
     frame: Frame,
     scene: Scene,
     options: TraceOptions,
-    inside: bool = False,
     begins: Array | None = None,
 ) -> list[Curve]:
     """Find what may be whiskers in a frame; points (n, 2) where some begin are on the face."""
     bodies, gain = scene.bodies(frame), scene.gain(frame)
     curves = []
-    parts = segments(scene.difference(frame), bodies, options.scale, inside)
+    parts = segments(scene.difference(frame), bodies, options.scale)
     for chain in joined(parts, bodies, [] if begins is None else bodies.near(begins)):
         step = np.hypot(*np.diff(chain.points, axis=0).T)
         # What is hidden at a join is not seen.

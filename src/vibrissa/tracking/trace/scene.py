@@ -159,6 +159,14 @@ class Scene:
         darker(frame, self.light, self.gain(frame), *_RANGE, out)
         return out
 
+    def change(self, frame: Frame) -> Image:
+        """How much darker a frame is than its background or, if that is not known, the light."""
+        if self.background is None:
+            return self.difference(frame)
+        out = np.empty(frame.shape, dtype=np.float32)
+        darker(frame, self.background, self.gain(frame), *_RANGE, out)
+        return out
+
     @property
     def bits(self) -> Bits | None:
         """Bits of `Clutter` of what never moves; None if it is not known."""

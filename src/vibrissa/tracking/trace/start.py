@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from vibrissa.cameras import Camera, triangulate
 from vibrissa.io import Frame
 from vibrissa.tracking.trace.curves import Curve, find_curves
+from vibrissa.tracking.trace.epipolar import seen_along
 from vibrissa.tracking.trace.follower import start_at
 from vibrissa.tracking.trace.ridge import noise_level
 from vibrissa.tracking.trace.scene import Scene
@@ -51,12 +52,6 @@ smallest share of frames in which they do: less than half, for they may be faint
 _SAME = 25.0
 """Largest distance between bases of one whisker in two frames, pixels."""
 
-_LONGER = 30.0
-"""Length by which a line is longer if it goes on before a body than if it began there, pixels."""
-
-_BEFORE = 30.0
-"""Length over which a line may be followed into a body beyond where it begins, pixels."""
-
 _MOVED = 0.4
 """Share of a whisker that moves, above which it counts as moving wholly."""
 
@@ -66,9 +61,13 @@ _BETTER = 1.5
 _LONG = 80.0
 """Score above which a line is a whisker rather than a hair."""
 
-_ONE_VIEW, _NO_FACE = 0.6, 0.5
+_ONE_VIEW, _NO_FACE = 0.85, 0.5
 """Factors of the confidence if one view alone shows where the whisker begins, and if what does not
 move begins at no face."""
+
+_CLEARLY = 0.5
+"""How much better a whisker of another view is seen than noise would be, as a share of itself, from
+which it is clearly seen. Without one it is 0.1 to 0.2."""
 
 _POLARITY = 3
 """Number of frames in which bright and dark whiskers are compared."""
@@ -208,7 +207,7 @@ class _Search:
     frames: Sequence[Sequence[Frame]]
     scenes: Sequence[Scene]
     options: TraceOptions
-    known: dict[tuple[int, int, bool], list[Curve]] = field(default_factory=dict)
+    known: dict[tuple[int, int], list[Curve]] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -230,18 +229,23 @@ class _Search:
         vote = _voted([self._combined(m, self.curves(m, moving=True)) for m in moments])
         if vote.confidence >= _SURE:
             return vote
-        moving = [self._shown(view, moments) for view in range(len(self.cameras))]
-        if not any(moving):
+        shown = [self._shown(view, moments) for view in range(len(self.cameras))]
+        if not any(shown):
             found = [self._combined(m, self.curves(m, moving=False)) for m in moments]
             return self._resting(_voted(found))
         # A view that shows the whisker before the animal does not show where it begins.
         for view in range(len(self.cameras)):
-            if any(shown for other, shown in enumerate(moving) if other != view):
-                other = _voted([self._combined(m, self._before(m, view)) for m in moments])
-                name, confidence = self.cameras[view].name, _ONE_VIEW * other.confidence
-                other = other._replace(hidden=name, confidence=confidence)
-                vote = max(vote, other, key=lambda one: one.confidence)
+            if any(shown[:view] + shown[view + 1 :]):
+                vote = max(vote, self._faint(view, moments), key=lambda one: one.confidence)
         return vote
+
+    def _faint(self, view: int, moments: Sequence[int]) -> _Vote:
+        """The vote if one view shows the whisker only along the lines of sight of another."""
+        vote = _voted([self._along(m, view) for m in moments])
+        clear = [one.curves[view].score / one.curves[view].length for one in vote.winners]
+        seen = min(1.0, float(np.median(clear)) / _CLEARLY) if clear else 0.0
+        name, confidence = self.cameras[view].name, _ONE_VIEW * seen * vote.confidence
+        return vote._replace(hidden=name, confidence=confidence)
 
     def _resting(self, vote: _Vote) -> _Vote:
         """The vote for what does not move, though it could have been seen to."""
@@ -255,17 +259,17 @@ class _Search:
         """What may be whiskers, view by view, the likeliest first."""
         found = []
         for view in range(len(self.cameras)):
-            curves = self._found(view, moment, inside=False)
+            curves = self._found(view, moment)
             if moving:
                 curves = [c._replace(score=c.score * min(1.0, c.moved / _MOVED)) for c in curves]
             found.append(sorted(curves, key=lambda curve: -curve.score)[:_LINES])
         return found
 
-    def _found(self, view: int, moment: int, inside: bool) -> list[Curve]:
-        key = view, moment, inside
+    def _found(self, view: int, moment: int) -> list[Curve]:
+        key = view, moment
         if key not in self.known:
             frame = self.frames[view][moment]
-            self.known[key] = find_curves(frame, self.scenes[view], self.options, inside)
+            self.known[key] = find_curves(frame, self.scenes[view], self.options)
         return self.known[key]
 
     def _shown(self, view: int, moments: Sequence[int]) -> bool:
@@ -275,37 +279,19 @@ class _Search:
         ]
         return self.scenes[view].background is not None and float(np.median(best)) > _LONG
 
-    def _before(self, moment: int, view: int) -> list[list[Curve]]:
-        """Curves of which those of one view may run before a body: they begin where others show."""
-        found = self.curves(moment, moving=True)
+    def _along(self, moment: int, view: int) -> list[_Combination]:
+        """Whiskers of one view, with what a view that shows them faintly shows along them."""
+        found, camera = self.curves(moment, moving=True), self.cameras[view]
         first = next(other for other in range(len(found)) if other != view)
-        # Where it is seen to begin at a body, hardly more is to be seen before that body.
-        begun = [c.length for c in found[view] if c.from_face and c.score > self.options.shortest]
-        least = _LONGER + max(begun, default=0.0)
-        loose = [c for c in self._found(view, moment, inside=True) if c.length > least]
-        cut = [
-            part
-            for known in found[first][:2]
-            for curve in loose
-            for part in self._cut(curve, view, known.line[0], first)
-            if part.length > least
-        ]
-        found[view] = sorted(cut, key=lambda curve: -curve.score)[:_LINES]
-        return found
-
-    def _cut(self, curve: Curve, view: int, base: Array, other: int) -> list[Curve]:
-        """Let a curve begin where it is seen in line with the base of another view."""
-        line = curve.line
-        cameras = [self.cameras[other], self.cameras[view]]
-        gaps = base_gap(cameras, np.stack([np.broadcast_to(base, line.shape), line]))
-        at = int(np.nanargmin(gaps))
-        share = 1.0 - at / len(line)
-        if gaps[at] > 2.0 * _GAP or curve.length * share < self.options.shortest:
-            return []
-        # A line that goes on before that base does not begin there.
-        before = np.exp(-curve.length * (1.0 - share) / _BEFORE)
-        worth = float(curve.score * share * before) * min(1.0, curve.moved / _MOVED)
-        return [curve._replace(line=line[at:], length=curve.length * share, score=worth)]
+        frame, scene = self.frames[view][moment], self.scenes[view]
+        pairs: list[_Combination] = []
+        for curve in found[first][:2]:
+            seen = seen_along(curve, self.cameras[first], camera, frame, scene)
+            if seen is not None:
+                one = list(found)
+                one[first], one[view] = [curve], [seen]
+                pairs += self._combined(moment, one)
+        return sorted(pairs, key=lambda pair: -pair.worth)
 
     def _combined(self, moment: int, curves: list[list[Curve]]) -> list[_Combination]:
         curves = [[curve for curve in view if curve.score > 0.0] for view in curves]
@@ -338,7 +324,7 @@ class _Vote(NamedTuple):
     confidence: float
     agreed: tuple[int, int]  # in how many of how many frames nothing else is likelier
     moves: bool = True
-    hidden: str = ""  # the view that does not show where it begins
+    hidden: str = ""  # the view that shows it only along the lines of sight of another
 
 
 def _voted(found: Sequence[Sequence[_Combination]]) -> _Vote:
@@ -388,8 +374,8 @@ def _start(search: _Search, vote: _Vote, bright: bool) -> Start:
     confidence, doubts = vote.confidence, []
     if not vote.moves:
         doubts.append("nothing that moves is like a whisker; this does not move")
-    if vote.hidden:
-        doubts.append(f"in {vote.hidden} it seems to begin on a dark body, at no edge of that")
+    if vote.hidden and confidence < _SURE:
+        doubts.append(f"{vote.hidden} hardly shows it along the lines of sight of the other view")
     if confidence < _SURE:
         first, count = vote.agreed
         doubts.append(f"it is the likeliest in {first} of {count} frames, or others are nearly so")

@@ -157,3 +157,9 @@ def test_the_command_line_marks_second_contacts(whisker, tmp_path):
     assert (marked == (table["one_contact"] < 0.01)).all()
     assert marked[:40].sum() <= 2
     assert vb.io.load_contacts(tmp_path / "contacts.csv").sizes["time"] == 80
+    words += ["--compliance-sigma", 3, "--force"]
+    result = CliRunner().invoke(app, [str(word) for word in (*words, *where)])
+    assert "compliance of the base" in " ".join(result.output.split()), result.output
+    softer = vb.io.load_contacts(tmp_path / "contacts.csv")
+    stated = softer["sigma_x"].values[:40] / table["sigma_x"][:40]
+    assert np.nanmedian(stated) > 1.001

@@ -101,6 +101,7 @@ class EstimateOptions:
     proximal: float | None = None
     friction_sigma: float = 0.0
     second_contacts: float = 0.0
+    compliance_sigma: float = 0.0
     noise: NoiseOptions
     assumed: AssumptionOptions
     own: WhiskerOptions
@@ -151,6 +152,7 @@ class EstimateOptions:
             self.proximal is not None,
             self.friction_sigma,
             self.second_contacts,
+            self.compliance_sigma,
             self.assumed.described(),
         )
         return any(bool(one) for one in (*stated, *other))
@@ -163,9 +165,12 @@ class EstimateOptions:
 
     def keywords(self) -> dict[str, Any]:
         """Options of all functions that estimate."""
+        errors = dict(self.assumed.errors)
+        if self.compliance_sigma:
+            errors["compliance_sigma"] = math.radians(self.compliance_sigma) * 1e6
         return {
             "method": self.method,
-            "errors": self.assumed.errors,
+            "errors": errors,
             "prior": self.assumed.prior,
             "friction": self.friction_sigma,
             "second_contacts": 0.01 * self.second_contacts,
@@ -177,6 +182,8 @@ class EstimateOptions:
         used = f"signals ({', '.join(names.split())}){by}"
         if self.friction_sigma:
             used += f", with friction along the whisker of {self.friction_sigma:g} (one sigma)"
+        if self.compliance_sigma:
+            noise += f"; compliance of the base known to {self.compliance_sigma:g} °/(µN·m)"
         if self.second_contacts:
             noise += f"; second contacts at {self.second_contacts:g} % false alarms"
         return (
@@ -231,6 +238,7 @@ def estimate(
             how.method != "exact",
             how.friction_sigma,
             how.second_contacts,
+            how.compliance_sigma,
         )
         if any(map(bool, stated)):
             raise ValueError(f"{sensor} is for tables, and has its own channels and noise")
@@ -241,6 +249,7 @@ def estimate(
         _from_sweep(signals, target, sensor)
     elif recorded:
         refuse({"--gravity": weight.gravity}, "it is of tables, with one direction")
+        refuse({"--compliance-sigma": how.compliance_sigma or None}, "it is of tables")
         _from_recording(signals, target, how)
     elif weight.gravity is None and _named_signals(signals, how):
         _from_lines(signals, target, how, None)
@@ -251,6 +260,8 @@ def estimate(
 def _named_signals(table: Path, how: EstimateOptions) -> bool:
     """Whether a table has the signals that are used, and not what they are computed from."""
     if how.whole or how.method != "exact" or how.friction_sigma or how.second_contacts:
+        return False
+    if how.compliance_sigma:
         return False
     names = how.names or vb.pipeline.TRIPLET
     first = next((line for line in vb.io.read_text(table).splitlines() if line.strip()), "")

@@ -189,6 +189,12 @@ OPTIONS = {
         "%",
         least=0.0,
     ),
+    "compliance_sigma": Option(
+        "Standard deviation of the compliance of the whisker's base about that of its "
+        "--base-stiffness, by default rigid, degrees per µN·m.",
+        "DEG",
+        least=0.0,
+    ),
     "gain_sigma": Option(
         "Standard deviation of the gain of each component of force and moment, %; likewise.",
         "%",

@@ -134,6 +134,7 @@ class ContactMap:
         stiffness_sigma: float = 0.0,
         gain_sigma: float | ArrayLike = 0.0,
         mixing_sigma: float | ArrayLike = 0.0,
+        compliance_sigma: float = 0.0,
         prior: Prior | None = None,
         friction: float = 0.0,
         gravity: Gravity | ArrayLike | None = None,
@@ -161,6 +162,11 @@ class ContactMap:
         mixing_sigma : float or (6, 6) array_like
             Standard deviations of what each of these reads of all six; or one number, relative: of
             the cross-talk among forces, and among moments. It needs noise.
+        compliance_sigma : float
+            Standard deviation of the compliance of the whisker's base in bending and in twist,
+            rad/(N·m): an unknown of each estimate, about the whisker's ``base_stiffness`` or a
+            rigid base, that adds to the covariances and is found where more than three signals
+            show it. It needs noise.
         prior : Prior, optional
             Possible contacts; others are left out of the candidates.
         friction : float
@@ -182,6 +188,8 @@ class ContactMap:
         """
         errors = common_errors(stiffness_sigma, gain_sigma, mixing_sigma)
         weight = Gravity.of(gravity)
+        if compliance_sigma and (weight is not None or friction):
+            raise ValueError("compliance_sigma is not combined with gravity or friction")
         if weight is not None:
             if friction != 0.0:
                 raise ValueError("friction is not combined with gravity; use the wrench with it")
@@ -198,10 +206,12 @@ class ContactMap:
                 stiffness_sigma,
             )
         if using == "wrench":
-            return estimate_components(self.whisker, signals, noise, errors, prior)
+            return estimate_components(
+                self.whisker, signals, noise, errors, prior, compliance_sigma
+            )
         if friction != 0.0:
             return estimate_with_friction(self, signals, using, noise, errors, prior, friction)
-        return estimate(self, signals, using, noise, errors, prior)
+        return estimate(self, signals, using, noise, errors, prior, compliance_sigma)
 
     def tree(self, triplet: tuple[str, ...]) -> SearchTree:
         """Return the search tree of three signals, made on first use.

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from vibrissa.contacts.ambiguity import Ambiguity
 from vibrissa.contacts.charted_whisker import ChartedWhisker
+from vibrissa.contacts.compliance import SoftBase, check_compliance
 from vibrissa.contacts.contacts import Candidates, Contact, contact_of, nowhere
 from vibrissa.contacts.noise import by_stiffness, common_errors, sensor_noise
 from vibrissa.contacts.prior import Prior, among_allowed, possible_candidates
@@ -51,11 +52,16 @@ class Estimator:
         cross-talk among forces, and among moments.
     prior : Prior, optional
         Possible contacts; others are left out of the candidates.
+    compliance_sigma : float
+        Standard deviation of the base's compliance, rad/(N·m), as of `ContactMap.estimate`, for
+        three signals or more. It needs noise, and takes a millisecond more.
 
     See Also
     --------
     Estimator.of_sensor : From the raw readings of a sensor, however it mixes and is mounted.
     """
+
+    _base: SoftBase | None = None
 
     def __init__(
         self,
@@ -67,6 +73,7 @@ class Estimator:
         gain_sigma: float | ArrayLike = 0.0,
         mixing_sigma: float | ArrayLike = 0.0,
         prior: Prior | None = None,
+        compliance_sigma: float = 0.0,
     ) -> None:
         names = selection(using, least=1)
         order = using.replace(",", " ").split() if isinstance(using, str) else list(using)
@@ -75,7 +82,15 @@ class Estimator:
         self._order: list[int] | None = [order.index(name) for name in names]
         if felt_above > 0.0 and sensor is None:
             raise ValueError("contact is detected by comparison with the noise; noise is needed")
-        self._start(contact_map, Named(contact_map, names, sensor), len(names), felt_above, prior)
+        readout = Named(contact_map, names, sensor)
+        self._start(contact_map, readout, len(names), felt_above, prior)
+        check_compliance(compliance_sigma, sensor)
+        if compliance_sigma > 0.0 and self._search is None:
+            raise ValueError("compliance_sigma is for three signals or more")
+        if compliance_sigma > 0.0 and sensor is not None:
+            d, steps = contact_map.chart.discretization, contact_map.steps
+            whisker = contact_map.whisker
+            self._base = SoftBase(whisker, d, steps, readout.channels, sensor, compliance_sigma)
 
     @classmethod
     def of_sensor(
@@ -150,6 +165,11 @@ class Estimator:
         if rank < UNKNOWNS:
             self._ambiguity = Ambiguity(contact_map.chart, self.readout)
         self._last: Array | None = None
+
+    @property
+    def softened(self) -> bool:
+        """Whether the compliance of the base is uncertain."""
+        return self._base is not None
 
     @property
     def noisy(self) -> bool:
@@ -259,6 +279,10 @@ class Estimator:
                 np.array([int(status)]),
                 np.array([chi_squared]),
             )
+            status, chi_squared = STATUSES[int(codes[0])], float(chi[0])
+        if self._base is not None:
+            flat, target = measurement.measured[None], measurement.target[None]
+            found, codes, chi = self._base.allow(flat, target, found, np.array([int(status)]))
             status, chi_squared = STATUSES[int(codes[0])], float(chi[0])
         number, continuing = int(found.number[0]), 0
         if number > 1 and self._last is not None:

@@ -141,6 +141,10 @@ class ContactFilter:
         sample.
     birth : float
         Probability that a sample shows another contact than any before.
+    memory : float
+        Time after which the errors that samples share, of the stiffness and of the sensor's gain
+        and mixing, have become others, s: first-order Gauss-Markov processes, as where a material
+        relaxes. By default infinite: they stay the same.
 
     Raises
     ------
@@ -156,6 +160,7 @@ class ContactFilter:
         persistence: float = 0.05,
         pose_sigma: float = 0.0,
         birth: float = 1e-4,
+        memory: float = math.inf,
     ) -> None:
         self._length = estimator.contact_map.whisker.length
         speed = 0.25 * self._length if speed is None else speed
@@ -164,12 +169,17 @@ class ContactFilter:
                 "speed and persistence are positive, pose_sigma is not negative and birth between "
                 f"0 and 1; got {speed}, {persistence}, {pose_sigma} and {birth}"
             )
+        if not memory > 0.0:
+            raise ValueError(f"memory is a time, positive, s; got {memory!r}")
+        if estimator.softened:
+            raise ValueError("a filter takes no estimator whose compliance_sigma is not zero")
         if not estimator.noisy:
             raise ValueError(
                 "a filter weighs what it knows against the noise: give its estimator's"
             )
         self.estimator = estimator
         self._drift = Drift(speed / self._length, persistence)
+        self._memory = memory
         self._pose = (pose_sigma / self._length) ** 2
         self._birth = math.log(birth)
         self._beginning = Beginning(estimator)
@@ -333,11 +343,23 @@ class ContactFilter:
         if not len(self._mixture.weight):
             return
         predict(self._mixture, *self._drift.over(step))
+        if self._memory < math.inf:
+            self._forget(math.exp(-step / self._memory))
         if step * self._drift.speed < _GAP:
             return
         variance = np.trace(self._mixture.spread[:, :3, :3], axis1=1, axis2=2)
         if (variance > _FORGOTTEN**2).all():
             self._mixture = room(0, self._errors)
+
+    def _forget(self, kept: float) -> None:
+        """Let shared errors keep this share; the rest of their effect becomes noise of the state.
+
+        With ε' = a ε + √(1 - a²) w the state's covariance with the error is a b, and its own
+        covariance, of which b bᵀ is part, stays what it was.
+        """
+        spread, by = self._mixture.spread, self._mixture.by_errors
+        spread += (1.0 - kept**2) * by @ np.swapaxes(by, 1, 2)
+        by *= kept
 
     def _known(self, status: Status, located: Contact | None, turn: Array, base: Array) -> Followed:
         return combined(self._mixture, status, located, turn, base, self._length)

@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from vibrissa.contacts.candidates import UNEXPLAINED, Problem
+from vibrissa.contacts.compliance import SoftBase, check_compliance
 from vibrissa.contacts.contacts import Candidates, Contacts, contacts_of
 from vibrissa.contacts.inversion import polish
 from vibrissa.contacts.noise import explained, sensor_noise
@@ -197,10 +198,12 @@ def estimate(
     noise: Mapping[str, float] | ArrayLike | None,
     errors: Array,
     prior: Prior | None,
+    compliance_sigma: float = 0.0,
 ) -> Contacts:
     """Find all frictionless contacts of a whisker that explain measured signals."""
     names = selection(using)
     sensor = sensor_noise(noise, names, errors)
+    check_compliance(compliance_sigma, sensor)
     values, dims, coords = measured(signals, names)
     check_signals(values, names)
     d = contact_map.chart.discretization
@@ -215,6 +218,11 @@ def estimate(
             found, status, chi_squared = among_allowed(
                 prior, contact_map, readout, (flat, targets), found, status, chi_squared
             )
+        if compliance_sigma > 0.0:
+            assert sensor is not None
+            whisker, steps = contact_map.whisker, contact_map.steps
+            base = SoftBase(whisker, d, steps, readout.channels, sensor, compliance_sigma)
+            found, status, chi_squared = base.allow(flat, targets, found, status)
     else:
         found, chi_squared = Candidates.room(len(flat), 1), np.full(len(flat), np.nan)
         known = np.isfinite(flat).all(axis=1)

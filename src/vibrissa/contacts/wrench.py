@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.contacts.channels import WRENCH
+from vibrissa.contacts.channels import WRENCH, Channels
+from vibrissa.contacts.compliance import SoftBase, check_compliance
 from vibrissa.contacts.contacts import Candidates, Contacts, contacts_of
 from vibrissa.contacts.least_squares import Fits, fit, unknowns_covariance
 from vibrissa.contacts.noise import (
@@ -102,6 +103,7 @@ def estimate_from_wrench(
     stiffness_sigma: float = 0.0,
     gain_sigma: float | ArrayLike = 0.0,
     mixing_sigma: float | ArrayLike = 0.0,
+    compliance_sigma: float = 0.0,
     prior: Prior | None = None,
     steps: int = STEPS,
 ) -> Contacts:
@@ -126,6 +128,8 @@ def estimate_from_wrench(
     mixing_sigma : float or (6, 6) array_like
         Standard deviations of what each component reads of all six; or one number, relative: of
         the cross-talk among forces, and among moments.
+    compliance_sigma : float
+        Standard deviation of the base's compliance, rad/(N·m), as of `ContactMap.estimate`.
     prior : Prior, optional
         Which contacts are possible; others are left out of the candidates.
     steps : int
@@ -152,7 +156,7 @@ def estimate_from_wrench(
     """
     errors = common_errors(stiffness_sigma, gain_sigma, mixing_sigma)
     labelled = labelled_wrench(force, moment)
-    return _located(whisker, labelled, noise, errors, prior, steps)
+    return _located(whisker, labelled, noise, errors, prior, steps, compliance_sigma)
 
 
 def estimate_components(
@@ -161,6 +165,7 @@ def estimate_components(
     noise: Mapping[str, float] | ArrayLike | None,
     errors: Array,
     prior: Prior | None,
+    compliance_sigma: float = 0.0,
 ) -> Contacts:
     """Locate contacts from signals that have ``force`` and ``moment``, or the six components."""
     if "force" in signals and "moment" in signals:
@@ -168,7 +173,7 @@ def estimate_components(
     else:
         values, dims, coords = measured(signals, WRENCH)
         labelled = values[..., :3], values[..., 3:], dims, coords
-    return _located(whisker, labelled, noise, errors, prior, STEPS)
+    return _located(whisker, labelled, noise, errors, prior, STEPS, compliance_sigma)
 
 
 def _located(
@@ -178,8 +183,10 @@ def _located(
     errors: Array,
     prior: Prior | None,
     steps: int,
+    compliance_sigma: float,
 ) -> Contacts:
     sensor = sensor_noise(noise, WRENCH, errors)
+    check_compliance(compliance_sigma, sensor)
     f, m, dims, coords = labelled
     d = discretize(whisker, steps)
     scale = np.repeat([d.force, d.moment], 3)
@@ -208,6 +215,11 @@ def _located(
     status[rows] = np.where(lost, int(Status.DEGENERATE), _statuses(found, limit))
     whole = found.spread_out(rows, len(wrenches))
     chi_squared = whole.chi_squared[:, 0]
+    if compliance_sigma > 0.0:
+        assert sensor is not None
+        channels = Channels(WRENCH, WRENCH)
+        base = SoftBase(whisker, d, steps, channels, sensor, compliance_sigma, friction=True)
+        whole, status, chi_squared = base.allow(wrenches, wrenches, whole, status)
     return contacts_of(whole, status, chi_squared, d, WRENCH, f.shape[:-1], dims, coords)
 
 

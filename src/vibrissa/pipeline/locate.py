@@ -257,6 +257,11 @@ def locate_from_wrench(
     return _alone(out, rest, measured, errors, _FRICTION, second_contacts)
 
 
+def _of_wrench(errors: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Errors of a measured wrench, without those of the base that the whisker is held by."""
+    return {name: value for name, value in (errors or {}).items() if name != "compliance_sigma"}
+
+
 def _alone(
     found: xr.Dataset,
     whisker: Whisker,
@@ -279,7 +284,7 @@ def _alone(
         noise=measured.typical,
         friction=friction,
         false_alarms=rate,
-        **(errors or {}),
+        **_of_wrench(errors),
     )
     status = found["status"].values.copy()
     status[np.flatnonzero(rows)[test["second_contact"].values]] = int(Status.NOT_ONE_CONTACT)
@@ -339,7 +344,7 @@ class _Measured(NamedTuple):
         typical, steady = None, bool((covariance == covariance[:1]).all())
         if noise is not None:
             typical = covariance[0] if steady else _typical(covariance[rows])
-        shared = common_errors(**(errors or {}))
+        shared = common_errors(**_of_wrench(errors))
         if len(shared):
             whole = np.concatenate([force, moment], axis=1)
             covariance = covariance + common_covariance(shared, np.eye(6), whole)

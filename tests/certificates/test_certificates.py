@@ -2,18 +2,22 @@
 
 from fractions import Fraction
 
-import numba
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from scipy.optimize import linprog
 from typer.testing import CliRunner
 
 import vibrissa as vb
-from vibrissa.certificates import certify, check_certificate, checker, load_certificate, outlook
-from vibrissa.certificates.certificate import _TOLERANCES, prepared
-from vibrissa.certificates.equations import enclosed, spatial_equations
-from vibrissa.certificates.flow import absorb
+from vibrissa.certificates import (
+    certificate as made,
+    certify,
+    check_certificate,
+    checker,
+    load_certificate,
+    outlook,
+)
+from vibrissa.certificates.certificate import prepared
+from vibrissa.certificates.equations import enclosed
 from vibrissa.certificates.search import covers
 from vibrissa.cli.app import app
 from vibrissa.identifiability import verdict_table
@@ -218,10 +222,10 @@ def test_enclosures_over_boxes_never_miss_a_point(curved, kind, monkeypatch):
     certificate, rng = prepared(contact_map), np.random.default_rng(3)
     keep = [0, 1, 2] if kind == "curved" else [0, 2]
     count = 7 if kind == "curved" else 5
-    for half, tolerance in ((0.0, 1e-11), (2e-4, 1e-5), (2e-3, 1e-5)):
-        monkeypatch.setitem(_TOLERANCES, "interior", tolerance)
+    for half, tolerance in ((0.0, 1e-11), (2e-4, 1e-6), (2e-3, 1e-6), (1e-2, 1e-6)):
+        monkeypatch.setattr(made, "_TOLERANCE", tolerance)
         near = rng.random((2, 3)) * [0.6, 2.8, 0.8] + [0.35, 0.1, 0.1]
-        near[0, 0] = 0.37  # where forces are large
+        near[0, 0] = 0.36  # where forces are large
         ends = np.stack([near - half, near + half], axis=-1)[:, keep]
         found, _ = certificate.evaluate("interior", ends, list(range(count)))
         for box, enclosure in zip(near, found, strict=True):
@@ -230,7 +234,7 @@ def test_enclosures_over_boxes_never_miss_a_point(curved, kind, monkeypatch):
             true = conditions(certificate, contact_map.whisker, at)
             size = np.abs(centre) + 1e-3
             assert (np.abs(true - centre) <= reach + 2e-8 * size).all()
-            assert (reach <= (300.0 * half + 100.0 * tolerance + 1e-7) * (size + 1.0)).all()
+            assert (reach <= (300.0 * half + 100.0 * tolerance + 3e-7) * (size + 1.0)).all()
 
 
 def test_a_box_across_an_end_of_polynomials_is_not_enclosed(curved):
@@ -239,34 +243,6 @@ def test_a_box_across_an_end_of_polynomials_is_not_enclosed(curved):
     box = np.array([[[0.499, 0.501], [1.0, 1.0], [0.5, 0.5]]])
     assert np.isnan(certificate.evaluate("interior", box, [0])[0]).all()
     assert 0.5 in certificate.stations
-
-
-@numba.njit
-def absorbed(program, state, unknowns):
-    absorb(program, state, unknowns)
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_what_symbols_carry_still_holds_all_states_together(seed):
-    # Values x = Aε + r and derivatives y = Bε + Cδ + r: every pair has new symbols and remainders.
-    rng, n, unknowns = np.random.default_rng(seed), 3, 1
-    program = spatial_equations(False)._replace(groups=np.zeros((2, n), dtype=np.int64))
-    state = np.zeros((2 * n, unknowns + 2 * n + 3))
-    state[:, 2 : 2 + n] = rng.standard_normal((2 * n, n)) * 10.0 ** rng.integers(-2, 1)
-    state[n:, 2 + n : 2 + 2 * n] = rng.standard_normal((n, n))
-    state[:, -2] = rng.random(2 * n) * 10.0 ** rng.integers(-3, 1)
-    state[:, -1] = np.abs(state[:, :-1]).sum(axis=1)
-    old = state.copy()
-    absorbed(program, state, unknowns)
-    columns = slice(1 + unknowns, 1 + unknowns + 2 * n)
-    for _ in range(8):
-        symbols = rng.choice([-1.0, 1.0], 2 * n)
-        point = old[:, columns] @ symbols + old[:, -2] * rng.choice([-1.0, 1.0], 2 * n)
-        rest = np.diag(state[:, -2])
-        new = linprog(
-            np.zeros(4 * n), A_eq=np.hstack([state[:, columns], rest]), b_eq=point, bounds=(-1, 1)
-        )
-        assert new.success
 
 
 def test_a_grid_shows_whether_a_certificate_can_exist(curved):

@@ -49,8 +49,8 @@ if TYPE_CHECKING:
 TRIPLET = "Fx MB MD"
 KIND = "vibrissa certificate"
 _ORDER = 8
-# Share of the states to which the last Taylor coefficient falls in a step, by part.
-_TOLERANCES = {"interior": 1e-5, "proximal": 1e-6, "distal": 1e-6, "fold": 1e-6, "rest": 1e-5}
+# Share of the states to which the last Taylor coefficient falls in a step.
+_TOLERANCE = 1e-6
 # Conditions by part: of the straight whisker, and of any.
 _PLANAR = {"interior": [0, 1, 2, 3], "proximal": [0, 4], "distal": [0, 4], "fold": [0, 1]}
 _SPATIAL = {"interior": [0, 1, 2, 3, 4], "proximal": [0, 1, 5, 6], "distal": [0, 1, 5, 6]}
@@ -219,8 +219,8 @@ class Certificate:
 
         Returns
         -------
-        conditions : (n, c, unknowns + 2) array
-            Centres, shares of the unknowns and remainders.
+        conditions : (n, c, unknowns + 3) array
+            Centres, shares of the unknowns and of their products, and remainders.
         widths : (n, unknowns) array
             Relative widths by unknown.
         """
@@ -234,17 +234,19 @@ class Certificate:
                 self._tables[kind] = spatial_conditions(self.sign)
         tables = self._tables[kind]
         unknowns = tables.unknowns
-        found = np.empty((len(boxes), len(tables.conditions), unknowns + 2))
+        found = np.empty((len(boxes), len(tables.conditions), unknowns + 3))
         widths = np.empty((len(boxes), unknowns))
-        bound, tolerance = self.bounds.packed(), _TOLERANCES[name]
-        boxes = np.ascontiguousarray(boxes)
+        bound = self.bounds.packed()
+        alike = np.lexsort(boxes[..., 0].T[::-1])  # neighbours need similar steps
+        boxes = np.ascontiguousarray(boxes[alike])
         share_out(
             len(boxes),
             lambda first, end: conditions_on(
-                tables, self.rod, bound, boxes, _ORDER, tolerance, found, widths, first, end
+                tables, self.rod, bound, boxes, _ORDER, _TOLERANCE, found, widths, first, end
             ),
         )
-        return found[:, which], widths
+        back = np.argsort(alike)
+        return found[back][:, which], widths[back]
 
     def probe(self) -> None:
         """Look for signs that are not certain at single contacts, so that boxes cannot help."""
@@ -282,7 +284,10 @@ class Certificate:
         def where(boxes: IntArray) -> Array:
             return bounds(boxes, part.domain, self.stations)
 
-        found = cover(lambda boxes: self.evaluate(name, where(boxes), which), part.undecided, most)
+        free = part.domain[:, 0] < part.domain[:, 1]
+        found = cover(
+            lambda boxes: self.evaluate(name, where(boxes), which), part.undecided, most, free
+        )
         part.certified = np.concatenate([part.certified, found.certified])
         part.undecided = found.undecided
         part.evaluated += found.evaluated

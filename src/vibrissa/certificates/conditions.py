@@ -25,14 +25,20 @@ from vibrissa.certificates.equations import (
     planar_equations,
     spatial_equations,
 )
-from vibrissa.certificates.flow import enclose
+from vibrissa.certificates.flow import enclose, first_piece, set_number
 from vibrissa.certificates.forms import (
+    COLUMNS_2,
+    COLUMNS_3,
+    LANES,
+    PURE_2,
+    PURE_3,
     ROUNDING,
     TINY,
     UP,
     add_product,
     clear,
     close,
+    coefficients,
     copy_row,
     reciprocal,
 )
@@ -63,6 +69,8 @@ SPATIAL_REST = ("deflection",)
 DEGREES = 6
 _GIVEN = ("one", "s", "level", "cos", "sin", "inverse", "alpha")
 _POLYNOMIALS = 5
+# Boxes end at the edges of pieces; only outward rounding may exceed these.
+_ROUNDED = 1e-13
 
 
 class Conditions(NamedTuple):
@@ -253,32 +261,70 @@ def compute(table: Program, z: Array, first: int, end: int) -> None:
 
 
 @inlined_rigorous
-def set_number(value: float, spread: float, symbol: int, z: Array, k: int) -> None:
-    """The number, or unknown, within a spread of a value."""
-    clear(z, k)
-    z[k, 0] = value
-    z[k, symbol] = spread
-    close(z, k, 1.0)
+def set_unknown(low: float, high: float, column: int, z: Array, k: int, lane: int) -> None:
+    """All numbers between two, in one lane; not yet closed."""
+    middle = 0.5 * (low + high)
+    half = 0.5 * (high - low) * UP + 4e-16 * (abs(low) + abs(high))
+    z[k, 0, lane], z[k, column, lane], z[k, z.shape[1] - 1, lane] = middle, half, abs(middle)
 
 
 @inlined_rigorous
-def set_angle(middle: float, half: float, symbol: int, z: Array, cos: int, sin: int) -> None:
-    """Cosine and sine of an angle within ±3.2, by their series."""
-    even, odd, term = 0.0, 0.0, 1.0
-    for k in range(40):
-        sign = 1.0 if k % 4 < 2 else -1.0
-        if k % 2:
-            odd += sign * term
+def set_angle(low: float, high: float, pure: IntArray, z: Array, k: int, lane: int) -> None:
+    """Cosine, in row k, and sine, in the next, of an angle within ±3.2; not yet closed.
+
+    By their series at the middle, and then about it; ``pure`` are the columns of the unknown's
+    powers.
+    """
+    middle = 0.5 * (low + high)
+    half = 0.5 * (high - low) * UP + 4e-16 * (abs(low) + abs(high))
+    cos, sin, term = 0.0, 0.0, 1.0
+    for n in range(40):
+        sign = 1.0 if n % 4 < 2 else -1.0
+        if n % 2:
+            sin += sign * term
         else:
-            even += sign * term
-        term *= middle / (k + 1)
-    # Beyond the tangent at most half²/2; the series is good to 80 u cosh 3.2 < 1.2e-13.
-    bend = 0.5 * half * half * UP + 1.2e-13
-    set_number(even, -odd * half, symbol, z, cos)
-    set_number(odd, even * half, symbol, z, sin)
-    for row in (cos, sin):
-        z[row, z.shape[1] - 2] += bend
-        close(z, row, 1.0)
+            cos += sign * term
+        term *= middle / (n + 1)
+    power = 1.0
+    for n in range(pure.size):
+        z[k, pure[n], lane], z[k + 1, pure[n], lane] = cos * power, sin * power
+        cos, sin = -sin, cos
+        power *= half / (n + 1) * UP
+    # The series at the middle is good to 80 u cosh 3.2 < 1.2e-13, and so are its derivatives.
+    for row in (k, k + 1):
+        z[row, coefficients(z), lane] = power + 1.2e-13 * (1.0 + half) ** 3 * UP
+        z[row, z.shape[1] - 1, lane] = (1.0 + half) ** 3
+
+
+@inlined_rigorous
+def report(z: Array, row: int, lane: int, unknowns: int, out: Array) -> None:
+    """A form as its centre, the shares of the unknowns, of their products, and the rest."""
+    n = coefficients(z)
+    out[0], out[unknowns + 1] = z[row, 0, lane], 0.0
+    for a in range(1, n):
+        if a <= unknowns:
+            out[a] = abs(z[row, a, lane])
+        else:
+            out[unknowns + 1] += abs(z[row, a, lane])
+    out[unknowns + 1] *= UP
+    out[unknowns + 2] = (z[row, n, lane] + ROUNDING * z[row, z.shape[1] - 1, lane]) * UP
+
+
+@inlined_rigorous
+def relative_widths(state: Array, states: int, lane: int, out: Array) -> None:
+    """Sum, over all vectors of states, of what each unknown changes over the vector's size."""
+    last = state.shape[1] - 1
+    for a in range(out.size):
+        out[a] = TINY
+        first = 0
+        while first < state.shape[0]:
+            end = min(first + 3, (first // states + 1) * states)
+            change, size = 0.0, TINY
+            for i in range(first, end):
+                change += abs(state[i, a + 1, lane])
+                size += state[i, last, lane]
+            out[a] += change / size
+            first = end
 
 
 @rigorous
@@ -305,69 +351,67 @@ def conditions_on(
     bound : (32,) array
         The taper α, the coefficients of P₀ … P₄, and ``room``.
     boxes : (n, unknowns, 2) array
-        Bounds of the unknowns.
+        Bounds of the unknowns; neighbours are computed side by side.
     order : int
         Order of the Taylor polynomials.
     tolerance : float
         Share of the states to which the last Taylor coefficient falls in a step.
-    found : (n, c, unknowns + 2) array
-        Conditions, each a centre, the share of each unknown, and the remainder with all else; NaN
-        where the states could not be enclosed.
+    found : (n, c, unknowns + 3) array
+        Conditions, each a centre, the share of each unknown and of their products, and the
+        remainder with all else; NaN where the states could not be enclosed.
     widths : (n, unknowns) array
         Relative widths of the states by unknown.
     first, end : int
         Rows to do.
     """
     groups, states = conditions.equations.groups.shape
-    unknowns = conditions.unknowns
-    n = unknowns + 2 * states
-    last = n + 2
-    table = conditions.table
-    z = np.zeros((table.kind.size, last + 1))
-    state, arc, load = np.zeros((groups * states, last + 1)), z[1:2].copy(), z[1:2].copy()
-    set_number(1.0, 0.0, 1, z, 0)
+    unknowns, table = conditions.unknowns, conditions.table
+    pure = PURE_3 if unknowns == 3 else PURE_2
+    width = COLUMNS_3 if unknowns == 3 else COLUMNS_2
+    z, work = np.zeros((table.kind.size, width, LANES)), np.zeros((3, width, LANES))
+    state, load = np.zeros((groups * states, width, LANES)), np.zeros((1, width, LANES))
+    set_number(1.0, 0.0, z, 0)
     for k in range(bound.size):
-        set_number(bound[k], 0.0, 1, z, 6 + k)
-    for box in range(first, end):
-        found[box] = np.nan
-        widths[box] = 1.0
-        for a in range(unknowns):
-            low, high = boxes[box, a, 0], boxes[box, a, 1]
-            middle = 0.5 * (low + high)
-            half = 0.5 * (high - low) * UP + 4e-16 * (abs(low) + abs(high))
-            if a == 1 and unknowns == 3:
-                set_angle(middle, half, 2, z, 3, 4)
-            else:
-                set_number(middle, half, a + 1, z, 1 if a == 0 else 2)
-        if not reciprocal(z, 1, z, 5):
-            continue
+        set_number(bound[k], 0.0, z, 6 + k)
+    row = first
+    while row < end:
+        piece = first_piece(rod, 0.5 * (boxes[row, 0, 0] + boxes[row, 0, 1]))
+        number = 1
+        while number < LANES and row + number < end:
+            s = 0.5 * (boxes[row + number, 0, 0] + boxes[row + number, 0, 1])
+            if first_piece(rod, s) != piece:
+                break
+            number += 1
+        for i in range(1, 5):
+            clear(z, i)
+        for lane in range(LANES):
+            box = boxes[row + min(lane, number - 1)]
+            set_unknown(box[0, 0], box[0, 1], 1, z, 1, lane)
+            level = unknowns - 1
+            set_unknown(box[level, 0], box[level, 1], unknowns, z, 2, lane)
+            if unknowns == 3:
+                set_angle(box[1, 0], box[1, 1], pure[1], z, 3, lane)
+        for i in range(1, 5):
+            close(z, i, 1.0)
+        reciprocal(z, 1, z, 5, work)
         compute(table, z, 0, conditions.middle)
-        copy_row(z, 1, arc, 0)
         if conditions.load >= 0:
             copy_row(z, conditions.load, load, 0)
         for i in range(groups * states):
             clear(state, i)
             if conditions.start[i] >= 0:
                 copy_row(z, conditions.start[i], state, i)
-        if enclose(conditions.equations, rod, arc, load, state, unknowns, order, tolerance) != 0:
-            continue
+        enclose(conditions.equations, rod, piece, z[1:2], load, state, order, tolerance)
         for i in range(groups * states):
-            if i >= states:  # remainders of different derivatives only share their symbols' names
-                for a in range(1 + unknowns + states, n + 1):
-                    state[i, n + 1] += abs(state[i, a])
-                    state[i, a] = 0.0
-                close(state, i, 1.0)
             copy_row(state, i, z, conditions.base + i)
         compute(table, z, conditions.middle, table.kind.size)
-        for c in range(conditions.conditions.size):
-            row = conditions.conditions[c]
-            rest = z[row, n + 1] + ROUNDING * z[row, last]
-            for a in range(1 + unknowns, n + 1):
-                rest += abs(z[row, a])
-            found[box, c, 0], found[box, c, unknowns + 1] = z[row, 0], rest * UP
-            for a in range(unknowns):
-                found[box, c, a + 1] = abs(z[row, a + 1])
-        for a in range(unknowns):
-            widths[box, a] = TINY
-            for i in range(groups * states):
-                widths[box, a] += abs(state[i, a + 1]) / (state[i, last] + TINY)
+        for lane in range(number):
+            # Contacts on both sides of an end of pieces have different equations.
+            box = boxes[row + lane, 0]
+            apart = max(rod.edges[piece] - box[0], box[1] - rod.edges[piece + 1]) > _ROUNDED
+            for c in range(conditions.conditions.size):
+                report(z, conditions.conditions[c], lane, unknowns, found[row + lane, c])
+            if apart:
+                found[row + lane] = np.nan
+            relative_widths(state, states, lane, widths[row + lane])
+        row += number

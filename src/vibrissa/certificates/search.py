@@ -11,10 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.numerics import Array, IntArray
+from vibrissa.numerics import AnyArray, Array, IntArray
 
 _BATCH = 2048
 _MOST_HALVINGS = 3
+# Remainders fall at least with this power of a box's size.
+_REMAINDER = 4
 _DEEPEST = 40
 
 Evaluate = Callable[[IntArray], tuple[Array, Array]]
@@ -62,19 +64,23 @@ def volume(boxes: IntArray) -> Array:
     return np.asarray(2.0 ** (-boxes[..., 0].sum(axis=-1).astype(np.float64)))
 
 
-def cover(evaluate: Evaluate, start: IntArray, most: int = 10**6) -> Cover:
+def cover(
+    evaluate: Evaluate, start: IntArray, most: int = 10**6, free: AnyArray | None = None
+) -> Cover:
     """Halve boxes until all conditions are certainly positive on each.
 
     Parameters
     ----------
     evaluate : callable
-        Function of boxes (n, unknowns, 2) that returns conditions (n, c, unknowns + 2), each a
-        centre, the share of each unknown in its range and the remainder, and the relative widths
-        (n, unknowns) of what they are computed from.
+        Function of boxes (n, unknowns, 2) that returns conditions (n, c, unknowns + 3), each a
+        centre, the share of each unknown and of their products in its range, and the remainder,
+        and the relative widths (n, unknowns) of what they are computed from.
     start : (n, unknowns, 2) array
         Boxes to begin with.
     most : int
         Largest number of boxes that are evaluated.
+    free : (unknowns,) array of bool, optional
+        Unknowns that are not fixed; by default all.
 
     Returns
     -------
@@ -82,20 +88,25 @@ def cover(evaluate: Evaluate, start: IntArray, most: int = 10**6) -> Cover:
         Boxes, certified or not.
     """
     left, none = start, start[:0]
+    free = np.ones(start.shape[1], dtype=bool) if free is None else free
     done: list[IntArray] = [none]
     evaluated = 0
     while len(left) and evaluated < most:
         batch, left = left[-_BATCH:], left[:-_BATCH]
         found, widths = evaluate(batch)
         evaluated += len(batch)
-        centre, shares, rest = found[..., 0], found[..., 1:-1], found[..., -1]
-        certain = (centre > (shares.sum(axis=-1) + rest) * (1.0 + 1e-12)).all(axis=-1)
+        centre, rest = found[..., 0], found[..., -1]
+        certain = (centre > found[..., 1:].sum(axis=-1) * (1.0 + 1e-12)).all(axis=-1)
         wrong = np.flatnonzero((centre < -rest).any(axis=-1))
         if wrong.size:
             bad = batch[wrong[:1]]
             return Cover(np.concatenate(done), np.concatenate([left, batch]), evaluated, bad)
         done.append(batch[certain])
         open_ = ~certain
+        # What could not be enclosed is halved where it is widest.
+        size = 2.0 ** (-batch[..., 0].astype(np.float64))
+        known = np.asarray(np.isfinite(found).all(axis=(1, 2)))
+        widths = np.where(known[:, None], widths, size) * free
         left = np.concatenate([left, _halved(batch[open_], found[open_], widths[open_])])
     return Cover(np.concatenate(done), left, evaluated, none)
 
@@ -104,26 +115,22 @@ def _halvings(found: Array, widths: Array) -> IntArray:
     """How often each unknown is to be halved: where that is expected to make the signs certain."""
     n, unknowns = widths.shape
     times = np.zeros((n, unknowns), dtype=np.int64)
-    known = np.asarray(np.isfinite(found).all(axis=(1, 2)))
-    centre = np.where(known[:, None], found[..., 0], 1.0)
-    shares = np.where(known[:, None, None], found[..., 1:-1], 1.0)
-    rest = np.where(known[:, None], found[..., -1], 4.0)
-    widths = np.where(known[:, None], widths, 1.0)
+    known = np.isfinite(found).all(axis=(1, 2), keepdims=True)
+    found = np.where(known, found, np.array([1.0, *unknowns * [0.0], 0.0, 100.0]))
+    centre, curved, rest = found[..., 0], found[..., -2], found[..., -1]
+    shares = found[..., 1:-2]
     for _ in range(_MOST_HALVINGS):
         scale = np.asarray(2.0 ** (-times.astype(np.float64)))
-        now = (widths * scale).sum(axis=1) / widths.sum(axis=1)
-        misses = (
-            centre <= (shares * scale[:, None, :]).sum(axis=-1) + rest * (now**2)[:, None]
-        ).any(axis=1)
-        more = misses | (times.sum(axis=1) == 0)
+        now = ((widths * scale).sum(axis=1) / widths.sum(axis=1))[:, None]
+        beyond = curved * now**2 + rest * now**_REMAINDER
+        linear = shares * scale[:, None, :]
+        more = (centre <= linear.sum(axis=-1) + beyond).any(axis=1) | (times.sum(axis=1) == 0)
         # The unknown that matters most to the worst condition, by its own share and its width.
-        excess = (shares.sum(axis=-1) + rest) / np.maximum(np.abs(centre), 1e-300)
-        worst = np.argmax(excess, axis=1)
-        rows = np.arange(n)
-        linear = shares[rows, worst] * scale
-        quadratic = (rest[rows, worst] * now)[:, None] * (widths * scale)
-        quadratic = quadratic / widths.sum(axis=1, keepdims=True)
-        which = np.argmax(linear + 2.0 * quadratic, axis=1)
+        excess = (linear.sum(axis=-1) + beyond) / np.maximum(np.abs(centre), 1e-300)
+        rows, worst = np.arange(n), np.argmax(excess, axis=1)
+        gain = 2.0 * curved * now**2 + _REMAINDER * rest * now**_REMAINDER
+        part = widths * scale / (widths * scale).sum(axis=1, keepdims=True)
+        which = np.argmax(linear[rows, worst] + gain[rows, worst][:, None] * part, axis=1)
         times[rows[more], which[more]] += 1
     return times
 

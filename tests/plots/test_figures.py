@@ -9,6 +9,7 @@ import pytest
 import xarray as xr
 from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
+from matplotlib.image import imread
 
 from vibrissa.plots import (
     contour_views,
@@ -117,6 +118,23 @@ def test_contour_shows_points_peg_and_fit_in_mm() -> None:
     assert len(dots.get_offsets()) == 49
     outline = top.patches[0].get_xy()
     np.testing.assert_allclose(np.hypot(*(outline - [25.0, 0.0]).T), 1.35)
+
+
+def test_what_a_figure_shows_is_written_above_it(tmp_path) -> None:
+    rng = np.random.default_rng(3)
+    true = np.stack([np.full(101, 25e-3), *rng.uniform(-0.5, 0.5, (2, 101))], axis=1)
+    errors = np.stack([np.linspace(0.0, 2e-3, 101), np.full(101, 0.01), np.zeros(101)], axis=1)
+    figure = estimated_against_true(true, true + errors, colour=np.arange(101.0), colour_name="MB")
+    finding = next(text for text in figure.texts if "101 contacts" in text.get_text())
+    assert "1 mm in $r$, 0.57° in" in finding.get_text()  # the errors are 0 to 2 mm, and 0.01 rad
+    wide, tall = figure.get_size_inches()
+    (file,) = save(figure, tmp_path / "a", ["png"])
+    rows, columns = imread(file).shape[:2]
+    assert columns == pytest.approx(300 * wide, abs=2)
+    assert 300 * (tall + 4.0 / 25.4) < rows < 300 * (tall + 8.0 / 25.4)
+    # The sentence is above all panels.
+    top = max(axes.get_position().y1 for axes in figure.axes)
+    assert finding.get_position()[1] > 1.0 > top
 
 
 def test_a_tilted_peg_is_cut_at_the_height_of_the_points() -> None:

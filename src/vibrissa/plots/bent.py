@@ -22,6 +22,7 @@ from vibrissa.plots.style import (
     SHADE,
     Width,
     box_axes,
+    conclude,
     force_arrow,
     head,
     limits_around,
@@ -45,6 +46,9 @@ _LEFT, _RIGHT, _BOTTOM, _TOP, _GAP = 10.0, 2.0, 8.5, 6.5, 10.0
 _ROW = 4.0
 """Room of a row of the legend, mm."""
 
+_FORCES = 25.0
+"""Room below the side view from which on forces are drawn there, mm."""
+
 _NARROWEST = 0.11
 """Smallest half of an axis, as a share of the whiskers' extent."""
 
@@ -54,6 +58,7 @@ class _Drawn(NamedTuple):
     lines: Array
     points: Array
     arrows: Array
+    forces: Array
     colours: list[str]
     labels: Sequence[str]
 
@@ -89,7 +94,8 @@ def bent_views(
     Returns
     -------
     Figure
-        Two axes, in mm; or the sentence "nothing bent".
+        Two axes, in mm, and where there is room for it the sizes of the forces; or the sentence
+        "nothing bent".
 
     Raises
     ------
@@ -113,10 +119,15 @@ def bent_views(
             lines[known],
             points[known],
             arrows,
+            to_display("force", size),
             [colours[i] for i in known],
             [labels[int(i)] for i in known] if labels else (),
         )
-        return _views(drawn, _limits(drawn, extent), width)
+        figure = _views(drawn, _limits(drawn, extent), width)
+        if largest > 0.0:
+            low, high = to_display("force", np.array([np.nanmin(size), largest]))
+            conclude(figure, f"Forces from {low:.3g} to {high:.3g} µN")
+        return figure
 
 
 def _check(
@@ -180,6 +191,10 @@ def _views(drawn: _Drawn, limits: Array, width: Width) -> Figure:
         axes.yaxis.set_major_locator(MaxNLocator(few, integer=True))
         axes.set(xlabel=axis_label("x"), ylabel=axis_label("xyz"[j]))
         head(axes, "ab"[number], ("from above", "from the side")[number])
+    below_side = tall[0] - tall[1] - _GAP - _BOTTOM
+    if abreast and below_side > _FORCES and np.isfinite(drawn.forces).any():
+        corner = _LEFT + scale * span[0] + _GAP + _LEFT, _BOTTOM
+        _forces(box_axes(figure, (*corner, scale * span[0], below_side - _TOP)), drawn)
     if drawn.labels:
         handles, texts = figure.axes[0].get_legend_handles_labels()
         # Above the views, from where the first begins.
@@ -188,6 +203,15 @@ def _views(drawn: _Drawn, limits: Array, width: Width) -> Figure:
             handles, texts, loc="upper left", bbox_to_anchor=place, ncols=2 * columns, borderpad=0.0
         )
     return figure
+
+
+def _forces(axes: Axes, drawn: _Drawn) -> None:
+    """How large the forces are, over how far from the resting whisker they act."""
+    away = np.linalg.norm(drawn.points[:, None] - drawn.rest, axis=-1).min(axis=1)
+    axes.scatter(away, drawn.forces, 14.0, color=drawn.colours, zorder=3)
+    axes.set(xlabel="distance of the contact from rest (mm)", ylabel=axis_label("force"))
+    axes.set(xlim=(0.0, None), ylim=(0.0, None))
+    head(axes, "c", "force")
 
 
 def _draw(axes: Axes, drawn: _Drawn, j: int) -> None:
@@ -245,7 +269,7 @@ def witness_pair(witness: xr.Dataset, *, width: Width = "double") -> Figure:
     span = np.ptp(limits, axis=1)
     page = page_width(width)
     abreast = width == "double"
-    left, gap, bottom, top = 12.0, 3.0, 9.0, 6.0
+    left, gap, bottom, top = 12.0, 3.0, 9.0, 2.0
     room = page - left - 2.0 - (_TABLE + 6.0 if abreast else 0.0)
     scale = min(room / span[0], 70.0 / (span[1] + span[2]))
     views = bottom + gap + top + scale * (span[1] + span[2])
@@ -267,8 +291,14 @@ def witness_pair(witness: xr.Dataset, *, width: Width = "double") -> Figure:
         above = place(shift + bottom + scale * span[2] + gap, 1)
         above.tick_params(labelbottom=False)
         side.set_xlabel(axis_label("x"))
-        title = f"the same {triplet_label(' '.join(triplet))}"
-        figure.text(left / page, 1.0 - 4.0 / height, title, fontsize=7.0)
+        points = to_display(
+            "contact_point", witness["contact_point"].transpose(..., "space").values
+        )
+        conclude(
+            figure,
+            f"Two contacts {np.linalg.norm(points[1] - points[0]):.1f} mm apart have the same "
+            f"({triplet_label(' '.join(triplet))})",
+        )
         start = left + scale * span[0] + 8.0 if abreast else 3.0
         box = (
             start / page,

@@ -17,6 +17,7 @@ from vibrissa.plots.style import (
     Box,
     Width,
     box_axes,
+    conclude,
     head,
     looking,
     new_figure,
@@ -110,6 +111,11 @@ def contact_places(
         bar = figure.colorbar(dots, cax=box_axes(figure, rail))
         plain(bar)
         bar.ax.set_title(axis_label(colour), fontsize=6.5, pad=4.0)
+        near, far = np.nanpercentile(np.linalg.norm(own, axis=1), [5.0, 95.0])
+        conclude(
+            figure,
+            f"{len(own)} contact points, 90 % of them {near:.0f} to {far:.0f} mm from the base",
+        )
         return figure
 
 

@@ -36,6 +36,7 @@ from vibrissa.plots.style import (
     ORANGE,
     Width,
     box_axes,
+    conclude,
     head,
     looking,
     new_figure,
@@ -123,12 +124,24 @@ def contour_views(
             dots = axes.scatter(across, up, size, zorder=3, **shading(shade))
         _note_outside(panels[0], places, limits)
         _legend(figure, panels, known, fitted, spread is not None)
+        if bodies and hasattr(bodies[-1][0], "signed_distance"):
+            _conclude(figure, np.asarray(points, dtype=np.float64)[rows], *bodies[-1])
         if shade is not None:
             page, height = 25.4 * figure.get_size_inches()
             box = page - _BAR + 2.0, _BOTTOM, 2.0, 0.6 * (height - _BOTTOM - _TOP)
             rail = box_axes(figure, box)
             plain(figure.colorbar(dots, cax=rail, label=axis_label(colour_name)))
         return figure
+
+
+def _conclude(figure: Figure, points: Array, body: Body, look: str) -> None:
+    """State how far the contact points are from the surface that was fitted, or is known."""
+    away = np.median(np.abs(to_display("r", body.signed_distance(points))))
+    conclude(
+        figure,
+        f"{len(points)} contact points on the whisker's centreline, half of them within "
+        f"{away:.2g} mm of the {look} surface",
+    )
 
 
 def _draw(
@@ -322,6 +335,13 @@ def distances_by_class(summaries: Sequence[xr.Dataset], *, width: Width = "doubl
         handles, labels = panels[0].get_legend_handles_labels()
         panels[0].yaxis.set_major_formatter("{x:g}")
         figure.legend(handles, labels, loc="outside upper right", ncols=len(labels))
+        medians = to_display("surface_distance", shown[0]["median"].values)
+        first = quantity(shown[0].attrs["quantity"]).long_name
+        conclude(
+            figure,
+            f"Median distance from the surface {np.nanmin(medians):.0f} to "
+            f"{np.nanmax(medians):.0f} µm, by class of {first}",
+        )
         return figure
 
 

@@ -10,7 +10,7 @@ from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from vibrissa.plots.style import MUTED, head, looking, new_figure, plain, say, shading
+from vibrissa.plots.style import MUTED, conclude, head, looking, new_figure, plain, say, shading
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.scene import Array, robust_limits
 
@@ -82,7 +82,20 @@ def estimated_against_true(
             }
             plain(figure.colorbar(dots, ax=panels, label=axis_label(name), pad=0.01, **place))
         figure.align_ylabels(panels[:, 0])
+        conclude(figure, f"{len(true)} contacts: {error_words(true, estimated)}")
         return figure
+
+
+def error_words(true: Array, estimated: Array) -> str:
+    """Median errors of r, θ and φ, of coordinates in m and rad."""
+    parts = []
+    for i, name in enumerate(_COORDINATES):
+        pair = to_display(name, true[:, i]), to_display(name, estimated[:, i])
+        row = quantity(name)
+        unit = row.display_unit if row.display_unit == "°" else f" {row.display_unit}"
+        error = np.median(np.abs(_difference(name, *pair)))
+        parts.append(f"{error:.2g}{unit} in ${row.symbol}$")
+    return f"median error {parts[0]}, {parts[1]} and {parts[2]}"
 
 
 def _usable(

@@ -28,6 +28,7 @@ from vibrissa.plots.style import (
     Box,
     Width,
     box_axes,
+    conclude,
     looking,
     new_figure,
     page_width,
@@ -143,7 +144,22 @@ def trial_overview(
         if compared:
             _compared(figure, sheet.against, course)
         _letters(figure, sheet)
+        conclude(figure, _finding(course))
         return figure
+
+
+def _finding(course: Course) -> str:
+    """How often and how strongly the whisker touched, and how well that was located."""
+    assert course.signals is not None
+    count = len(intervals(course.time, course.touching))
+    largest = np.nanmax(to_display("MB", course.signals["MB"]), initial=0.0)
+    words = f"{count} contact{'' if count == 1 else 's'}, bending moments up to {largest:.2g} µN·m"
+    if course.known is None or course.estimated is None:
+        return words
+    away = to_display("r", np.linalg.norm(course.estimated - course.known, axis=1))
+    if not np.isfinite(away).any():
+        return words
+    return f"{words}; estimates {np.nanmedian(away):.2g} mm from {course.known_as} contact points"
 
 
 def _sheet(width: Width, images: int, compared: bool) -> _Sheet:

@@ -19,6 +19,7 @@ from vibrissa.plots.style import (
     MUTED,
     ORANGE,
     Width,
+    conclude,
     looking,
     new_figure,
     say,
@@ -118,7 +119,31 @@ def sensitivity_panels(data: xr.Dataset, *, width: Width = "double") -> Figure:
             ncols=4 if width == "double" else 2,
             borderpad=0.0,
         )
+        if finding := _finding(contacts):
+            conclude(figure, finding)
         return figure
+
+
+def _finding(contacts: _Contacts) -> str:
+    """How much more the distance of a contact depends on signals that are small."""
+    kept, parts = contacts.weight > 0.0, []
+    for name in (n for n in contacts.signals if n not in _DIRECTIONS):
+        size = np.abs(contacts.signals[name][kept])
+        slope, weight = np.abs(contacts.derivatives["r", name][kept]), contacts.weight[kept]
+        low, high = _quantiles(size, weight, [0.2, 0.8])
+        medians = [
+            float(_quantiles(slope[part], weight[part], [0.5])[0])
+            for part in (size <= low, size >= high)
+        ]
+        if min(medians) > 0.0:
+            symbol = rf"$\partial r/\partial {quantity(name).symbol}$"
+            parts.append(f"{symbol} {medians[0] / medians[1]:.0f} times")
+    if not parts:
+        return ""
+    return (
+        f"Contacts with the fifth of smallest signals have {' and '.join(parts)} as large as those "
+        "with the largest"
+    )
 
 
 def _contacts(data: xr.Dataset) -> _Contacts:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from vibrissa.plots.style import BLUE, INK, SHADE, Width, head, looking, new_figure, say
+from vibrissa.plots.style import BLUE, INK, SHADE, Width, conclude, head, looking, new_figure, say
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.recording import Group
 from vibrissa.scene import Array, Mask
@@ -56,6 +56,16 @@ def signals_over_time(
             axes.set_xlim(time.min(), time.max() if time.size > 1 else time.min() + 1.0)
         figure.align_ylabels()
         _legend(figure, truth is not None, contact is not None)
+        # Signals without a direction have their largest size where the whisker is loaded most.
+        largest = [
+            f"${quantity(n).symbol}$ up to {np.nanmax(to_display(n, signals[n]), initial=0.0):.3g} "
+            f"{quantity(n).display_unit}"
+            for n in ("FT", "MB")
+            if n in signals
+        ]
+        count = "" if contact is None else f" in {len(intervals(time, contact))} contacts"
+        if largest:
+            conclude(figure, f"{' and '.join(largest)}{count}")
         return figure
 
 

@@ -16,6 +16,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from io import BytesIO
 from pathlib import Path
+from textwrap import wrap
 from types import MappingProxyType
 from typing import Any, Literal
 
@@ -26,6 +27,7 @@ from matplotlib.backend_bases import RendererBase
 from matplotlib.colorbar import Colorbar
 from matplotlib.colors import Colormap, ListedColormap
 from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
 from scipy.interpolate import CubicSpline
 
 from vibrissa.io import replacing
@@ -37,6 +39,9 @@ Box = tuple[float, float, float, float]
 
 WIDTHS: Mapping[str, float] = MappingProxyType({"single": 85.0, "double": 178.0})
 """Widths of figures, mm."""
+
+_LETTER = 1.5
+"""Mean width of a letter of 8 points, mm."""
 
 INK = "#1a1a1a"
 MUTED = "#8c8c8c"
@@ -107,10 +112,26 @@ class _StyledFigure(Figure):
     that moment; so without this they would look as whoever draws the figure likes them.
     """
 
+    above = 0.0
+    """Height of what is written above the panels, mm."""
+
     def draw(self, renderer: RendererBase) -> None:
         """Draw."""
         with looking():
             super().draw(renderer)
+
+    def savefig(self, fname: Any, **how: Any) -> None:
+        """Write the panels, and what is written above them."""
+        if self.above:
+            wide, tall = self.get_size_inches()
+            how.setdefault("bbox_inches", Bbox([[0.0, 0.0], [wide, tall + self.above / 25.4]]))
+            self.draw_without_rendering()
+            self.set_layout_engine("none")
+            for legend in self.legends:
+                # Those without an anchor would move to the top of what is written.
+                if legend.get_bbox_to_anchor() is self.bbox:
+                    legend.set_bbox_to_anchor((0.0, 0.0, 1.0, 1.0), self.transFigure)
+        super().savefig(fname, **how)
 
 
 def looking() -> AbstractContextManager[None]:
@@ -161,6 +182,17 @@ def sentence(message: str, width: Width) -> Figure:
 def say(figure: Figure, message: str) -> None:
     """Write one sentence where there is nothing to draw."""
     figure.text(0.5, 0.5, message, ha="center", va="center", color=MUTED, fontsize=8.0)
+
+
+def conclude(figure: Figure, finding: str) -> None:
+    """Write above a figure, in a sentence, what it shows."""
+    assert isinstance(figure, _StyledFigure)
+    wide, tall = 25.4 * figure.get_size_inches()
+    lines = wrap(finding, int(wide / _LETTER))
+    figure.above = 2.5 + 3.6 * len(lines)
+    figure.text(
+        1.5 / wide, 1.0 + 1.0 / tall, "\n".join(lines), fontsize=8.0, ha="left", va="bottom"
+    )
 
 
 def head(axes: Axes, letter: str, title: str, left: float = 0.0) -> None:

@@ -18,6 +18,7 @@ from vibrissa.plots.style import (
     MUTED,
     SHADE,
     Width,
+    conclude,
     head,
     looking,
     new_figure,
@@ -95,6 +96,9 @@ def _verdicts(found: xr.Dataset, verdict: xr.DataArray, degrees: Array, width: W
             _spread(axes, degrees[:, i], verdict.values[:, i], np.full(len(degrees), i))
         _cone_axis(axes)
         _key(figure, verdict.values)
+        held = (verdict.values == VERDICTS[0]).all(axis=0)
+        shown = ", ".join(f"({triplet_label(names[i])})" for i in np.flatnonzero(held)) or "none"
+        conclude(figure, f"Unique for each of {len(degrees)} whiskers: {shown}")
         return figure
     groups = found["group"].values.astype(str)
     rows = list(dict.fromkeys(groups))
@@ -106,7 +110,8 @@ def _verdicts(found: xr.Dataset, verdict: xr.DataArray, degrees: Array, width: W
         left, right = panels[2 * i], panels[2 * i + 1]
         words = verdict.values[:, i]
         _chart(left, found, words, degrees[:, i])
-        head(left, "ace"[i], f"{triplet_label(name)}, by taper and curvature")
+        held = int((words == VERDICTS[0]).sum())
+        head(left, "ace"[i], f"{triplet_label(name)}: unique for {held} of {len(words)} whiskers")
         _lines(right, rows)
         at = np.array([rows.index(group) for group in groups], dtype=int)
         _spread(right, degrees[:, i], words, at)

@@ -23,6 +23,7 @@ from vibrissa.plots.style import (
     ORANGE,
     SHADE,
     Width,
+    conclude,
     head,
     looking,
     new_figure,
@@ -94,6 +95,17 @@ def verdict_table(verdicts: xr.Dataset, *, width: Width = "double") -> Figure:
         for i, triplet in enumerate(triplets):
             _row(axes, verdicts.sel(triplet=triplet), i, triplet == chosen, width, page)
         _key(axes, height, width)
+        if "all" in regions:
+            every = verdicts["verdict"].sel(region="all").values
+            found = [
+                triplet_label(t) for t, v in zip(triplets, every, strict=True) if v == VERDICTS[0]
+            ]
+            shown = ", ".join(f"({name})" for name in found) or "none"
+            conclude(
+                figure,
+                f"{len(found)} of {len(triplets)} triplets locate every contact, as far as was "
+                f"searched: {shown}",
+            )
         return figure
 
 
@@ -274,6 +286,15 @@ def resolution(verdicts: xr.Dataset, *, width: Width = "double") -> Figure:
         for axes in grid[-1]:
             axes.set_xlabel("tolerance (of range)")
         _resolution_key(figure, share)
+        at = share.isel(region=0).sel(signal_tolerance=_TOLERANCE, method="nearest")
+        if np.isfinite(at.values).any():
+            best = at.isel(triplet=int(np.nanargmin(at.values)))
+            conclude(
+                figure,
+                f"With signals known to {100.0 * float(best['signal_tolerance']):g} % of their "
+                f"ranges ({triplet_label(str(best['triplet'].values))}) leaves fewest contacts "
+                f"ambiguous, {100.0 * float(best):.0f} %",
+            )
         return figure
 
 
@@ -354,7 +375,10 @@ def critical_cones(cones: xr.Dataset, *, width: Width = "double") -> Figure:
         grid = figure.subplots(*shape, sharex=True, sharey=True, squeeze=False)
         for i, axes in enumerate(grid.ravel()):
             _cone_map(axes, cone.isel(triplet=i), degrees[i], norm, colours)
-            head(axes, "abcdefghijkl"[i], triplet_label(str(cone["triplet"].values[i])))
+            known = degrees[i][np.isfinite(degrees[i])]
+            narrow = f"{(known <= _PAPERS_CONE).sum()} of {known.size} within {_PAPERS_CONE:g}°"
+            name = triplet_label(str(cone["triplet"].values[i]))
+            head(axes, "abcdefghijkl"[i], f"{name}: {narrow}")
         for axes in grid[:, 0]:
             axes.set_ylabel("base / tip radius")
         for axes in grid[-1]:

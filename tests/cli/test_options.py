@@ -49,6 +49,7 @@ def folder(tmp_path_factory):
         ("estimate t.nc --covariance noise.csv --force-noise 2", "--force-noise cannot be used"),
         ("reconstruct t.nc --using wrench --proximal 0.2", "--proximal cannot be used"),
         ("reconstruct t.nc --cutoff 60", "--cutoff cannot be used"),
+        ("signals t.nc --density 1200", "--density cannot be used: without --inertia"),
         ("deflect --point 25,12,1 --axis 0,0,1", "--axis cannot be used: they are of a --peg"),
         ("deflect --point 25,12,1 --push 0,1,0", "--push cannot be used"),
         (

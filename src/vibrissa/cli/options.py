@@ -228,7 +228,12 @@ OPTIONS = {
     "tip_radius": Option("Radius at the tip, mm; by default 1/15 of the base's.", "MM", least=0.0),
     "modulus": Option("Young's modulus, GPa.", "GPA", least=0.0),
     "poisson": Option("Poisson's ratio.", "RATIO"),
-    "density": Option("Density of the whisker, kg/m³, for its weight.", "KG/M3"),
+    "density": Option("Density of the whisker, kg/m³, for its weight or inertia.", "KG/M3"),
+    "inertia": Option(
+        "Remove the whisker's inertia and damping from a sensor's signals; the motion of the base "
+        "must be known and smooth. A rat's whisker, known to 20 %, unless stated."
+    ),
+    "damping": Option("Damping ratio of the whisker's first vibration.", "RATIO", least=0.0),
     "gravity": Option(
         "Gravity in the whisker's frame, minus the acceleration of its base, m/s²; 0,0,-9.81 is a "
         "level whisker. By default the whisker has no weight.",

@@ -149,6 +149,10 @@ def _as_made(about: Any) -> SourceOptions:
     """What signals that are there were made from."""
     source: Any = str(about.get("source")).replace(" ", "-")
     cutoff = float(about.get("cutoff", 0.0)) if source == "contact-point" else None
+    if "density" in about:
+        density, damping = np.mean(about["density"]), float(about["damping_ratio"])
+        usual = np.array_equal(about["density"], vb.simulation.Dynamics().density)
+        return SourceOptions(source, None, True, None if usual else float(density), damping)
     return SourceOptions(source, cutoff)
 
 

@@ -33,11 +33,31 @@ class SourceOptions:
 
     source: Source | None = None
     cutoff: float | None = None
+    inertia: bool = False
+    density: float | None = None
+    damping: float | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse statements about no inertia."""
+        if not self.inertia:
+            about = {"--density": self.density, "--damping": self.damping}
+            refuse(about, "without --inertia the whisker has no mass")
 
     @property
     def given(self) -> bool:
         """Whether anything is stated."""
-        return self.source is not None or self.cutoff is not None
+        return self.source is not None or self.cutoff is not None or self.inertia
+
+    @property
+    def dynamics(self) -> vb.simulation.Dynamics | None:
+        """Density and damping; None: the whisker has no mass."""
+        if not self.inertia:
+            return None
+        usual = vb.simulation.Dynamics()
+        return vb.simulation.Dynamics(
+            density=usual.density if self.density is None else (self.density, self.density),
+            damping_ratio=usual.damping_ratio if self.damping is None else self.damping,
+        )
 
     def as_keywords(
         self, recording: xr.DataTree, own: WhiskerOptions, proximal: float | None = None
@@ -50,12 +70,14 @@ class SourceOptions:
         )
         if source != "contact point":
             refuse({"--cutoff": self.cutoff}, f"signals of the {source} have a pose of their own")
-            return {"source": source, "whiskers": None}
+            whiskers = own.in_recording(recording) if self.inertia else None
+            return {"source": source, "whiskers": whiskers, "dynamics": self.dynamics}
         return {
             "source": source,
             "cutoff": vb.tracking.CUTOFF if self.cutoff is None else self.cutoff or None,
             "whiskers": own.in_recording(recording),
             "proximal": smallest_arc(proximal),
+            "dynamics": self.dynamics,
         }
 
 
@@ -118,7 +140,13 @@ def _origin(tree: xr.DataTree) -> str:
     about = tree["signals"].attrs if "signals" in tree.children else {}
     source = str(about.get("source", "a source that is not known"))
     if source == "sensor":
-        return "signals as the sensor read them"
+        if "density" not in about:
+            return "signals as the sensor read them"
+        density = " to ".join(f"{value:g}" for value in dict.fromkeys(np.ravel(about["density"])))
+        return (
+            f"signals of the sensor minus the whisker's inertia: {density} kg/m³, damping ratio "
+            f"{float(about['damping_ratio']):g}"
+        )
     if source == "rod":
         return "signals of the rod that fits the images"
     if source != "contact point":

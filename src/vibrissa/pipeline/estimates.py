@@ -150,7 +150,7 @@ def estimates_of(
         one = Group(data).whisker(k).data
         sigma = sensor_noise(one) if noise is None else np.asarray(noise, dtype=np.float64)
         wrench = one[["force", "moment"]]
-        if data.attrs.get("source") != "sensor":
+        if data.attrs.get("source") != "sensor" or "density" in data.attrs:
             wrench = wrench.assign(in_contact=one["in_contact"])
         if whole:
             found = locate_from_wrench(whisker, wrench, sigma, **how)

@@ -32,10 +32,12 @@ from vibrissa.pipeline.frames import (
     one_whisker,
     with_coordinates,
 )
+from vibrissa.pipeline.inertia import without_inertia
 from vibrissa.pipeline.locate import DETECTED, wrench_slopes
 from vibrissa.recording import Group, Recording, recorded
 from vibrissa.rod import PROXIMAL, PointContact, deflect
-from vibrissa.sensors import Sensor
+from vibrissa.sensors import FORCE_NOISE, MOMENT_NOISE, Sensor, component_noise
+from vibrissa.simulation import Dynamics
 from vibrissa.status import Status
 from vibrissa.tracking import CUTOFF, BasePose, HeadPose
 from vibrissa.whisker import Whisker, angles_of
@@ -56,6 +58,7 @@ def signals_of(
     *,
     whiskers: Sequence[Whisker] | None = None,
     proximal: float = PROXIMAL,
+    dynamics: Dynamics | None = None,
 ) -> xr.Dataset:
     """Force, moment and the six signals of every frame and whisker.
 
@@ -74,6 +77,9 @@ def signals_of(
     proximal : float
         Smallest arc length of a contact point with signals, as a share of the length; others have a
         status only.
+    dynamics : Dynamics, optional
+        Density and damping, known to 20 %, of whiskers whose inertia is to be removed from signals
+        of a sensor; the motion of the base must be smooth. By default nothing is removed.
 
     Returns
     -------
@@ -97,7 +103,10 @@ def signals_of(
     known_trial = Recording(recording)
     root = known_trial.root.data
     if chosen == "sensor":
-        return _by_sensor(root)
+        known = known_trial.whiskers if whiskers is None else whiskers
+        return _by_sensor(root, known, dynamics)
+    if dynamics is not None:
+        raise ValueError(f"inertia is removed from signals of a sensor; these are of the {chosen}")
     if chosen == "rod":
         return _by_rod(root)
     count = root.sizes["whisker"]
@@ -145,7 +154,9 @@ def _given_points(recording: Recording) -> Array | None:
     return measured["contact_point"] if given else None
 
 
-def _by_sensor(root: xr.Dataset) -> xr.Dataset:
+def _by_sensor(
+    root: xr.Dataset, whiskers: Sequence[Whisker], dynamics: Dynamics | None
+) -> xr.Dataset:
     covariance: Array | None
     if "force" not in root and {"reading", "mixing"} <= set(root.data_vars):
         root, covariance = _from_channels(root)
@@ -158,6 +169,13 @@ def _by_sensor(root: xr.Dataset) -> xr.Dataset:
             "there was no sensor: force and moment of this recording are those of the rod that "
             "fits its images; take them from the source 'rod'"
         )
+    if dynamics is not None:
+        noise = component_noise(FORCE_NOISE, MOMENT_NOISE) if covariance is None else covariance
+        each = zip(Group(root).each_whisker(), whiskers, strict=True)
+        parts = [without_inertia(one, whisker, dynamics, noise) for one, whisker in each]
+        about: dict[str, Any] = {"source": "sensor", "density": dynamics.density}
+        about["damping_ratio"] = dynamics.damping_ratio
+        return with_coordinates(xr.concat(parts, "whisker"), root, about)
     force, moment = (Group(root)[name] for name in ("force", "moment"))
     known = _known(force, moment)
     least = 0.0

@@ -9,6 +9,7 @@ from vibrissa.simulation.film import (
     views_of,
     with_true_traces,
 )
+from vibrissa.simulation.held import inertial_wrench as inertial_wrench
 from vibrissa.simulation.motion import (
     Motion,
     array_whisking,

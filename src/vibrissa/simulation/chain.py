@@ -256,6 +256,8 @@ def jacobian(points: Array, links: IntArray, weights: Array, pivots: Array, turn
     """Derivatives of a weighted sum of points of links with respect to the joints."""
     out = np.zeros((3, pivots.shape[0], 3))
     for point, link, weight in zip(points, links, weights, strict=True):
-        away = (point - pivots[:link])[:, None, :]
-        out[:, :link] += weight * np.cross(turns[:link].transpose(0, 2, 1), away).transpose(2, 0, 1)
+        away = weight * (point - pivots[:link])
+        for i in range(3):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            out[i, :link] += turns[:link, j] * away[:, k, None] - turns[:link, k] * away[:, j, None]
     return out.reshape(3, -1)

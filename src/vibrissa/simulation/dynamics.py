@@ -52,14 +52,8 @@ _SETTLE = 0.06
 _AT_ONCE = 4096
 """Number of steps whose placements are computed together."""
 
-_ROUNDS = 60
-"""Most rounds of Newton's method in a step."""
-
 _EAGER = 8
 """Rounds with the full derivative of friction, before its secant."""
-
-_TURNED = 1e-9
-"""Largest turn of a joint in the last round of a step, rad."""
 
 _MOST_TURNED = 0.3
 """Largest turn of a joint in one round, rad."""
@@ -172,12 +166,12 @@ def move_dynamically(
         whisker,
         chain,
         surfaces,
-        dynamics.damping_ratio,
-        dynamics.contact_stiffness,
+        damping_time(chain, dynamics.damping_ratio),
+        [s.stiffness if np.isfinite(s.stiffness) else dynamics.contact_stiffness for s in surfaces],
         friction,
         frame / parts,
     )
-    path = _Path(motion, frame / parts)
+    path = Path(motion.time, motion.base_rotation, motion.base_position, frame / parts)
     if not walk.begin(*path.at(np.arange(4))):
         still = path.at(np.zeros(1, dtype=int))
         for _ in range(int(np.ceil(_SETTLE / path.step))):
@@ -194,13 +188,13 @@ def move_dynamically(
     return moments
 
 
-class _Path:
+class Path:
     """Placements of the base, step by step."""
 
-    def __init__(self, motion: Motion, step: float) -> None:
-        time = motion.time - motion.time[0]
-        self._turn = RotationSpline(time, Rotation.from_matrix(motion.base_rotation))
-        self._shift = CubicSpline(time, motion.base_position, axis=0)
+    def __init__(self, time: Array, rotation: Array, position: Array, step: float) -> None:
+        time = time - time[0]
+        self._turn = RotationSpline(time, Rotation.from_matrix(rotation))
+        self._shift = CubicSpline(time, position, axis=0)
         self._last = float(time[-1])
         self.step, self.count = step, round(time[-1] / step) + 1
         self.frames = set(np.round(time / step).astype(int).tolist())
@@ -254,6 +248,11 @@ def frequencies(chain: Chain, count: int) -> Array:
         subset_by_index=[n - count, n - 1],
     )
     return np.asarray(1.0 / np.sqrt(slow[::-1]) / (2.0 * np.pi))
+
+
+def damping_time(chain: Chain, ratio: float) -> float:
+    """Time constant of a damping by which the first vibration has a damping ratio, s."""
+    return ratio / (np.pi * float(frequencies(chain, 1)[0]))
 
 
 def at_rest(chain: Chain) -> State:
@@ -345,23 +344,24 @@ class History(NamedTuple):
 class Walk:
     """The whisker, step by step."""
 
+    turned = 1e-9
+    """Largest turn of a joint in the last round of a step, rad."""
+
+    rounds = 60
+    """Most rounds of Newton's method in a step."""
+
     def __init__(
         self,
         whisker: Whisker,
         chain: Chain,
         surfaces: Sequence[Surface],
-        damping_ratio: float,
-        stiffness: float,
+        damping: float,
+        stiffness: Sequence[float],
         friction: float,
         step: float,
     ) -> None:
         self._chain, self._surfaces, self._step = chain, surfaces, step
-        self._friction = friction
-        self._stiffness = [
-            solid.stiffness if np.isfinite(solid.stiffness) else stiffness for solid in surfaces
-        ]
-        first = 2.0 * np.pi * frequencies(chain, 1)[0]
-        self._damping = 2.0 * damping_ratio / float(first)
+        self._friction, self._damping, self._stiffness = friction, damping, stiffness
         self._state = State(chain)
         t = np.arange(_PARTS) / _PARTS
         n = chain.nodes.size - 1
@@ -401,7 +401,7 @@ class Walk:
         spring = chain.stiffness * (1.0 + self._damping * rate)
         pull = np.zeros_like(state.masses)
         touching: list[tuple[Contact, Array, bool]] = []
-        for rounds in range(_ROUNDS):
+        for rounds in range(self.rounds):
             state.move(theta, rotation, base)
             speed = self._masses.rate_of(state.masses, h)
             pull = chain.mass[:, None] * self._masses.acceleration_of(speed, h)
@@ -432,7 +432,7 @@ class Walk:
             change = residual.reshape(theta.shape)
             largest = float(np.abs(change).max())
             theta -= change * min(1.0, _MOST_TURNED / max(largest, 1e-300))
-            if largest < _TURNED:
+            if largest < self.turned:
                 break
         self._theta = self._theta.then(theta, h)
         self._masses = self._masses.then(state.masses, h)

@@ -1,0 +1,83 @@
+"""Sensor signals without inertia, against the nonlinear chain that is stepped in time."""
+
+import numpy as np
+import pytest
+
+import vibrissa as vb
+from vibrissa.pipeline import estimates_of, signals_of, with_signals
+from vibrissa.simulation import (
+    Dynamics,
+    facing_peg,
+    inertial_wrench,
+    measure,
+    simulate,
+    sweep_past,
+)
+
+WHISKER = vb.Whisker.straight(30e-3, base_radius=80e-6, youngs_modulus=3.5e9)
+TRUE = Dynamics(
+    density=tuple(0.85 * value for value in Dynamics().density), damping_ratio=0.12, step=2e-4
+)
+
+
+@pytest.fixture(scope="module")
+def trial():
+    peg = facing_peg(WHISKER, 0.5, 0.7e-3)
+    motion = sweep_past(WHISKER, peg, 0.16, 1000.0, seed=5, frequency=8.0)
+    return simulate(WHISKER, motion, peg, dynamics=TRUE, nodes=9)
+
+
+@pytest.fixture(scope="module")
+def truth(trial):
+    return trial["truth"].to_dataset().isel(whisker=0)
+
+
+def settled(touching):
+    """Frames in contact for 8 ms and more, and for 2 ms more."""
+    return np.array([touching[max(i - 8, 0) : i + 3].all() and i > 8 for i in range(len(touching))])
+
+
+def test_what_is_left_is_the_wrench_of_a_rod_without_mass(trial, truth):
+    touching = truth.in_contact.values.astype(bool)
+    root = trial.to_dataset().isel(whisker=0)
+    points = np.where(touching[:, None], truth.contact_point.values, np.nan)
+    added = inertial_wrench(
+        WHISKER,
+        TRUE,
+        root.time.values,
+        root.base_rotation.values,
+        root.base_position.values,
+        points,
+        truth.arc_length.values,
+    )
+    rows = settled(touching)
+    bent = vb.deflect(WHISKER, vb.PointContact(truth.contact_point_whisker.values[rows]))
+    for name, part in (("force", added[rows, :3]), ("moment", added[rows, 3:])):
+        known, measured = getattr(bent, name), truth[name].values[rows]
+        away = np.linalg.norm(measured - known, axis=1)
+        left = np.linalg.norm(measured - part - known, axis=1)
+        assert np.nanmedian(left) < 0.25 * np.nanmedian(away)
+
+
+def test_contacts_are_as_near_as_stated_with_a_wrong_mass(trial, truth):
+    measured = measure(trial, 0.3e-6, 6e-9, seed=5)
+    errors, stated = [], []
+    for dynamics in (None, Dynamics()):
+        done = with_signals(measured, "sensor", dynamics=dynamics)
+        found = estimates_of(done, "wrench").isel(whisker=0)
+        away = found.contact_point_whisker.values - truth.contact_point_whisker.values
+        rows = settled(truth.in_contact.values.astype(bool))
+        errors.append(np.nanmedian(np.linalg.norm(away[rows], axis=1)))
+        spread = np.einsum("tii->t", found.covariance.values[rows])
+        stated.append(np.sqrt(np.nanmedian(spread)))
+    assert errors[0] > 2.0 * stated[0]
+    assert errors[1] < 0.6 * errors[0]
+    assert errors[1] < 1.3 * stated[1]
+
+
+def test_frames_that_are_not_equally_spaced_are_refused(trial):
+    gap = measure(trial).isel(time=[*range(20), *range(22, 40)])
+    with pytest.raises(ValueError, match="equal"):
+        signals_of(gap, "sensor", dynamics=Dynamics())
+    with pytest.raises(ValueError, match="sensor"):
+        signals_of(trial, "contact point", dynamics=Dynamics())

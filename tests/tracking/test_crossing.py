@@ -28,6 +28,19 @@ def test_crossing_whiskers_stay_themselves(crossing, view, inside):
     assert (score[np.isfinite(score)] == 1.0).mean() > 0.97
 
 
+def test_straight_whiskers_that_cross_in_one_place_keep_their_ends():
+    """From the first frame on three cross within 100 pixels; only how they bend shows the order."""
+    several = RowFilm(21, 3, frames=4)
+    truth = several.truth[1]
+    traces = trace_video(several.images[1], truth[0, :, 0])
+    score = scored(traces, truth)
+    assert (score[np.isfinite(score)] == 1.0).all()
+    # The ends of two of them are apart from all others; the third's is on the second's.
+    tips = np.array([[trace.line[-1] for trace in row] for row in traces[:2]])
+    away = np.linalg.norm(tips - truth[:, :2, -1].swapaxes(0, 1), axis=2)
+    assert np.median(away) < 3.0
+
+
 def test_nothing_is_measured_where_another_line_is():
     """A line at 10 pixels from another is measured, where they cross it is bridged."""
     y, x = np.mgrid[:120, :240].astype(float)

@@ -1,16 +1,20 @@
 """Several whiskers of one view in one frame: which line each of them has.
 
-In the first frame each is followed from its click, through all crossings: where whiskers lie on one
-another nothing is measured. From then on each is followed along where it is expected. Where there
-is any doubt, all lines of the frame are found once, and the cheapest way to give lines to whiskers
-is taken (`vibrissa.tracking.trace.identity`). Lines cost the more, the farther they begin from
-where the whisker is expected, and the shorter they are; the whole row may have turned and shifted
-by more than was expected, at a price of its own.
+In the first frame each is known from its click up to where it meets another one. Beyond it may go
+on in several ways, bending about as it did, to where the image shows a line; of all whiskers
+together the likeliest ways are taken, no two to the same end. Where whiskers lie on one another
+nothing is measured. From then on each is followed along where it is expected; one that stops at
+another, or has a kink there, is continued as in the first frame. Where there is any doubt, all
+lines of the frame are found once, and the cheapest way to give lines to whiskers is taken
+(`vibrissa.tracking.trace.identity`). Lines cost the more, the farther they begin from where the
+whisker is expected, and the shorter they are; the whole row may have turned and shifted by more
+than was expected, at a price of its own.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -34,7 +38,7 @@ from vibrissa.tracking.trace.identity import (
     same_whisker,
     sideways,
 )
-from vibrissa.tracking.trace.ridge import noise_level, prolonged, traced
+from vibrissa.tracking.trace.ridge import measure, noise_level, prolonged, traced
 from vibrissa.tracking.trace.scene import Scene
 from vibrissa.tracking.trace.trace import STEP, Trace, even, given, overlap
 
@@ -74,12 +78,32 @@ _LIKELY = 100.0
 _SAME_CURVE = 0.9
 """Share of a line along another one from which both are the same curve."""
 
-_FEWEST, _POLYNOMIAL, _AHEAD = 15, 60, 150
-"""Numbers of points: of a whisker's beginning, of what gives its bend, and by which it goes on."""
+_FEWEST, _POLYNOMIAL, _AHEAD, _FURTHER = 15, 60, 150, 15
+"""Numbers of points: of a whisker's beginning, of what gives its bend, by which it goes on at most,
+and by which it goes on beyond what is seen, so that its tip can be seen to end."""
+
+_BENDS, _BEND_CHANGES, _BEND_KNOWN = 2e-4, 1e-6, 2.7
+"""Standard deviation of a whisker's bend beyond a crossing from that before it, 1/pixel, and of its
+change along the whisker, 1/pixel²; uncertainty of a bend, times the square of its length."""
+
+_WIDEST, _FAN, _FAR = 3.0, 25, 40
+"""Standard deviations of the bend within which ends are searched, number of bends, and number of
+points at the far end by which two of them are distinguished."""
+
+_WORTH, _SUPPORTED = 0.1, 2.5
+"""Likelihood that is gained with each point that is seen, and depth from which it is, in standard
+deviations."""
+
+_ENDS, _COMBINED = 6, 2e4
+"""Largest number of ends of a whisker that are considered, and of ways to give them to all."""
 
 _KINKED, _SMOOTH, _STRAIGHTER = 0.25, 4, 0.7
 """Distance of a whisker from a smooth curve from which it may have a kink, pixels, the degree of
 that curve's polynomials, and the share of a kink that may be left."""
+
+_STOPPED, _LONGER = 5, 1.1
+"""Number of points before another whisker at which one may have been stopped by it, and by what
+factor it must be longer without."""
 
 _LARGEST_TURN = 0.35
 """Largest turn of the row between frames beyond what was expected, rad."""
@@ -162,8 +186,7 @@ def _begun(
 ) -> dict[int, Trace]:
     """Whiskers in the first frame, each where it was clicked.
 
-    Where whiskers cross, a line may go on as another one. So each is known up to there at first,
-    and followed beyond as it bends until there, with what others hide left out.
+    Where whiskers cross, a line may go on as another one: each is known up to there at first.
     """
     options = followers[0].options
     scene = scene or Scene.of([frame], options.scale)
@@ -182,32 +205,123 @@ def _begun(
         ]
     ).reshape(len(free), len(every))
     rows, columns = linear_sum_assignment(np.minimum(price, 2.0 * LOST))
-    guesses = {
-        free[i]: _up_to_a_crossing(every[c].line, [one.line for one in every])
+    lines = [one.line for one in every]
+    starts = {
+        free[i]: _up_to_a_crossing(even(lines[c]), lines)
         for i, c in zip(rows, columns, strict=True)
         if price[i, c] < 2.0 * LOST
     }
+    # A line may have met another one where that is not seen any more.
+    onward = {k: prolonged(start, _POLYNOMIAL, _AHEAD) for k, start in starts.items()}
+    starts = {
+        k: _up_to_a_crossing(start, [line for j, line in onward.items() if j != k])
+        for k, start in starts.items()
+    }
     known = {k: trace.line for k, trace in fixed.items()}
-    found = _through_crossings(followers, guesses, known, frame, noise, scene)
+    found = _through_crossings(followers, starts, known, frame, noise, scene)
     found = {k: trace for k, trace in found.items() if followers[k].long_enough(trace)}
     return _without_clashes(found, fixed)
 
 
 def _through_crossings(
     followers: Sequence[Follower],
-    guesses: Mapping[int, Array],
+    starts: Mapping[int, Array],
     known: Mapping[int, Array],
     frame: Frame,
     noise: float,
     scene: Scene | None,
 ) -> dict[int, Trace]:
-    """Whiskers along guessed lines, which show about where they cross one another and others."""
+    """Whiskers that are known up to where they cross others, each traced to its own end."""
+    _part(followers, {**known, **starts}, frame, scene)
+    guesses = _continued(followers, starts, [*known.values()], frame, noise)
     lines, found = guesses, dict[int, Trace]()
     for _ in range(_ROUNDS):
         _part(followers, {**known, **lines}, frame, scene)
-        found = {k: followers[k].along(frame, noise, g, "tight") for k, g in guesses.items()}
+        found = {
+            k: traced(frame, noise, guess, followers[k].options, clutter=followers[k].clutter)[0]
+            for k, guess in guesses.items()
+        }
         lines = {k: trace.line for k, trace in found.items()}
     return found
+
+
+class _End(NamedTuple):
+    """How a whisker may go on beyond a crossing."""
+
+    line: Array
+    shown: Array  # what the image shows next to its first points
+    cost: float
+
+
+def _continued(
+    followers: Sequence[Follower],
+    starts: Mapping[int, Array],
+    known: Sequence[Array],
+    frame: Frame,
+    noise: float,
+) -> dict[int, Array]:
+    """Lines that go on as they bend and as the image shows, no two of them to the same end."""
+    if not starts:
+        return {}
+    most = max(2, min(_ENDS, int(_COMBINED ** (1.0 / len(starts)))))
+    ends = [_ends(followers[k], start, frame, noise, most) for k, start in starts.items()]
+    total = np.zeros([len(some) for some in ends])
+    # What is seen counts once.
+    for i, some in enumerate(ends):
+        own = [end.cost + sum(_twice(end.shown, line) for line in known) for end in some]
+        total += np.expand_dims(own, [j for j in range(len(ends)) if j != i])
+        for j, others in enumerate(ends[:i]):
+            both = [[_twice(b.shown, a.shown) for b in some] for a in others]
+            total += np.expand_dims(both, [m for m in range(len(ends)) if m not in (i, j)])
+    best = np.unravel_index(int(np.argmin(total)), total.shape)
+    chosen = (some[c] for some, c in zip(ends, best, strict=True))
+    return {
+        k: np.concatenate([start, end.line[: len(end.shown) + _FURTHER]])
+        for (k, start), end in zip(starts.items(), chosen, strict=True)
+    }
+
+
+def _twice(line: Array, other: Array) -> float:
+    """What was gained with the points of a line that another one shows too."""
+    return _WORTH * len(line) * overlap(line, other)
+
+
+def _shared(line: Array, other: Array) -> bool:
+    """Whether one of two lines ends on the other."""
+    return max(overlap(line[-_FAR:], other), overlap(other[-_FAR:], line)) >= SAME
+
+
+def _ends(follower: Follower, start: Array, frame: Frame, noise: float, most: int) -> list[_End]:
+    """Different ways in which a whisker may go on: it bends as before, and changes that slowly."""
+    points, grey = np.empty((_AHEAD, 2)), [np.empty(_AHEAD) for _ in range(3)]
+    ends = [_End(np.empty((0, 2)), np.empty((0, 2)), 0.0)]
+    for line, unlike in _fan(start):
+        measure(frame, line, 1, noise, follower.options.scale, *follower.clutter, points, *grey)
+        _, flank, support = grey
+        seen = np.where(support > _SUPPORTED, 1.0, -1.0)
+        worth = np.cumsum(np.where(flank > 0.0, seen, 0.0))
+        count = int(np.argmax(worth)) + 1
+        gain = _WORTH * max(float(worth[count - 1]), 0.0)
+        ends.append(_End(line, points[:count].copy(), unlike - gain))
+    kept: list[_End] = []
+    for end in sorted(ends, key=lambda one: one.cost):
+        if len(kept) < most and not any(_shared(end.shown, other.shown) for other in kept):
+            kept.append(end)
+    return kept
+
+
+def _fan(start: Array) -> Iterator[tuple[Array, float]]:
+    """Lines that go on from a whisker's beginning, and how unlike it they are."""
+    n = min(len(start), _POLYNOMIAL)
+    curving, slope, begin = np.polyfit(STEP * np.arange(1 - n, 1), start[-n:], 2)
+    bend = 2.0 * (slope[0] * curving[1] - slope[1] * curving[0]) / np.hypot(*slope) ** 3
+    spread = np.hypot(_BENDS, _BEND_KNOWN / (STEP * n) ** 2)
+    s = STEP * (np.arange(_AHEAD) + 0.5)
+    for more, change in product(np.linspace(-_WIDEST, _WIDEST, _FAN), np.arange(-2.0, 3.0)):
+        angle = np.arctan2(slope[1], slope[0]) + (bend + more * spread) * s
+        angle += 0.5 * change * _BEND_CHANGES * s**2
+        steps = STEP * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        yield begin + np.cumsum(steps, axis=0), 0.5 * (more**2 + change**2)
 
 
 def _straightened(
@@ -218,25 +332,26 @@ def _straightened(
     noise: float,
     scene: Scene | None,
 ) -> dict[int, list[Trace]]:
-    """Whiskers with a kink where they cross another one, as whose end theirs was taken, anew."""
-    guesses, kinks = {}, {}
-    for k, traces in own.items():
-        if not traces or not len(traces[-1].line):
-            continue
-        line = traces[-1].line
-        met = np.flatnonzero(followers[k].clutter.hides(line))
-        met = met[met >= _FEWEST]
-        if met.size and (kink := _kink(traces[-1])) > _KINKED:
-            kinks[k], guesses[k] = kink, prolonged(line[: met[0]], _POLYNOMIAL, _AHEAD)
-    if not guesses:
+    """Whiskers anew that end, or have a kink, where others are: theirs is another one's end."""
+    before = {k: traces[-1] for k, traces in own.items() if traces and len(traces[-1].line)}
+    starts = {}
+    for k, trace in before.items():
+        hidden = followers[k].clutter.hides(prolonged(trace.line, _FEWEST, _STOPPED))
+        met = np.flatnonzero(hidden[_FEWEST:]) + _FEWEST
+        if met.size and (hidden[-_STOPPED:].any() or _kink(trace) > _KINKED):
+            starts[k] = trace.line[: met[0]]
+    if not starts:
         return {}
-    known = {k: traces[-1].line for k, traces in own.items() if traces and k not in guesses}
-    known |= {k: trace.line for k, trace in fixed.items()}
-    found = _through_crossings(followers, guesses, known, frame, noise, scene)
+    known = {k: trace.line for k, trace in (before | dict(fixed)).items() if k not in starts}
+    found = _through_crossings(followers, starts, known, frame, noise, scene)
     return {
         k: [trace]
         for k, trace in found.items()
-        if followers[k].long_enough(trace) and _kink(trace) < _STRAIGHTER * kinks[k]
+        if followers[k].long_enough(trace)
+        and (
+            _kink(trace) < _STRAIGHTER * _kink(before[k])
+            or followers[k].length_of(trace) > _LONGER * followers[k].length_of(before[k])
+        )
     }
 
 
@@ -258,14 +373,13 @@ def _price(click: Array, curve: Curve, half: float) -> float:
 
 
 def _up_to_a_crossing(line: Array, every: Sequence[Array]) -> Array:
-    """The beginning of a line, until it meets another one, prolonged as a parabola."""
-    line = even(line)
+    """The beginning of a line, until it meets another one."""
     others = [one for one in every if overlap(one, line) < _SAME_CURVE]
     if others:
         away, _ = cKDTree(np.concatenate(others)).query(line)
         met = np.flatnonzero((away < NEAR) & (np.arange(len(line)) >= _FEWEST))
         line = line[: met[0]] if met.size else line
-    return prolonged(line, _POLYNOMIAL, _AHEAD)
+    return line
 
 
 def _seen(

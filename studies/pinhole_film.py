@@ -16,6 +16,9 @@ from scipy.interpolate import CubicSpline
 FINE = 5
 """Subpixels of a pixel along each side."""
 
+HALF = 25e-3
+"""Half the length of the peg, m."""
+
 
 @dataclass(frozen=True)
 class Pinhole:
@@ -129,8 +132,8 @@ def _disc(pen, center, radius, fill):
 
 
 def _peg(pen, view, origin, axis, size, shine, rng):
-    """A cylinder of 50 mm, from its far end to its near one, or a bar if it is seen from aside."""
-    ends = view(origin + np.outer([-25e-3, 25e-3], axis))
+    """A cylinder, from its far end to its near one, or a bar if it is seen from aside."""
+    ends = view(origin + np.outer([-HALF, HALF], axis))
     along = ends[1] - ends[0]
     half = np.linalg.norm(view(origin + size * view.axes[0]) - view(origin))
     share, place = np.linspace(-1.0, 1.0, 41), rng.uniform(-0.6, 0.6, 2)
@@ -140,7 +143,7 @@ def _peg(pen, view, origin, axis, size, shine, rng):
         grey += (245.0 - grey) * np.exp(-0.5 * ((share - place[0]) / 0.12) ** 2)
         grey *= 1.0 - 0.85 * np.exp(-0.5 * ((share - place[1]) / 0.1) ** 2)
     if np.linalg.norm(along) < 12.0 * half:
-        near = np.argsort([-(view.axes[2] @ (origin + t * axis)) for t in (-25e-3, 25e-3)])
+        near = np.argsort([-(view.axes[2] @ (origin + t * axis)) for t in (-HALF, HALF)])
         for center in np.linspace(ends[near[0]], ends[near[1]], 40):
             _disc(pen, center, half, 0.5 * shine if shine else 35)
         if shine:
@@ -164,7 +167,12 @@ def _behind(view, line, origin, axis, size):
     a, b = (way**2).sum(1), (way * away).sum(1)
     # The whisker is on the surface where it touches: what is one pixel deep is not hidden.
     inside = b**2 - a * ((away**2).sum(1) - (size - 0.5 * view.pixel) ** 2)
-    return (inside > 0.0) & (-b + np.sqrt(np.maximum(inside, 0.0)) > 0.0)
+    hidden = np.zeros(len(line), bool)
+    for side in (-1.0, 1.0):
+        ahead = (-b + side * np.sqrt(np.maximum(inside, 0.0))) / a
+        along = (line + ahead[:, None] * sight - origin) @ axis
+        hidden |= (inside > 0.0) & (ahead > 0.0) & (np.abs(along) < HALF)
+    return hidden
 
 
 def _whisker(pen, view, line, radius, shown, look):

@@ -60,9 +60,12 @@ _COMMON, _WAVES = 0.05, 4
 """Standard deviation of errors that a view's traces share in all frames, pixels, if residuals show
 no larger ones, and number of their waves along the whisker."""
 
-_AT_BASE, _ENDS = (0.5, 0.03), 2.0
-"""The same at the base, which fur hides, and over what share of the length; and of ends along the
-whisker, in units of their standard deviation in one frame."""
+_AT_BASE, _FOLLOWED = 0.03, 2.0
+"""Share of the length over which fur may draw a trace aside, and by how much more it does than what
+the rod, which follows it, leaves of that."""
+
+_ENDS = 1.0
+"""Standard deviation of ends along the whisker, in units of that in one frame."""
 
 _WILD = 1e6
 """Slopes of points of a rod, in units of L, from which it is not in balance."""
@@ -377,8 +380,8 @@ def _shared(fit: _Linear) -> Array:
 
     Light from the side, a halo of compression or fur over the base shift a trace in the same way in
     many frames, so that neither many points nor many frames make it smaller: waves along the
-    whisker, and shifts of its ends along it. What of them the fit does not follow stays in the mean
-    of the residuals over time.
+    whisker, a bend at its base, and shifts of its ends along it. What of them the fit does not
+    follow stays in the mean of the residuals over time.
     """
     pulls = []
     for misses, ends, design, weight in zip(
@@ -390,7 +393,8 @@ def _shared(fit: _Linear) -> Array:
         sigma = np.hypot(_COMMON, np.sqrt(np.mean(left**2)))
         s = np.linspace(0.0, 1.0, design.shape[1] - 2)
         waves = [sigma / (1.0 + k) * np.cos(k * np.pi * s) for k in range(_WAVES)]
-        waves.append(_AT_BASE[0] * np.exp(-s / _AT_BASE[1]))
+        drawn = np.abs(left[s < 2.0 * _AT_BASE]).max()
+        waves.append(np.hypot(_COMMON, _FOLLOWED * drawn) * np.exp(-s / _AT_BASE))
         across = design[:, :-2] * weight[:, :-2, None]
         pulls += [np.einsum("tni,n->ti", across, wave) for wave in waves]
         for end in (0, 1):

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from vibrissa.contacts import Domain, within_paper_bounds
-from vibrissa.numerics import AnyArray, Array
+from vibrissa.numerics import AnyArray, Array, cross
 from vibrissa.rod import (
     Fold,
     contact_tangents,
@@ -57,7 +57,7 @@ class ContactSet(NamedTuple):
     def signals(self) -> Array:
         """The six signals (n, 6)."""
         force, point = self.values[:, :3], self.values[:, 3:]
-        return signals_of(force, np.cross(point, force))
+        return signals_of(force, cross(point, force))
 
 
 class Samples(NamedTuple):

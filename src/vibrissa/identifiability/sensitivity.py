@@ -36,7 +36,7 @@ from vibrissa.contacts import (
     spherical_derivatives,
     within_paper_bounds,
 )
-from vibrissa.numerics import Array, contact_weights, weighted_quantile
+from vibrissa.numerics import Array, contact_weights, cross, weighted_quantile
 from vibrissa.quantities import attributes, quantity
 from vibrissa.signals import (
     TRIPLETS,
@@ -117,7 +117,7 @@ def sensitivity(
     out.attrs |= {"triplet": " ".join(names), "method": "exact"}
     if sensor is not None:
         force = chosen.values[:, :3] * d.force
-        sigma = sensor.covariance(names, force, np.cross(point, force))
+        sigma = sensor.covariance(names, force, cross(point, force))
         covariance = by_signal @ sigma @ np.swapaxes(by_signal, -1, -2)
         out = out.merge(ellipsoids(covariance, chosen.dims, chosen.shape))
     return out
@@ -149,7 +149,7 @@ def _labelled(contact_map: ContactMap, chosen: ChosenContacts) -> xr.Dataset:
         columns["volume"] = (chosen.volume, units)
     for i, name in enumerate(("r", "theta", "phi")):
         columns[name] = (spherical(point)[:, i], attributes(name))
-    for signal in base_signals(force, np.cross(point, force)).data_vars.values():
+    for signal in base_signals(force, cross(point, force)).data_vars.values():
         name = str(signal.name)
         columns[name] = (signal.to_numpy(), attributes(name))
     data = {n: (chosen.dims, v.reshape(chosen.shape), a) for n, (v, a) in columns.items()}
@@ -279,5 +279,5 @@ def _errors(
     d = contact_map.chart.discretization
     force, point = chosen.values[:, :3] * d.force, chosen.values[:, 3:] * d.length
     by_signal = contact_signal_derivatives(d, chosen.values, chosen.tangents, names)
-    sigma = sensor.covariance(names, force, np.cross(point, force))
+    sigma = sensor.covariance(names, force, cross(point, force))
     return rms_error(by_signal @ sigma @ np.swapaxes(by_signal, -1, -2))

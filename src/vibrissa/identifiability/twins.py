@@ -15,7 +15,7 @@ import numpy as np
 
 from vibrissa.contacts import Domain, invert
 from vibrissa.identifiability.regions import ContactSet, contact_set, in_chart, sample
-from vibrissa.numerics import AnyArray, Array
+from vibrissa.numerics import AnyArray, Array, cross
 from vibrissa.rod import (
     Discretization,
     chart_of,
@@ -280,7 +280,7 @@ def _best(pairs: Pairs, regions: tuple[str, ...], separation: float) -> Pairs:
 def sizes(values: Array, names: tuple[str, ...]) -> Array:
     """Scale of a difference of each signal (n, k): |F|, |M|, or 1 for directions."""
     force = np.linalg.norm(values[:, :3], axis=1)
-    moment = np.linalg.norm(np.cross(values[:, 3:], values[:, :3]), axis=1)
+    moment = np.linalg.norm(cross(values[:, 3:], values[:, :3]), axis=1)
     one = np.ones(len(values))
     scales = {"Fx": force, "FT": force, "FD": one, "Mx": moment, "MB": moment, "MD": one}
     return np.stack([scales[name] for name in names], axis=1)
@@ -305,7 +305,7 @@ def equations(
     """T(ξ) - target (n, 3), ∂T/∂ξ (n, 3, 3) and (F, p) (n, 6)."""
     values, tangents = solve_forces(discretization, with_normal_force(xi), tangents=True)
     force, point = values[:, :3], values[:, 3:]
-    away = signals_of(force, np.cross(point, force))[:, signal_columns(names)] - targets
+    away = signals_of(force, cross(point, force))[:, signal_columns(names)] - targets
     return (
         within_turn(away, circular_among(names)),
         triplet_derivatives(values, tangents, names),
@@ -341,7 +341,7 @@ def found_again(
     at_first, _ = solve_forces(finer, with_normal_force(first))
     before, _ = solve_forces(coarse, with_normal_force(second))
     force, point = at_first[:, :3], at_first[:, 3:]
-    target = signals_of(force, np.cross(point, force))[:, signal_columns(names)]
+    target = signals_of(force, cross(point, force))[:, signal_columns(names)]
     _, values, misfit = corrected(finer, names, second, target, units(contact_map, second))
     points = np.stack([point, values[:, 3:]], axis=1)
     points[~(misfit <= AGREEMENT)] = np.nan

@@ -42,7 +42,7 @@ from vibrissa.identifiability.twins import (
     sizes,
     units,
 )
-from vibrissa.numerics import AnyArray, Array
+from vibrissa.numerics import AnyArray, Array, cross
 from vibrissa.quantities import attributes
 from vibrissa.rod import Discretization, discretize, solve_forces, with_normal_force
 from vibrissa.signals import CONE, REGIONS, SIGNALS, TRIPLETS, selection, signal_scales, signals_of
@@ -326,7 +326,7 @@ def _solved(d: Discretization, triplet: tuple[str, ...], xi: Array) -> tuple[Arr
     """Triplet and contact point of contacts."""
     values, _ = solve_forces(d, with_normal_force(xi))
     force, point = values[:, :3], values[:, 3:]
-    return signals_of(force, np.cross(point, force))[:, signal_columns(triplet)], point
+    return signals_of(force, cross(point, force))[:, signal_columns(triplet)], point
 
 
 def _surface(question: Question) -> str:

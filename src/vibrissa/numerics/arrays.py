@@ -11,3 +11,14 @@ Array: TypeAlias = NDArray[np.float64]
 IntArray: TypeAlias = NDArray[np.int64]
 AnyArray: TypeAlias = NDArray[Any]
 Vector: TypeAlias = tuple[float, float, float]
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Cross product of vectors (..., 3), which for some hundred takes a third of NumPy's time."""
+    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
+    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
+    out = np.empty((*np.broadcast_shapes(ax.shape, bx.shape), 3))
+    out[..., 0] = ay * bz - az * by
+    out[..., 1] = az * bx - ax * bz
+    out[..., 2] = ax * by - ay * bx
+    return out

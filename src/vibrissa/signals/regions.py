@@ -51,6 +51,11 @@ def resting(whisker: Whisker) -> tuple[Array, Array, cKDTree]:
     return s, places, cKDTree(places)
 
 
+@lru_cache(maxsize=16)
+def _tip_tangent(whisker: Whisker) -> Array:
+    return np.asarray(whisker.frame(np.array(whisker.length))[:, 0])
+
+
 def nearest_on_rest(whisker: Whisker, points: Array) -> tuple[Array, Array]:
     """Distance from the resting whisker, and the arc length of the nearest place.
 
@@ -140,7 +145,7 @@ def concave_backward(whisker: Whisker, points: Array) -> AnyArray:
         rest_y = np.interp(r, r_rest, places[:, 1])
     else:
         rest_y = _nearest_branch(points, r, r_rest, places)
-    tip, tangent = places[-1], whisker.frame(np.array(whisker.length))[:, 0]
+    tip, tangent = places[-1], _tip_tangent(whisker)
     beyond = r > r_rest.max()
     along = np.dot(tip, tangent)
     # |tip + a tangent| = r

@@ -5,6 +5,7 @@ from itertools import islice
 import numpy as np
 import pytest
 
+import vibrissa as vb
 from vibrissa import Whisker
 from vibrissa.cameras import orthogonal_views, save_cameras
 from vibrissa.cli.app import app
@@ -77,6 +78,56 @@ def test_views_that_contradict_each_other_are_refused_with_a_picture(videos, tmp
     assert "--base X,Y --base X,Y" in str(done.exception)
     assert (tmp_path / "start.png").exists()
     assert not (tmp_path / "t.nc").exists()
+
+
+def test_clicks_are_saved_and_used_again(videos, tmp_path, monkeypatch):
+    """A window in which both bases, a mask and the scale are shown, and a second run without it."""
+    out, begun = tmp_path / "t.nc", []
+
+    def pick(images, names, clicks, save):
+        bases = [tuple(camera.project(np.zeros(3)).tolist()) for camera in CAMERAS]
+        mask = ((150.0, 0.0), (191.0, 0.0), (191.0, 40.0))
+        views = [vb.io.ViewClicks((base,), (mask,)) for base in bases]
+        save(vb.io.Clicks(tuple(views), (), 60e-6))
+        return vb.io.Clicks(tuple(views), (), 60e-6)
+
+    def trace(path, kept, bases, options, mask=None, **more):
+        begun.append((bases, int(mask.sum())))
+        raise ValueError("enough")
+
+    monkeypatch.setattr("vibrissa.plots.pick", pick)
+    monkeypatch.setattr("vibrissa.tracking.trace_file", trace)
+    run(*arguments(videos, "--pick", "-o", out))
+    (tmp_path / "t.clicks.toml").rename(tmp_path / "kept.toml")
+    run(*arguments(videos, "--clicks", tmp_path / "kept.toml", "-o", out))
+    (tmp_path / "kept.toml").rename(tmp_path / "t.clicks.toml")
+    done = run(*arguments(videos, "-o", out))
+    assert begun[0][0][0] == pytest.approx(CAMERAS[0].project(np.zeros(3)), abs=0.01)
+    assert begun[0][1] > 700
+    for other in begun[1:]:
+        np.testing.assert_allclose(other[0], begun[0][0], atol=0.01)
+        assert other[1] == begun[0][1]
+    line = " ".join(done.stdout.split())
+    assert "is used: bases of 1 whiskers, 2 masks and regions, a pixel of 0.06 mm" in line
+
+
+def test_a_mask_hides_what_is_in_it_and_a_region_what_is_not(videos, tmp_path):
+    """The whisker's half beyond a column is masked: no part of it is seen there."""
+    cameras = ["--cameras", videos / "cameras.toml"]
+    square = [f"{a},{b}" for a, b in ((110, 0), (192, 0), (192, 192), (110, 192))]
+    image = np.zeros((192, 192), np.uint8)
+    image[:, :110] = 255
+    write_video(tmp_path / "shown.mkv", [image])
+    out = tmp_path / "t.nc"
+    words = ["--mask", "0:" + " ".join(square), "--region", f"1:{tmp_path / 'shown.mkv'}"]
+    done = run(*arguments(videos, *cameras, *words, "-o", out))
+    assert done.exit_code == 0, done.exception
+    seen = load_recording(out)["trace"].values[:, 0]
+    whole = 0.5 * np.nanmax(CAMERAS[0].project(np.array([8e-3, 0.0, 0.0])))
+    assert np.nanmax(seen[..., 0]) > whole
+    assert np.nanmax(seen[..., 0]) < 130.0
+    done = run(*arguments(videos, "--mask", "2:1,1 2,2 3,1", "-o", tmp_path / "u.nc"))
+    assert "views 0 to 1 are there" in str(done.exception)
 
 
 def test_several_trials_go_to_a_folder(videos, tmp_path):

@@ -209,7 +209,7 @@ OPTIONS = {
     "region": Option(
         "Region of the contacts that are considered: ELD, CF, CB, 'ELD CF' or 'ELD CB'; or, "
         "for estimates, limits of r (mm), theta and phi (degrees), as r=20:35,theta=-30:30. "
-        "Verdicts are of all six by default."
+        "Verdicts are of all six by default. Of videos: where whiskers are, as a --mask."
     ),
     "least_force": Option("Smallest force of a contact, µN.", "µN", least=0.0),
     "greatest_force": Option("Largest force of a contact, µN.", "µN", least=0.0),
@@ -310,6 +310,21 @@ OPTIONS = {
         "then whisker by whisker; by default the whisker is traced that all views show: "
         "start.png, next to the recording, shows which.",
         "X,Y",
+    ),
+    "clicks": Option(
+        "Bases, masks and scale as --pick saves them, TOML; by default NAME.clicks.toml next to "
+        "the recording, if it is there and of the same videos.",
+        "FILE",
+    ),
+    "pick": Option(
+        "Open a window first to click bases, mask a peg or the face, and draw the scale; saved for "
+        "--clicks, by default as NAME.clicks.toml next to the recording."
+    ),
+    "mask": Option(
+        "Area of a view, counted from 0, in which no whisker is measured, such as a peg or a clip: "
+        "corners of a polygon, '1:300,0 330,0 330,479 300,479', or an image of the view's size "
+        "that is bright there, 1:mask.png. May be repeated.",
+        "VIEW:AREA",
     ),
     "base_width": Option("Width of the whisker's base in the images, pixels, at least 3."),
     "jump": Option(

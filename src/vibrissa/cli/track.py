@@ -44,6 +44,9 @@ _NEAREST, _FARTHEST = 0.03, 30.0
 
 _RATE, _CUTOFF = 1000.0, 85.0
 
+_HALF = 127
+"""Grey value above which a pixel of an image of a mask is bright."""
+
 
 @dataclass(frozen=True)
 class FilmOptions:
@@ -118,6 +121,10 @@ class TraceStatements:
     base_width: float = _FINEST
     jump: float = 5.0
     bright: bool | None = None
+    clicks: Path | None = None
+    pick: bool = False
+    mask: list[str] | None = None
+    region: list[str] | None = None
 
     def __post_init__(self) -> None:
         """Refuse what cannot be."""
@@ -130,25 +137,103 @@ class TraceStatements:
         scale = max(self.base_width / _FINEST, 1.0)
         return vb.tracking.TraceOptions(scale=scale, jump=self.jump, bright=self.bright)
 
-    def bases(self, cameras: Sequence[vb.cameras.Camera]) -> list[list[list[float]] | None]:
+    def stored(self, videos: Sequence[Path], target: Path, count: int) -> vb.io.Clicks | None:
+        """Read what was clicked before in these videos of one or more trials, and state it."""
+        names = tuple(video.name for video in videos)
+        file = self.clicks or clicks_of(target)
+        if self.clicks is None and (len(videos) > count or not file.exists()):
+            return None
+        if self.pick and not file.exists():
+            return None
+        found = vb.io.load_clicks(file)
+        if len(found.views) != count:
+            raise ValueError(f"{file} has {len(found.views)} views; there are {count}")
+        if self.clicks is None and found.videos != names:
+            say(f"{file} is not used: it is of {', '.join(found.videos)}")
+            return None
+        bases = len(found.views[0].base)
+        areas = sum(len(view.mask) + len(view.region) for view in found.views)
+        scale = "" if found.pixel_size is None else f", a pixel of {1e3 * found.pixel_size:.4g} mm"
+        say(f"{file} is used: bases of {bases} whiskers, {areas} masks and regions{scale}")
+        return found
+
+    def bases(
+        self, cameras: Sequence[vb.cameras.Camera], clicks: vb.io.Clicks | None
+    ) -> list[list[list[float]] | None]:
         """Return the bases in each view; None: to be found."""
         views = len(cameras)
-        if not self.base:
-            return [None] * views
-        points = [numbers(text, ("x", "y"), "--base") for text in self.base]
+        points = [numbers(text, ("x", "y"), "--base") for text in self.base or ()]
         if len(points) % views:
             raise ValueError(
                 f"there are {len(points)} --base for {views} views; each needs as many"
             )
         each = len(points) // views
-        for i, (x, y) in enumerate(points):
-            width, height = cameras[i // each].size
-            if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
-                raise ValueError(
-                    f"--base {self.base[i]} is outside of view {i // each}, {width} × {height} "
-                    "pixels"
-                )
-        return [points[v * each : (v + 1) * each] for v in range(views)]
+        found = [points[v * each : (v + 1) * each] for v in range(views)]
+        if not points and clicks is not None:
+            found = [[list(point) for point in view.base] for view in clicks.views]
+        counts = [len(view) for view in found]
+        if len(set(counts)) > 1:
+            raise ValueError(f"the views have {counts} bases; each needs as many")
+        if not any(found):
+            return [None] * views
+        for i, camera in enumerate(cameras):
+            width, height = camera.size
+            for x, y in found[i]:
+                if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
+                    raise ValueError(
+                        f"--base {x:g},{y:g} is outside of view {i}, {width} × {height} pixels"
+                    )
+        return list(found)
+
+    def masks(
+        self, cameras: Sequence[vb.cameras.Camera], clicks: vb.io.Clicks | None
+    ) -> list[vb.io.Mask | None]:
+        """Return the pixels of each view in which no whisker is; None where all may be."""
+        views = list(clicks.views if clicks else [vb.io.ViewClicks()] * len(cameras))
+        images: list[list[vb.io.Mask]] = [[] for _ in views]
+        for name, stated in (("mask", self.mask), ("region", self.region)):
+            for text in stated or ():
+                number, _, area = text.partition(":")
+                if not number.isdigit() or int(number) >= len(views) or not area:
+                    raise ValueError(
+                        f"--{name} is {text!r}; VIEW:X,Y X,Y X,Y… or VIEW:IMAGE is needed, and "
+                        f"views 0 to {len(views) - 1} are there"
+                    )
+                view = int(number)
+                if Path(area).suffix and Path(area).exists():
+                    shown = next(iter(vb.io.read_video(Path(area)))) > _HALF
+                    images[view].append(shown if name == "mask" else ~shown)
+                    continue
+                corners = [numbers(one, ("x", "y"), f"--{name}") for one in area.split()]
+                polygon = vb.io.polygon_of(corners, f"--{name} {text}")
+                known = (*getattr(views[view], name), polygon)
+                views[view] = replace(views[view], **{name: known})
+        return [
+            vb.io.together([view.masked(camera.size), *image])
+            for view, camera, image in zip(views, cameras, images, strict=True)
+        ]
+
+
+def clicks_of(recording: Path) -> Path:
+    """Return the file in which what was clicked for a recording is kept."""
+    return recording.with_name(f"{recording.stem}.clicks.toml")
+
+
+def _picked(
+    videos: Sequence[Path],
+    names: Sequence[str],
+    file: Path,
+    clicks: vb.io.Clicks | None,
+) -> vb.io.Clicks:
+    """Open the window on the first frames, and save what is clicked."""
+    images = [next(iter(vb.io.read_video(video))) for video in videos]
+    known = tuple(video.name for video in videos)
+
+    def save(shown: vb.io.Clicks) -> None:
+        vb.io.save_clicks(file, replace(shown, videos=known))
+        say(f"wrote {file}; it is used again by vibrissa track, or with --clicks {file}")
+
+    return vb.plots.pick(images, names, clicks, save)
 
 
 @dataclass(frozen=True)
@@ -221,8 +306,14 @@ def track(
     for video in videos:
         refuse_tracks(video)
     views = filmed.seen_by(videos)
-    trials = _trials(videos, len(views), target, known.alone())
+    trials = _trials(videos, len(views), target, {**known.alone(), "--pick": traced.pick})
     free(trials, force)
+    clicks = traced.stored(videos, target, len(views))
+    if traced.pick:
+        file = traced.clicks or clicks_of(target)
+        clicks = _picked(videos, [view.name for view in views], file, clicks)
+    if clicks and clicks.pixel_size and filmed.cameras is None and filmed.pixel_size is None:
+        views = replace(filmed, pixel_size=1e3 * clicks.pixel_size).seen_by(videos)
     rate = filmed.frames_per_second
     low_pass = _CUTOFF if cutoff is None else cutoff
     if not 0.0 <= low_pass < 0.5 * rate:
@@ -237,12 +328,23 @@ def track(
         distance=filmed.distance,
         **own.tracked(base_radius),
     )
-    bases, fixed = traced.bases(views), known.corrected(len(views))
+    bases, masks = traced.bases(views, clicks), traced.masks(views, clicks)
+    fixed = known.corrected(len(views))
     reference = known.read(videos[0], rate)
     for file, trial in trials.items():
         picture = file.with_name("start.png" if len(trials) == 1 else f"{file.stem}.start.png")
         _track(
-            trial, file, picture, views, rate, bases, fixed, traced.trace_options(), how, reference
+            trial,
+            file,
+            picture,
+            views,
+            rate,
+            bases,
+            masks,
+            fixed,
+            traced.trace_options(),
+            how,
+            reference,
         )
 
 
@@ -253,6 +355,7 @@ def _track(
     cameras: tuple[vb.cameras.Camera, ...],
     rate: float,
     bases: Sequence[Any],
+    masks: Sequence[vb.io.Mask | None],
     corrections: Any,
     options: vb.tracking.TraceOptions,
     how: vb.tracking.TrackOptions,
@@ -260,7 +363,7 @@ def _track(
 ) -> None:
     """Track one trial and report what was found."""
     if bases[0] is None:
-        bases, options = _found(videos, picture, cameras, options, how.offset or 0)
+        bases, options = _found(videos, picture, cameras, masks, options, how.offset or 0)
     kept = [vb.tracking.partial_traces(recording, view) for view in range(len(videos))]
     with progress_bars() as tell:
         traces = [
@@ -270,6 +373,7 @@ def _track(
                 bases[view],
                 options,
                 corrections=corrections.get(view, {}),
+                mask=masks[view],
                 progress=partial(tell, f"trace {path.name}"),
             )
             for view, path in enumerate(videos)
@@ -286,22 +390,25 @@ def _found(
     videos: Sequence[Path],
     picture: Path,
     cameras: tuple[vb.cameras.Camera, ...],
+    masks: Sequence[vb.io.Mask | None],
     options: vb.tracking.TraceOptions,
     offset: int,
 ) -> tuple[list[Any], vb.tracking.TraceOptions]:
     """Find the whisker, and show what is taken for it before any time is spent on it."""
     numbers, frames = vb.tracking.start_frames(videos, offset)
-    start = vb.tracking.find_start(cameras, frames, options)
+    start = vb.tracking.find_start(cameras, frames, options, masks)
     names = [camera.name for camera in cameras]
     images = [view[start.frame] for view in frames]
     remarks = [f"frame {numbers[start.frame]} of {videos[0].name}: {why}" for why in start.doubts]
-    figure = vb.plots.start_views(images, start.lines, names, start.confidence, remarks)
+    shown = [(start.lines, start.confidence), *((o.lines, o.confidence) for o in start.others)]
+    figure = vb.plots.start_views(images, shown, names, remarks)
     vb.plots.save(figure, picture.with_suffix(""), ("png",))
     if start.bases is None:
         raise ValueError(
             f"where the whisker begins was not found: {start.doubts[0]}. See {picture}, and state "
             "where it leaves the face, once for each view: "
             + " ".join("--base X,Y" for _ in videos)
+            + " (or click it: --pick)"
         )
     _report_start(start, names, picture)
     return [[base.tolist()] for base in start.bases], replace(options, bright=start.bright)
@@ -324,7 +431,7 @@ def _calibrated(path: Path, videos: Sequence[Path]) -> tuple[vb.cameras.Camera, 
 
 
 def _trials(
-    videos: Sequence[Path], count: int, recording: Path, alone: Mapping[str, Path | None]
+    videos: Sequence[Path], count: int, recording: Path, alone: Mapping[str, object]
 ) -> dict[Path, Sequence[Path]]:
     """Videos of each trial, by the recording that they give."""
     trials = [videos[i : i + count] for i in range(0, len(videos), count)]
@@ -387,9 +494,12 @@ def _report_start(start: vb.tracking.Start, names: Sequence[str], picture: Path)
     )
     if start.doubts:
         say(
-            f"not sure: {'; '.join(start.doubts)}. If it is not the whisker, state where that "
-            f"leaves the face, once for each view: {' '.join('--base X,Y' for _ in names)}"
+            f"not sure: {'; '.join(start.doubts)}. If it is not the whisker, click where that "
+            f"leaves the face (--pick), or state it: {' '.join('--base X,Y' for _ in names)}"
         )
+    for number, other in enumerate(start.others, 2):
+        stated = " ".join(f"--base {x:.0f},{y:.0f}" for x, y in other.bases)
+        say(f"number {number} in the picture, confidence {other.confidence:.2f}: {stated}")
 
 
 def print_tracked(result: xr.DataTree, path: Path) -> None:

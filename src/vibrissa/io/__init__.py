@@ -13,6 +13,16 @@ from vibrissa.io.anipose import (
 )
 from vibrissa.io.array import load_array, save_array
 from vibrissa.io.centerline import load_centerline, load_whisker, save_centerline
+from vibrissa.io.clicks import (
+    Clicks,
+    Mask as Mask,
+    Points as Points,
+    ViewClicks,
+    load_clicks,
+    polygon_of as polygon_of,
+    save_clicks,
+    together as together,
+)
 from vibrissa.io.kinds import READERS as READERS, Kind, load_tracks, recognise
 from vibrissa.io.matlab import load_matlab
 from vibrissa.io.movie import write_movie, write_video
@@ -105,12 +115,15 @@ from vibrissa.io.video_tables import (
 from vibrissa.io.whisk import load_whiskers
 
 __all__ = [
+    "Clicks",
     "Kind",
     "Session",
     "VideoInfo",
+    "ViewClicks",
     "join_views",
     "load_array",
     "load_centerline",
+    "load_clicks",
     "load_contact_points",
     "load_contacts",
     "load_corrections",
@@ -126,6 +139,7 @@ __all__ = [
     "recognise",
     "save_array",
     "save_centerline",
+    "save_clicks",
     "save_contacts",
     "save_contour",
     "save_corrections",

@@ -10,6 +10,7 @@ from vibrissa.plots.correction import correct as correct
 from vibrissa.plots.estimates import estimated_against_true
 from vibrissa.plots.movies import contour_frames, signal_frames
 from vibrissa.plots.overview import key_frames, trial_overview
+from vibrissa.plots.picking import pick as pick
 from vibrissa.plots.sensitivity import sensitivity_panels
 from vibrissa.plots.signal_space import signal_clouds
 from vibrissa.plots.signals import signals_over_time as signals_over_time

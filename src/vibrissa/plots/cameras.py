@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.plots.style import (
+    BLUE,
     GREEN,
     INK,
     ORANGE,
@@ -162,38 +163,50 @@ _LINE = 4.0
 
 def start_views(
     images: Sequence[Grey],
-    lines: Sequence[ArrayLike],
+    candidates: Sequence[tuple[Sequence[ArrayLike], float]],
     names: Sequence[str],
-    confidence: float,
     remarks: Sequence[str] = (),
 ) -> Figure:
-    """Draw the line that is taken for the whisker into an image of each view."""
+    """Draw what may be the whisker into an image of each view, numbered from the one that is taken.
+
+    Each candidate is its line in every view, and its confidence.
+    """
     wide = (page_width("double") - _GAP * (len(images) - 1)) / len(images)
     heights = [wide * image.shape[0] / image.shape[1] for image in images]
     below = _LINE * len(remarks) + _GAP
-    colour = ORANGE if remarks else GREEN
     with looking():
         figure = new_figure("double", max(heights) + _TITLE + below, None)
-        for view, (image, line, name) in enumerate(zip(images, lines, names, strict=True)):
+        for view, (image, name) in enumerate(zip(images, names, strict=True)):
             box = (view * (wide + _GAP), below, wide, heights[view])
             rows, columns = image.shape
             axes = box_axes(figure, box, xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5))
             axes.set_axis_off()
             axes.imshow(image, cmap="gray", vmin=0, vmax=255, aspect="auto")
-            places = np.asarray(line, dtype=np.float64).reshape(-1, 2)
-            axes.plot(*places.T, color=colour, linewidth=0.8, alpha=0.8)
-            axes.scatter(
-                places[:1, 0], places[:1, 1], 60.0, facecolor="none", edgecolor=RED, linewidths=1.0
-            )
-            if len(places):
-                caption = f"confidence {confidence:.2f}"
-                column, row = places[0]
-                caption = f"base at {column:.0f}, {row:.0f}, {caption}"
-            else:
-                caption = "no whisker"
+            caption = "no whisker"
+            for number, (lines, confidence) in enumerate(candidates, 1):
+                line = np.asarray(lines[view], dtype=np.float64).reshape(-1, 2)
+                if not len(line):
+                    continue
+                if number == 1:
+                    caption = f"1 begins at {line[0, 0]:.0f}, {line[0, 1]:.0f}"
+                    caption += f", confidence {confidence:.2f}"
+                _candidate(axes, line, number, confidence, ORANGE if remarks else GREEN)
             axes.set_title(f"{name}: {caption}", loc="left", fontsize=7.0, pad=2.0)
         height = max(heights) + _TITLE + below
         for count, remark in enumerate(remarks):
             at = (below - _LINE * (count + 1)) / height
             figure.text(0.01, at, remark, fontsize=6.5, color=RED)
     return figure
+
+
+def _candidate(axes: Axes, line: Array, number: int, confidence: float, colour: str) -> None:
+    """Draw a line with its number and a circle at its base; all but the first fainter."""
+    first = number == 1
+    colour = colour if first else BLUE
+    axes.plot(*line.T, color=colour, linewidth=0.8, alpha=0.8, linestyle="-" if first else ":")
+    at = line[:1, 0], line[:1, 1]
+    axes.scatter(*at, s=60.0, facecolor="none", edgecolor=RED if first else BLUE, linewidths=1.0)
+    text = f"{number}" if first else f"{number} ({confidence:.2f})"
+    axes.annotate(
+        text, line[0], xytext=(5.0, 5.0), textcoords="offset points", color=colour, fontsize=7.0
+    )

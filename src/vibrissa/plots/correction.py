@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from matplotlib.backend_bases import Event, KeyEvent, MouseEvent
@@ -234,30 +234,31 @@ _KEYS: Mapping[str, str] = MappingProxyType(
 )
 
 
-def correct(
-    frames: Frames,
-    count: int,
-    corrections: Mapping[Key, ArrayLike] | None = None,
-    traces: Mapping[Key, ArrayLike] | None = None,
-    save: Save | None = None,
-) -> dict[Key, Array]:
-    """Open a window to correct traces in, and wait until it is closed."""
+class _Window(Protocol):
+    def close(self, event: Any = None) -> None:
+        """Save what is not saved."""
+
+
+W = TypeVar("W", bound=_Window)
+
+
+def opened(make: Callable[[Figure], W], instead: str, size: tuple[float, float]) -> W:
+    """Open a window, wait until it is closed, and return it; without a screen tell what to do."""
     import matplotlib as mpl
     import matplotlib.pyplot as plt
 
-    figure = plt.figure(figsize=(9.0, 9.0))
+    figure = plt.figure(figsize=size)
     try:
         manager = figure.canvas.manager
         if manager is None or mpl.get_backend().lower() in ("agg", "pdf", "svg", "ps", "cairo"):
             raise ValueError(
-                "there is no screen for a window: write the corrections as a table view,frame,"
-                "whisker,x,y, or run this where there is one"
+                f"there is no screen for a window: {instead}, or run this where there is one"
             )
         # Matplotlib's own keys do other things with s, q, l and the arrows.
         handler = getattr(manager, "key_press_handler_id", None)
         if handler is not None:
             figure.canvas.mpl_disconnect(handler)
-        window = Correction(frames, count, corrections, traces, save, figure)
+        window = make(figure)
         figure.canvas.mpl_connect("close_event", window.close)
 
         def leave(event: Event) -> None:
@@ -268,4 +269,20 @@ def correct(
         plt.show()
     finally:
         plt.close(figure)
+    return window
+
+
+def correct(
+    frames: Frames,
+    count: int,
+    corrections: Mapping[Key, ArrayLike] | None = None,
+    traces: Mapping[Key, ArrayLike] | None = None,
+    save: Save | None = None,
+) -> dict[Key, Array]:
+    """Open a window to correct traces in, and wait until it is closed."""
+    window = opened(
+        lambda figure: Correction(frames, count, corrections, traces, save, figure),
+        "write the corrections as a table view,frame,whisker,x,y",
+        (9.0, 9.0),
+    )
     return window.corrections

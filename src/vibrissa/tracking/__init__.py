@@ -24,6 +24,7 @@ from vibrissa.tracking.space.rest_shape import (
 from vibrissa.tracking.trace.curves import Found, find_whiskers as find_whiskers
 from vibrissa.tracking.trace.start import (
     FRAMES,
+    Candidate,
     Start,
     find_bases as find_bases,
     find_start,
@@ -45,6 +46,7 @@ from vibrissa.tracking.tracker_points import (
 __all__ = [
     "CUTOFF",
     "FRAMES",
+    "Candidate",
     "Found",
     "Start",
     "Trace",

@@ -71,7 +71,7 @@ def seen_along(
     line = points[np.arange(len(points)), path]
     apart = np.linalg.norm(points - line[:, None], axis=2) > _APART
     bright, _ = _best_path(-strength + np.where(in_image & apart, 0.0, -_MOST)[:, None])
-    # Before a body it is seen to begin where the other view shows it, and nothing goes on before that.
+    # It is seen to begin before a body, where the other view shows it; nothing goes on before that.
     on_body = float(np.mean(bodies.at(line[:_FIRST]) != 0))
     back = line[0] - line[min(_FIRST, len(line) - 1)]
     part = np.concatenate([line[0] + np.linspace(1.0, 0.0, _FIRST + 1)[:-1, None] * back, line])

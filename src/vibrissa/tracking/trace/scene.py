@@ -114,11 +114,22 @@ class Scene:
     thin: int
     ground: Image
     count: int
+    mask: NDArray[np.bool_] | None = None
     still: Still | None = None
 
     @classmethod
-    def of(cls, frames: Sequence[Frame], scale: float = 1.0) -> Scene:
-        """Take the scene from frames of one view."""
+    def of(
+        cls,
+        frames: Sequence[Frame],
+        scale: float = 1.0,
+        mask: NDArray[np.bool_] | None = None,
+    ) -> Scene:
+        """Take the scene from frames of one view; in masked pixels there is no whisker."""
+        if mask is not None and mask.shape != frames[0].shape:
+            raise ValueError(
+                f"a mask has {mask.shape[1]} × {mask.shape[0]} pixels and the video "
+                f"{frames[0].shape[1]} × {frames[0].shape[0]}; one of its size is needed"
+            )
         sparse = np.stack([f[::_SPARSE, ::_SPARSE] for f in frames]).astype(np.float32)
         usual = np.median(sparse, axis=0)
         thin = 2 * int(np.ceil(0.5 * _THIN * scale)) - 1
@@ -133,7 +144,7 @@ class Scene:
         light = _doubled(_smoothed(still, _SOFT), frames[0].shape)
         ground, share = _ground(still)
         usual = np.asarray(usual, dtype=np.float32)
-        return cls(light, share * ground, background, usual, thin, ground, len(frames))
+        return cls(light, share * ground, background, usual, thin, ground, len(frames), mask)
 
     def gain(self, frame: Frame) -> float:
         """Brightness of a frame relative to the scene."""
@@ -151,7 +162,14 @@ class Scene:
         for edge in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
             border[edge] = True
         number = np.where(area >= _SMALLEST, np.arange(count + 1), 0)
-        return Bodies(number[labels].astype(np.int32), border & (area > _LARGE * labels.size))
+        label_ = number[labels].astype(np.int32)
+        face = border & (area > _LARGE * labels.size)
+        if self.mask is not None:
+            rows, columns = label_.shape
+            masked = self.mask[::_HALF, ::_HALF][:rows, :columns]
+            label_ = np.where(masked & (label_ == 0), np.int32(count + 1), label_)
+            face = np.append(face, False)
+        return Bodies(label_, face)
 
     def difference(self, frame: Frame) -> Image:
         """How much darker a frame is than the light, pixel by pixel."""
@@ -165,12 +183,18 @@ class Scene:
             return self.difference(frame)
         out = np.empty(frame.shape, dtype=np.float32)
         darker(frame, self.background, self.gain(frame), *_RANGE, out)
+        if self.mask is not None:
+            out[self.mask] = 0.0
         return out
 
     @property
     def bits(self) -> Bits | None:
-        """Bits of `Clutter` of what never moves; None if it is not known."""
-        return None if self.still is None else self.still.bits
+        """Bits of `Clutter` of what never moves or is masked; None if neither is known."""
+        bits = None if self.still is None else self.still.bits
+        if self.mask is None:
+            return bits
+        masked = STILL * self.mask.astype(np.uint32)
+        return masked if bits is None else bits | masked
 
     def without_still(self, frame: Frame) -> Frame:
         """Give a frame without what never moves, where that is known."""

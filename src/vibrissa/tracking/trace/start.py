@@ -26,7 +26,7 @@ from vibrissa.tracking.trace.epipolar import seen_along
 from vibrissa.tracking.trace.follower import start_at
 from vibrissa.tracking.trace.ridge import noise_level
 from vibrissa.tracking.trace.scene import Scene
-from vibrissa.tracking.trace.trace import TraceOptions
+from vibrissa.tracking.trace.trace import Mask, TraceOptions, overlap
 
 Array = NDArray[np.float64]
 
@@ -69,11 +69,32 @@ _CLEARLY = 0.5
 """How much better a whisker of another view is seen than noise would be, as a share of itself, from
 which it is clearly seen. Without one it is 0.1 to 0.2."""
 
+_SHOWN, _ALIKE = 4, 0.5
+"""Number of candidates that are compared, and share of its line from which one is another one."""
+
 _POLARITY = 3
 """Number of frames in which bright and dark whiskers are compared."""
 
 _SURE, _GUESS = 0.5, 0.2
 """Confidence below which there is doubt, and below which nothing is found."""
+
+
+class Candidate(NamedTuple):
+    """What may be the whisker.
+
+    Attributes
+    ----------
+    bases : list of array (2,)
+        Column and row of its base in each view.
+    lines : list of array (n, 2)
+        Line in each view.
+    confidence : float
+        Confidence between 0 and 1, on the scale of that of `Start`.
+    """
+
+    bases: list[Array]
+    lines: list[Array]
+    confidence: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +119,8 @@ class Start:
         Number of frames in which nothing else is likelier, and number of frames.
     doubts : tuple of str
         Reasons why it may be wrong, a sentence each.
+    others : tuple of Candidate
+        What else may be the whisker, the likeliest first.
     """
 
     bases: list[Array] | None
@@ -107,6 +130,7 @@ class Start:
     confidence: float
     agreed: tuple[int, int]
     doubts: tuple[str, ...]
+    others: tuple[Candidate, ...] = ()
 
 
 class _Combination(NamedTuple):
@@ -160,6 +184,7 @@ def find_start(
     cameras: Sequence[Camera],
     frames: Sequence[Sequence[Frame]],
     options: TraceOptions | None = None,
+    masks: Sequence[Mask | None] | None = None,
 ) -> Start:
     """Find the whisker that all views show.
 
@@ -172,6 +197,8 @@ def find_start(
         spread over a whisk or more distinguish the whisker from what does not move.
     options : TraceOptions, optional
         Settings of tracing; ``bright``, unless None, is not asked.
+    masks : sequence of (array (height, width) of bool, or None), optional
+        Pixels of each view in which no whisker is.
 
     Returns
     -------
@@ -190,9 +217,10 @@ def find_start(
             f"{len(cameras)} cameras and {[len(view) for view in frames]} frames in the views do "
             "not fit: every view needs as many, one at least"
         )
-    search, bright = _Search.of(cameras, frames, options), bool(options.bright)
+    search, bright = _Search.of(cameras, frames, options, masks), bool(options.bright)
     if options.bright is not False:
-        other = _Search.of(cameras, [[negative(f) for f in view] for view in frames], options)
+        inverted = [[negative(f) for f in view] for view in frames]
+        other = _Search.of(cameras, inverted, options, masks)
         few = search.moments(_POLARITY)
         bright = bright or other.worth(few) > _BETTER * search.worth(few)
         search = other if bright else search
@@ -215,8 +243,11 @@ class _Search:
         cameras: Sequence[Camera],
         frames: Sequence[Sequence[Frame]],
         options: TraceOptions,
+        masks: Sequence[Mask | None] | None,
     ) -> _Search:
-        return cls(cameras, frames, [Scene.of(view, options.scale) for view in frames], options)
+        pairs = zip(frames, masks or [None] * len(frames), strict=True)
+        scenes = [Scene.of(view, options.scale, mask) for view, mask in pairs]
+        return cls(cameras, frames, scenes, options)
 
     def moments(self, count: int) -> list[int]:
         """Frames that are spread over all of them, the first among them."""
@@ -323,6 +354,7 @@ class _Vote(NamedTuple):
     winners: list[_Combination]  # of the frames that show it
     confidence: float
     agreed: tuple[int, int]  # in how many of how many frames nothing else is likelier
+    others: Sequence[tuple[float, list[_Combination]]] = ()  # with their worth relative to winners
     moves: bool = True
     hidden: str = ""  # the view that shows it only along the lines of sight of another
 
@@ -337,11 +369,15 @@ def _voted(found: Sequence[Sequence[_Combination]]) -> _Vote:
         near = ([one for one in row if _near(one, center)][:1] for row in found)
         return [one for first in near for one in first]
 
-    best = max(every, key=lambda one: sum(other.worth for other in supporters(one)))
-    winners = supporters(best)
-    total = sum(one.worth for one in winners)
-    rivals = (one for one in every if not _near(one, best))
-    rival = max((sum(one.worth for one in supporters(other)) for other in rivals), default=0.0)
+    ranked: list[list[_Combination]] = []
+    left = every
+    while left and len(ranked) < _SHOWN:
+        best = max(left, key=lambda one: sum(other.worth for other in supporters(one)))
+        ranked.append(supporters(best))
+        left = [one for one in left if not _near(one, best)]
+    winners = ranked[0]
+    total, *rest = (sum(one.worth for one in row) for row in ranked)
+    rival = max(rest, default=0.0)
     firsts = [row[0] for row in found if row]
     agreed = sum(any(one is first for first in firsts) for one in winners)
     # A whisker that leaves out what a view shows best is in doubt, whatever the others show.
@@ -349,7 +385,8 @@ def _voted(found: Sequence[Sequence[_Combination]]) -> _Vote:
     gap = float(np.median([one.gap for one in winners]))
     sure = share * float(np.exp(-0.5 * (gap / _GAP) ** 2))
     confidence = sure * agreed / len(found) * total / (total + rival)
-    return _Vote(winners, confidence, (agreed, len(found)))
+    others = [(worth / total, row) for worth, row in zip(rest, ranked[1:], strict=True)]
+    return _Vote(winners, confidence, (agreed, len(found)), others)
 
 
 def _near(one: _Combination, other: _Combination) -> bool:
@@ -389,7 +426,22 @@ def _start(search: _Search, vote: _Vote, bright: bool) -> Start:
     clear = [one for one in vote.winners if one.worth > 0.5 * best.worth]
     bases = list(min(clear, key=lambda one: one.frame).bases)
     lines = [curve.line for curve in best.curves]
-    return Start(bases, lines, best.frame, bright, confidence, vote.agreed, tuple(doubts))
+    others = _others(vote, best, confidence)
+    return Start(bases, lines, best.frame, bright, confidence, vote.agreed, tuple(doubts), others)
+
+
+def _others(vote: _Vote, best: _Combination, confidence: float) -> tuple[Candidate, ...]:
+    """Other candidates, about the frame of the best, but those that are the same line."""
+    found = [best]
+    shown = []
+    for worth, row in vote.others:
+        one = min(row, key=lambda other: abs(other.frame - best.frame))
+        pairs = [zip(one.curves, other.curves, strict=True) for other in found]
+        if not any(all(overlap(a.line, b.line) > _ALIKE for a, b in pair) for pair in pairs):
+            lines = [curve.line for curve in one.curves]
+            shown.append(Candidate(list(one.bases), lines, confidence * worth))
+            found.append(one)
+    return tuple(shown)
 
 
 def base_gap(cameras: Sequence[Camera], pixels: Array) -> Array:

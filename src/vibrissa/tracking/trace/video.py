@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import chain, islice
@@ -28,7 +29,7 @@ from vibrissa.tracking.trace.identity import Seen, decided
 from vibrissa.tracking.trace.row import follow_row
 from vibrissa.tracking.trace.scene import Scene
 from vibrissa.tracking.trace.start import FRAMES, is_bright, negative
-from vibrissa.tracking.trace.trace import Trace, TraceOptions, given, overlap
+from vibrissa.tracking.trace.trace import Mask, Trace, TraceOptions, given, overlap
 
 Array = NDArray[np.float64]
 
@@ -57,6 +58,7 @@ def trace_video(
     begun: Sequence[Sequence[Trace]] = (),
     kept: list[list[Trace]] | None = None,
     sample: Sequence[Frame] | None = None,
+    mask: Mask | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> list[list[Trace]]:
     """Trace whiskers from frame to frame.
@@ -81,6 +83,8 @@ def trace_video(
     sample : sequence of array (height, width), optional
         Frames spread over the film, which show what never moves; by default some of ``frames`` if
         they are a sequence, else the first 30.
+    mask : array (height, width) of bool, optional
+        Pixels in which no whisker is measured.
     progress : callable, optional
         Function that is called after every frame with the number of frames done.
 
@@ -113,7 +117,7 @@ def trace_video(
     begins = [follower.base for follower in followers] if bases is None else bases
     starts = np.array(begins, dtype=np.float64)
     alike = [negative(f) if bright else f for f in sample if f.shape == shape]
-    scene = Scene.of(alike, options.scale).with_still(starts)
+    scene = Scene.of(alike, options.scale, mask).with_still(starts)
     (still,) = between_whiskers([None], scene.bits, start.shape)
     for follower in followers:
         follower.clutter = still.still_only
@@ -300,6 +304,7 @@ def trace_file(
     options: TraceOptions | None = None,
     *,
     corrections: Corrections | None = None,
+    mask: Mask | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[list[Trace]]:
     """Trace the whiskers of a video file, or continue where this was stopped.
@@ -318,6 +323,8 @@ def trace_file(
         Settings of tracing.
     corrections : mapping, optional
         Points along whiskers, as in `trace_video`.
+    mask : array (height, width) of bool, optional
+        Pixels in which no whisker is measured.
     progress : callable, optional
         Function that is called as ``progress(done, total)`` with numbers of frames.
 
@@ -330,6 +337,7 @@ def trace_file(
     about = without_part(video)[0].stat()
     fixed = sorted((key, np.asarray(at).tolist()) for key, at in (corrections or {}).items())
     key = f"{video.resolve()} {about.st_size} {about.st_mtime_ns} {bases} {fixed} {options}"
+    key += "" if mask is None else f" {zlib.crc32(np.packbits(mask).tobytes())}"
     begun = [[Trace(*row) for row in whisker] for whisker in load_traces(partial, key) or []]
     kept: list[list[Trace]] = []
     total = max(video_info(video).frames, 1)
@@ -347,6 +355,7 @@ def trace_file(
             begun=begun,
             kept=kept,
             sample=start_frames([video])[1][0],
+            mask=mask,
             progress=report,
         )
     finally:

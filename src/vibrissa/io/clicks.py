@@ -1,4 +1,4 @@
-"""What a person showed in the images of a recording: bases, what is no whisker, the scale; TOML.
+"""What a person showed in the images of a recording: bases, masks, regions, the scale; TOML.
 
     videos = ["top.mp4", "front.mp4"]
     pixel_size = 0.058                                # mm
@@ -43,7 +43,7 @@ class ViewClicks:
     mask : tuple of polygons
         Areas without whiskers, each a tuple of corners (column, row), pixels.
     region : tuple of polygons
-        Areas outside of which is no whisker, if there are any, likewise.
+        Areas in which all whiskers are, if there are any, likewise.
     """
 
     base: Points = ()

@@ -1,4 +1,4 @@
-"""A window in which a person shows where whiskers begin, what is no whisker, and the scale.
+"""A window in which a person shows where whiskers begin, areas without whiskers, and the scale.
 
 The logic is in `Picking`, which needs only a figure; it works without a screen. `pick` opens a
 window on one.
@@ -21,9 +21,10 @@ from vibrissa.plots.correction import opened
 from vibrissa.plots.style import BLUE, GREEN, ORANGE, RED
 
 HELP = (
-    "b base of a whisker (in every view, in the same order) · m corners of what is no whisker, as "
-    "a peg · r corners of where whiskers are\nl two ends of a known length, then type it in mm · "
-    "enter closes a polygon or takes the length · u undo · s save · q save and close · esc close"
+    "b base of a whisker (in every view, in the same order) · m corners of an area without "
+    "whiskers, as a peg · r corners of where whiskers are\nl two ends of a known length, then type "
+    "it in mm · enter closes a polygon or takes the length · u undo · s save · q save and close · "
+    "esc close"
 )
 _MODES: Mapping[str, str] = MappingProxyType(
     {"b": "base", "m": "mask", "r": "region", "l": "length"}

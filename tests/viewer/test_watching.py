@@ -169,6 +169,8 @@ def test_the_chart_has_six_lines_and_shades_contacts(trial):
     assert len(re.findall("<rect ", drawn)) == len(trial.onsets())
     assert "nan" not in drawn
     assert 'data-cursor="0.5000"' in cursor(0.5)
+    # Over the timeline it is as far along.
+    assert re.findall('x1="[^"]*', cursor(0.5)) == re.findall('x1="[^"]*', cursor(0.5, strip=True))
 
 
 def test_a_long_line_keeps_its_extremes():

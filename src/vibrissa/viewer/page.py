@@ -345,6 +345,10 @@ PANEL = 0.52
 half of the width counts. How many pixels it has is not known: screens have one or more to each of
 the page's."""
 
+PHONE, LOW = 0.65, 0.55
+"""Width over height of a window in which the panel is below what is drawn, and its share of the
+height there."""
+
 _WIDTH = 1.25
 """How wide what is shown is, over the distance from which it is looked at."""
 
@@ -360,13 +364,17 @@ class Shot:
 
 def framed(shot: Shot, width: float, height: float, fov: float) -> tuple[Array, Array]:
     """Camera position and target, mm, for a window of this size."""
-    free = max(width - PANEL * height, 0.5 * width)
+    phone = width < PHONE * height
+    free = width if phone else max(width - PANEL * height, 0.5 * width)
     across = 2.0 * np.tan(0.5 * fov) / height  # of a pixel, over the distance
     distance = shot.distance * max(1.0, _WIDTH / (free * across))
     direction = shot.way / np.linalg.norm(shot.way)
     right = np.cross([0.0, 0.0, 1.0], direction)
     right /= np.linalg.norm(right)
-    middle = shot.centre + 0.5 * (width - free) * across * distance * right
+    aside = 0.5 * (width - free) * right
+    if phone:
+        aside = -0.5 * LOW * height * np.cross(direction, right)
+    middle = shot.centre + across * distance * aside
     return middle + distance * direction, middle
 
 

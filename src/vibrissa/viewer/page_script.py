@@ -152,6 +152,27 @@ SCRIPT = """
 })();
 """
 
+STYLE = """
+/* On a phone the panel is as wide as the screen, below what is drawn. */
+@media (max-width: 36em) {
+  .mantine-Paper-root:not([data-floating-window]) {
+    left: 0 !important; right: 0 !important; width: 100% !important; max-height: 55% !important;
+  }
+  .mantine-Paper-root:not([data-floating-window]) .mantine-ScrollArea-content > div {
+    width: 100% !important;
+  }
+}
+/* Between the cameras at the left and the panel at the right. */
+@media (max-width: 1300px) {
+  [data-floating-window]:has(svg[data-timeline]) {
+    width: calc(100vw - 770px) !important; min-width: 220px !important;
+  }
+}
+/* Blue can be read on black only if it is light. */
+[data-mantine-color-scheme=dark] svg [stroke="#0072b2"] { stroke: #56b4e9; }
+[data-mantine-color-scheme=dark] svg [fill="#0072b2"] { fill: #56b4e9; }
+"""
+
 _ICON = (
     "data:image/svg+xml,%3Csvg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 32 32'%3E"
     "%3Cpath d='M3 25C13 25 22 20 28 6' fill='none' stroke='%233e342c' stroke-width='3.5' "
@@ -177,5 +198,8 @@ def _zipped(page: bytes) -> bytes:
 
 def with_script(page: bytes) -> bytes:
     """Put the script, an icon and a title first of all that a page loads."""
-    ours = f'<link rel="icon" href="{_ICON}"/><title>vibrissa</title><script>{SCRIPT}</script>'
+    ours = (
+        f'<link rel="icon" href="{_ICON}"/><title>vibrissa</title><style>{STYLE}</style>'
+        f"<script>{SCRIPT}</script>"
+    )
     return page.replace(b"<head>", b"<head>" + ours.encode(), 1)

@@ -125,7 +125,7 @@ def chart(time: Array, signals: dict[str, Array], touching: NDArray[np.bool_]) -
     end = f"{1e3 * (time[-1] - time[0]):.0f} ms"
     foot = height() - 3.0
     parts.append(_text(LEFT, foot, "0", "start") + _text(WIDTH, foot, end, "end"))
-    return _svg("".join(parts))
+    return _svg("".join(parts), height())
 
 
 def height() -> float:
@@ -133,14 +133,15 @@ def height() -> float:
     return len(ROWS) * ROW + 14.0
 
 
-def cursor(share: float) -> str:
-    """A line at a share of the time, to be laid over the chart."""
+def cursor(share: float, *, strip: bool = False) -> str:
+    """A line at a share of the time, to be laid over the chart, or over the timeline."""
     x = LEFT + (WIDTH - LEFT) * share
+    tall, end = (STRIP, 12.0) if strip else (height(), len(ROWS) * ROW)
     line = (
-        f'<line x1="{x:.2f}" x2="{x:.2f}" y1="0" y2="{len(ROWS) * ROW:.0f}" stroke="currentColor" '
+        f'<line x1="{x:.2f}" x2="{x:.2f}" y1="0" y2="{end:.0f}" stroke="currentColor" '
         f'stroke-width="1.2" data-cursor="{share:.4f}"/>'
     )
-    return f'<div style="margin-top:{-100.0 * height() / WIDTH:.3f}%">{_svg(line)}</div>'
+    return f'<div style="margin-top:{-100.0 * tall / WIDTH:.3f}%">{_svg(line, tall)}</div>'
 
 
 PAD = 8
@@ -164,22 +165,13 @@ def timeline(time: Array, touching: NDArray[np.bool_], onsets: NDArray[np.int64]
         parts.append(f'<line x1="{x:.1f}" x2="{x:.1f}" y1="10" y2="12" stroke="#888"/>')
         parts.append(_text(x, STRIP - 1.0, f"{share * duration:.0f}", anchor))
     parts.append(_text(LEFT - 14.0, STRIP - 1.0, "ms", "end"))
-    return _svg("".join(parts), STRIP)
+    return _svg("".join(parts), STRIP, " data-timeline")
 
 
-def timeline_cursor(share: float) -> str:
-    """A line at a share of the time, to be laid over the timeline."""
-    x = LEFT + (WIDTH - LEFT) * share
-    line = (
-        f'<line x1="{x:.2f}" x2="{x:.2f}" y1="0" y2="12" stroke="currentColor" stroke-width="1.2"/>'
-    )
-    return f'<div style="margin-top:{-100.0 * STRIP / WIDTH:.3f}%">{_svg(line, STRIP)}</div>'
-
-
-def _svg(body: str, tall: float | None = None) -> str:
+def _svg(body: str, tall: float, mark: str = "") -> str:
     """A picture over time; the page's script seeks where it is clicked."""
     return (
-        f'<svg data-seek="{LEFT / WIDTH:.4f}" viewBox="0 0 {WIDTH:.0f} {tall or height():.0f}" '
+        f'<svg{mark} data-seek="{LEFT / WIDTH:.4f}" viewBox="0 0 {WIDTH:.0f} {tall:.0f}" '
         f'style="display:block;width:100%;padding-right:{PAD}px;box-sizing:border-box;'
         f'cursor:pointer" font-family="sans-serif" '
         f'font-size="8.5">{body}</svg>'

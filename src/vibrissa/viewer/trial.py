@@ -29,7 +29,7 @@ from vibrissa.scene import (
 from vibrissa.viewer.bend import arrow, mm, round_step, ruler, whisker_body
 from vibrissa.viewer.colours import CONTACT, FIT, OBJECT
 from vibrissa.viewer.page import Page, asked, put
-from vibrissa.viewer.readout import chart, cursor, table, timeline, timeline_cursor
+from vibrissa.viewer.readout import chart, cursor, table, timeline
 from vibrissa.viewer.recorded import View, Watched, picture, views
 from vibrissa.viewer.state import force_scale
 from vibrissa.viewer.threads import Player
@@ -278,7 +278,7 @@ class TrialMode:
         put(self._time, _MS * passed)
         share = passed / max(float(np.ptp(trial.time)), 1e-12)
         self._cursor.content = cursor(share)
-        self._now_line.content = timeline_cursor(share)
+        self._now_line.content = cursor(share, strip=True)
         self._words.content = self._words_of(frame)
 
     def go(self, time: float) -> None:

@@ -400,6 +400,11 @@ OPTIONS = {
     "again": Option("Try again what failed before."),
     "any_version": Option("Go on though another version of vibrissa began."),
     "dry_run": Option("Print number of cells, time and size, and stop."),
+    "live": Option(
+        "Draw the answers that `vibrissa stream --send udp://HOST:PORT` sends here.",
+        "HOST:PORT",
+        names="--stream",
+    ),
     "host": Option("Address to listen on; 0.0.0.0 lets other machines in.", "HOST"),
     "port": Option("Port to listen on; by default the first free one from 8080."),
     "browser": Option("Whether the browser is opened."),

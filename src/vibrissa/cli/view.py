@@ -9,7 +9,7 @@ import typer
 
 import vibrissa as vb
 from vibrissa.cli.inputs import MAP, RECORDING, WhiskerOptions, kind_in, map_from, print_notes
-from vibrissa.cli.options import with_options
+from vibrissa.cli.options import refuse, with_options
 from vibrissa.cli.terminal import say
 
 if TYPE_CHECKING:
@@ -32,11 +32,15 @@ def view(
     browser: bool = True,
     rat: str | None = None,
     any_length: bool = False,
+    live: str | None = None,
 ) -> None:
     """Bend a whisker with the mouse and see its signals; look at a map; watch a trial.
 
     Serves a page on this machine until Ctrl-C. Example: `vibrissa view trial.nc --video top.mp4
     --video front.mp4`
+
+    With --stream HOST:PORT the answers that `vibrissa stream --send udp://HOST:PORT` sends there
+    are drawn as they come. Example: `vibrissa view wire.nc --stream 127.0.0.1:5006`
     """
     kind = "" if path is None else kind_in(path)
     viewed: vb.Whisker | vb.ContactMap | xr.DataTree
@@ -45,12 +49,12 @@ def view(
             raise ValueError(
                 f"--rat and --any-length are about a whisker, and {path} is not its file"
             )
-        viewed = map_from(path) if kind == MAP else vb.load_recording(path)
+        viewed = map_from(path, live is None) if kind == MAP else vb.load_recording(path)
     else:
         viewed = WhiskerOptions(path, rat, any_length).read()
         print_notes(viewed)
     try:
-        with vb.viewer.view(viewed, videos=videos or (), host=host, port=port) as viewer:
+        with _served(viewed, videos or (), live, host, port) as viewer:
             say(f"{viewer.url}   Ctrl-C ends it")
             if browser:
                 import webbrowser
@@ -59,3 +63,19 @@ def view(
             viewer.wait()
     except KeyboardInterrupt:
         say("stopped")
+
+
+def _served(
+    viewed: vb.Whisker | vb.ContactMap | xr.DataTree,
+    videos: list[Path] | tuple[()],
+    live: str | None,
+    host: str,
+    port: int | None,
+) -> vb.viewer.Served:
+    if live is None:
+        return vb.viewer.view(viewed, videos=videos, host=host, port=port)
+    refuse({"--video": videos or None}, "a stream has none")
+    whisker = viewed.whisker if isinstance(viewed, vb.ContactMap) else viewed
+    if not isinstance(whisker, vb.Whisker):
+        raise ValueError("--stream is of a whisker or its map, and this is a recording")
+    return vb.viewer.view_stream(whisker, live, host=host, port=port)

@@ -8,11 +8,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from vibrissa.viewer.server import Viewer, view
+    from vibrissa.viewer.server import Served, Viewer, view, view_stream
 
 __all__ = [
+    "Served",
     "Viewer",
     "view",
+    "view_stream",
 ]
 
 

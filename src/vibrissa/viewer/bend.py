@@ -118,7 +118,7 @@ def force_arrow(whisker: Whisker, force: Array, at: Array) -> dict[str, Mark]:
 def bend_drawing(bend: Bend, exaggeration: float) -> Drawing:
     """Draw whisker, load and force; without an answer the last shape as a ghost."""
     whisker, held, ok = bend.whisker, bend.held, bend.status.ok
-    out = dict(_resting(whisker, exaggeration))
+    out = dict(resting(whisker, exaggeration))
     line = held.centerline(NODES)
     if ok:
         out["whisker"] = whisker_body(whisker, line, exaggeration)
@@ -135,7 +135,7 @@ def bend_drawing(bend: Bend, exaggeration: float) -> Drawing:
 
 
 @lru_cache(maxsize=4)
-def _resting(whisker: Whisker, exaggeration: float) -> dict[str, Mark]:
+def resting(whisker: Whisker, exaggeration: float) -> dict[str, Mark]:
     """What stays as it is while a whisker is bent."""
     return {
         "follicle": follicle(whisker, exaggeration),

@@ -212,8 +212,7 @@ class Page:
 
     def face_whisker(self) -> None:
         """Point all cameras at the whisker."""
-        length = float(to_display("length", self.bend.whisker.length))
-        self.look_at(np.array([0.45, 0.1, 0.0]) * length, 0.95 * length, (0.15, -0.8, 0.6))
+        self._framing.show(whole(self.bend.whisker))
 
     def look_at(self, centre: Array, distance: float, way: Sequence[float]) -> None:
         """Point all cameras at a position, mm, from a distance, mm, and a direction."""
@@ -376,6 +375,13 @@ def framed(shot: Shot, width: float, height: float, fov: float) -> tuple[Array, 
         aside = -0.5 * LOW * height * np.cross(direction, right)
     middle = shot.centre + across * distance * aside
     return middle + distance * direction, middle
+
+
+def whole(whisker: Whisker) -> Shot:
+    """Look at all of a whisker."""
+    length = float(to_display("length", whisker.length))
+    middle = np.array([0.45, 0.1, 0.0]) * length
+    return Shot(middle, 0.95 * length, np.array([0.15, -0.8, 0.6]))
 
 
 class Framing:

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from http import HTTPStatus
 from os import PathLike
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Protocol, Self
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -27,6 +27,7 @@ from numpy.typing import ArrayLike
 from vibrissa.contacts import ContactMap
 from vibrissa.io import Footage
 from vibrissa.viewer.bend import BendMode, WhiskerControls
+from vibrissa.viewer.live import Live, LivePage
 from vibrissa.viewer.locate import LocateMode, coloured, located, usual_sensor
 from vibrissa.viewer.map import MapMode
 from vibrissa.viewer.page import Mode, Page
@@ -52,8 +53,59 @@ _COMPILING = (
 )
 
 
-class Viewer:
+class Shown(Protocol):
+    """What is served."""
+
+    server: viser.ViserServer
+
+    def close(self) -> None:
+        """End it."""
+
+
+class Served:
     """A page that is being served; ends with its ``with`` block.
+
+    Parameters
+    ----------
+    page : Page or LivePage
+        Page that is served.
+    """
+
+    def __init__(self, page: Shown) -> None:
+        self.shown = page
+
+    @property
+    def url(self) -> str:
+        """Where the page is."""
+        server = self.shown.server
+        host = server.get_host()
+        shown = "127.0.0.1" if host in ("0.0.0.0", "") else host
+        return f"http://{f'[{shown}]' if ':' in shown else shown}:{server.get_port()}"
+
+    def wait(self) -> None:
+        """Serve until interrupted."""
+        while True:
+            time.sleep(3600.0)
+
+    def close(self) -> None:
+        """Stop serving."""
+        with contextlib.redirect_stdout(io.StringIO()):  # it would say so
+            self.shown.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+class Viewer(Served):
+    """A page of a whisker, a map or a trial that is being served; ends with its ``with`` block.
 
     Parameters
     ----------
@@ -62,14 +114,8 @@ class Viewer:
     """
 
     def __init__(self, page: Page) -> None:
+        super().__init__(page)
         self.page = page
-
-    @property
-    def url(self) -> str:
-        """Where the page is."""
-        host = self.page.server.get_host()
-        shown = "127.0.0.1" if host in ("0.0.0.0", "") else host
-        return f"http://{f'[{shown}]' if ':' in shown else shown}:{self.page.server.get_port()}"
 
     def put_contact(self, point: ArrayLike) -> None:
         """Put the wanted contact point where it would otherwise be dragged to.
@@ -82,26 +128,45 @@ class Viewer:
         self.page.change("drag", lambda bend: moved(loaded(bend, "point"), point))
         self.page.work.wait()
 
-    def wait(self) -> None:
-        """Serve until interrupted."""
-        while True:
-            time.sleep(3600.0)
 
-    def close(self) -> None:
-        """Stop serving."""
-        with contextlib.redirect_stdout(io.StringIO()):  # it would say so
-            self.page.close()
+def view_stream(
+    whisker: Whisker,
+    address: str,
+    *,
+    name: str = "",
+    host: str = HOST,
+    port: int | None = None,
+) -> Served:
+    """Serve a page that draws the answers of a running stream as they come.
 
-    def __enter__(self) -> Self:
-        return self
+    Parameters
+    ----------
+    whisker : Whisker
+        Whisker of the stream.
+    address : str
+        UDP address on which the answers come, ``HOST:PORT``, as ``vibrissa stream --send`` sends
+        them.
+    name : str
+        Name of the whisker, where the stream is of several.
+    host : str
+        Address to serve the page on; the default can only be reached from this machine.
+    port : int, optional
+        Port to serve the page on; by default the first free one from 8080.
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
+    Returns
+    -------
+    Served
+        Handle of the running server; close it to stop.
+
+    Raises
+    ------
+    ValueError
+        If one of the two addresses is not one, or is taken.
+    """
+    with contextlib.ExitStack() as opened:
+        live = LivePage(_served(host, port, opened), Live(whisker, name), address)
+        opened.pop_all()
+    return Served(live)
 
 
 def view(

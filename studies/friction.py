@@ -20,10 +20,14 @@ DEFLECTED = np.deg2rad(5.0)
 
 
 def rubbed(
-    contact_map: vb.ContactMap, coefficient: float, count: int, rng: np.random.Generator
+    contact_map: vb.ContactMap,
+    coefficient: float,
+    count: int,
+    rng: np.random.Generator,
+    whisker: vb.Whisker | None = None,
 ) -> tuple[np.ndarray, vb.Deflection]:
-    """Contact points of oblique forces on the whisker, with what they do to it."""
-    whisker = contact_map.whisker
+    """Contact points of oblique forces on the map's whisker or another, and what they do to it."""
+    whisker = whisker or contact_map.whisker
     nodes = contact_map.to_dataset().isel(station=slice(2, None), load=slice(2, -1))
     shape = nodes.arc_length.shape
     picked = rng.integers(0, nodes.arc_length.size, 5 * count)

@@ -328,6 +328,21 @@ def test_taper_is_found_where_contacts_lie_at_several_places(wire, touched):
     assert blind.misfit > 3.0
 
 
+def test_the_base_is_found_where_contacts_are_known(wire, touched):
+    sensor = Sensor(noise=np.repeat([1e-3, 1e-4], 3))
+    unit = wire.base_bending_stiffness / wire.length
+    soft = wire.with_properties(base_stiffness=(20.0 * unit, 20.0 * unit))
+    bent = vb.deflect(soft, vb.PointContact(touched.contact_point))
+    readings = sensor.read(np.arange(60.0), 1.1 * wrench_of(bent))
+    found = fit_stiffness(wire, touched.contact_point, readings, sensor, base=True)
+    true = 22.0 * unit  # a tenth stiffer, as the wire
+    away = 1.0 / found.base_stiffness - 1.0 / true
+    assert abs(away) < 4.0 * found.compliance_sigma < 0.4 / true
+    assert abs(found.stiffness / (1.1 * wire.base_bending_stiffness) - 1.0) < 0.02
+    assert found.whisker.base_stiffness == pytest.approx((found.base_stiffness,) * 2)
+    assert fit_stiffness(wire, touched.contact_point, readings, sensor).misfit > 2.0
+
+
 def test_two_moments_tell_stiffness_too(wire, touched):
     sensor = Sensor(("My", "Mz"), noise=1e-4)
     readings = sensor.read(np.arange(60.0), wrench_of(touched))

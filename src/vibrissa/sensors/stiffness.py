@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.deferred import optimize
 from vibrissa.sensors.least_squares import warn_of_misfit, warn_of_surprise
 from vibrissa.sensors.mixing import wrenches_of_contacts
 from vibrissa.sensors.sensor import Sensor
@@ -36,6 +35,12 @@ _OPEN = 2.0
 
 _SLIM, _WIDE = 0.01, 2.0
 """Bounds of a fitted taper."""
+
+_SOFT, _STIFF = 1.0, 1e4
+"""Bounds of the fitted stiffness of a base, over EI/L; what is stiffer is rigid."""
+
+_SPRING = 30.0
+"""Stiffness of a base that the fit begins with, over EI/L."""
 
 _TYPICAL_NOISE = 0.01
 """Noise of channels that state none, as a share of the size of their readings."""
@@ -64,6 +69,10 @@ class StiffnessFit:
     misfit : float
         χ² per degree of freedom; where larger than 1 the deviations are scaled up by its
         root.
+    base_stiffness : float
+        Stiffness of the base in bending and in twist, N·m/rad; infinite where it was not fitted.
+    compliance_sigma : float
+        Standard deviation of its inverse, rad/(N·m), as of ``ContactMap.estimate``; 0 likewise.
     """
 
     whisker: Whisker
@@ -77,6 +86,8 @@ class StiffnessFit:
     taper: float
     taper_sigma: float
     misfit: float
+    base_stiffness: float = np.inf
+    compliance_sigma: float = 0.0
 
 
 def fit_stiffness(
@@ -88,6 +99,7 @@ def fit_stiffness(
     modulus_sigma: float = np.inf,
     radius_sigma: float = 0.02,
     taper: bool = False,
+    base: bool = False,
 ) -> StiffnessFit:
     """Fit modulus and base radius to measured loads.
 
@@ -108,6 +120,8 @@ def fit_stiffness(
         unknown, 0 for exact. At least one must be finite.
     taper : bool
         Whether the ratio of tip to base radius is fitted too (the radius then is linear).
+    base : bool
+        Whether the stiffness of the base is fitted too: a spring, the same in bending and in twist.
 
     Returns
     -------
@@ -142,10 +156,9 @@ def fit_stiffness(
     size = np.sqrt((y**2).mean(axis=0)) if len(y) else noise
     noise = np.where(noise > 0.0, noise, _TYPICAL_NOISE * np.where(size > 0.0, size, 1.0))
 
-    def modelled(ratio: float) -> Array:
-        return (
-            wrenches_of_contacts(_tapered(whisker, ratio), contacts) @ sensor.base_mixing.T / noise
-        )
+    def modelled(ratio: float, spring: float | None = None) -> Array:
+        held = _on_spring(_tapered(whisker, ratio), spring)
+        return wrenches_of_contacts(held, contacts) @ sensor.base_mixing.T / noise
 
     ratio = whisker.tip_radius / whisker.base_radius
     scaled = y / noise
@@ -154,8 +167,8 @@ def fit_stiffness(
             "the readings do not grow with the loads: check the sensor's axes, sign (`reaction`) "
             "and offset, or nothing is measured"
         )
-    ratio, factor, spread, left = _fitted(modelled, scaled, ratio, taper)
-    degrees = y.size - (2 if taper else 1)
+    ratio, factor, spring, spread, left = _fitted(modelled, scaled, ratio, taper, base)
+    degrees = y.size - 1 - taper - base
     misfit = float((left**2).sum() / max(degrees, 1))
     warn_of_misfit(
         misfit,
@@ -163,6 +176,11 @@ def fit_stiffness(
         "offset and weight",
     )
     spread = spread * max(1.0, misfit)
+    if base and np.sqrt(spread[-1, -1]) > _OPEN:
+        raise ValueError(
+            "the contacts do not determine the stiffness of the base: it is too stiff to matter, "
+            "or they are too few or too alike"
+        )
     if taper and np.sqrt(spread[1, 1]) > _OPEN:
         raise ValueError(
             "the contacts do not determine the taper: touch the whisker nearer to the tip as well"
@@ -172,7 +190,8 @@ def fit_stiffness(
     modulus = whisker.youngs_modulus * float(np.exp(shift[0]))
     growth = float(np.exp(shift[1]))
     shaped = _tapered(whisker, ratio).scaled(radius_factor=growth)
-    found = shaped.with_properties(youngs_modulus=modulus)
+    found = _on_spring(shaped.with_properties(youngs_modulus=modulus), spring)
+    held = np.inf if found.base_stiffness is None or not base else found.base_stiffness[0]
     return StiffnessFit(
         whisker=found,
         stiffness=found.base_bending_stiffness,
@@ -185,7 +204,17 @@ def fit_stiffness(
         taper=float(ratio),
         taper_sigma=float(np.sqrt(spread[1, 1])) if taper else 0.0,
         misfit=misfit,
+        base_stiffness=held,
+        compliance_sigma=float(np.sqrt(spread[-1, -1])) / held if base else 0.0,
     )
+
+
+def _on_spring(whisker: Whisker, spring: float | None) -> Whisker:
+    """The whisker on a spring of this stiffness over EI/L; as it is held where there is none."""
+    if spring is None:
+        return whisker
+    stiffness = spring * whisker.base_bending_stiffness / whisker.length
+    return whisker.with_properties(base_stiffness=(stiffness, stiffness))
 
 
 def _tapered(whisker: Whisker, ratio: float) -> Whisker:
@@ -197,31 +226,37 @@ def _tapered(whisker: Whisker, ratio: float) -> Whisker:
 
 
 def _fitted(
-    modelled: Callable[[float], Array], scaled: Array, ratio: float, taper: bool
-) -> tuple[float, float, Array, Array]:
-    """Taper, factor of the stiffness, covariance of (log factor, log taper), and residuals."""
-    if not taper:
-        model = modelled(ratio)
-        factor = float((model * scaled).sum() / (model**2).sum())
-        spread = np.zeros((2, 2))
-        spread[0, 0] = 1.0 / (factor**2 * (model**2).sum())
-        return ratio, factor, spread, scaled - factor * model
-    start = modelled(ratio)
-    factor = float((start * scaled).sum() / (start**2).sum())
+    modelled: Callable[..., Array], scaled: Array, ratio: float, taper: bool, base: bool
+) -> tuple[float, float, float | None, Array, Array]:
+    """Taper, factor of the stiffness, spring of the base, covariance of their logs, residuals.
+
+    The covariance is that of factor, taper and spring in this order, as far as they are fitted.
+    """
+    from scipy.optimize import least_squares
+
+    model = modelled(ratio, _SPRING if base else None)
+    factor = float((model * scaled).sum() / (model**2).sum())
+    if not (taper or base):
+        spread = np.full((1, 1), 1.0 / (factor**2 * (model**2).sum()))
+        return ratio, factor, None, spread, scaled - factor * model
+
+    def parts(unknowns: Array) -> tuple[float, float | None]:
+        values = iter(np.exp(unknowns[1:]).tolist())
+        return (next(values) if taper else ratio), (next(values) if base else None)
 
     def residuals(unknowns: Array) -> Array:
-        return np.asarray((np.exp(unknowns[0]) * modelled(np.exp(unknowns[1])) - scaled).ravel())
+        return np.asarray((np.exp(unknowns[0]) * modelled(*parts(unknowns)) - scaled).ravel())
 
-    found = optimize.least_squares(
-        residuals,
-        [np.log(factor), np.log(ratio)],
-        bounds=([-np.inf, np.log(_SLIM)], [np.inf, np.log(_WIDE)]),
-        diff_step=[1e-4, 1e-4],
-    )
-    log_factor, log_ratio = found.x
+    unknowns = [(factor, 0.0, np.inf)]
+    unknowns += [(ratio, _SLIM, _WIDE)] if taper else []
+    unknowns += [(_SPRING, _SOFT, _STIFF)] if base else []
+    with np.errstate(divide="ignore"):
+        start, low, high = np.log(np.array(unknowns)).T
+    found = least_squares(residuals, start, bounds=(low, high), diff_step=[1e-4] * len(start))
     jacobian = np.asarray(found.jac, dtype=np.float64)
     inverse = np.asarray(np.linalg.pinv(jacobian.T @ jacobian), dtype=np.float64)
-    return float(np.exp(log_ratio)), float(np.exp(log_factor)), inverse, found.fun
+    ratio, spring = parts(found.x)
+    return ratio, float(np.exp(found.x[0])), spring, inverse, found.fun
 
 
 def _separated(

@@ -163,3 +163,8 @@ def test_faulty_objects():
         Box([0, 0, 0], [1e-2, 1e-2, 1e-2], 2 * np.eye(3))
     with pytest.raises(ValueError, match="stiffness is -1"):
         Peg([0, 0, 0], [0, 0, 1], 1e-3, stiffness=-1.0)
+
+
+def test_what_rounds_to_zero_has_no_sign():
+    peg = Peg([25e-3, -1e-9, 0.0], [-1e-9, 0.0, 1.0], 1e-3)
+    assert repr(peg).startswith("Peg(origin=(25.000, 0.000, 0.000) mm, axis=(0.000, 0.000, 1.000)")

@@ -1,13 +1,16 @@
 """What is saved from the page is what was on it."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import xarray as xr
 
 import vibrissa as vb
-from vibrissa.io import load_recording
+from vibrissa.io import load_recording, read_video, video_info
 from vibrissa.viewer.save import (
     deflection_dataset,
     map_netcdf,
+    movie,
     netcdf,
     on_paper,
     png,
@@ -67,3 +70,31 @@ def test_a_picture_on_paper_has_a_margin_and_no_more():
 def test_a_picture_is_a_png():
     image = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
     assert png(image).startswith(b"\x89PNG")
+
+
+def test_a_movie_shows_all_of_a_trial_on_white(tmp_path):
+    """Frames of odd size, of which the left is drawn as dark as far as the trial has gone."""
+    frames, seen = 130, []
+
+    def render(height, width, **_):
+        image = np.zeros((height, width, 4), dtype=np.uint8)  # transparent
+        image[:, :20] = [100, 100, 100, 255]
+        image[:, 20 : 20 + seen[-1]] = [0, 0, 0, 255]
+        return image
+
+    client = SimpleNamespace(
+        camera=SimpleNamespace(image_height=121, image_width=181), get_render=render
+    )
+    trial = SimpleNamespace(frames=frames)
+    mode = SimpleNamespace(trial=trial, pause=lambda: None, show=seen.append)
+    path = tmp_path / "trial.mp4"
+    path.write_bytes(movie(client, mode))
+    assert (seen[0], seen[-1], len(seen)) == (0, frames - 1, 100)
+    found = video_info(path)
+    assert (found.width, found.height, found.rate) == (180, 120, 25.0)
+    grey = np.stack([frame.copy() for frame in read_video(path)]).astype(float)
+    assert len(grey) == 100
+    np.testing.assert_allclose(grey[:, 20:100, 170], 255.0, atol=6.0)
+    np.testing.assert_allclose(grey[:, 20:100, 8], 100.0, atol=8.0)
+    dark = (grey[:, 60] < 60.0).sum(axis=1)
+    np.testing.assert_allclose(dark, seen, atol=2.0)

@@ -187,7 +187,7 @@ def _sensor(path: Path) -> Iterator[tuple[str, str]]:
     x, y, z = 1e3 * sensor.frame.position
     hand = "right" if sensor.frame.handedness > 0 else "left"
     counts = ", measures the reaction" if sensor.frame.reaction else ""
-    yield "frame", f"{hand}-handed, origin at ({x:.2f}, {y:.2f}, {z:.2f}) mm{counts}"
+    yield "frame", f"{hand}-handed, origin at ({x:z.2f}, {y:z.2f}, {z:z.2f}) mm{counts}"
     yield "carries", f"{1e3 * sensor.mass:.3g} g"
     known = []
     if sensor.gain_error.any():
@@ -210,7 +210,7 @@ def _array(path: Path, kind: str) -> Iterator[tuple[str, str]]:
     yield "whiskers", f"{len(array)}: {sides.count('left')} left, {sides.count('right')} right"
     for name, whisker in array.items():
         x, y, z = whisker.pose.origin * 1e3
-        yield name, f"base at ({x:.2f}, {y:.2f}, {z:.2f}) mm; {repr(whisker).split(': ', 1)[1]}"
+        yield name, f"base at ({x:z.2f}, {y:z.2f}, {z:z.2f}) mm; {repr(whisker).split(': ', 1)[1]}"
 
 
 def _video(path: Path) -> Iterator[tuple[str, str]]:
@@ -451,7 +451,7 @@ def _rows(kind: str, data: Any) -> Iterator[tuple[str, str]]:
         yield "whisker", repr(data)
         base, tip = (data.pose.to_source(data.position(s)) * 1e3 for s in (0.0, data.length))
         for name, (x, y, z) in (("base", base), ("tip", tip)):
-            yield name, f"at ({x:.2f}, {y:.2f}, {z:.2f}) mm in the file"
+            yield name, f"at ({x:z.2f}, {y:z.2f}, {z:z.2f}) mm in the file"
         yield from (
             ("note", note) for note in (*data.notes, *vb.whisker.length_faults(data.length))
         )

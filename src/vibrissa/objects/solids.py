@@ -73,11 +73,11 @@ def _set(thing: Any, **values: Any) -> None:
 
 
 def _mm(vector: Array) -> str:
-    return "(" + ", ".join(f"{x * 1e3:.3f}" for x in vector) + ") mm"
+    return "(" + ", ".join(f"{x * 1e3:z.3f}" for x in vector) + ") mm"
 
 
 def _direction(vector: Array) -> str:
-    return "(" + ", ".join(f"{x:.3f}" for x in vector) + ")"
+    return "(" + ", ".join(f"{x:z.3f}" for x in vector) + ")"
 
 
 def _soft(stiffness: float) -> str:

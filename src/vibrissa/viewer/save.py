@@ -21,6 +21,8 @@ from vibrissa.viewer.page import Page
 from vibrissa.viewer.trial import TrialMode
 from vibrissa.whisker import Whisker
 
+Picture = np.ndarray[Any, np.dtype[np.uint8]]
+
 NODES = 200
 _MARGIN = 24
 """White around a picture, pixels."""
@@ -69,7 +71,7 @@ def deflection_dataset(bent: Deflection) -> xr.Dataset:
     return out.merge(base_signals(out["force"], out["moment"]))
 
 
-def png(image: np.ndarray[Any, np.dtype[np.uint8]]) -> bytes:
+def png(image: Picture) -> bytes:
     """A picture (height, width, 3 or 4) as PNG."""
     import imageio.v3 as imageio
 
@@ -77,10 +79,15 @@ def png(image: np.ndarray[Any, np.dtype[np.uint8]]) -> bytes:
     return encoded
 
 
-def on_paper(image: np.ndarray[Any, np.dtype[np.uint8]]) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    """A picture (height, width, 4) on white (height, width, 3), without its empty margins."""
+def _on_white(image: Picture) -> Picture:
+    """A picture (height, width, 4) on white (height, width, 3)."""
     share = image[..., 3:] / 255.0
-    out = np.round(image[..., :3] * share + 255.0 * (1.0 - share)).astype(np.uint8)
+    return np.round(image[..., :3] * share + 255.0 * (1.0 - share)).astype(np.uint8)
+
+
+def on_paper(image: Picture) -> Picture:
+    """A picture (height, width, 4) on white (height, width, 3), without its empty margins."""
+    out = _on_white(image)
     rows, columns = np.nonzero((out != 255).any(axis=-1))
     if not rows.size:
         return out
@@ -101,7 +108,7 @@ _FRAMES = 100
 """Most frames of a movie."""
 
 
-def _render(client: viser.ClientHandle) -> np.ndarray[Any, np.dtype[np.uint8]]:
+def _render(client: viser.ClientHandle) -> Picture:
     """What a browser shows, without the panels."""
     camera = client.camera
     return client.get_render(
@@ -109,18 +116,20 @@ def _render(client: viser.ClientHandle) -> np.ndarray[Any, np.dtype[np.uint8]]:
     )
 
 
-def _frames(
-    client: viser.ClientHandle, mode: TrialMode
-) -> Iterator[np.ndarray[Any, np.dtype[np.uint8]]]:
-    """A trial, frame by frame, on white; sizes are even, as encoders need them."""
+def movie(client: viser.ClientHandle, mode: TrialMode) -> bytes:
+    """A trial as a browser sees it, frame by frame on white, as MP4."""
     mode.pause()
     count = min(mode.trial.frames, _FRAMES)
-    for row in np.linspace(0, mode.trial.frames - 1, count).round().astype(int):
-        mode.show(int(row))
-        image = _render(client)
-        share = image[..., 3:] / 255.0
-        paper = np.round(image[..., :3] * share + 255.0 * (1.0 - share)).astype(np.uint8)
-        yield paper[: paper.shape[0] // 2 * 2, : paper.shape[1] // 2 * 2]
+    rows = np.linspace(0, mode.trial.frames - 1, count).round().astype(int)
+
+    def frames() -> Iterator[Picture]:
+        for row in rows:
+            mode.show(int(row))
+            paper = _on_white(_render(client))
+            # Encoders need even sizes.
+            yield paper[: paper.shape[0] // 2 * 2, : paper.shape[1] // 2 * 2]
+
+    return _written("trial.mp4", lambda path: write_movie(path, frames(), 25.0))
 
 
 class SaveControls:
@@ -185,13 +194,7 @@ class SaveControls:
             self._page.say("Not saved", "a movie is of a trial: choose the mode Trial", "red")
             return
         self._page.say("Movie", f"{_FRAMES} frames are drawn; it takes about a minute")
-
-        def filmed() -> bytes:
-            return _written(
-                "trial.mp4", lambda path: write_movie(path, _frames(client, mode), 25.0)
-            )
-
-        self._send(event, "trial.mp4", filmed)
+        self._send(event, "trial.mp4", lambda: movie(client, mode))
 
     def _send(self, event: viser.GuiEvent[Any], name: str, made: Callable[[], bytes]) -> None:
         client = event.client

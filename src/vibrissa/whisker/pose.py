@@ -148,7 +148,7 @@ class Pose:
         cosine = np.clip((np.trace(self.rotation) - 1.0) / 2.0, -1.0, 1.0)
         x, y, z = self.origin * 1e3
         angle = np.degrees(np.arccos(cosine))
-        return f"Pose(origin=({x:.3f}, {y:.3f}, {z:.3f}) mm, turned by {angle:.1f}°)"
+        return f"Pose(origin=({x:z.3f}, {y:z.3f}, {z:z.3f}) mm, turned by {angle:.1f}°)"
 
 
 def _triples(values: ArrayLike) -> Array:

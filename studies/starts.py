@@ -32,7 +32,7 @@ CASES: dict[str, tuple[dict[str, Any], tuple[int, ...]]] = {
     "no peg": ({"peg": False}, (115,)),
     "bright whisker on dark": ({"bright": True}, (112,)),
     "whisker at rest": ({"still": True}, (114,)),
-    "front view before grey fur": ({"cheek": True}, (101, 102)),
+    "front view before grey fur": ({"cheek": True}, (123, 124, 125, 126, 127, 128, 131, 132)),
     "no whisker": ({"whisker": False}, (110, 111)),
 }
 HEAD = (

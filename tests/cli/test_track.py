@@ -130,6 +130,25 @@ def test_a_mask_hides_what_is_in_it_and_a_region_what_is_not(videos, tmp_path):
     assert "views 0 to 1 are there" in str(done.exception)
 
 
+def test_the_stated_radius_is_that_of_the_base_inside_the_fur(videos, tmp_path):
+    """The whisker is thinner where the fur ends; the error of all forces is one number."""
+    out = tmp_path / "t.nc"
+    cameras = ["--cameras", videos / "cameras.toml"]
+    done = run(*arguments(videos, *cameras, "--base-radius", 0.05, "--fur", 0.8, "-o", out))
+    assert done.exit_code == 0, done.exception
+    whisker = Recording(load_recording(out)).whisker()
+    tip, length = 50e-6 / 15.0, whisker.length
+    edge = 50e-6 - (50e-6 - tip) * 0.8e-3 / (length + 0.8e-3)
+    np.testing.assert_allclose(whisker.radius(np.array([0.0, length])), [edge, tip], rtol=1e-9)
+    # Forces at a length of fur that is 0.2 mm off, by the fourth power of the radius.
+    other = 50e-6 - (50e-6 - tip) * 1.0e-3 / (length + 1.0e-3)
+    percent = 100.0 * (1.0 - (other / edge) ** 4)
+    note = " ".join(done.stdout.split()).split("forces and moments, ")[1].split(" %")[0]
+    assert float(note) == pytest.approx(percent, rel=0.2)
+    done = run(*arguments(videos, "--fur", 0.8, "--whisker", out, "-o", tmp_path / "u.nc"))
+    assert "cut it there" in str(done.exception)
+
+
 def test_several_trials_go_to_a_folder(videos, tmp_path):
     (tmp_path / "second_top.mkv").write_bytes((videos / "top.mkv").read_bytes())
     words = [videos / "top.mkv", videos / "front.mkv", tmp_path / "second_top.mkv"]
@@ -202,6 +221,8 @@ def test_what_is_known_besides_the_videos_is_used(videos, tmp_path):
         (("--pixel-size", "0"), "--pixel-size is 0 mm"),
         (("--base-width", "nan"), "--base-width is nan"),
         (("--jump", "-1"), "--jump is -1"),
+        (("--fur", "30"), "--fur is 30 mm; 0 to 20"),
+        (("--region", "0:1,1 2,2"), "corners, three at least"),
         (("--pixel-size", "58"), "11.136 m wide; it is in mm"),
         (("--rate", "0"), "--rate is 0"),
         (("--rate", "170"), "below half of 170 frames/s"),

@@ -225,6 +225,12 @@ OPTIONS = {
     # Whiskers and their loads
     "length": Option("Length of a straight whisker, mm, instead.", "MM", least=0.0),
     "base_radius": Option("Radius of the whisker at its base, mm.", "MM"),
+    "fur": Option(
+        "Length of the whisker's base that fur hides, mm: --base-radius is that of the true base, "
+        "and forces are as much smaller as the whisker is thinner where the fur ends.",
+        "MM",
+        least=0.0,
+    ),
     "tip_radius": Option("Radius at the tip, mm; by default 1/15 of the base's.", "MM", least=0.0),
     "modulus": Option("Young's modulus, GPa.", "GPA", least=0.0),
     "poisson": Option("Poisson's ratio.", "RATIO"),

@@ -44,6 +44,9 @@ _NEAREST, _FARTHEST = 0.03, 30.0
 
 _RATE, _CUTOFF = 1000.0, 85.0
 
+_LONGEST_FUR = 20.0
+"""Longest part of a whisker that fur hides, mm."""
+
 _HALF = 127
 """Grey value above which a pixel of an image of a mask is bright."""
 
@@ -288,6 +291,7 @@ def track(
     known: KnownOptions,
     own: WhiskerOptions,
     base_radius: float | None = None,
+    fur: float = 0.0,
     cutoff: float | None = None,
     force: bool = False,
 ) -> None:
@@ -321,11 +325,16 @@ def track(
             f"--cutoff is {low_pass:g} Hz; it must be below half of {rate:g} frames/s, or 0 for "
             "none"
         )
+    if not fur <= _LONGEST_FUR:
+        raise ValueError(f"--fur is {fur:g} mm; 0 to {_LONGEST_FUR:g} mm are allowed")
+    if own.whisker is not None:
+        refuse({"--fur": fur or None}, "the --whisker begins where it is seen: cut it there")
     how = vb.tracking.TrackOptions(
         cutoff=low_pass or None,
         offset=None if filmed.offset == "auto" else int(filmed.offset),
         rough=filmed.cameras is None and filmed.distance != math.inf,
         distance=filmed.distance,
+        fur=1e-3 * fur,
         **own.tracked(base_radius),
     )
     bases, masks = traced.bases(views, clicks), traced.masks(views, clicks)

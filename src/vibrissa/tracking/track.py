@@ -71,6 +71,9 @@ _STRANGE, _OFTEN = 2.0, 0.05
 _MOST = 0.7
 """Share of the uncertainty of contact points that comes from the cameras and is worth a remark."""
 
+_FUR_KNOWN = 0.25
+"""Standard deviation of a stated length of fur, as a share of it."""
+
 _SHARE = 0.03
 """Distance between bases that are not the same, as a share of the whisker's length."""
 
@@ -95,6 +98,8 @@ class TrackOptions:
     whisker : Whisker, optional
         Whisker at rest, where it is known: its base is where it leaves the face. By default it is
         taken from the frames that are free of contact.
+    fur : float
+        Length of the whisker that fur hides, m: stated radii at the base are those before it.
     rough : bool
         Whether the cameras, orthographic ones, are not calibrated: what the views show of a free
         whisker then corrects them, where they cannot explain it.
@@ -108,8 +113,14 @@ class TrackOptions:
     fit: FitOptions = field(default_factory=FitOptions)
     properties: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
     whisker: Whisker | None = None
+    fur: float = 0.0
     rough: bool = False
     distance: float | None = None
+
+    @property
+    def at_base(self) -> dict[str, Any]:
+        """Radius and material, and what is hidden of the whisker, as `whisker_at_rest` has them."""
+        return {**self.properties, "hidden": self.fur}
 
 
 def track(
@@ -201,6 +212,7 @@ def track(
                 one = replace(one, fit=_with_optics_unsure(one.fit, optics))
                 remarks += _remarks_on_optics(one, optics, name)
             found.append(one)
+            remarks += _remarks_on_fur(one, options.fur, name)
             remarks += remarks_on(cameras, one.traces, one.length, one.fit.misfit, name)
             if len(cameras) == 1:
                 remarks += _remarks_on_plane(one, name)
@@ -343,12 +355,12 @@ def track_whisker(
     if options.whisker is None and not shape.whole:
         length = _length(fitter, shape, options)
         shape = lengthened(shape, length.value)
-        whisker = whisker_at_rest(shape, name, **options.properties)
+        whisker = whisker_at_rest(shape, name, **options.at_base)
     unfiltered, pose = _poses(fitter, shape, whisker, options)
     fit = fitter.fit(whisker, pose, on_head.shape[1])
     if length.sigma > 0.0:
         longer = lengthened(shape, length.value + _LONGER * length.sigma)
-        other = whisker_at_rest(longer, name, **options.properties)
+        other = whisker_at_rest(longer, name, **options.at_base)
         posed = _poses(fitter, longer, other, options)[1]
         further = fitter.fit(other, posed, on_head.shape[1])
         fit = with_length_unsure(fit, further, 1.0 / _LONGER)
@@ -373,7 +385,7 @@ def _at_rest(
             return _known_flat(curves, whisker, options.free)
         return known_rest(curves, whisker, options.free), whisker
     shape = rest_shape(curves, options.free, tips)
-    return shape, whisker_at_rest(shape, name, **options.properties)
+    return shape, whisker_at_rest(shape, name, **options.at_base)
 
 
 def _known_flat(curves: Array, whisker: Whisker, free: float) -> tuple[RestShape, Whisker]:
@@ -413,7 +425,7 @@ def _length(fitter: Fitter, shape: RestShape, options: TrackOptions) -> Length:
 
     def of(length: float) -> float:
         longer = lengthened(shape, length)
-        whisker = whisker_at_rest(longer, **options.properties)
+        whisker = whisker_at_rest(longer, **options.at_base)
         return cost(whisker, _poses(fitter, longer, whisker, options)[1])
 
     return likeliest_length(shape.length, of)
@@ -472,6 +484,25 @@ def remarks_on(
             "covariances."
         )
     return found
+
+
+def force_scale_sigma(whisker: Whisker, fur: float) -> float:
+    """Common relative error of all forces by what is not known of the fur over the base."""
+    at_edge, at_tip = whisker.radius(np.array([0.0, whisker.length]))
+    # Forces scale with the fourth power of the radius, which falls evenly along the whisker.
+    return float(4.0 * (1.0 - at_tip / at_edge) / whisker.length * _FUR_KNOWN * fur)
+
+
+def _remarks_on_fur(one: Tracked, fur: float, name: str) -> list[str]:
+    if fur == 0.0:
+        return []
+    percent = 100.0 * force_scale_sigma(one.whisker, fur)
+    hidden = f"{1e3 * fur:g} ± {1e3 * _FUR_KNOWN * fur:.2g} mm"
+    return [
+        f"{name}: {hidden} of its base are taken to be hidden by fur; what is not known of that is "
+        f"one error of all its forces and moments, {percent:.1f} % (standard deviation), which is "
+        "in no covariance. They are those where the fur ends."
+    ]
 
 
 def _remarks_on_plane(one: Tracked, name: str) -> list[str]:

@@ -256,10 +256,18 @@ def _swings(directions: Array, goal: Array) -> Array:
     return np.asarray(np.eye(3) + across + across @ across / nearness)
 
 
-def whisker_at_rest(shape: RestShape, name: str = "tracked", **properties: float) -> Whisker:
-    """Make a whisker of the rest shape."""
+def whisker_at_rest(
+    shape: RestShape, name: str = "tracked", hidden: float = 0.0, **properties: float
+) -> Whisker:
+    """Make a whisker of the rest shape, whose radii at its base are those before a hidden part."""
     noise = _SMOOTH * shape.noise
-    return Whisker.from_points(shape.points, noise=noise, name=name, **properties)  # type: ignore[arg-type]
+    whisker = Whisker.from_points(shape.points, noise=noise, name=name, **properties)  # type: ignore[arg-type]
+    if hidden == 0.0:
+        return whisker
+    at_base, at_tip = whisker.radius(np.array([0.0, whisker.length]))
+    share = hidden / (whisker.length + hidden)
+    edge = float(at_base + share * (at_tip - at_base))
+    return whisker.with_properties(base_radius=edge, tip_radius=float(at_tip))
 
 
 def aligned_lengths(curves: Array, spacing: float | None = None) -> tuple[float, Array]:

@@ -10,6 +10,7 @@ validation.
 
 import argparse
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import weight
@@ -19,6 +20,7 @@ from scipy.interpolate import RegularGridInterpolator
 
 import vibrissa as vb
 from vibrissa.contacts import bent_by_forces
+from vibrissa.simulation import Dynamics, facing_peg, measure, simulate, sweep_past
 
 SETS = ("Fx MB MD", "Fx FT FD Mx MB MD", "wrench")
 HEAD = (
@@ -134,6 +136,36 @@ def touching_twice(contact_map, apart, asked):
     return [f"two contacts {apart:g} L apart", remedy, *cells]
 
 
+def quick(contact_map, asked):
+    """A row: contacts of a whisker with mass, whisking past a peg; its mass is known to 15 %."""
+    whisker, true = contact_map.whisker, 0.85
+    usual = Dynamics()
+    dynamics = Dynamics(
+        density=tuple(true * value for value in usual.density), damping_ratio=0.12, step=2e-4
+    )
+    peg = facing_peg(whisker, 0.65, 1e-3)
+    motion = sweep_past(whisker, peg, 0.4, 1000.0, seed=asked.seed, frequency=5.0)
+    trial = simulate(whisker, motion, peg, dynamics=dynamics, nodes=9)
+    data = measure(trial, seed=asked.seed)
+    truth = trial["truth"].to_dataset().isel(whisker=0)
+    points = truth.contact_point_whisker.to_numpy()
+    arc = truth.arc_length.to_numpy()
+    resting = np.rint(2000 * np.nan_to_num(arc) / whisker.length).astype(int)
+    with np.errstate(invalid="ignore"):
+        turned = np.linalg.norm(points - whisker.centerline(2001)[resting], axis=1) / arc
+        kept = truth.in_contact.to_numpy().astype(bool) & (turned > DEFLECTED)
+    corrected = [vb.pipeline.with_signals(data, "sensor", dynamics=one) for one in (None, usual)]
+    cells = []
+    for using in SETS:
+        for signals in corrected:
+            found = vb.pipeline.estimates_of(signals, using, contact_maps=[contact_map])
+            one = found.isel(whisker=0)
+            both = one.contact_point_whisker.to_numpy(), one.covariance.to_numpy()
+            part = SimpleNamespace(point=both[0][kept], covariance=both[1][kept])
+            cells.append(scored(part, points[kept]))
+    return ["inertia", "inertia removed", *cells]
+
+
 def heavy(asked):
     """Rows of rods under their weight, held level."""
     for name, title in weight.NAMES.items():
@@ -170,6 +202,7 @@ def rows(contact_map, asked):
         yield remedied(name, remedy, contact_map, signals, truth, how)
     for apart in (0.05, 0.15):
         yield touching_twice(contact_map, apart, asked)
+    yield quick(contact_map, asked)
     yield from heavy(asked)
 
 

@@ -15,6 +15,7 @@ from vibrissa.certificates import (
     checker,
     load_certificate,
     outlook,
+    prove_witness,
 )
 from vibrissa.certificates.certificate import prepared
 from vibrissa.certificates.equations import enclosed
@@ -129,6 +130,25 @@ def test_a_certificate_is_made_and_shown_by_commands(theorem, tmp_path):
     shown = CliRunner().invoke(app, ["info", str(path)])
     assert "unique (proved)" in " ".join(shown.output.split())
     assert "0 undecided" in shown.output
+
+
+def test_witnesses_are_proved_and_other_pairs_are_not(curved):
+    found = vb.uniqueness(curved, ["FT FD MB"], ["all"], samples=64, resolution=False)
+    found = vb.identifiability.with_proved_witnesses(curved, found)
+    pair = found.isel(triplet=0, region=0, witness=0)
+    assert pair.witness_proved == 1
+    s, force = pair.witness_arc_length.values, pair.witness_contact_force.values
+    length = curved.whisker.length
+    whole = prove_witness(curved, "FT FD MB", s, force)
+    assert whole.proved
+    assert whole.separation == pytest.approx(float(pair.witness_separation) / length, abs=1e-4)
+    assert whole.reach < 1e-5
+    # The same contact twice; one whose force is beyond the fold; signals that fix no contact.
+    assert "same" in prove_witness(curved, "FT FD MB", s[[0, 0]], force[[0, 0]]).doubt
+    s, beyond = np.array([0.5, 0.5]) * length, np.array([[1.0, 0.0], [1.0, 0.0]])
+    beyond *= 3.0 * float(np.hypot(*force.T).max())
+    assert not prove_witness(curved, "FT FD MB", s, beyond).proved
+    assert not prove_witness(straight(1.0), "Fx MB MD", s, force).proved
 
 
 def test_boxes_cover_or_leave_a_hole():

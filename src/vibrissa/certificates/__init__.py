@@ -3,6 +3,7 @@
 from vibrissa.certificates.certificate import KIND, TRIPLET, Certificate, certify, load_certificate
 from vibrissa.certificates.checker import Checked, check_certificate
 from vibrissa.certificates.grid import Outlook, outlook
+from vibrissa.certificates.witness import Witness, prove_witness
 
 __all__ = [
     "KIND",
@@ -10,8 +11,10 @@ __all__ = [
     "Certificate",
     "Checked",
     "Outlook",
+    "Witness",
     "certify",
     "check_certificate",
     "load_certificate",
     "outlook",
+    "prove_witness",
 ]

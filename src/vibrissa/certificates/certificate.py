@@ -68,6 +68,24 @@ _SAVED_EVERY = 60.0
 Progress = Callable[[int, int], None]
 
 
+def enclosed_on(
+    tables: Conditions, rod: ExactRod, force: Bounds, boxes: Array, tolerance: float
+) -> tuple[Array, Array]:
+    """Enclose all conditions over boxes, with the relative widths: see `conditions_on`."""
+    alike = np.lexsort(boxes[..., 0].T[::-1])  # neighbours need similar steps
+    ordered, bound = np.ascontiguousarray(boxes[alike]), force.packed()
+    found = np.empty((len(boxes), len(tables.conditions), tables.unknowns + 3))
+    widths = np.empty((len(boxes), tables.unknowns))
+    share_out(
+        len(boxes),
+        lambda first, end: conditions_on(
+            tables, rod, bound, ordered, _ORDER, tolerance, found, widths, first, end
+        ),
+    )
+    back = np.argsort(alike)
+    return found[back], widths[back]
+
+
 @dataclass
 class Part:
     """One part of the domain and the boxes that cover it.
@@ -229,24 +247,11 @@ class Certificate:
             if self.straight:
                 self._tables[kind] = planar_conditions(fold=bool(kind))
             elif kind:
-                self._tables[kind] = spatial_point_conditions(rest=kind == "rest")
+                self._tables[kind] = spatial_point_conditions(kind)
             else:
                 self._tables[kind] = spatial_conditions(self.sign)
-        tables = self._tables[kind]
-        unknowns = tables.unknowns
-        found = np.empty((len(boxes), len(tables.conditions), unknowns + 3))
-        widths = np.empty((len(boxes), unknowns))
-        bound = self.bounds.packed()
-        alike = np.lexsort(boxes[..., 0].T[::-1])  # neighbours need similar steps
-        boxes = np.ascontiguousarray(boxes[alike])
-        share_out(
-            len(boxes),
-            lambda first, end: conditions_on(
-                tables, self.rod, bound, boxes, _ORDER, _TOLERANCE, found, widths, first, end
-            ),
-        )
-        back = np.argsort(alike)
-        return found[back][:, which], widths[back]
+        found, widths = enclosed_on(self._tables[kind], self.rod, self.bounds, boxes, _TOLERANCE)
+        return found[:, which], widths
 
     def probe(self) -> None:
         """Look for signs that are not certain at single contacts, so that boxes cannot help."""

@@ -227,26 +227,41 @@ def spatial_conditions(sign: float) -> Conditions:
     return _assembled(out, spatial_equations(False), middle, start, "Fx", wanted, 3)
 
 
-def spatial_point_conditions(rest: bool) -> Conditions:
-    """Conditions `SPATIAL_REST` of contacts near rest, or `SPATIAL_FOLD`."""
-    out = _spatial_load(rest)
+def spatial_point_conditions(kind: str) -> Conditions:
+    """Conditions `SPATIAL_REST` of contacts near rest, ``"rest"``, or `SPATIAL_FOLD`, ``"fold"``.
+
+    Of a ``"contact"``, with the force of contacts near rest: det ∂p/∂(s, f_y, f_z), positive where
+    it is stable; then F, M and p, and each of these by s, φ and ℓ.
+    """
+    out = _spatial_load(kind != "fold")
     middle = len(out.names)
     states = ("Fx", "Fy", "Fz", "Mx", "My", "Mz", "px", "py", "pz")
     out.given(*(f"{state}{by}" for by in ("", "_s", "_y", "_z") for state in states))
-    if rest:
+    wanted: tuple[str, ...] = ("beyond",)
+    if kind == "rest":
         for x in "xyz":
             out.add(ALGEBRAIC, f"along{x}", f"cos p{x}_y", f"sin p{x}_z")
             out.add(ALGEBRAIC, f"moved{x}", f"b0 along{x}")
         out.add(ALGEBRAIC, "allowed", "room s")
-        wanted = "inside"
-        out.add(ALGEBRAIC, wanted, "allowed allowed", *(f"-moved{x} moved{x}" for x in "xyz"))
+        wanted = ("inside",)
+        out.add(ALGEBRAIC, "inside", "allowed allowed", *(f"-moved{x} moved{x}" for x in "xyz"))
     else:
         for i, (a, b) in enumerate((("py", "pz"), ("pz", "px"), ("px", "py"))):
             out.add(ALGEBRAIC, f"area{i}", f"{a}_y {b}_z", f"-{b}_y {a}_z")
-        wanted = "beyond"
-        out.add(ALGEBRAIC, wanted, *(f"-{n}_s area{i}" for i, n in enumerate(("px", "py", "pz"))))
+        sign = "-" if kind == "fold" else ""
+        terms = (f"{sign}{n}_s area{i}" for i, n in enumerate(("px", "py", "pz")))
+        out.add(ALGEBRAIC, "beyond", *terms)
+    if kind == "contact":
+        out.add(ALGEBRAIC, "df", "db0 level")
+        wanted += states
+        for name in states:
+            out.add(ALGEBRAIC, f"{name}r", f"cos {name}_y", f"sin {name}_z")
+            out.add(ALGEBRAIC, f"{name}s", f"{name}_s", f"df {name}r")
+            out.add(ALGEBRAIC, f"{name}p", f"fy {name}_z", f"-fz {name}_y")
+            out.add(ALGEBRAIC, f"{name}l", f"b0 {name}r")
+            wanted += (f"{name}s", f"{name}p", f"{name}l")
     start = {1: "fy", 2: "fz", 19: "one", 29: "one"}
-    return _assembled(out, spatial_equations(True), middle, start, "Fx", (wanted,), 3)
+    return _assembled(out, spatial_equations(True), middle, start, "Fx", wanted, 3)
 
 
 @inlined_rigorous
@@ -312,11 +327,14 @@ def report(z: Array, row: int, lane: int, unknowns: int, out: Array) -> None:
 
 @inlined_rigorous
 def relative_widths(state: Array, states: int, lane: int, out: Array) -> None:
-    """Sum, over all vectors of states, of what each unknown changes over the vector's size."""
+    """Sum, over vectors of states, of what each unknown changes over the vector's size.
+
+    The vectors are those of the derivatives by the force, which change only as the rod turns.
+    """
     last = state.shape[1] - 1
     for a in range(out.size):
         out[a] = TINY
-        first = 0
+        first = 2 * states
         while first < state.shape[0]:
             end = min(first + 3, (first // states + 1) * states)
             change, size = 0.0, TINY
@@ -414,4 +432,6 @@ def conditions_on(
             if apart:
                 found[row + lane] = np.nan
             relative_widths(state, states, lane, widths[row + lane])
+            if unknowns == 3:  # the force turns with φ, also where the rod does not
+                widths[row + lane, 1] += 0.5 * (boxes[row + lane, 1, 1] - boxes[row + lane, 1, 0])
         row += number

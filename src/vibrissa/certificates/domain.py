@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
 
 # The fold is exceeded, and the cone undercut, by at least these shares.
-_BEYOND, _INSIDE = 2.5e-2, 4e-2
+_BEYOND, _INSIDE = 2.5e-2, 0.12
 _STATIONS, _BEARINGS = 40, 24
 
 

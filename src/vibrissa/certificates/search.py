@@ -17,6 +17,8 @@ _BATCH = 2048
 _MOST_HALVINGS = 3
 # Remainders fall at least with this power of a box's size.
 _REMAINDER = 4
+# Halvings of each unknown that make a box which can be enclosed.
+_INNER = 6
 _DEEPEST = 40
 
 Evaluate = Callable[[IntArray], tuple[Array, Array]]
@@ -103,10 +105,13 @@ def cover(
             return Cover(np.concatenate(done), np.concatenate([left, batch]), evaluated, bad)
         done.append(batch[certain])
         open_ = ~certain
-        # What could not be enclosed is halved where it is widest.
-        size = 2.0 ** (-batch[..., 0].astype(np.float64))
-        known = np.asarray(np.isfinite(found).all(axis=(1, 2)))
-        widths = np.where(known[:, None], widths, size) * free
+        lost = open_ & ~np.isfinite(found).all(axis=(1, 2))
+        if lost.any():  # what could not be enclosed shows near its middle where it is widest
+            inner = batch[lost] * [1, 2**_INNER] + [_INNER, 2 ** (_INNER - 1)]
+            near = evaluate(inner)[1]
+            size = 2.0 ** (-inner[..., 0].astype(np.float64))
+            widths[lost] = np.where(np.isfinite(near), near, size)
+        widths = widths * free
         left = np.concatenate([left, _halved(batch[open_], found[open_], widths[open_])])
     return Cover(np.concatenate(done), left, evaluated, none)
 

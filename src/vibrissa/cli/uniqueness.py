@@ -70,6 +70,10 @@ def uniqueness(
             certificate=certificate,
             progress=lambda done, total: tell("verdicts", done, total),
         )
+        if certificate is not None:
+            tell("witnesses", 0, 1)
+            found = vb.identifiability.with_proved_witnesses(contact_map, found)
+            bracket = vb.identifiability.cone_bracket(contact_map, certificate, samples)
         if network:
             found = vb.paper.with_network_errors(
                 contact_map, found, progress=lambda done, total: tell("networks", done, total)
@@ -80,10 +84,26 @@ def uniqueness(
     )
     if certificate is not None:
         say(f"\n{certificate.summary()}\nwrote {certify}")
+        _print_proofs(found, bracket)
     _print_witness(found)
     if target is not None:
         vb.identifiability.save_uniqueness(found, target)
         say(f"wrote {target}")
+
+
+def _print_proofs(found: Dataset, bracket: tuple[float, float]) -> None:
+    """What is certain: bounds on the critical cone, and the triplets with proved witnesses."""
+    low, high = np.rad2deg(bracket)
+    above = f" ≤ {high:.3g}° (certificate)" if np.isfinite(high) else ""
+    if low > 0.0 or above:
+        say(f"{low:.3g}° (witness, proved) ≤ critical cone of (Fx, MB, MD){above}")
+    over = ["region", "witness"]
+    there = found["witness_separation"].notnull().any(over).values
+    proved = (found["witness_proved"] == 1).any(over).values
+    for word, which in (("proved", there & proved), ("not proved", there & ~proved)):
+        if which.any():
+            names = [f"({t.replace(' ', ', ')})" for t in found["triplet"].values[which]]
+            say(f"not unique (witness), {word}: {', '.join(names)}")
 
 
 def _print_witness(found: Dataset) -> None:

@@ -1,6 +1,7 @@
 """Which signals locate a contact: witnesses, verdicts, critical cones, sensitivity."""
 
 from vibrissa.identifiability.cones import critical_cones
+from vibrissa.identifiability.proofs import cone_bracket, with_proved_witnesses
 from vibrissa.identifiability.sensitivity import best_triplet, sensitivity
 from vibrissa.identifiability.summary import (
     ENDINGS,
@@ -14,10 +15,12 @@ from vibrissa.identifiability.witness_pair import witness_pairs
 __all__ = [
     "ENDINGS",
     "best_triplet",
+    "cone_bracket",
     "critical_cones",
     "save_uniqueness",
     "sensitivity",
     "uniqueness",
     "verdict_table",
+    "with_proved_witnesses",
     "witness_pairs",
 ]

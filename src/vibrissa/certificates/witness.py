@@ -1,0 +1,225 @@
+"""Proofs that two contacts have the same signals: validated witnesses.
+
+The first contact ξ₁ = (s, φ, ℓ) is any, with the force f = (1/s - α)² ℓ. Of the second it is shown
+that a box X around it holds exactly one contact with the same three signals, by Krawczyk's test:
+with equations G(ξ₂) = 0, the middle x of X, its half widths ρ and any matrix Y,
+
+    |Y G(x)| + |1 - Y G'(X)| ρ < ρ    in each component.
+
+G compares F_x and M_x by their differences, magnitudes by their squares, and directions by the
+product of one with the other turned by 90°, and the sign of their scalar product. Enclosures are
+those of the certificates, so that the proof is about the continuous rod. Both contacts are stable
+if det ∂p/∂ξ is positive at every smaller force of the same s and φ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from vibrissa.certificates.certificate import enclosed_on
+from vibrissa.certificates.conditions import DEGREES, Conditions, spatial_point_conditions
+from vibrissa.certificates.domain import Bounds
+from vibrissa.certificates.equations import ExactRod, exact_rod
+from vibrissa.certificates.search import bounds, cover
+from vibrissa.numerics import Array, IntArray
+
+if TYPE_CHECKING:
+    from vibrissa.contacts import ContactMap
+
+# Share of the states to which Taylor coefficients fall: a witness needs narrow enclosures.
+_TOLERANCE = 1e-12
+# Newton steps that bring the second contact to the signals of the first; boxes that are tried.
+_STEPS, _TRIALS = 6, 8
+# What rounding adds to a sum of a few products of centres and radii, over its size.
+_LOST = 1e-14
+# Boxes in which the way from rest may be divided.
+_MOST_BOXES = 4096
+_PAIRS = {"FT": (1, 2), "FD": (1, 2), "MB": (4, 5), "MD": (4, 5)}
+_SINGLE = {"Fx": 0, "Mx": 3}
+
+
+class Witness(NamedTuple):
+    """What is proved of two contacts.
+
+    Attributes
+    ----------
+    proved : bool
+        Whether two stable contacts certainly have the same signals, apart by more than nothing.
+    reach : float
+        Distance in arc length within which the second contact is of where it is stated, over L.
+    separation : float
+        Least distance of the two contact points, over L.
+    doubt : str
+        What could not be shown; empty if all was.
+    """
+
+    proved: bool
+    reach: float
+    separation: float
+    doubt: str
+
+
+class _Range(NamedTuple):
+    """Centres and radii of numbers."""
+
+    centre: Array
+    radius: Array
+
+    def __add__(self, other: _Range) -> _Range:  # type: ignore[override]
+        total = self.centre + other.centre
+        radius = self.radius + other.radius + _LOST * np.abs(total)
+        return _Range(total, radius * (1.0 + _LOST))
+
+    def __neg__(self) -> _Range:
+        return _Range(-self.centre, self.radius)
+
+    def __mul__(self, other: _Range) -> _Range:  # type: ignore[override]
+        a, b = np.abs(self.centre), np.abs(other.centre)
+        radius = a * other.radius + b * self.radius + self.radius * other.radius
+        return _Range(self.centre * other.centre, (radius + _LOST * a * b) * (1.0 + _LOST))
+
+    def at(self, i: int) -> _Range:
+        """Component of a vector, or row of a matrix."""
+        return _Range(self.centre[i], self.radius[i])
+
+
+def prove_witness(
+    contact_map: ContactMap,
+    triplet: str | Sequence[str],
+    arc_length: Sequence[float],
+    force: Sequence[Sequence[float]],
+) -> Witness:
+    """Prove that two contacts near given ones have the same three signals.
+
+    Parameters
+    ----------
+    contact_map : ContactMap
+        Map of the whisker; of a rigid base.
+    triplet : str or sequence of str
+        Names of the three signals, such as ``"Fx MB MD"``.
+    arc_length : (2,) sequence of float
+        Arc lengths of the two contacts, m.
+    force : (2, 2) sequence of float
+        Forces across the whisker along d1 and d2, N. The pair that is proved is that of the first
+        contact, as near to the given one as floating-point numbers are, and one near the second.
+
+    Returns
+    -------
+    Witness
+        What is proved.
+    """
+    names = triplet.split() if isinstance(triplet, str) else list(triplet)
+    d = contact_map.chart.discretization
+    rod, whisker = exact_rod(contact_map.whisker), contact_map.whisker
+    alpha = 1.0 - whisker.tip_radius / whisker.base_radius
+    factors = np.zeros((5, DEGREES))
+    factors[0, 0] = 1.0
+    scene = _Scene(spatial_point_conditions("contact"), rod, Bounds(alpha, factors, 0.0))
+    s = np.asarray(arc_length, dtype=np.float64) / d.length
+    across = np.asarray(force, dtype=np.float64) / d.force
+    level = np.hypot(*across.T) / (1.0 / s - alpha) ** 2
+    first, second = np.stack([s, np.arctan2(across[:, 1], across[:, 0]), level], axis=1)
+    one = scene.at(np.stack([first, first], axis=-1))
+    if not np.isfinite(one.centre).all():
+        return Witness(False, np.inf, 0.0, "the first contact could not be enclosed")
+    for _ in range(_STEPS):
+        gap, slope = _equations(names, one, scene.at(np.stack([second, second], axis=-1)))
+        move = np.linalg.lstsq(slope.centre, gap.centre, rcond=1e-10)[0]
+        if not np.isfinite(move).all():
+            return Witness(False, np.inf, 0.0, "the second contact could not be enclosed")
+        second = second - move
+    two = scene.at(np.stack([second, second], axis=-1))
+    box = _unique_box(scene, names, one, two, second)
+    if box is None:
+        doubt = "no box around the second contact passes Krawczyk's test"
+        return Witness(False, np.inf, 0.0, doubt)
+    apart = one.at(slice(6, 9)) + -scene.at(box).at(slice(6, 9))  # type: ignore[arg-type]
+    least = float(np.linalg.norm(np.maximum(np.abs(apart.centre) - apart.radius, 0.0)) * 0.999999)
+    doubt = "" if least > 0.0 else "the two contacts may be the same"
+    for contact in (np.stack([first, first], axis=-1), box):
+        if not scene.stable(contact):
+            doubt = doubt or "that both contacts are stable could not be shown"
+    return Witness(not doubt, float(np.ptp(box[0])), least, doubt)
+
+
+class _Scene(NamedTuple):
+    """The whisker and what is computed on boxes of contacts."""
+
+    tables: Conditions
+    rod: ExactRod
+    force: Bounds
+
+    def at(self, box: Array) -> _Range:
+        """F, M and p, and these by s, φ and ℓ (36,), over a box (3, 2)."""
+        found = enclosed_on(self.tables, self.rod, self.force, box[None], _TOLERANCE)[0][0]
+        return _Range(found[1:, 0], found[1:, 1:].sum(axis=-1) * (1.0 + _LOST))
+
+    def stable(self, box: Array) -> bool:
+        """Whether det ∂p/∂ξ is positive from rest to a contact."""
+        domain = box.copy()
+        domain[2, 0] = 0.0
+        start = np.zeros((1, 3, 2), dtype=np.int64)
+
+        def evaluate(boxes: IntArray) -> tuple[Array, Array]:
+            inside = bounds(boxes, domain, domain[0])
+            found, widths = enclosed_on(self.tables, self.rod, self.force, inside, _TOLERANCE)
+            return found[:, :1], widths
+
+        found = cover(evaluate, start, _MOST_BOXES, np.array([False, False, True]))
+        return not len(found.undecided) and not len(found.refuted)
+
+
+def _equations(names: list[str], one: _Range, two: _Range) -> tuple[_Range, _Range]:
+    """Differences of signals (3,) and their derivatives by the second contact (3, 3)."""
+    slope = _Range(two.centre[9:].reshape(9, 3), two.radius[9:].reshape(9, 3))
+    gaps, slopes = [], []
+    for name in names:
+        if name in _SINGLE:
+            i = _SINGLE[name]
+            gaps.append(two.at(i) + -one.at(i))
+            slopes.append(slope.at(i))
+            continue
+        i, j = _PAIRS[name]
+        a, b = (two.at(i), two.at(j)) if name in ("FT", "MB") else (-one.at(j), one.at(i))
+        x, y = two.at(i), two.at(j)
+        value = a * x + b * y
+        if name in ("FT", "MB"):
+            value = value + -(one.at(i) * one.at(i) + one.at(j) * one.at(j))
+            a, b = a + a, b + b
+        gaps.append(value)
+        slopes.append(a * slope.at(i) + b * slope.at(j))
+    parts = zip(*gaps, strict=True), zip(*slopes, strict=True)
+    gap, by = (_Range(*(np.array(part) for part in both)) for both in parts)
+    return gap, by
+
+
+def _unique_box(
+    scene: _Scene, names: list[str], one: _Range, two: _Range, second: Array
+) -> Array | None:
+    """Box (3, 2) that holds exactly one contact with the signals of the first; None if unproved."""
+    gap, slope = _equations(names, one, two)
+    if np.linalg.matrix_rank(slope.centre) < len(names):
+        return None
+    inverse = np.linalg.inv(slope.centre)
+    off = np.abs(inverse) @ (np.abs(gap.centre) + gap.radius) * (1.0 + 1e-12)
+    half = 2.0 * off + 1e-15 * np.abs(second)
+    for _ in range(_TRIALS):
+        box = np.stack([second - half, second + half], axis=-1)
+        over = scene.at(box)
+        _, slope = _equations(names, one, over)
+        defect = np.abs(np.eye(3) - inverse @ slope.centre)
+        rounded = 1e-13 * np.abs(inverse) @ np.abs(slope.centre)
+        spread = np.abs(inverse) @ slope.radius + defect + rounded
+        need = (off + spread @ half) * (1.0 + 1e-9)
+        # The box's ends are rounded, by less than this.
+        if (need < half - 1e-15 * np.abs(second)).all():
+            pairs = [_PAIRS[name] for name in names if name in ("FD", "MD")]
+            along = [one.at(i) * over.at(i) + one.at(j) * over.at(j) for i, j in pairs]
+            return box if all(a.centre > a.radius for a in along) else None
+        half = 1.5 * np.maximum(need, half)
+        if not np.isfinite(half).all():
+            return None
+    return None

@@ -61,6 +61,7 @@ class _Drawn(NamedTuple):
     forces: Array
     colours: list[str]
     labels: Sequence[str]
+    dashes: Sequence[Any] = ()
 
 
 def bent_views(
@@ -160,9 +161,10 @@ def _colours(count: int) -> list[str]:
     return [mpl.colors.to_hex(shade) for shade in shades]
 
 
-def _limits(drawn: _Drawn, extent: float) -> Array:
-    """Limits (3, 2), mm, that hold whiskers and arrows."""
-    parts = (drawn.rest, drawn.lines.reshape(-1, 3), drawn.points, drawn.points - drawn.arrows)
+def _limits(drawn: _Drawn, extent: float, tail: float = 1.0) -> Array:
+    """Limits (3, 2), mm, that hold whiskers and arrows, these so many times as long."""
+    ends = drawn.points - tail * drawn.arrows
+    parts = (drawn.rest, drawn.lines.reshape(-1, 3), drawn.points, ends)
     everything = np.concatenate(parts)
     return limits_around(everything, 0.03 * extent, _NARROWEST * extent)
 
@@ -220,7 +222,10 @@ def _draw(axes: Axes, drawn: _Drawn, j: int) -> None:
     axes.plot(rest[:, 0], rest[:, j], color=_REST, linewidth=1.6, solid_capstyle="round")
     for i, (line, colour) in enumerate(zip(drawn.lines, drawn.colours, strict=True)):
         label = drawn.labels[i] if drawn.labels else None
-        axes.plot(line[:, 0], line[:, j], color=colour, linewidth=1.1, label=label)
+        dashes = drawn.dashes[i] if drawn.dashes else "-"
+        axes.plot(
+            line[:, 0], line[:, j], color=colour, linestyle=dashes, linewidth=1.1, label=label
+        )
         point, arrow = drawn.points[i], drawn.arrows[i]
         if np.isfinite(arrow).all():
             ends = (point - arrow)[[0, j]], point[[0, j]]
@@ -265,7 +270,8 @@ def witness_pair(witness: xr.Dataset, *, width: Width = "double") -> Figure:
     """
     triplet = _checked_pair(witness)
     extent = float(np.ptp(to_display("centerline", witness["rest"].values), axis=0).max())
-    limits = _pair_limits(witness, extent)
+    drawn = _pair(witness, extent)
+    limits = _limits(drawn, extent, 1.3)  # with the letters at the arrows' tails
     span = np.ptp(limits, axis=1)
     page = page_width(width)
     abreast = width == "double"
@@ -281,7 +287,7 @@ def witness_pair(witness: xr.Dataset, *, width: Width = "double") -> Figure:
         def place(low: float, j: int) -> Axes:
             box = (left, low, scale * span[0], scale * span[j])
             axes = box_axes(figure, box, xlim=limits[0], ylim=limits[j])
-            _draw_pair(axes, witness, j, extent)
+            _draw(axes, drawn, j)
             axes.set_ylabel(axis_label("xyz"[j]))
             few = max(3, round(scale * span[j] / 10.0))
             axes.yaxis.set_major_locator(MaxNLocator(few, integer=True))
@@ -291,13 +297,13 @@ def witness_pair(witness: xr.Dataset, *, width: Width = "double") -> Figure:
         above = place(shift + bottom + scale * span[2] + gap, 1)
         above.tick_params(labelbottom=False)
         side.set_xlabel(axis_label("x"))
-        points = to_display(
-            "contact_point", witness["contact_point"].transpose(..., "space").values
-        )
+        tails = drawn.points - 1.2 * drawn.arrows
+        for tail, name, colour in zip(tails, _NAMES, _PAIR_COLOURS, strict=True):
+            above.text(tail[0], tail[1], name, color=colour, fontweight="bold", **_CENTRED)
+        apart = np.linalg.norm(drawn.points[1] - drawn.points[0])
         conclude(
             figure,
-            f"Two contacts {np.linalg.norm(points[1] - points[0]):.1f} mm apart have the same "
-            f"({triplet_label(' '.join(triplet))})",
+            f"Two contacts {apart:.1f} mm apart have the same ({triplet_label(' '.join(triplet))})",
         )
         start = left + scale * span[0] + 8.0 if abreast else 3.0
         box = (
@@ -335,38 +341,20 @@ def _sizes(witness: xr.Dataset) -> Array:
     return np.asarray(np.linalg.norm(force, axis=1))
 
 
-def _arrows(witness: xr.Dataset, extent: float) -> Array:
-    """Forces (pair, space) as lengths in mm."""
-    force = witness["force"].transpose("pair", "space").values
-    return np.asarray(_PAIR_ARROW * extent * force / _sizes(witness).max())
-
-
-def _pair_limits(witness: xr.Dataset, extent: float) -> Array:
-    """Limits (3, 2) that hold whiskers and arrows."""
-    lines = to_display("centerline", witness["centerline"].transpose(..., "space").values)
-    rest = to_display("centerline", witness["rest"].transpose(..., "space").values)
-    points = to_display("contact_point", witness["contact_point"].transpose(..., "space").values)
-    ends = points - 1.3 * _arrows(witness, extent)  # with the letters at their tails
-    everything = np.concatenate([lines.reshape(-1, 3), rest, points, ends])
-    return limits_around(everything, 0.03 * extent, _NARROWEST * extent)
-
-
-def _draw_pair(axes: Axes, witness: xr.Dataset, j: int, extent: float) -> None:
-    """The resting and the two bent whiskers, seen along y or z."""
-    rest = to_display("centerline", witness["rest"].transpose("node", "space").values)
-    axes.plot(rest[:, 0], rest[:, j], color="#c4c4c4", linewidth=1.6, solid_capstyle="round")
-    arrows = _arrows(witness, extent)
-    for i, (colour, dashes, name) in enumerate(zip(_PAIR_COLOURS, _DASHES, _NAMES, strict=True)):
-        one = witness.isel(pair=i)
-        line = to_display("centerline", one["centerline"].transpose("node", "space").values)
-        point = to_display("contact_point", one["contact_point"].values)
-        axes.plot(line[:, 0], line[:, j], color=colour, linestyle=dashes, linewidth=1.2)
-        start = point - arrows[i]
-        force_arrow(axes, start[[0, j]], point[[0, j]], colour, 1.1)
-        axes.plot(point[0], point[j], "o", color=colour, markersize=2.6, zorder=5)
-        if j == 1:
-            tail = start - 0.2 * arrows[i]
-            axes.text(tail[0], tail[1], name, color=colour, fontweight="bold", **_CENTRED)
+def _pair(witness: xr.Dataset, extent: float) -> _Drawn:
+    """The two whiskers with their contacts and forces."""
+    sizes, force = _sizes(witness), witness["force"].transpose("pair", "space").values
+    lines = witness["centerline"].transpose("pair", "node", "space").values
+    return _Drawn(
+        to_display("centerline", witness["rest"].transpose("node", "space").values),
+        to_display("centerline", lines),
+        to_display("contact_point", witness["contact_point"].transpose("pair", "space").values),
+        _PAIR_ARROW * extent * force / sizes.max(),
+        to_display("force", sizes),
+        list(_PAIR_COLOURS),
+        (),
+        _DASHES,
+    )
 
 
 def _table(

@@ -126,6 +126,11 @@ def test_what_is_missing_or_wrong(whisker):
     found = vb.second_contact(whisker, force, moment, noise=NOISE)
     assert np.flatnonzero(np.isnan(found.one_contact)).tolist() == [3, 5, 7]
     assert not found.second_contact[[3, 5, 7]].any()
+    alone = vb.second_contact(whisker, force[0], moment[0], noise=NOISE)
+    assert alone.one_contact == found.one_contact[0]
+    shape = {"centerline": line[:2], "centerline_sigma": 2e-5}
+    absurd = vb.second_contact(whisker, 1e5 * force[:2], moment[:2], noise=NOISE, **shape)
+    assert absurd.second_contact.all()
     wrong = (
         ({"friction": -1.0}, "friction"),
         ({"false_alarms": 0.0}, "false_alarms"),

@@ -28,15 +28,8 @@ from scipy.special import chdtrc, chdtri
 
 from vibrissa.contacts.channels import WRENCH
 from vibrissa.contacts.least_squares import Fits, fit
-from vibrissa.contacts.noise import (
-    Noise,
-    SensorNoise,
-    common_covariance,
-    common_errors,
-    scaled_errors,
-    whitening,
-)
-from vibrissa.contacts.wrench import PROXIMAL, estimate_components
+from vibrissa.contacts.noise import Noise, SensorNoise, common_errors
+from vibrissa.contacts.wrench import PROXIMAL, estimate_components, wrench_weights
 from vibrissa.deferred import xr
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.quantities import attributes
@@ -64,6 +57,7 @@ _STEP, _ROUNDS = 1e-4, 10
 _LONGEST = 0.1
 # A residual of what has no meaning, as of a force that winds the whisker up.
 _LOST = 1e6
+_SOME = np.array([0.5, 0.0, 0.1, 0.0])
 
 
 class Bent(NamedTuple):
@@ -350,23 +344,13 @@ class _Test:
     ) -> tuple[Array, IntArray, Array]:
         """χ², degrees of freedom and contact points of measured wrenches, SI units."""
         flat = wrench / self.scale
-        weights = self._weights(flat)
+        weights = wrench_weights(self.sensor, self.d, flat)
         fits = self._fitted(wrench, flat, weights)
         left = (np.abs(weights).max(axis=2) > 0.0).sum(axis=1) - len(self.free)
         degrees = left + (1 if self.friction > 0.0 else 0)
         if lines is None:
             return fits.misfits, degrees, fits.values[:, 3:]
         return self._with_shapes(flat, weights, fits.contacts, *lines)
-
-    def _weights(self, flat: Array) -> Array:
-        if self.sensor.wrench is not None:
-            covariance = self.sensor.wrench / np.outer(self.scale, self.scale)
-        else:
-            assert self.sensor.deviations is not None
-            own = np.array([self.sensor.deviations[name] for name in WRENCH]) / self.scale
-            covariance = np.diag(own**2)
-        errors = scaled_errors(self.sensor.errors, self.d.force, self.d.moment)
-        return whitening(covariance + common_covariance(errors, np.eye(6), flat))
 
     def _fitted(self, wrench: Array, flat: Array, weights: Array) -> Fits:
         """Contacts of least χ² with the prior of friction."""
@@ -426,7 +410,8 @@ class _Test:
     ) -> tuple[Array, IntArray, Array]:
         """χ² of the directions that a second contact moves, with centrelines."""
         measured = _Measured(self.whisker, flat, weights, lines, sigma, self.friction)
-        x, residual, slopes = self._joint(measured, x.copy())
+        # A wrench that no contact was found for is fitted from some contact.
+        x, residual, slopes = self._joint(measured, np.where(np.isfinite(x), x, _SOME))
         basis, size, _ = np.linalg.svd(slopes, full_matrices=False)
         basis = basis * (size > 1e-9 * size[:, :1])[:, None, :]
         second = measured.by_second(x)

@@ -198,10 +198,8 @@ def _located(
     if sensor is None:
         weights = whitening(trusted(wrenches[rows]))
     else:
-        covariance = _covariance(sensor) / np.outer(scale, scale)
-        scaled = scaled_errors(sensor.errors, d.force, d.moment)
-        weights = whitening(covariance + common_covariance(scaled, np.eye(6), wrenches[rows]))
-        degrees = rank(covariance) - _UNKNOWNS
+        weights = wrench_weights(sensor, d, wrenches[rows])
+        degrees = rank(_covariance(sensor) / np.outer(scale, scale)) - _UNKNOWNS
     limit = explained(degrees)
     solved = _solve(discretize(whisker, _COARSE), d, wrenches[rows], weights, limit)
     found, lost = _candidates(solved), np.zeros(rows.size, np.bool_)
@@ -229,6 +227,14 @@ def _covariance(sensor: SensorNoise) -> Array:
         return sensor.wrench
     assert sensor.deviations is not None
     return np.diag([sensor.deviations[name] ** 2 for name in WRENCH])
+
+
+def wrench_weights(sensor: SensorNoise, d: Discretization, wrenches: Array) -> Array:
+    """Weights (n, 6, 6) of wrenches by noise and shared errors, non-dimensional."""
+    scale = np.repeat([d.force, d.moment], 3)
+    scaled = scaled_errors(sensor.errors, d.force, d.moment)
+    shared = common_covariance(scaled, np.eye(6), wrenches)
+    return whitening(_covariance(sensor) / np.outer(scale, scale) + shared)
 
 
 def _solve(

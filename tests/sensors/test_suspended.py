@@ -239,10 +239,28 @@ def test_drift_between_recordings_is_in_the_covariance():
 
 def test_with_many_touches_a_process_takes_what_the_rod_leaves():
     at = points(110)
-    found = calibrate_suspension(WIRE, at, TRUE.read(at, seed=3)[0], drift=[1.0, 2.0, 3.0])
+    readings = TRUE.read(at, seed=3)[0]
+    found = calibrate_suspension(WIRE, at, readings, drift=[1.0, 2.0, 3.0], free=5)
     assert len(found.names) == 5
     assert found.sensor.residual is not None
     np.testing.assert_array_equal(found.sensor.drift, [1.0, 2.0, 3.0])
+
+
+def test_the_pose_is_free_where_the_base_is_not_where_it_is_stated():
+    """Chosen by regions that are left out; the readings elsewhere are then predicted better."""
+    at = points(110)
+    readings = TRUE.read(at, seed=3)[0]
+    moved = replace(WIRE, pose=Pose(np.eye(3), [0.0, 1.0e-3, 0.5e-3]))
+    found = calibrate_suspension(moved, at, readings, base_sigma=1e-3)
+    assert "base y / L" in found.names
+    others = points(60, seed=9)
+    expected = TRUE.read(others)[0]
+    fixed = calibrate_suspension(moved, at, readings, base_sigma=1e-3, free=2)
+
+    def error(calibration):
+        return np.sqrt(np.nanmean((calibration.sensor.read(others)[0] - expected) ** 2))
+
+    assert error(found) < 0.6 * error(fixed)
 
 
 STAGE = """

@@ -10,8 +10,9 @@ where there are touches enough.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,15 +29,20 @@ if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
 
 FEWEST, SOME, PLENTY = 20, 40, 100
-"""Touches that are needed, above which pivot and pose are free, and from which on there is a
-Gaussian process."""
+"""Touches that are needed, above which more than the compliances may be free, and from which on
+there is a Gaussian process."""
 
-PIVOTED, POSED = 5, 11
-"""Mechanical unknowns up to the pivot, and up to the pose of the base.
+CHOICES = (2, 5, 11)
+"""Mechanical unknowns that may be free: the compliances; the pivot too; and the pose of the base.
 
-A Gaussian process explains what pose, curvature, taper and friction would. Where many touches
-determine these too, they take values that no wire has, and mislead outside the touches.
+Chosen are those that predict whole regions of touches which were left out: what neighbours share,
+and unknowns take up that the wire does not have, misleads there. Single touches that are left out
+do not show it, for they have neighbours. Below `PLENTY` too few would be left to judge by, and
+no process takes up what is left: the pose is free. Curvature, taper and friction mislead more than
+they help.
 """
+_REGIONS, _ENOUGH_TO_CHOOSE = 5, 300
+"""Regions that are left out in turn, and touches that the choice is made with at most."""
 
 _RATIOS = np.logspace(-6, 1, 15)
 """Variances of the noise over those of the (scaled) weights that are tried."""
@@ -140,8 +146,9 @@ def calibrate_suspension(
         Standard deviation of what readings change by from one recording to the next.
     free : int, optional
         Number of mechanical unknowns that are free, 2 to 19; by default the two compliances up to
-        40 touches, with pivot and pose of the base 11 below 100, and with the pivot 5 from there
-        on, where a Gaussian process explains what is left.
+        40 touches, and with pivot and pose of the base 11 below 100. From there on a Gaussian
+        process explains what is left, and those of 2, 5 (with the pivot) and 11 are free that
+        predict regions of touches best which are left out of the fit.
 
     Returns
     -------
@@ -169,13 +176,39 @@ def calibrate_suspension(
     if idle:
         raise ValueError(f"{', '.join(idle)} read the same at all touches")
     unknowns = _unknowns(whisker.length, base_sigma)
-    enough = int(known.sum())
-    number = free or (2 if enough <= SOME else POSED if enough < PLENTY else PIVOTED)
+    number = free or _chosen(whisker, p[known], y[known] - zero, unknowns)
     if not 2 <= number <= len(unknowns):
         raise ValueError(f"free is {free}; 2 to {len(unknowns)} mechanical unknowns can be free")
     problem = _Problem(whisker, p[known], y[known] - zero, unknowns[:number])
     found = problem.solved(names, zero, np.asarray(known))
     return replace(found, sensor=replace(found.sensor, drift=drift))
+
+
+def _chosen(whisker: Whisker, points: Array, readings: Array, unknowns: tuple[Unknown, ...]) -> int:
+    """Number of unknowns that predicts regions best which are left out."""
+    if len(points) < PLENTY:
+        return CHOICES[0] if len(points) <= SOME else CHOICES[-1]
+    from scipy.cluster.vq import kmeans2  # imports much that nothing else needs
+
+    kept = np.random.default_rng(0).permutation(len(points))[:_ENOUGH_TO_CHOOSE]
+    points, readings = points[kept], readings[kept]
+    region = kmeans2(points / np.abs(points).max(), _REGIONS, seed=0, minit="++")[1]
+    spread = readings.std(axis=0)
+    start = _Problem(whisker, points, readings, unknowns[: CHOICES[0]]).minimise()[0].values
+    misses = []
+    for number in CHOICES:
+        miss = np.ones_like(readings)  # where nothing is predicted: as bad as their mean
+        for one in range(_REGIONS):
+            out = region == one
+            if (~out).sum() < FEWEST:
+                continue
+            problem = _Problem(whisker, points[~out], readings[~out], unknowns[:number])
+            names = ("",) * spread.size
+            fit = problem.solved(names, 0.0 * spread, np.ones(len(problem.points), bool), [start])
+            found, _ = fit.sensor.read(points[out])
+            miss[out] = np.nan_to_num((found - readings[out]) / spread, nan=1.0)
+        misses.append((miss**2).mean())
+    return CHOICES[int(np.argmin(misses))]
 
 
 class _State(NamedTuple):
@@ -266,10 +299,10 @@ class _Problem:
             out.append(((change - q @ (q.T @ change)) / self.noise).ravel())
         return np.array(out).T
 
-    def minimise(self) -> tuple[_State, Array]:
-        """Least cost from the best start, and the derivatives there."""
+    def minimise(self, starts: Sequence[Any] = _STARTS) -> tuple[_State, Array]:
+        """Least cost from the best start of the compliances, and the derivatives there."""
         p = len(self.unknowns)
-        begin = [np.append(pair, np.zeros(p - 2)) for pair in _STARTS]
+        begin = [np.append(pair, np.zeros(p - 2)) for pair in starts]
         at = min((self.state(x, None) for x in begin), key=lambda one: one.cost)
         prior = np.diag(1.0 / self.sigma)
         damping = 1e-3
@@ -306,9 +339,15 @@ class _Problem:
         out = at.fit.residuals[at.ok] / np.maximum(1.0 - free, 0.1)
         return np.asarray(np.sqrt((out**2).mean(axis=0)))
 
-    def solved(self, names: tuple[str, ...], rest: Array, known: AnyArray) -> SuspensionCalibration:
+    def solved(
+        self,
+        names: tuple[str, ...],
+        rest: Array,
+        known: AnyArray,
+        starts: Sequence[Any] = _STARTS,
+    ) -> SuspensionCalibration:
         """Fit, and describe the result."""
-        at, jacobian = self.minimise()
+        at, jacobian = self.minimise(starts)
         noise, spread = self.left(at), np.diag(1.0 / self.sigma**2)
         covariance = np.linalg.inv(jacobian.T @ jacobian + spread)
         sigma = np.sqrt(np.diag(covariance))

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 import vibrissa as vb
@@ -120,6 +121,47 @@ def test_an_answer_beside_the_map_is_the_contact_of_least_misfit(gamma_map, besi
     # Size and direction of M are fitted as components: the same to second order in the noise.
     np.testing.assert_allclose(own, found.chi_squared[moved], rtol=1e-2)
     assert (own <= 1.01 * misfit(vb.base_signals(true.force, true.moment)) + 1e-3).all()
+
+
+def test_an_answer_in_a_bent_valley_is_the_contact_of_least_misfit(gamma_map, rng):
+    """Of light contacts that noise has carried out of T(Ω); SciPy, confined to Ω, gains nothing."""
+    chart = gamma_map.chart
+    d, sigma = chart.discretization, 1e-2 * SIGMA
+    force, moment, _ = contacts_of(gamma_map, 0.0, 0.02, 150, rng)
+    force, moment = noisy_wrenches(force, moment, rng, sigma)
+    found = gamma_map.estimate(vb.base_signals(force, moment), "Fx MB MD", np.diag(sigma**2))
+    moved = np.flatnonzero(found.chi_squared > 1e-3)[:30]
+    assert moved.size == 30
+    unit = np.array([d.force, d.moment, d.moment])
+
+    def residuals(z, row):
+        s, psi, load = z
+        place = np.array([[s, np.cos(psi), np.sin(psi)]])
+        fy, fz = load * fold_forces(chart.fold, place)[0] * place[0, 1:]
+        value = solve_forces(d, np.array([[s, 0.0, fy, fz]]))[0][0]
+        own = np.append(value[0], np.cross(value[3:], value[:3])[1:]) * unit
+        return (own - np.append(force[row, 0], moment[row, 1:])) / sigma[[0, 3, 3]]
+
+    for row in moved:
+        s, (fy, fz) = found.arc_length[row] / d.length, found.contact_force[row, 1:] / d.force
+        psi = np.arctan2(fz, fy)
+        fold = fold_forces(chart.fold, np.array([[s, np.cos(psi), np.sin(psi)]]))[0]
+        start = np.array([min(s, 1.0 - 1e-9), psi, min(np.hypot(fy, fz) / fold, 1.0 - 1e-9)])
+        low, high = [chart.proximal - 1e-6, -np.inf, 0.0], [1.0, np.inf, 1.0]
+        best = least_squares(residuals, start, bounds=(low, high), x_scale="jac", args=(row,))
+        assert found.chi_squared[row] < 2.0 * best.cost + 0.02
+
+
+def test_what_is_seen_at_nodes_is_within_the_bounds_of_their_block(gamma_map):
+    of = vb.Estimator(
+        gamma_map, "Fx FD MD", dict.fromkeys(("Fx", "FD", "MD"), 1e-3)
+    ).readout.searched
+    block = np.repeat(np.arange(of.blocks.size - 1), np.diff(of.blocks))
+    assert of.blocks[-1] == of.seen.shape[1] == np.unique(of.contacts, axis=0).shape[0]
+    away = of.seen - of.extent[0][:, block]
+    away -= 2.0 * np.pi * np.rint(away * of.turns[:, None])
+    assert (np.abs(away) <= of.extent[1][:, block] + 1e-9).all()
+    assert np.median(of.extent[1], axis=1).max() < 0.5
 
 
 def test_probabilities_are_how_often_candidates_are_true(gamma_map, rng):

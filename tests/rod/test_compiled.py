@@ -63,6 +63,32 @@ def test_what_is_compiled_is_said_with_the_verb():
     assert line.startswith("vibrissa: compiling kernels for `estimate` (once for this installation")
 
 
+def test_a_kernel_is_compiled_within_those_that_call_it():
+    """Not by itself too, unless Python calls it."""
+    run(
+        """
+        from vibrissa.numerics.compiled import inlined, kernel
+
+        @inlined
+        def square(x):
+            return x * x
+
+        @kernel
+        def inner(x, n):
+            return square(x) + n
+
+        @kernel
+        def outer(x):
+            return inner(x, 1) + inner(x, 2)
+
+        assert outer(3.0) == 21.0
+        assert not inner.overloads
+        assert len(inner.part.overloads) == 1  # for both constants
+        assert inner(3.0, 1) == 10.0
+        """
+    )
+
+
 SQUARE = """
 import resource, sys
 

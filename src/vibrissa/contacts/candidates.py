@@ -15,7 +15,7 @@ import numpy as np
 
 from vibrissa.contacts.contacts import MOST_CANDIDATES, Candidates
 from vibrissa.contacts.inversion import PARTS, invert_rows, nearest_of
-from vibrissa.contacts.least_squares import Fits, channel_equations, fit_rows
+from vibrissa.contacts.least_squares import Fits, channel_equations, fit_rows, same_contact
 from vibrissa.contacts.noise import INDISTINCT
 from vibrissa.contacts.weighing import Weighing, weigh
 from vibrissa.numerics import Array, IntArray, copy, inlined, kernel
@@ -43,8 +43,6 @@ _UNIQUE, _AMBIGUOUS = int(Status.UNIQUE), int(Status.AMBIGUOUS)
 _OUTSIDE, _FRICTION = int(Status.OUTSIDE_MAP), int(Status.NOT_FRICTIONLESS)
 #: Status of rows of three signals that no contact explains, whose reason is still to be found.
 UNEXPLAINED = -1
-#: Contacts within this (over L, and ten times that relative to the force) are one.
-SAME = 1e-3
 _MOST_ROWS = MOST_SEEDS + PARTS
 _TIMES = 8
 # At the foot of a valley fits are slow, and most go the same way: one that is this near in χ² to a
@@ -59,7 +57,11 @@ State = tuple[Array, Array, Array, Array, IntArray]
 
 
 class Searched(NamedTuple):
-    """What is searched, non-dimensional."""
+    """What is searched, non-dimensional.
+
+    The chart's nodes lie in blocks: ``blocks`` (n + 1,) has where each begins, ``extent`` (2, q, n)
+    middle and half width of what is seen in it.
+    """
 
     rod: Rod
     fold: Fold
@@ -73,7 +75,9 @@ class Searched(NamedTuple):
     turns: Array
     kinds: IntArray
     part: IntArray
-    log_volume: Array
+    volume: Array
+    blocks: IntArray
+    extent: Array
 
 
 class Problem(NamedTuple):
@@ -416,10 +420,7 @@ def _chosen(
             continue
         new = True
         for i in range(number):
-            other = x[kept[i]]
-            size = 10.0 * SAME * np.hypot(x[row, 2], x[row, 3])
-            apart = np.hypot(other[2] - x[row, 2], other[3] - x[row, 3])
-            new = new and not (abs(other[0] - x[row, 0]) < SAME and apart < size)
+            new = new and not same_contact(x[row], x[kept[i]])
         if new:
             kept[number] = row
             number += 1

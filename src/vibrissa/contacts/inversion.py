@@ -7,6 +7,7 @@ rad.
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from itertools import combinations
 from typing import NamedTuple
@@ -51,6 +52,8 @@ _SAME = 1e-7
 # More targets than this are brought into an order in which the tree's nodes stay at hand.
 _MANY = 1000
 _RANK_BITS = 5
+# Blocks of the chart's nodes, along each axis, that are left out together where they are far off.
+_BLOCKS = (4, 8, 4)
 
 
 class Solutions(NamedTuple):
@@ -340,9 +343,22 @@ def at_nodes(chart: StableSet, names: tuple[str, ...]) -> tuple[Array, Array, In
 
 def parts(chart: StableSet) -> IntArray:
     """To which of sixteen parts of the chart each of its nodes belongs, flat."""
-    n, m, k = chart.values.shape[:3]
-    i, j, _ = np.meshgrid(np.arange(n), np.arange(m), np.arange(k), indexing="ij")
-    return np.asarray((4 * (4 * i // n) + (4 * j // m) % 4).reshape(-1))
+    return _cut(chart, (4, 4, 1))
+
+
+def node_blocks(chart: StableSet) -> tuple[IntArray, IntArray]:
+    """Order of the chart's nodes in which those of a block follow each other; where each begins."""
+    block = _cut(chart, _BLOCKS)
+    order = np.argsort(block, kind="stable")
+    return order, np.searchsorted(block[order], np.arange(math.prod(_BLOCKS) + 1))
+
+
+def _cut(chart: StableSet, number: tuple[int, int, int]) -> IntArray:
+    """To which of so many blocks along each axis the chart's nodes belong, flat."""
+    size = chart.values.shape[:3]
+    axes = [n * np.arange(m) // m for n, m in zip(number, size, strict=True)]
+    i, j, k = np.meshgrid(*axes, indexing="ij")
+    return np.asarray(((i * number[1] + j) * number[2] + k).reshape(-1))
 
 
 @lru_cache(maxsize=16)

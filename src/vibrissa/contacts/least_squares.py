@@ -11,13 +11,12 @@ do where one fails. The contact may not leave the whisker: at the tip (and at th
 length considered) only the force is free. Everything is non-dimensional.
 
 Without friction a fit may also be kept within Ω, on its boundary where noise has carried the
-measurement out of it. In z = (s, ψ, λ), with bearing ψ and λ the force over the fold force
-f*(s, ψ),
-
-    ξ = (s, λ f* cos ψ, λ f* sin ψ),   proximal ≤ s ≤ 1,   λ ≤ 1,
-
-Ω is a box, to which steps can be confined: what would leave it stays on its face as long as χ²
-falls outward there. Where three signals fold, det ∂T/∂ξ = 0, the damping leads to the fold itself.
+measurement out of it: what would leave it stays on its face, in the coordinates (s, ψ, λ) of the
+chart, as long as χ² falls outward there. Elsewhere steps are straight in s and in s f, the moment
+about the base, along which valleys of χ² run. Where signals fold, or valleys are bent, JᵀJ is a
+poor model of χ²: what the curvature of the residuals adds to it is learnt from one contact to the
+next, as NL2SOL does (J. E. Dennis, D. M. Gay, R. E. Welsch, *An adaptive nonlinear least-squares
+algorithm*, ACM Trans. Math. Softw. 7 (1981) 348-368).
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ from vibrissa.numerics import (
     inlined,
     kernel,
     share_out,
-    solve3,
+    solve_root,
     wrapped,
 )
 from vibrissa.rod import (
@@ -73,18 +72,23 @@ _LONGEST = 0.1
 _MOST_DAMPING = 1e8
 _ROUNDS_WITHIN = 100
 # A step that promises less of χ² (as a share of it, and by itself) is not taken.
-_IDLE_WITHIN, _LITTLE = 1e-7, 1e-10
-# Nor is one that promises less of what χ² is above what counts.
-_SLOW = 0.05
+_IDLE_WITHIN, _LITTLE = 1e-6, 1e-6
+# Nor is one that, undamped or after many rounds, promises less of what χ² is above what counts.
+_SLOW, _PATIENCE, _LATE = 0.05, 3, 25
+# Where χ² rises by more than this factor contacts teach nothing of its curvature.
+_WILD = 4.0
 # Where a fit within Ω ends χ² must be level in each unknown by itself: what that could still gain
 # is at most the square of this.
 _LEVEL = 0.03
-# The longest steps of s, ψ and λ.
-_LONGEST_WITHIN = (0.1, 0.5, 0.25)
+# The longest steps of s; at the fold of ψ and λ; elsewhere of the moment, as a share of itself or
+# of that of the fold.
+_LONGEST_TURN, _LONGEST_FALL, _LONGEST_SHARE = 0.5, 0.25, 0.5
 # The chart knows the fold to a part in a million: as near to it contacts are still stable.
 _MOST_LOAD = 1.0 - 1e-5
 # Steps for derivatives of the fold force, which is smooth.
 _NUDGE = 1e-5
+# Contacts within this (over L, and ten times that relative to the force) are one.
+_SAME = 1e-3
 
 
 class Fits(NamedTuple):
@@ -157,14 +161,7 @@ def _damped_step(
         step[p] = 0.0 if fixed[p] > 0.0 else total
     if not cholesky(a, a):
         return False
-    for p in range(4):
-        for i in range(p):
-            step[p] -= a[p, i] * step[i]
-        step[p] /= a[p, p]
-    for p in range(3, -1, -1):
-        for i in range(p + 1, 4):
-            step[p] -= a[i, p] * step[i]
-        step[p] /= a[p, p]
+    solve_root(a, step)
     return True
 
 
@@ -421,87 +418,168 @@ def _once(
 
 
 @inlined
-def _contact(fold: Fold, z: Array, x: Array, frame: Array) -> None:
-    """Fill the contact x (4,) at z, and ∂x/∂z (4, 3)."""
-    s, psi, load = z[0], z[1], z[2]
-    cos, sin, force = math.cos(psi), math.sin(psi), fold_force(fold, s, psi)
+def same_contact(a: Array, b: Array) -> bool:
+    """Whether two contacts x (4,) are one."""
+    apart = math.hypot(a[2] - b[2], a[3] - b[3])
+    return bool(abs(a[0] - b[0]) < _SAME and apart < 10.0 * _SAME * math.hypot(a[2], a[3]))
+
+
+@inlined
+def _confine(fold: Fold, proximal: float, x: Array) -> bool:
+    """Bring a contact into Ω; whether it is at the fold."""
+    x[0] = min(max(x[0], proximal), 1.0)
+    force = math.hypot(x[2], x[3])
+    most = _MOST_LOAD * fold_force(fold, x[0], math.atan2(x[3], x[2]))
+    if force < most:
+        return False
+    x[2] *= most / force
+    x[3] *= most / force
+    return True
+
+
+@inlined
+def _directions(fold: Fold, x: Array, folded: bool, frame: Array) -> None:
+    """Fill ∂ξ/∂z (3, 3) of the coordinates of a fit, in units of their longest steps.
+
+    These are s and the moment; at the fold s, ψ and the share by which the force falls.
+    """
+    s, fy, fz = x[0], x[2], x[3]
+    psi, force = math.atan2(fz, fy), math.hypot(fy, fz)
+    frame[0, 0], frame[0, 1], frame[0, 2] = _LONGEST, 0.0, 0.0
+    if not folded:
+        most = max(_LONGEST_SHARE * force, _LONGEST_FALL * fold_force(fold, s, psi))
+        frame[1, 0], frame[2, 0] = -_LONGEST * fy / s, -_LONGEST * fz / s
+        frame[1, 1], frame[2, 1], frame[1, 2], frame[2, 2] = most, 0.0, 0.0, most
+        return
     by_s = fold_force(fold, s + _NUDGE, psi) - fold_force(fold, s - _NUDGE, psi)
     by_psi = fold_force(fold, s, psi + _NUDGE) - fold_force(fold, s, psi - _NUDGE)
-    by_s, by_psi = by_s / (2.0 * _NUDGE), by_psi / (2.0 * _NUDGE)
-    x[0], x[1], x[2], x[3] = s, 0.0, load * force * cos, load * force * sin
-    for a in range(4):
-        for p in range(3):
-            frame[a, p] = 0.0
-    frame[0, 0] = 1.0
-    frame[2, 0], frame[3, 0] = load * by_s * cos, load * by_s * sin
-    frame[2, 1], frame[3, 1] = (
-        load * (by_psi * cos - force * sin),
-        load * (by_psi * sin + force * cos),
-    )
-    frame[2, 2], frame[3, 2] = force * cos, force * sin
+    by_s *= _LONGEST * _MOST_LOAD / (2.0 * _NUDGE * force)
+    by_psi *= _LONGEST_TURN * _MOST_LOAD / (2.0 * _NUDGE * force)
+    frame[1, 0], frame[2, 0] = by_s * fy, by_s * fz
+    frame[1, 1] = by_psi * fy - _LONGEST_TURN * fz
+    frame[2, 1] = by_psi * fz + _LONGEST_TURN * fy
+    frame[1, 2], frame[2, 2] = -_LONGEST_FALL * fy, -_LONGEST_FALL * fz
 
 
 @inlined
-def _confine(fold: Fold, proximal: float, z: Array) -> None:
-    """Bring z into the box; a force that has turned round has the opposite bearing."""
-    z[0] = min(max(z[0], proximal), 1.0)
-    if z[2] < 0.0:
-        force = fold_force(fold, z[0], z[1])
-        z[1] += math.pi
-        z[2] *= -force / fold_force(fold, z[0], z[1])
-    z[2] = min(z[2], _MOST_LOAD)
+def _go(
+    fold: Fold, proximal: float, x: Array, folded: bool, frame: Array, step: Array, to: Array
+) -> None:
+    """Fill the contact that a step in the coordinates of `_directions` leads to."""
+    s = min(max(x[0] + _LONGEST * step[0], proximal), 1.0)
+    to[0], to[1] = s, 0.0
+    if folded:
+        psi = math.atan2(x[3], x[2]) + _LONGEST_TURN * step[1]
+        force = (1.0 - _LONGEST_FALL * step[2]) * _MOST_LOAD * fold_force(fold, s, psi)
+        to[2], to[3] = force * math.cos(psi), force * math.sin(psi)
+    else:
+        for a in range(2):
+            to[2 + a] = x[0] * (x[2 + a] + frame[1 + a, 1 + a] * step[1 + a]) / s
 
 
 @inlined
-def _next_within(
-    r: Array, j: Array, k: int, proximal: float, z: Array, damping: float, work: Array, step: Array
-) -> float:
-    """Fill a damped step within the box; χ² that it promises to gain, negative for no step."""
-    a, right, back = work[:3], work[3], work[4]
-    fixed = np.zeros(3, np.bool_)
-    for _ in range(3):
+def _normal_equations(
+    r: Array, j: Array, second: Array, frame: Array, gradient: Array, normal: Array, bent: Array
+) -> None:
+    """Fill Jᵀr, JᵀJ, and what the curvature of the residuals adds to it, in a fit's coordinates."""
+    along = np.empty((r.shape[0], 3))
+    for p in range(3):
+        gradient[p] = 0.0
+        for i in range(r.shape[0]):
+            along[i, p] = j[i, 0] * frame[0, p] + j[i, 2] * frame[1, p] + j[i, 3] * frame[2, p]
+            gradient[p] += along[i, p] * r[i]
+    for p in range(3):
+        for q in range(p + 1):
+            normal[p, q] = bent[p, q] = 0.0
+            for i in range(r.shape[0]):
+                normal[p, q] += along[i, p] * along[i, q]
+            for a in range(3):
+                for c in range(3):
+                    bent[p, q] += frame[a, p] * second[a, c] * frame[c, q]
+            normal[q, p], bent[q, p] = normal[p, q], bent[p, q]
+
+
+@inlined
+def _bend(
+    second: Array, x: Array, to: Array, r: Array, j: Array, r_there: Array, j_there: Array
+) -> None:
+    """Update the residuals' curvature, Σ r ∂²r/∂ξ² (3, 3), by those at another contact."""
+    d, rise, missed = np.empty(3), np.empty(3), np.empty(3)
+    along, size, new, steep, far = 0.0, 0.0, 0.0, 0.0, 0.0
+    for p in range(3):
+        q = p + (1 if p > 0 else 0)
+        d[p], rise[p], missed[p] = to[q] - x[q], 0.0, 0.0
+        for i in range(r.shape[0]):
+            rise[p] += j_there[i, q] * r_there[i] - j[i, q] * r[i]
+            missed[p] += (j_there[i, q] - j[i, q]) * r_there[i]
+        along += rise[p] * d[p]
+        new += missed[p] * d[p]
+        steep += rise[p] * rise[p]
+        far += d[p] * d[p]
+    for p in range(3):
+        for q in range(3):
+            size += d[p] * second[p, q] * d[q]
+    if not along * along > 1e-24 * steep * far:
+        return
+    share = min(abs(new / size), 1.0) if size != 0.0 else 1.0
+    left = 0.0
+    for p in range(3):
+        for q in range(3):
+            second[p, q] *= share
+            missed[p] -= second[p, q] * d[q]
+        left += missed[p] * d[p]
+    for p in range(3):
+        for q in range(3):
+            second[p, q] += (missed[p] * rise[q] + rise[p] * missed[q]) / along
+            second[p, q] -= left * rise[p] * rise[q] / (along * along)
+
+
+@inlined
+def _step_within(
+    gradient: Array,
+    normal: Array,
+    bent: Array,
+    damping: float,
+    ends: tuple[bool, bool, bool],
+    root: Array,
+    step: Array,
+) -> tuple[float, float]:
+    """Fill a damped step within Ω; slope and curvature of χ²/2 along it, of which 1, 0 for none.
+
+    ``ends`` states whether s cannot fall or rise, and whether the force cannot.
+    """
+    held = False
+    for _ in range(2):
         for p in range(3):
-            right[p] = 0.0
-            for i in range(k):
-                right[p] -= j[i, p] * r[i]
-            for q in range(3):
-                a[p, q] = 0.0
-                for i in range(k):
-                    a[p, q] += j[i, p] * j[i, q]
-            a[p, p] *= 1.0 + damping
-            back[p] = right[p]
-        for p in range(3):
-            if fixed[p] or a[p, p] == 0.0:
-                for q in range(3):
-                    a[p, q] = a[q, p] = 0.0
-                a[p, p], right[p] = 1.0, 0.0
-        size = a[0, 0] * a[1, 1] * a[2, 2]
-        if not abs(solve3(a, right, step)) > 1e-14 * size:
-            return -1.0
-        leaves_s = (z[0] >= 1.0 and step[0] > 0.0) or (z[0] <= proximal and step[0] < 0.0)
-        leaves_load = z[2] >= _MOST_LOAD and step[2] > 0.0
-        if not (leaves_s or leaves_load):
+            fixed = normal[p, p] == 0.0 or (p == 0 and held) or (p == 2 and ends[2])
+            step[p] = 0.0 if fixed else -gradient[p]
+            for q in range(p + 1):
+                root[p, q] = normal[p, q] + bent[p, q]
+                if fixed or normal[q, q] == 0.0 or (q == 0 and held):
+                    root[p, q] = 0.0
+            root[p, p] = 1.0 if fixed else root[p, p] + damping * normal[p, p]
+        if not cholesky(root, root):
+            return 1.0, 0.0
+        solve_root(root, step)
+        if held or not ((ends[0] and step[0] < 0.0) or (ends[1] and step[0] > 0.0)):
             break
-        fixed[0] = fixed[0] or leaves_s
-        fixed[2] = fixed[2] or leaves_load
-    gain = 0.0
+        held = True
+    slope, curve = 0.0, 0.0
     for p in range(3):
-        gain += back[p] * step[p]
-    return gain
+        slope += gradient[p] * step[p]
+        for q in range(3):
+            curve += step[p] * (normal[p, q] + bent[p, q]) * step[q]
+    return slope, curve
 
 
 @inlined
-def _level(r: Array, j: Array, k: int, proximal: float, z: Array) -> bool:
-    """Whether χ² falls nowhere but out of the box."""
+def _level(gradient: Array, normal: Array, ends: tuple[bool, bool, bool]) -> bool:
+    """Whether χ² falls nowhere but out of Ω."""
     for p in range(3):
-        slope, size = 0.0, 0.0
-        for i in range(k):
-            slope += j[i, p] * r[i]
-            size += j[i, p] * j[i, p]
-        outward = (p == 0 and z[0] >= 1.0) or (p == 2 and z[2] >= _MOST_LOAD)
-        if (outward and slope < 0.0) or (p == 0 and z[0] <= proximal and slope > 0.0):
+        slope = gradient[p]
+        if p == 0 and ((ends[1] and slope < 0.0) or (ends[0] and slope > 0.0)):
             continue
-        if slope * slope > _LEVEL * _LEVEL * size:
+        if not (p == 2 and ends[2]) and slope * slope > _LEVEL * _LEVEL * normal[p, p]:
             return False
     return True
 
@@ -518,59 +596,68 @@ def fit_within(
     value: Array,
     tangents: Array,
     worth: float,
+    known: Array,
 ) -> tuple[float, bool]:
-    """Find the contact of least χ² in Ω, downhill from another; given up if above ``worth``.
+    """Find the contact of least χ² in Ω, downhill from another.
 
-    Return χ², and whether it is a least one.
+    It is given up if above ``worth``, and at contacts that are known. Return χ², and whether it is
+    a least one.
     """
     b, k = np.zeros(BUFFER_SIZE), codes.shape[0]
-    z, to, step = np.empty(3), np.empty(3), np.zeros(3)
-    at, frame, work = np.empty(4), np.empty((4, 3)), np.empty((5, 3))
-    v, t = np.empty(6), np.zeros((6, 4))
+    to, v, t = x.copy(), np.empty(6), np.zeros((6, 4))
     residual, jacobian = np.empty(k), np.empty((k, 4))
-    trial_r, trial_j, r, j = np.empty(k), np.empty((k, 4)), np.empty(k), np.empty((k, 3))
-    to[0], to[1] = x[0], math.atan2(x[3], x[2])
-    to[2] = math.hypot(x[2], x[3]) / fold_force(fold, to[0], to[1])
-    best, damping = np.inf, 0.0
-    for _ in range(_ROUNDS_WITHIN):
-        _confine(fold, proximal, to)
-        _contact(fold, to, at, frame)
-        set_all_lanes(b, at[0], at[1], at[2], at[3])
+    r, j, r_there, j_there = np.empty(k), np.empty((k, 4)), np.empty(k), np.empty((k, 4))
+    frame, second, normal = np.empty((3, 3)), np.zeros((3, 3)), np.empty((3, 3))
+    bent, root, gradient, step = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
+    best, damping, promised, folded = np.inf, 0.0, 0.0, False
+    ends = (False, False, False)
+    for n in range(_ROUNDS_WITHIN):
+        folded_there = _confine(fold, proximal, to)
+        set_all_lanes(b, to[0], to[1], to[2], to[3])
         integrate(rod, b, 1)
         lane_value(b, 0, v)
         lanes_tangents(b, t)
-        channel_equations(at, v, t, codes, target, residual, jacobian)
-        misfit = whiten(weights, residual, jacobian, k, trial_r, trial_j)
+        channel_equations(to, v, t, codes, target, residual, jacobian)
+        misfit = whiten(weights, residual, jacobian, k, r_there, j_there)
+        if n > 0 and misfit < _WILD * best:
+            _bend(second, x, to, r, j, r_there, j_there)
         if misfit < best:
-            best, damping = misfit, 0.0 if damping < 1e-5 else 0.1 * damping
-            copy(to, z)
-            copy(at, x)
+            if best - misfit > 0.75 * promised:
+                damping = 0.0 if damping < 1e-5 else 0.1 * damping
+            elif best - misfit < 0.25 * promised:
+                damping = max(2.0 * damping, 1e-3)
+            best, folded = misfit, folded_there
+            copy(to, x)
             copy(v, value)
-            copy(trial_r, r)
+            copy(r_there, r)
             for a in range(6):
                 copy(t[a], tangents[a])
             for i in range(k):
-                for p in range(3):
-                    j[i, p] = 0.0
-                    for a in range(4):
-                        j[i, p] += trial_j[i, a] * frame[a, p]
+                copy(j_there[i], j[i])
+            for c in range(known.shape[0]):
+                if same_contact(x, known[c]):
+                    return best, False
+            _directions(fold, x, folded, frame)
         elif best == np.inf:
             return best, False
         else:
-            damping = max(10.0 * damping, 1e-2)
-        gain = _next_within(r, j, k, proximal, z, damping, work, step)
-        while gain < 0.0 and damping <= _MOST_DAMPING:
-            damping = max(10.0 * damping, 1e-8)
-            gain = _next_within(r, j, k, proximal, z, damping, work, step)
+            damping = max(4.0 * damping, 1e-2)
+        _normal_equations(r, j, second, frame, gradient, normal, bent)
+        ends = (x[0] <= proximal, x[0] >= 1.0, folded and gradient[2] >= 0.0)
+        slope, curve = _step_within(gradient, normal, bent, damping, ends, root, step)
+        while slope > 0.0 and damping <= _MOST_DAMPING:
+            damping = max(4.0 * damping, 1e-3)
+            slope, curve = _step_within(gradient, normal, bent, damping, ends, root, step)
+        gain = -2.0 * slope - curve
         if gain <= _IDLE_WITHIN * best + _LITTLE or damping > _MOST_DAMPING:
-            return best, _level(r, j, k, proximal, z)
-        if gain < _SLOW * (best - worth):
+            return best, _level(gradient, normal, ends)
+        if n >= _PATIENCE and (damping == 0.0 or n >= _LATE) and gain < _SLOW * (best - worth):
             break
-        shorten = 1.0
+        size = max(abs(step[0]), abs(step[1]), abs(step[2]), 1.0)
         for p in range(3):
-            shorten = min(shorten, _LONGEST_WITHIN[p] / max(abs(step[p]), 1e-300))
-        for p in range(3):
-            to[p] = z[p] + shorten * step[p]
+            step[p] /= size
+        promised = (-2.0 * slope - curve / size) / size
+        _go(fold, proximal, x, folded, frame, step, to)
     return best, False
 
 

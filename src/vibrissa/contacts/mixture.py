@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.least_squares import Fits, channel_equations, fit_rows
+from vibrissa.contacts.least_squares import Fits, channel_equations, fit_rows, same_contact
 from vibrissa.contacts.weighing import Weighing, gradients, weigh, wrong_by
 from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel
 from vibrissa.rod import Fold, Rod, point_determinant, stable
@@ -34,8 +34,6 @@ _TIMES = 8
 _GATE = 50.0
 # With one this near it is not looked for from where the hypothesis was as well.
 _NEAR = 4.0
-# Two places within this (over L, and ten times that relative to the force) are one.
-_SAME = 1e-3
 # Codes of px, py and pz among the channels.
 _PLACE = 11
 
@@ -320,13 +318,10 @@ def _fits(
 @inlined
 def _known(x: Array, out: Mixture, first: int, found: int) -> bool:
     """Whether a contact is one of those found before."""
-    force = np.hypot(x[2], x[3])
+    known = False
     for other in range(first, found):
-        y = out.contact[other]
-        apart = np.hypot(y[2] - x[2], y[3] - x[3])
-        if abs(y[0] - x[0]) < _SAME and apart < 10.0 * _SAME * force:
-            return True
-    return False
+        known = known or same_contact(x, out.contact[other])
+    return known
 
 
 @kernel

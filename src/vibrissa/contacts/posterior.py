@@ -28,7 +28,17 @@ from scipy.special import ndtri
 
 from vibrissa.contacts.channels import FITTED
 from vibrissa.contacts.least_squares import channel_equations, lane_contact, whiten
-from vibrissa.numerics import AnyArray, Array, IntArray, cholesky, copy, inlined, kernel, share_out
+from vibrissa.numerics import (
+    AnyArray,
+    Array,
+    IntArray,
+    cholesky,
+    copy,
+    inlined,
+    kernel,
+    mahalanobis,
+    share_out,
+)
 from vibrissa.rod import (
     BUFFER_SIZE,
     LANES,
@@ -63,7 +73,7 @@ _SWEEPS = 12
 
 
 def _normal(dimension: int) -> Array:
-    """Nodes (n, dimension) in pairs ±u with the covariance of a standard normal distribution.
+    """Nodes (dimension, n) in pairs ±u with the covariance of a standard normal distribution.
 
     An additive recurrence with the powers of the root of g^(d + 1) = g + 1 fills the cube evenly.
     """
@@ -74,11 +84,11 @@ def _normal(dimension: int) -> Array:
     half = ndtri((0.5 + np.arange(1, _NODES // 2 + 1)[:, None] * steps) % 1.0)
     nodes = np.concatenate([half, -half])
     root = np.linalg.cholesky(nodes.T @ nodes / _NODES)
-    return np.ascontiguousarray(nodes @ np.linalg.inv(root).T)
+    return np.ascontiguousarray((nodes @ np.linalg.inv(root).T).T)
 
 
 def _kurtosis(nodes: Array) -> float:
-    return float(((nodes**2).sum(axis=1) ** 2).mean())
+    return float(((nodes**2).sum(axis=0) ** 2).mean())
 
 
 #: Fourth moment of three coordinates that are normally distributed.
@@ -86,7 +96,7 @@ NORMAL_KURTOSIS = 15.0
 _NODES_3, _NODES_4 = _normal(3), _normal(4)
 # Fourth moment of the point's three coordinates: of the nodes, and with friction, where they are
 # three of four unknowns, that of a normal distribution.
-_KURTOSIS_3, _KURTOSIS_4 = _kurtosis(_NODES_3), _kurtosis(_NODES_4[:, :3])
+_KURTOSIS_3, _KURTOSIS_4 = _kurtosis(_NODES_3), _kurtosis(_NODES_4[:3])
 
 # Working memory for one candidate: r̂ (k), B (k, 4), H_r (k, 4, 4); A (4, 4), H_y (4, 4, 4); axes
 # (4, 4), in columns, by unknown.
@@ -335,11 +345,7 @@ def _even(model: Model, n: int) -> float:
                 total += bent_r[a, i, q] ** 2
             for a in range(3):
                 back[a] = bent_y[a, i, q]
-                for c in range(a):
-                    back[a] -= root[a, c] * back[c]
-                back[a] /= root[a, a]
-                total += back[a] ** 2
-            largest = max(largest, total)
+            largest = max(largest, total + mahalanobis(root, back))
     return math.sqrt(largest)
 
 
@@ -367,80 +373,116 @@ def _determinant(m: Array, n: int) -> float:
 
 
 @inlined
-def _density(
+def _densities(
     model: Model,
-    u: Array,
+    nodes: Array,
     s: float,
     proximal: float,
     friction: bool,
     turn: float,
-    y: Array,
-    m: Array,
-) -> float:
-    """Posterior density at a node relative to the nodes' own, and the displacement y of the point.
+    points: Array,
+    density: Array,
+) -> None:
+    """Fill posterior densities at nodes (n, m) relative to the nodes' own, and points (3, m).
 
-    ``turn`` is 1 where the axes are right-handed, -1 otherwise; ``m`` (4, 4) is working memory.
+    ``points`` are displacements of the point; ``turn`` is 1 where the axes are right-handed, -1
+    otherwise.
     """
     r0, by_r, bent_r, by_y, bent_y, axes = model
-    n, log = u.shape[0], 0.0
+    n, number = nodes.shape
+    slopes, arc, log = np.empty((n, n, number)), np.full(number, s), np.zeros(number)
+    sums, slope = np.empty(number), np.empty(number)
     for i in range(n):
-        s += axes[0, i] * u[i]
-        log += 0.5 * u[i] * u[i]
-    for a in range(4 if friction else 3):
-        total = 0.0
-        for i in range(n):
-            slope, bent = by_y[a, i], 0.0
-            for q in range(n):
-                bent += bent_y[a, i, q] * u[q]
-            m[a, i] = slope + bent
-            total += (slope + 0.5 * bent) * u[i]
-        if a < 3:
-            y[a] = total
-    if not proximal <= s <= 1.0:
-        return 0.0
+        along, u = axes[0, i], nodes[i]
+        for m in range(number):
+            arc[m] += along * u[m]
+            log[m] += 0.5 * u[m] * u[m]
     for a in range(r0.shape[0]):
-        total = r0[a]
+        sums[:] = r0[a]
         for i in range(n):
-            slope = by_r[a, i]
+            _slope(by_r[a, i], bent_r[a, i], 0.5, nodes, slope)
+            u = nodes[i]
+            for m in range(number):
+                sums[m] += slope[m] * u[m]
+        for m in range(number):
+            log[m] -= 0.5 * (sums[m] * sums[m] - r0[a] * r0[a])
+    for a in range(n):
+        sums[:] = 0.0
+        for i in range(n):
+            _slope(by_y[a, i], bent_y[a, i], 1.0, nodes, slopes[a, i])
+            first, u, there = by_y[a, i], nodes[i], slopes[a, i]
+            for m in range(number):
+                sums[m] += 0.5 * (first + there[m]) * u[m]
+        if a < 3:
+            copy(sums, points[a])
+    _determinants(slopes, density)
+    for m in range(number):
+        det = turn * density[m]
+        det = abs(det) if friction else max(det, 0.0)
+        inside = proximal <= arc[m] <= 1.0 and det > 0.0
+        density[m] = det * math.exp(min(log[m], _MOST_GAIN)) if inside else 0.0
+
+
+@inlined
+def _determinants(matrices: Array, out: Array) -> None:
+    """Determinants of matrices (n, n, m), n three or four."""
+    n = matrices.shape[0]
+    if n == 3:  # side by side
+        a, b, c = matrices[0], matrices[1], matrices[2]
+        for m in range(out.shape[0]):
+            out[m] = (
+                a[0, m] * (b[1, m] * c[2, m] - b[2, m] * c[1, m])
+                + a[1, m] * (b[2, m] * c[0, m] - b[0, m] * c[2, m])
+                + a[2, m] * (b[0, m] * c[1, m] - b[1, m] * c[0, m])
+            )
+        return
+    matrix = np.empty((n, n))
+    for m in range(out.shape[0]):
+        for p in range(n):
             for q in range(n):
-                slope += 0.5 * bent_r[a, i, q] * u[q]
-            total += slope * u[i]
-        log -= 0.5 * (total * total - r0[a] * r0[a])
-    det = turn * _determinant(m, n)
-    return (abs(det) if friction else max(det, 0.0)) * math.exp(min(log, _MOST_GAIN))
+                matrix[p, q] = matrices[p, q, m]
+        out[m] = _determinant(matrix, n)
+
+
+@inlined
+def _slope(first: float, bent: Array, share: float, nodes: Array, slope: Array) -> None:
+    """Fill a derivative along an axis, or its mean from the candidate on, at all nodes."""
+    slope[:] = first
+    for q in range(nodes.shape[0]):
+        change, u = share * bent[q], nodes[q]
+        for m in range(slope.shape[0]):
+            slope[m] += change * u[m]
 
 
 @inlined
 def second_moment(
     points: Array, density: Array, total: float, normal: float, covariance: Array
 ) -> float:
-    """Fill the second moment (3, 3) of points (n, 3) of some density, widened for their tails.
+    """Fill the second moment (3, 3) of points (3, n) of some density, widened for their tails.
 
     Their kurtosis is returned, relative to what is normal; infinite where there is none.
     """
     root, back = np.zeros((3, 3)), np.empty(3)
     for a in range(3):
-        for c in range(3):
-            covariance[a, c] = 0.0
-            for k in range(points.shape[0]):
-                covariance[a, c] += density[k] / total * points[k, a] * points[k, c]
+        for c in range(a + 1):
+            sum_of = 0.0
+            for k in range(points.shape[1]):
+                sum_of += density[k] * points[a, k] * points[c, k]
+            covariance[a, c] = covariance[c, a] = sum_of / total
     if not cholesky(covariance, root):
         return np.inf
     fourth = 0.0
-    for k in range(points.shape[0]):
-        size = 0.0
+    for k in range(points.shape[1]):
         for a in range(3):
-            back[a] = points[k, a]
-            for c in range(a):
-                back[a] -= root[a, c] * back[c]
-            back[a] /= root[a, a]
-            size += back[a] * back[a]
-        fourth += density[k] / total * size * size
-    wider = max(fourth / normal, 1.0) ** 0.75
+            back[a] = points[a, k]
+        size = mahalanobis(root, back)
+        fourth += density[k] * size * size
+    tailed = fourth / (total * normal)
+    wider = max(tailed, 1.0) ** 0.75
     for a in range(3):
         for c in range(3):
             covariance[a, c] *= wider
-    return fourth / normal
+    return tailed
 
 
 @inlined
@@ -454,11 +496,10 @@ def _moments(
     covariance: Array,
 ) -> tuple[float, bool]:
     """Fill the second moment about the point, widened; mean density, and whether it can serve."""
-    number = nodes.shape[0]
-    points, density = np.empty((number, 3)), np.empty(number)
-    m, total, squares = np.empty((4, 4)), 0.0, 0.0
+    number = nodes.shape[1]
+    points, density, total, squares = np.empty((3, number)), np.empty(number), 0.0, 0.0
+    _densities(model, nodes, s, proximal, friction, turn, points, density)
     for k in range(number):
-        density[k] = _density(model, nodes[k], s, proximal, friction, turn, points[k], m)
         total += density[k]
         squares += density[k] * density[k]
     counting = total * total / (number * squares) if squares > 0.0 else 0.0
@@ -467,7 +508,7 @@ def _moments(
             for c in range(3):
                 for k in range(number):
                     share = density[k] / total if total > 0.0 else 0.0
-                    covariance[a, c] += share * points[k, a] * points[k, c]
+                    covariance[a, c] += share * points[a, k] * points[c, k]
         return total / number, False
     normal = _KURTOSIS_4 if friction else _KURTOSIS_3
     tailed = second_moment(points, density, total, normal, covariance)

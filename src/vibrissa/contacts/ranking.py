@@ -21,7 +21,6 @@ from typing import NamedTuple
 import numpy as np
 
 from vibrissa.contacts.candidates import (
-    SAME,
     UNEXPLAINED,
     Problem,
     Searched,
@@ -31,11 +30,20 @@ from vibrissa.contacts.candidates import (
 )
 from vibrissa.contacts.contacts import MOST_CANDIDATES, Candidates
 from vibrissa.contacts.inversion import PARTS, nearest_of
-from vibrissa.contacts.least_squares import channel_equations, fit_within, whiten
+from vibrissa.contacts.least_squares import channel_equations, fit_within, same_contact, whiten
 from vibrissa.contacts.noise import INDISTINCT
 from vibrissa.contacts.posterior import CERTAIN, NORMAL_KURTOSIS, judge, rank, second_moment
 from vibrissa.contacts.weighing import Weighing, channel_covariance, weigh_any
-from vibrissa.numerics import AnyArray, Array, IntArray, cholesky, copy, inlined, kernel
+from vibrissa.numerics import (
+    AnyArray,
+    Array,
+    IntArray,
+    cholesky,
+    copy,
+    inlined,
+    kernel,
+    mahalanobis,
+)
 from vibrissa.rod import (
     LEAST_ARC,
     MOST_CELLS,
@@ -68,10 +76,8 @@ _OUTSIDE_REGION = 14.16
 # Logarithm of the volume of a normal distribution of three coordinates, over its peak.
 _LOG_NORMAL = 1.5 * math.log(2.0 * math.pi)
 _MOST_LOG = 700.0
-# Nodes whose χ², or the logarithm of whose density, is so much worse than the best do not count.
-_NEGLIGIBLE = 50.0
-# Nodes that are computed together stay in the nearest memory.
-_BLOCK = 512
+# Nodes whose χ² is so much worse than the best candidate's do not count.
+_NEGLIGIBLE = 60.0
 
 
 @kernel
@@ -238,13 +244,6 @@ def _starts(
     return count, n == MOST_CELLS
 
 
-@inlined
-def _same(a: Array, b: Array) -> bool:
-    """Whether two contacts x (4,) are one."""
-    apart = math.hypot(a[2] - b[2], a[3] - b[3])
-    return bool(abs(a[0] - b[0]) < SAME and apart < 10.0 * SAME * math.hypot(a[2], a[3]))
-
-
 @kernel
 def _try(
     of: Searched,
@@ -274,10 +273,20 @@ def _try(
             return number, False
         most = worth if number > 0 and misfits[0] <= worth else np.inf
         misfit, least = fit_within(
-            of.rod, of.fold, of.proximal, how.codes, target, weights, at, value[0], tangents, most
+            of.rod,
+            of.fold,
+            of.proximal,
+            how.codes,
+            target,
+            weights,
+            at,
+            value[0],
+            tangents,
+            most,
+            x[:number],
         )
         for c in range(number):
-            known = known or _same(at, x[c])
+            known = known or same_contact(at, x[c])
         if known:
             break
     lost = number == 0 or not misfits[0] <= worth
@@ -373,30 +382,56 @@ def _kept(limit: float, number: int, x: Array, values: Array, misfits: Array) ->
 
 
 @inlined
-def _misfits_at_nodes(of: Searched, how: Weighing, weights: Array, target: Array) -> Array:
-    """χ² at the chart's nodes."""
-    q, nodes = of.seen.shape
-    away, r, misfits = np.empty((q, _BLOCK)), np.empty(_BLOCK), np.zeros(nodes)
-    white = how.own[0, 0] > 0.0
-    for first in range(0, nodes, _BLOCK):
-        number = min(_BLOCK, nodes - first)
+def _near_blocks(
+    of: Searched, weights: Array, target: Array, most: float, blocks: IntArray
+) -> tuple[int, int]:
+    """List blocks of nodes that may have a χ² of ``most``; how many, with how many nodes.
+
+    Each whitened residual is within bounds over a block, as the channels are.
+    """
+    q, number, nodes, away = of.turns.shape[0], 0, 0, np.empty(of.turns.shape[0])
+    for n in range(blocks.shape[0]):
+        least = 0.0
         for i in range(q):
-            seen, turn, aim, mine = of.seen[i], of.turns[i], target[i], away[i]
-            for n in range(number):
-                mine[n] = seen[first + n] - aim
-            for n in range(number if turn > 0.0 else 0):
-                mine[n] -= np.rint(mine[n] * turn) * 2.0 * np.pi
+            away[i] = of.extent[0, i, n] - target[i]
+            away[i] -= 2.0 * np.pi * np.rint(away[i] * of.turns[i])
         for i in range(q):
-            r[:] = 0.0
+            middle, half = 0.0, 0.0
             for c in range(q):
-                w, mine = weights[i, c], away[c]
-                if white:
-                    w = 1.0 if i == c else 0.0
-                for n in range(number if w != 0.0 else 0):
-                    r[n] += w * mine[n]
-            for n in range(number):
-                misfits[first + n] += r[n] * r[n]
-    return misfits
+                middle += weights[i, c] * away[c]
+                half += abs(weights[i, c]) * of.extent[1, c, n]
+            least += max(abs(middle) - half, 0.0) ** 2
+        if least <= most:
+            blocks[number] = n
+            number, nodes = number + 1, nodes + of.blocks[n + 1] - of.blocks[n]
+    return number, nodes
+
+
+@inlined
+def _misfits_of_block(
+    of: Searched, weights: Array, target: Array, n: int, misfits: Array
+) -> tuple[int, int]:
+    """Fill χ² at the nodes of a block; the first of them, and how many there are."""
+    q, first = of.turns.shape[0], of.blocks[n]
+    number = of.blocks[n + 1] - first
+    away, r = np.empty((q, number)), np.empty(number)
+    for i in range(q):
+        seen, turn, aim, mine = of.seen[i], of.turns[i], target[i], away[i]
+        for k in range(number):
+            mine[k] = seen[first + k] - aim
+        for k in range(number if turn > 0.0 else 0):
+            mine[k] -= np.rint(mine[k] * turn) * 2.0 * np.pi
+    for k in range(number):
+        misfits[k] = 0.0
+    for i in range(q):
+        r[:] = 0.0
+        for c in range(q):
+            w, mine = weights[i, c], away[c]
+            for k in range(number if w != 0.0 else 0):
+                r[k] += w * mine[k]
+        for k in range(number):
+            misfits[k] += r[k] * r[k]
+    return first, number
 
 
 @kernel
@@ -417,46 +452,42 @@ def _over_the_map(
     share outside three standard deviations is that of contact points or of the chart, whichever is
     larger: contact points of little volume, as near slip-off, are not left out.
     """
-    misfits = _misfits_at_nodes(of, how, weights, target)
-    nodes, kept = misfits.shape[0], 0
-    largest = -np.inf
-    for node in range(nodes):
-        largest = max(largest, of.log_volume[node] - 0.5 * misfits[node])
-    points, density, likelihood = np.empty((nodes, 3)), np.empty(nodes), np.empty(nodes)
+    if how.own[0, 0] > 0.0:  # what is seen is white
+        weights = np.eye(of.turns.shape[0])
+    blocks = np.empty(of.blocks.shape[0] - 1, np.int64)
+    near, nodes = _near_blocks(of, weights, target, chi + _NEGLIGIBLE, blocks)
+    points, misfits = np.empty((3, nodes)), np.empty(nodes)
+    density, likelihood, kept = np.empty(nodes), np.empty(nodes), 0
     total, squares = 0.0, 0.0
-    for node in range(nodes):
-        log = of.log_volume[node] - 0.5 * misfits[node]
-        if log < largest - _NEGLIGIBLE and misfits[node] > chi + _NEGLIGIBLE:
-            continue
-        density[kept] = math.exp(log - largest)
-        likelihood[kept] = math.exp(-0.5 * max(misfits[node] - chi, 0.0))
-        total += density[kept]
-        squares += density[kept] * density[kept]
-        for a in range(3):
-            points[kept, a] = of.values[node, 3 + a] - point[a]
-        kept += 1
+    for i in range(near):
+        first, number = _misfits_of_block(of, weights, target, blocks[i], misfits)
+        for k in range(number):
+            if not misfits[k] < chi + _NEGLIGIBLE:
+                continue
+            fits = math.exp(0.5 * (chi - misfits[k]))
+            density[kept], likelihood[kept] = of.volume[first + k] * fits, min(fits, 1.0)
+            total += density[kept]
+            squares += density[kept] * density[kept]
+            for a in range(3):
+                points[a, kept] = of.values[first + k, 3 + a] - point[a]
+            kept += 1
     if total * total > _MANY * squares:
-        second_moment(points[:kept], density[:kept], total, NORMAL_KURTOSIS, covariance)
+        second_moment(points[:, :kept], density[:kept], total, NORMAL_KURTOSIS, covariance)
     root, back = np.zeros((3, 3)), np.empty(3)
     if not cholesky(covariance, root):
         return 0.0
     mass, mass_out, like, like_out = 0.0, 0.0, 0.0, 0.0
-    for node in range(kept):
-        far = 0.0
+    for k in range(kept):
         for a in range(3):
-            back[a] = points[node, a]
-            for c in range(a):
-                back[a] -= root[a, c] * back[c]
-            back[a] /= root[a, a]
-            far += back[a] * back[a]
-        if far > _OUTSIDE_REGION:
-            mass_out += density[node]
-            like_out += likelihood[node]
+            back[a] = points[a, k]
+        if mahalanobis(root, back) > _OUTSIDE_REGION:
+            mass_out += density[k]
+            like_out += likelihood[k]
         else:
-            mass += density[node]
-            like += likelihood[node]
+            mass += density[k]
+            like += likelihood[k]
     # The nodes may be too far apart to see all of the candidate itself.
-    mass = max(mass, math.exp(min(log_mass - largest, _MOST_LOG)))
+    mass = max(mass, math.exp(min(log_mass + 0.5 * chi, _MOST_LOG)), 1e-300)
     like = max(like, 1.0)
     return max(mass_out / (mass + mass_out), like_out / (like + like_out))
 
@@ -554,6 +585,27 @@ def _both_priors(weight: Array, chi: Array, n: int, sound: bool) -> None:
             weight[0, c] = math.log(share)
 
 
+@inlined
+def _put_in_order(row: int, n: int, out: Candidates, room: _Room) -> None:
+    """Write n candidates with what is known of them by falling probability."""
+    x, values, chi = out.x[row], out.values[row], out.chi_squared[row]
+    for c in range(n):
+        copy(x[c], room.x[c])
+        copy(values[c], room.values[c])
+        room.misfits[c] = chi[c]
+    for c in range(x.shape[0]):
+        out.probability[row, c] = room.chance[0, c]
+        if c >= n:
+            chi[c], x[c], values[c] = np.nan, np.nan, np.nan
+            continue
+        old = room.order[0, c]
+        copy(room.x[old], x[c])
+        copy(room.values[old], values[c])
+        chi[c], out.valid[row, c] = room.misfits[old], room.fine[old]
+        for a in range(3):
+            copy(room.spread[old, a], out.covariances[row, c, a])
+
+
 @kernel
 def settle(
     of: Searched,
@@ -619,21 +671,7 @@ def settle(
         weight[0, c] = weight[1, c]
     _both_priors(weight, chi, n, sound)
     rank(weight, out.number[row : row + 1], chance, order)
-    for c in range(n):
-        copy(x[c], room.x[c])
-        copy(values[c], room.values[c])
-        room.misfits[c] = chi[c]
-    for c in range(x.shape[0]):
-        out.probability[row, c] = chance[0, c]
-        if c >= n:
-            chi[c], x[c], values[c] = np.nan, np.nan, np.nan
-            continue
-        old = order[0, c]
-        copy(room.x[old], x[c])
-        copy(room.values[old], values[c])
-        chi[c], out.valid[row, c] = room.misfits[old], fine[old]
-        for a in range(3):
-            copy(room.spread[old, a], out.covariances[row, c, a])
+    _put_in_order(row, n, out, room)
     if out.probability[row, 0] > CERTAIN and (others or not out.valid[row, 0]):
         seen, best = measured if how.own[0, 0] > 0.0 else target, order[0, 0]
         log_mass = weight[1, best] + _LOG_NORMAL

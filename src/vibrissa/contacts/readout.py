@@ -15,7 +15,13 @@ import numpy as np
 
 from vibrissa.contacts.candidates import Searched
 from vibrissa.contacts.channels import CHANNELS, FITTED, WRENCH, Channels
-from vibrissa.contacts.inversion import at_nodes, parts, seeding_triplet, volumes
+from vibrissa.contacts.inversion import (
+    at_nodes,
+    node_blocks,
+    parts,
+    seeding_triplet,
+    volumes,
+)
 from vibrissa.contacts.noise import TRUSTED, SensorNoise, rank, scaled_errors
 from vibrissa.contacts.weighing import Weighing
 from vibrissa.numerics import AnyArray, Array
@@ -264,21 +270,27 @@ def _searched(
     kinds: Sequence[int],
 ) -> Searched:
     """What is searched; see there."""
-    d = chart.discretization
+    order, blocks = node_blocks(chart)
+    seen, turns = np.ascontiguousarray(seen[:, order]), np.asarray(turns)
+    away = seen - np.repeat(seen[:, blocks[:-1]], np.diff(blocks), axis=1)
+    away -= np.where(turns > 0.0, 2.0 * np.pi, 0.0)[:, None] * np.rint(away * turns[:, None])
+    low, high = (ufunc.reduceat(away, blocks[:-1], axis=1) for ufunc in (np.minimum, np.maximum))
     return Searched(
-        d.rod,
+        chart.discretization.rod,
         chart.fold,
         chart.proximal,
         tree,
         np.array(where),
         np.array(codes, dtype=np.float64),
-        chart.contacts.reshape(-1, 3),
-        chart.values.reshape(-1, 6),
+        chart.contacts.reshape(-1, 3)[order],
+        chart.values.reshape(-1, 6)[order],
         seen,
         turns,
         np.array(kinds),
-        parts(chart),
-        np.log(volumes(chart)),
+        parts(chart)[order],
+        volumes(chart)[order],
+        blocks,
+        np.stack([seen[:, blocks[:-1]] + 0.5 * (low + high), 0.5 * (high - low)]),
     )
 
 

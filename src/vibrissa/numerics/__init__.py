@@ -14,9 +14,11 @@ from vibrissa.numerics.threads import share_out as share_out, threads as threads
 if TYPE_CHECKING:
     from vibrissa.numerics.algebra import (
         cholesky,
+        mahalanobis as mahalanobis,
         norm3 as norm3,
         solve,
         solve3 as solve3,
+        solve_root as solve_root,
         wrapped as wrapped,
     )
     from vibrissa.numerics.compiled import (
@@ -42,7 +44,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "algebra": ("cholesky", "norm3", "solve", "solve3", "wrapped"),
+    "algebra": ("cholesky", "mahalanobis", "norm3", "solve", "solve3", "solve_root", "wrapped"),
     "compiled": ("copy", "inlined", "inlined_rigorous", "kernel", "rigorous", "specialised"),
     "device": ("Translation", "check_device"),
     "quantiles": ("contact_weights", "weighted_quantile"),

@@ -94,3 +94,32 @@ def cholesky(v: Array, root: Array) -> bool:
             else:
                 return False
     return True
+
+
+@inlined
+def forward(root: Array, x: Array) -> None:
+    """Solve root y = x in place for a lower root."""
+    for a in range(x.shape[0]):
+        for c in range(a):
+            x[a] -= root[a, c] * x[c]
+        x[a] /= root[a, a]
+
+
+@inlined
+def solve_root(root: Array, x: Array) -> None:
+    """Solve root rootᵀ y = x in place for a lower root."""
+    forward(root, x)
+    for a in range(x.shape[0] - 1, -1, -1):
+        for c in range(a + 1, x.shape[0]):
+            x[a] -= root[c, a] * x[c]
+        x[a] /= root[a, a]
+
+
+@inlined
+def mahalanobis(root: Array, x: Array) -> float:
+    """Squared Mahalanobis distance of x, which is overwritten, for the root of a covariance."""
+    forward(root, x)
+    total = 0.0
+    for a in range(x.shape[0]):
+        total += x[a] * x[a]
+    return total

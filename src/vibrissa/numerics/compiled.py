@@ -1,6 +1,9 @@
 """How kernels are compiled: cached on disk, errors as NumPy has them, contraction allowed.
 
 Compiling takes seconds, once for a given installation (:mod:`~vibrissa.numerics.kernel_cache`).
+Numba optimises every function by itself, and again within each function that calls it, and so on
+up to what Python calls. Here that alone is optimised, with all that it consists of: functions that
+kernels call are only translated (:class:`_Part`).
 """
 
 from __future__ import annotations
@@ -10,7 +13,10 @@ from contextlib import suppress
 from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
+from llvmlite.binding import parse_assembly
 from numba import types
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler
 from numba.core.registry import CPUDispatcher
 
 from vibrissa.numerics.kernel_cache import PackageCache
@@ -28,13 +34,41 @@ _STRICT: dict[str, Any] = {
 _OPTIONS = _STRICT | {"fastmath": _FASTMATH}
 
 
+class _Part(JITCodeLibrary):
+    """Code that is neither optimised nor run by itself, but in what it is linked into."""
+
+    def _optimize_final_module(self) -> None:
+        pass
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()  # type: ignore[no-untyped-call]
+        for variable in self._final_module.global_variables:
+            if "NumbaEnv" in variable.name:  # numba looks for this in what can be run
+                self._codegen._add_module(parse_assembly(str(variable)))
+        self._codegen._engine.finalize_object()
+        self._finalized = True
+
+
+class _PartCompiler(Compiler):
+    """Numba's compiler, with such a library."""
+
+    def __init__(self, typing: Any, target: Any, library: Any, *rest: Any) -> None:
+        library = _Part(target.codegen(), "part")  # type: ignore[no-untyped-call]
+        super().__init__(typing, target, library, *rest)  # type: ignore[no-untyped-call]
+
+
 class _Kernel(CPUDispatcher):
-    """What is compiled once for all constants that other kernels call it with."""
+    """What Python calls; where kernels call it, it is a part of them."""
+
+    part: Any
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
-        """Forget which constants the arguments are."""
-        args = tuple(types.unliteral(a) for a in args)
-        return super().get_call_template(args, kws)
+        """Compile the part, once for all constants that it is called with."""
+        return self.part.get_call_template(tuple(types.unliteral(a) for a in args), kws)
+
+    def get_overload(self, sig: Any) -> Any:
+        """Find the compiled part."""
+        return self.part.get_overload(sig)
 
 
 class _Inlined(CPUDispatcher):
@@ -48,6 +82,7 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function that Python calls; cached on disk, releases the GIL."""
     compiled: Any = specialised(function)
     compiled.__class__ = _Kernel
+    compiled.part = _part(function)
     return cast("Callable[P, R]", compiled)
 
 
@@ -61,11 +96,15 @@ def specialised(function: Callable[P, R]) -> Callable[P, R]:
 
 def inlined(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a small function into its callers, so that their lane loops still vectorise."""
-    compiled: Any = numba.njit(**_OPTIONS | {"forceinline": True, "no_cpython_wrapper": True})(
-        function
-    )
+    return cast("Callable[P, R]", _part(function, forceinline=True))
+
+
+def _part(function: Callable[P, R], **options: bool) -> Any:
+    compiled: Any = numba.njit(
+        **_OPTIONS | {"no_cpython_wrapper": True} | options, pipeline_class=_PartCompiler
+    )(function)
     compiled.__class__ = _Inlined
-    return cast("Callable[P, R]", compiled)
+    return compiled
 
 
 def rigorous(function: Callable[P, R]) -> Callable[P, R]:

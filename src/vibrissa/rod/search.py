@@ -413,7 +413,29 @@ def _boxes_around(turns: Array, box: Array, target: Array, slack: Array, inside:
         d1 -= 2.0 * np.pi * np.rint(d1 * turns[1])
         d2 -= 2.0 * np.pi * np.rint(d2 * turns[2])
         near = (abs(d0) <= box[3, c] + s0) & (abs(d1) <= box[4, c] + s1)
-        inside[c] = near & (abs(d2) <= box[5, c] + s2)
+        inside[c] = near & (abs(d2) <= box[5, c] + s2) & (box[3, c] >= 0.0)  # not a filler
+
+
+@inlined
+def _next_cells(
+    tree: SearchTree, target: Array, slack: Array, stack: IntArray, top: int, inside: AnyArray
+) -> tuple[int, int]:
+    """Go on to the next eight cells, and fill which may hold values within ``slack`` of a target's.
+
+    Return how many blocks are left on the stack, and the number of the eight; -1 if there are none.
+    """
+    last = tree.offsets.shape[0] - 2
+    while top > 0:
+        top -= 1
+        level, node = stack[top, 0], stack[top, 1]
+        _boxes_around(tree.turns, tree.boxes[tree.offsets[level] + node], target, slack, inside)
+        if level == last:
+            return top, node
+        for c in range(8):
+            if inside[c] and top < _STACK:
+                stack[top, 0], stack[top, 1] = level + 1, 8 * node + c
+                top += 1
+    return top, -1
 
 
 @inlined
@@ -457,30 +479,21 @@ def _begin_cell(
 @kernel
 def seeds(tree: SearchTree, target: Array, found: Array, inverses: Array, quality: IntArray) -> int:
     """All contacts that may have the target's values, as chart coordinates."""
-    grid, offsets, boxes, place = tree.grid, tree.offsets, tree.boxes, tree.place
-    levels = offsets.shape[0] - 1
-    stack = np.empty((_STACK, 2), np.int64)
+    grid, place, cells = tree.grid, tree.place, tree.boxes[tree.offsets[-2] :]
+    stack = np.zeros((_STACK, 2), np.int64)
     inside, slack = np.empty(8, np.bool_), np.zeros(3)
     work, relative, x = np.empty((6, 3)), np.empty(3), np.empty(3)
     b = np.zeros(_BUFFER)
     nearest, sides, half = np.empty(3), np.empty((3, 3)), np.empty(3)
-    count, top = 0, 1
-    stack[0, 0], stack[0, 1] = 0, 0
+    count = 0
     _aim(tree, target, b)
-    while top > 0:
-        top -= 1
-        level, node = stack[top, 0], stack[top, 1]
-        box = boxes[offsets[level] + node]
-        _boxes_around(tree.turns, box, target, slack, inside)
+    top, node = _next_cells(tree, target, slack, stack, 1, inside)
+    while node >= 0:
+        box = cells[node]
         for c in range(8):
             if not inside[c]:
                 continue
             child = 8 * node + c
-            if level < levels - 1:
-                if top < _STACK:
-                    stack[top, 0], stack[top, 1] = level + 1, child
-                    top += 1
-                continue
             careful = _begin_cell(tree, child, box, c, target, relative, b, work, half, x)
             if careful < 0:
                 continue
@@ -517,6 +530,7 @@ def seeds(tree: SearchTree, target: Array, found: Array, inverses: Array, qualit
                         quality,
                         count,
                     )
+        top, node = _next_cells(tree, target, slack, stack, top, inside)
     return count
 
 
@@ -548,25 +562,15 @@ def cells_around(
     ``spots`` (n, 3) are chart coordinates where in a cell these are nearest, ``away`` (n,) is how
     far they miss, relative to the slack. Return how many cells there are, at most n.
     """
-    grid, offsets, boxes, place = tree.grid, tree.offsets, tree.boxes, tree.place
-    levels, count, top = offsets.shape[0] - 1, 0, 1
-    stack, x, inside = np.empty((_STACK, 2), np.int64), np.empty(3), np.empty(8, np.bool_)
-    stack[0, 0], stack[0, 1] = 0, 0
-    while top > 0:
-        top -= 1
-        level, node = stack[top, 0], stack[top, 1]
-        box = boxes[offsets[level] + node]
-        _boxes_around(tree.turns, box, target, slack, inside)
+    grid, place, count = tree.grid, tree.place, 0
+    stack, x, inside = np.zeros((_STACK, 2), np.int64), np.empty(3), np.empty(8, np.bool_)
+    top, node = _next_cells(tree, target, slack, stack, 1, inside)
+    while node >= 0:
         for c in range(8):
-            if not (inside[c] and box[3, c] >= 0.0):
+            child, miss = 8 * node + c, 0.0
+            if not inside[c]:
                 continue
-            child = 8 * node + c
-            if level < levels - 1:
-                if top < _STACK:
-                    stack[top, 0], stack[top, 1] = level + 1, child
-                    top += 1
-                continue
-            miss, x[:] = 0.0, 0.5
+            x[:] = 0.5
             if tree.polar[child] < 0:
                 miss = _near_cell(tree, child, target, slack, x)
             if miss < 0.0:
@@ -577,4 +581,5 @@ def cells_around(
             count += 1
             if count == spots.shape[0]:
                 return count
+        top, node = _next_cells(tree, target, slack, stack, top, inside)
     return count

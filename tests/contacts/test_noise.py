@@ -127,7 +127,7 @@ def test_an_answer_in_a_bent_valley_is_the_contact_of_least_misfit(gamma_map, rn
     """Of light contacts that noise has carried out of T(Ω); SciPy, confined to Ω, gains nothing."""
     chart = gamma_map.chart
     d, sigma = chart.discretization, 1e-2 * SIGMA
-    force, moment, _ = contacts_of(gamma_map, 0.0, 0.02, 150, rng)
+    force, moment, _ = contacts_of(gamma_map, 0.0, 0.02, 900, rng)
     force, moment = noisy_wrenches(force, moment, rng, sigma)
     found = gamma_map.estimate(vb.base_signals(force, moment), "Fx MB MD", np.diag(sigma**2))
     moved = np.flatnonzero(found.chi_squared > 1e-3)[:30]

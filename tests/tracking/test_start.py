@@ -120,6 +120,21 @@ def test_before_grey_fur_a_whisker_is_found_along_the_lines_of_sight_of_the_othe
     assert np.mean(away < 4.0) > 0.9
 
 
+def test_before_grey_fur_it_is_followed_from_its_base():
+    """Not only beyond the cheek, where it is dark before open ground."""
+    film = Film(Setup(seed=101, frames=16, rate=250.0, cheek=True))
+    true = film.curves[1]
+    (row,) = trace_video(film.frames[1], [true[0][0]], TraceOptions(bright=False))
+    shown = []
+    for trace, curve in zip(row, true, strict=True):
+        if len(trace.line):
+            away = np.linalg.norm(trace.line[:, None] - curve[None], axis=2)
+            assert np.median(away.min(axis=1)) < 1.5
+            shown.append(np.mean(away.min(axis=0) < 2.0))
+    assert len(shown) > 0.5 * len(row)
+    assert np.median(shown) > 0.8
+
+
 def test_fur_in_which_no_whisker_is_to_be_seen_is_in_doubt(films):
     """The top view shows a whisker, the front view grey fur and nothing else."""
     shown, empty = films(241, cheek=True), films(241, cheek=True, whisker=False)

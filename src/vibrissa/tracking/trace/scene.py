@@ -78,6 +78,9 @@ whisker's middle must be, pixels."""
 _AT_BASE = 25.0
 """Distance from a base within which a still thing is taken to be the face, pixels."""
 
+_DEEP, _COVERED = 45.0, 0.98
+"""Distance within which a body covers such a share of all around a base that is before it."""
+
 _RANGE = (-20.0, 80.0)
 """Differences that count, grey values: what is darker or brighter counts as these."""
 
@@ -220,11 +223,16 @@ class Scene:
         weight, light = (gaussian_filter(one, _AROUND) for one in (known, known * shown))
         open_ = np.where(weight > _ENOUGH, light / np.maximum(weight, 1e-6), ground)
         parts, _ = label(stands)
-        # The face moves, with whatever hangs on it.
+        # The face moves, with whatever hangs on it; but a base far inside a body is before that.
         row, column = (np.arange(n) for n in stands.shape)
+        lifted = np.zeros_like(stands)
         for x, y in bases:
-            near = np.hypot.outer(row - y, column - x) < _AT_BASE
-            stands &= ~np.isin(parts, np.unique(parts[near & stands]))
+            away = np.hypot.outer(row - y, column - x)
+            at_base = np.isin(parts, np.unique(parts[(away < _AT_BASE) & stands]))
+            if stands[away < _DEEP].mean() > _COVERED:
+                lifted |= at_base
+            else:
+                stands &= ~at_base
         # Where whiskers cross or turn it is always dark too, though not over a long way.
         thick = binary_erosion(stands, iterations=_BLUR + _THICK)
         boxes = enumerate(find_objects(parts), 1)
@@ -232,10 +240,13 @@ class Scene:
         stands &= np.isin(parts, long) | np.isin(parts, np.unique(parts[thick]))
         at = np.flatnonzero(stands)
         factor = (open_ / shown).ravel()[at]
-        dark = stands & (shown < _OPAQUE * open_)
+        dark = stands & (shown < _OPAQUE * open_) & ~lifted
         bits = STILL * binary_dilation(dark, iterations=_SEEN).astype(np.uint32)
         bits |= EDGE * stands.astype(np.uint32)
-        return replace(self, still=Still(at, factor, open_.ravel()[at], bits))
+        return replace(
+            self,
+            still=Still(at, factor, open_.ravel()[at], dark.ravel()[at], bool(lifted.any()), bits),
+        )
 
     def moved(self, frame: Frame, points: Array, gain: float) -> float:
         """Share of dark points of a frame, of known brightness, that are usually not dark."""
@@ -258,6 +269,8 @@ class Still:
     at: NDArray[np.intp]
     factor: Array
     open: Array
+    opaque: NDArray[np.bool_]
+    before_body: bool  # some whisker begins before one of these, which is grey
     bits: Bits
 
     def removed(self, frame: Frame, gain: float) -> Frame:
@@ -266,8 +279,7 @@ class Still:
             return frame
         out = frame.copy()
         flat, most = out.reshape(-1), np.iinfo(frame.dtype).max
-        opaque = self.factor > 1.0 / _OPAQUE
-        grey = np.where(opaque, gain * self.open, self.factor * flat[self.at])
+        grey = np.where(self.opaque, gain * self.open, self.factor * flat[self.at])
         flat[self.at] = np.minimum(grey + 0.5, most).astype(frame.dtype)
         return out
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import zlib
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from itertools import chain, islice
 from os import PathLike
 from pathlib import Path
@@ -44,6 +45,9 @@ _AGREES = 0.9
 
 _SCENE = 30
 """Number of frames from which light and background are taken."""
+
+_FAINT = 2.4
+"""Factor of the jump of a single whisker before grey fur, where its base is less certain."""
 
 _SPAN = 400
 """Number of frames at the beginning of a film from which those for its start are taken."""
@@ -121,6 +125,8 @@ def trace_video(
     (still,) = between_whiskers([None], scene.bits, start.shape)
     for follower in followers:
         follower.clutter = still.still_only
+        if len(followers) == 1 and scene.still is not None and scene.still.before_body:
+            follower.options = replace(options, jump=_FAINT * options.jump)
     traces[:] = [list(row) for row in begun] or [[] for _ in followers]
     _check(corrections, len(followers))
     for i, frame in enumerate(chain(first, source)):

@@ -87,6 +87,30 @@ def test_the_contact_nearest_to_the_object_agrees(nodding, recording):
     assert isinstance(Recording(recording).objects[0], Peg)
 
 
+def test_contacts_of_poor_traces_are_on_a_known_object(nodding, traces):
+    """Traces that waver by half a pixel: without the object contacts are somewhere near it."""
+    random = np.random.default_rng(4)
+
+    def wavering(trace):
+        share = np.linspace(0.0, 1.0, len(trace.line))
+        wave = np.cos(3.0 * np.pi * share[:, None]) * random.normal(0.0, 0.5, 2)
+        return trace._replace(line=trace.line + wave)
+
+    poor = [[[wavering(trace) for trace in row] for row in view] for view in traces]
+    head = nodding.recording.to_dataset()[["head_position", "head_rotation"]]
+    whisker, objects = Recording(nodding.recording).whisker(), Recording(nodding.recording).objects
+    true, gaps, errors = nodding.truth["contact_point"].values, [], []
+    for things in ((), objects):
+        found = track(nodding.cameras, poor, RATE, head=head, objects=things)
+        data = found.to_dataset().isel(whisker=0)
+        points, known = data["contact_point"].values, np.isfinite(data["arc_length"].values)
+        radius = whisker.radius(data["arc_length"].values[known])
+        gaps.append(np.median(np.abs(objects[0].signed_distance(points[known]) - radius)))
+        errors.append(np.nanmedian(np.linalg.norm(points - true, axis=1)))
+    assert gaps[1] < 0.6 * gaps[0]
+    assert errors[1] < errors[0]
+
+
 def test_contact_points_of_a_table_are_compared(nodding, traces, recording):
     """Truth as a table, in space by time and in pixels by frame, comes out as it went in."""
     true = nodding.truth["contact_point"].values

@@ -1,7 +1,8 @@
 """Contact points that do not come from the rod: seen by a person, or nearest to a known object.
 
-They are compared with the contact points of the fitted rod, which does not depend on them: where
-both agree, each is right.
+They are compared with the contact points of the fitted rod. It does not depend on those of a
+person: where both agree, each is right. It does on a known object, on whose surface its contacts
+are; then the difference shows how well the measured whisker agrees with the object.
 """
 
 from __future__ import annotations

@@ -155,8 +155,8 @@ def track(
     contacts : xarray.Dataset, optional
         Contact points that were tracked otherwise; see `vibrissa.io.load_contact_points`.
     objects : sequence of Surface, optional
-        Objects in the laboratory frame. Without ``contacts``, the point of the whisker nearest to
-        any of them is where the contact is.
+        Objects in the laboratory frame, on which contacts of the fitted rod are. Without
+        ``contacts``, the point of the measured whisker nearest to any of them is compared with it.
     progress : callable, optional
         Function that is called as ``progress(stage, done, total)``.
 
@@ -202,7 +202,7 @@ def track(
         rows = [[view[k][i] for i in pairs[:, v]] for v, view in enumerate(traces)]
         name = names[k] if names is not None else f"whisker {k}"
         try:
-            one = track_whisker(cameras, rows, rate, options, name, progress, moving)
+            one = track_whisker(cameras, rows, rate, options, name, progress, moving, objects)
             if contacts is not None:
                 other = given_contacts(contacts, cameras, pairs, rate, k, one.fit)
                 one = replace(one, contacts=other)
@@ -300,6 +300,7 @@ def track_whisker(
     name: str = "whisker",
     progress: Progress | None = None,
     head: HeadPose | None = None,
+    objects: Sequence[Surface] = (),
 ) -> Tracked:
     """Track one whisker in space.
 
@@ -319,6 +320,8 @@ def track_whisker(
         Function that is called as ``progress(stage, done, total)``.
     head : HeadPose, optional
         Pose of the head in these frames; by default it does not move.
+    objects : sequence of Surface, optional
+        Known objects, on which contacts are.
 
     Returns
     -------
@@ -350,7 +353,7 @@ def track_whisker(
     if not shape.free.any():
         # Nothing but the bent shapes shows how the whisker is rolled.
         smoothness = replace(smoothness, roll=max(smoothness.roll, _ANY_ROLL))
-    fitter = Fitter(cameras, series, touching, on_head, rate, smoothness, head)
+    fitter = Fitter(cameras, series, touching, on_head, rate, smoothness, head, objects)
     length = Length(whisker.length, 0.0)
     if options.whisker is None and not shape.whole:
         length = _length(fitter, shape, options)

@@ -20,18 +20,18 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from vibrissa.cameras import Camera
+from vibrissa.objects import Surface
 from vibrissa.rod import Discretization, discretize, solve_forces
 from vibrissa.tracking.refine.least_squares import Smoother, trace_variance
 from vibrissa.tracking.refine.rods import (
     UNKNOWNS,
     State,
     bent,
+    contact_slopes,
     first_contacts,
-    pose_slopes,
     rods,
-    tangents,
 )
-from vibrissa.tracking.refine.trace_series import TraceSeries
+from vibrissa.tracking.refine.trace_series import FAR, TraceSeries
 from vibrissa.tracking.space.pose import BasePose, HeadPose
 from vibrissa.whisker import Whisker
 
@@ -60,7 +60,11 @@ _COMMON, _WAVES = 0.05, 4
 """Standard deviation of errors that a view's traces share in all frames, pixels, if residuals show
 no larger ones, and number of their waves along the whisker."""
 
-_AT_BASE, _FOLLOWED = 0.03, 2.0
+_LIT = 0.1
+"""Standard deviation at the base of the shift by light from the side, which is less where the
+whisker is thinner, pixels."""
+
+_AT_BASE, _FOLLOWED = 0.03, 3.0
 """Share of the length over which fur may draw a trace aside, and by how much more it does than what
 the rod, which follows it, leaves of that."""
 
@@ -94,6 +98,8 @@ class FitOptions:
         contact without friction.
     roll : float
         Standard deviation of the roll about what it is expected to be, rad.
+    surface : float
+        Standard deviation of the distance of contacts from known objects, m.
     rounds : int
         Largest number of Gauss–Newton steps.
     """
@@ -104,6 +110,7 @@ class FitOptions:
     pressing: float = 0.05
     friction: float = 0.1
     roll: float = np.radians(0.5)
+    surface: float = 3e-5
     rounds: int = 12
 
 
@@ -184,6 +191,7 @@ class Fitter:
     rate: float
     options: FitOptions
     head: HeadPose
+    objects: Sequence[Surface] = ()
 
     def fit(self, whisker: Whisker, pose: BasePose, nodes: int) -> RodFit:
         """Fit a whisker of an approximate pose."""
@@ -220,6 +228,7 @@ class Fitter:
         start.contact[:, 0] = _REST[0]
         start.contact[touching] = first_contacts(d, start, self.curves[frames], touching)[0]
         return Problem(
+            whisker,
             d,
             self.cameras,
             self.traces.rows(frames),
@@ -229,6 +238,7 @@ class Fitter:
             self.rate,
             self.options,
             self.head.rows(frames),
+            self.objects,
         )
 
 
@@ -250,6 +260,7 @@ class _Linear(NamedTuple):
 class Problem:
     """The equations of a fit: traces, motion over time, and the state from which it starts."""
 
+    whisker: Whisker
     d: Discretization
     cameras: Sequence[Camera]
     traces: TraceSeries
@@ -259,6 +270,7 @@ class Problem:
     rate: float
     options: FitOptions
     head: HeadPose
+    objects: Sequence[Surface] = ()
     begun: State | None = None
     variance: Array | None = None
 
@@ -326,7 +338,31 @@ class Problem:
         data = hessian * weight[:, None, None]
         smoother = Smoother(data, gradient * weight[:, None])
         cost = float((weight * total).sum()) + self._priors(smoother, state)
+        cost += self._touched(smoother, state)
         return _Linear(smoother, cost, misfit, wild, data, along, ends, designs, weights)
+
+    def _touched(self, smoother: Smoother, state: State) -> float:
+        """Pull contacts to the surfaces of known objects; what that costs."""
+        cost = 0.0
+        if not self.objects:
+            return cost
+        points, slopes, _ = contact_slopes(self.d, state)
+        points = self.head.put_in((points + state.position) * self.d.length)
+        radius = self.whisker.radius(state.contact[:, 0] * self.d.length)
+        for i in np.flatnonzero(self.touching):
+            found = [thing.local_geometry(points[i]) for thing in self.objects]
+            distance, normal, _ = min(found, key=lambda one: abs(one[0]))
+            # What is far from all objects touches something else.
+            gap = (distance - radius[i]) / self.options.surface
+            weight = 1.0 / np.sqrt(max(abs(gap) / FAR, 1.0))
+            row = (
+                normal
+                @ self.head.rotation[i]
+                @ slopes[i]
+                * (weight * self.d.length / self.options.surface)
+            )
+            cost += smoother.add_row(int(i), row, weight * gap)
+        return cost
 
     def _priors(self, smoother: Smoother, state: State) -> float:
         o = self.options
@@ -393,6 +429,7 @@ def _shared(fit: _Linear) -> Array:
         sigma = np.hypot(_COMMON, np.sqrt(np.mean(left**2)))
         s = np.linspace(0.0, 1.0, design.shape[1] - 2)
         waves = [sigma / (1.0 + k) * np.cos(k * np.pi * s) for k in range(_WAVES)]
+        waves.append(_LIT * (1.0 - s))
         drawn = np.abs(left[s < 2.0 * _AT_BASE]).max()
         waves.append(np.hypot(_COMMON, _FOLLOWED * drawn) * np.exp(-s / _AT_BASE))
         across = design[:, :-2] * weight[:, :-2, None]
@@ -408,15 +445,13 @@ def _answer(d: Discretization, state: State, fit: _Linear, touching: Mask, nodes
     """Results in SI units, relative to the head."""
     shared, misfit = _shared(fit), fit.misfit
     covariance = fit.smoother.covariances() + np.einsum("kti,ktj->tij", shared, shared)
+    turned, slopes, slope = contact_slopes(d, state)
     values, _ = solve_forces(d, state.contact)
-    slope = tangents(d, state.contact)
     force, point = values[:, :3], values[:, 3:]
     wrench = np.concatenate([force * d.force, np.cross(point, force) * d.moment], axis=1)
     moment_slope = np.cross(slope[:, 3:], force[:, :, None], axis=1)
     moment_slope += np.cross(point[:, :, None], slope[:, :3], axis=1)
     by_contact = np.concatenate([slope[:, :3] * d.force, moment_slope * d.moment], axis=1)
-    turned = np.einsum("tij,tj->ti", state.rotation, point)
-    slopes = np.concatenate([pose_slopes(turned), state.rotation @ slope[:, 3:]], axis=-1)
     inside = covariance[:, 6:, 6:]
     size = np.repeat([d.length, 1.0], 3)
     held = covariance[:, :6, :6] * np.outer(size, size)

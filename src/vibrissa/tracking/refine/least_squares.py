@@ -52,6 +52,12 @@ class Smoother:
         self.gradient[:, places] += weight * (target - values)
         return float((weight * (values - target) ** 2).sum())
 
+    def add_row(self, i: int, row: Array, value: float) -> float:
+        """Pull a combination of a frame's unknowns to zero; what that costs."""
+        self.diagonal[i] += np.outer(row, row)
+        self.gradient[i] -= row * value
+        return value**2
+
     def add_along(self, axis: Array, value: Array, begin: int, weight: float) -> float:
         """Pull one direction of three unknowns to zero; what that costs."""
         part = slice(begin, begin + 3)

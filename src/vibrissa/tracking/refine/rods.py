@@ -94,9 +94,16 @@ def rods(d: Discretization, contact: Array, s: Array) -> Array:
     return shapes(d, values, np.ascontiguousarray(contact[:, 0]), s)
 
 
-def tangents(d: Discretization, contact: Array) -> Array:
-    """Derivatives (t, 6, 4) of base force and contact point by the contact."""
-    return _differences(lambda each: solve_forces(d, each)[0], contact)
+def contact_slopes(d: Discretization, state: State) -> tuple[Array, Array, Array]:
+    """Contact points (t, 3) relative to the base, turned as it is, their derivatives (t, 3, 10).
+
+    And those (t, 6, 4) of force and contact point, in the whisker's frame, by the contact.
+    """
+    point = solve_forces(d, state.contact)[0][:, 3:]
+    slope = _differences(lambda each: solve_forces(d, each)[0], state.contact)
+    turned = np.einsum("tij,tj->ti", state.rotation, point)
+    both = np.concatenate([pose_slopes(turned), state.rotation @ slope[:, 3:]], axis=-1)
+    return turned, both, slope
 
 
 def first_contacts(

@@ -21,7 +21,7 @@ _FLOOR = 0.05
 _END = 1.0
 """Standard deviation of a trace's ends along it, pixels."""
 
-_FAR = 6.0
+FAR = 6.0
 """Distance, in pixels, from which the end of a trace is not the tip, and in standard deviations,
 from which an error shows that something else is wrong and is weighted down."""
 
@@ -104,14 +104,14 @@ class TraceSeries:
         weight = np.where(beyond, 0.0, 1.0 / deviation)
         # An error far beyond what is usual shows that something else is wrong.
         scaled = np.abs(miss) * weight
-        weight = weight / np.sqrt(np.maximum(scaled / _FAR, 1.0))
+        weight = weight / np.sqrt(np.maximum(scaled / FAR, 1.0))
         rows = np.einsum("tni,tnij->tnj", across, slopes) * weight[..., None]
         misses = miss * weight
         ends, gaps, shown = [], [], []
         for end in (0, -1):
             gap = ((line[:, end] - pixels[:, end]) * tangent[:, end]).sum(axis=1)
             counts = np.isfinite(gap) & (self.ends[:, view, end] > 0.5)
-            counts &= (end == 0) | (np.abs(gap) < _FAR)
+            counts &= (end == 0) | (np.abs(gap) < FAR)
             pull = np.einsum("ti,tij->tj", tangent[:, end], slopes[:, end]) / _END
             ends.append(np.where(counts[:, None], pull, 0.0))
             gaps.append(np.where(counts, gap / _END, 0.0))

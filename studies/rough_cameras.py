@@ -23,8 +23,8 @@ HELD = 7.815
 """χ² of three numbers that 95 % are below."""
 
 
-def whisk(seed, frames=90):
-    """A whisk that rises as it protracts, past a peg that leans."""
+def whisk(seed, frames=90, *share):
+    """A whisk that rises as it protracts, past a peg that leans, at a share of the length."""
     rng = np.random.default_rng(seed)
     whisker = Whisker.parabola(length=rng.uniform(30e-3, 36e-3), coefficient=rng.uniform(4.0, 9.0))
     phase = np.linspace(0.0, 1.0, frames)
@@ -32,7 +32,7 @@ def whisk(seed, frames=90):
     elevation = 0.1 + 0.35 * azimuth + rng.uniform(-0.1, 0.1)
     shift = np.outer(np.sin(np.pi * phase), rng.uniform(-0.6e-3, 0.6e-3, 3))
     base = np.array([-15e-3, -1e-3, 0.0]) + shift
-    angle, away = rng.uniform(0.3, 0.45), rng.uniform(0.5, 0.6) * whisker.length
+    angle, away = rng.uniform(0.3, 0.45), rng.uniform(*(share or (0.5, 0.6))) * whisker.length
     axis = np.array([*rng.uniform(-0.1, 0.1, 2), 1.0])
     origin = base[0] + away * np.array([np.cos(angle), np.sin(angle), 0.0])
     peg = Peg(origin, axis / np.linalg.norm(axis), rng.uniform(1.0e-3, 1.6e-3))

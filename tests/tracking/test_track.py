@@ -142,7 +142,16 @@ def test_a_step_to_a_contact_that_no_rod_withstands_is_not_taken():
     touching, frames = np.ones(2, dtype=bool), np.arange(2)
     still = HeadPose.still(2)
     problem = Problem(
-        discretize(whisker), pair, sight, touching, frames, state, 1000.0, FitOptions(), still
+        whisker,
+        discretize(whisker),
+        pair,
+        sight,
+        touching,
+        frames,
+        state,
+        1000.0,
+        FitOptions(),
+        still,
     )
     fit = problem.linear(state)
     assert fit.wild.tolist() == [False, True]

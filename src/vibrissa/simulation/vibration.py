@@ -11,6 +11,10 @@ impact, which decays in the same modes from an unknown start. So a frame is free
 little more than a period that contains it is explained by free vibration, up to the sensor's noise
 and a share of the window's own size; frames that no such window contains are in contact. A load
 that changes slowly is not imitated by vibrations about zero for so long.
+
+The last milliseconds before a whisker slips off are, as its moment goes over smoothly into the
+vibration after it. But the axial force does not: in contact it is of the size of M_B/L or more, in
+vibration of second order, and passes through zero within a millisecond or two of the release.
 """
 
 from __future__ import annotations
@@ -22,6 +26,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.interpolate import CubicSpline
 from scipy.linalg import eigh
+from scipy.ndimage import maximum_filter1d
 from scipy.signal import StateSpace, lsim
 from scipy.stats import chi2
 
@@ -41,6 +46,11 @@ _SCALES = (0.9, 0.95, 1.0, 1.05, 1.1)
 # Share of a window's own size that linear modes do not explain, and the chance that noise alone
 # makes a window of a free whisker look like a contact.
 _SHARE, _CHANCE = 0.1, 1e-4
+# Axial force, over the largest M_B/L within a quarter of a period, that no free whisker has; and
+# its share, of its largest value, that is left when a contact ends.
+_AXIAL, _ENDED = 1.5, 0.2
+# Least axial force that counts, in standard deviations of M_B/L.
+_COUNTS = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,4 +218,32 @@ class Vibration:
             True where neither the motion of the base nor free vibration explains the moment.
         """
         left = wrench - self.in_air(time, rotation, position)
-        return np.asarray(~self.free(float(np.diff(time).mean()), left[:, 3:], sigma))
+        step = float(np.diff(time).mean())
+        return self._until_release(step, left, sigma, ~self.free(step, left[:, 3:], sigma))
+
+    def _until_release(
+        self, step: float, left: Array, sigma: float, touching: AnyArray
+    ) -> AnyArray:
+        """Frames in contact, to the end that the axial force shows where it is large."""
+        length = float(np.linalg.norm(self.places, axis=1).max())
+        axial, bending = left[:, 0], np.hypot(left[:, 4], left[:, 5]) / length
+        quarter = max(round(0.5 * np.pi / self.rates[0] / step), 1)
+        usual = maximum_filter1d(bending, 2 * quarter + 1)
+        pulled = np.abs(axial) > np.maximum(_AXIAL * usual, _COUNTS * sigma / length)
+        out = np.asarray(touching | pulled)
+        for end in np.flatnonzero(out[:-1] & ~out[1:]) + 1:
+            first = max(end - 2 * quarter, 0)
+            if not (pulled & out)[max(end - quarter, 0) : end].any():
+                continue
+            last = axial[first:end] * out[first:end]
+            least = _ENDED * last[np.argmax(np.abs(last))]
+            row = end
+            if axial[end - 1] / least > 1.0:
+                while row < len(axial) and axial[row] / least > 1.0:
+                    out[row] = True
+                    row += 1
+            else:
+                while axial[row - 1] / least <= 1.0:
+                    row -= 1
+                    out[row] = False
+        return out

@@ -5,7 +5,16 @@ import pytest
 
 import vibrissa as vb
 from vibrissa.objects import Peg
-from vibrissa.simulation import Dynamics, Vibration, facing_peg, measure, simulate, sweep_past
+from vibrissa.simulation import (
+    Dynamics,
+    Vibration,
+    facing_peg,
+    fit_dynamics,
+    measure,
+    resonances,
+    simulate,
+    sweep_past,
+)
 
 
 @pytest.fixture(scope="module")
@@ -20,11 +29,27 @@ def measured(trial):
     return data.time.values, wrench, data.base_rotation.values, data.base_position.values
 
 
-def test_whisking_in_air_is_predicted(whisker):
-    dynamics = Dynamics(step=2e-4)
+@pytest.fixture(scope="module")
+def in_air(whisker):
     motion = sweep_past(whisker, facing_peg(whisker, 0.6), 0.2, 1000.0, seed=3, frequency=6.0)
     away = Peg(origin=np.array([1.0, 1.0, 0.0]), axis=np.array([0.0, 0.0, 1.0]), radius=1e-3)
-    trial = simulate(whisker, motion, away, dynamics=dynamics, nodes=9)
+    return simulate(whisker, motion, away, dynamics=Dynamics(step=2e-4), nodes=9)
+
+
+TRUE = Dynamics(
+    density=tuple(0.85 * value for value in Dynamics().density), damping_ratio=0.12, step=2e-4
+)
+
+
+@pytest.fixture(scope="module")
+def past_peg(whisker):
+    peg = facing_peg(whisker, 0.6)
+    motion = sweep_past(whisker, peg, 0.25, 1000.0, seed=5, frequency=6.0)
+    return measure(simulate(whisker, motion, peg, dynamics=TRUE, nodes=9), seed=5)
+
+
+def test_whisking_in_air_is_predicted(whisker, in_air):
+    trial, dynamics = in_air, Dynamics()
     truth = trial["truth"].to_dataset().isel(whisker=0)
     time, _, rotation, position = measured(measure(trial, seed=1))
     predicted = Vibration.of(whisker, dynamics).in_air(time, rotation, position)
@@ -36,12 +61,8 @@ def test_whisking_in_air_is_predicted(whisker):
         assert np.median(left) < 0.1 * np.median(np.linalg.norm(known, axis=1))
 
 
-def test_contact_is_distinguished_from_inertia_with_a_wrong_mass(whisker):
-    density = tuple(0.85 * value for value in Dynamics().density)
-    dynamics = Dynamics(density=density, damping_ratio=0.12, step=2e-4)
-    peg = facing_peg(whisker, 0.6)
-    motion = sweep_past(whisker, peg, 0.25, 1000.0, seed=5, frequency=6.0)
-    trial = measure(simulate(whisker, motion, peg, dynamics=dynamics, nodes=9), seed=5)
+def test_contact_is_distinguished_from_inertia_with_a_wrong_mass(whisker, past_peg):
+    trial = past_peg
     touching = trial["truth"].to_dataset().isel(whisker=0).in_contact.values.astype(bool)
     time, wrench, rotation, position = measured(trial)
     found = Vibration.of(whisker).in_contact(time, wrench, rotation, position, 2e-8)
@@ -49,3 +70,22 @@ def test_contact_is_distinguished_from_inertia_with_a_wrong_mass(whisker):
     assert np.mean(bare[~touching]) > 0.3
     assert np.mean(found[~touching]) < 0.05
     assert np.mean(found[touching]) > 0.97
+
+
+def test_ringing_gives_mass_resonances_and_damping(whisker, past_peg):
+    # The whisker does not move along with its base before the first frames.
+    fit = fit_dynamics(whisker, *(x[20:] for x in measured(past_peg)), 2e-8, stiffness_sigma=0.05)
+    known = (TRUE.density[0], resonances(whisker, TRUE)[0], TRUE.damping_ratio)
+    found = (fit.dynamics.density[0], fit.resonances[0], fit.dynamics.damping_ratio)
+    away = np.log(np.divide(found, known))
+    deviation = np.sqrt(np.diag(fit.covariance))
+    assert (np.abs(away) < [0.1, 0.04, 0.3]).all()
+    assert (np.abs(away[:2]) < 3.0 * deviation[:2]).all()
+
+
+def test_what_is_not_determined_is_stated(whisker, in_air):
+    air = [x[25:] for x in measured(measure(in_air, seed=1))]
+    with pytest.raises(ValueError, match="damping"):
+        fit_dynamics(whisker, *air, 2e-8)
+    with pytest.raises(ValueError, match="no free window"):
+        fit_dynamics(whisker, *(x[:9] for x in air), 2e-8)

@@ -1,6 +1,7 @@
 """Simulated trials with known truth: motion, dynamics, films, sensor readings."""
 
 from vibrissa.simulation.dynamics import Dynamics, resonances as resonances
+from vibrissa.simulation.dynamics_fit import FittedDynamics, fit_dynamics
 from vibrissa.simulation.film import (
     ImageConditions,
     film,
@@ -31,6 +32,7 @@ from vibrissa.simulation.vibration import Vibration
 
 __all__ = [
     "Dynamics",
+    "FittedDynamics",
     "ImageConditions",
     "Motion",
     "Vibration",
@@ -38,6 +40,7 @@ __all__ = [
     "facing_peg",
     "film",
     "film_frames",
+    "fit_dynamics",
     "head_path",
     "measure",
     "simulate",

@@ -45,7 +45,7 @@ _HIDDEN = 0.15
 _SCALES = (0.9, 0.95, 1.0, 1.05, 1.1)
 # Share of a window's own size that linear modes do not explain, and the chance that noise alone
 # makes a window of a free whisker look like a contact.
-_SHARE, _CHANCE = 0.1, 1e-4
+SHARE, _CHANCE = 0.1, 1e-4
 # Axial force, over the largest M_B/L within a quarter of a period, that no free whisker has; and
 # its share, of its largest value, that is left when a contact ends.
 _AXIAL, _ENDED = 1.5, 0.2
@@ -174,9 +174,9 @@ class Vibration:
         size = (windows**2).sum(axis=1)
         left = np.full(len(windows), np.inf)
         for scale in _SCALES:
-            basis = np.linalg.qr(self._free_moments(scale, step, width)).Q
+            basis = np.linalg.qr(self.free_moments(scale, step, width)).Q
             left = np.minimum(left, size - ((windows @ basis) ** 2).sum(axis=1))
-        spread = sigma**2 + _SHARE**2 * size / (2 * width)
+        spread = sigma**2 + SHARE**2 * size / (2 * width)
         passed = left < spread * chi2.isf(_CHANCE, 2 * width - 2 * _MODES)
         out = np.zeros(len(moments), np.bool_)
         # The large vibration after a release would hide the last frames of the contact before it.
@@ -185,8 +185,23 @@ class Vibration:
             out[i : i + len(passed)] |= passed
         return out
 
-    def _free_moments(self, scale: float, step: float, width: int) -> Array:
-        """M_y and M_z (2 n, 2 k) of free vibrations, of all times one after the other."""
+    def free_moments(self, scale: float, step: float, width: int) -> Array:
+        """Moments of free vibrations.
+
+        Parameters
+        ----------
+        scale : float
+            Factor of all frequencies.
+        step : float
+            Time between frames, s.
+        width : int
+            Number of frames.
+
+        Returns
+        -------
+        (2 width, 2 k) array
+            M_y of all frames, then M_z, of two vibrations of each mode.
+        """
         gains = self._wrench(self.shapes)[:, 4:]
         time = step * np.arange(width)
         columns = []

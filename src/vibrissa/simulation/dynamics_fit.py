@@ -150,7 +150,7 @@ def fit_dynamics(
             damping_ratio=dynamics.damping_ratio * damping * rate,
         ),
         whisker.youngs_modulus * mass * rate**2,
-        rate * first.rates / (2.0 * np.pi),
+        np.asarray(rate * first.rates / (2.0 * np.pi), dtype=np.float64),
         covariance,
         misfit,
     )

@@ -132,7 +132,8 @@ def fit_dynamics(
     # Each window gives as many numbers to its own vibration as there are amplitudes.
     misfit = 2.0 * fit.cost / (starts.size * (2 * width - 2 * len(first.rates)) - 3)
     slopes = np.asarray(fit.jac, dtype=np.float64)
-    covariance = np.linalg.pinv(slopes.T @ slopes, rcond=1e-15) * max(misfit, 1.0)
+    covariance: Array = np.linalg.pinv(slopes.T @ slopes, rcond=1e-15).astype(np.float64)
+    covariance *= max(misfit, 1.0)
     deviation = np.sqrt(np.diag(covariance))
     unknown = [
         f"{name} (σ {100 * one:.0f} %; {how})"
@@ -150,7 +151,7 @@ def fit_dynamics(
             damping_ratio=dynamics.damping_ratio * damping * rate,
         ),
         whisker.youngs_modulus * mass * rate**2,
-        np.asarray(rate * first.rates / (2.0 * np.pi), dtype=np.float64),
+        rate * first.rates / (2.0 * np.pi),
         covariance,
         misfit,
     )

@@ -17,9 +17,10 @@ _BATCH = 2048
 _MOST_HALVINGS = 3
 # Remainders fall at least with this power of a box's size.
 _REMAINDER = 4
-# Halvings of each unknown that make a box which can be enclosed.
-_INNER = 6
-_DEEPEST = 40
+# Largest remainder, relative to a condition, from which one halving is enough.
+_CLEAR = 0.1
+# How much more often arc length is halved than the other unknowns where nothing helps.
+_LONGER = 4
 
 Evaluate = Callable[[IntArray], tuple[Array, Array]]
 
@@ -105,23 +106,47 @@ def cover(
             return Cover(np.concatenate(done), np.concatenate([left, batch]), evaluated, bad)
         done.append(batch[certain])
         open_ = ~certain
-        lost = open_ & ~np.isfinite(found).all(axis=(1, 2))
-        if lost.any():  # what could not be enclosed shows near its middle where it is widest
-            inner = batch[lost] * [1, 2**_INNER] + [_INNER, 2 ** (_INNER - 1)]
-            near = evaluate(inner)[1]
-            size = 2.0 ** (-inner[..., 0].astype(np.float64))
-            widths[lost] = np.where(np.isfinite(near), near, size)
-        widths = widths * free
-        left = np.concatenate([left, _halved(batch[open_], found[open_], widths[open_])])
+        blurred = open_ & ~(rest < np.abs(centre)).all(axis=-1)
+        times = np.zeros(widths.shape, dtype=np.int64)
+        clear = open_ & ~blurred
+        times[clear] = _halvings(found[clear], widths[clear] * free)
+        times[blurred] = _clearing(evaluate, batch[blurred], free)
+        left = np.concatenate([left, _halved(batch[open_], times[open_])])
     return Cover(np.concatenate(done), left, evaluated, none)
+
+
+def _clearing(evaluate: Evaluate, boxes: IntArray, free: AnyArray) -> IntArray:
+    """How often to halve each unknown of boxes with large remainders: tried in their middles.
+
+    A quarter of the box along each unknown is tried. Where none can be enclosed the arc length is
+    halved, as steps of the rod are longer than contacts are spread, but not much more often than
+    the others; then all are.
+    """
+    number, unknowns = boxes.shape[:2]
+    blur = np.full((number, unknowns), np.inf)
+    for a in np.flatnonzero(free) if number else ():
+        inner = boxes.copy()
+        inner[:, a] = inner[:, a] * [1, 4] + [2, 1]
+        found, _ = evaluate(inner)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            share = np.abs(found[..., -1] / found[..., 0]).max(axis=1)
+        blur[:, a] = np.where(np.isfinite(share), share, np.inf)
+    best = np.argmin(blur, axis=1)
+    least = blur[np.arange(number), best]
+    axes = np.eye(unknowns, dtype=np.int64)
+    times: IntArray = np.where(least < _CLEAR, 1, 2)[:, None] * axes[best]
+    none, level = ~np.isfinite(least), boxes[..., 0]
+    times[none] = free.astype(np.int64)
+    if free[0]:
+        long = level[:, 0] < level[:, 1:].max(axis=1) + _LONGER
+        times[none & long] = 2 * axes[0]
+    return times
 
 
 def _halvings(found: Array, widths: Array) -> IntArray:
     """How often each unknown is to be halved: where that is expected to make the signs certain."""
     n, unknowns = widths.shape
     times = np.zeros((n, unknowns), dtype=np.int64)
-    known = np.isfinite(found).all(axis=(1, 2), keepdims=True)
-    found = np.where(known, found, np.array([1.0, *unknowns * [0.0], 0.0, 100.0]))
     centre, curved, rest = found[..., 0], found[..., -2], found[..., -1]
     shares = found[..., 1:-2]
     for _ in range(_MOST_HALVINGS):
@@ -140,12 +165,9 @@ def _halvings(found: Array, widths: Array) -> IntArray:
     return times
 
 
-def _halved(boxes: IntArray, found: Array, widths: Array) -> IntArray:
+def _halved(boxes: IntArray, times: IntArray) -> IntArray:
     """Parts of boxes."""
-    if not len(boxes):
-        return boxes
-    times = _halvings(found, widths)
-    parts = []
+    parts = [boxes[:0]]
     for pattern in np.unique(times, axis=0):
         rows = boxes[(times == pattern).all(axis=1)]
         steps = np.stack(

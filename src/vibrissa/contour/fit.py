@@ -35,7 +35,7 @@ from typing import Any, Literal, overload
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import OptimizeResult, least_squares
-from scipy.special import chdtrc, chdtri
+from scipy.special import chdtrc, chdtri, log_ndtr
 
 from vibrissa.contour.fitted_shape import excess_of
 from vibrissa.contour.simple_shapes import (
@@ -74,6 +74,9 @@ _PRECISE = 1e-6
 
 _SINGULAR = 1e-7
 """Least over largest singular value from which the parameters are determined."""
+
+_HOLLOW = 2.0
+"""Standard deviations below zero from which a radius is that of a hollow."""
 
 _LARGEST = 1e3
 """Size, in units of the extent, from which a shape is of no size."""
@@ -218,7 +221,6 @@ class _Posed:
 
 def _fitted(starts: Sequence[_Posed], given: Checked) -> SimpleShape:
     """Fit a shape to contacts."""
-    kind = starts[0].shape.kind
     touches = given.touches
     if touches.covariance is None:
         touches, starts = _scattered(starts, touches)
@@ -231,11 +233,7 @@ def _fitted(starts: Sequence[_Posed], given: Checked) -> SimpleShape:
             best = _best([best], touches.rows(used))
     best = best.moved(_solved(best, touches.rows(used), 1e-15).x)
     if not best.shape.size > 0.0:
-        # Equations with normals are linear in the radius and know no sign.
-        raise ValueError(
-            f"no {kind}: points and normals fit only a hollow one, of negative radius; forces are "
-            "not normals where there is friction or inertia: leave the normals out"
-        )
+        best = _solid(best, touches.rows(used))
     best = _Posed.at(best.shape.arranged(), best.frame[0], best.count)
     covariance, squares, equations = _uncertainty(best, touches.rows(used))
     scale = np.where(best.shape.directions, 1.0, given.extent)
@@ -250,6 +248,27 @@ def _fitted(starts: Sequence[_Posed], given: Checked) -> SimpleShape:
         chi_squared=chi_squared,
         equations=0 if given.touches.covariance is None else equations,
     )
+
+
+def _solid(best: _Posed, touches: Touches) -> _Posed:
+    """The shape of positive size that is as probable as a fit of negative size allows.
+
+    Equations with normals are linear in the radius and know no sign. A thin object may so have a
+    radius below zero within its standard deviation; then the mean of what is above zero is taken,
+    and the other parameters follow by their covariance with the radius.
+    """
+    covariance = _uncertainty(best, touches)[0]
+    size, sigma = best.shape.size, float(np.sqrt(covariance[-1, -1]))
+    if not size > -_HOLLOW * sigma:
+        raise ValueError(
+            f"no {best.shape.kind}: points and normals fit only a hollow one, of negative radius; "
+            "forces are not normals where there is friction or inertia: leave the normals out"
+        )
+    share = size / sigma
+    positive = size + sigma * np.exp(-0.5 * share**2 - log_ndtr(share)) / np.sqrt(2.0 * np.pi)
+    slopes = best.shape.step_slopes(best.frame)[:, : best.count]
+    steps = np.linalg.pinv(slopes) @ covariance[:, -1]
+    return best.moved(steps * (positive - size) / covariance[-1, -1])
 
 
 def _scattered(starts: Sequence[_Posed], touches: Touches) -> tuple[Touches, Sequence[_Posed]]:

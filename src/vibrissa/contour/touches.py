@@ -14,7 +14,7 @@ Mask = NDArray[np.bool_]
 FLOOR = 1e-7
 """Smallest standard deviation, as a share of the points' extent, where their noise is zero."""
 
-_FINE = 1e-12
+_FINE = 1e-10
 """Variance of the least noisy combination as a share of that of the point or normal, at least."""
 
 _NEGATIVE = 1e-8

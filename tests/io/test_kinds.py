@@ -81,7 +81,7 @@ def test_nothing_there(tmp_path):
 
 def test_info_of_tracks(tmp_path):
     said = info(anipose(tmp_path / "trial.csv"))
-    for part in ("table of Anipose", "frames 2, from 0 to 1 frame", "unit not stated", "100.0 %"):
+    for part in ("table of Anipose", "frames 2, numbered 0 to 1", "unit not stated", "100.0 %"):
         assert part in said
     image = np.ones((4, 2, 1, 3, 2))
     image[2:, 1] = np.nan

@@ -72,7 +72,7 @@ _LONGEST = 0.1
 _MOST_DAMPING = 1e8
 _ROUNDS_WITHIN = 100
 # A step that promises less of χ² (as a share of it, and by itself) is not taken.
-_IDLE_WITHIN, _LITTLE = 1e-6, 1e-6
+_IDLE_WITHIN, _LITTLE = 1e-6, 1e-9
 # Nor is one that, undamped or after many rounds, promises less of what χ² is above what counts.
 _SLOW, _PATIENCE, _LATE = 0.05, 3, 25
 # Where χ² rises by more than this factor contacts teach nothing of its curvature.

@@ -43,6 +43,7 @@ _HEAP = b"GCOL\1\0\0\0"
 def opened(path: str | PathLike[str], what: str, *, soft_links: bool = True) -> Iterator[h5py.File]:
     """Open a file in HDF5 for reading, once it has been found harmless."""
     path = check_readable(path)
+    refuse_whisk(path)
     with naming(path, what):
         _check_heaps(path)
     with naming(path, what), h5py.File(path, "r") as file:
@@ -172,12 +173,8 @@ def is_netcdf(path: str | PathLike[str]) -> bool:
 
 def kind_of(path: str | PathLike[str]) -> str:
     """Read the kind of content that a NetCDF-4 file states."""
-    try:
-        with opened(path, "NetCDF-4") as file:
-            kind = file.attrs.get("kind", "")
-    except ValueError:
-        refuse_whisk(path)
-        raise
+    with opened(path, "NetCDF-4") as file:
+        kind = file.attrs.get("kind", "")
     return kind.decode("utf-8", "replace") if isinstance(kind, bytes) else str(kind)
 
 

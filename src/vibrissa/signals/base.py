@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.deferred import xr
-from vibrissa.numerics import AnyArray, Array, IntArray, Vector, inlined
+from vibrissa.numerics import AnyArray, Array, IntArray, Vector, cross, inlined
 from vibrissa.quantities import attributes
 
 # Of a DataArray, by name.
@@ -316,8 +316,8 @@ def signal_derivatives(values: Array, tangents: Array) -> Array:
     """Derivatives of the six signals by the contact."""
     force, point = values[..., :3], values[..., 3:]
     d_force, d_point = tangents[..., :3, :], tangents[..., 3:, :]
-    d_moment = np.cross(d_point, force[..., None], axis=-2) + np.cross(
-        point[..., None], d_force, axis=-2
-    )
-    by_wrench = wrench_derivatives(force, np.cross(point, force))
+    by_point = cross(np.swapaxes(d_point, -1, -2), force[..., None, :])
+    by_force = cross(point[..., None, :], np.swapaxes(d_force, -1, -2))
+    d_moment = np.swapaxes(by_point + by_force, -1, -2)
+    by_wrench = wrench_derivatives(force, cross(point, force))
     return np.asarray(by_wrench @ np.concatenate([d_force, d_moment], axis=-2))

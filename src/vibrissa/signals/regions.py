@@ -29,7 +29,7 @@ _SAMPLES = 2049
 
 
 @lru_cache(maxsize=16)
-def resting(whisker: Whisker) -> tuple[Array, Array, cKDTree]:
+def resting(whisker: Whisker) -> tuple[Array, Array, cKDTree, Array]:
     """Sample the resting whisker; cached.
 
     Parameters
@@ -45,15 +45,12 @@ def resting(whisker: Whisker) -> tuple[Array, Array, cKDTree]:
         Points of the centreline, m.
     tree : cKDTree
         Search tree of these points.
+    tangent : (3,) array
+        Tangent at the tip.
     """
     s = np.linspace(0.0, whisker.length, _SAMPLES)
     places = whisker.position(s)
-    return s, places, cKDTree(places)
-
-
-@lru_cache(maxsize=16)
-def _tip_tangent(whisker: Whisker) -> Array:
-    return np.asarray(whisker.frame(np.array(whisker.length))[:, 0])
+    return s, places, cKDTree(places), whisker.frame(np.array(whisker.length))[:, 0]
 
 
 def nearest_on_rest(whisker: Whisker, points: Array) -> tuple[Array, Array]:
@@ -76,7 +73,7 @@ def nearest_on_rest(whisker: Whisker, points: Array) -> tuple[Array, Array]:
     distance, arc_length = np.full(len(flat), np.nan), np.full(len(flat), np.nan)
     rows = np.flatnonzero(np.isfinite(flat).all(axis=1))
     if rows.size:
-        s, places, tree = resting(whisker)
+        s, places, tree, _ = resting(whisker)
         _, i = tree.query(flat[rows])
         # Between samples the curve is straight enough: the nearest point of the two chords at
         # the sample.
@@ -138,14 +135,14 @@ def concave_backward(whisker: Whisker, points: Array) -> AnyArray:
     y = points[..., 1]
     if whisker.is_straight:
         return np.asarray(y > 0.0)
-    _, places, _ = resting(whisker)
+    _, places, _, tangent = resting(whisker)
     r_rest = np.linalg.norm(places, axis=1)
     r = np.linalg.norm(points, axis=-1)
     if np.all(np.diff(r_rest) > 0.0):
         rest_y = np.interp(r, r_rest, places[:, 1])
     else:
         rest_y = _nearest_branch(points, r, r_rest, places)
-    tip, tangent = places[-1], _tip_tangent(whisker)
+    tip = places[-1]
     beyond = r > r_rest.max()
     along = np.dot(tip, tangent)
     # |tip + a tangent| = r

@@ -1,8 +1,9 @@
 """Where tracking begins without a click, in films with all that resembles a whisker.
 
-`python studies/starts.py`: films of `tests/tracking/furry.py`, 24 frames spread over 0.4 s each,
-whose seeds set no number of the method; some minutes on a free core. `--page` writes the table into
-`docs/tracking.md`, else it is printed.
+`python studies/starts.py`: films of `tests/tracking/furry.py`, 24 frames spread over 0.4 s each;
+some minutes on a free core. Their seeds set no number of the method, but for those without a
+whisker and 123, 125 and 127 before grey fur. `--page` writes the table into `docs/tracking.md`,
+else it is printed.
 """
 
 import argparse

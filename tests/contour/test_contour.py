@@ -185,3 +185,19 @@ def test_normals_that_contradict_the_points_give_no_hollow_cylinder(seed):
     covariance = noise_along_x(generator, n, across=1e-4, along=(1e-4, 1e-3))
     with pytest.raises(ValueError, match="no cylinder"):
         fit_shape("cylinder", points, covariance, radius, normals=normal)
+
+
+def test_a_thin_cylinder_has_a_positive_radius():
+    """Contacts with noise on a short arc fit radii below zero as often as above; none is hollow."""
+    true, sigma, n = 20e-6, 2e-4, 60
+    for seed in range(10):
+        generator = np.random.default_rng(seed)
+        angle = generator.uniform(-0.5, 0.5, n)
+        normal = np.stack([np.cos(angle), np.sin(angle), np.zeros(n)], axis=1)
+        height = generator.uniform(-4e-3, 4e-3, n)
+        points = true * normal + height[:, None] * np.array([0.0, 0.0, 1.0])
+        points = points + sigma * generator.normal(size=(n, 3))
+        covariance = np.broadcast_to(sigma**2 * np.eye(3), (n, 3, 3))
+        fitted = fit_shape("cylinder", points, covariance, np.zeros(n), normals=normal)
+        assert fitted.radius > 0.0
+        assert abs(fitted.radius - true) < 3.0 * fitted.sigma["radius"]

@@ -75,8 +75,11 @@ _PRECISE = 1e-6
 _SINGULAR = 1e-7
 """Least over largest singular value from which the parameters are determined."""
 
-_HOLLOW = 2.0
+_HOLLOW = 3.0
 """Standard deviations below zero from which a radius is that of a hollow."""
+
+_ALIKE = 4.0
+"""Excess of the scatter over what is stated from which normals contradict the points."""
 
 _LARGEST = 1e3
 """Size, in units of the extent, from which a shape is of no size."""
@@ -235,7 +238,8 @@ def _fitted(starts: Sequence[_Posed], given: Checked) -> SimpleShape:
     if not best.shape.size > 0.0:
         best = _solid(best, touches.rows(used))
     best = _Posed.at(best.shape.arranged(), best.frame[0], best.count)
-    covariance, squares, equations = _uncertainty(best, touches.rows(used))
+    covariance, excess, squares, equations = _uncertainty(best, touches.rows(used))
+    covariance = covariance * excess
     scale = np.where(best.shape.directions, 1.0, given.extent)
     residuals, chi_squared = np.full((2, given.usable.size), np.nan)
     residuals[given.usable] = best.shape.gaps(touches) * given.extent
@@ -257,9 +261,9 @@ def _solid(best: _Posed, touches: Touches) -> _Posed:
     radius below zero within its standard deviation; then the mean of what is above zero is taken,
     and the other parameters follow by their covariance with the radius.
     """
-    covariance = _uncertainty(best, touches)[0]
+    covariance, excess, *_ = _uncertainty(best, touches)
     size, sigma = best.shape.size, float(np.sqrt(covariance[-1, -1]))
-    if not size > -_HOLLOW * sigma:
+    if not (size > -_HOLLOW * sigma and excess < _ALIKE):
         raise ValueError(
             f"no {best.shape.kind}: points and normals fit only a hollow one, of negative radius; "
             "forces are not normals where there is friction or inertia: leave the normals out"
@@ -321,8 +325,11 @@ def _best(starts: Sequence[_Posed], touches: Touches) -> _Posed:
     return best.moved(_solved(best, touches).x)
 
 
-def _uncertainty(best: _Posed, touches: Touches) -> tuple[Array, Array, int]:
-    """Covariance of the parameters; the squared miss of each contact, and its equations' number."""
+def _uncertainty(best: _Posed, touches: Touches) -> tuple[Array, float, Array, int]:
+    """Covariance of the parameters as stated, and by how much contacts scatter more than stated.
+
+    Also the squared miss of each contact, and the number of its equations.
+    """
     solved = _solved(best, touches, most=1)
     design, z = np.asarray(solved.jac), np.asarray(solved.fun)
     size = np.linalg.norm(design, axis=0)
@@ -343,4 +350,4 @@ def _uncertainty(best: _Posed, touches: Touches) -> tuple[Array, Array, int]:
     soft = float((z**2 / np.sqrt(1.0 + (z / _SOFT) ** 2)).sum()) / free
     excess = max(1.0, soft, excess_of(squares, equations))
     slopes = best.shape.step_slopes(best.frame)[:, : best.count]
-    return slopes @ np.linalg.inv(design.T @ design) @ slopes.T * excess, squares, equations
+    return slopes @ np.linalg.inv(design.T @ design) @ slopes.T, excess, squares, equations

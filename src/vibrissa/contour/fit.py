@@ -79,7 +79,7 @@ _HOLLOW = 3.0
 """Standard deviations below zero from which a radius is that of a hollow."""
 
 _ALIKE = 4.0
-"""Excess of the scatter over what is stated from which normals contradict the points."""
+"""Squared misses, relative to what is stated, from which most normals contradict the points."""
 
 _LARGEST = 1e3
 """Size, in units of the extent, from which a shape is of no size."""
@@ -261,9 +261,10 @@ def _solid(best: _Posed, touches: Touches) -> _Posed:
     radius below zero within its standard deviation; then the mean of what is above zero is taken,
     and the other parameters follow by their covariance with the radius.
     """
-    covariance, excess, *_ = _uncertainty(best, touches)
+    covariance, _, squares, equations = _uncertainty(best, touches)
     size, sigma = best.shape.size, float(np.sqrt(covariance[-1, -1]))
-    if not (size > -_HOLLOW * sigma and excess < _ALIKE):
+    contradicted = float(np.median(squares)) > _ALIKE * equations
+    if contradicted or not size > -_HOLLOW * sigma:
         raise ValueError(
             f"no {best.shape.kind}: points and normals fit only a hollow one, of negative radius; "
             "forces are not normals where there is friction or inertia: leave the normals out"

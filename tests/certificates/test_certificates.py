@@ -19,7 +19,7 @@ from vibrissa.certificates import (
 )
 from vibrissa.certificates.certificate import prepared
 from vibrissa.certificates.equations import enclosed
-from vibrissa.certificates.search import covers
+from vibrissa.certificates.search import bounds, cover, covers
 from vibrissa.cli.app import app
 from vibrissa.identifiability import verdict_table
 from vibrissa.io import write_netcdf
@@ -286,3 +286,37 @@ def test_a_compliant_base_is_refused():
     whisker = vb.Whisker.straight(40e-3, base_stiffness=(1e-4, 1e-4))
     with pytest.raises(ValueError, match="rigid base"):
         certify(charted(whisker))
+
+
+@pytest.mark.parametrize("cause", [0, 1, 2])
+def test_boxes_are_halved_in_the_unknown_that_makes_remainders_small(cause):
+    """Whatever the widths say: remainders are large until one unknown is halved six times."""
+
+    def evaluate(boxes):
+        found = np.zeros((len(boxes), 1, 6))
+        found[..., 0] = 1.0
+        found[..., -1] = 2.0 ** (8 * (6 - boxes[:, cause, 0]))[:, None] / 10.0
+        widths = np.ones((len(boxes), 3))
+        widths[:, cause] = 1e-3
+        return found, widths
+
+    found = cover(evaluate, np.zeros((1, 3, 2), dtype=np.int64))
+    assert not len(found.undecided)
+    assert covers(found.certified)
+    assert found.certified[:, cause, 0].max() <= 7
+    assert not np.delete(found.certified[..., 0], cause, axis=1).any()
+
+
+def test_the_most_bent_tip_of_a_curved_whisker_takes_few_boxes(curved):
+    certificate = prepared(curved, np.deg2rad(2.0))
+    domain, stations = certificate.parts["interior"].domain, certificate.stations
+    cell = np.array([[[4, 15], [3, 4], [4, 13]]])  # contacts from 0.96 L to the tip, near the fold
+
+    def evaluate(boxes):
+        where = bounds(boxes, domain, stations)
+        return certificate.evaluate("interior", where, [0, 1, 2, 3, 4])
+
+    found = cover(evaluate, cell, 500)
+    assert not len(found.undecided)
+    assert len(found.certified) >= 8
+    assert found.evaluated < 100

@@ -32,17 +32,17 @@ class Quantity:
     name : str
         The name of its variable in datasets and of its column in tables.
     symbol : str
-        In mathtext, without the dollar signs.
+        Symbol in mathtext, without the dollar signs.
     unit : str
         SI unit of every stored value; ``"1"`` for a number without one.
     display_unit : str
         Unit in figures and printed tables; empty for a number without one.
     display_factor : float
-        What a stored value is multiplied with to be in ``display_unit``.
+        Factor from the stored value to the one in ``display_unit``.
     long_name : str
         A few words, as in a legend.
     description : str
-        What it is exactly: frame, sign, convention.
+        Exact meaning: frame, sign, convention.
     """
 
     name: str
@@ -105,12 +105,12 @@ def quantity(name: str) -> Quantity:
     Parameters
     ----------
     name : str
-        Its name.
+        Name of the quantity.
 
     Returns
     -------
     Quantity
-        Its row of the table.
+        Row of the table.
 
     Raises
     ------
@@ -156,7 +156,7 @@ def axis_label(name: str) -> str:
     Returns
     -------
     str
-        In mathtext; without parentheses where the quantity has no unit.
+        Label in mathtext; without parentheses where the quantity has no unit.
 
     Examples
     --------
@@ -178,12 +178,12 @@ def shown_unit(name: str, values: ArrayLike) -> tuple[float, str]:
     name : str
         A name of :data:`QUANTITIES`.
     values : array_like, any shape
-        In the quantity's SI unit; NaN is left out.
+        Values in the quantity's SI unit; NaN is left out.
 
     Returns
     -------
     factor : float
-        What they are multiplied with to be in that unit.
+        Factor from the SI unit to that unit.
     unit : str
         The display unit or, of forces and moments far larger than a rat's, one that is larger.
 
@@ -209,12 +209,12 @@ def to_display(name: str, values: ArrayLike) -> NDArray[np.float64]:
     name : str
         A name of :data:`QUANTITIES`.
     values : array_like, any shape
-        In the quantity's SI unit.
+        Values in the quantity's SI unit.
 
     Returns
     -------
     ndarray, the shape of ``values``
-        In its display unit.
+        Values in the display unit.
 
     Examples
     --------

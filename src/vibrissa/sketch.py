@@ -52,13 +52,13 @@ class Mark:
     places : array_like (..., n, 3) or (n, 3)
         m, in any one frame; what is NaN is left out.
     colour : str
-        As CSS has it.
+        Colour, in any notation of CSS.
     dots : bool
         Points rather than curves.
     width : float
-        Of a line, or diameter of a dot, pixels.
+        Width of a line, or diameter of a dot, pixels.
     label : str
-        What it is, for the legend; none by default.
+        Name in the legend; none by default.
     """
 
     places: ArrayLike

@@ -22,9 +22,9 @@ class Status(enum.IntEnum):
     Attributes
     ----------
     explanation : str
-        What happened.
+        Sentence on what happened.
     advice : str
-        What to do about it; empty where there is nothing to do.
+        Sentence on what to do; empty where there is nothing to do.
     ok : bool
         Whether the row can be used as it stands.
     """
@@ -205,7 +205,7 @@ def describe(codes: ArrayLike) -> Counter[str]:
     Returns
     -------
     collections.Counter
-        How often each status occurs, by its sentences.
+        Number of times that each status occurs, by its sentence.
 
     Raises
     ------

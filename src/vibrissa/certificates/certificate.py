@@ -141,7 +141,7 @@ class Certificate:
     turns : bool
         Whether M_D certainly turns once where the direction of the force does.
     refuted : str
-        Where a condition certainly fails; empty if nowhere.
+        Place where a condition certainly fails; empty if there is none.
     seconds : float
         Time spent, s.
     """

@@ -47,7 +47,7 @@ class Program(NamedTuple):
     constant : (v,) array
         1 for variables without higher Taylor coefficients.
     first : (v + 1,) array
-        Where the products of each variable begin.
+        Index of the first product of each variable.
     sign : (o,) array
         Sign of each product.
     left, right : (o,) arrays

@@ -53,7 +53,7 @@ class Witness(NamedTuple):
     separation : float
         Least distance of the two contact points, over L.
     doubt : str
-        What could not be shown; empty if all was.
+        Statement that could not be shown; empty if all was.
     """
 
     proved: bool
@@ -109,7 +109,7 @@ def prove_witness(
     Returns
     -------
     Witness
-        What is proved.
+        The pair, and what of it is proved.
     """
     names = triplet.split() if isinstance(triplet, str) else list(triplet)
     d = contact_map.chart.discretization

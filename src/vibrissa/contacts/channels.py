@@ -62,7 +62,7 @@ class Channels:
         Returns
         -------
         Channels
-            Their channels.
+            Channels of the signals.
         """
         names = list(signals)
         for pair, components in _PAIRS.items():

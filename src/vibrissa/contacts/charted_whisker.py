@@ -17,7 +17,7 @@ class ChartedWhisker(Protocol):
 
     @property
     def chart(self) -> StableSet:
-        """Its stable contacts."""
+        """Chart of its stable contacts."""
 
     @property
     def steps(self) -> int:

@@ -113,7 +113,7 @@ class SoftBase:
         found : Candidates
             Contacts of the stated whisker.
         status : (n,) array
-            Their statuses.
+            Statuses of the contacts.
 
         Returns
         -------

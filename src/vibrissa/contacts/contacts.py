@@ -249,8 +249,7 @@ class Contacts(_Located):
         Returns
         -------
         Dataset
-            Fields of the contacts over the measurements' dimensions, ``space`` and ``material``,
-            and those of the candidates, their names led by ``candidate_``, over ``candidate`` too.
+            Variables of :meth:`Contacts.to_dataset`.
         """
         data = self._variables("")
         if self._candidates is not None:
@@ -444,7 +443,7 @@ class Contact(_Located):
         Returns
         -------
         Dataset
-            As :meth:`Contacts.to_dataset` gives it.
+            Variables of :meth:`Contacts.to_dataset`.
         """
         return self._as_contacts().to_dataset()
 

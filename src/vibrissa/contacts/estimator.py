@@ -121,7 +121,7 @@ class Estimator:
         Returns
         -------
         Estimator
-            To be called with readings, and where the sensor carries a mass with the rotation.
+            Estimator for readings, and where the sensor carries a mass for readings and rotation.
 
         Raises
         ------
@@ -227,7 +227,7 @@ class Estimator:
         Returns
         -------
         Measurement
-            For `locate`; NaN for what is missing.
+            Input of `locate`; NaN for what is missing.
         """
         try:
             values = np.asarray(signals, dtype=np.float64)
@@ -253,7 +253,7 @@ class Estimator:
         Parameters
         ----------
         measurement : Measurement
-            Of `measurement`.
+            Result of `measurement`.
 
         Returns
         -------
@@ -297,7 +297,7 @@ class Estimator:
         Parameters
         ----------
         measurement : Measurement
-            Of `measurement`.
+            Result of `measurement`.
 
         Returns
         -------

@@ -69,12 +69,12 @@ class Followed(NamedTuple):
         Most probable contact point, laboratory frame, m; NaN if there is none. Where hypotheses run
         together, as along the valley that a light contact leaves, it is their mean.
     covariance : (3, 3) array
-        Of the contact point about it, m²: of all hypotheses, weighed by their probabilities.
+        Covariance of the contact point, m²: over all hypotheses, weighed by their probabilities.
     velocity : (3,) array
-        Of the contact point in the laboratory, m/s.
+        Velocity of the contact point in the laboratory, m/s.
     probability : float
-        That the contact is there, within the spread of the hypotheses that run together; 0 if there
-        is none.
+        Probability that the contact is there, within the spread of the hypotheses that run
+        together; 0 if there is none.
     status : Status
         ``UNIQUE`` where that is above 0.99, else ``AMBIGUOUS``. ``MISSING``, ``NOT_FRICTIONLESS``
         and other reasons are of this sample, which neither a hypothesis nor any contact explains:

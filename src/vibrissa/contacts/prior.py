@@ -37,10 +37,10 @@ class Prior:
     Parameters
     ----------
     region : str or mapping
-        Where contacts may be: one of "all", "ELD", "CF", "CB", "ELD CF" and "ELD CB" (concave
+        Region of the contacts: one of "all", "ELD", "CF", "CB", "ELD CF" and "ELD CB" (concave
         backward and forward; excluding large deflections), or the least and the greatest value of
-        some of ``r`` (m), ``theta`` and ``phi`` (rad) in the whisker's frame. A θ whose least
-        value is above the greatest goes through ±π.
+        some of ``r`` (m), ``theta`` and ``phi`` (rad) in the whisker's frame. A θ whose least value
+        is above the greatest goes through ±π.
     least_force, greatest_force : float
         Size of the contact force, N.
 
@@ -96,7 +96,7 @@ class Prior:
         Parameters
         ----------
         whisker : Whisker
-            What is touched.
+            Whisker that is touched.
         points : (n, 3) array
             Contact points, whisker's frame, m.
         arc_lengths : (n,) array

@@ -112,11 +112,12 @@ def estimate_from_wrench(
     Parameters
     ----------
     whisker : Whisker
-        What is touched. On a compliant base the wrench is that in the frame of the resting base.
+        Whisker that is touched. On a compliant base the wrench is that in the frame of the resting
+        base.
     force : array_like or DataArray
-        Of the object on the whisker, whisker frame, N, shape (..., 3); NaN means missing.
+        Force of the object on the whisker, whisker frame, N, shape (..., 3); NaN means missing.
     moment : array_like or DataArray
-        About the base, N·m, same shape.
+        Moment of that force about the base, N·m, same shape.
     noise : mapping or (6, 6) array_like, optional
         Standard deviations of ``Fx``, ``Fy``, ``Fz``, ``Mx``, ``My`` and ``Mz``, or the covariance
         of (F, M), SI units.
@@ -131,14 +132,14 @@ def estimate_from_wrench(
     compliance_sigma : float
         Standard deviation of the base's compliance, rad/(N·m), as of `ContactMap.estimate`.
     prior : Prior, optional
-        Which contacts are possible; others are left out of the candidates.
+        Contacts that are possible; others are left out of the candidates.
     steps : int
         Integration steps along the whisker. The default is good to 1e-8 of the length.
 
     Returns
     -------
     Contacts
-        For each wrench the contact, its force and friction angle, and their uncertainty.
+        Contact for each wrench, its force and friction angle, and their uncertainty.
 
     Raises
     ------

@@ -31,11 +31,11 @@ class TrackingScores:
         Distance of traced points from the whisker in the image, pixels; without views where no
         traces are known.
     centerline : array (2,)
-        Of points in space from the whisker's centreline, m.
+        Errors of points in space from the whisker's centreline, m.
     base : array (2,)
-        Of the whisker's base, m.
+        Errors of the whisker's base, m.
     contact : array (2,)
-        Of the contact point, m, in frames that truly are in contact and were found to be.
+        Errors of the contact point, m, in frames that truly are in contact and were found to be.
     classified : float
         Share of the frames in which contact is classified correctly.
     """
@@ -56,9 +56,9 @@ class SignalRow:
     Parameters
     ----------
     label : str
-        Which contacts.
+        Name of a class of contacts.
     contacts : int
-        How many.
+        Number of contacts in it.
     force, moment : array (2,)
         Median and 95 % of the size of the error over that of the vector, laboratory frame.
     """

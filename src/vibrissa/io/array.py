@@ -62,12 +62,12 @@ def load_array(
     Parameters
     ----------
     path : str or path
-        What `save_array` wrote (``.nc``), a table of whiskers (``.csv``), or a folder of
-        centrelines, a file each.
+        File of `save_array` (``.nc``), a table of whiskers (``.csv``), or a folder of centrelines,
+        a file each.
     base : {"first", "last"} or array_like (3,), optional
-        Of centrelines: which end is the base; see `load_whisker`.
+        End of a centreline that is the base; see `load_whisker`.
     noise : float, optional
-        Of centrelines: standard deviation of a coordinate, m; see `load_whisker`.
+        Standard deviation of a coordinate of centrelines, m; see `load_whisker`.
 
     Returns
     -------
@@ -98,7 +98,7 @@ def save_array(path: str | PathLike[str], array: WhiskerArray) -> None:
         ``.nc``: without loss, whatever the whiskers' shapes. ``.csv``: a table, for whiskers that
         are parabolas with a linear taper, such as an average rat's.
     array : WhiskerArray
-        What is written.
+        Array that is written.
 
     Raises
     ------

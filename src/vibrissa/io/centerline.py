@@ -136,7 +136,7 @@ def save_centerline(path: str | PathLike[str], points: ArrayLike) -> None:
     Parameters
     ----------
     path : str or path
-        Where to write; an existing file is replaced.
+        Path of the table; an existing file is replaced.
     points : array (n, 3)
         Points, m.
     """
@@ -163,7 +163,7 @@ def load_whisker(
     noise : float, optional
         Standard deviation of a coordinate, m; 0 asks for interpolation. By default it is estimated.
     base : {"first", "last"} or array (3,), optional
-        Which end is the base: by name, or a point near it, m. By default the thicker one where the
+        End that is the base: by name, or a point near it, m. By default the thicker one where the
         file has radii that differ, and otherwise the first.
     **properties
         Radius and material; see `Whisker`. A radius that is given counts more than the file's.

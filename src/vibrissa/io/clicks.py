@@ -83,7 +83,7 @@ class Clicks:
     Parameters
     ----------
     views : tuple of ViewClicks
-        What was shown view by view.
+        Clicks of each view.
     videos : tuple of str
         Names of the videos' files.
     pixel_size : float, optional
@@ -130,7 +130,7 @@ def load_clicks(path: str | PathLike[str]) -> Clicks:
     Returns
     -------
     Clicks
-        What was shown.
+        Clicks of the file.
 
     Raises
     ------
@@ -174,7 +174,7 @@ def save_clicks(path: str | PathLike[str], clicks: Clicks) -> None:
     path : str or path
         TOML file; one that is there is replaced.
     clicks : Clicks
-        What was shown.
+        Clicks that are written.
     """
     check_writable(path, (".toml",))
     lines = [f"videos = {json.dumps(clicks.videos, ensure_ascii=False)}"]

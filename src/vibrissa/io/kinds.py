@@ -187,8 +187,8 @@ def load_tracks(
     kind : Kind, optional
         Kind of the file; by default it follows from its content.
     **labels
-        What the file may not say: fps (frames per second), view (name of the camera), and for
-        points in space unit ("m", "cm", "mm" or "um") and reference_frame; see `Labels`.
+        Facts that the file may not state: fps (frames per second), view (name of the camera), and
+        for points in space unit ("m", "cm", "mm" or "um") and reference_frame; see `Labels`.
 
     Returns
     -------

@@ -59,7 +59,7 @@ def load_matlab(
     path : str or path
         The ``.mat`` file.
     variable : str, optional
-        Which variable holds the whiskers, or the three that hold x, y and z, separated by commas.
+        Variable that holds the whiskers, or the three that hold x, y and z, separated by commas.
         Needed only if there are several.
     **labels
         fps; unit (needed for points in space) and reference_frame, or view; see `Labels`.

@@ -60,14 +60,14 @@ class Session:
     Parameters
     ----------
     start : datetime
-        When the recording began, with its time zone.
+        Time at which the recording began, with its time zone.
     description : str
-        Of the session.
+        Description of the session.
     identifier : str
-        Of the file, unique in the world; by default made up.
+        Identifier of the file, unique in the world; by default a random one.
     subject : mapping
-        Of the animal, as in NWB: subject_id, species, sex, age, description, …. What is missing
-        is written as unknown: sex "U", an age of 0 days or more ("P0D/").
+        Fields of the animal, as in NWB: subject_id, species, sex, age, description, …. What is
+        missing is written as unknown: sex "U", an age of 0 days or more ("P0D/").
     about : mapping
         More fields of NWB: experimenter, institution, lab, keywords, ….
     """
@@ -95,13 +95,12 @@ def save_nwb(
     Parameters
     ----------
     path : str or path
-        Where to write, with the ending ``.nwb``; an existing file is replaced once the new one is
-        complete.
+        Path with the ending ``.nwb``; an existing file is replaced once the new one is complete.
     recording : xarray.DataTree or Dataset
         A recording, with the group ``cameras`` if they are calibrated; or tracks. What it lacks
         is left out.
     session : Session
-        What else the file must say.
+        Facts of the experiment that a recording does not hold.
     predictors : xarray.Dataset, optional
         Table of `vibrissa.pipeline.predictors`, whose 16 predictors of models of spikes are written
         as one series for each whisker.

@@ -42,8 +42,8 @@ def save_recording(path: str | PathLike[str], recording: xr.DataTree) -> None:
     Parameters
     ----------
     path : str or path
-        Where to write, usually with the ending ``.nc``; an existing file is replaced once the new
-        one is complete.
+        Path, usually with the ending ``.nc``; an existing file is replaced once the new one is
+        complete.
     recording : xarray.DataTree
         Recording, with the attribute ``kind``.
 

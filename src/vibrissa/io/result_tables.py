@@ -41,7 +41,7 @@ def save_contacts(path: str | PathLike[str], contacts: xr.Dataset) -> None:
     Parameters
     ----------
     path : str or path
-        Where to write; an existing file is replaced.
+        Path of the table; an existing file is replaced.
     contacts : xarray.Dataset
         Dim time; a variable for each column. Columns that it lacks are written as missing, but
         ``time``, ``x``, ``y``, ``z`` and ``status`` must be there.
@@ -104,7 +104,7 @@ def save_contour(path: str | PathLike[str], contour: xr.Dataset) -> None:
     Parameters
     ----------
     path : str or path
-        Where to write; an existing file is replaced.
+        Path of the table; an existing file is replaced.
     contour : xarray.Dataset
         Dim contact; a variable for each column. Those that it lacks are written as missing, but
         ``time``, ``x``, ``y`` and ``z`` must be there.

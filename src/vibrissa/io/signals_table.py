@@ -113,7 +113,7 @@ def save_signals(path: str | PathLike[str], signals: xr.Dataset) -> None:
     Parameters
     ----------
     path : str or path
-        Where to write; an existing file is replaced.
+        Path of the table; an existing file is replaced.
     signals : xarray.Dataset
         Dims time, space: ``force`` and ``moment``.
 

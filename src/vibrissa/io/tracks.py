@@ -245,7 +245,7 @@ def join_views(*tracks: xr.Dataset) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        With all views.
+        Tracks of all views.
 
     Raises
     ------

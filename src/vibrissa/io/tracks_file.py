@@ -42,10 +42,10 @@ def save_tracks(path: str | PathLike[str], tracks: xr.Dataset) -> None:
     Parameters
     ----------
     path : str or path
-        Where to write, NetCDF or CSV by its ending; an existing file is replaced.
+        Path of a NetCDF file or a table (CSV), by its ending; an existing file is replaced.
     tracks : xarray.Dataset
-        As a reader gave them. A table holds the points and their confidence, either those in the
-        image or those in space.
+        Tracks as a reader returned them. A table holds the points and their confidence, either
+        those in the image or those in space.
 
     Raises
     ------

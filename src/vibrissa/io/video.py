@@ -42,7 +42,7 @@ class VideoInfo:
     Parameters
     ----------
     width, height : int
-        Of a frame, pixels.
+        Size of a frame, pixels.
     frames : int
         Stated number of frames; 0 if it is not stated.
     rate : float
@@ -106,7 +106,7 @@ def video_info(path: str | PathLike[str]) -> VideoInfo:
     Parameters
     ----------
     path : str or path
-        Of the video.
+        Path of the video.
 
     Returns
     -------
@@ -134,7 +134,7 @@ def read_video(path: str | PathLike[str]) -> Iterator[Frame]:
     Parameters
     ----------
     path : str or path
-        Of the video.
+        Path of the video.
 
     Yields
     ------
@@ -309,9 +309,9 @@ class FrameReader:
     Parameters
     ----------
     path : str or path
-        Of the video.
+        Path of the video.
     memory : float
-        What is kept, bytes.
+        Memory for frames that are kept, bytes.
     """
 
     def __init__(self, path: str | PathLike[str], memory: float = _MEMORY) -> None:

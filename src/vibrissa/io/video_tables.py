@@ -261,7 +261,7 @@ def load_corrections(path: str | PathLike[str]) -> dict[int, dict[tuple[int, int
     Returns
     -------
     dict
-        By view: by frame and whisker the points (n, 2) from base to tip, column and row.
+        Points (n, 2) from base to tip, column and row, by view and then by frame and whisker.
     """
     table = Table(path, CORRECTION_COLUMNS)
     values = np.stack([table.numbers(name) for name in CORRECTION_COLUMNS], axis=1)
@@ -293,7 +293,7 @@ def save_corrections(
     path : str or path
         CSV file; an existing one is replaced once the new one is complete.
     corrections : mapping
-        By view: by frame and whisker the points (n, 2) from base to tip, column and row.
+        Points (n, 2) from base to tip, column and row, by view and then by frame and whisker.
 
     Raises
     ------

@@ -123,9 +123,9 @@ class Mesh(Surface):
         path : str or path
             STL, OBJ, PLY or what else trimesh reads.
         unit : float
-            What a length of one in the file is, m; by default a millimetre.
+            Unit of the file's lengths, m; by default a millimetre.
         resolution, stiffness : float, optional
-            See `Mesh`.
+            Fineness and softness of the surface; see `Mesh`.
 
         Returns
         -------

@@ -150,7 +150,7 @@ class Peg(Surface):
         Parameters
         ----------
         base_rotation : array_like (..., 3, 3)
-            From the whisker's to the laboratory frame.
+            Rotation from the whisker's to the laboratory frame.
         base_position : array_like (..., 3)
             The base in the laboratory frame, m.
 
@@ -179,9 +179,9 @@ class Sphere(Surface):
     Parameters
     ----------
     origin : array_like (3,)
-        Its centre in the laboratory frame, m.
+        Centre in the laboratory frame, m.
     radius : float
-        Of its surface, m.
+        Radius of the surface, m.
     stiffness : float
         Force over indentation, N/m; infinite for a rigid one.
 
@@ -294,13 +294,13 @@ class Box(Surface):
     Parameters
     ----------
     origin : array_like (3,)
-        Its centre in the laboratory frame, m.
+        Centre in the laboratory frame, m.
     size : array_like (3,)
-        Its edges, m.
+        Lengths of the edges, m.
     rotation : array_like (3, 3)
         Columns are the directions of its edges in the laboratory frame.
     edge_radius : float
-        By which its edges and corners are rounded, m; 0 for sharp ones. A whisker lies against a
+        Radius by which edges and corners are rounded, m; 0 for sharp ones. A whisker lies against a
         sharp edge with its own radius.
     stiffness : float
         Force over indentation, N/m; infinite for a rigid one. A compliant box needs an edge radius

@@ -392,12 +392,12 @@ class NaturalNeighbour:
     Parameters
     ----------
     points : (n, 3) array_like
-        Where the values are known; not all in one plane. Of points that coincide one counts.
+        Places where the values are known; not all in one plane. Of points that coincide one counts.
     values : (n, k) array_like
         The values.
     scale : (3,) array_like, optional
-        What to divide each coordinate by, so that distances along all axes are comparable; by
-        default its range.
+        Divisors of the coordinates, so that distances along all axes are comparable; by default
+        their ranges.
 
     Raises
     ------
@@ -452,14 +452,14 @@ class NaturalNeighbour:
         Parameters
         ----------
         query : (3,) array_like
-            Where.
+            Place of the query.
 
         Returns
         -------
         indices : (j,) int array
             The natural neighbours; none outside the convex hull.
         weights : (j,) array
-            Their weights; they sum to one.
+            Weights of these points; they sum to one.
         """
         wanted, inside = self._located(np.asarray(query, dtype=np.float64)[None])
         if inside[0] < 0:

@@ -58,8 +58,8 @@ def central_differences(
     Returns
     -------
     Dataset
-        As of :func:`vibrissa.sensitivity`; NaN where a step leaves the table, and everywhere for
-        signals of which one is next to zero throughout.
+        Variables of :func:`vibrissa.sensitivity`; NaN where a step leaves the table, and everywhere
+        for signals of which one is next to zero throughout.
 
     Raises
     ------
@@ -136,7 +136,7 @@ def sensitivity_findings(data: xr.Dataset, region: xr.DataArray | None = None) -
     Parameters
     ----------
     data : Dataset
-        From :func:`~vibrissa.sensitivity`, of any triplet.
+        Result of :func:`~vibrissa.sensitivity`, for any triplet.
     region : DataArray of bool, optional
         Contacts to sum up, such as ``data.within_paper_bounds & ~data.small_deflection``; by
         default those outside the cone of 2° about rest.

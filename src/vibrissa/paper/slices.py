@@ -132,7 +132,7 @@ def error_solid(
     Returns
     -------
     Dataset
-        As of :func:`vibrissa.sensitivity` at these contacts, with ``error_distance``, m.
+        Variables of :func:`vibrissa.sensitivity` at these contacts, with ``error_distance``, m.
 
     Raises
     ------

@@ -90,7 +90,7 @@ def estimates_of(
         ``stiffness_sigma``, ``gain_sigma`` and ``mixing_sigma``, as of ``ContactMap.estimate``:
         the same errors in all frames. They need noise.
     prior : Prior, optional
-        Which contacts are possible; others are left out of the candidates.
+        Contacts that are possible; others are left out of the candidates.
     friction : float
         Standard deviation of the ratio of the force along the whisker to that across it, as of
         ``ContactMap.estimate``; 0, the default, for contacts without friction.

@@ -82,9 +82,9 @@ def bent_views(
     centerlines : array_like (m, k, 3)
         The bent ones, m; those with NaN, which have no equilibrium, are left out.
     contact_points : array_like (m, 3), optional
-        Where each is touched, m.
+        Contact point of each whisker, m.
     forces : array_like (m, 3), optional
-        On the whisker, whisker frame, N: drawn as arrows that end in the contact points, the
+        Forces on the whisker, whisker frame, N: drawn as arrows that end in the contact points, the
         longest a fifth as long as the whisker.
     labels : sequence of str, optional
         One for each. With up to four curves each has a colour of its own; more are shaded from
@@ -251,17 +251,17 @@ def witness_pair(witness: xr.Dataset, *, width: Width = "double") -> Figure:
     Parameters
     ----------
     witness : Dataset
-        In the whisker frame, SI units: ``rest`` (node, space) and ``centerline`` (pair, node,
-        space), m; ``contact_point`` (pair, space), m; ``force`` (pair, space), N; ``arc_length``
-        (pair), m; the six signals ``Fx`` … ``MD`` (pair). The attribute ``triplet`` names the three
-        that are the same, such as ``"Fx MB MD"``.
+        Two contacts in the whisker frame, SI units: ``rest`` (node, space) and ``centerline``
+        (pair, node, space), m; ``contact_point`` (pair, space), m; ``force`` (pair, space), N;
+        ``arc_length`` (pair), m; the six signals ``Fx`` … ``MD`` (pair). The attribute ``triplet``
+        names the three that are the same, such as ``"Fx MB MD"``.
     width : {"single", "double"}
         Columns of the page.
 
     Returns
     -------
     Figure
-        From above (x–y), from the side (x–z) and a table.
+        Views from above (x–y) and from the side (x–z), and a table.
 
     Raises
     ------

@@ -80,7 +80,7 @@ def contact_surfaces(
     samples : Dataset
         ``ContactMap.to_dataset()``: all of the reachable space.
     centerline : array_like (k, 3)
-        Of the resting whisker from base to tip, whisker frame, m.
+        Resting whisker from base to tip, whisker frame, m.
     width : {"single", "double"}
         Columns of the page.
 

@@ -62,15 +62,15 @@ def contact_places(
     Parameters
     ----------
     course : Course
-        Of the trial.
+        The trial.
     centerline : array_like (k, 3)
-        Of the resting whisker, whisker frame, m.
+        Resting whisker, whisker frame, m.
     bodies, fitted : sequence of object
         Objects as they are, filled grey, and as they were fitted to contacts, dashed: with
         ``signed_distance``, laboratory frame, m.
     colour : {"time", "deflection_angle"}
-        What colours the contacts: their time, or the angle at the base between the resting whisker
-        and the contact.
+        Quantity that colours the contacts: their time, or the angle at the base between the resting
+        whisker and the contact.
     width : {"single", "double"}
         Columns of the page.
 

@@ -76,17 +76,17 @@ def contour_views(
     points : array_like (n, 3)
         Contact points, laboratory frame, m; rows with NaN are left out.
     known, fitted : object, optional
-        What was touched, filled grey, and what was fitted to the points, dashed: anything with
+        Object that was touched, filled grey, and shape fitted to the points, dashed: anything with
         ``signed_distance(points)``, m, in the laboratory frame, such as objects of a trial and
         fitted shapes. With ``distance_sigma(points)``, m, its 95 % band is drawn. What has
         ``origin`` (3,), m, ``axis`` (3,) and ``radius``, m, is a cylinder.
     colour : array_like (n,), optional
-        What colours the points, in SI units, such as deflection angle or time; the largest values
-        are drawn last.
+        Values that colour the points, SI units, such as deflection angle or time; the largest are
+        drawn last.
     colour_name : str
-        Which quantity ``colour`` is.
+        Name of the quantity ``colour``.
     covariance : array_like (n, 3, 3), optional
-        Of the points, laboratory frame, m²: draws 95 % ellipses about some of them.
+        Covariances of the points, laboratory frame, m²: 95 % ellipses are drawn about some of them.
     width : {"single", "double"}
         Columns of the page.
 
@@ -309,7 +309,7 @@ def distances_by_class(summaries: Sequence[xr.Dataset], *, width: Width = "doubl
     Parameters
     ----------
     summaries : sequence of xarray.Dataset
-        Of `vibrissa.contour.distances_by`: one panel each.
+        Results of `vibrissa.contour.distances_by`, one panel each.
     width : {"single", "double"}
         Columns of the page.
 

@@ -33,13 +33,13 @@ def estimated_against_true(
     true_spherical, estimated_spherical : array_like (n, 3)
         (r, θ, φ) of the contact points, whisker frame, m and rad; rows with NaN are left out.
     time : array_like (n,), optional
-        Of the frames, s; without it the courses over time are left out.
+        Times of the frames, s; without them the courses over time are left out.
     colour : array_like (n,), optional
-        What colours the points, in SI units: by default the time, if known.
+        Values that colour the points, SI units: by default the time, if known.
     colour_name : str
-        Which quantity ``colour`` is.
+        Name of the quantity ``colour``.
     known_as : str
-        What those that count as true are called on the axes, such as "tracked".
+        Word on the axes for the values that count as true, such as "tracked".
 
     Returns
     -------

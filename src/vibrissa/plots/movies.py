@@ -223,13 +223,13 @@ def contour_frames(
     Parameters
     ----------
     course : Course
-        Of the trial, with contact points.
+        The trial, with contact points.
     centerline : array_like (k, 3)
-        Of the resting whisker, whisker frame, m.
+        Resting whisker, whisker frame, m.
     sights : sequence of Sight
         One or two views, each with an image for each row.
     rows : array_like (m,) of int
-        Which frames of the trial, rising. Contacts in between are shown too.
+        Indices of the trial's frames, rising. Contacts in between are shown too.
     bodies, fitted : sequence of object
         True objects, grey, and shapes fitted to the contacts, orange: with ``signed_distance``,
         laboratory frame, m.
@@ -443,13 +443,13 @@ def signal_frames(
     Parameters
     ----------
     course : Course
-        Of the trial, with signals.
+        The trial, with signals.
     samples : Dataset
         ``ContactMap.to_dataset()`` of the whisker.
     centerline : array_like (k, 3)
-        Of the resting whisker, whisker frame, m.
+        Resting whisker, whisker frame, m.
     rows : array_like (m,) of int
-        Which frames of the trial, rising; time axes reach from the first to the last.
+        Indices of the trial's frames, rising; time axes reach from the first to the last.
 
     Returns
     -------

@@ -61,7 +61,7 @@ def key_frames(course: Course) -> NDArray[np.intp]:
     Parameters
     ----------
     course : Course
-        Of the trial.
+        The trial.
 
     Returns
     -------
@@ -100,11 +100,11 @@ def trial_overview(
     Parameters
     ----------
     course : Course
-        Of the trial, with signals.
+        The trial, with signals.
     samples : Dataset
         ``ContactMap.to_dataset()`` of the whisker.
     centerline : array_like (k, 3)
-        Of the resting whisker, whisker frame, m.
+        Resting whisker, whisker frame, m.
     sights : sequence of Sight
         One or two views, each with an image for each row.
     rows : array_like (m,) of int

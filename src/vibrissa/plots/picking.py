@@ -41,9 +41,9 @@ class Picks:
     Parameters
     ----------
     clicks : Clicks
-        What is complete.
+        Clicks that are complete.
     mode : str
-        What clicks mean: base, mask, region or length.
+        Meaning of a click: base, mask, region or length.
     view : int
         View of the points that are not complete.
     points : tuple of (column, row)
@@ -51,7 +51,7 @@ class Picks:
     typed : str
         Length that is being typed, mm.
     remark : str
-        What to tell the person.
+        Remark that is shown to the person.
     """
 
     clicks: Clicks

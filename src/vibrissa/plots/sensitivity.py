@@ -75,14 +75,15 @@ def sensitivity_panels(data: xr.Dataset, *, width: Width = "double") -> Figure:
     Parameters
     ----------
     data : Dataset
-        From ``vibrissa.sensitivity``, SI units; ``at="grid"`` fills the panels best.
+        Result of ``vibrissa.sensitivity``, SI units; ``at="grid"`` fills the panels best.
     width : {"single", "double"}
-        How many columns wide.
+        Width in columns of a page.
 
     Returns
     -------
     Figure
-        With derivatives in mm and degrees by µN, µN·m and degrees; or the sentence "no contacts".
+        Panels of derivatives in mm and degrees by µN, µN·m and degrees; or the sentence "no
+        contacts".
 
     Raises
     ------

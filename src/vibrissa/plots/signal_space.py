@@ -88,14 +88,14 @@ def signal_clouds(
     samples : Dataset
         ``ContactMap.to_dataset()``: all of the reachable space.
     centerline : array_like (k, 3)
-        Of the resting whisker from base to tip, whisker frame, m; drawn in black.
+        Resting whisker from base to tip, whisker frame, m; drawn in black.
     width : {"single", "double"}
         Columns of the page.
     cutaway : bool
         Whether the quarter that faces the viewer is taken away, along the resting whisker, so that
         the whisker and what lies about it are seen.
     elevation, azimuth : float
-        From where the space is seen, degrees.
+        Direction of view, degrees.
 
     Returns
     -------

@@ -53,13 +53,13 @@ def solid_slices(
     Parameters
     ----------
     plane : Dataset
-        From ``vibrissa.paper.signal_slice``: ``r``, ``theta``, ``phi`` and, if known,
+        Result of ``vibrissa.paper.signal_slice``: ``r``, ``theta``, ``phi`` and, if known,
         ``error_distance`` over two signals, SI units; NaN outside the solid.
     solid : Dataset, optional
         Contacts with the three signals and ``error_distance``, such as the nodes of a map; with
         ``small_deflection`` if those are to be left out.
     width : {"single", "double"}
-        How many columns wide.
+        Width in columns of a page.
 
     Returns
     -------

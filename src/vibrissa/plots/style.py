@@ -267,7 +267,7 @@ def save(
     figure : Figure
         The figure.
     path_stem : str or Path
-        Where to, without the ending; the folder must exist.
+        Path without the ending; the folder must exist.
     formats : sequence of str
         Endings, such as ``"png"``, ``"pdf"`` or ``"svg"``.
 

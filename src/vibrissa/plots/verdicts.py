@@ -62,7 +62,7 @@ def verdict_table(verdicts: xr.Dataset, *, width: Width = "double") -> Figure:
     Parameters
     ----------
     verdicts : Dataset
-        As of ``vibrissa.uniqueness``: ``verdict`` over (triplet, region); with ``notation``
+        Result of ``vibrissa.uniqueness``: ``verdict`` over (triplet, region); with ``notation``
         (triplet), ``witness_separation`` (triplet, region, witness), ``critical_cone`` (triplet,
         region), ``ambiguous_share`` (triplet, region, signal_tolerance) and the attribute
         ``chosen_triplet``, if known.
@@ -247,7 +247,7 @@ def resolution(verdicts: xr.Dataset, *, width: Width = "double") -> Figure:
     Parameters
     ----------
     verdicts : Dataset
-        As of ``vibrissa.uniqueness``: ``ambiguous_share`` over (triplet, region,
+        Result of ``vibrissa.uniqueness``: ``ambiguous_share`` over (triplet, region,
         signal_tolerance), the tolerances as shares of each signal's range; with the attribute
         ``min_separation``, m, if known.
     width : {"single", "double"}

@@ -52,13 +52,13 @@ def whisker_views(
     Parameters
     ----------
     centerline : array_like (n, 3)
-        From base to tip, whisker frame, m; points with NaN are left out.
+        Points from base to tip, whisker frame, m; those with NaN are left out.
     radius : array_like (n,) or float
-        Of the whisker at these points, m.
+        Radius of the whisker at these points, m.
     name : str, optional
         Written above.
     magnification : float, optional
-        How many times too wide the whisker is drawn; chosen by default so that the base is easily
+        Factor by which the whisker is drawn too wide; chosen by default so that the base is easily
         seen, and always stated in the figure.
     assumed : sequence of str
         Properties of the whisker that were not measured; written under the magnification.

@@ -311,15 +311,15 @@ class Provenance:
     Parameters
     ----------
     command : str
-        As it would be typed.
+        Command as it would be typed.
     inputs : tuple of (str, int, str)
         Name of each file that was read, its size in bytes, and its SHA-256 in hexadecimal.
     versions : tuple of (str, str)
-        Of the package, of Python and of libraries.
+        Names and versions of the package, of Python and of libraries.
     seed : int or None
-        Of the draws behind what is predicted; None where nothing is drawn.
+        Seed of the draws behind what is predicted; None where nothing is drawn.
     date : datetime
-        With a time zone.
+        Date and time, with a time zone.
     """
 
     command: str

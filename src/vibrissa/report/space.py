@@ -149,7 +149,7 @@ def reachable_space(samples: xr.Dataset, centerline: Array, colour: str = "MB") 
     samples : Dataset
         ``ContactMap.to_dataset()``.
     centerline : array (k, 3)
-        Of the resting whisker, m.
+        Resting whisker, m.
     colour : str
         The signal that colours them.
 

@@ -157,12 +157,12 @@ class PointForce:
         Parameters
         ----------
         which : (n,) int array
-            Their numbers.
+            Indices of the loads.
 
         Returns
         -------
         PointForce
-            Those loads, of shape (n,).
+            Loads of these indices, of shape (n,).
         """
         parts = np.reshape(self.components, (-1, 3))[which]
         return PointForce(np.reshape(self.arc_length, -1)[which], components=parts)
@@ -199,12 +199,12 @@ class PointContact:
         Parameters
         ----------
         which : (n,) int array
-            Their numbers.
+            Indices of the loads.
 
         Returns
         -------
         PointContact
-            Those loads, of shape (n,).
+            Loads of these indices, of shape (n,).
         """
         return PointContact(np.reshape(self.points, (-1, 3))[which])
 
@@ -293,12 +293,12 @@ class PegContact:
         Parameters
         ----------
         which : (n,) int array
-            Their numbers.
+            Indices of the loads.
 
         Returns
         -------
         PegContact
-            Those loads, of shape (n,).
+            Loads of these indices, of shape (n,).
         """
         if self.start is not None:
             raise ValueError("pegs that go on from a start have one gravity in common")

@@ -73,7 +73,7 @@ class Weighted(NamedTuple):
     tangents : (n, 12, 4) array
         Derivatives of all but the last by (s, f_x, f_y, f_z); no rows unless wanted.
     directions : (n, 12, 3) array
-        Their derivatives by the direction of weight; no rows unless wanted.
+        Derivatives of the values by the direction of weight; no rows unless wanted.
     leans : (n, 3) array
         Directions of weight in the material frame at the tip.
     """
@@ -196,7 +196,7 @@ class Resting:
         Returns
         -------
         Whisker
-            It bends about that shape as if it had no weight.
+            Whisker that has no weight and that shape at rest.
         """
         whisker = self.whisker
         d = discretize(self)

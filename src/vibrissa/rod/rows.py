@@ -26,7 +26,7 @@ def share_rows(
     tables : tuple
         Arrays, numbers and named tuples of them that all rows share.
     inputs, outputs : tuple of (n, ...) array
-        What each row has and what it gets.
+        Arrays that a row reads, and those that it fills.
     device : str
         Name of the device, "cpu" or "cuda"; a rod with a weight is for the CPU alone.
     """

@@ -75,7 +75,7 @@ class SurfaceDeflection:
     surface : (n,) int array
         Number of the surface that is touched, -1 without contact.
     normal : (n, 3) array
-        Its outward normal at the contact, laboratory frame.
+        Outward normals of the surface at the contacts, laboratory frame.
     surface_point : (n, 3) array
         Touched point of the surface, laboratory frame, m.
     sliding : (n,) bool array

@@ -101,7 +101,7 @@ class PlaneVector(NamedTuple):
     values : (i, j, k, 2) array
         Components at the chart's nodes.
     derivatives : (i, j, k, 2, 3) array
-        Their derivatives by ξ there.
+        Derivatives of the values by ξ there.
     length, direction : int
         Number of its length and of its direction among the quantities, -1 if it is none of them.
     """
@@ -128,7 +128,7 @@ def search_tree(
     values : (i, j, k, 3) array
         Three quantities at the nodes, of any unit.
     derivatives : (i, j, k, 3, 3) array
-        Their derivatives by ξ there.
+        Derivatives of the values by ξ there.
     angles : tuple of bool
         Whether each of them is an angle, compared on the circle.
     plane : PlaneVector, optional

@@ -101,7 +101,7 @@ def course_of(trial: xr.DataTree, whisker: int = 0) -> Course:
     Returns
     -------
     Course
-        What is known of that whisker.
+        All that is known of that whisker.
 
     Raises
     ------

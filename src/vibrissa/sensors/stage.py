@@ -163,7 +163,7 @@ class Stage:
         Returns
         -------
         Stage
-            Its description.
+            Description of the stage.
         """
         with in_file(path):
             return cls(read_text(path), Path(path).parent)

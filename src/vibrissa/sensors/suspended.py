@@ -160,7 +160,7 @@ class SuspendedWhisker:
         Returns
         -------
         Touches
-            Their points and features.
+            Points and features of the contacts.
         """
         d = discretize(self.whisker)
         value, slope = self._rod(contacts)

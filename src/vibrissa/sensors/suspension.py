@@ -92,11 +92,11 @@ class SuspensionCalibration:
         Mechanical unknowns that were free; lengths are over the whisker's, compliances those over
         L/EI and L³/EI, curvature in Legendre polynomials of arc length, times L.
     values : (p,) array
-        Their values, as changes of what was stated.
+        Values of the parameters, as changes of what was stated.
     covariance : (p, p) array
-        Their covariance.
+        Covariance of the values.
     undetermined : tuple of str
-        Those that the readings hardly determine: their uncertainty is that of their prior.
+        Parameters that the readings hardly determine: their uncertainty is that of their prior.
     readout_covariance : (k, 13, 13) array
         Covariance of each channel's read-out, the mechanics being known.
     residual : (k,) array

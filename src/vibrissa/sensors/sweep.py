@@ -47,7 +47,7 @@ class SweptContacts(NamedTuple):
     points : (n, 3) array
         Contact points, laboratory frame, m; NaN where nothing is touched.
     covariance : (n, 3, 3) array
-        Their covariance, m².
+        Covariances of the points, m².
     normal : (n, 3) array
         Direction of the force on the whisker, laboratory frame: the surface's normal.
     arc_length : (n,) array

@@ -66,7 +66,7 @@ def inertial_wrench(
     points : (n, 3) array
         Points on the centreline that are held, laboratory frame, m; NaN where nothing is touched.
     arc_length : (n,) array
-        Their arc lengths, about, m; only the first of a contact counts.
+        Approximate arc lengths of the contacts, m; only the first of a contact counts.
     most : float
         Force on the chain without mass from which a point must be wrong, N; the point of the
         nearest frame takes its place, or the contact ends there.

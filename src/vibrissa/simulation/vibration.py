@@ -66,7 +66,7 @@ class Vibration:
     mass : (m,) array
         Masses of points of the whisker, kg.
     places : (m, 3) array
-        Where these are at rest, whisker frame, m.
+        Places of these points at rest, whisker frame, m.
     shapes : (k, m, 3) array
         Displacements of the modes, of mass one, 1/√kg.
     """
@@ -91,7 +91,7 @@ class Vibration:
         Returns
         -------
         Vibration
-            Its two lowest pairs of modes.
+            Vibration in the two lowest pairs of modes.
         """
         dynamics = dynamics or Dynamics()
         chain = Chain.of(whisker, dynamics.density, dynamics.segments)

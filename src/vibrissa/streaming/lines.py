@@ -83,18 +83,18 @@ class Sample(NamedTuple):
     line : int
         Number of the line, from 1.
     time : float or None
-        Of the sample, s; None where the line has none.
+        Time of the sample, s; None where the line has none.
     names : tuple of str
-        Which of the choices asked for it has; none where the line has a pose alone.
+        Choice of names that the line has, of those asked for; none where the line has a pose alone.
     values : (k,) array
-        In that order.
+        Values in the order of the names.
     rotation : (3, 3) array or None
-        From the whisker's to the laboratory frame; NaN where the line leaves it empty.
+        Rotation from the whisker's to the laboratory frame; NaN where the line leaves it empty.
     position : (3,) array or None
-        Of the base in the laboratory, m; NaN where the line leaves it empty.
+        Position of the base in the laboratory, m; NaN where the line leaves it empty.
     passed : mapping
-        What is passed on as it is: ``stamp_ns``, ``recorded_ns`` and ``frame_id``, where the line
-        has them.
+        Values that are passed on as they are: ``stamp_ns``, ``recorded_ns`` and ``frame_id``, where
+        the line has them.
     """
 
     line: int

@@ -193,7 +193,7 @@ class Cells:
 
     @property
     def done(self) -> NDArray[np.bool_]:
-        """Which whiskers are done."""
+        """Whether each whisker is done."""
         return self.rows >= 0
 
     def column(self, *names: str, fill: Any) -> NDArray[Any]:

@@ -65,7 +65,7 @@ class TrackerTraces:
     names : list of str
         Names of the whiskers.
     notes : tuple of str
-        What is assumed, a sentence each.
+        Assumptions, a sentence each.
     """
 
     cameras: tuple[Camera, ...]

@@ -49,7 +49,7 @@ class Live:
     whisker : Whisker
         Whisker that is drawn.
     name : str
-        Its name, where the stream is of several; answers of others are left out.
+        Name of the whisker, where the stream is of several; answers of others are left out.
     """
 
     def __init__(self, whisker: Whisker, name: str = "") -> None:
@@ -121,7 +121,7 @@ class LivePage:
     server : viser.ViserServer
         Server of the page.
     live : Live
-        What has come so far.
+        Answers that have come so far.
     address : str
         Address on which answers come, ``HOST:PORT``.
     """
@@ -140,7 +140,7 @@ class LivePage:
 
     @property
     def address(self) -> str:
-        """Where answers are listened for."""
+        """Address at which answers are listened for."""
         host, port = self._socket.getsockname()[:2]
         return f"{host}:{port}"
 

@@ -49,7 +49,7 @@ class Sensor:
 
     @property
     def covariance(self) -> Array | None:
-        """Of force and moment (6, 6); None where there is no noise."""
+        """Covariance of force and moment (6, 6); None where there is no noise."""
         sigma = np.repeat([self.force_noise, self.moment_noise], 3)
         return np.diag(sigma**2) if (sigma > 0.0).all() else None
 
@@ -84,7 +84,7 @@ class Located:
 
     @property
     def distances(self) -> Array:
-        """How far each candidate is from the true contact (k,), m."""
+        """Distance of each candidate from the true contact (k,), m."""
         return np.asarray(np.linalg.norm(self.points - self.contact, axis=-1))
 
     def others(self, length: float) -> Ints:

@@ -69,7 +69,7 @@ class Solids:
 
     @property
     def length(self) -> float:
-        """Of the whisker, mm."""
+        """Length of the whisker, mm."""
         return float(to_display("length", self.chart.whisker.length))
 
     def skin(self) -> Array:

@@ -45,7 +45,7 @@ class Watched:
 
     @property
     def frames(self) -> int:
-        """How many."""
+        """Number of frames."""
         return int(self.time.size)
 
     def at(self, time: float) -> int:

@@ -76,7 +76,7 @@ class Served:
 
     @property
     def url(self) -> str:
-        """Where the page is."""
+        """Address of the page."""
         server = self.shown.server
         host = server.get_host()
         shown = "127.0.0.1" if host in ("0.0.0.0", "") else host

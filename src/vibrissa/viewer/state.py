@@ -44,12 +44,12 @@ class Bend:
 
     @property
     def status(self) -> Status:
-        """What became of the load."""
+        """Status of the load."""
         return Status(int(self.deflection.status))
 
     @property
     def target(self) -> Array:
-        """What is dragged: the wanted contact point, the peg's origin, or where the force acts."""
+        """Point that is dragged: wanted contact point, origin of the peg, or place of the force."""
         if self.kind == "point":
             return self.point
         if self.kind == "peg":

@@ -129,7 +129,7 @@ class WhiskerArray(Mapping[str, Whisker]):
         Returns
         -------
         WhiskerArray
-            With these only.
+            Array of these only.
 
         Raises
         ------
@@ -175,8 +175,9 @@ class WhiskerArray(Mapping[str, Whisker]):
         Returns
         -------
         xarray.DataTree
-            At the top, along the dimension ``whisker``: side, row, column, pose, length, radii and
-            centreline, head's frame. In the groups ``whiskers/0``, … each whisker's own dataset.
+            Table along the dimension ``whisker`` at the top: side, row, column, pose, length, radii
+            and centreline, head's frame. In the groups ``whiskers/0``, … each whisker's own
+            dataset.
         """
         return array_tree(self.values(), self._identities.values())
 
@@ -187,7 +188,7 @@ class WhiskerArray(Mapping[str, Whisker]):
         Parameters
         ----------
         tree : xarray.DataTree
-            Of `to_tree`.
+            Result of `to_tree`.
 
         Returns
         -------
@@ -315,7 +316,7 @@ def whisker_array(
     Parameters
     ----------
     side : {"both", "left", "right"}
-        Of the animal.
+        Side of the animal.
     rows : iterable of {"A", "B", "C", "D", "E"}
         Rows to make, from the top down.
     columns : iterable of int
@@ -331,7 +332,7 @@ def whisker_array(
     Returns
     -------
     WhiskerArray
-        Their poses lead to the head's frame: origin at the tip of the snout, x to the animal's
+        Whiskers with poses in the head's frame: origin at the tip of the snout, x to the animal's
         right, y forward, z up.
 
     Raises

@@ -36,7 +36,7 @@ class Identity:
     Parameters
     ----------
     row : {"A", "B", "C", "D", "E"}
-        From the top down.
+        Row, from the top down.
     column : int
         0 for the Greek whiskers, then 1 to 6 (of some animals 9) from the back to the front.
     side : {"left", "right"} or None
@@ -109,7 +109,7 @@ class Identity:
         Parameters
         ----------
         side : {"left", "right"} or None
-            Which.
+            Side of the face.
 
         Returns
         -------
@@ -124,7 +124,7 @@ class Identity:
 
     @property
     def name(self) -> str:
-        """As it is written everywhere: ``C2``, ``γ``, ``LC2``, ``Rγ``."""
+        """Name as it is written everywhere: ``C2``, ``γ``, ``LC2``, ``Rγ``."""
         bare = f"{self.row}{self.column}"
         if self.column == 0 and self.row in ROWS[: len(GREEK)]:
             bare = GREEK[self.row_number - 1]

@@ -92,11 +92,11 @@ class Whisker:
     base_stiffness : tuple of float, optional
         Rotational stiffness of the base (bending, twist), N·m/rad; None is a rigid clamp.
     pose : Pose
-        Where the whisker frame sits in the frame the whisker came from.
+        Place of the whisker frame in the frame that the whisker came from.
     breaks : tuple of float
         Arc lengths, m, inside the whisker, at which curvature or radius has a kink or a jump.
     name : str
-        What to call it.
+        Name in messages and figures.
     notes : tuple of str
         Sentences about how it was made that its user should know.
 
@@ -185,14 +185,14 @@ class Whisker:
             Standard deviation of a coordinate, m; 0 asks for interpolation. By default it is
             estimated by cross-validation.
         base : {"first", "last"} or array (3,) or (2,), optional
-            Which end is the base: by name, or a point near it. By default the first.
+            End that is the base: by name, or a point near it. By default the first.
         **properties
             Radius and material; see `Whisker`.
 
         Returns
         -------
         Whisker
-            In the whisker frame; its pose leads back to the points' frame.
+            Whisker in its own frame; its pose leads back to the points' frame.
 
         Raises
         ------
@@ -283,7 +283,7 @@ class Whisker:
         Returns
         -------
         Whisker
-            Its frame is the one the curvature is stated in, whichever way it bends; `aligned`
+            Whisker in the frame in which the curvature is stated, whichever way it bends; `aligned`
             rolls it so that it bends to +y.
         """
         faults = length_faults(length, properties.get("any_length"))
@@ -354,7 +354,7 @@ class Whisker:
         s : array (...)
             Arc lengths from the base, m.
         side : {"right", "left"}
-            Which side counts where the curvature jumps.
+            Side that counts where the curvature jumps.
 
         Returns
         -------
@@ -371,7 +371,7 @@ class Whisker:
         s : array (...)
             Arc lengths from the base, m; NaN gives NaN.
         side : {"right", "left"}
-            Which side counts where the radius jumps.
+            Side that counts where the radius jumps.
 
         Returns
         -------
@@ -416,7 +416,7 @@ class Whisker:
         Parameters
         ----------
         n : int
-            How many, base and tip included.
+            Number of points, base and tip included.
 
         Returns
         -------
@@ -480,7 +480,7 @@ class Whisker:
         Parameters
         ----------
         **properties
-            What to change; see `Whisker`. What is not named stays.
+            Properties that change; see `Whisker`. What is not named stays.
 
         Returns
         -------
@@ -539,7 +539,7 @@ class Whisker:
         Returns
         -------
         Whisker
-            With the same material, base stiffness and pose.
+            Scaled whisker of the same material, base stiffness and pose.
         """
         for what, value in (("length_factor", length_factor), ("radius_factor", radius_factor)):
             if not (np.isfinite(value) and value > 0.0):

@@ -185,12 +185,13 @@ def base_rotation(azimuth: ArrayLike, elevation: ArrayLike, roll: ArrayLike) -> 
     Parameters
     ----------
     azimuth, elevation, roll : array_like (...)
-        Of the base, rad.
+        Angles of the base, rad.
 
     Returns
     -------
     array (..., 3, 3)
-        From the whisker's frame to that of the angles, R_z(azimuth) R_y(−elevation) R_x(roll).
+        Rotation from the whisker's frame to that of the angles, R_z(azimuth) R_y(−elevation)
+        R_x(roll).
 
     Examples
     --------
@@ -231,7 +232,7 @@ def mirrored(angles: ArrayLike) -> Array:
     Returns
     -------
     array (..., 3)
-        Of the mirror image, which bends to the mirrored side.
+        Angles of the mirror image, which bends to the mirrored side.
     """
     azimuth, elevation, roll = np.moveaxis(np.asarray(angles, dtype=np.float64), -1, 0)
     return np.stack([np.pi - azimuth, elevation, np.pi - roll], axis=-1)

@@ -176,7 +176,7 @@ def rough_optics(
     Returns
     -------
     Optics or None
-        What was found; None if too few frames show a free whisker.
+        Optics that were found; None if too few frames show a free whisker.
     """
     count = len(traces[0])
     rows = np.linspace(0, count - 1, min(_SAMPLE, count)).astype(int)
@@ -242,14 +242,14 @@ def estimated_optics(
     curves : array (time, node, 3)
         The whisker in space as the stated cameras show it, m.
     shape : RestShape
-        Its rest shape, with the frames that are free of contact.
+        Rest shape, with the frames that are free of contact.
     distance : float, optional
         Approximate distance of the lenses from what they see, m.
 
     Returns
     -------
     Optics or None
-        What was found; None if too few frames are free.
+        Optics that were found; None if too few frames are free.
     """
     alike = np.nan_to_num(shape.deviation, nan=np.inf) < _ALIKE * shape.length
     rows = np.flatnonzero((shape.free | alike) & np.isfinite(curves).all(axis=(1, 2)))

@@ -217,18 +217,18 @@ class Follower:
 
     @property
     def expected(self) -> Array | None:
-        """Where the next frame is expected to show it, (n, 2); None before it was ever seen."""
+        """Line on which the next frame should show it, (n, 2); None before it was ever seen."""
         moving = self._moving
         return self.last if moving is None else moving
 
     @property
     def last(self) -> Array | None:
-        """Where it was seen last, (n, 2)."""
+        """Line on which it was seen last, (n, 2)."""
         return None if self._last is None else self._last.line
 
     @property
     def _moving(self) -> Array | None:
-        """Where the last line will be if it moves on; None if that is not known."""
+        """Line on which it will be if it moves on; None if that is not known."""
         if self._last is None or self._before is None or self._missing:
             return None
         before, last = self._before.line, self._last.line
@@ -239,7 +239,7 @@ class Follower:
 
     @property
     def reach(self) -> float:
-        """How far from there it may be, pixels: the farther, the longer it is lost."""
+        """Distance from there at which it may be, pixels; it grows while the whisker is lost."""
         return self.options.jump + min(self._missing, 60)
 
     def long_enough(self, trace: Trace) -> bool:

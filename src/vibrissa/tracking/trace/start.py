@@ -120,7 +120,7 @@ class Start:
     doubts : tuple of str
         Reasons why it may be wrong, a sentence each.
     others : tuple of Candidate
-        What else may be the whisker, the likeliest first.
+        Other lines that may be the whisker, the likeliest first.
     """
 
     bases: list[Array] | None

@@ -58,24 +58,24 @@ from vibrissa.tracking import TrackOptions, partial_traces, trace_file, track
 from vibrissa.whisker import Whisker
 
 DURATION = 0.5
-"""Of the trial, s."""
+"""Duration of the trial, s."""
 
 FULL_DURATION = 3.5
-"""Of a trial like the paper's, s."""
+"""Duration of a trial like the paper's, s."""
 
 SIMULATED, TRACKED = "simulated.nc", "tracked.nc"
 """Recordings that are kept from one run to the next, as videos are."""
 
 _VIEWS = ("top", "front")
 _WRITTEN = ("trial.nc", "seen.nc", "contacts.csv", "map.nc")
-"""What is made anew each time."""
+"""Files that are made anew each time."""
 
 _SETTINGS = ".settings.json"
 _NODES = 9
 """Points by which it is known whether a whisker is the same."""
 
 _PROPERTIES = ("base_radius", "tip_radius", "youngs_modulus", "poisson_ratio")
-"""What no camera sees, and a lab has from elsewhere."""
+"""Properties that no camera sees, and a lab has from elsewhere."""
 
 _DIM = {"whisker": 0}
 

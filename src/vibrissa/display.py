@@ -1,4 +1,4 @@
-"""What the results that are plain datasets look like in a notebook or a terminal.
+"""Display of the results that are plain datasets, in a notebook or a terminal.
 
 Whiskers, deflections, maps and estimates show themselves. Verdicts on triplets and recordings are
 xarray's own types, whose display lists variables; `show` explains them.
@@ -79,7 +79,7 @@ def show(result: Any) -> Shown:
 
 
 def _facts(recording: xr.DataTree) -> list[tuple[str, str]]:
-    """What a recording is of, in words."""
+    """Describe what a recording is of, in words."""
     root = recording.to_dataset()
     time = root["time"].values
     facts = [("origin", str(recording.attrs.get("origin", "unknown")))]

@@ -74,7 +74,7 @@ _FACTORS = {
 
 
 def _display_factor(unit: str, shown: str) -> float:
-    """What a value is multiplied with to be shown in another unit; ValueError if not known."""
+    """Factor from one unit to another; ValueError if it is not known."""
     # Units of covariances are made of others, whose products are written with a dot.
     if unit.replace("N m", "N·m").replace("^2", "²") == shown or (unit, shown) in _SAME:
         return 1.0

@@ -1,4 +1,4 @@
-"""How results show themselves in a notebook: a small picture, a table with units, progress bars.
+"""Display of results in a notebook: a small picture, a table with units, progress bars.
 
 The picture is a few lines of SVG, so that showing a value never loads a plotting library: the
 whisker's x–y and x–z planes at one scale, with a bar of round length. Figures are in

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 
 class Status(enum.IntEnum):
-    """What became of one load or one estimate.
+    """Outcome of one load or one estimate.
 
     ``str(status)`` is a sentence that explains, followed by one that advises.
 

@@ -39,7 +39,7 @@ _VARIABLES = {
     "image_size": ("size", ("side",), "pixel", "width and height"),
     "projection": ("projection", (), "1", "orthographic or perspective"),
 }
-"""By variable: attribute of a camera, dimensions, unit and description."""
+"""Attribute of a camera, dimensions, unit and description of each variable."""
 
 
 def load_cameras(path: str | PathLike[str], unit: float = 1e-3) -> tuple[Camera, ...]:

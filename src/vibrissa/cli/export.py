@@ -58,7 +58,7 @@ def export(
 
 
 def _start(text: str | None, recording: Path) -> datetime:
-    """When the session began; by default when the file was written."""
+    """Return when the session began; by default when the file was written."""
     if text is None:
         start = datetime.fromtimestamp(recording.stat().st_mtime, UTC)
         remark(f"--session-start is not stated: {start:%Y-%m-%dT%H:%MZ}, when {recording} was made")

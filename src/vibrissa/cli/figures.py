@@ -39,7 +39,7 @@ _CONTACTS = ("estimates", "truth")
 
 @dataclass(frozen=True)
 class TrialOptions:
-    """What a picture of a trial is drawn with, and of which whisker."""
+    """Options for the picture of a trial, and of which whisker."""
 
     videos: list[Path] | None = None
     map: Path | None = None

@@ -100,7 +100,7 @@ def _file(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
 
 
 def _recording(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
-    """What a recording is and holds in five lines, what is assumed, and what comes next."""
+    """Describe a recording in five lines: contents, assumptions, and what comes next."""
     found = vb.pipeline.summarise(_summarised(path))
     one = len(found.whiskers) == 1
     names = ", ".join(found.whiskers[:_SHOWN]) + (", …" if len(found.whiskers) > _SHOWN else "")
@@ -144,7 +144,7 @@ def _contacts(found: vb.pipeline.TrialSummary) -> str:
 
 
 def _summarised(path: Path) -> xr.DataTree:
-    """What a summary needs of a recording; a long one takes a while to read whole."""
+    """Read what a summary needs of a recording; a long one takes a while to read whole."""
     import xarray as xr
 
     with vb.io.opened(path, "a recording") as file:
@@ -159,7 +159,7 @@ def _summarised(path: Path) -> xr.DataTree:
 
 
 def _settings(path: Path) -> Iterator[tuple[str, str]]:
-    """What other settings are for; they are checked by the verb that takes them."""
+    """Describe other settings; they are checked by the verb that takes them."""
     settings = vb.io.read_toml(path)
     study = {"whiskers", "tasks"} & set(settings)
     yield "kind", "a study, for vibrissa sweep" if study else "settings, as of vibrissa simulate"
@@ -323,7 +323,7 @@ def _groups(path: Path, whole: bool = False) -> Iterator[tuple[str, str]]:
 
 
 def _certificate(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
-    """What a certificate proves, and by how many boxes."""
+    """Describe what a certificate proves, and by how many boxes."""
     found = vb.certificates.load_certificate(path)
     yield "whisker", found.whisker
     yield "states", found.summary()
@@ -374,7 +374,7 @@ def _variables(name: str, group: Any) -> Iterator[tuple[str, str]]:
 
 
 def _notes(group: Any) -> Iterator[tuple[str, str]]:
-    """What is assumed about the whisker of a group, or about all that are stacked in it."""
+    """List the assumptions about the whisker of a group, or about all that are stacked in it."""
     import json
 
     if _text(group.attrs.get("kind", "")) != "vibrissa whisker":
@@ -394,7 +394,7 @@ def _text(value: Any) -> str:
 
 
 def _compared(path: Path) -> Iterator[tuple[str, str]]:
-    """How contact points that do not come from the rod compare with those that do."""
+    """Compare contact points that do not come from the rod with those that do."""
     import xarray as xr
 
     with vb.io.opened(path, "a recording") as file:
@@ -413,7 +413,7 @@ def _compared(path: Path) -> Iterator[tuple[str, str]]:
 
 
 def _table(path: Path) -> Iterator[tuple[str, str]]:
-    """What a CSV file is."""
+    """Describe a CSV file."""
     # A centreline comes last: other tables have columns x, y and z too.
     readers: tuple[tuple[str, vb.io.Kind | None, Callable[[Path], Any]], ...] = (
         ("contacts", vb.io.Kind.CONTACTS, vb.io.load_contacts),
@@ -439,14 +439,14 @@ def _table(path: Path) -> Iterator[tuple[str, str]]:
 
 
 def _header(path: Path) -> str:
-    """What a table begins with."""
+    """Quote the first line of a table."""
     cells = next(vb.io.table_rows(vb.io.read_text(path)), (0, []))[1]
     shown = ", ".join(cells[:_SHOWN]) + (", …" if len(cells) > _SHOWN else "")
     return f"its first line is {shown}" if cells else "it has no lines"
 
 
 def _rows(kind: str, data: Any) -> Iterator[tuple[str, str]]:
-    """What a table holds."""
+    """Describe the rows of a table."""
     if kind == "whisker":
         yield "whisker", repr(data)
         base, tip = (data.pose.to_source(data.position(s)) * 1e3 for s in (0.0, data.length))

@@ -1,4 +1,4 @@
-"""What verbs share: options that belong together, and the files that are read and written."""
+"""Inputs that verbs share: options that belong together, and files that are read and written."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ class NoiseOptions:
 
 @dataclass(frozen=True)
 class AssumptionOptions:
-    """What is known beforehand: errors that all samples share, and which contacts are possible."""
+    """Assumptions: errors that all samples share, and which contacts are possible."""
 
     stiffness_sigma: float = 0.0
     gain_sigma: float = 0.0

@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 
 _KINDS = ("signals", "contour")
 _LASTS = 45.0
-"""How long a movie of a whole trial lasts at most, s, unless a step is given."""
+"""Longest duration of a movie of a whole trial, s, unless a step is given."""
 
 
 @dataclass(frozen=True)
 class FrameOptions:
-    """Which frames a movie shows, and how fast."""
+    """Range of frames that a movie shows, and its rate."""
 
     fps: float = 25.0
     step: int | None = None
@@ -99,7 +99,7 @@ def make_movies(
 
 
 def _files(target: Path, trial: Path, kinds: Sequence[str]) -> dict[str, Path]:
-    """Where each movie goes."""
+    """File of each movie."""
     if target.suffix.lower() == ".mp4":
         if len(kinds) > 1:
             raise ValueError(f"--output is the file {target}; for one file choose one --kind")

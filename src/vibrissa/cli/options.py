@@ -21,11 +21,11 @@ import typer
 import vibrissa as vb
 
 _NAMED = 3
-"""How many files are named in one message."""
+"""Number of files named in one message."""
 
 
 class Option(NamedTuple):
-    """What an option means.
+    """Meaning of an option.
 
     Its names are that of the parameter, and of a switch that is on by default also its opposite,
     unless others are stated.

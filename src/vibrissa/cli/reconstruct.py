@@ -146,7 +146,7 @@ def stages(
 
 
 def _as_made(about: Any) -> SourceOptions:
-    """What signals that are there were made from."""
+    """Source of signals that are there."""
     source: Any = str(about.get("source")).replace(" ", "-")
     cutoff = float(about.get("cutoff", 0.0)) if source == "contact-point" else None
     if "density" in about:
@@ -178,7 +178,7 @@ def _report(
     whiskers: list[vb.Whisker],
     wanted: ShapeOptions,
 ) -> None:
-    """What became of the frames, the object, and how far contacts are from one that is known."""
+    """Report on frames, object, and distances of contacts from an object that is known."""
     contour, estimates = (tree[name].to_dataset() for name in ("contour", "estimates"))
     shapes, fit = None, vb.contour.shape_from_dataset(contour)
     if wanted.shape != "free" and fit.misfit > _SUSPECT:
@@ -257,7 +257,7 @@ def _matching(contour: xr.Dataset, known: tuple[vb.objects.Surface, ...]) -> dic
 
 
 def _agreement(fit: vb.contour.FittedShape, contour: xr.Dataset) -> str:
-    """How well contacts agree with the fitted object."""
+    """State how well contacts agree with the fitted object."""
     found, used = int(np.isfinite(fit.residuals).sum()), int(fit.used.sum())
     inside = int((fit.used & fit.inliers).sum())
     share = f"all {used}" if used < inside + 1 else f"{inside} of {used}"

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """What signals come from."""
+    """Source of the signals."""
 
     source: Source | None = None
     cutoff: float | None = None

@@ -99,7 +99,7 @@ def simulate(
 
 
 def _report(trial: xr.DataTree) -> None:
-    """What happened, in a few lines."""
+    """Summarise the trial in a few lines."""
     truth = trial["truth"].to_dataset()
     names = trial.to_dataset()["whisker"].values.tolist()
     print_statuses(truth["status"].values.ravel(), "frames:")
@@ -122,7 +122,7 @@ def _report(trial: xr.DataTree) -> None:
 
 
 def _films(folder: Path) -> list[Path]:
-    """Where the videos of the two views go."""
+    """Paths of the videos of the two views."""
     return [folder / f"{view}.mkv" for view in ("top", "front")]
 
 

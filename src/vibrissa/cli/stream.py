@@ -42,7 +42,7 @@ _MOUNT = ("X", "Y", "Z", "QW", "QX", "QY", "QZ")
 
 @dataclass(frozen=True)
 class LineOptions:
-    """Where lines come from."""
+    """Source of the lines."""
 
     source: Annotated[
         Path | None,
@@ -175,7 +175,7 @@ class MeasurementOptions:
 
 @dataclass(frozen=True)
 class FollowOptions:
-    """How contacts are followed over time, and where the whisker is mounted."""
+    """Options for contacts that are followed over time, and the place of the whisker."""
 
     filter: bool = False
     speed: float | None = None

@@ -15,10 +15,10 @@ from vibrissa.quantities import quantity
 from vibrissa.sketch import progress
 
 output = Console(markup=False, emoji=False)
-"""Where results go, as they are: names of files and whiskers may have brackets."""
+"""Console for results, written as they are: names of files and whiskers may have brackets."""
 
 errors = Console(stderr=True, markup=False, emoji=False)
-"""Where progress and messages go, so that results can be piped."""
+"""Console for progress and messages, so that results can be piped."""
 
 Tell = Callable[[str, int, int], None]
 """Called with what is being done, and how much of how much is."""

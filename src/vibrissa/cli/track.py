@@ -53,7 +53,7 @@ _HALF = 127
 
 @dataclass(frozen=True)
 class FilmOptions:
-    """How the videos were filmed."""
+    """Options on how the videos were filmed."""
 
     pixel_size: float | None = None
     distance: float | None = None
@@ -118,7 +118,7 @@ class FilmOptions:
 
 @dataclass(frozen=True)
 class TraceStatements:
-    """How whiskers look in the images, and where they begin."""
+    """Options on how whiskers look in the images, and where they begin."""
 
     base: list[str] | None = None
     base_width: float = _FINEST
@@ -241,7 +241,7 @@ def _picked(
 
 @dataclass(frozen=True)
 class KnownOptions:
-    """What is known besides the videos."""
+    """Options on what is known besides the videos."""
 
     corrections: Path | None = None
     head: Path | None = None

@@ -92,7 +92,7 @@ def uniqueness(
 
 
 def _print_proofs(found: Dataset, bracket: tuple[float, float]) -> None:
-    """What is certain: bounds on the critical cone, and the triplets with proved witnesses."""
+    """Print what is proved: bounds on the critical cone, and triplets with proved witnesses."""
     low, high = np.rad2deg(bracket)
     above = f" ≤ {high:.3g}° (certificate)" if np.isfinite(high) else ""
     if low > 0.0 or above:

@@ -16,7 +16,7 @@ from vibrissa.contour.touches import Array
 from vibrissa.quantities import attributes
 
 _INWARD = 0.9
-"""How far inside of its base a surface may be, as a share of the radius."""
+"""Largest depth of a surface inside its base, as a share of the radius."""
 
 _ROUND = np.pi / 3.0
 """Gap between azimuths from which a shape is drawn open."""

@@ -67,7 +67,7 @@ _ROUGH = 1e-2
 """Standard deviation to begin with, as a share of the extent, where it is not known."""
 
 _ROUNDS = 4
-"""How often the noise is estimated from the scatter."""
+"""Number of times that the noise is estimated from the scatter."""
 
 _PRECISE = 1e-6
 """Tolerance up to which derivatives are central differences."""
@@ -88,7 +88,7 @@ _NEEDS = {
     "axis": ("cylinder", "three numbers, not all zero, are needed"),
     "outside": ("plane", "three finite numbers are needed"),
 }
-"""What else may be known of which shape, and what that must be."""
+"""Options that apply to some shapes only, and what they must be."""
 
 
 @overload

@@ -73,10 +73,10 @@ _NEIGHBOURS = 9
 """Number of contacts whose median an outlier is found by at first."""
 
 _ROUNDS = 2
-"""How often the deviation is fitted, with the slope of the fit before."""
+"""Number of times that the deviation is fitted, with the slope of the fit before."""
 
 _PLACING_ROUNDS = 5
-"""How often a contact's foot is moved until its offset is zero."""
+"""Largest number of moves of a contact's foot until its offset is zero."""
 
 _NOISES = (1e-10, 1e-2)
 """Bounds of the variance that no covariance contains, in units of the extent squared."""

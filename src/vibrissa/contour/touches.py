@@ -18,7 +18,7 @@ _FINE = 1e-10
 """Variance of the least noisy combination as a share of that of the point or normal, at least."""
 
 _NEGATIVE = 1e-8
-"""How negative an eigenvalue of a covariance may be by rounding, as a share of the largest."""
+"""Largest negative eigenvalue of a covariance by rounding, as a share of the largest."""
 
 
 class Touches(NamedTuple):
@@ -64,7 +64,7 @@ class Checked:
 
 
 class ContactArrays(TypedDict, total=False):
-    """What may be known of contacts in addition to their points; see `fit_shape`."""
+    """Optional facts on contacts in addition to their points; see `fit_shape`."""
 
     covariance: ArrayLike | None
     whisker_radius: ArrayLike | None

@@ -1,4 +1,4 @@
-"""How far tracks and signals are from the truth: the stages before the estimates."""
+"""Errors of tracks and signals against the truth: the stages before the estimates."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _SPREAD = (50.0, 95.0)
 
 @dataclass(frozen=True, eq=False)
 class TrackingScores:
-    """How well a whisker was tracked: medians and 95 %, SI units but for pixels.
+    """Errors of tracking: medians and 95 %, SI units but for pixels.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def tracking_scores(tracked: xr.Dataset, truth: xr.Dataset) -> TrackingScores:
 
 
 def _distances(tracked: xr.Dataset, truth: xr.Dataset, name: str) -> Array:
-    """How far a point (time, space) is from the true one."""
+    """Distances of a point (time, space) from the true one."""
     pair = [Group(data)[name] for data in (tracked, truth)]
     return np.asarray(np.linalg.norm(pair[0] - pair[1], axis=-1))
 
@@ -259,5 +259,5 @@ def truth_of(recording: xr.DataTree, whisker: int = 0) -> tuple[xr.Dataset, Whis
 
 
 def caution(source: object) -> str | None:
-    """What errors of contacts do not test, by the source of their signals."""
+    """State what errors of contacts do not test, by the source of their signals."""
     return _CIRCULAR if source in ("contact point", "rod") else None

@@ -1,4 +1,4 @@
-"""Which signals locate a contact: witnesses, verdicts, critical cones, sensitivity."""
+"""Identifiability: which signals locate a contact, critical cones, sensitivity."""
 
 from vibrissa.identifiability.cones import critical_cones
 from vibrissa.identifiability.proofs import cone_bracket, with_proved_witnesses

@@ -1,4 +1,4 @@
-"""How curvature and taper decide which triplets locate a contact: critical cones."""
+"""Critical cones: how curvature and taper decide which triplets locate a contact."""
 
 from __future__ import annotations
 

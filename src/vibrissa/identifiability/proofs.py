@@ -1,4 +1,4 @@
-"""What is certain of verdicts: witnesses that are proved, and brackets of critical cones."""
+"""Proofs of verdicts: witnesses that are proved, and brackets of critical cones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far the contact point moves when a signal at the base changes, and the best triplet.
+"""Sensitivity of the contact point to each signal at the base, and the best triplet.
 
 Three signals T locate the contact point p, so ∂p/∂T is the effect of a small change of a signal on
 the estimate: noise of covariance Σ spreads p by ∂p/∂T Σ (∂p/∂T)ᵀ, an ellipsoid. The derivatives are

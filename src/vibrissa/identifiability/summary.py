@@ -128,7 +128,7 @@ def _twins(verdicts: xr.Dataset, triplet: str) -> str:
 
 
 def _certificate_note(verdicts: xr.Dataset) -> list[str]:
-    """What a grid shows of a proof."""
+    """State what a grid shows of a proof."""
     if "determinant_cone" not in verdicts.attrs:
         return []
     angle = np.rad2deg(verdicts.attrs["determinant_cone"])

@@ -1,4 +1,4 @@
-"""Which signals locate a contact: verdicts on triplets, with their evidence.
+"""Verdicts: which signals locate a contact, with the evidence.
 
 Two contacts with the same triplet are a *witness*: a proof that it does not locate the contact. The
 verdict on a triplet and a region is whether there are witnesses outside the cone that is left out;

@@ -14,7 +14,7 @@ from vibrissa.whisker import Whisker
 
 _NODES = 101
 _AGREE = 1e-6
-"""How closely signals of a saved witness must agree with those of the whisker."""
+"""Largest difference of a saved witness's signals from those of the whisker."""
 
 _NEEDED = {"witness_arc_length", "witness_contact_force", "witness_separation"}
 

@@ -81,7 +81,7 @@ def _table(path: Path) -> tuple[Array, Array | None, str]:
 
 
 def _columns(path: Path, header: list[str]) -> tuple[list[int], float]:
-    """Where the coordinates stand, and the length of their unit, m."""
+    """Indices of the coordinates' columns, and the length of their unit, m."""
     found: dict[float, dict[str, int]] = {}
     for place, name in enumerate(header):
         match = _COORDINATE.fullmatch(name)
@@ -99,7 +99,7 @@ def _columns(path: Path, header: list[str]) -> tuple[list[int], float]:
 
 
 def _thickness(path: Path, header: list[str], coordinates: float) -> list[tuple[int, float]]:
-    """Where radius or diameter stands, and what makes it a radius in m; at most one."""
+    """Columns of radius or diameter, and the factor to a radius in m; at most one."""
     found = []
     for place, name in enumerate(header):
         match = _THICKNESS.fullmatch(name)

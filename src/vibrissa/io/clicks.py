@@ -1,4 +1,4 @@
-"""What a person showed in the images of a recording: bases, masks, regions, the scale; TOML.
+"""Clicks of a person in the images of a recording: bases, masks, regions, the scale; TOML.
 
     videos = ["top.mp4", "front.mp4"]
     pixel_size = 0.058                                # mm
@@ -34,7 +34,7 @@ _FEWEST = 3
 
 @dataclass(frozen=True)
 class ViewClicks:
-    """What was shown in one view.
+    """Clicks in one view.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def together(masks: Iterable[Mask | None]) -> Mask | None:
 
 @dataclass(frozen=True)
 class Clicks:
-    """What was shown in the images of all views.
+    """Clicks in the images of all views.
 
     Parameters
     ----------

@@ -274,7 +274,7 @@ def _above_mark(stack: list[Any]) -> list[Any]:
 
 
 def _checked_names(stack: list[Any]) -> Names:
-    """What is left of a pickle, if it is a list of text or of tuples of text."""
+    """Check what is left of a pickle: a list of text or of tuples of text."""
     if len(stack) != 1 or not isinstance(stack[0], list):
         raise ValueError("the names of its columns are not a list")
     names: Names = [name if isinstance(name, tuple) else (name,) for name in stack[0]]

@@ -168,7 +168,7 @@ READERS: Mapping[Kind, Callable[[Path], RawTracks]] = MappingProxyType(
         Kind.TRACKS_TABLE: read_tracks_table,
     }
 )
-"""What reads the files of other programs, by their kind."""
+"""Reader of each kind of other programs' files."""
 
 
 def load_tracks(

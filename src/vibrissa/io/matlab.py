@@ -42,7 +42,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class _Frames:
-    """What one layout gives: the points of each entry, and which frame and whisker it is."""
+    """Points of each entry of one layout, and which frame and whisker it is."""
 
     points: Sequence[Array]
     frames: Sequence[float] | None = None

@@ -157,7 +157,7 @@ def _check_type(name: str, kind: h5t.TypeID) -> None:
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 COMPRESSED: Mapping[str, Any] = {"zlib": True, "complevel": 1, "shuffle": True}
-"""How large variables are encoded, without loss."""
+"""Encoding of large variables, without loss."""
 
 
 def is_netcdf(path: str | PathLike[str]) -> bool:

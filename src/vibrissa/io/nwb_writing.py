@@ -55,7 +55,7 @@ _VECTORS = 2
 
 @dataclass(frozen=True)
 class Session:
-    """What an NWB file must say of the experiment, and a recording does not know.
+    """Facts on the experiment that NWB requires and a recording does not know.
 
     Parameters
     ----------

@@ -32,7 +32,7 @@ NWB = (".nwb",)
 
 
 _WHISK = {b"bwhiskbin": "traces of whisk (.whiskers)", b"measv": "measurements of whisk"}
-"""What whisk's binary files begin with, and what they are called."""
+"""First bytes of whisk's binary files, and the names of these files."""
 
 
 _VIDEO_PART = re.compile(r"^(?P<file>.+)#(?P<part>\d+,\d+,\d+,\d+(?::[a-z]+)*)$", re.DOTALL)

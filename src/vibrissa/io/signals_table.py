@@ -69,7 +69,7 @@ def load_signals(path: str | PathLike[str]) -> xr.Dataset:
 
 
 def _notes(time: Array) -> list[str]:
-    """Where time does not rise, as when trials stand one below the other."""
+    """Note where time does not rise, as when trials stand one below the other."""
     known = np.flatnonzero(np.isfinite(time))
     step = np.diff(time[known])
     notes = []
@@ -152,7 +152,7 @@ def _csv(path: Path) -> Array:
 
 
 def _columns(path: Path, header: list[str]) -> tuple[list[int], Array]:
-    """Where each column stands and its unit; all that is wrong with the header in one error."""
+    """Find each column and its unit; all that is wrong with the header is one error."""
     found, strange = signal_columns(header, COLUMNS)
     missing = [name for name in COLUMNS if name not in found and name not in strange]
     faults = [f"it lacks {', '.join(missing)}"] if missing else []

@@ -43,7 +43,7 @@ SPACE = ("time", "whisker", "node", "space")
 
 
 class Labels(TypedDict, total=False):
-    """What files of other programs do not say.
+    """Facts that files of other programs may lack.
 
     ``fps``: frames per second; by default that of the file, else time counts frames. ``view``: name
     of the camera of a file with pixels; by default that of the file, or ``camera``. ``unit``: of
@@ -59,7 +59,7 @@ class Labels(TypedDict, total=False):
 
 @dataclass(frozen=True, eq=False)
 class RawTracks:
-    """What a reader found in a file.
+    """Contents of a tracker's file as they are.
 
     Parameters
     ----------
@@ -177,7 +177,7 @@ def _stated(path: Path, name: str, stated: str, given: str | None) -> str:
 
 
 def _factor(path: Path, unit: str, points: Array) -> float:
-    """How many metres the unit of the points is."""
+    """Length of the points' unit, m."""
     if unit not in UNITS:
         got = f"{unit!r} is not known" if unit else "the file does not say it"
         raise ValueError(

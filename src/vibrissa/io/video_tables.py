@@ -148,7 +148,7 @@ def load_contact_points(path: str | PathLike[str]) -> xr.Dataset:
 
 
 def _numbers(path: Path, column: Array, name: str) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
-    """Which numbers a column has, and where each of its rows is among them."""
+    """Numbers that a column has, and the index of each of its rows among them."""
     wrong = np.flatnonzero(~(column >= 0.0) | (column != np.round(column)))
     if wrong.size:
         raise ValueError(f"{path}: {name} is not a number from 0 on in rows {few(wrong + 1)}")
@@ -162,7 +162,7 @@ QUATERNION = ("qw", "qx", "qy", "qz")
 MATRIX = tuple(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))
 
 _ROUNDED = 1e-3
-"""By how much a quaternion's length and a matrix's RᵀR may miss 1: decimals are cut in tables."""
+"""Largest error of a quaternion's length and of a matrix's RᵀR: tables cut decimals."""
 
 
 def load_head(path: str | PathLike[str]) -> xr.Dataset:

@@ -1,4 +1,4 @@
-"""What a whisker touches: solids with their signed distance, gradient and curvature."""
+"""Objects that a whisker touches: solids with signed distance, gradient and curvature."""
 
 from vibrissa.objects.mesh import Mesh
 from vibrissa.objects.solids import (

@@ -1,4 +1,4 @@
-"""What a whisker meets in the laboratory: pegs, spheres, planes, boxes; all objects as datasets.
+"""Solids in the laboratory: pegs, spheres, planes, boxes; all objects as datasets.
 
 Each is a solid with a signed distance d (negative inside), its gradient, the outward normal n, and
 ∂n/∂x, in closed form; a `vibrissa.objects.Surface`. Each may be compliant: pressed with N it

@@ -267,7 +267,7 @@ def with_network_errors(
 
 
 def _counted(contact_map: ContactMap, drawn: DrawnContacts, verdicts: xr.Dataset) -> list[AnyArray]:
-    """Which contacts are in each region of verdicts, outside the cone."""
+    """Select the contacts in each region of verdicts, outside the cone."""
     whisker, d = contact_map.whisker, contact_map.chart.discretization
     inside = cone_angle(whisker, drawn.point) > verdicts.attrs["cone"]
     if verdicts.attrs["domain"] == "paper":

@@ -111,7 +111,7 @@ def signals_in(recording: xr.DataTree) -> xr.Dataset:
 
 
 _VERBS = {"signals": ("signals_of", "signals"), "estimates": ("estimates_of", "estimate")}
-"""What makes a group, in Python and on the command line."""
+"""Function and verb of the command line that make a group."""
 
 
 def _group_in(recording: xr.DataTree, name: str, needs: Sequence[str]) -> xr.Dataset:

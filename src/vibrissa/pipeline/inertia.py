@@ -37,7 +37,7 @@ _KNOWN_TO = 0.2
 """Relative standard deviation of mass and damping."""
 
 _LEFT = 0.1
-"""What vibrations leave, as a share of the correction's root mean square."""
+"""Error that vibrations leave, as a share of the correction's root mean square."""
 
 _SLIPS = 2.0
 """Contact force from which contact points must be wrong, over the largest that is measured."""
@@ -151,7 +151,7 @@ def _trial(
 
 
 def _added(trial: _Trial, dynamics: Dynamics) -> tuple[Array, Array]:
-    """What inertia and damping add to the wrench (n, 6), and its change in the last round."""
+    """Wrench (n, 6) that inertia and damping add, and its change in the last round."""
     # The whisker's bending lags behind the moment by the time constant of its damping.
     left = _lagged(trial.wrench, trial.step / Vibration.of(trial.whisker, dynamics).damping)
     added = change = trial.wrench - left

@@ -157,7 +157,7 @@ _BEFORE = ("signals", "", "truth")
 
 @dataclass(frozen=True)
 class TrialSummary:
-    """What a recording holds.
+    """Summary of a recording.
 
     Parameters
     ----------

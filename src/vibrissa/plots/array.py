@@ -62,7 +62,7 @@ _LEFT, _GAP, _BOTTOM, _TOP, _RIGHT = 10.0, 13.0, 8.5, 6.5, 3.0
 
 @dataclass(frozen=True, eq=False)
 class _Scene:
-    """What is drawn, mm: at one moment, but for the contact points."""
+    """Things that are drawn, mm: at one moment, but for the contact points."""
 
     lines: Array  # (whisker, node, 3)
     names: list[str]

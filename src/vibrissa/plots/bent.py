@@ -208,7 +208,7 @@ def _views(drawn: _Drawn, limits: Array, width: Width) -> Figure:
 
 
 def _forces(axes: Axes, drawn: _Drawn) -> None:
-    """How large the forces are, over how far from the resting whisker they act."""
+    """State how large the forces are, over how far from the resting whisker they act."""
     away = np.linalg.norm(drawn.points[:, None] - drawn.rest, axis=-1).min(axis=1)
     axes.scatter(away, drawn.forces, 14.0, color=drawn.colours, zorder=3)
     axes.set(xlabel="distance of the contact from rest (mm)", ylabel=axis_label("force"))
@@ -397,7 +397,7 @@ def _number(value: float, digits: int) -> str:
 
 
 def _sentences(witness: xr.Dataset, triplet: tuple[str, ...]) -> list[str]:
-    """How equal the signals are, and how far apart the contacts."""
+    """State how equal the signals are, and how far apart the contacts."""
     apart = float(np.linalg.norm(np.diff(witness["contact_point"].values, axis=0)))
     step = np.diff(witness["rest"].transpose("node", "space").values, axis=0)
     length = float(np.linalg.norm(step, axis=1).sum())

@@ -1,4 +1,4 @@
-"""What cameras see: a part of an image with the traced whisker and the contact point."""
+"""Views of the cameras: a part of an image with the traced whisker and the contact point."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class _View(Protocol):
 
     @property
     def name(self) -> str:
-        """Of the view."""
+        """Name of the view."""
 
     @property
     def size(self) -> tuple[int, int]:

@@ -275,7 +275,7 @@ def course_scales(
 
 
 def _gentle(nodes: Array, measured: Array) -> Array:
-    """How far signals are within 1.5 times those of a trial; negative beyond."""
+    """Margin of signals within 1.5 times those of a trial; negative beyond."""
     force, moment = _ROOM * np.nanmax(np.abs(measured[:, :2]), axis=0)
     tension = 1.0 - np.abs(values_of("Fx", nodes)) / max(force, 1e-12)
     bending = 1.0 - values_of("MB", nodes) / max(moment, 1e-15)

@@ -30,7 +30,7 @@ from vibrissa.scene import Array, Course, deflection_angles
 
 _SNAPSHOTS = 7
 _FACE = np.array([[-11.0, -26.0, 2.0], [11.0, -26.0, 2.0], [0.0, 0.0, 0.0]])
-"""What is to be seen of the head: its eyes and the snout, mm."""
+"""Visible part of the head: its eyes and the snout, mm."""
 
 _ROOM = 2.0
 """Around what is to be seen, mm."""

@@ -295,7 +295,7 @@ def _legend(
 
 
 def _across(body: Body) -> str:
-    """Its diameter, where it has one."""
+    """Diameter of a shape, where it has one."""
     radius = getattr(body, "radius", None)
     return "" if radius is None else f", {2.0 * float(to_display('object_radius', radius)):.2f} mm"
 

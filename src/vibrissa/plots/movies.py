@@ -50,10 +50,10 @@ from vibrissa.scene import TRIPLET, Array, Course, spherical
 Picture = NDArray[np.uint8]
 
 WIDTH, HEIGHT = 203.2, 114.3
-"""Of a movie's figure, mm: lettering is as large in it as on a page of two columns."""
+"""Size of a movie's figure, mm: lettering is as large in it as on a page of two columns."""
 
 SIZE = (1280, 720)
-"""Of a movie, pixels."""
+"""Size of a movie, pixels."""
 
 _DPI = 160.0
 
@@ -426,7 +426,7 @@ def _bar(figure: Figure, norm: Normalize) -> None:
 
 
 _TRAIL = 0.05
-"""How long the way just gone stays bold, s."""
+"""Duration for which the way just gone stays bold, s."""
 
 _BOXES = tuple(
     (left, bottom, wide, 12.0)

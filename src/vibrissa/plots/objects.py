@@ -224,16 +224,16 @@ def draw_section(
 
 
 _PAD = np.array([7.7e-3, -9.0e-3, -4.9e-3])
-"""Where a whisker at the right begins if nothing else is known: right, forward, up of the snout."""
+"""Base of a whisker at the right if nothing else is known: right, forward, up of the snout."""
 
 _FAR = 2e-3
-"""From how far a base lies from the head's origin, m, this is the snout."""
+"""Smallest distance of a base from the head's origin for this to be the snout, m."""
 
 _SKIN, _EDGE, _EYE = "#efe6dc", "#a89a8c", "#5a4f45"
 
 
 class Head(NamedTuple):
-    """Where a head is."""
+    """Place of a head."""
 
     snout: Array
     axes: Array

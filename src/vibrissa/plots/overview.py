@@ -44,7 +44,7 @@ _CONTACT: dict[str, Any] = {"facecolor": "#f0e442", "edgecolor": "black", "linew
 
 
 class _Sheet(NamedTuple):
-    """Where panels lie, mm."""
+    """Places of the panels, mm."""
 
     height: float
     sights: tuple[Box, ...]
@@ -149,7 +149,7 @@ def trial_overview(
 
 
 def _finding(course: Course) -> str:
-    """How often and how strongly the whisker touched, and how well that was located."""
+    """State how often and how strongly the whisker touched, and how well that was located."""
     assert course.signals is not None
     count = len(intervals(course.time, course.touching))
     largest = np.nanmax(to_display("MB", course.signals["MB"]), initial=0.0)

@@ -36,7 +36,7 @@ _CORNERS = 3
 
 @dataclass(frozen=True)
 class Picks:
-    """What was clicked so far: a state, from which each click or key makes the next one.
+    """Clicks so far: a state, from which each click or key makes the next one.
 
     Parameters
     ----------

@@ -126,7 +126,7 @@ def sensitivity_panels(data: xr.Dataset, *, width: Width = "double") -> Figure:
 
 
 def _finding(contacts: _Contacts) -> str:
-    """How much more the distance of a contact depends on signals that are small."""
+    """State how much more the distance of a contact depends on signals that are small."""
     kept, parts = contacts.weight > 0.0, []
     for name in (n for n in contacts.signals if n not in _DIRECTIONS):
         size = np.abs(contacts.signals[name][kept])
@@ -219,7 +219,7 @@ def _limits(values: Array, weight: Array) -> Array:
 
 
 def _bend(x: Array, weight: Array, direction: bool) -> float | None:
-    """Where an axis turns from linear to logarithmic; None where it stays linear."""
+    """Value from which an axis is logarithmic; None where it stays linear."""
     if direction:
         return None
     low, high = _quantiles(np.abs(x), weight, [0.1, SHARE])

@@ -50,7 +50,7 @@ _TITLES = {"FD": "direction of $F_T$", "MD": "direction of $M_B$"}
 
 
 class _Sheet(NamedTuple):
-    """Where panels lie."""
+    """Places of the panels."""
 
     height: float
     space: Box
@@ -147,7 +147,7 @@ def _mm(triangles: Array) -> Array:
 
 
 def _turning(name: str, triangles: Array) -> Mask:
-    """Where a direction differs by more than 45° within a triangle, as where a force reverses."""
+    """Whether a direction differs by more than 45° within a triangle, as where a force reverses."""
     turn = values_of(name, triangles)
     gap = np.abs(np.angle(np.exp(1j * (turn - np.roll(turn, 1, axis=1)))))
     return np.asarray(gap.max(axis=1) > np.pi / 4.0)

@@ -1,4 +1,4 @@
-"""What a study found: which whiskers are unique, how far, and how large errors are."""
+"""Results of a study: which whiskers are unique, how far, and how large errors are."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which triplets of signals locate a contact (Table A), how finely, and for which whiskers."""
+"""Verdicts on triplets of signals (Table A), how finely, and for which whiskers."""
 
 from __future__ import annotations
 
@@ -211,7 +211,7 @@ def _evidence(axes: Axes, verdict: xr.Dataset, left: float, y: float) -> None:
 
 
 def _key(axes: Axes, height: float, width: Width) -> None:
-    """What the symbols mean."""
+    """Explain the symbols."""
     y = height - _FOOT + 3.0
     axes.plot([1.5, axes.get_xlim()[1] - 1.5], [y - 3.0] * 2, color=INK, linewidth=0.9)
     x = 3.5
@@ -432,7 +432,7 @@ def _contours(axes: Axes, x: Array, y: Array, degrees: Array, high: float) -> No
 
 
 def _exceptional(degrees: Array) -> NDArray[np.bool_]:
-    """Which whiskers stand far above a neighbour, as straight ones and cylinders do.
+    """Whether whiskers stand far above a neighbour, as straight ones and cylinders do.
 
     There a triplet loses a dimension; nothing leads gradually up to them, so contours keep off.
     """

@@ -24,7 +24,7 @@ ONE_VIEW = (
     "(Mz). Not measured, and given as 0: elevation, depth, force across the plane (Fz), and the "
     "moments Mx and My; roll is 0° or 180°. What turns out of the plane looks shorter and bent."
 )
-"""What is known of a trial that was filmed by one camera."""
+"""Variables of a trial that was filmed by one camera."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class RecordedVariable:
-    """What one variable of a recording is like.
+    """Declaration of one variable of a recording.
 
     Parameters
     ----------
@@ -199,7 +199,7 @@ def _declared(name: str) -> RecordedVariable:
 
 
 def _fault(name: str, variable: xr.Variable, selected: frozenset[str]) -> str:
-    """What is wrong with a variable, of whose dimensions those selected may be missing."""
+    """State what is wrong with a variable, of whose dimensions those selected may be missing."""
     dims = _declared(name).dims
     sizes = {_ALSO_CALLED.get(str(dim), str(dim)): n for dim, n in variable.sizes.items()}
     if not set(dims) - selected <= set(sizes) <= set(dims):

@@ -30,7 +30,7 @@ _POLICY = (
     # The library that draws in 3D compiles functions.
     "script-src 'unsafe-inline' 'unsafe-eval'"
 )
-"""What the page may load: only what is in it."""
+"""Rule on what the page may load: only what is in it."""
 
 # Figures are dark on white; on a dark page each is on a card of its own, slightly dimmed.
 _STYLE = """
@@ -227,7 +227,7 @@ CAPTIONS = {
     "resolution": "Share of ambiguous contacts by how finely signals are measured.",
     "array": "The array and the face.",
 }
-"""What figures show, by name, in the order in which they come."""
+"""Captions of figures, by name, in the order in which they come."""
 
 _WITNESS = "witness_"
 
@@ -283,7 +283,7 @@ def _link(path: Path, folder: Path) -> str:
 
 
 _LEAST = 1e-5
-"""In a display unit; nothing is known so well."""
+"""Smallest error that is stated, in a display unit; nothing is known so well."""
 
 
 def shown_value(name: str, value: float, digits: int = 4) -> str:
@@ -306,7 +306,7 @@ _EPOCH = "SOURCE_DATE_EPOCH"
 
 @dataclass(frozen=True)
 class Provenance:
-    """What has to be known to make a page again.
+    """Facts that are needed to make a page again.
 
     Parameters
     ----------

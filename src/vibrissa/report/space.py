@@ -31,7 +31,7 @@ _NODES = 101
 
 _MOST_POINTS = 4000
 _SHAPES = 7
-"""How many bent whiskers are drawn."""
+"""Number of bent whiskers that are drawn."""
 _ROOM = 0.15
 """Left about the contacts, as a share of their extent."""
 _CAMERA = {"eye": {"x": 1.65, "y": -1.8, "z": 1.05}, "center": {"x": 0.0, "y": 0.0, "z": -0.12}}
@@ -236,7 +236,7 @@ def _whiskers(lines: Array, label: str = "whisker", colour: str = "#a0522d") -> 
 
 
 def _limits(points: Array) -> Array:
-    """What is seen (3, 2), with room about the points."""
+    """Limits of the view (3, 2), with room about the points."""
     low, high = points.min(axis=0), points.max(axis=0)
     room = _ROOM * max(float((high - low).max()), 1.0)
     return np.stack([low - room, high + room], axis=1)

@@ -471,7 +471,7 @@ def _distances(recording: xr.DataTree, seed: int) -> str:
 
 
 def _statuses(groups: dict[str, xr.Dataset | None]) -> str:
-    """In how many frames each group has which status."""
+    """Count the frames of each group by status."""
     counts = {
         name or "recording": describe(data["status"].values)
         for name, data in groups.items()

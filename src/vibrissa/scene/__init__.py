@@ -1,4 +1,4 @@
-"""What pictures are made of, without a renderer: marks, shapes as triangles, solids, trials.
+"""Contents of pictures, without a renderer: marks, shapes as triangles, solids, trials.
 
 Figures, the viewer and the report draw what is made here.
 """

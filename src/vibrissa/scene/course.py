@@ -155,7 +155,7 @@ def _signals(data: Group) -> dict[str, Array] | None:
 
 
 def _touching(order: tuple[Group, ...], count: int) -> Mask:
-    """In contact by the first group that has it."""
+    """Whether there is contact, by the first group that has it."""
     for group in order:
         if "in_contact" in group:
             return group["in_contact"]

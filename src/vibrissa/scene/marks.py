@@ -1,4 +1,4 @@
-"""What there is to draw, in mm, without a renderer; limits of its colours and axes.
+"""Marks, in mm, without a renderer; limits of colours and axes.
 
 Marks are bodies, clouds, arrows, lines and labels. Limits are those that hold most values, and
 roots show small ones.

@@ -115,13 +115,13 @@ def _rows(nodes: Array, line: Array) -> Array:
 
 
 def outside_cone(points: Array, centerline: Array) -> Array:
-    """How far contacts lie outside the cone of small deflections."""
+    """Distance of contacts from the cone of small deflections."""
     distance, arc_length = nearest_at_rest(points, centerline)
     return np.asarray(distance - arc_length * np.tan(_CONE))
 
 
 def nearest_at_rest(points: Array, centerline: Array) -> tuple[Array, Array]:
-    """How far contacts lie from the resting whisker."""
+    """Distance of contacts from the resting whisker."""
     from scipy.spatial import cKDTree
 
     count = max(2000, len(centerline))

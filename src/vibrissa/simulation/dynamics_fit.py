@@ -33,7 +33,7 @@ _QUANTITIES = {
     "resonances": "the whisker must ring, after a release or a tap",
     "damping": "the whisker must ring, after a release or a tap",
 }
-"""What is fitted, and what determines it."""
+"""Quantities that are fitted, and what determines each."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What inertia and damping add to the wrench of a whisker that is held at known points.
+"""Wrench that inertia and damping add while a whisker is held at known points.
 
 The chain of :mod:`vibrissa.simulation.dynamics` is moved at its base and slides, without friction,
 through a given point of the laboratory while it is in contact there, and vibrates freely otherwise.

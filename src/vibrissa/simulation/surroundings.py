@@ -1,4 +1,4 @@
-"""What is around the whiskers of a film: fur with hairs, the animal's cheek, wires.
+"""Surroundings of the whiskers in a film: fur with hairs, the animal's cheek, wires.
 
 The fur's texture, its hairs and the cheek move with the face, by whole pixels. Nothing of it is
 part of the truth.
@@ -33,7 +33,7 @@ _WIRE = (0.6, 1.6)
 """Smallest and largest half width of a wire, pixels."""
 
 _BEHIND = (0.35, 0.5)
-"""How far the cheek goes, as a share of the length of the longest whisker in the image."""
+"""Reach of the cheek, as a share of the length of the longest whisker in the image."""
 
 _CHEEK = 48.0
 """Grey value of the cheek."""

@@ -1,4 +1,4 @@
-"""What a whisker's own mass adds to the wrench at its base, and when nothing is touched.
+"""Vibrations: what a whisker's mass adds to the wrench at its base, and detection of contact.
 
 About its rest shape a free whisker that is held at a moving base vibrates in modes S_k, which
 :mod:`vibrissa.simulation.chain` has: with a the acceleration of its points if it did not bend,

@@ -1,4 +1,4 @@
-"""What may be wrong with a stream as a whole."""
+"""Advice on a stream as a whole."""
 
 from __future__ import annotations
 

@@ -282,7 +282,7 @@ class Lines:
 
 
 def _passed(known: Mapping[str, object]) -> dict[str, Any]:
-    """What is passed on as it is."""
+    """Values that are passed on as they are."""
     out: dict[str, Any] = {}
     for name in (STAMP, RECORDED):
         if known.get(name) in (None, ""):
@@ -300,7 +300,7 @@ def _passed(known: Mapping[str, object]) -> dict[str, Any]:
 
 
 def _number(name: str, value: object) -> float:
-    """Of a cell; empty and null are missing."""
+    """Number in a cell; empty and null are missing."""
     if value is None or value == "":
         return math.nan
     if isinstance(value, bool) or not isinstance(value, int | float | str):

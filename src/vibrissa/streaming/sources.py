@@ -1,4 +1,4 @@
-"""Where lines come from: a file, pipe or serial device, or UDP datagrams; and where answers go.
+"""Sources of lines: a file, pipe or serial device, or UDP datagrams; and targets of answers.
 
 A pipe holds its sender up until what it sent is read. Datagrams wait instead, and where more come
 than can be answered, answers fall behind by as many as the system keeps, and what comes then is

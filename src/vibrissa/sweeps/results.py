@@ -1,4 +1,4 @@
-"""What a study has found so far: as one dataset, its failures, and a summary in a few lines."""
+"""Results of a study so far: as one dataset, its failures, and a summary in a few lines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a study's results are kept: one record a cell, appended to the file of its task.
+"""Store of a study's results: one record a cell, appended to the file of its task.
 
     .study.json      what the study is, and which codes computed
     TASK.json        what a result of the task looks like: variables, dimensions, coordinates
@@ -92,7 +92,7 @@ def computing_sources() -> list[Path]:
 
 @dataclass(frozen=True)
 class Layout:
-    """What a result of a task looks like: (dims, shape, dtype, attributes) of each variable."""
+    """Form of a task's results: (dims, shape, dtype, attributes) of each variable."""
 
     variables: Mapping[str, tuple[list[str], list[int], str, dict[str, Any]]]
     coordinates: Mapping[str, tuple[list[Any], dict[str, Any]]]
@@ -418,7 +418,7 @@ def read_failures(path: Path) -> Iterator[dict[str, Any]]:
 
 
 def _described(study: Study) -> dict[str, Any]:
-    """What two studies must have in common to share a store."""
+    """Facts that two studies must have in common to share a store."""
     content = {
         "layout": LAYOUT,
         "name": study.name,

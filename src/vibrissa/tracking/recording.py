@@ -164,7 +164,7 @@ def _few(shared: Array) -> Array:
 
 
 def _measured(one: Tracked) -> xr.Dataset:
-    """What was measured before the rod was fitted."""
+    """Measurements from before the rod was fitted."""
     values = {
         "centerline": one.curves,
         **_pose(one, one.pose),

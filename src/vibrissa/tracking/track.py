@@ -80,7 +80,7 @@ _SHARE = 0.03
 
 @dataclass(frozen=True)
 class TrackOptions:
-    """How traces become a recording.
+    """Options that turn traces into a recording.
 
     Parameters
     ----------
@@ -237,7 +237,7 @@ def _corrected(
     pairs: NDArray[np.int64],
     distance: float | None,
 ) -> tuple[Optics | None, Sequence[Camera], list[str]]:
-    """What a free whisker shows of the cameras, those to use, and what there is to say of them."""
+    """Errors of the cameras that a free whisker shows, cameras to use, and remarks."""
     rows = [[view[i] for i in pairs[:, v]] for v, view in enumerate(traces)]
     optics = rough_optics(cameras, rows, distance)
     stated = "orthographic cameras" if distance is None else f"lenses at {distance:g} m"
@@ -272,7 +272,7 @@ def _with_optics_unsure(fit: RodFit, optics: Optics) -> RodFit:
 
 
 def _remarks_on_optics(one: Tracked, optics: Optics, name: str) -> list[str]:
-    """How much what is not known of the cameras moves contact points, where that is most of it."""
+    """State by how much unknown optics move contact points, where that is most of the error."""
     moved = np.linalg.norm(optics.displacements(one.fit.contact_point), axis=(0, 2))
     spread = np.sqrt(np.trace(one.fit.contact_covariance, axis1=1, axis2=2))
     if not np.isfinite(moved).any() or np.nanmedian(moved / spread) < _MOST:
@@ -453,7 +453,7 @@ def _check_views(cameras: Sequence[Camera], series: TraceSeries, name: str) -> N
 def remarks_on(
     cameras: Sequence[Camera], series: TraceSeries, length: Length, misfit: Array, name: str
 ) -> list[str]:
-    """What is unusual about a tracked whisker."""
+    """State what is unusual about a tracked whisker."""
     found = []
     gap = _gap(cameras, series)
     if gap > _NEAR:

@@ -136,7 +136,7 @@ def bend_drawing(bend: Bend, exaggeration: float) -> Drawing:
 
 @lru_cache(maxsize=4)
 def resting(whisker: Whisker, exaggeration: float) -> dict[str, Mark]:
-    """What stays as it is while a whisker is bent."""
+    """Draw what stays as it is while a whisker is bent."""
     return {
         "follicle": follicle(whisker, exaggeration),
         **axes(whisker),
@@ -154,7 +154,7 @@ def _peg(bend: Bend) -> Body:
 
 @lru_cache(maxsize=4)
 def _ball(whisker: Whisker, exaggeration: float) -> Body:
-    """What marks the contact: it sticks out of the whisker where this can touch."""
+    """Mark of the contact: it sticks out of the whisker where this can touch."""
     own = float(whisker.radius(0.5 * whisker.length))
     radius = max(1.7 * exaggeration * own, 0.006 * whisker.length)
     vertices, faces = ellipsoid(np.zeros(3), _size(radius) * np.eye(3), 12)
@@ -355,5 +355,5 @@ class WhiskerControls:
 
 
 def _rounded(value: float) -> float:
-    """To four digits, however small: rubber has a thousandth of a hair's modulus."""
+    """Round to four digits, however small: rubber has a thousandth of a hair's modulus."""
     return float(f"{value:.4g}")

@@ -28,7 +28,7 @@ _COUNTS = ((0.80, 0.82, 0.84), (0.35, 0.62, 0.80), (0.90, 0.55, 0.10), (0.75, 0.
 
 @dataclass(frozen=True)
 class Legend:
-    """What the colours mean."""
+    """Meaning of the colours."""
 
     title: str
     steps: tuple[tuple[str, str], ...]

@@ -42,7 +42,7 @@ _WIDEST = 0.25
 
 
 class Live:
-    """What a stream has answered so far of one whisker.
+    """Answers of a stream so far, of one whisker.
 
     Parameters
     ----------

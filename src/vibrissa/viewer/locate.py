@@ -41,7 +41,7 @@ _APART = 0.005
 
 @dataclass(frozen=True)
 class Sensor:
-    """What locates the contact."""
+    """Signals that locate the contact."""
 
     triplet: tuple[str, ...] = ("Fx", "MB", "MD")
     force_noise: float = 1e-6
@@ -68,7 +68,7 @@ def usual_sensor(whisker: Whisker) -> Sensor:
 
 @dataclass(frozen=True, eq=False)
 class Located:
-    """What three signals of a bent whisker tell."""
+    """Contacts that three signals of a bent whisker allow."""
 
     sensor: Sensor
     signals: xr.Dataset
@@ -128,7 +128,7 @@ def _predicted_error(chart: Chart, sensor: Sensor) -> Array:
 
 
 def _separation(estimate: Contacts, points: Array) -> Array:
-    """How far (n,), m, the farthest other candidate of each contact is; NaN without candidates."""
+    """Distance (n,), m, of the farthest other candidate of each contact; NaN without candidates."""
     away = np.linalg.norm(estimate.candidates.point - points[:, None], axis=-1)
     farthest = np.nanmax(np.nan_to_num(away), axis=1)
     farthest[farthest < 1e-9] = 0.0  # the contact itself, found again
@@ -163,7 +163,7 @@ def locate_drawing(whisker: Whisker, found: Located, exaggeration: float) -> Dra
 
 
 def of_located(whisker: Whisker, found: Located | None, status: Status) -> str:
-    """What three signals tell: how many contacts, how far apart, how exact."""
+    """State how many contacts three signals allow, how far apart, how exact."""
     if found is None:
         return sentence(status)
     names = found.sensor.triplet

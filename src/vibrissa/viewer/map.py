@@ -44,7 +44,7 @@ from vibrissa.viewer.state import Chart
 
 COORDINATES = ("r", "theta", "phi")
 SLICES = ("x", "y", "z", "r", "theta", "phi", "Fx", "Mx", "arc_length")
-"""What can be held fixed in a slice."""
+"""Quantities that can be held fixed in a slice."""
 
 _SHAPE = (24, 48, 12)
 _OPEN = (np.pi, 2.5 * np.pi)
@@ -53,10 +53,10 @@ _OPEN = (np.pi, 2.5 * np.pi)
 _HEIGHT = 0.85
 _PLACES = ((1.75, 0.62), (0.4, -0.78), (1.75, -0.78))
 _CONTACTS = (0.0, 0.62)
-"""Where spaces stand in the plane that faces the viewer: two above, two below, in L."""
+"""Places of spaces in the plane that faces the viewer: two above, two below, in L."""
 
 TURN = float(np.deg2rad(62.0))
-"""By how much signals are turned about their axis, so that one looks into what is cut open."""
+"""Angle by which signals are turned about their axis, so that one looks into what is cut open."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,12 +112,12 @@ class Solids:
         return reach, float(heights.min()), float(heights.max())
 
     def axis_height(self) -> float:
-        """Where F_x = 0 is on the axis of the signals, mm."""
+        """Height of F_x = 0 on the axis of the signals, mm."""
         _, low, high = self._limits
         return self.length * _HEIGHT * (-low / (high - low) - 0.5)
 
     def place(self, number: int | None) -> Array:
-        """Where a space stands, mm: contacts (None), or signals coloured by r, θ, φ (0, 1, 2)."""
+        """Place of a space, mm: contacts (None), or signals coloured by r, θ, φ (0, 1, 2)."""
         x, z = _CONTACTS if number is None else _PLACES[number]
         return self.length * np.array([x, 0.0, z])
 
@@ -159,7 +159,7 @@ _RINGS = 2
 
 
 def frame_drawing(solids: Solids, exaggeration: float) -> Drawing:
-    """What does not change: the resting whisker, and rings, rays and axes of the signals."""
+    """Draw what does not change: the resting whisker, and rings, rays and axes of the signals."""
     whisker, length = solids.chart.whisker, solids.length
     here = solids.place(None)
     line = whisker.centerline(NODES)

@@ -42,7 +42,7 @@ _READ = 0.05
 as for a whisker, and nobody reads faster."""
 
 _REST = 0.15
-"""How long the mouse rests before everything is written, s."""
+"""Time that the mouse rests before everything is written, s."""
 
 Transition = Callable[[Bend], Bend]
 
@@ -66,7 +66,7 @@ class Mode(Protocol):
 
 
 class Page:
-    """What all modes share."""
+    """Base of all modes."""
 
     def __init__(
         self, server: viser.ViserServer, whisker: Whisker, contact_map: ContactMap | None = None
@@ -349,7 +349,7 @@ PHONE, LOW = 0.65, 0.55
 height there."""
 
 _WIDTH = 1.25
-"""How wide what is shown is, over the distance from which it is looked at."""
+"""Width of what is shown, over the distance from which it is looked at."""
 
 
 @dataclass(frozen=True, eq=False)

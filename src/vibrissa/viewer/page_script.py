@@ -1,4 +1,4 @@
-"""What is put into the page before it starts: a name, an icon, and less work for weak graphics.
+"""Additions to the page before it starts: a name, an icon, and less work for weak graphics.
 
 viser serves a page that is ready made and has no place for such things, so they are written into
 its head on the way to the browser. Without them the page works as well, but not as fast.

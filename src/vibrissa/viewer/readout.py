@@ -129,7 +129,7 @@ def chart(time: Array, signals: dict[str, Array], touching: NDArray[np.bool_]) -
 
 
 def height() -> float:
-    """Of the chart, pixels per :data:`WIDTH` of them."""
+    """Height of the chart, pixels per :data:`WIDTH` of them."""
     return len(ROWS) * ROW + 14.0
 
 

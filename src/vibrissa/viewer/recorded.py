@@ -133,7 +133,7 @@ def _measured(trial: Recording, shape: tuple[int, int]) -> tuple[Array, dict[str
 Frame = NDArray[np.uint8]
 
 WIDTH = 420
-"""Of a picture, pixels."""
+"""Width of a picture, pixels."""
 
 _MARGIN = 40.0
 _TRACE = np.array([255, 96, 0], dtype=np.uint8)

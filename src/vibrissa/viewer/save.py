@@ -1,4 +1,4 @@
-"""What is on the page as files, and the buttons that hand them over."""
+"""Files of what is on the page, and the buttons that hand them over."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def on_paper(image: Picture) -> Picture:
 
 
 def _written(name: str, write: Callable[[Path], object]) -> bytes:
-    """What a writer of files writes."""
+    """Return the bytes that a writer of files writes."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / name
         write(path)
@@ -109,7 +109,7 @@ _FRAMES = 100
 
 
 def _render(client: viser.ClientHandle) -> Picture:
-    """What a browser shows, without the panels."""
+    """Render what a browser shows, without the panels."""
     camera = client.camera
     return client.get_render(
         camera.image_height, camera.image_width, transport_format="png", timeout=_TIMEOUT
@@ -171,7 +171,7 @@ class SaveControls:
         return "bent.nc", lambda: netcdf(deflection_dataset(bent))
 
     def _picture(self, event: viser.GuiEvent[Any]) -> None:
-        """What the one who asks sees, without the panel."""
+        """Picture of what the one who asks sees, without the panel."""
         client = event.client
         if client is None:
             return

@@ -54,7 +54,7 @@ _COMPILING = (
 
 
 class Shown(Protocol):
-    """What is served."""
+    """Thing that is served."""
 
     server: viser.ViserServer
 
@@ -241,7 +241,7 @@ def view(
 
 
 def _once(given: Any, shown: Any, name: str) -> Any:
-    """What is shown, where it is not given a second time."""
+    """Return what is shown, where it is not given a second time."""
     if given is not None:
         raise ValueError(f"got two {name}s; give one")
     return shown
@@ -292,7 +292,7 @@ def _furnished(
 
 
 def rehearsal(page: Page) -> list[Rehearsal]:
-    """What someone may ask of a page, as jobs that change nothing."""
+    """Make requests that someone may make of a page, as jobs that change nothing."""
     bend = page.bend
 
     def locate() -> None:

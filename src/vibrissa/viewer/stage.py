@@ -74,7 +74,7 @@ class Stage:
         self._shown[layer] = after
 
     def node(self, layer: str, name: str) -> viser.SceneNodeHandle | None:
-        """What stands for a thing on the page, if it does."""
+        """Node of a thing on the page, if there is one."""
         found = self._shown.get(layer, {}).get(name)
         return None if found is None else found[1]
 

@@ -1,4 +1,4 @@
-"""What the page shows, as states and their transitions: whisker, load, deflection, contacts.
+"""States of the page and their transitions: whisker, load, deflection, contacts.
 
 Nothing here needs a browser. A load without an equilibrium leaves the last shape that had one,
 so that there is something to look at along with the reason.
@@ -174,7 +174,7 @@ def _load(bend: Bend) -> PointContact | PegContact | PointForce:
 
 @dataclass(frozen=True)
 class Shape:
-    """What the sliders say."""
+    """Shape that the sliders set."""
 
     length: float
     turn: float
@@ -183,14 +183,14 @@ class Shape:
 
 
 def whole_turn(whisker: Whisker) -> float:
-    """By how much a whisker turns from base to tip, ∫|κ| ds, rad."""
+    """Angle by which a whisker turns from base to tip, ∫|κ| ds, rad."""
     s = (np.arange(400) + 0.5) / 400.0 * whisker.length
     bending = np.linalg.norm(whisker.curvature(s)[:, 1:], axis=1)
     return float(bending.mean() * whisker.length)
 
 
 def shape_of(whisker: Whisker) -> Shape:
-    """What the sliders say for a whisker as it is."""
+    """Shape of a whisker as it is."""
     taper = whisker.base_radius / whisker.tip_radius
     return Shape(whisker.length, whole_turn(whisker), taper, whisker.youngs_modulus)
 

@@ -53,7 +53,7 @@ class Latest:
             self._thread.join(timeout=5.0)
 
     def _pause(self) -> float:
-        """How long nothing is due, s."""
+        """Time for which nothing is due, s."""
         first = min((due for due, _ in self._jobs.values()), default=inf)
         return first - time.monotonic()
 

@@ -1,4 +1,4 @@
-"""What bends: shape, section, material and frame of a whisker, and the array on the face."""
+"""Whiskers: shape, section, material and frame, and the array on the face."""
 
 from vibrissa.whisker import morphology
 from vibrissa.whisker.array import WhiskerArray, whisker_array

@@ -100,7 +100,7 @@ def _profile_rows(name: str, profile: Profile, units: str, long_name: str) -> li
 
 
 class Stored(Protocol):
-    """What a file holds of a whisker: a dataset, or plain arrays."""
+    """Contents of a whisker's file: a dataset, or plain arrays."""
 
     @property
     def variables(self) -> Mapping[Any, Any]:

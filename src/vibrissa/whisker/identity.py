@@ -1,4 +1,4 @@
-"""Which whisker of the face: side, row and column.
+"""Identity of a whisker on the face: side, row and column.
 
 The rows of large whiskers on a rat's cheek are called A (the uppermost) to E, the columns 1 to 6
 from the back to the front. The four hindmost whiskers stand between the rows and have Greek

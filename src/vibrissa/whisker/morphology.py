@@ -90,7 +90,7 @@ def curvature_bound(length: ArrayLike) -> Array:
 
 
 def base_point(row: ArrayLike, column: ArrayLike) -> Array:
-    """Where whiskers of the right side leave the cheek (Towal et al. 2011).
+    """Points at which whiskers of the right side leave the cheek (Towal et al. 2011).
 
     On the ellipsoid of the cheek, in whose own axes the direction from its centre has the azimuth
     15.2953 column − 144.2220 and the angle 18.2237 row + 34.7558 from the third axis, in degrees.
@@ -128,7 +128,7 @@ def projection_angles(row: ArrayLike, column: ArrayLike) -> Array:
 
 
 def emergence_angles(row: ArrayLike, column: ArrayLike) -> Array:
-    """How whiskers of the right side leave the face (Towal et al. 2011)."""
+    """Angles at which whiskers of the right side leave the face (Towal et al. 2011)."""
     theta, phi, _, zeta = np.moveaxis(projection_angles(row, column), -1, 0)
     azimuth = theta - np.pi / 2.0
     elevation = np.arctan(np.tan(phi) * np.cos(azimuth))

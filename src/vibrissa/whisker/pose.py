@@ -1,4 +1,4 @@
-"""Where a whisker sits in the frame its points came from.
+"""Pose of a whisker in the frame that its points came from.
 
     x_source = R x_whisker + o
 

@@ -172,7 +172,7 @@ def _between_kinks(x: Array, y: Array) -> list[tuple[Array, Array]]:
 
 
 def _kinks(x: Array, y: Array) -> list[tuple[float, float]]:
-    """Where the slope of samples changes at once: arc lengths and values, rising."""
+    """Places where the slope of samples changes at once: arc lengths and values, rising."""
     if x.size < 6:
         return []
     h = np.diff(x)

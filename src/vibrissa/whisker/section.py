@@ -40,7 +40,7 @@ SHORTEST, LONGEST = 0.5e-3, 0.5
 """Lengths, m, between which the unit is not doubted."""
 
 CONFIRMATION = "any_length=True (Python) or --any-length (command line)"
-"""How a length outside them is confirmed."""
+"""How to confirm a length outside them."""
 
 # A rod's radius is at most this share of its length.
 _STOUT = 0.1
@@ -92,7 +92,7 @@ def split(properties: Properties) -> tuple[Section, Holding]:
 
 _SECTION_KEYS = Section.__optional_keys__
 ASSUMED = " assumed, not measured"
-"""What follows the name of a property in a note that it was not stated."""
+"""Ending of a note on a property that was not stated."""
 
 _RADIUS_ASSUMED = f"radius{ASSUMED}"
 _NOTED = {"youngs_modulus": "Young's modulus", "poisson_ratio": "Poisson's ratio"}

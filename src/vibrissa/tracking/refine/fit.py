@@ -77,7 +77,7 @@ _WILD = 1e6
 
 @dataclass(frozen=True)
 class FitOptions:
-    """How smooth motion and contact are over time, and when the fit ends.
+    """Smoothness of motion and contact over time, and the end of the fit.
 
     Standard deviations of second differences are those at 1,000 frames/s; at other rates they scale
     with the square of the time between frames.
@@ -182,7 +182,7 @@ def fit_rod(
 
 @dataclass(frozen=True, eq=False)
 class Fitter:
-    """What is common to rods that are fitted to the same traces."""
+    """Tables that are common to rods that are fitted to the same traces."""
 
     cameras: Sequence[Camera]
     traces: TraceSeries

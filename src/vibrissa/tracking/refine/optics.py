@@ -84,7 +84,7 @@ _FAR = 6.0
 
 @dataclass(frozen=True, eq=False)
 class Optics:
-    """What the motion of a free whisker shows about the cameras.
+    """Errors of the cameras that the motion of a free whisker shows.
 
     Parameters
     ----------

@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 UNKNOWNS = 10
-"""Of a frame: shift (3), turn (3), s_c, f_x, f_y, f_z."""
+"""Number of a frame's unknowns: shift (3), turn (3), s_c, f_x, f_y, f_z."""
 
 _SAMPLES = 48
 """Number of points of a rod that are compared with the traces."""

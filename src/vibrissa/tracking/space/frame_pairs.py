@@ -1,4 +1,4 @@
-"""Which frames of two cameras belong together.
+"""Pairs of frames of two cameras that belong together.
 
 Two views of one point are along lines that meet. In frames of different times the lines to the
 whisker's base and tip pass each other at a distance; the shift between the videos is the one for

@@ -310,7 +310,7 @@ def _largest_group(shapes: Array, least: float) -> tuple[int, Mask]:
 
 
 def _pace(shapes: Array) -> Array:
-    """How fast the direction of the base turns in each frame, at most as 1, the usual pace."""
+    """Speed of the base's turning in each frame, at most 1, the usual pace."""
     ahead = shapes[:, shapes.shape[1] // _BASE] - shapes[:, 0]
     ahead = ahead / np.linalg.norm(ahead, axis=1, keepdims=True)
     pace = np.linalg.norm(np.gradient(ahead, axis=0), axis=1)

@@ -96,7 +96,7 @@ def _epipolar_lines(pixels: Array, known: Camera, camera: Camera) -> tuple[Array
 
 
 def _strengths(points: Array, ways: Array, smooth: Image, factors: Array, bodies: Bodies) -> Array:
-    """How dark a line is, (n, m, t), that runs through points (n, t, 2) in directions (n, m, 2)."""
+    """Darkness of a line, (n, m, t), that runs through points (n, t, 2) in directions (n, m, 2)."""
     height, width = smooth.shape
     column = np.rint(points[..., 0]).astype(np.intp).clip(1, width - 2)
     row = np.rint(points[..., 1]).astype(np.intp).clip(1, height - 2)

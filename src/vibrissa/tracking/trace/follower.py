@@ -94,7 +94,7 @@ _BRIGHT = 0.35
 """Smallest brightness on both sides of a whisker, relative to the bright parts of the image."""
 
 _AROUND = 36.0
-"""How far inside the face the base is searched where it is known by a click only, pixels."""
+"""Depth inside the face at which the base is searched where it is known by a click only, pixels."""
 
 _SPREADS = {
     "tight": (np.array([1.0, 0.03, 2e-4]), 4e-5),
@@ -105,7 +105,7 @@ _SPREADS = {
 
 
 class Appearance(NamedTuple):
-    """How a whisker usually looks, and by how much that varies."""
+    """Usual look of a whisker, and by how much that varies."""
 
     middle: Array
     spread: Array

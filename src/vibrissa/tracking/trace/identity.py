@@ -141,7 +141,7 @@ class Assignment:
 
 
 def clashes(lines: Sequence[Array]) -> Mask:
-    """Which lines cannot belong to two whiskers: one runs along the other."""
+    """Whether lines cannot belong to two whiskers: one runs along the other."""
     clash = np.eye(len(lines), dtype=bool)
     for a, one in enumerate(lines):
         for b, other in enumerate(lines[:a]):
@@ -279,7 +279,7 @@ def motion_between(line: Array, other: Array) -> Array:
 
 
 def sideways(expected: Array, line: Array) -> Array:
-    """How far a line is to the left (−dy, dx) of an expected one, at its first points, pixels."""
+    """Distance of a line to the left (−dy, dx) of an expected one, at its first points, pixels."""
     points = np.minimum(POINTS, min(len(expected), len(line)) - 1)
     tangent = np.gradient(expected[: POINTS[-1] + 2], axis=0)
     size = np.linalg.norm(tangent[points], axis=1, keepdims=True)

@@ -246,7 +246,7 @@ def _through_crossings(
 
 
 class _End(NamedTuple):
-    """How a whisker may go on beyond a crossing."""
+    """Possible continuation of a whisker beyond a crossing."""
 
     line: Array
     shown: Array  # what the image shows next to its first points
@@ -282,7 +282,7 @@ def _continued(
 
 
 def _twice(line: Array, other: Array) -> float:
-    """What was gained with the points of a line that another one shows too."""
+    """Gain from the points of a line that another one shows too."""
     return _WORTH * len(line) * overlap(line, other)
 
 
@@ -389,7 +389,7 @@ def _seen(
     followers: Sequence[Follower],
     fixed: set[int],
 ) -> Seen:
-    """What a frame shows: lines that were considered, and who was found where."""
+    """Contents of a frame: lines that were considered, and who was found where."""
     lines = [trace for trace in found if len(trace.line)]
     lines += [trace for trace in pool if not any(trace.line is other.line for other in lines)]
     chosen = [

@@ -1,4 +1,4 @@
-"""Where a whisker begins: what several frames of all views show together.
+"""Start of a whisker: what several frames of all views show together.
 
 In one view or one frame a hair may be more like a whisker than the whisker is, or the glint of a
 peg. In each of some frames, lines that may be whiskers are combined, one of each view. A
@@ -80,7 +80,7 @@ _SURE, _GUESS = 0.5, 0.2
 
 
 class Candidate(NamedTuple):
-    """What may be the whisker.
+    """Line that may be the whisker.
 
     Attributes
     ----------
@@ -99,7 +99,7 @@ class Candidate(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Where a whisker begins, as several frames of all views show it together.
+    """Start of a whisker, as several frames of all views show it together.
 
     Parameters
     ----------
@@ -287,7 +287,7 @@ class _Search:
         return vote._replace(moves=False, confidence=confidence)
 
     def curves(self, moment: int, moving: bool) -> list[list[Curve]]:
-        """What may be whiskers, view by view, the likeliest first."""
+        """Lines that may be whiskers, view by view, the likeliest first."""
         found = []
         for view in range(len(self.cameras)):
             curves = self._found(view, moment)
@@ -343,13 +343,13 @@ class _Search:
         return sorted(found, key=lambda one: -one.worth)
 
     def worth(self, moments: Sequence[int]) -> float:
-        """How much is seen of whiskers in some frames."""
+        """Evidence of whiskers in some frames."""
         found = [self._combined(m, self.curves(m, moving=True)) for m in moments]
         return sum(row[0].worth for row in found if row)
 
 
 class _Vote(NamedTuple):
-    """What most frames show."""
+    """Lines that most frames show."""
 
     winners: list[_Combination]  # of the frames that show it
     confidence: float
@@ -394,7 +394,7 @@ def _near(one: _Combination, other: _Combination) -> bool:
 
 
 def _start(search: _Search, vote: _Vote, bright: bool) -> Start:
-    """What was found, and what there is to doubt."""
+    """Return what was found, and what there is to doubt."""
     if not vote.winners or vote.confidence < _GUESS:
         moment = search.moments(_VOTES)[0]
         alone = [

@@ -23,7 +23,7 @@ _GIVEN = 0.5
 
 @dataclass(frozen=True)
 class TraceOptions:
-    """How a whisker is traced.
+    """Options of tracing a whisker.
 
     Parameters
     ----------

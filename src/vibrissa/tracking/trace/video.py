@@ -35,7 +35,7 @@ from vibrissa.tracking.trace.trace import Mask, Trace, TraceOptions, given, over
 Array = NDArray[np.float64]
 
 Corrections = Mapping[tuple[int, int], ArrayLike]
-"""By frame and whisker: points (n, 2) along it from base to tip, column and row."""
+"""Points (n, 2) along a whisker from base to tip, column and row, by frame and whisker."""
 
 _BACK = 64
 """Largest number of frames before its own that a correction can change."""
@@ -192,7 +192,7 @@ def _resumed(row: Sequence[Trace], base: ArrayLike | None, options: TraceOptions
 
 
 def _seen_before(frame: Frame, found: Sequence[Trace], followers: Sequence[Follower]) -> Seen:
-    """What a frame showed that is not traced again."""
+    """Result for a frame that is not traced again."""
     lines = [trace for trace in found if len(trace.line)]
     features = [features_of(frame, trace) for trace in lines]
     chosen, rest = [], iter(range(len(lines)))

@@ -135,15 +135,16 @@ def thinned(values: NDArray[_Kind], most: int) -> NDArray[_Kind]:
     return rows
 
 
-# A third of 300 mm is a round length, but for rounding.
-_ROUNDING = 1.0 + 1e-9
+def round_step(size: float) -> float:
+    """Give the largest of 1, 2 and 5 times a power of ten that is at most a size."""
+    size *= 1.0 + 1e-9  # a third of 300 mm is a round length, but for rounding
+    power = 10.0 ** np.floor(np.log10(size))
+    return float(max(f for f in (1.0, 2.0, 5.0) if f * power <= size) * power)
 
 
 def _bar(extent: float, scale: float, height: float) -> str:
     """A bar of round length, m, below the left panel."""
-    aim = extent / 3.0
-    power = 10.0 ** np.floor(np.log10(aim))
-    length = max(step * power for step in (1.0, 2.0, 5.0) if step * power <= aim * _ROUNDING)
+    length = round_step(extent / 3.0)
     y, x = height + 6.0, _MARGIN
     line = f'<path d="M{x} {y}h{length * scale:.1f}" stroke="currentColor" stroke-width="2"/>'
     return line + _text(x + length * scale + 5.0, y + 4.0, f"{length * 1e3:g} mm")

@@ -13,7 +13,6 @@ from vibrissa.viewer.state import (
     envelope,
     loaded,
     moved,
-    places,
     shape_of,
     shaped,
     with_force,
@@ -150,7 +149,7 @@ def _rest(shape):
 
 def test_the_envelope_encloses_the_cloud():
     chart = charted(vb.samples.curved())
-    cloud, skin = places(chart), envelope(chart).triangles.reshape(-1, 3)
+    cloud, skin = 1e3 * chart.points, envelope(chart).triangles.reshape(-1, 3)
     centre = np.array([20.0, 5.0, 0.0])
     assert np.linalg.norm(cloud - centre, axis=1).max() < np.linalg.norm(
         skin - centre, axis=1

@@ -21,6 +21,7 @@ from vibrissa.scene import (
     ellipsoid,
     tube,
 )
+from vibrissa.sketch import round_step
 from vibrissa.viewer.colours import CONTACT, FORCE, GHOST, OBJECT, REST, WHISKER
 from vibrissa.viewer.page import EXAGGERATION, Page, asked, put, show
 from vibrissa.viewer.readout import number, numbers, sentence
@@ -88,12 +89,6 @@ def ruler(start: Array, length: float) -> dict[str, Mark]:
         unit = " mm" if tick == ticks[-1] else ""
         out[f"tick {tick:g}"] = Label(place + 3.0 * down, f"{tick:g}{unit}")
     return out
-
-
-def round_step(size: float) -> float:
-    """The largest of 1, 2 and 5 times a power of ten that is at most a size."""
-    power = 10.0 ** np.floor(np.log10(size))
-    return float(max(f for f in (1.0, 2.0, 5.0) if f * power <= size) * power)
 
 
 def arrow(start: Array, end: Array, thickness: float) -> Arrows:
@@ -205,7 +200,7 @@ class BendMode:
                 "Load", KINDS, hint="What bends the whisker: a point, a straight peg, or a force"
             )
             self._target = gui.add_vector3(
-                "Place (mm)", (x, y, z), step=0.05, hint="Drag the ball, or type"
+                "Position (mm)", (x, y, z), step=0.05, hint="Drag the ball, or type"
             )
             self._radius = gui.add_slider(
                 "Radius (mm)", 0.0, _MM * 0.08 * length, 0.01, bend.radius, visible=False

@@ -12,7 +12,7 @@ from vibrissa.quantities import quantity, to_display
 from vibrissa.scene import DIRECTIONS, Array, Bytes, Colour, Ints, robust_limits, root, squared
 from vibrissa.viewer.readout import plain, symbol
 
-WHISKER: Colour = (84, 68, 56)
+WHISKER: Colour = (122, 96, 76)
 REST: Colour = (150, 158, 168)
 GHOST: Colour = (213, 94, 0)
 CONTACT: Colour = (213, 94, 0)

@@ -28,7 +28,7 @@ from vibrissa.viewer.bend import NODES, bend_drawing, mm, whisker_body
 from vibrissa.viewer.colours import FIT, GHOST, Legend, counted, shaded
 from vibrissa.viewer.page import Page, asked
 from vibrissa.viewer.readout import note, number, sentence, table
-from vibrissa.viewer.state import Bend, Chart, coloured_cloud, places
+from vibrissa.viewer.state import Bend, Chart, coloured_solid
 from vibrissa.whisker import Whisker
 
 _RAT = (1.5e-4, 6e-6)
@@ -137,6 +137,9 @@ def _separation(estimate: Contacts, points: Array) -> Array:
 
 SIGMAS = 2.0
 """Standard deviations of the ellipsoids."""
+
+_CLEAR = 0.5
+"""Opacity of all contacts, so that the whisker is seen among them."""
 
 MOST = 0.3
 """Longest semi-axis that is drawn, over the length: what is longer is as good as unknown."""
@@ -287,10 +290,9 @@ class LocateMode:
         if self._cloud is None or self._page.mode is not self:
             return
         chart, colours = self._cloud
-        points = places(chart)
-        keep = points[:, 2] <= 0.0 if self._cut else slice(None)
-        cloud = coloured_cloud(chart, points[keep], colours[keep])
-        self._page.stage.show("cloud", {"contacts": cloud})
+        opacity = None if self._cut else _CLEAR
+        solid = coloured_solid(chart, colours, self._cut, opacity)
+        self._page.stage.show("cloud", {"contacts": solid})
 
     def _sense(self, **changes: object) -> None:
         self._sensor = Sensor(**{**vars(self._sensor), **changes})

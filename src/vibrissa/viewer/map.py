@@ -32,6 +32,7 @@ from vibrissa.scene import (
     root,
     sample_contacts,
     solid_surface,
+    squared,
     values_of,
 )
 from vibrissa.signals import SIGNALS
@@ -97,7 +98,7 @@ class Solids:
 
     def signal_rows(self, rows: Array) -> Array:
         """Places (..., 3), mm, of rows in the space of signals, its axis at the origin."""
-        reach, low, high = self._limits
+        reach, low, high = self.limits
         size = np.sqrt(values_of("MB", rows)) / reach
         turn = values_of("MD", rows) + TURN
         height = (root(values_of("Fx", rows)) - low) / (high - low)
@@ -105,7 +106,7 @@ class Solids:
         return self.length * np.stack([*flat, _HEIGHT * (height - 0.5)], axis=-1)
 
     @property
-    def _limits(self) -> tuple[float, float, float]:
+    def limits(self) -> tuple[float, float, float]:
         """Largest √M_B, least and largest root of F_x."""
         heights = root(values_of("Fx", self.nodes))
         reach = float(np.sqrt(values_of("MB", self.nodes).max()))
@@ -113,7 +114,7 @@ class Solids:
 
     def axis_height(self) -> float:
         """Height of F_x = 0 on the axis of the signals, mm."""
-        _, low, high = self._limits
+        _, low, high = self.limits
         return self.length * _HEIGHT * (-low / (high - low) - 0.5)
 
     def place(self, number: int | None) -> Array:
@@ -169,7 +170,9 @@ def frame_drawing(solids: Solids, exaggeration: float) -> Drawing:
         "title": Label(here + length * np.array([0.05, 0.0, 0.62]), "contacts"),
     }
     turn = np.linspace(0.0, 2.0 * np.pi, 73)
-    floor = -0.5 * 0.85 * length
+    floor = -0.5 * _HEIGHT * length
+    reach, low, _ = solids.limits
+    largest, least = number("MB", reach**2, 3), number("Fx", float(squared(low)), 3)
     for i, name in enumerate(COORDINATES):
         centre = solids.place(i)
         bottom = centre + np.array([0.0, 0.0, floor])
@@ -189,6 +192,8 @@ def frame_drawing(solids: Solids, exaggeration: float) -> Drawing:
         out[f"zero {name}"] = Label(centre + np.array([0.0, 0.0, solids.axis_height()]), "0")
         edge = 0.5 * length * np.array([np.cos(TURN), np.sin(TURN), 0.0])
         out[f"rim {name}"] = Label(bottom + edge, "MD = 0°")
+        out[f"ring {name}"] = Label(bottom - edge, f"MB = {largest}")
+        out[f"lowest {name}"] = Label(bottom, least)
         out[f"title {name}"] = Label(
             centre + length * np.array([-0.45, 0.0, 0.62]), f"signals, coloured by {_NAMES[name]}"
         )

@@ -390,6 +390,7 @@ class Framing:
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
         self._shot: Shot | None = None
+        self._placed: dict[int, tuple[int, int, Array]] = {}
         server.on_client_connect(self._came)
 
     def show(self, shot: Shot) -> None:
@@ -405,9 +406,19 @@ class Framing:
         if self._shot is not None:
             self._turn(client, self._shot)
 
+        @client.camera.on_update
+        async def _(camera: viser.CameraHandle) -> None:
+            # Panels come and go; who has turned the view keeps it.
+            wide, tall, place = self._placed.get(client.client_id, (0, 0, np.zeros(3)))
+            resized = (camera.image_width, camera.image_height) != (wide, tall)
+            if self._shot is not None and resized and np.allclose(camera.position, place, atol=0.1):
+                self._turn(client, self._shot)
+
     def _turn(self, client: viser.ClientHandle, shot: Shot) -> None:
         camera = client.camera
-        place, target = framed(shot, camera.image_width, camera.image_height, camera.fov)
+        wide, tall = camera.image_width, camera.image_height
+        place, target = framed(shot, wide, tall, camera.fov)
+        self._placed[client.client_id] = wide, tall, place
         with client.atomic():
             camera.position = _triple(place)
             camera.look_at = _triple(target)

@@ -155,7 +155,7 @@ SCRIPT = """
 STYLE = """
 /* On a phone the panel is as wide as the screen, below what is drawn. */
 @media (max-width: 36em) {
-  .mantine-Paper-root:not([data-floating-window]) {
+  .mantine-Paper-root[style*="position: fixed"]:not([data-floating-window]) {
     left: 0 !important; right: 0 !important; width: 100% !important; max-height: 55% !important;
   }
   .mantine-Paper-root:not([data-floating-window]) .mantine-ScrollArea-content > div {

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from vibrissa.quantities import quantity, to_display
 from vibrissa.rod import Deflection
-from vibrissa.scene import Array
+from vibrissa.scene import Array, spherical
 from vibrissa.signals import SIGNALS, signals_of
+from vibrissa.sketch import round_step
 from vibrissa.status import Status
 
 _GREEK = {"theta": "θ", "varphi": "φ", "sigma": "σ"}
@@ -100,14 +101,9 @@ def numbers(bent: Deflection) -> str:
     """Signals at the base, and contact point."""
     signals = signals_of(np.asarray(bent.force), np.asarray(bent.moment))
     measured = dict(zip(SIGNALS, signals.tolist(), strict=True))
-    x, y, z = np.asarray(bent.contact_point)
-    where = {
-        "arc_length": float(bent.arc_length),
-        "r": float(np.linalg.norm([x, y, z])),
-        "theta": float(np.arctan2(y, x)),
-        "phi": float(np.arctan2(z, np.hypot(x, y))),
-    }
-    return table(measured, "At the base") + table(where, "Contact")
+    where = (float(bent.arc_length), *spherical(np.asarray(bent.contact_point)).tolist())
+    contact = dict(zip(("arc_length", "r", "theta", "phi"), where, strict=True))
+    return table(measured, "At the base") + table(contact, "Contact")
 
 
 ROWS = (("Fx", "FT"), ("Mx", "MB"), ("FD", "MD"))
@@ -159,11 +155,11 @@ def timeline(time: Array, touching: NDArray[np.bool_], onsets: NDArray[np.int64]
         f'<line x1="{x:.1f}" x2="{x:.1f}" y1="0" y2="10" stroke="#d55e00"/>'
         for x in _x(time, time[onsets])
     ]
-    for share in np.linspace(0.0, 1.0, 5):
-        x = LEFT + (WIDTH - LEFT) * share
-        anchor = "end" if share == 1.0 else "middle"
+    for at in np.arange(0.0, 1.001 * duration, round_step(max(duration, 1e-3) / 3.0)):
+        x = LEFT + (WIDTH - LEFT) * at / max(duration, 1e-9)
+        anchor = "end" if x > WIDTH - 8.0 else "middle"
         parts.append(f'<line x1="{x:.1f}" x2="{x:.1f}" y1="10" y2="12" stroke="#888"/>')
-        parts.append(_text(x, STRIP - 1.0, f"{share * duration:.0f}", anchor))
+        parts.append(_text(x, STRIP - 1.0, f"{at:g}", anchor))
     parts.append(_text(LEFT - 14.0, STRIP - 1.0, "ms", "end"))
     return _svg("".join(parts), STRIP, " data-timeline")
 
@@ -208,7 +204,7 @@ def _row(time: Array, signals: dict[str, Array], names: tuple[str, str], top: fl
         f'<line x1="{LEFT}" x2="{WIDTH}" y1="{bottom:.1f}" y2="{bottom:.1f}" stroke="#8888"/>',
         _text(LEFT - 3.0, top + 11.0, _brief(high), "end"),
         _text(LEFT - 3.0, bottom, _brief(low), "end"),
-        _text(LEFT - 3.0, top + 0.5 * ROW + 3.0, unit, "end"),
+        _text(LEFT - 3.0, top + 0.5 * ROW + 7.0, unit, "end"),
     ]
     for i, name in enumerate(names):
         x, values = _thinned(time, shown[name])
@@ -216,7 +212,7 @@ def _row(time: Array, signals: dict[str, Array], names: tuple[str, str], top: fl
         out.append(_path(_x(time, x), y, _COLOURS[i], direction=name in ("FD", "MD")))
         words = symbol(name).replace("<sub>", '<tspan dy="2" font-size="6.5">')
         words = words.replace("</sub>", "</tspan>")
-        out.append(_text(LEFT + 4.0 + 17.0 * i, top + 10.0, words, "start", _COLOURS[i]))
+        out.append(_text(2.0 + 17.0 * i, top + 0.5 * ROW - 4.0, words, "start", _COLOURS[i]))
     return "".join(out)
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from PIL import Image, ImageDraw
 
 from vibrissa.cameras import Camera
 from vibrissa.objects import Surface
@@ -136,8 +137,7 @@ WIDTH = 420
 """Width of a picture, pixels."""
 
 _MARGIN = 40.0
-_TRACE = np.array([255, 96, 0], dtype=np.uint8)
-_CONTACT = np.array([0, 150, 255], dtype=np.uint8)
+_TRACE, _CONTACT = (255, 96, 0), (0, 150, 255)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,34 +184,15 @@ def picture(view: View, trial: Watched, frame: int, image: Frame | None = None) 
     columns = np.arange(left, right, 1.0 / view.scale).astype(int)
     rows = rows[rows < source.shape[0]]
     columns = columns[columns < source.shape[1]]
-    out = np.repeat(source[np.ix_(rows, columns)][..., None], 3, axis=2)
+    out = Image.fromarray(source[np.ix_(rows, columns)]).convert("RGB")
+    draw = ImageDraw.Draw(out)
     assert trial.traces is not None  # else there are no views
     for trace in trial.traces[frame, :, view.number]:
-        _mark(out, (_dense(trace, view.scale) - [left, top]) * view.scale, _TRACE, 1)
+        known = (trace[np.isfinite(trace).all(axis=1)] - [left, top]) * view.scale
+        draw.line(np.round(known).ravel().tolist(), _TRACE)
     touching = trial.contacts[frame][trial.touching[frame]]
     if touching.size:
         seen = trial.cameras[view.number].project(touching)
-        _mark(out, (seen - [left, top]) * view.scale, _CONTACT, 4)
-    return out
-
-
-def _dense(trace: Array, scale: float) -> Array:
-    """Points of a trace (k, 2), half a pixel of the picture apart; none where it is lost."""
-    known = trace[np.isfinite(trace).all(axis=1)]
-    if len(known) < 2:
-        return np.empty((0, 2))
-    steps = np.linalg.norm(np.diff(known, axis=0), axis=1) * scale
-    along = np.concatenate([[0.0], np.cumsum(steps)])
-    at = np.arange(0.0, along[-1], 0.5)
-    return np.stack([np.interp(at, along, known[:, i]) for i in range(2)], axis=1)
-
-
-def _mark(picture: Bytes, places: Array, colour: Bytes, size: int) -> None:
-    """Paint squares at places (n, 2): column, row."""
-    height, width = picture.shape[:2]
-    corner = np.round(places - 0.5 * (size - 1)).astype(int)
-    for i in range(size):
-        for j in range(size):
-            x, y = corner[:, 0] + i, corner[:, 1] + j
-            inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-            picture[y[inside], x[inside]] = colour
+        for at in np.round((seen - [left, top]) * view.scale):
+            draw.ellipse([*(at - 3.0), *(at + 3.0)], _CONTACT)
+    return np.asarray(out)

@@ -16,7 +16,6 @@ from vibrissa.io import netcdf_image, save_centerline, save_recording, write_mov
 from vibrissa.quantities import attributes
 from vibrissa.rod import Deflection
 from vibrissa.signals import base_signals
-from vibrissa.status import flag_attributes
 from vibrissa.viewer.page import Page
 from vibrissa.viewer.trial import TrialMode
 from vibrissa.whisker import Whisker
@@ -55,19 +54,9 @@ def netcdf(data: xr.Dataset) -> bytes:
 
 def deflection_dataset(bent: Deflection) -> xr.Dataset:
     """One bent whisker as a labelled dataset."""
-    values: dict[str, Any] = {
-        "centerline": (("node", "space"), bent.centerline(NODES), attributes("centerline")),
-        "force": ("space", np.asarray(bent.force), attributes("force")),
-        "moment": ("space", np.asarray(bent.moment), attributes("moment")),
-        "contact_point": (
-            "space",
-            np.asarray(bent.contact_point),
-            attributes("contact_point_whisker"),
-        ),
-        "arc_length": ((), float(bent.arc_length), attributes("arc_length")),
-        "status": ((), int(bent.status), {**attributes("status"), **flag_attributes()}),
-    }
-    out = xr.Dataset(values, {"space": list("xyz")}, {"reference_frame": "whisker"})
+    out = bent.to_dataset().assign_attrs(reference_frame="whisker")
+    out["centerline"] = ("node", "space"), bent.centerline(NODES), attributes("centerline")
+    out["contact_point"].attrs |= attributes("contact_point_whisker")
     return out.merge(base_signals(out["force"], out["moment"]))
 
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from vibrissa.contacts import ContactMap
 from vibrissa.quantities import to_display
 from vibrissa.rod import Deflection, PegContact, PointContact, PointForce, deflect
-from vibrissa.scene import Array, Bytes, Cloud, Painted, sample_contacts, sheet
+from vibrissa.scene import Array, Bytes, Painted, column, sample_contacts, sheet, solid_surface
 from vibrissa.signals import SIGNALS
 from vibrissa.status import Status
 from vibrissa.viewer.colours import CLOUD
@@ -217,9 +217,7 @@ def shaped(whisker: Whisker, asked: Shape) -> Whisker:
     return out.with_properties(youngs_modulus=asked.modulus)
 
 
-_SKIN = (12, 48, 6)
-_POINT = 0.008
-"""Width of a point of the cloud, over L."""
+_SKIN, _SOLID = (12, 48, 6), (36, 72, 16)
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,11 +247,6 @@ def charted(whisker: Whisker, contact_map: ContactMap | None = None) -> Chart:
     return Chart(contact_map, samples, line, kept["contact_point"].to_numpy()[aside], signals)
 
 
-def places(chart: Chart) -> Array:
-    """Contact points (n, 3) of the cloud, mm."""
-    return to_display("contact_point", chart.points)
-
-
 def envelope(chart: Chart) -> Painted:
     """The surface at which the whisker slips off, seen from inside, so that it hides nothing."""
     nodes = sample_contacts(chart.samples, chart.line, shape=_SKIN)[..., :3]
@@ -265,6 +258,13 @@ def envelope(chart: Chart) -> Painted:
     return Painted(triangles, colours, 0.45, "back")
 
 
-def coloured_cloud(chart: Chart, points: Array, colours: Bytes) -> Cloud:
-    """Contacts (n, 3), mm, in their colours (n, 3)."""
-    return Cloud(points, colours, float(to_display("length", _POINT * chart.whisker.length)))
+def coloured_solid(chart: Chart, colours: Bytes, cut: bool, opacity: float | None) -> Painted:
+    """Draw all contacts, or those with z < 0, in the colours (n, 3) of the nearest samples."""
+    from scipy.spatial import cKDTree
+
+    nodes = sample_contacts(chart.samples, chart.line, shape=_SOLID)
+    nodes = np.concatenate([nodes, -nodes[..., 2:3]], axis=-1)
+    below = (nodes.shape[-1] - 1,) if cut else ()
+    points = solid_surface(nodes, True, column("deflection"), *below)[..., :3]
+    _, nearest = cKDTree(chart.points).query(points)
+    return Painted(to_display("contact_point", points), colours[nearest], opacity)

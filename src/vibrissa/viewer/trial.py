@@ -26,8 +26,9 @@ from vibrissa.scene import (
     object_surface,
     sheet,
 )
-from vibrissa.viewer.bend import arrow, mm, round_step, ruler, whisker_body
-from vibrissa.viewer.colours import CONTACT, FIT, OBJECT
+from vibrissa.sketch import round_step
+from vibrissa.viewer.bend import arrow, mm, ruler, whisker_body
+from vibrissa.viewer.colours import CONTACT, FIT, OBJECT, Legend
 from vibrissa.viewer.page import Page, asked, put
 from vibrissa.viewer.readout import chart, cursor, table, timeline
 from vibrissa.viewer.recorded import View, Watched, picture, views
@@ -58,7 +59,22 @@ _SIGMAS = 2.0
 _SHARP = 0.3e-3
 """Standard deviation, m, from which on contacts are paler."""
 
-_PALE = np.array([205.0, 208.0, 212.0])
+_PALE = np.array([150.0, 152.0, 155.0])
+"""Colour of the least certain contacts, as faint on white as on black."""
+
+_LEGEND = Legend(
+    "",
+    tuple(
+        (f"rgb{colour}", words)
+        for colour, words in (
+            (CONTACT, "contacts"),
+            (tuple(_PALE.astype(int).tolist()), "uncertain ones"),
+            (OBJECT, "object"),
+            (FIT, "fitted shape"),
+        )
+    ),
+    smooth=False,
+)
 
 
 def moment_drawing(
@@ -213,6 +229,7 @@ class TrialMode:
                 for layer in LAYERS:
                     box = gui.add_checkbox(layer, True, visible=self._has(layer))
                     asked(box, partial(self._see, layer))
+            gui.add_html(_LEGEND.html())
             self._words = gui.add_html("")
             self._chart = gui.add_html("")
             self._cursor = gui.add_html("")
@@ -364,5 +381,5 @@ class TrialMode:
         touching = "in contact" if trial.touching[frame, i] else "free"
         passed = f"{_MS * float(trial.time[frame] - trial.time[0]):.1f} ms"
         count = int(trial.touching[: frame + 1].sum())
-        so_far = f"{count} contact{'' if count == 1 else 's'} so far"
+        so_far = f"{count} contact point{'' if count == 1 else 's'}"
         return table(rows, f"{passed}: {touching}, {so_far}")

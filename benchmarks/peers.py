@@ -1,7 +1,7 @@
 # ruff: noqa: T201 -- a script that reports
-"""Static equilibrium of a tapered rod under a point force, by vibrissa, SciPy and PyElastica.
+"""Static equilibrium of a tapered rod under a point force, by vibrissa and by other programs.
 
-    pip install pyelastica
+    pip install pyelastica mujoco soromox
     python benchmarks/peers.py [--elements 10 20]
 
 A straight rod (40 mm, 0.4 mm in radius at the base, ratio 15) is bent by a force at 0.6 of its
@@ -9,10 +9,13 @@ length until the tangent there has turned by about 65°. Beyond the force nothin
 all three solve the rod up to it. vibrissa has the force in the bent frame and integrates once, or
 has the point and searches; SciPy's ``solve_bvp`` and PyElastica have the force in space.
 PyElastica, which is dynamic, is damped until the loaded point moves by less than 1e-6 of the length
-in a period of its slowest vibration. Errors are distances of the loaded point over the length, from
+in a period of its slowest vibration. MuJoCo has a chain of bodies with springs in their hinges,
+damped until the end moves by less than 1e-7 of the length in 50 steps; SoRoMox pieces of constant
+curvature, whose springs and Jacobian are in balance with the force after a few steps of Newton's
+method with the derivatives of JAX. Errors are distances of the loaded point over the length, from
 vibrissa with eight times the steps, which ``solve_bvp`` at 1e-10 confirms; PyElastica's rod also
 stretches and shears, which alone is some 1e-4. Times are CPU times of one core, after a first call
-that compiles. Without PyElastica its rows are left out.
+that compiles. Programs that are not installed are left out.
 """
 
 from __future__ import annotations
@@ -128,6 +131,79 @@ def of_pyelastica(whisker: vb.Whisker, force: np.ndarray, elements: int) -> Row:
     return name, rod.position_collection[:2, -1], seconds
 
 
+def of_mujoco(whisker: vb.Whisker, force: np.ndarray, elements: int) -> Row:
+    """Lengths in units of the loaded one, forces in units of B/length², a body of mass h each."""
+    import mujoco
+
+    end, h = WHERE * whisker.length, 1.0 / elements
+    bending = (
+        whisker.youngs_modulus * np.pi / 4.0 * whisker.radius(np.arange(elements) * h * end) ** 4
+    )
+    springs = bending / bending[0] / h
+    springs[0] *= 2.0  # the hinge at the clamp stands for half an element
+    bodies = "".join(
+        f'''<body pos="{h if i else 0.0} 0 0">
+        <joint type="hinge" axis="0 0 1" stiffness="{spring}" damping="{0.3 * spring}"/>
+        <inertial pos="{h / 2} 0 0" mass="{h}" diaginertia="{" ".join([str(h**3 / 12)] * 3)}"/>'''
+        for i, spring in enumerate(springs)
+    )
+    point = '<inertial pos="0 0 0" mass="1e-4" diaginertia="1e-9 1e-9 1e-9"/></body>'
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><option gravity="0 0 0" integrator="implicit" timestep="0.01"/><worldbody>'
+        f'{bodies}<body name="end" pos="{h} 0 0">{point}{"</body>" * elements}</worldbody></mujoco>'
+    )
+    data, last = mujoco.MjData(model), model.body("end").id
+    data.xfrc_applied[last, :2] = force * end**2 / bending[0]
+    before, begun = np.full(3, np.inf), time.process_time()
+    while np.linalg.norm(data.xpos[last] - before) > 1e-7:
+        before = data.xpos[last].copy()
+        mujoco.mj_step(model, data, 50)
+    seconds = time.process_time() - begun
+    return f"MuJoCo, {elements} bodies", data.xpos[last, :2] * end, seconds
+
+
+def of_soromox(whisker: vb.Whisker, force: np.ndarray, elements: int) -> Row:
+    import jax
+    import jax.numpy as jnp
+    from soromox.systems.components.links import LinkSpec
+    from soromox.systems.pcs.planar_pcs import PlanarPCS, PlanarPCSStructure
+
+    jax.config.update("jax_enable_x64", True)
+    end = WHERE * whisker.length
+    links = [
+        LinkSpec.circular(
+            length=end / elements,
+            radius=float(whisker.radius((i + 0.5) * end / elements)),
+            density=1000.0,
+            reference_strain=[0.0, 1.0, 0.0],
+            young_modulus=whisker.youngs_modulus,
+            poisson_ratio=whisker.poisson_ratio,
+        )
+        for i in range(elements)
+    ]
+    bends = PlanarPCSStructure(strain_selector=[True, False, False] * elements)
+    rod = PlanarPCS.from_links(links, structure=bends, base_pose=jnp.zeros(3))
+    wrench = jnp.array([0.0, *force])
+
+    def imbalance(q: Any) -> Any:
+        return rod.K_active @ q - rod.jacobian_inertialframe(q, jnp.array(end)).T @ wrench
+
+    @jax.jit
+    def newton(q: Any) -> Any:
+        return q - jnp.linalg.solve(jax.jacfwd(imbalance)(q), imbalance(q))
+
+    def solve() -> Any:
+        q, before = jnp.zeros(elements), jnp.full(elements, jnp.inf)
+        while float(jnp.abs(q - before).max()) * end / elements > 1e-9:
+            q, before = newton(q), q
+        return q
+
+    solve()  # compiles
+    q, seconds = timed(solve, 3)
+    place = np.asarray(rod.forward_kinematics(q, jnp.array(end)))[1:3]
+    return f"SoRoMox, {elements} pieces", place, seconds
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--elements", type=int, nargs="*", default=[10, 20])
@@ -150,11 +226,15 @@ def rows(
     yield from of_vibrissa(whisker, load)
     for tolerance in (1e-3, 1e-6, 1e-10):
         yield of_scipy(whisker, force, tolerance)
-    try:
-        for n in elements:
-            yield of_pyelastica(whisker, force, n)
-    except ImportError:
-        print("| PyElastica is not installed | | |")
+    for program, solver in PROGRAMS.items():
+        try:
+            for n in elements:
+                yield solver(whisker, force, n)
+        except ModuleNotFoundError:
+            print(f"| {program} is not installed | | |")
+
+
+PROGRAMS = {"PyElastica": of_pyelastica, "MuJoCo": of_mujoco, "SoRoMox": of_soromox}
 
 
 if __name__ == "__main__":

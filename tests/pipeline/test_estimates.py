@@ -358,18 +358,41 @@ def test_without_noise_there_is_no_covariance_but_a_fit(trial):
     assert float(contour["object_radius"]) > 0
 
 
-def test_an_error_that_all_contacts_share_is_in_the_covariance_of_the_object(trial):
+@pytest.mark.parametrize("of_pose", [False, True])
+def test_an_error_that_all_contacts_share_is_in_the_covariance_of_the_object(trial, of_pose):
+    """Of tracked contacts that of the traces; of a sensor's that of the pose that places them."""
     done = with_estimates(trial)
     shift = np.array([20e-6, -10e-6, 5e-6])
-    shared = np.broadcast_to(shift, (trial.sizes["time"], 1, 1, 3))
+    errors = {"contact_shared": shift}
+    if of_pose:
+        errors = {"contact_shared": 3.0 * shift, "pose_shared": np.append(shift, np.zeros(3))}
+    each = (trial.sizes["time"], 1, 1)
     known = done.copy()
-    known.dataset = done.to_dataset().assign(contact_shared=recorded("contact_shared", shared))
+    known.dataset = done.to_dataset().assign(
+        {name: recorded(name, np.tile(error, (*each, 1))) for name, error in errors.items()}
+    )
     more, less = (reconstruct(one)["parameter_covariance"].values for one in (known, done))
     # Contacts that are all shifted shift the object with them, and change nothing else of it.
     expected = np.zeros((7, 7))
     expected[:3, :3] = np.outer(shift, shift)
     sigma = np.sqrt(np.diag(more))
     assert (np.abs(more - less - expected) <= 1e-3 * np.outer(sigma, sigma)).all()
+
+
+def test_a_pose_that_is_turned_in_all_frames_turns_the_object_of_a_sensor(trial):
+    """A turn of the laboratory about the peg's own axis: the peg moves with the base, not else."""
+    done = with_estimates(trial)
+    turn = np.array([0.0, 0.0, 1e-3])
+    shared = np.tile(np.append(np.zeros(3), turn), (trial.sizes["time"], 1, 1, 1))
+    errors = {"pose_shared": shared, "contact_shared": 0.0 * shared[..., :3]}
+    known = done.copy()
+    known.dataset = done.to_dataset().assign({n: recorded(n, v) for n, v in errors.items()})
+    more, less = (reconstruct(one) for one in (known, done))
+    added = more["parameter_covariance"].values - less["parameter_covariance"].values
+    base = done["base_position"].values[:, 0].mean(axis=0)
+    moved = np.cross(turn, less["object_position"].values - base)
+    sigma = np.sqrt(np.diag(added)[:2])
+    np.testing.assert_allclose(sigma, np.abs(moved[:2]), atol=0.1 * np.linalg.norm(moved))
 
 
 def test_contacts_are_as_far_from_the_known_object_as_predicted(trial):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
+from scipy.spatial.transform import Rotation
 
 from vibrissa.recording import Recording
 from vibrissa.status import Status
@@ -179,6 +180,19 @@ def test_an_error_that_all_frames_share_is_in_the_covariances(filmed, traces, fo
     held = np.einsum("ti,tij,tj->t", moved, np.linalg.inv(spread), moved)
     alone = np.einsum("ti,tij,tj->t", moved, np.linalg.inv(spread - together), moved)
     assert np.percentile(held, 95.0) < 7.8 < np.median(alone)
+
+
+def test_the_whisker_s_frame_is_known_as_well_as_stated(filmed, found):
+    """The axis and the roll of its frame are those of the rest shape: no residuals show them."""
+    true = filmed.recording["base_rotation"].values[:, 0]
+    error = found["base_rotation"].values @ np.swapaxes(true, 1, 2)
+    turn = Rotation.from_matrix(error).as_rotvec()
+    spread = found["pose_covariance"].values[:, 3:, 3:]
+    shared = found["pose_shared"].values[..., 3:]
+    together = np.einsum("tki,tkj->tij", shared, shared)
+    assert (np.linalg.eigvalsh(spread - together) > -1e-9).all()
+    square = np.einsum("ti,tij,tj->t", turn, np.linalg.inv(spread), turn)
+    assert 0.02 < np.median(square) < 7.8
 
 
 def test_the_paper_s_way_is_beside_it(filmed, recording):

@@ -145,14 +145,27 @@ def _widened(fit: FittedShape, together: float) -> FittedShape:
 
 
 def _moved_together(recording: xr.DataTree, estimates: xr.Dataset) -> Iterator[xr.Dataset]:
-    """Estimates shifted by each error that all contacts of a tracked recording share."""
-    shared = recording.to_dataset().get("contact_shared")
-    if shared is None:
-        return
-    for _, shift in shared.transpose("error", "time", "whisker", "space").groupby("error"):
-        shift = shift.squeeze("error").reindex(time=estimates["time"])
-        # A contact that was not tracked does not show by how much it is shifted.
-        yield estimates.assign(contact_point=estimates["contact_point"] + shift.fillna(0.0))
+    """Estimates moved by each error that all frames of a tracked recording share.
+
+    It moves a contact that was tracked as it does the trace, and one of a sensor with the pose by
+    which it is in the laboratory; the pose turns normals.
+    """
+    root, found = Recording(recording).root, Group(estimates)
+    point, normal = found["contact_point"], found["contact_normal"]
+    for k in range(root.data.sizes.get("error", 0)):
+        # What was not tracked does not show by how much it is moved.
+        moved = np.nan_to_num(root["contact_shared"][:, :, k])
+        turned = np.zeros_like(normal)
+        if "pose_shared" in root:
+            pose = np.nan_to_num(root["pose_shared"][:, :, k])
+            turned = np.cross(pose[..., 3:], normal)
+            if estimates.attrs.get("source") == "sensor":
+                arm = point - root["base_position"]
+                moved = pose[..., :3] + np.cross(pose[..., 3:], arm)
+        yield estimates.assign(
+            contact_point=((*EACH, "space"), point + moved),
+            contact_normal=((*EACH, "space"), normal + turned),
+        )
 
 
 def _with_shared_errors(fit: FittedShape, others: Sequence[FittedShape]) -> FittedShape:

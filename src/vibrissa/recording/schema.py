@@ -80,6 +80,7 @@ VARIABLES: Mapping[str, RecordedVariable] = MappingProxyType(
         "head_position": RecordedVariable(("time", "space"), _TOP, _LAB),
         "head_rotation": RecordedVariable(("time", "space", "head_axis"), _TOP),
         "pose_covariance": RecordedVariable((*_EACH, "pose", "pose_"), ("", "signals")),
+        "pose_shared": RecordedVariable((*_EACH, "error", "pose"), _TOP),
         "unfiltered_base_position": RecordedVariable(_VECTOR, _MEASURED, _LAB),
         **{f"unfiltered_{name}": RecordedVariable(_EACH, _MEASURED) for name in _ANGLES},
         # Where it is

@@ -24,10 +24,6 @@ from vibrissa.whisker import Whisker, angles_of
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_ERRORS = 8
-"""Number of independent errors of contact points that are kept, the largest: the rest is less than
-the tolerance of the contour."""
-
 
 @dataclass(frozen=True, eq=False)
 class Tracked:
@@ -85,7 +81,8 @@ def tracked_recording(
     cutoff: float | None = CUTOFF,
 ) -> xr.DataTree:
     """Make a recording of tracked whiskers."""
-    root = xr.concat([_variables(one) for one in found], "whisker").assign_coords(
+    errors = max(one.fit.shared.shape[1] for one in found)
+    root = xr.concat([_variables(one, errors) for one in found], "whisker").assign_coords(
         coordinates(pairs[:, 0] / rate, [one.whisker.name for one in found])
         | {"view": [camera.name for camera in cameras], "image_axis": ["column", "row"]}
     )
@@ -112,9 +109,10 @@ def _labelled(values: Mapping[str, Any]) -> dict[str, xr.Variable]:
     return {name: recorded(name, array) for name, array in values.items()}
 
 
-def _variables(one: Tracked) -> xr.Dataset:
-    """Variables of one whisker, dim whisker of length 1."""
+def _variables(one: Tracked, errors: int) -> xr.Dataset:
+    """Variables of one whisker, dim whisker of length 1, with so many shared errors."""
     fit, traces = one.fit, one.traces
+    shared = np.pad(fit.shared, ((0, 0), (0, errors - fit.shared.shape[1]), (0, 0)))
     angles = angles_of(np.swapaxes(one.head.rotation, 1, 2) @ fit.rotation)
     fitted = np.isfinite(fit.misfit)
     status = np.full(len(fit.misfit), int(Status.MISSING), dtype=np.int8)
@@ -137,7 +135,8 @@ def _variables(one: Tracked) -> xr.Dataset:
         "confidence": np.where(fitted, traces.confidence.min(axis=1), 0.0),
         "status": status,
         "contact_covariance": fit.contact_covariance,
-        "contact_shared": _few(fit.contact_shared),
+        "contact_shared": shared[..., :3],
+        "pose_shared": shared[..., 3:],
         "wrench_covariance": fit.wrench_covariance,
         "pose_covariance": fit.pose_covariance,
         "pose_wrench_covariance": fit.pose_wrench_covariance,
@@ -148,19 +147,6 @@ def _variables(one: Tracked) -> xr.Dataset:
         "trace_confidence": traces.confidence,
     }
     return xr.Dataset(_labelled(values))
-
-
-def _few(shared: Array) -> Array:
-    """Shifts (time, error, 3) by as many errors that have the same covariance but for little."""
-    known = np.isfinite(shared).all(axis=(1, 2))
-    out = np.full((len(shared), _ERRORS, 3), np.nan)
-    if known.any():
-        every = np.concatenate(list(shared[known]), axis=1)
-        _, size, ways = np.linalg.svd(every, full_matrices=False)
-        most = (size[:, None] * ways)[:_ERRORS]
-        out[known] = 0.0
-        out[known, : len(most)] = np.stack(np.split(most, known.sum(), axis=1))
-    return out
 
 
 def _measured(one: Tracked) -> xr.Dataset:

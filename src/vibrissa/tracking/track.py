@@ -260,13 +260,15 @@ def _corrected(
 
 def _with_optics_unsure(fit: RodFit, optics: Optics) -> RodFit:
     """Add to the covariances of points what is not known of the cameras."""
-    contact, base = (optics.displacements(points) for points in (fit.contact_point, fit.position))
+    moved = [optics.displacements(points) for points in (fit.contact_point, fit.position)]
+    contact, base = moved
+    shared = np.concatenate([*moved, np.zeros_like(base)], axis=2)
     pose = fit.pose_covariance.copy()
     pose[:, :3, :3] += np.einsum("vti,vtj->tij", base, base)
     return replace(
         fit,
         contact_covariance=fit.contact_covariance + np.einsum("vti,vtj->tij", contact, contact),
-        contact_shared=np.concatenate([fit.contact_shared, np.moveaxis(contact, 0, 1)], axis=1),
+        shared=np.append(fit.shared, np.moveaxis(shared, 0, 1), axis=1),
         pose_covariance=pose,
     )
 

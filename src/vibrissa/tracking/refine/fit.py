@@ -68,6 +68,13 @@ _AT_BASE, _FOLLOWED = 0.03, 3.0
 """Share of the length over which fur may draw a trace aside, and by how much more it does than what
 the rod, which follows it, leaves of that."""
 
+_HOOKED, _HOOK = 0.01, 0.25
+"""Standard deviation of how far the rest shape is drawn aside at its base, where its tangent is the
+axis of the whisker's frame, pixels, if residuals show no more; and its share of what they show."""
+
+_PROXIMAL = 0.7
+"""Share of the whisker that determines the roll of its frame."""
+
 _ENDS = 1.0
 """Standard deviation of ends along the whisker, in units of that in one frame."""
 
@@ -130,9 +137,10 @@ class RodFit:
         Contact point in the whisker's and in the laboratory frame, m.
     contact_covariance : array (time, 3, 3)
         Covariance of the contact point in the laboratory, m².
-    contact_shared : array (time, error, 3)
-        Shifts of the contact point by errors that all frames share, m: each by one standard
-        deviation of one error, which is independent of the others. They are part of the covariance.
+    shared : array (time, error, 9)
+        Shifts of the contact point and of the base, m, and turns of the base, rad, laboratory
+        axes, by errors that all frames share: each by one standard deviation of one error, which is
+        independent of the others. They are part of the covariances.
     force, moment : array (time, 3)
         Force and moment at the base, whisker's frame, N and N·m; 0 without contact.
     wrench_covariance : array (time, 6, 6)
@@ -153,7 +161,7 @@ class RodFit:
     contact_point_whisker: Array
     contact_point: Array
     contact_covariance: Array
-    contact_shared: Array
+    shared: Array
     force: Array
     moment: Array
     wrench_covariance: Array
@@ -197,7 +205,7 @@ class Fitter:
         """Fit a whisker of an approximate pose."""
         problem = self._problem(whisker, pose)
         _, state, linear = problem.trusted()
-        found = _answer(problem.d, state, linear, problem.touching, nodes)
+        found = _answer(problem, state, linear, nodes)
         return _whole(_in_laboratory(found, problem.head), problem.frames, len(self.curves))
 
     def costs(self) -> Callable[[Whisker, BasePose], float]:
@@ -254,6 +262,16 @@ class _Linear(NamedTuple):
     ends: list[Array]
     designs: list[Array]
     weights: list[Array]
+
+    @property
+    def left(self) -> list[Array]:
+        """Means over time of the residuals of each view, pixels."""
+        found = []
+        for misses, weight in zip(self.misses, self.weights, strict=True):
+            shown = weight[:, :-2] > 0.0
+            left = np.where(shown, misses / np.where(shown, weight[:, :-2], 1.0), 0.0)
+            found.append(left.sum(axis=0) / np.maximum(shown.sum(axis=0), 1))
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -420,18 +438,13 @@ def _shared(fit: _Linear) -> Array:
     follow stays in the mean of the residuals over time.
     """
     pulls = []
-    for misses, ends, design, weight in zip(
-        fit.misses, fit.ends, fit.designs, fit.weights, strict=True
-    ):
-        shown = weight[:, :-2] > 0.0
-        left = np.where(shown, misses / np.where(shown, weight[:, :-2], 1.0), 0.0)
-        left = left.sum(axis=0) / np.maximum(shown.sum(axis=0), 1)
+    views = zip(fit.left, fit.ends, fit.designs, fit.weights, strict=True)
+    for left, ends, design, weight in views:
         sigma = np.hypot(_COMMON, np.sqrt(np.mean(left**2)))
         s = np.linspace(0.0, 1.0, design.shape[1] - 2)
         waves = [sigma / (1.0 + k) * np.cos(k * np.pi * s) for k in range(_WAVES)]
         waves.append(_LIT * (1.0 - s))
-        drawn = np.abs(left[s < 2.0 * _AT_BASE]).max()
-        waves.append(np.hypot(_COMMON, _FOLLOWED * drawn) * np.exp(-s / _AT_BASE))
+        waves.append(np.hypot(_COMMON, _FOLLOWED * _drawn(left)) * np.exp(-s / _AT_BASE))
         across = design[:, :-2] * weight[:, :-2, None]
         pulls += [np.einsum("tni,n->ti", across, wave) for wave in waves]
         for end in (0, 1):
@@ -441,8 +454,34 @@ def _shared(fit: _Linear) -> Array:
     return fit.smoother.responses(np.array(pulls))
 
 
-def _answer(d: Discretization, state: State, fit: _Linear, touching: Mask, nodes: int) -> RodFit:
+def _drawn(left: Array) -> float:
+    """Largest of the residuals that all frames share at the base, pixels."""
+    return float(np.abs(left[: round(2.0 * _AT_BASE * len(left))]).max())
+
+
+def _frame_turns(problem: Problem, state: State, fit: _Linear) -> Array:
+    """Turns (2, 3) of the whisker's frame, in its own axes, by the rest shape's error at its base.
+
+    The shape follows the traces there, and the rod the shape: what is wrong with the tangent at the
+    base, which is the x axis, and with the plane of the proximal part, which the roll follows from
+    it, leaves no residuals.
+    """
+    whisker = problem.whisker
+    base = problem.head.put_in(state.position * whisker.length)
+    slopes = [
+        np.hypot(_HOOKED, _HOOK * _drawn(left))
+        / np.linalg.norm(camera.project_with_slopes(base)[1], axis=1).max()
+        for camera, left in zip(problem.cameras, fit.left, strict=True)
+    ]
+    lean = max(slopes) / (_AT_BASE * whisker.length)
+    x, y, _ = whisker.position(np.linspace(0.0, _PROXIMAL, len(fit.left[0])) * whisker.length).T
+    roll = min(lean * abs(x @ y) / max(y @ y, lean**2 * (x @ x)), 1.0)
+    return np.array([[0.0, 0.0, lean], [roll, lean, 0.0]])
+
+
+def _answer(problem: Problem, state: State, fit: _Linear, nodes: int) -> RodFit:
     """Results in SI units, relative to the head."""
+    d, touching = problem.d, problem.touching
     shared, misfit = _shared(fit), fit.misfit
     covariance = fit.smoother.covariances() + np.einsum("kti,ktj->tij", shared, shared)
     turned, slopes, slope = contact_slopes(d, state)
@@ -456,12 +495,23 @@ def _answer(d: Discretization, state: State, fit: _Linear, touching: Mask, nodes
     size = np.repeat([d.length, 1.0], 3)
     held = covariance[:, :6, :6] * np.outer(size, size)
     both = covariance[:, :6, 6:] * size[:, None] @ np.swapaxes(by_contact, 1, 2)
+    # An error of the whisker's frame turns force and moment in it the other way.
+    turns = _frame_turns(problem, state, fit)
+    framed = np.pad(np.einsum("tij,kj->tki", state.rotation, turns), ((0, 0), (0, 0), (6, 0)))
+    against = [np.cross(vector[:, None], turns) for vector in (wrench[:, :3], wrench[:, 3:])]
+    aside = np.concatenate(against, axis=2)
+    held = held + np.einsum("tki,tkj->tij", framed[..., 3:], framed[..., 3:])
+    both = both + np.einsum("tki,tkj->tij", framed[..., 3:], aside)
     line = rods(d, state.contact, np.linspace(0.0, 1.0, nodes))
     line = np.einsum("tij,tnj->tni", state.rotation, line) + state.position[:, None]
     none = np.where(touching, 1.0, np.nan)
     spread = slopes @ covariance @ np.swapaxes(slopes, 1, 2)
     moved = np.einsum("tij,ktj->tki", slopes, shared)
     wrench_spread = by_contact @ inside @ np.swapaxes(by_contact, 1, 2)
+    wrench_spread += np.einsum("tki,tkj->tij", aside, aside)
+    moved = np.concatenate(
+        [moved * (d.length * none[:, None, None]), shared.swapaxes(0, 1)[..., :6] * size], axis=2
+    )
     return RodFit(
         rotation=state.rotation,
         position=state.position * d.length,
@@ -469,7 +519,7 @@ def _answer(d: Discretization, state: State, fit: _Linear, touching: Mask, nodes
         contact_point_whisker=point * d.length * none[:, None],
         contact_point=(turned + state.position) * d.length * none[:, None],
         contact_covariance=spread * (d.length**2 * none[:, None, None]),
-        contact_shared=moved * (d.length * none[:, None, None]),
+        shared=np.concatenate([moved, framed], axis=1),
         force=wrench[:, :3] * touching[:, None],
         moment=wrench[:, 3:] * touching[:, None],
         wrench_covariance=wrench_spread * touching[:, None, None],
@@ -485,13 +535,14 @@ def _in_laboratory(found: RodFit, head: HeadPose) -> RodFit:
     turn = head.rotation
     both = np.zeros((len(turn), 6, 6))
     both[:, :3, :3] = both[:, 3:, 3:] = turn
+    parts = found.shared.reshape(*found.shared.shape[:2], 3, 3)
     return replace(
         found,
         rotation=turn @ found.rotation,
         position=head.put_in(found.position),
         contact_point=head.put_in(found.contact_point),
         contact_covariance=turn @ found.contact_covariance @ np.swapaxes(turn, 1, 2),
-        contact_shared=found.contact_shared @ np.swapaxes(turn, 1, 2),
+        shared=np.einsum("tij,tevj->tevi", turn, parts).reshape(found.shared.shape),
         pose_covariance=both @ found.pose_covariance @ np.swapaxes(both, 1, 2),
         pose_wrench_covariance=both @ found.pose_wrench_covariance,
         centerline=head.put_in(found.centerline),
@@ -522,7 +573,7 @@ def with_length_unsure(found: RodFit, other: RodFit, share: float) -> RodFit:
     return replace(
         found,
         contact_covariance=found.contact_covariance + point[:, :, None] * point[:, None],
-        contact_shared=np.concatenate([found.contact_shared, point[:, None]], axis=1),
+        shared=np.append(found.shared, np.append(point, pose, axis=1)[:, None], axis=1),
         pose_covariance=found.pose_covariance + pose[:, :, None] * pose[:, None],
         wrench_covariance=found.wrench_covariance + wrench[:, :, None] * wrench[:, None],
         pose_wrench_covariance=found.pose_wrench_covariance + pose[:, :, None] * wrench[:, None],

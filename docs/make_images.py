@@ -52,6 +52,9 @@ LEVELS = {
 }
 """Of red, green and blue in figures for which 256 colours are too few."""
 
+GROWING, SMALL = 48, (800, 450)
+"""Frames of the animated picture, and its size, pixels."""
+
 CURVATURES = np.arange(8) / 5.0
 TAPER_RATIOS = (1.0, 2.0, 4.0, 8.0, 15.0, 30.0, 60.0)
 
@@ -132,10 +135,10 @@ def contour() -> Figure:
     )
 
 
-def filmed(rows: Sequence[int]) -> list[plots.Sight]:
+def filmed(rows: Sequence[int], of: Callable[[], xr.DataTree] = trial) -> list[plots.Sight]:
     """Both views of some of its frames."""
-    shown = trial().isel(time=rows)
-    return [plots.Sight(camera, film_frames(shown, camera)) for camera in views_of(trial())]
+    shown = of().isel(time=rows)
+    return [plots.Sight(camera, film_frames(shown, camera)) for camera in views_of(of())]
 
 
 def overview() -> Figure:
@@ -165,6 +168,14 @@ def contour_movie() -> np.ndarray:
     return list(
         plots.contour_frames(course, line(), filmed(rows), rows, Recording(trial()).objects)
     )[1]
+
+
+def growing() -> list[np.ndarray]:
+    """The movie of the contour of the long trial in few frames."""
+    course = course_of(long_trial())
+    rows = np.linspace(0, len(course.time) - 1, GROWING).astype(int).tolist()
+    objects = Recording(long_trial()).objects
+    return list(plots.contour_frames(course, line(), filmed(rows, long_trial), rows, objects))
 
 
 def line() -> np.ndarray:
@@ -232,7 +243,7 @@ def distances() -> Figure:
     )
 
 
-FIGURES: dict[str, Callable[[], Figure | np.ndarray]] = {
+FIGURES: dict[str, Callable[[], Figure | np.ndarray | list[np.ndarray]]] = {
     "title": lambda: title_picture(long_trial(), chart()),
     "contour": contour,
     "array": lambda: plots.array_views(vb.whisker_array().to_tree()),
@@ -251,14 +262,28 @@ FIGURES: dict[str, Callable[[], Figure | np.ndarray]] = {
     "contact_places": places,
     "movie_signals": signal_movie,
     "movie_contour": contour_movie,
+    "growing": growing,
     "contour_free": free_surface,
     "contour_distances": distances,
     "critical_cones": lambda: plots.critical_cones(critical_cones(CURVATURES, TAPER_RATIOS)),
 }
 
 
-def save(figure: Figure | np.ndarray, path: Path) -> None:
-    """Write a figure or a frame of a movie."""
+def save(figure: Figure | np.ndarray | list[np.ndarray], path: Path) -> None:
+    """Write a figure, a frame of a movie, or several as an animated picture."""
+    if isinstance(figure, list):
+        frames = [
+            Image.fromarray(frame[..., :3]).resize(SMALL, Image.Resampling.LANCZOS)
+            for frame in figure
+        ]
+        # One palette, of the first and the last, so that nothing flickers.
+        both = Image.fromarray(np.concatenate([np.asarray(frames[k]) for k in (0, -1)]))
+        palette = both.quantize(128, Image.Quantize.FASTOCTREE)
+        first, *others = [frame.quantize(palette=palette, dither=0) for frame in frames]
+        times = [120] * len(others) + [3000]  # ms; the whole contour stays
+        how = {"save_all": True, "append_images": others, "duration": times, "loop": 0}
+        first.save(path.with_suffix(".gif"), optimize=True, **how)
+        return
     if isinstance(figure, Figure):
         drawn = io.BytesIO()
         figure.savefig(drawn, format="png")

@@ -1,6 +1,7 @@
 """From the files of other trackers to a contour, by the command line alone."""
 
 import csv
+from datetime import UTC, datetime
 from pathlib import Path
 
 import h5py
@@ -97,6 +98,31 @@ def movement(folder, views):
     return [folder / "poses.nc"]
 
 
+def nwb(folder, views):
+    """One NWB file with a pose of each camera, by ndx-pose itself, sorted as HDF5 does."""
+    pynwb, ndx_pose = pytest.importorskip("pynwb"), pytest.importorskip("ndx_pose")
+    start = datetime(2026, 1, 1, tzinfo=UTC)
+    file = pynwb.NWBFile("poses", "poses", start)
+    names = [f"w{i}" for i in range(NODES)]
+    skeleton = ndx_pose.Skeleton(name="whisker", nodes=names)
+    module = file.create_processing_module("behavior", "poses")
+    module.add(ndx_pose.Skeletons(skeletons=[skeleton]))
+    for view, pixels in views.items():
+        series = [
+            ndx_pose.PoseEstimationSeries(
+                name=name, data=pixels[:, i], unit="pixels", reference_frame="image", rate=1000.0
+            )
+            for i, name in enumerate(names)
+        ]
+        pose = ndx_pose.PoseEstimation(
+            name=f"camera_{view}", pose_estimation_series=series, skeleton=skeleton
+        )
+        module.add(pose)
+    with pynwb.NWBHDF5IO(folder / "poses.nwb", "w") as out:
+        out.write(file)
+    return [folder / "poses.nwb"]
+
+
 def run(*words):
     done = CliRunner().invoke(app, [str(word) for word in words])
     if done.exception and not isinstance(done.exception, SystemExit):
@@ -132,7 +158,7 @@ def test_two_views_to_a_recording(trial, tmp_path, write):
     assert "vibrissa reconstruct" in run("info", out)
 
 
-@pytest.mark.parametrize(("write", "program"), [(labels, "SLEAP"), (movement, "movement")])
+@pytest.mark.parametrize(("write", "program"), [(labels, "SLEAP"), (nwb, "NWB")])
 def test_two_views_to_the_contour(trial, tmp_path, write, program):
     line = trial[1]
     save_cameras(tmp_path / "cameras.toml", CAMERAS)
@@ -180,15 +206,37 @@ def test_points_in_space_and_one_view_of_a_plane(trial, tmp_path):
     assert np.median(np.abs(arcs)) < 3e-4
 
 
+def test_a_table_of_anipose_to_a_recording(trial, tmp_path):
+    truth, line = trial
+    points = 1e3 * line[:, 0] + np.random.default_rng(2).normal(0.0, 5e-3, line[:, 0].shape)
+    with (tmp_path / "pose-3d.csv").open("w", newline="") as file:
+        table = csv.writer(file)
+        kinds = ("x", "y", "z", "error", "ncams", "score")
+        table.writerow([*(f"w{i}_{kind}" for i in range(NODES) for kind in kinds), "fnum"])
+        for k, row in enumerate(points):
+            table.writerow([*(cell for point in row for cell in (*point, 0.4, 2, 0.98)), k])
+    _, _, command = run("info", tmp_path / "pose-3d.csv").partition("pose-3d.csv --unit mm")
+    typed = command.partition(" -o ")[0].replace("FRAMES_A_SECOND", "1000").split()
+    out = tmp_path / "t.nc"
+    run("import", tmp_path / "pose-3d.csv", "--unit", "mm", *typed, "-o", out)
+    assert np.median(errors(out, truth)) < 1.5e-4
+
+
 def test_the_frame_rate_is_asked_for_and_views_are_matched_by_name(trial, tmp_path):
     files = tables(tmp_path, {"top": trial[1][:, 0, :, :2], "front": trial[1][:, 0, :, 1:]})
     with pytest.raises(ValueError, match="--rate"):
         run("import", *files, "--pixel-size", 0.05, "-o", tmp_path / "t.nc")
     image = np.random.default_rng(5).uniform(0.0, 300.0, (4, 1, 2, 5, 2))
-    for views, order in ((("front", "top"), [1, 0]), (("left", "right"), [0, 1])):
+    for views, order, guessed in (
+        (("front", "top"), [1, 0], False),
+        (("camera_front", "camera_top"), [1, 0], False),
+        (("left", "right"), [0, 1], True),
+        (("stop", "top"), [0, 1], True),  # both hold the name of one camera
+    ):
         raw = RawTracks("test", ["w"], image=image, views=views, fps=500.0)
         found = tracker_traces(labelled(raw, "a"), CAMERAS)
         assert [camera.name for camera in found.cameras] == [CAMERAS[i].name for i in order]
+        assert any("in their order" in note for note in found.notes) == guessed
 
 
 def test_ends_and_curvature_make_an_arc():

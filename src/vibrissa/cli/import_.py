@@ -110,9 +110,9 @@ def _tracks(
         own = vb.io.recognise(path) in (vb.io.Kind.TRACKS, vb.io.Kind.RECORDING)
         parts.append(vb.load_tracks(path, **({} if own else labels)))
     if len(paths) > 1:
-        named = [camera.name for camera in cameras] if cameras else list(_VIEWS)
-        if len(paths) > len(named):
+        if cameras is None and len(paths) > len(_VIEWS):
             raise ValueError(f"{len(paths)} files of views; give the --cameras of all of them")
+        named = _VIEWS if cameras is None else [f"{path.parent.name}/{path.stem}" for path in paths]
         if any(part.sizes.get("view", 1) > 1 for part in parts):
             raise ValueError("several files must hold one view each")
         if spatial := [str(p) for p, part in zip(paths, parts, strict=True) if "trace" not in part]:

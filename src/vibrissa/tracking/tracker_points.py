@@ -91,7 +91,7 @@ def tracker_traces(
     elif "trace" in tracks:
         name = "trace_confidence" if "trace_confidence" in tracks else "confidence"
         points = _confident(tracks, "trace", name)
-        views = _views(points, tracks, cameras, pixel_size)
+        views = _views(points, tracks, cameras, pixel_size, notes)
     else:
         raise ValueError("the tracks hold neither a trace nor a centreline")
     points, known = _identified(tracks, points, notes)
@@ -149,6 +149,7 @@ def _views(
     tracks: xr.Dataset,
     cameras: Sequence[Camera] | None,
     pixel_size: float | None,
+    notes: list[str],
 ) -> tuple[Camera, ...]:
     """Cameras of the views; without calibration one or two orthogonal ones."""
     count = points.shape[2]
@@ -158,9 +159,18 @@ def _views(
             raise ValueError(
                 f"there are {len(cameras)} cameras for {count} views: {', '.join(shown)}"
             )
-        named = {camera.name: camera for camera in cameras}
-        # Files name their views in any order; names that fit no camera are in that of the cameras.
-        return tuple(named[name] for name in shown) if set(named) == set(shown) else tuple(cameras)
+        # Files name their views in any order, often after the camera: camera_top, topDLC.
+        fitting = [
+            [camera for camera in cameras if camera.name == name]
+            or [camera for camera in cameras if camera.name in name]
+            for name in shown
+        ]
+        if sorted(c.name for each in fitting for c in each) == sorted(c.name for c in cameras):
+            return tuple(each[0] for each in fitting)
+        pairs = zip(shown, cameras, strict=True)
+        listed = ", ".join(f"{name} is {camera.name}" for name, camera in pairs)
+        notes.append(f"views are not named after cameras and are taken in their order: {listed}")
+        return tuple(cameras)
     if count > 2:
         raise ValueError(f"{count} views need calibrated cameras")
     if pixel_size is None:

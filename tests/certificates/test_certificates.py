@@ -13,9 +13,11 @@ from vibrissa.certificates import (
     certify,
     check_certificate,
     checker,
+    curved_checker,
     load_certificate,
     outlook,
     prove_witness,
+    smallest_cone,
 )
 from vibrissa.certificates.certificate import prepared
 from vibrissa.certificates.equations import enclosed
@@ -36,6 +38,11 @@ def straight(ratio):
 @pytest.fixture(scope="module")
 def curved():
     return charted(vb.Whisker.parabola(length=39.4e-3, coefficient=10.0))
+
+
+@pytest.fixture(scope="module")
+def steep():
+    return charted(vb.Whisker.parabola(40e-3, 0.82 / 40e-3))
 
 
 @pytest.fixture(scope="module")
@@ -65,10 +72,25 @@ def test_a_cylinder_is_not_proved():
     assert sum(part.evaluated for part in found.parts.values()) == 0
 
 
-def test_a_curved_whisker_with_wrong_signs_is_refuted_at_once():
-    found = certify(charted(vb.Whisker.parabola(40e-3, 0.82 / 40e-3)), np.deg2rad(1.0))
+def test_a_curved_whisker_with_wrong_signs_is_refuted_at_once(steep):
+    found = certify(steep, np.deg2rad(3.0))
     assert not found.proved
-    assert "is certainly wrong" in found.refuted
+    assert "outside 7.2" in found.refuted
+    certain = prepared(steep, np.deg2rad(1.0))
+    certain.probe()
+    assert "is certainly wrong" in certain.refuted
+
+
+def test_the_smallest_cone_of_a_grid_is_that_from_where_on_no_sign_is_wrong(steep):
+    cone = smallest_cone(steep)
+    # Its determinant changes sign at 5.23°; forces begin a little within the cone.
+    assert 6.0 < np.rad2deg(cone) < 8.0
+    larger = prepared(steep, 1.01 * cone)
+    larger.probe()
+    assert not larger.refuted
+    assert outlook(steep, 0.8 * cone).failing["determinant"] > 0.0
+    with pytest.raises(ValueError, match="cones below 18"):
+        prepared(steep, np.deg2rad(19.0))
 
 
 def test_a_certificate_with_a_hole_or_a_wrong_whisker_is_noticed(theorem):
@@ -94,14 +116,48 @@ def test_an_independent_check_confirms_boxes_and_no_others(theorem, tmp_path, mo
     assert checked.confirmed == checked.boxes == 4
     # Half the force: that face is not beyond the fold.
     monkeypatch.setattr(checker, "_ROUNDS", 2)
+    forged = tmp_path / "forged.nc"
+    changed = load_certificate(path)
+    changed.bounds = changed.bounds._replace(factors=0.5 * changed.bounds.factors)
+    changed.save(forged)
+    assert check_certificate(forged, 1, parts=["fold"])[1:] == (1, 0)
     data = found.to_dataset()
-    data["factors"] = 0.5 * data["factors"]
-    write_netcdf(tmp_path / "forged.nc", data)
-    forged = check_certificate(tmp_path / "forged.nc", 1, parts=("fold",))
-    assert (forged.boxes, forged.confirmed) == (1, 0)
-    data["interior_domain"][0, 0] = 0.5
-    write_netcdf(tmp_path / "forged.nc", data)
-    assert not check_certificate(tmp_path / "forged.nc", 1, parts=("distal",)).covers
+    data["distal_domain"][0, 0] = 0.5
+    write_netcdf(forged, data)
+    assert not check_certificate(forged, 1, parts=["distal"]).covers
+    data = found.to_dataset()
+    data["factors"] = data["factors"] * 1.1
+    write_netcdf(forged, data)
+    with pytest.raises(ValueError, match="other numbers"):
+        check_certificate(forged)
+
+
+def test_an_independent_check_of_a_curved_whisker(curved, tmp_path, monkeypatch):
+    path, certificate = tmp_path / "curved.nc", prepared(curved, np.deg2rad(2.0))
+    certificate.pursue("rest", 10**4)
+    certificate.save(path)
+    whole = check_certificate(path, 2, parts=["rest"], whisker=curved.whisker)
+    assert whole == (True, 2, 2)
+    with pytest.raises(ValueError, match="another whisker"):
+        check_certificate(path, whisker=vb.samples.gamma())
+    boxes = certificate.parts["rest"].certified
+    larger = boxes.copy()
+    larger[5, 1] = larger[5, 1, 0] - 1, larger[5, 1, 1] // 2  # its parent
+    assert checker.covers(boxes)
+    assert not checker.covers(larger)
+    assert not checker.covers(np.delete(boxes, 5, axis=0))
+    data = certificate.to_dataset()
+    data.attrs["cone"] *= 0.99  # contacts that are left out are not within this one
+    write_netcdf(path, data)
+    assert not check_certificate(path, 0).covers
+    monkeypatch.setattr(checker, "_ROUNDS", 1)
+    small, large = np.array([[[10, 600], [7, 30], [6, 30]]]), np.array([[[4, 9], [1, 0], [1, 0]]])
+    for sign, box, confirmed in ((1.0, small, 1), (-1.0, small, 0), (1.0, large, 0)):
+        certificate.parts["interior"].certified = box
+        data = certificate.to_dataset()
+        data.attrs["sign"] *= sign
+        write_netcdf(path, data)
+        assert check_certificate(path, parts=["interior"]).confirmed == confirmed
 
 
 def test_verdicts_name_their_evidence(theorem):
@@ -238,8 +294,10 @@ def conditions(certificate, whisker, at):
 
 @pytest.mark.parametrize("kind", ["straight", "curved"])
 def test_enclosures_over_boxes_never_miss_a_point(curved, kind, monkeypatch):
+    """Those of the search, and those of the check of curved whiskers."""
     contact_map = curved if kind == "curved" else straight(15.0)
     certificate, rng = prepared(contact_map), np.random.default_rng(3)
+    data = certificate.to_dataset()
     keep = [0, 1, 2] if kind == "curved" else [0, 2]
     count = 7 if kind == "curved" else 5
     for half, tolerance in ((0.0, 1e-11), (2e-4, 1e-6), (2e-3, 1e-6), (1e-2, 1e-6)):
@@ -248,12 +306,17 @@ def test_enclosures_over_boxes_never_miss_a_point(curved, kind, monkeypatch):
         near[0, 0] = 0.36  # where forces are large
         ends = np.stack([near - half, near + half], axis=-1)[:, keep]
         found, _ = certificate.evaluate("interior", ends, list(range(count)))
-        for box, enclosure in zip(near, found, strict=True):
+        checks = curved_checker.wanted(data, "interior", ends) if kind == "curved" else []
+        for row, (box, enclosure) in enumerate(zip(near, found, strict=True)):
             centre, reach = enclosure[:, 0], enclosure[:, 1:].sum(axis=1)
             at = box + half * (2.0 * rng.random(3) - 1.0)
             true = conditions(certificate, contact_map.whisker, at)
             size = np.abs(centre) + 1e-3
             assert (np.abs(true - centre) <= reach + 2e-8 * size).all()
+            for value, form in zip(true, checks, strict=False):
+                spread = np.abs(form.coef[1:, row]).sum() + form.rest[row]
+                assert abs(value - form.coef[0, row]) <= spread + 2e-8 * (abs(value) + 1e-3)
+                assert spread <= (300.0 * half + 1e-5) * (abs(value) + 1.0)
             assert (reach <= (300.0 * half + 100.0 * tolerance + 3e-7) * (size + 1.0)).all()
 
 
@@ -265,11 +328,11 @@ def test_a_box_across_an_end_of_polynomials_is_not_enclosed(curved):
     assert 0.5 in certificate.stations
 
 
-def test_a_grid_shows_whether_a_certificate_can_exist(curved):
+def test_a_grid_shows_whether_a_certificate_can_exist(curved, steep):
     seen = outlook(curved, np.deg2rad(2.0))
     assert seen.possible
     assert 0.9 < np.rad2deg(seen.determinant_cone) < 1.3
-    strongly = outlook(charted(vb.Whisker.parabola(40e-3, 0.82 / 40e-3)), np.deg2rad(2.0))
+    strongly = outlook(steep, np.deg2rad(2.0))
     assert not strongly.possible
     assert strongly.failing["determinant"] > 0.0
     assert 4.9 < np.rad2deg(strongly.determinant_cone) < 5.6

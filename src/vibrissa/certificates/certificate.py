@@ -37,6 +37,7 @@ from vibrissa.certificates.conditions import (
 )
 from vibrissa.certificates.domain import Bounds, bounds_of, is_planar, room_within
 from vibrissa.certificates.equations import ExactRod, exact_rod
+from vibrissa.certificates.grid import doubt
 from vibrissa.certificates.search import bounds, cover, covers, volume
 from vibrissa.io import read_dataset, write_netcdf
 from vibrissa.numerics import Array, IntArray, share_out
@@ -462,7 +463,7 @@ def prepared(contact_map: ContactMap, cone: float = CONE) -> Certificate:
         raise ValueError("a curved whisker's certificate needs a cone about rest; got 0")
     rod = exact_rod(whisker)
     near = contact_map.chart.proximal
-    room = 0.0 if straight else room_within(rod, cone, near)
+    room = 0.0 if straight else room_within(rod, cone)
     force = bounds_of(contact_map, room)
     stations = _stations(rod, near)
     turn = float(np.nextafter(np.pi, 4.0))
@@ -536,18 +537,20 @@ def certify(
     ValueError
         If the base is compliant, or the file is a certificate of another whisker or domain.
     """
-    out = prepared(contact_map, cone)
-    if path is not None and Path(path).exists():
-        before = load_certificate(path)
-        if before.identity != out.identity:
-            raise ValueError(f"{path} is a certificate of another whisker or domain")
+    before = load_certificate(path) if path is not None and Path(path).exists() else None
+    if before is None or not sum(len(part.certified) for part in before.parts.values()):
+        out = prepared(contact_map, cone)
+        out.refuted = doubt(contact_map, cone)
+        if not out.refuted:
+            out.probe()
+    elif before.is_of(contact_map) and (before.straight or np.isclose(before.cone, cone)):
         out = before
-    if not sum(part.evaluated for part in out.parts.values()):
-        out.probe()
+    else:
+        raise ValueError(f"{path} is a certificate of another whisker or domain")
     began = saved = time.monotonic()
     spent = out.seconds
     try:
-        for name, part in out.parts.items():
+        for name, part in sorted(out.parts.items(), key=lambda one: one[0] == "interior"):
             while len(part.undecided) and not out.refuted and time.monotonic() - began <= seconds:
                 out.pursue(name, _AT_A_TIME)
                 now = time.monotonic()

@@ -1,10 +1,10 @@
-"""An independent check of a certificate's file for a straight whisker.
+"""An independent check of a certificate's file.
 
-It shares nothing with the search but the file and the lemma: another formulation (arc length in
-units of the contact's, so that the contact is at τ = 0 and the base at τ = 1, with derivatives by
-s_c at fixed τ), another arithmetic (forms of NumPy arrays, many boxes side by side, each operation
-rounded outward by itself), no symbols for remainders. It needs smaller boxes for that and halves
-those of the certificate as often as it must.
+It shares nothing with the search but the file and the lemma, and halves the boxes as often as it
+must. Curved whiskers are in :mod:`vibrissa.certificates.curved_checker`. For straight ones it has
+another formulation (arc length in units of the contact's, so that the contact is at τ = 0 and the
+base at τ = 1, with derivatives by s_c at fixed τ), another arithmetic (forms of NumPy arrays, many
+boxes side by side, each operation rounded outward by itself), no symbols for remainders.
 
 With F = f², n = f (-fρ, ν), m = fμ, q = (x, fη), w = cμ, c = b⁻⁴, b = β₀ + β₁ s_c (1 - τ):
 
@@ -13,17 +13,27 @@ With F = f², n = f (-fρ, ν), m = fμ, q = (x, fη), w = cμ, c = b⁻⁴, b =
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from vibrissa.certificates.curved_checker import (
+    CURVED_PARTS,
+    domains_fit as curved_domains_fit,
+    is_of,
+    positive as curved_positive,
+)
 from vibrissa.io import read_dataset
+
+if TYPE_CHECKING:
+    from vibrissa.whisker import Whisker
 
 Array = NDArray[np.float64]
 
@@ -147,7 +157,7 @@ class Checked(NamedTuple):
     Attributes
     ----------
     covers : bool
-        Whether the boxes of each part fill its domain, and the domains are those of the lemma.
+        Whether the boxes of each part fill its domain once, and the domains are those of the lemma.
     boxes, confirmed : int
         Numbers of boxes tried and confirmed.
     """
@@ -161,9 +171,10 @@ def check_certificate(
     path: str | PathLike[str],
     number: int | None = 16,
     seed: int = 0,
-    parts: tuple[str, ...] = PARTS,
+    parts: Sequence[str] | None = None,
+    whisker: Whisker | None = None,
 ) -> Checked:
-    """Verify a certificate of a straight whisker.
+    """Verify a certificate.
 
     Parameters
     ----------
@@ -173,8 +184,10 @@ def check_certificate(
         Number of boxes of each part that are drawn at random; None for all.
     seed : int
         Seed of the draw.
-    parts : tuple of str
-        Parts of the domain that are checked.
+    parts : sequence of str, optional
+        Parts of the domain that are checked; by default all.
+    whisker : Whisker, optional
+        Whisker that the certificate is to be of.
 
     Returns
     -------
@@ -184,14 +197,21 @@ def check_certificate(
     Raises
     ------
     ValueError
-        If the file is not a certificate of a straight whisker.
+        If the file is not a certificate, has other numbers than it was written with, or is of
+        another whisker.
     """
-    data = read_dataset(Path(path))
-    if data.attrs.get("kind") != "vibrissa certificate" or not data.attrs["straight"]:
-        raise ValueError(f"{path} is not a certificate of a straight whisker")
+    data = read_dataset(Path(path)).load()
+    if data.attrs.get("kind") != "vibrissa certificate":
+        raise ValueError(f"{path} is not a certificate")
+    if _identity(data) != data.attrs["identity"]:
+        raise ValueError(f"{path} has other numbers than those that it was written with")
+    if whisker is not None and not is_of(data, whisker):
+        raise ValueError(f"{path} is a certificate of another whisker")
+    straight = bool(data.attrs["straight"])
     rng = np.random.default_rng(seed)
-    whole, tried, held = _domains_fit(data), 0, 0
-    for part in parts:
+    whole, tried, held = _domains_fit(data) if straight else curved_domains_fit(data), 0, 0
+    positive = _positive if straight else curved_positive
+    for part in parts or (PARTS if straight else CURVED_PARTS):
         boxes = data[f"{part}_certified"].values.astype(np.int64)
         domain = data[f"{part}_domain"].values
         whole &= covers(boxes)
@@ -201,8 +221,19 @@ def check_certificate(
         for start in range(0, len(chosen), _BATCH):
             rows = boxes[chosen[start : start + _BATCH]]
             tried += len(rows)
-            held += int(_confirmed(data, part, _bounds(rows, domain)).sum())
+            bounds = _bounds(rows, domain, data["stations"].values)
+            held += int(_confirmed(data, part, bounds, positive).sum())
     return Checked(whole, tried, held)
+
+
+def _identity(data: xr.Dataset) -> str:
+    """Hash of the whisker, the bounds on the force and the domain."""
+    names = ("rod_edges", "rod_local", "rod_coefficients", "rod_twist")
+    bounds = [[data.attrs["alpha"]], data["factors"].values, [data.attrs["room"]]]
+    arrays = [*(data[name].values for name in names), *bounds]
+    arrays += [data["stations"].values, data["interior_domain"].values]
+    flat = (np.asarray(one, dtype=np.float64).tobytes() for one in arrays)
+    return hashlib.sha256(b"".join(flat)).hexdigest()[:16]
 
 
 def _domains_fit(data: xr.Dataset) -> bool:
@@ -217,8 +248,11 @@ def _domains_fit(data: xr.Dataset) -> bool:
 
 
 def covers(boxes: NDArray[np.int64]) -> bool:
-    """Whether boxes, rows of (level, index) by unknown, fill the unit cube: by halving it."""
-    unknowns = boxes.shape[1]
+    """Whether boxes, rows of (level, index) by unknown, fill the unit cube once: by halving it."""
+    unknowns, levels = boxes.shape[1], boxes[..., 0].sum(axis=1).tolist()
+    most = max(levels, default=0)
+    if sum(1 << (most - level) for level in levels) != 1 << most:
+        return False
     cells = [(np.zeros(unknowns, int), np.zeros(unknowns, int), np.arange(len(boxes)))]
     while cells:
         level, index, rows = cells.pop()
@@ -239,27 +273,30 @@ def covers(boxes: NDArray[np.int64]) -> bool:
     return True
 
 
-def _bounds(boxes: NDArray[np.int64], domain: Array) -> Array:
-    """Bounds (n, unknowns, 2), a little wider than they are."""
-    extent = domain[:, 1] - domain[:, 0]
-    low = domain[:, 0] + extent * boxes[..., 1] / 2.0 ** boxes[..., 0]
-    high = domain[:, 0] + extent * (boxes[..., 1] + 1) / 2.0 ** boxes[..., 0]
-    blur = _LOST * np.abs(domain).max(axis=1)
-    return np.stack([low - blur, high + blur], axis=-1)
+def _bounds(boxes: NDArray[np.int64], domain: Array, stations: Array) -> Array:
+    """Bounds (n, unknowns, 2), a little wider than they are; arc lengths between stations."""
+    share = (boxes[..., 1, None] + [0, 1]) / 2.0 ** boxes[..., 0, None]
+    out = domain[:, :1] + (domain[:, 1:] - domain[:, :1]) * share
+    if domain[0, 0] < domain[0, 1]:
+        out[:, 0] = np.interp(share[:, 0], np.linspace(0.0, 1.0, len(stations)), stations)
+    blur = _LOST * np.abs(domain).max(axis=1)[:, None]
+    return np.asarray(out + blur * [-1.0, 1.0])
 
 
-def _confirmed(data: xr.Dataset, part: str, bounds: Array) -> NDArray[np.bool_]:
+def _confirmed(
+    data: xr.Dataset, part: str, bounds: Array, positive: Callable[..., NDArray[np.bool_]]
+) -> NDArray[np.bool_]:
     """Whether all conditions hold on each box, halved as often as is needed."""
     owner, holds = np.arange(len(bounds)), np.ones(len(bounds), dtype=bool)
     for halved in range(_ROUNDS):
         step = _STEP * max(_SHORTER**halved, 0.25)
         batches = [bounds[i : i + _BATCH] for i in range(0, len(bounds), _BATCH)]
         with np.errstate(all="ignore"):  # where nothing is enclosed numbers grow out of bounds
-            good = np.concatenate([_positive(data, part, batch, step) for batch in batches])
+            good = np.concatenate([positive(data, part, batch, step) for batch in batches])
         owner, bounds = owner[~good], bounds[~good]
         if not len(owner):
             return holds
-        if len(bounds) > _MOST:
+        if len(bounds) > _MOST * len(holds):
             break
         for axis in range(bounds.shape[1]):
             if (bounds[:, axis, 1] - bounds[:, axis, 0] > 1e-12).any():

@@ -12,11 +12,11 @@ A contact p at s is within the cone of half angle c if f_min |∂p/∂f| ≤ `ro
 rest, r₀(s), for then |p - r₀(s)| ≤ room · s, room = √k sin c: with the nearest point r₀(s') of the
 whisker at rest, e = s - s' > 0 and its largest curvature κ ≤ π/L,
 
-    |p - r₀(s)|² ≥ |p - r₀(s')|² + e² k,    k = 1 - κD - κ²(πD)²/12,    D = L sin c ≥ |p - r₀(s')|,
+    |p - r₀(s)|² ≥ |p - r₀(s')|² + e² k,    k = 1 - κD - κ²(πD)²/12,    D = s sin c ≥ |p - r₀(s')|,
 
-as p - r₀(s') is across the whisker, the chord from s' to s is at least that of a circle (Schur)
-and leaves the tangent by κe²/2 at most, and e ≤ πD. The largest |p - r₀(s')|/s' that this leaves
-is tan c.
+as p - r₀(s') is across the whisker (s' is not its base, as e ≤ πD < s for π sin c < 1), and the
+chord from s' to s, at most 2D, is at least that of a circle (Schur) and leaves the tangent by κe²/2
+at most. The largest |p - r₀(s')|/s' that this leaves is tan c. With s ≤ L, k holds for D = L sin c.
 """
 
 from __future__ import annotations
@@ -35,7 +35,9 @@ if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
 
 # The fold is exceeded, and the cone undercut, by at least these shares.
-_BEYOND, _INSIDE = 2.5e-2, 0.12
+_BEYOND, _INSIDE = 2.5e-2, 0.03
+# Largest κ sin c: where k is zero.
+_MOST_BENT = 0.65
 _STATIONS, _BEARINGS = 40, 24
 
 
@@ -81,14 +83,16 @@ class Bounds(NamedTuple):
         )
 
 
-def room_within(rod: ExactRod, cone: float, proximal: float) -> float:
+def room_within(rod: ExactRod, cone: float) -> float:
     """Share of the arc length by which a contact may be deflected so that it is in the cone."""
     largest = np.abs(rod.coefficients[:, 1:3]).sum(axis=(2, 3)) * (1.0 + 1e-12)
     kappa, sine = float(np.hypot(*largest.T).max()), float(np.sin(cone))
-    if kappa > 3.1 or np.pi * sine > proximal:
+    limit = min(1.0 / np.pi, _MOST_BENT / max(kappa, _MOST_BENT))
+    if kappa > 3.1 or sine >= limit:
+        allowed, angle = np.rad2deg([np.arcsin(limit), cone])
         raise ValueError(
-            f"certificates are for curvatures below 3.1/L and cones below {proximal:g}/π rad; this "
-            f"whisker's curvature is up to {kappa:.3g}/L, and the cone {cone:.3g} rad"
+            f"certificates are for curvatures below 3.1/L and, of this whisker, cones below "
+            f"{allowed:.3g}°; its curvature is up to {kappa:.3g}/L, and the cone {angle:.3g}°"
         )
     k = 1.0 - kappa * sine - (kappa * np.pi * sine) ** 2 / 12.0
     return float(np.sqrt(k) * sine * (1.0 - 1e-12))

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from vibrissa.certificates.conditions import PLANAR, SPATIAL
-from vibrissa.certificates.domain import Bounds, bounds_of
+from vibrissa.certificates.domain import Bounds, bounds_of, room_within
+from vibrissa.certificates.equations import exact_rod
 from vibrissa.numerics import AnyArray, Array
 from vibrissa.rod import fold_forces, solve_forces, with_normal_force
 from vibrissa.signals import cone_angle
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
     from vibrissa.contacts import ContactMap
 
 _STATIONS, _BEARINGS, _LEVELS = 15, 24, 11
+# The grid, and the cones over that of the determinant, with which the smallest cone is looked for.
+_FINE, _SHARES = (29, 24, 21), 1.03 ** np.arange(2, 40)
 # Cone about rest within which a straight whisker's grid does not look.
 _REST = 1e-3
 # Halvings that find where the determinant changes its sign, and where rays begin.
@@ -63,21 +66,67 @@ def outlook(contact_map: ContactMap, cone: float) -> Outlook:
         Whether a certificate can exist, and outside which cone.
     """
     straight = bool(contact_map.whisker.is_straight)
-    near = contact_map.chart.proximal
-    s = np.linspace(near, 1.0, _STATIONS)
-    phi = np.array([0.0]) if straight else 2.0 * np.pi * np.arange(_BEARINGS) / _BEARINGS
-    level = np.linspace(0.0, 1.0, _LEVELS)
-    bounds = bounds_of(contact_map, float(np.sin(_REST if straight else cone)))
+    room = float(np.sin(_REST if straight else cone))
+    failing = _failing(contact_map, room, (_STATIONS, _BEARINGS, _LEVELS))
+    angle = 0.0 if straight else _determinant_cone(contact_map)
+    return Outlook(failing, not any(failing.values()), angle)
+
+
+def smallest_cone(contact_map: ContactMap) -> float:
+    """Find the smallest cone outside of which all signs are right on a grid.
+
+    Parameters
+    ----------
+    contact_map : ContactMap
+        Map of the whisker; of a rigid base.
+
+    Returns
+    -------
+    float
+        Half angle about the resting whisker, rad; infinite if there is none, 0 for a straight
+        whisker that needs none.
+    """
+    if contact_map.whisker.is_straight:
+        return 0.0 if outlook(contact_map, 0.0).possible else np.inf
+    rod = exact_rod(contact_map.whisker)
+    low = max(_determinant_cone(contact_map), _REST)
+    try:
+        for share in _SHARES:
+            failing = _failing(contact_map, room_within(rod, low * share), _FINE)
+            if not any(failing.values()):
+                return float(low * share)
+    except ValueError:  # certificates are not for larger cones
+        pass
+    return np.inf
+
+
+def doubt(contact_map: ContactMap, cone: float) -> str:
+    """What a grid shows against a certificate of a curved whisker, in words; empty if nothing."""
+    if contact_map.whisker.is_straight:
+        return ""
+    room = room_within(exact_rod(contact_map.whisker), cone)
+    wrong = [name for name, share in _failing(contact_map, room, _FINE).items() if share > 0.0]
+    if not wrong:
+        return ""
+    angle = float(np.rad2deg(smallest_cone(contact_map)))
+    fault = f"in floats the sign of the {wrong[0]} is wrong on a grid"
+    return fault + (f"; outside {angle:.3g}° all are right" if np.isfinite(angle) else "")
+
+
+def _failing(contact_map: ContactMap, room: float, shape: tuple[int, int, int]) -> dict[str, float]:
+    """Share of a grid on which each condition fails."""
+    straight, near = bool(contact_map.whisker.is_straight), contact_map.chart.proximal
+    s, level = np.linspace(near, 1.0, shape[0]), np.linspace(0.0, 1.0, shape[2])
+    phi = np.array([0.0]) if straight else 2.0 * np.pi * np.arange(shape[1]) / shape[1]
     grid = np.meshgrid(s, phi, level, indexing="ij")
-    names, signs = (PLANAR if straight else SPATIAL), _conditions(contact_map, bounds, *grid)
+    names = PLANAR if straight else SPATIAL
+    signs = _conditions(contact_map, bounds_of(contact_map, room), *grid)
     edge = (grid[0] == near) | (grid[0] == 1.0)
     wanted = np.stack([edge | (name not in _ON_FACES) for name in names])
-    failing = {
+    return {
         name: float((~(sign > 0.0) & on).sum() / on.sum())
         for name, sign, on in zip(names, signs, wanted, strict=True)
     }
-    angle = _determinant_cone(contact_map, s, phi)
-    return Outlook(failing, not any(failing.values()), angle)
 
 
 _ON_FACES = ("ratio along the load", "direction", "direction and force")
@@ -142,11 +191,11 @@ def _majority(x: AnyArray) -> float:
     return 1.0 if (x > 0.0).mean() > 0.5 else -1.0
 
 
-def _determinant_cone(contact_map: ContactMap, s: Array, phi: Array) -> float:
+def _determinant_cone(contact_map: ContactMap) -> float:
     """Largest cone angle at which the determinant has the rarer sign, along rays from rest."""
-    if contact_map.whisker.is_straight:
-        return 0.0
     d = contact_map.chart.discretization
+    s = np.linspace(contact_map.chart.proximal, 1.0, _STATIONS)
+    phi = 2.0 * np.pi * np.arange(_BEARINGS) / _BEARINGS
     stations, bearings = (a.ravel() for a in np.meshgrid(s, phi, indexing="ij"))
     unit = np.stack([stations, np.cos(bearings), np.sin(bearings)], axis=1)
     fold = fold_forces(contact_map.chart.fold, unit)

@@ -10,7 +10,7 @@ import numpy as np
 import vibrissa as vb
 from vibrissa.cli.inputs import map_from
 from vibrissa.cli.options import MapArgument, Region, check_new, with_options
-from vibrissa.cli.terminal import output, progress_bars, say, shown
+from vibrissa.cli.terminal import output, progress_bars, remark, say, shown
 
 if TYPE_CHECKING:
     from xarray import Dataset
@@ -50,13 +50,17 @@ def uniqueness(
     with progress_bars() as tell:
         certificate = None
         if certify is not None:
-            certificate = vb.certificates.certify(
-                contact_map,
-                float(np.deg2rad(cone)),
-                path=certify,
-                seconds=60.0 * minutes,
-                progress=lambda done, total: tell("certificate", done, total),
-            )
+            try:
+                certificate = vb.certificates.certify(
+                    contact_map,
+                    float(np.deg2rad(cone)),
+                    path=certify,
+                    seconds=60.0 * minutes,
+                    progress=lambda done, total: tell("certificate", done, total),
+                )
+            except KeyboardInterrupt:
+                remark(f"{certify} holds what is certain by now; the same command goes on from it")
+                raise
         tell("verdicts", 0, 1)
         found = vb.uniqueness(
             contact_map,

@@ -308,6 +308,9 @@ _TAPER, _FADES = 0.8, 4.0
 _AT_FACE, _AT_BODY, _ALONE = 1.0, 0.6, 0.35
 """Worth of a curve that begins at a face, at another body, at none."""
 
+_ACROSS, _SKIPPED = 6, 5
+"""How far across a line it is dark, pixels, and number of points that have one direction."""
+
 _TURNING = 2.0
 """Largest turn of a whisker, rad."""
 
@@ -336,15 +339,16 @@ def find_curves(
 ) -> list[Curve]:
     """Find what may be whiskers in a frame; points (n, 2) where some begin are on the face."""
     bodies, gain = scene.bodies(frame), scene.gain(frame)
-    curves = []
-    parts = segments(scene.difference(frame), bodies, options.scale)
+    curves, difference = [], scene.difference(frame)
+    parts = segments(difference, bodies, options.scale)
     for chain in joined(parts, bodies, [] if begins is None else bodies.near(begins)):
         step = np.hypot(*np.diff(chain.points, axis=0).T)
         # What is hidden at a join is not seen.
         length = float(step[step < _STEP].sum())
         if len(chain.points) >= _DIRECTION and length >= options.shortest:
             moved = scene.moved(frame, chain.points, gain)
-            both = (_begun(part, bodies, length, moved) for part in (chain, chain.reversed))
+            dark = chain._replace(strength=_darkness(difference, chain.points, options.scale))
+            both = (_begun(part, bodies, length, moved) for part in (dark, dark.reversed))
             curves += [curve for curve in both if curve is not None]
     return sorted(curves, key=lambda curve: -curve.score)
 
@@ -451,6 +455,22 @@ def _chained(found: Sequence[Segment], joins: Sequence[tuple[float, int, int]]) 
         if start <= end ^ 1:
             chains.append(Segment(*(np.concatenate(one) for one in zip(*parts, strict=True))))
     return chains
+
+
+def _darkness(difference: Image, line: Array, scale: float) -> Array:
+    """How dark each point of a line is, summed across it: more where a whisker is wider."""
+    offsets = scale * np.arange(-_ACROSS, _ACROSS + 1)
+    direction = (
+        np.gradient(line[::_SKIPPED], axis=0) if len(line) > _SKIPPED else line[-1:] - line[:1]
+    )
+    direction = np.repeat(direction, _SKIPPED, axis=0)[: len(line)]
+    normal = direction[:, ::-1] * [-1.0, 1.0]
+    normal /= np.maximum(np.hypot(*normal.T), 1e-9)[:, None]
+    points = np.rint(line[:, None] + offsets[:, None] * normal[:, None]).astype(np.intp)
+    rows, columns = difference.shape
+    grey = difference[points[..., 1].clip(0, rows - 1), points[..., 0].clip(0, columns - 1)]
+    around = np.minimum(grey[:, 0], grey[:, -1])[:, None]
+    return np.asarray(np.maximum((grey - around).sum(axis=1), 1.0), dtype=np.float64)
 
 
 def _begun(chain: Segment, bodies: Bodies, length: float, moved: float) -> Curve | None:

@@ -72,6 +72,9 @@ _LEARNED = 20
 _PROXIMAL = 30
 """Points at the beginning of a line by which it is compared with the expected one."""
 
+_TURNED = 0.87
+"""Cosine of the largest turn between frames of a whisker that is wholly seen, 30°."""
+
 _COLD = 6
 """Number of lines near a base that are traced without expectations."""
 
@@ -233,7 +236,9 @@ class Follower:
             return None
         before, last = self._before.line, self._last.line
         n = min(len(before), len(last))
-        velocity = last[:n] - before[:n]
+        # Across only: where along itself it is seen to begin varies, and moves no point of it.
+        across = np.gradient(last[:n], axis=0)[:, ::-1] * [-1.0, 1.0] / STEP
+        velocity = ((last[:n] - before[:n]) * across).sum(axis=1, keepdims=True) * across
         beyond = np.repeat(velocity[-1:], len(last) - n, axis=0)
         return np.asarray(last + np.concatenate([velocity, beyond]))
 
@@ -252,9 +257,14 @@ class Follower:
         expected = self.expected
         if expected is None or not self.long_enough(trace):
             return self.long_enough(trace)
-        n = min(len(expected), len(trace.line), _PROXIMAL)
-        away = np.linalg.norm(expected[4:n] - trace.line[4:n], axis=1)
-        return float(np.median(away)) <= self.reach
+        away = _distances(expected[:_PROXIMAL], trace.line[: 2 * _PROXIMAL])
+        if float(np.median(away[4:])) <= self.reach:
+            return True
+        # It may have turned about its base by more: then all of it is seen, and no more than that.
+        share = self.length_of(trace) / max(self.usual, 1.0)
+        turn = float(_direction(expected) @ _direction(trace.line))
+        whole = _WANTED <= share <= 1.0 / _WANTED and turn > _TURNED
+        return bool(whole and away[0] <= self.options.jump)
 
     def accept(self, trace: Trace) -> Trace:
         """Take a trace for the whisker in the next frame; less confident if it is short."""
@@ -355,9 +365,10 @@ class Follower:
         return found
 
     def _worth(self, trace: Trace) -> float:
-        """Length that is seen, less the farther from where it is to begin."""
+        """Length that is seen, less the farther from where it is to begin, and the longer."""
         away = float(np.linalg.norm(trace.line[0] - self.base)) / _CLICK
-        return trace.support * float(np.exp(-0.5 * away**2))
+        longer = _WANTED * trace.support / self.usual if self.usual else 1.0
+        return trace.support * float(np.exp(-0.5 * away**2)) / max(longer, 1.0) ** 2
 
     def _march(
         self,
@@ -409,11 +420,21 @@ def _repeats(line: Array, other: Array) -> bool:
     return not far and len(line) > 1 and overlap(line, other, _REPEATED) == 1.0
 
 
+def _direction(line: Array) -> Array:
+    """Unit vector in which a line begins."""
+    chord = line[min(_PROXIMAL, len(line) - 1)] - line[0]
+    return np.asarray(chord / max(float(np.hypot(*chord)), 1e-9))
+
+
 def _alike(line: Array, other: Array) -> bool:
     """Whether two lines begin in the same way."""
     n = min(len(line), len(other), 2 * _PROXIMAL)
-    distance = np.linalg.norm(line[n // 3 : n, None] - other[None, : n + 5], axis=2).min(axis=1)
-    return bool(np.median(distance) < 2.0)
+    return bool(np.median(_distances(line[n // 3 : n], other[: n + 5])) < 2.0)
+
+
+def _distances(line: Array, other: Array) -> Array:
+    """Distance of each point of a line from the nearest one of another, pixels."""
+    return np.asarray(np.linalg.norm(line[:, None] - other[None], axis=2).min(axis=1))
 
 
 def start_at(base: ArrayLike, options: TraceOptions | None = None) -> Follower:

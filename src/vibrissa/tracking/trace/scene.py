@@ -75,8 +75,13 @@ _OPAQUE, _SEEN = 0.5, 1
 """Share of the light below which nothing is seen before a still thing, and how far from there a
 whisker's middle must be, pixels."""
 
-_AT_BASE = 25.0
-"""Distance from a base within which a still thing is taken to be the face, pixels."""
+_AT_BASE, _CLOSE = 25.0, 6.0
+"""Distance from a base within which a still thing is taken to be the face, and within which a still
+line may be the whisker, pixels."""
+
+_RIM, _ONE_SIDE = 4, 0.8
+"""How far a still body is seen around it, pixels, and mean of the directions to a line's points
+from which it begins at a base, as a resting whisker does, and does not pass it."""
 
 _DEEP, _COVERED = 45.0, 0.98
 """Distance within which a body covers such a share of all around a base that is before it."""
@@ -205,13 +210,7 @@ class Scene:
 
     def with_still(self, bases: Array) -> Scene:
         """Find what never moves, if it is known, but for what whiskers begin at (n, 2)."""
-        from scipy.ndimage import (
-            binary_dilation,
-            binary_erosion,
-            find_objects,
-            gaussian_filter,
-            label,
-        )
+        from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter, label
 
         if self.background is None or self.count < _MANY:
             return self
@@ -223,7 +222,12 @@ class Scene:
         weight, light = (gaussian_filter(one, _AROUND) for one in (known, known * shown))
         open_ = np.where(weight > _ENOUGH, light / np.maximum(weight, 1e-6), ground)
         parts, _ = label(stands)
-        # The face moves, with whatever hangs on it; but a base far inside a body is before that.
+        thick = binary_erosion(stands, iterations=_BLUR + _THICK)
+        wide = binary_dilation(thick, iterations=_BLUR + _THICK + _RIM)
+        bodies, lines = label(wide & stands)[0], label(stands & ~wide)[0]
+        across = np.isin(lines, _long(lines))
+        # The face moves, with whatever hangs on it, but not a line that only passes the base, nor
+        # what a base far inside a body is before.
         row, column = (np.arange(n) for n in stands.shape)
         lifted = np.zeros_like(stands)
         for x, y in bases:
@@ -231,13 +235,14 @@ class Scene:
             at_base = np.isin(parts, np.unique(parts[(away < _AT_BASE) & stands]))
             if stands[away < _DEEP].mean() > _COVERED:
                 lifted |= at_base
-            else:
-                stands &= ~at_base
+                continue
+            for k in np.unique(lines[(away < _AT_BASE) & across]):
+                if _begins(np.argwhere(lines == k)[:, ::-1] - [x, y]):
+                    across &= lines != k
+            other = (bodies > 0) & ~np.isin(bodies, np.unique(bodies[away < _AT_BASE]))
+            stands &= ~at_base | across | other
         # Where whiskers cross or turn it is always dark too, though not over a long way.
-        thick = binary_erosion(stands, iterations=_BLUR + _THICK)
-        boxes = enumerate(find_objects(parts), 1)
-        long = [k for k, box in boxes if max(side.stop - side.start for side in box) >= _LONG]
-        stands &= np.isin(parts, long) | np.isin(parts, np.unique(parts[thick]))
+        stands &= np.isin(parts, _long(parts)) | np.isin(parts, np.unique(parts[thick]))
         at = np.flatnonzero(stands)
         factor = (open_ / shown).ravel()[at]
         dark = stands & (shown < _OPAQUE * open_) & ~lifted
@@ -282,6 +287,23 @@ class Still:
         grey = np.where(self.opaque, gain * self.open, self.factor * flat[self.at])
         flat[self.at] = np.minimum(grey + 0.5, most).astype(frame.dtype)
         return out
+
+
+def _long(labels: Any) -> list[int]:
+    """Numbers of the parts that are long enough for a still line."""
+    from scipy.ndimage import find_objects
+
+    boxes = enumerate(find_objects(labels), 1)
+    return [k for k, box in boxes if max(side.stop - side.start for side in box) >= _LONG]
+
+
+def _begins(away: Array) -> bool:
+    """Whether a still line, by its points (n, 2) from a base, may be a whisker that rests."""
+    far = np.hypot(*away.T)
+    nearest = away[far.argmin()]
+    ways = away - nearest
+    ways = ways / np.maximum(np.hypot(*ways.T), 1.0)[:, None]
+    return bool(far.min() < _CLOSE or np.hypot(*ways.mean(axis=0)) > _ONE_SIDE)
 
 
 def _gain(sparse: Any, usual: Any) -> float:

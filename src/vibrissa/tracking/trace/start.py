@@ -361,25 +361,24 @@ class _Vote(NamedTuple):
 
 def _voted(found: Sequence[Sequence[_Combination]]) -> _Vote:
     """Choose the bases that outweigh all others over all frames."""
-    every = [one for row in found for one in row[:3]]
-    if not every:
-        return _Vote([], 0.0, (0, len(found)))
+    left = [list(row) for row in found]
 
     def supporters(center: _Combination) -> list[_Combination]:
-        near = ([one for one in row if _near(one, center)][:1] for row in found)
+        near = ([one for one in row if _near(one, center)][:1] for row in left)
         return [one for first in near for one in first]
 
     ranked: list[list[_Combination]] = []
-    left = every
-    while left and len(ranked) < _SHOWN:
-        best = max(left, key=lambda one: sum(other.worth for other in supporters(one)))
+    while any(left) and len(ranked) < _SHOWN:
+        firsts = (one for row in left for one in row[:3])
+        best = max(firsts, key=lambda one: sum(other.worth for other in supporters(one)))
         ranked.append(supporters(best))
-        left = [one for one in left if not _near(one, best)]
+        left = [[one for one in row if not _near(one, best)] for row in left]
+    if not ranked:
+        return _Vote([], 0.0, (0, len(found)))
     winners = ranked[0]
     total, *rest = (sum(one.worth for one in row) for row in ranked)
     rival = max(rest, default=0.0)
-    firsts = [row[0] for row in found if row]
-    agreed = sum(any(one is first for first in firsts) for one in winners)
+    agreed = sum(any(one is row[0] for row in found if row) for one in winners)
     # A whisker that leaves out what a view shows best is in doubt, whatever the others show.
     share = min(1.0, 2.0 * float(np.median([one.share for one in winners])))
     gap = float(np.median([one.gap for one in winners]))

@@ -6,7 +6,9 @@ import pytest
 from vibrissa.status import Status
 from vibrissa.tracking import Trace, TraceOptions, find_whiskers, trace_video
 from vibrissa.tracking.trace import ridge
+from vibrissa.tracking.trace.curves import find_curves
 from vibrissa.tracking.trace.ridge import traced
+from vibrissa.tracking.trace.scene import Scene
 
 
 @pytest.fixture(scope="module")
@@ -153,6 +155,69 @@ def test_what_is_done_is_gone_on_with_as_if_it_never_stopped(filmed):
     assert len(found[0][-1].line)
     with pytest.raises(ValueError, match="show no whisker"):
         trace_video(frames, begun=[lost])
+
+
+def tapered(angle, base=(60.0, 100.0), length=110.0, wide=1.2, wire=None, seed=0, size=200):
+    """A tapered line that leaves a dark face to the right, and a still wire across at a column."""
+    y, x = np.mgrid[:size, :size].astype(float)
+    along = (x - base[0]) * np.cos(angle) + (y - base[1]) * np.sin(angle)
+    across = (y - base[1]) * np.cos(angle) - (x - base[0]) * np.sin(angle)
+    width = wide * np.clip(1.0 - 0.8 * along / length, 0.05, 1.0)
+    grey = 190.0 - 140.0 * ((along > -5.0) & (along < length)) * np.exp(
+        -0.5 * (across / width) ** 2
+    )
+    if wire is not None:
+        grey = np.minimum(grey, 190.0 - 130.0 * np.exp(-0.5 * ((x - wire - 0.1 * y) / 1.2) ** 2))
+    grey = np.where(x < base[0], 30.0, grey)
+    noise = np.random.default_rng(seed).normal(0.0, 2.0, grey.shape)
+    return np.clip(np.rint(grey + noise), 0, 255).astype(np.uint8)
+
+
+def shown_along(trace, angle, base=(60.0, 100.0)):
+    """How far its points are from a line, and from where to where they are along it, pixels."""
+    away = trace.line - base
+    along = away @ [np.cos(angle), np.sin(angle)]
+    return np.abs(away @ [-np.sin(angle), np.cos(angle)]).max(), along.min(), along.max()
+
+
+def test_a_whisker_that_turns_by_20_degrees_a_frame_is_followed():
+    angles = np.radians([0.0, 20.0, 0.0, -20.0, 0.0, 20.0])
+    frames = [tapered(angle, seed=i) for i, angle in enumerate(angles)]
+    (row,) = trace_video(frames, [(60.0, 100.0)])
+    for trace, angle in zip(row, angles, strict=True):
+        away, first, last = shown_along(trace, angle)
+        assert away < 1.0
+        assert first < 5.0
+        assert last > 80.0
+
+
+def test_a_still_wire_before_the_face_draws_no_trace_away():
+    """It passes the base at ten pixels and hangs on the face as the whisker does."""
+    angles = 0.25 * np.sin(np.arange(20.0))
+    frames = [tapered(angle, wire=62.0, seed=i) for i, angle in enumerate(angles)]
+    (row,) = trace_video(frames, [(60.0, 100.0)])
+    for trace, angle in zip(row, angles, strict=True):
+        away, first, last = shown_along(trace, angle)
+        assert away < 2.0
+        assert first < 6.0
+        assert last > 80.0
+
+
+def test_a_whisker_that_rests_is_not_divided_out():
+    frames = [tapered(0.1, seed=i) for i in range(20)]
+    (row,) = trace_video(frames, [(60.0, 100.0)])
+    assert min(trace.support for trace in row) > 80.0
+
+
+@pytest.mark.parametrize("wide", [0.8, 1.5, 4.0])
+def test_a_whisker_begins_at_its_wide_end(wide):
+    """Also where it is wider than what lines are smoothed by, which makes its base fainter."""
+    frame = tapered(0.2, wide=wide)
+    curves = find_curves(frame, Scene.of([frame]), TraceOptions())
+    (forward,) = [one for one in curves if one.from_face]
+    others = [one.score for one in curves if not one.from_face]
+    assert forward.length > 70.0
+    assert forward.score > 2.0 * max(others)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -460,10 +460,7 @@ def _chained(found: Sequence[Segment], joins: Sequence[tuple[float, int, int]]) 
 def _darkness(difference: Image, line: Array, scale: float) -> Array:
     """How dark each point of a line is, summed across it: more where a whisker is wider."""
     offsets = scale * np.arange(-_ACROSS, _ACROSS + 1)
-    direction = (
-        np.gradient(line[::_SKIPPED], axis=0) if len(line) > _SKIPPED else line[-1:] - line[:1]
-    )
-    direction = np.repeat(direction, _SKIPPED, axis=0)[: len(line)]
+    direction = np.repeat(np.gradient(line[::_SKIPPED], axis=0), _SKIPPED, axis=0)[: len(line)]
     normal = direction[:, ::-1] * [-1.0, 1.0]
     normal /= np.maximum(np.hypot(*normal.T), 1e-9)[:, None]
     points = np.rint(line[:, None] + offsets[:, None] * normal[:, None]).astype(np.intp)

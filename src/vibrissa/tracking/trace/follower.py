@@ -254,17 +254,18 @@ class Follower:
 
     def _belongs(self, trace: Trace) -> bool:
         """Whether a trace is long enough, and where the whisker may be."""
-        expected = self.expected
-        if expected is None or not self.long_enough(trace):
+        expected, last = self.expected, self.last
+        if expected is None or last is None or not self.long_enough(trace):
             return self.long_enough(trace)
-        away = _distances(expected[:_PROXIMAL], trace.line[: 2 * _PROXIMAL])
-        if float(np.median(away[4:])) <= self.reach:
+        away = _distances(expected[4:_PROXIMAL], trace.line[: 2 * _PROXIMAL])
+        if float(np.median(away)) <= self.reach:
             return True
         # It may have turned about its base by more: then all of it is seen, and no more than that.
         share = self.length_of(trace) / max(self.usual, 1.0)
-        turn = float(_direction(expected) @ _direction(trace.line))
+        turn = float(_direction(last) @ _direction(trace.line))
+        base = _distances(last[:1], trace.line[:_PROXIMAL])[0]
         whole = _WANTED <= share <= 1.0 / _WANTED and turn > _TURNED
-        return bool(whole and away[0] <= self.options.jump)
+        return bool(whole and base <= self.options.jump)
 
     def accept(self, trace: Trace) -> Trace:
         """Take a trace for the whisker in the next frame; less confident if it is short."""

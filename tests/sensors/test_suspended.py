@@ -237,6 +237,22 @@ def test_drift_between_recordings_is_in_the_covariance():
         replace(sensor, drift=[1.0, 2.0])
 
 
+def test_an_error_that_all_readings_share_moves_contacts_as_their_shared_errors_state():
+    base, _, _, bent = swept()
+    sensor, readings, on = read_by_spring(bent)
+    found = follow_sweep(sensor, readings, base)
+    both = found.in_contact & on
+    moved = follow_sweep(sensor, readings + 10.0 * on[:, None] * np.array([1.0, -1.0, 1.0]), base)
+    away = (moved.points - found.points)[both].ravel()
+    shared = found.shared[:, both].reshape(len(found.shared), -1)
+    amount = np.linalg.lstsq(shared.T, away, rcond=None)[0]
+    assert np.linalg.norm(away - amount @ shared) < 0.3 * np.linalg.norm(away)
+    assert np.abs(amount).max() < 3.0  # standard deviations
+    own = found.covariance - np.einsum("mka,mkb->kab", found.shared, found.shared)
+    assert np.linalg.eigvalsh(own[both]).min() > -1e-6 * np.abs(found.covariance[both]).max()
+    assert not found.shared[:, ~found.in_contact].any()
+
+
 def test_with_many_touches_a_process_takes_what_the_rod_leaves():
     at = points(110)
     readings = TRUE.read(at, seed=3)[0]

@@ -19,7 +19,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import LinAlgError, solveh_banded
+from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded, solveh_banded
+from scipy.sparse.linalg import LinearOperator, eigsh
 
 from vibrissa.numerics import AnyArray, Array
 from vibrissa.sensors.suspended import SuspendedWhisker, Touches
@@ -37,6 +38,10 @@ _STARTS = (0.45, 0.65, 0.85)
 _ROUNDS, _ENOUGH = 40, 1e-4
 _MOST_STEP = 0.1
 _LEAST_ARC = 0.05
+_HELD = 1e12
+"""Factor on the Hessian's diagonal that holds an arc length at the end of its range."""
+_SHARED = 9
+"""Errors of a touch that are stated as shared: of its three channels level, slope and bend."""
 
 
 class SweptContacts(NamedTuple):
@@ -56,6 +61,9 @@ class SweptContacts(NamedTuple):
         Whether the whisker touches.
     bias : (n, k) array
         Errors of the model that were found, in the channels' units.
+    shared : (m, n, 3) array
+        Shifts of all points, m, by one standard deviation of each of the errors that samples of a
+        touch share; they are part of the covariance.
     """
 
     points: Array
@@ -64,6 +72,7 @@ class SweptContacts(NamedTuple):
     arc_length: Array
     in_contact: AnyArray
     bias: Array
+    shared: Array
 
 
 def follow_sweep(
@@ -121,6 +130,7 @@ def follow_sweep(
         np.full(n, np.nan),
         np.zeros(n, dtype=bool),
         np.full((n, k), np.nan),
+        np.zeros((0, n, 3)),
     )
     edges = np.flatnonzero(np.diff(np.concatenate([[False], touching, [False]]).astype(int)))
     for first, last in edges.reshape(-1, 2):
@@ -128,8 +138,11 @@ def follow_sweep(
             continue
         rows = slice(first, last)
         touch = _Touch(sensor, change[rows] + sensor.readout[:, 0], base[rows], turn[rows])
-        for mine, found in zip(out, touch.contacts(), strict=True):
+        *each, errors = touch.contacts()
+        for mine, found in zip(out[:-1], each, strict=True):
             mine[rows] = found
+        around = ((0, 0), (first, n - last), (0, 0))
+        out = out._replace(shared=np.concatenate([out.shared, np.pad(errors, around)]))
     return out
 
 
@@ -142,8 +155,6 @@ class _State(NamedTuple):
     points: Array
     misfit: Array
     slopes: Array
-    metric: Array
-    cost: float
 
 
 class _Touch:
@@ -155,22 +166,24 @@ class _Touch:
         noise = sensor.uncertainty
         self.weight = 1.0 / (WHITE * noise) ** 2
         moved = np.linalg.norm(np.diff(self.base, axis=0), axis=1) + _LEAST_STEP
-        self.kept = np.exp(-moved * sensor.length / PERSISTENCE)
+        self.kept = np.exp(-moved * sensor.length / PERSISTENCE)[:, None]
         self.first = 1.0 / (BIAS * noise) ** 2
-        self.change = self.first / (1.0 - self.kept**2)[:, None]
+        self.change = self.first / (1.0 - self.kept**2)
         self.normal, self.sliding = 1.0 / (NORMAL * moved) ** 2, 1.0 / (SLIDING * moved) ** 2
 
-    def state(self, contacts: Array, bias: Array, metric: Array | None = None) -> _State:
-        """Evaluate unknowns; without a metric the one of these contacts' normals."""
+    def state(self, contacts: Array, bias: Array) -> _State:
+        """Evaluate unknowns."""
         touches = self.sensor.touches(contacts)
         points = self.base + (self.turn @ touches.points[:, :, None])[:, :, 0]
         values, slopes = self.sensor.readings(touches)
-        misfit = values + bias - self.readings
-        used = self.metric(touches) if metric is None else metric
-        step, drift = np.diff(points, axis=0), bias[1:] - self.kept[:, None] * bias[:-1]
-        cost = (misfit**2 * self.weight).sum() + (bias[0] ** 2 * self.first).sum()
-        cost += np.einsum("ki,kij,kj->", step, used, step) + (drift**2 * self.change).sum()
-        return _State(contacts, bias, touches, points, misfit, slopes, used, float(cost))
+        return _State(contacts, bias, touches, points, values + bias - self.readings, slopes)
+
+    def cost(self, at: _State, metric: Array) -> float:
+        """What is minimised, with the weights of the steps."""
+        step, drift = np.diff(at.points, axis=0), at.bias[1:] - self.kept * at.bias[:-1]
+        cost = (at.misfit**2 * self.weight).sum() + (at.bias[0] ** 2 * self.first).sum()
+        cost += np.einsum("ki,kij,kj->", step, metric, step) + (drift**2 * self.change).sum()
+        return float(cost)
 
     def normals(self, touches: Touches) -> Array:
         """Directions of the forces, laboratory frame."""
@@ -187,40 +200,48 @@ class _Touch:
             self.normal[:, None, None] * along + self.sliding[:, None, None] * (np.eye(3) - along)
         )
 
-    def system(self, at: _State) -> tuple[Array, Array]:
-        """Gradient (n, m) and banded Hessian of half the cost, by contacts and bias."""
+    def system(self, at: _State, metric: Array) -> tuple[Array, Array]:
+        """Gradient (n, m) and banded Hessian of half the cost, by contacts and bias.
+
+        An arc length at an end of its range that the gradient drives outwards is held there.
+        """
         n, k = at.bias.shape
         size = 3 + k
         point = self.turn @ at.touches.point_slopes
         both = np.concatenate([at.slopes, np.broadcast_to(np.eye(k), (n, k, k))], axis=2)
         gradient = np.einsum("kai,a,ka->ki", both, self.weight, at.misfit)
         own = np.einsum("kai,a,kaj->kij", both, self.weight, both)
-        pull = (at.metric @ np.diff(at.points, axis=0)[:, :, None])[:, :, 0]
+        pull = (metric @ np.diff(at.points, axis=0)[:, :, None])[:, :, 0]
         gradient[1:, :3] += np.einsum("kji,kj->ki", point[1:], pull)
         gradient[:-1, :3] -= np.einsum("kji,kj->ki", point[:-1], pull)
-        after, before = at.metric @ point[1:], at.metric @ point[:-1]
+        after, before = metric @ point[1:], metric @ point[:-1]
         own[1:, :3, :3] += np.swapaxes(point[1:], 1, 2) @ after
         own[:-1, :3, :3] += np.swapaxes(point[:-1], 1, 2) @ before
         cross = np.zeros((n - 1, size, size))
         cross[:, :3, :3] = -np.swapaxes(point[1:], 1, 2) @ before
-        drift = (at.bias[1:] - self.kept[:, None] * at.bias[:-1]) * self.change
+        drift = (at.bias[1:] - self.kept * at.bias[:-1]) * self.change
         gradient[0, 3:] += at.bias[0] * self.first
         gradient[1:, 3:] += drift
-        gradient[:-1, 3:] -= self.kept[:, None] * drift
+        gradient[:-1, 3:] -= self.kept * drift
         i = np.arange(3, size)
         own[0, i, i] += self.first
         own[1:, i, i] += self.change
-        own[:-1, i, i] += self.kept[:, None] ** 2 * self.change
-        cross[:, i, i] = -self.kept[:, None] * self.change
+        own[:-1, i, i] += self.kept**2 * self.change
+        cross[:, i, i] = -self.kept * self.change
+        s, pushed = at.contacts[:, 0], gradient[:, 0]
+        held = ((s >= 1.0) & (pushed < 0.0)) | ((s <= _LEAST_ARC) & (pushed > 0.0))
+        gradient[held, 0] = 0.0
+        own[held, 0, 0] *= _HELD
         return gradient, _banded(own, cross)
 
-    def minimise(self, start: float) -> _State:
-        """Least cost from contacts at some arc length."""
+    def minimise(self, start: float) -> tuple[_State, Array, float]:
+        """Least cost from contacts at some arc length, and the weights of the steps there."""
         n, k = self.readings.shape
-        light = np.tile([start, 1e-3, 1e-3], (n, 1))
-        at, damping = self.state(light, np.zeros((n, k))), 1e-2
+        at, damping = self.state(np.tile([start, 1e-3, 1e-3], (n, 1)), np.zeros((n, k))), 1e-2
         for _ in range(_ROUNDS):
-            gradient, band = self.system(at)
+            metric = self.metric(at.touches)
+            cost = self.cost(at, metric)
+            gradient, band = self.system(at, metric)
             while damping < 1e8:
                 damped = band.copy()
                 damped[0] *= 1.0 + damping
@@ -232,32 +253,32 @@ class _Touch:
                 step /= max(np.abs(step[:, 0]).max() / _MOST_STEP, 1.0)
                 contacts = at.contacts + step[:, :3]
                 contacts[:, 0] = np.clip(contacts[:, 0], _LEAST_ARC, 1.0)
-                new = self.state(contacts, at.bias + step[:, 3:], at.metric)
-                if new.cost < at.cost:
+                new = self.state(contacts, at.bias + step[:, 3:])
+                if (after := self.cost(new, metric)) < cost:
                     break
                 damping *= 10.0
             else:
                 break
-            gain, damping = at.cost - new.cost, max(0.1 * damping, 1e-9)
-            at = self.state(new.contacts, new.bias)
-            if gain < _ENOUGH * at.cost:
+            at, damping = new, max(0.1 * damping, 1e-9)
+            if cost - after < _ENOUGH * cost:
                 break
-        return at
+        metric = self.metric(at.touches)
+        return at, metric, self.cost(at, metric)
 
     def contacts(self) -> SweptContacts:
         """Most probable contacts."""
-        at = min((self.minimise(start) for start in _STARTS), key=lambda one: one.cost)
-        _, band = self.system(at)
-        n, k = at.bias.shape
-        spread = _inverse_blocks(band, 3 + k)[:, :3, :3]
+        at, metric, _ = min(map(self.minimise, _STARTS), key=lambda one: one[2])
+        root = cholesky_banded(self.system(at, metric)[1], lower=True)
         point = self.turn @ at.touches.point_slopes * self.sensor.length
+        spread = _inverse_blocks(root, len(point))[:, :3, :3]
         return SweptContacts(
             at.points * self.sensor.length,
             point @ spread @ np.swapaxes(point, 1, 2),
             self.normals(at.touches),
             at.contacts[:, 0] * self.sensor.length,
-            np.ones(n, dtype=bool),
+            np.ones(len(point), dtype=bool),
             at.bias,
+            _largest_errors(root, point),
         )
 
 
@@ -273,10 +294,29 @@ def _banded(own: Array, cross: Array) -> Array:
     return band
 
 
-def _inverse_blocks(band: Array, size: int) -> Array:
-    """Diagonal blocks of the inverse of a banded matrix."""
-    n = band.shape[1]
-    unit = np.eye(n)
-    inverse = solveh_banded(band, unit, lower=True)
-    index = np.arange(n).reshape(-1, size)
-    return np.asarray(inverse[index[:, :, None], index[:, None, :]])
+def _inverse_blocks(root: Array, n: int) -> Array:
+    """Diagonal blocks of (L Lᵀ)⁻¹, from the last, of the band of a block-bidiagonal L."""
+    size = len(root) // 2
+    i, j = np.indices((size, size))
+    columns = size * np.arange(n)[:, None, None] + j
+    back = np.linalg.inv(np.where(i >= j, root[np.maximum(i - j, 0), columns], 0.0))
+    below = root[size + i - j, columns] @ back
+    out = np.swapaxes(back, 1, 2) @ back
+    for k in range(n - 2, -1, -1):
+        out[k] += below[k].T @ out[k + 1] @ below[k]
+    return np.asarray(out)
+
+
+def _largest_errors(root: Array, point: Array) -> Array:
+    """Shifts of all points by the largest errors that they share, one standard deviation each."""
+    n = len(point)
+
+    def spread(vector: Array) -> Array:
+        full = np.zeros((n, len(root) // 2))
+        full[:, :3] = np.einsum("kai,ka->ki", point, vector.reshape(n, 3))
+        full = cho_solve_banded((root, True), full.ravel()).reshape(n, -1)
+        return np.asarray(np.einsum("kai,ki->ka", point, full[:, :3]).ravel())
+
+    joint = LinearOperator((3 * n, 3 * n), matvec=spread, dtype=np.float64)
+    size, shifts = eigsh(joint, k=_SHARED, v0=np.ones(3 * n))
+    return np.asarray((np.sqrt(np.maximum(size, 0.0)) * shifts).T.reshape(_SHARED, n, 3))

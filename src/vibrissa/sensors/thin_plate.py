@@ -89,10 +89,12 @@ class ThinPlate:
         slopes : (n, k, 3) array
             Derivatives by the point, 1/m.
         """
-        away = points[:, None, :] - self.points
-        x = np.minimum(np.linalg.norm(away, axis=2) / self.reach, 1.0)
+        x = np.minimum(cdist(points, self.points) / self.reach, 1.0)
         by_square = 6.0 * (x - 1.0) / self.reach**2  # (dk/dx) / (x R²)
-        slopes = np.einsum("nm,nma,mk->nka", by_square, away, self.weights, optimize=True)
+        n, k = len(points), self.weights.shape[1]
+        moments = self.weights[:, :, None] * self.points[:, None, :]
+        slopes = (by_square @ self.weights)[:, :, None] * points[:, None, :]
+        slopes -= (by_square @ moments.reshape(-1, 3 * k)).reshape(n, k, 3)
         return np.asarray(_kernel(x) @ self.weights), slopes
 
 

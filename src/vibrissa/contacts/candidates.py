@@ -14,8 +14,15 @@ from typing import NamedTuple
 import numpy as np
 
 from vibrissa.contacts.contacts import MOST_CANDIDATES, Candidates
-from vibrissa.contacts.inversion import PARTS, invert_rows, nearest_of
-from vibrissa.contacts.least_squares import Fits, channel_equations, fit_rows, same_contact
+from vibrissa.contacts.inversion import invert_rows
+from vibrissa.contacts.least_squares import (
+    Fits,
+    channel_equations,
+    fit_rows,
+    same_contact,
+    stable_fit,
+)
+from vibrissa.contacts.nodes import PARTS, Searched, nearest_of
 from vibrissa.contacts.noise import INDISTINCT
 from vibrissa.contacts.weighing import Weighing, weigh
 from vibrissa.numerics import Array, IntArray, copy, inlined, kernel
@@ -25,17 +32,13 @@ from vibrissa.rod import (
     LEAST_ARC,
     MOST_SEEDS,
     ROUNDING,
-    Fold,
     Rod,
-    SearchTree,
     chart_to_contact,
     evaluate,
     integrate,
     lane_value,
-    point_determinant,
     seeds,
     set_lane,
-    stable,
 )
 from vibrissa.status import Status
 
@@ -54,30 +57,6 @@ _FORCE = 1e-6
 # Row by row: x (n, 4), (F, p) (n, 6), ∂(F, p)/∂x (n, 6, 4), χ² (n,), and where a fit ended (n,):
 # 2 on the map, 1 nearer to the base, 0 nowhere.
 State = tuple[Array, Array, Array, Array, IntArray]
-
-
-class Searched(NamedTuple):
-    """What is searched, non-dimensional.
-
-    The chart's nodes lie in blocks: ``blocks`` (n + 1,) has where each begins, ``extent`` (2, q, n)
-    middle and half width of what is seen in it.
-    """
-
-    rod: Rod
-    fold: Fold
-    proximal: float
-    tree: SearchTree
-    where: IntArray
-    codes: Array
-    contacts: Array
-    values: Array
-    seen: Array
-    turns: Array
-    kinds: IntArray
-    part: IntArray
-    volume: Array
-    blocks: IntArray
-    extent: Array
 
 
 class Problem(NamedTuple):
@@ -145,6 +124,7 @@ def explain_rows(
                 status[row] = _OUTSIDE
 
 
+@kernel
 def solve_rows(
     of: Searched,
     targets: Array,
@@ -154,40 +134,27 @@ def solve_rows(
     first: int,
     last: int,
 ) -> None:
-    """Find the contacts that give three signals exactly."""
+    """Find the contacts that give three signals exactly; NaN rows are left alone."""
     n = last - first
     aims, xi = np.empty((n, 6)), np.empty((n, MOST_CANDIDATES, 3))
-    number, values = out.number[first:last], out.values[first:last]
-    _aim_rows(of.where, of.codes, targets[first:last], measured[first:last], aims)
-    invert_rows(of.rod, of.fold, of.tree, of.proximal, aims, number, xi, values, 0, n)
-    _keep_rows(number, xi, aims, out.x[first:last], out.chi_squared[first:last], status[first:last])
-
-
-@kernel
-def _aim_rows(where: IntArray, codes: Array, targets: Array, measured: Array, aims: Array) -> None:
-    """Write the three measured signals and the codes of the cells that may hold them."""
-    for i in range(len(targets)):
-        known = finite(targets[i])
+    for i in range(n):
+        row, known = first + i, finite(targets[first + i])
         for k in range(3):
-            aims[i, k] = measured[i, where[k]] if known else np.nan
-            aims[i, 3 + k] = codes[k]
-
-
-@kernel
-def _keep_rows(
-    number: IntArray, xi: Array, aims: Array, x: Array, chi: Array, status: IntArray
-) -> None:
-    """Write solutions as candidates that explain the signals exactly."""
-    for i in range(len(number)):
+            aims[i, k] = measured[row, of.where[k]] if known else np.nan
+            aims[i, 3 + k] = of.codes[k]
+    number, values = out.number[first:last], out.values[first:last]
+    invert_rows(of.rod, of.fold, of.tree, of.proximal, aims, number, xi, values, 0, n)
+    for i in range(n):
         if aims[i, 0] != aims[i, 0]:
             continue
+        row = first + i
         for c in range(number[i]):
-            x[i, c, 0], x[i, c, 1] = xi[i, c, 0], 0.0
-            x[i, c, 2], x[i, c, 3] = xi[i, c, 1], xi[i, c, 2]
-            chi[i, c] = 0.0
-        status[i] = UNEXPLAINED
+            x = out.x[row, c]
+            x[0], x[1], x[2], x[3] = xi[i, c, 0], 0.0, xi[i, c, 1], xi[i, c, 2]
+            out.chi_squared[row, c] = 0.0
+        status[row] = UNEXPLAINED
         if number[i] > 0:
-            status[i] = _UNIQUE if number[i] == 1 else _AMBIGUOUS
+            status[row] = _UNIQUE if number[i] == 1 else _AMBIGUOUS
 
 
 @inlined
@@ -296,17 +263,11 @@ def _fitted(
 @inlined
 def _where(of: Searched, x: Array, tangents: Array, misfit: float) -> int:
     """Whether a fit is on the map, 2, nearer to the base, 1, or neither, 0."""
-    xi, by_xi = np.empty(3), np.empty((6, 3))
-    xi[0], xi[1], xi[2] = x[0], x[2], x[3]
-    for a in range(6):
-        t = tangents[a]
-        by_xi[a, 0], by_xi[a, 1], by_xi[a, 2] = t[0], t[2], t[3]
-    sign = point_determinant(by_xi)
     if not misfit < np.inf:
         return 0
-    if stable(of.fold, of.proximal, xi, sign):
+    if stable_fit(of.fold, of.proximal, x, tangents):
         return 2
-    return 1 if stable(of.fold, LEAST_ARC + ROUNDING, xi, sign) else 0
+    return 1 if stable_fit(of.fold, LEAST_ARC + ROUNDING, x, tangents) else 0
 
 
 @kernel
@@ -384,11 +345,11 @@ def _everywhere(
 ) -> int:
     """Fit from the nodes of all parts of the map that come nearest; how many rows there are."""
     x, values = state[0], state[1]
-    nearest = np.full((1, PARTS), -1)
-    nearest_of(of.seen, of.turns, of.part, of.kinds, how.mixing, target, nearest)
+    nearest = np.full(PARTS, -1)
+    nearest_of(of, how.mixing, target, nearest)
     rows = n
     for part in range(PARTS):
-        node = nearest[0, part]
+        node = nearest[part]
         if node < 0:
             continue
         c = of.contacts[node]

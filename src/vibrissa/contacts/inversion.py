@@ -7,14 +7,12 @@ rad.
 
 from __future__ import annotations
 
-import math
 from functools import lru_cache
 from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.channels import CHANNELS, CIRCULAR as CIRCULAR_CHANNELS, channels_of
 from vibrissa.contacts.contacts import MOST_CANDIDATES
 from vibrissa.numerics import Array, IntArray, copy, inlined, kernel, share_out, wrapped
 from vibrissa.rod import (
@@ -45,15 +43,11 @@ from vibrissa.signals import (
     signals_of,
 )
 
-#: Parts of the chart in each of which the nearest node is a start.
-PARTS = 16
 # Two solutions this near (relative to L and to the force) are one.
 _SAME = 1e-7
 # More targets than this are brought into an order in which the tree's nodes stay at hand.
 _MANY = 1000
 _RANK_BITS = 5
-# Blocks of the chart's nodes, along each axis, that are left out together where they are far off.
-_BLOCKS = (4, 8, 4)
 
 
 class Solutions(NamedTuple):
@@ -330,99 +324,3 @@ def seeding_triplet(chart: StableSet, names: tuple[str, ...]) -> tuple[str, ...]
             return float(np.median(np.abs(np.linalg.det(slopes[:, which]))))
 
         return max(combinations(names, 3), key=volume)
-
-
-@lru_cache(maxsize=64)
-def at_nodes(chart: StableSet, names: tuple[str, ...]) -> tuple[Array, Array, IntArray]:
-    """Channels (k, nodes) at the chart's nodes, 1/2π for those that are angles, and each's part."""
-    which = [CHANNELS.index(name) for name in names]
-    known = np.ascontiguousarray(channels_of(chart.values.reshape(-1, 6))[:, which].T)
-    turns = np.array([0.5 / np.pi if CIRCULAR_CHANNELS[w] else 0.0 for w in which])
-    return known, turns, parts(chart)
-
-
-def parts(chart: StableSet) -> IntArray:
-    """To which of sixteen parts of the chart each of its nodes belongs, flat."""
-    return _cut(chart, (4, 4, 1))
-
-
-def node_blocks(chart: StableSet) -> tuple[IntArray, IntArray]:
-    """Order of the chart's nodes in which those of a block follow each other; where each begins."""
-    block = _cut(chart, _BLOCKS)
-    order = np.argsort(block, kind="stable")
-    return order, np.searchsorted(block[order], np.arange(math.prod(_BLOCKS) + 1))
-
-
-def _cut(chart: StableSet, number: tuple[int, int, int]) -> IntArray:
-    """To which of so many blocks along each axis the chart's nodes belong, flat."""
-    size = chart.values.shape[:3]
-    axes = [n * np.arange(m) // m for n, m in zip(number, size, strict=True)]
-    i, j, k = np.meshgrid(*axes, indexing="ij")
-    return np.asarray(((i * number[1] + j) * number[2] + k).reshape(-1))
-
-
-@lru_cache(maxsize=16)
-def volumes(chart: StableSet) -> Array:
-    """Volumes of contact points that the chart's nodes stand for, flat."""
-    size = np.abs(np.linalg.det(chart.tangents[..., 3:, :] @ chart.frames))
-    n, m, k = (number - 1 for number in size.shape)
-    size *= 2.0 * np.pi / (n * m * k)  # the chart is 1 × 2π × 1
-    for axis in range(3):  # nodes on its faces stand for half a cell
-        ends = np.ones(size.shape[axis])
-        ends[[0, -1]] = 0.5
-        size = size * np.expand_dims(ends, [i for i in range(3) if i != axis])
-    return np.asarray(np.maximum(size, np.finfo(float).tiny).reshape(-1))
-
-
-@kernel
-def _nearest(
-    known: Array,
-    turns: Array,
-    part: IntArray,
-    targets: Array,
-    scale: Array,
-    out: IntArray,
-    first: int,
-    last: int,
-) -> None:
-    nodes = known.shape[1]
-    least, total = np.empty(out.shape[1]), np.empty(nodes)
-    for row in range(first, last):
-        least[:], total[:] = np.inf, 0.0
-        for k in range(known.shape[0]):
-            target, size, turn = targets[row, k], scale[row, k], turns[k]
-            seen = known[k]
-            for node in range(nodes):
-                away = seen[node] - target
-                away -= np.rint(away * turn) * 2.0 * np.pi
-                total[node] += (away * size) ** 2
-        for node in range(nodes):
-            p = part[node]
-            if total[node] < least[p]:
-                least[p] = total[node]
-                out[row, p] = node
-
-
-@kernel
-def nearest_of(
-    known: Array,
-    turns: Array,
-    part: IntArray,
-    kinds: IntArray,
-    mixing: Array,
-    target: Array,
-    out: IntArray,
-) -> None:
-    """Fill the nodes of all parts of the chart that come nearest to one measurement."""
-    q, k = known.shape[0], target.shape[0]
-    wanted, scale = np.zeros((1, q)), np.ones((1, q))
-    sizes = np.zeros(2)
-    for i in range(q):
-        for c in range(k):
-            wanted[0, i] += mixing[i, c] * target[c]
-        if kinds[i] < 2:
-            sizes[kinds[i]] += wanted[0, i] ** 2
-    for i in range(q):
-        if kinds[i] < 2 and sizes[kinds[i]] > 0.0:
-            scale[0, i] = 1.0 / np.sqrt(sizes[kinds[i]])
-    _nearest(known, turns, part, wanted, scale, out, 0, 1)

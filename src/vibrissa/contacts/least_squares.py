@@ -27,6 +27,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vibrissa.contacts.channels import FITTED, RATIO, channel_derivatives
+from vibrissa.contacts.weighing import Weighing, weigh_any
 from vibrissa.numerics import (
     AnyArray,
     Array,
@@ -75,6 +76,9 @@ _ROUNDS_WITHIN = 100
 _IDLE_WITHIN, _LITTLE = 1e-6, 1e-9
 # Nor is one that, undamped or after many rounds, promises less of what χ² is above what counts.
 _SLOW, _PATIENCE, _LATE = 0.05, 3, 25
+# Where the slopes of a fit miss a known contact by so much (χ²), and by no more than this share of
+# the fall of χ² to there, χ² falls all the way: that contact is where the fit would end.
+_FORESEEN, _DOWNHILL = 1.0, 0.25
 # Where χ² rises by more than this factor contacts teach nothing of its curvature.
 _WILD = 4.0
 # Where a fit within Ω ends χ² must be level in each unknown by itself: what that could still gain
@@ -326,34 +330,27 @@ def fit_rows(
                     converged[at], active[i] = True, False
 
 
-@kernel
-def _charted(
-    fold: Fold,
-    proximal: float,
-    contacts: Array,
-    tangents: Array,
-    found: AnyArray,
-    first: int,
-    last: int,
-) -> None:
+@inlined
+def stable_fit(fold: Fold, proximal: float, x: Array, tangents: Array) -> bool:
+    """Whether a fit without friction is stable and beyond an arc length; tangents (6, 4)."""
     xi, by_xi = np.empty(3), np.empty((6, 3))
-    for row in range(first, last):
-        xi[0], xi[1], xi[2] = contacts[row, 0], contacts[row, 2], contacts[row, 3]
-        for a in range(6):
-            t = tangents[row, a]
-            by_xi[a, 0], by_xi[a, 1], by_xi[a, 2] = t[0], t[2], t[3]
-        found[row] = stable(fold, proximal, xi, point_determinant(by_xi))
+    xi[0], xi[1], xi[2] = x[0], x[2], x[3]
+    for a in range(6):
+        t = tangents[a]
+        by_xi[a, 0], by_xi[a, 1], by_xi[a, 2] = t[0], t[2], t[3]
+    return stable(fold, proximal, xi, point_determinant(by_xi))
+
+
+@kernel
+def _charted(fold: Fold, proximal: float, fits: Fits, found: AnyArray) -> None:
+    for row in range(found.shape[0]):
+        found[row] = stable_fit(fold, proximal, fits.contacts[row], fits.tangents[row])
 
 
 def charted(chart: StableSet, fits: Fits, proximal: float) -> AnyArray:
     """Whether fits without friction are stable contacts beyond an arc length, (n,)."""
     found = np.zeros(len(fits.contacts), np.bool_)
-    share_out(
-        len(found),
-        lambda first, last: _charted(
-            chart.fold, proximal, fits.contacts, fits.tangents, found, first, last
-        ),
-    )
+    _charted(chart.fold, proximal, fits, found)
     return found
 
 
@@ -584,26 +581,41 @@ def _level(gradient: Array, normal: Array, ends: tuple[bool, bool, bool]) -> boo
     return True
 
 
+@inlined
+def by_slopes(x: Array, r: Array, j: Array, other: Array) -> float:
+    """χ² at another contact by the slopes at one; it bends little in s and s f."""
+    total, ds = 0.0, other[0] - x[0]
+    dy = other[0] * (other[2] - x[2]) / x[0]
+    dz = other[0] * (other[3] - x[3]) / x[0]
+    for a in range(r.shape[0]):
+        away = r[a] + j[a, 0] * ds + j[a, 2] * dy + j[a, 3] * dz
+        total += away * away
+    return total
+
+
 @kernel
 def fit_within(
     rod: Rod,
     fold: Fold,
     proximal: float,
-    codes: IntArray,
+    how: Weighing,
     target: Array,
-    weights: Array,
+    measured: Array,
     x: Array,
     value: Array,
     tangents: Array,
     worth: float,
     known: Array,
+    misfits: Array,
 ) -> tuple[float, bool]:
-    """Find the contact of least χ² in Ω, downhill from another.
+    """Find the contact of least χ² in Ω, downhill from another, with the weights of that one.
 
-    It is given up if above ``worth``, and at contacts that are known. Return χ², and whether it is
-    a least one.
+    It is given up if above ``worth``. Where the way leads to a contact that is known and worth it,
+    with its χ² in ``misfits``, x becomes that. Return χ², and whether it is a least one.
     """
-    b, k = np.zeros(BUFFER_SIZE), codes.shape[0]
+    b, codes = np.zeros(BUFFER_SIZE), how.codes
+    k = codes.shape[0]
+    weights = np.empty((k, k))
     to, v, t = x.copy(), np.empty(6), np.zeros((6, 4))
     residual, jacobian = np.empty(k), np.empty((k, 4))
     r, j, r_there, j_there = np.empty(k), np.empty((k, 4)), np.empty(k), np.empty((k, 4))
@@ -617,6 +629,8 @@ def fit_within(
         integrate(rod, b, 1)
         lane_value(b, 0, v)
         lanes_tangents(b, t)
+        if n == 0 and not weigh_any(how, v, measured, weights):
+            break
         channel_equations(to, v, t, codes, target, residual, jacobian)
         misfit = whiten(weights, residual, jacobian, k, r_there, j_there)
         if n > 0 and misfit < _WILD * best:
@@ -635,7 +649,11 @@ def fit_within(
             for i in range(k):
                 copy(j_there[i], j[i])
             for c in range(known.shape[0]):
-                if same_contact(x, known[c]):
+                left = math.sqrt(by_slopes(x, r, j, known[c])) + math.sqrt(misfits[c])
+                sure = misfits[c] <= worth < np.inf
+                sure = sure and left * left < min(_FORESEEN, _DOWNHILL * (best - misfits[c]))
+                if sure or same_contact(x, known[c]):
+                    copy(known[c], x)
                     return best, False
             _directions(fold, x, folded, frame)
         elif best == np.inf:

@@ -23,10 +23,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.least_squares import Fits, channel_equations, fit_rows, same_contact
+from vibrissa.contacts.least_squares import (
+    Fits,
+    channel_equations,
+    fit_rows,
+    same_contact,
+    stable_fit,
+)
 from vibrissa.contacts.weighing import Weighing, gradients, weigh, wrong_by
 from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel
-from vibrissa.rod import Fold, Rod, point_determinant, stable
+from vibrissa.rod import Fold, Rod
 
 _TIMES = 8
 # A contact that gives the signals is a place to look from if it is no farther (Mahalanobis distance
@@ -418,15 +424,12 @@ def learn(
     rows = _starts(mixture, prior, root, contacts, values, of, x, v)
     _fits(rod, proximal, how, target, measured, passes, prior, root, of, rows, x, v, t, chi)
     found, first = 0, 0
-    xi, by_xi, own = np.empty(3), np.empty((6, 3)), np.empty((k, k))
+    own = np.empty((k, k))
     for row in range(rows):
         i = of[row]
         if row > 0 and of[row - 1] != i:
             first = found
-        xi[0], xi[1], xi[2] = x[row, 0], x[row, 2], x[row, 3]
-        for a in range(6):
-            by_xi[a, 0], by_xi[a, 1], by_xi[a, 2] = t[row, a, 0], t[row, a, 2], t[row, a, 3]
-        if not (chi[row] < np.inf and stable(fold, proximal, xi, point_determinant(by_xi))):
+        if not (chi[row] < np.inf and stable_fit(fold, proximal, x[row], t[row])):
             continue
         if _known(x[row], out, first, found) or not weigh(how, v[row], measured, own):
             continue

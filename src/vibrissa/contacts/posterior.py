@@ -37,7 +37,9 @@ from vibrissa.numerics import (
     inlined,
     kernel,
     mahalanobis,
+    quick_exp,
     share_out,
+    solve,
 )
 from vibrissa.rod import (
     BUFFER_SIZE,
@@ -61,8 +63,9 @@ _MISSED, _TAILED, _COUNTING = 0.03, 1.8, 0.3
 _BROKEN, _MOST_GAIN = 0.3, 3.0
 # With a smaller share than this moments mean nothing.
 _TOO_FEW = 0.1
-# Below this second order (relative to the first, at two standard deviations) the first will do.
-_STRAIGHT = 0.03
+# Below this second order (of the point, or the channels, for a standard deviation of each axis) the
+# first will do: variances differ by less than 4 %.
+_STRAIGHT = 0.06
 # The longest axis, of s (and relative to the force, 1); and the largest second derivative of -log
 # density along an axis, where its length is not changed: for a normal distribution it is 1.
 _LONGEST, _SHARP = 0.25, 2.0
@@ -73,7 +76,7 @@ _SWEEPS = 12
 
 
 def _normal(dimension: int) -> Array:
-    """Nodes (dimension, n) in pairs ±u with the covariance of a standard normal distribution.
+    """Nodes ±u, of which u (dimension, n / 2), with the covariance of a normal distribution.
 
     An additive recurrence with the powers of the root of g^(d + 1) = g + 1 fills the cube evenly.
     """
@@ -84,11 +87,11 @@ def _normal(dimension: int) -> Array:
     half = ndtri((0.5 + np.arange(1, _NODES // 2 + 1)[:, None] * steps) % 1.0)
     nodes = np.concatenate([half, -half])
     root = np.linalg.cholesky(nodes.T @ nodes / _NODES)
-    return np.ascontiguousarray((nodes @ np.linalg.inv(root).T).T)
+    return np.ascontiguousarray((half @ np.linalg.inv(root).T).T)
 
 
-def _kurtosis(nodes: Array) -> float:
-    return float(((nodes**2).sum(axis=0) ** 2).mean())
+def _kurtosis(half: Array) -> float:
+    return float(((half**2).sum(axis=0) ** 2).mean())
 
 
 #: Fourth moment of three coordinates that are normally distributed.
@@ -350,29 +353,6 @@ def _even(model: Model, n: int) -> float:
 
 
 @inlined
-def _determinant(m: Array, n: int) -> float:
-    """Determinant of the leading (n, n) of a matrix, which is overwritten."""
-    det = 1.0
-    for c in range(n):
-        best = c
-        for i in range(c + 1, n):
-            if abs(m[i, c]) > abs(m[best, c]):
-                best = i
-        if m[best, c] == 0.0:
-            return 0.0
-        if best != c:
-            det = -det
-            for q in range(n):
-                m[c, q], m[best, q] = m[best, q], m[c, q]
-        det *= m[c, c]
-        for i in range(c + 1, n):
-            f = m[i, c] / m[c, c]
-            for q in range(c + 1, n):
-                m[i, q] -= f * m[c, q]
-    return det
-
-
-@inlined
 def _densities(
     model: Model,
     nodes: Array,
@@ -383,44 +363,55 @@ def _densities(
     points: Array,
     density: Array,
 ) -> None:
-    """Fill posterior densities at nodes (n, m) relative to the nodes' own, and points (3, m).
+    """Fill posterior densities at nodes ±u relative to the nodes' own, and points (3, 2 m).
 
-    ``points`` are displacements of the point; ``turn`` is 1 where the axes are right-handed, -1
-    otherwise.
+    Of the nodes u (n, m) is given; what is odd in u and what is even is shared by both. ``points``
+    are displacements of the point; ``turn`` is 1 where the axes are right-handed, -1 otherwise.
     """
     r0, by_r, bent_r, by_y, bent_y, axes = model
-    n, number = nodes.shape
-    slopes, arc, log = np.empty((n, n, number)), np.full(number, s), np.zeros(number)
-    sums, slope = np.empty(number), np.empty(number)
+    n, half = nodes.shape
+    slopes, arc = np.empty((n, n, 2 * half)), np.full(2 * half, s)
+    log = np.zeros(2 * half)
+    odd, even, bent = np.empty(half), np.empty(half), np.empty(half)
     for i in range(n):
         along, u = axes[0, i], nodes[i]
-        for m in range(number):
+        for m in range(half):
             arc[m] += along * u[m]
             log[m] += 0.5 * u[m] * u[m]
+    for m in range(half):
+        arc[half + m], log[half + m] = 2.0 * s - arc[m], log[m]
     for a in range(r0.shape[0]):
-        sums[:] = r0[a]
+        here = r0[a]
+        odd[:], even[:] = 0.0, here
         for i in range(n):
-            _slope(by_r[a, i], bent_r[a, i], 0.5, nodes, slope)
-            u = nodes[i]
-            for m in range(number):
-                sums[m] += slope[m] * u[m]
-        for m in range(number):
-            log[m] -= 0.5 * (sums[m] * sums[m] - r0[a] * r0[a])
+            _change_of_slope(bent_r[a, i], nodes, bent)
+            first, u = by_r[a, i], nodes[i]
+            for m in range(half):
+                odd[m] += first * u[m]
+                even[m] += 0.5 * bent[m] * u[m]
+        for m in range(half):
+            up, down = even[m] + odd[m], even[m] - odd[m]
+            log[m] -= 0.5 * (up * up - here * here)
+            log[half + m] -= 0.5 * (down * down - here * here)
     for a in range(n):
-        sums[:] = 0.0
+        odd[:], even[:] = 0.0, 0.0
         for i in range(n):
-            _slope(by_y[a, i], bent_y[a, i], 1.0, nodes, slopes[a, i])
-            first, u, there = by_y[a, i], nodes[i], slopes[a, i]
-            for m in range(number):
-                sums[m] += 0.5 * (first + there[m]) * u[m]
+            _change_of_slope(bent_y[a, i], nodes, bent)
+            first, u, slope = by_y[a, i], nodes[i], slopes[a, i]
+            for m in range(half):
+                slope[m], slope[half + m] = first + bent[m], first - bent[m]
+                odd[m] += first * u[m]
+                even[m] += 0.5 * bent[m] * u[m]
         if a < 3:
-            copy(sums, points[a])
+            moved = points[a]
+            for m in range(half):
+                moved[m], moved[half + m] = even[m] + odd[m], even[m] - odd[m]
     _determinants(slopes, density)
-    for m in range(number):
+    for m in range(2 * half):
         det = turn * density[m]
         det = abs(det) if friction else max(det, 0.0)
-        inside = proximal <= arc[m] <= 1.0 and det > 0.0
-        density[m] = det * math.exp(min(log[m], _MOST_GAIN)) if inside else 0.0
+        inside = (arc[m] >= proximal) & (arc[m] <= 1.0)
+        density[m] = det * quick_exp(min(log[m], _MOST_GAIN)) if inside else 0.0
 
 
 @inlined
@@ -436,22 +427,35 @@ def _determinants(matrices: Array, out: Array) -> None:
                 + a[2, m] * (b[0, m] * c[1, m] - b[1, m] * c[0, m])
             )
         return
-    matrix = np.empty((n, n))
+    matrix, nothing = np.empty((n, n)), np.zeros(n)
     for m in range(out.shape[0]):
         for p in range(n):
             for q in range(n):
                 matrix[p, q] = matrices[p, q, m]
-        out[m] = _determinant(matrix, n)
+        out[m] = solve(matrix, nothing)
 
 
 @inlined
-def _slope(first: float, bent: Array, share: float, nodes: Array, slope: Array) -> None:
-    """Fill a derivative along an axis, or its mean from the candidate on, at all nodes."""
-    slope[:] = first
+def _change_of_slope(bent: Array, nodes: Array, out: Array) -> None:
+    """Fill what second derivatives (n,) change of a slope at all nodes."""
+    out[:] = 0.0
     for q in range(nodes.shape[0]):
-        change, u = share * bent[q], nodes[q]
-        for m in range(slope.shape[0]):
-            slope[m] += change * u[m]
+        change, u = bent[q], nodes[q]
+        for m in range(out.shape[0]):
+            out[m] += change * u[m]
+
+
+@inlined
+def squared_distances(root: Array, points: Array, out: Array) -> None:
+    """Fill squared Mahalanobis distances (n,) of points (3, n), for the root of a covariance."""
+    r00, r11, r22 = 1.0 / root[0, 0], 1.0 / root[1, 1], 1.0 / root[2, 2]
+    r10, r20, r21 = root[1, 0], root[2, 0], root[2, 1]
+    x, y, z = points[0], points[1], points[2]
+    for k in range(out.shape[0]):
+        a = r00 * x[k]
+        b = r11 * (y[k] - r10 * a)
+        c = r22 * (z[k] - r20 * a - r21 * b)
+        out[k] = a * a + b * b + c * c
 
 
 @inlined
@@ -462,21 +466,22 @@ def second_moment(
 
     Their kurtosis is returned, relative to what is normal; infinite where there is none.
     """
-    root, back = np.zeros((3, 3)), np.empty(3)
-    for a in range(3):
-        for c in range(a + 1):
-            sum_of = 0.0
-            for k in range(points.shape[1]):
-                sum_of += density[k] * points[a, k] * points[c, k]
-            covariance[a, c] = covariance[c, a] = sum_of / total
+    root, far = np.zeros((3, 3)), np.empty(points.shape[1])
+    xx, xy, xz, yy, yz, zz, fourth = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(points.shape[1]):
+        x, y, z = points[0, k], points[1, k], points[2, k]
+        wx, wy = density[k] * x, density[k] * y
+        xx, xy, xz = xx + wx * x, xy + wx * y, xz + wx * z
+        yy, yz, zz = yy + wy * y, yz + wy * z, zz + density[k] * z * z
+    covariance[0, 0], covariance[1, 1], covariance[2, 2] = xx / total, yy / total, zz / total
+    covariance[0, 1] = covariance[1, 0] = xy / total
+    covariance[0, 2] = covariance[2, 0] = xz / total
+    covariance[1, 2] = covariance[2, 1] = yz / total
     if not cholesky(covariance, root):
         return np.inf
-    fourth = 0.0
+    squared_distances(root, points, far)
     for k in range(points.shape[1]):
-        for a in range(3):
-            back[a] = points[a, k]
-        size = mahalanobis(root, back)
-        fourth += density[k] * size * size
+        fourth += density[k] * far[k] * far[k]
     tailed = fourth / (total * normal)
     wider = max(tailed, 1.0) ** 0.75
     for a in range(3):
@@ -496,7 +501,7 @@ def _moments(
     covariance: Array,
 ) -> tuple[float, bool]:
     """Fill the second moment about the point, widened; mean density, and whether it can serve."""
-    number = nodes.shape[1]
+    number = 2 * nodes.shape[1]
     points, density, total, squares = np.empty((3, number)), np.empty(number), 0.0, 0.0
     _densities(model, nodes, s, proximal, friction, turn, points, density)
     for k in range(number):
@@ -545,6 +550,7 @@ def judge(
     r0, j, slopes = np.empty(k), np.empty((k, 4)), np.zeros((4, 4))
     by_r, bent_r = np.zeros((k, 4)), np.zeros((k, 4, 4))
     by_y, bent_y, axes = np.zeros((4, 4)), np.zeros((4, 4, 4)), np.zeros((4, 4))
+    nothing = np.zeros(n)
     model = (r0, by_r, bent_r, by_y, bent_y, axes)
     for row in range(first, last):
         x, covariance = contacts[row], covariances[row]
@@ -581,13 +587,13 @@ def judge(
         inside = proximal + away < x[0] < 1.0 - away
         for a in range(4):
             copy(by_y[a], slopes[a])
-        first_order, density, fair = abs(_determinant(slopes, n)), 0.0, True
+        first_order, density, fair = abs(solve(slopes, nothing)), 0.0, True
         straight = inside and bent < _STRAIGHT and pulled < _STRAIGHT and not short
         if not straight:
             for p in range(n):
                 for q in range(n):
                     slopes[p, q] = axes[unknowns[p], q]
-            turn = math.copysign(1.0, _determinant(slopes, n))
+            turn = math.copysign(1.0, solve(slopes, nothing))
             nodes = _NODES_4 if friction else _NODES_3
             density, fair = _moments(model, nodes, x[0], proximal, friction, turn, covariance)
             for a in range(4):

@@ -20,64 +20,32 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vibrissa.contacts.basins import deviations, starts_of_basins
 from vibrissa.contacts.candidates import (
     UNEXPLAINED,
     Problem,
-    Searched,
     explain_rows,
     finite,
     solve_rows,
 )
 from vibrissa.contacts.contacts import MOST_CANDIDATES, Candidates
-from vibrissa.contacts.inversion import PARTS, nearest_of
 from vibrissa.contacts.least_squares import channel_equations, fit_within, same_contact, whiten
+from vibrissa.contacts.nodes import PARTS, Searched, nearest_of, outside_share
 from vibrissa.contacts.noise import INDISTINCT
-from vibrissa.contacts.posterior import CERTAIN, NORMAL_KURTOSIS, judge, rank, second_moment
-from vibrissa.contacts.weighing import Weighing, channel_covariance, weigh_any
-from vibrissa.numerics import (
-    AnyArray,
-    Array,
-    IntArray,
-    cholesky,
-    copy,
-    inlined,
-    kernel,
-    mahalanobis,
-)
-from vibrissa.rod import (
-    LEAST_ARC,
-    MOST_CELLS,
-    along,
-    cells_around,
-    chart_to_contact,
-    evaluate,
-    fold_force,
-)
-from vibrissa.signals import FY, MY
+from vibrissa.contacts.posterior import CERTAIN, judge, rank
+from vibrissa.contacts.weighing import Weighing, weigh_any
+from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel
+from vibrissa.rod import LEAST_ARC, evaluate
 from vibrissa.status import Status
 
 _UNIQUE, _AMBIGUOUS = int(Status.UNIQUE), int(Status.AMBIGUOUS)
 # How far apart signals are that the tree is asked for as well, in standard deviations; and where
 # nothing that is known explains the measurement.
 _APART, _FAR_APART = 2.0, 4.0
-# The most that this can be; more than half a turn.
-_WIDEST = 1e3
-# Between two basins cells must miss the measurement by so much more, relative to the slack.
-_SILL = 0.5
-# What a known contact explains by its slopes: χ² of three quantities, each up to the slack away,
-# and as much again for what cells are wrong by.
-_LINEAR = 25.0
 # At most so many starts for one measurement.
 _MOST_STARTS = 6
-# So many of the chart's nodes must count for their moments to replace those about one contact.
-_MANY = 30.0
-# Squared Mahalanobis distance of three standard deviations of a point in space (99.73 %).
-_OUTSIDE_REGION = 14.16
 # Logarithm of the volume of a normal distribution of three coordinates, over its peak.
 _LOG_NORMAL = 1.5 * math.log(2.0 * math.pi)
-_MOST_LOG = 700.0
-# Nodes whose χ² is so much worse than the best candidate's do not count.
-_NEGLIGIBLE = 60.0
 
 
 @kernel
@@ -89,159 +57,6 @@ def chi_squared_of(how: Weighing, x: Array, value: Array, target: Array, measure
         return np.nan
     channel_equations(x, value, np.zeros((6, 4)), how.codes, target, residual, jacobian)
     return whiten(weights, residual, jacobian, k, np.empty(k), np.empty((k, 4)))
-
-
-@inlined
-def _deviations(of: Searched, how: Weighing, value: Array, measured: Array, out: Array) -> None:
-    """Standard deviations of the three quantities that the tree is asked for, near (F, p)."""
-    k = how.codes.shape[0]
-    if how.own[0, 0] > 0.0:  # a mix of components, white
-        for q in range(3):
-            out[q] = 1.0
-        return
-    sigma = np.empty((k, k))
-    channel_covariance(how, value, measured, sigma)
-    for q in range(3):
-        i = of.where[q]
-        code = how.codes[i]
-        out[q] = sigma[i, i]
-        if code >= FY:  # components instead of a size (first) and its direction
-            first = i if code in (FY, MY) else i - 1
-            angle = measured[first + 1]
-            along_y, along_z = math.cos(angle), math.sin(angle)
-            if i > first:
-                size = max(measured[first], 1e-300)
-                along_y, along_z = -along_z / size, along_y / size
-            out[q] = (
-                along_y * along_y * sigma[first, first]
-                + 2.0 * along_y * along_z * sigma[first, first + 1]
-                + along_z * along_z * sigma[first + 1, first + 1]
-            )
-        out[q] = math.sqrt(out[q])
-
-
-@inlined
-def _chart_of(of: Searched, x: Array, out: Array) -> None:
-    """Chart coordinates (η, ψ, ρ) of a contact x (4,)."""
-    out[1] = math.atan2(x[3], x[2])
-    out[0] = along(of.fold.bounds, x[0])
-    out[2] = math.sqrt(math.hypot(x[2], x[3]) / fold_force(of.fold, x[0], out[1]))
-
-
-@inlined
-def _adjacent(of: Searched, a: int, b: int) -> bool:
-    """Whether two cells of the chart touch; near rest bearings are all one."""
-    one, other = of.tree.place[a], of.tree.place[b]
-    around = round(2.0 * math.pi / of.tree.grid[1, 1])
-    turn = abs(one[1] - other[1])
-    near = min(turn, around - turn) <= 1 or one[2] + other[2] == 0
-    return bool(near and abs(one[0] - other[0]) <= 1 and abs(one[2] - other[2]) <= 1)
-
-
-@inlined
-def _holds(of: Searched, cell: int, position: Array) -> bool:
-    """Whether a position in the chart is in a cell or next to it."""
-    place, grid, apart = of.tree.place[cell], of.tree.grid, np.empty(3)
-    for a in range(3):
-        apart[a] = abs((position[a] - grid[0, a]) / grid[1, a] - place[a] - 0.5)
-    apart[1] = min(apart[1], 2.0 * math.pi / grid[1, 1] - apart[1])
-    return bool(max(apart[0], apart[2]) <= 1.5 and (apart[1] <= 1.5 or place[2] == 0))
-
-
-@inlined
-def _root(parent: IntArray, i: int) -> int:
-    """Which basin a cell belongs to."""
-    while parent[i] != i:
-        i = parent[i]
-    return i
-
-
-@kernel
-def _basins(
-    of: Searched, cells: IntArray, away: Array, n: int, order: IntArray, parent: IntArray
-) -> None:
-    """Fill the order of cells by how far they miss, and the basin (its best cell) of each.
-
-    Cells that touch are of one basin unless they are separated by a sill.
-    """
-    for i in range(n):
-        place = i
-        while place > 0 and away[order[place - 1]] > away[i]:
-            order[place] = order[place - 1]
-            place -= 1
-        order[place] = i
-    for nth in range(n):
-        i = order[nth]
-        parent[i] = i
-        for before in range(nth):
-            j = order[before]
-            mine, theirs = _root(parent, i), _root(parent, j)
-            if mine == theirs or not _adjacent(of, cells[i], cells[j]):
-                continue
-            if away[mine] < away[theirs]:
-                mine, theirs = theirs, mine
-            if away[i] - away[mine] <= _SILL:
-                parent[mine] = theirs
-
-
-@inlined
-def _by_slopes(x: Array, r: Array, j: Array, xi: Array) -> float:
-    """χ² at a contact ξ by the slopes of a known one; it bends little in s and s f."""
-    total, ds = 0.0, xi[0] - x[0]
-    dy = (xi[0] * (xi[1] - x[2])) / x[0]
-    dz = (xi[0] * (xi[2] - x[3])) / x[0]
-    for a in range(r.shape[0]):
-        away = r[a] + j[a, 0] * ds + j[a, 2] * dy + j[a, 3] * dz
-        total += away * away
-    return total
-
-
-@kernel
-def _starts(
-    of: Searched,
-    apart: float,
-    sigma: Array,
-    measured: Array,
-    x: Array,
-    residuals: Array,
-    jacobians: Array,
-    number: int,
-    starts: Array,
-) -> tuple[int, bool]:
-    """Fill contacts to start from, one for each basin that known contacts x do not explain.
-
-    Return how many there are, and whether there are more.
-    """
-    target, slack, known = np.empty(3), np.empty(3), np.empty((MOST_CANDIDATES, 3))
-    cells, order = np.empty(MOST_CELLS, np.int64), np.empty(MOST_CELLS, np.int64)
-    spots, away = np.empty((MOST_CELLS, 3)), np.empty(MOST_CELLS)
-    parent, kept, count = np.empty(MOST_CELLS, np.int64), 0, 0
-    for q in range(3):
-        target[q], slack[q] = measured[of.where[q]], min(apart * sigma[q], _WIDEST)
-    n = cells_around(of.tree, target, slack, cells, spots, away)
-    for c in range(number):
-        _chart_of(of, x[c], known[c])
-    for i in range(n):
-        xi, new = starts[0, 1:], True
-        chart_to_contact(of.fold, spots[i], xi)
-        for c in range(number):
-            new = new and not _holds(of, cells[i], known[c])
-            new = new and not _by_slopes(x[c], residuals[c], jacobians[c], xi) < _LINEAR
-        if new:
-            cells[kept], away[kept] = cells[i], away[i]
-            copy(spots[i], spots[kept])
-            kept += 1
-    _basins(of, cells, away, kept, order, parent)
-    for nth in range(kept):
-        i = order[nth]
-        if parent[i] == i:
-            if count == starts.shape[0]:
-                return count, True
-            start = starts[count]
-            chart_to_contact(of.fold, spots[i], start[1:])
-            start[0], start[1] = start[1], 0.0
-            count += 1
-    return count, n == MOST_CELLS
 
 
 @kernel
@@ -262,43 +77,42 @@ def _try(
 
     Return how many there are then, and whether the fit ended elsewhere although χ² is so small.
     """
-    k = how.codes.shape[0]
-    weights, value, tangents = np.empty((k, k)), np.empty((1, 6)), np.zeros((6, 4))
     if number == MOST_CANDIDATES:
         return number, True
     at, misfit, known, least = start.copy(), np.inf, False, False
-    evaluate(of.rod, at.reshape(1, 4), value, np.empty((0, 6, 3)), 0, 1)
+    value, tangents = np.empty(6), np.zeros((6, 4))
+    lost = number == 0 or not misfits[0] <= worth
+    most = np.inf if lost else worth
     for _ in range(passes):
-        if not weigh_any(how, value[0], measured, weights):
-            return number, False
-        most = worth if number > 0 and misfits[0] <= worth else np.inf
         misfit, least = fit_within(
             of.rod,
             of.fold,
             of.proximal,
-            how.codes,
+            how,
             target,
-            weights,
+            measured,
             at,
-            value[0],
+            value,
             tangents,
             most,
             x[:number],
+            misfits,
         )
         for c in range(number):
             known = known or same_contact(at, x[c])
-        if known:
+        if known or not misfit < np.inf:
             break
-    lost = number == 0 or not misfits[0] <= worth
+    if not misfit < np.inf:
+        return number, False
     if lost and (number == 0 or misfit < misfits[0]):  # the nearest so far, whatever it is
         copy(at, x[0])
-        copy(value[0], values[0])
+        copy(value, values[0])
         misfits[0] = misfit
         return max(number, 1), misfit <= worth and not least
     if known or not (least and misfit <= worth):
         return number, not known and misfit <= worth
     copy(at, x[number])
-    copy(value[0], values[number])
+    copy(value, values[number])
     misfits[number] = misfit
     return number + 1, False
 
@@ -323,21 +137,21 @@ def complete(
     Return how many there are then, and whether others may be probable that are not among them.
     """
     sigma, starts = np.empty(3), np.empty((_MOST_STARTS, 4))
-    start, nodes, least = np.zeros(4), np.full((1, PARTS), -1), np.inf
+    start, nodes, least = np.zeros(4), np.full(PARTS, -1), np.inf
     for c in range(number):
         least = min(least, misfits[c])
     lost = not least <= limit
     if lost:
-        nearest_of(of.seen, of.turns, of.part, of.kinds, how.mixing, target, nodes)
+        nearest_of(of, how.mixing, target, nodes)
         node = 0
-        while node < PARTS - 1 and nodes[0, node] < 0:
+        while node < PARTS - 1 and nodes[node] < 0:
             node += 1
-        _deviations(of, how, of.values[max(nodes[0, node], 0)], measured, sigma)
+        deviations(of, how, of.values[max(nodes[node], 0)], measured, sigma)
     else:
-        _deviations(of, how, values[0], measured, sigma)
+        deviations(of, how, values[0], measured, sigma)
     worth = limit if lost else min(limit, least + INDISTINCT)
     apart = _FAR_APART if lost else _APART
-    n, others = _starts(
+    n, others = starts_of_basins(
         of, apart, sigma, measured, x, residuals, jacobians, 0 if lost else number, starts
     )
     for i in range(n):
@@ -348,8 +162,8 @@ def complete(
     for c in range(number):
         lost = lost and not misfits[c] <= limit
     for i in range(PARTS if lost else 0):
-        if nodes[0, i] >= 0:
-            contact = of.contacts[nodes[0, i]]
+        if nodes[i] >= 0:
+            contact = of.contacts[nodes[i]]
             start[0], start[2], start[3] = contact[0], contact[1], contact[2]
             number, other = _try(
                 of, how, passes, worth, target, measured, start, number, x, values, misfits
@@ -379,117 +193,6 @@ def _kept(limit: float, number: int, x: Array, values: Array, misfits: Array) ->
             misfits[kept] = misfits[c]
             kept += 1
     return kept
-
-
-@inlined
-def _near_blocks(
-    of: Searched, weights: Array, target: Array, most: float, blocks: IntArray
-) -> tuple[int, int]:
-    """List blocks of nodes that may have a χ² of ``most``; how many, with how many nodes.
-
-    Each whitened residual is within bounds over a block, as the channels are.
-    """
-    q, number, nodes, away = of.turns.shape[0], 0, 0, np.empty(of.turns.shape[0])
-    for n in range(blocks.shape[0]):
-        least = 0.0
-        for i in range(q):
-            away[i] = of.extent[0, i, n] - target[i]
-            away[i] -= 2.0 * np.pi * np.rint(away[i] * of.turns[i])
-        for i in range(q):
-            middle, half = 0.0, 0.0
-            for c in range(q):
-                middle += weights[i, c] * away[c]
-                half += abs(weights[i, c]) * of.extent[1, c, n]
-            least += max(abs(middle) - half, 0.0) ** 2
-        if least <= most:
-            blocks[number] = n
-            number, nodes = number + 1, nodes + of.blocks[n + 1] - of.blocks[n]
-    return number, nodes
-
-
-@inlined
-def _misfits_of_block(
-    of: Searched, weights: Array, target: Array, n: int, misfits: Array
-) -> tuple[int, int]:
-    """Fill χ² at the nodes of a block; the first of them, and how many there are."""
-    q, first = of.turns.shape[0], of.blocks[n]
-    number = of.blocks[n + 1] - first
-    away, r = np.empty((q, number)), np.empty(number)
-    for i in range(q):
-        seen, turn, aim, mine = of.seen[i], of.turns[i], target[i], away[i]
-        for k in range(number):
-            mine[k] = seen[first + k] - aim
-        for k in range(number if turn > 0.0 else 0):
-            mine[k] -= np.rint(mine[k] * turn) * 2.0 * np.pi
-    for k in range(number):
-        misfits[k] = 0.0
-    for i in range(q):
-        r[:] = 0.0
-        for c in range(q):
-            w, mine = weights[i, c], away[c]
-            for k in range(number if w != 0.0 else 0):
-                r[k] += w * mine[k]
-        for k in range(number):
-            misfits[k] += r[k] * r[k]
-    return first, number
-
-
-@kernel
-def _over_the_map(
-    of: Searched,
-    how: Weighing,
-    weights: Array,
-    target: Array,
-    point: Array,
-    chi: float,
-    log_mass: float,
-    covariance: Array,
-) -> float:
-    """Share of the probability that the chart's nodes leave to other regions than a candidate's.
-
-    Where noise leaves more open than the second order about one contact can describe, so that many
-    nodes count, the covariance is replaced by the second moment of the posterior over them. The
-    share outside three standard deviations is that of contact points or of the chart, whichever is
-    larger: contact points of little volume, as near slip-off, are not left out.
-    """
-    if how.own[0, 0] > 0.0:  # what is seen is white
-        weights = np.eye(of.turns.shape[0])
-    blocks = np.empty(of.blocks.shape[0] - 1, np.int64)
-    near, nodes = _near_blocks(of, weights, target, chi + _NEGLIGIBLE, blocks)
-    points, misfits = np.empty((3, nodes)), np.empty(nodes)
-    density, likelihood, kept = np.empty(nodes), np.empty(nodes), 0
-    total, squares = 0.0, 0.0
-    for i in range(near):
-        first, number = _misfits_of_block(of, weights, target, blocks[i], misfits)
-        for k in range(number):
-            if not misfits[k] < chi + _NEGLIGIBLE:
-                continue
-            fits = math.exp(0.5 * (chi - misfits[k]))
-            density[kept], likelihood[kept] = of.volume[first + k] * fits, min(fits, 1.0)
-            total += density[kept]
-            squares += density[kept] * density[kept]
-            for a in range(3):
-                points[a, kept] = of.values[first + k, 3 + a] - point[a]
-            kept += 1
-    if total * total > _MANY * squares:
-        second_moment(points[:, :kept], density[:kept], total, NORMAL_KURTOSIS, covariance)
-    root, back = np.zeros((3, 3)), np.empty(3)
-    if not cholesky(covariance, root):
-        return 0.0
-    mass, mass_out, like, like_out = 0.0, 0.0, 0.0, 0.0
-    for k in range(kept):
-        for a in range(3):
-            back[a] = points[a, k]
-        if mahalanobis(root, back) > _OUTSIDE_REGION:
-            mass_out += density[k]
-            like_out += likelihood[k]
-        else:
-            mass += density[k]
-            like += likelihood[k]
-    # The nodes may be too far apart to see all of the candidate itself.
-    mass = max(mass, math.exp(min(log_mass + 0.5 * chi, _MOST_LOG)), 1e-300)
-    like = max(like, 1.0)
-    return max(mass_out / (mass + mass_out), like_out / (like + like_out))
 
 
 class _Room(NamedTuple):
@@ -675,9 +378,9 @@ def settle(
     if out.probability[row, 0] > CERTAIN and (others or not out.valid[row, 0]):
         seen, best = measured if how.own[0, 0] > 0.0 else target, order[0, 0]
         log_mass = weight[1, best] + _LOG_NORMAL
-        outside = _over_the_map(
+        outside = outside_share(
             of,
-            how,
+            how.own[0, 0] > 0.0,
             room.weights[best],
             seen,
             values[0, 3:],

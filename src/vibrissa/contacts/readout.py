@@ -7,25 +7,18 @@ knows where contacts that explain it may lie: from a search tree of three quanti
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.candidates import Searched
 from vibrissa.contacts.channels import CHANNELS, FITTED, WRENCH, Channels
-from vibrissa.contacts.inversion import (
-    at_nodes,
-    node_blocks,
-    parts,
-    seeding_triplet,
-    volumes,
-)
+from vibrissa.contacts.inversion import seeding_triplet
+from vibrissa.contacts.nodes import at_nodes, searched
 from vibrissa.contacts.noise import TRUSTED, SensorNoise, rank, scaled_errors
 from vibrissa.contacts.weighing import Weighing
 from vibrissa.numerics import AnyArray, Array
-from vibrissa.rod import SearchTree, StableSet, search_tree
+from vibrissa.rod import search_tree
 from vibrissa.sensors import COMPONENTS
 from vibrissa.signals import CIRCULAR, SIGNALS, signal_scales, signals_of
 
@@ -117,8 +110,8 @@ class Named:
         self._noise = [] if sensor is None else self._deviations(sensor)
         if len(names) >= 3:
             three = names if len(names) == 3 else seeding_triplet(chart, names)
-            known, turns, _ = at_nodes(chart, self.channels.names)
-            self.searched = _searched(
+            known, turns = at_nodes(chart, self.channels.names)
+            self.searched = searched(
                 chart,
                 contact_map.tree(three),
                 [names.index(name) for name in three],
@@ -226,7 +219,7 @@ class Mixed:
             slopes = three @ np.concatenate([force, moment], axis=-2)
             straight = (False, False, False)
             tree = search_tree(chart, np.ascontiguousarray(values), slopes, straight)
-            self.searched = _searched(
+            self.searched = searched(
                 chart,
                 tree,
                 range(3),
@@ -258,40 +251,6 @@ class Mixed:
     def beyond(self, measurement: Measurement) -> bool:
         """Whether the readings are far larger than any on the map."""
         return bool((np.abs(measurement.measured) > self._largest).any())
-
-
-def _searched(
-    chart: StableSet,
-    tree: SearchTree,
-    where: Sequence[int],
-    codes: Sequence[int],
-    seen: Array,
-    turns: Array,
-    kinds: Sequence[int],
-) -> Searched:
-    """What is searched; see there."""
-    order, blocks = node_blocks(chart)
-    seen, turns = np.ascontiguousarray(seen[:, order]), np.asarray(turns)
-    away = seen - np.repeat(seen[:, blocks[:-1]], np.diff(blocks), axis=1)
-    away -= np.where(turns > 0.0, 2.0 * np.pi, 0.0)[:, None] * np.rint(away * turns[:, None])
-    low, high = (ufunc.reduceat(away, blocks[:-1], axis=1) for ufunc in (np.minimum, np.maximum))
-    return Searched(
-        chart.discretization.rod,
-        chart.fold,
-        chart.proximal,
-        tree,
-        np.array(where),
-        np.array(codes, dtype=np.float64),
-        chart.contacts.reshape(-1, 3)[order],
-        chart.values.reshape(-1, 6)[order],
-        seen,
-        turns,
-        np.array(kinds),
-        parts(chart)[order],
-        volumes(chart)[order],
-        blocks,
-        np.stack([seen[:, blocks[:-1]] + 0.5 * (low + high), 0.5 * (high - low)]),
-    )
 
 
 def _weighing(

@@ -16,7 +16,7 @@ is lost by looking only near the last one.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -109,8 +109,8 @@ class Search:
             status[0], targets = self._nothing, np.full(targets.shape, np.nan)
         elif readout.beyond(measurement):
             status[0], targets = self._beyond, np.full(targets.shape, np.nan)
-        found, status, chi_squared = self._rows(values, targets, status)
-        return found, STATUSES[int(status[0])], float(chi_squared[0])
+        out, status, chi_squared = self._rows(values, targets, status)
+        return out, STATUSES[int(status[0])], float(chi_squared[0])
 
     @property
     def _nothing(self) -> int:
@@ -126,7 +126,8 @@ class Search:
         readout, out = self.readout, Candidates.room(len(values))
         share_out(
             len(values),
-            lambda first, last: estimate_rows(
+            partial(
+                estimate_rows,
                 readout.searched,
                 readout.how,
                 self._problem,
@@ -134,17 +135,16 @@ class Search:
                 values,
                 out,
                 status,
-                first,
-                last,
             ),
         )
         chi_squared = out.chi_squared[:, 0].copy()
+        if UNEXPLAINED not in status:
+            return out, status, chi_squared
         rows = np.flatnonzero(status == UNEXPLAINED)
-        if rows.size:
-            assert isinstance(readout, Named)
-            status[rows], away = why_none(self.contact_map, readout.names, values[rows])
-            none = out.number[rows] == 0
-            chi_squared[rows[none]] = away[none]
+        assert isinstance(readout, Named)
+        status[rows], away = why_none(self.contact_map, readout.names, values[rows])
+        none = out.number[rows] == 0
+        chi_squared[rows[none]] = away[none]
         return out, status, chi_squared
 
 

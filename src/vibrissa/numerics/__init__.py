@@ -16,6 +16,7 @@ if TYPE_CHECKING:
         cholesky,
         mahalanobis as mahalanobis,
         norm3 as norm3,
+        quick_exp as quick_exp,
         solve,
         solve3 as solve3,
         solve_root as solve_root,
@@ -44,7 +45,16 @@ __all__ = [
 ]
 
 _HOMES = {
-    "algebra": ("cholesky", "mahalanobis", "norm3", "solve", "solve3", "solve_root", "wrapped"),
+    "algebra": (
+        "cholesky",
+        "mahalanobis",
+        "norm3",
+        "quick_exp",
+        "solve",
+        "solve3",
+        "solve_root",
+        "wrapped",
+    ),
     "compiled": ("copy", "inlined", "inlined_rigorous", "kernel", "rigorous", "specialised"),
     "device": ("Translation", "check_device"),
     "quantiles": ("contact_weights", "weighted_quantile"),

@@ -1,0 +1,174 @@
+"""Where else contacts may be that explain a measurement: basins of the chart's cells; compiled.
+
+The cells of the tree that may hold signals within two standard deviations of the measured ones form
+basins, separated by cells that come less near. Each that known contacts do not explain by their
+slopes has a contact from which to look for another.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from vibrissa.contacts.contacts import MOST_CANDIDATES
+from vibrissa.contacts.least_squares import by_slopes
+from vibrissa.contacts.nodes import Searched
+from vibrissa.contacts.weighing import Weighing, channel_covariance
+from vibrissa.numerics import Array, IntArray, copy, inlined, kernel
+from vibrissa.rod import MOST_CELLS, along, cells_around, chart_to_contact, fold_force
+from vibrissa.signals import FY, MY
+
+# The most that cells are asked for in a quantity; more than half a turn.
+_WIDEST = 1e3
+# Between two basins cells must miss the measurement by so much more, relative to the slack.
+_SILL = 0.5
+# What a known contact explains by its slopes: χ² of three quantities, each up to the slack away,
+# and as much again for what cells are wrong by.
+_LINEAR = 25.0
+
+
+@inlined
+def deviations(of: Searched, how: Weighing, value: Array, measured: Array, out: Array) -> None:
+    """Standard deviations of the three quantities that the tree is asked for, near (F, p)."""
+    k = how.codes.shape[0]
+    if how.own[0, 0] > 0.0:  # a mix of components, white
+        for q in range(3):
+            out[q] = 1.0
+        return
+    sigma = np.empty((k, k))
+    channel_covariance(how, value, measured, sigma)
+    for q in range(3):
+        i = of.where[q]
+        code = how.codes[i]
+        out[q] = sigma[i, i]
+        if code >= FY:  # components instead of a size (first) and its direction
+            first = i if code in (FY, MY) else i - 1
+            angle = measured[first + 1]
+            along_y, along_z = math.cos(angle), math.sin(angle)
+            if i > first:
+                size = max(measured[first], 1e-300)
+                along_y, along_z = -along_z / size, along_y / size
+            out[q] = (
+                along_y * along_y * sigma[first, first]
+                + 2.0 * along_y * along_z * sigma[first, first + 1]
+                + along_z * along_z * sigma[first + 1, first + 1]
+            )
+        out[q] = math.sqrt(out[q])
+
+
+@inlined
+def _chart_of(of: Searched, x: Array, out: Array) -> None:
+    """Chart coordinates (η, ψ, ρ) of a contact x (4,)."""
+    out[1] = math.atan2(x[3], x[2])
+    out[0] = along(of.fold.bounds, x[0])
+    out[2] = math.sqrt(math.hypot(x[2], x[3]) / fold_force(of.fold, x[0], out[1]))
+
+
+@inlined
+def _start_at(of: Searched, spot: Array, start: Array) -> None:
+    """Fill the contact x (4,) at a position in the chart."""
+    chart_to_contact(of.fold, spot, start[1:])
+    start[0], start[1] = start[1], 0.0
+
+
+@inlined
+def _adjacent(of: Searched, a: int, b: int) -> bool:
+    """Whether two cells of the chart touch; near rest bearings are all one."""
+    one, other = of.tree.place[a], of.tree.place[b]
+    around = round(2.0 * math.pi / of.tree.grid[1, 1])
+    turn = abs(one[1] - other[1])
+    near = min(turn, around - turn) <= 1 or one[2] + other[2] == 0
+    return bool(near and abs(one[0] - other[0]) <= 1 and abs(one[2] - other[2]) <= 1)
+
+
+@inlined
+def _holds(of: Searched, cell: int, position: Array) -> bool:
+    """Whether a position in the chart is in a cell or next to it."""
+    place, grid, apart = of.tree.place[cell], of.tree.grid, np.empty(3)
+    for a in range(3):
+        apart[a] = abs((position[a] - grid[0, a]) / grid[1, a] - place[a] - 0.5)
+    apart[1] = min(apart[1], 2.0 * math.pi / grid[1, 1] - apart[1])
+    return bool(max(apart[0], apart[2]) <= 1.5 and (apart[1] <= 1.5 or place[2] == 0))
+
+
+@inlined
+def _root(parent: IntArray, i: int) -> int:
+    """Which basin a cell belongs to."""
+    while parent[i] != i:
+        i = parent[i]
+    return i
+
+
+@kernel
+def _basins(
+    of: Searched, cells: IntArray, away: Array, n: int, order: IntArray, parent: IntArray
+) -> None:
+    """Fill the order of cells by how far they miss, and the basin (its best cell) of each.
+
+    Cells that touch are of one basin unless they are separated by a sill.
+    """
+    for i in range(n):
+        place = i
+        while place > 0 and away[order[place - 1]] > away[i]:
+            order[place] = order[place - 1]
+            place -= 1
+        order[place] = i
+    for nth in range(n):
+        i = order[nth]
+        parent[i] = i
+        for before in range(nth):
+            j = order[before]
+            mine, theirs = _root(parent, i), _root(parent, j)
+            if mine == theirs or not _adjacent(of, cells[i], cells[j]):
+                continue
+            if away[mine] < away[theirs]:
+                mine, theirs = theirs, mine
+            if away[i] - away[mine] <= _SILL:
+                parent[mine] = theirs
+
+
+@kernel
+def starts_of_basins(
+    of: Searched,
+    apart: float,
+    sigma: Array,
+    measured: Array,
+    x: Array,
+    residuals: Array,
+    jacobians: Array,
+    number: int,
+    starts: Array,
+) -> tuple[int, bool]:
+    """Fill contacts to start from, one for each basin that known contacts x do not explain.
+
+    Return how many there are, and whether there are more.
+    """
+    target, slack, known = np.empty(3), np.empty(3), np.empty((MOST_CANDIDATES, 3))
+    cells, order = np.empty(MOST_CELLS, np.int64), np.empty(MOST_CELLS, np.int64)
+    spots, away = np.empty((MOST_CELLS, 3)), np.empty(MOST_CELLS)
+    parent, kept, count = np.empty(MOST_CELLS, np.int64), 0, 0
+    for q in range(3):
+        target[q], slack[q] = measured[of.where[q]], min(apart * sigma[q], _WIDEST)
+    n = cells_around(of.tree, target, slack, cells, spots, away)
+    for c in range(number):
+        _chart_of(of, x[c], known[c])
+    for i in range(n):
+        start, new = starts[0], True
+        _start_at(of, spots[i], start)
+        for c in range(number):
+            new = new and not _holds(of, cells[i], known[c])
+            new = new and not by_slopes(x[c], residuals[c], jacobians[c], start) < _LINEAR
+        if new:
+            cells[kept], away[kept] = cells[i], away[i]
+            copy(spots[i], spots[kept])
+            kept += 1
+    _basins(of, cells, away, kept, order, parent)
+    for nth in range(kept):
+        i = order[nth]
+        if parent[i] == i:
+            if count == starts.shape[0]:
+                return count, True
+            _start_at(of, spots[i], starts[count])
+            count += 1
+    return count, n == MOST_CELLS

@@ -1,0 +1,272 @@
+"""What is searched for contacts: a map's tree of cells, and the chart's nodes; compiled.
+
+The nodes serve where candidates alone do not: the nearest of them are starts, and together they
+show what else is probable than a candidate.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from vibrissa.contacts.channels import CHANNELS, CIRCULAR, channels_of
+from vibrissa.contacts.posterior import NORMAL_KURTOSIS, second_moment, squared_distances
+from vibrissa.numerics import Array, IntArray, cholesky, inlined, kernel, quick_exp
+from vibrissa.rod import Fold, Rod, SearchTree, StableSet
+
+#: Parts of the chart in each of which the nearest node is a start.
+PARTS = 16
+_PARTS_BY_AXIS = (4, 4, 1)
+# Blocks of the chart's nodes, along each axis, that are left out together where they are far off.
+_BLOCKS = (4, 8, 4)
+# So many of the chart's nodes must count for their moments to replace those about one contact.
+_MANY = 30.0
+# Squared Mahalanobis distance of three standard deviations of a point in space (99.73 %).
+_OUTSIDE_REGION = 14.16
+_MOST_LOG = 700.0
+# Nodes whose χ² is so much worse than the best candidate's do not count: of ten thousand such
+# nodes the likelihood is a ten thousandth of the candidate's.
+_NEGLIGIBLE = 36.0
+
+
+class Searched(NamedTuple):
+    """What is searched, non-dimensional.
+
+    The chart's nodes lie in blocks: ``blocks`` (n + 1,) has where each begins, ``extent`` (2, q, n)
+    middle and half width of what is seen in it.
+    """
+
+    rod: Rod
+    fold: Fold
+    proximal: float
+    tree: SearchTree
+    where: IntArray
+    codes: Array
+    contacts: Array
+    values: Array
+    seen: Array
+    turns: Array
+    kinds: IntArray
+    part: IntArray
+    volume: Array
+    blocks: IntArray
+    extent: Array
+
+
+def searched(
+    chart: StableSet,
+    tree: SearchTree,
+    where: Sequence[int],
+    codes: Sequence[int],
+    seen: Array,
+    turns: Array,
+    kinds: Sequence[int],
+) -> Searched:
+    """Bring a chart's tree and nodes, with what is seen at them (q, nodes), into order."""
+    block = _cut(chart, _BLOCKS)
+    order = np.argsort(block, kind="stable")
+    blocks = np.searchsorted(block[order], np.arange(math.prod(_BLOCKS) + 1))
+    seen = np.ascontiguousarray(seen[:, order])
+    away = seen - np.repeat(seen[:, blocks[:-1]], np.diff(blocks), axis=1)
+    away -= np.where(turns > 0.0, 2.0 * np.pi, 0.0)[:, None] * np.rint(away * turns[:, None])
+    low, high = (ufunc.reduceat(away, blocks[:-1], axis=1) for ufunc in (np.minimum, np.maximum))
+    return Searched(
+        chart.discretization.rod,
+        chart.fold,
+        chart.proximal,
+        tree,
+        np.array(where),
+        np.array(codes, dtype=np.float64),
+        chart.contacts.reshape(-1, 3)[order],
+        chart.values.reshape(-1, 6)[order],
+        seen,
+        turns,
+        np.array(kinds),
+        _cut(chart, _PARTS_BY_AXIS)[order],
+        _volumes(chart)[order],
+        blocks,
+        np.stack([seen[:, blocks[:-1]] + 0.5 * (low + high), 0.5 * (high - low)]),
+    )
+
+
+@lru_cache(maxsize=64)
+def at_nodes(chart: StableSet, names: tuple[str, ...]) -> tuple[Array, Array]:
+    """Channels (k, nodes) at the chart's nodes, and 1/2π for those that are angles."""
+    which = [CHANNELS.index(name) for name in names]
+    known = np.ascontiguousarray(channels_of(chart.values.reshape(-1, 6))[:, which].T)
+    return known, np.array([0.5 / np.pi if CIRCULAR[w] else 0.0 for w in which])
+
+
+def _cut(chart: StableSet, number: tuple[int, int, int]) -> IntArray:
+    """To which of so many blocks along each axis the chart's nodes belong, flat."""
+    size = chart.values.shape[:3]
+    axes = [n * np.arange(m) // m for n, m in zip(number, size, strict=True)]
+    i, j, k = np.meshgrid(*axes, indexing="ij")
+    return np.asarray(((i * number[1] + j) * number[2] + k).reshape(-1))
+
+
+@lru_cache(maxsize=16)
+def _volumes(chart: StableSet) -> Array:
+    """Volumes of contact points that the chart's nodes stand for, flat."""
+    size = np.abs(np.linalg.det(chart.tangents[..., 3:, :] @ chart.frames))
+    n, m, k = (number - 1 for number in size.shape)
+    size *= 2.0 * np.pi / (n * m * k)  # the chart is 1 × 2π × 1
+    for axis in range(3):  # nodes on its faces stand for half a cell
+        ends = np.ones(size.shape[axis])
+        ends[[0, -1]] = 0.5
+        size = size * np.expand_dims(ends, [i for i in range(3) if i != axis])
+    return np.asarray(np.maximum(size, np.finfo(float).tiny).reshape(-1))
+
+
+@kernel
+def nearest_of(of: Searched, mixing: Array, target: Array, out: IntArray) -> None:
+    """Fill the nodes of all parts of the chart that come nearest to one measurement."""
+    q, nodes, sizes = of.turns.shape[0], of.seen.shape[1], np.zeros(2)
+    wanted, least, total = np.zeros(q), np.full(PARTS, np.inf), np.zeros(nodes)
+    for i in range(q):
+        for c in range(target.shape[0]):
+            wanted[i] += mixing[i, c] * target[c]
+        if of.kinds[i] < 2:
+            sizes[of.kinds[i]] += wanted[i] ** 2
+    for i in range(q):
+        seen, aim, turn, scale = of.seen[i], wanted[i], of.turns[i], 1.0
+        if of.kinds[i] < 2 and sizes[of.kinds[i]] > 0.0:
+            scale = 1.0 / np.sqrt(sizes[of.kinds[i]])
+        for node in range(nodes):
+            away = seen[node] - aim
+            away -= np.rint(away * turn) * 2.0 * np.pi
+            total[node] += (away * scale) ** 2
+    for node in range(nodes):
+        p = of.part[node]
+        if total[node] < least[p]:
+            least[p] = total[node]
+            out[p] = node
+
+
+@inlined
+def _near_blocks(
+    of: Searched, weights: Array, target: Array, most: float, blocks: IntArray
+) -> tuple[int, int]:
+    """List blocks of nodes that may have a χ² of ``most``; how many, with how many nodes.
+
+    Each whitened residual is within bounds over a block, as the channels are.
+    """
+    q, number, nodes, away = of.turns.shape[0], 0, 0, np.empty(of.turns.shape[0])
+    for n in range(blocks.shape[0]):
+        least = 0.0
+        for i in range(q):
+            away[i] = of.extent[0, i, n] - target[i]
+            away[i] -= 2.0 * np.pi * np.rint(away[i] * of.turns[i])
+        for i in range(q):
+            middle, half = 0.0, 0.0
+            for c in range(q):
+                middle += weights[i, c] * away[c]
+                half += abs(weights[i, c]) * of.extent[1, c, n]
+            least += max(abs(middle) - half, 0.0) ** 2
+        if least <= most:
+            blocks[number] = n
+            number, nodes = number + 1, nodes + of.blocks[n + 1] - of.blocks[n]
+    return number, nodes
+
+
+@inlined
+def _misfits_of_block(
+    of: Searched, weights: Array, target: Array, first: int, away: Array, misfits: Array
+) -> None:
+    """Fill χ² (n,) at nodes from the first of a block on; ``away`` (q + 1, n) is for work."""
+    q, number = of.turns.shape[0], misfits.shape[0]
+    r = away[q]
+    for i in range(q):
+        seen, turn, aim, mine = of.seen[i], of.turns[i], target[i], away[i]
+        for k in range(number):
+            mine[k] = seen[first + k] - aim
+        for k in range(number if turn > 0.0 else 0):
+            mine[k] -= np.rint(mine[k] * turn) * 2.0 * np.pi
+    for k in range(number):
+        misfits[k] = 0.0
+    for i in range(q):
+        r[:] = 0.0
+        for c in range(q):
+            w, mine = weights[i, c], away[c]
+            for k in range(number if w != 0.0 else 0):
+                r[k] += w * mine[k]
+        for k in range(number):
+            misfits[k] += r[k] * r[k]
+
+
+@inlined
+def _likely_nodes(
+    of: Searched, weights: Array, target: Array, most: float, blocks: IntArray, near: int, size: int
+) -> tuple[int, IntArray, Array]:
+    """List the nodes of some blocks with a χ² below ``most``; how many, which, and their χ²."""
+    nodes, misfits, kept, longest = np.empty(size, np.int64), np.empty(size), 0, 0
+    for i in range(near):
+        longest = max(longest, of.blocks[blocks[i] + 1] - of.blocks[blocks[i]])
+    away, here = np.empty((of.turns.shape[0] + 1, longest)), np.empty(longest)
+    for i in range(near):
+        first = of.blocks[blocks[i]]
+        number = of.blocks[blocks[i] + 1] - first
+        _misfits_of_block(of, weights, target, first, away, here[:number])
+        for k in range(number):  # without branches: what does not count is written over
+            nodes[kept], misfits[kept] = first + k, here[k]
+            kept += 1 if here[k] < most else 0
+    return kept, nodes, misfits
+
+
+@kernel
+def outside_share(
+    of: Searched,
+    white: bool,
+    weights: Array,
+    target: Array,
+    point: Array,
+    chi: float,
+    log_mass: float,
+    covariance: Array,
+) -> float:
+    """Share of the probability that the chart's nodes leave to other regions than a candidate's.
+
+    Where noise leaves more open than the second order about one contact can describe, so that many
+    nodes count, the covariance is replaced by the second moment of the posterior over them. The
+    share outside three standard deviations is that of contact points or of the chart, whichever is
+    larger: contact points of little volume, as near slip-off, are not left out. What is seen may be
+    ``white`` already.
+    """
+    if white:
+        weights = np.eye(of.turns.shape[0])
+    blocks, most = np.empty(of.blocks.shape[0] - 1, np.int64), chi + _NEGLIGIBLE
+    near, size = _near_blocks(of, weights, target, most, blocks)
+    n, nodes, misfits = _likely_nodes(of, weights, target, most, blocks, near, size)
+    points, density, likelihood, far = np.empty((3, n)), np.empty(n), np.empty(n), np.empty(n)
+    total, squares = 0.0, 0.0
+    for k in range(n):
+        likelihood[k] = quick_exp(0.5 * (chi - misfits[k]))
+    for k in range(n):
+        node = nodes[k]
+        density[k] = of.volume[node] * likelihood[k]
+        total += density[k]
+        squares += density[k] * density[k]
+        for a in range(3):
+            points[a, k] = of.values[node, 3 + a] - point[a]
+    if total * total > _MANY * squares:
+        second_moment(points, density, total, NORMAL_KURTOSIS, covariance)
+    root = np.zeros((3, 3))
+    if not cholesky(covariance, root):
+        return 0.0
+    squared_distances(root, points, far)
+    mass, mass_out, like, like_out = 0.0, 0.0, 0.0, 0.0
+    for k in range(n):
+        if far[k] > _OUTSIDE_REGION:
+            mass_out += density[k]
+            like_out += min(likelihood[k], 1.0)
+        else:
+            mass += density[k]
+            like += min(likelihood[k], 1.0)
+    # The nodes may be too far apart to see all of the candidate itself.
+    mass = max(mass, math.exp(min(log_mass + 0.5 * chi, _MOST_LOG)), 1e-300)
+    like = max(like, 1.0)
+    return max(mass_out / (mass + mass_out), like_out / (like + like_out))

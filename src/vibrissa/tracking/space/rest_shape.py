@@ -66,8 +66,9 @@ _ROUNDS = 4
 _STEP, _LONGEST = 0.03, 1.45
 """Step and largest value of the lengths that are tried, as a share of what is seen."""
 
-_CERTAIN = 0.005
-"""Smallest standard deviation of a length, as a share: the taper is not quite that of the rod."""
+_CERTAIN = 0.015
+"""Smallest standard deviation of a length that bending shows, as a share: errors of traces, and of
+the taper, that all frames share."""
 
 _OUTER = 0.4
 """Share of the shape that determines how it continues."""

@@ -342,9 +342,9 @@ one in which the tip is searched."""
 _BORDER = 8.0
 """Distance from the image's border within which a line may end because the image does, pixels."""
 
-_CLEAR = 3.0
-"""Standard deviations by which each of a line's last points must be darker than what is beyond for
-its end to be seen: then it is known to a point."""
+_CLEAR = 1.5
+"""Standard deviations of one point by which a line's last points are darker on average than what is
+beyond, for its end to be seen, to a few points: nearly five of the mean of ten."""
 
 _SMOOTHED = 0.6
 """Noise below which an image is not as a sensor gives it, grey values: twice that of rounding."""
